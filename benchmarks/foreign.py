@@ -65,7 +65,9 @@ LIQUIDS: dict[str, complex] = {
     "sugar water": 7.50 - 12.0j,
 }
 KINDS = ("plates", "dishes", "sheets")
-CHI2_99, NARROW, ALIKE = 9.21, 0.10, 0.15
+CHI2_99 = 9.21
+NARROW = 0.10
+ALIKE = 0.15
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,9 @@ def draw_scene(rng: np.random.Generator, kind: str, first: int) -> World:
         names = [list(FOREIGN)[(first + k) % len(FOREIGN)] for k in range(9)]
         stacks = {name: Stack(below=_piece(rng, FOREIGN[name])) for name in names}
     elif kind == "sheets":
-        real, tangent, size_m = rng.uniform(2, 5, 9), rng.uniform(0.002, 0.05, 9), rng.uniform(1e-3, 5e-3, 9)
+        real = rng.uniform(2, 5, 9)
+        tangent = rng.uniform(0.002, 0.05, 9)
+        size_m = rng.uniform(1e-3, 5e-3, 9)
         stacks = {f"sheet {k}": Stack(((real[k] * (1 - 1j * tangent[k]), size_m[k]),), 1.0) for k in range(9)}
     else:
         stacks = {name: Stack(below=_piece(rng, eps)) for name, eps in LIQUIDS.items()}
@@ -115,7 +119,8 @@ def judge_scene(kind: str, seed: int, nuisance: str = "none") -> list[Piece]:
         stack = plates[patch.patch.label].stack
         if stack.is_metal:
             continue
-        name, e = patch.verdict, patch.permittivity
+        name = patch.verdict
+        e = patch.permittivity
         true = stack.layers[0][0] if stack.layers else stack.below
         misled = False
         if patch.refused is None and e.value is not None and e.covariance is not None:
@@ -123,7 +128,10 @@ def judge_scene(kind: str, seed: int, nuisance: str = "none") -> list[Piece]:
             width = 1.96 * float(np.sqrt(np.trace(e.covariance) / 2)) / abs(e.value)
             misled = float(off @ np.linalg.solve(e.covariance, off)) > CHI2_99 and width < NARROW
         thin = patch.refused is not None and patch.refused.what == "possible layer"
-        said = ("not judged", None, 0.0) if name is None else (name.name, name.source, name.confidence)
+        if name is None:
+            said = ("not judged", None, 0.0)
+        else:
+            said = (name.name, name.source, name.confidence)
         alike = name is not None and any(_alike(other, true) for other in name.literature)
         out.append(Piece(plates[patch.patch.label].name, *said, alike, thin, misled))
     return out

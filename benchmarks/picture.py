@@ -172,7 +172,10 @@ def run(args: argparse.Namespace) -> int:
     boxes = json.loads(sources[0].with_suffix(".json").read_text())["boxes_px"]
     figures = {}
     with tempfile.TemporaryDirectory() as scratch:
-        library = write_table_2_library(Path(scratch) / "table-2.npz") if args.table_2 else args.library
+        if args.table_2:
+            library = write_table_2_library(Path(scratch) / "table-2.npz")
+        else:
+            library = args.library
         for form in forms_of(sources[0], boxes, Path(scratch)):
             scan, patch_of = process(form, boxes, library)
             by_number = {patch.label: patch for patch in scan.segments}

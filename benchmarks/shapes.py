@@ -144,7 +144,9 @@ class ScanKind:
     def boards(self) -> Boards:
         """Antennas of the rig file; of a quick scan, one RX of each board."""
         boards = load_boards(RIG_FILE)
-        return replace(boards, h=boards.h[1:2], v=boards.v[1:2]) if self.is_quick else boards
+        if self.is_quick:
+            return replace(boards, h=boards.h[1:2], v=boards.v[1:2])
+        return boards
 
     @property
     def optics(self) -> Optics:
@@ -321,7 +323,10 @@ def run(args: argparse.Namespace) -> int:
     with ProcessPoolExecutor(args.jobs) as pool:
         for judged in pool.map(_judge, jobs):
             figures.append(judged)
-            said = "no permittivity" if judged.error is None else f"permittivity within {100 * judged.error:.1f} %"
+            if judged.error is None:
+                said = "no permittivity"
+            else:
+                said = f"permittivity within {100 * judged.error:.1f} %"
             print(f"{judged.kind} {judged.seed}, {judged.disturbance}: {judged.points} points, {said}", file=sys.stderr)
     print(__doc__)
     print(f"{'kind':<26}{'n':>5}{'normal deg':>16}{'point mm':>16}{'eps %':>16}{'given %':>7}"

@@ -195,7 +195,8 @@ def analyse_world(
     `declared` is the plate that is given as the metal reference; None: it is looked for. `measured`: the rig's leakage
     was measured. `searched`: patches are searched for instead of given as boxes.
     """
-    h, v = pair.h.astype(np.complex64), pair.v.astype(np.complex64)
+    h = pair.h.astype(np.complex64)
+    v = pair.v.astype(np.complex64)
     usable: npt.NDArray[np.bool_] = np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
     light = illumination_of_worlds(h.shape, float(pair.x_m[1] - pair.x_m[0]))
     images = Images(h, v, pair.x_m, pair.y_m, usable, illumination=light)
@@ -223,7 +224,8 @@ def analyse_world(
 def box_in_mm(box: tuple[int, int, int, int], pair: ImagePair) -> tuple[float, float, float, float]:
     """Return a box in pixels as millimetres from the picture's middle, x0, y0, x1, y1."""
     left, bottom, right, top = box
-    x_mm, y_mm = axis_mm(pair.x_m), axis_mm(pair.y_m)
+    x_mm = axis_mm(pair.x_m)
+    y_mm = axis_mm(pair.y_m)
     return float(x_mm[left]), float(y_mm[bottom]), float(x_mm[right - 1]), float(y_mm[top - 1])
 
 
@@ -269,7 +271,9 @@ def figures_of(nuisance: str, patch: PatchResult, plate: Plate) -> PatchFigures:
     """Compare one patch with its plate."""
     e = patch.permittivity
     refused = "" if patch.refused is None else patch.refused.what
-    distance2, half_width, error = None, None, None
+    distance2 = None
+    half_width = None
+    error = None
     if e.value is not None and e.covariance is not None and not refused:
         away = e.value - plate.stack.below
         parts = np.array([away.real, away.imag])
@@ -374,7 +378,10 @@ def verdict_line(title: str, scenes: Sequence[SceneFigures], undisturbed: Sequen
     places = [scene.named_at(title) for scene in scenes]
     early = np.mean([place is not None and place < FIRST_REASONS for place in places])
     ever = np.mean([place is not None for place in places])
-    false = np.mean([scene.named_at(title) is not None for scene in undisturbed]) if undisturbed else np.nan
+    if undisturbed:
+        false = np.mean([scene.named_at(title) is not None for scene in undisturbed])
+    else:
+        false = np.nan
     cells.append(f"{100 * early:>9.0f}{100 * ever:>6.0f}{100 * false:>13.0f}" if title in CAUSES else f"{'-':>9}")
     refused = sum(bool(p.refused) for scene in scenes for p in scene.patches)
     cells.append(f"   refused {refused}, missed {sum(s.missed for s in scenes)}, stray {sum(s.stray for s in scenes)}")

@@ -59,7 +59,8 @@ def reflect(eps, theta):
     if eps is None:
         return -1.0, -1.0
     n = np.sqrt(eps)
-    c, ct = np.cos(theta), np.sqrt(1 - np.sin(theta) ** 2 / eps)
+    c = np.cos(theta)
+    ct = np.sqrt(1 - np.sin(theta) ** 2 / eps)
     return (c - n * ct) / (c + n * ct), (ct - n * c) / (ct + n * c)
 
 
@@ -83,15 +84,18 @@ def make(
     materials = NINE if materials is None else materials
     x = (np.arange(pixels) - (pixels - 1) / 2) * pixel_mm
     places = [((i % 3 - 1) * pitch_mm, (i // 3 - 1) * pitch_mm) for i in rng.permutation(9)]
-    s, p = np.zeros((pixels, pixels), complex), np.zeros((pixels, pixels), complex)
+    s = np.zeros((pixels, pixels), complex)
+    p = np.zeros((pixels, pixels), complex)
     plates = []
     for (name, eps), (cx, cy) in zip(materials.items(), places, strict=False):
-        cx, cy = cx + rng.uniform(-jitter_mm, jitter_mm), cy + rng.uniform(-jitter_mm, jitter_mm)
+        cx = cx + rng.uniform(-jitter_mm, jitter_mm)
+        cy = cy + rng.uniform(-jitter_mm, jitter_mm)
         half = size_mm / 2
         plates.append(TruthPlate(name, (cx - half, cy - half, cx + half, cy + half), eps, metal=eps is None))
         inside = (abs(x[:, None] - cy) <= half) & (abs(x[None, :] - cx) <= half)
         s[inside], p[inside] = reflect(eps, theta)
-    h, v = gain_h * (s + leak[0] * p), gain_v * (p + leak[1] * s)
+    h = gain_h * (s + leak[0] * p)
+    v = gain_v * (p + leak[1] * s)
     frequency = np.fft.fftfreq(pixels, pixel_mm)
     passed = (abs(frequency[:, None]) < 0.443 / 3.6) & (abs(frequency[None, :]) < 0.443 / 5.4)
     out = []

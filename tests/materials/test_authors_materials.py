@@ -22,7 +22,8 @@ GAIN = 3.0 * np.exp(0.7j)
 def content(n=90, gain=GAIN):
     h = gain * (0.6 + 0.01 * RNG.standard_normal(n))
     v = 0.5 * (0.15 + 0.01 * RNG.standard_normal(n)).astype(complex)
-    metal_h, metal_v = gain * np.ones(40), 0.5 * np.ones(40, complex)
+    metal_h = gain * np.ones(40)
+    metal_v = 0.5 * np.ones(40, complex)
     return {
         "name": "PET",
         "thickness": 0.5,
@@ -85,7 +86,8 @@ class Hostile:
 
 
 def test_a_hostile_file_is_refused_and_does_nothing(tmp_path):
-    target, path = tmp_path / "ran", tmp_path / "evil_55.pkl"
+    target = tmp_path / "ran"
+    path = tmp_path / "evil_55.pkl"
     path.write_bytes(pickle.dumps(content() | {"name": Hostile(target)}))
     with refused(ErrorCode.FILE_FOREIGN, "system"):
         read_material(path)

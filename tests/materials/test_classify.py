@@ -154,14 +154,16 @@ def test_two_scans_as_typed(folders, capsys):
 
 
 def test_patches_exchanged_between_two_angles_are_told(folders, scans, capsys):
-    there, angle = scans[1], "60"
+    there = scans[1]
+    angle = "60"
     truths = {"wood": "ceramic", "ceramic": "wood"}
     like = {p.truth: p for p in there.patches}
     swap = {a: b for a in like for key, other in truths.items() if a and key in a for b in like if b and other in b}
     assert len(swap) == 2
     with np.load(folders / angle / PATCHES) as stored:
         content = dict(stored)
-    features, first = content["features"].copy(), np.cumsum([0, *[len(p.features) for p in there.patches]])
+    features = content["features"].copy()
+    first = np.cumsum([0, *[len(p.features) for p in there.patches]])
     where = {p.truth: np.arange(first[i], first[i + 1]) for i, p in enumerate(there.patches)}
     one, other = swap
     middle = {name: np.median(features[where[name]], axis=0) for name in swap}

@@ -22,10 +22,12 @@ def drawn(seed=0, scans=8, pixels=12, scan=0.02, patch=0.01, pixel=0.03, means=M
     shape = (scans, len(means), pixels, 3)
     z = np.array(means)[None, :, None] + scan * rng.standard_normal((scans, 1, 1, 3))
     z = z + patch * rng.standard_normal((*shape[:2], 1, 3)) + pixel * rng.standard_normal(shape)
-    h, v = np.exp(z[..., 0]).ravel(), np.exp(z[..., 1]).ravel()
+    h = np.exp(z[..., 0]).ravel()
+    v = np.exp(z[..., 1]).ravel()
     x = feature_matrix(h, v, h / v * np.exp(1j * z[..., 2].ravel()))
     s, m, _ = np.indices(shape[:3])
-    names, groups = np.char.add("m", m.ravel().astype(str)), np.char.add("s", s.ravel().astype(str))
+    names = np.char.add("m", m.ravel().astype(str))
+    groups = np.char.add("s", s.ravel().astype(str))
     return Samples(x, names, groups, (s * len(means) + m).ravel())
 
 
@@ -52,10 +54,12 @@ def test_an_error_that_all_patches_of_a_scan_share_changes_no_name():
     model = ErrorDiscriminant().fit(drawn(0, means=near))
     test = drawn(1, scans=1, scan=0.0, means=near)
     gains = np.array([1.03, 0.96]), np.exp(0.04j)
-    h, v = test.x[:, 0] * gains[0][0], test.x[:, 1] * gains[0][1]
+    h = test.x[:, 0] * gains[0][0]
+    v = test.x[:, 1] * gains[0][1]
     p = gains[1] * gains[0][0] / gains[0][1] / (test.x[:, 2] + 1j * test.x[:, 3])
     moved = feature_matrix(h, v, p)
-    here, there = model.by_scan(test.x, test.patches), model.by_scan(moved, test.patches)
+    here = model.by_scan(test.x, test.patches)
+    there = model.by_scan(moved, test.patches)
     assert here.names.tolist() == there.names.tolist() == [f"m{i}" for i in range(5)]
     alone = (model.by_pixel(moved)[0] == test.names).mean()
     assert (there.pixel_names == test.names).mean() > alone
@@ -85,7 +89,8 @@ def test_probabilities_mean_what_they_say():
     """Of the patches named with confidence c, a share c is named right: five materials close to each other in |H|."""
     near = [[-0.6 + 0.02 * i, -2.0, 0.1] for i in range(5)]
     model = ErrorDiscriminant().fit(drawn(0, scans=60, means=near))
-    sure, right = [], []
+    sure = []
+    right = []
     for seed in range(60):
         test = drawn(100 + seed, scans=1, means=near)
         found = model.by_scan(test.x, test.patches)
@@ -103,7 +108,8 @@ def test_a_material_that_was_never_learnt_is_unknown():
 
 def test_a_stranger_does_not_shift_the_others():
     model = ErrorDiscriminant().fit(drawn(0))
-    test, strange = drawn(5, scans=1), drawn(6, scans=1, means=[[-1.5, -3.5, 1.5]] * 3)
+    test = drawn(5, scans=1)
+    strange = drawn(6, scans=1, means=[[-1.5, -3.5, 1.5]] * 3)
     alone = model.by_scan(test.x, test.patches)
     joint = model.by_scan(np.concatenate([test.x, strange.x]), np.concatenate([test.patches, strange.patches + 100]))
     assert joint.names[:5].tolist() == alone.names.tolist()
@@ -113,11 +119,14 @@ def test_a_stranger_does_not_shift_the_others():
 
 def with_metal(samples, stray):
     """The same scans with metal beside: no error of scan or patch, and one stray pixel a patch, the first or last."""
-    rng, scans = np.random.default_rng(7), np.unique(samples.groups)
+    rng = np.random.default_rng(7)
+    scans = np.unique(samples.groups)
     n = int((samples.patches == 0).sum())
     z = 0.03 * rng.standard_normal((scans.size, n, 3))
-    z[:, stray] += [0.0, -0.5, 0.3]  # |1/P - 1| of 0.5
-    h, v = np.exp(z[..., 0]).ravel(), np.exp(z[..., 1]).ravel()
+    # |1/P - 1| of 0.5
+    z[:, stray] += [0.0, -0.5, 0.3]
+    h = np.exp(z[..., 0]).ravel()
+    v = np.exp(z[..., 1]).ravel()
     x = feature_matrix(h, v, h / v * np.exp(1j * z[..., 2].ravel()))
     patches = samples.patches.max() + 1 + np.repeat(np.arange(scans.size), n)
     metal = Samples(x, np.full(len(x), "metal"), np.repeat(scans, n), patches)
@@ -127,7 +136,8 @@ def with_metal(samples, stray):
 def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
     samples = with_metal(drawn(8), 0)
     turned = samples.take(np.arange(len(samples.x))[::-1])
-    here, there = ErrorDiscriminant().fit(samples), ErrorDiscriminant().fit(turned)
+    here = ErrorDiscriminant().fit(samples)
+    there = ErrorDiscriminant().fit(turned)
     np.testing.assert_allclose(here.scan, there.scan, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(here.level, there.level, rtol=1e-9, atol=1e-12)
     assert here.patch_level == pytest.approx(there.patch_level)
@@ -145,7 +155,8 @@ def test_metal_with_a_stray_pixel_tells_nothing_of_the_reference(stray):
 
 
 def test_two_angles_are_independent_and_tell_more():
-    one, two = drawn(0, pixel=0.1, patch=0.05), drawn(1, pixel=0.1, patch=0.05)
+    one = drawn(0, pixel=0.1, patch=0.05)
+    two = drawn(1, pixel=0.1, patch=0.05)
     both = one.joined(two)
     model = ErrorDiscriminant().fit(both)
     for covariance in (model.scan, model.between, model.within):
@@ -165,7 +176,8 @@ def with_lonely(samples, scans=1):
 def test_a_material_of_one_scan_is_neither_right_nor_wrong(model):
     """It cannot be learnt from other scans: the accuracy is that of the others, and it is named."""
     some = drawn(12, scans=4, pixels=4)
-    without, beside = score(some, model), score(with_lonely(some), model)
+    without = score(some, model)
+    beside = score(with_lonely(some), model)
     assert (without.not_judged, beside.not_judged) == ((), ("lonely",))
     assert beside.pixels == pytest.approx(without.pixels, abs=0.02)
     assert beside.patches == pytest.approx(without.patches, abs=0.02)
@@ -183,7 +195,8 @@ def test_a_library_says_which_materials_could_not_be_judged():
 
 def test_the_channels_alone_are_judged_on_the_same_materials():
     some = drawn(0, scans=4, pixels=6)
-    without, beside = fit_weights(some).by_channel, fit_weights(with_lonely(some)).by_channel
+    without = fit_weights(some).by_channel
+    beside = fit_weights(with_lonely(some)).by_channel
     assert [beside[c] for c in "hv"] == pytest.approx([without[c] for c in "hv"])
 
 
@@ -204,7 +217,9 @@ def test_the_report_and_the_table_of_models_name_what_was_not_judged(tmp_path, c
     entries = []
     for patch in np.unique(samples.patches):
         at = samples.patches == patch
-        h, v, q = samples.x[at, 0], samples.x[at, 1], samples.x[at, 2] + 1j * samples.x[at, 3]
+        h = samples.x[at, 0]
+        v = samples.x[at, 1]
+        q = samples.x[at, 2] + 1j * samples.x[at, 3]
         (name, *_), (scan, *_) = samples.names[at], samples.groups[at]
         plain = (h.astype(np.float32), v.astype(np.float32), (1 / q).astype(np.complex64))
         entries.append(Entry(str(name), str(scan), *plain, 55.0, True))

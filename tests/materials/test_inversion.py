@@ -30,8 +30,10 @@ def world(rng, leak, noise=0.003, dull=0.03, angle=0.0, reference=0.0, eps=EPS):
     a, b = leak
     theta = THETA + angle
     q = np.sqrt(eps - np.sin(theta) ** 2)
-    r_s, r_p = (np.cos(theta) - q) / (np.cos(theta) + q), (q - eps * np.cos(theta)) / (q + eps * np.cos(theta))
-    h, v = (r_s + a * r_p) / -(1 + a), (r_p + b * r_s) / -(1 + b)
+    r_s = (np.cos(theta) - q) / (np.cos(theta) + q)
+    r_p = (q - eps * np.cos(theta)) / (q + eps * np.cos(theta))
+    h = (r_s + a * r_p) / -(1 + a)
+    v = (r_p + b * r_s) / -(1 + b)
     z = rng.standard_normal((2, eps.size))
     ratio = v / h * (1 + reference) + noise * (z[0] + 1j * z[1])
     level = np.abs(h) * np.exp(dull * rng.standard_normal(eps.size))
@@ -57,14 +59,19 @@ parts = st.floats(-0.6, 0.6)
 
 @given(small, small, small, small, small, small, parts, parts)
 def test_ratio_there_and_back(ar, ai, br, bi, rr, ri, tr, ti):
-    a, b, rho, t = complex(ar, ai), complex(br, bi), complex(rr, ri), complex(tr, ti)
+    a = complex(ar, ai)
+    b = complex(br, bi)
+    rho = complex(rr, ri)
+    t = complex(tr, ti)
     assert true_ratio(measured_ratio(t, a, b, rho), a, b, rho) == pytest.approx(t, abs=1e-12)
-    assert measured_ratio(1.0, a, b) == pytest.approx(1.0)  # metal is the reference, whatever leaks
+    # Metal is the reference, whatever leaks
+    assert measured_ratio(1.0, a, b) == pytest.approx(1.0)
 
 
 @given(parts, parts)
 def test_slope_is_the_derivative(tr, ti):
-    t, step = complex(tr, ti), 1e-6
+    t = complex(tr, ti)
+    step = 1e-6
     by = (permittivity_from_ratio(t + step, THETA) - permittivity_from_ratio(t - step, THETA)) / (2 * step)
     assert slope(t, THETA) == pytest.approx(by, rel=1e-5, abs=1e-6)
 
@@ -84,9 +91,13 @@ def test_regions_hold_the_truth_as_often_as_they_say(measured, request):
     for seed in range(60 if request.config.getoption("--long") else 25):
         rng = np.random.default_rng(seed)
         leak = (drawn_leakage(rng), drawn_leakage(rng))
-        angle, reference = 2e-3 * rng.standard_normal(), 0.005 * complex(*rng.standard_normal(2))
+        angle = 2e-3 * rng.standard_normal()
+        reference = 0.005 * complex(*rng.standard_normal(2))
         seen = world(rng, leak, angle=angle, reference=reference)
-        known = tuple(x + 0.003 * complex(*rng.standard_normal(2)) for x in leak) if measured else (0j, 0j)
+        if measured:
+            known = tuple(x + 0.003 * complex(*rng.standard_normal(2)) for x in leak)
+        else:
+            known = (0j, 0j)
         prior = RigPrior(2e-3, known, 0.003 if measured else 0.041, measured, reference_std=0.005)
         d += distances(invert(seen, prior))
     d = np.array(d)
@@ -115,7 +126,8 @@ def test_where_even_plates_tell_the_leakage_it_is_found():
 
 def test_shares_add_up_and_a_better_measurement_shrinks_what_it_dominates():
     seen = world(np.random.default_rng(3), (0j, 0j))
-    wide, known = invert(seen, RigPrior(2e-3)), invert(seen, RigPrior(2e-3, (0j, 0j), 0.001, True))
+    wide = invert(seen, RigPrior(2e-3))
+    known = invert(seen, RigPrior(2e-3, (0j, 0j), 0.001, True))
     for a, b in zip(wide.patches, known.patches, strict=True):
         assert set(a.shares) == set(SOURCES)
         assert sum(a.shares.values()) == pytest.approx(1.0, abs=1e-6)
@@ -132,7 +144,8 @@ def test_metal_like_patches_get_no_permittivity():
 
 def test_drawn_covariance_agrees_with_the_slope_where_both_hold():
     eps = np.array([12.0 - 3.0j])
-    noises, ratios = (0.01, 0.03), []
+    noises = (0.01, 0.03)
+    ratios = []
     for noise in noises:
         seen = [
             PatchMeasurement(s.inverse_ratio, noise, THETA, None)
@@ -146,7 +159,8 @@ def test_drawn_covariance_agrees_with_the_slope_where_both_hold():
 def test_a_thin_sheet_does_not_pull_the_others():
     seen = world(np.random.default_rng(5), (0j, 0j), dull=0.01)
     odd = [*seen[:-1], PatchMeasurement(seen[-1].inverse_ratio, seen[-1].std, THETA, 0.3 * seen[-1].brightness)]
-    before, after = invert(seen, RigPrior(2e-3)), invert(odd, RigPrior(2e-3))
+    before = invert(seen, RigPrior(2e-3))
+    after = invert(odd, RigPrior(2e-3))
     for a, b in zip(before.patches[:-1], after.patches[:-1], strict=True):
         assert abs(a.permittivity - b.permittivity) < np.sqrt(np.trace(a.covariance))
 
@@ -154,9 +168,11 @@ def test_a_thin_sheet_does_not_pull_the_others():
 def test_ratio_error_is_that_of_draws():
     prior = RigPrior(2e-3)
     found = invert([PatchMeasurement(0.2 + 0.1j, 0.003, THETA, None)], prior)
-    rng, t = np.random.default_rng(6), np.array([0.1 + 0.05j, -0.2j, 0.5])
+    rng = np.random.default_rng(6)
+    t = np.array([0.1 + 0.05j, -0.2j, 0.5])
     z = rng.multivariate_normal(np.zeros(6), found.nuisance_covariance, 20000)
-    a, b = prior.leakage_std * (z[:, 0] + 1j * z[:, 1]), prior.leakage_std * (z[:, 2] + 1j * z[:, 3])
+    a = prior.leakage_std * (z[:, 0] + 1j * z[:, 1])
+    b = prior.leakage_std * (z[:, 2] + 1j * z[:, 3])
     rho = prior.reference_std * (z[:, 4] + 1j * z[:, 5])
     for value, stated in zip(t, ratio_error(found, prior, t), strict=True):
         away = np.array([measured_ratio(value, *x) - value for x in zip(a, b, rho, strict=True)])

@@ -22,8 +22,10 @@ from polysight.process import Inputs, boxes_as_patches
 from polysight.settings import DEFAULT
 from polysight_shared.error_codes import ErrorCode
 
-X_M = Y_M = np.linspace(-0.049, 0.049, 50)  # 50 pixels of 2 mm: -50 to 50 mm
-COPPER, OAK = (-40.0, -10.0, -10.0, 10.0), (10.0, -10.0, 40.0, 10.0)
+# 50 pixels of 2 mm: -50 to 50 mm
+X_M = Y_M = np.linspace(-0.049, 0.049, 50)
+COPPER = (-40.0, -10.0, -10.0, 10.0)
+OAK = (10.0, -10.0, 40.0, 10.0)
 NAN = float("nan")
 
 
@@ -31,7 +33,8 @@ def checked(boxes, **more):
     return check_labels(Labels(boxes, "mm", **more), X_M, Y_M)
 
 
-INVALID, CONFLICT = ErrorCode.VALUE_INVALID, ErrorCode.VALUES_CONFLICT
+INVALID = ErrorCode.VALUE_INVALID
+CONFLICT = ErrorCode.VALUES_CONFLICT
 
 
 @pytest.mark.parametrize(

@@ -19,11 +19,13 @@ from polysight.results import ScanMaterials
 THETA = np.radians(55.0)
 CHIRP = published_rig().chirp
 BANDS = Spectrum.of(CHIRP, 4)
-RANGE, NEAR = (0.3e-3, 6e-3), (1e-3, 2.4e-3)
+RANGE = (0.3e-3, 6e-3)
+NEAR = (1e-3, 2.4e-3)
 SHEET = Layer("sheet", 3.4 - 0.1j, 1.7e-3)
 PLATE = Layer("plate", METAL)
 GLASS = Layer("glass", 5.5 - 0.05j, 2e-3)
-OWN, COMMON = 3e-4, 3e-3
+OWN = 3e-4
+COMMON = 3e-3
 
 
 def shared_covariance(own=OWN, common=COMMON, bands=4):
@@ -136,7 +138,8 @@ def test_other_forms_are_refused_with_those_that_are_known(text, capsys):
 def folder(tmp_path):
     """Products of a sheet on metal, which one interface has no permittivity of."""
     q, h = predict([SHEET, PLATE], BANDS, THETA)
-    covariance, ratio = shared_covariance(), 1 / q
+    covariance = shared_covariance()
+    ratio = 1 / q
     edges = [(b.first_hz, b.last_hz) for b in sub_bands(CHIRP, 4)]
     bands = [
         {

@@ -72,7 +72,8 @@ def test_water_behind_glass_where_eq3_is_off_by_a_factor():
 
 
 def test_error_bars_are_those_of_repeated_measurements():
-    stack, unknown = [Layer("pvc", 4.15 - 0.81j, 1.5e-3)], [Layer("pvc", None, 1.5e-3)]
+    stack = [Layer("pvc", 4.15 - 0.81j, 1.5e-3)]
+    unknown = [Layer("pvc", None, 1.5e-3)]
     rng = np.random.default_rng(1)
     fits = [fit_layer(measured(stack, 0.01, rng=rng), unknown, THETA) for _ in range(60)]
     near = [f for f in fits if abs(f.permittivity - stack[0].permittivity) < 1.0]
@@ -86,7 +87,8 @@ def test_error_bars_are_those_of_repeated_measurements():
 
 def test_ambiguity_is_said():
     """The ratio of one narrow band repeats with every half wave in the sheet; the whole sweep tells them apart."""
-    eps, sheet = 7.0 - 0.1j, [Layer("sheet", None, 2e-3)]
+    eps = 7.0 - 0.1j
+    sheet = [Layer("sheet", None, 2e-3)]
     band = Spectrum(np.array([[76.3e9]]), np.array([[1.0]]))
     narrow = fit_layer(measured([Layer("sheet", eps, 2e-3)], 0.005, spectrum=band), sheet, THETA)
     assert narrow.ambiguous
@@ -136,7 +138,8 @@ def test_a_solution_at_the_end_of_what_is_looked_for_says_so():
 
 
 def test_what_one_scan_in_a_thousand_would_miss_is_said_and_its_rivals_are_kept():
-    fit = LayerFit(4 - 0.4j, 3e-3, 0.03, 0.03, 0.0, 24.4, 7)  # probability 0.97e-3
+    # Probability 0.97e-3
+    fit = LayerFit(4 - 0.4j, 3e-3, 0.03, 0.03, 0.0, 24.4, 7)
     assert any("does not explain" in words for words in fit.warnings())
     assert not any("does not explain" in words for words in replace(fit, chi2=24.0).warnings())
     # Two sheets that the data tell apart only as far as the model fits them.
@@ -146,7 +149,8 @@ def test_what_one_scan_in_a_thousand_would_miss_is_said_and_its_rivals_are_kept(
     loose = fit_layer(Bands(BANDS, q * 1.08, np.full(q.size, 0.002)), [Layer("sheet", None, 3e-3)], THETA)
     assert stiff.stretch == 1
     assert loose.stretch > 2
-    assert loose.rivals[0].chi2 - loose.chi2 > 9  # kept all the same
+    # Kept all the same
+    assert loose.rivals[0].chi2 - loose.chi2 > 9
     assert loose.rivals[0].permittivity == pytest.approx(stiff.rivals[0].permittivity, rel=1e-3)
 
 

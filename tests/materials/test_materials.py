@@ -98,14 +98,16 @@ def test_at_least_eight_of_nine_named_right(synthetic, library):
         result = synthetic(seed).analyse(classifier=classifier)
         shares.append((pixel_accuracy(result), expected_pixel_accuracy(result)))
         named = [r for r in result.patches if r.verdict is not None]
-        assert len(named) == 8  # the metal reference is not named by itself
+        # The metal reference is not named by itself
+        assert len(named) == 8
         assert sum(r.verdict.name == r.truth.name for r in named) >= 7
         assert pixel_accuracy(result) > 0.75
         for r in named:
             assert 0 < r.verdict.confidence <= 1
             assert sum(r.verdict.votes.values()) == pytest.approx(1)
     right, expected = np.mean(shares, axis=0)
-    assert 0.75 < expected < right + 0.05  # six scans teach little: the classifier is rather too cautious
+    # Six scans teach little: the classifier is rather too cautious
+    assert 0.75 < expected < right + 0.05
 
 
 def test_without_truth_or_probabilities_no_share_of_right_pixels_is_expected(synthetic, library):
@@ -127,7 +129,8 @@ def test_far_material_is_unknown(synthetic, library):
     names = {r.truth.name: r.verdict.name for r in result.patches if r.truth and r.verdict}
     assert names["water"] == UNKNOWN
     assert names["rubber"] == "rubber"
-    assert "copper" not in names  # the reference
+    # The reference
+    assert "copper" not in names
 
 
 def of_scans(library, count):
@@ -144,7 +147,8 @@ def test_one_scan_is_not_enough_and_splits_are_by_scan(library):
     fit = fit_library(shuffled).fit["angles"]["55"]
     assert all(judged["pixels"] < 0.4 for judged in fit["judged"].values())
     knn = fit["judged"][PAPER]
-    assert knn["pixels_split_by_pixel"] > 2 * knn["pixels"]  # the patch knows itself
+    # The patch knows itself
+    assert knn["pixels_split_by_pixel"] > 2 * knn["pixels"]
 
 
 def test_unusable_libraries_are_refused(library):
@@ -178,7 +182,8 @@ def test_pixels_that_are_not_finite_are_unknown(library):
 
 
 def test_a_majority_names_the_patch():
-    names, distance = np.array(["a", "b", "a", "c"]), np.array([0.1, 0.2, 0.3, 9.0])
+    names = np.array(["a", "b", "a", "c"])
+    distance = np.array([0.1, 0.2, 0.3, 9.0])
     found = majority(names, distance, np.array([7, 7, 7, 9]))
     assert found.patches.tolist() == [7, 9]
     assert found.names.tolist() == ["a", "c"]
@@ -212,7 +217,8 @@ def test_median_ratio_is_unbiased_where_v_nearly_vanishes():
     rng = np.random.default_rng(1)
     r_s, r_p = fresnel(2.61 - 0.01j, THETA)
     n = rng.standard_normal((4, 20000)) * 0.03
-    h, v = r_s + n[0] + 1j * n[1], r_p + n[2] + 1j * n[3]
+    h = r_s + n[0] + 1j * n[1]
+    v = r_p + n[2] + 1j * n[3]
     v[:500] = 50.0
     assert abs(1 / median_ratio(h, v) - r_p / r_s) < 0.006
 

@@ -22,12 +22,15 @@ def scene(rng, plates, metal, patterns_db=1.0):
         0.3 * rng.standard_normal(plates)
     )
     q = np.sqrt(eps - np.sin(THETA) ** 2)
-    r_s, r_p = (np.cos(THETA) - q) / (np.cos(THETA) + q), (q - eps * np.cos(THETA)) / (q + eps * np.cos(THETA))
+    r_s = (np.cos(THETA) - q) / (np.cos(THETA) + q)
+    r_p = (q - eps * np.cos(THETA)) / (q + eps * np.cos(THETA))
     if metal:
-        r_s, r_p = np.append(r_s, -1.0), np.append(r_p, -1.0)
+        r_s = np.append(r_s, -1.0)
+        r_p = np.append(r_p, -1.0)
     a, b = (0.1 * rng.random() * np.exp(2j * np.pi * rng.random()) for _ in range(2))
     dull = np.exp(0.04 * rng.standard_normal(r_s.size))
-    h, v = (r_s + a * r_p) / (1 + a) * dull, (r_p + b * r_s) / (1 + b) * dull
+    h = (r_s + a * r_p) / (1 + a) * dull
+    v = (r_p + b * r_s) / (1 + b) * dull
     v = v * 10 ** (patterns_db * rng.standard_normal() / 20) + 0.004 * h * rng.standard_normal(r_s.size)
     best = int(np.argmax(np.abs(h * v)))
     rest = [i for i in range(h.size) if i != best]

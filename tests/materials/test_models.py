@@ -13,7 +13,10 @@ from polysight_shared.error_codes import ErrorCode
 def samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=0, angle=0.0):
     """Materials in a row of V/H; `offset`: what all pixels of a patch share (placement, reference)."""
     rng = np.random.default_rng(seed)
-    x, names, group, patch = [], [], [], []
+    x = []
+    names = []
+    group = []
+    patch = []
     for g in range(groups):
         for m in range(materials):
             q = 0.1 + 0.05 * m + angle + 0.02j * m + offset * complex(*rng.standard_normal(2))
@@ -100,7 +103,8 @@ def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
     monkeypatch.setitem(MODELS, "spy", lambda _: Spy())
     data = samples()
     copied = Samples(data.x.copy(), data.names, data.groups, data.patches)
-    copied.x[1::2] = copied.x[::2]  # twins within a patch
+    # Twins within a patch
+    copied.x[1::2] = copied.x[::2]
     score(copied, "spy")
     assert not any(seen)
     score(copied, "spy", by_pixel=True)
@@ -117,11 +121,13 @@ def test_a_second_angle_helps():
 
 
 def test_joining_angles_pairs_whole_patches():
-    one, two = samples(groups=3, pixels=5), samples(groups=3, pixels=4, seed=2)
+    one = samples(groups=3, pixels=5)
+    two = samples(groups=3, pixels=4, seed=2)
     other = Samples(two.x, two.names, np.char.add("at 55 ", two.groups), two.patches + 1000)
     for there in (two, other):
         both = one.joined(there)
-        assert both.names.size == 3 * 6 * 4  # the fewer pixels of each patch
+        # The fewer pixels of each patch
+        assert both.names.size == 3 * 6 * 4
         for patch in np.unique(both.patches):
             at = both.patches == patch
             source = {tuple(row) for row in one.x[one.patches == patch]}
@@ -151,18 +157,21 @@ def test_the_paper_s_distance_is_what_scikit_learn_votes_with():
     """lambda_H |dH| + lambda_V |dV| with no P is a Manhattan distance, which scikit-learn computes by itself."""
     from sklearn.neighbors import KNeighborsClassifier
 
-    data, asked = samples(noise=0.02), samples(noise=0.02, seed=9)
+    data = samples(noise=0.02)
+    asked = samples(noise=0.02, seed=9)
     ours, _ = PaperKnn(weights=Weights(3.0, 0.7, 0.0, neighbours=7)).fit(data).by_pixel(asked.x)
     scaled = [d.x[:, :2] * [3.0, 0.7] for d in (data, asked)]
     theirs = KNeighborsClassifier(7, metric="manhattan").fit(scaled[0], data.names).predict(scaled[1])
-    assert (ours == theirs).mean() > 0.99  # ties may fall either way
+    # Ties may fall either way
+    assert (ours == theirs).mean() > 0.99
 
 
 def test_weights_are_fitted_and_turn_from_a_channel_that_tells_nothing():
     data = samples(groups=5, pixels=10)
     noisy = data.x.copy()
     noisy[:, 0] += np.random.default_rng(3).standard_normal(len(noisy))
-    without_h, without_v = fit_weights(Samples(noisy, data.names, data.groups, data.patches)), data.x.copy()
+    without_h = fit_weights(Samples(noisy, data.names, data.groups, data.patches))
+    without_v = data.x.copy()
     without_v[:, 1] += np.random.default_rng(3).standard_normal(len(noisy))
     other = fit_weights(Samples(without_v, data.names, data.groups, data.patches))
     assert without_h.weights.h / without_h.weights.v < other.weights.h / other.weights.v

@@ -24,7 +24,8 @@ def named_again(found, scene, classifier, path):
 
 
 def test_a_scan_is_named_again_as_it_was_named(synthetic, library, tmp_path):
-    scene, classifier = synthetic(3), Classifier(library)
+    scene = synthetic(3)
+    classifier = Classifier(library)
     found = scene.analyse(classifier=classifier)
     again = named_again(found, scene, classifier, tmp_path / "patches.npz")
     for r in found.patches:
@@ -36,7 +37,8 @@ def test_a_scan_is_named_again_as_it_was_named(synthetic, library, tmp_path):
 @pytest.mark.parametrize("gain", [0.8, 0.9, 1.1, 1.25])
 def test_brightness_that_all_plates_share_does_not_change_their_names(gain, synthetic, library, tmp_path):
     """A low or tilted metal plate makes all others brighter or darker in both channels: V / H stays."""
-    scene, classifier = synthetic(3), Classifier(library)
+    scene = synthetic(3)
+    classifier = Classifier(library)
     plain = scene.analyse(classifier=classifier)
     metal = plain.segmentation.labels == plain.metal.label
     factor = np.where(metal, 1.0, gain)

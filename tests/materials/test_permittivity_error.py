@@ -33,7 +33,8 @@ def test_a_shifted_plate_stays_within_its_error_bar(synthetic):
     for seed in range(8):
         scene = synthetic(seed, uneven=0.0)
         for patch in scene.analyse().patches:
-            e, truth = patch.permittivity, patch.truth
+            e = patch.permittivity
+            truth = patch.truth
             if truth is None or truth.permittivity is None or e.value is None:
                 continue
             difference = e.value - truth.permittivity

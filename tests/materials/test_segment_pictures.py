@@ -161,7 +161,8 @@ def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_els
     folder = Path(PUBLISHED or "")
     boxes = json.loads((folder / "20250612_142257_multi.json").read_text())["boxes_px"]
     with np.load(folder / "20250612_142257_multi.npz") as z:
-        h, v = z["h"], z["v"]
+        h = z["h"]
+        v = z["v"]
     found = segment(h, v, AXIS, AXIS)
     assert len(found.patches) == len(boxes) == 9
     for name, (x0, y0, x1, y1) in boxes.items():

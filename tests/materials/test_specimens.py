@@ -36,7 +36,8 @@ def drawn(spread, scans, seed=0, pixels=8, gain=0.01, kinds=KINDS, labelled=True
         speckle = gain * (rng.standard_normal((*shape, pixels)) + 1j * rng.standard_normal((*shape, pixels)))
         return -r[..., None] * np.exp(error + speckle)
 
-    h, v = channel(s), channel(p)
+    h = channel(s)
+    v = channel(p)
     i, k, _ = np.indices(h.shape)
     which = np.char.add("s", i.ravel().astype(str)) if labelled else None
     names = np.array(list(kinds))[k.ravel()]
@@ -70,9 +71,12 @@ def test_without_specimens_apart_the_published_spread_stands():
 
 
 def test_the_order_of_patches_does_not_matter_to_the_spread():
-    rng, kinds = np.random.default_rng(3), np.repeat(np.arange(3), 10)
-    residual, plates = 0.02 * rng.standard_normal((30, 3)), np.arange(30)
-    effects, noise = rng.standard_normal((3, 3, 2)), 1e-4 * np.eye(3)
+    rng = np.random.default_rng(3)
+    kinds = np.repeat(np.arange(3), 10)
+    residual = 0.02 * rng.standard_normal((30, 3))
+    plates = np.arange(30)
+    effects = rng.standard_normal((3, 3, 2))
+    noise = 1e-4 * np.eye(3)
     turn = rng.permutation(30)
     here, there = (fit_spread(residual[at], kinds[at], plates[at], effects, noise) for at in (np.arange(30), turn))
     for a, b in zip(here, there, strict=True):
@@ -82,7 +86,8 @@ def test_the_order_of_patches_does_not_matter_to_the_spread():
 def test_probabilities_mean_what_they_say_of_specimens_never_seen():
     close = {"a": 4.0 - 0.4j, "b": 4.2 - 0.45j, "c": 4.45 - 0.6j, "d": 4.7 - 0.7j}
     model = MODELS[DISCRIMINANT]("H+V+P").fit(drawn((0.03, 0.15), 40, 1, kinds=close))
-    sure, right = [], []
+    sure = []
+    right = []
     for seed in range(40):
         test = drawn((0.03, 0.15), 1, 100 + seed, kinds=close)
         found = model.by_scan(test.x, test.patches)
@@ -98,7 +103,9 @@ def entries(samples):
     out = []
     for p in np.unique(samples.patches):
         at = samples.patches == p
-        h, v, q = samples.x[at, 0], samples.x[at, 1], samples.x[at, 2] + 1j * samples.x[at, 3]
+        h = samples.x[at, 0]
+        v = samples.x[at, 1]
+        q = samples.x[at, 2] + 1j * samples.x[at, 3]
         out.append(
             Entry(
                 str(samples.names[at][0]),
@@ -131,7 +138,8 @@ def test_liquids_of_a_small_library_are_seldom_called_unknown(own, monkeypatch):
     of the materials' covariances is far from each.
     """
     monkeypatch.setattr(specimens, "OWN_FREEDOM", own)
-    liquids, errors = groups()["liquids"].materials, Errors(0.00356, 0.022, spread=(0.05, 0.2))
+    liquids = groups()["liquids"].materials
+    errors = Errors(0.00356, 0.022, spread=(0.05, 0.2))
     model = MODELS[DISCRIMINANT]("H+V+P").fit(draw(liquids, 55.0, errors, 43, 8).samples())
     test = draw(liquids, 55.0, errors, 500, 12).samples()
     rejected = []

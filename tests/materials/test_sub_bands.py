@@ -118,7 +118,8 @@ def test_errors_that_sub_bands_share_do_not_shrink_with_their_number():
 
 def test_error_bars_of_four_sub_bands_are_those_of_repeated_placements():
     """Each placement has one error of V / H, the same in all of its sub-bands."""
-    rng, inverse = np.random.default_rng(4), 1 / ratio_from_permittivity(THICK, THETA)
+    rng = np.random.default_rng(4)
+    inverse = 1 / ratio_from_permittivity(THICK, THETA)
     fits = []
     for _ in range(60):
         error = INVERSE_STD * complex(*rng.standard_normal(2))

@@ -7,14 +7,17 @@ from polysight.materials.analyse import KnownScene, Optics, analyse, smooth_insi
 from polysight.materials.labels import TruthPlate, patches_from_labels, patches_from_plates
 from polysight.polarimetry import fresnel
 
-X_M, Y_M = np.arange(60) * 2e-3, np.arange(40) * 2e-3
+X_M = np.arange(60) * 2e-3
+Y_M = np.arange(40) * 2e-3
 THETA = np.radians(55.0)
-LEFT, RIGHT = 4 - 0.4j, 9 - 2j
+LEFT = 4 - 0.4j
+RIGHT = 9 - 2j
 
 
 def _scene():
     """Metal below, two materials side by side above it; channels as complex64 [ny, nx], and boxes in pixels."""
-    h, v = np.full((40, 60), -1, np.complex64), np.full((40, 60), -1, np.complex64)
+    h = np.full((40, 60), -1, np.complex64)
+    v = np.full((40, 60), -1, np.complex64)
     for eps, columns in ((LEFT, slice(0, 30)), (RIGHT, slice(30, 60))):
         h[20:, columns], v[20:, columns] = fresnel(eps, THETA)
     boxes = {"metal": (0, 0, 60, 18), "left": (2, 20, 30, 40), "right": (30, 20, 58, 40), "nowhere": (58, 20, 60, 40)}
@@ -37,10 +40,12 @@ def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
     valid = np.ones(h.shape, bool)
     valid[:, :12] = valid[:, 58:] = False
     h[~valid] = v[~valid] = 0  # as images have it
-    pair, optics = Images(h, v, X_M, Y_M, valid), Optics(THETA, smooth_px=1.0)
+    pair = Images(h, v, X_M, Y_M, valid)
+    optics = Optics(THETA, smooth_px=1.0)
     result = analyse(pair, optics, KnownScene(found, labels["metal"]))
     rows = {r.label: r for r in result.rows()}
-    left, nowhere = rows[labels["left"]], rows[labels["nowhere"]]
+    left = rows[labels["left"]]
+    nowhere = rows[labels["nowhere"]]
     assert abs(left.amplitude_h - abs(complex(fresnel(LEFT, THETA)[0]))) < 5e-4
     assert abs(left.permittivity.value - LEFT) < 0.5 * left.permittivity.real_std
     assert nowhere.interior_pixels == 0

@@ -104,7 +104,8 @@ def test_classify_names_nothing_without_a_result_and_no_refused_patch(tmp_path, 
     assert main(["classify", str(good), *more]) == 0
     out = capsys.readouterr().out
     if as_json:
-        assert [p["label"] for p in json.loads(out)["patches"]] == [2]  # patch 1 is the metal reference
+        # Patch 1 is the metal reference
+        assert [p["label"] for p in json.loads(out)["patches"]] == [2]
         assert [p["label"] for p in json.loads(out)["refused"]] == [3]
     else:
         assert "3  not judged: noise" in out

@@ -41,9 +41,11 @@ def channels(eps, gain_h=1.0, gain_v=1.0, a=0.0, b=0.0, common=None, noise=0.0):
     r_s[METAL], r_p[METAL] = fresnel(np.inf, THETA)
     r_s[PLATE], r_p[PLATE] = fresnel(eps, THETA)
     rng = np.random.default_rng(1)
-    h, v = gain_h * (r_s + a * r_p), gain_v * (r_p + b * r_s)
+    h = gain_h * (r_s + a * r_p)
+    v = gain_v * (r_p + b * r_s)
     if common is not None:
-        h, v = h * common, v * common
+        h = h * common
+        v = v * common
     n = rng.standard_normal((4, *SHAPE)) * noise / np.sqrt(2)
     return h + n[0] + 1j * n[1], v + n[2] + 1j * n[3]
 
@@ -99,7 +101,8 @@ def test_metal_alone_does_not_separate_leakage_from_gain():
 def test_reference_over_the_whole_plane_removes_uneven_illumination():
     h, v = channels(4 - 0.4j)
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 40
-    light_h, light_v = (1 + 0.3 * x) * np.exp(2j * y), (1.2 - 0.2 * y) * np.exp(1j * x)
+    light_h = (1 + 0.3 * x) * np.exp(2j * y)
+    light_v = (1.2 - 0.2 * y) * np.exp(1j * x)
     out = divide_by_metal(images_of(h * light_h, v * light_v), -light_h, -light_v)
     r_s, r_p = fresnel(4 - 0.4j, THETA)
     np.testing.assert_allclose(out.p[PLATE], r_s / r_p, rtol=1e-9)
@@ -142,7 +145,8 @@ def test_the_incidence_angle_is_that_of_the_specular_midpoint():
         np.mean([incidence_deg(rig, b) for b in rig.receivers]), abs=0.02
     )
     mx, my, _ = specular_midpoint_m(rig, rig.receivers[0])
-    x, y = mx + np.linspace(-0.15, 0.15, 7), my + np.linspace(-0.15, 0.15, 5)
+    x = mx + np.linspace(-0.15, 0.15, 7)
+    y = my + np.linspace(-0.15, 0.15, 5)
     angles = incidence_choice(rig, x, y, "one")
     assert angles.one_rad.shape == angles.pixel_rad.shape == (5, 7)
     assert np.ptp(angles.one_rad) == 0

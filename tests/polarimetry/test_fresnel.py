@@ -50,7 +50,8 @@ def test_metal_is_one_at_every_angle_and_the_pole_of_eq3():
     assert abs(ratio_from_permittivity(1.29e5 - 3.05e5j, np.radians(55.0)) - 1) < 0.01
 
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 any_part = st.floats(allow_nan=True, allow_infinity=True)
 
 

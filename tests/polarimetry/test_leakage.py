@@ -20,7 +20,8 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.scene import strips
 
 THETA = np.radians(55.0)
-UPRIGHT, LYING = 0.0, np.pi / 2
+UPRIGHT = 0.0
+LYING = np.pi / 2
 gain = st.tuples(st.floats(0.3, 3.0), st.floats(-3.1, 3.1)).map(lambda g: g[0] * np.exp(1j * g[1]))
 leak = st.tuples(st.floats(0.0, 0.15), st.floats(-3.1, 3.1)).map(lambda g: g[0] * np.exp(1j * g[1]))
 seeds = st.integers(0, 2**32 - 1)
@@ -40,7 +41,8 @@ def standard(truth, wave, rng, noise=0.0):
 
 @given(leak, leak, gain, seeds, st.floats(0.0, 0.3))
 def test_leakage_and_gain_are_recovered_from_a_plate_and_two_orientations(a, b, g, seed, turned):
-    truth, rng = Leakage(a, b, g, 0.0), np.random.default_rng(seed)
+    truth = Leakage(a, b, g, 0.0)
+    rng = np.random.default_rng(seed)
     waves = (PLATE, strips_wave(UPRIGHT + turned, THETA), strips_wave(LYING + turned, THETA))
     found = estimate_leakage([standard(truth, w, rng) for w in waves])
     np.testing.assert_allclose([found.h, found.v, found.imbalance], [a, b, g], rtol=1e-6, atol=1e-8)
@@ -50,7 +52,8 @@ def test_leakage_and_gain_are_recovered_from_a_plate_and_two_orientations(a, b, 
 @given(leak, leak, gain, seeds)
 def test_with_noise_crosstalk_and_imbalance_stay_below_the_limits(a, b, g, seed):
     """26 dB per pixel: residual crosstalk below 0.01, imbalance below 0.025."""
-    truth, rng = Leakage(a, b, g, 0.0), np.random.default_rng(seed)
+    truth = Leakage(a, b, g, 0.0)
+    rng = np.random.default_rng(seed)
     waves = (PLATE, strips_wave(UPRIGHT, THETA), strips_wave(LYING, THETA))
     crosstalk, imbalance = remaining(estimate_leakage([standard(truth, w, rng, 0.05) for w in waves]), truth)
     assert crosstalk < 0.01
@@ -59,19 +62,22 @@ def test_with_noise_crosstalk_and_imbalance_stay_below_the_limits(a, b, g, seed)
 
 @given(leak, leak, gain, seeds)
 def test_more_orientations_give_a_least_squares_solution_and_a_residual(a, b, g, seed):
-    truth, rng = Leakage(a, b, g, 0.0), np.random.default_rng(seed)
+    truth = Leakage(a, b, g, 0.0)
+    rng = np.random.default_rng(seed)
     waves = [PLATE, *(strips_wave(np.radians(d), THETA) for d in (0, 45, 90, 135, -30))]
     exact = estimate_leakage([standard(truth, w, rng) for w in waves])
     assert exact.residual < 1e-7
     assert remaining(exact, truth) == pytest.approx((0, 0), abs=1e-7)
     wrong = [standard(truth, w, rng) for w in waves]
-    wrong[3] = Standard(wrong[3].measured, strips_wave(np.radians(75), THETA))  # wrong orientation
+    # Wrong orientation
+    wrong[3] = Standard(wrong[3].measured, strips_wave(np.radians(75), THETA))
     assert estimate_leakage(wrong).residual > 0.02
 
 
 @given(leak, gain, seeds)
 def test_one_orientation_gives_the_axial_ratio_of_two_equal_boards(a, g, seed):
-    truth, rng = Leakage(a, a, g, 0.0), np.random.default_rng(seed)
+    truth = Leakage(a, a, g, 0.0)
+    rng = np.random.default_rng(seed)
     for psi in (UPRIGHT, LYING, 0.4):
         strips = standard(truth, strips_wave(psi, THETA), rng)
         found = estimate_axial_ratio(standard(truth, PLATE, rng), strips)
@@ -112,8 +118,10 @@ def test_strips_agree_with_the_simulator_which_solves_for_the_current(psi, theta
 
 
 def test_insufficient_standards_are_refused():
-    truth, rng = Leakage(0.05, 0.05j, 1.0, 0.0), np.random.default_rng(1)
-    plate, upright = standard(truth, PLATE, rng), standard(truth, strips_wave(UPRIGHT, THETA), rng)
+    truth = Leakage(0.05, 0.05j, 1.0, 0.0)
+    rng = np.random.default_rng(1)
+    plate = standard(truth, PLATE, rng)
+    upright = standard(truth, strips_wave(UPRIGHT, THETA), rng)
     with refused(ErrorCode.NOT_ENOUGH_DATA, 2):
         estimate_leakage([plate, upright])
     with refused(ErrorCode.VALUES_CONFLICT):

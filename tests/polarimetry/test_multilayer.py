@@ -36,7 +36,8 @@ def by_tmm(eps, thickness_m, frequency_hz, theta):
 @given(st.lists(st.tuples(media, thickness), max_size=4), media, frequency, angle)
 def test_random_stacks_agree_with_tmm(layers, last, f, theta):
     """The host sums echoes, the simulator calculates transmission lines in series."""
-    eps, inside = [e for e, _ in layers] + [last], [d for _, d in layers]
+    eps = [e for e, _ in layers] + [last]
+    inside = [d for _, d in layers]
     expected, _ = by_tmm(eps, inside, f, theta)
     np.testing.assert_allclose(multilayer(eps, inside, f, theta), expected, rtol=1e-8, atol=1e-10)
     stack = [Layer((e.real, -e.imag), 1e3 * d) for e, d in layers] + [Layer((last.real, -last.imag))]
@@ -54,7 +55,8 @@ def test_interfaces_and_plates_of_the_simulator_agree_with_tmm(eps, d, f, theta)
 @given(st.lists(st.tuples(lossless, thickness), min_size=1, max_size=4), frequency, angle)
 def test_energy_is_conserved_by_lossless_layers(layers, f, theta):
     eps, inside = zip(*layers, strict=True)
-    r = multilayer(list(eps), list(inside), f, theta)  # air follows
+    # Air follows
+    r = multilayer(list(eps), list(inside), f, theta)
     _, passed = by_tmm([*eps, 1.0], inside, f, theta)
     np.testing.assert_allclose(np.abs(r) ** 2 + passed, 1.0, atol=1e-9)
     mirrored = multilayer([*eps, 1 - 1e16j], list(inside), f, theta)

@@ -11,7 +11,8 @@ from polysight.polarimetry import fresnel, plane_reference
 from polysight_shared.error_codes import ErrorCode
 
 THETA = np.radians(55.0)
-X, Y = np.arange(60) * 2e-3, np.arange(50) * 2e-3
+X = np.arange(60) * 2e-3
+Y = np.arange(50) * 2e-3
 
 
 def images_of(h, v):
@@ -53,7 +54,8 @@ def test_speckle_of_the_plate_is_smoothed_and_measured():
     reference = plane_reference(images_of(noisy(one, rng, 0.05), noisy(one, rng, 0.05)))
     p = (reference.h / reference.v)[reference.valid]
     assert np.std(p) < 0.01
-    assert reference.spread == pytest.approx(0.05, rel=0.2)  # each part of V / H: two channels, half of each
+    # Each part of V / H: two channels, half of each
+    assert reference.spread == pytest.approx(0.05, rel=0.2)
 
 
 def test_weak_parts_and_the_rim_are_masked():

@@ -16,7 +16,8 @@ from polysight_worlds.shapes import Shape
 GATE_M = (1.5, 1.85)
 # Fewer than a scan's, for speed: they hold paths of 0.7 m.
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 9)
-COLUMNS, ROWS = 80, 56
+COLUMNS = 80
+ROWS = 56
 See = Callable[..., Seen]
 
 

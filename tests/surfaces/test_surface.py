@@ -57,7 +57,8 @@ def test_the_permittivity_of_a_sphere_is_found_within_its_error(glass_ball):
     miss = main.permittivity - scene.permittivity
     d = np.array([miss.real, miss.imag])
     assert abs(miss) < 0.03 * abs(scene.permittivity)
-    assert d @ np.linalg.inv(np.array(main.covariance)) @ d < 9.2  # 99 %
+    # 99 %
+    assert d @ np.linalg.inv(np.array(main.covariance)) @ d < 9.2
 
 
 def test_a_cylinder_of_50_mm_is_measured(see, gains, optics):

@@ -25,7 +25,8 @@ def test_the_sharp_edges_of_a_tilted_plate_are_no_surface(see, gains, optics):
         if segment.permittivity is not None:
             miss = segment.permittivity - MEDIUM
             d = np.array([miss.real, miss.imag])
-            assert d @ np.linalg.inv(np.array(segment.covariance)) @ d < 13.8  # 99.9 %
+            # 99.9 %
+            assert d @ np.linalg.inv(np.array(segment.covariance)) @ d < 13.8
 
 
 def test_edges_alone_give_no_permittivity(see, gains, optics):

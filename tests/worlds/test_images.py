@@ -39,7 +39,8 @@ def undisturbed(pair) -> ImagePair:
 def test_a_plate_stands_where_it_was_put(undisturbed):
     x0, y0, x1, y1 = undisturbed.world.plates[0].box_m
     lit = np.abs(undisturbed.h) > 0.5 * np.abs(undisturbed.h).max()
-    columns, rows = np.flatnonzero(lit.any(axis=0)), np.flatnonzero(lit.any(axis=1))
+    columns = np.flatnonzero(lit.any(axis=0))
+    rows = np.flatnonzero(lit.any(axis=1))
     assert undisturbed.x_m[columns[[0, -1]]] == pytest.approx([x0, x1], abs=0.005)
     assert undisturbed.y_m[rows[[0, -1]]] == pytest.approx([y0, y1], abs=0.005)
 

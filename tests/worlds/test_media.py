@@ -24,7 +24,8 @@ def fresnel(permittivity: complex, cosine: float) -> tuple[complex, complex]:
 def between(above: complex, below: complex, cosine: float) -> tuple[complex, complex]:
     """Fresnel's formulas at a boundary of two media; `cosine` of the angle in air."""
     sine_squared = 1 - cosine**2
-    first, second = np.sqrt(above - sine_squared + 0j), np.sqrt(below - sine_squared + 0j)
+    first = np.sqrt(above - sine_squared + 0j)
+    second = np.sqrt(below - sine_squared + 0j)
     s = (first - second) / (first + second)
     return s, (above * second - below * first) / (above * second + below * first)
 

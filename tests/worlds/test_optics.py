@@ -59,7 +59,8 @@ def test_a_small_plate_has_its_radar_cross_section():
 
 @pytest.mark.parametrize("angle_deg", [3.0, 7.0, 12.0])
 def test_a_plate_off_its_specular_direction_falls_as_a_sinc(angle_deg):
-    width_m, distance_m = 0.02, 80.0
+    width_m = 0.02
+    distance_m = 80.0
     tx = looking(np.array([0.0, 0, -distance_m]), np.zeros(3))
     angle = np.radians(angle_deg)
     rx = looking(distance_m * np.array([np.sin(angle), 0, -np.cos(angle)]), np.zeros(3))

@@ -30,8 +30,10 @@ def facets_of(surface: Surface, plate: Plate, rig: Rig) -> Facets:
     z = rig.plane_m - plate.height_mm / 1000 + surface.height_m.ravel()
     slope_x, slope_y = (np.full(x.shape, slope) for slope in surface.mean_slopes)
     if surface.local_slopes is not None:
-        slope_x, slope_y = slope_x + surface.local_slopes[0].ravel(), slope_y + surface.local_slopes[1].ravel()
-    step, flat = np.full(x.shape, rig.step_m), np.zeros(x.shape)
+        slope_x = slope_x + surface.local_slopes[0].ravel()
+        slope_y = slope_y + surface.local_slopes[1].ravel()
+    step = np.full(x.shape, rig.step_m)
+    flat = np.zeros(x.shape)
     edges = np.stack([flat, step, step * slope_y]), np.stack([step, flat, step * slope_x])
     return Facets(np.stack([x, y, z]), *edges)
 
@@ -56,7 +58,8 @@ def test_convolutions_equal_the_sum_over_facets(rig, shape, error, channel):
     surface = make_surface(plate, rig.step_m, np.random.default_rng([7, 2, 0]))
     x, y = rig.offsets_m()
     rng = np.random.default_rng(0)
-    row, column = rng.integers(0, rig.rows, 12), rng.integers(0, rig.columns, 12)
+    row = rng.integers(0, rig.rows, 12)
+    column = rng.integers(0, rig.columns, 12)
     offsets = np.stack([x[column], y[row], np.zeros(12)], axis=1)
     expected = scatter(rig.tx, rx, facets_of(surface, plate, rig), plate.stack, rig.frequencies_hz, offsets)
     rms = np.sqrt(np.mean(np.abs(expected) ** 2))
@@ -64,9 +67,11 @@ def test_convolutions_equal_the_sum_over_facets(rig, shape, error, channel):
 
 
 def test_the_rig_file_is_the_published_rig():
-    loaded, built = load_rig(ROOT / "instrument.toml"), published_rig()
+    loaded = load_rig(ROOT / "instrument.toml")
+    built = published_rig()
     for name in ("tx", "h", "v"):
-        one, other = getattr(loaded, name), getattr(built, name)
+        one = getattr(loaded, name)
+        other = getattr(built, name)
         assert one.position == pytest.approx(other.position, abs=1e-5)
         assert one.polarisation == pytest.approx(other.polarisation, abs=1e-5)
     assert loaded.incidence_deg("h") == pytest.approx(55, abs=0.1)

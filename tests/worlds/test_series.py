@@ -23,7 +23,8 @@ from polysight_worlds.zones import sum_window
 FREQUENCY_HZ = 78e9
 K = 2 * np.pi * FREQUENCY_HZ / LIGHT_M_PER_S
 MEDIA = [None, 4 - 0.4j, 9 - 1j, 2.2 - 0.05j]
-S_AXIS, P_AXIS = np.array([[0.0], [1.0], [0.0]]), np.array([[0.0], [0.0], [1.0]])
+S_AXIS = np.array([[0.0], [1.0], [0.0]])
+P_AXIS = np.array([[0.0], [0.0], [1.0]])
 
 
 def dipoles(tx_m: tuple[float, ...], rx_m: tuple[float, ...], sent: np.ndarray, received: np.ndarray) -> Pair:
@@ -42,7 +43,8 @@ def random_pair(seed: int) -> tuple[Pair, Pair]:
 
 
 def test_a_large_metal_sphere_has_its_radar_cross_section():
-    radius_m, distance_m = 0.1, 60.0
+    radius_m = 0.1
+    distance_m = 60.0
     there = (0.0, 0.0, -distance_m)
     echo = scatter_sphere(dipoles(there, there, S_AXIS, S_AXIS), radius_m, None, FREQUENCY_HZ)[0]
     # sigma = 4 pi |E_s|^2 R^4 for a unit wave at 1 m; geometrical optics: pi a^2.
@@ -51,7 +53,9 @@ def test_a_large_metal_sphere_has_its_radar_cross_section():
 
 
 def test_a_tiny_sphere_is_rayleighs_dipole():
-    radius_m, distance_m, eps = 1e-4, 10.0, 4.0
+    radius_m = 1e-4
+    distance_m = 10.0
+    eps = 4.0
     pair = dipoles((0, 0, -distance_m), (distance_m, 0, 0), S_AXIS, S_AXIS)
     echo = abs(scatter_sphere(pair, radius_m, eps - 1e-9j, FREQUENCY_HZ, with_inside=True)[0])
     expected = K**2 * radius_m**3 * (eps - 1) / (eps + 2) / distance_m**2
@@ -86,7 +90,8 @@ def test_transmitter_and_receiver_may_be_exchanged(permittivity, seed):
 @pytest.mark.parametrize("permittivity", [None, 4 - 0.4j])
 @pytest.mark.parametrize(("sent", "received"), [(S_AXIS, S_AXIS), (P_AXIS, P_AXIS), (S_AXIS, P_AXIS)])
 def test_the_stationary_axial_wave_gives_the_whole_integral(permittivity, sent, received):
-    frequency_hz, radius_m = 24e9, 0.03
+    frequency_hz = 24e9
+    radius_m = 0.03
     k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
     # A turn of both dipoles, so that all parts of the sum are there.
     pair = dipoles((-0.25, 0.3, -0.5), (0.3, -0.2, -0.5), sent + 0.3 * S_AXIS, received + 0.2 * P_AXIS)

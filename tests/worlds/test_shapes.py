@@ -49,9 +49,13 @@ def geometrical_optics(shape: Shape, tx: Antenna, rx: Antenna, offset_m: np.ndar
     tx_m, rx_m = places
     patch = shape.at(*find_specular(shape, tx_m, rx_m))
     path = follow_path(patch, tx_m, rx_m)
-    out, back = patch.point - tx_m, rx_m - patch.point
-    out_m, back_m = np.linalg.norm(out), np.linalg.norm(back)
-    incident, scattered, normal = out[:, 0] / out_m, back[:, 0] / back_m, patch.normal[:, 0]
+    out = patch.point - tx_m
+    back = rx_m - patch.point
+    out_m = np.linalg.norm(out)
+    back_m = np.linalg.norm(back)
+    incident = out[:, 0] / out_m
+    scattered = back[:, 0] / back_m
+    normal = patch.normal[:, 0]
     s_axis = np.cross(incident, normal) / np.linalg.norm(np.cross(incident, normal))
     cosine = -incident @ normal
     basis = patch.tangents()[..., 0]
@@ -79,7 +83,8 @@ def test_a_shape_reflects_by_geometrical_optics_but_for_a_few_per_cent(shape):
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.name)
 def test_a_surface_knows_its_points_normals_and_derivatives(shape):
-    a, b = np.array([0.02, -0.03]), np.array([0.01, 0.04])
+    a = np.array([0.02, -0.03])
+    b = np.array([0.01, 0.04])
     patch = shape.at(a, b)
     step = 1e-5
     along_a = (shape.at(a + step, b).point - shape.at(a - step, b).point) / (2 * step)
@@ -94,7 +99,9 @@ def test_a_surface_knows_its_points_normals_and_derivatives(shape):
 
 
 def test_curvatures_are_those_of_the_solids():
-    ball, pipe, saddle = SHAPES[0], SHAPES[1], SHAPES[3]
+    ball = SHAPES[0]
+    pipe = SHAPES[1]
+    saddle = SHAPES[3]
     assert np.linalg.eigvalsh(ball.at(0.1, 0.2).curvature()) == pytest.approx([10, 10])
     assert np.linalg.eigvalsh(pipe.at(0.1, 0.2).curvature()) == pytest.approx([0, 10], abs=1e-9)
     assert saddle.at(0.0, 0.0).curvature() == pytest.approx(np.array([[7, 1], [1, -6]]))
@@ -126,6 +133,7 @@ def test_the_phase_is_that_of_the_path_beyond_the_direct_one():
     direct_m = np.linalg.norm(rx.position - BOARDS.tx.position)
     echo = record_shapes([SHAPES[0]], BOARDS, FREQUENCIES_HZ, OFFSETS_M[:1])["h"][0, :, 0]
     slope_m = np.ptp(np.unwrap(np.angle(echo))) / (2 * np.pi * np.ptp(FREQUENCIES_HZ)) * LIGHT_M_PER_S
-    tx_m, rx_m = BOARDS.tx.position[:, None], rx.position[:, None]
+    tx_m = BOARDS.tx.position[:, None]
+    rx_m = rx.position[:, None]
     path = follow_path(SHAPES[0].at(*find_specular(SHAPES[0], tx_m, rx_m)), tx_m, rx_m)
     assert slope_m == pytest.approx(path.length_m[0] - direct_m, abs=2e-4)

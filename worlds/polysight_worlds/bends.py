@@ -76,7 +76,8 @@ def find_bend_terms(stack: Stack) -> BendTerms:
 
 def _compare(stack: Stack, axis: tuple[float, float, float], radius_m: float) -> NDArray:
     """Series minus physical optics over the ray's spreading, [angles, 4: s to s, p to p, s to p, p to s]."""
-    sines, cosines = np.sin(np.radians(ANGLES_DEG)), np.cos(np.radians(ANGLES_DEG))
+    sines = np.sin(np.radians(ANGLES_DEG))
+    cosines = np.cos(np.radians(ANGLES_DEG))
     shape = cylinder("solid", stack, (0.0, 0.0, radius_m), radius_m, 10.0, axis=axis)
     s_axis = np.array([0.0, 1.0, 0.0])
     optics = []
@@ -84,16 +85,17 @@ def _compare(stack: Stack, axis: tuple[float, float, float], radius_m: float) ->
     columns = []
     for sine, cosine in zip(sines, cosines, strict=True):
         # The plane of incidence is y = 0, the specular point the origin; p axes as of `optics.respond`.
-        tx_way, rx_way = np.array([-sine, 0.0, -cosine]), np.array([sine, 0.0, -cosine])
+        tx_way = np.array([-sine, 0.0, -cosine])
+        rx_way = np.array([sine, 0.0, -cosine])
         axes = (s_axis, np.cross(s_axis, -tx_way)), (s_axis, np.cross(rx_way, s_axis))
         tx_m, rx_m = (DISTANCE_M * way[:, None] for way in (tx_way, rx_way))
-        at = find_specular(shape, tx_m, rx_m)
-        patch = shape.at(*at)
+        specular = find_specular(shape, tx_m, rx_m)
+        patch = shape.at(*specular)
         path = follow_path(patch, tx_m, rx_m)
         for sent, received in PAIRS:
             tx = Antenna(tx_m[:, 0], -tx_way, axes[0][sent], 0.0, is_dipole=True)
             rx = Antenna(rx_m[:, 0], -rx_way, axes[1][received], 0.0, is_dipole=True)
-            arguments = (shape, tx, rx, np.array([FREQUENCY_HZ]), np.zeros((1, 3)), at)
+            arguments = (shape, tx, rx, np.array([FREQUENCY_HZ]), np.zeros((1, 3)), specular)
             optics.append(sum_window(*arguments)[0, 0])
             spreads.append(spread_of_ray(patch, path, tx_m, rx_m)[0])
             place = -np.asarray(shape.place_m)

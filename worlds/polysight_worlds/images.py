@@ -176,7 +176,8 @@ def _draw_bad_positions(rng: Generator, rig: Rig, nuisances: Nuisances) -> NDArr
 
 def _add_runs(rng: Generator, marked: NDArray, share: float) -> NDArray:
     while marked.mean() < share:
-        row, first = rng.integers(marked.shape[0]), rng.integers(marked.shape[1])
+        row = rng.integers(marked.shape[0])
+        first = rng.integers(marked.shape[1])
         marked[row, first : first + rng.integers(1, 21)] = True
     return marked
 
@@ -244,12 +245,12 @@ def _clip(echoes: NDArray, direct: NDArray, share: float) -> tuple[NDArray, NDAr
 
     Each frequency is a time of the chirp. What the limiter leaves is split again: the direct path has its mean gain.
     """
-    both = direct + echoes
-    amplitude = np.abs(both)
+    received = direct + echoes
+    amplitude = np.abs(received)
     limit = (1 - share) * amplitude.max()
     gain = np.minimum(1, limit / amplitude)
     new_direct = direct * gain.mean(axis=0)
-    return both * gain - new_direct, new_direct
+    return received * gain - new_direct, new_direct
 
 
 def pixel_centres(rig: Rig, pixels: int) -> tuple[NDArray, NDArray]:

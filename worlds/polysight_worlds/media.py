@@ -62,8 +62,10 @@ def _solve_waves(admittances: list[NDArray], delays: list[NDArray]) -> NDArray:
     matrix = np.zeros((*delays[0].shape, size, size), complex)
     source = np.zeros((*delays[0].shape, size, 1), complex)
     for m in range(boundaries):
-        above, below = admittances[m], admittances[m + 1]
-        electric, magnetic = 2 * m, 2 * m + 1
+        above = admittances[m]
+        below = admittances[m + 1]
+        electric = 2 * m
+        magnetic = 2 * m + 1
         down_below = 2 * m + 1
         if m == 0:
             source[..., electric, 0] = -1
@@ -94,7 +96,7 @@ class ReflectionTable:
     def look_up(self, cos_incidence: NDArray) -> tuple[NDArray, NDArray]:
         """(r_s, r_p) as complex64 by linear interpolation."""
         place = np.clip(cos_incidence, 0, 1) * (self.POINTS - 1)
-        left = np.minimum(place.astype(np.int32), self.POINTS - 2)
-        share = (place - left).astype(np.float32)
-        s, p = (table[left] + share * (table[left + 1] - table[left]) for table in self._tables)
+        left_index = np.minimum(place.astype(np.int32), self.POINTS - 2)
+        share = (place - left_index).astype(np.float32)
+        s, p = (table[left_index] + share * (table[left_index + 1] - table[left_index]) for table in self._tables)
         return s, p

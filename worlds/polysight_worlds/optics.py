@@ -54,8 +54,8 @@ class Antenna:
 
     def with_leakage(self, leakage: complex) -> Antenna:
         """The antenna that also takes `leakage` times the other polarisation."""
-        other = np.cross(self.boresight, self.polarisation)
-        return replace(self, polarisation=self.polarisation + leakage * other)
+        cross_axis = np.cross(self.boresight, self.polarisation)
+        return replace(self, polarisation=self.polarisation + leakage * cross_axis)
 
     def field(self, directions: NDArray) -> NDArray:
         """Complex field vectors [3, ...] of unit distance in unit `directions` [3, ...]."""
@@ -68,7 +68,9 @@ class Antenna:
 
 
 def _column(vector: NDArray, like: NDArray) -> NDArray:
-    return vector.reshape(3, *(1,) * (like.ndim - 1)) if vector.ndim == 1 else vector
+    if vector.ndim == 1:
+        return vector.reshape(3, *(1,) * (like.ndim - 1))
+    return vector
 
 
 def _dot(a: NDArray, b: NDArray) -> NDArray:
@@ -83,7 +85,8 @@ def _cross(a: NDArray, b: NDArray) -> NDArray:
 
 def _carry(start: NDArray, end: NDArray, vector: NDArray) -> NDArray:
     """Turn `vector` as the unit vector `start` is turned to `end` on the shortest arc."""
-    start, vector = _column(start, end), _column(vector, end)
+    start = _column(start, end)
+    vector = _column(vector, end)
     summed = start + end
     return vector - summed * (_dot(vector, end) / np.maximum(1 + _dot(start, end), 1e-6))
 
@@ -225,7 +228,8 @@ def ellipsoid(centre: NDArray, radii: NDArray, facet_m: float, half_widths: NDAr
     x, y = (np.arange(n) * d - w + d / 2 for n, d, w in zip(counts, step, half_widths, strict=True))
     x, y = (grid.ravel() for grid in np.meshgrid(x, y))
     inside = (x / radii[0]) ** 2 + (y / radii[1]) ** 2 < 0.97
-    x, y = x[inside], y[inside]
+    x = x[inside]
+    y = y[inside]
     root = np.sqrt(1 - (x / radii[0]) ** 2 - (y / radii[1]) ** 2)
     slope_x = radii[2] * x / radii[0] ** 2 / root
     slope_y = radii[2] * y / radii[1] ** 2 / root

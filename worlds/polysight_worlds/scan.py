@@ -96,7 +96,8 @@ class PlateEchoes:
     """One plate's echoes at one receiver, frequency by frequency."""
 
     def __init__(self, rig: Rig, rx: Antenna, plate: Plate, surface: Surface) -> None:
-        self._rig, self._surface = rig, surface
+        self._rig = rig
+        self._surface = surface
         self._brightness = plate.brightness
         rows, columns = surface.cover.shape
         self._shape = fast_length(rig.rows + rows - 1), fast_length(rig.columns + columns - 1)
@@ -125,7 +126,8 @@ class PlateEchoes:
 
     def _points(self, plate: Plate) -> NDArray:
         """Cell minus offset for all circular lags, [3, lags_y, lags_x]."""
-        rig, surface = self._rig, self._surface
+        rig = self._rig
+        surface = self._surface
         offsets_x, offsets_y = rig.offsets_m()
         x = surface.x0_m - offsets_x[0] - signed_lags(self._shape[1], rig.columns) * rig.step_m
         y = surface.y0_m - offsets_y[0] - signed_lags(self._shape[0], rig.rows) * rig.step_m
@@ -134,7 +136,8 @@ class PlateEchoes:
 
     def add_to(self, data: NDArray, index: int) -> None:
         """Add the echoes at frequency `index` to complex `data` [rows, columns]."""
-        rig, surface = self._rig, self._surface
+        rig = self._rig
+        surface = self._surface
         frequency_hz = rig.frequencies_hz[index]
         k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
         step, (slope_x, slope_y) = rig.step_m, surface.mean_slopes

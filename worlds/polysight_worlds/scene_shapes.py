@@ -63,7 +63,9 @@ def make_shapes(table: dict[str, Any], centre_m: Sequence[float]) -> tuple[Shape
     """Return the shapes of one [[shapes]] table, with optional keys filled in."""
     x, y, z = centre_m
     front_m = x + table["centre_mm"][0] / 1000, y + table["centre_mm"][1] / 1000, z + table["height_mm"] / 1000
-    name, kind, stack = table["name"], table["kind"], _stack_of(table)
+    name = table["name"]
+    kind = table["kind"]
+    stack = _stack_of(table)
     if kind == "plate":
         width_mm, height_mm = table["size_mm"]
         piece = plate(
@@ -76,7 +78,9 @@ def make_shapes(table: dict[str, Any], centre_m: Sequence[float]) -> tuple[Shape
             bends=tuple(table["bends_per_m"]),
         )
         return (piece,)
-    radius_m, length_m, axis = table["radius_mm"] / 1000, table["length_mm"] / 1000, tuple(table["axis"])
+    radius_m = table["radius_mm"] / 1000
+    length_m = table["length_mm"] / 1000
+    axis = tuple(table["axis"])
     middle_m = (front_m[0], front_m[1], front_m[2] + radius_m)
     if kind == "sphere":
         return (sphere(name, stack, middle_m, radius_m),)

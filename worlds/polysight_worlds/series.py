@@ -125,12 +125,16 @@ def scatter_sphere(
     """
     k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
     electric, magnetic = sphere_coefficients(radius_m, k, permittivity, with_inside=with_inside)
-    rx_r, tx_r = np.linalg.norm(pair.rx_m, axis=0), np.linalg.norm(pair.tx_m, axis=0)
-    to_rx, to_tx = pair.rx_m / rx_r, pair.tx_m / tx_r
-    q, p = pair.received, pair.sent
+    rx_r = np.linalg.norm(pair.rx_m, axis=0)
+    tx_r = np.linalg.norm(pair.tx_m, axis=0)
+    to_rx = pair.rx_m / rx_r
+    to_tx = pair.tx_m / tx_r
+    q = pair.received
+    p = pair.sent
     c = _dot(to_rx, to_tx)
     # Products of the dipoles with the derivatives of c by either direction.
-    q_r, p_r = _dot(q, to_rx), _dot(p, to_tx)
+    q_r = _dot(q, to_rx)
+    p_r = _dot(p, to_tx)
     q_t = _dot(q, to_tx) - c * q_r
     p_t = _dot(p, to_rx) - c * p_r
     mixed = _dot(q, p) - _dot(p, to_rx) * q_r - p_r * q_t
@@ -175,11 +179,13 @@ class _Legendre:
 
     def __init__(self, c: NDArray) -> None:
         self._c = c
-        one, zero = np.ones_like(c), np.zeros_like(c)
-        self._values = one, one
+        ones = np.ones_like(c)
+        zero = np.zeros_like(c)
+        self._values = ones, ones
         self._firsts = zero, zero
         self._seconds = zero, zero
-        self._last, self._now = (zero, zero, zero), (one, zero, zero)
+        self._last = (zero, zero, zero)
+        self._now = (ones, zero, zero)
 
     def step(self, n: int) -> tuple[NDArray, NDArray, NDArray]:
         """Orders are asked for in turn, from 1."""
@@ -187,7 +193,8 @@ class _Legendre:
         # P_n' = P_{n-2}' + (2 n - 1) P_{n-1}, and once more.
         first = self._last[1] + (2 * n - 1) * self._now[0]
         second = self._last[2] + (2 * n - 1) * self._now[1]
-        self._last, self._now = self._now, (value, first, second)
+        self._last = self._now
+        self._now = (value, first, second)
         return self._now
 
 
@@ -214,8 +221,10 @@ class EndlessCylinder:
         j_rate, h1_rate = (eta * (below - n / x * value) for below, value in ((j_below, j), (h1_below, h1)))
         # Orders that miss the body give nothing, with Hankel functions beyond all numbers.
         too_high = n > np.abs(x) + 4.05 * np.abs(x) ** (1 / 3) + MORE_TERMS
-        j, j_rate = np.where(too_high, 0, j), np.where(too_high, 0, j_rate)
-        h1, h1_rate = np.where(too_high, 1, h1), np.where(too_high, 1, h1_rate)
+        j = np.where(too_high, 0, j)
+        j_rate = np.where(too_high, 0, j_rate)
+        h1 = np.where(too_high, 1, h1)
+        h1_rate = np.where(too_high, 1, h1_rate)
         if self.permittivity is None:
             return -j_rate / h1_rate, -j / h1, np.zeros_like(h1)
         inside = np.conj(self.permittivity)
@@ -280,9 +289,9 @@ def _tabulate(
 
 def _axial_wave_number(k: float, along_m: NDArray | float, path_m: NDArray, place: float) -> tuple[NDArray, NDArray]:
     """Axial wave number at `place` beside the stationary one, and the unit of places."""
-    whole = np.hypot(along_m, path_m)
-    unit = np.sqrt(k * path_m**2 / whole**3)
-    return k * along_m / whole + unit * place, unit
+    distance_m = np.hypot(along_m, path_m)
+    unit = np.sqrt(k * path_m**2 / distance_m**3)
+    return k * along_m / distance_m + unit * place, unit
 
 
 def scatter_cylinder(
@@ -303,8 +312,9 @@ def scatter_cylinder(
     """
     k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
     along_m = np.round(pair.rx_m[0] - pair.tx_m[0], 9)
-    whole = np.hypot(along_m, path_m)
-    low, high = float(np.floor(100 * path_m.min()) / 100), float(np.floor(100 * path_m.max()) / 100) + 0.01
+    distance_m = np.hypot(along_m, path_m)
+    low = float(np.floor(100 * path_m.min()) / 100)
+    high = float(np.floor(100 * path_m.max()) / 100) + 0.01
     body = EndlessCylinder(radius_m, permittivity, with_inside)
     total = np.zeros(path_m.shape, complex)
     basis = chebyshev.chebvander((2 * path_m - low - high) / (high - low), DEGREE)
@@ -317,11 +327,11 @@ def scatter_cylinder(
         else:
             m_m, n_n, m_n = (basis @ table for table in _tabulate(body, k, float(along_m[0]), place, (low, high)))
         slow = sum_orders(pair, (m_m, n_n, m_n), k, h, path_m)
-        phase = h * along_m + np.sqrt(k**2 - h**2) * path_m - k * whole
+        phase = h * along_m + np.sqrt(k**2 - h**2) * path_m - k * distance_m
         total += weight * unit * slow * np.exp(1j * (phase + place**2 / 2))
     # The integral of exp(-i t^2 / 2) is sqrt(-2 pi i).
     total *= np.sqrt(2 * np.pi) * np.exp(-0.25j * np.pi)
-    return np.conj(0.5j * total * np.exp(1j * k * whole))
+    return np.conj(0.5j * total * np.exp(1j * k * distance_m))
 
 
 def sum_orders(
@@ -364,11 +374,14 @@ class _AzimuthalWaves:
         # Cross-section: local y and z.
         self.rho = np.hypot(place[1], place[2])
         self.angle = np.arctan2(place[2], place[1])
-        cosine, sine = place[1] / self.rho, place[2] / self.rho
+        cosine = place[1] / self.rho
+        sine = place[2] / self.rho
         self._radial = dipole[1] * cosine + dipole[2] * sine
         self._azimuthal = dipole[2] * cosine - dipole[1] * sine
         self._axial = dipole[0]
-        self._eta, self._h, self._k = eta, h, k
+        self._eta = eta
+        self._h = h
+        self._k = k
         self._argument = eta * self.rho
         self._now = special.hankel1e(0, self._argument)
         self._last = -special.hankel1e(1, self._argument)
@@ -378,7 +391,8 @@ class _AzimuthalWaves:
         """H_n and its derivative by the argument, scaled; orders are asked for in turn, from 0."""
         if n > 0:
             following = 2 * (n - 1) / self._argument * self._now - self._last
-            self._last, self._now = self._now, following
+            self._last = self._now
+            self._now = following
         return self._now, self._last - n / self._argument * self._now
 
     def products(self, n: int, z: NDArray, rate: NDArray) -> tuple[NDArray, NDArray]:

@@ -73,7 +73,9 @@ def echo_of(
     lattice, coordinates = _make_lattice(offsets, LATTICE_M if solution is sum_bent else LATTICE_OF_SERIES_M)
     if shows_inside(shape):
         # What crossed the body has paths of its own: no lattice of positions or frequencies holds it.
-        lattice, nodes_hz, expand = None, frequencies_hz, np.eye(len(frequencies_hz))
+        lattice = None
+        nodes_hz = frequencies_hz
+        expand = np.eye(len(frequencies_hz))
     if lattice is None:
         places = find_specular(shape, *antennas_at(tx, rx, offsets))
         slow = solution(shape, tx, rx, nodes_hz, offsets, places)
@@ -171,7 +173,8 @@ def _add_carrier(slow: NDArray, excess_m: NDArray, frequencies_hz: NDArray, expa
 
 def _make_lattice(offsets: NDArray, step_m: float) -> tuple[NDArray | None, NDArray]:
     """Coarse lattice [rows, columns, 3] around the offsets and their coordinates on it [2, n]; None: they are few."""
-    low, high = offsets.min(axis=0), offsets.max(axis=0)
+    low = offsets.min(axis=0)
+    high = offsets.max(axis=0)
     counts = np.ceil((high - low)[:2] / step_m).astype(int) + 1 + 2 * PADDING
     if counts.prod() > len(offsets) or np.any(offsets[:, 2] != offsets[0, 2]):
         return None, np.zeros((2, 0))
@@ -195,8 +198,8 @@ def _frequency_nodes(frequencies_hz: NDArray, count: int = 5) -> tuple[NDArray, 
     half = (frequencies_hz[-1] - frequencies_hz[0]) / 2
     nodes = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     basis = chebyshev.chebvander(nodes, count - 1)
-    wanted = chebyshev.chebvander((frequencies_hz - middle) / half, count - 1)
-    return middle + half * nodes, wanted @ np.linalg.inv(basis)
+    target = chebyshev.chebvander((frequencies_hz - middle) / half, count - 1)
+    return middle + half * nodes, target @ np.linalg.inv(basis)
 
 
 def sum_bent(
@@ -216,8 +219,10 @@ def _add_bends(
     tx_m, rx_m = antennas_at(tx, rx, offsets)
     patch = shape.at(*places)
     spread = spread_of_ray(patch, follow_path(patch, tx_m, rx_m), tx_m, rx_m) * shape.cover(*places)
-    out, back = patch.point - tx_m, rx_m - patch.point
-    incident, scattered = out / np.linalg.norm(out, axis=0), back / np.linalg.norm(back, axis=0)
+    out = patch.point - tx_m
+    back = rx_m - patch.point
+    incident = out / np.linalg.norm(out, axis=0)
+    scattered = back / np.linalg.norm(back, axis=0)
     s_axis = np.cross(incident, patch.normal, axis=0)
     s_axis /= np.linalg.norm(s_axis, axis=0)
     cosine = -np.einsum("in,in->n", incident, patch.normal)
@@ -227,7 +232,8 @@ def _add_bends(
     directions = np.array([[np.einsum("cn,cn->n", t, d) for t in tangents] for d in (along, s_axis)])
     curvature = np.einsum("xin,ijn,yjn->xyn", directions, patch.curvature(), directions)
     weights = np.stack([np.ones_like(cosine), curvature[0, 0], curvature[1, 1], curvature[0, 1]], axis=1)
-    sent, received = tx.field(incident), rx.field(-scattered)
+    sent = tx.field(incident)
+    received = rx.field(-scattered)
     parts_in = [np.einsum("in,in->n", sent, axis) for axis in (s_axis, np.cross(s_axis, incident, axis=0))]
     parts_out = [np.einsum("in,in->n", received, axis) for axis in (s_axis, np.cross(scattered, s_axis, axis=0))]
     pairs = np.stack([parts_in[i] * parts_out[j] for i, j in ((0, 0), (1, 1), (0, 1), (1, 0))], axis=1)

@@ -48,9 +48,9 @@ class ShapeScene:
         distances = np.full(len(points_m), np.inf)
         normals = np.zeros((len(points_m), 3))
         for shape in self.shapes:
-            found, a, b = shape.project(points_m)
-            nearer = np.abs(found) < np.abs(distances)
-            distances = np.where(nearer, found, distances)
+            projected, a, b = shape.project(points_m)
+            nearer = np.abs(projected) < np.abs(distances)
+            distances = np.where(nearer, projected, distances)
             normals = np.where(nearer[:, None], shape.at(a, b).normal.T, normals)
         return distances, normals
 
@@ -79,8 +79,8 @@ def disturb_boards(boards: Boards, nuisances: ShapeNuisances) -> Boards:
     def disturb(antennas: tuple[Antenna, ...], leakage: float) -> tuple[Antenna, ...]:
         shift_m = draw_direction(rng) * nuisances.misplaced_mm / 1000
         rotation = turn(antennas[0].boresight, nuisances.axes_deg * rng.choice([-1, 1]))
-        other = leakage * np.exp(2j * np.pi * rng.random())
-        return tuple(antenna.turned(rotation, shift_m).with_leakage(other) for antenna in antennas)
+        leaked = leakage * np.exp(2j * np.pi * rng.random())
+        return tuple(antenna.turned(rotation, shift_m).with_leakage(leaked) for antenna in antennas)
 
     tx = disturb((boards.tx,), 0.0)[0]
     return Boards(tx, disturb(boards.h, nuisances.leakage), disturb(boards.v, nuisances.leakage))
@@ -108,7 +108,8 @@ def scan_shapes(
     # Fewer frequencies than samples of the chirp hold the same signal.
     sigma = nuisances.noise * NOISE_A_SAMPLE * np.sqrt(len(frequencies_hz) / SAMPLES)
     for channel, cube in cubes.items():
-        level_db, phase = gains.normal(), gains.uniform(0, 2 * np.pi)
+        level_db = gains.normal()
+        phase = gains.uniform(0, 2 * np.pi)
         if nuisances.gain_db:
             cube *= np.complex64(10 ** (nuisances.gain_db * level_db / 20) * np.exp(1j * phase))
         pair = noise.standard_normal((2, *cube.shape), dtype=np.float32)
@@ -233,7 +234,8 @@ def draw_shapes(
     x, y = published_rig().centre_m + rng.uniform(-0.04, 0.04, 2)
     front_m = float(x), float(y), float(0.499 + rng.uniform(-0.02, 0.03))
     # Axes lie within 10 degrees of the picture's plane, in any direction of it.
-    around, towards = rng.uniform(0, np.pi), rng.uniform(-0.17, 0.17)
+    around = rng.uniform(0, np.pi)
+    towards = rng.uniform(-0.17, 0.17)
     axis = float(np.cos(around)), float(np.sin(around)), float(towards)
     stack = METAL if is_metal else Stack(below=medium)
     shapes, radius_m = KINDS[kind](_Draw(rng, front_m, stack, axis))

@@ -48,7 +48,9 @@ class Patch:
 
     def tangents(self) -> NDArray:
         """Orthonormal tangents as combinations of d_a and d_b: [2, 2, ...], row i the parameters' rates along i."""
-        aa, ab, bb = _dots(self.d_a, self.d_a), _dots(self.d_a, self.d_b), _dots(self.d_b, self.d_b)
+        aa = _dots(self.d_a, self.d_a)
+        ab = _dots(self.d_a, self.d_b)
+        bb = _dots(self.d_b, self.d_b)
         first = 1 / np.sqrt(aa)
         rest = np.sqrt(bb - ab**2 / aa)
         zero = np.zeros_like(first)
@@ -124,17 +126,19 @@ class Shape:
         a, b = self.grid()
         distance2 = ((points[:, :, None] - self.at(a, b).point[:, None]) ** 2).sum(axis=0)
         nearest = distance2.argmin(axis=1)
-        a, b = a[nearest], b[nearest]
+        a = a[nearest]
+        b = b[nearest]
         for _ in range(ITERATIONS):
             patch = self.at(a, b)
-            away = patch.point - points
-            gradient = np.stack([_dots(away, patch.d_a), _dots(away, patch.d_b)])
+            difference = patch.point - points
+            gradient = np.stack([_dots(difference, patch.d_a), _dots(difference, patch.d_b)])
             hessian = np.array([
                 [_dots(patch.d_a, patch.d_a), _dots(patch.d_a, patch.d_b)],
                 [_dots(patch.d_a, patch.d_b), _dots(patch.d_b, patch.d_b)],
             ])  # fmt: skip
             step = solve_2x2(hessian, gradient)
-            a, b = a - step[0], b - step[1]
+            a = a - step[0]
+            b = b - step[1]
         patch = self.at(a, b)
         return _dots(points - patch.point, patch.normal), a, b
 
@@ -160,15 +164,16 @@ class Graph(Shape):
 
     def local(self, a: NDArray, b: NDArray) -> Patch:
         """Return the surface in local axes."""
-        zero, one = np.zeros(np.broadcast(a, b).shape), np.ones(np.broadcast(a, b).shape)
+        zero = np.zeros(np.broadcast(a, b).shape)
+        ones = np.ones(np.broadcast(a, b).shape)
         height = (self.bend_x * a**2 + self.bend_y * b**2) / 2 + self.twist * a * b
         return Patch(
             point=np.stack([a + zero, b + zero, height]),
-            d_a=np.stack([one, zero, self.bend_x * a + self.twist * b]),
-            d_b=np.stack([zero, one, self.bend_y * b + self.twist * a]),
-            d_aa=np.stack([zero, zero, self.bend_x * one]),
-            d_ab=np.stack([zero, zero, self.twist * one]),
-            d_bb=np.stack([zero, zero, self.bend_y * one]),
+            d_a=np.stack([ones, zero, self.bend_x * a + self.twist * b]),
+            d_b=np.stack([zero, ones, self.bend_y * b + self.twist * a]),
+            d_aa=np.stack([zero, zero, self.bend_x * ones]),
+            d_ab=np.stack([zero, zero, self.twist * ones]),
+            d_bb=np.stack([zero, zero, self.bend_y * ones]),
         )
 
 
@@ -201,11 +206,13 @@ class Revolved(Shape):
         """Return the surface in local axes."""
         a, b = np.broadcast_arrays(a, b)
         radius, first, second = self.profile(a)
-        sine, cosine = np.sin(b), np.cos(b)
-        zero, one = np.zeros_like(radius), np.ones_like(radius)
+        sine = np.sin(b)
+        cosine = np.cos(b)
+        zero = np.zeros_like(radius)
+        ones = np.ones_like(radius)
         return Patch(
             point=np.stack([a, radius * sine, -radius * cosine]),
-            d_a=np.stack([one, first * sine, -first * cosine]),
+            d_a=np.stack([ones, first * sine, -first * cosine]),
             d_b=np.stack([zero, radius * cosine, radius * sine]),
             d_aa=np.stack([zero, second * sine, -second * cosine]),
             d_ab=np.stack([zero, first * cosine, first * sine]),
@@ -227,7 +234,10 @@ class Sphere(Shape):
         """Return the surface in local axes."""
         a, b = np.broadcast_arrays(a, b)
         radius = self.radius_m
-        sa, ca, sb, cb = np.sin(a), np.cos(a), np.sin(b), np.cos(b)
+        sa = np.sin(a)
+        ca = np.cos(a)
+        sb = np.sin(b)
+        cb = np.cos(b)
         zero = np.zeros_like(sa)
         point = radius * np.stack([sa * cb, sb, -ca * cb])
         return Patch(
@@ -260,9 +270,9 @@ def cylinder(
 ) -> Revolved:
     """Return a cylinder (with `slope` a cone, with `bulge` a barrel) about `axis` through its centre."""
     along = np.asarray(axis, float) / np.linalg.norm(axis)
-    away = np.array([0.0, 0.0, 1.0]) - along[2] * along
-    away /= np.linalg.norm(away)
-    axes = np.stack([along, np.cross(away, along), away], axis=1)
+    normal = np.array([0.0, 0.0, 1.0]) - along[2] * along
+    normal /= np.linalg.norm(normal)
+    axes = np.stack([along, np.cross(normal, along), normal], axis=1)
     size_m = (length_m, 2 * np.radians(80) * radius_m)
     return Revolved(name, stack, centre_m, size_m, axes, radius_m=radius_m, slope=slope, bulge=bulge)
 
@@ -307,11 +317,11 @@ def plate(
 ) -> Graph:
     """Return a plate: its z rises along x and y by the tilts; with `bends` (x, y, twist; 1 / m) a sheet or saddle."""
     slope_x, slope_y = np.tan(np.radians(tilt_deg))
-    away = np.array([-slope_x, -slope_y, 1.0])
-    away /= np.linalg.norm(away)
+    normal = np.array([-slope_x, -slope_y, 1.0])
+    normal /= np.linalg.norm(normal)
     x_axis = np.array([1.0, 0.0, slope_x])
     x_axis /= np.linalg.norm(x_axis)
-    axes = turn(away, turn_deg) @ np.stack([x_axis, np.cross(away, x_axis), away], axis=1)
+    axes = turn(normal, turn_deg) @ np.stack([x_axis, np.cross(normal, x_axis), normal], axis=1)
     bend_x, bend_y, twist = bends
     return Graph(name, stack, centre_m, size_m, axes, bend_x=bend_x, bend_y=bend_y, twist=twist, is_soft=is_soft)
 
@@ -369,11 +379,13 @@ def find_specular(shape: Shape, tx_m: NDArray, rx_m: NDArray) -> tuple[NDArray, 
     basis = patch.tangents()
     slope = np.einsum("ij...,j...->i...", basis, path.gradient)
     start = (slope**2).sum(axis=0).argmin(axis=-1)
-    a, b = grid[0][start], grid[1][start]
+    a = grid[0][start]
+    b = grid[1][start]
     for _ in range(ITERATIONS):
         path = follow_path(shape.at(a, b), tx_m, rx_m)
         step = solve_2x2(path.hessian, path.gradient)
         length = np.hypot(step[0] * scale[0], step[1] * scale[1])
         step = step * np.minimum(1, LONGEST_STEP_M / np.maximum(length, 1e-12))
-        a, b = a - step[0], b - step[1]
+        a = a - step[0]
+        b = b - step[1]
     return a, b

@@ -252,7 +252,9 @@ def disturb_plates(world: World, nuisances: Nuisances) -> World:
     rng = np.random.default_rng([nuisances.seed, 1])
     disturbed = []
     for plate in world.plates:
-        heights, tilts, bows = rng.uniform(0, 1), rng.uniform(-1, 1, 2), rng.uniform(-1, 1, 2)
+        heights = rng.uniform(0, 1)
+        tilts = rng.uniform(-1, 1, 2)
+        bows = rng.uniform(-1, 1, 2)
         brightness = (1 + nuisances.brightness) ** rng.uniform(-1, 1)
         if plate.name == "table":
             disturbed.append(plate)

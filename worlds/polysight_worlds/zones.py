@@ -58,7 +58,8 @@ def spread_of_ray(patch: Patch, path: PathAt, tx_m: NDArray, rx_m: NDArray) -> N
     cos(incidence) / (r1 r2 sqrt(det path'')), with the path's second derivatives by the tangent plane's metres; the
     root has a factor j for each negative curvature of the path.
     """
-    out_m, back_m = np.linalg.norm(patch.point - tx_m, axis=0), np.linalg.norm(patch.point - rx_m, axis=0)
+    out_m = np.linalg.norm(patch.point - tx_m, axis=0)
+    back_m = np.linalg.norm(patch.point - rx_m, axis=0)
     cosine = np.einsum("in,in->n", patch.normal, tx_m - patch.point) / out_m
     basis = patch.tangents()
     bends = np.linalg.eigvalsh(np.moveaxis(np.einsum("ij...,jk...,lk...->il...", basis, path.hessian, basis), -1, 0))
@@ -83,7 +84,8 @@ def sum_window(
     tables = [CosineTable.of(shape.stack, f) for f in frequencies_hz]
     for first in range(0, len(offsets), at_once):
         chunk = slice(first, first + at_once)
-        a0, b0 = places[0][chunk], places[1][chunk]
+        a0 = places[0][chunk]
+        b0 = places[1][chunk]
         u = offsets[chunk]
         middle = shape.at(a0, b0)
         path = follow_path(middle, *antennas_at(tx, rx, u))
@@ -130,7 +132,7 @@ class CosineTable:
     def look_up(self, cos_incidence: NDArray) -> tuple[NDArray, NDArray]:
         """(r_s, r_p) as complex128."""
         place = np.clip(cos_incidence, 0, 1) * 512
-        left = np.minimum(place.astype(np.int32), 511)
-        share = place - left
-        s, p = (table[left] + share * (table[left + 1] - table[left]) for table in self._tables)
+        left_index = np.minimum(place.astype(np.int32), 511)
+        share = place - left_index
+        s, p = (table[left_index] + share * (table[left_index + 1] - table[left_index]) for table in self._tables)
         return s, p

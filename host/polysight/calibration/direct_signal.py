@@ -107,7 +107,9 @@ class DirectSignal:
 def band_hz(rig: Instrument) -> tuple[float, float]:
     """Return the IF band of the receiver, Hz: 0 to 0.9 sample rates (complex 1x) or +-0.45 (complex 2x)."""
     width = PASSBAND * rig.chirp.sample_rate_hz
-    return (0.0, width) if rig.chirp.if_mode == "complex1x" else (-width / 2, width / 2)
+    if rig.chirp.if_mode == "complex1x":
+        return (0.0, width)
+    return (-width / 2, width / 2)
 
 
 def unwrapped(if_hz: NDArray[np.float64], rig: Instrument) -> NDArray[np.float64]:
@@ -130,13 +132,15 @@ def find_direct(
 
     `setup` is that of the board, if it exists already.
     """
-    setup, chirp = setup or BoardSetup.of(rig, board), rig.chirp
+    setup = setup or BoardSetup.of(rig, board)
+    chirp = rig.chirp
     shape = (len(words) // setup.pulses, setup.pulses)
     aligned = align_row(
         words.reshape(*shape, *words.shape[1:]), valid.reshape(shape), chirp.linear_samples, setup.equaliser, FULL_SCALE
     )
     # The drift estimate is linearised: the first pass finds 2 ppm within a tenth, the second the rest.
-    drift, time = reference(aligned, setup.path, chirp).drift, np.arange(aligned.halves.shape[-1]) * float(FOLD)
+    drift = reference(aligned, setup.path, chirp).drift
+    time = np.arange(aligned.halves.shape[-1]) * float(FOLD)
     time -= time.mean()
     flat = aligned._replace(halves=aligned.halves * cis(-0.5 * drift * time**2))
     done = reference(flat, setup.path, chirp)
@@ -160,7 +164,9 @@ def _recorded_noise(aligned: AlignedRow, noise: NDArray[np.float64]) -> float:
     """Return the noise power of a recorded sample: the estimate divided by the gain of the filter compensation."""
     raised = (aligned.gain**2 * aligned.good).sum(axis=1) / np.maximum(aligned.good.sum(axis=1), 1)
     recorded = noise / np.maximum(raised, 1e-12)
-    return float(np.nanmedian(recorded)) if np.isfinite(recorded).any() else 0.0
+    if np.isfinite(recorded).any():
+        return float(np.nanmedian(recorded))
+    return 0.0
 
 
 def _power(
@@ -170,9 +176,11 @@ def _power(
     if not len(words):
         return np.zeros(0)
     a, b = whole_blocks(setup.chirp.linear_samples)
-    n, path = b - a, setup.path
+    n = b - a
+    path = setup.path
     time = np.arange(n) - (n - 1) / 2
-    raw = words[:, a:b, 0] + 1j * words[:, a:b, 1].astype(np.float32)  # [chirp, sample, rx]
+    # [chirp, sample, rx]
+    raw = words[:, a:b, 0] + 1j * words[:, a:b, 1].astype(np.float32)
     still = raw * cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
     folded = still.reshape(len(words), n // FOLD, FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
     return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2
@@ -186,8 +194,9 @@ def fit_start(source: RawSource, board_name: str) -> BoardStart:
     rig = source.instrument
     board = rig.by_name(board_name)
     setup = BoardSetup.of(rig, board)
-    found = [find_direct(rig, board, words, ok, setup) for _, words, ok in board_rows(source, board_name, ROWS)]
-    if_hz, chirps = np.concatenate([s.if_hz for s in found]), sum(s.chirps for s in found)
+    signals = [find_direct(rig, board, words, ok, setup) for _, words, ok in board_rows(source, board_name, ROWS)]
+    if_hz = np.concatenate([s.if_hz for s in signals])
+    chirps = sum(s.chirps for s in signals)
     expected = direct_if_hz(rig, board)
     if if_hz.size < max(2, MIN_FOUND * chirps):
         raise DataError(
@@ -204,7 +213,8 @@ def start_of(
     rig: Instrument, board: Board, expected_hz: float, seen_hz: float, error_hz: float, chirps: int
 ) -> BoardStart:
     """Return the start offset that moves a direct path, aliased to `seen_hz`, to the middle of the IF band."""
-    rate, middle = rig.chirp.sample_rate_hz, sum(band_hz(rig)) / 2
+    rate = rig.chirp.sample_rate_hz
+    middle = sum(band_hz(rig)) / 2
     alias = round((expected_hz - seen_hz) / rate)
     offset = board.start_offset_hz + middle - (seen_hz + alias * rate)
     return BoardStart(
@@ -223,8 +233,8 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
     Raises DataError if the direct path is not found, or the sweep does not determine the corners.
     """
     setups: dict[str, BoardSetup] = {}
-    found = [_power_of_scan(scan, scan.instrument.by_name(board_name), setups) for scan in scans]
-    if_hz, power, noise_power = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    powers = [_power_of_scan(scan, scan.instrument.by_name(board_name), setups) for scan in scans]
+    if_hz, power, noise_power = (np.concatenate(parts) for parts in zip(*powers, strict=True))
     middles, levels = binned(if_hz, power, noise_power)
     if middles.size == 0:
         raise DataError(
@@ -248,16 +258,17 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
 def _power_of_scan(scan: RawSource, board: Board, setups: dict[str, BoardSetup]) -> tuple[Real, Real, Real]:
     """Return IF (Hz), power and noise power (ADC counts squared) of the direct path in the chirps of some rows."""
     rig = scan.instrument
-    key = f"{places_crc32(rig)} {rig.chirp} {rig.burst!r}"  # scans of one sweep share the setup
+    # Scans of one sweep share the setup
+    key = f"{places_crc32(rig)} {rig.chirp} {rig.burst!r}"
     if key not in setups:
         setups[key] = BoardSetup.of(rig, board)
-    found = [
+    signals = [
         find_direct(rig, board, words, ok, setups[key]) for _, words, ok in board_rows(scan, board.name, FILTER_ROWS)
     ]
     return (
-        np.concatenate([s.if_hz for s in found]),
-        np.concatenate([s.power for s in found]),
-        np.concatenate([s.noise_power for s in found]),
+        np.concatenate([s.if_hz for s in signals]),
+        np.concatenate([s.power for s in signals]),
+        np.concatenate([s.noise_power for s in signals]),
     )
 
 
@@ -280,7 +291,8 @@ def _errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple[Real, float]:
         out = np.log(level) - np.log(np.abs(HighPass(tuple(np.exp(logs))).response(if_hz)))
         return out - out.mean()
 
-    logs, step = np.log(corners_hz), 1e-4
+    logs = np.log(corners_hz)
+    step = 1e-4
     slopes = np.stack(
         [(residual(logs + d) - residual(logs - d)) / (2 * step) for d in step * np.eye(logs.size)], axis=1
     )

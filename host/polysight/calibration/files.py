@@ -284,7 +284,8 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
             for band, part in zip(bands, reference.bands, strict=True)
         ],
     )
-    path = write_calibration(file, out)  # reserves the name
+    # Reserves the name
+    path = write_calibration(file, out)
     images = path.with_suffix(".npz")
     try:
         arrays = {name: getattr(reference, name) for name in IMAGES}
@@ -316,7 +317,7 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
         )
     with open_npz(images) as f:
         arrays: dict[str, NDArray[Any]] = dict(f)
-    whole = PlaneReference(
+    reference = PlaneReference(
         *(arrays[name] for name in IMAGES),
         x_m=arrays["x_m"],
         y_m=arrays["y_m"],
@@ -325,10 +326,10 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
         made_with=file.imaged_with,
     )
     parts = (
-        replace(whole, spread=band.spread, how=band.how, **{n: arrays[f"band_{n}"][k] for n in IMAGES})
+        replace(reference, spread=band.spread, how=band.how, **{n: arrays[f"band_{n}"][k] for n in IMAGES})
         for k, band in enumerate(file.bands)
     )
-    return replace(whole, bands=tuple(parts))
+    return replace(reference, bands=tuple(parts))
 
 
 FOLDER = "calibration"
@@ -368,9 +369,12 @@ class Calibration:
         """Raise ConfigError if filters were measured with other programmed corners, or not for every receiver."""
         programmed = [khz for khz in (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz) if khz]
         for board in rig.receivers if self.filters is not None else ():
-            found = self.filters.boards.get(board.name) if self.filters else None
-            if found is None or [float(khz) for khz in found.programmed_khz if khz] != programmed:
-                what = "is not in it" if found is None else f"was measured with {found.programmed_khz} kHz programmed"
+            board_filter = self.filters.boards.get(board.name) if self.filters else None
+            if board_filter is None or [float(khz) for khz in board_filter.programmed_khz if khz] != programmed:
+                if board_filter is None:
+                    what = "is not in it"
+                else:
+                    what = f"was measured with {board_filter.programmed_khz} kHz programmed"
                 raise ConfigError(
                     f"{self.path('hpf')}: {board.name} {what}, the rig file says {programmed}",
                     "the boards or chirp.hpf1_khz, hpf2_khz were changed after the calibration",
@@ -380,19 +384,23 @@ class Calibration:
 
     @staticmethod
     def _shifted(board: Board, places: PlacesFile) -> Board:
-        found = places.boards.get(board.name)
-        if found is None:
+        board_places = places.boards.get(board.name)
+        if board_places is None:
             return board
-        return msgspec.structs.replace(board, mount=(*board.mount, MountStep(shift_mm=found.shift_mm)))
+        return msgspec.structs.replace(board, mount=(*board.mount, MountStep(shift_mm=board_places.shift_mm)))
 
     def high_pass(self, board: str) -> HighPass | None:
         """Return the measured filter of a board; None: as programmed."""
-        found = None if self.filters is None else self.filters.boards.get(board)
-        return None if found is None else HighPass(tuple(1e3 * corner for corner in found.corners_khz))
+        board_filter = None if self.filters is None else self.filters.boards.get(board)
+        if board_filter is None:
+            return None
+        return HighPass(tuple(1e3 * corner for corner in board_filter.corners_khz))
 
     def reference(self) -> PlaneReference | None:
         """Return the metal reference, pixel by pixel; None without one. Raises DataError if its images have changed."""
-        return None if self.metal is None else read_metal(self.metal, self.path("metal").parent / self.metal.images)
+        if self.metal is None:
+            return None
+        return read_metal(self.metal, self.path("metal").parent / self.metal.images)
 
     def high_passes(self, rig: Instrument) -> dict[str, HighPass | None]:
         """Return the measured filter of every receiver, by name; None: as programmed."""
@@ -409,9 +417,11 @@ class Calibration:
 
         Raises DataError if the metal plate was imaged with another rig, or without these sub-bands.
         """
-        plane, name = chosen, "the metal reference"
+        plane = chosen
+        name = "the metal reference"
         if plane is None and not in_scene:
-            plane, name = self.reference(), str(self.path("metal"))
+            plane = self.reference()
+            name = str(self.path("metal"))
         if plane is not None:
             plane.check_rig(self.imaged_with(rig), name)
             plane.check_bands(bands, name)
@@ -441,8 +451,8 @@ class Calibration:
 def load_calibration(paths: dict[str, Path]) -> Calibration:
     """Load calibration files by kind. Raises ConfigError or DataError for an invalid file."""
     kinds = {"direct_path": PlacesFile, "hpf": FilterFile, "metal": MetalFile, "sphere": SphereFile}
-    found = {kind: read_calibration(path, kinds[kind], kind) for kind, path in paths.items()}
-    metal = found.get("metal")
+    files = {kind: read_calibration(path, kinds[kind], kind) for kind, path in paths.items()}
+    metal = files.get("metal")
     if metal is not None and Path(metal.images).name != metal.images:
         raise DataError(
             f"{paths['metal']}: the images {metal.images!r} are not in the same folder",
@@ -451,10 +461,10 @@ def load_calibration(paths: dict[str, Path]) -> Calibration:
             code=ErrorCode.PATH_OUTSIDE,
         )
     return Calibration(
-        places=found.get("direct_path"),
-        filters=found.get("hpf"),
+        places=files.get("direct_path"),
+        filters=files.get("hpf"),
         metal=metal,
-        sphere=found.get("sphere"),
+        sphere=files.get("sphere"),
         paths=dict(paths),
     )
 
@@ -508,7 +518,8 @@ def checked_calibration(rig: Instrument, simulated: bool) -> Calibration:
     scan is not `simulated`.
     """
     calibration = calibration_of_rig(rig)
-    placed, reference = calibration.rig(rig), calibration.reference()
+    placed = calibration.rig(rig)
+    reference = calibration.reference()
     if reference is not None:
         reference.check_rig(calibration.imaged_with(placed), str(calibration.path("metal")))
         grid = image_grid(placed)
@@ -578,5 +589,6 @@ def board_rows(
         rows = [rows[i] for i in np.linspace(0, len(rows) - 1, limit).round().astype(int)]
     for row in rows:
         recorded = source.read_row(board, row)
-        samples, rx = source.instrument.chirp.samples, len(source.instrument.antennas.rx_mm)
+        samples = source.instrument.chirp.samples
+        rx = len(source.instrument.antennas.rx_mm)
         yield row, *row_words(recorded.payload, recorded.missing, recorded.frames_expected, samples, rx)

@@ -172,38 +172,43 @@ def fit_places(
     start[-3:-1] = _find_target(boards, centre, mm)
     size = sum(b.samples.size for b in boards)
     sigma = float(np.sqrt(np.mean(misfit(start, 1.0)[: 2 * size] ** 2)))
-    found: Any = None
-    for tolerance in (1e-3, 1e-6, 1e-8):  # each fit improves the estimate of the noise
-        found = scipy.optimize.least_squares(
+    fit: Any = None
+    # Each fit improves the estimate of the noise
+    for tolerance in (1e-3, 1e-6, 1e-8):
+        fit = scipy.optimize.least_squares(
             misfit, start, args=(sigma,), method="lm", x_scale=scale / 10, ftol=tolerance, xtol=tolerance
         )
-        start = found.x
-        sigma *= float(np.sqrt(np.mean(found.fun[: 2 * size] ** 2)))
+        start = fit.x
+        sigma *= float(np.sqrt(np.mean(fit.fun[: 2 * size] ** 2)))
     power = sum(float((np.abs(b.samples) ** 2).sum()) for b in boards)
     explained = 1 - 2 * size * sigma**2 / power
-    covariance = np.linalg.inv(found.jac.T @ found.jac)
-    return PlacesFit(found.x, covariance, explained, list(echoes))
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac)
+    return PlacesFit(fit.x, covariance, explained, list(echoes))
 
 
 def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass | None) -> BoardEchoes:
     """Synchronise a board's scan, reduce it to the range gate, equalise its RX and whiten its noise."""
-    board, plan = rig.by_name(name), plan_raster(rig.grid)
+    board = rig.by_name(name)
+    plan = plan_raster(rig.grid)
     setup = BoardSetup.of(rig, board, model=model)
-    every = tuple(Antennas.of(rig, b) for b in rig.receivers)
-    gate = scene_gate_m(every, plan, image_grid(rig), DEPTH_M)
+    receivers = tuple(Antennas.of(rig, b) for b in rig.receivers)
+    gate = scene_gate_m(receivers, plan, image_grid(rig), DEPTH_M)
     maps = reduction(rig.chirp, gate)
-    reduced, direct, offsets = [], [], []
+    reduced = []
+    direct = []
+    offsets = []
     stride = max(1, int(np.ceil(np.sqrt(plan.positions / POSITIONS))))
     for row, words, valid in board_rows(source, name):
         if row % stride:
             continue
         synced = synchronise_row(words, valid, setup)
         keep = np.flatnonzero(synced.valid)[::stride]
-        found = synced.samples[:, keep] @ maps.maps(synced.sweep_hz).T
-        reduced.append(found[..., :-1])
-        direct.append(found[..., -1])
+        values = synced.samples[:, keep] @ maps.maps(synced.sweep_hz).T
+        reduced.append(values[..., :-1])
+        direct.append(values[..., -1])
         offsets.append(row_offsets_m(rig, plan.row(row))[keep])
-    samples, gains = np.concatenate(reduced, axis=1), np.concatenate(direct, axis=1).mean(axis=1)
+    samples = np.concatenate(reduced, axis=1)
+    gains = np.concatenate(direct, axis=1).mean(axis=1)
     if not samples.size or np.any(gains == 0):
         raise DataError(
             f"{source.scan_id}: no direct path of {name}",
@@ -213,8 +218,8 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
         )
     # Noise is white in the raw samples, so its covariance in the reduced samples is that of the reduction.
     power, directions = scipy.linalg.eigh(maps.matrix @ maps.matrix.conj().T)
-    kept = power > _MIN_NOISE * power[-1]
-    white = directions[:, kept].conj().T / np.sqrt(power[kept])[:, None]
+    strong = power > _MIN_NOISE * power[-1]
+    white = directions[:, strong].conj().T / np.sqrt(power[strong])[:, None]
     samples = (samples / gains[:, None, None]) @ white.T
     flat = np.concatenate(offsets)
     places = np.column_stack([flat, np.zeros(len(flat))])
@@ -224,23 +229,27 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
 def _places_m(centre: Real, mm: Real, unknown: Real) -> Real:
     """Return the positions of the target's points, metres [point, 3], rig frame."""
     depth, x, y, turn = unknown[-4:]
-    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    c = np.cos(np.radians(turn))
+    s = np.sin(np.radians(turn))
     flat = mm @ np.array([[c, s], [-s, c]]) + [x, y]
     return centre + np.column_stack([flat, np.full(len(mm), depth)]) / 1e3
 
 
 def _design(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
     """Return the echo of each point with amplitude one, complex [rx * position * k, point]."""
-    tx, rx = board.antennas.tx_m, board.antennas.rx_m + np.asarray(shift_mm) / 1e3
-    away = places_m[None] - board.offsets_m[:, None]  # [position, point, 3]
-    out = np.linalg.norm(away - tx, axis=-1)
-    back = np.linalg.norm(away[None] - rx[:, None, None], axis=-1)
+    tx = board.antennas.tx_m
+    rx = board.antennas.rx_m + np.asarray(shift_mm) / 1e3
+    # [position, point, 3]
+    difference = places_m[None] - board.offsets_m[:, None]
+    out = np.linalg.norm(difference - tx, axis=-1)
+    back = np.linalg.norm(difference[None] - rx[:, None, None], axis=-1)
     path = out + back - np.linalg.norm(rx - tx, axis=-1)[:, None, None]
     f = board.frequencies_hz / SPEED_OF_LIGHT_M_S
     step = _turns(path * (f[-1] - f[0]) / (f.size - 1))
     tones = np.empty((*path.shape, f.size), np.complex128)
     tones[..., 0] = _turns(path * f[0]) / (out * back)
-    for k in range(1, f.size):  # evenly spaced
+    # Evenly spaced
+    for k in range(1, f.size):
         np.multiply(tones[..., k - 1], step, out=tones[..., k])
     echoes = tones.reshape(-1, f.size) @ board.echo.T
     return echoes.reshape(*path.shape, -1).transpose(0, 1, 3, 2).reshape(-1, len(places_m))
@@ -253,14 +262,16 @@ def _turns(cycles: Real) -> NDArray[np.complex128]:
 
 def _residual(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
     """Return the samples minus the best-fitting sum of the points' echoes."""
-    design, samples = _design(board, shift_mm, places_m), board.samples.reshape(-1)
+    design = _design(board, shift_mm, places_m)
+    samples = board.samples.reshape(-1)
     amplitude = np.linalg.lstsq(design.conj().T @ design, design.conj().T @ samples, rcond=1e-9)[0]
     return samples - design @ amplitude
 
 
 def _find_target(boards: list[BoardEchoes], centre: Real, mm: Real) -> tuple[float, float]:
     """Return the position of the target on a coarse grid, millimetres: maximum of the power at all points."""
-    best, found = -1.0, (0.0, 0.0)
+    best = -1.0
+    best_place = (0.0, 0.0)
     few = [_subset(b) for b in boards]
     steps = np.arange(-_REACH_MM, _REACH_MM + _STEP_MM / 2, _STEP_MM)
     for x in steps:
@@ -272,15 +283,16 @@ def _find_target(boards: list[BoardEchoes], centre: Real, mm: Real) -> tuple[flo
                 answer = design.conj().T @ board.samples.reshape(-1)
                 total += float((np.abs(answer) ** 2 / (np.abs(design) ** 2).sum(axis=0)).sum())
             if total > best:
-                best, found = total, (float(x), float(y))
-    return found
+                best = total
+                best_place = (float(x), float(y))
+    return best_place
 
 
 def _subset(b: BoardEchoes) -> BoardEchoes:
     """Return the samples of one RX at some positions."""
-    at = slice(None, None, -(-len(b.offsets_m) // _SEARCH_POSITIONS))
+    picked = slice(None, None, -(-len(b.offsets_m) // _SEARCH_POSITIONS))
     antennas = Antennas(b.antennas.tx_m, b.antennas.rx_m[:1])
-    return BoardEchoes(antennas, b.samples[:1, at], b.echo, b.offsets_m[at], b.frequencies_hz)
+    return BoardEchoes(antennas, b.samples[:1, picked], b.echo, b.offsets_m[picked], b.frequencies_hz)
 
 
 def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[SourceScan]) -> PlacesFile:
@@ -292,19 +304,20 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[Sour
             "check the target file; cover other reflecting objects",
             code=ErrorCode.MISMATCH,
         )
-    errors, boards = fit.errors, {}
+    errors = fit.errors
+    boards = {}
     for i, name in enumerate(fit.boards):
-        own = slice(3 * i, 3 * i + 3)
+        board_values = slice(3 * i, 3 * i + 3)
         antennas = Antennas.of(rig, rig.by_name(name))
-        before = antennas.rx_m[0] - antennas.tx_m
-        after = before + fit.values[own] / 1e3
-        along = after / np.linalg.norm(after)
+        vector_before = antennas.rx_m[0] - antennas.tx_m
+        vector_after = vector_before + fit.values[board_values] / 1e3
+        along = vector_after / np.linalg.norm(vector_after)
         boards[name] = BoardPlace(
-            _vector(fit.values[own]),
-            _vector(errors[own]),
-            float(np.linalg.norm(after) * 1e3),
-            float(np.linalg.norm(before) * 1e3),
-            float(np.sqrt(along @ fit.covariance[own, own] @ along)),
+            _vector(fit.values[board_values]),
+            _vector(errors[board_values]),
+            float(np.linalg.norm(vector_after) * 1e3),
+            float(np.linalg.norm(vector_before) * 1e3),
+            float(np.sqrt(along @ fit.covariance[board_values, board_values] @ along)),
         )
     depth, x, y, turn = (float(v) for v in fit.values[-4:])
     return PlacesFile(

@@ -10,7 +10,8 @@ import numpy as np
 from polysight.imaging.geometry import Aperture, device_of, excess_path_m, namespace, turn
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-_CHUNK = 1 << 20  # products of position and voxel in memory
+# Products of position and voxel in memory
+_CHUNK = 1 << 20
 
 
 def backproject(samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any) -> Any:
@@ -83,7 +84,8 @@ class _Scene:
         self, samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any, like: Any = None
     ) -> None:
         like = samples if like is None else like
-        self.xp, self.device = namespace(like), device_of(like)
+        self.xp = namespace(like)
+        self.device = device_of(like)
         shape = tuple(samples.shape) if hasattr(samples, "shape") else np.shape(samples)
         self.frequencies = [float(f) for f in frequencies_hz]
         if len(shape) != 2 or not self.frequencies or len(self.frequencies) != shape[1]:
@@ -116,7 +118,9 @@ class _Scene:
         size = max(1, _CHUNK // max(1, v.shape[0]))
         for first in range(0, self.tx.shape[0], size):
             part = slice(first, min(first + size, self.tx.shape[0]))
-            tx, rx, reference = self.tx[part, None, :], self.rx[part, None, :], self.reference[part, None]
+            tx = self.tx[part, None, :]
+            rx = self.rx[part, None, :]
+            reference = self.reference[part, None]
             d = excess_path_m(self.xp, v[None, :, 0], v[None, :, 1], v[None, :, 2], tx, rx, reference)
             yield part, d / SPEED_OF_LIGHT_M_S
 

@@ -22,8 +22,10 @@ from polysight_shared.errors import ConfigError
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.raster import Row, mean_burst_travel_mm, plan_raster
 
-_SAME_M = 1e-6  # tolerance of positions: 2e-3 rad at one position, far below the noise
-_FINER = 4  # the lattice in y may be this much finer than the pixels
+# Tolerance of positions: 2e-3 rad at one position, far below the noise
+_SAME_M = 1e-6
+# The lattice in y may be this much finer than the pixels
+_FINER = 4
 Window = str | tuple[Any, ...]
 """Window as for scipy.signal.get_window; "boxcar" for none."""
 
@@ -140,7 +142,8 @@ def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
     out = np.zeros((plan.rows, plan.columns, 3))
     along = {row.direction: row_offsets_m(rig, row)[:: row.direction, 0] for row in itertools.islice(plan, 2)}
     for row in plan:
-        out[row.index, :, 0], out[row.index, :, 1] = along[row.direction], row.y_mm / 1e3
+        out[row.index, :, 0] = along[row.direction]
+        out[row.index, :, 1] = row.y_mm / 1e3
     return out
 
 
@@ -173,7 +176,8 @@ class Aperture:
 
 def irregular(aperture: Aperture) -> str | None:
     """Return the reason why positions and pixels do not form a lattice; None if they do."""
-    offsets, grid = aperture.offsets_m, aperture.grid
+    offsets = aperture.offsets_m
+    grid = aperture.grid
     if np.ndim(grid.z_m):
         return "the imaged surface is not a plane parallel to the stage"
     if np.abs(offsets[..., 2] - offsets[0, 0, 2]).max() > _SAME_M:
@@ -216,7 +220,8 @@ def pitch_y_m(aperture: Aperture) -> float | None:
 
 def window_weights(name: Window, n: int) -> NDArray[np.float64]:
     """Return a symmetric window of n points without the zeros at its ends, float64 [n]."""
-    match name:  # common ones in NumPy: scipy.signal loads scipy.stats, which takes a second
+    # Common ones in NumPy: scipy.signal loads scipy.stats, which takes a second
+    match name:
         case "boxcar":
             weights = np.ones(n + 2)
         case "hann":

@@ -142,17 +142,18 @@ class Illumination:
         bends = []
         for axis in (1, 0):
             pitch_m = self.pixel_m[1 - axis]
-            ahead, here = (slice(1, None), slice(None, -1))
-            first, second = ((slice(None), part) if axis == 1 else (part, slice(None)) for part in (here, ahead))
+            ahead = slice(1, None)
+            following = slice(None, -1)
+            first, second = ((slice(None), part) if axis == 1 else (part, slice(None)) for part in (following, ahead))
             inside = mask[first] & mask[second]
             steps = np.sum(np.where(inside, channel[second] * np.conj(channel[first]), 0), axis=1 - axis)
-            seen = inside.sum(axis=1 - axis) > 2
-            if seen.sum() < _LEAST_LINES:
+            enough_pixels = inside.sum(axis=1 - axis) > 2
+            if enough_pixels.sum() < _LEAST_LINES:
                 bends.append(0.0)
                 continue
-            place_m = np.flatnonzero(seen) * pitch_m
-            weight = np.sqrt(np.abs(steps[seen]))
-            growth = float(np.polyfit(place_m, np.unwrap(np.angle(steps[seen])), 1, w=weight)[0])
+            place_m = np.flatnonzero(enough_pixels) * pitch_m
+            weight = np.sqrt(np.abs(steps[enough_pixels]))
+            growth = float(np.polyfit(place_m, np.unwrap(np.angle(steps[enough_pixels])), 1, w=weight)[0])
             # The samples are conjugated: the phase falls where the surface is farther.
             bends.append(-growth / pitch_m / float(self.steepness_rad_m.mean()))
         return bends[0], bends[1]
@@ -179,9 +180,9 @@ class Illumination:
         """Return the footprint at a patch's pixels divided by that `moved_m` away, [n]; 1 beyond the aperture."""
         rows, columns = np.nonzero(mask)
         level = np.abs(self.footprints[channel])
-        at = np.stack([rows + moved_m[1] / self.pixel_m[1], columns + moved_m[0] / self.pixel_m[0]])
+        coordinates = np.stack([rows + moved_m[1] / self.pixel_m[1], columns + moved_m[0] / self.pixel_m[0]])
         with np.errstate(divide="ignore", invalid="ignore"):
-            change = level[rows, columns] / scipy.ndimage.map_coordinates(level, at, order=1, mode="nearest")
+            change = level[rows, columns] / scipy.ndimage.map_coordinates(level, coordinates, order=1, mode="nearest")
         return np.where((change > 1 / _MAX_CHANGE) & (change < _MAX_CHANGE), change, 1.0)
 
 
@@ -256,15 +257,20 @@ class Images:
         if self.illumination is None:
             return self
         rise = self.illumination.rise(self.h, self.v, plate)
-        return correct_tilt(self, [plate], [rise]) if max(map(abs, rise)) <= MAX_RISE else self
+        if max(map(abs, rise)) <= MAX_RISE:
+            return correct_tilt(self, [plate], [rise])
+        return self
 
 
 def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -> tuple[NDArray[np.float64], float]:
     """Return `moved_m` [2, 2] and `steepness_rad_m` of a board at its specular point on the plane at `z_m`."""
-    tx, rx = antennas.tx_m, antennas.rx_m.mean(axis=0)
-    z_tx, z_rx = z_m - tx[2], z_m - rx[2]
+    tx = antennas.tx_m
+    rx = antennas.rx_m.mean(axis=0)
+    z_tx = z_m - tx[2]
+    z_rx = z_m - rx[2]
     point = np.append((tx[:2] * z_rx + rx[:2] * z_tx) / (z_tx + z_rx), z_m)
-    bend, cosines = np.zeros((2, 2)), 0.0
+    bend = np.zeros((2, 2))
+    cosines = 0.0
     for antenna in (tx, rx):
         leg = point - antenna
         r = float(np.linalg.norm(leg))
@@ -311,8 +317,8 @@ class View:
     def of(self, rig: Instrument, swapped: bool = False) -> Instrument:
         """Return the rig with this plane and these pixels; `swapped`: the rig's x is the image's y."""
         columns, rows = (self.rows, self.columns) if swapped else (self.columns, self.rows)
-        wanted = {"columns": columns, "rows": rows, "pixel_mm": self.pixel_mm}
-        image = msgspec.structs.replace(rig.image, **{k: v for k, v in wanted.items() if v is not None})
+        values = {"columns": columns, "rows": rows, "pixel_mm": self.pixel_mm}
+        image = msgspec.structs.replace(rig.image, **{k: v for k, v in values.items() if v is not None})
         distance = rig.geometry.object_distance_mm + self.depth_mm
         geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=distance)
         return msgspec.structs.replace(rig, image=image, geometry=geometry)
@@ -357,9 +363,12 @@ class ImageBuilder:
         depth_m: float = 0.0,
         gate_m: tuple[float, float] | None = None,
     ) -> None:
-        self.rig, self.grid, self.live = rig, image_grid(rig), live
+        self.rig = rig
+        self.grid = image_grid(rig)
+        self.live = live
         if live:
-            import_module("scipy.ndimage")  # load it now instead of after the last row
+            # Load it now instead of after the last row
+            import_module("scipy.ndimage")
         plan = plan_raster(rig.grid)
         antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
         self.gate_m = needed_gate_m(rig, depth_m) if gate_m is None else gate_m
@@ -367,7 +376,8 @@ class ImageBuilder:
         weights_y = window_weights(self.taper, plan.rows)
         weights = np.outer(weights_y, window_weights(self.taper, plan.columns)).astype(np.float32)
         gated = reduction(rig.chirp, self.gate_m)
-        self._antennas, self._middle_hz = antennas, float(np.mean(gated.frequencies_hz))
+        self._antennas = antennas
+        self._middle_hz = float(np.mean(gated.frequencies_hz))
         self.boards = {b.name: BoardSamples(rig, b, self.grid, gated, weights, live) for b in rig.receivers}
 
     def add_row(
@@ -560,22 +570,24 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
         if set(self.places_mm) != set(now.places_mm):
             yield f"the boards are {', '.join(now.places_mm)}, not {', '.join(self.places_mm)}"
         for name in self.places_mm.keys() & now.places_mm.keys():
-            before, after = self.places_mm[name], now.places_mm[name]
-            if len(before) != len(after):
-                yield f"{name} has {len(after) - 2} antennas in use, not {len(before) - 2}"
+            place_before = self.places_mm[name]
+            place_after = now.places_mm[name]
+            if len(place_before) != len(place_after):
+                yield f"{name} has {len(place_after) - 2} antennas in use, not {len(place_before) - 2}"
                 continue
-            moved = max(math.dist(a, b) for a, b in zip(before, after, strict=True))
+            moved = max(math.dist(a, b) for a, b in zip(place_before, place_after, strict=True))
             if moved > SAME_MM:
                 yield f"{name} or its antennas moved or turned, by up to {moved:.2g} mm"
         if abs(self.object_distance_mm - now.object_distance_mm) > SAME_MM:
             yield f"the object plane is at {now.object_distance_mm:.2f} mm, not {self.object_distance_mm:.2f} mm"
-        off = max(abs(a - b) for a, b in zip(self.band_hz, now.band_hz, strict=True))
-        if off > SAME_HZ or self.samples != now.samples:
+        difference_hz = max(abs(a - b) for a, b in zip(self.band_hz, now.band_hz, strict=True))
+        if difference_hz > SAME_HZ or self.samples != now.samples:
             yield f"the linear samples are {_band(now)}, not {_band(self)}"
         if self.apodisation != now.apodisation:
             yield f"image.apodisation is {now.apodisation!r}, not {self.apodisation!r}"
         for name in self.high_pass_khz.keys() & now.high_pass_khz.keys():
-            was, corners = self.high_pass_khz[name], now.high_pass_khz[name]
+            was = self.high_pass_khz[name]
+            corners = now.high_pass_khz[name]
             same = len(was) == len(corners)
             if not same or any(abs(a - b) > SAME_CORNER_KHZ for a, b in zip(was, corners, strict=True)):
                 yield f"{name}'s high-pass corners are {_corners(corners)}, not {_corners(was)}"

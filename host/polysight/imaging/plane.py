@@ -125,7 +125,8 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
             image = board.image(replace(grid, z_m=float(np.mean(grid.z_m)) + depth))[0]
             stack[i] += np.abs(image) ** 2
     cells = _cells(builder, depths)
-    x, y = grid.x_m - grid.x_m.mean(), grid.y_m - grid.y_m.mean()
+    x = grid.x_m - grid.x_m.mean()
+    y = grid.y_m - grid.y_m.mean()
 
     def sharpness(plane: NDArray[np.float64]) -> float:
         """Return the sharpness on a plane: depth in mm at the centre, rise along x and y in mm per 100 mm."""
@@ -138,15 +139,15 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
     flat = np.array([sharpness(np.array([1e3 * depth, 0.0, 0.0])) for depth in depths])
     start = np.array([1e3 * depths[int(np.argmax(flat))], 0.0, 0.0])
     rise = 1e2 * float(np.tan(np.radians(_MAX_TILT_DEG)))
-    found = scipy.optimize.minimize(
+    optimum = scipy.optimize.minimize(
         lambda plane: -sharpness(plane) / flat.max(),
         start,
         method="Nelder-Mead",
         bounds=[(-1e3 * depth_m, 1e3 * depth_m), (-rise, rise), (-rise, rise)],
         options={"initial_simplex": start + np.vstack([np.zeros(3), np.eye(3)]), "xatol": 0.005, "fatol": 1e-9},
     )
-    depth, along_x, along_y = found.x
-    gain = -found.fun * flat.max() / sharpness(np.zeros(3))
+    depth, along_x, along_y = optimum.x
+    gain = -optimum.fun * flat.max() / sharpness(np.zeros(3))
     tilt = np.degrees(np.arctan(np.array([along_x, along_y]) / 1e2))
     return Focus(1e3 * depths, flat / flat.max(), float(depth), (float(tilt[0]), float(tilt[1])), float(gain))
 
@@ -156,7 +157,8 @@ def _cells(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.flo
 
     Interpolated from nine points per plane, for it varies slowly.
     """
-    aperture, grid = next(iter(builder.boards.values())).aperture, builder.grid
+    aperture = next(iter(builder.boards.values())).aperture
+    grid = builder.grid
     z = float(np.mean(grid.z_m)) + depths
     axes = (z[[0, -1]], grid.y_m[[0, grid.y_m.size // 2, -1]], grid.x_m[[0, grid.x_m.size // 2, -1]])
     area = np.array(
@@ -247,8 +249,8 @@ class PlaneEstimate:
         d theta / d z = sin theta cos theta / z.
         """
         theta = np.radians(incidence_deg(rig, rig.receivers[0]))
-        known = float(np.hypot(self.offset_std_m, MOUNT_STD_M)) if self.known else PRIOR_STD_M
-        return float(np.sin(theta) * np.cos(theta) / (rig.geometry.object_distance_mm / 1e3) * known)
+        offset_std_m = float(np.hypot(self.offset_std_m, MOUNT_STD_M)) if self.known else PRIOR_STD_M
+        return float(np.sin(theta) * np.cos(theta) / (rig.geometry.object_distance_mm / 1e3) * offset_std_m)
 
     def transposed(self) -> PlaneEstimate:
         """Return the estimate with x and y swapped."""
@@ -284,7 +286,8 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         bool [ny, nx], one per patch, on the builder's grid.
     """
     grid = builder.grid
-    x, y = grid.x_m - grid.x_m.mean(), grid.y_m - grid.y_m.mean()
+    x = grid.x_m - grid.x_m.mean()
+    y = grid.y_m - grid.y_m.mean()
     ranges = [_ranges(board, masks) for board in builder.boards.values()]
     precision = np.stack([1 / std**2 for _, std in ranges])
     total = precision.sum(axis=0)
@@ -301,12 +304,15 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     by_phase = False
     if fine.sum() >= 2:
         finer, fine_covariance = _fit(places[fine], phase[0][fine], np.full(int(fine.sum()), _PHASE_STD_M))
-        off = phase[0][fine] - _height_at(finer, places[fine])
-        agree = float(np.sqrt(np.mean((off * phase[1]) ** 2))) < _PHASE_FITS_RAD
+        residual = phase[0][fine] - _height_at(finer, places[fine])
+        agree = float(np.sqrt(np.mean((residual * phase[1]) ** 2))) < _PHASE_FITS_RAD
         # Thin sheets change the phase themselves: accept the plane only if the ranges agree.
-        apart = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, 3e-3, 3e-3]
-        if agree and fine.sum() >= 4 and bool(apart.all()) and float(np.hypot(*finer[1:])) < _MAX_TILT:
-            plane, covariance, heights, by_phase = finer, fine_covariance, phase[0], True
+        agrees = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, 3e-3, 3e-3]
+        if agree and fine.sum() >= 4 and bool(agrees.all()) and float(np.hypot(*finer[1:])) < _MAX_TILT:
+            plane = finer
+            covariance = fine_covariance
+            heights = phase[0]
+            by_phase = True
     std = np.sqrt(np.diag(covariance))
     return PlaneEstimate(
         float(plane[0]),
@@ -346,25 +352,29 @@ def _ranges(board: BoardSamples, masks: Sequence[NDArray[np.bool_]]) -> tuple[ND
     """Return the height of each patch from the range of its echo, and its standard deviation, metres."""
     image, footprint, _ = board.image()
     slope, mirror_slope = board.range_slope()
-    moved, moved_slope = board.mirror_image(_STEP_M), board.mirror_slope(_STEP_M)
-    heights, stds = np.full(len(masks), np.nan), np.full(len(masks), np.inf)
+    moved = board.mirror_image(_STEP_M)
+    moved_slope = board.mirror_slope(_STEP_M)
+    heights = np.full(len(masks), np.nan)
+    stds = np.full(len(masks), np.inf)
     for i, mask in enumerate(masks):
         power = np.abs(image[mask].astype(np.complex128)) ** 2
         if not power.sum() > 0:
             continue
         weight = power / power.sum()
         with np.errstate(invalid="ignore", divide="ignore"):
-            own = np.real(slope[mask] / image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
+            path_slope = np.real(slope[mask] / image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
             by_height = (np.real(moved_slope[mask] / moved[mask]) - np.real(mirror_slope[mask] / footprint[mask])) / (
                 _STEP_M
             )
         per_metre = float(np.nansum(weight * by_height))
-        own = np.where(np.isfinite(own), own, 0.0)
-        mean = float(np.sum(weight * own))
-        spread = float(np.sqrt(np.sum(weight * (own - mean) ** 2)))
-        height, std = mean / per_metre, spread / abs(per_metre)
+        path_slope = np.where(np.isfinite(path_slope), path_slope, 0.0)
+        mean = float(np.sum(weight * path_slope))
+        spread = float(np.sqrt(np.sum(weight * (path_slope - mean) ** 2)))
+        height = mean / per_metre
+        std = spread / abs(per_metre)
         if std < 0.05 and np.isfinite(height):
-            heights[i], stds[i] = height, max(std, _MIN_STD_M)
+            heights[i] = height
+            stds[i] = max(std, _MIN_STD_M)
     return heights, stds
 
 
@@ -380,7 +390,8 @@ def _heights_by_phase(
     phases = np.full(len(masks), np.nan)
     rates = []
     for i, mask in enumerate(masks):
-        flat = -image[mask].astype(np.complex128) * np.conj(footprint[mask])  # r_s is nearly real and negative
+        # r_s is nearly real and negative
+        flat = -image[mask].astype(np.complex128) * np.conj(footprint[mask])
         coherent = abs(flat.sum()) / max(float(np.abs(flat).sum()), 1e-300)
         if mask.any() and coherent > _COHERENT:
             phases[i] = np.angle(flat.sum())
@@ -389,22 +400,22 @@ def _heights_by_phase(
         return phases, 1.0
     rate = float(np.median(rates))
     turn = 2 * np.pi / abs(rate)
-    known = np.flatnonzero(np.isfinite(phases))
+    with_phase = np.flatnonzero(np.isfinite(phases))
     best: tuple[float, NDArray[np.float64]] = (np.inf, np.full(len(masks), np.nan))
     # The range leaves an ambiguity of some turns, common to all plates except for the tilt: try several tilts.
     for tilt_x in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
         for tilt_y in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
-            guess = _height_at(plane + np.array([0.0, tilt_x, tilt_y]), places[known])
-            heights = phases[known] / rate
+            guess = _height_at(plane + np.array([0.0, tilt_x, tilt_y]), places[with_phase])
+            heights = phases[with_phase] / rate
             common = np.angle(np.mean(np.exp(2j * np.pi * (heights - guess) / turn))) / (2 * np.pi) * turn
             heights = heights + turn * np.round((guess + common - heights) / turn)
             shift = turn * np.round((np.median(guess) - np.median(heights)) / turn)
-            fitted, _ = _fit(places[known], heights + shift, np.full(known.size, _PHASE_STD_M))
-            miss = float(np.sum((heights + shift - _height_at(fitted, places[known])) ** 2)) / _PHASE_STD_M**2
+            fitted, _ = _fit(places[with_phase], heights + shift, np.full(with_phase.size, _PHASE_STD_M))
+            miss = float(np.sum((heights + shift - _height_at(fitted, places[with_phase])) ** 2)) / _PHASE_STD_M**2
             miss += float(np.sum((fitted[1:] / _TILT_PRIOR_RAD) ** 2))
             if miss < best[0]:
                 out = np.full(len(masks), np.nan)
-                out[known] = heights + shift
+                out[with_phase] = heights + shift
                 best = (miss, out)
     return best[1], rate
 
@@ -420,9 +431,9 @@ def _fit(
     information = rows.T @ rows + np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
     plane = np.asarray(np.linalg.solve(information, rows.T @ (heights / stds)), np.float64)
     covariance = np.linalg.inv(information)
-    off = (heights - _height_at(plane, places)) / stds
+    residual = (heights - _height_at(plane, places)) / stds
     freedom = max(len(places) - 3, 1)
-    return plane, np.asarray(covariance * max(1.0, float(np.sum(off**2)) / freedom), np.float64)
+    return plane, np.asarray(covariance * max(1.0, float(np.sum(residual**2)) / freedom), np.float64)
 
 
 def _height_at(plane: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,9 +21,12 @@ from polysight_shared.config import Instrument
 from polysight_shared.geometry import specular_midpoint_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-_BLOCKS = 32  # blocks of positions per axis: exact within 16 resolution cells to either side
-_CELLS = 6.0  # resolution cells evaluated to either side
-_POINTS = 20  # points per resolution cell
+# Blocks of positions per axis: exact within 16 resolution cells to either side
+_BLOCKS = 32
+# Resolution cells evaluated to either side
+_CELLS = 6.0
+# Points per resolution cell
+_POINTS = 20
 # Nearest ghosts: step of the numerical derivative, reach and precision of the search, places that are tried.
 _STEP_M = 1e-4
 _MAX_DISTANCE_M = 20.0
@@ -65,8 +68,8 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
     grid = aperture.grid
     point = np.array([grid.x_m.mean(), grid.y_m.mean(), float(np.mean(grid.z_m))])
     limit = [limit_m(small, point, axis) for axis in (0, 1)]
-    one = ImageGrid(point[:1], point[1:2], float(point[2]), grid.pixel_m)
-    answer = DirectImager(replace(small, grid=one)).samples(np.ones((1, 1))) * total
+    point_grid = ImageGrid(point[:1], point[1:2], float(point[2]), grid.pixel_m)
+    answer = DirectImager(replace(small, grid=point_grid)).samples(np.ones((1, 1))) * total
     cuts = [_cut(small, answer, point, axis, limit[axis]) for axis in (0, 1)]
     wave = SPEED_OF_LIGHT_M_S / aperture.frequencies_hz.mean()
     length = np.ptp(aperture.offsets_m[..., :2], axis=(0, 1))
@@ -101,8 +104,8 @@ def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
     line = aperture.offsets_m[middle[0]] if axis == 0 else aperture.offsets_m[:, middle[1]]
     slope = np.zeros(len(line))
     for place in (aperture.antennas.tx_m, aperture.antennas.rx_m[0]):
-        away = point - line - place
-        slope += away[:, axis] / np.linalg.norm(away, axis=1)
+        difference = point - line - place
+        slope += difference[:, axis] / np.linalg.norm(difference, axis=1)
     spread = np.ptp(slope) * aperture.frequencies_hz.mean() / SPEED_OF_LIGHT_M_S
     return float(0.886 / spread) if spread > 0 else float("inf")
 
@@ -115,7 +118,8 @@ def _cut(
     step = (cell_m if np.isfinite(cell_m) else aperture.grid.pixel_m) / _POINTS
     voxels = np.tile(point, (2 * count + 1, 1))
     voxels[:, axis] += np.arange(-count, count + 1) * step
-    shift, a = aperture.offsets_m.reshape(-1, 3), aperture.antennas
+    shift = aperture.offsets_m.reshape(-1, 3)
+    a = aperture.antennas
     total = np.zeros(len(voxels), complex)
     for rx, samples in enumerate(answer):
         places = (a.tx_m + shift, a.rx_m[rx] + shift, voxels, np.full(len(shift), a.direct_m[rx]))
@@ -233,9 +237,11 @@ class PhaseSlope:
 
 def field_limits(rig: Instrument) -> FieldLimits:
     """Compute the limits for a rig's grid."""
-    chirp, grid = rig.chirp, rig.grid
+    chirp = rig.chirp
+    grid = rig.grid
     low, high = (chirp.first_sample_hz + n * chirp.hz_per_sample for n in chirp.linear_samples)
-    free, zone = [], []
+    free = []
+    zone = []
     for axis, (count, step_mm) in enumerate(((grid.columns, grid.step_x_mm), (grid.rows, grid.step_y_mm))):
         slope = PhaseSlope(rig, axis)
         change = (slope.at(_STEP_M, (low + high) / 2) - slope.at(-_STEP_M, (low + high) / 2)) / (2 * _STEP_M)
@@ -255,8 +261,10 @@ def _nearest_ghost_m(slope: PhaseSlope, frequency_hz: float, difference_rad_per_
 
     if not too_far(_MAX_DISTANCE_M):
         return float("inf")
-    near, far = 0.0, _MAX_DISTANCE_M
-    while far - near > _PRECISION_M:  # bisection: importing scipy.optimize takes longer than the whole forecast
+    near = 0.0
+    far = _MAX_DISTANCE_M
+    # Bisection: importing scipy.optimize takes longer than the whole forecast
+    while far - near > _PRECISION_M:
         middle = (near + far) / 2
         near, far = (near, middle) if too_far(middle) else (middle, far)
     return far

@@ -54,13 +54,17 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 _BESIDE_M = 0.1
 _PASSED_M = 1.0
 _ECHO = 30.0
-_NOISE = 1e-3  # noise power of a sample relative to the gate, for the estimate of the direct path
-REACH = 4  # positions to either side
-_BAND = 0.45  # largest frequency of the filter, cycles per position
+# Noise power of a sample relative to the gate, for the estimate of the direct path
+_NOISE = 1e-3
+# Positions to either side
+REACH = 4
+# Largest frequency of the filter, cycles per position
+_BAND = 0.45
 
 Image = NDArray[np.complex64]
 _log = logging.getLogger(__name__)
-_CHUNK = 120  # positions per matrix product: larger ones are slower by half (OpenBLAS)
+# Positions per matrix product: larger ones are slower by half (OpenBLAS)
+_CHUNK = 120
 
 
 @dataclass(frozen=True)
@@ -110,15 +114,16 @@ class Reduction:
         paths = np.linspace(-_BESIDE_M, max(self.gate_m[1] + _BESIDE_M, middle_m + _PASSED_M), 4 * sweep_hz.size)
         echoes = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(self.sweep_hz[linear], paths))
         signals = np.concatenate([np.eye(len(echoes)), _ECHO / np.sqrt(paths.size) * echoes], axis=1)
-        found = np.linalg.lstsq((decimated @ signals).T, (maps[:, linear] @ signals).T, rcond=None)[0]
-        return found.T.astype(np.complex128)
+        solution = np.linalg.lstsq((decimated @ signals).T, (maps[:, linear] @ signals).T, rcond=None)[0]
+        return solution.T.astype(np.complex128)
 
 
 def scene_gate_m(
     antennas: tuple[Antennas, ...], plan: RasterPlan, grid: ImageGrid, depth_m: float = 0.0
 ) -> tuple[float, float]:
     """Return the smallest and largest excess path of all pixels (`depth_m` nearer and farther) and stage positions."""
-    half_x = ((plan.columns - 1) / 2 * plan.step_x_mm + 2) / 1e3  # 2 mm more: the travel within a burst
+    # 2 mm more: the travel within a burst
+    half_x = ((plan.columns - 1) / 2 * plan.step_x_mm + 2) / 1e3
     half_y = (plan.rows - 1) / 2 * plan.step_y_mm / 1e3
     dx, dy = np.meshgrid(
         np.linspace(grid.x_m[0] - half_x, grid.x_m[-1] + half_x, 41),
@@ -152,9 +157,9 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
     product = (gate_m[1] - gate_m[0]) * band / SPEED_OF_LIGHT_M_S
     frequencies = np.linspace(sweep[0], sweep[-1], int(np.ceil(product)) + extra)
     d = np.linspace(*gate_m, max(64, 8 * frequencies.size)) / SPEED_OF_LIGHT_M_S
-    wanted = np.exp(-2j * np.pi * np.outer(d, sweep)) * weight
+    target = np.exp(-2j * np.pi * np.outer(d, sweep)) * weight
     basis = np.exp(-2j * np.pi * np.outer(d, frequencies))
-    m = np.linalg.lstsq(basis, wanted, rcond=1e-6)[0]
+    m = np.linalg.lstsq(basis, target, rcond=1e-6)[0]
 
     echoes = np.exp(2j * np.pi * np.outer(sweep, d)) / np.sqrt(d.size)
     covariance = echoes @ echoes.conj().T + _NOISE * np.eye(b - a)
@@ -163,13 +168,13 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
 
     matrix = np.zeros((frequencies.size, chirp.samples), complex)
     matrix[:, a:b] = m - np.outer(m.sum(axis=1), direct)
-    whole = np.zeros(chirp.samples, complex)
-    whole[a:b] = direct
+    spectrum = np.zeros(chirp.samples, complex)
+    spectrum[a:b] = direct
     # Echoes at the samples' frequencies are combinations of echoes at the few frequencies.
     few = np.exp(2j * np.pi * np.outer(d, frequencies))
     from_few = np.linalg.lstsq(few, np.exp(2j * np.pi * np.outer(d, sweep)), rcond=1e-9)[0].T
     model = (matrix[:, a:b] @ from_few).astype(np.complex128)
-    return Reduction(frequencies, matrix, whole, model, gate_m, sweep_of(chirp))
+    return Reduction(frequencies, matrix, spectrum, model, gate_m, sweep_of(chirp))
 
 
 def burst_filters(rig: Instrument) -> NDArray[np.float32]:
@@ -178,7 +183,8 @@ def burst_filters(rig: Instrument) -> NDArray[np.float32]:
     The first tap is the middle one, the others apply on both sides. Least squares up to 0.45 cycles per position.
     """
     times_s = np.array(rig.burst.chirp_times_s)
-    moved = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm  # motion of each chirp, in positions
+    # Motion of each chirp, in positions
+    moved = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm
     turns = np.linspace(0, _BAND, 91)
     loss = np.cos(2 * np.pi * np.outer(turns, moved)).mean(axis=1)
     out = np.zeros((REACH + 1, REACH + 1))
@@ -187,7 +193,8 @@ def burst_filters(rig: Instrument) -> NDArray[np.float32]:
         # The sum of the taps is one, so that constants keep their amplitude.
         basis = 2 * np.cos(2 * np.pi * np.outer(turns, np.arange(1, reach + 1))) - 2
         side = np.linalg.lstsq(basis, 1 / loss - 1, rcond=None)[0]
-        out[reach, 0], out[reach, 1 : reach + 1] = 1 - 2 * side.sum(), side
+        out[reach, 0] = 1 - 2 * side.sum()
+        out[reach, 1 : reach + 1] = side
     return out.astype(np.float32)
 
 
@@ -207,7 +214,8 @@ def undo_burst_motion(
     filters
         From :func:`burst_filters`.
     """
-    count, reach = valid.size, np.zeros(valid.size, int)
+    count = valid.size
+    reach = np.zeros(valid.size, int)
     for i in range(1, min(REACH, (count - 1) // 2) + 1):
         near = np.zeros(count, bool)
         near[i : count - i] = valid[: count - 2 * i] & valid[2 * i :] & valid[i : count - i]
@@ -305,30 +313,39 @@ class BoardSamples:
         taper: NDArray[np.float32],
         live: bool = False,
     ) -> None:
-        self.board, self.taper = board, taper
-        self._plan, self._grid = plan_raster(rig.grid), grid
+        self.board = board
+        self.taper = taper
+        self._plan = plan_raster(rig.grid)
+        self._grid = grid
         self._reduction = reduction
         # Maps for pairs of real numbers and the samples they use, by the row's number of samples.
         self._maps: dict[int, tuple[slice, NDArray[np.float32]]] = {}
         self._filters = burst_filters(rig)
-        self._antennas, self._chirp = Antennas.of(rig, board), rig.chirp
+        self._antennas = Antennas.of(rig, board)
+        self._chirp = rig.chirp
         self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
         self._offsets = scan_offsets_m(rig)
         self._planned = row_starts_m(self._offsets)
-        rx, shape = len(self._antennas.rx_m), taper.shape
+        rx = len(self._antennas.rx_m)
+        shape = taper.shape
         self._cube = np.zeros((rx, reduction.frequencies_hz.size, *shape), np.complex64)
         self._direct = np.zeros((rx, *shape), np.complex64)
         self.valid = np.zeros(shape, bool)
         regular = irregular(self.aperture) is None
         self._final: SpectralImager | None = None
-        self._spectra = np.zeros(0, np.complex64)  # spectra of the rows along x, for the final image
-        self._padded = np.zeros(0, np.complex64)  # a weighted row, padded with zeros to a period
-        self._stale = set(range(shape[0]))  # rows whose spectra are out of date
-        self._moved = False  # rows differ from the lattice of the live image
+        # Spectra of the rows along x, for the final image
+        self._spectra = np.zeros(0, np.complex64)
+        # A weighted row, padded with zeros to a period
+        self._padded = np.zeros(0, np.complex64)
+        # Rows whose spectra are out of date
+        self._stale = set(range(shape[0]))
+        # Rows differ from the lattice of the live image
+        self._moved = False
         self._live = None
         if live and regular:
             self._live = IncrementalImager(self.aperture, self.mirror)
-            self._prepare()  # compute kernels now instead of after the last row
+            # Compute kernels now instead of after the last row
+            self._prepare()
 
     @property
     def aperture(self) -> Aperture:
@@ -381,7 +398,8 @@ class BoardSamples:
         reduced = self._reduced(row.samples, row.sweep_hz)
         if row.turn is not None:
             reduced = undo_burst_motion(reduced, row.valid, row.turn, self._filters)
-        reduced, valid = reduced[..., forward], row.valid[forward]
+        reduced = reduced[..., forward]
+        valid = row.valid[forward]
         self._put(index, ReducedRow(reduced[:, :-1] * valid, reduced[:, -1] * valid, valid), offsets_m, forward)
 
     def put(self, index: int, row: ReducedRow) -> None:
@@ -403,7 +421,8 @@ class BoardSamples:
         self._cube[:, :, index], self._direct[:, index], self.valid[index] = row
         if offsets_m is not None:
             self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
-            self._final, self._moved = None, True
+            self._final = None
+            self._moved = True
             moved = abs(row_starts_m(self._offsets)[index] - self._planned[index])
             if moved > SLACK_M or irregular(self.aperture) is not None:
                 self._live = None
@@ -412,7 +431,8 @@ class BoardSamples:
 
     def _reduced(self, samples: NDArray[np.complex64], sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Apply the range gate to a row; return samples and the direct path, [rx, frequency + 1, position]."""
-        if samples.strides[1] < 0:  # reversed positions make the product slow
+        # Reversed positions make the product slow
+        if samples.strides[1] < 0:
             return self._reduced(samples[:, ::-1], sweep_hz)[..., ::-1]
         if sweep_hz.size not in self._maps:
             self._maps[sweep_hz.size] = _on_pairs(self._reduction.maps(sweep_hz))
@@ -427,7 +447,8 @@ class BoardSamples:
     def _prepare(self) -> None:
         """Create the spectral imager of all rows if the aperture is regular; keep it while positions do not change."""
         if self._final is None and irregular(self.aperture) is None:
-            self._final = SpectralImager(self.aperture, slack_m=SLACK_M)  # shares spectra with the live imager
+            # Shares spectra with the live imager
+            self._final = SpectralImager(self.aperture, slack_m=SLACK_M)
             self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)
             self._padded = np.zeros((*self._cube.shape[:2], self._final.period), np.complex64)
             self._stale = set(range(len(self.valid)))
@@ -457,9 +478,9 @@ class BoardSamples:
         count_x = len(self.valid[0])
         along = np.arange(count_x) / columns
         for index in range(count_y):
-            before = coarse._offsets[index // rows]
+            coarse_offset = coarse._offsets[index // rows]
             for axis in range(3):
-                self._offsets[index, :, axis] = np.interp(along, np.arange(len(before)), before[:, axis])
+                self._offsets[index, :, axis] = np.interp(along, np.arange(len(coarse_offset)), coarse_offset[:, axis])
         y_m = coarse._offsets[:, 0, 1]
         self._offsets[..., 1] = np.interp(np.arange(count_y) / rows, np.arange(len(y_m)), y_m)[:, None]
         self._final = None
@@ -518,7 +539,8 @@ class BoardSamples:
         grid
             Other pixels than the rig file's, within the range gate.
         """
-        gains, notice = (1 / self.rx_calibration()).astype(np.complex64), None
+        gains = (1 / self.rx_calibration()).astype(np.complex64)
+        notice = None
         if grid is None:
             self._prepare()
         if grid is None and self._final is not None:
@@ -539,10 +561,11 @@ class BoardSamples:
         All positions are focused on `point_m` [3], rig frame. An echo from there has its peak at 0, echoes from behind
         it at positive shifts.
         """
-        at = point_m - self._offsets.reshape(-1, 3)
+        relative_m = point_m - self._offsets.reshape(-1, 3)
         weights = (self.weights / self.count).ravel()
-        excess = self._antennas.excess_m(at[:, 0], at[:, 1], at[:, 2])
-        f, gains = self._reduction.frequencies_hz, 1 / self.rx_calibration()
+        excess = self._antennas.excess_m(relative_m[:, 0], relative_m[:, 1], relative_m[:, 2])
+        f = self._reduction.frequencies_hz
+        gains = 1 / self.rx_calibration()
         cube = self._cube.reshape(*self._cube.shape[:2], -1) * weights
         turned = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * f[None, :, None] * excess[:, None, :])
         focused = (gains[:, None] * (cube * turned).sum(axis=-1)).sum(axis=0)
@@ -599,8 +622,11 @@ def _on_pairs(maps: NDArray[np.complex128]) -> tuple[slice, NDArray[np.float32]]
     used = np.flatnonzero(maps.any(axis=0))[[0, -1]]
     maps = maps[:, used[0] : used[1] + 1]
     out = np.empty((maps.shape[1], 2, maps.shape[0], 2), np.float32)
-    out[:, 0, :, 0], out[:, 1, :, 0] = maps.real.T, -maps.imag.T  # contributions to the real part
-    out[:, 0, :, 1], out[:, 1, :, 1] = maps.imag.T, maps.real.T
+    # contributions to the real part
+    out[:, 0, :, 0] = maps.real.T
+    out[:, 1, :, 0] = -maps.imag.T
+    out[:, 0, :, 1] = maps.imag.T
+    out[:, 1, :, 1] = maps.real.T
     return slice(2 * used[0], 2 * used[1] + 2), out.reshape(2 * maps.shape[1], -1)
 
 

@@ -34,7 +34,8 @@ MOST_ADDED = 4
 """Largest number of steps into which a step between positions is divided."""
 TEST_SHARE = 10
 """One in so many recorded rows, columns or positions is left out of the first fit, to measure the prediction."""
-_POWER_ROUNDS = 12  # steps of the power iteration
+# Steps of the power iteration
+_POWER_ROUNDS = 12
 
 
 @dataclass(frozen=True)

@@ -26,17 +26,22 @@ from numpy.typing import NDArray
 from polysight.imaging.geometry import Aperture, column_step_m, excess_path_m, fft_of, pitch_y_m, row_starts_m, turn
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-_FADE = 0.08  # length of the cross-fade relative to the kernel's length in x
-_FADE_COLUMNS = 20  # smallest length of the cross-fade
-_FILLED = 1e-5  # relative to the kernel's strongest spectral bin: weaker ones are left out
+# Length of the cross-fade relative to the kernel's length in x
+_FADE = 0.08
+# Smallest length of the cross-fade
+_FADE_COLUMNS = 20
+# Relative to the kernel's strongest spectral bin: weaker ones are left out
+_FILLED = 1e-5
 KEEP_BYTES = 1 << 28
 """Size of the cache: two boards of the published grid take 90 MB."""
 _cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
 SLACK_M = 2e-3
 """Largest deviation of a row's start along x from the aperture."""
-_LEFT_OUT = 6e-6  # relative to the strongest principal component: weaker ones are left out
-_CHUNK = 32  # wavenumbers processed in double precision at a time
+# Relative to the strongest principal component: weaker ones are left out
+_LEFT_OUT = 6e-6
+# Wavenumbers processed in double precision at a time
+_CHUNK = 32
 
 
 @dataclass(frozen=True)
@@ -89,8 +94,10 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     slack_m
         Largest shift of rows along x from their nominal position.
     """
-    grid, offsets = aperture.grid, aperture.offsets_m
-    x, y = offsets[..., 0], offsets[:, 0, 1]
+    grid = aperture.grid
+    offsets = aperture.offsets_m
+    x = offsets[..., 0]
+    y = offsets[:, 0, 1]
     pitch_y = pitch_y_m(aperture) or grid.pixel_m
     pixel_stride = round(grid.pixel_m / pitch_y)
     row_stride = round((y[1] - y[0]) / pitch_y) if y.size > 1 else 1
@@ -123,7 +130,8 @@ def delays_s(aperture: Aperture, x: Any, y: Any, xp: Any = np, device: Any = Non
     """Yield the delay of the excess path for lags `pixel - position` (x [nx], y [ny]), float64 [ny, nx], by RX."""
     a = aperture.antennas
     z = float(aperture.grid.z_m) - float(aperture.offsets_m[0, 0, 2])
-    tx, places = xp.asarray(a.tx_m, device=device), xp.asarray(a.rx_m, device=device)
+    tx = xp.asarray(a.tx_m, device=device)
+    places = xp.asarray(a.rx_m, device=device)
     for rx, direct in enumerate(a.direct_m):
         path = excess_path_m(xp, x[None, :], y[:, None], z, tx, places[rx, :], float(direct))
         yield path / SPEED_OF_LIGHT_M_S
@@ -136,7 +144,8 @@ def cross_fade(xp: Any, kernel: Any, size: int) -> Any:
     spectrum, so that phase ramps shift it by any fraction.
     """
     fade = kernel.shape[-1] - size
-    curve = (1 + scipy.special.erf(np.linspace(-1, 1, fade + 2)[1:-1] * 2.7)) / 2  # 1e-4 from its ends
+    # 1e-4 from its ends
+    curve = (1 + scipy.special.erf(np.linspace(-1, 1, fade + 2)[1:-1] * 2.7)) / 2
     ramp = xp.asarray(curve, dtype=xp.float32, device=getattr(kernel, "device", None))
     period = xp.asarray(kernel[..., fade:], copy=True)
     period[..., size - fade :] = period[..., size - fade :] * (1 - ramp) + kernel[..., :fade] * ramp
@@ -148,8 +157,10 @@ def _band(aperture: Aperture, first: float, last: float, step: float, columns: i
 
     Computed on a finer lattice, for the first and the last frequency, all RX, and nine lags in y.
     """
-    grid, y = aperture.grid, aperture.offsets_m[:, 0, 1]
-    fastest = 2 * aperture.frequencies_hz[-1] / SPEED_OF_LIGHT_M_S  # largest possible wavenumber, cycles per metre
+    grid = aperture.grid
+    y = aperture.offsets_m[:, 0, 1]
+    # Largest possible wavenumber, cycles per metre
+    fastest = 2 * aperture.frequencies_hz[-1] / SPEED_OF_LIGHT_M_S
     finer = max(1, math.ceil(2.2 * step * fastest))
     size = columns * finer
     fade = size - math.ceil((last - first) / step * finer) - 1
@@ -181,7 +192,8 @@ def cached(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
 def _bytes(arrays: Any) -> int:
     if isinstance(arrays, tuple):
         return sum(_bytes(a) for a in arrays)
-    return math.prod(getattr(arrays, "shape", (0,))) * 8  # the size of a lattice is negligible
+    # The size of a lattice is negligible
+    return math.prod(getattr(arrays, "shape", (0,))) * 8
 
 
 def forget() -> None:
@@ -191,14 +203,16 @@ def forget() -> None:
 
 def lattice_key(aperture: Aperture, slack_m: float) -> tuple[Any, ...]:
     """Return the cache key of a lattice."""
-    a, grid = aperture.antennas, aperture.grid
+    a = aperture.antennas
+    grid = aperture.grid
     numbers = (a.tx_m, a.rx_m, aperture.frequencies_hz, aperture.offsets_m, grid.x_m, grid.y_m)
     return ("lattice", slack_m, float(grid.z_m), grid.pixel_m, *(n.tobytes() for n in numbers))
 
 
 def key_of(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tuple[Any, ...]:
     """Return the cache key of kernels."""
-    a, grid = aperture.antennas, aperture.grid
+    a = aperture.antennas
+    grid = aperture.grid
     numbers = (a.tx_m, a.rx_m, aperture.frequencies_hz, lattice.band)
     return (
         *(n.tobytes() for n in numbers),
@@ -214,7 +228,9 @@ def spectra_along_x(aperture: Aperture, lattice: Lattice, xp: Any = np, device: 
 
     One distance map per RX; a constant phase step leads from one frequency to the next.
     """
-    fft, n, f = fft_of(xp), lattice.size_x, aperture.frequencies_hz
+    fft = fft_of(xp)
+    n = lattice.size_x
+    f = aperture.frequencies_hz
     fade = n - lattice.exact_x
     x = lattice.first_lag_m[0] + xp.arange(-fade, n, dtype=xp.float64, device=device) * lattice.pitch_x_m
     y = lattice.first_lag_m[1] + xp.arange(lattice.lags_y, dtype=xp.float64, device=device) * lattice.pitch_y_m
@@ -246,14 +262,16 @@ class RowSpectra:
     """
 
     def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
-        self.aperture, self.xp, self.device = aperture, xp, device
+        self.aperture = aperture
+        self.xp = xp
+        self.device = device
         self.lattice: Lattice = cached(lattice_key(aperture, slack_m), lambda: lattice(aperture, slack_m))
         self._fft = fft_of(xp)
         self.period = self.lattice.size_x // self.lattice.stride_x
         self._take = self.put(self.lattice.band % self.period)
         self._origin = float(row_starts_m(aperture.offsets_m).min())
-        at = aperture.grid.x_m - self._origin - self.lattice.first_lag_m[0]
-        wave = np.exp(2j * np.pi * np.outer(self.lattice.wavenumbers, at)) / self.lattice.size_x
+        lags_m = aperture.grid.x_m - self._origin - self.lattice.first_lag_m[0]
+        wave = np.exp(2j * np.pi * np.outer(self.lattice.wavenumbers, lags_m)) / self.lattice.size_x
         self._to_pixels = self.put(wave.astype(np.complex64))
 
     def put(self, array: Any) -> Any:
@@ -275,15 +293,17 @@ class RowSpectra:
 
     def of_rows(self, rows: Any, ramps: Any) -> Any:
         """Return the spectra of rows [..., row, column] in the kernel's band, [..., row, k]."""
-        whole = self._fft.fft(rows, n=self.period, axis=-1)
-        return self.xp.take(whole, self._take, axis=-1) * ramps
+        spectra = self._fft.fft(rows, n=self.period, axis=-1)
+        return self.xp.take(spectra, self._take, axis=-1) * ramps
 
     def to_rows(self, spectra: Any, ramps: Any) -> Any:
         """Apply the adjoint of :meth:`of_rows`."""
-        xp, count, columns = self.xp, self.lattice.band.size, self.aperture.offsets_m.shape[1]
+        xp = self.xp
+        count = self.lattice.band.size
+        columns = self.aperture.offsets_m.shape[1]
         rest = xp.zeros((*spectra.shape[:-1], self.lattice.size_x - count), dtype=xp.complex64, device=self.device)
-        whole = xp.roll(xp.concat([spectra * xp.conj(ramps), rest], axis=-1), int(self.lattice.band[0]), axis=-1)
-        folded = xp.sum(xp.reshape(whole, (*spectra.shape[:-1], self.lattice.stride_x, self.period)), axis=-2)
+        spectrum = xp.roll(xp.concat([spectra * xp.conj(ramps), rest], axis=-1), int(self.lattice.band[0]), axis=-1)
+        folded = xp.sum(xp.reshape(spectrum, (*spectra.shape[:-1], self.lattice.stride_x, self.period)), axis=-2)
         return self._fft.ifft(folded, axis=-1)[..., :columns] * self.period
 
     def of_pixels(self, image: Any) -> Any:
@@ -301,11 +321,16 @@ class SpectralImager(RowSpectra):
     def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
         super().__init__(aperture, xp, device, slack_m)
         self._ramps = self.ramps(row_starts_m(aperture.offsets_m))
-        self._echo: Any = None  # the last constant echo, and its kernel
-        sizes, rows, lines = self.lattice, aperture.offsets_m.shape[0], aperture.grid.shape[0]
-        self._last = sizes.row_stride * (rows - 1)  # lattice row of the first row of pixels
+        # The last constant echo, and its kernel
+        self._echo: Any = None
+        sizes = self.lattice
+        rows = aperture.offsets_m.shape[0]
+        lines = aperture.grid.shape[0]
+        # Lattice row of the first row of pixels
+        self._last = sizes.row_stride * (rows - 1)
         count = sizes.size_y // sizes.row_stride
-        self._tall = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)  # zeros below rows
+        # Zeros below rows
+        self._tall = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)
         self._repeat = self.put(np.arange(sizes.size_y) % count)
         self._rows = self.put(np.arange(rows) * sizes.row_stride)
         self._pixel_rows = self.put(self._last + np.arange(lines) * sizes.pixel_stride)
@@ -339,7 +364,8 @@ class SpectralImager(RowSpectra):
 
     def constant(self, echo: Any, weights: Any) -> Any:
         """Return the image of an echo [rx, frequency] at every position, times weights [row, column]."""
-        xp, echo = self.xp, self.xp.asarray(echo, dtype=self.xp.complex64)
+        xp = self.xp
+        echo = self.xp.asarray(echo, dtype=self.xp.complex64)
         if self._echo is None or not bool(xp.all(self._echo[0] == echo)):
             channels = xp.reshape(echo, (-1,))
             total = xp.zeros(self._kernels.shape[1:], dtype=xp.complex64, device=self.device)
@@ -351,7 +377,8 @@ class SpectralImager(RowSpectra):
 
     def samples(self, image: Any) -> Any:
         """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
-        xp, sizes = self.xp, self.lattice
+        xp = self.xp
+        sizes = self.lattice
         lines = self.of_pixels(image)
         spread = xp.zeros((sizes.size_y, lines.shape[-1]), dtype=xp.complex64, device=self.device)
         end = self._last + sizes.pixel_stride * lines.shape[0]
@@ -366,8 +393,10 @@ class SpectralImager(RowSpectra):
     def _along_y(self, lines: Any) -> Any:
         """Return the 2-D spectrum on the lattice [ky, k] of the rows' spectra [row, k]."""
         self._tall[: lines.shape[0], :] = lines
-        whole = self._fft.fft(self._tall, axis=0)
-        return whole if self.lattice.row_stride == 1 else self.xp.take(whole, self._repeat, axis=0)
+        spectrum = self._fft.fft(self._tall, axis=0)
+        if self.lattice.row_stride == 1:
+            return spectrum
+        return self.xp.take(spectrum, self._repeat, axis=0)
 
     def _inverse(self, total: Any) -> Any:
         lines = self.xp.take(self._fft.ifft(total, axis=0), self._pixel_rows, axis=0)
@@ -389,7 +418,8 @@ class IncrementalImager(RowSpectra):
 
     def __init__(self, aperture: Aperture, echo: Any = None, xp: Any = np, device: Any = None) -> None:
         super().__init__(aperture, xp, device, SLACK_M)
-        rows, lines = aperture.shape[2], aperture.grid.shape[0]
+        rows = aperture.shape[2]
+        lines = aperture.grid.shape[0]
         self._last = self.lattice.row_stride * (rows - 1)
         self._span = self.lattice.pixel_stride * (lines - 1) + 1
         self._kernels, self._components = cached(self.key("rows"), self._principal_kernels)
@@ -419,9 +449,9 @@ class IncrementalImager(RowSpectra):
         by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
         for r in range(rx):
             by_rx[:, r * m : (r + 1) * m, r] = lines[r, :, :].mT
-        at = self._lags(index)
-        self._sum += xp.matmul(self._kernels[:, at, :], xp.matmul(self._components, by_rx))
-        self._constant += self._echo_kernel[:, at] * white[:, None]
+        lags = self._lags(index)
+        self._sum += xp.matmul(self._kernels[:, lags, :], xp.matmul(self._components, by_rx))
+        self._constant += self._echo_kernel[:, lags] * white[:, None]
 
     def image_of_sum(self, factors: Any) -> Any:
         """Return the image of the rows so far, with a factor per RX [rx], complex64 [ny, nx]."""
@@ -478,16 +508,19 @@ class IncrementalImager(RowSpectra):
     def _principal_kernels(self) -> tuple[Any, Any]:
         """Return kernels [k, lag, component], and the transform from channels, [k, component, channel]."""
         xp = self.xp
-        whole = self.kernels()
-        by_k = xp.empty(whole.shape[::-1], dtype=xp.complex64, device=self.device)
-        by_k[...] = xp.permute_dims(whole, (2, 1, 0))  # contiguous, so that products are fast
+        kernels = self.kernels()
+        by_k = xp.empty(kernels.shape[::-1], dtype=xp.complex64, device=self.device)
+        # Contiguous, so that products are fast
+        by_k[...] = xp.permute_dims(kernels, (2, 1, 0))
         squares = []
         for first in range(0, by_k.shape[0], _CHUNK):
             last = min(first + _CHUNK, by_k.shape[0])
-            exact = xp.astype(by_k[first:last, :, :], xp.complex128)  # weak components need the digits
+            # Weak components need the digits
+            exact = xp.astype(by_k[first:last, :, :], xp.complex128)
             squares.append(xp.matmul(xp.conj(exact).mT, exact))
         power, vectors = xp.linalg.eigh(xp.concat(squares))
-        strongest = xp.max(power, axis=0)  # ascending: the last component is the strongest at every wavenumber
+        # Ascending: the last component is the strongest at every wavenumber
+        strongest = xp.max(power, axis=0)
         count = int(xp.sum(xp.astype(strongest > _LEFT_OUT**2 * strongest[-1], xp.int64)))
         vectors_used = xp.astype(vectors[:, :, -count:], xp.complex64)
         return xp.matmul(by_k, vectors_used), xp.asarray(xp.conj(vectors_used).mT, copy=True)

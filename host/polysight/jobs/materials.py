@@ -56,7 +56,8 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.findings import Finding
 
-_SAME_FREQUENCY = 1e-6  # relative: far above rounding, far below any other chirp
+# Relative: far above rounding, far below any other chirp
+_SAME_FREQUENCY = 1e-6
 _REASONS = 3  # of a verdict, for the terminal
 
 
@@ -339,7 +340,8 @@ def report(folder: Path) -> int:
     saved = find_products(folder, REPORT)
     if saved is None:
         if not is_source(folder):
-            read_products(folder, REPORT)  # raises with the reason
+            # Raises with the reason
+            read_products(folder, REPORT)
         from polysight.jobs.process import process
 
         status = process(folder, folder / "products")
@@ -523,9 +525,9 @@ def _contradictions(
         evidence = [None if m.evidence is None else m.evidence[i : i + 1] for m in matched]
         alone.append(Classifier(library, model=model, angles_deg=[angle_deg]).scan(features, evidence))
     out = []
-    for m, together, *each in zip(matched, named, *alone, strict=True):
-        names = [n.verdict.name for n in each]
-        materials_alone = {n.verdict.name for n in each if n.verdict.source == "library"}
+    for m, together, *single_scans in zip(matched, named, *alone, strict=True):
+        names = [n.verdict.name for n in single_scans]
+        materials_alone = {n.verdict.name for n in single_scans if n.verdict.source == "library"}
         if together.verdict.source != "library" and len(materials_alone) > 1:
             answers = ", ".join(f"{name} at {a:g} degrees" for name, a in zip(names, angles_deg, strict=True))
             out.append(f"patch {m.label} contradicts itself: {answers}; was it moved or exchanged between the scans?")

@@ -51,15 +51,15 @@ def seen_by(data: Path, config: Path | None) -> tuple[Pipeline, Optics, Seen]:
     pipeline = processed_rows(source, data, Settings(config=path_text(config), depth_range_mm=1e3 * DEPTH_M))
     optics = make_rig_optics(pipeline.rig)
     say("specular points")
-    seen = see_rows(pipeline, optics)
-    if not len(seen):
+    points = see_rows(pipeline, optics)
+    if not len(points):
         raise DataError(
             f"{data}: no surface shows a specular point",
             "nothing smooth faces the rig, or the objects lie outside the range gate",
             f"put objects within {1e3 * DEPTH_M:.0f} mm of the object plane; `polysight plan` shows visible normals",
             code=ErrorCode.NO_DATA,
         )
-    return pipeline, optics, seen
+    return pipeline, optics, points
 
 
 def surface(
@@ -116,12 +116,12 @@ def find_axis(rig: Instrument, axis_mm: tuple[float, float]) -> tuple[float, flo
 
 def make_surface(data: Path, config: Path | None = None, reference: Path | None = None) -> Surface:
     """Return the surfaces of a recorded scan; `reference` is a scan of a flat metal plate. Raises PolysightError."""
-    pipeline, optics, seen = seen_by(data, config)
+    pipeline, optics, points = seen_by(data, config)
     gains: Reference | None = None
     if reference is not None:
         _, _, metal = seen_by(reference, config)
         gains = make_reference(thin_out(metal[metal.segment == 0]))
-    return analyse_points(pipeline, optics, seen, gains)
+    return analyse_points(pipeline, optics, points, gains)
 
 
 def _list_columns(echoes: Echoes) -> list[list[float]]:
@@ -136,8 +136,8 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
     from polysight.jobs.calibrate import print_result, rig_file_keys
 
     raw = open_raw(scan, None if config is None else load_instrument(config))
-    _, optics, seen = seen_by(scan, config)
-    metal = seen[seen.segment == 0]
+    _, optics, points = seen_by(scan, config)
+    metal = points[points.segment == 0]
     if len(metal) < LEAST_METAL_POINTS:
         raise DataError(
             f"{scan}: {len(metal)} points of the sphere, {LEAST_METAL_POINTS} are needed",
@@ -158,8 +158,8 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
             "give the sphere's radius, or calibrate the places first",
             code=ErrorCode.MISMATCH,
         )
-    kept = thin_out(metal)
-    gains = learn_gains(find_voltages(kept, optics), optics.wave_number)
+    chosen_metal = thin_out(metal)
+    gains = learn_gains(find_voltages(chosen_metal, optics), optics.wave_number)
     file = SphereFile(
         **header("sphere", [source_scan(raw, scan)]),
         radius_mm=radius_mm,
@@ -167,7 +167,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
         centre_mm=(1e3 * float(centre[0]), 1e3 * float(centre[1]), 1e3 * float(centre[2])),
         misfit_mm=1e3 * rest_m,
         gain_std=gains.std,
-        points={"h": _list_columns(kept.h), "v": _list_columns(kept.v)},
+        points={"h": _list_columns(chosen_metal.h), "v": _list_columns(chosen_metal.v)},
     )
     path = write_calibration(file, out)
     low, high = (np.degrees(np.arcsin(edge)) for edge in gains.covered)

@@ -120,9 +120,11 @@ class Optics:
         Leakage without a `leakage_std` in the rig file was not measured: it is not subtracted, its mean is zero.
         """
         p = rig.polarimetry
-        leakage, leakage_std = (0j, 0j), float(p.leakage_prior / np.sqrt(2))
+        leakage = (0j, 0j)
+        leakage_std = float(p.leakage_prior / np.sqrt(2))
         if p.leakage_std is not None:
-            leakage, leakage_std = (complex(*p.leakage_h), complex(*p.leakage_v)), p.leakage_std
+            leakage = (complex(*p.leakage_h), complex(*p.leakage_v))
+            leakage_std = p.leakage_std
         prior = RigPrior(
             theta_std_rad=theta_std_rad,
             leakage=leakage,
@@ -172,9 +174,10 @@ def level(images: Images, found: Segmentation, tilts: Tilts | None = None) -> tu
         return images, Tilts({}, 1)
     if tilts is None:
         tilts = _tilts(images, images.illumination, found)
-    there = [p for p in found.patches if p.label in tilts.rises]
-    masks, own = [p.mask for p in there], [tilts.rises[p.label] for p in there]
-    return correct_tilt(images, masks, own), tilts
+    risen_patches = [p for p in found.patches if p.label in tilts.rises]
+    masks = [p.mask for p in risen_patches]
+    rises = [tilts.rises[p.label] for p in risen_patches]
+    return correct_tilt(images, masks, rises), tilts
 
 
 def _tilts(images: Images, illumination: Illumination, found: Segmentation) -> Tilts:
@@ -186,8 +189,8 @@ def _tilts(images: Images, illumination: Illumination, found: Segmentation) -> T
         for label, rise in rises.items()
         if max(map(abs, rise)) > MAX_RISE or max(map(abs, bends[label])) > MAX_BEND
     )
-    known = {label: (_modelled(x), _modelled(y)) for label, (x, y) in rises.items()}
-    return Tilts(known, illumination.across, steep)
+    usable_rises = {label: (_modelled(x), _modelled(y)) for label, (x, y) in rises.items()}
+    return Tilts(usable_rises, illumination.across, steep)
 
 
 def _modelled(rise: float) -> float:
@@ -210,7 +213,8 @@ STEEP = Finding(
     "lay it flat, or measure it as it is with `polysight surface`",
 )
 """Why a steep patch gets no permittivity."""
-HALO_OF_METAL, HALO_OF_PATCH = 4.0, 3.0
+HALO_OF_METAL = 4.0
+HALO_OF_PATCH = 3.0
 """Error of the metal's V / H, and of V on a plate, over the halo of V around them: clipped scenes of an independent
 generator (by 10 to 50 %)."""
 THIN = Finding(
@@ -243,48 +247,48 @@ def analyse(
         plane.check_axes(images.x_m, images.y_m)
         images = images.within(plane.valid)
     images, apart_mm = align(images)
-    found = _patches(images, known)
-    images, tilts = level(images, found)
-    reference = _reference(images, known, found)
+    segmentation = _patches(images, known)
+    images, tilts = level(images, segmentation)
+    reference = _reference(images, known, segmentation)
     raw = to_metal(images, reference, plane)
-    rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
-    refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
-    refused |= {p.label: STEEP for p in found.patches if p.label in tilts.steep}
-    judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
+    rh, rv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (raw.h, raw.v))
+    refused = check_patches(segmentation, rh, rv, background(raw.h, raw.v, segmentation, images.usable), reference.mask)
+    refused |= {p.label: STEEP for p in segmentation.patches if p.label in tilts.steep}
+    judged = [p for p in segmentation.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
-    seen = Seen.of((rh, rv), raw, judged, found, reference, plane, images, tilts)
-    prior = seen.prior(optics.prior, float(np.hypot(*apart_mm)))
-    measured = [seen.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
+    scene = Seen.of((rh, rv), raw, judged, segmentation, reference, plane, images, tilts)
+    prior = scene.prior(optics.prior, float(np.hypot(*apart_mm)))
+    measured = [scene.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
     kinds = _kinds(classifier, float(np.mean(theta)))
     labels = [p.label for p in judged]
     if plane is None:
         channel = _channel_ratio(images, reference) if prior.channels_known else None
-        others = dict(zip(labels, measured, strict=True))
-        evidence = metal_evidence(others, prior, channel, Kinds(literature(), float(np.mean(theta))))
+        measured_by_label = dict(zip(labels, measured, strict=True))
+        evidence = metal_evidence(measured_by_label, prior, channel, Kinds(literature(), float(np.mean(theta))))
         reference = replace(reference, evidence=evidence)
     inversion = invert(measured, prior, kinds)
     # Of the pixels only leakage is removed that is known: an undetermined estimate leans on what the patches may be.
     calibrated = remove_leakage(raw, inversion.leakage if inversion.leakage_determined else prior.leakage)
-    sh, sv = (smooth_inside(c, found, optics.smooth_px) for c in (calibrated.h, calibrated.v))
+    sh, sv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
     estimates = dict(zip(labels, inversion.patches, strict=True))
-    off = dict(zip(labels, inversion.brightness_off.tolist(), strict=True))
+    brightness_off = dict(zip(labels, inversion.brightness_off.tolist(), strict=True))
     patches = {
         p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _angle(theta, p), estimates.get(p.label))
-        for p in found.patches
+        for p in segmentation.patches
     }
     refused |= _impossible(patches, estimates, kinds)
     named = _names(classifier, (sh, sv, sp), inversion, judged)
-    truth = match_truth(found.patches, known.plates)
-    at = [(p, p.label) for p in found.patches]
-    results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in at)
+    truth = match_truth(segmentation.patches, known.plates)
+    labelled = [(p, p.label) for p in segmentation.patches]
+    results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in labelled)
     return MaterialsResult(
-        calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, tilts=tilts,
+        calibrated, sh, sv, sp, reference, segmentation, results, theta, inversion, prior, tilts=tilts,
         boxes=dict(known.names), library=() if classifier is None else classifier.names,
-        brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
+        brightness_off={label: ln for label, ln in brightness_off.items() if np.isfinite(ln)},
         evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
-        apart_mm=apart_mm, drift=seen.change, halo=seen.halo.level, behind=seen.usual_background(measured),
-        ripple=seen.usual, relief_rad=seen.relief_rad,
+        apart_mm=apart_mm, drift=scene.change, halo=scene.halo.level, behind=scene.usual_background(measured),
+        ripple=scene.usual, relief_rad=scene.relief_rad,
     )  # fmt: skip
 
 
@@ -344,25 +348,27 @@ class Seen:
 
         `channels` are relative to metal and smoothed inside patches, `raw` is relative to metal.
         """
-        every = {p.label: scatter_of(p.interior, *channels, images.x_m, images.y_m) for p in judged}
-        scatter = {label: s for label, s in every.items() if s is not None}
+        scatter_by_label = {p.label: scatter_of(p.interior, *channels, images.x_m, images.y_m) for p in judged}
+        scatter = {label: s for label, s in scatter_by_label.items() if s is not None}
         metal = None
         if plane is None and reference.mask.any():
             metal = scatter_of(reference.mask, *channels, images.x_m, images.y_m)
-        known = [*scatter.values(), *([] if metal is None else [metal])]
+        scatters = [*scatter.values(), *([] if metal is None else [metal])]
         spread = None if plane is None else plane.spread
         metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
         evenly = images.illumination is not None and images.illumination.known
         at_border = [*(touches_border(p.mask) for p in judged if p.label in scatter), False]
-        change = None if metal is None else common_change(known, metal.centre_m, at_border)
+        change = None if metal is None else common_change(scatters, metal.centre_m, at_border)
         halo = NO_HALO if metal is None else find_halo(reference.mask, found.patches, images)
         behind = background_mean(raw.h, raw.v, found, images.usable)
-        return cls(scatter, usual_scatter(known), metal, change, spread, tilts, evenly, metal_rise, halo, behind)
+        return cls(scatter, usual_scatter(scatters), metal, change, spread, tilts, evenly, metal_rise, halo, behind)
 
     @property
     def relief_rad(self) -> float:
         """Usual standard deviation of the phase of H about a plane inside the plates; 0 without plates."""
-        return float(np.median([s.relief_rad for s in self.scatter.values()])) if self.scatter else 0.0
+        if self.scatter:
+            return float(np.median([s.relief_rad for s in self.scatter.values()]))
+        return 0.0
 
     def prior(self, prior: RigPrior, apart_mm: float) -> RigPrior:
         """Return the prior of the rig's errors with what the plates show: the metal's error and tilt.
@@ -388,12 +394,12 @@ class Seen:
         change = None
         if scatter is not None and self.change is not None:
             change = self.change.of(list(self.scatter).index(patch.label))
-        seen = measure_patch(patch, *channels, theta_rad, scatter, self.usual, change, local_std, rise)
-        if not seen.brightness:
-            return seen
-        around = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0) / seen.brightness
-        behind = abs(seen.inverse_ratio) * self.background_in(seen)
-        return replace(seen, std=float(np.sqrt(seen.std**2 + around**2 + behind**2)))
+        patch_measurement = measure_patch(patch, *channels, theta_rad, scatter, self.usual, change, local_std, rise)
+        if not patch_measurement.brightness:
+            return patch_measurement
+        around = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0) / patch_measurement.brightness
+        behind = abs(patch_measurement.inverse_ratio) * self.background_in(patch_measurement)
+        return replace(patch_measurement, std=float(np.sqrt(patch_measurement.std**2 + around**2 + behind**2)))
 
     def background_in(self, seen: PatchMeasurement) -> float:
         """Return the standard deviation of each part of a patch's ln(V / H) by what lies behind it."""
@@ -406,7 +412,9 @@ class Seen:
 
     def usual_background(self, measured: Sequence[PatchMeasurement]) -> float:
         """Return the median of :meth:`background_in` over patches; 0 without any."""
-        return float(np.median([self.background_in(m) for m in measured])) if measured else 0.0
+        if measured:
+            return float(np.median([self.background_in(m) for m in measured]))
+        return 0.0
 
 
 def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
@@ -465,11 +473,11 @@ def _no_material(e: Permittivity) -> Finding | None:
     if e.value is None or e.real_std is None or e.loss_std is None:
         return None
     remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
-    why = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
+    causes = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
     if e.value.imag > ACTIVE * e.loss_std + 0.02:
-        return Finding("error", AMPLIFIES, why, remedy)
+        return Finding("error", AMPLIFIES, causes, remedy)
     if e.value.real < 1 - ACTIVE * e.real_std - 0.02:
-        return Finding("error", BELOW_AIR, why, remedy)
+        return Finding("error", BELOW_AIR, causes, remedy)
     return None
 
 
@@ -478,7 +486,7 @@ def _impossible(
 ) -> dict[int, Finding]:
     """Return why patches are no half spaces: an impossible permittivity, or rather a thin plate."""
     thin = {label: THIN for label, e in estimates.items() if _is_thin(e, kinds)}
-    return thin | {label: why for label, e in patches.items() if (why := _no_material(e)) is not None}
+    return thin | {label: reason for label, e in patches.items() if (reason := _no_material(e)) is not None}
 
 
 def _is_thin(estimate: PatchEstimate, kinds: Kinds) -> bool:
@@ -494,9 +502,12 @@ def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
 
 def _channel_ratio(images: Images, metal: MetalReference) -> complex | None:
     """Return V / H of the metal reference in the images; None without signal."""
-    h, v = images.h[metal.mask], images.v[metal.mask]
+    h = images.h[metal.mask]
+    v = images.v[metal.mask]
     power = float(np.sum(np.abs(h.astype(np.complex128)) ** 2))
-    return complex(np.vdot(h.astype(np.complex128), v)) / power if power > 0 else None
+    if power > 0:
+        return complex(np.vdot(h.astype(np.complex128), v)) / power
+    return None
 
 
 def _patches(images: Images, known: KnownScene) -> Segmentation:
@@ -508,11 +519,11 @@ def _patches(images: Images, known: KnownScene) -> Segmentation:
         # As of a scan without a direct path in any position: nothing to search, and the verdict says why.
         return Segmentation(np.zeros(images.h.shape, np.int32), ())
     even = images if known.plane is None else known.plane.apply(images)
-    found = segment(even.h, even.v, images.x_m, images.y_m, images.valid)
+    segmentation = segment(even.h, even.v, images.x_m, images.y_m, images.valid)
     filled = known.plane is not None and float(np.median(np.abs(even.h[images.valid]))) > FILLED
-    if not found.patches and filled:
+    if not segmentation.patches and filled:
         return whole_plane(images.valid, images.x_m, images.y_m, SegmentSettings().margin_mm)
-    return found
+    return segmentation
 
 
 def _reference(images: Images, known: KnownScene, found: Segmentation) -> MetalReference:
@@ -543,7 +554,10 @@ def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | 
 
 def reference_spread(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
     """Return the relative spread of the metal's pixels."""
-    spread = inverse_spread(h[metal.mask], v[metal.mask]) if reference is None else reference.spread
+    if reference is None:
+        spread = inverse_spread(h[metal.mask], v[metal.mask])
+    else:
+        spread = reference.spread
     return spread if np.isfinite(spread) else 0.0
 
 
@@ -554,10 +568,10 @@ def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
     for patch in found.patches:
         if patch.interior.any():
             lines, columns = (np.flatnonzero(patch.interior.any(axis=axis)) for axis in (1, 0))
-            near = tuple(slice(max(0, at[0] - reach), at[-1] + reach + 1) for at in (lines, columns))
+            near = tuple(slice(max(0, indices[0] - reach), indices[-1] + reach + 1) for indices in (lines, columns))
             inside = patch.interior[near]
-            one = smooth(np.where(inside, image[near], complex(np.nan, np.nan)).astype(image.dtype), sigma_px)
-            out[near] = np.where(inside, one, out[near])
+            smoothed = smooth(np.where(inside, image[near], complex(np.nan, np.nan)).astype(image.dtype), sigma_px)
+            out[near] = np.where(inside, smoothed, out[near])
     return out
 
 
@@ -577,8 +591,10 @@ def expected_pixel_accuracy(result: MaterialsResult) -> float | None:
     on these data. None without known truth, or if the classifier gives no probabilities.
     """
     shares = [n.confidence for n, _ in _pixels_with_truth(result)]
-    known = [s for s in shares if s is not None]
-    return float(np.concatenate(known).mean()) if known and len(known) == len(shares) else None
+    known_shares = [s for s in shares if s is not None]
+    if known_shares and len(known_shares) == len(shares):
+        return float(np.concatenate(known_shares).mean())
+    return None
 
 
 def _pixels_with_truth(result: MaterialsResult) -> list[tuple[NamedPatch, str]]:
@@ -589,7 +605,8 @@ def _pixels_with_truth(result: MaterialsResult) -> list[tuple[NamedPatch, str]]:
 
 def image_centre_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[float, float]:
     """Return the image centre in the rig frame, millimetres: the origin of boxes and outlines."""
-    x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
+    x = np.asarray(x_m, np.float64)
+    y = np.asarray(y_m, np.float64)
     return float(x[0] * 1e3 - axis_mm(x)[0]), float(y[0] * 1e3 - axis_mm(y)[0])
 
 
@@ -600,10 +617,10 @@ def permittivity_change(found: MaterialsResult, angles: IncidenceChoice) -> dict
     """
     changes = []
     for r in found.patches:
-        at = r.patch.interior
-        if r.permittivity.value is not None and at.any():
-            used, other = (float(np.mean(a[at])) for a in (angles.used_rad, angles.other_rad))
-            eps = permittivity_from_ratio(r.permittivity.ratio, np.array([used, other]))
+        pixels = r.patch.interior
+        if r.permittivity.value is not None and pixels.any():
+            used, other_angle = (float(np.mean(a[pixels])) for a in (angles.used_rad, angles.other_rad))
+            eps = permittivity_from_ratio(r.permittivity.ratio, np.array([used, other_angle]))
             changes.append((float(abs(eps[1] / eps[0] - 1)), r.patch.label))
     if not changes:
         return {}

@@ -153,7 +153,8 @@ def find_material(name: str) -> CatalogueMaterial | None:
 
 def same_material(name: str, other: str) -> bool:
     """True if both names are, or may be, of one material: equal, aliases, or one the generic name of the other."""
-    first, second = normalise_name(name), normalise_name(other)
+    first = normalise_name(name)
+    second = normalise_name(other)
     return first == second or second in _all_names(first) or first in _all_names(second)
 
 

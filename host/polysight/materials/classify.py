@@ -107,7 +107,9 @@ class PaperKnn(Model):
     def __init__(
         self, channels: str = "H+V+P", weights: Weights | None = None, thresholds: Mapping[str, float] | None = None
     ) -> None:
-        self.channels, self.given, self.thresholds = channels, weights, dict(thresholds or {})
+        self.channels = channels
+        self.given = weights
+        self.thresholds = dict(thresholds or {})
         self._distributions: ErrorDiscriminant | None = None
 
     def fit(self, samples: Samples) -> PaperKnn:
@@ -128,7 +130,8 @@ class PaperKnn(Model):
         self._knn = PaperKNeighborsClassifier(count, weight_h=w.h, weight_v=w.v, weight_p=w.p, measure=w.measure)
         self._knn.fit(ratio_columns(samples.x), samples.names)
         self._materials, self._material = np.unique(samples.names, return_inverse=True)
-        self._samples, self._distributions = samples, None
+        self._samples = samples
+        self._distributions = None
         return self
 
     @property
@@ -195,7 +198,8 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
             "process more scans with other placements",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
-    few, neighbours = _few(samples), Weights.neighbours
+    few = _few(samples)
+    neighbours = Weights.neighbours
     same_scan = few.groups[:, None] == few.groups[None, :]
     # Every pixel must find so many in other scans.
     voters = min(neighbours, int((~same_scan).sum(axis=1).min()))
@@ -222,16 +226,16 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
 def _few(samples: Samples) -> Samples:
     """Return at most `FIT_PIXELS` random pixels of every patch."""
     rng = np.random.default_rng(0)
-    at = [rng.permutation(np.flatnonzero(samples.patches == i))[:FIT_PIXELS] for i in np.unique(samples.patches)]
-    return samples.take(np.sort(np.concatenate(at)))
+    picked = [rng.permutation(np.flatnonzero(samples.patches == i))[:FIT_PIXELS] for i in np.unique(samples.patches)]
+    return samples.take(np.sort(np.concatenate(picked)))
 
 
 def _left_out(distance: Real, voters: int, few: Samples, same_scan: npt.NDArray[np.bool_]) -> float:
     """Return the pixel accuracy, mean over the materials of two or more scans, without votes of the same scan."""
     names, classes = np.unique(few.names, return_inverse=True)
     nearest = find_neighbours(np.where(same_scan, np.inf, distance), voters)
-    found = names[count_votes(classes[nearest], names.size).argmax(axis=1)]
-    return float(np.mean([(found[few.names == n] == n).mean() for n in np.unique(few.names[few.shared])]))
+    predicted = names[count_votes(classes[nearest], names.size).argmax(axis=1)]
+    return float(np.mean([(predicted[few.names == n] == n).mean() for n in np.unique(few.names[few.shared])]))
 
 
 def _thresholds(distance: Real, neighbours: int, few: Samples) -> dict[str, float]:
@@ -322,7 +326,9 @@ class Classifier:
                 code=ErrorCode.VALUES_CONFLICT,
             )
         fit = parts[0].fit if len(parts) == 1 else library.fit_of([p.angles_deg[0] for p in parts])
-        self.library, self.fit, self.angles_deg = library, fit, tuple(p.angles_deg[0] for p in parts)
+        self.library = library
+        self.fit = fit
+        self.angles_deg = tuple(p.angles_deg[0] for p in parts)
         self.model = PAPER if weights else _model_name(model or fit.get("model", PAPER))
         if self.model == PAPER:
             if weights is None:
@@ -370,7 +376,7 @@ class Classifier:
         for x, of_patch in zip(patches, evidence or [None] * len(patches), strict=True):
             ratios = by_angle(x)[2]
             if of_patch is None:
-                of_patch = [evidence_of_pixels(t, at) for t, at in zip(ratios.T, self.kinds, strict=True)]
+                of_patch = [evidence_of_pixels(t, pixels) for t, pixels in zip(ratios.T, self.kinds, strict=True)]
             named.append(name_patch(self.kinds, of_patch, ratios))
         return named
 
@@ -409,7 +415,8 @@ def _model_name(given: str) -> str:
 
 def classifier_sentence(classifier: Classifier) -> str:
     """Describe a classifier, its library, and its score on scans left out of training."""
-    library, fit = classifier.library, classifier.fit
+    library = classifier.library
+    fit = classifier.fit
     kind = "simulated " if library.simulated else ""
     angles = " and ".join(f"{a:g}" for a in classifier.angles_deg)
     out = f"{classifier.model} on |H|, |V| and complex P"

@@ -15,7 +15,8 @@ import scipy
 from polysight.imaging import Image, Mask
 from polysight.materials.segment import Patch
 
-WEAK_DB, WEAKEST_DB = -12.0, -30.0
+WEAK_DB = -12.0
+WEAKEST_DB = -30.0
 """Levels of copies relative to the brightest plate: shares of a quarter to a thirtieth."""
 LEAST_OVERLAP = 0.6
 """Share of a copy that a shifted plate covers, and of the shifted plates that copies cover."""
@@ -38,8 +39,10 @@ def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -
 
     `h`, `v` complex [ny, nx] are the images that the patches were found in.
     """
-    found = [copies for channel in (h, v) if (copies := _copies_in(patches, np.abs(channel), pixel_mm)) is not None]
-    return max(found, key=lambda copies: len(copies.labels), default=None)
+    copies_of_channels = [
+        copies for channel in (h, v) if (copies := _copies_in(patches, np.abs(channel), pixel_mm)) is not None
+    ]
+    return max(copies_of_channels, key=lambda copies: len(copies.labels), default=None)
 
 
 def _copies_in(patches: Sequence[Patch], amplitude: np.ndarray, pixel_mm: float) -> Copies | None:
@@ -81,9 +84,9 @@ def _copies_at(
     source = np.asarray(scipy.ndimage.shift(amplitude, shift_px, order=0))
     levels_db = {}
     for patch in weak:
-        both = patch.mask & expected
-        if float(both.sum()) >= LEAST_OVERLAP * float(patch.mask.sum()):
-            levels_db[patch.label] = 20 * float(np.log10(np.median(amplitude[both]) / np.median(source[both])))
+        overlap = patch.mask & expected
+        if float(overlap.sum()) >= LEAST_OVERLAP * float(patch.mask.sum()):
+            levels_db[patch.label] = 20 * float(np.log10(np.median(amplitude[overlap]) / np.median(source[overlap])))
     middle_db = float(np.median(list(levels_db.values()))) if levels_db else 0.0
     labels = tuple(label for label, level in levels_db.items() if abs(level - middle_db) <= SAME_DB)
     if len(labels) < 2 or middle_db > WEAK_DB:

@@ -109,11 +109,9 @@ class ErrorDiscriminant(Model):
         _, patch, count = np.unique(samples.patches, return_inverse=True, return_counts=True)
         first = np.zeros(count.size, np.intp)
         first[patch[::-1]] = np.arange(of.size)[::-1]
-        material, scan, plate = (
-            of[first],
-            np.unique(samples.groups, return_inverse=True)[1][first],
-            samples.plates[first],
-        )
+        material = of[first]
+        scan = np.unique(samples.groups, return_inverse=True)[1][first]
+        plate = samples.plates[first]
         mean = np.stack([np.bincount(patch, c) for c in d.T], axis=1) / count[:, None]
         informative = ~self._metal_like(samples.x, patch)
         if not informative.any():
@@ -126,7 +124,8 @@ class ErrorDiscriminant(Model):
         residual = mean - self.level[material] - offset[scan]
         scans = np.unique(scan[informative]).size
         dof = max(int(informative.sum()) - np.unique(material[informative]).size - scans + 1, 1)
-        pixel, used = d - mean[patch], informative[patch]
+        pixel = d - mean[patch]
+        used = informative[patch]
         self.within = self._independent(_covariance(pixel[used], max(int(used.sum() - informative.sum()), 1)))
         self._effects = self._specimen_effects()
         self._fit_patches(
@@ -252,7 +251,8 @@ class ErrorDiscriminant(Model):
     def _deviations(self, x: Real) -> Real:
         """Return the deviations from every material's anchor, [n, materials, features]."""
         h, v, t = by_angle(x)
-        if self.channels == "V":  # alone, by its own logarithm
+        # Alone, by its own logarithm
+        if self.channels == "V":
             return np.log(np.maximum(v, 1e-6))[:, None] - self._anchor_v
         log_h = np.log(np.maximum(h, 1e-6))[:, None] - self._anchor_h
         return self._chosen(relative(log_h, t[:, None] - self._anchor_t, self._anchor_t))
@@ -295,7 +295,10 @@ class ErrorDiscriminant(Model):
         """
         width = patches.shape[1]
         free = max(dof - width + 1, 1)
-        law = float(width * dof / free * scipy.special.fdtri(width, free, 1 - REJECTED)) if dof > width else np.inf
+        if dof > width:
+            law = float(width * dof / free * scipy.special.fdtri(width, free, 1 - REJECTED))
+        else:
+            law = np.inf
         left_out = (self.placements / np.maximum(self.placements - 1, 1))[:, None]
 
         def farthest(d: Real, of: npt.NDArray, covariances: Real) -> float:
@@ -309,7 +312,8 @@ class ErrorDiscriminant(Model):
 
 def _two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: npt.NDArray) -> tuple[Real, Real]:
     """Least squares of patch means = material + scan: offsets [scans, d], of mean zero, and levels [materials, d]."""
-    offset, level = np.zeros((scan.max() + 1, mean.shape[1])), np.zeros((material.max() + 1, mean.shape[1]))
+    offset = np.zeros((scan.max() + 1, mean.shape[1]))
+    level = np.zeros((material.max() + 1, mean.shape[1]))
     for _ in range(TWO_WAY_ROUNDS):
         for k in np.unique(material):
             at = material == k

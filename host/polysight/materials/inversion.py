@@ -129,8 +129,8 @@ class PatchMeasurement:
     @property
     def covariance(self) -> Real:
         """Covariance of real and imaginary part of V / H, float64 [2, 2]."""
-        own = max(self.std, LEAST_RATIO_STD)
-        return own**2 * np.eye(2) + turned(self.inverse_ratio, np.diag(np.square(self.relative_std)))
+        std = max(self.std, LEAST_RATIO_STD)
+        return std**2 * np.eye(2) + turned(self.inverse_ratio, np.diag(np.square(self.relative_std)))
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,9 @@ class PatchEstimate:
     @property
     def dominated_by(self) -> str | None:
         """The source with the largest share of the error."""
-        return max(self.shares, key=lambda s: self.shares[s]) if self.shares else None
+        if self.shares:
+            return max(self.shares, key=lambda s: self.shares[s])
+        return None
 
 
 @dataclass(frozen=True)
@@ -393,8 +395,8 @@ class _Scene:
         with np.errstate(divide="ignore", invalid="ignore"):
             q = (1 + t) / (1 - t) * np.sin(angle) ** 2 / cosine
             model = np.log(np.abs((cosine - q) / (cosine + q) * (1 + a * t) / (1 + a)))
-        off = self.log_level - model - METAL_BRIGHTNESS_STD * z[..., METAL_BRIGHTNESS, None]
-        return np.where(np.isfinite(off), np.clip(off, -10, 10), 10.0)
+        difference = self.log_level - model - METAL_BRIGHTNESS_STD * z[..., METAL_BRIGHTNESS, None]
+        return np.where(np.isfinite(difference), np.clip(difference, -10, 10), 10.0)
 
     def brightness_std(self, z: Real) -> Real:
         """Return the usual size of ln kappa, [...]."""
@@ -411,9 +413,9 @@ class _Scene:
     def log_likelihoods(self, z: Real) -> Real:
         """Return log likelihoods [..., 1 + patch]: of all brightnesses, and of each patch to be some material."""
         size = self.brightness_std(z)[..., None]
-        off = self.brightness_off(z)
-        usual = (1 - ODD_BRIGHTNESS) / size * np.exp(-0.5 * (off / size) ** 2)
-        odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (off / ODD_BRIGHTNESS_STD) ** 2)
+        brightness_difference = self.brightness_off(z)
+        usual = (1 - ODD_BRIGHTNESS) / size * np.exp(-0.5 * (brightness_difference / size) ** 2)
+        odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (brightness_difference / ODD_BRIGHTNESS_STD) ** 2)
         of_brightness = np.where(self.bright, np.log(usual + odd + 1e-300), 0.0).sum(axis=-1, keepdims=True)
         if self.kinds is None:
             no_evidence = np.zeros((*of_brightness.shape[:-1], self.patch_count))
@@ -529,9 +531,9 @@ def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> Patch
     drawn_t = t + noise[..., 0] + 1j * noise[..., 1]
     drawn = np.asarray(permittivity_from_ratio(drawn_t, angles), np.complex128)
     # Near metal the moments of the far tail do not exist: three standard deviations of the ratio are kept.
-    off = pair(drawn_t - middle)
-    kept = np.einsum("...i,ij,...j->...", off, np.linalg.inv(of_ratio), off) < CHI2_997
-    parts = pair(drawn[kept] - value)
+    difference = pair(drawn_t - middle)
+    inside = np.einsum("...i,ij,...j->...", difference, np.linalg.inv(of_ratio), difference) < CHI2_997
+    parts = pair(drawn[inside] - value)
     covariance = np.asarray(parts.T @ parts / len(parts), np.float64)
     # A tail (the mount may have moved) widens a covariance more than the region that holds 95 %.
     distance2 = np.einsum("...i,ij,...j->...", parts, np.linalg.inv(covariance), parts)

@@ -37,7 +37,9 @@ METAL_SHARE = 0.1
 """Share of metal in these patches."""
 SHEET_SHARE = 0.15
 """Share of thin plates, which reflect at both faces, in the patches that are none of the library's materials."""
-SHEET_REAL, SHEET_LOSS_TANGENT, SHEET_MM = (1.5, 8.0), (1e-3, 0.2), (0.2, 6.0)
+SHEET_REAL = (1.5, 8.0)
+SHEET_LOSS_TANGENT = (1e-3, 0.2)
+SHEET_MM = (0.2, 6.0)
 """Permittivities and thicknesses of thin plates; all uniform on logarithmic scales."""
 HOLDER_REAL = (1.0, 2.5)
 """Permittivity behind a thin plate: air, foam, wood. Half of the plates have air."""
@@ -49,7 +51,8 @@ LEAST_LOSS_SPREAD = 0.02
 METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat."""
 _STEP = 1e-4
-_SHEETS, _HALF_SPACES = 6000, 4000
+_SHEETS = 6000
+_HALF_SPACES = 4000
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,8 @@ def at_angle(t: Complex, theta_rad: npt.ArrayLike, other_rad: float) -> Complex:
 
     With u = (1 + t) / (1 - t) Eq. 3 is sqrt(eps - sin^2) = u sin^2 / cos.
     """
-    sine2, other2 = np.sin(theta_rad) ** 2, np.sin(other_rad) ** 2
+    sine2 = np.sin(theta_rad) ** 2
+    other2 = np.sin(other_rad) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         q = (1 + t) / (1 - t) * sine2 / np.cos(theta_rad)
         there = np.sqrt(q**2 + sine2 - other2)
@@ -165,11 +169,11 @@ class Kinds:
         if self.sheet_share:
             others += self.sheet_share * _histogram(self.sheets, real, imag, covariance)
         density = np.stack([np.zeros_like(others), others])
-        both = self.covariance + covariance
-        reach = 4.5 * np.sqrt(both[:, (0, 1), (0, 1)])
+        summed = self.covariance + covariance
+        reach = 4.5 * np.sqrt(summed[:, (0, 1), (0, 1)])
         columns = np.searchsorted(real, self.t.real + np.array([-1, 1])[:, None] * reach[:, 0])
         rows = np.searchsorted(imag, self.t.imag + np.array([-1, 1])[:, None] * reach[:, 1])
-        inverse = np.linalg.inv(both)
+        inverse = np.linalg.inv(summed)
         scale = self.share * np.sqrt(np.linalg.det(inverse)) / (2 * np.pi)
         for k in np.flatnonzero((columns[1] > columns[0]) & (rows[1] > rows[0])):
             window = slice(rows[0, k], rows[1, k]), slice(columns[0, k], columns[1, k])
@@ -185,7 +189,8 @@ class Kinds:
         Errors of the measurement soften the border of the passive half spaces: the density there is that of the
         nearest passive one, times the probability of an error as large.
         """
-        s, cosine = np.sin(self.theta_rad), np.cos(self.theta_rad)
+        s = np.sin(self.theta_rad)
+        cosine = np.cos(self.theta_rad)
         with np.errstate(divide="ignore", invalid="ignore"):
             parts = pair(permittivity_from_ratio(t, self.theta_rad))
             slope = np.abs(4 * s**2 * (s / cosine) ** 2 * (1 + t) / (1 - t) ** 3)
@@ -316,23 +321,23 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
     """
     first = kinds[0]
     size = 2 * len(seen)
-    errors = scipy.linalg.block_diag(*(one.covariance for one in seen))
-    t = np.array([one.inverse_ratio for one in seen])
-    effects = np.concatenate([at.effects for at in kinds], axis=1)
+    errors = scipy.linalg.block_diag(*(evidence.covariance for evidence in seen))
+    t = np.array([evidence.inverse_ratio for evidence in seen])
+    effects = np.concatenate([kind.effects for kind in kinds], axis=1)
     inverse = np.linalg.inv(effects @ effects.mT + 1e-10 * np.eye(size) + errors)
-    off = pair(t - np.stack([at.t for at in kinds], axis=1)).reshape(-1, size)
-    distance2 = np.einsum("ki,kij,kj->k", off, inverse, off)
-    each = first.share * np.sqrt(np.linalg.det(inverse / (2 * np.pi))) * np.exp(-0.5 * distance2)
-    ours = float(np.mean([one.library_share for one in seen])) if first.ours.any() else 0.0
-    each = each * np.where(first.ours, ours, 1 - ours)
-    drawn = np.stack([at.sheets for at in kinds], axis=1)
+    difference = pair(t - np.stack([kind.t for kind in kinds], axis=1)).reshape(-1, size)
+    distance2 = np.einsum("ki,kij,kj->k", difference, inverse, difference)
+    weight = first.share * np.sqrt(np.linalg.det(inverse / (2 * np.pi))) * np.exp(-0.5 * distance2)
+    ours = float(np.mean([evidence.library_share for evidence in seen])) if first.ours.any() else 0.0
+    weight = weight * np.where(first.ours, ours, 1 - ours)
+    drawn = np.stack([kind.sheets for kind in kinds], axis=1)
     sheet = (1 - ours) * first.sheet_share * float(np.mean(_normal(drawn, t, errors + SHEET_KERNEL**2 * np.eye(size))))
-    other = (1 - ours) * first.other * _other_density(kinds, seen)
+    other_weight = (1 - ours) * first.other * _other_density(kinds, seen)
     distance = np.sqrt(distance2 / scipy.special.chdtri(size, 0.01))
-    total = float(each.sum()) + sheet + other
+    total = float(weight.sum()) + sheet + other_weight
     if not total > 0:
-        return Odds(np.zeros(len(each)), 0.0, 1.0, distance)
-    inside = np.where(distance <= 1, each, 0.0) / total
+        return Odds(np.zeros(len(weight)), 0.0, 1.0, distance)
+    inside = np.where(distance <= 1, weight, 0.0) / total
     sheet = sheet / total
     return Odds(inside, sheet, 1 - sheet - float(inside.sum()), distance)
 
@@ -340,9 +345,9 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
 def _normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
     """Return the normal density of draws [draw, scan] about `mean` [scan], with `covariance` [2 scan, 2 scan]."""
     inverse = np.linalg.inv(covariance)
-    off = pair(draws - mean).reshape(len(draws), -1)
+    difference = pair(draws - mean).reshape(len(draws), -1)
     scale = np.sqrt(np.linalg.det(inverse / (2 * np.pi)))
-    return scale * np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, inverse, off))
+    return scale * np.exp(-0.5 * np.einsum("ni,ij,nj->n", difference, inverse, difference))
 
 
 def _other_density(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> float:
@@ -351,15 +356,16 @@ def _other_density(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> flo
     With several angles by half spaces that are drawn from the measurement that is known best.
     """
     best = min(range(len(seen)), key=lambda i: float(np.linalg.det(seen[i].covariance)))
-    mean, covariance = seen[best].inverse_ratio, seen[best].covariance
+    mean = seen[best].inverse_ratio
+    covariance = seen[best].covariance
     if len(seen) == 1:
         return float(kinds[best].any_half_space(np.array(mean), covariance))
     noise = np.random.default_rng(0).multivariate_normal(np.zeros(2), covariance, _HALF_SPACES, method="cholesky")
     t = mean + noise[:, 0] + 1j * noise[:, 1]
     density = kinds[best].any_half_space(t, 1e-8 * np.eye(2))
     eps = permittivity_from_ratio(t, kinds[best].theta_rad)
-    for i, one in enumerate(seen):
+    for i, evidence in enumerate(seen):
         if i != best:
-            there = inverse_ratio(eps, one.theta_rad)
-            density = density * _normal(there[:, None], np.array([one.inverse_ratio]), one.covariance)
+            ratio = inverse_ratio(eps, evidence.theta_rad)
+            density = density * _normal(ratio[:, None], np.array([evidence.inverse_ratio]), evidence.covariance)
     return float(np.mean(density))

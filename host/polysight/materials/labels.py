@@ -91,7 +91,9 @@ def specimen_seed(path: Path) -> int | None:
     read_truth(path)
     scene = read_json(path).get("scene")
     spread = scene.get("specimen_spread") if isinstance(scene, dict) else None
-    return scene.get("seed") if isinstance(scene, dict) and isinstance(spread, list) and any(spread) else None
+    if isinstance(scene, dict) and isinstance(spread, list) and any(spread):
+        return scene.get("seed")
+    return None
 
 
 def find_truth(folder: Path) -> tuple[Plates, str]:
@@ -190,7 +192,9 @@ class Labels:
 
     def is_metal(self, name: str) -> bool:
         """Return true if this box is the metal reference, or has a metal's name if the file has no reference."""
-        return name == self.metal if self.metal is not None else is_metal(material_of(name))
+        if self.metal is not None:
+            return name == self.metal
+        return is_metal(material_of(name))
 
     def specimen(self, name: str) -> str | None:
         """Return the physical piece in a box: as given, or the part of its name after `#`; None if not known."""
@@ -200,12 +204,14 @@ class Labels:
         """Return the labels with boxes in millimetres from the centre of an image with these axes."""
         if self.unit == "mm":
             return self
-        x, y = axis_mm(x_m), axis_mm(y_m)
-        dx, dy = float(x[1] - x[0]), float(y[1] - y[0])
+        x = axis_mm(x_m)
+        y = axis_mm(y_m)
+        dx = float(x[1] - x[0])
+        dy = float(y[1] - y[0])
 
         def converted(box: Box) -> Box:
-            x0, x1 = (float(x[0]) + (at - 0.5) * dx for at in (box[0], box[2]))
-            y0, y1 = (float(y[0]) + (at - 0.5) * dy for at in (box[1], box[3]))
+            x0, x1 = (float(x[0]) + (edge - 0.5) * dx for edge in (box[0], box[2]))
+            y0, y1 = (float(y[0]) + (edge - 0.5) * dy for edge in (box[1], box[3]))
             return x0, y0, x1, y1
 
         return replace(self, boxes={n: converted(b) for n, b in self.boxes.items()}, unit="mm")
@@ -245,14 +251,17 @@ def read_labels(path: Path) -> Labels:
         if not (isinstance(box, list) and len(box) == 4 and all(_is_number(b) for b in box)):
             raise invalid(f"labels.{name} = {box!r}", "four numbers [x0, y0, x1, y1]")
         out[str(name)] = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
-    unit, metal, specimens = raw.get("unit", "pixel"), raw.get("metal"), raw.get("specimens") or {}
+    unit = raw.get("unit", "pixel")
+    metal = raw.get("metal")
+    specimens = raw.get("specimens") or {}
     if unit not in ("mm", "pixel"):
         raise invalid(f"unit = {unit!r}", '"mm" or "pixel"')
     if not (metal is None or (isinstance(metal, str) and metal in out)):
         raise invalid(f"metal = {metal!r}", f"the name of a box: {', '.join(out)}")
     if not (isinstance(specimens, dict) and all(n in out and isinstance(s, str) for n, s in specimens.items())):
         raise invalid(f"specimens = {specimens!r}", "{name of a box: name of the piece}")
-    by_hand, text = raw.get("by_hand") is True, raw.get("description")
+    by_hand = raw.get("by_hand") is True
+    text = raw.get("description")
     return Labels(out, unit, metal, specimens, by_hand, text if isinstance(text, str) else "")
 
 
@@ -281,8 +290,8 @@ def patches_from_plates(
     Raises DataError if a plate has no pixel.
     """
     boxes = {f"{plate.name} ({n})": plate.box_mm for n, plate in enumerate(plates, 1)}
-    found, _ = patches_from_labels(boxes, x_m, y_m, unit="mm", margin_mm=margin_mm)
-    return found, {n: plate.name for n, plate in enumerate(plates, 1)}
+    patches, _ = patches_from_labels(boxes, x_m, y_m, unit="mm", margin_mm=margin_mm)
+    return patches, {n: plate.name for n, plate in enumerate(plates, 1)}
 
 
 def patches_from_labels(
@@ -299,7 +308,8 @@ def patches_from_labels(
 
     Raises DataError if a box has no pixel.
     """
-    x, y = axis_mm(x_m), axis_mm(y_m)
+    x = axis_mm(x_m)
+    y = axis_mm(y_m)
     labels = np.zeros((y.size, x.size), np.int32)
     patches: list[Patch] = []
     names: dict[int, str] = {}
@@ -325,8 +335,10 @@ def patches_from_labels(
 LONGEST_NAME = 80
 RESERVED = ("unknown", "none of these", "possible layer")
 """Words that the classifier uses."""
-_TOLERANCE_MM = 0.01  # files hold three decimals
-_HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]")  # invisible characters
+# Files hold three decimals
+_TOLERANCE_MM = 0.01
+# Invisible characters
+_HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]")
 
 
 def clean_name(text: str, kind: str = "name") -> str:
@@ -336,7 +348,7 @@ def clean_name(text: str, kind: str = "name") -> str:
     word.
     """
     name = re.sub(" +", " ", unicodedata.normalize("NFC", text).strip())
-    shown = name if len(name) <= 40 else f"{name[:40]}..."
+    shortened = name if len(name) <= 40 else f"{name[:40]}..."
     wrong = ""
     if not name:
         wrong = "it is empty"
@@ -352,7 +364,7 @@ def clean_name(text: str, kind: str = "name") -> str:
         wrong = "a plain number is the number of a patch"
     if wrong:
         raise DataError(
-            f"{kind} {shown!a} cannot be used", wrong, "give another one, such as oak or PMMA 3 mm",
+            f"{kind} {shortened!a} cannot be used", wrong, "give another one, such as oak or PMMA 3 mm",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     return name
@@ -368,8 +380,10 @@ def box_name(text: str) -> str:
 
 def image_extent_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Box:
     """Return the outer edges (x0, y0, x1, y1) of an image, millimetres from its centre."""
-    x, y = axis_mm(x_m), axis_mm(y_m)
-    dx, dy = float(x[1] - x[0]) / 2, float(y[1] - y[0]) / 2
+    x = axis_mm(x_m)
+    y = axis_mm(y_m)
+    dx = float(x[1] - x[0]) / 2
+    dy = float(y[1] - y[0]) / 2
     return float(x[0]) - dx, float(y[0]) - dy, float(x[-1]) + dx, float(y[-1]) + dy
 
 
@@ -381,11 +395,12 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
     Raises DataError if a box is empty, not finite, outside the image or without a valid pixel; if two boxes overlap; if
     a name is invalid or used twice; if there are several boxes and the metal reference is not known.
     """
-    given = labels.in_mm(x_m, y_m)
-    boxes, extent = {}, image_extent_mm(x_m, y_m)
-    for name, box in given.boxes.items():
+    labels_mm = labels.in_mm(x_m, y_m)
+    boxes = {}
+    extent = image_extent_mm(x_m, y_m)
+    for name, box in labels_mm.boxes.items():
         clean = box_name(name)
-        if twin := next((other for other in boxes if other.casefold() == clean.casefold()), None):
+        if twin := next((other_name for other_name in boxes if other_name.casefold() == clean.casefold()), None):
             raise name_taken(clean, twin)
         boxes[clean] = _checked_box(clean, box, extent)
         mask = box_mask(box, x_m, y_m)
@@ -396,14 +411,14 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
                 "draw it where labels.png shows the material",
                 code=ErrorCode.NO_DATA,
             )
-    for (one, a), (other, b) in combinations(boxes.items(), 2):
-        _check_apart(one, a, other, b)
-    specimens = {box_name(n): clean_name(s, "specimen") for n, s in given.specimens.items()}
-    metal = None if given.metal is None else box_name(given.metal)
+    for (one, a), (other_name, b) in combinations(boxes.items(), 2):
+        _check_apart(one, a, other_name, b)
+    specimens = {box_name(n): clean_name(s, "specimen") for n, s in labels_mm.specimens.items()}
+    metal = None if labels_mm.metal is None else box_name(labels_mm.metal)
     missing = [n for n in (*specimens, *([] if metal is None else [metal])) if n not in boxes]
     if missing:
         raise no_box(missing[0], boxes)
-    return replace(given, boxes=boxes, specimens=specimens, metal=metal or _metal_by_name(boxes))
+    return replace(labels_mm, boxes=boxes, specimens=specimens, metal=metal or _metal_by_name(boxes))
 
 
 def name_taken(name: str, twin: str) -> DataError:
@@ -420,9 +435,9 @@ def name_taken(name: str, twin: str) -> DataError:
 
 def no_box(name: str, boxes: Mapping[str, Any]) -> DataError:
     """Return the error for an unknown name of a box."""
-    known = ", ".join(boxes) if boxes else "there are none"
+    listed = ", ".join(boxes) if boxes else "there are none"
     return DataError(
-        f"no box is called {name}", f"the boxes: {known}", "polysight label SCAN --list shows them",
+        f"no box is called {name}", f"the boxes: {listed}", "polysight label SCAN --list shows them",
         code=ErrorCode.KEY_UNKNOWN,
     )  # fmt: skip
 
@@ -447,7 +462,8 @@ def _checked_box(name: str, box: Box, extent: Box) -> Box:
 
 
 def _check_apart(one: str, a: Box, other: str, b: Box) -> None:
-    across, up = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
+    across = min(a[2], b[2]) - max(a[0], b[0])
+    up = min(a[3], b[3]) - max(a[1], b[1])
     if across > _TOLERANCE_MM and up > _TOLERANCE_MM:
         raise DataError(
             f"the boxes of {one} and {other} overlap by {across:.1f} x {up:.1f} mm",
@@ -463,9 +479,9 @@ def _metal_by_name(boxes: Mapping[str, Box]) -> str | None:
     if len(metals) == 1:
         return metals[0]
     if len(boxes) > 1:
-        found = f"{' and '.join(metals)} are possible" if metals else "no name is that of a metal"
+        candidates = f"{' and '.join(metals)} are possible" if metals else "no name is that of a metal"
         raise DataError(
-            f"the metal reference among the {len(boxes)} boxes is not known: {found}",
+            f"the metal reference among the {len(boxes)} boxes is not known: {candidates}",
             "training data are relative to metal in the same scan",
             f"add --metal NAME: {', '.join(metals or boxes)}",
             code=ErrorCode.KEY_MISSING,

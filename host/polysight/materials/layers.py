@@ -136,7 +136,10 @@ class Bands:
     @property
     def data_covariance(self) -> Real:
         """Covariance of all data: real and imaginary parts of the ratios, band by band, then |H|; [n, n]."""
-        ratios = np.diag(np.repeat(self.sigma**2, 2)) if self.covariance is None else self.covariance
+        if self.covariance is None:
+            ratios = np.diag(np.repeat(self.sigma**2, 2))
+        else:
+            ratios = self.covariance
         if self.amplitude_h is None or self.sigma_h is None:
             return ratios
         shared = self.common_h * self.amplitude_h
@@ -195,8 +198,8 @@ def average(
     eps: Sequence[npt.ArrayLike], thickness: Sequence[npt.ArrayLike], spectrum: Spectrum, theta_rad: npt.ArrayLike
 ) -> tuple[Complex, Real]:
     """Return V / H and |H| [..., K] of stacks; entries are numbers or [..., 1, 1]; else as :func:`predict`."""
-    both = multilayer(eps, thickness, spectrum.frequency_hz, theta_rad)
-    r_s, r_p = (np.asarray((r * spectrum.weight).sum(axis=-1), np.complex128) for r in both)
+    reflections = multilayer(eps, thickness, spectrum.frequency_hz, theta_rad)
+    r_s, r_p = (np.asarray((r * spectrum.weight).sum(axis=-1), np.complex128) for r in reflections)
     with np.errstate(divide="ignore", invalid="ignore"):
         return r_p / r_s, np.asarray(np.abs(r_s), np.float64)
 
@@ -245,8 +248,10 @@ UNLIKELY = 1e-3
 DETERMINED = 0.05
 """Largest relative half width of 95 % regions of a fit that is not ambiguous."""
 _DRAWS = 1500
-_REACH = 4.0  # standard deviations
-_BENT = 1.15  # ratio of sampled to linear standard deviations above which the sampled ones are used
+# Standard deviations
+_REACH = 4.0
+# Ratio of sampled to linear standard deviations above which the sampled ones are used
+_BENT = 1.15
 
 
 @dataclass(frozen=True)
@@ -291,8 +296,8 @@ class LayerFit:
     @property
     def relative_std(self) -> float:
         """The larger of the standard deviations of permittivity and of thickness, relative."""
-        own = float(np.hypot(self.std_real, self.std_loss)) / abs(self.permittivity)
-        return max(own, self.std_thickness_m / self.thickness_m if self.thickness_m else 0.0)
+        real_and_loss_std = float(np.hypot(self.std_real, self.std_loss)) / abs(self.permittivity)
+        return max(real_and_loss_std, self.std_thickness_m / self.thickness_m if self.thickness_m else 0.0)
 
     @property
     def ambiguous(self) -> bool:
@@ -303,7 +308,10 @@ class LayerFit:
         """Return the warnings about this fit, one sentence each."""
         out = []
         for r in self.rivals:
-            size = "" if r.thickness_m is None or not self.std_thickness_m else f" at {1e3 * r.thickness_m:.3g} mm"
+            if r.thickness_m is None or not self.std_thickness_m:
+                size = ""
+            else:
+                size = f" at {1e3 * r.thickness_m:.3g} mm"
             out.append(
                 f"{format_permittivity(r.permittivity)}{size} is not excluded: chi-square {r.chi2:.1f}, the best has"
                 f" {self.chi2:.1f} for {self.freedom} degrees"
@@ -337,16 +345,22 @@ def fit_layer(
     DataError
         with fewer data than unknowns.
     """
-    at = [i for i, layer in enumerate(stack) if layer.permittivity is None]
-    if len(at) != 1:
+    unknown_layers = [i for i, layer in enumerate(stack) if layer.permittivity is None]
+    if len(unknown_layers) != 1:
         raise PolysightError(
-            f"{len(at)} layers of unknown permittivity",
+            f"{len(unknown_layers)} layers of unknown permittivity",
             "one can be fitted",
             "give the permittivity of the others",
             code=ErrorCode.VALUES_CONFLICT,
         )
-    check_range(thickness_range_m or stack[at[0]].thickness_range_m)
-    model = _Model(bands, tuple(stack), at[0], theta_rad, thickness_range_m or stack[at[0]].thickness_range_m)
+    check_range(thickness_range_m or stack[unknown_layers[0]].thickness_range_m)
+    model = _Model(
+        bands,
+        tuple(stack),
+        unknown_layers[0],
+        theta_rad,
+        thickness_range_m or stack[unknown_layers[0]].thickness_range_m,
+    )
     if model.freedom < 0:
         raise DataError(
             f"{model.data} numbers for {model.unknowns} unknowns",
@@ -356,13 +370,14 @@ def fit_layer(
         )
     rough = sorted((model.solve(start, precision=1e-3) for start in model.starts()), key=lambda one: one.chi2)
     level = rough[0].chi2 + 3 * RIVAL * model.fit(rough[0], drawn=False).stretch
-    found = sorted((model.solve(one.x) for one in _apart(rough, level, 0.01)), key=lambda one: one.chi2)
-    level = found[0].chi2 + RIVAL * model.fit(found[0], drawn=False).stretch
-    near = [model.fit(one, drawn=True) for one in _apart(found, level, 1e-3)]
-    best, rivals = near[0], list[LayerFit]()
-    for other in near[1:]:
-        if all(_differ(other, known) for known in (best, *rivals)):
-            rivals.append(other)
+    solutions = sorted((model.solve(one.x) for one in _apart(rough, level, 0.01)), key=lambda one: one.chi2)
+    level = solutions[0].chi2 + RIVAL * model.fit(solutions[0], drawn=False).stretch
+    near = [model.fit(one, drawn=True) for one in _apart(solutions, level, 1e-3)]
+    best = near[0]
+    rivals = list[LayerFit]()
+    for rival in near[1:]:
+        if all(_differ(rival, accepted) for accepted in (best, *rivals)):
+            rivals.append(rival)
     return replace(best, rivals=tuple(rivals))
 
 
@@ -402,11 +417,11 @@ class _Solution:
 def _apart(found: Sequence[_Solution], level: float, relative: float) -> list[_Solution]:
     """Return solutions up to a chi-square `level`, without repetitions (closer than `relative`), best first."""
     out: list[_Solution] = []
-    for one in found:
-        if one.chi2 <= level and all(
-            np.any(np.abs(one.x - o.x) > relative * np.maximum(np.abs(o.x), 0.1)) for o in out
+    for solution in found:
+        if solution.chi2 <= level and all(
+            np.any(np.abs(solution.x - o.x) > relative * np.maximum(np.abs(o.x), 0.1)) for o in out
         ):
-            out.append(one)
+            out.append(solution)
     return out
 
 
@@ -428,7 +443,10 @@ class _Model:
         check_stack(
             [replace(layer, thickness_m=1.0) if self.sized and i == at else layer for i, layer in enumerate(stack)]
         )
-        self.bands, self.stack, self.at, self.theta_rad = bands, stack, at, theta_rad
+        self.bands = bands
+        self.stack = stack
+        self.at = at
+        self.theta_rad = theta_rad
         self.range_mm = tuple(1e3 * d for d in thickness_range_m or (0.0, 0.0))
         self.turned = bands.theta_std_rad > 0
         limits = [REAL_RANGE, LOSS_RANGE, *([self.range_mm] * self.sized), *([(-8.0, 8.0)] * self.turned)]
@@ -489,13 +507,13 @@ class _Model:
         valleys = (chi2 == scipy.ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~out
         index = np.argwhere(valleys)
         order = np.argsort(chi2[tuple(index.T)])[:STARTS]
-        return [grid[tuple(one)] for one in index[order]]
+        return [grid[tuple(cell)] for cell in index[order]]
 
     def _slopes(self, x: Real) -> Real:
         """Return the Jacobian of the residuals, [data, n], by central differences."""
         step = np.diag(1e-6 * np.maximum(np.abs(x), 0.1))
-        apart = self.residuals(np.concatenate([x + step, x - step]))
-        return ((apart[: x.size] - apart[x.size :]) / (2 * np.diag(step)[:, None])).T
+        residuals = self.residuals(np.concatenate([x + step, x - step]))
+        return ((residuals[: x.size] - residuals[x.size :]) / (2 * np.diag(step)[:, None])).T
 
     def solve(self, start: Real, precision: float = 1e-10) -> _Solution:
         """Solve by least squares from one start."""
@@ -518,11 +536,11 @@ class _Model:
         """Return a solution with its error bars; by samples of the posterior if `drawn` and the valley is bent."""
         n = self.unknowns
         covariance = np.asarray(np.linalg.pinv(one.jacobian.T @ one.jacobian), np.float64)
-        own = self._drawn(one, covariance) if drawn else covariance[:n, :n]
+        own_covariance = self._drawn(one, covariance) if drawn else covariance[:n, :n]
         wider = max(1.0, one.chi2 / self.freedom) if self.freedom > 0 else 1.0
         units = np.array([1.0, 1.0, 1e-3])[:n]
-        own = np.asarray(wider * own * np.outer(units, units), np.float64)
-        std = np.sqrt(np.maximum(np.diag(own), 0.0))
+        own_covariance = np.asarray(wider * own_covariance * np.outer(units, units), np.float64)
+        std = np.sqrt(np.maximum(np.diag(own_covariance), 0.0))
         ends = zip(("the real part", "the loss", "the thickness"), one.active, (True, False, True), strict=False)
         return LayerFit(
             complex(one.x[0], -one.x[1]),
@@ -532,8 +550,10 @@ class _Model:
             float(std[2]) if self.sized else 0.0,
             one.chi2,
             self.freedom,
-            at_limit=tuple(name for name, end, both in itertools.islice(ends, n) if end > 0 or (both and end < 0)),
-            covariance=own,
+            at_limit=tuple(
+                name for name, end, two_sided in itertools.islice(ends, n) if end > 0 or (two_sided and end < 0)
+            ),
+            covariance=own_covariance,
         )
 
     def _drawn(self, one: _Solution, covariance: Real) -> Real:
@@ -541,26 +561,29 @@ class _Model:
 
         By importance sampling along index and phase, where the valley is straighter than in thickness.
         """
-        n, x = self.unknowns, one.x
+        n = self.unknowns
+        x = one.x
         to_z = self._straight(x)
         spread = to_z @ covariance @ to_z.T
         spread = spread + np.diag(1e-12 * np.maximum(np.diag(spread), 1e-18))
         # A wide proposal (Student's t, five degrees of freedom); beyond _REACH there is another valley: a rival.
-        rng, freedom = np.random.default_rng(0), 5.0
+        rng = np.random.default_rng(0)
+        freedom = 5.0
         unit = rng.standard_normal((_DRAWS, x.size)) / np.sqrt(rng.chisquare(freedom, (_DRAWS, 1)) / freedom)
         unit = 1.15 * unit[np.sum(unit**2, axis=1) < (_REACH / 1.15) ** 2]
-        at = self._from_straight(x, unit @ np.linalg.cholesky(spread).T)
-        inside = np.all((at >= self.lower) & (at <= self.upper), axis=-1)
+        draws = self._from_straight(x, unit @ np.linalg.cholesky(spread).T)
+        inside = np.all((draws >= self.lower) & (draws <= self.upper), axis=-1)
         linear = covariance[:n, :n]
         if not np.any(inside):
             return linear
-        at, unit = at[inside], unit[inside]
-        log = -0.5 * np.sum(self.residuals(at) ** 2, axis=-1)
+        draws = draws[inside]
+        unit = unit[inside]
+        log = -0.5 * np.sum(self.residuals(draws) ** 2, axis=-1)
         log += (freedom + x.size) / 2 * np.log1p(np.sum((unit / 1.15) ** 2, axis=1) / freedom)
         weight = np.exp(log - log.max())
         weight /= weight.sum()
-        away = (at - x)[:, :n]
-        second = (away * weight[:, None]).T @ away
+        differences = (draws - x)[:, :n]
+        second = (differences * weight[:, None]).T @ differences
         ratio = np.sqrt(np.diag(second) / np.maximum(np.diag(linear), 1e-30))
         return second if np.any(ratio > _BENT) else linear
 
@@ -569,7 +592,8 @@ class _Model:
         out = np.eye(x.size)
         if self.sized:
             index = float(np.sqrt(max(x[0] - np.sin(self.theta_rad) ** 2, 1e-3)))
-            out[2, 0], out[2, 2] = x[2] / (2 * index), index
+            out[2, 0] = x[2] / (2 * index)
+            out[2, 2] = index
         return out
 
     def _from_straight(self, x: Real, draws: Real) -> Real:

@@ -118,8 +118,8 @@ class Library:
                 code=ErrorCode.MISMATCH,
             )
         angle = min(near, key=lambda a: abs(a - angle_deg))
-        mine = tuple(e for e in self.entries if abs(e.incidence_deg - angle) <= SAME_ANGLE_DEG)
-        return Library(mine, self.fit_of([angle]), self.note)
+        entries_of_angle = tuple(e for e in self.entries if abs(e.incidence_deg - angle) <= SAME_ANGLE_DEG)
+        return Library(entries_of_angle, self.fit_of([angle]), self.note)
 
     def columns(self) -> tuple[Real, npt.NDArray[np.str_], npt.NDArray[np.str_]]:
         """Return X [n, 4] (|H|, |V|, Re P, Im P), the material y [n] and the scan [n] of each pixel."""
@@ -151,7 +151,8 @@ class Library:
         ]
         meta = {"format": FORMAT, "note": self.note, "fit": self.fit, "entries": entries}
         text = np.frombuffer(json.dumps(meta, sort_keys=True).encode("utf-8"), np.uint8)
-        empty_f, empty_c = np.zeros(0, np.float32), np.zeros(0, np.complex64)
+        empty_f = np.zeros(0, np.float32)
+        empty_c = np.zeros(0, np.complex64)
         buffer = io.BytesIO()
         np.savez_compressed(
             buffer,
@@ -173,7 +174,9 @@ class Library:
         try:
             with open_npz(path) as z:
                 meta = json.loads(z["meta"].tobytes().decode("utf-8"))
-                h, v, p = z["h"], z["v"], z["p"]
+                h = z["h"]
+                v = z["v"]
+                p = z["p"]
         except FileNotFoundError:
             raise DataError(
                 f"{path}: no such library",
@@ -182,14 +185,14 @@ class Library:
                 code=ErrorCode.FILE_MISSING,
             ) from None
         except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
-            why = str(e) if isinstance(e, ValueError) else f"{type(e).__name__}: {e}"
+            cause = str(e) if isinstance(e, ValueError) else f"{type(e).__name__}: {e}"
             raise DataError(
-                bad, why, "give a library of polysight train, or a folder of products", code=ErrorCode.FILE_UNREADABLE
+                bad, cause, "give a library of polysight train, or a folder of products", code=ErrorCode.FILE_UNREADABLE
             ) from None
         if not isinstance(meta, dict) or meta.get("format") != FORMAT:
-            found = meta.get("format") if isinstance(meta, dict) else None
+            file_format = meta.get("format") if isinstance(meta, dict) else None
             raise DataError(
-                bad, f"its format is {found!r}, this program reads {FORMAT!r}", "train it again",
+                bad, f"its format is {file_format!r}, this program reads {FORMAT!r}", "train it again",
                 code=ErrorCode.VERSION_UNSUPPORTED,
             )  # fmt: skip
         try:
@@ -203,7 +206,8 @@ class Library:
 def _entries(rows: list[dict[str, Any]], h: npt.NDArray, v: npt.NDArray, p: npt.NDArray) -> tuple[Entry, ...]:
     if not h.shape == v.shape == p.shape or h.ndim != 1 or sum(r["pixels"] for r in rows) != h.size:
         raise ValueError(f"arrays {h.shape}, {v.shape}, {p.shape}")
-    out, start = [], 0
+    out = []
+    start = 0
     for row in rows:
         stop = start + row["pixels"]
         fields = {k: value for k, value in row.items() if k != "pixels"}
@@ -339,8 +343,8 @@ class Samples:
     @property
     def plates(self) -> npt.NDArray[np.intp]:
         """Number of each pixel's plate (material and specimen), [n]."""
-        which = np.full(self.names.shape, "") if self.specimens is None else self.specimens
-        pairs = np.stack([np.unique(a, return_inverse=True)[1] for a in (self.names, which)], axis=1)
+        specimens = np.full(self.names.shape, "") if self.specimens is None else self.specimens
+        pairs = np.stack([np.unique(a, return_inverse=True)[1] for a in (self.names, specimens)], axis=1)
         return np.asarray(np.unique(pairs, axis=0, return_inverse=True)[1].ravel(), np.intp)
 
     @property
@@ -352,19 +356,19 @@ class Samples:
         if self.specimens is None or not (self.specimens != "").any():
             return self.groups
         joined = {g: g for g in np.unique(self.groups).tolist()}
-        known = self.specimens != ""
-        for plate in np.unique(self.plates[known]):
-            seen = {joined[g] for g in np.unique(self.groups[known & (self.plates == plate)]).tolist()}
-            joined = {g: min(seen) if to in seen else to for g, to in joined.items()}
+        with_specimen = self.specimens != ""
+        for plate in np.unique(self.plates[with_specimen]):
+            joined_groups = {joined[g] for g in np.unique(self.groups[with_specimen & (self.plates == plate)]).tolist()}
+            joined = {g: min(joined_groups) if target in joined_groups else target for g, target in joined.items()}
         out = np.array([joined[g] for g in self.groups.tolist()])
         return out if np.unique(out).size > 1 else self.groups
 
     @property
     def groups_of_material(self) -> npt.NDArray[np.int64]:
         """Number of groups that have each pixel's material, [n]."""
-        names, of = np.unique(self.names, return_inverse=True)
-        count = [np.unique(self.groups[of == k]).size for k in range(names.size)]
-        return np.array(count, np.int64)[of]
+        names, material_index = np.unique(self.names, return_inverse=True)
+        count = [np.unique(self.groups[material_index == k]).size for k in range(names.size)]
+        return np.array(count, np.int64)[material_index]
 
     @property
     def shared(self) -> npt.NDArray[np.bool_]:
@@ -378,17 +382,21 @@ class Samples:
         Raises DataError if no pixel is usable.
         """
         rng = np.random.default_rng(0)
-        x, names, groups, patches, specimens = [], [], [], [], []
+        x = []
+        names = []
+        groups = []
+        patches = []
+        specimens = []
         for i, e in enumerate(library.entries):
             with np.errstate(divide="ignore", invalid="ignore"):
                 features = feature_matrix(e.h, e.v, e.p)
             good = np.flatnonzero(usable(features))
-            at = rng.permutation(good)[:pixels_per_patch]
-            x.append(features[at])
-            names += [e.name] * at.size
-            groups += [e.scan] * at.size
-            patches += [i] * at.size
-            specimens += [e.specimen or ""] * at.size
+            pixels = rng.permutation(good)[:pixels_per_patch]
+            x.append(features[pixels])
+            names += [e.name] * pixels.size
+            groups += [e.scan] * pixels.size
+            patches += [i] * pixels.size
+            specimens += [e.specimen or ""] * pixels.size
         if not names:
             raise DataError(
                 "the library has no usable pixel", "nothing was trained", "polysight train", code=ErrorCode.NO_DATA
@@ -398,8 +406,8 @@ class Samples:
 
     def take(self, at: npt.NDArray) -> Samples:
         """Return some of the pixels, by index or by mask."""
-        which = None if self.specimens is None else self.specimens[at]
-        return Samples(self.x[at], self.names[at], self.groups[at], self.patches[at], which, self.angles_deg)
+        specimens = None if self.specimens is None else self.specimens[at]
+        return Samples(self.x[at], self.names[at], self.groups[at], self.patches[at], specimens, self.angles_deg)
 
     def joined(self, other: Samples) -> Samples:
         """Join with samples of a second angle, patch by patch.
@@ -411,19 +419,27 @@ class Samples:
         Raises DataError if no material was seen under both angles.
         """
         rng = np.random.default_rng(0)
-        ours, theirs = np.unique(self.groups), np.unique(other.groups)
+        ours = np.unique(self.groups)
+        theirs = np.unique(other.groups)
         common = np.intersect1d(ours, theirs)
-        pairs = zip(common, common, strict=True) if common.size else zip(ours, theirs, strict=False)
-        left, right, groups, patches = [], [], [], []
+        if common.size:
+            pairs = zip(common, common, strict=True)
+        else:
+            pairs = zip(ours, theirs, strict=False)
+        left_rows = []
+        right = []
+        groups = []
+        patches = []
         angles = self.angles_deg + other.angles_deg if self.angles_deg and other.angles_deg else ()
         for a, b in pairs:
             for name in np.unique(self.names):
-                here = np.unique(self.patches[(self.groups == a) & (self.names == name)])
-                there = np.unique(other.patches[(other.groups == b) & (other.names == name)])
-                for p, q in zip(here, there, strict=False):
-                    i, j = np.flatnonzero(self.patches == p), np.flatnonzero(other.patches == q)
+                patches_here = np.unique(self.patches[(self.groups == a) & (self.names == name)])
+                patches_there = np.unique(other.patches[(other.groups == b) & (other.names == name)])
+                for p, q in zip(patches_here, patches_there, strict=False):
+                    i = np.flatnonzero(self.patches == p)
+                    j = np.flatnonzero(other.patches == q)
                     n = min(i.size, j.size)
-                    left.append(rng.permutation(i)[:n])
+                    left_rows.append(rng.permutation(i)[:n])
                     right.append(rng.permutation(j)[:n])
                     groups += [a if a == b else f"{a} + {b}"] * n
                     patches += [p] * n
@@ -432,10 +448,11 @@ class Samples:
                 "no material was seen under both angles", "the materials' names differ", "train both angles",
                 code=ErrorCode.MISMATCH,
             )  # fmt: skip
-        i, j = np.concatenate(left), np.concatenate(right)
-        which = None if self.specimens is None else self.specimens[i]
+        i = np.concatenate(left_rows)
+        j = np.concatenate(right)
+        specimens = None if self.specimens is None else self.specimens[i]
         x = np.hstack([self.x[i], other.x[j]])
-        return Samples(x, self.names[i], np.array(groups), np.array(patches), which, angles)
+        return Samples(x, self.names[i], np.array(groups), np.array(patches), specimens, angles)
 
 
 @dataclass(frozen=True)
@@ -494,10 +511,11 @@ class Model(ABC):
 
 def majority(found: npt.NDArray, distance: Real, patches: npt.NDArray) -> NamedScan:
     """Name each patch as most of its pixels; confidence is their share, distance the median over all pixels."""
-    ids, rows = np.unique(patches), []
+    ids = np.unique(patches)
+    rows = []
     for i in ids:
-        at = patches == i
-        names, count = np.unique(found[at], return_counts=True)
-        rows.append((names[count.argmax()], count.max() / at.sum(), float(np.median(distance[at]))))
+        pixels = patches == i
+        names, count = np.unique(found[pixels], return_counts=True)
+        rows.append((names[count.argmax()], count.max() / pixels.sum(), float(np.median(distance[pixels]))))
     names, share, far = zip(*rows, strict=True)
     return NamedScan(found, distance, ids, np.array(names), np.array(share), np.array(far))

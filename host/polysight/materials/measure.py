@@ -66,7 +66,8 @@ FLAT_CONTRAST = 0.4
 """Largest standard deviation of |H| over its mean in a patch: noise or speckle has 0.52, plates less than 0.25."""
 LEAST_LEVEL = 2.0
 """Least |H| over the background's root mean square."""
-ODD_SHARE, ODD_RATIO = 0.15, 0.15
+ODD_SHARE = 0.15
+ODD_RATIO = 0.15
 """Share of pixels, and their distance from the median V / H, that indicate several materials in one patch."""
 RIPPLE = 0.5
 """Distance relative to that median which is no sign of it: real metal ripples by 25 % and 13 degrees, so that a tenth
@@ -74,7 +75,8 @@ of its pixels lie two standard deviations of 0.24 away."""
 HALVES_APART = 0.07
 """Difference of V / H between opposite halves of a dielectric (thrice for metal), above which two materials touch. A
 real plate of one material (acrylic, published rig) has 0.06 after the factor for its V / H."""
-_AROUND_PX = 6  # margin around patches that does not count as background
+# Margin around patches that does not count as background
+_AROUND_PX = 6
 
 AMPLIFIES = "it would amplify beyond its error bar"
 BELOW_AIR = "its permittivity would be below that of air"
@@ -85,10 +87,10 @@ NOT_PASSIVE = (AMPLIFIES, BELOW_AIR, POSSIBLE_LAYER)
 
 def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[float, float]:
     """Return the rms of |H| and |V| away from all patches (noise and sidelobes); NaN without such pixels."""
-    away = _away_from_patches(h, v, found, usable)
-    if not away.any():
+    background_mask = _away_from_patches(h, v, found, usable)
+    if not background_mask.any():
         return float("nan"), float("nan")
-    return _rms(h[away]), _rms(v[away])
+    return _rms(h[background_mask]), _rms(v[background_mask])
 
 
 def background_mean(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[float, float]:
@@ -98,24 +100,26 @@ def background_mean(h: Image, v: Image, found: Segmentation, usable: Mask) -> tu
     little over a plate, so that neither averaging nor the scatter of the plate's pixels tells of it: on the published
     picture the mean over a plate's size is only 6 dB below the background itself. 0 without such places.
     """
-    away = _away_from_patches(h, v, found, usable)
+    background_mask = _away_from_patches(h, v, found, usable)
     widths = [np.sqrt(patch.interior.sum()) for patch in found.patches if patch.interior.any()]
     if not widths:
         return 0.0, 0.0
     width_px = max(1, round(float(np.median(widths))))
-    whole = _windowed(away.astype(np.complex128), width_px).real > 1 - 1e-6
-    if not whole.any():
+    window_is_whole = _windowed(background_mask.astype(np.complex128), width_px).real > 1 - 1e-6
+    if not window_is_whole.any():
         return 0.0, 0.0
-    behind_h, behind_v = (_windowed(np.where(away, channel, 0), width_px)[whole] for channel in (h, v))
+    behind_h, behind_v = (
+        _windowed(np.where(background_mask, channel, 0), width_px)[window_is_whole] for channel in (h, v)
+    )
     return _rms(behind_h), _rms(behind_v)
 
 
 def _away_from_patches(h: Image, v: Image, found: Segmentation, usable: Mask) -> Mask:
     """Return the usable pixels with some distance to every patch."""
-    away = usable & np.isfinite(h) & np.isfinite(v)
+    background_mask = usable & np.isfinite(h) & np.isfinite(v)
     for patch in found.patches:
-        away &= ~np.asarray(scipy.ndimage.binary_dilation(patch.mask, iterations=_AROUND_PX), bool)
-    return away
+        background_mask &= ~np.asarray(scipy.ndimage.binary_dilation(patch.mask, iterations=_AROUND_PX), bool)
+    return background_mask
 
 
 def _windowed(values: Image, width_px: int) -> Image:
@@ -141,37 +145,41 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     uneven
         Difference between halves of the metal reference: the scan's own effect on a single material.
     """
-    at = patch.interior & np.isfinite(h) & np.isfinite(v)
+    pixels = patch.interior & np.isfinite(h) & np.isfinite(v)
     remedy = "check the image, the direct path and the range profile"
     if patch.cut:
         return Finding(
             "error", "cut by the border of the image", "the part outside of it is missing, and the rest is dimly lit",
             "move the plate towards the middle, or scan a larger grid",
         )  # fmt: skip
-    if int(at.sum()) < LEAST_PIXELS:
+    if int(pixels.sum()) < LEAST_PIXELS:
         return Finding(
-            "error", "too few pixels", f"{int(at.sum())} lie inside its edges", "scan a larger plate, or finer pixels"
+            "error",
+            "too few pixels",
+            f"{int(pixels.sum())} lie inside its edges",
+            "scan a larger plate, or finer pixels",
         )
-    level = np.abs(h[at]).astype(np.float64)
+    level = np.abs(h[pixels]).astype(np.float64)
     if not level.mean() > 0:
         return Finding("error", "no signal", "H is zero there", remedy)
     if float(level.std() / level.mean()) > FLAT_CONTRAST:
         return Finding("error", "noise or speckle, not a flat plate", "its brightness varies like noise", remedy)
     if np.isfinite(dark[0]) and float(np.median(level)) < LEAST_LEVEL * dark[0]:
         return Finding("error", "as dark as the background", "it does not stand out from noise and sidelobes", remedy)
-    cross = abs(np.vdot(h[at].astype(np.complex128), v[at]))
-    power_h, power_v = (float(np.sum(np.abs(c[at].astype(np.complex128)) ** 2)) for c in (h, v))
-    dim = float(np.median(np.abs(v[at]))) < 0.12 * float(np.median(level))
+    cross = abs(np.vdot(h[pixels].astype(np.complex128), v[pixels]))
+    power_h, power_v = (float(np.sum(np.abs(c[pixels].astype(np.complex128)) ** 2)) for c in (h, v))
+    dim = float(np.median(np.abs(v[pixels]))) < 0.12 * float(np.median(level))
     if not dim and cross < 0.7 * np.sqrt(power_h * power_v):
         return Finding(
             "error", "H and V do not agree", "their phase difference varies from pixel to pixel, like noise", remedy
         )
-    allowed = max(HALVES_APART, uneven) * (1 + 2 * float(np.median(np.abs(v[at])) / np.median(level)))
-    several, apart = "several kinds together", "move the plates apart, or draw boxes"
-    if halves_apart(h, v, at) > allowed:
+    allowed = max(HALVES_APART, uneven) * (1 + 2 * float(np.median(np.abs(v[pixels])) / np.median(level)))
+    several = "several kinds together"
+    apart = "move the plates apart, or draw boxes"
+    if halves_apart(h, v, pixels) > allowed:
         return Finding("error", several, "its halves have different ratios", apart)
-    middle = 1 / median_ratio(h[at], v[at])
-    odd = np.abs(v[at] / h[at] - middle) > max(ODD_RATIO, RIPPLE * abs(middle))
+    middle = 1 / median_ratio(h[pixels], v[pixels])
+    odd = np.abs(v[pixels] / h[pixels] - middle) > max(ODD_RATIO, RIPPLE * abs(middle))
     if float(odd.mean()) > ODD_SHARE:
         return Finding("error", several, f"{100 * odd.mean():.0f} % of its pixels have another ratio", apart)
     return None
@@ -180,11 +188,13 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
 def halves_apart(h: Image, v: Image, at: Mask) -> float:
     """Return the largest difference of the median V / H between opposite halves of a patch; 0 with too few pixels."""
     rows, columns = np.nonzero(at & np.isfinite(h) & np.isfinite(v) & (h != 0))
-    values, largest = v[rows, columns] / h[rows, columns], 0.0
+    values = v[rows, columns] / h[rows, columns]
+    largest = 0.0
     for place in (rows, columns):
         if place.size == 0:
             break
-        low, high = values[place < np.median(place)], values[place > np.median(place)]
+        low = values[place < np.median(place)]
+        high = values[place > np.median(place)]
         if min(low.size, high.size) >= LEAST_PIXELS // 2:
             real = float(np.median(low.real) - np.median(high.real))
             imag = float(np.median(low.imag) - np.median(high.imag))
@@ -221,29 +231,31 @@ class Scatter:
 
 def scatter_of(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Scatter | None:
     """Return how V / H scatters over the pixels of a mask; None with fewer than `LEAST_PIXELS` usable ones."""
-    at = mask & np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
-    rows, columns = np.nonzero(at)
+    pixels = mask & np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
+    rows, columns = np.nonzero(pixels)
     if rows.size < LEAST_PIXELS:
         return None
-    inverse = np.asarray(v[at].astype(np.complex128) / h[at], np.complex128)
+    inverse = np.asarray(v[pixels].astype(np.complex128) / h[pixels], np.complex128)
     middle = complex(np.median(inverse.real), np.median(inverse.imag))
     if middle == 0:
         return None
-    off = np.asarray(np.log(inverse / middle), np.complex128)
-    amplitude, phase = (1.4826 * float(np.median(np.abs(part - np.median(part)))) for part in (off.real, off.imag))
+    log_ratio = np.asarray(np.log(inverse / middle), np.complex128)
+    amplitude, phase = (
+        1.4826 * float(np.median(np.abs(part - np.median(part)))) for part in (log_ratio.real, log_ratio.imag)
+    )
     places = np.stack([x_m[columns], y_m[rows]], axis=1)
     centred = places - places.mean(axis=0)
     pixel_m2 = abs((x_m[1] - x_m[0]) * (y_m[1] - y_m[0]))
     blocks = max(1.0, rows.size * pixel_m2 / BLOCK_M**2)
     information = centred.T @ centred + 1e-12 * np.eye(2)
     # Robust against bright strips at edges: deviations beyond three standard deviations are cut.
-    cut = np.clip(off.real, -3 * amplitude, 3 * amplitude) + 1j * np.clip(off.imag, -3 * phase, 3 * phase)
+    cut = np.clip(log_ratio.real, -3 * amplitude, 3 * amplitude) + 1j * np.clip(log_ratio.imag, -3 * phase, 3 * phase)
     slope_of = np.linalg.solve(information, centred.T @ cut)
-    rest = np.asarray(off - centred @ slope_of, np.complex128)
+    rest = np.asarray(log_ratio - centred @ slope_of, np.complex128)
     about = complex(*(1.4826 * float(np.median(np.abs(part - np.median(part)))) for part in (rest.real, rest.imag)))
     unit = np.sqrt(np.diag(np.linalg.inv(information)) * rows.size / blocks)
     x, y = places.mean(axis=0).tolist()
-    return Scatter(amplitude, phase, blocks, slope_of, unit * about, (x, y), _relief(h[at], centred))
+    return Scatter(amplitude, phase, blocks, slope_of, unit * about, (x, y), _relief(h[pixels], centred))
 
 
 def _relief(h: Image, centred: Real) -> float:
@@ -315,13 +327,13 @@ def common_change(
         for k, (part, unit) in enumerate(((np.real, 1), (np.imag, 1j))):
             slopes = np.array([part(s.slope[axis]) for s in plates], np.float64)
             noise = np.maximum([part(s.slope_std[axis]) for s in plates], 1e-3) + BORDER_SLOPE_STD * border
-            left = slopes - np.median(slopes)
+            remaining_slopes = slopes - np.median(slopes)
             if axis == 1:
                 change, deviation, drift_slopes = _averaged_drift(y_m, origin_m[1], slopes, noise)
                 value += unit * change
                 std += unit * deviation
-                left = slopes - drift_slopes
-            ripple2[k] += _excess_scatter(left[~border], noise[~border]) / 2
+                remaining_slopes = slopes - drift_slopes
+            ripple2[k] += _excess_scatter(remaining_slopes[~border], noise[~border]) / 2
     return CommonChange(value, std, complex(*np.sqrt(ripple2)))
 
 
@@ -341,18 +353,21 @@ def _averaged_drift(y_m: Real, origin_m: float, slopes: Real, noise: Real) -> tu
 
     They are averaged over `DRIFTS`, `COMMON_SLOPES` and `OWN_SLOPES` with the evidence of each.
     """
-    apart = y_m[:, None] - y_m
-    near = np.exp(-0.5 * (apart / DRIFT_M) ** 2)
+    distance_m = y_m[:, None] - y_m
+    near = np.exp(-0.5 * (distance_m / DRIFT_M) ** 2)
     from_origin = y_m - origin_m
     near_origin = np.exp(-0.5 * (from_origin / DRIFT_M) ** 2)
     # Covariances of a drift of variance 1, relative to the origin: of its slopes, with its slopes, of itself.
-    of_slopes = near * (1 - (apart / DRIFT_M) ** 2) / DRIFT_M**2
-    with_slopes = (apart * near + (from_origin * near_origin)[None, :]) / DRIFT_M**2
+    of_slopes = near * (1 - (distance_m / DRIFT_M) ** 2) / DRIFT_M**2
+    with_slopes = (distance_m * near + (from_origin * near_origin)[None, :]) / DRIFT_M**2
     of_itself = 2 - 2 * near_origin
-    means, variances, fitted, evidences = [], [], [], []
-    for drift, common, own in itertools.product(DRIFTS, COMMON_SLOPES, OWN_SLOPES):
+    means = []
+    variances = []
+    fitted = []
+    evidences = []
+    for drift, common, own_slope in itertools.product(DRIFTS, COMMON_SLOPES, OWN_SLOPES):
         explained = drift**2 * of_slopes + common**2
-        total = explained + np.diag(noise**2 + own**2)
+        total = explained + np.diag(noise**2 + own_slope**2)
         inverse = np.linalg.inv(total)
         gain = drift**2 * with_slopes @ inverse
         means.append(gain @ slopes)
@@ -411,17 +426,18 @@ def measure_patch(
     rise
         Its rise along x and across the plane of incidence, radians.
     """
-    at = patch.interior
-    ratio = median_ratio(h[at], v[at])
+    pixels = patch.interior
+    ratio = median_ratio(h[pixels], v[pixels])
     inverse = 1 / ratio if ratio else complex(np.inf, 0.0)
-    level = np.abs(h[at])
+    level = np.abs(h[pixels])
     level = level[np.isfinite(level)]
-    std = float(np.hypot(LEAST_STD, TILT_STD * _phase_spread(h[at])))
+    std = float(np.hypot(LEAST_STD, TILT_STD * _phase_spread(h[pixels])))
     amplitude, phase = relative_errors(scatter, usual)
     if change is not None:
         common, (more_amplitude, more_phase) = change
         inverse *= complex(np.exp(-common))
-        amplitude, phase = float(np.hypot(amplitude, more_amplitude)), float(np.hypot(phase, more_phase))
+        amplitude = float(np.hypot(amplitude, more_amplitude))
+        phase = float(np.hypot(phase, more_phase))
     relative = float(np.hypot(amplitude, local_std)), float(np.hypot(phase, local_std))
     brightness = float(np.median(level)) if level.size else None
     return PatchMeasurement(inverse, std, theta_rad, brightness, relative, rise)
@@ -439,8 +455,8 @@ def check_patches(
 ) -> dict[int, Finding]:
     """Return patch number to reason for all patches that are no plates; `metal` is the metal reference's interior."""
     uneven = halves_apart(h, v, metal)
-    why = ((p.label, check_patch(p, h, v, dark, uneven)) for p in found.patches)
-    return {label: reason for label, reason in why if reason is not None}
+    reasons = ((p.label, check_patch(p, h, v, dark, uneven)) for p in found.patches)
+    return {label: reason for label, reason in reasons if reason is not None}
 
 
 def ratio_sigma(
@@ -511,7 +527,9 @@ class Permittivity:
     @property
     def dominated_by(self) -> str | None:
         """The source with the largest share of the error."""
-        return max(self.shares, key=lambda s: self.shares[s]) if self.shares else None
+        if self.shares:
+            return max(self.shares, key=lambda s: self.shares[s])
+        return None
 
     @property
     def metal_like(self) -> bool:
@@ -524,7 +542,8 @@ def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
 
     `digits` stand behind the point; `width` is the least width of the real part, for aligned columns.
     """
-    real, imag = (round(float(part), digits) + 0.0 for part in (value.real, value.imag))  # + 0.0: no -0.00
+    # + 0.0: no -0.00
+    real, imag = (round(float(part), digits) + 0.0 for part in (value.real, value.imag))
     return f"{real:{width}.{digits}f} {'+' if imag > 0 else '-'} j{abs(imag):.{digits}f}"
 
 
@@ -568,7 +587,8 @@ def estimate_permittivity(
     n = int(good.sum())
     inverse = 1 / ratio if ratio != 0 else complex(np.inf, 0.0)
     inverse_std = inverse_spread(h, v)
-    if not distance >= METAL_WITHOUT_PERMITTIVITY:  # also when it is not a number
+    # Also when it is not a number
+    if not distance >= METAL_WITHOUT_PERMITTIVITY:
         return Permittivity.not_estimated(ratio, inverse_std, float(distance), n)
     theta = np.broadcast_to(np.asarray(theta_rad, np.float64), h.shape)[good]
     value = complex(permittivity_from_ratio(ratio, float(theta.mean())))
@@ -607,7 +627,7 @@ def permittivity_of_patch(
         return Permittivity.not_estimated(alone.ratio, alone.inverse_std, alone.metal_distance, alone.pixels)
     ratio = 1 / estimate.inverse_ratio if estimate.inverse_ratio else complex(np.inf, 0.0)
     real_std, loss_std = (float(s) for s in np.sqrt(np.diag(estimate.covariance)))
-    own = estimate.inverse_ratio_covariance
+    covariance = estimate.inverse_ratio_covariance
     ranges = alone.real_range or (np.nan, np.nan), alone.imag_range or (np.nan, np.nan)
     return replace(
         alone,
@@ -617,7 +637,7 @@ def permittivity_of_patch(
         real_std=real_std,
         loss_std=loss_std,
         ratio=ratio,
-        inverse_std=float(np.sqrt(np.trace(own) / 2)),
+        inverse_std=float(np.sqrt(np.trace(covariance) / 2)),
         covariance=estimate.covariance,
         shares=estimate.shares,
     )

@@ -35,7 +35,8 @@ Real = npt.NDArray[np.float64]
 
 CHANNEL_RATIO_STD_DB = 2.5
 """Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
-DOUBTFUL_V_DB, WEAK_V_DB = -3.0, -7.0
+DOUBTFUL_V_DB = -3.0
+WEAK_V_DB = -7.0
 """V / H relative to the direct path below which a patch that nobody declared is no metal, and below which even a
 declared one is none: half spaces of eps' up to 10 have -8 dB or less, bare water -4 dB, metal 0 dB, but for the
 patterns of the antennas (-4 dB with those of an independent generator)."""
@@ -49,8 +50,10 @@ AROUND_MM = (4.0, 14.0)
 HALO_EXCESS = 1.6
 """Power of V beside the metal relative to H's, each relative to metal, above which it is a halo: 2 dB; undisturbed
 scenes of an independent generator have -7 to 0 dB, clipped ones 2 to 8 dB."""
-_CELLS, _EDGE = 128, 1.15
-_ODD_PATCH = 0.1  # share of other patches that are nothing known, and their density of t
+_CELLS = 128
+_EDGE = 1.15
+# Share of other patches that are nothing known, and their density of t
+_ODD_PATCH = 0.1
 _ODD_DENSITY = 0.5
 
 
@@ -81,7 +84,8 @@ class MetalEvidence:
         """Least score to count as metal, from random scenes (tests/materials/test_metal_evidence.py)."""
         if self.others == 0:
             return np.inf
-        if self.channel_ratio_db is None:  # the verdict is never good without a direct path
+        # The verdict is never good without a direct path
+        if self.channel_ratio_db is None:
             return 1.0 if self.others == 1 else 0.5
         return 0.4 if self.others == 1 else 0.75
 
@@ -110,14 +114,17 @@ def metal_evidence(
     `patches` are the other patches by their number, relative to the judged one; `channel_ratio` is V / H of the patch
     itself in images referenced to the direct path, None for others; `kinds` are the materials that patches may be.
     """
-    level = None if channel_ratio is None or not abs(channel_ratio) > 0 else 20 * float(np.log10(abs(channel_ratio)))
-    unlike = [label for label, seen in patches.items() if abs(seen.inverse_ratio - 1) > METAL_UNLIKE]
-    seen = [patches[label] for label in unlike]
+    if channel_ratio is None or not abs(channel_ratio) > 0:
+        level = None
+    else:
+        level = 20 * float(np.log10(abs(channel_ratio)))
+    unlike = [label for label, measurements in patches.items() if abs(measurements.inverse_ratio - 1) > METAL_UNLIKE]
+    measurements = [patches[label] for label in unlike]
     if not unlike:
         return MetalEvidence(0.0, 0, level)
-    q = np.array([s.inverse_ratio for s in seen], np.complex128)
-    own = np.median([np.trace(s.covariance) / 2 for s in seen])
-    blur = float(own + 2 * prior.leakage_std**2 + prior.reference_std**2 * np.median(np.abs(q)) ** 2)
+    q = np.array([s.inverse_ratio for s in measurements], np.complex128)
+    variance = np.median([np.trace(s.covariance) / 2 for s in measurements])
+    blur = float(variance + 2 * prior.leakage_std**2 + prior.reference_std**2 * np.median(np.abs(q)) ** 2)
     corner = complex(_EDGE, _EDGE)
     density = kinds.density_map(-corner, corner, blur * np.eye(2), _CELLS)
     axis = np.linspace(-_EDGE, _EDGE, _CELLS)
@@ -128,9 +135,9 @@ def metal_evidence(
         usual = np.exp(density.at(own_t[..., None] * q)[1]) * np.abs(own_t[..., None]) ** 2
         return np.log((1 - _ODD_PATCH) * usual + _ODD_PATCH * _ODD_DENSITY)
 
-    theta = np.array([s.theta_rad for s in seen])
+    theta = np.array([s.theta_rad for s in measurements])
     dull = float(np.hypot(BRIGHTNESS_RANGE[0], 1.5 * prior.leakage_std))
-    level_of = [s.brightness for s in seen]
+    level_of = [s.brightness for s in measurements]
     brightness = np.array([np.nan if value is None else value for value in level_of], np.float64)
     as_metal = other_patches(np.asarray(1.0 + 0j))
     dielectric = density.log_density[1] + other_patches(t0).sum(axis=-1) + _brightness(t0, q, brightness, theta, dull)
@@ -154,15 +161,15 @@ def _brightness(
 
     Their ln |H| scatters about Eq. 2's by an unknown amount, `least_std` or more; the judged patch has its own error.
     """
-    known = np.isfinite(level) & (level > 0)
+    positive = np.isfinite(level) & (level > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        expected = _log_r_s(own_t[..., None] * q[known], theta[known]) - _log_r_s(own_t, theta.mean())[..., None]
-        off = np.log(level[known]) - expected
-    off = np.clip(np.nan_to_num(off, nan=5.0, posinf=5.0, neginf=-5.0), -5, 5)
-    n = int(known.sum())
+        expected = _log_r_s(own_t[..., None] * q[positive], theta[positive]) - _log_r_s(own_t, theta.mean())[..., None]
+        difference = np.log(level[positive]) - expected
+    difference = np.clip(np.nan_to_num(difference, nan=5.0, posinf=5.0, neginf=-5.0), -5, 5)
+    n = int(positive.sum())
     size2 = np.geomspace(least_std, BRIGHTNESS_RANGE[1], 8) ** 2
-    total = (off.sum(axis=-1) ** 2)[..., None]
-    squares = (off**2).sum(axis=-1)[..., None]
+    total = (difference.sum(axis=-1) ** 2)[..., None]
+    squares = (difference**2).sum(axis=-1)[..., None]
     common2 = METAL_BRIGHTNESS_STD**2
     # Patches share the judged patch's own error: the covariance is size^2 I + common^2 1 1'.
     distance2 = (squares - common2 * total / (size2 + n * common2)) / size2
@@ -224,7 +231,8 @@ def metal_in_box(
     count, patch = max(overlaps, key=lambda o: o[0], default=(0, None))
     label = None
     if patch is not None and count >= 9:
-        mask, label = mask & patch.interior, patch.label
+        mask = mask & patch.interior
+        label = patch.label
     if not mask.any():
         raise DataError(
             f"the metal box {tuple(round(b, 1) for b in box_mm)} mm holds no valid pixel",
@@ -232,9 +240,9 @@ def metal_in_box(
             "give --metal x,y,w,h inside the image",
             code=ErrorCode.NO_DATA,
         )
-    where = "" if label is None else f", inside patch {label}"
+    place = "" if label is None else f", inside patch {label}"
     return MetalReference(
-        mask, label, f"given as a box around ({', '.join(f'{b:.0f}' for b in box_mm)}) mm{where}", given=True
+        mask, label, f"given as a box around ({', '.join(f'{b:.0f}' for b in box_mm)}) mm{place}", given=True
     )
 
 
@@ -276,9 +284,12 @@ def find_metal(h: Image, v: Image, segmentation: Segmentation) -> MetalReference
         return None
     best, patch = scores[0]
     margin = best / scores[1][0] if len(scores) > 1 and scores[1][0] > 0 else float("inf")
-    beside = "the only patch found" if len(scores) == 1 else f"|H||V| {margin:.1f} times the next"
-    how = f"chosen as the patch that is brightest in both channels ({beside})"
-    return MetalReference(patch.interior, patch.label, how)
+    if len(scores) == 1:
+        beside = "the only patch found"
+    else:
+        beside = f"|H||V| {margin:.1f} times the next"
+    description = f"chosen as the patch that is brightest in both channels ({beside})"
+    return MetalReference(patch.interior, patch.label, description)
 
 
 @dataclass(frozen=True)
@@ -307,13 +318,13 @@ def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
     if min(levels) <= 0:
         return Halo()
     relative = [np.abs(channel) / level for channel, level in zip((images.h, images.v), levels, strict=True)]
-    own = next((p.mask for p in patches if (p.mask & metal).any()), metal)
-    plates = np.logical_or.reduce([own, *(p.mask for p in patches)])
+    metal_mask = next((p.mask for p in patches if (p.mask & metal).any()), metal)
+    plates = np.logical_or.reduce([metal_mask, *(p.mask for p in patches)])
     free = images.usable & (_distance_mm(plates, pixel_mm) > AROUND_MM[0])
-    level = _excess(relative, free, own, HALO_MM, pixel_mm)
+    level = _excess(relative, free, metal_mask, HALO_MM, pixel_mm)
     if level == 0:
         return Halo()
-    from_metal_mm = _distance_mm(own, pixel_mm)
+    from_metal_mm = _distance_mm(metal_mask, pixel_mm)
     around = {}
     for patch in patches:
         around[patch.label] = _excess(relative, free, patch.mask, AROUND_MM, pixel_mm)

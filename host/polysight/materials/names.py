@@ -116,12 +116,12 @@ def name_of_literature(kinds: Kinds, odds: Odds) -> tuple[str, npt.NDArray[np.bo
         labels, member = np.unique(groups, return_inverse=True)
         share = np.bincount(member, foreign)
         order = np.argsort(-share, kind="stable")[:MOST_NAMES]
-        needed = 1 + int(np.searchsorted(np.cumsum(share[order]), MOST_OF_IT * foreign.sum()))
-        if needed > MOST_NAMES or not foreign.any():
+        material_count = 1 + int(np.searchsorted(np.cumsum(share[order]), MOST_OF_IT * foreign.sum()))
+        if material_count > MOST_NAMES or not foreign.any():
             continue
-        meant = np.isin(member, order[:needed]) & ~kinds.ours
+        meant = np.isin(member, order[:material_count]) & ~kinds.ours
         said = []
-        for group in order[:needed]:
+        for group in order[:material_count]:
             alone = np.where(member == group, foreign, 0.0)
             likeliest = int(alone.argmax())
             by_itself = alone[likeliest] >= MOST_OF_IT * share[group]
@@ -262,13 +262,13 @@ def _name_pixels(
     size = 2 * len(seen)
     values = pair(t[good]).reshape(-1, size)
     pixel = np.cov(values.T) if len(values) > 2 else np.zeros((size, size))
-    effects = np.concatenate([at.effects[named] for at in kinds], axis=1)
-    errors = scipy.linalg.block_diag(*(one.covariance for one in seen)) + pixel + 1e-10 * np.eye(size)
+    effects = np.concatenate([kind.effects[named] for kind in kinds], axis=1)
+    errors = scipy.linalg.block_diag(*(evidence.covariance for evidence in seen)) + pixel + 1e-10 * np.eye(size)
     inverse = np.linalg.inv(effects @ effects.mT + errors)
-    middles = np.stack([at.t[named] for at in kinds], axis=1)
+    middles = np.stack([kind.t[named] for kind in kinds], axis=1)
     usable: npt.NDArray[np.complex128] = np.where(good.reshape(-1, 1), t, 0)
-    off = pair(usable[:, None, :] - middles).reshape(t.shape[0], -1, size)
-    distance2 = np.einsum("nki,kij,nkj->nk", off, inverse, off)
+    difference = pair(usable[:, None, :] - middles).reshape(t.shape[0], -1, size)
+    distance2 = np.einsum("nki,kij,nkj->nk", difference, inverse, difference)
     ours = np.take(first.ours, np.flatnonzero(named))
     prior = (1 - INCLUSIONS) * of_patch[named] + INCLUSIONS * ours / max(ours.sum(), 1)
     likelihood = prior * np.sqrt(np.linalg.det(inverse)) * np.exp(-0.5 * np.minimum(distance2, 1400))
@@ -305,17 +305,20 @@ def add_explanation(
         nearest_text = _with_permittivity(nearest, known.get(nearest))
         near = f"; nearest: {nearest_text}"
     if name.name == UNKNOWN:
-        why = f"not in the library: {estimate}{near}" if estimate else f"not in the library{near}"
+        explanation = f"not in the library: {estimate}{near}" if estimate else f"not in the library{near}"
     elif name.name == LAYER:
-        why = f"{estimate} as a half space, but rather a thin plate{near}" if estimate else f"rather a thin plate{near}"
+        if estimate:
+            explanation = f"{estimate} as a half space, but rather a thin plate{near}"
+        else:
+            explanation = f"rather a thin plate{near}"
     elif name.from_literature:
         values = _values_of(name.literature)
-        why = f"{estimate} is like {values} of the literature; not measured by this library{near}"
+        explanation = f"{estimate} is like {values} of the literature; not measured by this library{near}"
     else:
-        why = f"{estimate} matches the library's {nearest_text}{_rivals(name)}"
+        explanation = f"{estimate} matches the library's {nearest_text}{_rivals(name)}"
         if not estimate:
-            why = f"it looks like the library's {nearest_text}{_rivals(name)}"
-    return replace(named, verdict=replace(name, why=why))
+            explanation = f"it looks like the library's {nearest_text}{_rivals(name)}"
+    return replace(named, verdict=replace(name, why=explanation))
 
 
 def _rivals(name: PatchName) -> str:
@@ -345,4 +348,6 @@ def _values_of(literature: Mapping[str, float]) -> str:
 
 
 def _with_permittivity(name: str, permittivity: complex | None) -> str:
-    return name if permittivity is None else f"{name} ({format_permittivity(permittivity)})"
+    if permittivity is None:
+        return name
+    return f"{name} ({format_permittivity(permittivity)})"

@@ -93,12 +93,16 @@ class PatchResult:
     @property
     def verdict(self) -> PatchName | None:
         """Name with confidence and votes; None if it was not named or is refused."""
-        return None if self.named is None or self.refused is not None else self.named.verdict
+        if self.named is None or self.refused is not None:
+            return None
+        return self.named.verdict
 
     @property
     def names(self) -> npt.NDArray[np.str_] | None:
         """Names of the interior's pixels, in image order; None as for `verdict`."""
-        return None if self.named is None or self.refused is not None else self.named.names
+        if self.named is None or self.refused is not None:
+            return None
+        return self.named.names
 
 
 @dataclass(frozen=True)
@@ -177,7 +181,9 @@ class MaterialsResult:
     def rows(self) -> list[PatchFigures]:
         """Return the figures of each patch, for materials.json."""
         figures = [self._figures(r) for r in self.patches]
-        return [patch.withheld() for patch in figures] if self.withheld else figures
+        if self.withheld:
+            return [patch.withheld() for patch in figures]
+        return figures
 
     def without_result(self) -> MaterialsResult:
         """Return the same patches without names, ratios, permittivities and metal reference."""
@@ -187,7 +193,8 @@ class MaterialsResult:
 
     def p_sigma(self, usable: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
         """Return the standard deviation of each pixel's P, [ny, nx]; NaN without a result or if not `usable`."""
-        h, v = self.calibrated.h, self.calibrated.v
+        h = self.calibrated.h
+        v = self.calibrated.v
         if self.withheld:
             return np.full(h.shape, np.nan, np.float32)
         dark = background(h, v, self.segmentation, usable)
@@ -197,7 +204,10 @@ class MaterialsResult:
 
     def incidence_deg(self, patch: Patch) -> float:
         """Return the mean incidence angle over a patch's interior, degrees."""
-        inside = self.theta_rad[patch.interior] if self.theta_rad.ndim and patch.interior.any() else self.theta_rad
+        if self.theta_rad.ndim and patch.interior.any():
+            inside = self.theta_rad[patch.interior]
+        else:
+            inside = self.theta_rad
         return float(np.degrees(np.mean(inside)))
 
     def _figures(self, r: PatchResult) -> PatchFigures:
@@ -355,13 +365,16 @@ def labels_of(found: MaterialsResult, description: str = "") -> Labels:
 
 def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike, simulated: bool) -> bytes:
     """Return the content of `patches.npz`."""
-    x, y = axis_mm(x_m), axis_mm(y_m)
-    rows, places, features = [], [np.zeros((0, 2))], [np.zeros((0, 4))]
+    x = axis_mm(x_m)
+    y = axis_mm(y_m)
+    rows = []
+    places = [np.zeros((0, 2))]
+    features = [np.zeros((0, 4))]
     for r in found.patches:
-        at = r.patch.interior
-        iy, ix = np.nonzero(at)
+        pixels = r.patch.interior
+        iy, ix = np.nonzero(pixels)
         places.append(np.stack([x[ix], y[iy]], axis=1))
-        features.append(features_of(found.h[at], found.v[at], found.p[at]))
+        features.append(features_of(found.h[pixels], found.v[pixels], found.p[pixels]))
         truth = r.truth.name if r.truth else None
         rows.append({"label": r.patch.label, "centre_mm": r.patch.centre_mm, "truth": truth, "pixels": int(ix.size)})
     angle = float(np.degrees(np.mean(found.theta_rad)))
@@ -387,7 +400,8 @@ def read_patches(path: Path) -> ScanPatches:
     try:
         with open_npz(path) as z:
             meta = json.loads(z["meta"].tobytes().decode("utf-8"))
-            places, features = z["places_mm"].astype(np.float64), z["features"].astype(np.float64)
+            places = z["places_mm"].astype(np.float64)
+            features = z["features"].astype(np.float64)
             evidence = _read_evidence(z, meta["judged"]) if "evidence_ratio" in z else {}
         if meta["format"] != PATCHES_FORMAT:
             raise ValueError(f"its format is {meta['format']!r}, this program reads {PATCHES_FORMAT!r}")
@@ -435,20 +449,24 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
     """
     out = []
     for patch in scans[0].patches:
-        partners = [p for other in scans[1:] if (p := _partner(patch, scans[0], other)) is not None]
+        partners = [p for other_scan in scans[1:] if (p := _partner(patch, scans[0], other_scan)) is not None]
         if len(partners) < len(scans) - 1:
             continue
         every = zip(scans, (patch, *partners), strict=True)
         evidence = tuple(scan.evidence[p.label] for scan, p in every if p.label in scan.evidence)
         places = patch.places_mm - patch.centre_mm
-        columns, kept = [patch.features], np.ones(len(places), bool)
+        columns = [patch.features]
+        near_enough = np.ones(len(places), bool)
         for partner in partners:
             theirs = partner.places_mm - partner.centre_mm
-            far, at = scipy.spatial.KDTree(theirs).query(places) if len(theirs) else (np.full(len(places), np.inf), 0)
-            kept &= far <= NEAR_MM
-            columns.append(partner.features[np.minimum(at, len(theirs) - 1)] if len(theirs) else columns[0])
+            if len(theirs):
+                far, nearest_index = scipy.spatial.KDTree(theirs).query(places)
+            else:
+                far, nearest_index = (np.full(len(places), np.inf), 0)
+            near_enough &= far <= NEAR_MM
+            columns.append(partner.features[np.minimum(nearest_index, len(theirs) - 1)] if len(theirs) else columns[0])
         complete = evidence if len(evidence) == len(scans) else None
-        out.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[kept], complete))
+        out.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[near_enough], complete))
     return out
 
 
@@ -460,5 +478,7 @@ def _partner(patch: ScanPatch, here: ScanPatches, there: ScanPatches) -> ScanPat
         best = min(among.patches, key=apart, default=None)
         return best if best is not None and apart(best) <= APART_MM else None
 
-    found = nearest(patch, there)
-    return found if found is not None and nearest(found, here) is patch else None
+    partner = nearest(patch, there)
+    if partner is not None and nearest(partner, here) is patch:
+        return partner
+    return None

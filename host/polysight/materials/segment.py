@@ -24,7 +24,8 @@ from polysight_shared.errors import DataError
 
 Real = npt.NDArray[np.float64]
 Box = tuple[float, float, float, float]
-_LEAST_WEIGHT = 0.1  # dB
+# DB
+_LEAST_WEIGHT = 0.1
 EDGE_DB = 6.0
 """A plate's edge is at half of its amplitude, the edge of a band-limited step."""
 OVERFLOW = 1.5
@@ -37,7 +38,8 @@ BODY = 0.65
 """Parts of a region narrower than this share of its width do not belong to it."""
 STEP_DB = 1.0
 """Step of the falling threshold."""
-LEAST_APART_MM, MOST_APART_MM = 0.4, 10.0
+LEAST_APART_MM = 0.4
+MOST_APART_MM = 10.0
 """Distances between the images of H and V that are corrected: smaller ones are below its error (0.2 mm), and larger
 ones have no such cause."""
 EDGE_FLOOR = 0.05
@@ -135,7 +137,8 @@ def axis_mm(axis_m: npt.ArrayLike) -> Real:
 
 def box_mask(box_mm: Box, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Mask:
     """Return the pixels whose centres lie in a box (x0, y0, x1, y1), mm from the image centre; bool [ny, nx]."""
-    x, y = axis_mm(x_m), axis_mm(y_m)
+    x = axis_mm(x_m)
+    y = axis_mm(y_m)
     x0, x1 = sorted((box_mm[0], box_mm[2]))
     y0, y1 = sorted((box_mm[1], box_mm[3]))
     return ((y >= y0) & (y <= y1))[:, None] & ((x >= x0) & (x <= x1))[None, :]
@@ -145,7 +148,8 @@ def make_patch(
     label: int, mask: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float, usable: Mask | None = None
 ) -> Patch:
     """Make a patch of a mask [ny, nx]; the margin shrinks if the patch is too small for it."""
-    x, y = axis_mm(x_m), axis_mm(y_m)
+    x = axis_mm(x_m)
+    y = axis_mm(y_m)
     pixel = abs(float(x[1] - x[0]))
     padded = np.pad(mask, 1)
     depth = np.asarray(scipy.ndimage.distance_transform_edt(padded))[1:-1, 1:-1] * pixel
@@ -402,13 +406,13 @@ def align(images: Images) -> tuple[Images, tuple[float, float]]:
         return images, (0.0, 0.0)
     # None is documented; the stub takes the default's type.
     options: dict[str, Any] = {"upsample_factor": 20, "normalization": None}
-    found = skimage.registration.phase_cross_correlation(edges_h, edges_v, **options)
-    back_px = np.asarray(found[0], np.float64)
+    registration = skimage.registration.phase_cross_correlation(edges_h, edges_v, **options)
+    back_px = np.asarray(registration[0], np.float64)
     pixel_mm = abs(float(images.x_m[1] - images.x_m[0])) * 1e3
     apart_mm = -back_px[::-1] * pixel_mm
     moved = np.asarray(scipy.ndimage.shift(edges_v, back_px, order=1))
-    alike = float(np.corrcoef(edges_h.ravel(), moved.ravel())[0, 1])
-    if not LEAST_APART_MM <= float(np.hypot(*apart_mm)) <= MOST_APART_MM or alike < ALIKE:
+    correlation = float(np.corrcoef(edges_h.ravel(), moved.ravel())[0, 1])
+    if not LEAST_APART_MM <= float(np.hypot(*apart_mm)) <= MOST_APART_MM or correlation < ALIKE:
         return images, (0.0, 0.0)
     usable_v = np.where(images.usable, images.v, 0).astype(np.complex128)
     v = np.asarray(scipy.ndimage.shift(usable_v, back_px, order=3, mode="nearest"))

@@ -53,9 +53,9 @@ def softened(t: npt.ArrayLike) -> Real:
 
 def features(permittivity: npt.ArrayLike, angles_rad: Sequence[float]) -> tuple[Real, Complex]:
     """Return ln|H| and V / H of half spaces relative to metal (Eq. 2), each [..., angles]."""
-    both = [fresnel(permittivity, angle) for angle in angles_rad]
-    log_h = np.stack([np.log(np.abs(s)) for s, _ in both], axis=-1)
-    return log_h, np.stack([p / s for s, p in both], axis=-1)
+    reflections = [fresnel(permittivity, angle) for angle in angles_rad]
+    log_h = np.stack([np.log(np.abs(s)) for s, _ in reflections], axis=-1)
+    return log_h, np.stack([p / s for s, p in reflections], axis=-1)
 
 
 def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
@@ -110,40 +110,43 @@ def fit_spread(
     [d, d]. The spread is that of all materials together, with the published spread as prior, corrected by each
     material's own. A material with a single specimen is ignored.
     """
-    one = np.array([np.unique(specimen[material == k]).size < 2 for k in range(len(effects))])
-    telling = ~one & (np.abs(effects).max(axis=(1, 2), initial=0) > 0)
+    is_single = np.array([np.unique(specimen[material == k]).size < 2 for k in range(len(effects))])
+    telling = ~is_single & (np.abs(effects).max(axis=(1, 2), initial=0) > 0)
     _, group = np.unique(specimen, return_inverse=True)
     count = np.bincount(group)
     kind = np.zeros(count.size, np.intp)
     kind[group] = material
     sums = np.stack([np.bincount(group, c) for c in residuals.T], axis=1)
-    used, f = telling[kind], effects[kind]
+    used = telling[kind]
+    f = effects[kind]
     prior = np.square(PUBLISHED_SPREAD)
-    pooled, placement, second = prior, noise, np.zeros((count.size, 2))
+    pooled = prior
+    placement = noise
+    second = np.zeros((count.size, 2))
     for _ in range(_ROUNDS):
         information = f.mT @ np.linalg.inv(placement + _floor(noise))
         spread = np.linalg.inv(np.diag(1 / pooled) + count[:, None, None] * (information @ f))
         spread[~used] = 0.0
         mean = np.einsum("gab,gbd,gd->ga", spread, information, sums)
         second = mean**2 + np.einsum("gaa->ga", spread)
-        before = pooled
+        pooled_before = pooled
         pooled = (PRIOR_FREEDOM * prior + second[used].sum(axis=0)) / (PRIOR_FREEDOM + used.sum())
-        left = residuals - np.einsum("gda,ga->gd", f, mean)[group]
+        residuals_left = residuals - np.einsum("gda,ga->gd", f, mean)[group]
         blur = np.einsum("g,gda,gab,geb->de", count.astype(float), f, spread, f)
-        placement = (left.T @ left + blur) / len(residuals)
+        placement = (residuals_left.T @ residuals_left + blur) / len(residuals)
         placement = alike(placement) if gains_alike else placement
-        if np.abs(pooled / before - 1).max() < _SETTLED:
+        if np.abs(pooled / pooled_before - 1).max() < _SETTLED:
             break
     return _each(pooled, second, kind, telling), placement
 
 
 def _each(pooled: Real, second: Real, kind: npt.NDArray[np.intp], telling: npt.NDArray[np.bool_]) -> Real:
     """Return the spread of each material: the pooled one, corrected by its own specimens' squares [specimen, 2]."""
-    own = np.tile(pooled, (telling.size, 1))
+    spreads = np.tile(pooled, (telling.size, 1))
     for k in np.flatnonzero(telling):
-        mine = second[kind == k]
-        own[k] = (OWN_FREEDOM * pooled + mine.sum(axis=0)) / (OWN_FREEDOM + len(mine))
-    return own
+        moments = second[kind == k]
+        spreads[k] = (OWN_FREEDOM * pooled + moments.sum(axis=0)) / (OWN_FREEDOM + len(moments))
+    return spreads
 
 
 def alike(covariance: Real) -> Real:

@@ -120,13 +120,13 @@ def band_rows(
             code=ErrorCode.MISMATCH,
         )
     parts: dict[int, list[BandFigures]] = {r.patch.label: [] for r in found.patches}
-    for k, (band, made) in enumerate(zip(bands, images, strict=True)):
+    for k, (band, band_images) in enumerate(zip(bands, images, strict=True)):
         reference = references[k] if references is not None else None
-        h, v, error = _relative_to_metal(found, made, leakage, smooth_px, reference)
+        h, v, error = _relative_to_metal(found, band_images, leakage, smooth_px, reference)
         for r in found.patches:
-            at = r.patch.interior & made.valid
-            whole = (found.h[at], found.v[at])
-            parts[r.patch.label].append(_measure_band(band, h[at], v[at], whole, error))
+            pixels = r.patch.interior & band_images.valid
+            full_band = (found.h[pixels], found.v[pixels])
+            parts[r.patch.label].append(_measure_band(band, h[pixels], v[pixels], full_band, error))
     own = {r.patch.label: _own_std(found, r.patch.interior) for r in found.patches}
     return {label: _with_covariance(rows, found, own[label]) for label, rows in parts.items()}
 
@@ -149,8 +149,8 @@ def _with_covariance(rows: list[BandFigures], found: MaterialsResult, common: fl
         return rows
     slopes = ratio_slopes(found.inversion, found.prior, 1 / np.array(ratios, np.complex128)).reshape(2 * len(rows), 6)
     place = common * np.tile(np.eye(2), (len(rows), 1))
-    own = np.repeat([(row.own_std or 0.0) ** 2 for row in rows], 2)
-    covariance = slopes @ slopes.T + place @ place.T + np.diag(own)
+    variances = np.repeat([(row.own_std or 0.0) ** 2 for row in rows], 2)
+    covariance = slopes @ slopes.T + place @ place.T + np.diag(variances)
     std = np.sqrt(np.diag(covariance).reshape(-1, 2).mean(axis=1))
     return [
         structs.replace(row, inverse_ratio_std=float(std[k]), covariance=covariance[2 * k : 2 * k + 2].tolist())
@@ -190,13 +190,13 @@ def _measure_band(band: SubBand, h: Image, v: Image, whole: tuple[Image, Image],
     if not (math.isfinite(abs(ratio)) and math.isfinite(std)):
         return BandFigures(first_hz=band.first_hz, last_hz=band.last_hz)
     with np.errstate(divide="ignore", invalid="ignore"):
-        apart = inverse_spread(np.ones_like(h), v / h - whole[1] / whole[0])
+        spread = inverse_spread(np.ones_like(h), v / h - whole[1] / whole[0])
     return BandFigures(
         first_hz=band.first_hz,
         last_hz=band.last_hz,
         ratio=ComplexNumber.of(ratio),
         inverse_ratio_std=std,
-        own_std=math.hypot(BAND_STD, BAND_SHARE * apart) if math.isfinite(apart) else std,
+        own_std=math.hypot(BAND_STD, BAND_SHARE * spread) if math.isfinite(spread) else std,
         amplitude_h=float(np.nanmedian(np.abs(h))),
     )
 
@@ -246,7 +246,8 @@ def bands_of_row(
         return None
     inverse = 1 / np.array(ratios, np.complex128)
     sigma = np.array(errors)
-    spectrum, level = Spectrum.of(chirp, count), [part.amplitude_h for part in parts]
+    spectrum = Spectrum.of(chirp, count)
+    level = [part.amplitude_h for part in parts]
     shared = [part.covariance for part in row.bands or () if part.covariance]
     covariance = None
     if count > 1 and len(shared) == count:
@@ -254,7 +255,10 @@ def bands_of_row(
     else:
         # Products of earlier releases have no covariance: K bands are then no better than one.
         sigma = np.sqrt(count) * sigma
-    turn = (float(np.hypot(theta_std_rad, LAYERED_STD_RAD)), PHASE_PER_ANGLE) if theta_std_rad else (0.0, 0.0)
+    if theta_std_rad:
+        turn = (float(np.hypot(theta_std_rad, LAYERED_STD_RAD)), PHASE_PER_ANGLE)
+    else:
+        turn = (0.0, 0.0)
     if not amplitude_error or any(a is None for a in level):
         return Bands(spectrum, inverse, sigma, None, None, covariance, 0.0, *turn)
     h = np.array(level, np.float64)
@@ -344,7 +348,9 @@ def fit_row(
         sized = any(layer.thickness_range_m for layer in stack)
         bands = max(1, len(row.bands or ())) if sized else 1
     data = bands_of_row(row, chirp, bands, amplitude_error, theta_std_rad)
-    return None if data is None else fit_layer(data, stack, float(np.radians(row.incidence_deg or np.nan)))
+    if data is None:
+        return None
+    return fit_layer(data, stack, float(np.radians(row.incidence_deg or np.nan)))
 
 
 def incidence_std_rad(materials: ScanMaterials | None) -> float:
@@ -358,7 +364,10 @@ def layer_content(fit: LayerFit) -> dict[str, Any]:
     """Return a fit as plain values for JSON; permittivities as [eps', eps''], lengths in millimetres."""
     sized = fit.std_thickness_m > 0
     units = np.array([1.0, 1.0, 1e3])[: 3 if sized else 2]
-    covariance = None if fit.covariance is None else (fit.covariance * np.outer(units, units)).tolist()
+    if fit.covariance is None:
+        covariance = None
+    else:
+        covariance = (fit.covariance * np.outer(units, units)).tolist()
     return {
         **_solution(fit),
         "std_real": fit.std_real,
@@ -412,7 +421,8 @@ class Line:
     @classmethod
     def through(cls, angle_rad: npt.ArrayLike, percent: npt.ArrayLike) -> Line:
         """Fit the line. Raises DataError with fewer than three patches or two concentrations."""
-        x, y = np.asarray(angle_rad, np.float64), np.asarray(percent, np.float64)
+        x = np.asarray(angle_rad, np.float64)
+        y = np.asarray(percent, np.float64)
         if x.size < 3 or np.unique(y).size < 2 or np.ptp(x) == 0:
             raise DataError(
                 f"{x.size} patches of {np.unique(y).size} concentrations",
@@ -479,11 +489,11 @@ def concentrations(names: Iterable[str], given: Mapping[str, float] | None = Non
     """
     out: dict[str, float] = {}
     for name in names:
-        found = _PERCENT.search(name)
+        percent = _PERCENT.search(name)
         if given and name in given:
             out[name] = given[name]
-        elif found:
-            out[name] = float(found[1])
+        elif percent:
+            out[name] = float(percent[1])
     return out
 
 
@@ -497,9 +507,9 @@ def fit_concentration(
 
     Raises DataError with fewer than three known concentrations, or patches of several incidence angles.
     """
-    known = concentrations(library.names, given)
-    entries = [e for e in library.entries if e.name in known]
-    values = {known[e.name] for e in entries}
+    percent_by_name = concentrations(library.names, given)
+    entries = [e for e in library.entries if e.name in percent_by_name]
+    values = {percent_by_name[e.name] for e in entries}
     if len(values) < 3:
         raise DataError(
             f"{len(values)} known concentrations in this library",
@@ -516,7 +526,7 @@ def fit_concentration(
             code=ErrorCode.MISMATCH,
         )
     x = np.array([float(np.median(polarisation_angle_rad(e.p))) for e in entries])
-    y = np.array([known[e.name] for e in entries])
+    y = np.array([percent_by_name[e.name] for e in entries])
     rows: list[LeftOut] = []
     for value in sorted(values):
         test = y == value

@@ -55,7 +55,8 @@ ORIENTATIONS = {
     "x and y swapped": lambda a: a.T,
     "x and y swapped, y from the last row": lambda a: a.T[::-1],
 }
-_CLEARLY = 0.05  # how much more of the variance another orientation must explain
+# How much more of the variance another orientation must explain
+_CLEARLY = 0.05
 _ALLOWED = {
     ("numpy", "ndarray"),
     ("numpy", "dtype"),
@@ -131,13 +132,13 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
     """
     file = folder / f"{folder.name}.json"
     if not file.exists():
-        others = sorted(folder.glob("*.json"))
-        if len(others) != 1:
+        json_files = sorted(folder.glob("*.json"))
+        if len(json_files) != 1:
             raise DataError(
                 f"{file}: no such label file", "the download is not complete", "fetch the scan again",
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
-        file = others[0]
+        file = json_files[0]
     boxes = dict(read_labels(file).boxes)
     description = str(read_json(file).get("description", ""))
     images = []
@@ -177,12 +178,14 @@ def explained_variance(scan: LabelledScan) -> float:
 def image_orientation(scans: Sequence[LabelledScan]) -> str:
     """Return the orientation of a data set's images: the first of `ORIENTATIONS`, unless another explains more."""
     shares = {}
-    for how in ORIENTATIONS:
+    for orientation in ORIENTATIONS:
         try:
-            shares[how] = float(np.mean([explained_variance(s.oriented(how)) for s in scans]))
-        except DataError:  # a box outside the image
-            shares[how] = -1.0
-    first, best = next(iter(ORIENTATIONS)), max(shares, key=lambda h: shares[h])
+            shares[orientation] = float(np.mean([explained_variance(s.oriented(orientation)) for s in scans]))
+        except DataError:
+            # A box outside the image
+            shares[orientation] = -1.0
+    first = next(iter(ORIENTATIONS))
+    best = max(shares, key=lambda h: shares[h])
     return best if shares[best] > shares[first] + _CLEARLY else first
 
 
@@ -205,18 +208,19 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
     v = scan.v / np.asarray(metal_v, scan.v.dtype)
     out = []
     for name in scan.boxes:
-        hs, vs = h[scan.mask(name)], v[scan.mask(name)]
+        hs = h[scan.mask(name)]
+        vs = v[scan.mask(name)]
         good = np.flatnonzero(np.isfinite(hs) & np.isfinite(vs) & (hs != 0) & (vs != 0))
         if good.size == 0:
             continue
-        at = good[np.unique(np.linspace(0, good.size - 1, min(PUBLISHED_PIXELS, good.size)).round().astype(int))]
+        picked = good[np.unique(np.linspace(0, good.size - 1, min(PUBLISHED_PIXELS, good.size)).round().astype(int))]
         out.append(
             Entry(
                 name=name,
                 scan=scan.scan,
-                h=np.abs(hs[at]).astype(np.float32),
-                v=np.abs(vs[at]).astype(np.float32),
-                p=(hs[at] / vs[at]).astype(np.complex64),
+                h=np.abs(hs[picked]).astype(np.float32),
+                v=np.abs(vs[picked]).astype(np.float32),
+                p=(hs[picked] / vs[picked]).astype(np.complex64),
                 incidence_deg=angle_deg,
                 simulated=scan.simulated,
                 reference=scan.metal,
@@ -227,15 +231,17 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
 
 def label_folders(folder: Path) -> list[Path]:
     """Return the folders of scans in a `labels/` folder."""
-    return sorted(p for p in folder.iterdir() if p.is_dir() and any(p.glob("*.json"))) if folder.is_dir() else []
+    if folder.is_dir():
+        return sorted(p for p in folder.iterdir() if p.is_dir() and any(p.glob("*.json")))
+    return []
 
 
 def angle_in_text(texts: Iterable[str]) -> float | None:
     """Return the incidence angle in texts such as "60 deg" or "scan_55degrees", degrees; None without one."""
     for text in texts:
-        found = re.search(r"(\d{2}(?:\.\d+)?)\s*(?:°|deg)", text.lower())
-        if found:
-            return float(found[1])
+        match = re.search(r"(\d{2}(?:\.\d+)?)\s*(?:°|deg)", text.lower())
+        if match:
+            return float(match[1])
     return None
 
 
@@ -288,12 +294,15 @@ def read_material(path: Path) -> Entry:
 
     Raises DataError as :func:`read_pickle`, or if keys are missing or arrays are invalid.
     """
-    raw, most = read_pickle(path), path.stat().st_size
+    raw = read_pickle(path)
+    most = path.stat().st_size
     try:
         p, h, v = (_pixels(x, most) for x in raw["values"])
         ref_p, ref_h, ref_v = (_pixels(x, most) for x in raw["ref_values"])
-        name, angle = str(raw["name"]), float(raw["incident_angle"])
-        scan, reference = str(raw["collection_name"]), str(raw["ref_name"])
+        name = str(raw["name"])
+        angle = float(raw["incident_angle"])
+        scan = str(raw["collection_name"])
+        reference = str(raw["ref_name"])
         thickness = _number(raw.get("thickness"))
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as e:
         raise DataError(
@@ -307,7 +316,9 @@ def read_material(path: Path) -> Entry:
             f"{path}: P, H and V have {p.size}, {h.size}, {v.size} pixels", "they belong to one box",
             "leave the file out", code=ErrorCode.MISMATCH,
         )  # fmt: skip
-    level_h, level_v, level_p = np.sqrt(np.mean(abs(ref_h) ** 2)), np.sqrt(np.mean(abs(ref_v) ** 2)), np.mean(ref_p)
+    level_h = np.sqrt(np.mean(abs(ref_h) ** 2))
+    level_v = np.sqrt(np.mean(abs(ref_v) ** 2))
+    level_p = np.mean(ref_p)
     if not (np.isfinite([level_h, level_v, abs(level_p)]).all() and min(level_h, level_v, abs(level_p)) > 0):
         raise DataError(
             f"{path}: the reference {reference} has no signal", "ref_values are zero or not finite",
@@ -340,14 +351,20 @@ def read_materials(folder: Path) -> Library:
 def _pixels(values: Any, most: int) -> npt.NDArray[np.complex128]:
     """Return the numbers of a file of `most` bytes. Raises ValueError: nested references can expand to any size."""
     plain = isinstance(values, list | tuple) and all(isinstance(v, int | float | complex) for v in values)
-    size = values.nbytes if isinstance(values, np.ndarray) else len(values) if plain else most + 1
+    if isinstance(values, np.ndarray):
+        size = values.nbytes
+    elif plain:
+        size = len(values)
+    else:
+        size = most + 1
     if size > most:
         raise ValueError("pixels are not an array or list of numbers, or of more numbers than the file has bytes")
     return np.asarray(values, np.complex128).ravel()
 
 
 def _number(value: Any) -> float | None:
-    if isinstance(value, str):  # "3 mm"
+    # "3 mm"
+    if isinstance(value, str):
         value = value.lower().removesuffix("mm").strip()
     return None if value is None or value == "" else float(value)
 
@@ -410,10 +427,10 @@ def calibration_error(confidence: npt.NDArray, right: npt.NDArray, bins: int = 1
     """
     if not len(confidence):
         return float("nan")
-    at = np.clip((np.asarray(confidence) * bins).astype(int), 0, bins - 1)
-    count = np.bincount(at, minlength=bins)
-    off = np.bincount(at, confidence, bins) - np.bincount(at, right, bins)
-    return float(np.abs(off).sum() / count.sum())
+    bin_index = np.clip((np.asarray(confidence) * bins).astype(int), 0, bins - 1)
+    count = np.bincount(bin_index, minlength=bins)
+    difference = np.bincount(bin_index, confidence, bins) - np.bincount(bin_index, right, bins)
+    return float(np.abs(difference).sum() / count.sum())
 
 
 def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iterator[tuple[npt.NDArray, npt.NDArray]]:
@@ -434,11 +451,11 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
                 "larger boxes, or more scans", code=ErrorCode.NOT_ENOUGH_DATA,
             )  # fmt: skip
         smallest = int(sizes.min())
-        kept = StratifiedKFold(max(2, min(folds, smallest)), shuffle=True, random_state=0)
+        folds_kept = StratifiedKFold(max(2, min(folds, smallest)), shuffle=True, random_state=0)
         with warnings.catch_warnings():
             # A material of one pixel is not judged.
             warnings.filterwarnings("ignore", "The least populated class")
-            pairs = list(kept.split(samples.x, samples.names))
+            pairs = list(folds_kept.split(samples.x, samples.names))
         yield from pairs
         return
     if groups.size < 2:
@@ -448,15 +465,15 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
             "process more scans",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
-    held = samples.groups_of_material[samples.shared]
-    if not held.size:
+    held_out = samples.groups_of_material[samples.shared]
+    if not held_out.size:
         raise DataError(
             f"no material is in two of the {groups.size} scans",
             "a scan left out has no material of the training scans",
             "process a second scan with the same materials",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
-    if held.min() <= -(-groups.size // folds):
+    if held_out.min() <= -(-groups.size // folds):
         folds = groups.size
     yield from GroupKFold(min(folds, groups.size)).split(samples.x, samples.names, samples.independent)
 
@@ -477,19 +494,21 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
         fitted = MODELS[model](channels)
         fitted.fit(samples.take(train))
         alone[test], far = fitted.by_pixel(samples.x[test])
-        whole = [test]
+        test_sets = [test]
         if fitted.knows_scans:
-            whole = [test[samples.groups[test] == group] for group in np.unique(samples.groups[test])]
-        for at in whole:
+            test_sets = [test[samples.groups[test] == group] for group in np.unique(samples.groups[test])]
+        for test_set in test_sets:
             if fitted.knows_scans:
-                found = fitted.by_scan(samples.x[at], samples.patches[at])
+                predicted = fitted.by_scan(samples.x[test_set], samples.patches[test_set])
             else:
-                found = majority(alone[at], far, samples.patches[at])
-            row = np.searchsorted(found.patches, samples.patches[at])
-            in_scan[at], of_patch[at], unknown[at] = found.pixel_names, found.names[row], (found.distance > 1)[row]
-            sure[at] = found.confidence[row]
+                predicted = majority(alone[test_set], far, samples.patches[test_set])
+            row = np.searchsorted(predicted.patches, samples.patches[test_set])
+            in_scan[test_set] = predicted.pixel_names
+            of_patch[test_set] = predicted.names[row]
+            unknown[test_set] = (predicted.distance > 1)[row]
+            sure[test_set] = predicted.confidence[row]
     names = np.unique(samples.names)
-    tables = [_confusion(samples.names[learnt], found[learnt], names) for found in (alone, in_scan, of_patch)]
+    tables = [_confusion(samples.names[learnt], predicted[learnt], names) for predicted in (alone, in_scan, of_patch)]
     judged = np.isin(names, samples.names[learnt])
     first = np.unique(samples.patches, return_index=True)[1]
     first = first[learnt[first]]
@@ -528,14 +547,14 @@ def score_unseen_materials(samples: Samples, model: str) -> dict[str, float]:
     for name in np.unique(samples.names):
         missed = []
         for train, test in splits(samples):
-            others = train[samples.names[train] != name]
+            other_samples = train[samples.names[train] != name]
             fitted = MODELS[model]("H+V+P")
-            fitted.fit(samples.take(others))
+            fitted.fit(samples.take(other_samples))
             for group in np.unique(samples.groups[test]):
-                at = test[samples.groups[test] == group]
-                found = fitted.by_scan(samples.x[at], samples.patches[at])
-                mine = np.unique(samples.patches[at][samples.names[at] == name])
-                missed += list(found.distance[np.searchsorted(found.patches, mine)] > 1)
+                test_set = test[samples.groups[test] == group]
+                naming = fitted.by_scan(samples.x[test_set], samples.patches[test_set])
+                own_patches = np.unique(samples.patches[test_set][samples.names[test_set] == name])
+                missed += list(naming.distance[np.searchsorted(naming.patches, own_patches)] > 1)
         out[str(name)] = float(np.mean(missed))
     return out
 
@@ -546,7 +565,7 @@ def fit_library(library: Library) -> Library:
     Raises DataError with fewer than two scans of an angle: a split by pixel would be too optimistic.
     """
     samples = {f"{angle:g}": Samples.of(library.at(angle), PIXELS) for angle in library.angles_deg}
-    fits = {angle: fit_samples(of) for angle, of in samples.items()}
+    fits = {angle: fit_samples(angle_samples) for angle, angle_samples in samples.items()}
     if len(samples) > 1:
         fits["+".join(samples)] = fit_samples(reduce(Samples.joined, samples.values()))
     return Library(library.entries, {"angles": fits}, library.note)
@@ -559,11 +578,12 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
     is empty, if no material but metal is in two scans.
     """
     scores = {model: score(samples, model) for model in MODELS}
-    weighted, own = fit_weights(samples), scores[DISCRIMINANT]
+    weighted = fit_weights(samples)
+    own_score = scores[DISCRIMINANT]
     judged = {s.model: {"pixels": s.pixels, "patches": s.patches} for s in scores.values()}
     for name in (DISCRIMINANT, PAPER):
         judged[name]["pixels_split_by_pixel"] = score(samples, name, by_pixel=True).pixels
-    if all(is_metal(name) for name in set(own.names) - set(own.not_judged)):
+    if all(is_metal(name) for name in set(own_score.names) - set(own_score.not_judged)):
         # All is relative to metal: that it is named right says nothing about names.
         judged = {}
     return {
@@ -571,21 +591,21 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
         "weights": weighted.weights.to_dict(),
         "thresholds": weighted.thresholds,
         "by_channel": weighted.by_channel,
-        "split": own.split,
-        "pixel_accuracy": own.pixels if judged else None,
-        "patch_accuracy": own.patches if judged else None,
-        "known_called_unknown": own.unknown,
-        "pixel_accuracy_in_scan": own.in_scan,
-        "calibration_error": own.calibration,
-        "named": own.named if judged else None,
-        "said": own.said,
-        "right": own.right,
+        "split": own_score.split,
+        "pixel_accuracy": own_score.pixels if judged else None,
+        "patch_accuracy": own_score.patches if judged else None,
+        "known_called_unknown": own_score.unknown,
+        "pixel_accuracy_in_scan": own_score.in_scan,
+        "calibration_error": own_score.calibration,
+        "named": own_score.named if judged else None,
+        "said": own_score.said,
+        "right": own_score.right,
         "scans": int(np.unique(samples.groups).size),
         "specimen_freedom": specimen_freedom(samples),
         "alike": alike_pairs(samples),
         "judged": judged,
-        "materials": len(own.names),
-        "not_judged": list(own.not_judged),
+        "materials": len(own_score.names),
+        "not_judged": list(own_score.not_judged),
     }
 
 
@@ -633,16 +653,16 @@ def entries_of(scan: TrainingScan) -> list[Entry]:
         if name is None or rows.size == 0:
             continue
         pick = np.unique(np.linspace(0, rows.size - 1, min(PIXELS, rows.size)).round().astype(int))
-        at = (rows[pick], cols[pick])
+        picked = (rows[pick], cols[pick])
         eps = patch.truth.permittivity if patch.truth else None
-        theta = r.theta_rad[at] if r.theta_rad.ndim else r.theta_rad
+        theta = r.theta_rad[picked] if r.theta_rad.ndim else r.theta_rad
         out.append(
             Entry(
                 name=name,
                 scan=scan.scan,
-                h=np.abs(r.h[at]).astype(np.float32),
-                v=np.abs(r.v[at]).astype(np.float32),
-                p=r.p[at].astype(np.complex64),
+                h=np.abs(r.h[picked]).astype(np.float32),
+                v=np.abs(r.v[picked]).astype(np.float32),
+                p=r.p[picked].astype(np.complex64),
                 incidence_deg=float(np.degrees(np.mean(theta))),
                 simulated=scan.simulated,
                 seed=scan.seed,

@@ -87,9 +87,11 @@ def metal_gains(h: Image, v: Image, metal_mask: Mask) -> tuple[complex, complex]
             f"metal region {metal_mask.shape} and images {h.shape}, {v.shape} differ in shape",
             "they are not of one scan", "give arrays of one scan", code=ErrorCode.MISMATCH,
         )  # fmt: skip
-    mh, mv = h[metal_mask].astype(np.complex128), v[metal_mask].astype(np.complex128)
+    mh = h[metal_mask].astype(np.complex128)
+    mv = v[metal_mask].astype(np.complex128)
     good = np.isfinite(mh) & np.isfinite(mv)
-    mh, mv = mh[good], mv[good]
+    mh = mh[good]
+    mv = mv[good]
     cross = complex(np.vdot(mv, mh)) if mh.size else 0j
     if mh.size == 0 or abs(cross) == 0:
         raise DataError(
@@ -140,7 +142,8 @@ def correct_leakage(h: Image, v: Image, leak_hv: complex, leak_vh: complex) -> t
 
     Raises PolysightError if |leakage| is not below 1.
     """
-    a, b = leak_hv, leak_vh
+    a = leak_hv
+    b = leak_vh
     if not (abs(a) < 1 and abs(b) < 1):
         raise PolysightError(
             f"leakage {a}, {b}: amplitudes must be below 1",
@@ -148,7 +151,8 @@ def correct_leakage(h: Image, v: Image, leak_hv: complex, leak_vh: complex) -> t
             code=ErrorCode.VALUE_INVALID,
         )
     kind = np.result_type(h, np.complex64)
-    s, p = h * kind.type(1 + a), v * kind.type(1 + b)
+    s = h * kind.type(1 + a)
+    p = v * kind.type(1 + b)
     scale = kind.type(1 / (1 - a * b))
     return (s - kind.type(a) * p) * scale, (p - kind.type(b) * s) * scale
 
@@ -215,8 +219,8 @@ class PlaneReference:
     def check_axes(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> None:
         """Raise DataError if a scan has other pixels."""
         same = all(
-            np.shape(own) == np.shape(other) and np.allclose(own, other, rtol=0, atol=1e-5)
-            for own, other in ((self.x_m, x_m), (self.y_m, y_m))
+            np.shape(own_axis) == np.shape(other_axis) and np.allclose(own_axis, other_axis, rtol=0, atol=1e-5)
+            for own_axis, other_axis in ((self.x_m, x_m), (self.y_m, y_m))
         )
         if not same:
             raise DataError(
@@ -241,9 +245,9 @@ class PlaneReference:
                 " --reference SCAN instead",
                 code=ErrorCode.KEY_MISSING,
             )
-        if found := self.made_with.differences(now):
+        if differences := self.made_with.differences(now):
             raise DataError(
-                f"{name} is of another rig: {'; '.join(found)}",
+                f"{name} is of another rig: {'; '.join(differences)}",
                 "the rig or its file was changed after the scan of the metal plate, which changes the gains",
                 "empty calibration.metal, scan the metal plate again with the present rig, and calibrate with it; or"
                 " restore the rig file",
@@ -253,10 +257,13 @@ class PlaneReference:
     def check_bands(self, count: int, name: str = "the metal reference") -> None:
         """Raise DataError if the reference does not have `count` sub-bands; one band is always there."""
         if count > 1 and len(self.bands) != count:
-            held = f"{len(self.bands)} sub-bands" if self.bands else "no sub-bands"
-            instead = f"--bands {len(self.bands)} uses those it has" if self.bands else "leave --bands out"
+            band_text = f"{len(self.bands)} sub-bands" if self.bands else "no sub-bands"
+            if self.bands:
+                instead = f"--bands {len(self.bands)} uses those it has"
+            else:
+                instead = "leave --bands out"
             raise DataError(
-                f"{name} holds {held}, not {count}",
+                f"{name} holds {band_text}, not {count}",
                 "each sub-band needs a metal reference in the same part of the sweep",
                 f"`polysight calibrate metal SCAN --bands {count}` adds them; or {instead}; or --reference SCAN",
                 code=ErrorCode.MISMATCH,
@@ -264,12 +271,13 @@ class PlaneReference:
 
     def facts(self) -> MetalPlate:
         """Return the variation of the gains over the plane, for quality.json."""
-        at = self.valid
-        h, v = self.h[at], self.v[at]
+        pixels = self.valid
+        h = self.h[pixels]
+        v = self.v[pixels]
         turned = np.angle(h / v * np.conj(np.mean(h / v)))
         return MetalPlate(
             how=self.how,
-            share_of_plane=round(float(at.mean()), 4),
+            share_of_plane=round(float(pixels.mean()), 4),
             h_variation_db=_variation_db(h),
             v_variation_db=_variation_db(v),
             ratio_variation_db=_variation_db(h / v),
@@ -297,7 +305,9 @@ def plane_reference(
 
     Raises DataError if the image shows no metal.
     """
-    h, v, usable = images.h, images.v, images.usable
+    h = images.h
+    v = images.v
+    usable = images.usable
     smooth_px = smooth_mm / 1e3 / abs(float(images.x_m[1] - images.x_m[0]))
     power_h, power_v = (smooth(np.where(usable, np.abs(z) ** 2, 0.0).astype(np.float64), smooth_px) for z in (h, v))
     strong = usable.copy()
@@ -320,8 +330,10 @@ def plane_reference(
     metal_v = np.where(inside, level_v, np.nan).astype(metal_h.dtype)
     spread = inverse_spread(h[inside] / metal_h[inside], v[inside] / metal_v[inside])
     share = 100 * float(inside.mean())
-    how = f"a metal plate scanned on its own{f' ({name})' if name else ''}, by position on {share:.0f} % of the image"
-    return PlaneReference(metal_h, metal_v, inside, images.x_m, images.y_m, spread, how)
+    description = (
+        f"a metal plate scanned on its own{f' ({name})' if name else ''}, by position on {share:.0f} % of the image"
+    )
+    return PlaneReference(metal_h, metal_v, inside, images.x_m, images.y_m, spread, description)
 
 
 def _disk(radius: int) -> npt.NDArray[np.bool_]:
@@ -405,8 +417,8 @@ def common_direction(h: Image, v: Image, mask: Mask | None = None) -> Wave:
 
     Raises DataError if there is no signal.
     """
-    at = np.isfinite(h) & np.isfinite(v) & (True if mask is None else mask)
-    m = np.stack([h[at], v[at]]).astype(np.complex128)
+    pixels = np.isfinite(h) & np.isfinite(v) & (True if mask is None else mask)
+    m = np.stack([h[pixels], v[pixels]]).astype(np.complex128)
     if m.size == 0 or not np.any(m):
         raise DataError(
             "a metal standard has no signal",
@@ -450,14 +462,17 @@ def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
     g_h, g_ha, g_vb, g_v = vh[3].conj() * np.array([scale[0], scale[0], scale[1], scale[1]])
     fitted = (np.array([[g_h, g_ha], [g_vb, g_v]]) / scale[:, None] @ e.T).T
     sine = np.abs(m[:, 1] * fitted[:, 0] - m[:, 0] * fitted[:, 1]) / np.linalg.norm(fitted, axis=1)
-    residual = float(np.sqrt(np.mean(np.minimum(sine, 1.0) ** 2))) if len(standards) > 3 else 0.0
+    if len(standards) > 3:
+        residual = float(np.sqrt(np.mean(np.minimum(sine, 1.0) ** 2)))
+    else:
+        residual = 0.0
     return Leakage(complex(g_ha / g_h), complex(g_vb / g_v), complex(g_h / g_v), residual)
 
 
 def estimate_axial_ratio(plate: Standard, strips: Standard) -> Leakage:
     """Estimate equal leakage of both boards (the authors' axial ratio) from the plate and strips in one orientation."""
     # Relative to the plate (H, V) ~ (s + a p, p + a s).
-    h, v = (m / whole for m, whole in zip(strips.measured, plate.measured, strict=True))
+    h, v = (m / plate_value for m, plate_value in zip(strips.measured, plate.measured, strict=True))
     s, p = strips.wave
     size = float(np.hypot(abs(s), abs(p)) * np.hypot(abs(h), abs(v)))
     if abs(s - p) * np.hypot(abs(h), abs(v)) < 0.1 * size or abs(v * p - h * s) < 1e-9 * size:
@@ -501,8 +516,11 @@ def leakage_from_images(
         Standard(common_direction(ratio(h, gain_h), ratio(v, gain_v), mask), strips_wave(psi, theta_rad))
         for psi, h, v in strips
     ]
-    whole = Standard(PLATE, PLATE)
-    found = estimate_axial_ratio(whole, relative[0]) if len(relative) == 1 else estimate_leakage([whole, *relative])
+    full_standard = Standard(PLATE, PLATE)
+    if len(relative) == 1:
+        estimate = estimate_axial_ratio(full_standard, relative[0])
+    else:
+        estimate = estimate_leakage([full_standard, *relative])
     mean = common_direction(gain_h, gain_v, mask)
     # Relative to the plate g is (1 + b) / (1 + a); the plate itself is g_h (1 + a) / (g_v (1 + b)).
-    return Leakage(found.h, found.v, found.imbalance * mean[0] / mean[1], found.residual)
+    return Leakage(estimate.h, estimate.v, estimate.imbalance * mean[0] / mean[1], estimate.residual)

@@ -36,7 +36,8 @@ Complex = npt.NDArray[np.complex128]
 Real = npt.NDArray[np.float64]
 _AIR = np.asarray(1.0 + 0j)
 _NAN = complex(np.nan, np.nan)
-_CONDUCTOR = 1 - 1e24j  # replaces infinite permittivity: reflects -1 within 1e-12
+# Replaces infinite permittivity: reflects -1 within 1e-12
+_CONDUCTOR = 1 - 1e24j
 
 Incidence = Literal["one", "pixel"]
 """One angle for the image (specular), or one per pixel (:func:`effective_incidence_map`)."""
@@ -75,7 +76,8 @@ def fresnel(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> tuple[Complex, Comp
         `eps` or the angle is NaN.
     """
     eps, theta, metal, unknown = _media(eps, theta_rad)
-    c, s = np.cos(theta), np.sin(theta)
+    c = np.cos(theta)
+    s = np.sin(theta)
     q = _normal_wavenumber(eps, s)
     r_s = np.where(metal, -1.0, (c - q) / (c + q))
     # cos(theta_t) = q / n, so n_i cos(theta_t) -+ n_t cos(theta_i) is (q -+ eps c) / n: no square root of eps needed.
@@ -232,7 +234,8 @@ def _half_bistatic(rig: Instrument, board_index: int, points_m: Real) -> tuple[R
     """Return half the angle TX-point-RX1 (radians) and the path TX-point-RX1 (metres) for points [..., 3]."""
     a = np.asarray(tx_position_m(rig)) - points_m
     b = np.asarray(rx_positions_m(rig, rig.receivers[board_index])[0]) - points_m
-    na, nb = np.linalg.norm(a, axis=-1), np.linalg.norm(b, axis=-1)
+    na = np.linalg.norm(a, axis=-1)
+    nb = np.linalg.norm(b, axis=-1)
     cosine = np.sum(a * b, axis=-1) / (na * nb)
     return np.arccos(np.clip(cosine, -1.0, 1.0)) / 2, na + nb
 
@@ -260,7 +263,8 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
     x_m, y_m
         Pixel centres, rig frame, metres; [nx] and [ny].
     """
-    x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
+    x = np.asarray(x_m, np.float64)
+    y = np.asarray(y_m, np.float64)
     step = np.array([rig.grid.step_x_mm, rig.grid.step_y_mm]) / 1e3
     count = np.array([rig.grid.columns, rig.grid.rows])
     wavelength = SPEED_OF_LIGHT_M_S / (rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2)
@@ -273,17 +277,19 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
     for i, board in enumerate(rig.receivers):
         middle = np.asarray(specular_midpoint_m(rig, board))
         points = np.empty((dy.size, dx.size, 3))
-        points[..., 0], points[..., 1], points[..., 2] = middle[0] + dx[None, :], middle[1] + dy[:, None], middle[2]
+        points[..., 0] = middle[0] + dx[None, :]
+        points[..., 1] = middle[1] + dy[:, None]
+        points[..., 2] = middle[2]
         angle, path = _half_bistatic(rig, i, points)
         specular, shortest = _half_bistatic(rig, i, middle)
         weight = np.exp(-((2 * np.pi / wavelength * (path - shortest)) ** 2) / 8)
-        deviation, mass = (_convolved(visited, one) for one in (weight * (angle - specular), weight))
+        deviation, mass = (_convolved(visited, map_part) for map_part in (weight * (angle - specular), weight))
         # Sample (row, column) of the full convolution is the pixel at offset + displacement from the midpoint.
         column = (x - middle[0]) / step[0] + (count[0] - 1) / 2 + reach[0]
         row = (y - middle[1]) / step[1] + (count[1] - 1) / 2 + reach[1]
-        where = np.meshgrid(row, column, indexing="ij")
-        num = scipy.ndimage.map_coordinates(deviation, where, order=1, mode="constant")
-        den = scipy.ndimage.map_coordinates(mass, where, order=1, mode="constant")
+        grid = np.meshgrid(row, column, indexing="ij")
+        num = scipy.ndimage.map_coordinates(deviation, grid, order=1, mode="constant")
+        den = scipy.ndimage.map_coordinates(mass, grid, order=1, mode="constant")
         lit = den > 1e-3 * float(weight.sum())
         total += float(specular) + np.where(lit, num / np.where(lit, den, 1.0), 0.0)
     return total / len(rig.receivers)
@@ -293,8 +299,8 @@ def _convolved(a: Real, b: Real) -> Real:
     """Return the full linear convolution of two images; scipy.signal would load scipy.stats, which takes a second."""
     shape = [m + n - 1 for m, n in zip(a.shape, b.shape, strict=True)]
     fast = [scipy.fft.next_fast_len(n, real=True) for n in shape]
-    both = scipy.fft.rfft2(a, fast) * scipy.fft.rfft2(b, fast)
-    return np.asarray(scipy.fft.irfft2(both, fast), np.float64)[: shape[0], : shape[1]]
+    product = scipy.fft.rfft2(a, fast) * scipy.fft.rfft2(b, fast)
+    return np.asarray(scipy.fft.irfft2(product, fast), np.float64)[: shape[0], : shape[1]]
 
 
 @dataclass(frozen=True)
@@ -317,13 +323,16 @@ class IncidenceChoice:
 
     def facts(self, valid: npt.NDArray[np.bool_]) -> IncidenceAngles:
         """Return both angles and their largest difference over valid pixels, for quality.json; degrees."""
-        pixel = np.degrees(self.pixel_rad[valid]) if valid.any() else np.degrees(self.pixel_rad).ravel()
-        one = float(np.degrees(self.one_rad.flat[0]))
+        if valid.any():
+            pixel = np.degrees(self.pixel_rad[valid])
+        else:
+            pixel = np.degrees(self.pixel_rad).ravel()
+        single_angle = float(np.degrees(self.one_rad.flat[0]))
         return IncidenceAngles(
             used="one number for the image" if self.choice == "one" else "by pixel",
-            one_deg=round(one, 4),
+            one_deg=round(single_angle, 4),
             pixel_deg=tuple(round(float(q), 4) for q in (pixel.min(), np.median(pixel), pixel.max())),
-            largest_difference_deg=round(float(np.abs(pixel - one).max()), 4),
+            largest_difference_deg=round(float(np.abs(pixel - single_angle).max()), 4),
         )
 
 

@@ -50,7 +50,8 @@ class Antenna:
 
     def turned(self, angle_rad: float) -> Antenna:
         """Return the antenna with its polarisation turned about the boresight."""
-        cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+        cos = np.cos(angle_rad)
+        sin = np.sin(angle_rad)
         turned = [cos * v + sin * np.cross(self.boresight, v) for v in (self.wanted, self.other)]
         return replace(self, wanted=turned[0], other=turned[1])
 
@@ -206,16 +207,18 @@ def reflect_curved(
     is_metal = bool(np.any(np.isinf(eps)))
     around = bends if is_metal else (0 * bend_inside, 0 * bend_across)
     flat = _reflect_local(eps, theta, around, wave_number)
-    after = _reflect_local(eps, theta + ANGLE_STEP, around, wave_number)
-    before = _reflect_local(eps, theta - ANGLE_STEP, around, wave_number)
+    reflection_above = _reflect_local(eps, theta + ANGLE_STEP, around, wave_number)
+    reflection_below = _reflect_local(eps, theta - ANGLE_STEP, around, wave_number)
     cos = np.cos(theta)
     sin = np.sin(theta)
     coefficients = []
-    for local, r, other, up, down in zip(middle, flat, flat[::-1], after, before, strict=True):
+    for local, r, other_flat, up, down in zip(
+        middle, flat, flat[::-1], reflection_above, reflection_below, strict=True
+    ):
         first = (up - down) / (2 * ANGLE_STEP)
         second = (up - 2 * r + down) / ANGLE_STEP**2
         inside = 1j * bend_inside / (4 * wave_number * cos) * second
-        beside = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other - r) / sin**2)
+        beside = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other_flat - r) / sin**2)
         coefficients.append(local + inside + beside)
     return coefficients[0], coefficients[1]
 

@@ -376,8 +376,8 @@ def _add_up(fit: _Fit, windows: _Windows, values: Array) -> NDArray:
 
 def _fit_one(fit: _Fit, windows: _Windows, values: Array) -> _Maximum:
     """Fit an echo; the RX are added up twice, first for the coarse path."""
-    found = _maximise(fit, _add_up(fit, windows, values), windows.valid, windows.offsets, values)
-    return _maximise(fit, _add_up(fit, windows, found.values), windows.valid, windows.offsets, found.values)
+    maximum = _maximise(fit, _add_up(fit, windows, values), windows.valid, windows.offsets, values)
+    return _maximise(fit, _add_up(fit, windows, maximum.values), windows.valid, windows.offsets, maximum.values)
 
 
 def _synthesise(fit: _Fit, windows: _Windows, found: _Maximum) -> NDArray[np.complex64]:
@@ -385,8 +385,8 @@ def _synthesise(fit: _Fit, windows: _Windows, found: _Maximum) -> NDArray[np.com
     path, slope, _ = _unpack(found.values)
     paths = np.einsum("wnp,wp->wn", _basis(windows.offsets), found.values)
     wave = np.exp(1j * fit.omega[:, None] * paths[:, None]) * (found.amplitude[:, None] * windows.valid)[:, None]
-    away = fit.steer(windows.at_m, path, slope).conj()
-    echo = away[..., None] * wave[:, None]
+    conjugate_steering = fit.steer(windows.at_m, path, slope).conj()
+    echo = conjugate_steering[..., None] * wave[:, None]
     if fit.board.model is not None:
         echo = np.einsum("fg,wrgn->wrfn", fit.model, echo)
     return echo.astype(np.complex64)
@@ -454,7 +454,7 @@ def _select(windows: _Windows, keep: NDArray) -> _Windows:
 
 def _separate(fit: _Fit, search: _Search, windows: _Windows) -> list[Echoes]:
     """Echoes of windows, one list entry per rank; the strongest are subtracted before the next are searched."""
-    found: list[tuple[NDArray, _Maximum, NDArray]] = []
+    echoes: list[tuple[NDArray, _Maximum, NDArray]] = []
     rest = windows.samples.copy()
     active = np.arange(len(windows.valid))
     energy = np.sum(np.abs(rest) ** 2, axis=(1, 2, 3))
@@ -469,18 +469,18 @@ def _separate(fit: _Fit, search: _Search, windows: _Windows) -> list[Echoes]:
         first = _kept(first, keep)
         echo = _synthesise(fit, _select(windows, active), first)
         rest[active] -= echo
-        found.append((active, first, echo))
-        left = np.sum(np.abs(rest[active]) ** 2, axis=(1, 2, 3)) / energy[active]
-        more = left > MIN_LEFT
-        if rank and more.any():
-            _refine(fit, windows, rest, found)
-        active = active[more]
+        echoes.append((active, first, echo))
+        energy_left = np.sum(np.abs(rest[active]) ** 2, axis=(1, 2, 3)) / energy[active]
+        has_more = energy_left > MIN_LEFT
+        if rank and has_more.any():
+            _refine(fit, windows, rest, echoes)
+        active = active[has_more]
         if not active.size:
             break
-    if len(found) > 1:
+    if len(echoes) > 1:
         for _ in range(2):
-            _refine(fit, windows, rest, found)
-    return [_echoes(fit, _select(windows, at), values) for at, values, _ in found]
+            _refine(fit, windows, rest, echoes)
+    return [_echoes(fit, _select(windows, members), values) for members, values, _ in echoes]
 
 
 def _refine(fit: _Fit, windows: _Windows, rest: NDArray, found: list) -> None:
@@ -488,14 +488,14 @@ def _refine(fit: _Fit, windows: _Windows, rest: NDArray, found: list) -> None:
     shared = found[1][0]
     for index, (active, values, echo) in enumerate(found):
         again = np.isin(active, shared)
-        at = active[again]
-        with_echo = rest[at] + echo[again]
-        part = _select(windows, at)
+        picked = active[again]
+        with_echo = rest[picked] + echo[again]
+        part = _select(windows, picked)
         part.samples = with_echo
         start = values.values[again]
         better = _maximise(fit, _add_up(fit, part, start), part.valid, part.offsets, start, iterations=4)
         new = _synthesise(fit, part, better)
-        rest[at] = with_echo - new
+        rest[picked] = with_echo - new
         echo[again] = new
         for field in fields(_Maximum):
             getattr(values, field.name)[again] = getattr(better, field.name)

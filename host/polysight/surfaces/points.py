@@ -41,10 +41,10 @@ def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -
     points = points + np.stack([np.zeros_like(path_m), np.zeros_like(path_m), np.full_like(path_m, 0.5)], axis=-1)
     for _ in range(NEWTON_STEPS):
         t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
-        both = t + r
-        miss = np.concatenate([(out_m + back_m - path_m)[:, None], both[:, :2] + slope], axis=1)
+        bisector = t + r
+        miss = np.concatenate([(out_m + back_m - path_m)[:, None], bisector[:, :2] + slope], axis=1)
         bend = bend_of_legs(t, r, out_m, back_m)
-        matrix = np.concatenate([both[:, None], bend[:, :2]], axis=1)
+        matrix = np.concatenate([bisector[:, None], bend[:, :2]], axis=1)
         step = np.linalg.solve(matrix + 1e-12 * np.eye(3), miss[..., None])[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         points = points - step * np.minimum(1, LONGEST_STEP_M / np.maximum(length, 1e-30))

@@ -319,7 +319,8 @@ def read_surface(path: Path) -> Surface:
         row["covariance"] = None if covariance is None else tuple(map(tuple, covariance))
         row["centre_m"], row["normal"] = tuple(row["centre_m"]), tuple(row["normal"])
         segments.append(Segment(**row))
-    scan_id, simulated = str(arrays.pop("scan_id")), bool(arrays.pop("simulated"))
+    scan_id = str(arrays.pop("scan_id"))
+    simulated = bool(arrays.pop("simulated"))
     return Surface(scan_id=scan_id, simulated=simulated, segments=tuple(segments), **arrays)
 
 

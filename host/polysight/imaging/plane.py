@@ -401,23 +401,24 @@ def _heights_by_phase(
     rate = float(np.median(rates))
     turn = 2 * np.pi / abs(rate)
     with_phase = np.flatnonzero(np.isfinite(phases))
-    best: tuple[float, NDArray[np.float64]] = (np.inf, np.full(len(masks), np.nan))
+    design = np.column_stack([np.ones(with_phase.size), places[with_phase]])
     # The range leaves an ambiguity of some turns, common to all plates except for the tilt: try several tilts.
-    for tilt_x in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
-        for tilt_y in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
-            guess = _height_at(plane + np.array([0.0, tilt_x, tilt_y]), places[with_phase])
-            heights = phases[with_phase] / rate
-            common = np.angle(np.mean(np.exp(2j * np.pi * (heights - guess) / turn))) / (2 * np.pi) * turn
-            heights = heights + turn * np.round((guess + common - heights) / turn)
-            shift = turn * np.round((np.median(guess) - np.median(heights)) / turn)
-            fitted, _ = _fit(places[with_phase], heights + shift, np.full(with_phase.size, _PHASE_STD_M))
-            miss = float(np.sum((heights + shift - _height_at(fitted, places[with_phase])) ** 2)) / _PHASE_STD_M**2
-            miss += float(np.sum((fitted[1:] / _TILT_PRIOR_RAD) ** 2))
-            if miss < best[0]:
-                out = np.full(len(masks), np.nan)
-                out[with_phase] = heights + shift
-                best = (miss, out)
-    return best[1], rate
+    tilts = np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD
+    tried = plane + np.array([(0.0, tilt_x, tilt_y) for tilt_x in tilts for tilt_y in tilts])
+    guesses = tried @ design.T
+    heights = phases[with_phase] / rate
+    common = np.angle(np.mean(np.exp(2j * np.pi * (heights - guesses) / turn), axis=1)) / (2 * np.pi) * turn
+    lifted = heights + turn * np.round((guesses + common[:, None] - heights) / turn)
+    lifted += turn * np.round((np.median(guesses, axis=1) - np.median(lifted, axis=1)) / turn)[:, None]
+    # All tilts have the same places, so one inverse fits them all.
+    prior = np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
+    weighted = design / _PHASE_STD_M**2
+    fitted = np.linalg.solve(design.T @ weighted + prior, (lifted @ weighted).T).T
+    misses = ((lifted - fitted @ design.T) ** 2).sum(axis=1) / _PHASE_STD_M**2
+    misses += ((fitted[:, 1:] / _TILT_PRIOR_RAD) ** 2).sum(axis=1)
+    best = np.full(len(masks), np.nan)
+    best[with_phase] = lifted[int(np.argmin(misses))]
+    return best, rate
 
 
 def _fit(

@@ -21,8 +21,8 @@ from polysight_shared.config import Instrument
 from polysight_shared.geometry import specular_midpoint_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Blocks of positions per axis: exact within 16 resolution cells to either side
-_BLOCKS = 32
+# Blocks of positions per axis: exact within 12 resolution cells to either side
+_BLOCKS = 24
 # Resolution cells evaluated to either side
 _CELLS = 6.0
 # Points per resolution cell
@@ -62,12 +62,12 @@ class PointResponse:
 def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointResponse:
     """Return the point response of an aperture with weights [row, column], 0 where a position is missing.
 
-    Positions are combined into at most 32 x 32 blocks at their mean positions, exact enough within the evaluated range.
+    Positions are combined into at most 24 x 24 blocks at their mean positions, exact enough within the evaluated range.
     """
     small, total = _blocks(aperture, weights)
     grid = aperture.grid
     point = np.array([grid.x_m.mean(), grid.y_m.mean(), float(np.mean(grid.z_m))])
-    limit = [limit_m(small, point, axis) for axis in (0, 1)]
+    limit = [limit_m(aperture, point, axis) for axis in (0, 1)]
     point_grid = ImageGrid(point[:1], point[1:2], float(point[2]), grid.pixel_m)
     answer = DirectImager(replace(small, grid=point_grid)).samples(np.ones((1, 1))) * total
     cuts = [_cut(small, answer, point, axis, limit[axis]) for axis in (0, 1)]

@@ -339,6 +339,8 @@ class BoardSamples:
         self._padded = np.zeros(0, np.complex64)
         # Rows whose spectra are out of date
         self._stale = set(range(shape[0]))
+        # Image of the rows so far, once it was formed
+        self._image: tuple[Image, Image, str | None] | None = None
         # Rows differ from the lattice of the live image
         self._moved = False
         self._live = None
@@ -427,6 +429,7 @@ class BoardSamples:
             if moved > SLACK_M or irregular(self.aperture) is not None:
                 self._live = None
         self._stale.add(index)
+        self._image = None
         self._show(index, 1)
 
     def _reduced(self, samples: NDArray[np.complex64], sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
@@ -498,6 +501,7 @@ class BoardSamples:
     def _invalidate(self) -> None:
         """Discard everything that was computed from the samples."""
         self._live = None
+        self._image = None
         self._stale = set(range(len(self.valid)))
 
     def _show(self, index: int, sign: int) -> None:
@@ -539,6 +543,13 @@ class BoardSamples:
         grid
             Other pixels than the rig file's, within the range gate.
         """
+        if grid is not None:
+            return self._form(grid)
+        if self._image is None:
+            self._image = self._form(None)
+        return self._image
+
+    def _form(self, grid: ImageGrid | None) -> tuple[Image, Image, str | None]:
         gains = (1 / self.rx_calibration()).astype(np.complex64)
         notice = None
         if grid is None:

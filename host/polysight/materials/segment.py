@@ -19,6 +19,7 @@ import scipy
 import skimage
 
 from polysight.imaging import Image, Images, Mask
+from polysight.materials.smoothing import drop_corners, reduce_variation
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -166,7 +167,7 @@ def make_patch(
     )
     contour = max(skimage.measure.find_contours(padded.astype(np.float64), 0.5), key=len) - 1
     outline = np.column_stack([np.interp(contour[:, 1], range(x.size), x), np.interp(contour[:, 0], range(y.size), y)])
-    return Patch(label, box, skimage.measure.approximate_polygon(outline, pixel / 2), int(mask.sum()), mask, interior)
+    return Patch(label, box, drop_corners(outline, pixel / 2), int(mask.sum()), mask, interior)
 
 
 def level_db(h: Image, v: Image, usable: Mask, smooth_px: float, plate_px: float) -> Real:
@@ -289,11 +290,7 @@ def whole_plane(usable: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm:
 
 def _without_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> Real:
     """Return the level after total variation, dB, with the weight for the speckle of the bright plates."""
-
-    def even(weight: float) -> Real:
-        return np.asarray(skimage.restoration.denoise_tv_chambolle(level, weight=weight, max_num_iter=100))
-
-    strongest = even(cfg.speckle_db)
+    strongest = reduce_variation(level, cfg.speckle_db)
     inside = strongest[usable]
     if np.ptp(inside) == 0:
         return strongest
@@ -303,7 +300,7 @@ def _without_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: 
         return strongest
     difference = (level - strongest)[middle]
     speckle = 1.4826 * float(np.median(np.abs(difference - np.median(difference))))
-    return even(min(cfg.speckle_db, max(speckle, _LEAST_WEIGHT)))
+    return reduce_variation(level, min(cfg.speckle_db, max(speckle, _LEAST_WEIGHT)))
 
 
 def _separate(level: Real, bright: Mask, least_contrast_db: float) -> bool:

@@ -18,6 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.patheffects import withStroke
@@ -27,11 +28,13 @@ from msgspec import UNSET
 from polysight.materials import Box, axis_mm
 from polysight.products import ProcessedScan
 from polysight.report.style import (
+    BAR_IN,
     HATCH,
     INK,
     METAL_COLOUR,
     MUTED,
     REFUSED_COLOUR,
+    RIGHT_IN,
     STAMP,
     UNKNOWN_COLOUR,
     MapLabel,
@@ -41,12 +44,13 @@ from polysight.report.style import (
     extent_mm,
     figure_label,
     fit_labels,
-    new_axes,
+    new_figure,
     outline_of,
     patch_colour,
     patch_label,
     plate_label,
     png,
+    set_margins,
     short_label,
     shorten_labels,
     style_legend,
@@ -82,6 +86,7 @@ _METAL, _OTHER = "#ff9e3d", "#ffffff"  # boxes drawn by hand
 _FOCUS_RANGE_DB = 30.0
 Limits = tuple[float, float]
 _ROOM = 0.05  # of a map's height, for a label
+_BETWEEN = 0.26  # of a map's width, between two maps for a colour bar's and an axis's numbers
 _POSITION_COLOURS = ("#dfe5ec", "#882255")  # with data light, masked dark: readable without colour
 
 
@@ -134,8 +139,7 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
         return None
     colours = colours_of(scan)
     size_in = (7.8, max(4.4, 1.5 + 0.19 * len(estimates)))
-    fig = Figure(figsize=size_in, dpi=160, layout="constrained", facecolor="white")
-    FigureCanvasAgg(fig)
+    fig = new_figure(*size_in, RIGHT_IN)
     ax = fig.add_subplot()
     truths = [t for patch, _ in estimates if (t := _truth(patch))]
     dress(ax, "Permittivity, estimate and truth" if truths else "Permittivity", scan.stamped)
@@ -154,8 +158,8 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
         "ε″ < 0: gain", (0, 0), xycoords="axes fraction", xytext=(4, 3), textcoords="offset points", fontsize=7,
         color=MUTED, zorder=1,
     )  # fmt: skip
-    _legend(fig, estimates, colours, bool(truths))
-    fig.draw_without_rendering()
+    legend = _legend(fig, estimates, colours, bool(truths))
+    set_margins(fig, legend.get_window_extent().width / fig.dpi + RIGHT_IN)
     _write_numbers(fig, ax, estimates, truths)
     return png(fig)
 
@@ -207,7 +211,7 @@ def _half_size(e: PermittivityFigures) -> Point:
     return real, max(abs(end - e.imag) for end in e.imag_p30_p70 or (e.imag,))
 
 
-def _legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str], with_truth: bool) -> None:
+def _legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str], with_truth: bool) -> Legend:
     dot: dict[str, Any] = {
         "marker": "o",
         "linestyle": "",
@@ -226,7 +230,9 @@ def _legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str],
         ]
     if with_truth:
         handles.append(Line2D([], [], color=INK, marker="x", linestyle="", markeredgewidth=1.5, label="truth"))
-    style_legend(fig.legend(handles=handles, loc="outside right upper", fontsize=7.5, frameon=False))
+    legend = fig.legend(handles=handles, loc="upper right", fontsize=7.5, frameon=False)
+    style_legend(legend)
+    return legend
 
 
 def _write_numbers(fig: Figure, ax: Axes, estimates: Sequence[Estimate], truths: Sequence[Point]) -> None:
@@ -347,7 +353,8 @@ def _strength_db(scan: ProcessedScan) -> npt.NDArray[np.float64]:
 
 def channel_figure(scan: ProcessedScan, key: str) -> bytes:
     """Return a PNG of one of FIGURES with a colour bar. The phase of P spans the range of the patches."""
-    fig, ax = new_axes()
+    fig = new_figure(5.0, 4.6, BAR_IN)
+    ax = fig.add_subplot()
     limits = phase_limits_deg(scan) if key == "phase_p" else None
     shown, unit = draw_channel(ax, scan, key, limits)
     dress(ax, FIGURES[key], scan.stamped)
@@ -453,11 +460,12 @@ def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[MapLabe
 
 def map_figure(scan: ProcessedScan, draw: Callable[[Axes, ProcessedScan], list[MapLabel]], title: str) -> bytes:
     """Return a PNG of a material map or of the truth. If names lack room all become numbers, with a legend below."""
-    fig, ax = new_axes(4.6, 4.6)
+    fig = new_figure(4.6, 4.6, RIGHT_IN)
+    ax = fig.add_subplot()
     labels = draw(ax, scan)
     dress(ax, title, scan.stamped)
     ax.set_facecolor("#f3f5f8")
-    fit_labels(fig, labels, 4.7)
+    fit_labels(fig, labels, RIGHT_IN)
     return png(fig)
 
 
@@ -475,12 +483,11 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
             middle[patch.label] = f"{e.real:.2f}\n± {e.spread.real_std:.2f}"
     if not real:
         return None
-    fig = Figure(figsize=(9.4, 4.6), dpi=160, layout="constrained", facecolor="white")
-    FigureCanvasAgg(fig)
+    fig = new_figure(9.4, 4.6, BAR_IN)
     percents = {label: f"{v:.0f} %" if v >= 10 else f"{v:.1f} %" for label, v in errors.items()}
     low, high = min(real.values()), max(real.values())
     margin = max(0.1 * (high - low), 0.25)
-    left, right = fig.subplots(1, 2)
+    left, right = fig.subplots(1, 2, gridspec_kw={"wspace": _BETWEEN})
     _fill_patches(fig, left, scan, real, middle, ("viridis", low - margin, high + margin, "real part ε′"))
     _fill_patches(fig, right, scan, errors, percents, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|"))
     dress(left, "Permittivity ε′ ± standard error", simulated=False)
@@ -611,7 +618,8 @@ def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | 
     metal
         Name of the metal reference; None without one.
     """
-    fig, ax = new_axes(5.4, 4.8)
+    fig = new_figure(5.4, 4.8, BAR_IN)
+    ax = fig.add_subplot()
     shown, unit = draw_channel(ax, scan, "amplitude_h")
     labels = []
     for number, (name, (x0, y0, x1, y1)) in enumerate(boxes_mm.items(), 1):
@@ -624,7 +632,7 @@ def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | 
         labels.append(MapLabel(middle, str(number), text, colour, below))
     dress(ax, "Amplitude H, and the boxes", scan.stamped)
     colour_bar(fig, ax, shown, unit)
-    fit_labels(fig, labels, 4.9)
+    fit_labels(fig, labels, BAR_IN)
     return png(fig)
 
 

@@ -43,6 +43,10 @@ UNKNOWN_COLOUR = "#BBBBBB"
 METAL_COLOUR, REFUSED_COLOUR = "#C9D3DE", "#8d949e"  # the metal reference; patches that were not judged
 HATCH = "////"
 _GAP_PT = 8.0  # between names side by side
+_LEFT_IN, _BOTTOM_IN, _TOP_IN = 0.66, 0.5, 0.28  # margins for a number of five characters, labels and a title
+RIGHT_IN, BAR_IN = 0.1, 0.62
+"""Margins on the right of an axes, and of a colour bar with its numbers and label."""
+_LEGEND_LINE_IN = 0.17
 _LONGEST = 26  # characters of a name in a legend
 
 
@@ -107,12 +111,26 @@ def extent_mm(scan: ProcessedScan) -> tuple[float, float, float, float]:
     return float(x[0] - hx), float(x[-1] + hx), float(y[0] - hy), float(y[-1] + hy)
 
 
-def new_axes(width: float = 5.0, height: float = 4.6) -> tuple[Figure, Axes]:
-    """Return a white figure of this size in inches, and its only axes."""
-    fig = Figure(figsize=(width, height), dpi=160, layout="constrained", facecolor="white")
+def new_figure(width: float, height: float, right_in: float) -> Figure:
+    """Return a white figure of this size in inches, with :func:`set_margins`."""
+    fig = Figure(figsize=(width, height), dpi=160, facecolor="white")
     FigureCanvasAgg(fig)
-    ax = fig.add_subplot()
-    return fig, ax
+    set_margins(fig, right_in)
+    return fig
+
+
+def set_margins(fig: Figure, right_in: float, below_in: float = 0.0) -> None:
+    """Leave room for titles, axis labels and tick labels, `right_in` on the right, and `below_in` for a legend.
+
+    Matplotlib's "constrained" layout measures all texts four times, and takes longer than the drawing.
+    """
+    width, height = fig.get_size_inches()
+    fig.subplots_adjust(
+        left=_LEFT_IN / width,
+        right=1 - right_in / width,
+        bottom=(_BOTTOM_IN + below_in) / height,
+        top=1 - _TOP_IN / height,
+    )
 
 
 def dress(ax: Axes, title: str, simulated: bool) -> None:
@@ -213,7 +231,11 @@ def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
     """Replace all labels by numbers if two touch or one leaves the frame; return the replaced labels."""
     if not labels:
         return []
-    fig.draw_without_rendering()
+    engine = fig.get_layout_engine()
+    if engine is not None:
+        engine.execute(fig)
+    for ax in fig.axes:
+        ax.apply_aspect()
     gap = _GAP_PT * fig.dpi / 72
     boxes = [one.text.get_window_extent() for one in labels]
     frames = [one.text.axes.bbox if one.text.axes else fig.bbox for one in labels]
@@ -229,17 +251,19 @@ def _widened(box: BboxBase, gap: float) -> Bbox:
     return Bbox.from_extents(box.x0 - gap / 2, box.y0, box.x1 + gap / 2, box.y1)
 
 
-def fit_labels(fig: Figure, labels: Sequence[MapLabel], height: float) -> None:
-    """Replace names by numbers if they lack room, with a legend below the axes; `height` of the figure then, inches."""
+def fit_labels(fig: Figure, labels: Sequence[MapLabel], right_in: float) -> None:
+    """Replace names by numbers if they lack room, with a legend below the axes; `right_in` as of `set_margins`."""
     replaced = shorten_labels(fig, labels)
     if not replaced:
         return
-    fig.set_figheight(height + 0.17 * ((len(replaced) + 1) // 2))
+    legend_in = 0.1 + _LEGEND_LINE_IN * ((len(replaced) + 1) // 2)
+    fig.set_figheight(fig.get_figheight() + legend_in)
+    set_margins(fig, right_in, legend_in)
     handles = [
         Patch(facecolor=one.colour, edgecolor=INK, linewidth=0.6, label=f"{one.number}  {short_label(one.name)}")
         for one in replaced
     ]
-    legend = fig.legend(handles=handles, loc="outside lower left", ncols=2, handlelength=1.1, frameon=False)
+    legend = fig.legend(handles=handles, loc="lower left", ncols=2, handlelength=1.1, frameon=False)
     style_legend(legend)
 
 
@@ -252,5 +276,6 @@ def style_legend(legend: Legend) -> None:
 def png(fig: Figure) -> bytes:
     """Return a figure as PNG bytes without a time stamp: the same data gives the same file."""
     buffer = io.BytesIO()
-    fig.savefig(buffer, format="png", metadata={"Software": None})
+    # `savefig` would draw everything twice, the first time only to place the axes; `draw` places them itself.
+    FigureCanvasAgg(fig).print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 4})
     return buffer.getvalue()

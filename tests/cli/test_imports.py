@@ -85,7 +85,15 @@ def test_a_plan_is_made_without_scipys_parts():
 
 def test_jobs_load_what_they_compute_with_when_they_compute():
     jobs = {f.stem for f in (RIG_FILE.parent / "host" / "polysight" / "jobs").glob("[a-z]*.py")}
-    modules = [*(f"jobs.{job}" for job in sorted(jobs)), "pipeline", "acquisition", "doctor", "api", "plan", "serve"]
+    modules = [
+        *(f"jobs.{job}" for job in sorted(jobs)),
+        "pipeline",
+        "acquisition",
+        "doctor",
+        "api",
+        "planning",
+        "serve",
+    ]
     code = "import sys\n" + "".join(f"import polysight.{m}\n" for m in modules) + "print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=RIG_FILE.parent)
     assert set(done.stdout.split()) & (HEAVY - {"zmq"}) == set()

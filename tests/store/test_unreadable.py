@@ -14,8 +14,7 @@ from tests.support.store.faulty_disk import GROWS, FaultyDisk
 from tests.support.store.plain_scan import errors
 from tests.support.store.small_scan import Samples, SmallScan
 
-from polysight.store import logs as appending
-from polysight.store import validation
+from polysight.store import manifest, validation
 from polysight.store.manifest import ManifestWriter
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
@@ -30,7 +29,7 @@ def test_a_disk_without_locks_is_not_a_scan_in_use(tmp_path, monkeypatch):
     def no_locks(*_: object) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr(appending.fcntl, "flock", no_locks)
+    monkeypatch.setattr(manifest.fcntl, "flock", no_locks)
     with refused(ErrorCode.FILE_UNWRITABLE, os.strerror(errno.ENOLCK)):
         ManifestWriter(path, create=False)
 

@@ -137,6 +137,8 @@ def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
         _check_dropped(pipeline, out)
         try:
             products = pipeline.finish(new, plates, progress)
+            if pipeline.quality.boards_masked:
+                raise _no_pixel_error(pipeline)
             if has_steep_patch(new):
                 progress("surfaces")
                 add_surfaces(pipeline, new)
@@ -144,20 +146,25 @@ def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
         except DataError as e:
             if not (new / IMAGE).exists():
                 raise
-            why = _why_no_pixel(pipeline) or e.why
             if (out / REPORT).exists():
                 where = f"{out} holds the earlier products; `polysight image` with another --out writes the images"
-                raise DataError(e.what, why, advice(e.remedy, where), code=e.code) from None
-            failed = DataError(e.what, why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
+                raise DataError(e.what, e.why, advice(e.remedy, where), code=e.code) from None
+            failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
     raise failed
 
 
-def _why_no_pixel(pipeline: Pipeline) -> str:
-    """Name the boards without any valid position, which leave no pixel valid; "" if there are none."""
+def _no_pixel_error(pipeline: Pipeline, data: Path | None = None) -> DataError:
+    """Return the error of images without a valid pixel. A board without any valid position is named: P needs both."""
+    why = "nothing was recorded, or all of it was masked"
     boards = " and ".join(pipeline.quality.boards_masked)
-    if not boards:
-        return ""
-    return f"no position of {boards} has a direct path: TX or RX is off, or its data are constant"
+    if boards:
+        why = f"no position of {boards} has a direct path: TX or RX is off, or its data are constant"
+    return DataError(
+        "the image has no valid pixel",
+        why,
+        f"`polysight sync-report {data or 'SCAN'} --out DIR` shows the direct path of each row",
+        code=ErrorCode.NO_DATA,
+    )
 
 
 def plane_of(pipeline: Pipeline, images: Images) -> PlaneReference:
@@ -333,12 +340,7 @@ def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
     pipeline.quality.note_imaging(pipeline.images, images)
     write_json(out / QUALITY, imaged_scan(out, source, pipeline.rig, images, pipeline.quality).quality)
     if not images.valid.any():
-        raise DataError(
-            "the image has no valid pixel",
-            _why_no_pixel(pipeline) or "nothing was recorded, or all of it was masked",
-            f"`polysight sync-report {data} --out DIR` shows the direct path of each row",
-            code=ErrorCode.NO_DATA,
-        )
+        raise _no_pixel_error(pipeline, data)
     return 0
 
 

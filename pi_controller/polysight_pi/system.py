@@ -108,7 +108,10 @@ class MemoryWatch(threading.Thread):
                 continue
             with suppress(OSError):  # no descriptor left: retried at the next check
                 cut = self._cut_connections()
-                self._ended.wait(SETTLE_S)
+                # A client that connects again and floods on would fill the memory before the next check.
+                for _ in range(round(SETTLE_S / LOOK_S)):
+                    self._ended.wait(LOOK_S)
+                    cut += self._cut_connections()
                 ctypes.CDLL(None).malloc_trim(0)
                 left_bytes = self.resident_bytes()
                 self._most_bytes = max(MAX_BYTES, left_bytes + SPARE_BYTES)

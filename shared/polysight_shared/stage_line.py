@@ -49,9 +49,9 @@ class Parameter(IntEnum):
 
     # Steps/s^2
     ACCEL = 0
-    # Ms of silence after which a moving stage stops
+    # Milliseconds of silence after which a moving stage stops
     HEARTBEAT = 1
-    # Us, width of the trigger pulse
+    # Microseconds, width of the trigger pulse
     TRIGGER = 2
     # Steps, soft limit 0..TRAVEL_X
     TRAVEL_X = 3

@@ -10,7 +10,7 @@ import pytest
 from skimage.measure import approximate_polygon, find_contours
 from skimage.restoration import denoise_tv_chambolle
 
-from polysight.materials.smoothing import drop_corners, reduce_variation
+from polysight.materials.segment import drop_corners, reduce_variation
 
 
 @pytest.mark.parametrize("weight", [0.1, 3.0, 12.0])

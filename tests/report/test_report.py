@@ -131,6 +131,7 @@ def page(scan, tmp_path_factory):
 def test_a_phone_shows_the_result_before_anything_is_opened(page, browser):
     """Two screens of verdict and picture, then the names: not the images, tables and settings."""
     browser.visit((page[0] / "report.html").as_uri(), PHONE)
+    browser.wait("document.readyState == 'complete'", "the report")
     assert browser.value("document.documentElement.scrollHeight") <= 4000
     assert browser.value("document.documentElement.scrollWidth") == PHONE[0]
     assert browser.value("document.querySelectorAll('details[open]').length") == 0

@@ -387,7 +387,7 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
     page.open("/scan?scan=one")
     page.browser.click("#process-open")
     page.browser.value("document.getElementById('library').value = 'mine'")
-    page.browser.click("#process button")
+    page.browser.click("#process button:not([type=button])")
     page.browser.wait("document.getElementById('rows').innerText.includes('my plastic')", "the new name")
     found = find_program(scans / "one", "process")
     assert found is not None

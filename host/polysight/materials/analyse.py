@@ -455,7 +455,7 @@ def name_permittivity(permittivity: complex, covariance: npt.NDArray[np.float64]
 
     The library and the literature share the expectation: nothing else of the scene says how common its materials are.
     """
-    kinds = Kinds(classifier.kinds, float(np.radians(classifier.angles_deg[0])))
+    kinds = classifier.kinds[0]
     inverse = complex(inverse_ratio(permittivity, kinds.theta_rad))
     step = 1e-4
     slope = (complex(inverse_ratio(permittivity + step, kinds.theta_rad)) - inverse) / step

@@ -37,10 +37,9 @@ def paper_distance(
     else:
         channels = channel_distances(ratio_columns(first), ratio_columns(second), measure if p else None)
         distance = h * channels[0] + v * channels[1] + p * channels[2]
-    # type: ignore[return-value]
     if np.ndim(a) > 1 or np.ndim(b) > 1:
         return distance
-    return float(distance[0, 0])
+    return distance[0, 0]
 
 
 class PaperKNeighborsClassifier(KNeighborsClassifier):

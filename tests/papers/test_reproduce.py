@@ -4,8 +4,8 @@ import csv
 import json
 import re
 
-import matplotlib.figure
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from polysight.cli.main import main
 from polysight_papers.sensys2026 import run as report
@@ -24,13 +24,13 @@ def item(key="fig3", value=1.0):
 
 def test_every_figure_is_stamped(monkeypatch, tmp_path):
     texts = []
-    save = matplotlib.figure.Figure.savefig
+    save = FigureCanvasAgg.print_png
 
-    def spy(figure, *args, **kwargs):
-        texts.append(figure.get_suptitle())
-        return save(figure, *args, **kwargs)
+    def spy(canvas, *args, **kwargs):
+        texts.append(canvas.figure.get_suptitle())
+        return save(canvas, *args, **kwargs)
 
-    monkeypatch.setattr(matplotlib.figure.Figure, "savefig", spy)
+    monkeypatch.setattr(FigureCanvasAgg, "print_png", spy)
     report.write_item(tmp_path, item())
     assert texts == ["SIMULATED"]
 

@@ -16,8 +16,8 @@ from polysight.materials import TruthPlate
 from polysight.process.quality import masked_runs
 from polysight.report import write_report
 from polysight.report.figures import coverage_figure, masked_positions
-from polysight.report.report import imaging_table, pretty, quality_tables, render, text
-from polysight.report.style import colours_of, png
+from polysight.report.report import format_heading, format_value, imaging_table, quality_tables, render
+from polysight.report.style import assign_colours, png
 from polysight.results import RxGain, ScanFacts, ScanMaterials, ScanQuality
 from polysight_shared.raster import RasterPlan
 
@@ -222,20 +222,20 @@ def test_dark_and_invalid_images_do_not_fail(scan, tmp_path):
 
 
 def test_one_material_has_one_colour(scan):
-    table = colours_of(scan)
+    table = assign_colours(scan)
     assert {"copper", "acrylic", "cork", "PET <b>", "unknown"} == set(table)
     assert len(set(table.values())) == len(table)
 
 
 def test_numbers_read_well():
-    assert text(268800) == "268\u202f800"
-    assert text(16) == "16"
-    assert text(0.00512) == "0.00512"
-    assert text(True) == "yes"
-    assert text([]) == "none"
-    assert text({"a": 1, "b": [2, 3]}) == "a: 1, b: 2, 3"
-    assert pretty("RH if_hz") == "RH IF (Hz)"
-    assert pretty("rows_retaken") == "rows retaken"
+    assert format_value(268800) == "268\u202f800"
+    assert format_value(16) == "16"
+    assert format_value(0.00512) == "0.00512"
+    assert format_value(True) == "yes"
+    assert format_value([]) == "none"
+    assert format_value({"a": 1, "b": [2, 3]}) == "a: 1, b: 2, 3"
+    assert format_heading("RH if_hz") == "RH IF (Hz)"
+    assert format_heading("rows_retaken") == "rows retaken"
 
 
 def scanned(scan, boards):
@@ -349,4 +349,4 @@ def test_numbers_that_are_none_are_shown_as_not_known(scan, value):
         html = render(strange, {})
     words = re.findall(r"[\w.]+", Page(html).words.lower())
     assert not {"nan", "inf", "infinity"} & set(words), [w for w in words if w in ("nan", "inf")]
-    assert text(value) == "–"
+    assert format_value(value) == "–"

@@ -34,7 +34,7 @@ from polysight.report.figures import (
     SHARES,
     channel_figure,
     draw_materials,
-    ellipse_of,
+    fit_ellipse,
     permittivity_map,
     phase_limits_deg,
     place_numbers,
@@ -135,7 +135,7 @@ def test_products_of_earlier_releases_have_no_verdict_and_no_budget(tmp_path):
 def test_an_ellipse_holds_its_share_of_draws(share, mixed):
     std = np.array([0.3, 0.05])
     matrix = np.outer(std, std) * np.array([[1, mixed], [mixed, 1]])
-    width, height, angle = ellipse_of(matrix, share)
+    width, height, angle = fit_ellipse(matrix, share)
     draws = np.random.default_rng(5).multivariate_normal([0, 0], matrix, 100_000)
     turn = np.radians(angle)
     along = draws @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -148,7 +148,7 @@ def test_an_ellipse_leans_as_real_part_and_loss_do():
         **PERMITTIVITY
     ).spread  # real and imag rise together: the loss falls as the real part rises
     assert spread is not None
-    width, height, angle = ellipse_of(spread.matrix, 0.68)
+    width, height, angle = fit_ellipse(spread.matrix, 0.68)
     assert np.tan(np.radians(angle if width > height else angle + 90)) < 0
 
 

@@ -38,14 +38,14 @@ from polysight.report.style import (
     STAMP,
     UNKNOWN_COLOUR,
     MapLabel,
+    assign_colours,
     colour_bar,
-    colours_of,
+    draw_outline,
     dress,
     extent_mm,
     figure_label,
     fit_labels,
     new_figure,
-    outline_of,
     patch_colour,
     patch_label,
     plate_label,
@@ -65,8 +65,12 @@ _STYLES: dict[float, dict[str, Any]] = {
     0.68: {"linestyle": "-", "linewidth": 1.2},
     0.95: {"linestyle": "--", "linewidth": 0.8},
 }
-_LABEL_PT, _NEAR_PT = (9.0, 9.0), 5.0  # sizes of a number and of a point
-_RADII_PT, _ANGLES = (11, 17, 25, 34, 45, 58), 16
+# Size of a patch's number and of its point in `permittivity_figure`, in points of 1/72 inch, measured on its PNG.
+_LABEL_PT = (9.0, 9.0)
+_POINT_PT = 5.0
+# Places that `place_numbers` tries: rings around the point, and directions on each.
+_RADII_PT = (11, 17, 25, 34, 45, 58)
+_ANGLES = 16
 Array = npt.NDArray[np.float64]
 Point = tuple[float, float]
 Estimate = tuple[PatchFigures, PermittivityFigures]
@@ -79,18 +83,26 @@ FIGURES: dict[str, str] = {
     "phase_v": "Phase V",
     "phase_p": "Phase of P = H / V",
 }
-_INSIDE = 0.6  # of a patch's box: what lies further out is its edge
+# Pixels further out than this share of a patch's box belong to its edge, where two materials mix.
+_INSIDE = 0.6
+# Range of the phase of P that the colours span: percentiles of the pixels, at least and at most this wide.
 _PERCENTILES = (5.0, 95.0)
-_LEAST_DEG, _MAX_DEG = 20.0, 300.0
-_METAL, _OTHER = "#ff9e3d", "#ffffff"  # boxes drawn by hand
+_LEAST_DEG = 20.0
+_MAX_DEG = 300.0
+# Outlines of boxes drawn by hand.
+_METAL_BOX = "#ff9e3d"
+_OTHER_BOX = "#ffffff"
 _FOCUS_RANGE_DB = 30.0
 Limits = tuple[float, float]
-_ROOM = 0.05  # of a map's height, for a label
-_BETWEEN = 0.26  # of a map's width, between two maps for a colour bar's and an axis's numbers
-_POSITION_COLOURS = ("#dfe5ec", "#882255")  # with data light, masked dark: readable without colour
+# Share of a map's height that a label needs.
+_LABEL_HEIGHT = 0.05
+# Share of a map's width between two maps: a colour bar's and an axis's numbers stand there.
+_BETWEEN = 0.26
+# Positions with data are light, masked ones dark, so that the map is readable without colour.
+_POSITION_COLOURS = ("#dfe5ec", "#882255")
 
 
-def ellipse_of(matrix: Array, share: float) -> tuple[float, float, float]:
+def fit_ellipse(matrix: Array, share: float) -> tuple[float, float, float]:
     """Return width, height and angle in degrees of the ellipse that holds a share of draws with a covariance [2, 2]."""
     values, vectors = np.linalg.eigh(matrix)
     width, height = 2 * np.sqrt(np.maximum(values, 0.0) * SHARES[share])
@@ -117,13 +129,16 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
     ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
     candidates = np.concatenate([radius * ring for radius in _RADII_PT])
     for point in points:
-        best, least = point + candidates[0], math.inf
+        best = point + candidates[0]
+        least_cost = math.inf
         for place in point + candidates:
             labels = sum(bool((np.abs(place - other) < _LABEL_PT).all()) for other in taken)
-            covered = (np.abs(solid - place) < np.array(_LABEL_PT) / 2 + _NEAR_PT / 2).all(axis=1).sum()
-            if (cost := 2.0 * labels + covered) < least:
-                best, least = place, cost
-            if least == 0:
+            covered = (np.abs(solid - place) < np.array(_LABEL_PT) / 2 + _POINT_PT / 2).all(axis=1).sum()
+            cost = 2.0 * labels + covered
+            if cost < least_cost:
+                best = place
+                least_cost = cost
+            if least_cost == 0:
                 break
         taken.append(best)
     return np.array(taken).reshape(-1, 2)
@@ -137,12 +152,15 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
     estimates = [(patch, patch.permittivity) for patch in scan.segments if patch.permittivity is not None]
     if not estimates:
         return None
-    colours = colours_of(scan)
+    colours = assign_colours(scan)
     size_in = (7.8, max(4.4, 1.5 + 0.19 * len(estimates)))
     fig = new_figure(*size_in, RIGHT_IN)
     ax = fig.add_subplot()
     truths = [t for patch, _ in estimates if (t := _truth(patch))]
-    dress(ax, "Permittivity, estimate and truth" if truths else "Permittivity", scan.stamped)
+    title = "Permittivity"
+    if truths:
+        title += ", estimate and truth"
+    dress(ax, title, scan.stamped)
     ax.set_aspect("auto")
     ax.set_facecolor("white")
     ax.grid(color="#e6e9ee", linewidth=0.8)
@@ -166,26 +184,30 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
 
 def _truth(patch: PatchFigures) -> Point | None:
     truth = patch.true_permittivity
-    return None if truth is None else (truth.real, -truth.imag)
+    if truth is None:
+        return None
+    return truth.real, -truth.imag
 
 
 def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour: str) -> None:
-    at = (e.real, e.loss)
+    centre = (e.real, e.loss)
     if e.spread is not None:
         for share, style in _STYLES.items():
-            w, h, angle = ellipse_of(e.spread.matrix, share)
-            ax.add_patch(Ellipse(at, w, h, angle=angle, facecolor="none", edgecolor=colour, zorder=2.5, **style))
+            w, h, angle = fit_ellipse(e.spread.matrix, share)
+            ax.add_patch(Ellipse(centre, w, h, angle=angle, facecolor="none", edgecolor=colour, zorder=2.5, **style))
             if share == min(_STYLES):
-                ax.add_patch(Ellipse(at, w, h, angle=angle, facecolor=colour, alpha=0.18, linewidth=0, zorder=2))
+                ax.add_patch(Ellipse(centre, w, h, angle=angle, facecolor=colour, alpha=0.18, linewidth=0, zorder=2))
     elif e.real_p30_p70 and e.imag_p30_p70:
-        (r0, r1), (i0, i1) = e.real_p30_p70, e.imag_p30_p70
+        r0, r1 = e.real_p30_p70
+        i0, i1 = e.imag_p30_p70
         ax.errorbar(
-            *at, xerr=[[max(at[0] - r0, 0)], [max(r1 - at[0], 0)]], yerr=[[max(at[1] + i1, 0)], [max(-i0 - at[1], 0)]],
-            color=colour, linewidth=1.2, zorder=3,
+            *centre, color=colour, linewidth=1.2, zorder=3,
+            xerr=[[max(e.real - r0, 0)], [max(r1 - e.real, 0)]],
+            yerr=[[max(e.loss + i1, 0)], [max(-i0 - e.loss, 0)]],
         )  # fmt: skip
-    ax.plot(*at, "o", color=colour, markersize=6, markeredgecolor=INK, markeredgewidth=0.6, zorder=3)
+    ax.plot(*centre, "o", color=colour, markersize=6, markeredgecolor=INK, markeredgewidth=0.6, zorder=3)
     if truth:
-        ax.plot([at[0], truth[0]], [at[1], truth[1]], color=MUTED, linewidth=0.8, zorder=2)
+        ax.plot([centre[0], truth[0]], [centre[1], truth[1]], color=MUTED, linewidth=0.8, zorder=2)
         ax.plot(*truth, "x", color=INK, markersize=6, markeredgewidth=1.5, zorder=4)
 
 
@@ -194,7 +216,8 @@ def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequ
     centres = np.array([(e.real, e.loss) for e in estimates])
     certain = np.concatenate([centres, np.array(truths, float).reshape(-1, 2)])
     half = np.array([_half_size(e) for e in estimates])
-    low, high = certain.min(axis=0), certain.max(axis=0)
+    low = certain.min(axis=0)
+    high = certain.max(axis=0)
     span = np.maximum(high - low, (0.5, 0.3))
     low = np.minimum(low, np.maximum((centres - half).min(axis=0), low - 0.75 * span)) - 0.08 * span
     high = np.maximum(high, np.minimum((centres + half).max(axis=0), high + 0.75 * span)) + 0.08 * span
@@ -245,16 +268,18 @@ def _write_numbers(fig: Figure, ax: Axes, estimates: Sequence[Estimate], truths:
     line = {"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkA": 3, "shrinkB": 3}
     for (patch, e), place, point in zip(estimates, places, points, strict=True):
         offset = place - point
-        far = float(np.hypot(*offset)) > _RADII_PT[0] + 1
+        arrow = None
+        if np.hypot(*offset) > _RADII_PT[0] + 1:
+            arrow = line
         ax.annotate(
             str(patch.label), (e.real, e.loss), textcoords="offset points",
             xytext=(float(offset[0]), float(offset[1])), ha="center", va="center", fontsize=8, color=INK, zorder=5,
             fontweight="bold", path_effects=[withStroke(linewidth=2, foreground="white")],
-            arrowprops=line if far else None,
+            arrowprops=arrow,
         )  # fmt: skip
 
 
-def _shown(scan: ProcessedScan, values: npt.NDArray) -> npt.NDArray:
+def _mask_invalid(scan: ProcessedScan, values: npt.NDArray) -> npt.NDArray:
     bad = ~np.isfinite(values)
     return np.ma.masked_array(values, bad | ~scan.valid)
 
@@ -269,10 +294,11 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     The metal reference, 0 degrees by definition, counts only if there is no other patch. The range is taken around the
     circular mean, so that values on both sides of 180 degrees lie side by side: limits may pass 180.
     """
-    x, y = axis_mm(scan.x_m), axis_mm(scan.y_m)
+    x = axis_mm(scan.x_m)
+    y = axis_mm(scan.y_m)
     inside: list[npt.NDArray] = []
-    others = [patch for patch in scan.segments if patch.refused is None and not patch.metal_reference]
-    for patch in others or scan.segments:
+    judged_patches = [patch for patch in scan.segments if patch.refused is None and not patch.metal_reference]
+    for patch in judged_patches or scan.segments:
         near_x = np.abs(x - patch.centre_x_mm) <= _INSIDE * patch.width_mm / 2
         near_y = np.abs(y - patch.centre_y_mm) <= _INSIDE * patch.height_mm / 2
         part = scan.p[np.ix_(near_y, near_x)]
@@ -285,8 +311,11 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     turned = np.degrees(np.angle(np.concatenate(inside) * np.exp(-1j * middle)))
     low, high = np.percentile(turned, _PERCENTILES) + np.degrees(middle)
     margin = max(0.15 * (high - low), (_LEAST_DEG - (high - low)) / 2)
-    low, high = float(np.floor((low - margin) / 5) * 5), float(np.ceil((high + margin) / 5) * 5)
-    return (low, high) if high - low < _MAX_DEG else None
+    low = float(np.floor((low - margin) / 5) * 5)
+    high = float(np.ceil((high + margin) / 5) * 5)
+    if high - low < _MAX_DEG:
+        return low, high
+    return None
 
 
 def _decibels(scan: ProcessedScan) -> str:
@@ -302,10 +331,14 @@ def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | No
     """
     kind, _, channel = key.partition("_")
     data = {"h": scan.h, "v": scan.v, "p": scan.p}[channel]
-    unit, colours = _decibels(scan), "cividis"
-    fade = _fade(scan) if kind == "phase" or channel == "p" else None
+    unit = _decibels(scan)
+    colours = "cividis"
+    fade = None
+    if kind == "phase" or channel == "p":
+        fade = _fade(scan)
     if kind == "phase":
-        unit, colours = "degrees", "cividis" if phase_deg else "twilight"
+        unit = "degrees"
+        colours = "cividis" if phase_deg else "twilight"
         low, high = phase_deg or (-180.0, 180.0)
         middle = (low + high) / 2
         values = np.degrees(np.angle(np.where(np.isfinite(data), data, 1)))
@@ -316,13 +349,18 @@ def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | No
     else:
         values = _db(data)
         finite = values[np.isfinite(data) & scan.valid]
-        high = 0.0 if scan.metal_referenced else float(np.percentile(finite, 99.8)) if finite.size else 0.0
+        if scan.metal_referenced:
+            high = 0.0
+        elif finite.size:
+            high = float(np.percentile(finite, 99.8))
+        else:
+            high = 0.0
         low = high - 35
-    shown = ax.imshow(
-        _shown(scan, values), extent=extent_mm(scan), origin="lower", cmap=colours, vmin=low, vmax=high, alpha=fade,
-        interpolation="nearest",
+    image = ax.imshow(
+        _mask_invalid(scan, values), extent=extent_mm(scan), origin="lower", cmap=colours, vmin=low, vmax=high,
+        alpha=fade, interpolation="nearest",
     )  # fmt: skip
-    return shown, unit
+    return image, unit
 
 
 def _ratio_range_db(scan: ProcessedScan, level: npt.NDArray) -> tuple[float, float]:
@@ -330,9 +368,12 @@ def _ratio_range_db(scan: ProcessedScan, level: npt.NDArray) -> tuple[float, flo
     levels = [patch.p_abs_db for patch in scan.segments]
     values = np.array([level for level in levels if level is not None])
     if values.size == 0:
-        values = level[(_fade(scan) > 0.5) & np.isfinite(level)]
-        values = np.percentile(values, [5, 95]) if values.size else np.array([0.0, 20.0])
-    low, high = float(values.min()), float(values.max())
+        bright = level[(_fade(scan) > 0.5) & np.isfinite(level)]
+        values = np.array([0.0, 20.0])
+        if bright.size:
+            values = np.percentile(bright, [5, 95])
+    low = float(values.min())
+    high = float(values.max())
     return np.floor(min(low, 0.0) - 1), max(np.ceil(high + 1), np.floor(low) + 6)
 
 
@@ -347,7 +388,8 @@ def _strength_db(scan: ProcessedScan) -> npt.NDArray[np.float64]:
     for channel in (scan.h, scan.v):
         p = np.nan_to_num(np.abs(channel).astype(np.float64) ** 2, nan=0.0, posinf=0.0)
         top = float(np.percentile(p, 99.5))
-        power += p / top if top > 0 else 0.0
+        if top > 0:
+            power += p / top
     return 10 * np.log10(np.maximum(power, 1e-12))
 
 
@@ -356,26 +398,37 @@ def channel_figure(scan: ProcessedScan, key: str) -> bytes:
     fig = new_figure(5.0, 4.6, BAR_IN)
     ax = fig.add_subplot()
     limits = phase_limits_deg(scan) if key == "phase_p" else None
-    shown, unit = draw_channel(ax, scan, key, limits)
+    image, unit = draw_channel(ax, scan, key, limits)
     dress(ax, FIGURES[key], scan.stamped)
     if key.endswith("_p"):
         _write_ratios(ax, scan, key)
-    bar = colour_bar(fig, ax, shown, unit, "both" if limits else "neither")
-    if unit == "degrees" and limits is None:
-        bar.set_ticks([-180, -90, 0, 90, 180])
-    elif limits is not None:  # beyond 180 the circle begins again
+    if limits is None:
+        bar = colour_bar(fig, ax, image, unit)
+        if unit == "degrees":
+            bar.set_ticks([-180, -90, 0, 90, 180])
+    else:
+        bar = colour_bar(fig, ax, image, unit, extend="both")
         ticks = [t for t in bar.get_ticks() if limits[0] <= t <= limits[1]]
-        bar.set_ticks(ticks, labels=[f"{(t + 180) % 360 - 180:g}" if abs(t) != 180 else "180" for t in ticks])
+        bar.set_ticks(ticks, labels=[_wrap_degrees(t) for t in ticks])
     return png(fig)
+
+
+def _wrap_degrees(angle: float) -> str:
+    """Format a phase between -180 and 180 degrees; both ends of the circle are 180."""
+    if abs(angle) == 180:
+        return "180"
+    return f"{(angle + 180) % 360 - 180:g}"
 
 
 def _write_ratios(ax: Axes, scan: ProcessedScan, key: str) -> None:
     """Write each patch's median as a number: small differences do not show as colours."""
     for patch in scan.segments:
         if patch.p_phase_deg is not None and patch.p_abs_db is not None:
-            # Adding zero after rounding removes the sign of a negative zero.
-            level = round(patch.p_abs_db, 1) + 0.0
-            number = f"{round(patch.p_phase_deg)}°" if key == "phase_p" else f"{level:.1f}"
+            if key == "phase_p":
+                number = f"{round(patch.p_phase_deg)}°"
+            else:
+                # Adding zero after rounding removes the sign of a negative zero.
+                number = f"{round(patch.p_abs_db, 1) + 0.0:.1f}"
             write_label(ax, patch.centre_x_mm, patch.centre_y_mm, number, 9, on_dark=True)
 
 
@@ -384,7 +437,7 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[Map
 
     Patches that were not judged are hatched grey. Return the labels.
     """
-    colours = colours_of(scan)
+    colours = assign_colours(scan)
     rgb = np.ones((*scan.h.shape, 3)) * np.array(to_rgb("#f3f5f8"))
     for patch in scan.segments:
         rgb[scan.labels == patch.label] = 0.55 + 0.45 * np.array(to_rgb(patch_colour(patch, colours)))
@@ -398,12 +451,15 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[Map
     for patch in scan.segments:
         _, y0, _, y1 = patch.box_mm
         if patch.refused is not None:
-            ax.add_patch(outline_of(patch, fill=False, edgecolor=REFUSED_COLOUR, hatch=HATCH, linewidth=0.0))
+            ax.add_patch(draw_outline(patch, fill=False, edgecolor=REFUSED_COLOUR, hatch=HATCH, linewidth=0.0))
         if patch.outline_mm or patch.refused is not None:
-            ax.add_patch(outline_of(patch, fill=False, edgecolor=INK, linewidth=0.9))
+            ax.add_patch(draw_outline(patch, fill=False, edgecolor=INK, linewidth=0.9))
         name = patch_label(patch)
-        within = "" if patch.confidence is None else f"{100 * patch.confidence:.0f} %"
-        within = within if patch.refused is None else "not judged"
+        within = ""
+        if patch.refused is not None:
+            within = "not judged"
+        elif patch.confidence is not None:
+            within = f"{100 * patch.confidence:.0f} %"
         text = write_label(ax, patch.centre_x_mm, y1 + 0.5, name, size, above=True)
         _keep_inside(ax, text, y1)
         # Two lines above the patch would reach the next one.
@@ -415,7 +471,7 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[Map
 def _keep_inside(ax: Axes, text: Text, top_mm: float) -> None:
     """Put a label below the upper edge of its patch if it would reach into the title."""
     bottom, top = ax.get_ylim()
-    if top_mm > top - _ROOM * (top - bottom):
+    if top_mm > top - _LABEL_HEIGHT * (top - bottom):
         text.set(y=min(top_mm, top) - 1.0, verticalalignment="top")
 
 
@@ -425,9 +481,13 @@ def _crop(ax: Axes, scan: ProcessedScan) -> None:
     left, right, bottom, top = extent_mm(scan)
     if boxes:
         b = np.array(boxes)
-        x0, y0, x1, y1 = b[:, 0].min() - 20, b[:, 1].min() - 12, b[:, 2].max() + 20, b[:, 3].max() + 24
+        x0 = b[:, 0].min() - 20
+        y0 = b[:, 1].min() - 12
+        x1 = b[:, 2].max() + 20
+        y1 = b[:, 3].max() + 24
         half = max(x1 - x0, y1 - y0) / 2
-        cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
+        cx = (x0 + x1) / 2
+        cy = (y0 + y1) / 2
         left, right, bottom, top = (
             max(left, cx - half),
             min(right, cx + half),
@@ -440,9 +500,10 @@ def _crop(ax: Axes, scan: ProcessedScan) -> None:
 
 def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[MapLabel]:
     """Draw the true plates. Return the labels."""
-    colours = colours_of(scan)
+    colours = assign_colours(scan)
     _crop(ax, scan)
-    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    left, right = ax.get_xlim()
+    bottom, top = ax.get_ylim()
     labels = []
     for number, plate in enumerate(scan.plates, 1):
         x0, y0, x1, y1 = plate.box_mm
@@ -452,7 +513,8 @@ def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[MapLabe
         if y1 < top:
             text = write_label(ax, (x0 + x1) / 2, y1 + 0.5, name, size, above=True)
             _keep_inside(ax, text, y1)
-        else:  # larger than the image: a name above it would be far outside the picture
+        else:
+            # The plate is larger than the image: a name above it would be far outside the picture.
             text = write_label(ax, (max(x0, left) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size)
         labels.append(MapLabel(text, str(number), name, colour))
     return labels
@@ -479,23 +541,35 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
         if e is not None and e.spread is not None:
             real[patch.label] = e.real
             size = abs(e.value)
-            errors[patch.label] = 100 * math.hypot(e.spread.real_std, e.spread.loss_std) / size if size else 0.0
+            if size:
+                errors[patch.label] = 100 * math.hypot(e.spread.real_std, e.spread.loss_std) / size
+            else:
+                errors[patch.label] = 0.0
             middle[patch.label] = f"{e.real:.2f}\n± {e.spread.real_std:.2f}"
     if not real:
         return None
     fig = new_figure(9.4, 4.6, BAR_IN)
-    percents = {label: f"{v:.0f} %" if v >= 10 else f"{v:.1f} %" for label, v in errors.items()}
-    low, high = min(real.values()), max(real.values())
+    percents = {label: _format_percent(error) for label, error in errors.items()}
+    low = min(real.values())
+    high = max(real.values())
     margin = max(0.1 * (high - low), 0.25)
-    left, right = fig.subplots(1, 2, gridspec_kw={"wspace": _BETWEEN})
-    _fill_patches(fig, left, scan, real, middle, ("viridis", low - margin, high + margin, "real part ε′"))
-    _fill_patches(fig, right, scan, errors, percents, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|"))
-    dress(left, "Permittivity ε′ ± standard error", simulated=False)
-    dress(right, "Relative error of ε", scan.stamped)
-    for ax in (left, right):
+    value_axes, error_axes = fig.subplots(1, 2, gridspec_kw={"wspace": _BETWEEN})
+    _fill_patches(fig, value_axes, scan, real, middle, ("viridis", low - margin, high + margin, "real part ε′"))
+    _fill_patches(
+        fig, error_axes, scan, errors, percents, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|")
+    )
+    dress(value_axes, "Permittivity ε′ ± standard error", simulated=False)
+    dress(error_axes, "Relative error of ε", scan.stamped)
+    for ax in (value_axes, error_axes):
         ax.set_facecolor("#f3f5f8")
-    right.set_ylabel("")
+    error_axes.set_ylabel("")
     return png(fig)
+
+
+def _format_percent(value: float) -> str:
+    if value >= 10:
+        return f"{value:.0f} %"
+    return f"{value:.1f} %"
 
 
 def _fill_patches(
@@ -515,10 +589,10 @@ def _fill_patches(
         fill: Any = METAL_COLOUR if patch.metal_reference else "#e4e7ec"
         if patch.label in values:
             fill = colours.to_rgba(np.array([values[patch.label]]))[0]
-        ax.add_patch(outline_of(patch, facecolor=fill, edgecolor=INK, linewidth=0.9))
+        ax.add_patch(draw_outline(patch, facecolor=fill, edgecolor=INK, linewidth=0.9))
         text = "–"
         if patch.refused is not None:
-            ax.add_patch(outline_of(patch, fill=False, edgecolor=REFUSED_COLOUR, hatch=HATCH, linewidth=0.0))
+            ax.add_patch(draw_outline(patch, fill=False, edgecolor=REFUSED_COLOUR, hatch=HATCH, linewidth=0.0))
             text = "not\njudged"
         if patch.metal_reference or patch.metal_like:
             text = "metal"
@@ -545,7 +619,10 @@ def _mask(board: BoardQuality, plan: RasterPlan) -> npt.NDArray[np.bool_]:
     for row, runs in (board.masked_columns or {}).items():
         for start, stop in runs:
             mask[row, start:stop] = True
-    recorded = range(plan.rows) if board.rows_recorded is UNSET else board.rows_recorded
+    if board.rows_recorded is UNSET:
+        recorded = range(plan.rows)
+    else:
+        recorded = board.rows_recorded
     absent = sorted(set(range(plan.rows)) - set(recorded))
     mask[absent] = True
     return mask
@@ -559,7 +636,8 @@ def coverage_figure(scan: ProcessedScan, masks: dict[str, npt.NDArray[np.bool_]]
     plan = scan.plan
     if plan is None:
         raise ValueError("a map of positions needs the plan")
-    width, height = plan.columns * plan.step_x_mm, plan.rows * plan.step_y_mm
+    width = plan.columns * plan.step_x_mm
+    height = plan.rows * plan.step_y_mm
     extent = (-width / 2, width / 2, -height / 2, height / 2)
     size = (9.0, 0.9 + 4.2 * min(1.2, max(0.3, height / width)))
     fig = Figure(figsize=size, dpi=130, layout="constrained", facecolor="white")
@@ -581,23 +659,33 @@ def draw_overview(fig: Figure, axes: Sequence[Axes], scan: ProcessedScan, bar_la
         ("H, s-polarised (dB)", "V, p-polarised (dB)", "P = H / V (dB)"),
         strict=True,
     ):
-        shown, unit = draw_channel(ax, scan, key)
+        image, unit = draw_channel(ax, scan, key)
         dress(ax, title, scan.stamped)
-        colour_bar(fig, ax, shown, unit if bar_labels else "")
+        label = ""
+        if bar_labels:
+            label = unit
+        colour_bar(fig, ax, image, label)
     labels = []
     for ax in axes[3:]:
         labels += draw_materials(ax, scan, size=6.5)
-        dress(ax, "Materials" if scan.judged else "Patches", scan.stamped)
+        dress(ax, _map_title(scan), scan.stamped)
     shorten_labels(fig, labels)
+
+
+def _map_title(scan: ProcessedScan) -> str:
+    """Return "Materials", or "Patches" where nothing was named."""
+    if scan.judged:
+        return "Materials"
+    return "Patches"
 
 
 def figures(scan: ProcessedScan) -> dict[str, bytes]:
     """Return all figures of a report as PNG, by file name without suffix."""
     out = {key: channel_figure(scan, key) for key in FIGURES}
     if scan.segments:
-        out["materials"] = map_figure(scan, draw_materials, "Materials found" if scan.judged else "Patches found")
-        made = {"permittivity": permittivity_figure(scan), "permittivity_map": permittivity_map(scan)}
-        out |= {name: picture for name, picture in made.items() if picture is not None}
+        out["materials"] = map_figure(scan, draw_materials, f"{_map_title(scan)} found")
+        permittivities = {"permittivity": permittivity_figure(scan), "permittivity_map": permittivity_map(scan)}
+        out |= {name: picture for name, picture in permittivities.items() if picture is not None}
     masks = masked_positions(scan)
     if any(m.any() for m in masks.values()):
         out["coverage"] = png(coverage_figure(scan, masks))
@@ -620,18 +708,23 @@ def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | 
     """
     fig = new_figure(5.4, 4.8, BAR_IN)
     ax = fig.add_subplot()
-    shown, unit = draw_channel(ax, scan, "amplitude_h")
+    image, unit = draw_channel(ax, scan, "amplitude_h")
     labels = []
     for number, (name, (x0, y0, x1, y1)) in enumerate(boxes_mm.items(), 1):
-        colour = _METAL if name == metal else _OTHER
+        text = figure_label(name, f"box {number}")
+        written = text
+        colour = _OTHER_BOX
+        below = ""
+        if name == metal:
+            colour = _METAL_BOX
+            below = "metal"
+            written = f"{text}\nmetal"
         for edge, width in (("#10141b", 3.0), (colour, 1.5)):
             ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=edge, linewidth=width))
-        text, below = figure_label(name, f"box {number}"), "metal" if name == metal else ""
-        written = f"{text}\n{below}" if below else text
         middle = write_label(ax, (x0 + x1) / 2, (y0 + y1) / 2, written, 8.5, on_dark=True)
         labels.append(MapLabel(middle, str(number), text, colour, below))
     dress(ax, "Amplitude H, and the boxes", scan.stamped)
-    colour_bar(fig, ax, shown, unit)
+    colour_bar(fig, ax, image, unit)
     fit_labels(fig, labels, BAR_IN)
     return png(fig)
 
@@ -657,22 +750,25 @@ def focus_figure(
     curve.set_xlabel("plane, relative to the rig file (mm)", fontsize=9, color=MUTED)
     curve.set_ylabel("sharpness of the untilted plane", fontsize=9, color=MUTED)
     tilt = sweep["tilt_deg"]
-    title = f"Tilt found: {tilt[0]:+.2f}° in x, {tilt[1]:+.2f}° in y" if sweep["certain"] else "No clear maximum"
+    title = "No clear maximum"
+    if sweep["certain"]:
+        title = f"Tilt found: {tilt[0]:+.2f}° in x, {tilt[1]:+.2f}° in y"
     curve.set_title(title, loc="left", fontsize=10, color=INK)
     curve.legend(fontsize=8, frameon=False)
     top = max(float(np.abs(before).max()), float(np.abs(after).max()), 1e-30)
-    x, y = axis_mm(x_m), axis_mm(y_m)
+    x = axis_mm(x_m)
+    y = axis_mm(y_m)
     for ax, image, title in zip(
         pictures, (before, after), ("H on the rig file's plane", "H on the found plane"), strict=True
     ):
         level = 20 * np.log10(np.maximum(np.abs(image) / top, 1e-6))
-        shown = ax.pcolormesh(
+        mesh = ax.pcolormesh(
             x, y, level, cmap="cividis", vmin=-_FOCUS_RANGE_DB, vmax=0, shading="nearest", rasterized=True
         )
         ax.set_title(title, loc="left", fontsize=10, color=INK)
         ax.set_aspect("equal")
         ax.set_xlabel("x (mm)", fontsize=9, color=MUTED)
-        colour_bar(fig, ax, shown, "dB")
+        colour_bar(fig, ax, mesh, "dB")
     if simulated:
         fig.suptitle("SIMULATED", fontsize=9, color=STAMP, fontweight="bold", x=0.99, ha="right")
     return png(fig)

@@ -21,7 +21,7 @@ from markupsafe import Markup, escape
 from polysight.materials import UNKNOWN
 from polysight.products import REPORT, ProcessedScan
 from polysight.report.figures import FIGURES, figures, masked_positions
-from polysight.report.style import colours_of, patch_colour, patch_label, plate_label
+from polysight.report.style import assign_colours, patch_colour, patch_label, plate_label
 from polysight.report.surface import surface_figure
 from polysight.results import (
     ErrorBudget,
@@ -41,6 +41,7 @@ from polysight_shared.config import Instrument
 from polysight_shared.files import write_atomically
 from polysight_shared.geometry import incidence_deg
 
+# Shown where a value is not known.
 DASH = "–"
 NOT_ON_HARDWARE = "Nothing of this instrument has run on hardware yet."
 _IMAGING_ROWS: tuple[tuple[str, str], ...] = (
@@ -54,6 +55,7 @@ _IMAGING_ROWS: tuple[tuple[str, str], ...] = (
     ("point_sidelobe_db", "Strongest sidelobe, x, y (dB)"),
 )
 Table = dict[str, Any]
+# Figures of a board that have a table or a map of their own, or that only programs read.
 _NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
 UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
 
@@ -61,9 +63,8 @@ UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm"
 def write_report(out_dir: Path, scan: ProcessedScan) -> Path:
     """Write `report.html` and `figures/*.png` into a folder; return the path of the page."""
     pictures = figures(scan)
-    surface = read_surface(out_dir / SURFACE) if (out_dir / SURFACE).exists() else None
-    if surface is not None:
-        pictures["surface"] = surface_figure(surface)
+    if (out_dir / SURFACE).exists():
+        pictures["surface"] = surface_figure(read_surface(out_dir / SURFACE))
     for name, data in pictures.items():
         write_atomically(out_dir / "figures" / f"{name}.png", data)
     page = out_dir / REPORT
@@ -80,7 +81,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         trim_blocks=True,
     )
     environment.filters["code"] = _code
-    colours = colours_of(scan)
+    colours = assign_colours(scan)
     rows = [_row(patch, colours) for patch in scan.segments]
     names_found = {row["truth"] for row in rows}
     alt = {
@@ -93,16 +94,29 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         "surface": "Surfaces from three sides",
     }
     centre = [f"{(float(a[0]) + float(a[-1])) * 500:.1f}" for a in (scan.x_m, scan.y_m)]
-    materials = scan.materials if scan.judged else None
-    budget = (scan.materials and scan.materials.error_budget) or None
+    metal_how = ""
+    library = ""
+    if scan.materials is not None and scan.judged:
+        library = scan.materials.library
+        if scan.materials.metal_reference:
+            metal_how = scan.materials.metal_reference.how
+    budget = None
+    if scan.materials is not None and scan.materials.error_budget:
+        budget = budget_table(scan.materials.error_budget)
+    missed_plates: list[str] = []
+    if rows:
+        missed_plates = [plate.name for plate in scan.plates if plate.name not in names_found]
+    config: list[tuple[str, str]] = []
+    if scan.rig is not None:
+        config = _config(scan.rig)
     return environment.get_template("report.html").render(
         scan=scan,
         title=f"Scan {scan.scan_id}".strip(),
         simulated=scan.stamped,
         notes=_notes(scan),
-        metal_how=materials.metal_reference.how if materials and materials.metal_reference else "",
-        library=materials.library if materials else "",
-        images={key: base64.b64encode(pictures[key]).decode("ascii") if key in pictures else "" for key in alt},
+        metal_how=metal_how,
+        library=library,
+        images={key: base64.b64encode(pictures.get(key, b"")).decode("ascii") for key in alt},
         alt=alt,
         lead=_lead(scan),
         keys=key_numbers(scan, rows),
@@ -112,28 +126,32 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         rows=rows,
         headings=[figure.column.title for figure in _shown_figures(scan)],
         with_errors=any(patch.permittivity and patch.permittivity.spread for patch in scan.segments),
-        budget=None if budget is None else budget_table(budget),
+        budget=budget,
         replaced=_replaced_names(scan),
-        missed=[plate.name for plate in scan.plates if plate.name not in names_found] if rows else [],
+        missed=missed_plates,
         quality=quality_tables(plain(scan.quality)),
         coverage=coverage_sentence(masked_positions(scan)),
-        config=[] if scan.rig is None else _config(scan.rig),
-        rig_file=tomli_w.dumps(scan.facts.instrument) if scan.facts.instrument else "",
+        config=config,
+        rig_file=tomli_w.dumps(scan.facts.instrument or {}),
         provenance=_provenance(scan),
     )
 
 
 def _notes(scan: ProcessedScan) -> list[str]:
     """Return the sentences at the top: damage of the manifest, and why nothing was named."""
-    notes = [scan.quality.coverage.damage if scan.quality.coverage else "", NOT_ON_HARDWARE]
-    if scan.materials is not None and scan.materials.model is None:
+    notes = [NOT_ON_HARDWARE]
+    if scan.quality.coverage and scan.quality.coverage.damage:
+        notes.insert(0, scan.quality.coverage.damage)
+    if scan.materials is not None and scan.materials.model is None and scan.materials.library:
         notes.append(scan.materials.library)
-    return [note for note in notes if note]
+    return notes
 
 
 def _config(rig: Instrument) -> list[tuple[str, str]]:
     """Return a short summary of the rig file: name and text."""
-    chirp, grid, leakage = rig.chirp, rig.grid, rig.polarimetry
+    chirp = rig.chirp
+    grid = rig.grid
+    leakage = rig.polarimetry
     measured = "not measured"
     if leakage.leakage_std is not None:
         measured = (
@@ -168,16 +186,18 @@ def _shown_figures(scan: ProcessedScan) -> list[Figure]:
 def _code(words: str) -> Markup:
     """Escape text and mark `commands` in it as code."""
     parts = [escape(part) for part in words.split("`")]
-    return Markup("").join(Markup("<code>{}</code>").format(part) if i % 2 else part for i, part in enumerate(parts))
+    # Every second part stood between two backquotes.
+    parts[1::2] = [Markup("<code>{}</code>").format(part) for part in parts[1::2]]
+    return Markup("").join(parts)
 
 
 def _remedies(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Return the measurements that would shrink the errors, each with the patches that it helps."""
-    found: dict[tuple[str, str], list[str]] = {}
+    patches_by_remedy: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row["do"]:
-            found.setdefault((row["dominated_by"], row["do"]), []).append(str(row["label"]))
-    return [{"what": what, "do": do, "patches": ", ".join(labels)} for (what, do), labels in found.items()]
+            patches_by_remedy.setdefault((row["dominated_by"], row["do"]), []).append(str(row["label"]))
+    return [{"what": what, "do": do, "patches": ", ".join(labels)} for (what, do), labels in patches_by_remedy.items()]
 
 
 def _replaced_names(scan: ProcessedScan) -> list[str]:
@@ -190,17 +210,20 @@ def _replaced_names(scan: ProcessedScan) -> list[str]:
 def _lead(scan: ProcessedScan) -> str:
     ny, nx = scan.h.shape
     pixel_mm = abs(float(scan.x_m[1] - scan.x_m[0])) * 1e3
-    what = "simulated scan" if scan.stamped else "scan"
+    kind = "simulated scan" if scan.stamped else "scan"
     return (
-        f"Co- and cross-polarised images of a {what}, {nx} × {ny} pixels of {pixel_mm:g} mm: "
+        f"Co- and cross-polarised images of a {kind}, {nx} × {ny} pixels of {pixel_mm:g} mm: "
         "reflectivity, materials and quality of the data."
     )
 
 
 def _row(patch: PatchFigures, colours: dict[str, str]) -> dict[str, Any]:
     """Format one line of the materials table."""
-    truth, e = patch.truth, patch.permittivity
-    name = patch.name or ("metal reference" if patch.metal_reference else f"patch {patch.label}")
+    truth = patch.truth
+    e = patch.permittivity
+    name = patch.name or f"patch {patch.label}"
+    if patch.metal_reference and not patch.name:
+        name = "metal reference"
     row: dict[str, Any] = {
         "label": patch.label,
         "name": name,
@@ -211,23 +234,31 @@ def _row(patch: PatchFigures, colours: dict[str, str]) -> dict[str, Any]:
         "drawn_as": patch.box or "",
         "refused": patch.refused is not None,
         "why_refused": patch.refused_text or "",
-        "truth": truth.name if truth else "",
-        "strange": truth is not None and patch.name == UNKNOWN and not truth.in_library,
-        "right": truth is not None and (truth.name == patch.name or (patch.metal_reference and truth.metal)),
+        "truth": "",
+        "strange": False,
+        "right": False,
         "why": patch.why,
         "votes": _share(patch.confidence, 0),
-        "real": "metal-like" if patch.metal_like else DASH,
+        "real": DASH,
         "loss": DASH,
         **dict.fromkeys(("real_error", "loss_error", "real_range", "loss_range", "dominated_by", "share", "do"), ""),
-        "true_real": ("metal" if truth.metal else DASH) if truth else DASH,
+        "true_real": DASH,
         "true_loss": DASH,
         "error": DASH,
         "relative_error": None,
         "pixels": patch.pixels_used,
         "shown": [figure.shown(patch) for figure in figures_of(type(patch)) if figure.column.title],
     }
+    if patch.metal_like:
+        row["real"] = "metal-like"
+    if truth is not None:
+        row["truth"] = truth.name
+        row["strange"] = patch.name == UNKNOWN and not truth.in_library
+        row["right"] = truth.name == patch.name or (patch.metal_reference and truth.metal)
+        if truth.metal:
+            row["true_real"] = "metal"
     if e is not None:
-        row |= _estimate(e)
+        row |= _format_estimate(e)
     if patch.true_permittivity is not None:
         row["true_real"] = f"{patch.true_permittivity.real:.2f}"
         row["true_loss"] = f"{-patch.true_permittivity.imag:.2f}"
@@ -238,17 +269,23 @@ def _row(patch: PatchFigures, colours: dict[str, str]) -> dict[str, Any]:
     return row
 
 
-def _estimate(e: PermittivityFigures) -> dict[str, str]:
+def _format_estimate(e: PermittivityFigures) -> dict[str, str]:
     """Format a permittivity with its errors and their main source."""
     row = {"real": f"{e.real:.2f}", "loss": f"{e.loss:.2f}"}
     if e.spread is not None:
-        row["real_error"], row["loss_error"] = f"± {e.spread.real_std:.2f}", f"± {e.spread.loss_std:.2f}"
+        row["real_error"] = f"± {e.spread.real_std:.2f}"
+        row["loss_error"] = f"± {e.spread.loss_std:.2f}"
     if e.real_p30_p70 and e.imag_p30_p70:
-        (r0, r1), (i0, i1) = e.real_p30_p70, e.imag_p30_p70
-        row["real_range"], row["loss_range"] = f"({r0:.2f} … {r1:.2f})", f"({-i1:.2f} … {-i0:.2f})"
+        r0, r1 = e.real_p30_p70
+        i0, i1 = e.imag_p30_p70
+        row["real_range"] = f"({r0:.2f} … {r1:.2f})"
+        row["loss_range"] = f"({-i1:.2f} … {-i0:.2f})"
+    row["dominated_by"] = e.dominated_by or ""
+    row["do"] = e.do or ""
     share = e.shares.get(e.dominated_by or "")
-    row["dominated_by"], row["do"] = e.dominated_by or "", e.do or ""
-    row["share"] = "" if share is None else f"{100 * share:.0f} %"
+    row["share"] = ""
+    if share is not None:
+        row["share"] = f"{100 * share:.0f} %"
     return row
 
 
@@ -264,14 +301,16 @@ def coverage_sentence(masks: dict[str, npt.NDArray[np.bool_]]) -> str:
 
 def imaging_table(imaging: Any) -> Table | None:
     """Return the table of `imaging` of quality.json, a column for each board; None without it."""
-    boards = {k: v for k, v in imaging.items() if isinstance(v, dict)} if isinstance(imaging, dict) else {}
+    if not isinstance(imaging, dict):
+        return None
+    boards = {k: v for k, v in imaging.items() if isinstance(v, dict)}
     if not boards:
         return None
-    rows = [
-        _cells(heading, *(_number(board.get(key), " × " if key.endswith("_mm") else ", ") for board in boards.values()))
-        for key, heading in _IMAGING_ROWS
-        if any(key in board for board in boards.values())
-    ]
+    rows = []
+    for key, heading in _IMAGING_ROWS:
+        if any(key in board for board in boards.values()):
+            between = " × " if key.endswith("_mm") else ", "
+            rows.append(_cells(heading, *(_number(board.get(key), between) for board in boards.values())))
     caption = "Imaging. The point response is computed for the middle of the image, with taper and mask as they are."
     for notice in imaging.get("notices", ()):
         caption += f" {notice}."
@@ -284,45 +323,54 @@ def _is_unknown(value: Any) -> bool:
 
 
 def _share(value: float | None, digits: int) -> str:
-    return "–" if value is None or _is_unknown(value) else f"{100 * value:.{digits}f} %"
+    if value is None or _is_unknown(value):
+        return DASH
+    return f"{100 * value:.{digits}f} %"
 
 
 def _number(value: Any, between: str = " × ") -> str:
     if _is_unknown(value):
-        return "–"
+        return DASH
     if isinstance(value, list | tuple):
         return between.join(_number(v) for v in value)
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def text(value: Any) -> str:
-    """Format a value for reading: grouped thousands, few digits, yes and no, lists with commas."""
-    if _is_unknown(value):
-        return "–"
-    if isinstance(value, bool | np.bool_):
-        return "yes" if value else "no"
-    if isinstance(value, int | np.integer):
-        return f"{int(value):,}".replace(",", "\u202f") if abs(int(value)) >= 10000 else str(int(value))
-    if isinstance(value, float | np.floating):
-        v = float(value)
-        if v == int(v) and abs(v) < 1e15:
-            return text(int(v))
-        return f"{v:.3g}" if abs(v) < 1000 else f"{v:,.0f}".replace(",", "\u202f")
-    if isinstance(value, dict):
-        return ", ".join(f"{k}: {text(v)}" for k, v in value.items()) or "–"
-    if isinstance(value, list | tuple):
-        return ", ".join(text(v) for v in value) or "none"
+    if isinstance(value, float):
+        return f"{value:.3g}"
     return str(value)
 
 
-def pretty(key: str) -> str:
+def format_value(value: Any) -> str:
+    """Format a value for reading: grouped thousands, few digits, yes and no, lists with commas."""
+    if _is_unknown(value):
+        return DASH
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        if abs(int(value)) < 10000:
+            return str(int(value))
+        return f"{int(value):,}".replace(",", "\u202f")
+    if isinstance(value, float | np.floating):
+        v = float(value)
+        if v == int(v) and abs(v) < 1e15:
+            return format_value(int(v))
+        if abs(v) < 1000:
+            return f"{v:.3g}"
+        return f"{v:,.0f}".replace(",", "\u202f")
+    if isinstance(value, dict):
+        return ", ".join(f"{k}: {format_value(v)}" for k, v in value.items()) or DASH
+    if isinstance(value, list | tuple):
+        return ", ".join(format_value(v) for v in value) or "none"
+    return str(value)
+
+
+def format_heading(key: str) -> str:
     """Format a key as a heading: `RH if_hz` becomes `RH IF (Hz)`."""
     words = key.replace("_", " ").split()
-    unit = UNITS.get(words[-1]) if len(words) > 1 else None
-    if unit:
-        words = words[:-1]
-    out = " ".join({"if": "IF", "std": ""}.get(w, w) for w in words).replace("  ", " ").strip()
-    return f"{out} ({unit})" if unit else out
+    unit = ""
+    if len(words) > 1 and words[-1] in UNITS:
+        unit = f" ({UNITS[words.pop()]})"
+    # The table's caption says that the figures are standard deviations.
+    words = ["IF" if word == "if" else word for word in words if word != "std"]
+    return " ".join(words) + unit
 
 
 def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[str, str]]:
@@ -333,43 +381,51 @@ def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[st
         out.append({"value": value, "text": what})
 
     if count := scan.plates_named:
-        aside = f", {count.strange} recognised as not in the library" if count.strange else ""
+        aside = ""
+        if count.strange:
+            aside = f", {count.strange} recognised as not in the library"
         add(f"{count.right} of {count.plates}", f"plates named right{aside}")
     elif rows:
         add(str(len(rows)), "patches found")
     accuracy = scan.materials and scan.materials.pixel_accuracy
     if accuracy is not None:
         expected = scan.expected_accuracy
-        aside = "" if expected is None else f"; their own confidence expects {_share(expected, 1)}"
+        aside = ""
+        if expected is not None:
+            aside = f"; their own confidence expects {_share(expected, 1)}"
         add(_share(accuracy, 1), f"of interior pixels named right{aside}")
     errors = [abs(r["relative_error"]) for r in rows if r["relative_error"] is not None]
     if errors:
         add(f"{100 * float(np.median(errors)):.1f} %", f"median error of ε′, worst {100 * max(errors):.1f} %")
-    for value, what in _received(scan.quality):
-        add(value, what)
+    for share, description in _received_shares(scan.quality):
+        add(share, description)
     if seconds := scan.quality.seconds_per_stage:
-        total = sum(seconds.values())
-        add(f"{total:.1f} s" if total < 100 else f"{total / 60:.1f} min", "of processing, all stages")
+        total_s = sum(seconds.values())
+        duration = f"{total_s:.1f} s"
+        if total_s >= 100:
+            duration = f"{total_s / 60:.1f} min"
+        add(duration, "of processing, all stages")
     return out
 
 
-def _received(quality: ScanQuality) -> list[tuple[str, str]]:
+def _received_shares(quality: ScanQuality) -> list[tuple[str, str]]:
     """Return shares of rows and frames received: of the plan, or of recorded rows in products without `coverage`."""
     if coverage := quality.coverage:
         share = percent(coverage.frames_received, coverage.frames_planned, 2)
-        frames = (share, f"of {text(coverage.frames_planned)} planned frames received")
-        recorded = (f"{coverage.rows_recorded} of {coverage.rows_planned}", "rows recorded")
-        return [recorded, frames] if coverage.rows_absent else [frames]
+        shares = [(share, f"of {format_value(coverage.frames_planned)} planned frames received")]
+        if coverage.rows_absent:
+            shares.insert(0, (f"{coverage.rows_recorded} of {coverage.rows_planned}", "rows recorded"))
+        return shares
     expected = sum(board.frames_expected for board in quality.boards.values())
     received = sum(board.frames_received for board in quality.boards.values())
     if not expected:
         return []
-    return [(percent(received, expected, 2), f"of {text(expected)} frames of recorded rows received")]
+    return [(percent(received, expected, 2), f"of {format_value(expected)} frames of recorded rows received")]
 
 
 def quality_tables(quality: dict[str, Any]) -> list[Table]:
     """Return tables of the known parts of quality.json, then one of all other keys."""
-    known = {"boards", "seconds_per_stage", "imaging", "verdict", "error_budget"}
+    shown_elsewhere = {"boards", "seconds_per_stage", "imaging", "verdict", "error_budget"}
     boards = quality.get("boards")
     parts = (
         _boards(boards),
@@ -378,9 +434,9 @@ def quality_tables(quality: dict[str, Any]) -> list[Table]:
         _seconds(quality.get("seconds_per_stage")),
     )
     out = [part for part in parts if part]
-    if rest := {k: v for k, v in quality.items() if k not in known}:
+    if rest := {k: v for k, v in quality.items() if k not in shown_elsewhere}:
         flat = _flatten(rest, nested=False)
-        rows = [_cells(pretty(k), text(v)) for k, v in flat.items()]
+        rows = [_cells(format_heading(k), format_value(v)) for k, v in flat.items()]
         out.append({"caption": "Rows, masked data and other figures.", "head": [], "rows": rows})
     return out
 
@@ -397,9 +453,9 @@ def budget_table(budget: ErrorBudget) -> Table | None:
     rows = [*_leakage_rows(budget.leakage), *_incidence_rows(budget.incidence), *_plane_rows(budget.plane)]
     metal = budget.metal
     if metal is not None and metal.score is not None:
-        evidence = f"score {_signed(metal.score, 1)} from {metal.others} other patches"
+        evidence = f"score {_with_sign(metal.score, 1)} from {metal.others} other patches"
         if metal.channel_ratio_db is not None:
-            evidence += f"; V over H {_signed(metal.channel_ratio_db, 1)} dB relative to the direct path"
+            evidence += f"; V over H {_with_sign(metal.channel_ratio_db, 1)} dB relative to the direct path"
         rows.append(_cells("Evidence that the reference is metal", evidence))
     if not rows:
         return None
@@ -411,12 +467,13 @@ def _leakage_rows(leakage: LeakageError | None) -> list[dict[str, Any]]:
     if leakage is None:
         return []
     rows = [_cells("Leakage", _SOURCES.get(leakage.source, leakage.source))]
-    stds = leakage.std or (None, None)
-    for channel, value, std in (("H", leakage.h, stds[0]), ("V", leakage.v, stds[1])):
+    std_h, std_v = leakage.std or (None, None)
+    for channel, value, std in (("H", leakage.h, std_h), ("V", leakage.v, std_v)):
         if value is not None and value[0] is not None and value[1] is not None:
-            error = "" if std is None else f" ± {std:.3f}"
             sign = "+" if value[1] >= 0 else "−"
-            number = f"{_signed(value[0], 3)} {sign} {abs(value[1]):.3f}i{error}"
+            number = f"{_with_sign(value[0], 3)} {sign} {abs(value[1]):.3f}i"
+            if std is not None:
+                number += f" ± {std:.3f}"
             rows.append(_cells(f"Leakage of {channel}, relative to its own channel", number))
     return rows
 
@@ -424,8 +481,10 @@ def _leakage_rows(leakage: LeakageError | None) -> list[dict[str, Any]]:
 def _incidence_rows(incidence: IncidenceError | None) -> list[dict[str, Any]]:
     if incidence is None or incidence.deg is None:
         return []
-    error = "" if incidence.std_deg is None else f" ± {incidence.std_deg:.2f}°"
-    return [_cells("Incidence angle", f"{incidence.deg:.2f}°{error}")]
+    angle = f"{incidence.deg:.2f}°"
+    if incidence.std_deg is not None:
+        angle += f" ± {incidence.std_deg:.2f}°"
+    return [_cells("Incidence angle", angle)]
 
 
 def _plane_rows(plane: PlaneError | None) -> list[dict[str, Any]]:
@@ -433,18 +492,21 @@ def _plane_rows(plane: PlaneError | None) -> list[dict[str, Any]]:
         return []
     if not plane.known:
         return [_cells("Plane of the plates", "not found; that of the rig file is used")]
-    error = f" ± {plane.offset_std_mm:.1f} mm" if plane.offset_std_mm else ""
-    offset = f"{_signed(plane.offset_mm or 0.0, 1)} mm{error}"
+    offset = f"{_with_sign(plane.offset_mm or 0.0, 1)} mm"
+    if plane.offset_std_mm:
+        offset += f" ± {plane.offset_std_mm:.1f} mm"
     rows = [_cells("Plane of the plates, relative to the rig file", offset)]
     if plane.tilt_deg and plane.tilt_deg[0] is not None and plane.tilt_deg[1] is not None:
-        tilt = f"{_signed(plane.tilt_deg[0], 2)}° in x, {_signed(plane.tilt_deg[1], 2)}° in y"
+        tilt = f"{_with_sign(plane.tilt_deg[0], 2)}° in x, {_with_sign(plane.tilt_deg[1], 2)}° in y"
         rows.append(_cells("Tilt of the plane", tilt))
-    if plane.by:
-        rows.append(_cells("Plane found by", plane.by + (f" of {plane.plates} plates" if plane.plates else "")))
+    if plane.by and plane.plates:
+        rows.append(_cells("Plane found by", f"{plane.by} of {plane.plates} plates"))
+    elif plane.by:
+        rows.append(_cells("Plane found by", plane.by))
     return rows
 
 
-def _signed(value: float, digits: int) -> str:
+def _with_sign(value: float, digits: int) -> str:
     """Format a number with its sign, a true minus, and no negative zero."""
     return f"{round(float(value), digits) + 0.0:+.{digits}f}".replace("-", "−")
 
@@ -457,38 +519,44 @@ def _boards(boards: Any) -> Table | None:
     """Return a table with a line for each figure and a column for each board: narrow enough for a phone."""
     if not isinstance(boards, dict) or not boards:
         return None
-    flat = {name: _numbers_of(board) for name, board in boards.items()}
+    flat = {name: _flatten_board(board) for name, board in boards.items()}
     keys = dict.fromkeys(k for board in flat.values() for k in board)
-    rows = [_cells(pretty(k), *(text(board.get(k)) for board in flat.values())) for k in keys]
+    rows = [_cells(format_heading(k), *(format_value(board.get(k)) for board in flat.values())) for k in keys]
     caption = "Frames by board, of the recorded rows. Missing data are masked, never interpolated."
     return {"caption": caption, "head": ["Board", *map(str, boards)], "rows": rows}
 
 
-def _numbers_of(board: dict[str, Any]) -> dict[str, Any]:
+def _flatten_board(board: dict[str, Any]) -> dict[str, Any]:
     """Flatten a board's figures: `direct_path_hz` {median} becomes `direct_path_median_hz`."""
     out: dict[str, Any] = {}
     for key, value in board.items():
         if key in _NOT_LISTED:
             continue
-        stem, _, unit = key.rpartition("_")
-        for part, number in value.items() if isinstance(value, dict) else ():
-            out[f"{stem}_{part}_{unit}" if unit in UNITS else f"{key}_{part}"] = number
         if not isinstance(value, dict):
             out[key] = value
+            continue
+        stem, _, unit = key.rpartition("_")
+        for part, number in value.items():
+            if unit in UNITS:
+                out[f"{stem}_{part}_{unit}"] = number
+            else:
+                out[f"{key}_{part}"] = number
     return out
 
 
 def _residuals(boards: Any) -> Table | None:
     """Return a table of `synchronisation` of all boards: a line for each stage, a column for each quantity."""
+    if not isinstance(boards, dict):
+        return None
     flat: dict[str, dict[str, Any]] = {}
-    for name, board in boards.items() if isinstance(boards, dict) else ():
+    for name, board in boards.items():
         for stage, quantities in (board.get("synchronisation") or {}).items():
             flat.setdefault(stage, {}).update(_flatten({name: quantities}))
     if not flat:
         return None
     keys = list(dict.fromkeys(k for v in flat.values() for k in v))
-    rows = [_cells(pretty(stage), *(text(v.get(k)) for k in keys)) for stage, v in flat.items()]
-    head = ["After stage", *map(pretty, keys)]
+    rows = [_cells(format_heading(stage), *(format_value(v.get(k)) for k in keys)) for stage, v in flat.items()]
+    head = ["After stage", *map(format_heading, keys)]
     caption = (
         "Residual (standard deviation) after each stage of synchronisation: of one chirp as received and aligned, of"
         " the direct path in a position's average, and of the object referenced to it; amplitude relative to its mean."
@@ -501,8 +569,10 @@ def _flatten(value: dict[str, Any], prefix: str = "", nested: bool = True) -> di
     out: dict[str, Any] = {}
     for k, v in value.items():
         name = f"{prefix} {k}".strip()
-        deeper = isinstance(v, dict) and v and (nested or not prefix)
-        out.update(_flatten(v, name, nested) if deeper else {name: v})
+        if isinstance(v, dict) and v and (nested or not prefix):
+            out |= _flatten(v, name, nested)
+        else:
+            out[name] = v
     return out
 
 
@@ -510,5 +580,5 @@ def _seconds(seconds: Mapping[str, float] | None) -> Table | None:
     if not seconds:
         return None
     longest = max([*seconds.values(), 1e-9])
-    rows = [_cells(pretty(k), f"{v:.2f} s", share=round(100 * v / longest, 1)) for k, v in seconds.items()]
+    rows = [_cells(format_heading(k), f"{v:.2f} s", share=round(100 * v / longest, 1)) for k, v in seconds.items()]
     return {"caption": "Time by stage.", "head": [], "rows": rows}

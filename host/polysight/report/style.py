@@ -33,22 +33,32 @@ from polysight.materials import TruthPlate, axis_mm
 from polysight.products import ProcessedScan
 from polysight.results import PatchFigures
 
-INK, MUTED, STAMP = "#1b2330", "#5b6675", "#b3261e"
-"""Colours of a figure's text: titles, axes, and the word SIMULATED."""
+# Colours of a figure's text: titles, axes, and the word SIMULATED.
+INK = "#1b2330"
+MUTED = "#5b6675"
+STAMP = "#b3261e"
 PALETTE = (
     "#332288", "#88CCEE", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499",
     "#77AADD", "#EE8866", "#EEDD88", "#FFAABB", "#99DDFF", "#44BB99", "#BBCC33", "#AAAA00",
 )  # fmt: skip
 UNKNOWN_COLOUR = "#BBBBBB"
-METAL_COLOUR, REFUSED_COLOUR = "#C9D3DE", "#8d949e"  # the metal reference; patches that were not judged
+# Colours of the metal reference and of patches that were not judged.
+METAL_COLOUR = "#C9D3DE"
+REFUSED_COLOUR = "#8d949e"
 HATCH = "////"
-_GAP_PT = 8.0  # between names side by side
-_LEFT_IN, _BOTTOM_IN, _TOP_IN = 0.66, 0.5, 0.28  # margins for a number of five characters, labels and a title
-RIGHT_IN, BAR_IN = 0.1, 0.62
-"""Margins on the right of an axes, and of a colour bar with its numbers and label."""
+# Two names side by side need this gap, otherwise they read as one.
+_GAP_PT = 8.0
+# Margins of an axes hold a number of five characters, the axis labels and a title.
+_LEFT_IN = 0.66
+_BOTTOM_IN = 0.5
+_TOP_IN = 0.28
+RIGHT_IN = 0.1
+"""Margin on the right of an axes."""
+BAR_IN = 0.62
+"""Margin on the right of an axes with a colour bar, its numbers and its label."""
 _LEGEND_LINE_IN = 0.17
-_LONGEST = 26  # characters of a name in a legend
-
+# Characters of a name in a legend: two names fit side by side below a map.
+_LONGEST_NAME = 26
 
 OWN = "DejaVu Sans"
 """The font that comes with matplotlib."""
@@ -91,10 +101,11 @@ def figure_label(name: str, number: str) -> str:
     """
     if is_drawable(name):
         return name
-    return f"{number}: {''.join(c if c.isascii() and c.isprintable() else '?' for c in name)}"
+    ascii_name = name.encode("ascii", "replace").decode("ascii")
+    return f"{number}: {''.join(c if c.isprintable() else '?' for c in ascii_name)}"
 
 
-def colours_of(scan: ProcessedScan) -> dict[str, str]:
+def assign_colours(scan: ProcessedScan) -> dict[str, str]:
     """Return the colour of each material in the results or the truth, the same in all figures."""
     names = {patch.name for patch in scan.segments if patch.name} | {plate.name for plate in scan.plates}
     for pixels, _ in scan.pixel_names.values():
@@ -106,8 +117,10 @@ def colours_of(scan: ProcessedScan) -> dict[str, str]:
 
 def extent_mm(scan: ProcessedScan) -> tuple[float, float, float, float]:
     """Return the left, right, bottom, top edge of the image, millimetres from its centre."""
-    x, y = axis_mm(scan.x_m), axis_mm(scan.y_m)
-    hx, hy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
+    x = axis_mm(scan.x_m)
+    y = axis_mm(scan.y_m)
+    hx = (x[1] - x[0]) / 2
+    hy = (y[1] - y[0]) / 2
     return float(x[0] - hx), float(x[-1] + hx), float(y[0] - hy), float(y[-1] + hy)
 
 
@@ -164,9 +177,14 @@ def write_label(
     ax: Axes, x: float, y: float, text: str, size: float = 8.0, above: bool = False, on_dark: bool = False
 ) -> Text:
     """Write a name or number with a halo, centred on a point or `above` it."""
-    ink, halo = ("white", "#10141b") if on_dark else (INK, "white")
+    ink = INK
+    halo = "white"
+    if on_dark:
+        ink = "white"
+        halo = "#10141b"
+    alignment = "bottom" if above else "center"
     return ax.text(
-        x, y, text, ha="center", va="bottom" if above else "center", fontsize=size, color=ink, linespacing=1.2,
+        x, y, text, ha="center", va=alignment, fontsize=size, color=ink, linespacing=1.2,
         path_effects=[withStroke(linewidth=2.4, foreground=halo)], family=list(font_families()), parse_math=False,
     )  # fmt: skip
 
@@ -174,15 +192,19 @@ def write_label(
 def patch_label(patch: PatchFigures) -> str:
     """Return the text beside a patch in figures."""
     number = f"patch {patch.label}"
-    if not patch.name:
-        return "metal reference" if patch.metal_reference else number
-    return figure_label(patch.name, number)
+    if patch.name:
+        return figure_label(patch.name, number)
+    if patch.metal_reference:
+        return "metal reference"
+    return number
 
 
 def short_label(text: str) -> str:
     """Return a name cut to the length of a legend's line."""
     text = " ".join(text.split())
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+    if len(text) <= _LONGEST_NAME:
+        return text
+    return f"{text[: _LONGEST_NAME - 1]}…"
 
 
 def patch_colour(patch: PatchFigures, colours: dict[str, str]) -> str:
@@ -199,7 +221,7 @@ def plate_label(plate: TruthPlate, number: int) -> str:
     return figure_label(plate.name, f"plate {number}")
 
 
-def outline_of(patch: PatchFigures, **style: Any) -> Polygon | Rectangle:
+def draw_outline(patch: PatchFigures, **style: Any) -> Polygon | Rectangle:
     """Return a patch's outline, or its box if it has none; `style` are options of matplotlib's patches."""
     if patch.outline_mm:
         return Polygon(patch.outline_mm, closed=True, **style)
@@ -237,17 +259,21 @@ def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
     for ax in fig.axes:
         ax.apply_aspect()
     gap = _GAP_PT * fig.dpi / 72
-    boxes = [one.text.get_window_extent() for one in labels]
-    frames = [one.text.axes.bbox if one.text.axes else fig.bbox for one in labels]
+    boxes = [label.text.get_window_extent() for label in labels]
+    frames = [(label.text.axes or fig).bbox for label in labels]
     outside = any(b.x0 < f.x0 - 1 or b.x1 > f.x1 + 1 for b, f in zip(boxes, frames, strict=True))
-    if not outside and not any(a.overlaps(b) for a, b in combinations([_widened(b, gap) for b in boxes], 2)):
+    touching = any(a.overlaps(b) for a, b in combinations([_widen(b, gap) for b in boxes], 2))
+    if not outside and not touching:
         return []
-    for one in labels:
-        one.text.set_text(f"{one.number}: {one.below}" if one.below else one.number)
+    for label in labels:
+        replacement = label.number
+        if label.below:
+            replacement += f": {label.below}"
+        label.text.set_text(replacement)
     return list(labels)
 
 
-def _widened(box: BboxBase, gap: float) -> Bbox:
+def _widen(box: BboxBase, gap: float) -> Bbox:
     return Bbox.from_extents(box.x0 - gap / 2, box.y0, box.x1 + gap / 2, box.y1)
 
 
@@ -260,8 +286,8 @@ def fit_labels(fig: Figure, labels: Sequence[MapLabel], right_in: float) -> None
     fig.set_figheight(fig.get_figheight() + legend_in)
     set_margins(fig, right_in, legend_in)
     handles = [
-        Patch(facecolor=one.colour, edgecolor=INK, linewidth=0.6, label=f"{one.number}  {short_label(one.name)}")
-        for one in replaced
+        Patch(facecolor=label.colour, edgecolor=INK, linewidth=0.6, label=f"{label.number}  {short_label(label.name)}")
+        for label in replaced
     ]
     legend = fig.legend(handles=handles, loc="lower left", ncols=2, handlelength=1.1, frameon=False)
     style_legend(legend)

@@ -29,24 +29,26 @@ def surface_figure(surface: Surface) -> bytes:
     panels = fig.subplots(1, 3)
     points_mm = 1e3 * surface.points_m
     colour = surface_colours(surface)
-    known = np.isfinite(colour)
+    known_colour = np.isfinite(colour)
     low, high = colour_range(surface)
-    shown = None
+    coloured = None
     for ax, ((across, up), title, (label_x, label_y)) in zip(panels, VIEWS, strict=True):
-        ax.scatter(points_mm[~known, across], points_mm[~known, up], s=5, color=NO_PERMITTIVITY)
-        shown = ax.scatter(
-            points_mm[known, across], points_mm[known, up], s=6, c=colour[known], cmap="viridis", vmin=low, vmax=high
-        )
-        each = max(1, len(points_mm) // NORMALS_SHOWN)
-        start, way = points_mm[::each], NORMAL_MM * surface.normals[::each]
-        ends = start + way
+        ax.scatter(points_mm[~known_colour, across], points_mm[~known_colour, up], s=5, color=NO_PERMITTIVITY)
+        coloured = ax.scatter(
+            points_mm[known_colour, across], points_mm[known_colour, up], s=6, c=colour[known_colour],
+            cmap="viridis", vmin=low, vmax=high,
+        )  # fmt: skip
+        stride = max(1, len(points_mm) // NORMALS_SHOWN)
+        start = points_mm[::stride]
+        needle = NORMAL_MM * surface.normals[::stride]
+        ends = start + needle
         ax.plot([start[:, across], ends[:, across]], [start[:, up], ends[:, up]], color=INK, linewidth=0.5, alpha=0.6)
         dress(ax, title, surface.simulated)
         ax.set_xlabel(label_x, fontsize=9, color=MUTED)
         ax.set_ylabel(label_y, fontsize=9, color=MUTED)
         ax.set_aspect("equal", adjustable="datalim")
-    if known.any() and shown is not None:
-        bar = fig.colorbar(shown, ax=panels, shrink=0.85, pad=0.01)
+    if known_colour.any() and coloured is not None:
+        bar = fig.colorbar(coloured, ax=panels, shrink=0.85, pad=0.01)
         bar.set_label("permittivity, real part", fontsize=9, color=MUTED)
     lines = [segment_text(segment) for segment in surface.segments[:MAX_LINES]]
     fig.supxlabel("\n".join(lines), fontsize=9, color=INK, x=0.01, ha="left")

@@ -26,7 +26,8 @@ PAPER = {"frequency_hz": 138.0, "phase_rad": 0.022}
 QUANTITIES = ("frequency_hz", "phase_rad", "amplitude")
 _LABELS = ("frequency (Hz)", "phase (rad)", "amplitude / mean - 1")
 _BINS = 121
-_REACH = 5.0  # standard deviations shown on either side, of the first row's
+# Histograms reach this many standard deviations of the first row to either side.
+_REACH = 5.0
 
 
 @dataclass
@@ -55,7 +56,9 @@ class SyncReport:
     """Accumulates the residual errors of one board, row by row, in constant memory."""
 
     def __init__(self, sample_rate_hz: float, linear: tuple[int, int], rx: int) -> None:
-        self._rate, self._samples, self._rx = sample_rate_hz, linear[1] - linear[0], rx
+        self._rate = sample_rate_hz
+        self._samples = linear[1] - linear[0]
+        self._rx = rx
         self.stages: dict[str, _Stage] = {}
         self.positions = self.chirps = 0
         self._snr: list[tuple[float, int]] = []
@@ -70,7 +73,8 @@ class SyncReport:
                     reach = _REACH * np.maximum(np.sqrt((values**2).mean(axis=1)), 1e-12)
                     self.stages[name] = _Stage(reach)
                 self.stages[name].add(values)
-        several = row.valid & (row.chirps > 1)  # one chirp alone has no noise estimate
+        # One chirp alone has no noise estimate.
+        several = row.valid & (row.chirps > 1)
         if row.noise is not None and several.any():
             ratio = np.median(row.direct_amplitude[several]) ** 2 / np.median(row.noise[several])
             self._snr.append((float(ratio), int(several.sum())))
@@ -89,24 +93,29 @@ class SyncReport:
         """
         if not self.chirps or not self._snr:
             return {}
-        n, chirps = self._samples, self.chirps / max(self.positions, 1)
+        n = self._samples
+        chirps = self.chirps / max(self.positions, 1)
 
         def tone(snr: float) -> tuple[float, float, float]:
             phase = 1 / np.sqrt(2 * snr * n)
             f = np.sqrt(6 / (snr * n * (n**2 - 1))) / (2 * np.pi) * self._rate
             return float(f), float(phase), float(phase)
 
-        one, mean = tone(self.snr * self._rx), tone(self.snr * self._rx * chirps)
+        single_chirp = tone(self.snr * self._rx)
+        mean = tone(self.snr * self._rx * chirps)
         f, phase, amplitude = (float(np.sqrt(2)) * bound for bound in mean)
-        return {"aligned": one, "averaged": mean, "referenced": (f, phase, amplitude)}
+        return {"aligned": single_chirp, "averaged": mean, "referenced": (f, phase, amplitude)}
 
     def summary(self) -> dict[str, Any]:
         """Return the content of sync.json."""
         bounds = self.bounds()
+        direct_snr_db = None
+        if self._snr:
+            direct_snr_db = round(10 * np.log10(self.snr), 2)
         return {
             "positions": self.positions,
             "chirps": self.chirps,
-            "direct_snr_db": round(10 * np.log10(self.snr), 2) if self._snr else None,
+            "direct_snr_db": direct_snr_db,
             "stages": {
                 name: {
                     "samples": stage.n,
@@ -122,23 +131,27 @@ def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
     """Return a PNG: histograms of errors after each stage, the bounds as normal distributions, the paper's values."""
     fig = Figure(figsize=(11, 9), dpi=110, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
-    fig.suptitle(title + ("   SIMULATED" if simulated else ""), color=STAMP if simulated else INK, fontsize=12)
+    if simulated:
+        fig.suptitle(f"{title}   SIMULATED", color=STAMP, fontsize=12)
+    else:
+        fig.suptitle(title, color=INK, fontsize=12)
     bounds = report.bounds()
     axes = fig.subplots(len(STAGES), 3, squeeze=False)
-    for line, (name, what) in zip(axes, STAGES.items(), strict=True):
+    for line, (name, description) in zip(axes, STAGES.items(), strict=True):
         stage = report.stages.get(name)
         for i, ax in enumerate(line):
             ax.tick_params(labelsize=8, colors=MUTED)
             ax.set_yticks([])
             ax.locator_params(axis="x", nbins=5)
             if i == 0:
-                ax.set_ylabel(f"{name}\n{textwrap.fill(what, 34)}", fontsize=8, color=INK)
+                ax.set_ylabel(f"{name}\n{textwrap.fill(description, 34)}", fontsize=8, color=INK)
             if name == list(STAGES)[-1]:
                 ax.set_xlabel(_LABELS[i], fontsize=9, color=MUTED)
             if stage is None or stage.n == 0:
                 ax.text(0.5, 0.5, "nothing to measure", ha="center", transform=ax.transAxes, fontsize=8, color=MUTED)
                 continue
-            reach, std = stage.reach[i], stage.std[i]
+            reach = stage.reach[i]
+            std = stage.std[i]
             x = (np.arange(_BINS) + 0.5) / _BINS * 2 * reach - reach
             density = stage.counts[i] / max(stage.counts[i].sum(), 1) / (2 * reach / _BINS)
             ax.fill_between(x, density, step="mid", color="#88CCEE", label=f"std {std:.3g}")
@@ -155,11 +168,16 @@ def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
     return png(fig)
 
 
-def text_of(boards: dict[str, dict[str, Any]], simulated: bool) -> str:
+def format_report(boards: dict[str, dict[str, Any]], simulated: bool) -> str:
     """Return the report as text."""
-    lines = ["Synchronisation residuals (standard deviations)" + (", simulated data" if simulated else ""), ""]
+    heading = "Synchronisation residuals (standard deviations)"
+    if simulated:
+        heading += ", simulated data"
+    lines = [heading, ""]
     for board, s in boards.items():
-        snr = "" if s["direct_snr_db"] is None else f", direct path {s['direct_snr_db']} dB over noise a channel"
+        snr = ""
+        if s["direct_snr_db"] is not None:
+            snr = f", direct path {s['direct_snr_db']} dB over noise a channel"
         lines.append(f"{board}: {s['chirps']} chirps at {s['positions']} positions{snr}")
         for name, stage in s["stages"].items():
             values = f"{stage['frequency_hz_std']:10.2f} Hz {stage['phase_rad_std']:9.5f} rad"
@@ -178,6 +196,6 @@ def write_sync_report(out: Path, reports: dict[str, SyncReport], scan: str, simu
     write_json(out / "sync.json", {"scan": scan, "simulated": simulated, "paper": PAPER, "boards": boards})
     for name, report in reports.items():
         write_atomically(out / f"sync-{name}.png", figure_png(report, f"{scan}, {name}", simulated))
-    text = text_of(boards, simulated)
+    text = format_report(boards, simulated)
     write_atomically(out / "sync.txt", text.encode())
     return text

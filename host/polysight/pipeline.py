@@ -22,15 +22,23 @@ class Pipeline:
         live: bool = False,
         samples: process.Use = "none",
     ) -> None:
-        self.source, self.settings, self.inputs = source, settings, inputs
+        self.source = source
+        self.settings = settings
+        self.inputs = inputs
         self.calibration = calibration.calibration_of_scan(source)
         rig = self.calibration.rig(source.instrument)
-        filters, self.plane = self.calibration.high_passes(rig), imaging.UNKNOWN_PLANE
+        filters = self.calibration.high_passes(rig)
+        self.plane = imaging.UNKNOWN_PLANE
         self.synchroniser = sync.RowSynchroniser(source, rig, filters)
         self.quality = process.Quality(rig, source, self.calibration.facts())
-        kept = process.KeptSamples(source, rig, filters, self.quality, settings, live=live, samples=samples)
-        self.samples, self.images, self.sub_bands = kept, kept.images, kept.sub_bands
-        self.rig = store.mirrored(self.images.rig) if source.mirrored else self.images.rig  # x from TX to RX
+        samples_on_disk = process.KeptSamples(source, rig, filters, self.quality, settings, live=live, samples=samples)
+        self.samples = samples_on_disk
+        self.images = samples_on_disk.images
+        self.sub_bands = samples_on_disk.sub_bands
+        self.rig = self.images.rig
+        # Images of a mirrored scan are transposed, so that x runs from TX to RX: the rig follows them.
+        if source.mirrored:
+            self.rig = store.mirror_rig(self.rig)
 
     def add_row(self, row: int) -> None:
         """Add one row of every board to the images: from kept samples, or from raw data."""
@@ -57,14 +65,20 @@ class Pipeline:
         if self.settings.sparse and not from_sums:
             self.sub_bands = self.samples.fill_missing()
         with self.quality.timed("image"):
-            images = self.images.current() if from_sums else self.samples.filled.finish()
+            if from_sums:
+                images = self.images.current()
+            else:
+                images = self.samples.filled.finish()
         self.quality.note(**self.synchroniser.recording_facts())
-        return images.transposed() if self.source.mirrored else images
+        if self.source.mirrored:
+            return images.transposed()
+        return images
 
     def place_plane(self, images: imaging.Images, move: bool = True) -> imaging.Images:
         """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
         with self.quality.timed("plane"):
-            masks, swapped = materials.insides(images), self.source.mirrored
+            masks = materials.insides(images)
+            swapped = self.source.mirrored
             self.plane, images = imaging.move_to_plane(self.samples.filled, images, masks, swapped, move)
         return images
 
@@ -76,30 +90,34 @@ class Pipeline:
     ) -> materials.MaterialsResult:
         """Find patches (unless known), metal reference, permittivities and names; in sub-bands too, if imaged."""
         with self.quality.timed("materials"):
-            rig, std = self.plane.applied_to(self.rig), self.plane.incidence_std_rad(self.rig)
+            rig = self.plane.applied_to(self.rig)
+            std = self.plane.incidence_std_rad(self.rig)
             angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, self.settings.incidence)
             optics = materials.Optics.of(self.rig, angles, std, self.synchroniser.direct_path_known)
-            found = materials.analyse(images, optics, known, classifier)
+            result = materials.analyse(images, optics, known, classifier)
             plane = None if known is None else known.plane
-            self.quality.note_materials(found, angles, images.valid, plane)
+            self.quality.note_materials(result, angles, images.valid, plane)
         with self.quality.timed("sub-bands"):
             parts = self.sub_bands.finish(self.source.mirrored, self.plane.moved_m)
-            return materials.with_bands(found, self.sub_bands.bands, parts, optics, plane) if parts else found
+            if parts:
+                result = materials.with_bands(result, self.sub_bands.bands, parts, optics, plane)
+        return result
 
     def examine(self, images: imaging.Images, plates: materials.Plates = ()) -> process.Findings:
         """Find plane and materials, and judge them; a verdict "no result" removes names and permittivities."""
         classifier = process.load_classifier(self.settings, self.rig)
-        known = process.boxes_as_patches(self.settings, self.inputs, images.x_m, images.y_m)
-        given, bands = self.inputs.reference, self.settings.bands
-        plane = self.calibration.metal_plane(self.rig, given, known.metal is not None, bands)
+        scene = process.boxes_as_patches(self.settings, self.inputs, images.x_m, images.y_m)
+        has_metal = scene.metal is not None
+        plane = self.calibration.metal_plane(self.rig, self.inputs.reference, has_metal, self.settings.bands)
         images = self.place_plane(images)
         if plane is not None:
             images = images.within(plane.valid_on(images.x_m, images.y_m))
-            known = replace(known, metal=plane)
-        found = self.find_materials(images, replace(known, plates=plates), classifier)
-        verdict = process.judge(self.quality, found, self.plane, classifier, self.rig.check)
-        shown = found if verdict.usable else found.without_result()
-        return process.Findings(images, shown, verdict, self.plane, classifier, plates)
+            scene = replace(scene, metal=plane)
+        result = self.find_materials(images, replace(scene, plates=plates), classifier)
+        verdict = process.judge(self.quality, result, self.plane, classifier, self.rig.check)
+        if not verdict.usable:
+            result = result.without_result()
+        return process.Findings(images, result, verdict, self.plane, classifier, plates)
 
     def finish(self, out: Path, plates: materials.Plates = (), progress: Progress = no_progress) -> process.Products:
         """Write all products into `out`: images first, so that they stay if a later step fails."""
@@ -112,4 +130,4 @@ class Pipeline:
         progress("figures and report")
         unnamed = process.why_unnamed(self.settings, self.rig)
         scan = process.processed_scan(out, self.source, self.rig, findings, self.quality, unnamed)
-        return process.save_materials(out, scan, findings.found, unnamed)
+        return process.save_materials(out, scan, findings.analysis, unnamed)

@@ -62,7 +62,9 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def path(self, name: str) -> Path | None:
         """Return one of `FILES` as a path; None if it is not given."""
         value = getattr(self, name)
-        return None if value is None else Path(value)
+        if value is None:
+            return None
+        return Path(value)
 
     def files(self) -> dict[str, Path]:
         """Return the files and folders that are given, by field."""
@@ -84,4 +86,6 @@ DEFAULT = Settings()
 
 def path_text(path: Path | None) -> str | None:
     """Return a path as settings hold it."""
-    return None if path is None else str(path)
+    if path is None:
+        return None
+    return str(path)

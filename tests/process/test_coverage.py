@@ -113,6 +113,6 @@ def test_lost_positions_of_odd_rows_are_counted_by_column(scan_of, tmp_path):
         expected[index, columns] = True
     nothing, axis = np.zeros((1, 1), np.complex64), np.zeros(1)
     images = Images(nothing, nothing, axis, axis, nothing.astype(bool), nothing)
-    scan = ProcessedScan.computed(Path(), images=images, quality=quality, facts=ScanFacts(), plan=source.plan)
+    scan = ProcessedScan.from_results(Path(), images=images, quality=quality, facts=ScanFacts(), plan=source.plan)
     for masked in masked_positions(scan).values():
         np.testing.assert_array_equal(masked, expected)

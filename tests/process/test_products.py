@@ -94,9 +94,9 @@ def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
 
     def examine_tilted(self: Pipeline, *words: object) -> object:
         findings = examine(self, *words)  # type: ignore[arg-type]
-        first, *others = findings.found.patches
+        first, *others = findings.analysis.patches
         patches = (replace(first, refused=STEEP if is_steep else None), *others)
-        return replace(findings, found=replace(findings.found, patches=patches))
+        return replace(findings, analysis=replace(findings.analysis, patches=patches))
 
     monkeypatch.setattr(Pipeline, "examine", examine_tilted)
     out = tmp_path / "out"

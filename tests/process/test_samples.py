@@ -20,7 +20,7 @@ from polysight.pipeline import Pipeline
 from polysight.process import Use, map_rows
 from polysight.store import RowData, ScanFolder
 from polysight.store.manifest import encode_line
-from polysight.store.source import pieces_of
+from polysight.store.source import split_pieces
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -147,14 +147,14 @@ def test_damaged_samples_are_made_again(two_plates: Path, kept: Path, what: str)
 
 def test_rows_with_other_raw_data_are_synchronised_again(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As after a retake or a new placement of the row: the committed digest differs."""
-    committed = ScanFolder.committed
+    committed = ScanFolder.committed_rows
 
     def changed(self: ScanFolder) -> dict:
         rows = committed(self)
         rows[2].boards["RV"] = msgspec.structs.replace(rows[2].boards["RV"], index_crc32="00000000")
         return rows
 
-    monkeypatch.setattr(ScanFolder, "committed", changed)
+    monkeypatch.setattr(ScanFolder, "committed_rows", changed)
     pipeline = Pipeline(ScanFolder.load(kept), samples="read")
     assert [row for row in pipeline.source.rows() if not pipeline.samples.restore(row)] == [2]
 
@@ -240,7 +240,7 @@ def damaged_raw(monkeypatch: pytest.MonkeyPatch, change: Callable[[str, np.ndarr
         found = read_row(self, board, row)
         words = found.payload.view("<i2").reshape(-1, 8).copy()
         change(board, words)
-        return RowData(pieces_of(words.view(np.uint8).ravel()), [], found.frames_expected, found.crc32)
+        return RowData(split_pieces(words.view(np.uint8).ravel()), [], found.frames_expected, found.crc32)
 
     monkeypatch.setattr(ScanFolder, "read_row", changed)
 

@@ -47,7 +47,7 @@ def examine(rig):
         pipeline, images = imaged(source)
         findings = pipeline.examine(images)
         plates = truth_plates(truth(source.instrument, scene, scene.seed))
-        true = match_truth([r.patch for r in findings.found.patches], plates)
+        true = match_truth([r.patch for r in findings.analysis.patches], plates)
         return findings, true
 
     return make
@@ -56,7 +56,7 @@ def examine(rig):
 def distances(findings, true):
     """Squared distance of each patch's true permittivity in its region."""
     out = []
-    for r in findings.found.patches:
+    for r in findings.analysis.patches:
         plate, e = true.get(r.patch.label), r.permittivity
         if plate is not None and plate.permittivity is not None and e.value is not None:
             away = e.value - plate.permittivity
@@ -70,7 +70,7 @@ def reasons(findings):
 
 
 def silent(findings):
-    return all(r.name is None and r.permittivity is None and r.ratio is None for r in findings.found.rows())
+    return all(r.name is None and r.permittivity is None and r.ratio is None for r in findings.analysis.rows())
 
 
 def test_a_measured_rig_and_a_plain_scene_are_good(examine):
@@ -78,8 +78,8 @@ def test_a_measured_rig_and_a_plain_scene_are_good(examine):
     assert findings.verdict.level == "good", reasons(findings)
     assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
     assert sum(r.verdict is not None and r.verdict.name.startswith(true[r.patch.label].name)
-               for r in findings.found.patches) >= 4  # fmt: skip
-    (reference,) = [r for r in findings.found.rows() if r.metal_reference]
+               for r in findings.analysis.patches) >= 4  # fmt: skip
+    (reference,) = [r for r in findings.analysis.rows() if r.metal_reference]
     assert reference.name is None  # never judged by itself
 
 
@@ -110,7 +110,7 @@ def test_unmeasured_leakage_is_in_the_error_bars(examine, leak):
         assert findings.verdict.level == "good"
         return
     assert findings.verdict.level == "care"
-    assert {e.dominated_by for e in findings.found.inversion.patches} <= {"leakage", "metal reference", "noise"}
+    assert {e.dominated_by for e in findings.analysis.inversion.patches} <= {"leakage", "metal reference", "noise"}
     assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
 
 
@@ -177,7 +177,7 @@ def test_products_without_a_result_hold_images_and_no_name(rig, tmp_path):
 def test_p_sigma_covers_the_error_of_p(examine):
     scene = world(disturbances={"leakage_measured": 0.003})
     findings, true = examine(scene)
-    found, sigma = findings.found, findings.found.p_sigma(findings.images.valid)
+    found, sigma = findings.analysis, findings.analysis.p_sigma(findings.images.valid)
     inside = []
     for r in found.patches:
         plate = true.get(r.patch.label)

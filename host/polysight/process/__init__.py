@@ -11,8 +11,8 @@ from polysight.process.given_images import (
     GivenPair,
     analyse_given_images,
     is_given_images,
+    make_reference,
     read_given_images,
-    reference_of,
 )
 from polysight.process.inputs import (
     NO_INPUTS,
@@ -51,12 +51,12 @@ __all__ = [
     "is_given_images",
     "judge",
     "load_classifier",
+    "make_reference",
     "map_boards",
     "map_rows",
     "no_progress",
     "processed_scan",
     "read_given_images",
-    "reference_of",
     "save_images",
     "save_materials",
     "why_unnamed",

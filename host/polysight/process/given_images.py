@@ -36,9 +36,9 @@ from polysight.materials import (
 from polysight.polarimetry import IncidenceChoice, PlaneReference, plane_reference, specular_incidence_rad
 from polysight.process.inputs import Inputs, boxes_as_patches, load_classifier, why_unnamed
 from polysight.process.quality import scene_reasons
-from polysight.process.save import Findings, materials_of
+from polysight.process.save import Findings, assemble_result
 from polysight.products import ProcessedScan
-from polysight.results import GivenImages, IncidenceAngles, ScanFacts, ScanQuality, reason, verdict_of
+from polysight.results import GivenImages, IncidenceAngles, ScanFacts, ScanQuality, join_reasons, reason
 from polysight.settings import Settings
 from polysight.store import open_npz, versions
 from polysight_shared.config import Instrument
@@ -56,6 +56,8 @@ MIN_PIXELS = 8
 EVEN = 0.01
 """Largest deviation of a pixel's distance from the mean one, relative to it."""
 _EXPECTED = "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid [ny, nx], incidence_deg, simulated"
+# Distances of the object plane between which `place_rig` looks for an incidence angle.
+_NEAREST_MM = 60.0
 _FARTHEST_MM = 1e5
 
 
@@ -93,12 +95,18 @@ class GivenPair:
     @property
     def scan_id(self) -> str:
         """Name of the images: that of the file or folder."""
-        return self.path.stem if self.path.suffix == NPZ else self.path.name
+        if self.path.suffix == NPZ:
+            return self.path.stem
+        return self.path.name
 
     def boxes(self, drawn: Labels | None) -> Labels | None:
         """Return drawn boxes, or else those that came with the images, in millimetres from the image centre."""
-        labels = self.labels if drawn is None else drawn
-        return None if labels is None else labels.in_mm(self.x_m, self.y_m)
+        labels = self.labels
+        if drawn is not None:
+            labels = drawn
+        if labels is None:
+            return None
+        return labels.in_mm(self.x_m, self.y_m)
 
 
 def is_given_images(path: Path) -> bool:
@@ -120,7 +128,8 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     arrays = _read_arrays(path)
     _check_channels(path, arrays)
     assumed: list[str] = []
-    h, v = arrays["h"], arrays["v"]
+    h = arrays["h"]
+    v = arrays["v"]
     x_m = _axis(path, arrays, "x_m", h.shape[1], rig, assumed)
     y_m = _axis(path, arrays, "y_m", h.shape[0], rig, assumed)
     _check_square(path, x_m, y_m)
@@ -131,7 +140,16 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     angle = _number(path, arrays, "incidence_deg")
     images = _ascending(h, v, valid, x_m, y_m)
     simulated = bool(_number(path, arrays, "simulated") or False)
-    return GivenPair(path, images, x_m, y_m, None, angle, simulated, tuple(assumed))
+    return GivenPair(
+        path=path,
+        images=images,
+        x_m=x_m,
+        y_m=y_m,
+        labels=None,
+        incidence_deg=angle,
+        simulated=simulated,
+        assumed=tuple(assumed),
+    )
 
 
 def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
@@ -149,9 +167,9 @@ def _check_channels(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     """Raise DataError unless h and v are complex images of one shape."""
     missing = [name for name in CHANNELS if name not in arrays]
     if missing:
-        held = ", ".join(arrays) or "nothing"
+        names = ", ".join(arrays) or "nothing"
         raise DataError(
-            f"{path}: no {' and no '.join(missing)}; it holds {held}", _EXPECTED,
+            f"{path}: no {' and no '.join(missing)}; it holds {names}", _EXPECTED,
             "save the s-polarised channel as h and the p-polarised one as v", code=ErrorCode.KEY_MISSING,
         )  # fmt: skip
     for name in CHANNELS:
@@ -168,7 +186,8 @@ def _check_channels(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
                 f"an image has two axes [ny, nx], each of {MIN_PIXELS} pixels or more",
                 "save one image per channel", code=ErrorCode.MISMATCH,
             )  # fmt: skip
-    h, v = arrays["h"], arrays["v"]
+    h = arrays["h"]
+    v = arrays["v"]
     if h.shape != v.shape:
         raise DataError(
             f"{path}: h is {_shape(h)}, v is {_shape(v)}", "both channels need the same pixels",
@@ -186,9 +205,8 @@ def _axis(
     """Return the pixel centres along one axis, metres; the rig file's pixel, centred, if the file has none."""
     if name not in arrays:
         pixel_mm = rig.image.pixel_mm
-        first = "the lowest" if name == "y_m" else "the leftmost"
-        line = "row" if name == "y_m" else "column"
-        assumed.append(f"no {name}: pixels of {pixel_mm:g} mm (rig file), {line} 0 is {first}")
+        position = "row 0 is the lowest" if name == "y_m" else "column 0 is the leftmost"
+        assumed.append(f"no {name}: pixels of {pixel_mm:g} mm (rig file), {position}")
         centred = np.arange(size, dtype=np.float64) - (size - 1) / 2
         return np.asarray(centred * pixel_mm / 1e3, np.float64)
     axis = arrays[name]
@@ -211,7 +229,8 @@ def _axis(
 
 def _check_square(path: Path, x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.float64]) -> None:
     """Raise DataError unless pixels are square and of 0.1 to 20 mm: other numbers are a mistaken unit."""
-    dx, dy = abs(x_m[1] - x_m[0]) * 1e3, abs(y_m[1] - y_m[0]) * 1e3
+    dx = abs(x_m[1] - x_m[0]) * 1e3
+    dy = abs(y_m[1] - y_m[0]) * 1e3
     if not 0.1 <= dx <= 20 or abs(dx - dy) > EVEN * dx:
         raise DataError(
             f"{path}: pixels of {dx:.4g} x {dy:.4g} mm", "pixels must be square, of 0.1 to 20 mm; axes are in metres",
@@ -221,7 +240,8 @@ def _check_square(path: Path, x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.
 
 def _valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.bool_]:
     """Return the pixels to use. Raises DataError if one of them is not finite, or none is left."""
-    h, v = arrays["h"], arrays["v"]
+    h = arrays["h"]
+    v = arrays["v"]
     valid = arrays.get("valid", np.ones(h.shape, bool))
     if valid.dtype.kind != "b" or valid.shape != h.shape:
         raise DataError(
@@ -265,8 +285,8 @@ def _ascending(
     y_m: npt.NDArray[np.float64],
 ) -> Images:
     """Return the pair with ascending axes, zero where it is not valid."""
-    rows = slice(None, None, 1 if y_m[1] > y_m[0] else -1)
-    columns = slice(None, None, 1 if x_m[1] > x_m[0] else -1)
+    rows = slice(None, None, int(np.sign(y_m[1] - y_m[0])))
+    columns = slice(None, None, int(np.sign(x_m[1] - x_m[0])))
     usable = valid[rows, columns]
     shown_h = np.where(usable, h[rows, columns], 0).astype(np.complex64)
     shown_v = np.where(usable, v[rows, columns], 0).astype(np.complex64)
@@ -276,39 +296,51 @@ def _ascending(
 def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
     """Read `labels/<scan>`; row 0 of its images is the top of the published pictures."""
     scan = read_labelled_scan(folder)
-    how = image_orientation([scan])
-    scan = scan.oriented(how)
+    orientation = image_orientation([scan])
+    scan = scan.oriented(orientation)
     arrays = {"h": scan.h, "v": scan.v}
     _check_channels(folder, arrays)
     x_m = _axis(folder, arrays, "x_m", scan.h.shape[1], rig, [])
     y_m = _axis(folder, arrays, "y_m", scan.h.shape[0], rig, [])[::-1]
-    assumed = [f"no geometry: pixels of {rig.image.pixel_mm:g} mm (rig file), row 0 is the highest; boxes: {how}"]
+    assumed = [
+        f"no geometry: pixels of {rig.image.pixel_mm:g} mm (rig file), row 0 is the highest; boxes: {orientation}"
+    ]
     file = next(iter([folder / f"{folder.name}.json", *sorted(folder.glob("*.json"))]))
-    labels = read_labels(file) if scan.boxes else None
+    labels = None
+    if scan.boxes:
+        labels = read_labels(file)
     images = _ascending(scan.h, scan.v, _valid(folder, arrays), x_m, y_m)
-    return GivenPair(folder, images, x_m, y_m, labels, None, scan.simulated, tuple(assumed))
+    return GivenPair(
+        path=folder,
+        images=images,
+        x_m=x_m,
+        y_m=y_m,
+        labels=labels,
+        incidence_deg=None,
+        simulated=scan.simulated,
+        assumed=tuple(assumed),
+    )
 
 
-def rig_at(rig: Instrument, incidence_deg: float) -> Instrument:
+def place_rig(rig: Instrument, incidence_deg: float) -> Instrument:
     """Return the rig with its object plane where the specular incidence angle is the given one.
 
     Raises ConfigError if no distance of the plane gives this angle.
     """
 
-    def moved(distance_mm: float) -> Instrument:
+    def place_plane(distance_mm: float) -> Instrument:
         geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=distance_mm)
         return msgspec.structs.replace(rig, geometry=geometry)
 
     def miss(distance_mm: float) -> float:
-        return float(np.degrees(specular_incidence_rad(moved(distance_mm)))) - incidence_deg
+        return float(np.degrees(specular_incidence_rad(place_plane(distance_mm)))) - incidence_deg
 
-    nearest = 60.0
-    if not miss(nearest) > 0 > miss(_FARTHEST_MM):
+    if not miss(_NEAREST_MM) > 0 > miss(_FARTHEST_MM):
         raise ConfigError(
             f"an incidence angle of {incidence_deg:g} degrees", "the rig's geometry has no plane with this angle",
             "give an angle between 5 and 80 degrees", code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
-    return moved(float(scipy.optimize.brentq(miss, nearest, _FARTHEST_MM, xtol=1e-9)))
+    return place_plane(float(scipy.optimize.brentq(miss, _NEAREST_MM, _FARTHEST_MM, xtol=1e-9)))
 
 
 @dataclass(frozen=True)
@@ -336,7 +368,7 @@ def choose_angle(pair: GivenPair, settings: Settings, rig: Instrument) -> Angle:
     return Angle(float(np.degrees(specular_incidence_rad(rig))), "rig file")
 
 
-def illumination_of(images: Images, rig: Instrument) -> Illumination:
+def describe_illumination(images: Images, rig: Instrument) -> Illumination:
     """Return what the phase of a plate says about its tilt, for a rig; the footprints are not known, and taken as even.
 
     A row of phases gives the tilt (`Illumination.rise`); nothing is divided out.
@@ -384,22 +416,26 @@ BETTER_SIGN = 1.0
 """Difference of the metal reference's log evidence by which the other sign of the phases is taken."""
 
 
-def fits_better(one: MaterialsResult, other: MaterialsResult) -> bool:
+def fits_better(result: MaterialsResult, other: MaterialsResult) -> bool:
     """Return true if the patches of one result are clearly more plausible materials beside the metal reference.
 
     Fewer patches that would amplify decide, then the evidence of the metal reference.
     """
-    if one.metal.evidence is None or other.metal.evidence is None:
+    if result.metal.evidence is None or other.metal.evidence is None:
         return False
-    amplifying, amplifying_other = (
-        sum(p.refused is not None and p.refused.what in NOT_PASSIVE for p in result.patches) for result in (one, other)
-    )
+    amplifying = _count_amplifying(result)
+    amplifying_other = _count_amplifying(other)
     if amplifying != amplifying_other:
         return amplifying < amplifying_other
-    return one.metal.evidence.score > other.metal.evidence.score + BETTER_SIGN
+    return result.metal.evidence.score > other.metal.evidence.score + BETTER_SIGN
 
 
-def reference_of(pair: GivenPair) -> PlaneReference:
+def _count_amplifying(result: MaterialsResult) -> int:
+    """Return the number of patches that would reflect more than metal or amplify: no material does."""
+    return sum(p.refused is not None and p.refused.what in NOT_PASSIVE for p in result.patches)
+
+
+def make_reference(pair: GivenPair) -> PlaneReference:
     """Return the metal reference that given images of a plate make. Raises DataError if they show none."""
     return plane_reference(pair.images, name=pair.scan_id)
 
@@ -417,33 +453,37 @@ def analyse_given_images(
     """
     began = time.perf_counter()
     angle = choose_angle(pair, settings, rig)
-    rig = rig_at(rig, angle.deg)
+    rig = place_rig(rig, angle.deg)
     classifier = load_classifier(settings, rig)
-    images = replace(pair.images, illumination=illumination_of(pair.images, rig))
+    images = replace(pair.images, illumination=describe_illumination(pair.images, rig))
     boxed = replace(inputs, labels=pair.boxes(inputs.labels))
-    known = boxes_as_patches(settings, boxed, images.x_m, images.y_m)
+    scene = boxes_as_patches(settings, boxed, images.x_m, images.y_m)
     plane = inputs.reference
-    if plane is not None and known.metal is None:
+    if plane is not None and scene.metal is None:
         images = images.within(plane.valid_on(images.x_m, images.y_m))
-        known = replace(known, metal=plane)
+        scene = replace(scene, metal=plane)
     everywhere = np.full(images.h.shape, np.radians(angle.deg))
     optics = Optics.of(
         rig, IncidenceChoice("one", everywhere, everywhere), theta_std_rad=UNKNOWN_PLANE.incidence_std_rad(rig)
     )
-    known = replace(known, plates=plates)
-    found = analyse(images, optics, known, classifier)
-    turned = replace(images, h=images.h.conj(), v=images.v.conj())
-    otherwise = analyse(turned, optics, known, classifier)
+    scene = replace(scene, plates=plates)
+    result = analyse(images, optics, scene, classifier)
+    # Another program may have the opposite sign of phase: take the one with which the patches are materials.
+    conjugated = replace(images, h=images.h.conj(), v=images.v.conj())
+    result_conjugated = analyse(conjugated, optics, scene, classifier)
     sign: list[Finding] = []
-    if fits_better(otherwise, found):
-        found, images, sign = otherwise, turned, [CONJUGATED]
-    verdict = verdict_of([*given_reasons(pair, angle), *sign, *scene_reasons(found, None, classifier)])
-    shown = found if verdict.usable else found.without_result()
-    findings = Findings(images, shown, verdict, UNKNOWN_PLANE, classifier, plates)
+    if fits_better(result_conjugated, result):
+        result = result_conjugated
+        images = conjugated
+        sign = [CONJUGATED]
+    verdict = join_reasons([*given_reasons(pair, angle), *sign, *scene_reasons(result, None, classifier)])
+    if not verdict.usable:
+        result = result.without_result()
+    findings = Findings(images, result, verdict, UNKNOWN_PLANE, classifier, plates)
     quality = ScanQuality(
         seconds_per_stage={"materials": round(time.perf_counter() - began, 4)},
         verdict=verdict,
-        pixel_accuracy=pixel_accuracy(shown),
+        pixel_accuracy=pixel_accuracy(result),
         incidence=IncidenceAngles(used="one number for the image", one_deg=round(angle.deg, 4)),
         given_images=GivenImages(file=str(pair.path), incidence_from=angle.source, assumed=list(pair.assumed)),
     )
@@ -454,4 +494,4 @@ def analyse_given_images(
         versions=versions(),
     )
     unnamed = why_unnamed(settings, rig)
-    return materials_of(pair.path.parent, facts, quality, findings, unnamed), findings, unnamed
+    return assemble_result(pair.path.parent, facts, quality, findings, unnamed), findings, unnamed

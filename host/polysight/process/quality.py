@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from polysight.imaging import ImageBuilder, Images, PlaneEstimate, imaging_facts
@@ -49,6 +49,7 @@ from polysight.results import (
     fit_reasons,
     halo_reasons,
     incidence_reasons,
+    join_reasons,
     leakage_reasons,
     level_reasons,
     metal_reasons,
@@ -58,7 +59,6 @@ from polysight.results import (
     recording_reasons,
     signal_reasons,
     tilt_reasons,
-    verdict_of,
 )
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import SyncedRow, block_sweep_of, estimate_backlash, object_filter, sweep_of
@@ -181,13 +181,17 @@ class BoardRows:
 
         None if unknown (cubes that another program synchronised).
         """
-        values = _known([r.direct_snr for r in self.rows.values()])
-        return float(10 * np.log10(np.median(values))) if values.size else None
+        values = _finite_values([r.direct_snr for r in self.rows.values()])
+        if values.size:
+            return float(10 * np.log10(np.median(values)))
+        return None
 
     def residual(self, stage: str) -> float | None:
         """Return the standard deviation of the phase after a synchronisation stage, radians; None if unknown."""
         phases = [r.residuals[stage][1] for r in self.figures.values() if stage in r.residuals]
-        return float(np.median(phases)) if phases else None
+        if phases:
+            return float(np.median(phases))
+        return None
 
     def summary(self, backlash: bool = True) -> BoardQuality:
         """Return the board's entry of quality.json. Residuals are RMS over rows, weighted by valid positions.
@@ -195,8 +199,13 @@ class BoardRows:
         `backlash=False` skips the estimate of the stage's backlash, which takes 2 ms per row.
         """
         figures = self.figures
-        direct = _known([self.rows[row].direct_hz for row in figures])
+        direct = _finite_values([self.rows[row].direct_hz for row in figures])
         snr = self.direct_snr_db
+        if snr is not None:
+            snr = round(snr, 2)
+        shift = None
+        if backlash:
+            shift = self._estimate_backlash()
         return BoardQuality(
             frames_expected=self.frames_expected,
             frames_received=self.frames_received,
@@ -207,16 +216,16 @@ class BoardRows:
             chirps_clipped=sum(r.chirps_clipped for r in figures.values()),
             chirps_disturbed=sum(r.chirps_disturbed for r in figures.values()),
             positions_clipped=sum(r.positions_clipped for r in figures.values()),
-            direct_path_hz=_frequency_range(direct) if direct.size else UNSET,
-            direct_path_snr_db=None if snr is None else round(snr, 2),
-            stage_backlash_mm=self._backlash() if backlash else None,
+            direct_path_hz=_frequency_range(direct),
+            direct_path_snr_db=snr,
+            stage_backlash_mm=shift,
             masked_columns={row: r.masked_columns for row, r in figures.items() if r.masked_columns},
             rows_recorded=list(figures),
             raw_crc32={row: r.crc32 for row, r in figures.items() if r.crc32},
             synchronisation=_residuals(list(figures.values())),
         )
 
-    def _backlash(self) -> Backlash | None:
+    def _estimate_backlash(self) -> Backlash | None:
         """Return the shift of odd rows towards +x relative to the plan, estimated from echoes; None if undetermined."""
         estimate = estimate_backlash({row: quality.echo for row, quality in self.rows.items()}, self.rig)
         if estimate is None:
@@ -224,7 +233,9 @@ class BoardRows:
         return Backlash(shift=round(estimate.shift_mm, 4), std=round(estimate.std_mm, 4))
 
 
-def _frequency_range(direct_hz: NDArray[np.float64]) -> FrequencyRange:
+def _frequency_range(direct_hz: NDArray[np.float64]) -> FrequencyRange | UnsetType:
+    if direct_hz.size == 0:
+        return UNSET
     return FrequencyRange(float(np.median(direct_hz)), float(direct_hz.min()), float(direct_hz.max()))
 
 
@@ -252,9 +263,11 @@ def _direct_snr(row: SyncedRow) -> NDArray[np.float64]:
     return out
 
 
-def _known(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _finite_values(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return the finite values of all rows in one array."""
-    values = np.concatenate(rows) if rows else np.zeros(0)
+    if not rows:
+        return np.zeros(0)
+    values = np.concatenate(rows)
     return values[np.isfinite(values)]
 
 
@@ -276,9 +289,13 @@ class Quality:
         self.source = source
         self.boards = {board.name: BoardRows(rig, board) for board in rig.receivers}
         self.seconds: dict[str, float] = {}
-        self.notes: dict[str, Any] = {"calibration": dict(calibration)} if calibration else {}
-        self.filled: Mapping[str, ReconstructedPositions] = {}  # boards with reconstructed positions
-        self._lock = threading.Lock()  # rows are processed in several threads
+        self.notes: dict[str, Any] = {}
+        if calibration:
+            self.notes["calibration"] = dict(calibration)
+        # Boards with reconstructed positions.
+        self.filled: Mapping[str, ReconstructedPositions] = {}
+        # Rows are processed in several threads, which all add to `seconds`.
+        self._lock = threading.Lock()
 
     @property
     def boards_masked(self) -> list[str]:
@@ -287,13 +304,17 @@ class Quality:
 
     def coverage(self) -> Coverage:
         """Compare rows, positions and frames with the plan; missing rows count as not received."""
-        plan, boards = self.source.plan, list(self.boards.values())
+        plan = self.source.plan
+        boards = list(self.boards.values())
         absent = [row for row in range(plan.rows) if any(row not in board.rows for board in boards)]
-        frames_at = 1 if self.source.synchronised else self.source.instrument.burst.chirps_a_position
+        frames_a_position = self.source.instrument.burst.chirps_a_position
+        # A cube that another program synchronised holds the average of each position.
+        if self.source.synchronised:
+            frames_a_position = 1
         return Coverage(
             rows_planned=plan.rows,
             rows_recorded=plan.rows - len(absent),
-            frames_planned=len(boards) * plan.positions * frames_at,
+            frames_planned=len(boards) * plan.positions * frames_a_position,
             frames_received=sum(board.frames_received for board in boards),
             manifest=tuple(f"{fault.where}: {fault.what}" for fault in self.source.manifest_faults),
             rows_absent=tuple(absent),
@@ -316,10 +337,10 @@ class Quality:
         self.note(sparse=dict(filled))
 
     def note_materials(
-        self, found: MaterialsResult, angles: IncidenceChoice, valid: NDArray[np.bool_], plane: PlaneReference | None
+        self, result: MaterialsResult, angles: IncidenceChoice, valid: NDArray[np.bool_], plane: PlaneReference | None
     ) -> None:
         """Add the effect of the incidence angle and the use of the metal plate to quality.json."""
-        self.note(incidence=msgspec.structs.replace(angles.facts(valid), **permittivity_change(found, angles)))
+        self.note(incidence=msgspec.structs.replace(angles.facts(valid), **permittivity_change(result, angles)))
         if plane is not None:
             self.note(metal_reference=plane.facts())
 
@@ -354,29 +375,42 @@ def recording_verdict(quality: Quality) -> list[Finding]:
     masked = sum(b.positions_masked for b in quality.boards.values())
     missing: list[Finding] = []
     for name, board in quality.boards.items():
-        share = 1 - board.positions_masked / board.positions if board.positions else 0.0
+        share_with_path = _ratio(board.positions - board.positions_masked, board.positions, default=0.0)
+        received = _ratio(board.frames_received, board.frames_expected, default=0.0)
         # Positions without a whole frame have no direct path either; do not count that loss twice.
-        received = board.frames_received / board.frames_expected if board.frames_expected else 0.0
-        missing += direct_path_reasons(
-            name, board.direct_snr_db, board.residual("averaged"), share / received if received else 1.0
-        )
+        share_of_received = _ratio(share_with_path, received, default=1.0)
+        missing += direct_path_reasons(name, board.direct_snr_db, board.residual("averaged"), share_of_received)
         missing += _disturbances(name, list(board.figures.values()))
-    recorded = recording_reasons(coverage, masked / positions if positions else 1.0)
+    recorded = recording_reasons(coverage, _ratio(masked, positions, default=1.0))
     filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]
     return recorded + missing + reconstruction_reasons(filled)
 
 
+def _ratio(part: float, whole: float, default: float) -> float:
+    """Return part / whole; `default` if there is no whole."""
+    if not whole:
+        return default
+    return part / whole
+
+
 def _disturbances(name: str, rows: list[RowFigures]) -> list[Finding]:
     """Return reasons from the chirps of a board that were left out."""
-    chirps, positions = sum(r.frames_received for r in rows), sum(r.positions for r in rows)
-    clipped, disturbed = sum(r.chirps_clipped for r in rows), sum(r.chirps_disturbed for r in rows)
-    lost = sum(r.positions_clipped for r in rows)
-    return disturbance_reasons(name, clipped / max(1, chirps), disturbed / max(1, chirps), lost / max(1, positions))
+    chirps = sum(r.frames_received for r in rows)
+    positions = sum(r.positions for r in rows)
+    clipped = sum(r.chirps_clipped for r in rows)
+    disturbed = sum(r.chirps_disturbed for r in rows)
+    positions_clipped = sum(r.positions_clipped for r in rows)
+    return disturbance_reasons(
+        name,
+        clipped=clipped / max(1, chirps),
+        disturbed=disturbed / max(1, chirps),
+        positions_clipped=positions_clipped / max(1, positions),
+    )
 
 
 def judge(
     quality: Quality,
-    found: MaterialsResult,
+    result: MaterialsResult,
     plane: PlaneEstimate | None,
     classifier: Classifier | None,
     check: CheckPlate,
@@ -387,7 +421,7 @@ def judge(
     ----------
     quality
         Figures of all rows.
-    found
+    result
         Patches, metal reference and joint inversion.
     plane
         Plane of the plates; None if it was not estimated.
@@ -396,53 +430,64 @@ def judge(
     check
         The rig file's plate of known permittivity.
     """
-    reasons = recording_verdict(quality) + scene_reasons(found, plane, classifier)
+    reasons = recording_verdict(quality) + scene_reasons(result, plane, classifier)
     if check.name:
-        reasons += check_reasons(check_plate(check, found.rows()))
-    return verdict_of(reasons)
+        reasons += check_reasons(check_plate(check, result.rows()))
+    return join_reasons(reasons)
 
 
-def scene_reasons(found: MaterialsResult, plane: PlaneEstimate | None, classifier: Classifier | None) -> list[Finding]:
+def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifier: Classifier | None) -> list[Finding]:
     """Return reasons from the scene: patches, metal, leakage, plane, tilts, brightness and angle, as :func:`judge`."""
     reasons: list[Finding] = []
-    refused = {r.patch.label: r.refused.what for r in found.patches if r.refused is not None}
+    refused = {r.patch.label: r.refused.what for r in result.patches if r.refused is not None}
     gaining = {
         r.patch.label: r.refused.what
-        for r in found.patches
+        for r in result.patches
         if r.refused is not None and r.refused.what in NOT_PASSIVE and r.permittivity.value is not None
     }
     no_plates = {k: v for k, v in refused.items() if k not in gaining}
-    reasons += signal_reasons(no_plates, len(found.patches), found.segmentation.left_out)
-    pixel_mm = abs(float(found.calibrated.x_m[1] - found.calibrated.x_m[0])) * 1e3
-    copies = find_copies([r.patch for r in found.patches], found.calibrated.h, found.calibrated.v, pixel_mm)
+    reasons += signal_reasons(no_plates, len(result.patches), result.segmentation.left_out)
+    pixel_mm = abs(float(result.calibrated.x_m[1] - result.calibrated.x_m[0])) * 1e3
+    copies = find_copies([r.patch for r in result.patches], result.calibrated.h, result.calibrated.v, pixel_mm)
     if copies is not None:
         reasons += copies_reasons(copies.labels, copies.shift_mm, copies.level_db)
-    reasons += apart_reasons(found.apart_mm)
-    if found.drift is not None:
-        reasons += drift_reasons(*found.drift.largest())
-    reasons += halo_reasons(found.halo)
-    reasons += background_reasons(found.behind)
-    reasons += fit_reasons(found.ripple, found.relief_rad)
+    reasons += apart_reasons(result.apart_mm)
+    if result.drift is not None:
+        reasons += drift_reasons(*result.drift.largest())
+    reasons += halo_reasons(result.halo)
+    reasons += background_reasons(result.behind)
+    reasons += fit_reasons(result.ripple, result.relief_rad)
     reasons += passivity_reasons(gaining)
-    metal = found.metal
-    if found.patches and metal.evidence is not None:
-        e, patch = metal.evidence, "the given box" if metal.label is None else f"patch {metal.label}"
-        enough = e.enough and (metal.given or metal.label not in refused)
-        reasons += metal_reasons(patch, enough, enough and e.sure, metal.given, e.against, e.others == 0, e.culprit)
-    light = found.calibrated.illumination
-    if found.prior.channels_known and (light is None or light.known):
-        gains = {"H": found.calibrated.metal_h, "V": found.calibrated.metal_v}
+    metal = result.metal
+    if result.patches and metal.evidence is not None:
+        evidence = metal.evidence
+        patch = "the given box" if metal.label is None else f"patch {metal.label}"
+        enough = evidence.enough and (metal.given or metal.label not in refused)
+        reasons += metal_reasons(
+            patch,
+            likely=enough,
+            certain=enough and evidence.sure,
+            given=metal.given,
+            contradicted=evidence.against,
+            only_patch=evidence.others == 0,
+            culprit=evidence.culprit,
+        )
+    light = result.calibrated.illumination
+    if result.prior.channels_known and (light is None or light.known):
+        gains = {"H": result.calibrated.metal_h, "V": result.calibrated.metal_v}
         reasons += level_reasons({channel: _median_level(gain) for channel, gain in gains.items()})
-    reasons += leakage_reasons(found.prior.leakage_measured, found.inversion.leakage_determined, _leakage_error(found))
+    reasons += leakage_reasons(
+        result.prior.leakage_measured, result.inversion.leakage_determined, _leakage_error(result)
+    )
     if plane is not None:
-        std = float(np.degrees(found.prior.theta_std_rad))
+        std = float(np.degrees(result.prior.theta_std_rad))
         tilt = (float(np.degrees(plane.tilt_rad[0])), float(np.degrees(plane.tilt_rad[1])))
         reasons += plane_reasons(plane.known, 1e3 * plane.offset_m, tilt, std)
-    judged = {r.patch.label for r in found.patches if r.refused is None}
-    reasons += tilt_reasons({k: float(np.degrees(found.tilts.across_rad(k))) for k in judged})
-    reasons += brightness_reasons({k: ln for k, ln in found.brightness_off.items() if k in judged})
+    judged = {r.patch.label for r in result.patches if r.refused is None}
+    reasons += tilt_reasons({k: float(np.degrees(result.tilts.across_rad(k))) for k in judged})
+    reasons += brightness_reasons({k: ln for k, ln in result.brightness_off.items() if k in judged})
     if classifier is not None and len(classifier.angles_deg) == 1:
-        angle = float(np.degrees(np.mean(found.theta_rad)))
+        angle = float(np.degrees(np.mean(result.theta_rad)))
         reasons += incidence_reasons(angle, float(classifier.angles_deg[0]))
     return reasons
 
@@ -452,44 +497,55 @@ def _median_level(gain: npt.NDArray[np.complexfloating] | complex | None) -> flo
     if gain is None:
         return None
     magnitude = np.abs(np.asarray(gain))
-    known = magnitude[np.isfinite(magnitude)]
-    return float(np.median(known)) if known.size else None
+    magnitude = magnitude[np.isfinite(magnitude)]
+    if magnitude.size == 0:
+        return None
+    return float(np.median(magnitude))
 
 
-def _leakage_error(found: MaterialsResult) -> float:
+def _leakage_error(result: MaterialsResult) -> float:
     """Return the median relative error of the permittivities due to leakage; 0 without permittivities."""
     parts = []
-    for r in found.patches:
+    for r in result.patches:
         e = r.permittivity
         if e.value is not None and e.covariance is not None and e.shares:
             share = e.shares.get("leakage", 0.0) + e.shares.get("brightness", 0.0)
             parts.append(float(np.sqrt(share * np.trace(e.covariance) / 2)) / abs(e.value))
-    return float(np.median(parts)) if parts else 0.0
+    if parts:
+        return float(np.median(parts))
+    return 0.0
 
 
-def error_budget(found: MaterialsResult, plane: PlaneEstimate | None) -> ErrorBudget:
+def error_budget(result: MaterialsResult, plane: PlaneEstimate | None) -> ErrorBudget:
     """Return `error_budget` of materials.json: leakage, incidence angle, plane and evidence for metal."""
-    i, prior = found.inversion, found.prior
+    inversion = result.inversion
     source = "prior and scene"
-    if prior.leakage_measured:
+    if result.prior.leakage_measured:
         source = "measured"
-    elif i.leakage_determined:
+    elif inversion.leakage_determined:
         source = "scene"
-    evidence = found.metal.evidence
+    evidence = result.metal.evidence
     metal = None
     if evidence is not None:
         ratio_db = evidence.channel_ratio_db
-        ratio_db = None if ratio_db is None else round(ratio_db, 2)
+        if ratio_db is not None:
+            ratio_db = round(ratio_db, 2)
         metal = MetalScore(score=round(evidence.score, 2), others=evidence.others, channel_ratio_db=ratio_db)
-    angle = float(np.degrees(np.mean(found.theta_rad) + i.theta_error_rad))
+    leakage_h, leakage_v = inversion.leakage
+    std_h, std_v = inversion.leakage_std
+    angle_deg = float(np.degrees(np.mean(result.theta_rad) + inversion.theta_error_rad))
+    angle_std_deg = float(np.degrees(inversion.theta_std_rad))
+    plane_error = PlaneError()
+    if plane is not None:
+        plane_error = msgspec.convert(plane.to_dict(), PlaneError)
     return ErrorBudget(
         leakage=LeakageError(
-            h=(round(i.leakage[0].real, 5), round(i.leakage[0].imag, 5)),
-            v=(round(i.leakage[1].real, 5), round(i.leakage[1].imag, 5)),
-            std=(round(i.leakage_std[0], 5), round(i.leakage_std[1], 5)),
+            h=(round(leakage_h.real, 5), round(leakage_h.imag, 5)),
+            v=(round(leakage_v.real, 5), round(leakage_v.imag, 5)),
+            std=(round(std_h, 5), round(std_v, 5)),
             source=source,
         ),
-        incidence=IncidenceError(deg=round(angle, 4), std_deg=round(float(np.degrees(i.theta_std_rad)), 4)),
-        plane=PlaneError() if plane is None else msgspec.convert(plane.to_dict(), PlaneError),
+        incidence=IncidenceError(deg=round(angle_deg, 4), std_deg=round(angle_std_deg, 4)),
+        plane=plane_error,
         metal=metal,
     )

@@ -46,8 +46,8 @@ from polysight.store import (
     SAMPLES,
     ScanFolder,
     Source,
+    check_inside,
     dropped_rows,
-    inside,
     lock_file,
     manifest,
     open_records,
@@ -86,7 +86,9 @@ def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
 
 def cores() -> int:
     """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def map_rows(add: Callable[[int], object], rows: Sequence[int], threads: int | None = None) -> Iterator[int]:
@@ -113,7 +115,9 @@ def map_rows(add: Callable[[int], object], rows: Sequence[int], threads: int | N
 def map_boards(names: Iterable[str], function: Callable[[str], Result], parallel: bool) -> dict[str, Result]:
     """Return `function(name)` for each board, by name; on one thread per core if `parallel`."""
     names = list(names)
-    count = min(cores(), len(names)) if parallel else 1
+    count = 1
+    if parallel:
+        count = min(cores(), len(names))
     if count <= 1:
         return {name: function(name) for name in names}
     with ThreadPoolExecutor(count) as pool:
@@ -167,16 +171,25 @@ class KeptSamples:
         samples: Use = "none",
     ) -> None:
         view = View(settings.depth_mm, settings.columns, settings.rows, settings.pixel_mm)
-        depth_m = PLANE_REACH_M if view == AS_IN_RIG_FILE else 0.0
+        depth_m = 0.0
+        if view == AS_IN_RIG_FILE:
+            depth_m = PLANE_REACH_M
         if settings.depth_range_mm is not None:
             depth_m = settings.depth_range_mm / 1e3
-        self._scan = source if isinstance(source, ScanFolder) and samples != "none" else None
-        self._folder = Path() if self._scan is None else self._scan.path / SAMPLES
-        self._plan, self._made, self._quality = source.plan, made_with(rig, filters), quality
-        self._bands, self._keep = settings.bands, samples == "keep"
+        self._scan: ScanFolder | None = None
+        self._folder = Path()
+        if isinstance(source, ScanFolder) and samples != "none":
+            self._scan = source
+            self._folder = source.path / SAMPLES
+        self._plan = source.plan
+        self._made = made_with(rig, filters)
+        self._quality = quality
+        self._bands = settings.bands
+        self._keep = samples == "keep"
         self._lines: dict[int, dict[str, Any]] = {}
         self._read_bytes = 0
-        self._rows: int | None = None  # file descriptor of rows.jsonl, locked, while rows are written
+        # File descriptor of rows.jsonl, locked, while rows are written.
+        self._rows: int | None = None
         self._arrays: dict[str, NDArray[Any]] = {}
         self._lock = threading.Lock()
         self._head = self._read_head()
@@ -191,12 +204,14 @@ class KeptSamples:
 
     def _gate_m(self, rig: Instrument, needed: Gate, usual: Gate) -> Gate:
         """Return the gate on disk (without samples: the usual one) if it covers the needed one, else the latter."""
-        kept = tuple(self._head.get("gate_m", usual))
-        if self._head and not _has_frequencies(self._head, rig, kept, usual):
-            self._head, kept = {}, usual
-        if kept[0] <= needed[0] and needed[1] <= kept[1]:
-            return kept
-        self._head, self._keep = {}, False
+        gate_on_disk = tuple(self._head.get("gate_m", usual))
+        if self._head and not _has_frequencies(self._head, rig, gate_on_disk, usual):
+            self._head = {}
+            gate_on_disk = usual
+        if gate_on_disk[0] <= needed[0] and needed[1] <= gate_on_disk[1]:
+            return gate_on_disk
+        self._head = {}
+        self._keep = False
         return needed
 
     def processable(self, source: Source, folder: Path) -> list[int]:
@@ -208,15 +223,17 @@ class KeptSamples:
             if there are none.
         """
         rows = list(source.rows())
-        gone = dropped_rows(source) if isinstance(source, ScanFolder) else set()
-        lost = [row for row in rows if row in gone and not self.is_kept(row)]
-        if lost and len(lost) == len(rows) and isinstance(source, ScanFolder):
-            require_raw(source)
-        if lost:
+        unreadable: list[int] = []
+        if isinstance(source, ScanFolder):
+            without_raw = dropped_rows(source)
+            unreadable = [row for row in rows if row in without_raw and not self.is_kept(row)]
+            if unreadable and len(unreadable) == len(rows):
+                require_raw(source)
+        if unreadable:
             _log.warning(
                 "%s: rows %s are left out: their samples are damaged or missing, and their raw data was dropped;"
                 " `polysight validate %s` names the files; restore them from a copy",
-                self._folder, ", ".join(map(str, lost)), folder,
+                self._folder, ", ".join(map(str, unreadable)), folder,
             )  # fmt: skip
         if not rows:
             raise DataError(
@@ -225,7 +242,7 @@ class KeptSamples:
                 f"`polysight resume {folder}` takes the missing rows of a scan folder",
                 code=ErrorCode.NO_DATA,
             )
-        return [row for row in rows if row not in lost]
+        return [row for row in rows if row not in unreadable]
 
     def is_kept(self, row: int) -> bool:
         """True if a row can be restored."""
@@ -248,13 +265,17 @@ class KeptSamples:
 
     def _records(self, row: int) -> dict[str, tuple[Any, RowFigures]] | None:
         """Return a row's record and figures by board; None if one of them is missing, damaged or outdated."""
-        line, found = self._line(row), {}
-        for board, entry in ({} if line is None else line["boards"]).items():
-            array, figures = self._array(board), _read_figures(entry["figures"])
+        line = self._line(row)
+        if line is None:
+            return None
+        records = {}
+        for board, entry in line["boards"].items():
+            array = self._array(board)
+            figures = _read_figures(entry["figures"])
             if array is None or figures is None or record_digest(array[row]) != entry["crc32"]:
                 return None
-            found[board] = (array[row], figures)
-        return found or None
+            records[board] = (array[row], figures)
+        return records or None
 
     def save(self, row: int) -> None:
         """Save a row that was just added to the images; log a warning if it cannot be written."""
@@ -267,8 +288,9 @@ class KeptSamples:
         if not self._keep:
             return
         try:
-            rows = self._open() if self._rows is None else self._rows
-            if rows is None:
+            if self._rows is None:
+                self._rows = self._open()
+            if self._rows is None:
                 return
             boards = {}
             for board, digest in digests.items():
@@ -277,14 +299,16 @@ class KeptSamples:
                     file.seek(-(self._plan.rows - row) * record.nbytes, 2)
                     file.write(record.tobytes())
                 boards[board] = {"crc32": record_digest(record), "raw": digest, "figures": msgspec.to_builtins(figures)}
-            os.write(rows, manifest.encode_line({"fact": "row", "row": row, "boards": boards}))
+            os.write(self._rows, manifest.encode_line({"fact": "row", "row": row, "boards": boards}))
         except (OSError, ValueError, DataError) as e:
             self._keep = False
             _log.warning("samples are not kept in %s: %s", self._folder, e)
 
     def _digests(self, row: int) -> dict[str, str] | None:
         """Return the digests of a committed row's raw data, by receiver; None if this source keeps no samples."""
-        committed = self._scan.committed().get(row) if self._scan is not None else None
+        if self._scan is None:
+            return None
+        committed = self._scan.committed_rows().get(row)
         if committed is None or any(name not in committed.boards for name in self._quality.boards):
             return None
         return {name: raw_digest(committed.boards[name]) for name in self._quality.boards}
@@ -297,11 +321,15 @@ class KeptSamples:
         with self._lock:
             if self._kept_digests(row) != digests:
                 self._read_lines()
-            return self._lines[row] if self._kept_digests(row) == digests else None
+            if self._kept_digests(row) != digests:
+                return None
+            return self._lines[row]
 
     def _kept_digests(self, row: int) -> dict[str, str] | None:
         """Return the digests of the raw data that a saved row was made from; None if it is not saved."""
-        return {name: b["raw"] for name, b in self._lines[row]["boards"].items()} if row in self._lines else None
+        if row not in self._lines:
+            return None
+        return {name: board["raw"] for name, board in self._lines[row]["boards"].items()}
 
     def _read_head(self) -> dict[str, Any]:
         """Return samples.json if its samples can be used, otherwise an empty dict."""
@@ -311,8 +339,8 @@ class KeptSamples:
             head = read_json(self._folder / HEAD)
         except (OSError, ValueError, DataError):
             return {}
-        wanted = {"format": FORMAT, "scan_id": self._scan.scan_id, "made_with": self._made}
-        if not isinstance(head, dict) or any(head.get(key) != value for key, value in wanted.items()):
+        required = {"format": FORMAT, "scan_id": self._scan.scan_id, "made_with": self._made}
+        if not isinstance(head, dict) or any(head.get(key) != value for key, value in required.items()):
             return {}
         if self._bands not in (1, head.get("bands")) or not _is_valid_head(head):
             return {}
@@ -326,15 +354,16 @@ class KeptSamples:
     def _array(self, board: str) -> NDArray[Any] | None:
         """Return a board's records, memory-mapped; None if the file does not fit samples.json."""
         if board not in self._arrays:
-            found = open_records(self._folder / f"{board}.npy")
-            if found is None or found.dtype != self._type(board) or found.shape != (self._plan.rows,):
+            records = open_records(self._folder / f"{board}.npy")
+            if records is None or records.dtype != self._type(board) or records.shape != (self._plan.rows,):
                 return None
-            self._arrays[board] = found
+            self._arrays[board] = records
         return self._arrays[board]
 
     def _type(self, board: str) -> np.dtype[Any]:
         """Return the structured type of one board's record of a row."""
-        columns, rx = self._plan.columns, len(self._builders["samples"].boards[board].aperture.antennas.rx_m)
+        columns = self._plan.columns
+        rx = len(self._builders["samples"].boards[board].aperture.antennas.rx_m)
         parts: list[Any] = []
         for name, frequencies in self._head["frequencies_hz"].items():
             parts += [(name, "<c8", (rx, len(frequencies), columns)), (f"{name}_direct", "<c8", (rx, columns))]
@@ -343,12 +372,14 @@ class KeptSamples:
 
     def _record(self, board: str, row: int) -> tuple[NDArray[Any], RowFigures]:
         """Return the record of a row, and its quality figures for rows.jsonl."""
-        out, forward = np.zeros((), self._type(board)), slice(None, None, self._plan.row(row).direction)
+        out = np.zeros((), self._type(board))
+        forward = slice(None, None, self._plan.row(row).direction)
         for name, builder in self._builders.items():
             out[name], out[f"{name}_direct"], out["valid"] = builder.boards[board].reduced(row)
         quality = self._quality.boards[board].rows[row]
         out["echo"] = quality.echo[:, forward]
-        out["direct_hz"], out["direct_snr"] = quality.direct_hz[forward], quality.direct_snr[forward]
+        out["direct_hz"] = quality.direct_hz[forward]
+        out["direct_snr"] = quality.direct_snr[forward]
         return out, quality.figures
 
     def _put(self, board: str, row: int, record: Any, figures: RowFigures) -> None:
@@ -356,16 +387,20 @@ class KeptSamples:
         forward = slice(None, None, self._plan.row(row).direction)
         for name, builder in self._builders.items():
             builder.boards[board].put(row, ReducedRow(record[name], record[f"{name}_direct"], record["valid"]))
-        direct_hz, direct_snr = np.array(record["direct_hz"][forward]), np.array(record["direct_snr"][forward])
+        direct_hz = np.array(record["direct_hz"][forward])
+        direct_snr = np.array(record["direct_snr"][forward])
         echo = np.array(record["echo"][:, forward])
         self._quality.boards[board].rows[row] = RowQuality(figures, direct_hz, direct_snr, echo)
 
     def _open(self) -> int | None:
         """Open and lock rows.jsonl; start new files if those on disk do not fit. None if another program locked it."""
+        scan = self._scan
+        if scan is None:
+            return None
         self._folder.mkdir(exist_ok=True)
-        if self._scan is not None:
-            for name in (HEAD, SAMPLE_ROWS, f"{HEAD}.part", *(f"{board}.npy" for board in self._quality.boards)):
-                inside(self._scan.path, f"{SAMPLES}/{name}", SAMPLES)  # a link could overwrite another file
+        for name in (HEAD, SAMPLE_ROWS, f"{HEAD}.part", *(f"{board}.npy" for board in self._quality.boards)):
+            # A link could overwrite another file.
+            check_inside(scan.path, f"{SAMPLES}/{name}", SAMPLES)
         rows = os.open(self._folder / SAMPLE_ROWS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         weakref.finalize(self, os.close, rows)
         try:
@@ -374,29 +409,36 @@ class KeptSamples:
             self._keep = False
             return None
         if not self._head or any(self._array(board) is None for board in self._quality.boards):
-            self._create(rows)
+            self._create(scan, rows)
         self._read_lines()
-        os.truncate(rows, self._read_bytes)  # drop a line that was cut by a kill
-        self._rows = rows
+        # A killed program may have cut its last line: the next one would be joined to it.
+        os.truncate(rows, self._read_bytes)
         return rows
 
-    def _create(self, rows: int) -> None:
+    def _create(self, scan: ScanFolder, rows: int) -> None:
         """Create samples.json and empty records for all rows."""
         (self._folder / HEAD).unlink(missing_ok=True)
         os.truncate(rows, 0)
-        self._lines, self._read_bytes, self._arrays = {}, 0, {}
-        scan, first = self._scan, next(iter(self._quality.boards))
+        self._lines = {}
+        self._read_bytes = 0
+        self._arrays = {}
+        first_board = next(iter(self._quality.boards))
+        frequencies_hz = {
+            name: builder.boards[first_board].aperture.frequencies_hz.tolist()
+            for name, builder in self._builders.items()
+        }
         self._head = {
             "format": FORMAT,
-            "scan_id": "" if scan is None else scan.scan_id,
-            "simulated": scan is not None and scan.simulated,
+            "scan_id": scan.scan_id,
+            "simulated": scan.simulated,
             "bands": self._bands,
             "gate_m": self._builders["samples"].gate_m,
-            "frequencies_hz": {n: b.boards[first].aperture.frequencies_hz.tolist() for n, b in self._builders.items()},
+            "frequencies_hz": frequencies_hz,
             "made_with": self._made,
         }
         for board in self._quality.boards:
-            (self._folder / f"{board}.npy").unlink(missing_ok=True)  # programs that have it mapped keep it
+            # Programs that have the old file mapped keep it: it is not overwritten in place.
+            (self._folder / f"{board}.npy").unlink(missing_ok=True)
             np.lib.format.open_memmap(self._folder / f"{board}.npy", "w+", self._type(board), (self._plan.rows,))
         part = self._folder / f"{HEAD}.part"
         part.write_text(json.dumps(self._head, indent=1) + "\n", encoding="utf-8")
@@ -405,7 +447,8 @@ class KeptSamples:
 
 def _is_valid_head(head: Mapping[str, Any]) -> bool:
     """True if samples.json has a gate of two finite numbers, and lists of frequencies."""
-    gate, frequencies = head.get("gate_m"), head.get("frequencies_hz")
+    gate = head.get("gate_m")
+    frequencies = head.get("frequencies_hz")
     if not (isinstance(gate, list) and isinstance(frequencies, dict) and "samples" in frequencies):
         return False
     numbers = [gate, *frequencies.values()]
@@ -417,8 +460,9 @@ def _has_frequencies(head: Mapping[str, Any], rig: Instrument, gate: Gate, usual
     """True if the frequencies in samples.json are those of its gate; a gate twice as wide as usual is damage."""
     if not 0 < gate[1] - gate[0] < 2 * (usual[1] - usual[0]):
         return False
-    kept, expected = head["frequencies_hz"]["samples"], reduction(rig.chirp, gate).frequencies_hz
-    return len(kept) == expected.size and np.allclose(kept, expected, rtol=1e-9, atol=0)
+    on_disk = head["frequencies_hz"]["samples"]
+    expected = reduction(rig.chirp, gate).frequencies_hz
+    return len(on_disk) == expected.size and np.allclose(on_disk, expected, rtol=1e-9, atol=0)
 
 
 def _is_finite(value: object) -> bool:

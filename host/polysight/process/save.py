@@ -33,7 +33,7 @@ from polysight.products import (
     write_image,
     write_json,
 )
-from polysight.results import MetalSource, NoResult, ScanFacts, ScanMaterials, ScanQuality, Verdict, verdict_of
+from polysight.results import MetalSource, NoResult, ScanFacts, ScanMaterials, ScanQuality, Verdict, join_reasons
 from polysight.store import Scan, versions
 from polysight_shared.config import Instrument
 from polysight_shared.files import write_atomically
@@ -59,7 +59,9 @@ class Products:
     @property
     def exit_status(self) -> int:
         """Exit status of the command: 0, or that of `NoResult` if the verdict allows no result."""
-        return 0 if self.verdict.usable else NoResult.exit_status
+        if self.verdict.usable:
+            return 0
+        return NoResult.exit_status
 
     def summary(self) -> str:
         """Return the text for the terminal."""
@@ -75,7 +77,7 @@ class Findings:
     ----------
     images
         Both channels, valid where they were analysed.
-    found
+    analysis
         Patches and their materials; without names and permittivities if the verdict is "no result".
     verdict
         How far the results can be trusted.
@@ -88,7 +90,7 @@ class Findings:
     """
 
     images: Images
-    found: MaterialsResult
+    analysis: MaterialsResult
     verdict: Verdict
     plane: PlaneEstimate
     classifier: Classifier | None = None
@@ -98,7 +100,7 @@ class Findings:
     def calibrated(self) -> Images:
         """Images relative to metal, without leakage, with the ratio p and its standard deviation."""
         valid = self.images.valid
-        return replace(self.found.calibrated, valid=valid, p_sigma=self.found.p_sigma(valid))
+        return replace(self.analysis.calibrated, valid=valid, p_sigma=self.analysis.p_sigma(valid))
 
 
 def imaged_scan(
@@ -109,8 +111,8 @@ def imaged_scan(
     `rig` is the rig that the images were formed with, `folder` where the data are. `backlash=False` leaves the
     estimate of the stage's backlash out.
     """
-    verdict = verdict_of(recording_verdict(quality))
-    return ProcessedScan.computed(
+    verdict = join_reasons(recording_verdict(quality))
+    return ProcessedScan.from_results(
         folder,
         images=with_ratio(images),
         quality=quality.result(verdict, backlash=backlash),
@@ -123,17 +125,17 @@ def processed_scan(
     folder: Path, source: Scan, rig: Instrument, findings: Findings, quality: Quality, unnamed: str
 ) -> ProcessedScan:
     """Return the result of a scan with its materials; `unnamed` is the reason why nothing was named, or ""."""
-    return materials_of(
+    return assemble_result(
         folder,
         _facts(source, rig, findings.images),
-        quality.result(findings.verdict, pixel_accuracy(findings.found)),
+        quality.result(findings.verdict, pixel_accuracy(findings.analysis)),
         findings,
         unnamed,
         source.plan,
     )
 
 
-def materials_of(
+def assemble_result(
     folder: Path,
     facts: ScanFacts,
     quality: ScanQuality,
@@ -142,25 +144,30 @@ def materials_of(
     plan: RasterPlan | None = None,
 ) -> ProcessedScan:
     """Return the result with its materials, from findings; parameters as of :func:`processed_scan`."""
-    found, classifier = findings.found, findings.classifier
+    analysis = findings.analysis
+    library = unnamed or "Nothing was named."
+    model = None
+    if findings.classifier is not None:
+        library = classifier_sentence(findings.classifier)
+        model = findings.classifier.model
     materials = ScanMaterials(
         scan_id=facts.scan_id or "",
         simulated=facts.simulated,
         verdict=findings.verdict,
-        error_budget=error_budget(found, findings.plane),
-        metal_reference=MetalSource(how=found.metal.how, certain=found.metal.certain),
-        library=classifier_sentence(classifier) if classifier else unnamed or "Nothing was named.",
-        model=classifier.model if classifier else None,
-        pixel_accuracy=pixel_accuracy(found),
-        segments=found.rows(),
+        error_budget=error_budget(analysis, findings.plane),
+        metal_reference=MetalSource(how=analysis.metal.how, certain=analysis.metal.certain),
+        library=library,
+        model=model,
+        pixel_accuracy=pixel_accuracy(analysis),
+        segments=analysis.rows(),
     )
-    return ProcessedScan.computed(
+    return ProcessedScan.from_results(
         folder,
         images=findings.calibrated,
         quality=quality,
         facts=facts,
         materials=materials,
-        found=found,
+        analysis=analysis,
         plates=findings.plates,
         plan=plan,
     )
@@ -184,41 +191,50 @@ def save_images(out: Path, scan: ProcessedScan) -> None:
     write_json(out / QUALITY, scan.quality)
 
 
-def save_materials(out: Path, scan: ProcessedScan, found: MaterialsResult, unnamed: str) -> Products:
+def save_materials(out: Path, scan: ProcessedScan, result: MaterialsResult, unnamed: str) -> Products:
     """Write all products: metal-referenced image.npz, quality.json, materials.json, patches, labels, figures, report.
 
-    `found` is the analysis behind the result, `unnamed` the reason why nothing was named; "" if patches were named.
+    `result` is the analysis behind the scan, `unnamed` the reason why nothing was named; "" if patches were named.
     """
-    from polysight.report import write_report  # here: matplotlib takes a second to load
+    # Imported here: matplotlib takes a second to load.
+    from polysight.report import write_report
 
     save_images(out, scan)
-    boxes = labels_of(found, f"patches of scan {scan.scan_id}, in pixels of image.npz")
+    boxes = labels_of(result, f"patches of scan {scan.scan_id}, in pixels of image.npz")
     write_atomically(out / LABELS, pack_labels(boxes))
-    write_atomically(out / PATCHES, pack_patches(found, scan.images.x_m, scan.images.y_m, scan.stamped))
+    write_atomically(out / PATCHES, pack_patches(result, scan.images.x_m, scan.images.y_m, scan.stamped))
     write_json(out / MATERIALS, scan.materials)
     write_report(out, scan)
     verdict = scan.verdict or Verdict("good")
-    coverage = scan.quality.coverage.lines() if scan.quality.coverage else ()
-    lines = (*verdict.lines(3), *_result_lines(scan, found), *coverage)
-    return Products(out, (*lines, unnamed) if unnamed else lines, verdict)
+    lines = [*verdict.lines(3), *_result_lines(scan, result)]
+    if scan.quality.coverage:
+        lines += scan.quality.coverage.lines()
+    if unnamed:
+        lines.append(unnamed)
+    return Products(out, tuple(lines), verdict)
 
 
-def _result_lines(scan: ProcessedScan, found: MaterialsResult) -> tuple[str, ...]:
+def _result_lines(scan: ProcessedScan, result: MaterialsResult) -> tuple[str, ...]:
     """Return lines for the terminal: number of patches, metal reference, and names compared with the truth."""
     patches = scan.segments
-    head = (
-        f"{'simulated ' if scan.simulated else ''}scan {scan.scan_id}: {len(patches)} patches; metal {found.metal.how}"
-    )
+    head = f"scan {scan.scan_id}: {len(patches)} patches; metal {result.metal.how}"
+    if scan.simulated:
+        head = f"simulated {head}"
     count = scan.plates_named
     if count is None:
         return (head,)
-    aside = f"; {count.strange} not in the library, and called unknown" if count.strange else ""
-    return (head, f"{count.right} of {count.plates} plates named right{_pixels_right(found)}{aside}")
+    names = f"{count.right} of {count.plates} plates named right{_pixels_right(result)}"
+    if count.strange:
+        names += f"; {count.strange} not in the library, and called unknown"
+    return (head, names)
 
 
-def _pixels_right(found: MaterialsResult) -> str:
-    accuracy, expected = pixel_accuracy(found), expected_pixel_accuracy(found)
+def _pixels_right(result: MaterialsResult) -> str:
+    accuracy = pixel_accuracy(result)
+    expected = expected_pixel_accuracy(result)
     if accuracy is None:
         return ""
     share = f", {100 * accuracy:.1f} % of their pixels"
-    return share if expected is None else f"{share} (their own confidence expects {100 * expected:.1f} %)"
+    if expected is None:
+        return share
+    return f"{share} (their own confidence expects {100 * expected:.1f} %)"

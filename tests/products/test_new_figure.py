@@ -13,7 +13,7 @@ from tests.support.products import changed, computed, judged_products
 from polysight.products import patch_dataset, read_products
 from polysight.products.exports import pack_csv, pack_mat
 from polysight.report.report import render
-from polysight.results import PatchFigures, ScanMaterials, plain
+from polysight.results import PatchFigures, ScanMaterials, to_plain
 from polysight.results.materials import Column
 
 
@@ -58,6 +58,6 @@ def test_a_declared_figure_stands_in_the_report(scan):
 
 
 def test_a_declared_figure_is_in_the_file_and_is_read_back(scan):
-    content = plain(scan.materials)
+    content = to_plain(scan.materials)
     assert [segment["roughness_mm"] for segment in content["segments"]] == [0.25] * 3
     assert msgspec.convert(content["segments"][0], RoughPatch).roughness_mm == 0.25

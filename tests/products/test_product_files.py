@@ -9,7 +9,7 @@ import pytest
 from polysight.imaging import Images
 from polysight.products import write_image, write_json
 from polysight.products.processed import read_image
-from polysight.results import plain
+from polysight.results import to_plain
 from polysight_shared.errors import DataError
 from polysight_shared.files import write_atomically
 
@@ -48,7 +48,7 @@ def test_json_products_are_strict(tmp_path):
         "c": [1, 2],
         "d": [True, None, "ε"],
     }
-    assert plain(plain(content)) == plain(content)
+    assert to_plain(to_plain(content)) == to_plain(content)
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

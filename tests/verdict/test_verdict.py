@@ -19,6 +19,7 @@ from polysight.results.verdict import (
     fit_reasons,
     halo_reasons,
     incidence_reasons,
+    join_reasons,
     leakage_reasons,
     level_reasons,
     metal_reasons,
@@ -31,7 +32,6 @@ from polysight.results.verdict import (
     recording_reasons,
     signal_reasons,
     tilt_reasons,
-    verdict_of,
 )
 
 ALL = [
@@ -43,23 +43,23 @@ ALL = [
 
 @pytest.mark.parametrize("order", list(itertools.permutations(ALL)))
 def test_the_worst_reason_decides_and_weight_orders(order):
-    verdict = verdict_of(order)
+    verdict = join_reasons(order)
     assert verdict.level == "none"
     assert [r.what for r in verdict.reasons] == ["c", "b", "a"]
-    assert verdict_of(r for r in order if r.level == "warning").level == "care"
+    assert join_reasons(r for r in order if r.level == "warning").level == "care"
 
 
 def test_only_no_result_hides_names_and_permittivities():
-    assert [verdict_of(ALL[:n]).usable for n in range(4)] == [True, True, True, False]
+    assert [join_reasons(ALL[:n]).usable for n in range(4)] == [True, True, True, False]
 
 
 def test_without_reasons_all_is_good():
-    assert verdict_of([]) == Verdict("good")
-    assert verdict_of([]).lines() == ["verdict:  good"]
+    assert join_reasons([]) == Verdict("good")
+    assert join_reasons([]).lines() == ["verdict:  good"]
 
 
 def test_json_gives_back_what_was_written():
-    verdict = verdict_of(ALL)
+    verdict = join_reasons(ALL)
     content = {"verdict": verdict.to_dict(), "other": 1}
     again = read_verdict(content)
     assert again is not None
@@ -78,7 +78,7 @@ def test_damaged_reasons_are_left_out(reasons):
 
 
 def test_no_result_has_an_exit_status_of_its_own():
-    error = verdict_of(ALL).error("the images are kept")
+    error = join_reasons(ALL).error("the images are kept")
     assert isinstance(error, NoResult)
     assert error.exit_status == 7
     assert "c" in error.what
@@ -86,7 +86,7 @@ def test_no_result_has_an_exit_status_of_its_own():
 
 
 def level(reasons):
-    return verdict_of(reasons).level
+    return join_reasons(reasons).level
 
 
 @pytest.mark.parametrize(
@@ -332,7 +332,7 @@ PARTS = (
 
 def order(*reasons):
     """Parts of the reasons' texts as the verdict lists them, given in reverse."""
-    listed = verdict_of([r for group in reversed(reasons) for r in group]).reasons
+    listed = join_reasons([r for group in reversed(reasons) for r in group]).reasons
     return [next(part for part in PARTS if part in r.what) for r in listed]
 
 
@@ -359,14 +359,14 @@ def test_no_verdict_shows_a_number_that_is_none(x):
         *reconstruction_reasons([("RH", 0.3, x)]),
     ]
     assert len(found) > 4
-    shown = " ".join(verdict_of(found).lines())
+    shown = " ".join(join_reasons(found).lines())
     assert not re.search(r"\b(nan|inf)\b", shown), shown
 
 
 def test_a_terminal_shows_the_heaviest_reasons_and_how_many_more_there_are():
-    assert verdict_of(ALL).lines(1)[1:] == ["  - c: because", "    do: do c", "  - and 2 more, see the report"]
-    assert verdict_of(ALL).lines(3) == verdict_of(ALL).lines()
-    assert "more" not in "".join(verdict_of(ALL).lines())
+    assert join_reasons(ALL).lines(1)[1:] == ["  - c: because", "    do: do c", "  - and 2 more, see the report"]
+    assert join_reasons(ALL).lines(3) == join_reasons(ALL).lines()
+    assert "more" not in "".join(join_reasons(ALL).lines())
 
 
 @pytest.mark.parametrize(

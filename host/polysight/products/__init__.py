@@ -23,10 +23,10 @@ from polysight.products.folder import (
     LABELS_PICTURE,
     check_products_folder,
     find_labels,
+    find_scan_folder,
     label_folder,
     making_products,
     products_locked,
-    scan_folder_of,
 )
 from polysight.products.processed import (
     FINISHED,
@@ -62,6 +62,7 @@ __all__ = [
     "export",
     "find_labels",
     "find_products",
+    "find_scan_folder",
     "full_dataset",
     "image_dataset",
     "label_folder",
@@ -75,7 +76,6 @@ __all__ = [
     "read_netcdf",
     "read_products",
     "rx_gains",
-    "scan_folder_of",
     "surface_dataset",
     "write_image",
     "write_json",

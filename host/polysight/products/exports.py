@@ -29,7 +29,7 @@ from msgspec import UNSET
 from polysight.materials import axis_mm, image_centre_mm, incidence_std_rad, slope
 from polysight.polarimetry import incidence_choice, permittivity_from_ratio, specular_incidence_rad
 from polysight.products.processed import ProcessedScan, read_products
-from polysight.results import Figure, PatchFigures, Verdict, figures_of, plain
+from polysight.results import Figure, PatchFigures, Verdict, declared_figures, to_plain
 from polysight.store import MAX_BYTES
 from polysight.surfaces import Surface
 from polysight_shared.error_codes import ErrorCode
@@ -55,13 +55,19 @@ UNREFERENCED = "none: h, v and p are in arbitrary units"
 
 def ranges_text(numbers: Sequence[int]) -> str:
     """Return ascending numbers as text, `3, 7-9`; `none` without numbers."""
-    found: list[list[int]] = []
+    ranges: list[list[int]] = []
     for n in numbers:
-        if found and n == found[-1][1] + 1:
-            found[-1][1] = n
+        if ranges and n == ranges[-1][1] + 1:
+            ranges[-1][1] = n
         else:
-            found.append([n, n])
-    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in found) or "none"
+            ranges.append([n, n])
+    texts = []
+    for first, last in ranges:
+        if first == last:
+            texts.append(f"{first}")
+        else:
+            texts.append(f"{first}-{last}")
+    return ", ".join(texts) or "none"
 
 
 def verdict_attributes(verdict: Verdict | None) -> dict[str, str]:
@@ -81,9 +87,14 @@ def provenance(scan: ProcessedScan) -> dict[str, Any]:
     simulated = "unknown" if scan.simulated is None else scan.simulated
     metal = UNREFERENCED
     if scan.materials is not None:
-        metal = scan.materials.metal_reference.how if scan.materials.metal_reference else "given"
+        metal = "given"
+        if scan.materials.metal_reference:
+            metal = scan.materials.metal_reference.how
+    title = f"scan {scan.scan_id or 'without a name'}"
+    if simulated is True:
+        title += " (simulated)"
     attrs: dict[str, Any] = {
-        "title": f"scan {scan.scan_id or 'without a name'}{' (simulated)' if simulated is True else ''}",
+        "title": title,
         "scan_id": scan.scan_id,
         "simulated": simulated,
         "convention": CONVENTION,
@@ -113,10 +124,11 @@ def provenance(scan: ProcessedScan) -> dict[str, Any]:
 
 
 def _numbers(values: Sequence[Any]) -> npt.NDArray[np.float64]:
-    return np.array([np.nan if v is None else v for v in values], np.float64)
+    """Return numbers as an array; None becomes NaN."""
+    return np.array(values, np.float64)
 
 
-def _described(dims: tuple[str, ...], values: Any, units: str, long_name: str) -> tuple[Any, ...]:
+def _describe(dims: tuple[str, ...], values: Any, units: str, long_name: str) -> tuple[Any, ...]:
     return dims, np.array(values), {"units": units, "long_name": long_name}
 
 
@@ -137,19 +149,21 @@ def image_dataset(scan: ProcessedScan) -> xarray.Dataset:
     images = scan.images
     unit = "reflection relative to metal" if scan.metal_referenced else "arbitrary units"
     data = {
-        "h": _described(PLANE, images.h, "1", f"s-polarised channel, {unit}"),
-        "v": _described(PLANE, images.v, "1", f"p-polarised channel, {unit}"),
-        "p": _described(PLANE, images.p, "1", f"polarisation ratio H / V, {unit}"),
-        "valid": _described(PLANE, images.valid, "1", "True where the scan illuminates the pixel"),
+        "h": _describe(PLANE, images.h, "1", f"s-polarised channel, {unit}"),
+        "v": _describe(PLANE, images.v, "1", f"p-polarised channel, {unit}"),
+        "p": _describe(PLANE, images.p, "1", f"polarisation ratio H / V, {unit}"),
+        "valid": _describe(PLANE, images.valid, "1", "True where the scan illuminates the pixel"),
     }
     if images.p_sigma is not None:
         about = "standard deviation of p: root of the mean variance of its real and imaginary part"
-        data["p_sigma"] = _described(PLANE, images.p_sigma, "1", about)
+        data["p_sigma"] = _describe(PLANE, images.p_sigma, "1", about)
     angle_deg = _incidence_deg(scan)
     if angle_deg is not None:
-        dims = PLANE if np.ndim(angle_deg) else ()
-        data["incidence_deg"] = _described(dims, angle_deg, "degree", "incidence angle")
-        data["incidence_rad"] = _described(dims, np.radians(angle_deg), "rad", "incidence angle")
+        dims = ()
+        if np.ndim(angle_deg):
+            dims = PLANE
+        data["incidence_deg"] = _describe(dims, angle_deg, "degree", "incidence angle")
+        data["incidence_rad"] = _describe(dims, np.radians(angle_deg), "rad", "incidence angle")
     return xarray.Dataset(data, _axes(scan), provenance(scan))
 
 
@@ -170,9 +184,9 @@ def _axes(scan: ProcessedScan) -> dict[str, Any]:
         dims = (f"{name}_mm",)
         # Rounded, so that `.sel(x_mm=20)` finds a pixel whose centre is at 20 mm.
         place_mm = np.round(axis_mm(place_m), 6)
-        axes[f"{name}_mm"] = _described(dims, place_mm, "mm", f"pixel centre, {name} from the image's centre")
+        axes[f"{name}_mm"] = _describe(dims, place_mm, "mm", f"pixel centre, {name} from the image's centre")
         axes[f"{name}_mm"][2]["axis"] = name.upper()
-        axes[f"{name}_m"] = _described(dims, place_m, "m", f"pixel centre, {name} of the rig frame")
+        axes[f"{name}_m"] = _describe(dims, place_m, "m", f"pixel centre, {name} of the rig frame")
     return axes
 
 
@@ -196,9 +210,9 @@ def patch_dataset(scan: ProcessedScan) -> xarray.Dataset:
 
     if scan.materials is None:
         raise _no_materials(scan)
-    data = {"label": _described(PLANE, scan.labels, "1", "number of the patch that holds the pixel, 0 for none")}
+    data = {"label": _describe(PLANE, scan.labels, "1", "number of the patch that holds the pixel, 0 for none")}
     if scan.interior is not None:
-        data["interior"] = _described(PLANE, scan.interior, "1", "True where the pixel is used for the patch's numbers")
+        data["interior"] = _describe(PLANE, scan.interior, "1", "True where the pixel is used for the patch's numbers")
     data |= _figure_variables(scan.segments) | _band_variables(scan.segments)
     naming = {"library": scan.materials.library, "model": scan.materials.model}
     attributes = provenance(scan) | {key: text for key, text in naming.items() if text}
@@ -242,16 +256,19 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
         # d eps / d P = -slope(1 / P) / P^2.
         by_ratio = np.abs(slope(1 / p, theta_rad) / p**2)
         by_angle = (permittivity_from_ratio(p, theta_rad + _ANGLE_STEP_RAD) - value) / _ANGLE_STEP_RAD
-        p_std = np.nan if scan.images.p_sigma is None else scan.images.p_sigma.astype(np.float64)
+        if scan.images.p_sigma is None:
+            p_std = np.nan
+        else:
+            p_std = scan.images.p_sigma.astype(np.float64)
         angle_std_rad = incidence_std_rad(scan.materials)
         real_std = np.hypot(by_ratio * p_std, by_angle.real * angle_std_rad)
         loss_std = np.hypot(by_ratio * p_std, by_angle.imag * angle_std_rad)
         mask = np.hypot(real_std, loss_std) < LARGEST_ERROR * np.abs(value)
     data = {
-        "permittivity": _described(PLANE, value, "1", "relative permittivity eps' - j eps'' as a half space"),
-        "permittivity_real_standard_error": _described(PLANE, real_std, "1", "standard error of eps'"),
-        "permittivity_loss_standard_error": _described(PLANE, loss_std, "1", "standard error of eps''"),
-        "mask": _described(PLANE, mask, "1", "True where the permittivity is known to half of its size"),
+        "permittivity": _describe(PLANE, value, "1", "relative permittivity eps' - j eps'' as a half space"),
+        "permittivity_real_standard_error": _describe(PLANE, real_std, "1", "standard error of eps'"),
+        "permittivity_loss_standard_error": _describe(PLANE, loss_std, "1", "standard error of eps''"),
+        "mask": _describe(PLANE, mask, "1", "True where the permittivity is known to half of its size"),
     }
     return xarray.Dataset(data, _axes(scan), provenance(scan))
 
@@ -271,25 +288,25 @@ def patch_coordinates(scan: ProcessedScan) -> dict[str, Any]:
     centre_x_mm = _numbers([patch.centre_x_mm for patch in scan.segments])
     centre_y_mm = _numbers([patch.centre_y_mm for patch in scan.segments])
     return {
-        "patch": _described(("patch",), numbers, "1", "number of the patch in label"),
-        "centre_x_mm": _described(("patch",), centre_x_mm, "mm", "middle of the patch, x from the image's centre"),
-        "centre_y_mm": _described(("patch",), centre_y_mm, "mm", "middle of the patch, y from the image's centre"),
+        "patch": _describe(("patch",), numbers, "1", "number of the patch in label"),
+        "centre_x_mm": _describe(("patch",), centre_x_mm, "mm", "middle of the patch, x from the image's centre"),
+        "centre_y_mm": _describe(("patch",), centre_y_mm, "mm", "middle of the patch, y from the image's centre"),
     }
 
 
 def _figure_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
     """Return a variable on dimension `patch` for each declared figure, and angles in radians too."""
     variables = {}
-    for figure in figures_of(type(patches[0]) if patches else PatchFigures):
+    for figure in _patch_figures(patches):
         values = figure.values(patches)
         if not figure.variable or (figure.column.optional and not any(values)):
             continue
         array = figure.array(patches)
         column = figure.column
-        variables[figure.variable] = _described(("patch",), array, column.unit, column.about)
+        variables[figure.variable] = _describe(("patch",), array, column.unit, column.about)
         if column.unit == "degree":
             name = f"{figure.variable.removesuffix('_deg')}_rad"
-            variables[name] = _described(("patch",), np.radians(array), "rad", column.about)
+            variables[name] = _describe(("patch",), np.radians(array), "rad", column.about)
     return variables
 
 
@@ -298,17 +315,20 @@ def _band_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
     rows = [patch.bands for patch in patches if patch.bands]
     if not rows or len(rows) < len(patches):
         return {}
-    nothing = complex(np.nan, np.nan)
-    ratios = [[nothing if band.ratio is None else band.ratio.value for band in row] for row in rows]
+    ratios = np.full((len(rows), len(rows[0])), complex(np.nan, np.nan))
+    for i, row in enumerate(rows):
+        for j, band in enumerate(row):
+            if band.ratio is not None:
+                ratios[i, j] = band.ratio.value
     errors = [_numbers([band.inverse_ratio_std for band in row]) for row in rows]
     first_hz = [band.first_hz for band in rows[0]]
     last_hz = [band.last_hz for band in rows[0]]
     plane = ("patch", "band")
     return {
-        "band_ratio": _described(plane, ratios, "1", "median of P = H / V in the sub-band"),
-        "band_inverse_ratio_standard_error": _described(plane, errors, "1", "standard error of V / H in the sub-band"),
-        "band_first_hz": _described(("band",), first_hz, "Hz", "first transmit frequency"),
-        "band_last_hz": _described(("band",), last_hz, "Hz", "last transmit frequency"),
+        "band_ratio": _describe(plane, ratios, "1", "median of P = H / V in the sub-band"),
+        "band_inverse_ratio_standard_error": _describe(plane, errors, "1", "standard error of V / H in the sub-band"),
+        "band_first_hz": _describe(("band",), first_hz, "Hz", "first transmit frequency"),
+        "band_last_hz": _describe(("band",), last_hz, "Hz", "last transmit frequency"),
     }
 
 
@@ -333,16 +353,16 @@ def surface_dataset(surface: Surface) -> xarray.Dataset:
     square = ("point", "row", "column")
     return xarray.Dataset(
         {
-            "position": _described(("point", "axis"), surface.points_m, "m", "specular point, rig frame"),
-            "normal": _described(("point", "axis"), surface.normals, "1", "unit normal towards the antennas"),
-            "curvature": _described(square, surface.curvature, "1/m", "curvature, positive for convex bodies"),
-            "incidence_deg": _described(("point",), surface.incidence_deg, "degree", "angle of incidence"),
-            "incidence_rad": _described(("point",), np.radians(surface.incidence_deg), "rad", "angle of incidence"),
-            "permittivity": _described(("point",), surface.permittivity, "1", "relative permittivity"),
-            "permittivity_covariance": _described(square, surface.covariance, "1", "covariance of (real, imaginary)"),
-            "position_std": _described(("point",), surface.position_std_m, "m", "standard deviation along the normal"),
-            "normal_std_deg": _described(("point",), surface.normal_std_deg, "degree", "standard deviation"),
-            "segment": _described(("point",), surface.segment, "1", "number of the connected surface"),
+            "position": _describe(("point", "axis"), surface.points_m, "m", "specular point, rig frame"),
+            "normal": _describe(("point", "axis"), surface.normals, "1", "unit normal towards the antennas"),
+            "curvature": _describe(square, surface.curvature, "1/m", "curvature, positive for convex bodies"),
+            "incidence_deg": _describe(("point",), surface.incidence_deg, "degree", "angle of incidence"),
+            "incidence_rad": _describe(("point",), np.radians(surface.incidence_deg), "rad", "angle of incidence"),
+            "permittivity": _describe(("point",), surface.permittivity, "1", "relative permittivity"),
+            "permittivity_covariance": _describe(square, surface.covariance, "1", "covariance of (real, imaginary)"),
+            "position_std": _describe(("point",), surface.position_std_m, "m", "standard deviation along the normal"),
+            "normal_std_deg": _describe(("point",), surface.normal_std_deg, "degree", "standard deviation"),
+            "segment": _describe(("point",), surface.segment, "1", "number of the connected surface"),
         },
         coords={"axis": ["x", "y", "z"]},
         attrs={"scan_id": surface.scan_id, "simulated": int(surface.simulated)},
@@ -351,34 +371,34 @@ def surface_dataset(surface: Surface) -> xarray.Dataset:
 
 def split_complex(dataset: xarray.Dataset) -> xarray.Dataset:
     """Return a dataset with each complex variable `h` replaced by real variables `h_real` and `h_imag`."""
-    made: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     for name, variable in dataset.data_vars.items():
         if variable.dtype.kind != "c":
-            made[str(name)] = variable
+            variables[str(name)] = variable
             continue
         about = variable.attrs.get("long_name", str(name))
         for suffix, part in (("real", "real"), ("imag", "imaginary")):
-            values = variable.real if suffix == "real" else variable.imag
+            values = getattr(variable, suffix)
             attrs = {**variable.attrs, "long_name": f"{about}, {part} part", _PART: suffix}
-            made[f"{name}_{suffix}"] = values.copy().assign_attrs(attrs)
-    return dataset.drop_vars(list(dataset.data_vars)).assign(made)
+            variables[f"{name}_{suffix}"] = values.copy().assign_attrs(attrs)
+    return dataset.drop_vars(list(dataset.data_vars)).assign(variables)
 
 
 def join_complex(dataset: xarray.Dataset) -> xarray.Dataset:
     """Undo :func:`split_complex`: join the variables with the attribute `complex_part`."""
-    made: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     for full_name, variable in dataset.data_vars.items():
         name, _, suffix = str(full_name).rpartition("_")
         if variable.attrs.get(_PART) == "real" and f"{name}_imag" in dataset:
-            both = np.empty(variable.shape, np.complex64 if variable.dtype == np.float32 else np.complex128)
-            both.real = variable.values
-            both.imag = dataset[f"{name}_imag"].values
+            joined = np.empty(variable.shape, np.result_type(variable.dtype, np.complex64))
+            joined.real = variable.values
+            joined.imag = dataset[f"{name}_imag"].values
             attrs = {key: text for key, text in variable.attrs.items() if key != _PART}
             attrs["long_name"] = str(attrs.get("long_name", name)).removesuffix(", real part")
-            made[name] = (variable.dims, both, attrs)
+            variables[name] = (variable.dims, joined, attrs)
         elif variable.attrs.get(_PART) != suffix or suffix != "imag":
-            made[str(full_name)] = variable
-    return dataset.drop_vars(list(dataset.data_vars)).assign(made)
+            variables[str(full_name)] = variable
+    return dataset.drop_vars(list(dataset.data_vars)).assign(variables)
 
 
 def _require_h5netcdf() -> None:
@@ -408,7 +428,9 @@ def pack_netcdf(dataset: xarray.Dataset) -> bytes:
     """
     _require_h5netcdf()
     split = split_complex(dataset)
-    split.attrs = {key: int(value) if isinstance(value, bool) else value for key, value in split.attrs.items()}
+    for key, value in split.attrs.items():
+        if isinstance(value, bool):
+            split.attrs[key] = int(value)
     packed = {"zlib": True, "complevel": 4, "shuffle": True}
     encoding = {name: packed for name, v in split.data_vars.items() if v.ndim == 2 and v.dtype.kind in "biuf"}
     buffer = io.BytesIO()
@@ -452,10 +474,12 @@ def _check_hdf5(path: Path) -> None:
     sizes: list[int] = []
     external: list[str] = []
     with h5py.File(path, "r") as file:
-        # Called by HDF5, must not raise
+        # HDF5 calls this function from C: it must not raise.
         def check(name: str) -> None:
             outside = isinstance(file.get(name, getlink=True), h5py.ExternalLink)
-            content = None if outside else file.get(name)
+            content = None
+            if not outside:
+                content = file.get(name)
             if isinstance(content, h5py.Dataset):
                 outside = bool(content.external) or content.is_virtual
                 sizes.append((content.size or 0) * content.dtype.itemsize)
@@ -481,8 +505,14 @@ def _check_hdf5(path: Path) -> None:
 
 def table_figures(scan: ProcessedScan) -> list[Figure]:
     """Return the declared figures that are columns of the exported tables."""
-    kind = type(scan.segments[0]) if scan.segments else PatchFigures
-    return [figure for figure in figures_of(kind) if figure.column.name]
+    return [figure for figure in _patch_figures(scan.segments) if figure.column.name]
+
+
+def _patch_figures(patches: Sequence[PatchFigures]) -> tuple[Figure, ...]:
+    """Return the figures that the patches' class declares: a new one may stand in a class of its own."""
+    if not patches:
+        return declared_figures(PatchFigures)
+    return declared_figures(type(patches[0]))
 
 
 def pack_csv(scan: ProcessedScan) -> bytes:
@@ -501,6 +531,7 @@ def pack_csv(scan: ProcessedScan) -> bytes:
     return text.getvalue().encode("utf-8")
 
 
+# Longest name of a variable or field in MATLAB (namelengthmax).
 _LONGEST_NAME = 63
 
 
@@ -527,8 +558,8 @@ def pack_mat(scan: ProcessedScan) -> bytes:
         "scan_id": scan.scan_id,
         "simulated": np.nan if scan.simulated is None else scan.simulated,
         "convention": CONVENTION,
-        "quality_json": json.dumps(plain(scan.quality)),
-        "materials_json": json.dumps(plain(scan.materials) or {}),
+        "quality_json": json.dumps(to_plain(scan.quality)),
+        "materials_json": json.dumps(to_plain(scan.materials) or {}),
         **verdict_attributes(scan.verdict),
     }
     if images.p_sigma is not None:
@@ -541,7 +572,9 @@ def pack_mat(scan: ProcessedScan) -> bytes:
 def _column(figure: Figure, scan: ProcessedScan) -> Any:
     """Return a column of numbers (NaN if unknown) or of bools, or a cell array of text."""
     column = figure.array(scan.segments)
-    return (column.astype(object) if figure.kind is str else column)[:, None]
+    if figure.kind is str:
+        column = column.astype(object)
+    return column[:, None]
 
 
 def _struct(node: Any) -> Any:
@@ -562,7 +595,9 @@ def _struct(node: Any) -> Any:
 
 def _name(key: str) -> str:
     name = re.sub(r"\W", "_", key)
-    return (name if name[:1].isalpha() else f"x{name}")[:_LONGEST_NAME]
+    if not name[:1].isalpha():
+        name = f"x{name}"
+    return name[:_LONGEST_NAME]
 
 
 _FOLDER = "export"

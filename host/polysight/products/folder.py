@@ -105,9 +105,9 @@ def check_products_folder(out: Path, scan_id: str) -> None:
         )
     place = out.resolve()
     if Path.cwd().is_relative_to(place) or place.is_mount():
-        what = "a mount point" if place.is_mount() else "the current folder"
+        kind = "a mount point" if place.is_mount() else "the current folder"
         raise ConfigError(
-            f"{out} is {what}",
+            f"{out} is {kind}",
             "products replace their whole folder",
             "give a folder inside it as --out",
             code=ErrorCode.VALUE_INVALID,
@@ -263,20 +263,22 @@ def _is_product(name: str) -> bool:
     return name in PRODUCTS or name == FINISHED
 
 
-def scan_folder_of(folder: Path) -> Path | None:
+def find_scan_folder(folder: Path) -> Path | None:
     """Return the scan folder of a scan or of its products; None for products outside a scan folder."""
     if is_source(folder):
         return folder
     above = folder.resolve().parent
     if not is_source(above):
         return None
-    # The parent of `.` is `.`
-    return folder.parent if folder.parent.resolve() == above else above
+    # The path is kept as the user wrote it, except where its parent is no other folder: that of `.` is `.`.
+    if folder.parent.resolve() == above:
+        return folder.parent
+    return above
 
 
 def label_folder(folder: Path) -> Path:
     """Return the folder for `labels.json` of a scan or of products."""
-    return scan_folder_of(folder) or folder
+    return find_scan_folder(folder) or folder
 
 
 def find_labels(folder: Path) -> tuple[Path, Labels] | None:
@@ -287,7 +289,7 @@ def find_labels(folder: Path) -> tuple[Path, Labels] | None:
     DataError
         if the file cannot be read.
     """
-    scan = scan_folder_of(folder)
+    scan = find_scan_folder(folder)
     if scan is not None and (path := scan / LABELS).exists():
         return path, read_labels(path)
     for path in (folder / LABELS, folder / "products" / LABELS):

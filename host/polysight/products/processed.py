@@ -40,7 +40,7 @@ from polysight.results import (
     ScanMaterials,
     ScanQuality,
     Verdict,
-    damaged,
+    damage_error,
     json_text,
 )
 from polysight.store import open_npz
@@ -142,7 +142,7 @@ def _check_image(arrays: dict[str, npt.NDArray]) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write a value as a JSON file, see :func:`polysight.results.plain`."""
+    """Write a value as a JSON file, see :func:`polysight.results.to_plain`."""
     write_atomically(path, json_text(content).encode("utf-8"))
 
 
@@ -182,7 +182,7 @@ class Computed(TypedDict, total=False):
     quality: Required[ScanQuality]
     facts: Required[ScanFacts]
     materials: ScanMaterials | None
-    found: MaterialsResult | None
+    analysis: MaterialsResult | None
     plates: tuple[TruthPlate, ...]
     plan: RasterPlan | None
     labels: Labels
@@ -206,7 +206,7 @@ class ProcessedScan:
     folder: Path
 
     @classmethod
-    def computed(cls, folder: Path, **content: Unpack[Computed]) -> Self:
+    def from_results(cls, folder: Path, **content: Unpack[Computed]) -> Self:
         """Return a result that was just computed; `folder` is where its data were read."""
         scan = cls(folder)
         vars(scan).update({"materials": None, **content})
@@ -270,7 +270,7 @@ class ProcessedScan:
         return read_patches(self.folder / PATCHES)
 
     @cached_property
-    def found(self) -> MaterialsResult | None:
+    def analysis(self) -> MaterialsResult | None:
         """Result of the analysis behind the figures of the patches; None for saved products."""
         return None
 
@@ -282,13 +282,16 @@ class ProcessedScan:
     @cached_property
     def pixel_names(self) -> PixelNames:
         """Patch to the names of its interior's pixels in image order, and that interior; empty for saved products."""
-        patches = () if self.found is None else self.found.patches
-        return {r.patch.label: (r.names, r.patch.interior) for r in patches if r.names is not None}
+        if self.analysis is None:
+            return {}
+        return {r.patch.label: (r.names, r.patch.interior) for r in self.analysis.patches if r.names is not None}
 
     @cached_property
     def expected_accuracy(self) -> float | None:
         """Share of pixels that the best classifier is expected to name right; None for saved products."""
-        return None if self.found is None else expected_pixel_accuracy(self.found)
+        if self.analysis is None:
+            return None
+        return expected_pixel_accuracy(self.analysis)
 
     @property
     def plates_named(self) -> PlatesNamed | None:
@@ -299,8 +302,8 @@ class ProcessedScan:
         """
         if not self.plates or not any(patch.name for patch in self.segments):
             return None
-        found = [patch for patch in self.segments if not patch.metal_reference]
-        judged = [(patch.name, patch.truth) for patch in found if patch.truth and patch.truth.permittivity]
+        non_metal_patches = [patch for patch in self.segments if not patch.metal_reference]
+        judged = [(patch.name, patch.truth) for patch in non_metal_patches if patch.truth and patch.truth.permittivity]
         right = sum(name == truth.name for name, truth in judged)
         strange = sum(name == UNKNOWN and not truth.in_library for name, truth in judged)
         plates = sum(plate.permittivity is not None for plate in self.plates)
@@ -309,7 +312,9 @@ class ProcessedScan:
     @property
     def segments(self) -> list[PatchFigures]:
         """Patches; empty if only images were made."""
-        return [] if self.materials is None else self.materials.segments
+        if self.materials is None:
+            return []
+        return self.materials.segments
 
     @property
     def metal_referenced(self) -> bool:
@@ -354,7 +359,7 @@ class ProcessedScan:
                 return decode(self.facts.instrument, Instrument, f"{path}: instrument")
             return None
         except ConfigError as e:
-            raise damaged(path, e.what) from None
+            raise damage_error(path, e.what) from None
 
     @property
     def rows(self) -> Rows | None:
@@ -363,7 +368,10 @@ class ProcessedScan:
         indices = [set(rows) for rows in recorded if rows is not UNSET]
         if self.rig is None or not recorded or len(indices) < len(recorded):
             return None
-        planned = self.rig.grid.columns if self.by_columns else self.rig.grid.rows
+        if self.by_columns:
+            planned = self.rig.grid.columns
+        else:
+            planned = self.rig.grid.rows
         return Rows(planned, tuple(sorted(set.intersection(*indices))))
 
     @property
@@ -381,8 +389,8 @@ class ProcessedScan:
     @cached_property
     def labels(self) -> Labels:
         """Patch number of each pixel, 0 for none, int32 [ny, nx]; saved outlines are accurate to half a pixel."""
-        if self.found is not None:
-            return self.found.segmentation.labels
+        if self.analysis is not None:
+            return self.analysis.segmentation.labels
         x_m = self.images.x_m
         y_m = self.images.y_m
         labels = np.zeros((y_m.size, x_m.size), np.int32)
@@ -402,8 +410,8 @@ class ProcessedScan:
     def interior(self) -> Mask | None:
         """Pixels used for the patches' statistics, bool [ny, nx]; None if unknown."""
         interior = np.zeros(self.images.valid.shape, bool)
-        if self.found is not None:
-            for patch in self.found.segmentation.patches:
+        if self.analysis is not None:
+            for patch in self.analysis.segmentation.patches:
                 interior |= patch.interior
         elif self._has_pixels:
             for pixels in self.patches.patches:
@@ -441,12 +449,12 @@ def read_products(folder: Path, needs: str = IMAGE) -> ProcessedScan:
         return products
     if not folder.exists():
         raise no_such(folder)
-    raise DataError(
-        f"{folder}: no {needs}",
-        "the folder is wrong, the scan was not processed" + ("" if needs == IMAGE else ", or only to images"),
-        "give a folder that polysight process" + (" or polysight image wrote" if needs == IMAGE else " wrote"),
-        code=ErrorCode.FILE_MISSING,
-    )
+    cause = "the folder is wrong, the scan was not processed, or only to images"
+    remedy = "give a folder that polysight process wrote"
+    if needs == IMAGE:
+        cause = "the folder is wrong, the scan was not processed"
+        remedy = "give a folder that polysight process or polysight image wrote"
+    raise DataError(f"{folder}: no {needs}", cause, remedy, code=ErrorCode.FILE_MISSING)
 
 
 def raw_dropped(folder: Path) -> RawDropped | None:

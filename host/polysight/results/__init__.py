@@ -2,13 +2,14 @@
 
 `ScanMaterials`, `ScanQuality` and `ScanFacts` are the content of materials.json, quality.json and scan.json; their
 `read` takes files of any release. `PatchFigures` declares each figure of a patch once, with name, unit and title
-(`Column`); `figures_of` lists them for tables, exports and datasets. With the verdict "no result" a `ScanMaterials`
-cannot hold names or permittivities. The functions `*_reasons` are the rules of the verdict, `verdict_of` joins them.
-`plain` converts all of it to JSON types.
+(`Column`); `declared_figures` lists them for tables, exports and datasets. With the verdict "no result" a
+`ScanMaterials` cannot hold names or permittivities. The functions `*_reasons` are the rules of the verdict,
+`join_reasons` joins them.
+`to_plain` converts all of it to JSON types.
 """
 
 from polysight.results.check_plate import WARNING_SIGMAS, CheckResult, check_plate, check_reasons
-from polysight.results.json_files import damaged, json_text, one_line, plain, read_object
+from polysight.results.json_files import damage_error, json_text, one_line, read_object, to_plain
 from polysight.results.materials import (
     BandFigures,
     ComplexNumber,
@@ -23,7 +24,7 @@ from polysight.results.materials import (
     PlaneError,
     ScanMaterials,
     TruthFigures,
-    figures_of,
+    declared_figures,
 )
 from polysight.results.quality import (
     Backlash,
@@ -57,6 +58,7 @@ from polysight.results.verdict import (
     fit_reasons,
     halo_reasons,
     incidence_reasons,
+    join_reasons,
     leakage_reasons,
     level_reasons,
     metal_reasons,
@@ -68,7 +70,6 @@ from polysight.results.verdict import (
     recording_reasons,
     signal_reasons,
     tilt_reasons,
-    verdict_of,
 )
 
 __all__ = [
@@ -112,14 +113,15 @@ __all__ = [
     "check_plate",
     "check_reasons",
     "copies_reasons",
-    "damaged",
+    "damage_error",
+    "declared_figures",
     "direct_path_reasons",
     "disturbance_reasons",
     "drift_reasons",
-    "figures_of",
     "fit_reasons",
     "halo_reasons",
     "incidence_reasons",
+    "join_reasons",
     "json_text",
     "leakage_reasons",
     "level_reasons",
@@ -127,7 +129,6 @@ __all__ = [
     "one_line",
     "passivity_reasons",
     "percent",
-    "plain",
     "plane_reasons",
     "read_object",
     "reason",
@@ -135,5 +136,5 @@ __all__ = [
     "recording_reasons",
     "signal_reasons",
     "tilt_reasons",
-    "verdict_of",
+    "to_plain",
 ]

@@ -18,7 +18,7 @@ from polysight_shared.findings import Finding
 T = TypeVar("T")
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """Convert a value to strict JSON types.
 
     Structs become objects without their UNSET fields, numpy arrays lists, complex numbers {real, imag}, numbers that
@@ -28,19 +28,21 @@ def plain(value: Any) -> Any:
         return {"what": value.what, "why": value.why, "do": value.do}
     if isinstance(value, msgspec.Struct):
         fields = {name: getattr(value, name) for name in value.__struct_fields__}
-        return {name: plain(item) for name, item in fields.items() if item is not msgspec.UNSET}
+        return {name: to_plain(item) for name, item in fields.items() if item is not msgspec.UNSET}
     if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): to_plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
+        return [to_plain(v) for v in value]
     if isinstance(value, np.ndarray):
-        return plain(value.tolist())
+        return to_plain(value.tolist())
     if isinstance(value, np.generic):
-        return plain(value.item())
+        return to_plain(value.item())
     if isinstance(value, complex):
-        return {"real": plain(value.real), "imag": plain(value.imag)}
+        return {"real": to_plain(value.real), "imag": to_plain(value.imag)}
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        if not math.isfinite(value):
+            return None
+        return value
     if value is None or isinstance(value, bool | int | str):
         return value
     return str(value)
@@ -53,8 +55,8 @@ def one_line(finding: Finding) -> str:
 
 
 def json_text(content: Any) -> str:
-    """Return a value as the text of a JSON file, see :func:`plain`."""
-    return json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    """Return a value as the text of a JSON file, see :func:`to_plain`."""
+    return json.dumps(to_plain(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def read_object(path: Path) -> dict[str, Any] | None:
@@ -64,9 +66,9 @@ def read_object(path: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as e:
-        raise damaged(path, str(e)) from None
+        raise damage_error(path, str(e)) from None
     if not isinstance(content, dict):
-        raise damaged(path, "not a JSON object")
+        raise damage_error(path, "not a JSON object")
     return content
 
 
@@ -75,10 +77,10 @@ def convert(content: dict[str, Any], kind: type[T], path: Path) -> T:
     try:
         return msgspec.convert(content, kind, str_keys=True)
     except msgspec.ValidationError as e:
-        raise damaged(path, str(e)) from None
+        raise damage_error(path, str(e)) from None
 
 
-def damaged(path: Path, what: str) -> DataError:
+def damage_error(path: Path, what: str) -> DataError:
     """Return the error of a product that cannot be read."""
     return DataError(
         f"{path}: cannot be read: {what}",

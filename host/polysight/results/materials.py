@@ -90,10 +90,13 @@ class Figure:
         if self.kind is bool:
             return np.array(values, np.bool_)
         number = np.complex128 if self.kind is complex else np.float64
-        unknown = complex(np.nan, np.nan) if self.kind is complex else np.nan
+        if self.kind is complex:
+            unknown = complex(np.nan, np.nan)
+        else:
+            unknown = np.nan
         return np.array([unknown if value is None else value for value in values], number)
 
-    def shown(self, patch: "PatchFigures") -> str:
+    def format(self, patch: "PatchFigures") -> str:
         """Return the value for people, with its unit; a dash if it is not known."""
         value = getattr(patch, self.attribute)
         if value is None or value is UNSET:
@@ -107,7 +110,7 @@ class Figure:
 
 
 @lru_cache
-def figures_of(kind: type["PatchFigures"]) -> tuple[Figure, ...]:
+def declared_figures(kind: type["PatchFigures"]) -> tuple[Figure, ...]:
     """Return the figures declared in a class of patches, in the order of their declaration."""
     hints = get_type_hints(kind, include_extras=True)
     for ancestor in reversed(kind.__mro__):
@@ -119,7 +122,10 @@ def figures_of(kind: type["PatchFigures"]) -> tuple[Figure, ...]:
         if get_origin(hint) is Annotated:
             bare, *extras = get_args(hint)
             kinds = [part for part in get_args(bare) if part not in (NoneType, UnsetType)]
-            value_kind = kinds[0] if kinds else bare
+            if kinds:
+                value_kind = kinds[0]
+            else:
+                value_kind = bare
             figures += [Figure(name, value_kind, column) for column in extras if isinstance(column, Column)]
     return tuple(sorted(figures, key=lambda figure: figure.column.position))
 
@@ -131,7 +137,7 @@ class ComplexNumber(msgspec.Struct, frozen=True):
     imag: float | None
 
     @classmethod
-    def of(cls, value: complex | None) -> "ComplexNumber | None":
+    def from_complex(cls, value: complex | None) -> "ComplexNumber | None":
         """Return a finite number; otherwise None."""
         if value is None or not (math.isfinite(value.real) and math.isfinite(value.imag)):
             return None
@@ -144,8 +150,10 @@ class ComplexNumber(msgspec.Struct, frozen=True):
         return complex(*parts)
 
 
-def _known(number: ComplexNumber | None) -> complex | None:
-    return None if number is None else number.value
+def _complex_value(number: ComplexNumber | None) -> complex | None:
+    if number is None:
+        return None
+    return number.value
 
 
 class PermittivityFigures(msgspec.Struct, frozen=True, kw_only=True):
@@ -336,31 +344,41 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def permittivity_value(self) -> Annotated[complex | None, Column("", "relative permittivity", "1", "permittivity")]:
         """Permittivity eps' - j eps''."""
-        return None if self.permittivity is None else self.permittivity.value
+        if self.permittivity is None:
+            return None
+        return self.permittivity.value
 
     @property
     def permittivity_real(self) -> Annotated[Number, Column("permittivity_real", "eps'", variable="")]:
         """Real part eps'."""
-        return None if self.permittivity is None else self.permittivity.real
+        if self.permittivity is None:
+            return None
+        return self.permittivity.real
 
     @property
     def permittivity_real_std(
         self,
     ) -> Annotated[Number, Column("permittivity_real_standard_error", "standard error of the permittivity, real part")]:
         """Standard error of eps'."""
-        return None if self._spread is None else self._spread.real_std
+        if self._spread is None:
+            return None
+        return self._spread.real_std
 
     @property
     def permittivity_loss(self) -> Annotated[Number, Column("permittivity_loss", "loss eps''", variable="")]:
         """Loss eps''."""
-        return None if self.permittivity is None else self.permittivity.loss
+        if self.permittivity is None:
+            return None
+        return self.permittivity.loss
 
     @property
     def permittivity_loss_std(
         self,
     ) -> Annotated[Number, Column("permittivity_loss_standard_error", "standard error of the permittivity, loss part")]:
         """Standard error of the loss."""
-        return None if self._spread is None else self._spread.loss_std
+        if self._spread is None:
+            return None
+        return self._spread.loss_std
 
     @property
     def permittivity_covariance(
@@ -370,7 +388,9 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
         Column("permittivity_real_loss_covariance", "covariance of the permittivity's real part and loss"),
     ]:
         """Covariance of (eps', eps'')."""
-        return None if self._spread is None else self._spread.covariance
+        if self._spread is None:
+            return None
+        return self._spread.covariance
 
     @property
     def dominated_by(
@@ -386,34 +406,46 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def refused_text(self) -> Annotated[Text, Column("refused", "why the patch was not judged, and what to do", "")]:
         """Why it has no result, and the remedy, in one line; None if it has one."""
-        return None if self.refused is None else one_line(self.refused)
+        if self.refused is None:
+            return None
+        return one_line(self.refused)
 
     ratio: ComplexNumber | None = None
 
     @property
     def p(self) -> Annotated[complex | None, Column("", "median of P = H / V relative to metal", "1", "ratio")]:
         """Median of P."""
-        return None if self.ratio is None else self.ratio.value
+        if self.ratio is None:
+            return None
+        return self.ratio.value
 
     @property
     def p_real(self) -> Annotated[Number, Column("p_real", "real part of P", variable="")]:
         """Real part of P."""
-        return None if self.p is None else self.p.real
+        if self.p is None:
+            return None
+        return self.p.real
 
     @property
     def p_imag(self) -> Annotated[Number, Column("p_imag", "imaginary part of P", variable="")]:
         """Imaginary part of P."""
-        return None if self.p is None else self.p.imag
+        if self.p is None:
+            return None
+        return self.p.imag
 
     @property
     def p_abs_db(self) -> Annotated[Number, Column("p_abs_db", "level of P", "dB", "")]:
         """Level of P, dB; None for zero."""
-        return 20 * math.log10(abs(self.p)) if self.p else None
+        if not self.p:
+            return None
+        return 20 * math.log10(abs(self.p))
 
     @property
     def p_abs(self) -> Annotated[Number, Column("", "size of P", variable="", title="|P|", digits=2)]:
         """Absolute value of P."""
-        return None if self.p is None else abs(self.p)
+        if self.p is None:
+            return None
+        return abs(self.p)
 
     @property
     def p_phase_deg(self) -> Annotated[Number, Column("p_phase_deg", "phase of P", "degree", "", title="∠P", digits=1)]:
@@ -436,7 +468,9 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def true_name(self) -> Annotated[Text, Column("true_name", "material of the simulated scene", "", optional=True)]:
         """True material."""
-        return None if self.truth is None else self.truth.name
+        if self.truth is None:
+            return None
+        return self.truth.name
 
     @property
     def true_permittivity(
@@ -446,7 +480,9 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
         Column("", "relative permittivity of the simulated scene", "1", "true_permittivity", optional=True),
     ]:
         """True permittivity."""
-        return None if self.truth is None else _known(self.truth.permittivity)
+        if self.truth is None:
+            return None
+        return _complex_value(self.truth.permittivity)
 
     @property
     def true_permittivity_real(self) -> Annotated[Number, Column("true_permittivity_real", variable="")]:
@@ -477,7 +513,9 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def _spread(self) -> PermittivitySpread | None:
-        return None if self.permittivity is None else self.permittivity.spread
+        if self.permittivity is None:
+            return None
+        return self.permittivity.spread
 
     @property
     def _second(self) -> tuple[Text, Number]:
@@ -582,21 +620,25 @@ class ScanMaterials(msgspec.Struct, frozen=True, kw_only=True):
     def read(cls, path: Path) -> "ScanMaterials | None":
         """Read a file; None if there is none, as where only images were made. Raises DataError if it is damaged."""
         content = read_object(path)
-        return None if content is None else cls.decode(content, path)
+        if content is None:
+            return None
+        return cls.decode(content, path)
 
     @classmethod
     def decode(cls, content: dict[str, Any], path: Path = Path("materials.json")) -> Self:
         """Return the content of a file as a struct; `path` is for messages. Raises DataError if it is damaged."""
         segments = content.get("segments", [])
         if isinstance(segments, list):
-            segments = [_with_finding(segment) if isinstance(segment, dict) else segment for segment in segments]
+            segments = [_with_finding(segment) for segment in segments]
         return convert({**content, "verdict": read_verdict(content), "segments": segments}, cls, path)
 
 
-def _with_finding(segment: dict[str, Any]) -> dict[str, Any]:
+def _with_finding(segment: Any) -> Any:
     """Return an entry with its reason for refusal as a finding; files hold what, why and do."""
-    refused = segment.get("refused")
-    if not isinstance(refused, dict):
+    if not isinstance(segment, dict) or not isinstance(segment.get("refused"), dict):
         return segment
-    what, why, do = (str(refused.get(key, "")) for key in ("what", "why", "do"))
-    return {**segment, "refused": Finding("error", what, why, do)}
+    refused = segment["refused"]
+    problem = str(refused.get("what", ""))
+    cause = str(refused.get("why", ""))
+    remedy = str(refused.get("do", ""))
+    return {**segment, "refused": Finding("error", problem, cause, remedy)}

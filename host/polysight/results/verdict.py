@@ -1,8 +1,8 @@
 """The verdict: the level of trust in a result, its reasons in order of weight, and the rules that find them.
 
 Each function `*_reasons` turns one kind of evidence into findings (what was found, why it matters, what to do), none if
-the evidence is good; `verdict_of` joins them. All limits are constants of this module. In files and messages a verdict
-is `{"level": ..., "reasons": [{"what", "why", "do"}]}`.
+the evidence is good; `join_reasons` joins them. All limits are constants of this module. In files and messages a
+verdict is `{"level": ..., "reasons": [{"what", "why", "do"}]}`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeGuard
 import msgspec
 import numpy as np
 
-from polysight.results.json_files import plain
+from polysight.results.json_files import to_plain
 from polysight_shared.errors import PolysightError
 from polysight_shared.findings import Finding
 from polysight_shared.findings import Level as FindingLevel
@@ -59,14 +59,17 @@ class Verdict(msgspec.Struct, frozen=True):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as files and messages hold it."""
-        return plain(self)
+        return to_plain(self)
 
     def lines(self, most: int | None = None) -> list[str]:
         """Return text for a terminal: the level, then each reason and remedy; at most `most` reasons."""
         shown_reasons = self.reasons[:most]
         out = [f"verdict:  {self.text}"]
         for r in shown_reasons:
-            out.append(f"  - {r.what}: {r.why}" if r.why else f"  - {r.what}")
+            cause = ""
+            if r.why:
+                cause = f": {r.why}"
+            out.append(f"  - {r.what}{cause}")
             if r.do:
                 out.append(f"    do: {r.do}")
         if len(shown_reasons) < len(self.reasons):
@@ -75,12 +78,15 @@ class Verdict(msgspec.Struct, frozen=True):
 
     def error(self, kept: str = "") -> NoResult:
         """Return the error that ends a command without a result; `kept` says where the images are."""
-        first = self.reasons[0] if self.reasons else reason("none", "no result", "", "")
+        if self.reasons:
+            first = self.reasons[0]
+        else:
+            first = reason("none", "no result", "", "")
         remedy = "; ".join(part for part in (first.do, kept) if part)
         return NoResult(f"no result: {first.what}", first.why, remedy)
 
 
-def verdict_of(reasons: Iterable[Finding]) -> Verdict:
+def join_reasons(reasons: Iterable[Finding]) -> Verdict:
     """Join reasons to a verdict; its level is the worst of theirs, `good` without reasons."""
     ordered = tuple(sorted(reasons, key=lambda r: (_ORDER.index(r.level), -r.weight)))
     if not ordered:
@@ -98,11 +104,13 @@ def read_verdict(content: Mapping[str, Any]) -> Verdict | None:
     if not levels:
         return None
     level = levels[0]
-    listed = raw.get("reasons")
+    entries = raw.get("reasons")
+    if not isinstance(entries, list):
+        return Verdict(level)
     reasons = [
-        reason(level, str(r.get("what", "")), str(r.get("why", "")), str(r.get("do", "")))
-        for r in (listed if isinstance(listed, list) else [])
-        if isinstance(r, Mapping)
+        reason(level, str(entry.get("what", "")), str(entry.get("why", "")), str(entry.get("do", "")))
+        for entry in entries
+        if isinstance(entry, Mapping)
     ]
     return Verdict(level, tuple(reasons))
 
@@ -187,7 +195,9 @@ class Coverage(msgspec.Struct, frozen=True):
             rows += f" ({100 * self.positions_absent / self.positions_planned:.1f} % of positions absent)"
         received = f"{rows}; frames: {percent(self.frames_received, self.frames_planned, 1)}"
         counts = f"{received} of {self.frames_planned} planned"
-        return (counts, self.damage) if self.damage else (counts,)
+        if self.damage:
+            return counts, self.damage
+        return (counts,)
 
 
 def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Finding]:
@@ -408,7 +418,9 @@ def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> 
 def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], theta_std_deg: float) -> list[Finding]:
     """Judge the position of the plates' plane against the rig file."""
     if not known or not all(map(is_known, (offset_mm, *tilt_deg))):
-        error = f", +-{theta_std_deg:.2f} degrees" if is_known(theta_std_deg) else ""
+        error = ""
+        if is_known(theta_std_deg):
+            error = f", +-{theta_std_deg:.2f} degrees"
         return [reason(
             "care",
             f"the plane was not found; the angle is the rig file's{error}",
@@ -522,7 +534,9 @@ def tilt_reasons(across_deg: Mapping[int, float]) -> list[Finding]:
     if not tilted:
         return []
     worst = max(tilted, key=lambda label: abs(tilted[label]))
-    remark = "" if len(tilted) == 1 else f" ({len(tilted)} patches in all)"
+    remark = ""
+    if len(tilted) != 1:
+        remark = f" ({len(tilted)} patches in all)"
     return [reason(
         "care", f"patch {worst} rises by {tilted[worst]:+.1f} degrees across the plane of incidence{remark}",
         "the polarisation turns with it: 5 to 13 % of a permittivity per degree, corrected to about a quarter",

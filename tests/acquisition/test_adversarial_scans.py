@@ -82,7 +82,7 @@ def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
     """Check that every committed byte is right or masked, and that a row with a mask is listed as incomplete."""
     scan = ScanFolder.load(folder)
     assert errors(folder) == []
-    for row, committed in scan.committed().items():
+    for row, committed in scan.committed_rows().items():
         for name, board in committed.boards.items():
             data = scan.read_row(name, row)
             want = np.frombuffer(payload_of(name, row, rig.instrument.row_bytes), dtype=np.uint8)

@@ -174,8 +174,8 @@ def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished, t
     assert answer[:4] == ["scan_started", "row_committed", "scan_paused", "scan_continued"]
     assert answer[4:] == ["row_committed", "row_committed", "scan_ended"]
     assert validate(scan.path) == []
-    rows = ScanFolder.load(scan.path).committed()
-    others = ScanFolder.load(finished).committed()
+    rows = ScanFolder.load(scan.path).committed_rows()
+    others = ScanFolder.load(finished).committed_rows()
     assert {r: c.boards for r, c in rows.items()} == {r: c.boards for r, c in others.items()}
 
 
@@ -188,5 +188,5 @@ def test_a_paused_scan_can_be_stopped(samples, tmp_path):
 
     scan = scan_with(samples, tmp_path, stop, pause)
     assert facts(scan.path)[-1] == "scan_ended"
-    assert list(ScanFolder.load(scan.path).committed()) == [0]
+    assert list(ScanFolder.load(scan.path).committed_rows()) == [0]
     assert scan.run().exit_status == "success"

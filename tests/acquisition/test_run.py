@@ -35,7 +35,7 @@ from polysight_shared.messages import Capture, RunStarted, RunStopped
 def digests(scan: ScanFolder) -> dict[str, str]:
     return {
         b.file: hashlib.sha256((scan.path / b.file).read_bytes()).hexdigest()
-        for r in scan.committed().values()
+        for r in scan.committed_rows().values()
         for b in r.boards.values()
     }
 
@@ -90,7 +90,7 @@ def test_lost_packets_make_the_row_be_taken_again(rig, payload, tmp_path, droppe
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 1)
     scan = ScanFolder.load(tmp_path / "s")
-    assert scan.committed()[1].take == 2
+    assert scan.committed_rows()[1].take == 2
     assert scan.read_row("RV", 1).payload.tobytes() == payload("RV", 1, rig.instrument.row_bytes)
     rejected = facts_of(scan, "row_rejected")
     assert [(r["row"], r["take"]) for r in rejected] == [(1, 1)]
@@ -104,12 +104,12 @@ def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
     with refused(ErrorCode.ROW_INCOMPLETE, "RV", "3 takes"):
         run_scan(rig.instrument, tmp_path / "s")
     scan = ScanFolder.load(tmp_path / "s")
-    assert list(scan.committed()) == [0]
+    assert list(scan.committed_rows()) == [0]
     assert facts_of(scan, "scan_ended")[0]["exit_status"] == "fail"
     assert rig.pi.journal[scan.scan_id][-1].exit_status == "fail"
     result = resume_scan(tmp_path / "s")
     assert result.exit_status == "success"
-    assert ScanFolder.load(tmp_path / "s").committed()[1].take == 4
+    assert ScanFolder.load(tmp_path / "s").committed_rows()[1].take == 4
     assert errors(tmp_path / "s") == []
 
 
@@ -134,7 +134,7 @@ def test_keep_incomplete_masks_a_slipped_row_as_a_whole(rig, tmp_path):
     run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
     scan = ScanFolder.load(tmp_path / "s")
     assert scan.read_row("RH", 1).missing == [(0, rig.instrument.row_bytes)]
-    assert scan.committed()[1].boards["RH"].frames_received == 0
+    assert scan.committed_rows()[1].boards["RH"].frames_received == 0
 
 
 def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
@@ -146,7 +146,7 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
 
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     assert result.exit_status == "abort"
-    assert list(result.folder.committed()) == [0, 1]
+    assert list(result.folder.committed_rows()) == [0, 1]
     before = digests(result.folder)
     (tmp_path / "s" / "raw" / "RH" / "0002.part").write_bytes(b"half a row")
     with (tmp_path / "s" / "manifest.jsonl").open("ab") as f:
@@ -182,7 +182,7 @@ def test_killed_host_resumes_and_committed_rows_stay(rig, config, payload, tmp_p
     result = resume_scan(tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 0)
     assert {k: v for k, v in digests(result.folder).items() if k in before} == before
-    assert [r.take for r in result.folder.committed().values()] == [1, 1, 2, 1]
+    assert [r.take for r in result.folder.committed_rows().values()] == [1, 1, 2, 1]
     assert result.folder.read_row("RH", 2).payload.tobytes() == payload("RH", 2, rig.instrument.row_bytes)
     assert validate(tmp_path / "s") == []
 

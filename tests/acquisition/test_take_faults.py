@@ -100,7 +100,7 @@ def test_stopped_now_is_on_request_whatever_else_is_missing(rig, tmp_path):
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     (fact,) = facts_of(result.folder, "row_rejected")
     assert (fact["reasons"], fact["faults"]) == ([str(ON_REQUEST)], [{"kind": "on_request"}])
-    assert (result.exit_status, list(result.folder.committed())) == ("abort", [])
+    assert (result.exit_status, list(result.folder.committed_rows())) == ("abort", [])
     assert not list((tmp_path / "s" / "raw").rglob("*.part"))
 
 

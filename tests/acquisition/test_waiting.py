@@ -69,7 +69,7 @@ def test_stop_while_waiting_for_processing(rig, tmp_path):
         limited(rig.instrument, rows_waiting=1), tmp_path / "s", on_row=lambda _: release.wait(HANG_S) and None,
         progress=progress, stop=stop,
     )  # fmt: skip
-    assert (result.exit_status, sorted(result.folder.committed())) == ("abort", [0, 1])
+    assert (result.exit_status, sorted(result.folder.committed_rows())) == ("abort", [0, 1])
 
 
 def test_rows_of_an_earlier_run_hold_nothing_up(rig, tmp_path):
@@ -242,7 +242,7 @@ def test_stop_now_before_the_row_begins_moves_nothing(rig, tmp_path, state):
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     assert result.exit_status == "abort"
     assert rig.pi.rows_run == [(0, 1)]
-    assert list(result.folder.committed()) == [0]
+    assert list(result.folder.committed_rows()) == [0]
     assert resume_scan(tmp_path / "s").exit_status == "success"
 
 

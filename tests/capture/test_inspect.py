@@ -18,7 +18,7 @@ from tests.support.processes import Bench
 from tests.support.refusals import refused
 from tests.support.scenes import small_scene
 
-from polysight.capture import kind_of
+from polysight.capture import recognise_format
 from polysight.capture.dca1000 import Status
 from polysight.capture.inspect import Layout, inspect_bin, inspect_pcap, is_pcap, read_pcap
 from polysight.jobs.recordings import inspect_file, main_text
@@ -212,7 +212,7 @@ def npy() -> bytes:
     ],
 )
 def test_other_files_are_recognised_by_their_first_bytes(head, kind):
-    assert kind_of(head) == kind
+    assert recognise_format(head) == kind
 
 
 @pytest.fixture

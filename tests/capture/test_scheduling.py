@@ -28,7 +28,7 @@ def test_cores_leave_the_first_to_the_host():
 
 def test_core_and_priority_are_reported(board):
     core = max(os.sched_getaffinity(0))
-    with ReceiverProcess(board, 1 << 20, Core(core, own=True)) as receiver:
+    with ReceiverProcess(board, 1 << 20, Core(core, exclusive=True)) as receiver:
         pinned = os.sched_getaffinity(receiver.pid) == {core}
         urgent = os.sched_getscheduler(receiver.pid) == os.SCHED_RR
         assert (f"core {core}" in receiver.scheduling) is pinned

@@ -14,7 +14,7 @@ from tests.support.store.facts import facts_of
 
 from polysight.acquisition.scan import resume_scan
 from polysight.cli.main import main
-from polysight.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, with_connection
+from polysight.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, extract_connection, with_connection
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError
 from polysight_shared.tables import decode, to_builtins
@@ -73,11 +73,11 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
         assert given != begun
         if may_change(path):
             check_same_scan(begun, given, "mine.toml")
-            assert with_connection(begun, connection_of(given)) == given
+            assert with_connection(begun, extract_connection(given)) == given
             taken += 1
         elif does_not_matter(path):
             check_same_scan(begun, given, "mine.toml")
-            assert with_connection(begun, connection_of(given)) == begun
+            assert with_connection(begun, extract_connection(given)) == begun
         else:
             name = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
             with pytest.raises(ConfigError) as e:
@@ -109,7 +109,7 @@ def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
     assert scan.instrument == now
     started, (first, second) = facts_of(scan, "scan_started")[0], facts_of(scan, "scan_resumed")
     assert decode(started["instrument"], Instrument, "begun") == begun
-    assert (first["rig"], "rig" in second) == (connection_of(now), False)
+    assert (first["rig"], "rig" in second) == (extract_connection(now), False)
     story = begin_history(started)
     for fact in (first, second):
         add_fact(story, fact)

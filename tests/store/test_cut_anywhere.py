@@ -243,7 +243,7 @@ def test_withdrawn_row_counts_again_once_it_is_taken(undisturbed, tmp_path):
     with folder.writer() as writer:
         writer.append({"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["test"]})
         folder.reload()
-        assert list(folder.committed()) == [0, 2]
+        assert list(folder.committed_rows()) == [0, 2]
         writer.append(fact)
     folder.reload()
-    assert list(folder.committed()) == [0, 1, 2]
+    assert list(folder.committed_rows()) == [0, 1, 2]

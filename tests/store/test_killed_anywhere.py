@@ -40,7 +40,7 @@ def broken_off(scan: SmallScan, disk: FaultyDisk) -> bool:
     except Killed:
         if scan.begun:
             assert errors(scan.path) == []
-            assert scan.acknowledged <= set(ScanFolder.load(scan.path).committed())
+            assert scan.acknowledged <= set(ScanFolder.load(scan.path).committed_rows())
         return True
     return False
 

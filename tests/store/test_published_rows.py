@@ -7,7 +7,7 @@ from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 from polysight.store.open import open_source
-from polysight.store.published import RowLosses, mirrored
+from polysight.store.published import RowLosses, mirror_rig
 from polysight_shared.config import Burst, Grid
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
@@ -211,13 +211,13 @@ def test_columns_are_rows_of_the_mirrored_rig(tmp_path):
     scan = open_source(folder, BASE)
     assert (scan.plan.columns, scan.plan.rows) == (ROWS, COLUMNS)
     assert scan.recording_facts()["recording"].direction == "col"
-    back = mirrored(scan.instrument)
+    back = mirror_rig(scan.instrument)
     assert (back.grid.columns, back.grid.rows) == (COLUMNS, ROWS)
 
 
 def test_a_mirror_changes_no_path_and_twice_is_nothing():
-    other = mirrored(BASE)
-    assert mirrored(other) == BASE
+    other = mirror_rig(BASE)
+    assert mirror_rig(other) == BASE
     assert incidence_deg(other, other.receivers[0]) == pytest.approx(incidence_deg(BASE, BASE.receivers[0]))
     assert tx_position_m(other) == pytest.approx(
         (tx_position_m(BASE)[1], tx_position_m(BASE)[0], tx_position_m(BASE)[2])

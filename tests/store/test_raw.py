@@ -255,7 +255,7 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
         with pytest.raises(PowerCut):
             drop(ScanFolder.load(scan), digests, scan / "products")
     left = ScanFolder.load(scan)
-    gone = {str(b.file) for row in left.committed().values() for b in row.boards.values()} - {
+    gone = {str(b.file) for row in left.committed_rows().values() for b in row.boards.values()} - {
         str(path.relative_to(scan)) for path in payloads(scan)
     }
     assert gone <= set(dropped_files(left))

@@ -18,7 +18,7 @@ from polysight.store import manifest
 from polysight.store.logs import EventWriter, crc32, read_events
 from polysight.store.manifest import ManifestWriter, RowCommitted, ScanResumed, encode_line, parse
 from polysight.store.scan_folder import ScanFolder
-from polysight.store.source import RawSource, pieces_of
+from polysight.store.source import RawSource, split_pieces
 from polysight.store.validation import to_json, validate
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError
@@ -116,8 +116,8 @@ def test_last_take_wins(whole):
     with scan.writer() as writer:
         writer.append({**fact, "take": 7})
     scan.reload()
-    assert scan.committed()[2].take == 7
-    assert len(scan.committed()) == 4
+    assert scan.committed_rows()[2].take == 7
+    assert len(scan.committed_rows()) == 4
 
 
 def flip(path: Path, at: int = 50) -> None:
@@ -224,7 +224,7 @@ def test_read_row_refuses_damage(whole):
 def test_pieces_of_any_size_are_the_payload(whole, size):
     row = ScanFolder.load(whole).read_row("RH", 1)
     assert b"".join(piece.tobytes() for piece in row.pieces(size)) == (whole / "raw/RH/0001.bin").read_bytes()
-    assert row.payload.tobytes() == b"".join(piece.tobytes() for piece in pieces_of(row.payload)(size))
+    assert row.payload.tobytes() == b"".join(piece.tobytes() for piece in split_pieces(row.payload)(size))
 
 
 def test_other_folders_are_refused(whole, tmp_path):
@@ -292,7 +292,7 @@ def test_start_that_died_before_its_first_line_is_repeated(tmp_path):
     instrument = small_instrument()
     for torn in (b"", b'{"fact":"scan_star'):
         (tmp_path / "manifest.jsonl").write_bytes(torn)
-        assert ScanFolder.create(tmp_path, instrument, plan_raster(instrument.grid)).committed() == {}
+        assert ScanFolder.create(tmp_path, instrument, plan_raster(instrument.grid)).committed_rows() == {}
         (tmp_path / "manifest.jsonl").unlink()
 
 

@@ -38,7 +38,7 @@ def test_a_disk_without_locks_is_not_a_scan_in_use(tmp_path, monkeypatch):
 @pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE])
 def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed, monkeypatch, suffix, number):
     scan = ScanFolder.load(undisturbed.path)
-    bad = (undisturbed.path / next(iter(scan.committed()[0].boards.values())).file).with_suffix(suffix)
+    bad = (undisturbed.path / next(iter(scan.committed_rows()[0].boards.values())).file).with_suffix(suffix)
 
     def fails(path: Path) -> None:
         if path == bad:
@@ -56,7 +56,7 @@ def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed, monkeypatch, 
 
 def test_row_whose_file_is_gone_is_taken_again(undisturbed, monkeypatch):
     scan = ScanFolder.load(undisturbed.path)
-    gone = undisturbed.path / next(iter(scan.committed()[1].boards.values())).file
+    gone = undisturbed.path / next(iter(scan.committed_rows()[1].boards.values())).file
     opened = Path.open
 
     def absent(path: Path, *how, **more):
@@ -100,7 +100,7 @@ def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed, tmp_path,
             seen += 1
             assert os.strerror(errno.ENOSPC) in error.what
             assert error.remedy
-        committed = set(ScanFolder.load(scan.path).committed()) if scan.begun else set()
+        committed = set(ScanFolder.load(scan.path).committed_rows()) if scan.begun else set()
         assert scan.acknowledged <= committed
         if scan.begun:
             assert errors(scan.path) == []

@@ -62,7 +62,7 @@ def test_a_row_outside_the_scan_is_refused_by_whatever_reads_it(scan, file):
     victim = scan.path.parent / "victim.bin"
     victim.write_bytes(b"mine")
     committed_as(scan, file)
-    for use in (scan.committed, lambda: list(scan.rows()), lambda: droppable(scan, {})):
+    for use in (scan.committed_rows, lambda: list(scan.rows()), lambda: droppable(scan, {})):
         with refused(ErrorCode.PATH_OUTSIDE):
             use()
     assert any(f.level == "error" for f in validate(scan.path))
@@ -70,7 +70,7 @@ def test_a_row_outside_the_scan_is_refused_by_whatever_reads_it(scan, file):
 
 
 def test_a_link_out_of_the_scan_is_refused(scan, tmp_path):
-    name = next(iter(scan.committed()[0].boards))
+    name = next(iter(scan.committed_rows()[0].boards))
     elsewhere = tmp_path / "elsewhere"
     (scan.path / "raw" / name).rename(elsewhere)
     (scan.path / "raw" / name).symlink_to(elsewhere)
@@ -88,12 +88,12 @@ def test_a_board_whose_name_is_a_path_is_refused(name, tmp_path):
 
 
 def test_only_bytes_that_were_committed_are_dropped(scan):
-    row = scan.committed()[0]
+    row = scan.committed_rows()[0]
     name, board = next(iter(row.boards.items()))
     other_board = next(n for n in row.boards if n != name)
     other = bytes(board.bytes)
     (scan.path / board.file).write_bytes(other)
-    processed = {n: {r.row: r.boards[n].crc32 for r in scan.committed().values()} for n in row.boards}
+    processed = {n: {r.row: r.boards[n].crc32 for r in scan.committed_rows().values()} for n in row.boards}
     kept = droppable(scan, processed).kept
     assert [line for line in kept if board.file in line]
     drop(scan, processed, scan.path)
@@ -144,7 +144,7 @@ def claims(runs: int, packets: int, size: int) -> np.ndarray:
     ids=["row", "overflow", "empty packets", "many packets"],
 )
 def test_a_packet_log_that_claims_too_much_is_refused(scan, change):
-    board = next(iter(scan.committed()[0].boards.values()))
+    board = next(iter(scan.committed_rows()[0].boards.values()))
     path = (scan.path / board.file).with_suffix(PACKETS)
     line, _, tail = path.read_bytes().partition(b"\n")
     head = json.loads(line)
@@ -180,7 +180,7 @@ def test_links_within_a_scan_and_of_its_products_folder_are_allowed(scan, tmp_pa
     (tmp_path / "elsewhere").mkdir()
     (scan.path / "products").symlink_to(tmp_path / "elsewhere")
     (scan.path / "note").symlink_to("manifest.jsonl")
-    assert ScanFolder.load(scan.path).committed()
+    assert ScanFolder.load(scan.path).committed_rows()
 
 
 def test_a_pipe_in_a_scan_is_refused(scan):
@@ -242,7 +242,7 @@ def test_a_manifest_with_another_form_of_calibration_is_refused(scan, answer):
 
 
 def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):
-    name, board = next(iter(scan.committed()[0].boards.items()))
+    name, board = next(iter(scan.committed_rows()[0].boards.items()))
     # A hole: the file takes no space, its bytes would
     os.truncate(scan.path / board.file, 1 << 42)
     with refused(ErrorCode.FILE_DAMAGED, 1 << 42):
@@ -252,7 +252,7 @@ def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):
 
 @pytest.mark.parametrize("file", ["manifest.jsonl", "raw/{board}/0000.idx", "raw/{board}/0000.pkt"])
 def test_files_of_any_size_are_refused_before_they_are_read(scan, file):
-    board = next(iter(scan.committed()[0].boards))
+    board = next(iter(scan.committed_rows()[0].boards))
     path = scan.path / file.format(board=board)
     os.truncate(path, 1 << 42)
     for use in (manifest.read, read_index, lambda path: read_packets(path, np.zeros(8, np.uint8))):

@@ -37,9 +37,11 @@ def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int,
     (last pulse) and `now_ns` are on the monotonic clock; `silence_ns` is the silence that ends a record.
     """
     silent_ns = now_ns - max(progress.last_arrival_ns, since_ns)
-    # Its short last packet, or its status.
+    # The card reports the end by a short last packet, or by its status.
     reported = progress.ended or Status.RECORD_COMPLETED in status
-    return progress.complete or silent_ns >= (min(GRACE_NS, silence_ns) if reported else silence_ns)
+    if reported:
+        silence_ns = min(GRACE_NS, silence_ns)
+    return progress.complete or silent_ns >= silence_ns
 
 
 class CaptureRig:

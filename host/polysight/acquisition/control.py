@@ -96,7 +96,9 @@ def stop_on_interrupt(stop: StopRequest) -> Iterator[None]:
         else:
             stop.request("Ctrl-C")
 
-    numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+    numbers = ()
+    if _in_main_thread():
+        numbers = (signal.SIGINT, signal.SIGTERM)
     old_handlers = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield
@@ -172,7 +174,9 @@ def started_ticks(pid: int) -> int | None:
     except OSError:
         return None
     fields = text.rpartition(")")[2].split()
-    return None if fields[0] == "Z" else int(fields[19])
+    if fields[0] == "Z":
+        return None
+    return int(fields[19])
 
 
 class ControlFolder:
@@ -214,7 +218,10 @@ class ControlFolder:
                     for command in ScanCommand:
                         self._obey(command)
                 pending = self._stop.pending
-                asker = self._stop.asker if pending else ""
+                if pending:
+                    asker = self._stop.asker
+                else:
+                    asker = ""
                 life = Life(os.getpid(), ticks, socket.gethostname(), self._doing, pending, asker)
                 if life != written or time.monotonic() >= next_alive_s:
                     self._write(life)

@@ -128,10 +128,14 @@ def place_frames(
         with strictly increasing slots; -1 where the evidence allows more than one pulse.
     """
     pulses = pulses_ns.size
-    received = -(-int(arrivals[-1, 1]) // frame_bytes) if len(arrivals) else 0
+    received = 0
+    if len(arrivals):
+        received = -(-int(arrivals[-1, 1]) // frame_bytes)
     try:
-        if received == 0 or received > pulses:
-            raise _UndeterminedError("no frame came" if received == 0 else "more frames came than pulses were sent")
+        if received == 0:
+            raise _UndeterminedError("no frame came")
+        if received > pulses:
+            raise _UndeterminedError("more frames came than pulses were sent")
         if frame_bytes < payload_bytes and received < pulses:
             raise _UndeterminedError("a packet holds several frames: those that are missing cannot be told")
         trains = _find_trains(pulses_ns, received_ns, arrivals, frame_bytes, payload_bytes, frame_ns)
@@ -235,7 +239,9 @@ def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int, payload_byt
     if (slots < 0).all():
         cause = "the delays in this row are as long as the pauses between its bursts"
         return PlacedFrames(slots, [], pulses, cause, disturbed=True)
-    return PlacedFrames(slots, [], pulses, doubtful=doubtful.tolist() if is_sharp else [])
+    if not is_sharp:
+        return PlacedFrames(slots, [], pulses)
+    return PlacedFrames(slots, [], pulses, doubtful=doubtful.tolist())
 
 
 def _longest_run(flags: Flags) -> int:
@@ -332,7 +338,10 @@ def _expected_arrivals(
     for b in range(bursts):
         packets = slice(int(edges[b]), int(edges[b + 1]))
         # A burst's first packet is of its first frame; frames below a packet are counted from the row's first.
-        first_frame = frame[packets][:1] if frame_bytes >= payload_bytes else b * count
+        if frame_bytes >= payload_bytes:
+            first_frame = frame[packets][:1]
+        else:
+            first_frame = b * count
         pulse = frame[packets] - first_frame
         of_burst = (pulse >= 0) & (pulse < count)
         if of_burst.any() and (is_whole or pulse.max() == count - 1):
@@ -420,9 +429,12 @@ def describe(placed: PlacedFrames, pulses: int) -> str:
     if count == 0:
         return f"frames are not at their pulses: spurious edges on SYNC_IN; {placed.uncertain} frames are lost"
     places = [f"position {s // pulses} pulse {s % pulses}" for s in placed.missed[:_SHOWN]]
-    ellipsis = ["..."] if len(placed.missed) > _SHOWN else []
-    text = f"missed {count} SYNC_IN pulses ({', '.join(places + ellipsis) or 'positions uncertain'})"
-    return text + (f", and {placed.uncertain} frames near them cannot be placed" if placed.uncertain else "")
+    if len(placed.missed) > _SHOWN:
+        places.append("...")
+    text = f"missed {count} SYNC_IN pulses ({', '.join(places) or 'positions uncertain'})"
+    if placed.uncertain:
+        text += f", and {placed.uncertain} frames near them cannot be placed"
+    return text
 
 
 def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_bytes: int) -> RowCapture:
@@ -531,4 +543,6 @@ def _outside(ranges: list[Gap], start: int, stop: int) -> list[Gap]:
             if a > start:
                 out.append((start, a))
             start = b
-    return [*out, (start, stop)] if start < stop else out
+    if start < stop:
+        return [*out, (start, stop)]
+    return out

@@ -113,7 +113,10 @@ def check_between_rows(status: StatusReply, scan_id: str, first: bool) -> None:
         cause = explained.why
         remedy = explained.remedy
     elif not first and needs_homing:
-        reason = f": {status.reason}" if status.reason else ""
+        if status.reason:
+            reason = f": {status.reason}"
+        else:
+            reason = ""
         problem = f"the stage is {status.state!r} between two rows{reason}"
         cause = "its position was lost, homing was stopped, or somebody ended the run at the Pi"
         remedy = "check that nothing is in the way, then `polysight-pi home`"
@@ -167,4 +170,6 @@ def check_same_stage(stage: Stage, hello: HelloReply, source: str) -> list[str]:
             " other values belong to another scan",
             code=ErrorCode.STAGE_DIFFERS,
         )
-    return [] if hello.stage else [STAGE_NOT_REPORTED]
+    if hello.stage:
+        return []
+    return [STAGE_NOT_REPORTED]

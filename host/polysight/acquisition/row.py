@@ -100,7 +100,9 @@ class TakeFault:
     number: int = 0  # of a `PI_FAULT`
 
     def __str__(self) -> str:
-        return f"{self.board}: {self.text}" if self.board else self.text
+        if self.board:
+            return f"{self.board}: {self.text}"
+        return self.text
 
     def fact(self) -> RowFault:
         """Return the fault as the manifest stores it."""
@@ -193,7 +195,10 @@ class Take:
         else:
             held_text = ""
         if capture.packets == 0:
-            detail = f": its radar was {radar.detail}, and may not have obeyed" if radar.detail else ""
+            if radar.detail:
+                detail = f": its radar was {radar.detail}, and may not have obeyed"
+            else:
+                detail = ""
             return TakeFault(FaultKind.NO_DATA, f"no data{detail}", name)
         if placed is not None:
             if placed.slots.size < placed.pulses:
@@ -224,8 +229,8 @@ class Take:
                 f"{capture.missing_bytes} bytes are missing in {len(capture.missing)} places"
                 f" ({capture.kernel_drops} packets dropped by this machine)"
             )
-            dropped_here = capture.kernel_drops > 0
-            return TakeFault(FaultKind.LOST_BY_HOST if dropped_here else FaultKind.LOST_ON_THE_WAY, text, name)
+            kind = FaultKind.LOST_BY_HOST if capture.kernel_drops > 0 else FaultKind.LOST_ON_THE_WAY
+            return TakeFault(kind, text, name)
         return None
 
     @property
@@ -274,21 +279,27 @@ def commit_row(
         final = scan.row_path(name, take.row.index)
         frames = take.frames.get(name)
         moved = frames_to_move(capture, frames)
-        untimed = take.count_untimed(name, scan.instrument.burst.pulses) if capture.located else 0
+        untimed = 0
+        if capture.located:
+            untimed = take.count_untimed(name, scan.instrument.burst.pulses)
+        missed = None
         if capture.slipped and frames is not None:
             missed = frames.pulses - frames.slots.size
-        else:
-            missed = None
         if moved is not None:
             capture = rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
             take.captures[name] = capture
             # Of a whole row, the frames that came at no pulse's time are masked now.
-            untimed = 0 if faults else untimed - len(moved.doubtful)
+            untimed -= len(moved.doubtful)
+            if faults:
+                untimed = 0
         try:
             final.with_suffix(PART).rename(final)
         except OSError as e:
             raise write_error(final, "renamed", e) from None
         sync_folder(final.parent)
+        packets_crc32 = ""
+        if capture.packets_crc32:
+            packets_crc32 = f"{capture.packets_crc32:08x}"
         boards[name] = BoardRow(
             file=str(final.relative_to(scan.path)),
             bytes=capture.expected,
@@ -297,18 +308,21 @@ def commit_row(
             missing_bytes=capture.missing_bytes,
             crc32=f"{capture.crc32:08x}",
             index_crc32=f"{capture.index_crc32:08x}",
-            packets_crc32=f"{capture.packets_crc32:08x}" if capture.packets_crc32 else "",
+            packets_crc32=packets_crc32,
             pulses_missed=missed,
             frames_untimed=untimed,
             **_reception(capture),
         )
+    pulses = 0
+    if take.finished:
+        pulses = take.finished.pulses
     writer.append(
         RowCommitted(
             row=take.row.index,
             take=take.number,
             direction=take.row.direction,
             boards=boards,
-            pulses=take.finished.pulses if take.finished else 0,
+            pulses=pulses,
             events=events,
             committed_utc=utc_now(),
             kept_incomplete=[str(f) for f in faults],

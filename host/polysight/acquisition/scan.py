@@ -60,8 +60,8 @@ from polysight.store import (
     ScanPaused,
     ScanResumed,
     check_same_scan,
-    connection_of,
     damaged_rows,
+    extract_connection,
     new_scan_id,
     read_events,
     utc_now,
@@ -106,7 +106,9 @@ class ProcessingQueue:
     def behind(self) -> int:
         """Number of unprocessed rows of this run if it is above the limit, otherwise 0."""
         self._own = [f for f in self._own if not f.done()]
-        return len(self._own) if len(self._own) > self._limit else 0
+        if len(self._own) <= self._limit:
+            return 0
+        return len(self._own)
 
     @property
     def left(self) -> int:
@@ -213,7 +215,7 @@ class RunningScan:
         self._stop = stop
         self._radars = radars
         self._queue = ProcessingQueue(on_row, scan.instrument.limits.rows_waiting)
-        self._committed = set(scan.committed())
+        self._committed = set(scan.committed_rows())
         self._row_seconds: list[float] = []
         # Monotonic, plus pauses; None between rows.
         self._row_began: float | None = None
@@ -267,7 +269,10 @@ class RunningScan:
         safe = f"{len(self._committed)} of {self._plan.rows} rows are safe"
         resume = f"`polysight resume {self._scan.path}` continues from there"
         if isinstance(e, PolysightError):
-            e.remedy = advice(e.remedy, safe, "" if f"polysight resume {self._scan.path}" in e.remedy else resume)
+            # A remedy that names the command already is not told twice.
+            if f"polysight resume {self._scan.path}" in e.remedy:
+                resume = ""
+            e.remedy = advice(e.remedy, safe, resume)
             self._error = e
             self.result.reason = e.what
         else:
@@ -310,15 +315,15 @@ class RunningScan:
         check_disk(self._scan.path, self._instrument, len(todo))
         takes = takes_so_far(self._scan)
         taker = RowTaker(
-            self._instrument,
-            self._rig,
-            self._radars,
-            self._pi,
-            self._scan.scan_id,
-            self._scan.path,
-            self._stop,
-            self._point,
-            self._notify,
+            instrument=self._instrument,
+            rig=self._rig,
+            radars=self._radars,
+            pi=self._pi,
+            scan_id=self._scan.scan_id,
+            folder=self._scan.path,
+            stop=self._stop,
+            on_point=self._point,
+            notify=self._notify,
         )
         for row in todo:
             if self._stop.after_row:
@@ -391,7 +396,10 @@ class RunningScan:
             return None
         self._was_ready = True
         self._current = (row.index, number, row.points)
-        self._notify("row", f"row {row.index}" + (f", take {number}" if number > 1 else ""))
+        message = f"row {row.index}"
+        if number > 1:
+            message += f", take {number}"
+        self._notify("row", message)
         try:
             return taker.take(row, number, transaction)
         finally:
@@ -447,7 +455,9 @@ class RunningScan:
         faults = take.faults(self._instrument.burst.pulses)
         keep = last and self._keep_incomplete and take.all_pulses_sent and not self._stop.now
         if faults and not keep:
-            reject_row(self._scan, self._writer, take, [ON_REQUEST] if self._stop.now else faults)
+            if self._stop.now:
+                faults = [ON_REQUEST]
+            reject_row(self._scan, self._writer, take, faults)
             transaction.to(RowState.REJECTED)
             return False
         commit_row(self._scan, self._writer, take, faults, events.digest())
@@ -463,21 +473,33 @@ class RunningScan:
         """Add `scan_ended` to the manifest and end the Pi's run."""
         status = self.result.exit_status
         reason = self.result.reason
+        cause = ""
+        remedy = ""
+        if self._error is not None:
+            cause = self._error.why
+            remedy = self._error.remedy
+        command = ""
+        asker = ""
+        if status == "abort":
+            command = self._stop.pending
+            asker = self._stop.asker
         self._writer.append(
             ScanEnded(
                 exit_status=status,
                 reason=reason,
-                why=self._error.why if self._error is not None else "",
-                remedy=self._error.remedy if self._error is not None else "",
+                why=cause,
+                remedy=remedy,
                 lost_mm=self._lost_mm,
                 rows_committed=len(self._committed),
                 events_refetched=self._pi.gaps_filled,
                 ended_utc=utc_now(),
-                asked=self._stop.pending if status == "abort" else "",
-                asker=self._stop.asker if status == "abort" else "",
+                asked=command,
+                asker=asker,
             )
         )
-        waiting = f"; {self._queue.left} rows wait to be processed" if self._queue.left else ""
+        waiting = ""
+        if self._queue.left:
+            waiting = f"; {self._queue.left} rows wait to be processed"
         self._notify("end", reason + waiting)
         if not begun:
             return
@@ -507,10 +529,23 @@ class RunningScan:
         committed = len(self._committed)
         remaining = None
         if self._row_seconds:
-            elapsed_s = time.monotonic() - self._row_began if self._row_began is not None else 0.0
+            elapsed_s = 0.0
+            if self._row_began is not None:
+                elapsed_s = time.monotonic() - self._row_began
             remaining = time_left(rows - committed, typical_row_s(self._row_seconds), elapsed_s)
         row, take, row_points = self._current
-        report = ScanProgress(phase, message, rows, committed, row, take, points, row_points, remaining, self._state)
+        report = ScanProgress(
+            phase=phase,
+            message=message,
+            rows=rows,
+            committed=committed,
+            row=row,
+            take=take,
+            points=points,
+            row_points=row_points,
+            remaining_s=remaining,
+            state=self._state,
+        )
         try:
             self._progress(report)
         # A closed terminal, or a log on a full disk, must not end the row.
@@ -584,7 +619,17 @@ def run_scan(
         writer = stack.enter_context(scan.writer())
         radars = stack.enter_context(radars or radar_control(instrument))
         stop = stop or StopRequest()
-        return RunningScan(scan, writer, pi, rig, radars, on_row, progress, keep_incomplete, stop).run(warnings)
+        return RunningScan(
+            scan=scan,
+            writer=writer,
+            pi=pi,
+            rig=rig,
+            radars=radars,
+            on_row=on_row,
+            progress=progress,
+            keep_incomplete=keep_incomplete,
+            stop=stop,
+        ).run(warnings)
 
 
 def resume_scan(
@@ -626,24 +671,37 @@ def resume_scan(
             # The earlier rows were placed by that Pi, not by the host's rig file
             differences = stage_differences(scan.instrument.stage, hello)
             warnings = [f"not compared when the scan began: {d}" for d in differences]
+        connection = None
+        if rig_now is not None:
+            connection = extract_connection(rig_now)
         writer.append(
             ScanResumed(
                 resumed_utc=utc_now(),
                 rows_missing=len(scan.rows_absent),
                 pi=describe_pi(hello),
-                rig=None if rig_now is None else connection_of(rig_now),
+                rig=connection,
             )
         )
         scan.reload()
         radars = stack.enter_context(radars or radar_control(scan.instrument))
         stop = stop or StopRequest()
-        running = RunningScan(scan, writer, pi, rig, radars, on_row, progress, keep_incomplete, stop)
+        running = RunningScan(
+            scan=scan,
+            writer=writer,
+            pi=pi,
+            rig=rig,
+            radars=radars,
+            on_row=on_row,
+            progress=progress,
+            keep_incomplete=keep_incomplete,
+            stop=stop,
+        )
         return running.run(withdrawn + warnings)
 
 
 def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProgress | None) -> list[str]:
     """Withdraw every committed row whose files differ from their digests; return warnings. Raises DeviceError."""
-    rows = scan.committed()
+    rows = scan.committed_rows()
     if progress is not None:
         progress(ScanProgress("check", f"comparing {len(rows)} committed rows with their digests", scan.plan.rows, 0))
     damaged = damaged_rows(scan)

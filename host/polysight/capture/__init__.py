@@ -20,7 +20,7 @@ from polysight.capture.dca1000 import (
     row_words,
     valid_frames,
 )
-from polysight.capture.inspect import CardReport, Layout, Report, inspect_bin, inspect_pcap, is_pcap, kind_of
+from polysight.capture.inspect import CardReport, Layout, Report, inspect_bin, inspect_pcap, is_pcap, recognise_format
 from polysight.capture.network import check_receive_buffer, route_interface, silent_radar
 from polysight.capture.placement import Evidence, Placed, place_record
 from polysight.capture.receiver import (
@@ -65,13 +65,13 @@ __all__ = [
     "inspect_bin",
     "inspect_pcap",
     "is_pcap",
-    "kind_of",
     "place_record",
     "program_eeprom",
     "raw_words",
     "read_index",
     "read_packets",
     "receiver_cores",
+    "recognise_format",
     "route_interface",
     "row_words",
     "silent_radar",

@@ -249,7 +249,9 @@ class CardClient:
 
     def _silent(self, code: Code, attempts: int) -> DeviceError:
         """Return the error for a card that does not answer, with the hop that does not work, if known."""
-        tried = f"{attempts} attempts" if attempts > 1 else "1 attempt"
+        tried = "1 attempt"
+        if attempts > 1:
+            tried = f"{attempts} attempts"
         problem = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({tried})"
         return silent_card(self.board, problem, self._kernel_root)
 
@@ -442,7 +444,9 @@ def _reach(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
         error = e
     faulty = ""
     if error is not None:
-        faulty = "card" if survey.version else _FAULTY_HOP.get(silent_hop(address), "card")
+        faulty = "card"
+        if not survey.version:
+            faulty = _FAULTY_HOP.get(silent_hop(address), "card")
     if address.startswith("127."):
         interface = "loopback"
     else:

@@ -236,7 +236,10 @@ def decode_two_lane(
 def _complex(parts: NDArray[np.int16], swap_iq: bool = False) -> NDArray[np.complex64]:
     """Join I and Q, int16 [2, rx, chirp, sample] (with `swap_iq` Q and I)."""
     out = np.empty(parts.shape[1:], dtype=np.complex64)
-    out.real, out.imag = parts[::-1] if swap_iq else parts
+    if swap_iq:
+        out.real, out.imag = parts[::-1]
+    else:
+        out.real, out.imag = parts
     return out
 
 

@@ -2,7 +2,7 @@
 
 `inspect_bin` reads payload, in a layout that is given. A file of whole packets, with headers, is recognised and placed
 by byte count first. `inspect_pcap` reads a packet capture (pcap or pcapng): the replies of the card, and its record,
-placed as live data is. `kind_of` recognises other kinds of files.
+placed as live data is. `recognise_format` recognises other kinds of files.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ MAGIC = {
 }  # fmt: skip
 
 
-def kind_of(head: bytes) -> str:
+def recognise_format(head: bytes) -> str:
     """Describe the kind of file that begins with these bytes: `a picture (PNG)`, `text`, or `unknown bytes`."""
     for magic, kind in MAGIC.items():
         if head.startswith(magic):
@@ -173,7 +173,7 @@ def inspect_bin(path: Path, layout: Layout = Layout()) -> Report:
         payload = np.fromfile(path, dtype=np.uint8, count=MAX_BYTES)
     except OSError as e:
         raise _unreadable(path, e) from None
-    kind = kind_of(payload[:4096].tobytes())
+    kind = recognise_format(payload[:4096].tobytes())
     if kind not in ("empty", "unknown bytes"):
         problem = f"{path}: not a capture: it begins as {kind}"
         remedy = "give a row (.bin) or a packet capture (.pcap)"
@@ -380,7 +380,7 @@ def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") 
 
 def _from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram]]:
     """Return a card's replies and its other datagrams. Raises DataError for several cards."""
-    card = CardReport("", [], "", Status(0), None, 0, 0.0)
+    card = CardReport(address="", replies=[], version="", status=Status(0), record=None, tail_bytes=0, tail_after_s=0.0)
     packets = []
     for datagram in read_pcap(path):
         if datagram.source[1] != dca1000.CARD_SOURCE_PORT or card_address not in ("", datagram.source[0]):
@@ -400,7 +400,10 @@ def _from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram
             continue
         if reply.code == Code.STATUS:
             card.status |= Status(reply.status & 0x0FFF)
-        name = Code(reply.code).name if reply.code in set(Code) else f"0x{reply.code:02x}"
+        if reply.code in set(Code):
+            name = Code(reply.code).name
+        else:
+            name = f"0x{reply.code:02x}"
         card.replies.append((name, reply.status))
         if reply.code == Code.VERSION:
             card.version = str(dca1000.decode_version(reply.status))
@@ -408,5 +411,20 @@ def _from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram
 
 
 def _empty(path: Path, layout: Layout, card: CardReport) -> Report:
-    none = np.zeros(0)
-    return Report(path, 0, layout, 0, 0, 0.0, 0, [], [], 0, none, none, remarks=["no data packets"], card=card)
+    empty = np.zeros(0)
+    return Report(
+        path=path,
+        bytes=0,
+        layout=layout,
+        chirps=0,
+        peak_bin=0,
+        peak_db=0.0,
+        clipped=0,
+        rx_dc=[],
+        rx_rms=[],
+        left_over_bytes=0,
+        profile_db=empty,
+        rx_profile_db=empty,
+        remarks=["no data packets"],
+        card=card,
+    )

@@ -76,7 +76,7 @@ class _Message(ctypes.Structure):
     _fields_ = (("header", _Header), ("received", ctypes.c_uint32))
 
 
-def bind_udp(address: str, port: int, what: str) -> socket.socket:
+def bind_udp(address: str, port: int, problem: str) -> socket.socket:
     """Return a bound, non-blocking, unconnected UDP socket; `what` names it in errors.
 
     Raises
@@ -92,20 +92,22 @@ def bind_udp(address: str, port: int, what: str) -> socket.socket:
         sock.close()
         if e.errno == errno.EADDRINUSE:
             raise DeviceError(
-                f"{what}: {address}:{port} (UDP) is in use",
+                f"{problem}: {address}:{port} (UDP) is in use",
                 "another program receives from this card, perhaps an earlier one that still runs",
                 f"`ss -ulnp 'sport = :{port}'` shows it; stop it",
                 code=ErrorCode.BUSY,
             ) from None
         if e.errno == errno.EADDRNOTAVAIL:
             raise DeviceError(
-                f"{what}: {address} is not an address of this machine",
+                f"{problem}: {address} is not an address of this machine",
                 "the network interface to the cards is down or has another address",
                 f"`ip address add {address}/24 dev <interface>`, or correct host_address in instrument.toml"
                 " (for a scan to resume: `polysight resume SCAN --config instrument.toml`)",
                 code=ErrorCode.VALUE_INVALID,
             ) from None
-        raise DeviceError(f"{what}: cannot bind {address}:{port} (UDP): {e.strerror}", "", "check host_address") from e
+        raise DeviceError(
+            f"{problem}: cannot bind {address}:{port} (UDP): {e.strerror}", "", "check host_address"
+        ) from e
     return sock
 
 
@@ -121,7 +123,9 @@ def enlarge_receive_buffer(sock: socket.socket, wanted_bytes: int) -> int:
 def granted_bytes(sock: socket.socket) -> int:
     """Return the size of the receive buffer; Linux reports twice the request, for its overhead."""
     size = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-    return size // 2 if sys.platform == "linux" else size
+    if sys.platform == "linux":
+        return size // 2
+    return size
 
 
 def kernel_drops(sock: socket.socket) -> int:
@@ -182,8 +186,8 @@ class BatchReceiver:
             number = ctypes.get_errno()
             if number in (errno.EAGAIN, errno.EINTR):
                 return 0
-            what = f"receiving from the capture card failed: {os.strerror(number)}"
-            raise DeviceError(what, "the network interface went down", "`polysight doctor` names the hop")
+            problem = f"receiving from the capture card failed: {os.strerror(number)}"
+            raise DeviceError(problem, "the network interface went down", "`polysight doctor` names the hop")
         self.lengths[:n] = self._received[:n]
         self.times_ns[:n] = self._read_times(n)
         is_from_card = self._sources[:n] == self._source
@@ -316,7 +320,9 @@ def route_interface(address: str, root: Path = _ROOT) -> str | None:
         length = mask.bit_count()
         if flags & _UP and target & mask == destination and length > longest_mask:
             longest_mask = length
-            interface = "" if flags & _GATEWAY else words[0]
+            interface = ""
+            if not flags & _GATEWAY:
+                interface = words[0]
     return interface
 
 
@@ -349,12 +355,12 @@ def neighbour_answers(address: str, root: Path = _ROOT) -> bool | None:
     return None
 
 
-def silent_card(board: Board, what: str, root: Path = _ROOT) -> DeviceError:
+def silent_card(board: Board, problem: str, root: Path = _ROOT) -> DeviceError:
     """Return the error for a card that does not answer: `what` happened, and the hop that does not work, if known."""
     hop = silent_hop(board.card_address, root)
     interface = route_interface(board.card_address, root)
     if hop is Hop.ROUTE:
-        return no_route(board, what)
+        return no_route(board, problem)
     cause = "the card is off, or listens at another address or port"
     remedy = (
         f"the card answers to the host address and ports in its EEPROM: it must send to {board.host_address}"
@@ -377,13 +383,13 @@ def silent_card(board: Board, what: str, root: Path = _ROOT) -> DeviceError:
             "the card is mute: a device has its address, but its program does not answer; wrong command port, or its"
             " replies go to another host address"
         )
-    return DeviceError(what, cause, remedy, code=ErrorCode.NO_ANSWER)
+    return DeviceError(problem, cause, remedy, code=ErrorCode.NO_ANSWER)
 
 
-def no_route(board: Board, what: str) -> DeviceError:
+def no_route(board: Board, problem: str) -> DeviceError:
     """Return the error for a card that is in no subnet of this machine."""
     return DeviceError(
-        what,
+        problem,
         f"no route: no network interface of this machine is in the subnet of {board.card_address}",
         f"`ip address add {board.host_address}/24 dev <interface>`; `ip route get {board.card_address}` shows the"
         " present route",
@@ -395,7 +401,10 @@ def silent_radar(board: Board, row: RowCapture | None = None) -> DeviceError:
     """Return the error for a card that replies but sends no data, with the likeliest cause from the capture `row`."""
     problem = f"no data from {board.name} (card {board.card_address} to {board.host_address}:{board.data_port})"
     remedy = "arm the radar, check the SYNC_IN wire (`polysight doctor` sends pulses), the data port in the EEPROM"
-    status = Status(row.card_status) if row is not None else Status(0)
+    if row is not None:
+        status = Status(row.card_status)
+    else:
+        status = Status(0)
     if row is not None and row.strangers:
         cause = f"{row.strangers} packets came from another address than {board.card_address}"
         remedy = (

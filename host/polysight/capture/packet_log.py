@@ -143,7 +143,9 @@ class PacketLog:
     @property
     def last_arrival_ns(self) -> int:
         """Arrival time of the last packet; 0 before the first."""
-        return int(self._times[self.count - 1]) if self.count else 0
+        if not self.count:
+            return 0
+        return int(self._times[self.count - 1])
 
     @staticmethod
     def restore(

@@ -107,7 +107,7 @@ class Placed:
     # Knowledge for the next record
     past: Past
     # int64 [packet]: offset of its payload in the row, -1 outside the row
-    at: Counts
+    offsets: Counts
     # int64 [n, 2]: time (monotonic, ns), bytes received by then
     arrivals: Counts
     # Missing ranges below the furthest byte, in the card's order
@@ -194,7 +194,7 @@ def place_record(
         counts=row.counts,
         losses=_losses(missing, row.extent, log.expected),
         past=_past_after(record, cause),
-        at=row.at,
+        offsets=row.offsets,
         arrivals=row.arrivals(),
         holes=holes,
         slipped=cause.frames_missing and not dropped_by_card,
@@ -205,10 +205,10 @@ def place_record(
 def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
     """Return the progress of a row from its packets so far, without comparing or copying payload."""
     record = _find_record(log, past, not_before_ns)
-    if not record.own.any():
+    if not record.of_row.any():
         return Preview(0, log.expected == 0, ended=False)
-    starts = record.offsets[record.own]
-    ends = np.minimum(starts + log.sizes[record.own], log.expected)
+    starts = record.offsets[record.of_row]
+    ends = np.minimum(starts + log.sizes[record.of_row], log.expected)
     order = np.lexsort((ends, starts))
     reached = np.maximum.accumulate(ends[order])
     fresh = reached - np.maximum(np.append(0, reached[:-1]), starts[order])
@@ -231,7 +231,7 @@ class _Record:
     # int64, packets behind the start
     steps: Counts
     # Counters within the row, and came after the first pulse
-    own: Flags
+    of_row: Flags
     # Counts on from this record behind the row's last byte
     beyond: Flags
     later: Flags  # of a record behind this one
@@ -239,7 +239,7 @@ class _Record:
     early: Flags
     too_early: Flags  # of these, the ones with counters of the row
     # Has counters of a card that restarted within the row
-    anew: Flags
+    after_restart: Flags
     # Payload of a full packet, bytes
     full: int
     # Bytes up to the end of the furthest packet
@@ -257,7 +257,7 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     early = log.arrivals_ns < not_before_ns
     live = np.flatnonzero(~early)
     predicted = _select_record(log, past.start or SWITCHED_ON, full, early)
-    if live.size == 0 or (past.start is not None and predicted.own.any()):
+    if live.size == 0 or (past.start is not None and predicted.of_row.any()):
         return predicted
     record = _select_record(log, _start_of_most(log, live, full), full, early)
     return replace(record, doubt=_doubt_start(log, past, record))
@@ -282,12 +282,12 @@ def _doubt_start(log: PacketLog, past: Past, record: _Record) -> str:
         return "the record does not begin where the card counts: a second card?"
     if past.lost:
         return "it is unknown where the last record ended"
-    is_other = ~record.own & ~record.early
+    is_other = ~record.of_row & ~record.early
     behind = is_other & (record.offsets < 0) & (record.steps < 0)
     if (is_other & ~behind).any() or 2 * int(log.sizes[behind].sum()) >= log.expected:
         return "packets of another record came with it"
-    offsets = record.offsets[record.own]
-    sizes = log.sizes[record.own]
+    offsets = record.offsets[record.of_row]
+    sizes = log.sizes[record.of_row]
     ended_before = ((sizes < record.full) & (offsets + sizes < record.length)).any()
     _, first_arrival = np.unique(offsets, return_index=True)
     if ended_before or (np.diff(first_arrival) < 0).any():
@@ -322,12 +322,12 @@ def _select_record(log: PacketLog, start: Counters, full: int, early: Flags) -> 
         start=start,
         offsets=offsets,
         steps=steps,
-        own=is_own,
+        of_row=is_own,
         beyond=beyond,
         later=later & ~counts_on_anew,
         early=early,
         too_early=early & on_line & (offsets < expected),
-        anew=counts_on_anew,
+        after_restart=counts_on_anew,
         full=full,
         length=length,
         ended=ended,
@@ -376,7 +376,7 @@ def _why_not_located(record: _Record, row: _Row, log: PacketLog, frame_bytes: in
         return _Doubt()
     if log.count == 0:
         return _Doubt("no packet came")
-    if not record.own.any():
+    if not record.of_row.any():
         return _Doubt("every packet is of an earlier record, by its counters or by its arrival before the first pulse")
     if record.doubt:
         return _Doubt(record.doubt)
@@ -409,7 +409,7 @@ def _why_not_located(record: _Record, row: _Row, log: PacketLog, frame_bytes: in
 def _past_after(record: _Record, why: _Doubt) -> Past:
     """Return where the next record begins: known behind a record whose start and end are certain."""
     is_certain = not why.text or why.frames_missing
-    if not is_certain or not record.own.any() or record.later.any():
+    if not is_certain or not record.of_row.any() or record.later.any():
         return Past(lost=True)
     return Past(start=record.start.after(record.length, -(-record.length // record.full)))
 
@@ -419,11 +419,11 @@ def _count_packets(
 ) -> PacketCounts:
     """Count a row's packets. `placed`, `duplicate`, `conflicting`: bool [packet], disjoint."""
     rest = ~(placed | duplicate | conflicting)
-    leftover = rest & (record.early | ((record.offsets < 0) & (record.steps < 0) & ~record.anew))
-    restarted = rest & record.anew & ~leftover
+    leftover = rest & (record.early | ((record.offsets < 0) & (record.steps < 0) & ~record.after_restart))
+    restarted = rest & record.after_restart & ~leftover
     rest &= ~(leftover | restarted)
     behind_the_row = (record.offsets >= log.expected) & (record.steps > 0) & (record.offsets < 2 * log.expected)
-    outside = rest & (record.own | record.beyond | behind_the_row)
+    outside = rest & (record.of_row | record.beyond | behind_the_row)
     return PacketCounts(
         placed=int(placed.sum()),
         duplicates=int(duplicate.sum()),
@@ -449,8 +449,8 @@ class _Row:
         self._sizes = log.sizes
         self._starts = np.cumsum(log.sizes) - log.sizes
         kept = np.arange(log.count) < log.kept
-        self._own = record.own & kept
-        self.at: Counts = np.full(log.count, -1, dtype=np.int64)
+        self._of_row = record.of_row & kept
+        self.offsets: Counts = np.full(log.count, -1, dtype=np.int64)
         # Sorted, joined.
         self.covered: list[Gap] = []
         self.conflicts: list[Gap] = []
@@ -483,13 +483,13 @@ class _Row:
 
     def _place(self) -> None:
         """Of packets at the same place, select the first and any with more bytes."""
-        packets = np.flatnonzero(self._own)
+        packets = np.flatnonzero(self._of_row)
         offsets = self._record.offsets[packets]
         order = np.argsort(offsets, kind="stable")
         sorted_offsets = offsets[order]
         new = np.append(True, np.diff(sorted_offsets) != 0)[: order.size]
         self._placed[packets] = True
-        self.at[packets] = offsets
+        self.offsets[packets] = offsets
         if new.all():
             return
         firsts = np.flatnonzero(new)
@@ -507,7 +507,7 @@ class _Row:
                 self.conflicts.append((offset, offset + common))
                 self._placed[k] = False
                 self._conflicting[k] = True
-                self.at[k] = -1
+                self.offsets[k] = -1
                 if self._stops[k] > self._stops[longest]:
                     self.conflicts.append((offset, int(self._stops[k])))
                     self.conflicts.append((offset, int(self._stops[longest])))
@@ -536,7 +536,7 @@ class _Row:
         placed = np.flatnonzero(self._placed)
         out = log.payload[: log.expected]
         is_whole = not holes and self.extent == log.expected
-        if not is_whole or (self.at[placed] != self._starts[placed]).any():
+        if not is_whole or (self.offsets[placed] != self._starts[placed]).any():
             out = np.zeros(log.expected, dtype=np.uint8)
             self._copy(placed, out)
         out[self.extent :] = 0
@@ -548,7 +548,7 @@ class _Row:
         """Copy runs of packets that are consecutive in the log and in the row."""
         if not placed.size:
             return
-        offsets = self.at[placed]
+        offsets = self.offsets[placed]
         sizes = self._sizes[placed]
         starts = self._starts[placed]
         stops = self._stops[placed]

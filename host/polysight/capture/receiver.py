@@ -32,10 +32,10 @@ PRIORITY_REMEDY = (
 
 
 class Core(NamedTuple):
-    """A core for a receiver; `own` if no other receiver shares it."""
+    """A core for a receiver; `exclusive` if no other receiver shares it."""
 
     number: int
-    own: bool
+    exclusive: bool
 
 
 def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[Core | None]:
@@ -44,10 +44,14 @@ def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[Core 
     `cores` are the usable cores (default: those of this process).
     """
     if cores is None:
-        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+        cores = []
+        if hasattr(os, "sched_getaffinity"):
+            cores = sorted(os.sched_getaffinity(0))
     usable = cores[1:][::-1]
-    is_own = len(usable) >= receivers
-    return [Core(usable[k % len(usable)], is_own) if usable else None for k in range(receivers)]
+    if not usable:
+        return [None] * receivers
+    exclusive = len(usable) >= receivers
+    return [Core(usable[k % len(usable)], exclusive) for k in range(receivers)]
 
 
 def take_core(core: int | None, own: bool = True, urgent: bool = True) -> tuple[int | None, str]:
@@ -286,13 +290,24 @@ class ReceiverProcess:
                 [sys.executable, "-m", "polysight.capture.receiver_process", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # only the host handles Ctrl-C
+                # Only the host handles Ctrl-C.
+                start_new_session=True,
             )
         self._connection = Connection(ours.detach())
         try:
-            number, own = core or (None, True)
+            # Without a core of its own the receiver may run on any.
+            core_number = None
+            exclusive = True
+            if core is not None:
+                core_number, exclusive = core
             request = Open(
-                board.name, board.host_address, board.data_port, board.card_address, buffer_bytes, number, own
+                board=board.name,
+                host_address=board.host_address,
+                data_port=board.data_port,
+                card_address=board.card_address,
+                buffer_bytes=buffer_bytes,
+                core=core_number,
+                own_core=exclusive,
             )
             opened = self._ask(request, Opened, _START_TIMEOUT_S)
         except DeviceError:

@@ -234,7 +234,7 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
 
 def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the offset of each packet's unchanged payload in the row's file, int64 [packet]; -1 if it is not there."""
-    offsets = placed.at[: sizes.size].copy()
+    offsets = placed.offsets[: sizes.size].copy()
     offsets[offsets + sizes > placed.expected] = -1
     for start, stop in placed.holes:
         offsets[(offsets < stop) & (offsets + sizes > start)] = -1
@@ -253,11 +253,19 @@ def _restore_log(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], 
     size_of_each = np.repeat(sizes, many)
     parts = []
     for n, size, place in zip(many.tolist(), sizes.tolist(), runs["place"].tolist(), strict=True):
-        source, start = (row, place) if place >= 0 else (own, -1 - place)
+        if place >= 0:
+            source = row
+            start = place
+        else:
+            source = own
+            start = -1 - place
         parts.append(source[start : start + n * size])
         if parts[-1].size != n * size:
             raise ValueError("payload is missing")
-    payload = np.concatenate(parts) if parts else np.zeros(0, dtype=np.uint8)
+    if parts:
+        payload = np.concatenate(parts)
+    else:
+        payload = np.zeros(0, dtype=np.uint8)
     sequences = np.repeat(runs["sequence"].astype(np.int64), many) + nth
     counts = np.repeat(runs["byte_count"].astype(np.int64), many) + nth * size_of_each
     times = np.repeat(batches[:, 0], np.diff(batches[:, 1], prepend=0))[: many.sum()]

@@ -30,7 +30,7 @@ from polysight.store.manifest import (
     lock_file,
 )
 from polysight.store.open import is_source, open_source
-from polysight.store.published import COLLECTION, mirrored, read_settings, rig_of
+from polysight.store.published import COLLECTION, build_rig, mirror_rig, read_settings
 from polysight.store.raw import (
     Digests,
     PlacedAgain,
@@ -49,11 +49,11 @@ from polysight.store.scan_folder import (
     SAMPLES,
     TRUTH,
     ScanFolder,
+    check_inside,
     check_same_scan,
-    connection_of,
     damaged_samples,
     dropped_rows,
-    inside,
+    extract_connection,
     locked_samples,
     new_scan_id,
     open_npz,
@@ -67,8 +67,8 @@ from polysight.store.scan_folder import (
 )
 from polysight.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
 from polysight.store.validation import (
-    damage_of,
     damaged_rows,
+    describe_damage,
     to_json,
     to_text,
     validate,
@@ -110,20 +110,21 @@ __all__ = [
     "ScanResumed",
     "ScanStarted",
     "Source",
+    "build_rig",
+    "check_inside",
     "check_same_scan",
-    "connection_of",
-    "damage_of",
     "damaged_rows",
     "damaged_samples",
+    "describe_damage",
     "drop",
     "droppable",
     "dropped_rows",
-    "inside",
+    "extract_connection",
     "is_source",
     "lock_file",
     "locked_samples",
     "manifest",
-    "mirrored",
+    "mirror_rig",
     "new_scan_id",
     "open_npz",
     "open_records",
@@ -137,7 +138,6 @@ __all__ = [
     "record_digest",
     "replace_rows",
     "require_raw",
-    "rig_of",
     "to_json",
     "to_text",
     "utc_now",

@@ -262,7 +262,7 @@ def encode_line(fact: Fact | Mapping[str, Any], **chain: int | str) -> bytes:
     return line.encode("ascii") + b"\n"
 
 
-def digest_of(line: bytes) -> str:
+def compute_digest(line: bytes) -> str:
     """Return the digest that the next line stores: 16 hex digits of the SHA-256 of the line without its end."""
     return hashlib.sha256(line).hexdigest()[:16]
 
@@ -277,9 +277,12 @@ def decode_line(line: bytes) -> dict[str, Any] | None:
         return None
     crc = content.pop("crc", None)
     try:
-        return content if crc == compute_crc(content) else None
+        is_whole = crc == compute_crc(content)
     except ValueError:
         return None
+    if not is_whole:
+        return None
+    return content
 
 
 def _check_line(line: bytes) -> _Head | None:
@@ -379,7 +382,7 @@ class Manifest:
                 self.count += 1
             else:
                 self._add_line(head, line)
-            self.digest = digest_of(line)
+            self.digest = compute_digest(line)
             self.length += len(line) + 1
         return self.facts[old_facts:]
 
@@ -442,7 +445,9 @@ class Manifest:
         """State of the scan according to its last run."""
         if self.ended is None:
             return "paused" if self.paused else "open"
-        planned = 0 if self.started is None else self.started.plan.rows
+        planned = 0
+        if self.started is not None:
+            planned = self.started.plan.rows
         if self.ended.exit_status == "success" and len(self.rows) >= planned:
             return "finished"
         return "stopped" if self.ended.exit_status == "abort" else "failed"
@@ -504,7 +509,10 @@ def lock_file(file: IO[Any] | int, *, shared: bool = False) -> None:
         return
     import msvcrt
 
-    descriptor = file if isinstance(file, int) else file.fileno()
+    if isinstance(file, int):
+        descriptor = file
+    else:
+        descriptor = file.fileno()
     position = os.lseek(descriptor, 0, os.SEEK_CUR)
     # A byte behind the end, because Windows keeps others from reading what is locked. All its locks are exclusive.
     os.lseek(descriptor, _LOCKED_BYTE, os.SEEK_SET)
@@ -585,7 +593,7 @@ class ManifestWriter:
         line = encode_line(fact, count=self._count, previous=self._digest)
         self._file.append(line)
         self._count += 1
-        self._digest = digest_of(line[:-1])
+        self._digest = compute_digest(line[:-1])
 
     def close(self) -> None:
         """Close the file and release the lock. Safe to repeat."""

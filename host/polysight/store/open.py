@@ -60,7 +60,10 @@ def open_source(path: Path, base: Instrument | Path | None = None, dropped: bool
             "give the instrument.toml of the published rig",
             code=ErrorCode.KEY_MISSING,
         )
-    rig = load_instrument(base) if isinstance(base, Path) else base
+    if isinstance(base, Path):
+        rig = load_instrument(base)
+    else:
+        rig = base
     if any(path.glob("*" + SYNCED)):
         return PublishedCubes(path, rig)
     return PublishedScan(path, rig)

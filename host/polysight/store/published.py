@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.store.source import HEADER_LOCK, CubeRow, RowData, pieces_of
+from polysight.store.source import HEADER_LOCK, CubeRow, RowData, split_pieces
 from polysight_shared import files
 from polysight_shared.config import Board, Instrument, MountStep
 from polysight_shared.error_codes import ErrorCode
@@ -109,7 +109,7 @@ def read_settings(path: Path) -> Collection:
     return s
 
 
-def rig_of(s: Collection, base: Instrument, path: Path) -> Rig:
+def build_rig(s: Collection, base: Instrument, path: Path) -> Rig:
     """Return the base rig with the scan's settings; values missing in the JSON stay the base's. Raises ConfigError."""
     c = s.chirp_configs[0]
     grid = {"columns": s.total_x, "rows": s.total_y, "step_x_mm": s.dx, "step_y_mm": s.dy}
@@ -125,18 +125,28 @@ def rig_of(s: Collection, base: Instrument, path: Path) -> Rig:
     table["burst"] |= {"pulses": s.num_trigger, "period_us": s.period_frame * 1e3}
     table["geometry"]["object_distance_mm"] = s.object_distance
     table["chirp"] |= {
-        "start_hz": c.f0 if c.f0 > 1e6 else c.f0 * 1e9,
-        "slope_hz_per_s": c.slope if c.slope > 1e6 else c.slope * 1e12,
-        "ramp_end_us": c.ramp_time * 1e6 if c.ramp_time < 1 else c.ramp_time,
-        "adc_start_us": c.adc_start_time * 1e6 if c.adc_start_time < 1e-2 else c.adc_start_time,
+        "start_hz": _to_large_unit(c.f0, least=1e6, factor=1e9),
+        "slope_hz_per_s": _to_large_unit(c.slope, least=1e6, factor=1e12),
+        "ramp_end_us": _to_large_unit(c.ramp_time, least=1, factor=1e6),
+        "adc_start_us": _to_large_unit(c.adc_start_time, least=1e-2, factor=1e6),
         "samples": c.num_adc,
-        "sample_rate_hz": c.Fs if c.Fs > 1e5 else c.Fs * 1e3,
+        "sample_rate_hz": _to_large_unit(c.Fs, least=1e5, factor=1e3),
         "linear_samples": [min(n, c.num_adc) for n in base.chirp.linear_samples],
     }
     rig = decode(table, Instrument, str(path))
     notices: list[str] = []
     boards = tuple(msgspec.structs.replace(b, mount=_mount(b, s, notices)) for b in rig.boards)
     return Rig(msgspec.structs.replace(rig, boards=boards), tuple(notices))
+
+
+def _to_large_unit(value: float, least: float, factor: float) -> float:
+    """Return a value in the wanted unit: their files have some in SI, some in the units of TI's tools.
+
+    No chirp has a value below `least` in the wanted unit; such a value is in the other one and is multiplied.
+    """
+    if value < least:
+        return value * factor
+    return value
 
 
 def _mount(board: Board, s: Collection, notices: list[str]) -> tuple[MountStep, ...]:
@@ -147,19 +157,21 @@ def _mount(board: Board, s: Collection, notices: list[str]) -> tuple[MountStep, 
     the board origins.
     """
     steps = list(board.mount)
-    tx = board.role == "transmit"
-    facing = s.txboard_angle_y if tx else s.rxboard_angle_y
+    transmits = board.role == "transmit"
+    key = "txboard_angle_y" if transmits else "rxboard_angle_y"
+    facing = getattr(s, key)
+    # The transmitter stands at negative x and faces +x, receivers the other way round.
+    side = -1 if transmits else 1
     if facing is not None and (turns := _turns(steps, "y")):
         # Its normal, (sin a, 0, cos a), would point away from the other boards.
-        if facing * (1 if tx else -1) < 0:
-            key = "txboard_angle_y" if tx else "rxboard_angle_y"
+        if facing * side > 0:
             notices.append(
                 f"{board.name}: {key} = {facing:g} would turn the board away from the object;"
                 f" read with the other sense of rotation, {-facing:g}"
             )
             facing = -facing
         steps[turns[-1]] = MountStep(turn_deg=facing, about="y")
-    if not tx:
+    if not transmits:
         if s.rxboard_angle_z is not None and (turns := _turns(steps, "z")):
             steps[turns[-1]] = MountStep(turn_deg=s.rxboard_angle_z, about="z")
         turns_y = _turns(steps, "y")
@@ -168,10 +180,11 @@ def _mount(board: Board, s: Collection, notices: list[str]) -> tuple[MountStep, 
         shifts = _shifts(steps)
         if s.rxboard_tilt_offset is not None and len(shifts) > 1:
             steps[shifts[-2]] = MountStep(shift_mm=s.rxboard_tilt_offset)
-    last = steps[-1].shift_mm if steps else None
+    last = None
+    if steps:
+        last = steps[-1].shift_mm
     if s.board_dist is not None and last is not None:
-        side = -0.5 if tx else 0.5
-        steps[-1] = MountStep(shift_mm=(side * s.board_dist * 1e3, last[1], last[2]))
+        steps[-1] = MountStep(shift_mm=(side * s.board_dist * 1e3 / 2, last[1], last[2]))
     return tuple(steps)
 
 
@@ -183,7 +196,7 @@ def _shifts(steps: list[MountStep]) -> list[int]:
     return [i for i, step in enumerate(steps) if step.shift_mm is not None]
 
 
-def mirrored(rig: Instrument) -> Instrument:
+def mirror_rig(rig: Instrument) -> Instrument:
     """Mirror the rig in x = y; mirroring twice gives the rig itself.
 
     The mirrored rig records row by row the same path lengths as the rig column by column. A turn about an axis becomes
@@ -209,11 +222,11 @@ def mirrored(rig: Instrument) -> Instrument:
             rx_mm=tuple((y, x, z) for x, y, z in rig.antennas.rx_mm),
             tx_mm=tuple((y, x, z) for x, y, z in rig.antennas.tx_mm),
         ),
-        boards=tuple(replace(b, mount=tuple(_mirrored_step(s) for s in b.mount)) for b in rig.boards),
+        boards=tuple(replace(b, mount=tuple(_mirror_step(s) for s in b.mount)) for b in rig.boards),
     )
 
 
-def _mirrored_step(step: MountStep) -> MountStep:
+def _mirror_step(step: MountStep) -> MountStep:
     if step.shift_mm is not None:
         x, y, z = step.shift_mm
         return MountStep(shift_mm=(y, x, z))
@@ -300,8 +313,8 @@ def read_log(path: Path) -> PacketLog | None:
     try:
         table = np.loadtxt(lines, delimiter=",", usecols=(0, 1, 2), ndmin=2)
     except ValueError as e:
-        what = f"{path}: not a packet log: {e}"
-        raise DataError(what, "a damaged file", "download it again", code=ErrorCode.FILE_DAMAGED) from None
+        problem = f"{path}: not a packet log: {e}"
+        raise DataError(problem, "a damaged file", "download it again", code=ErrorCode.FILE_DAMAGED) from None
     sequence, first = np.unique(table[:, 0].astype(np.int64), return_index=True)
     size = table[first, 1].astype(np.int64)
     at_s = table[first, 2]
@@ -327,7 +340,9 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
     raw = np.fromfile(file, np.uint8)
     none = np.zeros(0, np.int64)
     if log is None:
-        silent = _silent(raw, PACKET_BYTES) if zero_filled else np.zeros(0, bool)
+        silent = np.zeros(0, bool)
+        if zero_filled:
+            silent = _silent(raw, PACKET_BYTES)
         return Stream(raw, _ranges(silent, PACKET_BYTES, raw.size), int(silent.sum()), none, np.zeros(0), PACKET_BYTES)
     full = int(log.size.max())
     first = _first_sequence(log, shape, full, raw if zero_filled else None)
@@ -354,7 +369,10 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
         else:
             data = np.concatenate([raw, np.zeros(end - raw.size, np.uint8)])
     else:
-        data = raw if end == raw.size else _spread(raw, start, log.size, end)
+        if end == raw.size:
+            data = raw
+        else:
+            data = _spread(raw, start, log.size, end)
     count = -(-end // full)
     arrived_packets = np.zeros(count, bool)
     arrived_packets[start // full] = True
@@ -381,8 +399,13 @@ def _silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
     """Packets that are all zero, bool [packet]."""
     whole_packets = data.size // packet
     rows = data[: whole_packets * packet].reshape(whole_packets, packet)
-    wide = rows.view(np.uint64) if packet % 8 == 0 and data.ctypes.data % 8 == 0 else rows
-    tail = [not data[whole_packets * packet :].any()] if data.size % packet else []
+    if packet % 8 == 0 and data.ctypes.data % 8 == 0:
+        wide = rows.view(np.uint64)
+    else:
+        wide = rows
+    tail = []
+    if data.size % packet:
+        tail = [not data[whole_packets * packet :].any()]
     return np.append(~np.any(wide, axis=1), np.array(tail, bool))
 
 
@@ -401,7 +424,10 @@ def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDA
         begin -= int(np.argmin(np.append(_silent(zero_filled, full), False)))
     elif log.size[-1] < full and _pauses(log.at_s, shape.positions - 1).size == shape.positions - 1:
         begin = min(first, last - expected + 1)
-    return begin if last > expected or begin in (0, 1) else 1
+    fits_from_1 = last <= expected
+    if begin not in (0, 1) and fits_from_1:
+        return 1
+    return begin
 
 
 def _pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:
@@ -428,9 +454,14 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
     before_end = np.minimum(stream.start[first_packets - 1] + stream.packet_bytes, end)
     for i, (low, high) in enumerate(zip(before_end, stream.start[first_packets] + stream.packet_bytes, strict=True)):
         # The burst ends in the packet that straddles the pause: a whole number of bursts if one fits, else of frames.
-        begun = ends[i - 1] if i else 0
+        begun = 0
+        if i:
+            begun = ends[i - 1]
         whole_bursts_end = begun + -(-(low - begun) // shape.burst_bytes) * shape.burst_bytes
-        ends[i] = whole_bursts_end if whole_bursts_end < high else -(-low // frame) * frame
+        if whole_bursts_end < high:
+            ends[i] = whole_bursts_end
+        else:
+            ends[i] = -(-low // frame) * frame
     edges = np.concatenate([[0], ends, [-(-end // frame) * frame]])
     return Bursts(np.stack([edges[:-1], edges[1:]], axis=1), stream.at_s[np.concatenate([[0], first_packets])])
 
@@ -493,9 +524,12 @@ class _Published:
     def __init__(self, path: Path, base: Instrument) -> None:
         self.path = path
         self._settings = read_settings(path)
-        rig, self.notices = rig_of(self._settings, base, path)
+        rig, self.notices = build_rig(self._settings, base, path)
         self.mirrored = self._settings.by_columns
-        self._instrument = mirrored(rig) if self.mirrored else rig
+        if self.mirrored:
+            self._instrument = mirror_rig(rig)
+        else:
+            self._instrument = rig
         self._plan = plan_raster(self._instrument.grid)
 
     @property
@@ -535,8 +569,10 @@ class PublishedScan(_Published):
             match = _ROW_FILE.fullmatch(file.name)
             if match is None:
                 continue
-            start = int(match[2 if self.mirrored else 1])
-            row = int(match[1 if self.mirrored else 2])
+            start = int(match[1])
+            row = int(match[2])
+            if self.mirrored:
+                start, row = row, start
             if row < self._plan.rows:
                 self._check_start(file, start, row)
                 files[row] = file
@@ -545,7 +581,12 @@ class PublishedScan(_Published):
     def _check_start(self, file: Path, start: int, row: int) -> None:
         expected = self._plan.row(row).column(0)
         if start != expected:
-            row_name, column_name = ("column", "row") if self.mirrored else ("row", "column")
+            if self.mirrored:
+                row_name = "column"
+                column_name = "row"
+            else:
+                row_name = "row"
+                column_name = "column"
             raise DataError(
                 f"{file}: {row_name} {row} starts at {column_name} {start}; in a serpentine from {column_name} 0 it"
                 f" starts at {expected}",
@@ -578,7 +619,7 @@ class PublishedScan(_Published):
         if stream.data.size >= shape.bytes:
             self._note(board_name, row, RowLosses(packets_lost))
             gaps = [(a, min(b, shape.bytes)) for a, b in stream.lost if a < shape.bytes]
-            return RowData(pieces_of(stream.data[: shape.bytes]), gaps, frames)
+            return RowData(split_pieces(stream.data[: shape.bytes]), gaps, frames)
         bursts = find_bursts(stream, shape)
         positions = None
         if bursts is not None:
@@ -587,12 +628,12 @@ class PublishedScan(_Published):
             positions = find_positions(bursts, other_bursts, shape.positions, min(periods, default=None))
         if bursts is None or positions is None:
             self._note(board_name, row, RowLosses(packets_lost, rows_not_placed=1))
-            return RowData(pieces_of(np.zeros(shape.bytes, np.uint8)), [(0, shape.bytes)], frames)
+            return RowData(split_pieces(np.zeros(shape.bytes, np.uint8)), [(0, shape.bytes)], frames)
         payload, arrived, short = _place(stream, bursts, positions, shape)
         self._note(board_name, row, RowLosses(packets_lost, shape.positions - positions.size, short))
         edges = np.flatnonzero(np.diff(np.concatenate([[1], arrived, [1]]).astype(np.int8)))
         gaps = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-        return RowData(pieces_of(payload), gaps, frames)
+        return RowData(split_pieces(payload), gaps, frames)
 
     def _stream(self, board_name: str, row: int) -> Stream | None:
         file = self._files.get(board_name, {}).get(row)
@@ -614,7 +655,9 @@ class PublishedScan(_Published):
                 stream = self._stream(board.name, row)
                 if stream is not None and stream.data.size >= self._shape.bytes and stream.at_s.size:
                     bursts = find_bursts(stream, self._shape)
-                    return None if bursts is None else period_s(bursts)
+                    if bursts is None:
+                        return None
+                    return period_s(bursts)
         return None
 
     def _note(self, board_name: str, row: int, losses: RowLosses) -> None:
@@ -683,7 +726,10 @@ class PublishedCubes(_Published):
             problem = f"{file}: shape {cube.shape}, {shape} in its settings"
             raise DataError(problem, "not the settings of this scan", "download both again", code=ErrorCode.MISMATCH)
         # From the smallest x (y) on.
-        ascending = cube[:, :, row] if self.mirrored else cube[:, row]
+        if self.mirrored:
+            ascending = cube[:, :, row]
+        else:
+            ascending = cube[:, row]
         return CubeRow(np.array(ascending[:, :: self._plan.row(row).direction], np.complex64))
 
     def recording_facts(self) -> dict[str, Any]:

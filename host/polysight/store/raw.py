@@ -77,7 +77,7 @@ def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
     ScanError
         if rows are missing, for which the scan can still be resumed and processed again.
     """
-    rows = scan.committed()
+    rows = scan.committed_rows()
     missing = scan.plan.rows - len(rows)
     if missing:
         raise ScanError(
@@ -117,16 +117,17 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
     # A power cut must lose neither the products nor the samples, which are written without waiting for the disk.
     _make_durable(products)
     _make_durable(scan.path / SAMPLES)
-    inside = products.resolve().is_relative_to(scan.path.resolve())
-    products_name = str(products.resolve().relative_to(scan.path.resolve()) if inside else products.resolve())
+    products_path = products.resolve()
+    if products_path.is_relative_to(scan.path.resolve()):
+        products_path = products_path.relative_to(scan.path.resolve())
     with scan.writer() as writer:
         scan.reload()
         droppable_files = droppable(scan, processed)
         recorded = dropped_files(scan)
-        rows = scan.committed()
+        rows = scan.committed_rows()
         for index, files in droppable_files.files.items():
             if any(str(path.relative_to(scan.path)) not in recorded for path in files.values()):
-                writer.append(_fact(rows[index], list(files), products_name))
+                writer.append(_fact(rows[index], list(files), str(products_path)))
             for path in files.values():
                 try:
                     path.unlink(missing_ok=True)
@@ -221,7 +222,7 @@ def replace_rows(scan: ScanFolder) -> list[Replaced]:
     reports = []
     with scan.writer() as writer:
         scan.reload()
-        for row in scan.committed().values():
+        for row in scan.committed_rows().values():
             boards = {name: _place(scan, row, board) for name, board in row.boards.items()}
             reports += [report for report, _ in boards.values()]
             changed = {name: again for name, (report, again) in boards.items() if report.changed and again is not None}

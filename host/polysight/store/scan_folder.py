@@ -1,9 +1,9 @@
 """The scan folder: raw rows, the manifest with the committed rows (docs/spec/scan-folder.md), and kept samples.
 
 `ScanFolder` reads a scan; its `writer` opens it for appending. A scan is resumed with the rig file it was begun with.
-Only the connection may change: `connection_of` and `with_connection` take addresses and limits from another rig file;
-`check_same_scan` refuses one that differs in anything else. A folder may come from anywhere: `inside` and `check_links`
-refuse names and links that lead out of it, `open_npz` refuses oversized arrays.
+Only the connection may change: `extract_connection` and `with_connection` take addresses and limits from another rig
+file; `check_same_scan` refuses one that differs in anything else. A folder may come from anywhere: `check_inside` and
+`check_links` refuse names and links that lead out of it, `open_npz` refuses oversized arrays.
 
 Kept samples (docs/spec/samples.md) are made and restored by `process/rows.py`. What their files say of themselves is
 read here, without anything of the processing, so that `validate` and `drop-raw` check them.
@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.capture import kind_of, read_index
+from polysight.capture import read_index, recognise_format
 from polysight.store import manifest
 from polysight.store.logs import crc32
 from polysight.store.manifest import (
@@ -76,7 +76,7 @@ MAX_BYTES = 2 << 30
 """Largest size of the arrays in one archive: a hundred times the images of the published scan."""
 
 
-def connection_of(rig: Instrument) -> dict[str, Any]:
+def extract_connection(rig: Instrument) -> dict[str, Any]:
     """Return the connection settings of a rig file, as `scan_resumed` stores them."""
     table = to_builtins(rig)
     return {
@@ -100,7 +100,7 @@ def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
         with every other key that differs; `name` is the rig file's in the message.
     """
     table = to_builtins(begun)
-    given_table = _with(to_builtins(given), connection_of(begun))
+    given_table = _with(to_builtins(given), extract_connection(begun))
     given_table["stage"] = {**given_table["stage"], **{key: table["stage"][key] for key in SERIAL}}
     given_table["calibration"] = table["calibration"]
     differences = list(_differences(table, given_table, ""))
@@ -128,8 +128,13 @@ def _differences(begun: Any, given: Any, key: str) -> Iterator[str]:
         for k, pair in enumerate(zip(begun, given, strict=True)):
             yield from _differences(*pair, f"{key}[{k}]")
     elif begun != given:
-        begun_text, given_text = ("not given" if value is None else repr(value) for value in (begun, given))
-        yield f"{key} is {begun_text} in the scan and {given_text} there"
+        yield f"{key} is {_describe_value(begun)} in the scan and {_describe_value(given)} there"
+
+
+def _describe_value(value: Any) -> str:
+    if value is None:
+        return "not given"
+    return repr(value)
 
 
 def new_scan_id(now: datetime | None = None) -> str:
@@ -260,14 +265,14 @@ class ScanFolder:
         """Return all facts of one kind, in order."""
         return self.content.of_kind(kind)
 
-    def committed(self) -> dict[int, RowCommitted]:
+    def committed_rows(self) -> dict[int, RowCommitted]:
         """Return committed rows by index: the last committed take of each row, unless it was withdrawn.
 
         Raises DataError if the manifest names a file outside `raw`, ConfigError for a row of another form.
         """
-        return dict(self._committed())
+        return dict(self._cached_rows())
 
-    def _committed(self) -> dict[int, RowCommitted]:
+    def _cached_rows(self) -> dict[int, RowCommitted]:
         """Return the committed rows from a cache, which is valid until facts are added."""
         if self._rows is None or self._rows[0] is not self.content or self._rows[1] != len(self.content.facts):
             for number, fact in self.content.problems:
@@ -275,7 +280,7 @@ class ScanFolder:
                     raise self._unreadable(number, fact)
             for fact in self.facts(RowCommitted):
                 for board in fact.boards.values():
-                    inside(self.path, board.file, "raw")
+                    check_inside(self.path, board.file, "raw")
             self._rows = (self.content, len(self.content.facts), dict(sorted(self.content.rows.copy().items())))
         return self._rows[2]
 
@@ -289,10 +294,10 @@ class ScanFolder:
             return faults
         last = ends[-1]
         counted = self.facts(ScanEnded)[-1].rows_committed
-        if counted is None or counted <= len(self._committed()):
+        if counted is None or counted <= len(self._cached_rows()):
             return faults
         # Rows that were later withdrawn, or taken again, were committed then.
-        rows = {fact.row for fact in content.facts[:last] if isinstance(fact, RowCommitted)} | {*self._committed()}
+        rows = {fact.row for fact in content.facts[:last] if isinstance(fact, RowCommitted)} | {*self._cached_rows()}
         lost_rows = counted - len(rows)
         if lost_rows <= sum(fault.facts["lost"] for fault in faults):
             return faults
@@ -302,23 +307,23 @@ class ScanFolder:
     @property
     def rows_absent(self) -> list[int]:
         """Rows of the plan that are not committed."""
-        return [row for row in range(self.plan.rows) if row not in self._committed()]
+        return [row for row in range(self.plan.rows) if row not in self._cached_rows()]
 
     def recording_facts(self) -> dict[str, Any]:
         """Return `rows_retaken` (rejected takes of all runs) and `rows_incomplete` for quality.json."""
         return {
             "rows_retaken": len(self.content.rejected),
-            "rows_incomplete": [row for row, fact in self._committed().items() if fact.kept_incomplete],
+            "rows_incomplete": [row for row, fact in self._cached_rows().items() if fact.kept_incomplete],
         }
 
     def rows(self) -> Iterator[int]:
         """Indices of the committed rows, ascending."""
-        return iter(self.committed())
+        return iter(self.committed_rows())
 
     @property
     def complete(self) -> bool:
         """True if every row of the plan is committed."""
-        return len(self.committed()) == self.plan.rows
+        return len(self.committed_rows()) == self.plan.rows
 
     def row_path(self, board: str, row: int) -> Path:
         """Return the path of a row's payload."""
@@ -332,8 +337,10 @@ class ScanFolder:
         DataError
             if the row is not committed or its index is damaged; when the payload is used: if it is missing or damaged.
         """
-        committed = self._committed().get(row)
-        board = None if committed is None else committed.boards.get(board_name)
+        committed = self._cached_rows().get(row)
+        board = None
+        if committed is not None:
+            board = committed.boards.get(board_name)
         if board is None:
             raise DataError(
                 f"{self.path}: row {row} of {board_name} is not committed",
@@ -353,7 +360,11 @@ class ScanFolder:
         try:
             with path.open("rb") as file:
                 size_on_disk = os.fstat(file.fileno()).st_size
-                for start in range(0, board.bytes if size_on_disk == board.bytes else 0, memory.size):
+                # A file of another size is refused below, unread.
+                bytes_to_read = 0
+                if size_on_disk == board.bytes:
+                    bytes_to_read = board.bytes
+                for start in range(0, bytes_to_read, memory.size):
                     piece = memory[: board.bytes - start]
                     file.readinto(piece.data)
                     digest = crc32(piece, digest)
@@ -444,7 +455,7 @@ def damaged_samples(scan: ScanFolder) -> dict[int, list[str]]:
     lines, _ = read_sample_rows(folder)
     records = {name: open_records(folder / f"{name}.npy") for name in boards}
     damaged: dict[int, list[str]] = {}
-    for row, committed in scan.committed().items():
+    for row, committed in scan.committed_rows().items():
         saved = lines.get(row, {}).get("boards", {})
         if any(name not in saved or saved[name]["raw"] != raw_digest(committed.boards[name]) for name in boards):
             damaged[row] = [f"{SAMPLES}/{SAMPLE_ROWS}"]
@@ -525,7 +536,7 @@ def utc_now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-def inside(folder: Path, name: str, within: str = "") -> Path:
+def check_inside(folder: Path, name: str, within: str = "") -> Path:
     """Return the path of a file that a manifest names, relative to the scan folder and inside its folder `within`.
 
     Only the name is foreign: `folder` is the user's own path, in whatever form.
@@ -537,7 +548,10 @@ def inside(folder: Path, name: str, within: str = "") -> Path:
     """
     path = folder / name
     home = folder.resolve()
-    root = (folder / within).resolve() if within else home
+    if within:
+        root = (folder / within).resolve()
+    else:
+        root = home
     try:
         target = path.resolve()
         is_inside = ".." not in Path(name).parts and target.is_relative_to(home / within)
@@ -615,7 +629,7 @@ def open_npz(path: Path) -> Iterator[Any]:
                 size = sum(member.file_size for member in archive.infolist())
         except zipfile.BadZipFile as e:
             f.seek(0)
-            raise ValueError(f"it is {kind_of(f.read(512))}, not an archive of arrays ({e})") from None
+            raise ValueError(f"it is {recognise_format(f.read(512))}, not an archive of arrays ({e})") from None
         if size > MAX_BYTES:
             raise DataError(
                 f"{path}: its arrays take {size} bytes, the limit is {MAX_BYTES} bytes",

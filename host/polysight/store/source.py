@@ -29,7 +29,7 @@ HEADER_LOCK = threading.Lock()
 ("AST constructor recursion depth mismatch") when two threads are in it."""
 
 
-def pieces_of(payload: NDArray[np.uint8]) -> Pieces:
+def split_pieces(payload: NDArray[np.uint8]) -> Pieces:
     """Return the pieces of a payload in memory."""
     return lambda size: (
         payload[i : i + (size or payload.size)] for i in range(0, payload.size, size or payload.size or 1)

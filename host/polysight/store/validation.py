@@ -34,7 +34,10 @@ _FETCHED = "resume fetches the rest from the Pi's journal"
 
 def to_text(finding: Finding) -> str:
     """Return a finding as one line."""
-    return f"{finding.level}: {finding.where}: {finding.what}" + (f" ({finding.do})" if finding.do else "")
+    text = f"{finding.level}: {finding.where}: {finding.what}"
+    if finding.do:
+        text += f" ({finding.do})"
+    return text
 
 
 def to_json(findings: list[Finding]) -> str:
@@ -69,7 +72,7 @@ def validate(path: Path) -> list[Finding]:
         findings.append(_note(MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off"))
     try:
         scan = ScanFolder(path, content)
-        rows = scan.committed()
+        rows = scan.committed_rows()
     except PolysightError as e:
         lost_lines = [_lost_lines(fault, "its facts are lost") for fault in content.faults]
         return [*findings, *lost_lines, _error(MANIFEST, e.what, e.remedy)]
@@ -102,7 +105,7 @@ def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
 
     Raises DeviceError on a read error: the row may be undamaged and must not be taken again.
     """
-    findings = {row.row: _row(scan, row) for row in scan.committed().values()}
+    findings = {row.row: _row(scan, row) for row in scan.committed_rows().values()}
     unreadable = [f for faults in findings.values() for f in faults if f.code is ErrorCode.FILE_UNREADABLE]
     if unreadable:
         raise DeviceError(
@@ -114,9 +117,9 @@ def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
     return {row: [to_text(f) for f in faults] for row, faults in findings.items() if faults}
 
 
-def damage_of(scan: ScanFolder, path: Path) -> str:
+def describe_damage(scan: ScanFolder, path: Path) -> str:
     """Compare a row's files with the manifest; return the faults, "" if there are none. `path` is its payload."""
-    for row in scan.committed().values():
+    for row in scan.committed_rows().values():
         for board in row.boards.values():
             if (scan.path / board.file).resolve() == path.resolve():
                 return "; ".join(map(to_text, board_faults(scan, board, row.pulses)))
@@ -124,8 +127,10 @@ def damage_of(scan: ScanFolder, path: Path) -> str:
 
 
 def _lost_lines(fault: Finding, lost: str) -> Finding:
-    """Add to a fault of the manifest what is lost; it is a note if no row is `lost`."""
-    return msgspec.structs.replace(fault, level="error" if lost else "note", do=lost or _ALL_THERE)
+    """Add to a fault of the manifest which rows are `lost`; it is a note if none is."""
+    if lost:
+        return msgspec.structs.replace(fault, level="error", do=lost)
+    return msgspec.structs.replace(fault, level="note", do=_ALL_THERE)
 
 
 def _what_is_lost(scan: ScanFolder) -> str:
@@ -170,7 +175,11 @@ def board_faults(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding
     is_kept = board.file not in dropped_files(scan) or path.exists()
     try:
         # Only the committed digest is left of a dropped payload.
-        size, crc = _digest(path) if is_kept else (board.bytes, int(board.crc32, 16))
+        if is_kept:
+            size, crc = _digest(path)
+        else:
+            size = board.bytes
+            crc = int(board.crc32, 16)
     except OSError as e:
         return [*findings, _not_read(place, e)]
     if size != board.bytes:
@@ -279,13 +288,19 @@ def _events(scan: ScanFolder) -> list[Finding]:
     if log.torn:
         findings.append(_note(EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
     commits = [(fact.row, fact.events) for fact in scan.facts(RowCommitted) if fact.events is not None]
-    row, committed = commits[-1] if commits else (0, LogDigest(0, ""))
+    if commits:
+        row, committed = commits[-1]
+    else:
+        row = 0
+        committed = LogDigest(0, "")
     # Behind the last commit nothing was synced for certain, and a power cut may leave any of it. Rows of earlier
     # releases, and simulated ones, do not say how many events were committed.
     is_known = bool(commits) or not scan.facts(RowCommitted)
     is_committed_damage = bool(log.damage) and not (is_known and log.length >= committed.bytes)
-    if log.damage:
-        findings.append((_error if is_committed_damage else _note)(EVENTS, log.damage, _FETCHED))
+    if is_committed_damage:
+        findings.append(_error(EVENTS, log.damage, _FETCHED))
+    elif log.damage:
+        findings.append(_note(EVENTS, log.damage, _FETCHED))
     if {e.scan_id for e in log.events} - {scan.scan_id}:
         findings.append(_error(EVENTS, "holds events of another scan"))
     if [e.seq for e in log.events] != list(range(1, len(log.events) + 1)):

@@ -12,7 +12,7 @@ from tests.support.scenes import COPPER, PET
 
 from polysight.catalogue import Pixels, compare, draw_comparison, draw_products, probe, read_result, thumbnail
 from polysight.catalogue.pictures import MAPS
-from polysight.catalogue.results import SIGNIFICANT, scatter_of
+from polysight.catalogue.results import SIGNIFICANT, measure_scatter
 from polysight.polarimetry import permittivity_from_ratio
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -125,12 +125,12 @@ def test_errors_that_both_scans_share_do_not_hide_a_change():
     rng = np.random.default_rng(3)
     stated = np.abs(rng.standard_normal(20_000) + 1j * rng.standard_normal(20_000)) / 3
     stated[:4000] += 5 / 3
-    sigmas = stated / scatter_of(stated)
-    assert scatter_of(stated[4000:]) == pytest.approx(1 / 3, rel=0.03)
+    sigmas = stated / measure_scatter(stated)
+    assert measure_scatter(stated[4000:]) == pytest.approx(1 / 3, rel=0.03)
     assert (sigmas[4000:] > 2.448).mean() == pytest.approx(0.03, abs=0.025)
     assert (sigmas[:4000] > SIGNIFICANT).mean() > 0.95
-    assert scatter_of(3 * stated) == 1.0
-    assert np.isnan(scatter_of(np.array([np.nan])))
+    assert measure_scatter(3 * stated) == 1.0
+    assert np.isnan(measure_scatter(np.array([np.nan])))
 
 
 def test_scans_that_cannot_be_compared_say_so(processed, tmp_path):

@@ -36,7 +36,7 @@ def begun(finished):
 def test_counts_are_those_of_the_scan_folder(finished):
     history = answer(facts_of(finished))
     scan = ScanFolder.load(finished)
-    rows = scan.committed()
+    rows = scan.committed_rows()
     assert history.takes == {row: r.take for row, r in rows.items()}
     assert history.ended is not None
     for board in history.boards:

@@ -16,7 +16,7 @@ from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
-from tests.support.page.asking import TOKEN, ask, digest_of, get, post, raw
+from tests.support.page.asking import TOKEN, ask, compute_digest, get, post, raw
 from tests.support.page.live_view import served_folder
 from tests.support.processes import LIMIT_S
 from tests.support.products import judged_products
@@ -55,7 +55,7 @@ def test_names_of_others_are_not_answered_to(scans):
 def test_other_sites_may_not_ask(scans):
     own = "http://127.0.0.1"
     with served_folder(scans, TOKEN) as view:
-        before = digest_of(scans)
+        before = compute_digest(scans)
         for origin in ("https://evil.example", "null", own, f"{own}:1", f"https://127.0.0.1:{view.port}"):
             status, reported = post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=origin)
             assert (status, reported["code"]) == (403, ErrorCode.ORIGIN_FOREIGN), origin
@@ -69,7 +69,7 @@ def test_other_sites_may_not_ask(scans):
             assert not [name for name in headers if name.startswith("access-control")]
             assert "default-src 'self'" in headers["content-security-policy"]
             assert "unsafe" not in headers["content-security-policy"]
-        assert digest_of(scans) == before
+        assert compute_digest(scans) == before
         assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=f"{own}:{view.port}")[0] == 200
 
 
@@ -102,7 +102,7 @@ def test_beyond_loopback_reading_needs_the_token_too(scans):
 
 def test_large_bodies_are_refused_and_nothing_is_kept(scans):
     with served_folder(scans, TOKEN) as view:
-        before = digest_of(scans)
+        before = compute_digest(scans)
         large = b"x" * (guard.BODY_BYTES + 1)
         status, _, _ = ask(view, "/api/notes?scan=one", "POST", large, **{TOKEN_HEADER: TOKEN})
         assert status == 413
@@ -112,7 +112,7 @@ def test_large_bodies_are_refused_and_nothing_is_kept(scans):
         for size in (17_000, 70_000, 1 << 20):
             answer = raw(view, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"y" * size + b"\r\n\r\n")[:40]
             assert b" 400 " in answer or b" 431 " in answer or answer == b""
-        assert digest_of(scans) == before
+        assert compute_digest(scans) == before
 
 
 def test_open_connections_and_unread_answers_lock_nobody_out(scans):
@@ -208,7 +208,7 @@ def test_no_name_leads_out_of_the_folder(scans, tmp_path):
     from urllib.parse import quote
 
     with served_folder(scans, TOKEN) as view:
-        before = digest_of(tmp_path)
+        before = compute_digest(tmp_path)
         for name in NAMES:
             given = quote(name, safe="")
             for what in READ:
@@ -220,7 +220,7 @@ def test_no_name_leads_out_of_the_folder(scans, tmp_path):
                 assert post(view, f"/api/{what}?scan={given}", asked)[0] in (400, 404), (name, what)
         for name in ("../secret.txt", "..%2f..%2fmanifest.jsonl", "manifest.jsonl", "figures", "%00"):
             assert ask(view, f"/api/file/{name}?scan=one")[0] in (400, 404)
-        assert digest_of(tmp_path) == before
+        assert compute_digest(tmp_path) == before
 
 
 def test_a_link_among_products_is_not_served(scans, tmp_path):
@@ -292,7 +292,7 @@ def hostile(port: int) -> list[bytes]:
 @pytest.mark.slow
 def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, tmp_path):
     with served_folder(scans, TOKEN) as view:
-        before = digest_of(tmp_path)
+        before = compute_digest(tmp_path)
         requests = list(islice(cycle(hostile(view.port)), 1000))
         held: list[socket.socket] = []
 
@@ -312,7 +312,7 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, t
             time.sleep(0.01)
         for s in held:
             s.close()
-        assert digest_of(tmp_path) == before
+        assert compute_digest(tmp_path) == before
         assert post(view, "/api/notes?scan=one", {"notes": "the operator's", "tags": ["a"]})[0] == 200
         assert get(view, "/api/scan?scan=one")["notes"] == "the operator's"
 

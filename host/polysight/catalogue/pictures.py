@@ -91,7 +91,9 @@ class Pixels(ProcessedScan):
     @cached_property
     def theta_rad(self) -> float:
         """Incidence angle, from the error budget or the rig. Raises DataError."""
-        budget = None if self.materials is None else self.materials.error_budget
+        budget = None
+        if self.materials is not None:
+            budget = self.materials.error_budget
         if budget and budget.incidence is not None and budget.incidence.deg is not None:
             return float(np.radians(budget.incidence.deg))
         if self.rig is None:
@@ -210,7 +212,9 @@ def draw_products(pixels: Pixels, name: str, limits: Limits | None = None) -> Pi
         values = _derived_values(pixels, name)
     else:
         values = _channel_values(pixels)[name]
-    return draw_values(values if limits is None else replace(values, limits=limits))
+    if limits is not None:
+        values = replace(values, limits=limits)
+    return draw_values(values)
 
 
 def thumbnail(pixels: Pixels) -> Picture:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -23,9 +24,9 @@ from polysight.products import (
     REPORT,
     SCAN,
     find_labels,
+    find_scan_folder,
     label_folder,
     read_products,
-    scan_folder_of,
 )
 from polysight.results import ComplexNumber, PatchFigures, PermittivityFigures, Verdict
 from polysight.store import MANIFEST, ScanFolder
@@ -100,13 +101,15 @@ def read_result(folder: Path) -> Result:
         if there are none, or one is damaged.
     """
     pixels = Pixels(read_products(folder).folder)
-    source = None if pixels.materials is None else pixels.materials.metal_reference
+    metal_how = ""
+    if pixels.materials is not None and pixels.materials.metal_reference:
+        metal_how = pixels.materials.metal_reference.how
     return Result(
         generation=read_generation(pixels.folder),
         processed_utc=pixels.facts.processed_utc or "",
         extent_mm=pixels.extent_mm,
         pictures=[drawn for drawn in MAPS.values() if pixels.referenced or not drawn.needs_metal],
-        metal=source.how if source else "",
+        metal=metal_how,
         verdict=pixels.verdict,
         patches=pixels.segments,
         labels=_labels(folder, pixels),
@@ -206,8 +209,18 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
     pixels = Pixels(read_products(folder).folder)
     row, column = pixels.nearest(x_mm, y_mm)
     place = (float(pixels.x_mm[column]), float(pixels.y_mm[row]))
-    why = _why_no_permittivity(pixels, row, column)
-    eps = None if why else _parts(complex(pixels.permittivity[row, column]))
+    reason = _why_no_permittivity(pixels, row, column)
+    eps = None
+    eps_sigma = None
+    if not reason:
+        eps = _parts(complex(pixels.permittivity[row, column]))
+        eps_sigma = _number(pixels.permittivity_sigma[row, column])
+    nearest: list[NearMaterial] = []
+    if eps:
+        nearest = _nearest_materials(pixels, row, column, library)
+    patch = None
+    if pixels.referenced:
+        patch = _find_patch(pixels.segments, place)
     profile, profile_why = _profile(folder, float(pixels.x_m[column]), float(pixels.y_m[row]))
     return Probe(
         place_mm=(round(place[0], 2), round(place[1], 2)),
@@ -218,10 +231,10 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
         p_sigma=_number(pixels.p_std[row, column]),
         referenced=pixels.referenced,
         permittivity=eps,
-        permittivity_sigma=None if why else _number(pixels.permittivity_sigma[row, column]),
-        why=why,
-        patch=_patch_at(pixels.segments, place) if pixels.referenced else None,
-        nearest=_nearest_materials(pixels, row, column, library) if eps else [],
+        permittivity_sigma=eps_sigma,
+        why=reason,
+        patch=patch,
+        nearest=nearest,
         profile=profile,
         profile_why=profile_why,
     )
@@ -237,7 +250,7 @@ def _why_no_permittivity(pixels: Pixels, row: int, column: int) -> str:
     return ""
 
 
-def _patch_at(patches: list[PatchFigures], place_mm: tuple[float, float]) -> PatchFigures | None:
+def _find_patch(patches: list[PatchFigures], place_mm: tuple[float, float]) -> PatchFigures | None:
     """The patch whose outline holds a place."""
     for patch in patches:
         outline = patch.outline_mm
@@ -257,10 +270,9 @@ def _library_ratios(path: Path, changed_ns: int, angle_deg: float) -> dict[str, 
     ratios = {}
     for name, values in patches.items():
         means = np.array(values)
+        spread = 0.0
         if len(means) > 1:
             spread = float(np.sqrt(np.mean(np.abs(means - means.mean()) ** 2) / 2))
-        else:
-            spread = 0.0
         ratios[name] = (complex(means.mean()), spread)
     return ratios
 
@@ -275,27 +287,40 @@ def _nearest_materials(pixels: Pixels, row: int, column: int, library: Path | No
         return []
     p = complex(pixels.p[row, column])
     p_std = float(pixels.p_std[row, column])
-    pixel_std = p_std / max(abs(p) ** 2, 1e-9) if np.isfinite(p_std) else 0.0
+    pixel_std = 0.0
+    if np.isfinite(p_std):
+        pixel_std = p_std / max(abs(p) ** 2, 1e-9)
     materials = []
     for name, (mean, spread) in ratios.items():
         std = float(np.hypot(pixel_std, max(spread, LEAST_SPREAD)))
         eps = None
         if mean and not is_metal(name):
             half_space = complex(permittivity_from_ratio(1 / mean, pixels.theta_rad))
-            eps = _parts(half_space) if np.isfinite(half_space) else None
-        sigmas = round(abs(1 / p - mean) / std, 1) if p else None
+            if np.isfinite(half_space):
+                eps = _parts(half_space)
+        sigmas = None
+        if p:
+            sigmas = round(abs(1 / p - mean) / std, 1)
         materials.append(NearMaterial(name, sigmas, eps))
-    return sorted(materials, key=lambda m: np.inf if m.sigmas is None else m.sigmas)[:MAX_NEAREST]
+    return sorted(materials, key=_sort_by_sigmas)[:MAX_NEAREST]
+
+
+def _sort_by_sigmas(material: NearMaterial) -> float:
+    if material.sigmas is None:
+        return math.inf
+    return material.sigmas
 
 
 def _profile(folder: Path, x_m: float, y_m: float) -> tuple[FocusedProfile | None, str]:
     """Focused range profile through a place, from the scan's kept samples, or why there is none."""
-    scan = scan_folder_of(folder)
+    scan = find_scan_folder(folder)
     if scan is None or not (scan / MANIFEST).exists():
         return None, "the rows are not in this folder"
     samples = scan / "samples" / "rows.jsonl"
     try:
-        pipeline = _restore_rows(scan, samples.stat().st_mtime_ns) if samples.exists() else None
+        pipeline = None
+        if samples.exists():
+            pipeline = _restore_rows(scan, samples.stat().st_mtime_ns)
     except (PolysightError, OSError) as e:
         return None, str(e).splitlines()[0]
     if pipeline is None:
@@ -329,7 +354,9 @@ def _db(value: complex) -> float | None:
 
 
 def _number(value: float) -> float | None:
-    return round(float(value), 5) if np.isfinite(value) else None
+    if not np.isfinite(value):
+        return None
+    return round(float(value), 5)
 
 
 def _parts(value: complex) -> ComplexNumber:
@@ -371,7 +398,7 @@ class ComparisonFigures(msgspec.Struct, frozen=True, kw_only=True):
     compared, significant_share
         Number of pixels, and the share of them that differs by more than `significant_sigmas`; None: not known.
     scatter
-        Scatter of unchanged pixels in stated errors, :func:`scatter_of`; None if the errors are not known.
+        Scatter of unchanged pixels in stated errors, :func:`measure_scatter`; None if the errors are not known.
     """
 
     patches: list[PatchPair]
@@ -435,21 +462,27 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
     eps = np.where(in_both, a.permittivity - b.permittivity[same_place], np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         stated = np.abs(p) / np.hypot(a.p_std, b.p_std[same_place])
-    scatter = scatter_of(stated)
+    scatter = measure_scatter(stated)
     sigmas = stated / scatter
     judged = sigmas[np.isfinite(sigmas)]
+    significant_share = None
+    if judged.size:
+        significant_share = float((judged > SIGNIFICANT).mean())
+    rounded_scatter = None
+    if not np.isnan(scatter):
+        rounded_scatter = round(scatter, 3)
     figures = ComparisonFigures(
         patches=_pair_patches(a.segments, b.segments),
         notes=_notes(a, b, scatter),
         extent_mm=a.extent_mm,
         compared=int(np.isfinite(p).sum()),
-        significant_share=float((judged > SIGNIFICANT).mean()) if judged.size else None,
-        scatter=None if np.isnan(scatter) else round(scatter, 3),
+        significant_share=significant_share,
+        scatter=rounded_scatter,
     )
     return Comparison(p, eps, sigmas, figures)
 
 
-def scatter_of(differences: Real) -> float:
+def measure_scatter(differences: Real) -> float:
     """Estimate the scatter of unchanged pixels, 0.1 to 1, from |differences| in stated errors; nan without any.
 
     Stated errors include those that both scans share (leakage, metal reference, sidelobes), which cancel in a
@@ -554,7 +587,8 @@ def draw_comparison(comparison: Comparison, name: str) -> Picture:
     values = maps[name]
     visible = np.isfinite(values)
     is_signed = name in ("permittivity", "loss")
-    reach = max(percentile(np.abs(values), visible, 95 if is_signed else 98, 1.0), 1e-3)
+    share = 95 if is_signed else 98
+    reach = max(percentile(np.abs(values), visible, share, 1.0), 1e-3)
     if name == "sigmas":
         reach = max(reach, 2 * SIGNIFICANT)
     if is_signed:

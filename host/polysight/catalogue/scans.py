@@ -237,16 +237,22 @@ def summarise(folder: Path, name: str) -> Summary:
     started = content.started
     if started is None:
         return replace(summary, state="damaged")
+    state = content.state
+    if state == "open":
+        state = "lost"
+    reason = ""
+    if content.ended is not None:
+        reason = content.ended.reason[:300]
     return replace(
         summary,
-        state="lost" if content.state == "open" else content.state,
+        state=state,
         scan_id=started.scan_id,
         rig=str(started.instrument.get("name", "")),
         simulated=started.simulated,
         started_utc=started.started_utc,
         rows=started.plan.rows,
         committed=len(content.rows),
-        reason="" if content.ended is None else content.ended.reason[:300],
+        reason=reason,
         seconds=_parse_utc(started.started_utc) or summary.seconds,
     )
 
@@ -271,7 +277,10 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
     try:
         products = ProcessedScan(places[0])
         if products.materials is not None:
-            level = "" if products.verdict is None else products.verdict.level
+            if products.verdict is None:
+                level = ""
+            else:
+                level = products.verdict.level
             names = dict.fromkeys(patch.name for patch in products.segments if patch.name)
             summary = replace(summary, verdict=level, materials=tuple(names)[:12])
         if places[0] == folder:
@@ -539,7 +548,10 @@ class Scans:
         valid = bool(name) and len(name) <= 1000 and len(parts) <= MAX_DEPTH and all(map(_is_name, parts))
         if self.only is not None:
             valid = valid and name == self.only
-        path = self.root / PurePosixPath(name) if valid else self.root
+        if valid:
+            path = self.root / PurePosixPath(name)
+        else:
+            path = self.root
         try:
             # No link on the way.
             valid = valid and path.resolve() == self.root.resolve() / name
@@ -559,9 +571,10 @@ class Scans:
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
         if not exists:
-            why = "nothing was recorded there"
-            missing = DataError(f"{path}: no scan", why, "see the list", code=ErrorCode.FILE_MISSING)
-            raise missing if path.exists() else no_such(path)
+            if not path.exists():
+                raise no_such(path)
+            cause = "nothing was recorded there"
+            raise DataError(f"{path}: no scan", cause, "see the list", code=ErrorCode.FILE_MISSING)
         return path
 
     def _summary(self, name: str) -> Summary:

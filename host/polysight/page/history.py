@@ -108,8 +108,10 @@ def notice_of_fault(event: Fault) -> Finding:
     details = {}
     if event.what != table.what:
         details["detail"] = event.what
-    what = f"Fault {event.number} at the Pi: {table.what}"
-    return Finding(level, what, sentence(event.why or table.why), sentence(event.remedy or table.remedy), facts=details)
+    problem = f"Fault {event.number} at the Pi: {table.what}"
+    return Finding(
+        level, problem, sentence(event.why or table.why), sentence(event.remedy or table.remedy), facts=details
+    )
 
 
 def _cause(faults: Sequence[RowFault]) -> tuple[str, str]:
@@ -138,9 +140,9 @@ def is_on_request(faults: Sequence[RowFault]) -> bool:
     return bool(faults) and all(fault.kind == K.ON_REQUEST for fault in faults)
 
 
-def _row_notice(row: int, what: str, why_do: tuple[str, str], reasons: Sequence[str], utc: str) -> Finding:
+def _row_notice(row: int, problem: str, why_do: tuple[str, str], reasons: Sequence[str], utc: str) -> Finding:
     """Notice of a row; the page shows the reasons in full on demand, and the time if it is known."""
-    return Finding("warning", what, *why_do, where=f"row {row}", facts={"detail": "; ".join(reasons), "utc": utc})
+    return Finding("warning", problem, *why_do, where=f"row {row}", facts={"detail": "; ".join(reasons), "utc": utc})
 
 
 class BoardCounts(msgspec.Struct):
@@ -303,9 +305,9 @@ class ScanHistory:
                 self.rows_since_trouble = 0
             self.notices.append(notice_of_rejection(fact.row, fact.take, fact.reasons, fact.faults, fact.rejected_utc))
         elif isinstance(fact, RowWithdrawn):
-            what = f"Row {fact.row} on the disk differs from what was committed"
+            problem = f"Row {fact.row} on the disk differs from what was committed"
             why_do = ("The disk is faulty, or the file was changed", "Nothing: the row is retaken")
-            self.notices.append(_row_notice(fact.row, what, why_do, fact.reasons, fact.withdrawn_utc))
+            self.notices.append(_row_notice(fact.row, problem, why_do, fact.reasons, fact.withdrawn_utc))
         elif isinstance(fact, ScanResumed):
             self.run_started_s = seconds(fact.resumed_utc)
             if fact.rig:
@@ -321,8 +323,8 @@ class ScanHistory:
         self.rows_since_trouble += 1
         if fact.kept_incomplete:
             self.rows_since_trouble = 0
-            what = f"Row {fact.row} is kept with gaps, which are masked"
-            notice = _row_notice(fact.row, what, _cause(fact.faults), fact.kept_incomplete, fact.committed_utc)
+            problem = f"Row {fact.row} is kept with gaps, which are masked"
+            notice = _row_notice(fact.row, problem, _cause(fact.faults), fact.kept_incomplete, fact.committed_utc)
             self.notices.append(notice)
         if not fact.committed_utc:
             # Made in one step, by `polysight simulate`.

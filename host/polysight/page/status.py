@@ -225,18 +225,22 @@ class Motion(msgspec.Struct, frozen=True, kw_only=True):
 def make_snapshot(inputs: Inputs) -> Snapshot:
     """Describe the whole state of a scan."""
     history = inputs.history
-    shown = inputs.shown
+    pictures = inputs.shown
     if history is None:
         return Snapshot(status=judge(inputs), notices=_notices(inputs), control=inputs.control)
     plan = history.plan
     marks = history.marks
     boards = history.boards
     for board in boards:
-        board.masked = sum(sync.masked for sync in shown.sync.get(board.name, {}).values())
+        board.masked = sum(sync.masked for sync in pictures.sync.get(board.name, {}).values())
     sync = {
         name: {row: round(math.degrees(sync.object_rad), 3) for row, sync in rows.items()}
-        for name, rows in shown.sync.items()
+        for name, rows in pictures.sync.items()
     }
+    snr_db = {name: {row: round(sync.snr_db, 1) for row, sync in rows.items()} for name, rows in pictures.sync.items()}
+    verdict = None
+    if _may_have_result(inputs, history):
+        verdict = inputs.verdict
     return Snapshot(
         status=judge(inputs),
         notices=_notices(inputs),
@@ -259,12 +263,14 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
         ),
         boards=boards,
         trigger=history.trigger,
-        pictures=_pictures(history, shown),
-        profile=shown.profile,
+        pictures=_pictures(history, pictures),
+        profile=pictures.profile,
         sync=sync,
-        snr_db={name: {row: round(sync.snr_db, 1) for row, sync in rows.items()} for name, rows in shown.sync.items()},
+        snr_db={
+            name: {row: round(sync.snr_db, 1) for row, sync in rows.items()} for name, rows in pictures.sync.items()
+        },
         lost=history.lost_shares,
-        verdict=inputs.verdict if _may_have_result(inputs, history) else None,
+        verdict=verdict,
     )
 
 
@@ -274,10 +280,10 @@ def make_motion(inputs: Inputs) -> Motion:
     if inputs.history is None:
         return Motion(now_s=now_s)
     pi = inputs.pi
+    left_s = None
+    basis = ""
     if inputs.signs.alive:
         left_s, basis = remaining(inputs.history, inputs.signs.now_s)
-    else:
-        left_s, basis = (None, "")
     stage = None
     if pi.x_mm is not None and pi.y_mm is not None:
         stage = (round(pi.x_mm, 1), round(pi.y_mm, 1))
@@ -288,10 +294,14 @@ def remaining(history: ScanHistory, now_s: float) -> tuple[int | None, str]:
     """Seconds to the scan's end and their origin (`measured`, `first row`, `plan`); None: not known."""
     rows_left = history.plan.rows - len(history.takes)
     if history.ended is not None or history.row_seconds is None:
-        return (0, "measured") if rows_left == 0 else (None, "")
+        if rows_left == 0:
+            return 0, "measured"
+        return None, ""
     row_s, basis = history.row_seconds
     row_began_s = max(history.last_commit_s, history.run_started_s)
-    in_row_s = 0.0 if history.paused else now_s - row_began_s
+    in_row_s = 0.0
+    if not history.paused:
+        in_row_s = now_s - row_began_s
     return round(time_left(rows_left, row_s, in_row_s)), basis
 
 
@@ -498,8 +508,12 @@ def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
     if pi.state == "held":
         return say("held")
     if every_row:
-        return say("homing_again") if pi.state == "homing" else say("finishing")
-    return say("homing") if pi.state == "homing" else None
+        if pi.state == "homing":
+            return say("homing_again")
+        return say("finishing")
+    if pi.state != "homing":
+        return None
+    return say("homing")
 
 
 def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:

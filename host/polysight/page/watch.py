@@ -419,7 +419,10 @@ def _follow_row(state: PiState, event: AnyEvent) -> PiState:
     if isinstance(event, Capture):
         return replace(state, row=event.row_index, take=event.take, point=event.point + 1)
     if isinstance(event, RowFinished):
-        return replace(state, row=-1, point=0, faults=() if event.status == "done" else state.faults)
+        faults = state.faults
+        if event.status == "done":
+            faults = ()
+        return replace(state, row=-1, point=0, faults=faults)
     if isinstance(event, Fault):
         return replace(state, faults=(*state.faults, notice_of_fault(event))[-MAX_FAULTS:])
     return state
@@ -434,7 +437,9 @@ class Versioned(NamedTuple):
     def publish(self, content: Snapshot | Motion) -> Versioned:
         """The next version, if the content differs."""
         data = msgspec.json.encode(content)
-        return self if data == self.data else Versioned(self.version + 1, data)
+        if data == self.data:
+            return self
+        return Versioned(self.version + 1, data)
 
 
 class Watch:
@@ -491,7 +496,10 @@ class Watch:
         self._attend()
         if self._viewer is not None:
             self.shown = self._viewer.shown
-        pi = self._listener.state if self._listener is not None else PiState()
+        if self._listener is not None:
+            pi = self._listener.state
+        else:
+            pi = PiState()
         exists = self.folder.is_dir()
         self._existed |= exists
         program, failure = self._programs.look()
@@ -559,10 +567,14 @@ class Watch:
         now = time.monotonic()
         wall_s = time.time()
         life = read_life(self.folder)
-        life_s = None if life is None else life.written_s
+        life_s = None
+        if life is not None:
+            life_s = life.written_s
         if life_s is not None and life_s != self._life_s:
             # The first sign may be old; from then on changes count, not clocks.
-            age_s = max(0.0, wall_s - life_s) if self._life_s is None else 0.0
+            age_s = 0.0
+            if self._life_s is None:
+                age_s = max(0.0, wall_s - life_s)
             self._life_s = life_s
             self._life_at = now - age_s
         killed = life is not None and life.killed
@@ -573,9 +585,21 @@ class Watch:
             alive = now - self._grown_at < patience_s
         else:
             alive = not killed and now - self._life_at < self._lapse_s
-        alive_s = 0 if alive else round(life_s or self._manifest.file.modified_s)
-        pi_silent_s = now - pi.heard_s if pi.heard_s else None
-        return LifeSigns(life, alive, killed, alive_s, pi_silent_s, PI_LIMIT_S, wall_s)
+        alive_s = 0
+        if not alive:
+            alive_s = round(life_s or self._manifest.file.modified_s)
+        pi_silent_s = None
+        if pi.heard_s:
+            pi_silent_s = now - pi.heard_s
+        return LifeSigns(
+            life=life,
+            alive=alive,
+            killed=killed,
+            alive_s=alive_s,
+            pi_silent_s=pi_silent_s,
+            pi_limit_s=PI_LIMIT_S,
+            now_s=wall_s,
+        )
 
     def _close_parts(self) -> None:
         for part in (self._viewer, self._listener):

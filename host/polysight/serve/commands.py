@@ -336,12 +336,14 @@ def _check_free(site: Site) -> None:
     running = [s.name for s in site.scans.list() if s.state in ("running", "paused", "frozen") or _is_starting(site, s)]
     doctor = find_program(site.logs, "doctor")
     if running:
-        what = f"{running[0]} is being scanned"
+        activity = f"{running[0]} is being scanned"
     elif doctor is not None and doctor.running:
-        what = "the doctor checks the rig"
+        activity = "the doctor checks the rig"
     else:
         return
-    raise ScanError(what, "a rig does one thing at a time", "wait until it has ended, or stop it", code=ErrorCode.BUSY)
+    raise ScanError(
+        activity, "a rig does one thing at a time", "wait until it has ended, or stop it", code=ErrorCode.BUSY
+    )
 
 
 def _is_starting(site: Site, s: Summary) -> bool:

@@ -13,14 +13,17 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError, os_error
 
 
-def refuse(status: int, code: ErrorCode, what: str, why: str, do: str) -> Response:
+def refuse(status: int, code: ErrorCode, problem: str, why: str, do: str) -> Response:
     """An error as JSON: its code, and the three parts that people read."""
-    return JSONResponse({"code": code, "what": what, "why": why, "do": do}, status)
+    return JSONResponse({"code": code, "what": problem, "why": why, "do": do}, status)
 
 
 async def tell_error(request: Request, e: Exception) -> Response:
     """An error that was raised. A file that cannot be written or read is no defect of this program."""
-    error = os_error(e) if isinstance(e, OSError) else e
+    if isinstance(e, OSError):
+        error = os_error(e)
+    else:
+        error = e
     if not isinstance(error, PolysightError):
         raise e
     wrong_values = (ErrorCode.VALUE_INVALID, ErrorCode.VALUES_CONFLICT, ErrorCode.TYPE_WRONG, ErrorCode.KEY_MISSING)
@@ -50,9 +53,9 @@ async def _tell_nobody(request: Request, e: Exception) -> Response:
 async def _tell_defect(request: Request, e: Exception) -> Response:
     sys.stderr.write(f"{request.method} {request.url.path}\n{''.join(traceback.format_exception(e))}")
     sys.stderr.flush()
-    what = f"An internal error of the server: {type(e).__name__}"
+    problem = f"An internal error of the server: {type(e).__name__}"
     do = "report it, with the server's terminal output"
-    return refuse(500, ErrorCode.OTHER, what, "a defect of this program", do)
+    return refuse(500, ErrorCode.OTHER, problem, "a defect of this program", do)
 
 
 HANDLERS: dict[Any, Any] = {

@@ -154,8 +154,8 @@ def control_routes(front: Front) -> list[Route]:
         command = request.path_params["command"]
         if command not in list(ScanCommand):
             commands = ", ".join(ScanCommand)
-            what = f"a scan cannot be asked to {command[:40]!r}"
-            return refuse(400, ErrorCode.VALUE_INVALID, what, "the name is wrong", f"one of {commands}")
+            problem = f"a scan cannot be asked to {command[:40]!r}"
+            return refuse(400, ErrorCode.VALUE_INVALID, problem, "the name is wrong", f"one of {commands}")
         asker = "the page"
         if request.client is not None and not front.access.loopback:
             asker = f"the page at {request.client.host}"
@@ -220,7 +220,9 @@ class Reader:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward one request, and its answer until the browser is gone."""
         # The guard has read it whole.
-        body = (await receive()).get("body", b"") if scope["method"] == "POST" else b""
+        body = b""
+        if scope["method"] == "POST":
+            body = (await receive()).get("body", b"")
         async with anyio.create_task_group() as tasks:
 
             async def cancel_when_gone() -> None:
@@ -251,9 +253,9 @@ class Reader:
         except (OSError, h11.RemoteProtocolError):
             # It was ended in the middle, and is started again. Half an answer is cut off.
             if not is_answered:
-                what = "The reading part of the server does not answer"
+                problem = "The reading part of the server does not answer"
                 do = "load the page again; control goes on without it"
-                await refuse(503, ErrorCode.NO_ANSWER, what, "it starts, or was ended", do)(scope, receive, send)
+                await refuse(503, ErrorCode.NO_ANSWER, problem, "it starts, or was ended", do)(scope, receive, send)
 
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         deadline = time.monotonic() + READER_PATIENCE_S

@@ -126,8 +126,8 @@ class Guard:
         method = scope["method"]
         line_bytes = len(scope.get("raw_path") or scope["path"]) + len(scope.get("query_string", b""))
         if line_bytes + sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_BYTES:
-            what = f"The head is longer than {HEAD_BYTES} bytes"
-            return refuse(431, ErrorCode.MESSAGE_INVALID, what, "no page sends so much", "send less")
+            problem = f"The head is longer than {HEAD_BYTES} bytes"
+            return refuse(431, ErrorCode.MESSAGE_INVALID, problem, "no page sends so much", "send less")
         if not self._access.accepts_host(headers.get("host", "")):
             return refuse(
                 400, ErrorCode.HOST_UNKNOWN, "This server has another name", "the request names another host",
@@ -160,7 +160,9 @@ class Guard:
                 403, ErrorCode.READ_ONLY, "This view is read-only", "it was started so",
                 "start it with --control to have buttons",
             )  # fmt: skip
-        return None if access.has_token(headers) else _refuse_token(403)
+        if access.has_token(headers):
+            return None
+        return _refuse_token(403)
 
 
 async def _read_body(receive: Receive) -> bytes | None:
@@ -189,8 +191,8 @@ def _replay(body: bytes, receive: Receive) -> Receive:
 
 def refuse_body() -> Response:
     """The refusal of a body that is too large."""
-    what = f"More than {BODY_BYTES} bytes"
-    return _close_after(refuse(413, ErrorCode.MESSAGE_INVALID, what, "no page sends so much", "send less"))
+    problem = f"More than {BODY_BYTES} bytes"
+    return _close_after(refuse(413, ErrorCode.MESSAGE_INVALID, problem, "no page sends so much", "send less"))
 
 
 def _close_after(answer: Response) -> Response:

@@ -38,7 +38,9 @@ def started_ticks(pid: int) -> int | None:
     except OSError:
         return None
     fields = text.rpartition(")")[2].split()
-    return None if fields[0] == "Z" else int(fields[19])
+    if fields[0] == "Z":
+        return None
+    return int(fields[19])
 
 
 def launch(words: list[str], cwd: str, base: str) -> subprocess.Popen[bytes]:

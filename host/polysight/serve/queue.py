@@ -95,7 +95,9 @@ class Queue:
             return
         name, path = requests[0]
         try:
-            state = self._state_of(self._last) if self._last else "finished"
+            state = "finished"
+            if self._last:
+                state = self._state_of(self._last)
             if state in ("stopped", "failed", "lost", "frozen", "damaged"):
                 self._held = f"{self._last}: {state}"
                 return

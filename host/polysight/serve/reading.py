@@ -121,7 +121,9 @@ async def _scans(site: Site, request: Request) -> Response:
 
     def list_scans() -> ScanList:
         scans = [ListedScan(**asdict(s), bytes=site.size(s.name)) for s in site.scans.list()]
-        free_bytes = shutil.disk_usage(root).free if root.is_dir() else None
+        free_bytes = None
+        if root.is_dir():
+            free_bytes = shutil.disk_usage(root).free
         return ScanList(scans, free_bytes, list(site.libraries()), site.scans.left_out())
 
     return json_answer(await site.read("", list_scans))
@@ -185,8 +187,8 @@ async def _events(site: Site, request: Request) -> Response:
 async def _live_picture(site: Site, request: Request) -> Response:
     picture = (await _open_watch(site, request)).shown.pictures.get(request.path_params["name"])
     if picture is None:
-        what = "This picture is not there yet"
-        return refuse(404, ErrorCode.FILE_MISSING, what, "no row is processed", "it comes with the first row")
+        problem = "This picture is not there yet"
+        return refuse(404, ErrorCode.FILE_MISSING, problem, "no row is processed", "it comes with the first row")
     return Response(picture.png, media_type="image/png")
 
 
@@ -211,21 +213,21 @@ async def _read_products(site: Site, request: Request, work: Callable[[Path], T]
 
     Raises ScanError if the page shows another one, which it then loads, or if they are replaced again and again.
     """
-    shown = request.query_params.get("generation", "")
+    shown_generation = request.query_params.get("generation", "")
 
     def read(folder: Path) -> T:
         for _ in range(MAX_TRIES):
-            before = read_generation(read_products(folder).folder)
-            if shown and before != shown:
+            generation_before = read_generation(read_products(folder).folder)
+            if shown_generation and generation_before != shown_generation:
                 break
             try:
                 result = work(folder)
             except (PolysightError, OSError):
                 # Half of it may be of the folder before, half of the one behind.
-                if read_generation(read_products(folder).folder) == before:
+                if read_generation(read_products(folder).folder) == generation_before:
                     raise
                 continue
-            if read_generation(read_products(folder).folder) == before:
+            if read_generation(read_products(folder).folder) == generation_before:
                 return result
         raise ScanError(
             "the scan was processed again meanwhile", "another program replaced its products", "load the page again",
@@ -241,7 +243,9 @@ async def _map(site: Site, request: Request) -> Response:
     if "low" in request.query_params and "high" in request.query_params:
         low = _number(request, "low")
         high = _number(request, "high")
-        limits = (low, high) if low < high else None
+        limits = None
+        if low < high:
+            limits = (low, high)
     return _picture_answer(await _read_products(site, request, lambda folder: draw_map(folder, name, limits)))
 
 
@@ -264,7 +268,10 @@ async def _file(site: Site, request: Request) -> Response:
                 f"no file is called {name[:80]!r}", "it was not made, or the name is wrong", "see the scan's page",
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
-        place = folder / EXPORT if of == EXPORT else read_products(folder).folder
+        if of == EXPORT:
+            place = folder / EXPORT
+        else:
+            place = read_products(folder).folder
         return folder.name, place / name
 
     scan, path = await site.read_scan(request, find_file)
@@ -321,15 +328,15 @@ async def _use_comparison(site: Site, request: Request, use: Callable[[Compariso
     first = site.name(request, "a")
     second = site.name(request, "b")
     # If one of them hangs, the other is still read alone.
-    both = f"{first.partition('/')[0]} and {second.partition('/')[0]}"
+    both_scans = f"{first.partition('/')[0]} and {second.partition('/')[0]}"
     folder = site.scans.folder
-    return await site.read(both, lambda: use(compare_products(folder(first), folder(second))))
+    return await site.read(both_scans, lambda: use(compare_products(folder(first), folder(second))))
 
 
 async def _compare(site: Site, request: Request) -> Response:
-    return json_answer(await _use_comparison(site, request, lambda both: both.figures))
+    return json_answer(await _use_comparison(site, request, lambda both_scans: both_scans.figures))
 
 
 async def _compare_map(site: Site, request: Request) -> Response:
     name = request.path_params["name"]
-    return _picture_answer(await _use_comparison(site, request, lambda both: draw_comparison(both, name)))
+    return _picture_answer(await _use_comparison(site, request, lambda both_scans: draw_comparison(both_scans, name)))

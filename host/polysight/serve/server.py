@@ -147,7 +147,9 @@ def _run(shown: Shown, place: Place, what: str) -> int:
 
 
 def _access(place: Place, listener: socket.socket, control: bool) -> Access:
-    token = load_token() if control or not place.loopback else ""
+    token = ""
+    if control or not place.loopback:
+        token = load_token()
     hosts = set(place.hosts)
     if not place.loopback:
         hosts |= {place.host, socket.gethostname(), str(listener.getsockname()[0])} - {"0.0.0.0", "::"}
@@ -232,7 +234,9 @@ def _reading(shown: Shown, path: Path) -> Iterator[None]:
 
 def run_reader(shown: Shown, path: Path) -> None:
     """Run the reading process until it is ended, or the process that started it is gone."""
-    programs = Programs() if shown.control and shown.only is None else None
+    programs = None
+    if shown.control and shown.only is None:
+        programs = Programs()
     lower_priority()
     watches = Watches(shown.control)
     if shown.only is not None:
@@ -279,7 +283,10 @@ def _welcome(access: Access, place: Place, listener: socket.socket, what: str) -
     if ":" in name:
         name = f"[{name}]"
     scheme = "https" if access.secure else "http"
-    token = f"#token={access.token}" if access.token else ""
+    if access.token:
+        token = f"#token={access.token}"
+    else:
+        token = ""
     address = f"{scheme}://{name}:{port}/{token}"
     lines = [f"{what}: {address}"]
     if access.control:

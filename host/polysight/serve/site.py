@@ -445,7 +445,9 @@ class Programs:
             line = self._launcher.stdout.readline()
         except OSError as e:
             return str(e)
-        return str(json.loads(line)) if line else "the launcher has ended"
+        if not line:
+            return "the launcher has ended"
+        return str(json.loads(line))
 
     def close(self) -> None:
         """End the launcher; started programs go on."""

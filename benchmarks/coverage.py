@@ -211,7 +211,7 @@ def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigur
     """Judged patches of one scene: the sample from which coverage is counted."""
     scene, rig, findings, _ = judged(seed, kind, raw)
     plates = truth_plates(truth(rig, scene, scene.seed))
-    result = findings.found
+    result = findings.analysis
     true = match_truth([r.patch for r in result.patches], plates)
     out = []
     for r in result.patches:
@@ -270,7 +270,7 @@ def _names(seed: int) -> list[tuple[float, bool]]:
     """Probability beside each name of one scene, and whether the name is right."""
     scene, rig, findings, _ = judged(seed, "named")
     plates = truth_plates(truth(rig, scene, scene.seed))
-    result = findings.found
+    result = findings.analysis
     true = match_truth([r.patch for r in result.patches], plates)
     named = [(r.verdict, true[r.patch.label]) for r in result.patches if r.patch.label in true]
     return [(v.confidence, v.name == plate.name) for v, plate in named if v is not None and v.name != UNKNOWN]
@@ -294,7 +294,7 @@ def _reliability(pairs: list[tuple[float, bool]]) -> list[dict[str, float]]:
 def _without(job: tuple[int, str]) -> tuple[str, int, str, int, str]:
     seed, kind = job
     _, _, findings, _ = judged(seed, kind)
-    rows = findings.found.rows()
+    rows = findings.analysis.rows()
     said = sum(r.name is not None or r.permittivity is not None for r in rows)
     reason = findings.verdict.reasons[0].what if findings.verdict.reasons else ""
     return kind, seed, findings.verdict.level, said, reason

@@ -151,7 +151,7 @@ def rows_of(seed: int, rig: Instrument, scene: Scene, metal: PlaneReference) -> 
     pipeline = _imaged(rig, scene)
     pipeline.inputs = Inputs(reference=metal)
     findings = pipeline.examine(pipeline.form_images())
-    result = findings.found
+    result = findings.analysis
     plates = match_truth([r.patch for r in result.patches], truth_plates(truth(apply_scene(rig, scene), scene, seed)))
     rows = {plates[row.label].name: row for row in result.rows() if row.label in plates}
     return rows, result.prior.theta_std_rad

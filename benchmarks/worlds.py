@@ -43,7 +43,7 @@ from polysight.materials.segment import Segmentation
 from polysight.materials.train import fit_library
 from polysight.polarimetry import fresnel
 from polysight.process.quality import scene_reasons
-from polysight.results import verdict_of
+from polysight.results import join_reasons
 from polysight_shared.config import load_instrument
 from polysight_worlds import (
     NUISANCES,
@@ -254,20 +254,20 @@ def judge_world(nuisance: str, seed: int, searched: bool = False) -> SceneFigure
     pair = draw_pair(nuisance, seed)
     classifier = table_2_classifier(float(np.radians(pair.incidence_deg)))
     found, plates = analyse_world(pair, measured=nuisance not in UNMEASURED, classifier=classifier, searched=searched)
-    verdict = verdict_of(scene_reasons(found, None, classifier))
+    verdict = join_reasons(scene_reasons(found, None, classifier))
     judged = [(patch, plates[patch.patch.label]) for patch in found.patches if patch.patch.label in plates]
     return SceneFigures(
         nuisance,
         seed,
         verdict.level,
         tuple(f"{r.what}: {r.why}" for r in verdict.reasons),
-        tuple(figures_of(nuisance, patch, plate) for patch, plate in judged if not plate.stack.is_metal),
+        tuple(declared_figures(nuisance, patch, plate) for patch, plate in judged if not plate.stack.is_metal),
         missed=len(pixel_boxes(pair)) - len({plate.centre_m for _, plate in judged}),
         stray=len(found.patches) - len(judged),
     )
 
 
-def figures_of(nuisance: str, patch: PatchResult, plate: Plate) -> PatchFigures:
+def declared_figures(nuisance: str, patch: PatchResult, plate: Plate) -> PatchFigures:
     """Compare one patch with its plate."""
     e = patch.permittivity
     refused = "" if patch.refused is None else patch.refused.what
@@ -324,7 +324,7 @@ def judge_metal(kind: str, seed: int, searched: bool) -> MetalFigures:
         declared = next(plate.name for plate in world.plates if not plate.stack.layers and not plate.stack.is_metal)
     classifier = table_2_classifier(float(np.radians(pair.incidence_deg)))
     found, _ = analyse_world(pair, declared, classifier=classifier, searched=searched)
-    verdict = verdict_of(scene_reasons(found, None, classifier))
+    verdict = join_reasons(scene_reasons(found, None, classifier))
     shown = found if verdict.usable else found.without_result()
     names = [patch.verdict.name for patch in shown.patches if patch.verdict is not None]
     withdrawn = found.metal.evidence is not None and found.metal.evidence.against

@@ -156,7 +156,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         """An event for each committed row since the last call, in the order of the plan."""
         if self._place is None or not (self._place / MANIFEST).exists():
             return
-        rows = list(ScanFolder.load(self._place).committed().values())
+        rows = list(ScanFolder.load(self._place).committed_rows().values())
         for row in rows[self._collected :]:
             missing = sum(board.missing_bytes for board in row.boards.values())
             values = {"row": row.row, "take": row.take, "pulses": row.pulses, "missing_bytes": missing}

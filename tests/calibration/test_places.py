@@ -9,7 +9,7 @@ from tests.support.refusals import refused
 from polysight.calibration.files import Calibration, PlacesFile, load_calibration, open_raw, read_calibration
 from polysight.calibration.places import Prior, TargetPoint, fit_places, load_echoes, places_file, read_target
 from polysight.imaging.geometry import Antennas
-from polysight.jobs.calibrate import with_places_of
+from polysight.jobs.calibrate import take_antenna_places
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 
@@ -144,5 +144,5 @@ def test_a_target_needs_three_points(tmp_path):
 def test_another_rig_files_places_are_taken_and_nothing_else(make_rig):
     scanned = make_rig(grid={"columns": 5})
     other = make_rig(geometry={"object_distance_mm": 600.0})
-    taken = with_places_of(scanned, other)
+    taken = take_antenna_places(scanned, other)
     assert (taken.geometry, taken.grid) == (other.geometry, scanned.grid)

@@ -52,7 +52,7 @@ def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
     assert (found.where, found.level) == ("config", "error")
 
 
-def verdict_of(context, name):
+def join_reasons(context, name):
     return checks._run_check(next(c for c in CHECKS if c.name == name), context, None).level
 
 
@@ -63,8 +63,8 @@ def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
     hello = HelloReply(pi_release="", firmware="", backend=WIRES, state="homed", scan_id="", last_seq=0)
     assert check_calibration(dataclasses.replace(context, hello=hello)).level == "ok"
     real = msgspec.structs.replace(hello, backend=GPIOD)
-    assert verdict_of(dataclasses.replace(context, hello=real), "calibration") == "error"
-    assert verdict_of(context_of(programmed_rig(calibration={"hpf": "/nowhere.toml"})), "calibration") == "error"
+    assert join_reasons(dataclasses.replace(context, hello=real), "calibration") == "error"
+    assert join_reasons(context_of(programmed_rig(calibration={"hpf": "/nowhere.toml"})), "calibration") == "error"
 
 
 @pytest.mark.parametrize(

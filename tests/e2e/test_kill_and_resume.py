@@ -24,7 +24,7 @@ def rig(tmp_path, running_rig):
 
 def digests(path):
     """SHA-256 of every file of every committed row."""
-    files = [path / b.file for row in ScanFolder.load(path).committed().values() for b in row.boards.values()]
+    files = [path / b.file for row in ScanFolder.load(path).committed_rows().values() for b in row.boards.values()]
     return {f: hashlib.sha256(f.read_bytes()).hexdigest() for name in files for f in (name, name.with_suffix(".idx"))}
 
 
@@ -33,7 +33,7 @@ def check_whole(rig, before):
     path = rig.folder / "scan"
     after = digests(path)
     assert {file: after[file] for file in before} == before
-    assert len(ScanFolder.load(path).committed()) == 6
+    assert len(ScanFolder.load(path).committed_rows()) == 6
     validated = rig.here("validate", path)
     assert (validated.status, validated.out, validated.err) == (0, f"{path}: whole\n", "")
     started = [(e.row.index, e.take) for e in read_events(path / "events.msgpack").events if isinstance(e, RowStarted)]

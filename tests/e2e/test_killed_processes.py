@@ -206,7 +206,7 @@ def begun(folder: Path) -> bool:
 
 def rows(folder: Path) -> dict[str, str]:
     """SHA-256 of every committed row of every board."""
-    files = [b.file for row in ScanFolder.load(folder).committed().values() for b in row.boards.values()]
+    files = [b.file for row in ScanFolder.load(folder).committed_rows().values() for b in row.boards.values()]
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in files}
 
 
@@ -319,4 +319,4 @@ def test_pi_is_lost_with_its_journal(killed: Killed):
 
 def committed(folder: Path) -> list[int]:
     """Rows that are committed, of a scan that may not be begun."""
-    return list(ScanFolder.load(folder).committed()) if begun(folder) else []
+    return list(ScanFolder.load(folder).committed_rows()) if begun(folder) else []

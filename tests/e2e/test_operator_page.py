@@ -74,7 +74,7 @@ class Lab:
     def wait_rows(self, folder: Path, rows: int) -> None:
         """Until so many rows are committed, on the page and on the disk."""
         self.browser.wait(f"parseInt(document.getElementById('count')?.innerText) >= {rows}", f"{rows} rows")
-        assert len(ScanFolder.load(folder).committed()) >= rows
+        assert len(ScanFolder.load(folder).committed_rows()) >= rows
 
     def ended(self, folder: Path) -> None:
         """Until the program that the page started has ended; the folder is whole."""
@@ -123,7 +123,7 @@ def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
     lab.wait_rows(folder, 1)
     lab.click("pause")
     lab.wait_headline("Paused")
-    rows = len(ScanFolder.load(folder).committed())
+    rows = len(ScanFolder.load(folder).committed_rows())
     lab.click("continue")
     lab.wait_rows(folder, rows + 1)
     lab.click("pause")
@@ -132,7 +132,7 @@ def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
     lab.click("stop")
     lab.wait_headline("Stopped on request")
     lab.ended(folder)
-    stopped = len(ScanFolder.load(folder).committed())
+    stopped = len(ScanFolder.load(folder).committed_rows())
     assert rows < stopped < ROWS
     lab.click("resume")
     lab.wait_rows(folder, stopped + 1)
@@ -149,8 +149,8 @@ def test_a_scan_outlives_its_server_and_the_next_one_finds_it(lab):
     before = json.loads((folder / PROGRAM / "scan.json").read_text())
     lab.server.kill()
     lab.browser.wait("document.body.classList.contains('lost')", "that the page says so")
-    rows = len(ScanFolder.load(folder).committed())
-    lab.rig.wait_for(lambda: len(ScanFolder.load(folder).committed()) > rows, "rows without a server")
+    rows = len(ScanFolder.load(folder).committed_rows())
+    lab.rig.wait_for(lambda: len(ScanFolder.load(folder).committed_rows()) > rows, "rows without a server")
     lab.serve()
     lab.open("/watch?scan=third", PHONE)
     lab.wait_headline("All is well")

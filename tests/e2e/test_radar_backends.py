@@ -60,7 +60,7 @@ def test_native_radars_make_a_frame_of_many_chirps_at_each_pulse(bench):
     burst = {"pulses": 1, "chirps": CHIRPS, "chirp_us": 228.51, "period_us": 1500.0}
     native = {board: {"usb_serial": board} for board in PORTS}
     result = scanned(bench, {"control": "native", "native": native}, burst)
-    assert {row.pulses for row in result.folder.committed().values()} == {COLUMNS}
+    assert {row.pulses for row in result.folder.committed_rows().values()} == {COLUMNS}
     data = result.folder.read_row("RH", 0)
     assert data.frames_expected == COLUMNS * CHIRPS
     words = data.payload.view("<u4") & 0x0FFFFFFF

@@ -27,7 +27,7 @@ from polysight.materials.library import FORMAT, majority, ratio_distance
 from polysight.materials.measure import median_ratio
 from polysight.materials.result import features_of
 from polysight.polarimetry import fresnel
-from polysight.results import plain
+from polysight.results import to_plain
 from polysight_papers.sensys2026.item import table2
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -251,7 +251,7 @@ def test_leakage_biases_and_is_removed_when_given(synthetic):
 
 def test_rows_are_plain_json(synthetic, library):
     result = synthetic(3).analyse(classifier=Classifier(library))
-    rows = json.loads(json.dumps(plain(result.rows()), allow_nan=False))
+    rows = json.loads(json.dumps(to_plain(result.rows()), allow_nan=False))
     assert len(rows) == 9
     metal = next(r for r in rows if r["metal_reference"])
     assert metal["permittivity"] is None

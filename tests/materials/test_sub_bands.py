@@ -12,7 +12,7 @@ from polysight.imaging.images import SubBand
 from polysight.materials.layers import Bands, Layer, fit_layer
 from polysight.materials.sub_bands import band_rows, bands_of_row
 from polysight.polarimetry import fresnel, ratio_from_permittivity
-from polysight.results import PatchFigures, plain
+from polysight.results import PatchFigures, to_plain
 
 THETA = np.radians(55.0)
 BAND = SubBand((0, 96), 76.3e9, 78.0e9)
@@ -96,7 +96,7 @@ def row_of(ratio, parts):
         "inverse_ratio_std": INVERSE_STD,
         "amplitude_h": abs(fresnel(THICK, THETA)[0]),
     }
-    return msgspec.convert(plain({"label": 1, **one, "bands": [one] * parts}), PatchFigures)
+    return msgspec.convert(to_plain({"label": 1, **one, "bands": [one] * parts}), PatchFigures)
 
 
 def bands_of(ratio, parts) -> Bands:

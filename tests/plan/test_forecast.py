@@ -11,7 +11,7 @@ from polysight.imaging import ImageBuilder, PhaseSlope, backproject, field_limit
 from polysight.imaging.geometry import Antennas
 from polysight.imaging.resolution import board_facts
 from polysight.planning import Changes, Noise, forecast, propose
-from polysight.planning.forecast import aperture_of, find_warnings, predict_burst, predict_noise
+from polysight.planning.forecast import describe_aperture, find_warnings, predict_burst, predict_noise
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 
@@ -46,7 +46,7 @@ def test_noise_falls_with_chirps_and_positions(rig):
 def test_image_noise_is_that_of_a_weighted_sum(rig):
     """Noise through taper and window, summed as the imager sums, beside a point's sum."""
     small = Changes(columns=16, rows=12).apply(rig)
-    aperture, taper = aperture_of(small)
+    aperture, taper = describe_aperture(small)
     rng = np.random.default_rng(1)
     rx = len(aperture.antennas.rx_m)
     samples = slice(*small.chirp.linear_samples)

@@ -15,7 +15,7 @@ from polysight.cli.main import main
 from polysight.imaging import Images
 from polysight.products import read_products, write_image, write_json
 from polysight.products.exports import pack_mat
-from polysight.results import plain
+from polysight.results import to_plain
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_matlab_round_trip(folder, tmp_path):
     assert config["chirp"]["start_hz"] == products.facts.instrument["chirp"]["start_hz"]
     assert list(config["boards"][1]["mount"][0]["shift_mm"]) == [15.837, -3.35, 0.0]
     assert found["versions"]["polysight"] == "0.1.0"
-    assert json.loads(found["materials_json"]) == plain(products.materials)
+    assert json.loads(found["materials_json"]) == to_plain(products.materials)
     assert bool(found["simulated"]) is True
 
 

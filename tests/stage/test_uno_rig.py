@@ -48,7 +48,7 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
     simulate(rig, load_scene(scene), tmp_path / "ideal")
     scan = ScanFolder.load(tmp_path / "scan")
     ideal = ScanFolder.load(tmp_path / "ideal")
-    assert sorted(scan.committed()) == [0, 1]
+    assert sorted(scan.committed_rows()) == [0, 1]
     for board in ("RH", "RV"):
         for row in (0, 1):
             seen = np.fromfile(scan.row_path(board, row), "<i2").astype(float)

@@ -82,7 +82,7 @@ def computed(images: Images, content: dict[str, Any] | None, quality: dict[str, 
     """A result that was just computed, with these contents of materials.json (None: images only) and quality.json."""
     given: dict[str, Any] = {"facts": ScanFacts(scan_id="s", simulated=True), "plates": (), **more}
     materials = None if content is None else ScanMaterials.decode(content)
-    return ProcessedScan.computed(
+    return ProcessedScan.from_results(
         Path(), images=images, materials=materials, quality=ScanQuality.decode(quality), **given
     )
 
@@ -90,7 +90,7 @@ def computed(images: Images, content: dict[str, Any] | None, quality: dict[str, 
 def changed(scan: ProcessedScan, **content: Any) -> ProcessedScan:
     """The same result with other contents."""
     given = {name: value for name, value in vars(scan).items() if name in Computed.__annotations__}
-    return ProcessedScan.computed(scan.folder, **{**given, **content})
+    return ProcessedScan.from_results(scan.folder, **{**given, **content})
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

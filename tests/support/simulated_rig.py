@@ -76,7 +76,7 @@ class Rig(Bench):
     def committed(self) -> int:
         """How many rows of the scan are committed."""
         with suppress(PolysightError):  # not begun yet
-            return len(ScanFolder.load(self.folder / "scan").committed())
+            return len(ScanFolder.load(self.folder / "scan").committed_rows())
         return 0
 
     def close(self) -> None:

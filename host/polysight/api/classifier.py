@@ -16,7 +16,7 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from polysight.data import packaged
-from polysight.jobs.train import library_of
+from polysight.jobs.train import train_from_scans
 from polysight.materials import (
     SHORT,
     ErrorDiscriminant,
@@ -68,7 +68,7 @@ def train(
     """
     folders = [scan if isinstance(scan, str | os.PathLike) else scan.folder for scan in scans]
     config = packaged(RIG) if rig is None else Path(rig)
-    return library_of([Path(folder) for folder in folders], config, note)
+    return train_from_scans([Path(folder) for folder in folders], config, note)
 
 
 class Classifier(ClassifierMixin, BaseEstimator):

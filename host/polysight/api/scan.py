@@ -56,7 +56,7 @@ from polysight.products import (
     surface_dataset,
     write_netcdf,
 )
-from polysight.results import PatchFigures, Verdict, figures_of
+from polysight.results import PatchFigures, Verdict, declared_figures
 from polysight.settings import Settings
 from polysight.store import MANIFEST, ScanFolder, Source, open_source
 from polysight_shared.config import Chirp, Instrument, load_instrument
@@ -192,7 +192,7 @@ def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) ->
 
 def _is_current(saved: ProcessedScan, scan: ScanFolder) -> bool:
     """True unless the products say that they were made from other rows than the scan holds now. Raises DataError."""
-    committed = scan.committed()
+    committed = scan.committed_rows()
     for name, board in saved.quality.boards.items():
         recorded = {row: entry.boards[name].crc32 for row, entry in committed.items() if name in entry.boards}
         if board.raw_crc32 is not UNSET and board.raw_crc32 != recorded:
@@ -633,7 +633,7 @@ class Processing:
 
 def patch_table(done: ProcessedScan) -> str:
     """Return the patches as an HTML table: the figures that reports show."""
-    figures = [figure for figure in figures_of(PatchFigures) if figure.column.title]
+    figures = [figure for figure in declared_figures(PatchFigures) if figure.column.title]
     lines = ["<tr><th>patch</th><th>name</th><th>permittivity</th>"]
     lines += [f"<th>{escape(figure.column.title)}</th>" for figure in figures]
     for patch in done.segments:
@@ -642,7 +642,7 @@ def patch_table(done: ProcessedScan) -> str:
         text = "–"
         if value is not None and value.real is not None and value.imag is not None:
             text = format_permittivity(complex(value.real, value.imag))
-        cells = [str(patch.label), name, text, *(figure.shown(patch) for figure in figures)]
+        cells = [str(patch.label), name, text, *(figure.format(patch) for figure in figures)]
         lines.append("</tr><tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells))
     return f"<table>{''.join(lines)}</tr></table>"
 

@@ -31,7 +31,7 @@ from polysight.store import (
     RawSource,
     ScanFolder,
     Source,
-    inside,
+    check_inside,
     manifest,
     open_npz,
     open_source,
@@ -484,10 +484,10 @@ def calibration_of_scan(scan: Source) -> Calibration:
     recorded = scan.started.calibration
     if recorded is None:
         named = {kind: name for kind, name in to_builtins(scan.instrument.calibration).items() if name}
-        return load_calibration({kind: inside(scan.path, name) for kind, name in named.items()})
+        return load_calibration({kind: check_inside(scan.path, name) for kind, name in named.items()})
     paths: dict[str, Path] = {}
     for kind, fact in _recorded(scan, recorded).items():
-        path = paths[kind] = inside(scan.path, fact["file"])
+        path = paths[kind] = check_inside(scan.path, fact["file"])
         if not path.is_file() or f"{zlib.crc32(path.read_bytes()):08x}" != fact["crc32"]:
             raise DataError(
                 f"{path}: missing, or changed since the scan was recorded",

@@ -87,7 +87,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as e:
         from polysight_shared.errors import PolysightError, os_error
 
-        error = os_error(e) if isinstance(e, OSError) else e
+        if isinstance(e, OSError):
+            error = os_error(e)
+        else:
+            error = e
         if not isinstance(error, PolysightError):
             raise
         sys.stderr.write(f"{name}: {error}\n")

@@ -50,7 +50,15 @@ def _permittivity(args: argparse.Namespace) -> int:
             code=ErrorCode.VALUES_CONFLICT,
         )
     amplitude = 10.0 if args.amplitude is None else args.amplitude
-    return permittivity(args.products, args.config, args.layer, args.patch, args.json, args.bands, amplitude / 100)
+    return permittivity(
+        folder=args.products,
+        config=args.config,
+        stack=args.layer,
+        number=args.patch,
+        as_json=args.json,
+        bands=args.bands,
+        amplitude_error=amplitude / 100,
+    )
 
 
 def _concentration(args: argparse.Namespace) -> int:
@@ -206,7 +214,9 @@ def _train(args: argparse.Namespace) -> int:
         return train_authors(args.authors, args.config, args.out)
     from polysight.jobs.train import train
 
-    scenes = None if args.simulate is None else packaged(args.simulate)
+    scenes = None
+    if args.simulate is not None:
+        scenes = packaged(args.simulate)
     return train(scenes, args.data, args.config, args.out, args.times)
 
 

@@ -48,7 +48,9 @@ class CommandParser(argparse.ArgumentParser):
         named = [a for a in self._actions if a.option_strings and a not in grouped]
         named.sort(key=lambda a: (not a.required, not set(self.most_used) & set(a.option_strings), a.dest == "help"))
         # No section for --help alone.
-        first = _FIRST if len(named) > _FIRST + 1 else len(named)
+        first = _FIRST
+        if len(named) <= _FIRST + 1:
+            first = len(named)
         formatter = self._get_formatter()
         formatter.add_text(self.description)
         formatter.add_text(self.epilog)

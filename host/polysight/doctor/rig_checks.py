@@ -154,7 +154,9 @@ def check_receivers(context: CheckContext) -> Finding:
     results, scheduling = context.system.measure_receivers(context.rig, rates)
     losses = []
     for r in results:
-        loss = f"{100 * r.lost / r.sent:.1f} % lost" if r.lost else "no loss"
+        loss = "no loss"
+        if r.lost:
+            loss = f"{100 * r.lost / r.sent:.1f} % lost"
         losses.append(f"{r.mbit_s:.0f} Mbit/s a card: {loss}")
     observed = f"receivers ({scheduling}) with all cores busy: {'; '.join(losses)}"
     facts = {"held": [vars(r) for r in results], "scheduling": scheduling}
@@ -374,7 +376,10 @@ def check_stage(context: CheckContext) -> Finding:
             f"{e.remedy}; on the Pi, with its service stopped, run `polysight-pi check` for port and board",
             fault=status.fault,
         )
-    firmware = "" if context.hello is None else context.hello.firmware
+    if context.hello is None:
+        firmware = ""
+    else:
+        firmware = context.hello.firmware
     position = "not homed yet"
     if status.homed:
         position = f"at {status.x_mm:.1f}, {status.y_mm:.1f} mm"

@@ -29,4 +29,13 @@ def main(card: str, card_port: int, host: str, port: int, first: int, packets: i
 
 if __name__ == "__main__":
     _, card, card_port, host, port, first, packets, rate, size = sys.argv
-    main(card, int(card_port), host, int(port), int(first), int(packets), float(rate), int(size))
+    main(
+        card=card,
+        card_port=int(card_port),
+        host=host,
+        port=int(port),
+        first=int(first),
+        packets=int(packets),
+        rate=float(rate),
+        size=int(size),
+    )

@@ -351,8 +351,11 @@ def process_many(
     skipped = [j for j in jobs if not again and is_finished(j)]
     todo = [j for j in jobs if j not in skipped]
     outcomes = {j.name: Outcome(j.name, "skipped") for j in skipped}
-    where = f"on the cluster at {dask}" if dask else f"{jobs_at_once} at a time"
-    sys.stderr.write(f"{len(jobs)} scans: {len(skipped)} finished before, {len(todo)} to process, {where}\n")
+    if dask:
+        workers_text = f"on the cluster at {dask}"
+    else:
+        workers_text = f"{jobs_at_once} at a time"
+    sys.stderr.write(f"{len(jobs)} scans: {len(skipped)} finished before, {len(todo)} to process, {workers_text}\n")
     out.mkdir(parents=True, exist_ok=True)
     for job in todo:
         (job.out / FINISHED).unlink(missing_ok=True)  # from now on a mark is one of this run
@@ -413,8 +416,13 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
         masked = patches = verdict = ""
         if o.has_products:
             masked, patches, verdict = _results(out / o.name)
-        seconds = f"{o.seconds:.0f}" if o.seconds else ""
-        memory = f"{o.memory_gb:.1f} GB" if o.memory_gb else ""
+        if o.seconds:
+            seconds = f"{o.seconds:.0f}"
+        else:
+            seconds = ""
+        memory = ""
+        if o.memory_gb:
+            memory = f"{o.memory_gb:.1f} GB"
         rows.append((o.name, o.status, seconds, memory, masked, patches, o.message or verdict))
     widths = [max(len(row[k]) for row in rows) for k in range(6)]
     lines = []
@@ -500,7 +508,9 @@ def peak_memory_bytes() -> int:
     except ModuleNotFoundError:
         return 0
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return used if sys.platform == "darwin" else 1024 * used
+    if sys.platform == "darwin":
+        return used
+    return 1024 * used
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def print_result(
     return 0
 
 
-def with_places_of(scanned: Instrument, other: Instrument) -> Instrument:
+def take_antenna_places(scanned: Instrument, other: Instrument) -> Instrument:
     """Return a scan's rig with antennas, mounts and object plane of another rig file. Raises ConfigError."""
     mounts = {b.name: b.mount for b in other.boards}
     if set(mounts) != {b.name for b in scanned.boards}:
@@ -73,12 +73,14 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     from polysight.calibration import Prior, calibration_of_scan, fit_places, load_echoes, places_file, read_target
 
     points = read_target(target)
-    rig_file = None if config is None else load_instrument(config)
+    rig_file = None
+    if config is not None:
+        rig_file = load_instrument(config)
     source = open_raw(scan, rig_file)
     if rig_file is None:
         rig = source.instrument
     else:
-        rig = with_places_of(source.instrument, rig_file)
+        rig = take_antenna_places(source.instrument, rig_file)
     calibration = calibration_of_scan(source)
     filters = {b.name: calibration.high_pass(b.name) for b in rig.receivers}
     say("places of boards and plane")
@@ -111,7 +113,9 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
     """Calibrate the receivers' high-pass filters with scans at several start frequencies. Raises PolysightError."""
     from polysight.calibration import fit_filter
 
-    rig = None if config is None else load_instrument(config)
+    rig = None
+    if config is not None:
+        rig = load_instrument(config)
     sources = [open_raw(folder, rig) for folder in scans]
     chirps = {(s.instrument.chirp.hpf1_khz, s.instrument.chirp.hpf2_khz) for s in sources}
     if len(chirps) > 1:
@@ -141,7 +145,9 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
     from polysight.imaging import sub_bands
 
     source = open_raw(scan, None if config is None else load_instrument(config))
-    parts = sub_bands(source.instrument.chirp, bands) if bands > 1 else ()
+    parts = ()
+    if bands > 1:
+        parts = sub_bands(source.instrument.chirp, bands)
     path = write_metal(load_reference(scan, config, bands), [source_scan(source, scan)], out, parts)
     file = read_calibration(path, MetalFile, "metal")
     lines = [

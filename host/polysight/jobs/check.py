@@ -9,7 +9,7 @@ from pathlib import Path
 from polysight.catalogue import Scans
 from polysight.jobs.output import print_json, print_lines
 from polysight.products import ProcessedScan, find_products, read_products
-from polysight.results import WARNING_SIGMAS, CheckResult, check_plate, plain
+from polysight.results import WARNING_SIGMAS, CheckResult, check_plate, to_plain
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.files import write_atomically
@@ -26,7 +26,9 @@ def check_scan(scan: ProcessedScan) -> CheckResult:
     ConfigError
         if its rig file names no check plate.
     """
-    result = None if scan.rig is None else check_plate(scan.rig.check, scan.segments)
+    result = None
+    if scan.rig is not None:
+        result = check_plate(scan.rig.check, scan.segments)
     if result is None:
         raise ConfigError(
             f"scan {scan.scan_id}: its rig file names no check plate",
@@ -75,7 +77,7 @@ def check(folders: Sequence[Path], chart: Path | None, as_json: bool) -> int:
     if chart is not None:
         write_atomically(chart, draw_control_chart(checked))
     if as_json:
-        print_json([{"scan_id": scan.scan_id, **plain(result)} for scan, result in checked])
+        print_json([{"scan_id": scan.scan_id, **to_plain(result)} for scan, result in checked])
     else:
         print_lines([_line(scan, result) for scan, result in checked])
     return int(any(result.level in ("action", "missing") for _, result in checked))

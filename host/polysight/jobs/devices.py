@@ -24,10 +24,10 @@ from polysight.radar import (
     SystemClock,
     WordLink,
     check_board,
-    firmware_of,
     open_board,
     plan_lines,
     radar_board,
+    read_firmware,
     read_image,
     require,
     traced,
@@ -81,7 +81,10 @@ def _hop(finding: Finding) -> dict[str, str]:
 def _survey_text(survey: CardSurvey) -> str:
     """Survey results as text."""
     b = survey.board
-    role = b.role if b.record else f"{b.role}, not recorded: only asked"
+    if b.record:
+        role = b.role
+    else:
+        role = f"{b.role}, not recorded: only asked"
     unchecked = [hop.where for hop in survey.hops if hop.level == "note" and not hop.what]
     text = f"{b.name} ({role}): card {b.card_address}:{b.command_port}, data to {b.host_address}:{b.data_port}\n"
     text += "".join(_line(hop) for hop in survey.hops if hop.where not in unchecked)
@@ -113,7 +116,10 @@ def _board(rig: Instrument, name: str, config: Path) -> Board:
 def _with_address(board: Board, at: str) -> Board:
     """Return the board with its card's present address, `ADDRESS` or `ADDRESS:PORT`. Raises ConfigError."""
     address, _, port = at.partition(":")
-    number = int(port) if port.isdigit() else board.command_port
+    if port.isdigit():
+        number = int(port)
+    else:
+        number = board.command_port
     if (port and not port.isdigit()) or not 1 <= number <= 65535:
         raise ConfigError(
             f"--at {at!r} is not of the form ADDRESS:PORT", "a typing error", "e.g. --at 192.168.33.180:4096"
@@ -143,11 +149,11 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
         )
     now = _with_address(board, at)
     with CardClient(now, rig.limits.command_timeout_s) as card:
-        what = (
+        message = (
             f"{name}: a card, FPGA {card.version()}, answers at {now.card_address}:{now.command_port}; its EEPROM is"
             f" written anew, and cannot be read back.\n{name}: {settings.text()}"
         )
-        program_eeprom(card, settings, confirm(what, settings.confirmation, yes))
+        program_eeprom(card, settings, confirm(message, settings.confirmation, yes))
     sys.stdout.write(f"{name}: written, and the card reports no failure. Now switch the card off and on.\n")
     sys.stdout.flush()
     if wait_s > 0:
@@ -265,7 +271,7 @@ def _check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], Wo
             sys.stdout.write(_step_text(name, row))
             sys.stdout.flush()
 
-    firmware = firmware_of(rig)
+    firmware = read_firmware(rig)
     transmits = rig.transmitter.name == name
     board = check_board(open_words, lambda w: radar_board(rig, name, w, clock, firmware), transmits, tell)
     report = {}

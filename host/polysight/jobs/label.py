@@ -98,7 +98,9 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     products = find_products(folder)
     if products is None:
         is_scan = (folder / "manifest.jsonl").exists()
-        out = folder / "products" if is_scan else "OUT"
+        out = "OUT"
+        if is_scan:
+            out = folder / "products"
         raise DataError(
             f"{folder}: no {IMAGE} to draw on",
             "the scan was not processed yet, its products lie elsewhere, or the path is wrong",

@@ -110,18 +110,22 @@ class ScanBar:
                 self._console.print(f"{p.committed} of {p.rows} rows, {_clock(p.remaining_s)}", highlight=False)
 
 
-def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, told: Notify) -> int:
+def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, notifier: Notify) -> int:
     """Run a scan, and tell whom the rig file names how it has ended."""
     stop = StopRequest()
     try:
         status = _run_rows(folder, processing, run_rows, stop)
     except PolysightError as e:
-        notify(told, folder, "stopped" if stop.pending else "failed", str(e).splitlines()[0])
+        state = "stopped" if stop.pending else "failed"
+        notify(notifier, folder, state, str(e).splitlines()[0])
         raise
     except BaseException as e:
-        notify(told, folder, "failed", type(e).__name__)
+        notify(notifier, folder, "failed", type(e).__name__)
         raise
-    notify(told, folder, "finished", "every row is safe" + ("" if status == 0 else ", without a result"))
+    message = "every row is safe"
+    if status != 0:
+        message += ", without a result"
+    notify(notifier, folder, "finished", message)
     return status
 
 
@@ -135,14 +139,20 @@ def _run_rows(folder: Path, processing: LiveProcessing | None, run_rows: RunScan
                 control.open()
             bar.update(progress)
 
-        result = run_rows(None if processing is None else processing.add_row, show, stop)
+        on_row = None
+        if processing is not None:
+            on_row = processing.add_row
+        result = run_rows(on_row, show, stop)
         control.end_rows()
         if result.exit_status == "success":
             _print(f"{folder}: every row is committed\n")
         if result.processing_error is not None:
             raise _add_advice(folder, result, result.processing_error)
         if result.exit_status != "success":
-            asker = f" (asked by {stop.asker})" if stop.asker else ""
+            if stop.asker:
+                asker = f" (asked by {stop.asker})"
+            else:
+                asker = ""
             raise ScanError(f"{folder}: {result.reason}{asker}", "", f"polysight resume {folder}")
         if processing is None:
             return 0
@@ -198,14 +208,15 @@ def scan(
 ) -> int:
     """Run a new scan into `folder`, and process it; returns the exit status. Raises PolysightError."""
     rig = load_instrument(config)
-    told = rig.notify
+    notifier = rig.notify
     # A web address may hold a secret, and manifests are passed on.
     rig = replace(rig, notify=Notify())
     _check_new(folder)
     if truth is not None and not truth.is_file():
         raise ConfigError(f"{truth}: no such file", "--truth names it", "give truth.json, or leave --truth out")
-    processing = _processing(folder, settings) if process else None
-    if processing is not None:
+    processing = None
+    if process:
+        processing = _processing(folder, settings)
         processing.check_new(rig, truth)
 
     def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
@@ -221,7 +232,7 @@ def scan(
             sys.stderr.write(f"note: {truth} was not copied into {folder}; a report does without\n")
         return result
 
-    return _run(folder, processing, run_rows, told)
+    return _run(folder, processing, run_rows, notifier)
 
 
 def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
@@ -231,11 +242,15 @@ def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: boo
     """
     source = ScanFolder.load(folder)
     require_raw(source)
-    rig_now = None if config is None else load_instrument(config)
-    if rig_now is not None:
+    rig_now = None
+    notifier = Notify()
+    if config is not None:
+        rig_now = load_instrument(config)
         check_same_scan(source.instrument, rig_now, str(config))
-    processing = _processing(folder, settings) if process else None
-    if processing is not None:
+        notifier = rig_now.notify
+    processing = None
+    if process:
+        processing = _processing(folder, settings)
         processing.check_resumed(source)
 
     def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
@@ -243,4 +258,4 @@ def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: boo
             folder, on_row=on_row, progress=on_progress, keep_incomplete=keep_incomplete, stop=stop, rig_now=rig_now
         )
 
-    return _run(folder, processing, run_rows, Notify() if rig_now is None else rig_now.notify)
+    return _run(folder, processing, run_rows, notifier)

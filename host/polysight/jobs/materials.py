@@ -49,7 +49,7 @@ from polysight.products import (
     find_products,
     read_products,
 )
-from polysight.results import NoResult, PatchFigures, PermittivityFigures, one_line, plain
+from polysight.results import NoResult, PatchFigures, PermittivityFigures, one_line, to_plain
 from polysight.store import is_source
 from polysight_shared.config import Chirp, load_instrument
 from polysight_shared.error_codes import ErrorCode
@@ -146,9 +146,9 @@ def permittivity(
         chirp = _chirp(products, config)
     rows: list[dict[str, Any]] = []
     for patch in patches:
-        row = {"label": patch.label, "name": patch.name, "single_interface": plain(patch.permittivity)}
+        row = {"label": patch.label, "name": patch.name, "single_interface": to_plain(patch.permittivity)}
         if patch.refused is not None:
-            row["refused"] = plain(patch.refused)
+            row["refused"] = to_plain(patch.refused)
         if chirp is not None and not patch.metal_reference:
             _check_bands(patch, chirp, str(config or products.folder / SCAN))
             fit = fit_row(patch, chirp, stack, bands, amplitude_error, incidence_std_rad(products.materials))
@@ -264,7 +264,7 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
     """
     scans = [read_products(folder, MATERIALS) for folder in data]
     if as_json:
-        print_json([{"products": str(s.folder), **plain(s.materials)} for s in scans])
+        print_json([{"products": str(s.folder), **to_plain(s.materials)} for s in scans])
         return max((print_verdict(s, to_terminal=False) for s in scans), default=0)
     worst = 0
     for scan in scans:
@@ -280,7 +280,7 @@ def catalogue(as_json: bool) -> int:
     """Print the catalogue of the literature, sorted by eps'; return the exit status. A star marks a default spread."""
     entries = sorted(load_catalogue(), key=lambda material: material.permittivity.real)
     if as_json:
-        print_json([plain(material) for material in entries])
+        print_json([to_plain(material) for material in entries])
         return 0
     sources = {source.key: source.citation for material in entries for source in material.sources}
     number = {key: k for k, key in enumerate(sorted(sources), 1)}
@@ -460,7 +460,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
         "contradictions": _contradictions(library, model, classifier.angles_deg, matched, named),
         "patches_not_in_every_scan": sum(len(s.patches) for s in scans) - len(scans) * len(matched),
         "refused": [
-            {"products": str(p.folder), "label": patch.label, **plain(patch.refused)}
+            {"products": str(p.folder), "label": patch.label, **to_plain(patch.refused)}
             for p in products
             for patch in p.segments
             if patch.refused is not None
@@ -502,11 +502,11 @@ def _print_names(content: dict[str, Any], several: bool) -> None:
         sys.stdout.write(f"{line}\n")
     print_lines(f"note: {line}" for line in content["contradictions"])
     for refused in content["refused"]:
-        where = ""
+        place = ""
         if several:
-            where = f" in {refused['products']}"
+            place = f" in {refused['products']}"
         text = one_line(Finding("error", refused["what"], refused["why"], refused["do"]))
-        sys.stdout.write(f"{refused['label']:>3}  not judged{where}: {text}\n")
+        sys.stdout.write(f"{refused['label']:>3}  not judged{place}: {text}\n")
 
 
 def _contradictions(

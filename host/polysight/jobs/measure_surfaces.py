@@ -121,7 +121,10 @@ def _parse_echoes(rows: np.ndarray) -> Echoes:
     count = len(rows)
     bend = np.stack([rows[:, [6, 7]], rows[:, [7, 8]]], axis=1)
     # Files of older versions end before the rise over the band: none is assumed then.
-    band_rise = rows[:, 12] if rows.shape[1] > 12 else np.zeros(count)
+    if rows.shape[1] > 12:
+        band_rise = rows[:, 12]
+    else:
+        band_rise = np.zeros(count)
     return Echoes(
         at_m=rows[:, :3],
         path_m=rows[:, 3],
@@ -142,13 +145,13 @@ def thin_out(metal: Seen) -> Seen:
     return metal[chosen]
 
 
-def analyse_points(pipeline: Pipeline, optics: Optics, seen: Seen, gains: Reference | None = None) -> Surface:
+def analyse_points(pipeline: Pipeline, optics: Optics, seen_rows: Seen, gains: Reference | None = None) -> Surface:
     """Return the surfaces of a scan's points, named; without `gains` those of the calibration's sphere count."""
     calibration = pipeline.calibration
     if gains is None and calibration.sphere is not None:
         gains = make_reference(load_sphere_points(calibration.sphere))
-    made = analyse_surface(
-        seen,
+    surface = analyse_surface(
+        seen_rows,
         optics,
         gains,
         uncertainty=find_uncertainty(pipeline.rig, places_known=calibration.places is not None),
@@ -157,8 +160,8 @@ def analyse_points(pipeline: Pipeline, optics: Optics, seen: Seen, gains: Refere
     )
     classifier = load_classifier(pipeline.settings, pipeline.rig)
     if classifier is None:
-        return made
-    return replace(made, segments=tuple(name_segment(segment, classifier) for segment in made.segments))
+        return surface
+    return replace(surface, segments=tuple(name_segment(segment, classifier) for segment in surface.segments))
 
 
 def name_segment(segment: Segment, classifier: Classifier) -> Segment:
@@ -169,12 +172,12 @@ def name_segment(segment: Segment, classifier: Classifier) -> Segment:
     return replace(segment, name=named.name, confidence=named.confidence)
 
 
-def save_surface(out: Path, made: Surface) -> None:
+def save_surface(out: Path, surface: Surface) -> None:
     """Write surface.npz, surface.ply and surface.png into a folder."""
     from polysight.report import surface_figure
 
-    write_surface(out, made)
-    write_atomically(out / "surface.png", surface_figure(made))
+    write_surface(out, surface)
+    write_atomically(out / "surface.png", surface_figure(surface))
 
 
 def has_steep_patch(products: Path) -> bool:
@@ -191,7 +194,7 @@ def add_surfaces(pipeline: Pipeline, products: Path) -> None:
     from polysight.report import write_report
 
     optics = make_rig_optics(pipeline.rig)
-    seen = see_rows(pipeline, optics)
-    if len(seen):
-        save_surface(products, analyse_points(pipeline, optics, seen))
+    seen_rows = see_rows(pipeline, optics)
+    if len(seen_rows):
+        save_surface(products, analyse_points(pipeline, optics, seen_rows))
         write_report(products, read_products(products))

@@ -23,7 +23,9 @@ def exit_status(worked: bool) -> int:
 
 def simulated_scan(scan_id: str, is_simulated: bool) -> str:
     """`scan NAME`, or `simulated scan NAME`."""
-    return f"simulated scan {scan_id}" if is_simulated else f"scan {scan_id}"
+    if is_simulated:
+        return f"simulated scan {scan_id}"
+    return f"scan {scan_id}"
 
 
 def print_json(content: Any) -> None:

@@ -26,9 +26,9 @@ from polysight.process import (
     imaged_scan,
     is_given_images,
     load_classifier,
+    make_reference,
     map_rows,
     read_given_images,
-    reference_of,
     save_images,
     save_materials,
     why_unnamed,
@@ -147,21 +147,23 @@ def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
             if not (new / IMAGE).exists():
                 raise
             if (out / REPORT).exists():
-                where = f"{out} holds the earlier products; `polysight image` with another --out writes the images"
-                raise DataError(e.what, e.why, advice(e.remedy, where), code=e.code) from None
+                images_note = (
+                    f"{out} holds the earlier products; `polysight image` with another --out writes the images"
+                )
+                raise DataError(e.what, e.why, advice(e.remedy, images_note), code=e.code) from None
             failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
     raise failed
 
 
 def _no_pixel_error(pipeline: Pipeline, data: Path | None = None) -> DataError:
     """Return the error of images without a valid pixel. A board without any valid position is named: P needs both."""
-    why = "nothing was recorded, or all of it was masked"
+    cause = "nothing was recorded, or all of it was masked"
     boards = " and ".join(pipeline.quality.boards_masked)
     if boards:
-        why = f"no position of {boards} has a direct path: TX or RX is off, or its data are constant"
+        cause = f"no position of {boards} has a direct path: TX or RX is off, or its data are constant"
     return DataError(
         "the image has no valid pixel",
-        why,
+        cause,
         f"`polysight sync-report {data or 'SCAN'} --out DIR` shows the direct path of each row",
         code=ErrorCode.NO_DATA,
     )
@@ -184,7 +186,7 @@ def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> 
         when the scan cannot be read, or shows no metal plate.
     """
     if is_given_images(folder):
-        return reference_of(read_given_images(folder, rig_of_images(config)))
+        return make_reference(read_given_images(folder, rig_of_images(config)))
     pipeline, images = imaged(folder, Settings(config=path_text(config), bands=bands))
     parts = tuple(plane_of(pipeline, band) for band in pipeline.sub_bands.finish(pipeline.source.mirrored))
     return replace(plane_of(pipeline, images), bands=parts)
@@ -252,7 +254,7 @@ def process_images(data: Path, out: Path, settings: Settings, inputs: Inputs) ->
         plates = find_plates(data)
     scan, findings, unnamed = analyse_given_images(pair, settings, inputs, rig, plates)
     with making_products(out, pair.scan_id) as new, current_step("figures and report"):
-        products = replace(save_materials(new, scan, findings.found, unnamed), folder=out)
+        products = replace(save_materials(new, scan, findings.analysis, unnamed), folder=out)
     sys.stdout.write(products.summary())
     return products.exit_status
 
@@ -358,7 +360,10 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     plates = pipeline.plane
     say("the plane at which the image is sharpest")
     sharpest = focus_sweep(builder, depth_m=depth_mm / 1e3)
-    depth_m = plates.offset_m if plates.known else sharpest.depth_mm / 1e3
+    if plates.known:
+        depth_m = plates.offset_m
+    else:
+        depth_m = sharpest.depth_mm / 1e3
     grid = builder.grid
     board = builder.boards[source.instrument.receivers[0].name]
     pictures = (board.image()[0], board.image(replace(grid, z_m=grid.z_m + depth_m))[0])

@@ -21,7 +21,7 @@ from polysight.store import (
     PlacedAgain,
     Replaced,
     ScanFolder,
-    damage_of,
+    describe_damage,
     place_again,
     replace_rows,
     to_json,
@@ -142,11 +142,11 @@ def inspect_file(
         report = inspect_bin(file, layout)
     report.simulated = scan is not None and scan.simulated
     if as_json:
-        from polysight.results import plain
+        from polysight.results import to_plain
 
         content = asdict(report)
         content |= content.pop("layout")
-        print_json(plain(content))
+        print_json(to_plain(content))
     else:
         sys.stdout.write(main_text(report))
     if plot is not None:
@@ -206,7 +206,7 @@ def inspect_placement(file: Path, as_json: bool) -> int:
     """
     row = file.with_suffix(".bin")
     if scan := find_scan(row):
-        if damage := damage_of(scan, row):
+        if damage := describe_damage(scan, row):
             raise DataError(
                 f"{row}: {damage}", "a damaged file, or one of another row", "`polysight validate SCAN`",
                 code=ErrorCode.FILE_DAMAGED,
@@ -236,7 +236,10 @@ def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
     missing = ", ".join(f"{a}..{b}" for a, b in p.missing[:_SHOWN])
     if len(p.missing) > _SHOWN:
         missing += ", ..."
-    located = "yes" if p.located else f"no: {p.reason}"
+    if p.located:
+        located = "yes"
+    else:
+        located = f"no: {p.reason}"
     lines = [
         f"{file}: {p.received} of {p.expected} bytes in place",
         f"packets    {counts or 'none'}",

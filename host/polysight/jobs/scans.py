@@ -24,7 +24,7 @@ from polysight.catalogue import (
 from polysight.jobs.output import confirm, print_json
 from polysight.materials import UNKNOWN
 from polysight.products import QUALITY, REPORT, products_locked, read_products, write_json
-from polysight.results import ComplexNumber, RawDropped, plain, read_object
+from polysight.results import ComplexNumber, RawDropped, read_object, to_plain
 from polysight.store import Digests, ScanFolder, damaged_samples, drop, droppable, dropped_rows, locked_samples, utc_now
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, no_such
@@ -116,7 +116,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
     """Print the results of a processed scan at one place; return 0. Raises DataError."""
     result = probe(folder, *place_mm, library)
     if as_json:
-        print_json(plain(result))
+        print_json(to_plain(result))
         return 0
     lines = [f"x {result.place_mm[0]:g} mm, y {result.place_mm[1]:g} mm from the image's centre"]
     if not result.lit:
@@ -145,7 +145,7 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
 
         write_atomically(picture, draw_comparison(comparison, "sigmas").png)
     if as_json:
-        print_json(plain(values))
+        print_json(to_plain(values))
         return 0
     lines = [f"{first} minus {second}: {values.compared} pixels", *(f"note: {n}" for n in values.notes)]
     if values.significant_share is not None:
@@ -212,7 +212,7 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
         when the scan is being processed or recorded.
     """
     scan = ScanFolder.load(folder)
-    payloads = [scan.path / board.file for row in scan.committed().values() for board in row.boards.values()]
+    payloads = [scan.path / board.file for row in scan.committed_rows().values() for board in row.boards.values()]
     if dropped_rows(scan) and not any(path.exists() for path in payloads):
         sys.stdout.write(f"{folder}: every processed row is dropped already\n")
         return 0

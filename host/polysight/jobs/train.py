@@ -45,8 +45,8 @@ from polysight.products import (
     ProcessedScan,
     find_labels,
     find_products,
+    find_scan_folder,
     read_products,
-    scan_folder_of,
 )
 from polysight.settings import Settings
 from polysight.store import TRUTH, open_source, versions
@@ -68,7 +68,7 @@ def training_scan(data: Path, config: Path) -> TrainingScan:
     NoResult
         if the verdict of a labelled scan is "no result".
     """
-    scan = scan_folder_of(data) or data
+    scan = find_scan_folder(data) or data
     check_labelled(data)
     saved_labels = find_labels(data)
     if saved_labels is None:
@@ -80,10 +80,10 @@ def training_scan(data: Path, config: Path) -> TrainingScan:
             return _from_images(saved, labels)
         return _from_rows(scan, config, labels)
     except DataError as e:
-        what = e.what
-        if str(path) not in what:
-            what = f"{path}: {what}"
-        raise DataError(what, e.why, e.remedy) from None
+        problem = e.what
+        if str(path) not in problem:
+            problem = f"{path}: {problem}"
+        raise DataError(problem, e.why, e.remedy) from None
 
 
 def check_labelled(data: Path) -> None:
@@ -94,7 +94,7 @@ def check_labelled(data: Path) -> None:
     DataError
         as :func:`training_scan`, as far as the saved image shows it.
     """
-    scan = scan_folder_of(data) or data
+    scan = find_scan_folder(data) or data
     if not data.is_dir():
         raise DataError(f"{data}: no such folder", "the path is wrong", "give scan folders, or folders of products")
     saved_labels = find_labels(data)
@@ -116,7 +116,7 @@ def check_labelled(data: Path) -> None:
 
 def _products_without_rows(data: Path, scan: Path) -> ProcessedScan | None:
     """Return the products if the raw rows are deleted, else None. Raises DataError."""
-    if scan_folder_of(data) is None:
+    if find_scan_folder(data) is None:
         return read_products(data)
     if (scan / "products" / IMAGE).exists():
         saved = ProcessedScan(scan / "products")
@@ -137,7 +137,7 @@ def _from_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
     findings = pipeline.examine(images)
     if not findings.verdict.usable:
         raise findings.verdict.error("no library was written")
-    return _with_labels(source.scan_id, findings.found, source.simulated, checked)
+    return _with_labels(source.scan_id, findings.analysis, source.simulated, checked)
 
 
 def _from_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
@@ -221,7 +221,7 @@ def _no_metal(folder: Path) -> DataError:
     )
 
 
-def library_of(data: Sequence[Path], config: Path, note: str = "") -> Library:
+def train_from_scans(data: Sequence[Path], config: Path, note: str = "") -> Library:
     """Return a library of labelled scans; `config` is the rig file of data without one.
 
     Raises

@@ -225,7 +225,7 @@ class MaterialsResult:
             pixels=r.patch.pixels,
             interior_pixels=e.pixels,
             incidence_deg=self.incidence_deg(r.patch),
-            ratio=ComplexNumber.of(e.ratio),
+            ratio=ComplexNumber.from_complex(e.ratio),
             inverse_ratio_std=_finite(e.inverse_std),
             amplitude_h=round(float(np.median(level)), 6) if level.size else None,
             refused=r.refused,
@@ -286,7 +286,7 @@ def _truth_figures(truth: TruthPlate, library: tuple[str, ...]) -> TruthFigures:
     return TruthFigures(
         name=truth.name,
         metal=truth.metal,
-        permittivity=ComplexNumber.of(truth.permittivity),
+        permittivity=ComplexNumber.from_complex(truth.permittivity),
         thickness_mm=truth.thickness_mm,
         in_library=truth.name in library,
     )

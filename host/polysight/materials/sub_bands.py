@@ -194,7 +194,7 @@ def _measure_band(band: SubBand, h: Image, v: Image, whole: tuple[Image, Image],
     return BandFigures(
         first_hz=band.first_hz,
         last_hz=band.last_hz,
-        ratio=ComplexNumber.of(ratio),
+        ratio=ComplexNumber.from_complex(ratio),
         inverse_ratio_std=std,
         own_std=math.hypot(BAND_STD, BAND_SHARE * spread) if math.isfinite(spread) else std,
         amplitude_h=float(np.nanmedian(np.abs(h))),

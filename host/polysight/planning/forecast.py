@@ -256,7 +256,7 @@ def forecast(
     and height of the scene in the object plane; default: the image's.
     """
     noise = noise or Noise()
-    aperture, taper = aperture_of(rig)
+    aperture, taper = describe_aperture(rig)
     return Forecast(
         rig=rig,
         time=scan_time(rig, row_overhead_s),
@@ -270,7 +270,7 @@ def forecast(
     )
 
 
-def aperture_of(rig: Instrument) -> tuple[Aperture, Real]:
+def describe_aperture(rig: Instrument) -> tuple[Aperture, Real]:
     """Return the aperture of the H receiver and its taper [row, column]."""
     grid = image_grid(rig)
     antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)

@@ -13,7 +13,7 @@ import numpy as np
 
 from polysight.imaging import field_limits, point_response
 from polysight.materials import SegmentSettings
-from polysight.planning.forecast import aperture_of
+from polysight.planning.forecast import describe_aperture
 from polysight.polarimetry import multilayer, specular_incidence_rad
 from polysight_shared.config import Instrument
 from polysight_shared.findings import Finding
@@ -69,7 +69,7 @@ def _plate(raw: Mapping[str, Any], path: Path) -> Plate:
 
 def warn_of_scene(rig: Instrument, plates: Sequence[Plate]) -> Iterator[Finding]:
     """Yield a note for each gap, size, place or thickness that spoils the result of a plate."""
-    aperture, taper = aperture_of(rig)
+    aperture, taper = describe_aperture(rig)
     cell_mm = point_response(aperture, taper).width_mm
     for plate in plates:
         yield from _warn_of_size(plate, cell_mm)

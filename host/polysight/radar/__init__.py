@@ -13,11 +13,11 @@ from polysight.radar.control import (
     BoardState,
     RadarControl,
     RadarState,
-    firmware_of,
     open_board,
     plan_lines,
     radar_board,
     radar_control,
+    read_firmware,
 )
 from polysight.radar.diagnosis import ReplayedWords, Row, check_board, traced
 from polysight.radar.firmware import Image, read_image
@@ -40,11 +40,11 @@ __all__ = [
     "chirp_us",
     "constraints",
     "direct_if_hz",
-    "firmware_of",
     "open_board",
     "plan_lines",
     "radar_board",
     "radar_control",
+    "read_firmware",
     "read_image",
     "require",
     "traced",

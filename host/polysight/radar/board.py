@@ -337,7 +337,9 @@ class BringUp:
         self._link.call(c.RF_INIT)
         event = self._link.wait_for((e.RF_INIT_DONE,), _CALIBRATION_TIMEOUT_S, self.note)
         self._board.facts.calibration = dict(event.values)
-        requested = ALL & ~RESTORED if restored else ALL
+        requested = ALL
+        if restored:
+            requested = ALL & ~RESTORED
         if failed := e.failed_calibrations(event, self._board.program.transmits, requested):
             raise DeviceError(
                 f"{self._board.name}: RF init failed: {', '.join(failed)} ({event})",
@@ -549,7 +551,9 @@ class RadarBoard:
         differences = []
         for question, setting in ((c.READ_PROFILE, 0x0100), (c.READ_CHIRP, 0x0101), (c.READ_FRAME, 0x0102)):
             blocks = self.link.call(question).blocks
-            read = blocks[0].data if blocks else b""
+            read = b""
+            if blocks:
+                read = blocks[0].data
             if read != sent[setting]:
                 differences.append(f"0x{setting:04X}: sent {sent[setting].hex()}, read back {read.hex()}")
         return differences

@@ -426,8 +426,14 @@ class Constraint(NamedTuple):
         return (self.low is None or self.value >= self.low) and (self.high is None or self.value <= self.high)
 
     def __str__(self) -> str:
-        low = "" if self.low is None else f"{self.low:.12g} <= "
-        high = "" if self.high is None else f" <= {self.high:.12g}"
+        if self.low is None:
+            low = ""
+        else:
+            low = f"{self.low:.12g} <= "
+        if self.high is None:
+            high = ""
+        else:
+            high = f" <= {self.high:.12g}"
         return f"{self.name}: {low}{self.formula} = {self.value:.12g}{high} {self.unit}".rstrip()
 
 
@@ -574,7 +580,9 @@ def _if_budget(rig: Instrument, board: Board) -> Constraint:
     direct_hz = direct_if_hz(rig, board)
     spread = c.slope_hz_per_s * TRIGGER_UNCERTAINTY_S
     width = PASSBAND * c.sample_rate_hz
-    low = 0.0 if c.if_mode == "complex1x" else -width / 2
+    low = 0.0
+    if c.if_mode != "complex1x":
+        low = -width / 2
     centred = board.start_offset_hz + low + width / 2 - direct_hz
     return Constraint(
         f"IF budget of {board.name}",

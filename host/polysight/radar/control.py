@@ -123,7 +123,9 @@ def radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmw
     commands = program(rig, rig.by_name(name))
     settings = b"".join(command.block().data for command in (*commands.basic, *commands.waveform))
     folder = rig.radar.calibration_dir
-    calibration = CalibrationFiles(Path(folder), settings) if folder else None
+    calibration = None
+    if folder:
+        calibration = CalibrationFiles(Path(folder), settings)
     return RadarBoard(name, words, clock, commands, firmware=firmware, die_id=native.die_id, calibration=calibration)
 
 
@@ -147,7 +149,7 @@ def plan_lines(rig: Instrument) -> tuple[list[str], bool]:
     return lines, True
 
 
-def firmware_of(rig: Instrument) -> Image | None:
+def read_firmware(rig: Instrument) -> Image | None:
     """Read and check the firmware image of a rig file; None if it has none. Raises ConfigError."""
     if not rig.radar.firmware:
         return None
@@ -222,7 +224,7 @@ class NativeRadars(RadarControl):
         self._traces: list[TracedWords] = []
         if rig.radar.trace_dir:
             _make_folder(Path(rig.radar.trace_dir))
-        firmware = firmware_of(rig)
+        firmware = read_firmware(rig)
         with ExitStack() as opened:
             opened.callback(self.close)
             for board in rig.boards:

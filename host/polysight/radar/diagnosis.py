@@ -110,7 +110,9 @@ def _frame_and_read_back(board: RadarBoard, transmits: bool, on_row: Callable[[R
 def _row_of_failure(step: Step | None, error: PolysightError) -> Row:
     if step is None:
         return Row("bring-up", False, "", error.what, f"{error.why}; {error.remedy}")
-    picture = f"\n{JUMPERS}" if step.name == "reset" else ""
+    picture = ""
+    if step.name == "reset":
+        picture = f"\n{JUMPERS}"
     return Row(step.name, False, step.expected, error.what, f"{error.why}; {error.remedy or step.remedy}{picture}")
 
 
@@ -305,7 +307,10 @@ class ReplayedWords:
         self._looks += 1
         while self._is_interrupt():
             line = self._lines[self._at]
-            later = line.t > self.now() if line.looks is None else line.looks >= self._looks
+            if line.looks is None:
+                later = line.t > self.now()
+            else:
+                later = line.looks >= self._looks
             if later:
                 break
             self._play_level()
@@ -369,7 +374,9 @@ def read_trace(file: Path) -> tuple[dict[str, Any], list[TraceLine]]:
     records: list[TraceLine] = []
     for number, line in enumerate(lines, 1):
         try:
-            value = msgspec.json.decode(line) if line else None
+            value = None
+            if line:
+                value = msgspec.json.decode(line)
         except (ValueError, RecursionError):
             # The last line of a killed program is incomplete.
             if number < len(lines):

@@ -83,7 +83,9 @@ def read_image(path: Path) -> Image:
 def check_image(data: bytes, name: str) -> Image:
     """Check the bytes of a file. Raises ConfigError if they are not a complete, undamaged image for an AWR2243."""
     if data[:4] != _MAGIC:
-        begin = data[:12].decode("latin-1") if data else "nothing"
+        begin = "nothing"
+        if data:
+            begin = data[:12].decode("latin-1")
         raise _file_error(
             name, f"begins with {begin!r} instead of {_MAGIC.decode()!r}", "another file, or an empty one"
         )

@@ -182,13 +182,12 @@ class Link:
                     return event
             if self._clock.now() > deadline:
                 names = ", ".join(f"0x{i:04X}" for i in ids)
-                raise NotReportedError(
-                    f"{self._name}: the radar did not report {names} within {timeout_s:g} s"
-                    + (f"; a message was lost meanwhile: {lost_message.what}" if lost_message else ""),
-                    lost_message.why if lost_message else f"it was reset, or: {_SILENT}",
-                    _REMEDY,
-                    code=ErrorCode.NO_ANSWER,
-                )
+                problem = f"{self._name}: the radar did not report {names} within {timeout_s:g} s"
+                cause = f"it was reset, or: {_SILENT}"
+                if lost_message:
+                    problem += f"; a message was lost meanwhile: {lost_message.what}"
+                    cause = lost_message.why
+                raise NotReportedError(problem, cause, _REMEDY, code=ErrorCode.NO_ANSWER)
             self._clock.sleep(_INTERVAL_S)
 
     def _read_messages(self) -> Finding | None:
@@ -229,7 +228,9 @@ class Link:
                 parts.append(message)
                 if message.remaining_chunks == 0:
                     return _join_chunks(parts), problem
-        return None, _lost_message("parts of the answer are missing", _DISTURBED) if parts else problem
+        if parts:
+            problem = _lost_message("parts of the answer are missing", _DISTURBED)
+        return None, problem
 
     def _receive(self) -> tuple[Message | None, Finding]:
         """Read one message while the interrupt is high; return None and the reason if it cannot be read."""
@@ -244,8 +245,10 @@ class Link:
         searched = 0
         while head[-SYNC_BYTES:] != DEVICE_SYNC:
             if searched >= _SYNC_SEARCH_BYTES:
-                same = len(set(head)) == 1
-                return None, _lost_message(f"no sync word in {searched} bytes", _NO_MISO if same else _DISTURBED)
+                # The same byte again and again comes from a line that nothing drives.
+                is_constant = len(set(head)) == 1
+                cause = _NO_MISO if is_constant else _DISTURBED
+                return None, _lost_message(f"no sync word in {searched} bytes", cause)
             head += self._read(2)
             searched += 2
         head = head[-SYNC_BYTES:] + self._read(HEADER_BYTES)

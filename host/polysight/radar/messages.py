@@ -114,7 +114,9 @@ class Message:
             if block.id == ERROR_BLOCK and len(block.data) >= 4:
                 number, block_number = _BLOCK.unpack(block.data[:4])
                 return number, block_number
-        return (None, None) if self.message_id == ERROR_MESSAGE else None
+        if self.message_id != ERROR_MESSAGE:
+            return None
+        return None, None
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,15 @@ def command(blocks: tuple[SubBlock, ...], *, sequence: int = 0, retry: bool = Fa
         raise ValueError(f"sub-blocks of one command share one message id, these have {sorted(ids)}")
     message_id = ids.pop()
     direction = Direction.HOST_TO_MAIN if message_id >= 0x200 else Direction.HOST_TO_RF
-    return Message(direction, Kind.COMMAND, message_id, blocks, sequence, retry, remaining)
+    return Message(
+        direction=direction,
+        kind=Kind.COMMAND,
+        message_id=message_id,
+        blocks=blocks,
+        sequence=sequence,
+        retry=retry,
+        remaining_chunks=remaining,
+    )
 
 
 def checksum(words: bytes) -> int:
@@ -188,7 +198,9 @@ def encode(message: Message) -> bytes:
     if SYNC_BYTES + length > MESSAGE_LIMIT:
         raise ValueError(f"a message of {SYNC_BYTES + length} bytes; one chunk holds at most {MESSAGE_LIMIT}")
     opcode = message.direction | message.kind << 4 | message.message_id << 6
-    flags = message.sequence << 12 | _CRC32 | (_RETRY if message.retry else 0)
+    flags = message.sequence << 12 | _CRC32
+    if message.retry:
+        flags |= _RETRY
     head = struct.pack("<5H", opcode, length, flags, message.remaining_chunks, len(message.blocks))
     head += checksum(head).to_bytes(2, "little")
     if message.direction in (Direction.HOST_TO_RF, Direction.HOST_TO_MAIN):
@@ -206,7 +218,15 @@ def decode_header(raw: bytes) -> Header:
     opcode, length, flags, remaining, count, expected = _HEADER.unpack(head)
     if checksum(head[:-2]) != expected:
         raise ProtocolError(f"header {head.hex()}: checksum {expected:04x} is wrong", _WHY, _DO)
-    header = Header(opcode & 0xF, Kind(opcode >> 4 & 3), opcode >> 6, length, flags, remaining, count)
+    header = Header(
+        direction=opcode & 0xF,
+        kind=Kind(opcode >> 4 & 3),
+        message_id=opcode >> 6,
+        length=length,
+        flags=flags,
+        remaining_chunks=remaining,
+        block_count=count,
+    )
     if not HEADER_BYTES + header.crc_bytes <= length <= MESSAGE_LIMIT - SYNC_BYTES:
         raise ProtocolError(f"header {head.hex()}: invalid length of {length} bytes", _WHY, _DO)
     return header
@@ -225,14 +245,17 @@ def decode(raw: bytes) -> Message:
         direction = Direction(header.direction)
     except ValueError:
         raise ProtocolError(f"message {inner.hex()}: unknown direction {header.direction}", _WHY, _DO) from None
+    block_count = header.block_count
+    if header.is_bare_refusal:
+        block_count = 0
     return Message(
-        direction,
-        header.kind,
-        header.message_id,
-        _blocks(inner[HEADER_BYTES:end], 0 if header.is_bare_refusal else header.block_count),
-        header.sequence,
-        header.flags & _RETRY == _RETRY,
-        header.remaining_chunks,
+        direction=direction,
+        kind=header.kind,
+        message_id=header.message_id,
+        blocks=_blocks(inner[HEADER_BYTES:end], block_count),
+        sequence=header.sequence,
+        retry=header.flags & _RETRY == _RETRY,
+        remaining_chunks=header.remaining_chunks,
     )
 
 
@@ -240,7 +263,10 @@ def crc(data: bytes, size: int) -> bytes:
     """Compute a CRC of 0, 2 or 4 bytes (ICD table 2.7): CCITT from 0xFFFF, or that of Ethernet; little-endian."""
     if size == 0:
         return b""
-    value = zlib.crc32(data) if size == 4 else binascii.crc_hqx(data, 0xFFFF)
+    if size == 4:
+        value = zlib.crc32(data)
+    else:
+        value = binascii.crc_hqx(data, 0xFFFF)
     return value.to_bytes(size, "little")
 
 
@@ -431,7 +457,9 @@ class Event:
     values: Mapping[str, object] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        return self.name + (f": {self.detail}" if self.detail else "")
+        if not self.detail:
+            return self.name
+        return f"{self.name}: {self.detail}"
 
 
 def describe_refusal(number: int | None, block: int | None) -> str:
@@ -476,7 +504,9 @@ def _cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
         kind, code, line = struct.unpack_from("<BBH", data)
         if kind == 0xFF:
             return "no fault", False, {}
-        detail = f", {_word(codes, code)}, firmware line {line}" if kind == 3 and codes else ""
+        detail = ""
+        if kind == 3 and codes:
+            detail = f", {_word(codes, code)}, firmware line {line}"
         return _word(_CPU_FAULTS, kind) + detail, True, {"type": kind, "code": code, "line": line}
 
     return read
@@ -495,7 +525,10 @@ def _init_done(data: bytes) -> _Read:
     status, updated, temperature, _, stamp = struct.unpack_from("<IIhHI", data)
     failed = sum(1 << b for b in INIT_BITS if not status >> b & 1)
     values = {"passed": status, "updated": updated, "temperature_c": temperature, "device_ms": stamp}
-    return f"{temperature} C" + (f"; failed: {_bits(_INIT_NAMES, failed)}" if failed else ""), False, values
+    text = f"{temperature} C"
+    if failed:
+        text += f"; failed: {_bits(_INIT_NAMES, failed)}"
+    return text, False, values
 
 
 def _analog(data: bytes) -> _Read:
@@ -512,7 +545,9 @@ def _boot(data: bytes) -> _Read:
         boot, ticks, tests = struct.unpack_from("<IIQ", data)
     else:
         ticks, boot, tests = struct.unpack_from("<IQQ", data)
-    parts = [_bits(_BOOT_BITS, boot, "bit")] if boot else []
+    parts = []
+    if boot:
+        parts = [_bits(_BOOT_BITS, boot, "bit")]
     if tests:
         parts.append(f"self-tests failed 0x{tests:X}")
     if any(boot >> bit & 1 for bit in _HARDWARE_BITS):

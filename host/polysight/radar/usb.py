@@ -183,22 +183,29 @@ class UsbWords:
         self._sense = sense
         self._sleep = sleep
         self._slow = slow
-        self._spi.write(set_up_spi(SLOW_DIVISOR if slow else SPI_DIVISOR))
+        divisor = SLOW_DIVISOR if slow else SPI_DIVISOR
+        self._spi.write(set_up_spi(divisor))
         self._interrupt.write(set_up_interrupt())
 
     def write(self, words: Sequence[int]) -> None:
         """Shift words out. Raises DeviceError."""
-        for part in [[w] for w in words] if self._slow else [words]:
+        parts = [words]
+        if self._slow:
+            parts = [[word] for word in words]
+        for part in parts:
             self._spi.write(write_words(part))
             self._pause()
 
     def read(self, count: int) -> list[int]:
         """Shift words in. Raises DeviceError."""
+        counts = [count]
+        if self._slow:
+            counts = [1] * count
         words: list[int] = []
-        for part in [1] * count if self._slow else [count]:
-            self._spi.write(read_words(part))
-            data = _read_exactly(self._spi, 2 * part)
-            words += struct.unpack(f">{part}H", data)
+        for part_count in counts:
+            self._spi.write(read_words(part_count))
+            data = _read_exactly(self._spi, 2 * part_count)
+            words += struct.unpack(f">{part_count}H", data)
             self._pause()
         return words
 
@@ -214,7 +221,10 @@ class UsbWords:
     def reset(self, held: bool) -> None:
         """Set the sense lines to functional mode, then hold or release the reset. Raises DeviceError."""
         self._sense.write(bytes((FUNCTIONAL_MODE,)))
-        self._reset.write(bytes((1 << WARM_RESET_PIN | (0 if held else 1 << RESET_PIN),)))
+        pins = 1 << WARM_RESET_PIN
+        if not held:
+            pins |= 1 << RESET_PIN
+        self._reset.write(bytes((pins,)))
         self._sleep(_RESET_S)
 
     def close(self) -> None:
@@ -251,7 +261,8 @@ class FtdiPort:
             self._ftdi.set_bitmode(0, ftdi.BitMode.RESET)
             self._ftdi.set_latency_timer(_LATENCY_MS)
             self._ftdi.purge_buffers()
-            self._ftdi.set_bitmode(direction, ftdi.BitMode.BITBANG if bit_bang else ftdi.BitMode.MPSSE)
+            mode = ftdi.BitMode.BITBANG if bit_bang else ftdi.BitMode.MPSSE
+            self._ftdi.set_bitmode(direction, mode)
         except self._library.errors as e:
             self.close()
             message = f"{place}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}"
@@ -318,7 +329,7 @@ def open_usb(place: str, slow: bool = False) -> UsbWords:
     """
     library = _library()
     library.tools.flush_cache()
-    chip = library.chip_at(place)
+    chip = library.find_chip(place)
     ports: list[FtdiPort] = []
     try:
         for interface, (direction, bit_bang) in enumerate(_CHANNELS, start=1):
@@ -339,20 +350,25 @@ class _Library(NamedTuple):
     errors: tuple[type[Exception], ...]
     find: Callable[..., Any]
 
-    def chip_at(self, place: str) -> Any:
+    def find_chip(self, place: str) -> Any:
         """Return the chip with this serial number or path. Raises DeviceError if there is none, or more than one."""
         name = place.removeprefix(PATH)
         try:
-            # Pyftdi's, in its order
+            # The backends of pyftdi, in its order of preference.
             backends = (import_module(name).get_backend() for name in self.tools.BACKENDS)
             backend = next((b for b in backends if b is not None), None)
             chips = list(self.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend))
             paths = {f"{d.bus}-{'.'.join(map(str, d.port_numbers or ()))}": d for d in chips}
             by_path = place.startswith(PATH)
-            matching = [p for p, d in paths.items() if (p if by_path else self._serial(d)) == name]
+            if by_path:
+                matching = [path for path in paths if path == name]
+            else:
+                matching = [path for path, chip in paths.items() if self._serial(chip) == name]
         except self.errors as e:
             raise _usb_error(f"{place}: {e}", e, "libusb is missing, or the chip was unplugged") from None
-        on_the_bus = f"chips at {', '.join(sorted(paths))}" if paths else "no chip on the bus"
+        on_the_bus = "no chip on the bus"
+        if paths:
+            on_the_bus = f"chips at {', '.join(sorted(paths))}"
         if not matching:
             kind_of_place = "at this path" if by_path else "with this serial number"
             raise DeviceError(

@@ -488,12 +488,10 @@ def _crop(ax: Axes, scan: ProcessedScan) -> None:
         half = max(x1 - x0, y1 - y0) / 2
         cx = (x0 + x1) / 2
         cy = (y0 + y1) / 2
-        left, right, bottom, top = (
-            max(left, cx - half),
-            min(right, cx + half),
-            max(bottom, cy - half),
-            min(top, cy + half),
-        )
+        left = max(left, cx - half)
+        right = min(right, cx + half)
+        bottom = max(bottom, cy - half)
+        top = min(top, cy + half)
     ax.set_xlim(left, right)
     ax.set_ylim(bottom, top)
 

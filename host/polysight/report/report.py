@@ -32,9 +32,9 @@ from polysight.results import (
     PermittivityFigures,
     PlaneError,
     ScanQuality,
-    figures_of,
+    declared_figures,
     percent,
-    plain,
+    to_plain,
 )
 from polysight.surfaces import SURFACE, read_surface
 from polysight_shared.config import Instrument
@@ -129,7 +129,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         budget=budget,
         replaced=_replaced_names(scan),
         missed=missed_plates,
-        quality=quality_tables(plain(scan.quality)),
+        quality=quality_tables(to_plain(scan.quality)),
         coverage=coverage_sentence(masked_positions(scan)),
         config=config,
         rig_file=tomli_w.dumps(scan.facts.instrument or {}),
@@ -180,7 +180,7 @@ def _provenance(scan: ProcessedScan) -> list[tuple[str, str]]:
 def _shown_figures(scan: ProcessedScan) -> list[Figure]:
     """Return the declared figures of patches that have a heading in tables for people."""
     kind = type(scan.segments[0]) if scan.segments else PatchFigures
-    return [figure for figure in figures_of(kind) if figure.column.title]
+    return [figure for figure in declared_figures(kind) if figure.column.title]
 
 
 def _code(words: str) -> Markup:
@@ -247,7 +247,7 @@ def _row(patch: PatchFigures, colours: dict[str, str]) -> dict[str, Any]:
         "error": DASH,
         "relative_error": None,
         "pixels": patch.pixels_used,
-        "shown": [figure.shown(patch) for figure in figures_of(type(patch)) if figure.column.title],
+        "shown": [figure.format(patch) for figure in declared_figures(type(patch)) if figure.column.title],
     }
     if patch.metal_like:
         row["real"] = "metal-like"

@@ -59,7 +59,7 @@ def _received(s: socket.socket) -> bytes:
         return b""
 
 
-def digest_of(folder: Path) -> dict[str, str]:
+def compute_digest(folder: Path) -> dict[str, str]:
     """SHA-256 of every file below a folder, and the targets of links."""
     return {
         str(p.relative_to(folder)): f"-> {p.readlink()}"

@@ -258,7 +258,7 @@ class SmallScan:
 
     def rows(self) -> dict[str, str]:
         """SHA-256 of the payload of every committed row."""
-        committed = ScanFolder.load(self.path).committed().values()
+        committed = ScanFolder.load(self.path).committed_rows().values()
         files = [self.path / board.file for row in committed for board in row.boards.values()]
         return {str(f.relative_to(self.path)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 

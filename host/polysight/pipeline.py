@@ -31,10 +31,9 @@ class Pipeline:
         self.plane = imaging.UNKNOWN_PLANE
         self.synchroniser = sync.RowSynchroniser(source, rig, filters)
         self.quality = process.Quality(rig, source, self.calibration.facts())
-        samples_on_disk = process.KeptSamples(source, rig, filters, self.quality, settings, live=live, samples=samples)
-        self.samples = samples_on_disk
-        self.images = samples_on_disk.images
-        self.sub_bands = samples_on_disk.sub_bands
+        self.samples = process.KeptSamples(source, rig, filters, self.quality, settings, live=live, samples=samples)
+        self.images = self.samples.images
+        self.sub_bands = self.samples.sub_bands
         self.rig = self.images.rig
         # Images of a mirrored scan are transposed, so that x runs from TX to RX: the rig follows them.
         if source.mirrored:

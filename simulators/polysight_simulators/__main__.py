@@ -14,7 +14,7 @@ import msgspec
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import ConfigError
 from polysight_shared.raster import check_burst_fits
-from polysight_simulators.process import command_line, exit_status_of
+from polysight_simulators.process import command_line, run_program
 from polysight_simulators.scene import apply_scene, load_scene, simulate
 
 
@@ -106,7 +106,7 @@ def main(argv: list[str] | None = None) -> int:
     sub.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="scene files")
     sub.add_argument("--config", type=Path, default=Path("instrument.toml"), help="rig file")
     args = parser.parse_args(argv)
-    return exit_status_of(lambda: args.run(args))
+    return run_program(lambda: args.run(args))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ FOLDER = SKETCH_DIR / "build"
 _FLAGS = ("-std=gnu++11", "-O2", "-Wall", "-Wextra", "-fno-exceptions", "-fno-rtti")
 
 
-def compiled(product: str, sources: Iterable[Path], command: Sequence[str], on_failure: tuple[str, str]) -> Path:
+def compile_once(product: str, sources: Iterable[Path], command: Sequence[str], on_failure: tuple[str, str]) -> Path:
     """Run `command` to make a file of `sources`, unless these sources were already compiled.
 
     Parameters
@@ -82,7 +82,8 @@ def _folder() -> Path:
         places.append(Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "polysight" / "build")
     for folder in places:
         try:
-            folder.mkdir(exist_ok=True, parents=folder != FOLDER)  # without the repository there is no arduino_stage
+            # Without the repository there is no arduino_stage.
+            folder.mkdir(exist_ok=True, parents=folder != FOLDER)
         except OSError:
             continue
         if os.access(folder, os.W_OK):
@@ -105,7 +106,7 @@ def build_sketch(gxx: str, flags: tuple[str, ...] = _FLAGS) -> Path:
     """Compile the sketch for this machine. Raises DeviceError if the compiler fails."""
     sources = [*SKETCH_DIR.glob("*.cpp"), *(SKETCH_DIR / "pc").glob("*.cpp")]
     headers = [*SKETCH_DIR.glob("*.h"), *(SKETCH_DIR / "pc").glob("*.h")]
-    return compiled(
+    return compile_once(
         "stage",
         [*sources, *headers],
         [gxx, *flags, "-o", "{folder}/stage", *map(str, sorted(sources))],

@@ -144,11 +144,11 @@ def read_faults(
         raise ConfigError(f"faults for unknown boards {unknown}", f"the boards are {list(boards)}", "correct the name")
     faults = {name: decode({**common, **board_tables.get(name, {})}, Faults, f"faults of {name}") for name in boards}
     for name, f in faults.items():
-        for needed, keys in OF_CONTROL.items():
-            if control not in (None, needed) and (idle := [key for key in keys if getattr(f, key)]):
+        for required, keys in OF_CONTROL.items():
+            if control not in (None, required) and (idle := [key for key in keys if getattr(f, key)]):
                 raise ConfigError(
                     f"faults {idle} of {name}: the rig has radar.control = {control!r}",
-                    f"they need {needed!r}",
+                    f"they need {required!r}",
                     "leave them out, or change radar.control (--native makes it native)",
                     code=ErrorCode.VALUES_CONFLICT,
                 )
@@ -157,4 +157,7 @@ def read_faults(
 
 def _merge(table: dict[str, Any], more: dict[str, Any]) -> None:
     for key, value in more.items():
-        table[key] = {**table.get(key, {}), **value} if isinstance(value, dict) else value
+        if isinstance(value, dict):
+            table[key] = {**table.get(key, {}), **value}
+        else:
+            table[key] = value

@@ -42,7 +42,7 @@ def announce_ready(text: str = "") -> None:
     sys.stdout.flush()
 
 
-def exit_status_of(run: Callable[[], object]) -> int:
+def run_program(run: Callable[[], object]) -> int:
     """Run a program; return its exit status. An error is one message on stderr."""
     try:
         run()
@@ -65,7 +65,7 @@ def run_until_stopped(run: Callable[[threading.Event], object]) -> int:
     """
     stop = stop_requested()
     die_with_parent()
-    return exit_status_of(lambda: run(stop))
+    return run_program(lambda: run(stop))
 
 
 def stop_requested() -> threading.Event:

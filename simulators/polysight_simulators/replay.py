@@ -48,7 +48,10 @@ class Recording:
         # None: without end
         self._left = max_bytes
         if not loop:
-            self._left = len(self._data) if max_bytes is None else min(max_bytes, len(self._data))
+            if max_bytes is None:
+                self._left = len(self._data)
+            else:
+                self._left = min(max_bytes, len(self._data))
         self._at = 0
 
     @property
@@ -130,7 +133,9 @@ class Player:
             self._endpoint.tick()
             wait = self._endpoint.flush()
         busy = PLAYING_S if self._playing is not None or card.recording else IDLE_S
-        return busy if wait is None else min(busy, wait)
+        if wait is None:
+            return busy
+        return min(busy, wait)
 
     def _feed(self, recording: Recording, now: float) -> None:
         room = _MAX_QUEUED_BYTES - self._endpoint.sender.queued_bytes
@@ -195,8 +200,13 @@ def _recordings(files: list[Path], max_bytes: int | None, loop: bool) -> Iterato
 def _run(args: argparse.Namespace, stop: Event) -> None:
     _check(args)
     name = args.board or BOARD
-    files = scan_rows(args.source, name, args.row) if args.source.is_dir() else [args.source]
-    max_bytes = None if args.frames is None else args.frames * args.frame_bytes
+    if args.source.is_dir():
+        files = scan_rows(args.source, name, args.row)
+    else:
+        files = [args.source]
+    max_bytes = None
+    if args.frames is not None:
+        max_bytes = args.frames * args.frame_bytes
     for path in files:
         # Raises DataError before the start
         Recording(path)
@@ -206,7 +216,16 @@ def _run(args: argparse.Namespace, stop: Event) -> None:
         raise ConfigError(f"faults {useless}", cause, "leave them out")
     network = Network(args.host_address, args.card_address, MAC, args.command_port, args.data_port)
     pace = Pace(not (args.no_wait or args.real_pacing), args.real_pacing)
-    endpoint = CardEndpoint(name, network, faults, args.seed, args.time_scale, time.monotonic, pace, lanes=None)
+    endpoint = CardEndpoint(
+        name=name,
+        network=network,
+        faults=faults,
+        seed=args.seed,
+        time_scale=args.time_scale,
+        clock_s=time.monotonic,
+        pace=pace,
+        lanes=None,
+    )
     try:
         bytes_per_s = args.rate_mbit * 1e6 / 8 * args.time_scale
         player = Player(endpoint, _recordings(files, max_bytes, args.loop), bytes_per_s, time.monotonic)

@@ -68,9 +68,14 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     `native` overrides the radar control of the rig file. Raises ConfigError if an override breaks a rule, DeviceError
     if no loopback subnet is free.
     """
-    table: dict[str, Any] = to_builtins(rig if scene is None else apply_scene(rig, scene))
+    disturbed_rig = rig
+    offset_hz = _NATIVE_OFFSET_HZ
+    if scene is not None:
+        disturbed_rig = apply_scene(rig, scene)
+        offset_hz = scene.disturbances.if_offset_hz
+    table: dict[str, Any] = to_builtins(disturbed_rig)
     if native:
-        _under_native_control(table, _NATIVE_OFFSET_HZ if scene is None else scene.disturbances.if_offset_hz)
+        _under_native_control(table, offset_hz)
     elif table["radar"]["control"] != "native" and scene is not None:
         _as_programmed(table, scene.disturbances.if_offset_hz)
     if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
@@ -96,7 +101,8 @@ class Child:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**_ENVIRONMENT, **os.environ},
-                start_new_session=True,  # Ctrl-C goes only to the rig, which ends its processes in order
+                # Ctrl-C goes only to the rig, which ends its processes in order.
+                start_new_session=True,
                 preexec_fn=die_with_parent,
             )
 
@@ -268,7 +274,10 @@ def _write_files(rig: Instrument, scene: Scene | None, folder: Path, options: Ri
     if rig.radar.firmware == str(folder / IMAGE_FILE):
         (folder / IMAGE_FILE).write_bytes(make_image())
     if scene is not None and not options.pattern:
-        facts = truth(rig, scene, scene.seed if options.seed is None else options.seed)
+        seed = options.seed
+        if seed is None:
+            seed = scene.seed
+        facts = truth(rig, scene, seed)
         (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
 
 
@@ -286,7 +295,9 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
             "the emulated board's heartbeat clock is scaled, the Pi's is not",
             f"give at most {UNO_TIME_SCALE:g}, or leave out --uno",
         )
-    scene = None if scene_path is None else load_scene(scene_path)
+    scene = None
+    if scene_path is not None:
+        scene = load_scene(scene_path)
     if options.time_scale <= 0:
         raise ConfigError(f"--time-scale {options.time_scale:g}", "it must be positive", "give a number above 0")
     if scene is None and not options.pattern:
@@ -336,9 +347,9 @@ def main(argv: list[str] | None = None) -> int:
         help=f"run the sketch's machine code on an emulated board; --time-scale at most {UNO_TIME_SCALE:g}",
     )
     parser.add_argument("--native", action="store_true", help="the host configures and arms the radars (simulated USB)")
-    given = vars(parser.parse_args(argv))
-    config, scene, folder = (given.pop(name) for name in ("config", "scene", "dir"))
-    options = RigOptions(**given)
+    arguments = vars(parser.parse_args(argv))
+    config, scene, folder = (arguments.pop(name) for name in ("config", "scene", "dir"))
+    options = RigOptions(**arguments)
     return run_until_stopped(lambda stop: run(config, scene, folder, options, stop))
 
 

@@ -15,8 +15,9 @@ from tests.support.store.facts import facts_of
 
 from polysight.acquisition import scan as running
 from polysight.acquisition.control import StopRequest
+from polysight.acquisition.progress import ScanProgress, time_left, typical_row_s
 from polysight.acquisition.row import row_limit_s
-from polysight.acquisition.scan import ScanProgress, run_scan, time_left, typical_row_s
+from polysight.acquisition.scan import run_scan
 from polysight.jobs.live_scan import ScanBar
 from polysight.page.history import seconds
 from polysight.page.status import remaining

@@ -21,7 +21,8 @@ from tests.support.store.facts import facts_of
 from polysight.acquisition import ready, row
 from polysight.acquisition import scan as running
 from polysight.acquisition.control import StopRequest
-from polysight.acquisition.scan import NICE, resume_scan, run_scan
+from polysight.acquisition.progress import NICE
+from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.store.validation import validate
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode

@@ -12,7 +12,8 @@ import tomli_w
 from tests.support.rigs import rig_table
 from tests.support.store.facts import facts_of
 
-from polysight.acquisition.scan import ScanResult, run_scan
+from polysight.acquisition.progress import ScanResult
+from polysight.acquisition.scan import run_scan
 from polysight.store.validation import validate
 from polysight_shared.config import load_instrument
 

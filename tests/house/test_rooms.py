@@ -85,7 +85,7 @@ def test_every_error_says_what_why_and_what_to_do():
 
 def test_the_root_of_host_is_the_flow_and_rooms():
     assert {p.name for p in HOST.glob("*.py")} == {"__init__.py", "__main__.py", "pipeline.py", "settings.py"}
-    assert len((HOST / "pipeline.py").read_text(encoding="utf-8").splitlines()) <= 115
+    assert len((HOST / "pipeline.py").read_text(encoding="utf-8").splitlines()) <= 135
 
 
 def rooms() -> list[Path]:

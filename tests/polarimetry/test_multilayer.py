@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from polysight.polarimetry import fresnel, multilayer
 from polysight_shared.errors import PolysightError
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
-from polysight_simulators.scene import Layer, layered
+from polysight_simulators.scene import Layer, reflect_layers
 from polysight_simulators.scene.optics import half_space, slab
 
 media = st.tuples(st.floats(1.0, 12.0), st.floats(0.0, 20.0)).map(lambda e: complex(e[0], -e[1]))
@@ -41,7 +41,7 @@ def test_random_stacks_agree_with_tmm(layers, last, f, theta):
     expected, _ = by_tmm(eps, inside, f, theta)
     np.testing.assert_allclose(multilayer(eps, inside, f, theta), expected, rtol=1e-8, atol=1e-10)
     stack = [Layer((e.real, -e.imag), 1e3 * d) for e, d in layers] + [Layer((last.real, -last.imag))]
-    np.testing.assert_allclose(layered(stack, f, theta), expected, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(reflect_layers(stack, f, theta), expected, rtol=1e-8, atol=1e-10)
 
 
 @settings(max_examples=60)

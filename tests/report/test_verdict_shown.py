@@ -30,15 +30,8 @@ from polysight import open_scan
 from polysight.materials import TruthPlate
 from polysight.products import ProcessedScan, read_products
 from polysight.report import write_report
-from polysight.report.figures import (
-    SHARES,
-    channel_figure,
-    draw_materials,
-    fit_ellipse,
-    permittivity_map,
-    phase_limits_deg,
-    place_numbers,
-)
+from polysight.report.figures import channel_figure, draw_materials, permittivity_map, phase_limits_deg
+from polysight.report.permittivity_plot import SHARES, fit_ellipse, place_numbers
 from polysight.report.report import budget_table
 from polysight.report.style import shorten_labels
 from polysight.results import ErrorBudget, PermittivityFigures

@@ -12,7 +12,7 @@ from polysight_simulators.uno import board
 
 
 def _compile(source: Path) -> Path:
-    return builds.compiled("copy.txt", [source], ["cp", str(source), "{folder}/copy.txt"], ("", ""))
+    return builds.compile_once("copy.txt", [source], ["cp", str(source), "{folder}/copy.txt"], ("", ""))
 
 
 @pytest.fixture

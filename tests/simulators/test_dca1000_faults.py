@@ -96,7 +96,7 @@ def test_overflow_takes_the_second_half_of_single_frames() -> None:
 def test_missed_pulses_are_those_named() -> None:
     pulses = [Pulse(i, 1000 * i) for i in range(10)]
     faults = PulseFaults(Faults(miss_pulses=(0, 4)), 0, "RH")
-    seen = faults.seen(pulses[:5]) + faults.seen(pulses[5:])
+    seen = faults.select_seen(pulses[:5]) + faults.select_seen(pulses[5:])
     assert [p.number for p in seen] == [1, 2, 3, 5, 6, 7, 8, 9]
     assert faults.missed == 2
 

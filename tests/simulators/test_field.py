@@ -44,7 +44,7 @@ def read(field: ObjectField, offsets_m: np.ndarray, f: np.ndarray, rx: int, samp
     values, _ = node_matrix(field, samples)
     picked = values[:, np.searchsorted(samples, f)]
     carrier = np.exp(2j * np.pi * f * field.centre_path_m / SPEED_OF_LIGHT_M_S)
-    return field.at(offsets_m[:, 0], offsets_m[:, 1])[:, rx] @ picked * carrier
+    return field.interpolate(offsets_m[:, 0], offsets_m[:, 1])[:, rx] @ picked * carrier
 
 
 def test_interpolation_between_frequencies_is_exact() -> None:
@@ -130,10 +130,10 @@ def test_a_point_at_the_specular_midpoint_equals_its_amplitude() -> None:
 def test_an_empty_scene_has_no_echo_and_offsets_outside_are_refused() -> None:
     rig, scene = setup()
     field = build_field(rig, scene, rig.receivers[0], sample_frequencies_hz(rig))
-    assert np.all(field.at(np.array([0.0]), np.array([0.0])) == 0)
+    assert np.all(field.interpolate(np.array([0.0]), np.array([0.0])) == 0)
     assert field.covers(np.array([0.14, 0.3]), np.array([0.1, 0.0])).tolist() == [True, False]
     with refused(ErrorCode.MISMATCH, "300.00 mm"):
-        field.at(np.array([0.3]), np.array([0.0]))
+        field.interpolate(np.array([0.3]), np.array([0.0]))
 
 
 def test_a_cached_field_is_the_same_field(tmp_path: Path) -> None:

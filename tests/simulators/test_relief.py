@@ -46,7 +46,7 @@ def fields(n: int = 12, role: str = "receive_h", rx: int = 1, **tables: Any) -> 
     offsets = np.random.default_rng(0).uniform(-1, 1, (n, 2)) * [0.1, 0.07]
     at = [0, 128, 255]
     carrier = np.exp(2j * np.pi * samples[at] * field.centre_path_m / SPEED_OF_LIGHT_M_S)
-    fast = field.at(offsets[:, 0], offsets[:, 1])[:, rx] @ node_matrix(field, samples)[0][:, at] * carrier
+    fast = field.interpolate(offsets[:, 0], offsets[:, 1])[:, rx] @ node_matrix(field, samples)[0][:, at] * carrier
     return fast, field_exact(rig, scene, board, offsets, samples[at], rx)
 
 
@@ -123,7 +123,7 @@ def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitu
         plate = {**PLATE, "metal": True, "rough_mm": rough_mm, "rough_length_mm": 3.0}
         plate.pop("permittivity")
         scene = setup(plates=[plate], seed=seed, grid={**GRID, "columns": 1, "rows": 1})[1]
-        return complex(build_field(rig, scene, board, samples, rx=[0]).at(offsets, offsets)[0, 0, 0])
+        return complex(build_field(rig, scene, board, samples, rx=[0]).interpolate(offsets, offsets)[0, 0, 0])
 
     smooth = amplitude(0.0, 1)
     for rough_mm in (0.15, 0.3):

@@ -30,7 +30,7 @@ from polysight.products.exports import read_netcdf
 from polysight.products.folder import making_products
 from polysight.products.processed import read_image
 from polysight.store import manifest
-from polysight.store.published import read_json as read_settings_json
+from polysight.store.published_rig import read_json as read_settings_json
 from polysight.store.raw import drop, droppable
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate

@@ -22,16 +22,15 @@ from polysight.acquisition.control import (
 from polysight.acquisition.pi_client import PiClient, RefusedError
 from polysight.acquisition.ready import make_ready, stage_differences
 from polysight.acquisition.row import FaultKind
-from polysight.acquisition.scan import (
+from polysight.acquisition.progress import (
     OnProgress,
     OnRow,
     ScanProgress,
     ScanResult,
-    resume_scan,
-    run_scan,
     time_left,
     typical_row_s,
 )
+from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.acquisition.states import BADGES, STATES, Button, StateLevel
 
 __all__ = [

@@ -266,7 +266,8 @@ class PiClient:
         """Send once and return the reply, None after the timeout. A new request replaces the old (relaxed REQ)."""
         try:
             self._commands.send(pack(command))
-        except zmq.Again:  # no connection
+        # There is no connection.
+        except zmq.Again:
             return None
         if not self._commands.poll(round(timeout_s * 1e3)):
             return None

@@ -82,7 +82,8 @@ class PlacedFrames:
     slots: Times
     # Numbers of the pulses that were certainly missed
     missed: list[int]
-    pulses: int  # in the row
+    # Number of pulses in the row.
+    pulses: int
     # Why the times say nothing; "" if they do
     reason: str = ""
     # Frames are at other pulses than their number says: none is certain
@@ -170,8 +171,10 @@ class _Trains(NamedTuple):
     low: Times
     # int64, upper bound of the shift at its last packet, bytes
     high: Times
-    punctual: Flags  # of one frame, and at the time of a pulse
-    astray: Flags  # of one frame, and at no pulse's time
+    # Trains of one frame at the time of a pulse.
+    punctual: Flags
+    # Trains of one frame at no pulse's time.
+    astray: Flags
 
 
 def _find_trains(

@@ -97,7 +97,8 @@ class TakeFault:
     text: str
     # "" if the fault is the whole row's
     board: str = ""
-    number: int = 0  # of a `PI_FAULT`
+    # The Pi's number of a `PI_FAULT`.
+    number: int = 0
 
     def __str__(self) -> str:
         if self.board:
@@ -133,7 +134,8 @@ class Take:
     radars: dict[str, BoardState] = field(default_factory=dict)
     # Radars that did not confirm the end of all frames
     not_done: list[str] = field(default_factory=list)
-    frames: dict[str, PlacedFrames] = field(default_factory=dict)  # by arrival times, of rows with a certain length
+    # Frames placed by their arrival times, for rows of a certain length.
+    frames: dict[str, PlacedFrames] = field(default_factory=dict)
 
     def faults(self, pulses_per_point: int) -> list[TakeFault]:
         """List the faults of this take; empty if it is complete."""

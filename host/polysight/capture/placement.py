@@ -60,13 +60,16 @@ class PacketCounts:
     duplicates: int = 0
     # Other bytes than a packet with equal counters: masked where they overlap
     conflicting: int = 0
-    leftover: int = 0  # of an earlier record
+    # Packets of an earlier record.
+    leftover: int = 0
     # After the card restarted within the row and reset its counters
     restarted: int = 0
-    outside: int = 0  # behind the record's last expected byte, or not kept for lack of memory
+    # Packets behind the record's last expected byte, or not kept for lack of memory.
+    outside: int = 0
     # Byte count and sequence contradict each other
     disagreeing: int = 0
-    malformed: int = 0  # no payload, or longer than the card's packets
+    # Packets without payload, or longer than the card's.
+    malformed: int = 0
     # Placed, after a packet that follows it
     late: int = 0
     # Largest delay of these, bytes
@@ -112,7 +115,8 @@ class Placed:
     arrivals: Counts
     # Missing ranges below the furthest byte, in the card's order
     holes: list[Gap] = field(default_factory=list)
-    slipped: bool = False  # not located only because whole frames are missing: triggers were missed
+    # The row is not located only because whole frames are missing: triggers were missed.
+    slipped: bool = False
 
     @property
     def complete(self) -> bool:
@@ -234,17 +238,20 @@ class _Record:
     of_row: Flags
     # Counts on from this record behind the row's last byte
     beyond: Flags
-    later: Flags  # of a record behind this one
+    # Packets of a record behind this one.
+    later: Flags
     # Came before the row's first pulse
     early: Flags
-    too_early: Flags  # of these, the ones with counters of the row
+    # The early packets with counters of the row.
+    too_early: Flags
     # Has counters of a card that restarted within the row
     after_restart: Flags
     # Payload of a full packet, bytes
     full: int
     # Bytes up to the end of the furthest packet
     length: int = 0
-    ended: bool = False  # that packet is short, as only a record's last one is
+    # The furthest packet is short, as only a record's last one is.
+    ended: bool = False
     # Every sign of an end at the row's last byte
     ends_as_planned: bool = False
     # Why the start is not certain

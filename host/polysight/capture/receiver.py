@@ -210,7 +210,8 @@ class RowCapture(_Message, frozen=True):
     restarted: int = 0
     before_pulses: int = 0
     packets_crc32: int = 0
-    start_lost: bool = False  # it is unknown where the card's next record begins: reset the card
+    # It is unknown where the card's next record begins: the card must be reset.
+    start_lost: bool = False
 
     @property
     def missing_bytes(self) -> int:

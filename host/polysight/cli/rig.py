@@ -460,7 +460,8 @@ def _reproduce(args: argparse.Namespace) -> int:
         # Refuse a wrong one now, not with the first item that needs it
         load_instrument(args.config)
     require_package("polysight_papers", "papers")
-    sys.stderr.write("polysight reproduce: starting\n")  # its figures' libraries take seconds to load
+    # The libraries for its figures take seconds to load.
+    sys.stderr.write("polysight reproduce: starting\n")
     sys.stderr.flush()
     if args.authors is not None:
         from polysight_papers.sensys2026.dataset_items import reproduce_authors

@@ -361,7 +361,8 @@ def capture_frames(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str
     frames = bursts * rig.burst.pulses
     with (
         tempfile.TemporaryDirectory(prefix="polysight-doctor-") as folder,
-        CaptureRig(rig) as cards,  # first: fails if a scan uses the ports, before a radar is configured
+        # The cards come first: they fail if a scan uses their ports, before a radar is configured.
+        CaptureRig(rig) as cards,
         radar_control(rig) as radars,
     ):
         for board in rig.recorded:

@@ -60,18 +60,22 @@ from polysight_shared.sockets import HOST_KEYS, is_loopback
 
 # Disk speed relative to the data rate
 _SPEED_MARGIN = 2.0
-_MAX_CLOCK_OFFSET_S = 1.0  # between host and Pi
+# Largest difference between the clocks of host and Pi.
+_MAX_CLOCK_OFFSET_S = 1.0
 _CLOCK_LOST_S = 60.0
 _SET_CLOCK = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"
 
-_CARD_HOPS = ("host", "route", "link", "card")  # of the network survey
+# Hops of the network survey that concern a card.
+_CARD_HOPS = ("host", "route", "link", "card")
 _MIN_MTU = 1500
 _MIN_SPEED_MBIT = 1000
 _MIN_RING = 512
-_MAX_CLIPPED = 0.01  # of the chirps
+# Share of chirps that may be clipped.
+_MAX_CLIPPED = 0.01
 # Counts
 _MIN_RMS = 4.0
-_MIN_DETECTED = 0.9  # of the chirps, for the direct path
+# Share of chirps in which the direct path must be found.
+_MIN_DETECTED = 0.9
 # 5 ns trigger clock and some ppm of the crystals
 _MAX_DELAY_S = 10e-9
 _SKEW_WARNING_S = 10e-9
@@ -221,7 +225,8 @@ def check_time(context: CheckContext) -> Finding:
 
 
 SIMULATED = "simulated wires: no hardware is driven"
-_POINTS = 8  # of the row for the trigger line
+# Points of the row that checks the trigger line.
+_POINTS = 8
 _ROW_TIMEOUT_S = 120.0
 _POLL_MS = 100
 
@@ -555,7 +560,8 @@ def check_level(context: CheckContext, board: Board) -> Finding:
         return not_checked("no complete frame was captured")
     words = captured.words[captured.valid]
     clipped = int(((words >= FULL_SCALE) | (words <= -FULL_SCALE)).any(axis=(1, 2, 3)).sum())
-    rms = np.sqrt(np.mean(words.astype(np.float64) ** 2, axis=(0, 1, 2)) * 2)  # of I and Q together, for each RX
+    # I and Q count together, for each RX.
+    rms = np.sqrt(np.mean(words.astype(np.float64) ** 2, axis=(0, 1, 2)) * 2)
     peak = int(np.abs(words.astype(np.int32)).max())
     observed = f"rms {rms.min():.0f}..{rms.max():.0f} counts over the RX, peak {peak} of {FULL_SCALE}"
     facts = {"clipped_chirps": clipped, "chirps": len(words), "rms": [round(float(r), 1) for r in rms], "peak": peak}
@@ -628,7 +634,8 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
             _better_start(rig, board, median),
             **facts,
         )
-    delay_s = -signal.start_delay_s(rig)[0]  # without the crystals' share
+    # The crystals' share of the delay is not known here, and left out.
+    delay_s = -signal.start_delay_s(rig)[0]
     if abs(delay_s) > _MAX_DELAY_S:
         start = board.start_offset_hz + delay_s * rig.chirp.slope_hz_per_s
         return warning(

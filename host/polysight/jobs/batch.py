@@ -129,7 +129,8 @@ def make_jobs(scans: Sequence[tuple[Path, Settings]], out: Path) -> list[Job]:
                 code=ErrorCode.NAME_TAKEN,
             )
         settings = settings.absolute()
-        if (data / MANIFEST).exists():  # it brings its own rig file
+        # A scan folder brings its own rig file.
+        if (data / MANIFEST).exists():
             settings = msgspec.structs.replace(settings, config=None)
         jobs[data.name] = Job(str(data), str(out.absolute() / data.name), settings, made_with(data, settings))
     return list(jobs.values())
@@ -225,7 +226,8 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
         os.close(alive)
         os.close(promise)
     seconds = time.monotonic() - began
-    if child.returncode == 0 or is_finished(job):  # it may be killed after the mark
+    # The child may have been killed after it wrote the mark.
+    if child.returncode == 0 or is_finished(job):
         return _done(job, seconds)
     if stop is not None and stop.is_set():
         return Outcome(job.name, "stopped", seconds)
@@ -235,7 +237,8 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
 def _follow(child: subprocess.Popen[bytes], job: Job, stop: Event | None) -> None:
     """Send a program its job and wait for its end; terminate it when `stop` is set."""
     if child.stdin is not None:
-        with suppress(BrokenPipeError):  # it ended before it read; its log says why
+        # The child may end before it reads; its log says why.
+        with suppress(BrokenPipeError):
             child.stdin.write(msgspec.msgpack.encode(job))
             child.stdin.close()
     while child.poll() is None:
@@ -308,7 +311,8 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
         for future in as_completed(list(named)):
             if future.status == "finished":
                 yield future.result()
-            elif is_finished(jobs_by_name[named[future]]):  # its worker was lost behind the mark
+            # The worker was lost after it wrote the mark.
+            elif is_finished(jobs_by_name[named[future]]):
                 yield _done(jobs_by_name[named[future]])
             else:
                 yield Outcome(named[future], "failed", message=f"its workers were lost: {future.exception()}")
@@ -358,7 +362,8 @@ def process_many(
     sys.stderr.write(f"{len(jobs)} scans: {len(skipped)} finished before, {len(todo)} to process, {workers_text}\n")
     out.mkdir(parents=True, exist_ok=True)
     for job in todo:
-        (job.out / FINISHED).unlink(missing_ok=True)  # from now on a mark is one of this run
+        # From now on a mark is one of this run.
+        (job.out / FINISHED).unlink(missing_ok=True)
     if not todo:
         results = iter(())
     elif dask:
@@ -405,7 +410,8 @@ def _positions(data: Path) -> int:
             s = read_json(data / COLLECTION)
             return int(s["total_x"]) * int(s["total_y"])
         return ScanFolder.load(data).plan.positions
-    except (PolysightError, OSError, ValueError, KeyError, TypeError):  # its own program will say what is wrong
+    # The program that processes the scan will say what is wrong.
+    except (PolysightError, OSError, ValueError, KeyError, TypeError):
         return 350 * 200
 
 

@@ -33,7 +33,8 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.tables import to_builtins
 
-LEAST_PIXELS = 100  # of a plate that serves as reference
+# Least size of a plate that serves as reference.
+LEAST_PIXELS = 100
 LEAST_LEAKAGE_STD = 1e-3
 # Real mounts leak up to 0.1; a plate in the place of strips gives 1.
 MAX_LEAKAGE = 0.5

@@ -49,7 +49,8 @@ METAL = "metal"
 REFERENCE = "the metal reference"
 FEW = 16
 """Largest number of pixels of a box that a library uses; with fewer it would learn speckle."""
-_LARGEST_MARGIN = 0.3  # of a patch's side
+# Largest margin, as a share of a patch's side.
+_LARGEST_MARGIN = 0.3
 Ask = Callable[[str], str]
 
 
@@ -244,7 +245,8 @@ def apply_edits(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tu
         boxes = {str(f.number): f.box for f in found}
         specimens = {}
         metal = None
-    names = {name: name for name in boxes}  # as it was to as it is
+    # Former name of each box to its new one.
+    names = {name: name for name in boxes}
     for name in (_find_box(n, boxes) for n in edits.removed):
         del boxes[name], names[name]
         specimens.pop(name, None)

@@ -58,7 +58,8 @@ from polysight_shared.findings import Finding
 
 # Relative: far above rounding, far below any other chirp
 _SAME_FREQUENCY = 1e-6
-_REASONS = 3  # of a verdict, for the terminal
+# Reasons of a verdict that the terminal shows.
+_REASONS = 3
 
 
 def print_verdict(products: ProcessedScan, to_terminal: bool = True) -> int:

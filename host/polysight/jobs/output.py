@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from polysight.process import Progress
 
 T = TypeVar("T")
-_LINE_S = 5.0  # at least, from one line to the next
+# Least time from one line of progress to the next.
+_LINE_S = 5.0
 
 
 def exit_status(worked: bool) -> int:

@@ -118,11 +118,13 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
     """
     if (out / REPORT).exists():
         return
-    images = pipeline.form_images(from_sums=True)  # within 1e-6 of those that `make_products` puts in their place
+    # These images differ by less than 1e-6 from those that `make_products` puts in their place.
+    images = pipeline.form_images(from_sums=True)
     with making_products(out, pipeline.source.scan_id) as new:
         scan = imaged_scan(out, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
         save_images(new, scan)
-    with suppress(OSError):  # that nobody reads it is no reason not to make the rest
+    # A terminal that is closed is no reason to leave out the rest.
+    with suppress(OSError):
         sys.stderr.write(f"image: {out / IMAGE}\n")
 
 

@@ -34,7 +34,8 @@ from polysight_shared.errors import DataError, PolysightError, os_error
 
 # Missing ranges that are printed
 _SHOWN = 8
-BOTTOM_DB = -20.0  # of the plot of a range profile
+# Lowest level in the plot of a range profile.
+BOTTOM_DB = -20.0
 
 
 def main_text(report: Report) -> str:

@@ -266,9 +266,7 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
         pictures=_pictures(history, pictures),
         profile=pictures.profile,
         sync=sync,
-        snr_db={
-            name: {row: round(sync.snr_db, 1) for row, sync in rows.items()} for name, rows in pictures.sync.items()
-        },
+        snr_db=snr_db,
         lost=history.lost_shares,
         verdict=verdict,
     )

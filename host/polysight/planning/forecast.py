@@ -52,7 +52,8 @@ machine. Not measured on hardware; `polysight plan --like SCAN` measures it in a
 """
 Real = NDArray[np.float64]
 
-MAX_STEPS_PER_S = 20_000  # of the stage's firmware (docs/spec/stage-line.md, timing)
+# Limit of the stage's firmware (docs/spec/stage-line.md, timing).
+MAX_STEPS_PER_S = 20_000
 SIMULATED_DIRECT_SNR_DB = 5.5
 _PUBLISHED_SPEED_MM_S = 20.0
 # Standard deviation of the phase of the object's peak, paper section 9.1
@@ -61,7 +62,8 @@ _MAX_BURST_LOSS_DB = 0.5
 # A full packet on Ethernet: headers, preamble, checksum, gap
 _WIRE_BYTES = 1470 + 42 + 24
 _ETHERNET_BYTES_PER_US = 125.0
-_FAST_TIME_WINDOW = "hann"  # as in host.imaging.ImageBuilder
+# The window that polysight.imaging.ImageBuilder uses.
+_FAST_TIME_WINDOW = "hann"
 
 
 @dataclass(frozen=True)

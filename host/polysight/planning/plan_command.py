@@ -51,10 +51,13 @@ from polysight_shared.tables import decode, to_builtins
 
 # Keys of [stage] that the Pi takes from its own rig file: acceleration, and the limit of the speed.
 _PI_KEYS = ("speed_mm_s", "accel_mm_s2")
-_STEP_MULTIPLES = (1, 2, 3, 4, 5)  # of the rig file's steps
-_MAX_DUTY = 0.95  # of a burst in the time between two points
+# Steps that are compared, as multiples of the rig file's.
+_STEP_MULTIPLES = (1, 2, 3, 4, 5)
+# Largest share of the time between two points that a burst may take.
+_MAX_DUTY = 0.95
 _MAX_TRAVEL_WAVELENGTHS = 0.5
-_MAX_FRAMES = 65535  # of a row (host/polysight/radar/commands.py)
+# Largest number of frames in a row, as in host/polysight/radar/commands.py.
+_MAX_FRAMES = 65535
 
 _WIDTH = 118
 # Rows from which the noise is measured

@@ -83,7 +83,8 @@ class PlatesNamed(NamedTuple):
 Labels = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
 PixelNames = Mapping[int, tuple[npt.NDArray[np.str_], Mask]]
-_PRODUCTS = "products"  # in a scan folder
+# Folder of the products in a scan folder.
+_PRODUCTS = "products"
 
 
 def write_image(path: Path, images: Images) -> None:

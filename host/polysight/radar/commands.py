@@ -371,7 +371,8 @@ def program(rig: Instrument, board: Board) -> Program:
                 ramp_end_us=chirp.ramp_end_us,
                 samples=chirp.samples,
                 sample_rate_hz=chirp.sample_rate_hz,
-                hpf1_khz=chirp.hpf1_khz or HPF_FIRST_KHZ[0],  # 0: a simulated rig without filters
+                # The chirp has 0 in a simulated rig without filters.
+                hpf1_khz=chirp.hpf1_khz or HPF_FIRST_KHZ[0],
                 hpf2_khz=chirp.hpf2_khz or HPF_SECOND_KHZ[0],
                 rx_gain_db=rig.radar.rx_gain_db,
                 rf_gain_target_db=rig.radar.rf_gain_target_db,
@@ -401,8 +402,10 @@ INTER_FRAME_US = 300.0
 AFTER_FRAME_US = 150.0
 FRAME_PERIOD_US = (MIN_PERIOD_US, 1.342e6)
 SAMPLE_MEMORY_BYTES = 16384
-TRIGGER_UNCERTAINTY_S = 5e-9  # of one board against the pulse (ICD 92)
-PASSBAND = 0.9  # of the sample rate
+# Uncertainty of one board's start against the pulse (ICD 92).
+TRIGGER_UNCERTAINTY_S = 5e-9
+# Share of the sample rate that the receiver passes.
+PASSBAND = 0.9
 MAX_SLOPE_CODE = 5510
 _LARGEST = 1.7e308
 # Regular ADC mode, 20 MHz IF (ICD 85)

@@ -271,7 +271,8 @@ class NativeRadars(RadarControl):
             return words
         try:
             log = traced(words, self._clock, new_trace(Path(folder), name), self._rig, name)
-        except OSError:  # such as a full disk: continue without a trace
+        # A full disk, for instance: continue without a trace.
+        except OSError:
             return words
         self._traces.append(log)
         return log

@@ -26,10 +26,12 @@ TO_RAM = 0
 TO_FLASH = 4
 # TI's limit for each part; the first one is acknowledged after erasing the flash
 CHUNK_TIMEOUT_S = 10.0
-MAX_BYTES = 2**20  # of a flash area, more than any image of TI
+# Size of a flash area, more than any image of TI.
+MAX_BYTES = 2**20
 # Major ROM version of AWR2243
 GENERATION = 2
-FAMILIES = {  # by major ROM version
+# Device family by major ROM version.
+FAMILIES = {
     1: "AWR1243 or another of the first generation",
     GENERATION: "AWR2243",
     6: "xWR6243, 57..64 GHz",

@@ -37,12 +37,17 @@ from polysight_shared.findings import Finding
 
 RESPONSE_TIMEOUT_S = 1.0
 ATTEMPTS = 3
-SETTLE_S = 30e-6  # from the interrupt to the first word (ICD 20)
-DATA_DELAY_S = 1e-3  # from the falling interrupt to the first word read, as in TI's port
-_INTERVAL_S = 0.5e-3  # between two polls
+# Time from the interrupt to the first word (ICD 20).
+SETTLE_S = 30e-6
+# Time from the falling interrupt to the first word read, as in TI's port.
+DATA_DELAY_S = 1e-3
+# Time between two polls.
+_INTERVAL_S = 0.5e-3
 _INTERRUPT_TIMEOUT_S = 0.1
-_RESTART_EVENT_S = 0.1  # in which a power-up event arrives after a refusal
-MAX_MESSAGES = 64  # of one poll
+# Time in which a power-up event arrives after a refusal.
+_RESTART_EVENT_S = 0.1
+# Messages that one poll reads.
+MAX_MESSAGES = 64
 MAX_POLL_S = 0.25
 _MAX_WARNINGS = 100
 _SYNC_SEARCH_BYTES = 252

@@ -25,8 +25,10 @@ READY_TO_READ = bytes.fromhex("78566587") + b"\xff" * 12
 SYNC_BYTES = 4
 HEADER_BYTES = 12
 CRC_BYTES = 4
-MESSAGE_LIMIT = 256  # with the sync word
-BODY_LIMIT = 232  # of one sub-block; the chunk size that TI recommends over SPI (ICD 20)
+# Bytes of a message with its sync word.
+MESSAGE_LIMIT = 256
+# Bytes of one sub-block: the chunk size that TI recommends over SPI (ICD 20).
+BODY_LIMIT = 232
 BLOCKS_PER_MESSAGE_ID = 32
 ERROR_MESSAGE = 0
 ERROR_BLOCK = 0x0000
@@ -55,7 +57,8 @@ BOOT_STATUS = 0x5005
 RF_ERROR = 0x5008
 
 
-RESTARTED = frozenset({MAIN_POWER_UP})  # without a reset: the board has lost its settings
+# Events of a start without a reset: the board has lost its settings.
+RESTARTED = frozenset({MAIN_POWER_UP})
 
 
 class Direction(IntEnum):

@@ -4,10 +4,9 @@
 errors of synchronisation. The other names are for single figures of commands and papers.
 """
 
-from polysight.report.figures import draw_channel, draw_overview, focus_figure, label_figure
+from polysight.report.figures import draw_channel, draw_overview, focus_figure, label_figure, surface_figure
 from polysight.report.report import write_report
 from polysight.report.style import INK, MUTED, PALETTE, STAMP, extent_mm, figure_label, font_families, png
-from polysight.report.surface import surface_figure
 from polysight.report.sync_report import QUANTITIES, SyncReport, write_sync_report
 
 __all__ = [

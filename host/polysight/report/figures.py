@@ -1,8 +1,7 @@
 """Figures of a report and of single commands: amplitude and phase of H, V and P in millimetres, and permittivities.
 
 Amplitude has a perceptually uniform, colour-blind safe map (cividis), phase a cyclic one (twilight). `label_figure`
-shows the boxes of a label file, `focus_figure` a sweep over depth, `permittivity_figure` loss over real part:
-estimates, error ellipses and the truth.
+shows the boxes of a label file, `focus_figure` a sweep over depth, `surface_figure` surfaces from three sides.
 """
 
 from __future__ import annotations
@@ -18,15 +17,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.legend import Legend
-from matplotlib.lines import Line2D
-from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from msgspec import UNSET
 
 from polysight.materials import Box, axis_mm
 from polysight.products import ProcessedScan
+from polysight.report.permittivity_plot import permittivity_figure
 from polysight.report.style import (
     BAR_IN,
     HATCH,
@@ -50,30 +48,23 @@ from polysight.report.style import (
     patch_label,
     plate_label,
     png,
-    set_margins,
-    short_label,
     shorten_labels,
-    style_legend,
     write_label,
 )
-from polysight.results import BoardQuality, PatchFigures, PermittivityFigures
+from polysight.results import BoardQuality
+from polysight.surfaces import Segment, Surface, describe_form, describe_material
 from polysight_shared.raster import RasterPlan
 
-SHARES = {0.68: 2.279, 0.95: 5.991}
-"""Share of draws to the squared radius that holds it: quantiles of chi-squared with two degrees of freedom."""
-_STYLES: dict[float, dict[str, Any]] = {
-    0.68: {"linestyle": "-", "linewidth": 1.2},
-    0.95: {"linestyle": "--", "linewidth": 0.8},
-}
-# Size of a patch's number and of its point in `permittivity_figure`, in points of 1/72 inch, measured on its PNG.
-_LABEL_PT = (9.0, 9.0)
-_POINT_PT = 5.0
-# Places that `place_numbers` tries: rings around the point, and directions on each.
-_RADII_PT = (11, 17, 25, 34, 45, 58)
-_ANGLES = 16
-Array = npt.NDArray[np.float64]
-Point = tuple[float, float]
-Estimate = tuple[PatchFigures, PermittivityFigures]
+# Axis numbers of a view (horizontal, vertical), its title, and the names of the axes.
+VIEWS = (
+    ((0, 1), "From the rig", ("x (mm)", "y (mm)")),
+    ((2, 1), "From the side", ("z (mm), away from the rig", "y (mm)")),
+    ((0, 2), "From above", ("x (mm)", "z (mm), away from the rig")),
+)
+NORMALS_SHOWN = 60
+NORMAL_MM = 12.0
+MAX_LINES = 8
+NO_PERMITTIVITY = "#9aa3ad"
 
 FIGURES: dict[str, str] = {
     "amplitude_h": "Amplitude H (s-polarised)",
@@ -100,183 +91,6 @@ _LABEL_HEIGHT = 0.05
 _BETWEEN = 0.26
 # Positions with data are light, masked ones dark, so that the map is readable without colour.
 _POSITION_COLOURS = ("#dfe5ec", "#882255")
-
-
-def fit_ellipse(matrix: Array, share: float) -> tuple[float, float, float]:
-    """Return width, height and angle in degrees of the ellipse that holds a share of draws with a covariance [2, 2]."""
-    values, vectors = np.linalg.eigh(matrix)
-    width, height = 2 * np.sqrt(np.maximum(values, 0.0) * SHARES[share])
-    return float(width), float(height), math.degrees(math.atan2(vectors[1, 0], vectors[0, 0]))
-
-
-def place_numbers(points: Array, obstacles: Array) -> Array:
-    """Place a label beside each point so that labels cover neither one another nor a point.
-
-    Parameters
-    ----------
-    points
-        [n, 2], in points of 1/72 inch.
-    obstacles
-        [m, 2]: further points to keep clear of.
-
-    Returns
-    -------
-    [n, 2]: the labels' middles: for each the nearest free place, else the one that covers least.
-    """
-    taken: list[Array] = []
-    solid = np.concatenate([points, obstacles.reshape(-1, 2)])
-    turns = np.radians(45 + np.arange(_ANGLES) * 360 / _ANGLES)
-    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    candidates = np.concatenate([radius * ring for radius in _RADII_PT])
-    for point in points:
-        best = point + candidates[0]
-        least_cost = math.inf
-        for place in point + candidates:
-            labels = sum(bool((np.abs(place - other) < _LABEL_PT).all()) for other in taken)
-            covered = (np.abs(solid - place) < np.array(_LABEL_PT) / 2 + _POINT_PT / 2).all(axis=1).sum()
-            cost = 2.0 * labels + covered
-            if cost < least_cost:
-                best = place
-                least_cost = cost
-            if least_cost == 0:
-                break
-        taken.append(best)
-    return np.array(taken).reshape(-1, 2)
-
-
-def permittivity_figure(scan: ProcessedScan) -> bytes | None:
-    """Return a PNG of the estimates with ellipses of 68 % and 95 %, and the truth as crosses; None without estimates.
-
-    Patches are numbered; a legend names them. Without a covariance, bars show the spread of the pixels.
-    """
-    estimates = [(patch, patch.permittivity) for patch in scan.segments if patch.permittivity is not None]
-    if not estimates:
-        return None
-    colours = assign_colours(scan)
-    size_in = (7.8, max(4.4, 1.5 + 0.19 * len(estimates)))
-    fig = new_figure(*size_in, RIGHT_IN)
-    ax = fig.add_subplot()
-    truths = [t for patch, _ in estimates if (t := _truth(patch))]
-    title = "Permittivity"
-    if truths:
-        title += ", estimate and truth"
-    dress(ax, title, scan.stamped)
-    ax.set_aspect("auto")
-    ax.set_facecolor("white")
-    ax.grid(color="#e6e9ee", linewidth=0.8)
-    ax.set_axisbelow(True)
-    ax.set_xlabel("real part ε′", fontsize=9, color=MUTED)
-    ax.set_ylabel("loss ε″", fontsize=9, color=MUTED)
-    for patch, e in estimates:
-        _draw_estimate(ax, e, _truth(patch), patch_colour(patch, colours))
-    _set_limits(ax, [e for _, e in estimates], truths)
-    low = ax.get_ylim()[0]
-    ax.axhspan(low, 0, color="#f0e7e6", zorder=0)
-    ax.annotate(
-        "ε″ < 0: gain", (0, 0), xycoords="axes fraction", xytext=(4, 3), textcoords="offset points", fontsize=7,
-        color=MUTED, zorder=1,
-    )  # fmt: skip
-    legend = _legend(fig, estimates, colours, bool(truths))
-    set_margins(fig, legend.get_window_extent().width / fig.dpi + RIGHT_IN)
-    _write_numbers(fig, ax, estimates, truths)
-    return png(fig)
-
-
-def _truth(patch: PatchFigures) -> Point | None:
-    truth = patch.true_permittivity
-    if truth is None:
-        return None
-    return truth.real, -truth.imag
-
-
-def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour: str) -> None:
-    centre = (e.real, e.loss)
-    if e.spread is not None:
-        for share, style in _STYLES.items():
-            w, h, angle = fit_ellipse(e.spread.matrix, share)
-            ax.add_patch(Ellipse(centre, w, h, angle=angle, facecolor="none", edgecolor=colour, zorder=2.5, **style))
-            if share == min(_STYLES):
-                ax.add_patch(Ellipse(centre, w, h, angle=angle, facecolor=colour, alpha=0.18, linewidth=0, zorder=2))
-    elif e.real_p30_p70 and e.imag_p30_p70:
-        r0, r1 = e.real_p30_p70
-        i0, i1 = e.imag_p30_p70
-        ax.errorbar(
-            *centre, color=colour, linewidth=1.2, zorder=3,
-            xerr=[[max(e.real - r0, 0)], [max(r1 - e.real, 0)]],
-            yerr=[[max(e.loss + i1, 0)], [max(-i0 - e.loss, 0)]],
-        )  # fmt: skip
-    ax.plot(*centre, "o", color=colour, markersize=6, markeredgecolor=INK, markeredgewidth=0.6, zorder=3)
-    if truth:
-        ax.plot([centre[0], truth[0]], [centre[1], truth[1]], color=MUTED, linewidth=0.8, zorder=2)
-        ax.plot(*truth, "x", color=INK, markersize=6, markeredgewidth=1.5, zorder=4)
-
-
-def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequence[Point]) -> None:
-    """Set limits around estimates, truths and ellipses; one very uncertain patch must not shrink all others."""
-    centres = np.array([(e.real, e.loss) for e in estimates])
-    certain = np.concatenate([centres, np.array(truths, float).reshape(-1, 2)])
-    half = np.array([_half_size(e) for e in estimates])
-    low = certain.min(axis=0)
-    high = certain.max(axis=0)
-    span = np.maximum(high - low, (0.5, 0.3))
-    low = np.minimum(low, np.maximum((centres - half).min(axis=0), low - 0.75 * span)) - 0.08 * span
-    high = np.maximum(high, np.minimum((centres + half).max(axis=0), high + 0.75 * span)) + 0.08 * span
-    ax.set_xlim(low[0], high[0])
-    ax.set_ylim(min(low[1], -0.1), high[1])
-
-
-def _half_size(e: PermittivityFigures) -> Point:
-    """Return how far the drawing of an estimate reaches: its 95 % ellipse, or its bars."""
-    if e.spread is not None:
-        radius = math.sqrt(SHARES[0.95])
-        return radius * e.spread.real_std, radius * e.spread.loss_std
-    real = max(abs(end - e.real) for end in e.real_p30_p70 or (e.real,))
-    return real, max(abs(end - e.imag) for end in e.imag_p30_p70 or (e.imag,))
-
-
-def _legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str], with_truth: bool) -> Legend:
-    dot: dict[str, Any] = {
-        "marker": "o",
-        "linestyle": "",
-        "markersize": 6,
-        "markeredgecolor": INK,
-        "markeredgewidth": 0.6,
-    }
-    handles = []
-    for patch, _ in estimates:
-        label = f"{patch.label}  {short_label(patch_label(patch))}"
-        handles.append(Line2D([], [], color=patch_colour(patch, colours), label=label, **dot))
-    if any(e.spread for _, e in estimates):
-        handles += [
-            Line2D([], [], color=MUTED, **style, label=f"{100 * share:.0f} % region")
-            for share, style in _STYLES.items()
-        ]
-    if with_truth:
-        handles.append(Line2D([], [], color=INK, marker="x", linestyle="", markeredgewidth=1.5, label="truth"))
-    legend = fig.legend(handles=handles, loc="upper right", fontsize=7.5, frameon=False)
-    style_legend(legend)
-    return legend
-
-
-def _write_numbers(fig: Figure, ax: Axes, estimates: Sequence[Estimate], truths: Sequence[Point]) -> None:
-    """Write the patches' numbers beside their points, with a line to numbers that are further away."""
-    per_point = fig.dpi / 72
-    values = np.array([(e.real, e.loss) for _, e in estimates])
-    points = ax.transData.transform(values) / per_point
-    crosses = ax.transData.transform(np.array(truths, float).reshape(-1, 2)) / per_point
-    places = place_numbers(points, crosses)
-    line = {"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkA": 3, "shrinkB": 3}
-    for (patch, e), place, point in zip(estimates, places, points, strict=True):
-        offset = place - point
-        arrow = None
-        if np.hypot(*offset) > _RADII_PT[0] + 1:
-            arrow = line
-        ax.annotate(
-            str(patch.label), (e.real, e.loss), textcoords="offset points",
-            xytext=(float(offset[0]), float(offset[1])), ha="center", va="center", fontsize=8, color=INK, zorder=5,
-            fontweight="bold", path_effects=[withStroke(linewidth=2, foreground="white")],
-            arrowprops=arrow,
-        )  # fmt: skip
 
 
 def _mask_invalid(scan: ProcessedScan, values: npt.NDArray) -> npt.NDArray:
@@ -770,3 +584,59 @@ def focus_figure(
     if simulated:
         fig.suptitle("SIMULATED", fontsize=9, color=STAMP, fontweight="bold", x=0.99, ha="right")
     return png(fig)
+
+
+def surface_figure(surface: Surface) -> bytes:
+    """Return a PNG of a surface from three sides."""
+    fig = Figure(figsize=(11.5, 4.9), dpi=150, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    panels = fig.subplots(1, 3)
+    points_mm = 1e3 * surface.points_m
+    colour = surface_colours(surface)
+    known_colour = np.isfinite(colour)
+    low, high = colour_range(surface)
+    coloured = None
+    for ax, ((across, up), title, (label_x, label_y)) in zip(panels, VIEWS, strict=True):
+        ax.scatter(points_mm[~known_colour, across], points_mm[~known_colour, up], s=5, color=NO_PERMITTIVITY)
+        coloured = ax.scatter(
+            points_mm[known_colour, across], points_mm[known_colour, up], s=6, c=colour[known_colour],
+            cmap="viridis", vmin=low, vmax=high,
+        )  # fmt: skip
+        stride = max(1, len(points_mm) // NORMALS_SHOWN)
+        start = points_mm[::stride]
+        needle = NORMAL_MM * surface.normals[::stride]
+        ends = start + needle
+        ax.plot([start[:, across], ends[:, across]], [start[:, up], ends[:, up]], color=INK, linewidth=0.5, alpha=0.6)
+        dress(ax, title, surface.simulated)
+        ax.set_xlabel(label_x, fontsize=9, color=MUTED)
+        ax.set_ylabel(label_y, fontsize=9, color=MUTED)
+        ax.set_aspect("equal", adjustable="datalim")
+    if known_colour.any() and coloured is not None:
+        bar = fig.colorbar(coloured, ax=panels, shrink=0.85, pad=0.01)
+        bar.set_label("permittivity, real part", fontsize=9, color=MUTED)
+    lines = [segment_text(segment) for segment in surface.segments[:MAX_LINES]]
+    fig.supxlabel("\n".join(lines), fontsize=9, color=INK, x=0.01, ha="left")
+    return png(fig)
+
+
+def surface_colours(surface: Surface) -> npt.NDArray[np.float64]:
+    """Real part of the permittivity of each point's segment, [n]; not a number without one."""
+    colours = np.full(len(surface.segment), np.nan)
+    for segment in surface.segments:
+        if segment.permittivity is not None:
+            colours[surface.segment == segment.number] = segment.permittivity.real
+    return colours
+
+
+def colour_range(surface: Surface) -> tuple[float, float]:
+    """Range of the colour bar: the permittivities, at least 1 wide."""
+    values = [s.permittivity.real for s in surface.segments if s.permittivity is not None] or [1.0]
+    middle = (min(values) + max(values)) / 2
+    half = max(0.5, 0.55 * (max(values) - min(values)))
+    return middle - half, middle + half
+
+
+def segment_text(segment: Segment) -> str:
+    """One line about a segment: form, permittivity with standard errors, or why it has none."""
+    head = f"{segment.number}: {segment.points} points, {describe_form(segment)}"
+    return f"{head}, incidence {segment.incidence_deg:.0f}°: {describe_material(segment)}"

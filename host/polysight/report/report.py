@@ -20,9 +20,8 @@ from markupsafe import Markup, escape
 
 from polysight.materials import UNKNOWN
 from polysight.products import REPORT, ProcessedScan
-from polysight.report.figures import FIGURES, figures, masked_positions
+from polysight.report.figures import FIGURES, figures, masked_positions, surface_figure
 from polysight.report.style import assign_colours, patch_colour, patch_label, plate_label
-from polysight.report.surface import surface_figure
 from polysight.results import (
     ErrorBudget,
     Figure,
@@ -55,6 +54,16 @@ _IMAGING_ROWS: tuple[tuple[str, str], ...] = (
     ("point_sidelobe_db", "Strongest sidelobe, x, y (dB)"),
 )
 Table = dict[str, Any]
+# Texts of the pictures for who does not see them, by file name.
+ALTERNATIVE_TEXTS = {
+    **FIGURES,
+    "materials": "Material map",
+    "truth": "True plates",
+    "permittivity": "Permittivity plot",
+    "permittivity_map": "Map of the permittivity and its error",
+    "coverage": "Masked positions",
+    "surface": "Surfaces from three sides",
+}
 # Figures of a board that have a table or a map of their own, or that only programs read.
 _NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
 UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
@@ -84,15 +93,6 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
     colours = assign_colours(scan)
     rows = [_row(patch, colours) for patch in scan.segments]
     names_found = {row["truth"] for row in rows}
-    alt = {
-        **FIGURES,
-        "materials": "Material map",
-        "truth": "True plates",
-        "permittivity": "Permittivity plot",
-        "permittivity_map": "Map of the permittivity and its error",
-        "coverage": "Masked positions",
-        "surface": "Surfaces from three sides",
-    }
     centre = [f"{(float(a[0]) + float(a[-1])) * 500:.1f}" for a in (scan.x_m, scan.y_m)]
     metal_how = ""
     library = ""
@@ -116,8 +116,8 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         notes=_notes(scan),
         metal_how=metal_how,
         library=library,
-        images={key: base64.b64encode(pictures.get(key, b"")).decode("ascii") for key in alt},
-        alt=alt,
+        images={key: base64.b64encode(pictures.get(key, b"")).decode("ascii") for key in ALTERNATIVE_TEXTS},
+        alt=ALTERNATIVE_TEXTS,
         lead=_lead(scan),
         keys=key_numbers(scan, rows),
         centre=centre,

@@ -30,7 +30,7 @@ from polysight.store.manifest import (
     lock_file,
 )
 from polysight.store.open import is_source, open_source
-from polysight.store.published import COLLECTION, build_rig, mirror_rig, read_settings
+from polysight.store.published_rig import COLLECTION, build_rig, mirror_rig, read_settings
 from polysight.store.raw import (
     Digests,
     PlacedAgain,

@@ -116,7 +116,8 @@ class BoardRow(Reception, frozen=True, kw_only=True, omit_defaults=True):
     crc32: str
     index_crc32: str = ""
     packets_crc32: str = ""
-    frames_untimed: int | None = None  # whose pulse follows from their count alone, not from arrival times
+    # Frames whose pulse follows from their count alone, not from arrival times.
+    frames_untimed: int | None = None
 
 
 class RowCommitted(Fact, frozen=True, kw_only=True, tag="row_committed"):
@@ -361,7 +362,8 @@ class Manifest:
     torn: bool = False
     count: int = 0
     digest: str = ""
-    _due: int = 0  # one more than the last count that was read
+    # One more than the last count that was read.
+    _due: int = 0
     _lines: int = 0
 
     def feed(self, raw: bytes) -> list[Fact]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from polysight.store.manifest import MANIFEST
-from polysight.store.published import COLLECTION, SYNCED, PublishedCubes, PublishedScan
+from polysight.store.published import SYNCED, PublishedCubes, PublishedScan
+from polysight.store.published_rig import COLLECTION
 from polysight.store.raw import require_raw
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.source import Source

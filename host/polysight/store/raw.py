@@ -44,7 +44,8 @@ Digests = dict[str, dict[int, str]]
 class Droppable:
     """Raw files that may be deleted."""
 
-    files: dict[int, dict[str, Path]]  # by row and board
+    # Files by row and board.
+    files: dict[int, dict[str, Path]]
     bytes: int
     # Files that must be kept, with the reason
     kept: list[str] = field(default_factory=list)

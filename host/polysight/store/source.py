@@ -40,7 +40,8 @@ def split_pieces(payload: NDArray[np.uint8]) -> Pieces:
 class RowData:
     """One board's recording of one row. It is read when needed: in pieces, which stay in the cache, or as a whole."""
 
-    pieces: Pieces  # of the payload as sent by the card, [frames_expected * bytes of a chirp]; zero where missing
+    # Payload as sent by the card, [frames_expected * bytes of a chirp]; zero where missing.
+    pieces: Pieces
     # Byte ranges (start, stop) that never arrived: sorted, not touching, half open
     missing: list[tuple[int, int]]
     # Chirps in `payload`: points of the row x chirps of a position; most frames are one chirp

@@ -335,7 +335,10 @@ def _confused(panels: Sequence[Panel], shown: int = 5) -> str:
             i, j = np.unravel_index(cell, confusions.shape)
             if confusions[i, j] > 0:
                 lines.append(f"   {scored.names[i]} named {scored.names[j]}: {100 * confusions[i, j]:.0f} %")
-        lines += [""] if confusions.any() else ["   none", ""]
+        if confusions.any():
+            lines += [""]
+        else:
+            lines += ["   none", ""]
     return "\n".join(lines)
 
 

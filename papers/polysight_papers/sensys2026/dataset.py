@@ -32,7 +32,7 @@ from polysight.materials import (
     read_material,
 )
 from polysight.polarimetry import correct_leakage
-from polysight.store import COLLECTION, open_npz, read_settings, rig_of
+from polysight.store import COLLECTION, build_rig, open_npz, read_settings
 from polysight_papers.sensys2026.item import Published, table2
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
@@ -174,7 +174,7 @@ def _angle(folder: Path, scan: LabelledScan, base: Instrument, notices: list[str
     for form in ("unsynced", "raw"):
         path = folder / form / scan.scan
         if (path / COLLECTION).exists():
-            rig, found = rig_of(read_settings(path), base, path)
+            rig, found = build_rig(read_settings(path), base, path)
             notices += found
             return incidence_deg(rig, rig.receivers[0])
     if (angle := angle_in_text([scan.description, scan.scan])) is not None:
@@ -254,10 +254,16 @@ def words(name: str) -> frozenset[str]:
             continue
         if word[0].isdigit():
             # "pet_05mm"
-            number = f"0.{word[1:]}" if re.fullmatch(r"0\d+", word) else word
+            if re.fullmatch(r"0\d+", word):
+                number = f"0.{word[1:]}"
+            else:
+                number = word
             out.append(f"{float(number):g}")
         else:
-            out += ["metal"] if word in METALS else str(_ALIASES.get(word, word)).split()
+            if word in METALS:
+                out += ["metal"]
+            else:
+                out += str(_ALIASES.get(word, word)).split()
     return frozenset(out)
 
 
@@ -269,7 +275,9 @@ def _share_of_common_words(theirs: frozenset[str], row: Published) -> float:
     else:
         optional = frozenset()
     union = (ours | theirs) - (optional - theirs)
-    return len(ours & theirs) / len(union) if union else 0.0
+    if not union:
+        return 0.0
+    return len(ours & theirs) / len(union)
 
 
 def row_of(name: str, thickness_mm: float | None = None) -> int | None:

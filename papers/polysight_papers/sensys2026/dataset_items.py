@@ -66,7 +66,9 @@ def task_samples(data: AuthorsData, source: str, task: str) -> Samples | None:
     numbers = range(group.materials[0].number, group.materials[-1].number + 1)
     first = data.at(source, numbers, group.angle_deg)
     if not two:
-        return _samples(first) if len(first.names) > 1 else None
+        if len(first.names) <= 1:
+            return None
+        return _samples(first)
     second = data.at(source, numbers, SECOND_ANGLE_DEG)
     if not first.entries or not second.entries:
         return None
@@ -210,7 +212,9 @@ def authors_fig18(judge: Judgements) -> Item:
         scores = [s for m in (PAPER, DISCRIMINANT) for s in judge.judged(source, task, m)]
         h_only = judge.judged(source, task, PAPER, "H")
         names = np.unique(samples.names)
-        material_count = 0 if several is None else np.unique(several.names).size
+        material_count = 0
+        if several is not None:
+            material_count = np.unique(several.names).size
         rows.append(
             (
                 f"{names.size} {task}",
@@ -230,7 +234,12 @@ def authors_fig18(judge: Judgements) -> Item:
             "judged_with_scans_left_out": material_count,
         }
         split = LEFT_OUT if several is not None else OPTIMISTIC
-        h, best = (h_only[0], scores[2]) if several is None else (h_only[1], scores[3])
+        if several is None:
+            h = h_only[0]
+            best = scores[2]
+        else:
+            h = h_only[1]
+            best = scores[3]
         if h is None or best is None:
             continue
         panels = [
@@ -567,7 +576,17 @@ def _estimates(data: AuthorsData, source: str, leakage: float) -> list[Estimate]
         ones = np.ones(p.size, np.complex128)
         theta = np.radians(angle)
         as_is, clean = (estimate_permittivity(x, ones, theta) for x in (p, without_leakage(p, leakage)))
-        source_estimates.append(Estimate(m, angle, scans, p.size, as_is, clean, authors_recipe(p, angle)))
+        source_estimates.append(
+            Estimate(
+                material=m,
+                angle_deg=angle,
+                scans=scans,
+                pixels=p.size,
+                as_is=as_is,
+                clean=clean,
+                recipe=authors_recipe(p, angle),
+            )
+        )
     return source_estimates
 
 

@@ -47,7 +47,10 @@ GRID = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}
 
 def plate(name: str, eps: complex | None, x_mm: float, y_mm: float) -> dict[str, Any]:
     """Return a square plate for the scene file; without permittivity it is metal."""
-    material = {"metal": True} if eps is None else {"permittivity": [eps.real, -eps.imag]}
+    if eps is None:
+        material = {"metal": True}
+    else:
+        material = {"permittivity": [eps.real, -eps.imag]}
     return {"name": name, "centre_mm": [x_mm, y_mm], "size_mm": [PLATE_MM, PLATE_MM], **material}
 
 
@@ -142,13 +145,13 @@ def _scan(
     plates += [plate(table2()[n - 1].name, table2()[n - 1].permittivity, *xy) for n, xy in zip(rows, at, strict=True)]
     with scanned(name, plates, config, seed=seed, **more) as (source, truth):
         imaged_scan = imaged(source, truth)
-    scan = ProcessedScan.computed(
+    scan = ProcessedScan.from_results(
         Path(),
         images=imaged_scan.result.calibrated,
         quality=ScanQuality(),
         facts=ScanFacts(scan_id=name, simulated=True),
         materials=ScanMaterials(segments=imaged_scan.result.rows()),
-        found=imaged_scan.result,
+        analysis=imaged_scan.result,
         plates=truth,
     )
     return ScanView(imaged_scan.result, scan)
@@ -209,7 +212,10 @@ def ratio_table(views: dict[str, ScanView]) -> Table:
             if patch.truth is None:
                 continue
             eps = patch.truth.permittivity
-            true = 1.0 + 0j if eps is None else complex(ratio_from_permittivity(eps, theta))
+            if eps is None:
+                true = 1.0 + 0j
+            else:
+                true = complex(ratio_from_permittivity(eps, theta))
             p = patch.permittivity.ratio
             ratios = [f"{20 * np.log10(abs(z)):.2f} dB, {np.degrees(np.angle(z)) + 0.0:.1f}°" for z in (p, true)]
             error = abs(1 / p - 1 / true)

@@ -86,7 +86,9 @@ def dress(ax: Axes, title: str, x: str, y: str) -> None:
 
 def percent(share: float | None) -> str:
     """Format a share as a percentage with two decimals; a dash for None."""
-    return "–" if share is None else f"{100 * share:.2f} %"
+    if share is None:
+        return "–"
+    return f"{100 * share:.2f} %"
 
 
 @dataclass(frozen=True)

@@ -251,7 +251,10 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
     The specimens' distribution is integrated on a grid; on ln|H|, ln|V| and arg P the errors are normal.
     """
     materials = groups()[group].materials
-    z = np.linspace(-3.5, 3.5, _GRID) if max(errors.spread) else np.zeros(1)
+    if max(errors.spread):
+        z = np.linspace(-3.5, 3.5, _GRID)
+    else:
+        z = np.zeros(1)
     weight = np.exp(-(z**2) / 2)
     nodes = np.stack(np.meshgrid(z, z, indexing="ij")).reshape(2, -1, 1)
     weights = np.outer(weight, weight).ravel() / weight.sum() ** 2

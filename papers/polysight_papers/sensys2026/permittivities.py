@@ -124,7 +124,10 @@ def fig16(run: Run) -> Item:
     levels: dict[str, dict[str, np.ndarray]] = {}
     for ax, (angle, quantity) in zip(axes, ((0.0, "|H|"), (55.0, "|P|"), (60.0, "|P|")), strict=True):
         measured = draw(materials, angle, errors, seed=16)
-        values = np.abs(measured.h) if quantity == "|H|" else np.abs(measured.h / measured.v)
+        if quantity == "|H|":
+            values = np.abs(measured.h)
+        else:
+            values = np.abs(measured.h / measured.v)
         level = 20 * np.log10(values)
         levels[f"{angle:.0f}"] = {m.name: level[:, j].ravel() for j, m in enumerate(materials)}
         for j in range(len(materials)):

@@ -162,7 +162,7 @@ def make_items(
         items.append(item)
         if on_item is not None:
             on_item(item)
-    page = write_page(out, items, pictures, failed, quick, origin, makers)
+    page = write_page(out=out, items=items, pictures=pictures, failed=failed, quick=quick, origin=origin, makers=makers)
     sys.stdout.write(f"{page}: {len(items)} items ({origin.word}) beside the published values\n")
     return 1 if failed else 0
 
@@ -179,7 +179,10 @@ def write_item(out: Path, item: Item, origin: Origin = SIMULATED) -> dict[str, b
     for name, data in pictures.items():
         write_atomically(out / "figures" / name, data)
     for i, table in enumerate(item.tables):
-        name = f"{item.key}.csv" if i == 0 else f"{item.key}-{i + 1}.csv"
+        if i == 0:
+            name = f"{item.key}.csv"
+        else:
+            name = f"{item.key}-{i + 1}.csv"
         write_atomically(out / name, _csv(table, origin).encode("utf-8"))
     head = {"item": item.key, "title": item.title, "simulated": origin.simulated}
     write_json(out / f"{item.key}.json", {**head, **item.data})

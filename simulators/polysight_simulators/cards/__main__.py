@@ -67,17 +67,20 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _check_arguments(args: argparse.Namespace, known: tuple[str, ...]) -> tuple[str, ...]:
+def _check_arguments(args: argparse.Namespace, board_names: tuple[str, ...]) -> tuple[str, ...]:
     if args.time_scale <= 0:
-        what = f"--time-scale {args.time_scale}"
-        raise ConfigError(what, "it must be positive", "give a number above 0", code=ErrorCode.VALUE_INVALID)
+        problem = f"--time-scale {args.time_scale}"
+        raise ConfigError(problem, "it must be positive", "give a number above 0", code=ErrorCode.VALUE_INVALID)
     if args.scene is None and not args.pattern:
-        why = "the cards need something to send"
-        raise ConfigError("neither --scene nor --pattern", why, "give one of them", code=ErrorCode.KEY_MISSING)
-    names = tuple(args.boards.split(",")) if args.boards else known
-    if unknown := sorted(set(names) - set(known)):
-        what = f"--boards {','.join(unknown)}: no such board"
-        raise ConfigError(what, f"the boards are {known}", "correct it", code=ErrorCode.KEY_UNKNOWN)
+        cause = "the cards need something to send"
+        raise ConfigError("neither --scene nor --pattern", cause, "give one of them", code=ErrorCode.KEY_MISSING)
+    if args.boards:
+        names = tuple(args.boards.split(","))
+    else:
+        names = board_names
+    if unknown := sorted(set(names) - set(board_names)):
+        problem = f"--boards {','.join(unknown)}: no such board"
+        raise ConfigError(problem, f"the boards are {board_names}", "correct it", code=ErrorCode.KEY_UNKNOWN)
     return names
 
 
@@ -94,13 +97,18 @@ def _source(args: argparse.Namespace, rig: Instrument, scene: Scene | None, name
 
 def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     rig = load_instrument(args.config)
-    known = tuple(b.name for b in rig.boards)
-    names = _check_arguments(args, known)
-    scene = None if args.scene is None else load_scene(args.scene)
+    board_names = tuple(b.name for b in rig.boards)
+    names = _check_arguments(args, board_names)
+    if args.scene is None:
+        scene = None
+    else:
+        scene = load_scene(args.scene)
     if scene is not None and args.offset_in_rig:
         scene = without_offset(scene)
-    base = {} if scene is None else {"loss": scene.disturbances.packet_loss}
-    faults = read_faults(args.faults, args.fault, known, base, rig.radar.control)
+    base = {}
+    if scene is not None:
+        base = {"loss": scene.disturbances.packet_loss}
+    faults = read_faults(args.faults, args.fault, board_names, base, rig.radar.control)
     if args.seed is not None:
         seed = args.seed
     elif scene is None:
@@ -115,10 +123,24 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     open_things.callback(lambda: _report(cards, args.report))
     for name in names:
         board = rig.by_name(name)
-        cards.append(SimulatedCard(rig, board, source, faults[name], seed, args.time_scale, time.monotonic, pace))
+        cards.append(
+            SimulatedCard(
+                rig=rig,
+                board=board,
+                source=source,
+                faults=faults[name],
+                seed=seed,
+                time_scale=args.time_scale,
+                clock_s=time.monotonic,
+                pace=pace,
+            )
+        )
     lines = tuple(sorted({card.line for card in cards} | {rig.pi.trigger_in}))
     wires = open_things.enter_context(closing(WireClient(args.wires, lines, motion=True)))
-    disturbed = Disturbances() if scene is None else scene.disturbances
+    if scene is None:
+        disturbed = Disturbances()
+    else:
+        disturbed = scene.disturbances
     track = StageTrack(rig, disturbed.burst_motion, disturbed.backlash_mm)
     control: list[LineServer] = []
     chips: list[RadarSocket] = []
@@ -131,7 +153,17 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
             name = card.board.name
             control.append(LineServer(rig.radar.servers[name], card.rearm, faults[name]))
             open_things.callback(control[-1].close)
-    server = CardServer(rig, cards, wires, args.time_scale, time.monotonic, track, power_cycle, control, chips)
+    server = CardServer(
+        rig=rig,
+        cards=cards,
+        wires=wires,
+        time_scale=args.time_scale,
+        clock_s=time.monotonic,
+        track=track,
+        power_cycle=power_cycle,
+        control=control,
+        chips=chips,
+    )
     open_things.callback(server.close)
     announce_ready(", ".join(f"{c.board.name} at {c.board.card_address}" for c in cards))
     server.serve(stop)

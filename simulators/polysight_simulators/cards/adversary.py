@@ -49,7 +49,8 @@ RADAR = (
 _FRAME_NS = 128_000
 NEAREST_EDGE_NS = 350_000
 """An edge nearer to a missed pulse makes that pulse's frame: the stage has moved by a hundredth of a millimetre."""
-_GAP_NS = 20_000  # between packets
+# Time between packets.
+_GAP_NS = 20_000
 
 
 @dataclass(frozen=True)
@@ -66,9 +67,11 @@ class Sent:
     """One record, and the packets that arrived while the host received it."""
 
     number: int
-    data: bytes  # that the row should contain
+    # Data that the row should contain.
+    data: bytes
     first_pulse_ns: int
-    arrivals: list[Arrival] = field(default_factory=list)  # in this order
+    # Packets in the order of their arrival.
+    arrivals: list[Arrival] = field(default_factory=list)
     # The card sent the complete record, with consecutive counters
     whole: bool = True
     troubles: tuple[str, ...] = ()
@@ -151,29 +154,42 @@ class Adversary:
         `edges_ns` are the times of its frames; without them, the packets follow each other.
         """
         chance = self._chance
-        self._number = self._number + 1
+        self._number += 1
         if not data:
             draw = np.random.default_rng(chance.getrandbits(32))
             data = draw.integers(1, 256, frames * self._frame, np.uint8).tobytes()
-        pulse_ns = self._now_ns + 1_000_000 if edges_ns is None else edges_ns[0] - 1_000_000
+        pulse_ns = self._now_ns + 1_000_000
+        if edges_ns is not None:
+            pulse_ns = edges_ns[0] - 1_000_000
         sent = Sent(self._number, data, pulse_ns, troubles=troubles)
-        packets, made = self._packets(sent, data)
+        packets, last_bytes = self._packets(sent, data)
         before = self.take_late(0.5)
         in_between = self.take_late(0.7)
         if "twin" in troubles or "twin_alone" in troubles:
             sent.whole = False
-            other = np.random.default_rng(chance.getrandbits(32)).integers(1, 256, len(data), np.uint8)
-            in_between += [Arrival(0, bytes(p), -1) for p in [*self._twin.feed(other), *self._twin.flush()]]
-        on_time = [] if "twin_alone" in troubles else self._network(packets, sent)
+            twin_data = np.random.default_rng(chance.getrandbits(32)).integers(1, 256, len(data), np.uint8)
+            in_between += [Arrival(0, bytes(p), -1) for p in [*self._twin.feed(twin_data), *self._twin.flush()]]
+        on_time = []
+        if "twin_alone" not in troubles:
+            on_time = self._network(packets, sent)
         arriving = [(k, Arrival(0, p, self._number)) for k, p in on_time]
         twin = [(k, a) for k, a in enumerate(in_between) if a.record == -1]
         for late in in_between:
             if late.record != -1:
-                place = chance.randint(0, min(len(arriving), 3) if chance.random() < 0.5 else len(arriving))
-                arriving.insert(place, (arriving[place - 1][0] if place else 0, late))
-        arriving = sorted(arriving + twin, key=lambda ka: ka[0]) if twin else arriving
+                latest_place = len(arriving)
+                if chance.random() < 0.5:
+                    latest_place = min(latest_place, 3)
+                place = chance.randint(0, latest_place)
+                number = 0
+                if place:
+                    number, _ = arriving[place - 1]
+                arriving.insert(place, (number, late))
+        if twin:
+            arriving = sorted(arriving + twin, key=lambda ka: ka[0])
         early_ns = [self._now_ns + k * 1000 for k in range(len(before))]
-        made_ns = None if edges_ns is None else [self._made_ns(byte, edges_ns) for byte in made]
+        made_ns = None
+        if edges_ns is not None:
+            made_ns = [self._made_ns(byte, edges_ns) for byte in last_bytes]
         times_ns = self._times([k for k, _ in arriving], pulse_ns, made_ns)
         sent.arrivals = [Arrival(t, a.packet, a.record) for t, a in zip(early_ns, before, strict=True)]
         sent.arrivals += [Arrival(t, a.packet, a.record) for t, (_, a) in zip(times_ns, arriving, strict=True)]
@@ -185,10 +201,10 @@ class Adversary:
         self._bytes = np.frombuffer(data, dtype=np.uint8)
         self._waiting = np.zeros(0, np.int64)
         self._made: list[int] = []
-        out = self._packets_of(sent, np.arange(len(data)))
+        out = self._send_record(sent, np.arange(len(data)))
         return out, self._made
 
-    def _packets_of(self, sent: Sent, data: NDArray[np.int64]) -> list[bytes]:
+    def _send_record(self, sent: Sent, data: NDArray[np.int64]) -> list[bytes]:
         """Send bytes of the data, by their numbers."""
         troubles = sent.troubles
         chance = self._chance
@@ -196,8 +212,10 @@ class Adversary:
         frames = len(data) // frame
         if "miss_frames" in troubles and frames > 1:
             sent.whole = False
-            for at in sorted(chance.sample(range(frames), chance.randint(1, min(3, frames - 1))), reverse=True):
-                data = np.delete(data, slice(at * frame, (at + 1) * frame))
+            for missed_frame in sorted(
+                chance.sample(range(frames), chance.randint(1, min(3, frames - 1))), reverse=True
+            ):
+                data = np.delete(data, slice(missed_frame * frame, (missed_frame + 1) * frame))
         if "drop_inside" in troubles or "drop_frames" in troubles:
             sent.whole = False
             if "drop_frames" in troubles:
@@ -219,17 +237,18 @@ class Adversary:
         if "end_early" in troubles and frames > 2:
             sent.whole = False
             cut = chance.randint(1, frames - 2) * frame
-            lost = chance.randint(0, 1) * frame
+            lost_bytes = chance.randint(0, 1) * frame
             out += self._stream(data[:cut]) + self._end()
-            data = data[cut + lost :]
+            data = data[cut + lost_bytes :]
         if "reset" in troubles or "reset_early" in troubles:
             sent.whole = False
             cut = chance.randrange(len(data) + 1)
-            cut = min(cut, 3 * self._payload) if "reset_early" in troubles else cut
+            if "reset_early" in troubles:
+                cut = min(cut, 3 * self._payload)
             out += self._stream(data[:cut])
-            lost = chance.choice([0, 0, chance.randint(1, 4000)])
+            lost_bytes = chance.choice([0, 0, chance.randint(1, 4000)])
             self._reset()
-            data = data[cut + lost :]
+            data = data[cut + lost_bytes :]
         return out + self._stream(data) + self._end()
 
     def forget_late(self) -> None:
@@ -238,21 +257,24 @@ class Adversary:
 
     def _reset(self) -> None:
         self._card = Packetiser(self._payload)
-        self.resets = self.resets + 1
+        self.resets += 1
         self._waiting = np.zeros(0, np.int64)
 
     def _stream(self, data: NDArray[np.int64]) -> list[bytes]:
         self._waiting = np.concatenate([self._waiting, data])
-        return self._noted(self._card.feed(self._bytes[data]))
+        return self._note_last_bytes(self._card.feed(self._bytes[data]))
 
     def _end(self) -> list[bytes]:
-        return self._noted(self._card.flush())
+        return self._note_last_bytes(self._card.flush())
 
-    def _noted(self, rows: NDArray[np.uint8]) -> list[bytes]:
+    def _note_last_bytes(self, rows: NDArray[np.uint8]) -> list[bytes]:
         """Note the last byte of each packet."""
         for row in rows:
             size = len(row) - DATA_HEADER_BYTES
-            self._made.append(int(self._waiting[min(size, self._waiting.size) - 1]) if self._waiting.size else 0)
+            last_byte = 0
+            if self._waiting.size:
+                last_byte = int(self._waiting[min(size, self._waiting.size) - 1])
+            self._made.append(last_byte)
             self._waiting = self._waiting[size:]
         return [bytes(row) for row in rows]
 
@@ -265,33 +287,35 @@ class Adversary:
         t = sent.troubles
         chance = self._chance
         n = len(packets)
-        gone: set[int] = set(range(n)) if "lose_all" in t else set()
+        lost_packets: set[int] = set()
+        if "lose_all" in t:
+            lost_packets = set(range(n))
         if "lose" in t:
-            gone |= {k for k in range(n) if chance.random() < chance.choice([0.02, 0.2])}
+            lost_packets |= {k for k in range(n) if chance.random() < chance.choice([0.02, 0.2])}
         if "lose_head" in t:
-            gone |= set(range(min(n, chance.randint(1, 4))))
+            lost_packets |= set(range(min(n, chance.randint(1, 4))))
         if "lose_tail" in t:
-            gone |= set(range(max(0, n - chance.randint(1, 4)), n))
+            lost_packets |= set(range(max(0, n - chance.randint(1, 4)), n))
         late: set[int] = set()
         if "delay" in t and n:
             late |= {chance.randrange(n) for _ in range(chance.randint(1, 3))}
         if "backlog" in t:
             late |= set(range(max(0, n - chance.randint(1, 4)), n))
-        self._late += [Arrival(0, packets[k], sent.number) for k in sorted(late - gone)]
-        coming = [(float(k), k, self._damaged(packets[k], t)) for k in range(n) if k not in gone | late]
+        self._late += [Arrival(0, packets[k], sent.number) for k in sorted(late - lost_packets)]
+        coming = [(float(k), k, self._damage(packets[k], t)) for k in range(n) if k not in lost_packets | late]
         if "duplicate" in t and coming:
             coming += [chance.choice(coming) for _ in range(chance.randint(1, 4))]
         if "two_paths" in t:
-            coming += [(at + chance.choice([0.5, 30.0]), k, p) for at, k, p in coming]
+            coming += [(arrival + chance.choice([0.5, 30.0]), k, p) for arrival, k, p in coming]
             if chance.random() < 0.5 and n:
                 self._late.append(Arrival(0, packets[-1], sent.number))
         if "reorder" in t:
-            coming = [(at + chance.uniform(-3, 3) * (chance.random() < 0.2), k, p) for at, k, p in coming]
+            coming = [(arrival + chance.uniform(-3, 3) * (chance.random() < 0.2), k, p) for arrival, k, p in coming]
         if "flows" in t:
-            coming = [(at + 5 * (k % 3), k, p) for at, k, p in coming]
+            coming = [(arrival + 5 * (k % 3), k, p) for arrival, k, p in coming]
         return [(k, p) for _, k, p in sorted(coming, key=lambda c: c[0])]
 
-    def _damaged(self, packet: bytes, troubles: tuple[str, ...]) -> bytes:
+    def _damage(self, packet: bytes, troubles: tuple[str, ...]) -> bytes:
         if "truncate" in troubles and self._chance.random() < 0.05:
             return packet[: self._chance.randint(DATA_HEADER_BYTES, len(packet))]
         if "turn_header_bit" in troubles and self._chance.random() < 0.05:
@@ -309,6 +333,7 @@ class Adversary:
             t = pulse_ns + (n + 1) * _GAP_NS
             if made_ns:
                 t = made_ns[min(number, len(made_ns) - 1)]
-                t = max(t, times[-1] + 1000) if times else t
+                if times:
+                    t = max(t, times[-1] + 1000)
             times.append(t)
         return times

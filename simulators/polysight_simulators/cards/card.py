@@ -50,18 +50,21 @@ from polysight_simulators.faults import Faults
 from polysight_simulators.radars import RadarBoard
 
 Rows = NDArray[np.uint8]
-_UDP_SEGMENT = 103  # linux/udp.h: the kernel cuts one buffer into equal datagrams
+# Option of linux/udp.h: the kernel cuts one buffer into equal datagrams.
+_UDP_SEGMENT = 103
 # Below the largest UDP datagram
 _CALL_BYTES = 65_000
 _CALL_SEGMENTS = 44
 # Unread at the receiver, below which the next 44 packets (about 100 kB) are sent
 _UNREAD_BYTES = 128 << 10
 _POLL_S = 0.001
-_WAIT_TIMEOUT_S = 2.0  # for a receiver that does not read; then its packets are lost, as with a real card
+# Time to wait for a receiver that does not read; then its packets are lost, as with a real card.
+_WAIT_TIMEOUT_S = 2.0
 _MAX_QUEUED_BYTES = 64 << 20
 # Largest delay that is made up for when sending many packets per call
 _CATCH_UP_S = 0.01
-_MAX_SPIN_S = 0.02  # in one call: commands wait in the meantime
+# Longest time in one call: commands wait in the meantime.
+_MAX_SPIN_S = 0.02
 # Waits below this spin, because a process cannot reliably sleep that short
 _SPIN_S = 0.001
 
@@ -70,8 +73,8 @@ class ReceiveQueue:
     """Unread data of a UDP socket of this machine, from the kernel's table of sockets."""
 
     def __init__(self, address: str, port: int, table: Path = Path("/proc/net/udp")) -> None:
-        own = struct.unpack("=I", socket.inet_aton(address))[0]
-        self._keys = tuple(f"{a:08X}:{port:04X}".encode() for a in (own, 0))
+        address_number = struct.unpack("=I", socket.inet_aton(address))[0]
+        self._keys = tuple(f"{a:08X}:{port:04X}".encode() for a in (address_number, 0))
         try:
             self._table: int | None = os.open(table, os.O_RDONLY)
         except OSError:
@@ -83,9 +86,9 @@ class ReceiveQueue:
             return None
         text = os.pread(self._table, 1 << 20, 0)
         for key in self._keys:
-            at = text.find(b" " + key + b" ")
-            if at >= 0:
-                fields = text[at : text.find(b"\n", at)].split()
+            line_start = text.find(b" " + key + b" ")
+            if line_start >= 0:
+                fields = text[line_start : text.find(b"\n", line_start)].split()
                 return int(fields[3].partition(b":")[2], 16), int(fields[-1])
         return None
 
@@ -163,13 +166,15 @@ class CardSender:
 
     def dropped_by_receiver(self) -> int | None:
         """Return the number of datagrams dropped by the receiving socket; None if it is not on this machine."""
-        seen = self._receiver.look()
-        return None if seen is None else seen[1]
+        queue_state = self._receiver.look()
+        if queue_state is None:
+            return None
+        return queue_state[1]
 
     def reply(self, message: bytes, due_s: float | None = None) -> None:
         """Send a command's reply at once, or at `due_s` of the clock given to :meth:`flush`."""
         if due_s is None:
-            self._send_to(message, self._command_to)
+            self._send_datagram(message, self._command_to)
         else:
             self._replies.append((due_s, message))
 
@@ -191,8 +196,10 @@ class CardSender:
         while self._replies:
             rest_s = self._replies[0][0] - clock_s()
             if rest_s > 0:
-                return rest_s if wait is None else min(wait, rest_s)
-            self._send_to(self._replies.popleft()[1], self._command_to)
+                if wait is None:
+                    return rest_s
+                return min(wait, rest_s)
+            self._send_datagram(self._replies.popleft()[1], self._command_to)
         return wait
 
     def _flush_queue(self, clock_s: Callable[[], float], packet_interval_s: float) -> float | None:
@@ -200,7 +207,7 @@ class CardSender:
         while self._queue:
             item = self._queue[0]
             if isinstance(item, bytes):
-                self._send_to(item, self._command_to)
+                self._send_datagram(item, self._command_to)
                 self._queue.popleft()
                 continue
             now = clock_s()
@@ -210,9 +217,8 @@ class CardSender:
                 continue
             if not self._may_send(now):
                 return _POLL_S
-            if self._pace.single:
-                n = 1
-            else:
+            n = 1
+            if not self._pace.single:
                 n = min(len(item), _CALL_SEGMENTS, max(1, _CALL_BYTES // item.shape[1]))
             self._send(item[:n])
             self._queued_bytes -= n * item.shape[1]
@@ -230,18 +236,18 @@ class CardSender:
         """Send everything queued at once, before the sockets are closed."""
         for item in self._queue:
             if isinstance(item, bytes):
-                self._send_to(item, self._command_to)
+                self._send_datagram(item, self._command_to)
             else:
-                for at in range(0, len(item), _CALL_SEGMENTS):
-                    self._send(item[at : at + _CALL_SEGMENTS])
+                for start in range(0, len(item), _CALL_SEGMENTS):
+                    self._send(item[start : start + _CALL_SEGMENTS])
         self._queue.clear()
         self._queued_bytes = 0
 
     def _may_send(self, now_s: float) -> bool:
         if not self._pace.wait_for_receiver:
             return True
-        seen = self._receiver.look()
-        if seen is None or seen[0] <= _UNREAD_BYTES:
+        queue_state = self._receiver.look()
+        if queue_state is None or queue_state[0] <= _UNREAD_BYTES:
             self._waiting_since_s = None
             return True
         if self._waiting_since_s is None:
@@ -255,12 +261,12 @@ class CardSender:
         self.payload_bytes += len(rows) * max(0, size - DATA_HEADER_BYTES)
         if self._segmented and len(rows) > 1:
             segment = [(socket.IPPROTO_UDP, _UDP_SEGMENT, struct.pack("=H", size))]
-            self._send_to(np.ascontiguousarray(rows).data, self._data_to, segment)
+            self._send_datagram(np.ascontiguousarray(rows).data, self._data_to, segment)
             return
         for row in rows:
-            self._send_to(row.data, self._data_to)
+            self._send_datagram(row.data, self._data_to)
 
-    def _send_to(
+    def _send_datagram(
         self, data: bytes | memoryview, address: tuple[str, int], how: list[tuple[int, int, bytes]] | None = None
     ) -> None:
         try:
@@ -364,7 +370,10 @@ class CardEndpoint:
         self._network_faults = NetworkFaults(faults, seed, name, self.counts)
         self._command_faults = CommandFaults(faults, seed, name, self.counts)
         self._status_rng = fault_generator(seed, name, "status")
-        self._twin = Packetiser(sequence=700, byte_count=1 << 40) if faults.twin else None
+        if faults.twin:
+            self._twin = Packetiser(sequence=700, byte_count=1 << 40)
+        else:
+            self._twin = None
         self._deaf_until_s = self._link_up_s = float("-inf")
         self.bindings = 0
         self._bind(network)
@@ -397,11 +406,11 @@ class CardEndpoint:
 
         Raises DeviceError if those are not addresses of this machine.
         """
-        before = self.card.network
+        network_before = self.card.network
         self.card.power_cycle()
         self.counts["power_cycles"] += 1
         self._deaf_until_s = self._clock_s() + self._faults.boot_s / self._time_scale
-        if self.card.network != before:
+        if self.card.network != network_before:
             self.sender.send_now()
             self._keep_sender_counts()
             self.close()
@@ -443,21 +452,21 @@ class CardEndpoint:
         if not self._command_faults.heard():
             return
         code = request[0]
-        refused = self._command_faults.refused(code)
+        refused = self._command_faults.refuses(code)
         if refused:
-            reply, *more = [message(code, 1)]
+            reply, *further_replies = [message(code, 1)]
         else:
-            reply, *more = self.card.command(datagram, self.wire_s())
+            reply, *further_replies = self.card.command(datagram, self.wire_s())
         if code == Code.CONFIGURE_FPGA:
             self._deaf_until_s = self._clock_s() + self._faults.deaf_ms * 1e-3
         if bits := self._command_faults.status_after(code):
-            more.append(message(Code.STATUS, bits))
+            further_replies.append(message(Code.STATUS, bits))
         if isinstance(reply, Message) and self._command_faults.reply_arrives():
             self.counts["replies"] += 1
             delay_s = self._faults.reply_delay_ms * 1e-3
             for _ in range(2 if self._twin else 1):
                 self.sender.reply(reply.payload, self._clock_s() + delay_s if delay_s else None)
-        self.emit(more)
+        self.emit(further_replies)
 
     def emit(self, outputs: Sequence[Output], link_is_up: bool = True) -> None:
         """Send the card's output through the faults of the network."""
@@ -485,8 +494,8 @@ class CardEndpoint:
             for rows in self._network_faults.carry(packets.rows):
                 self.sender.put_packets(rows)
             if self._twin is not None:
-                other = packets.rows[:, DATA_HEADER_BYTES:].reshape(-1)[::-1]
-                self.sender.put_packets(self._twin.feed(np.ascontiguousarray(other)))
+                reversed_payload = packets.rows[:, DATA_HEADER_BYTES:].reshape(-1)[::-1]
+                self.sender.put_packets(self._twin.feed(np.ascontiguousarray(reversed_payload)))
         else:
             self._network_faults.skip(packets.rows)
             self.counts["link_down_packets"] += n
@@ -553,7 +562,15 @@ class SimulatedCard:
         self._source = source
         self._clock_s = clock_s
         network = Network(board.host_address, board.card_address, MAC, board.command_port, board.data_port)
-        self.endpoint = CardEndpoint(board.name, network, faults, seed, time_scale, clock_s, pace)
+        self.endpoint = CardEndpoint(
+            name=board.name,
+            network=network,
+            faults=faults,
+            seed=seed,
+            time_scale=time_scale,
+            clock_s=clock_s,
+            pace=pace,
+        )
         self._burst = rig.burst
         later_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
         dead_s = (later_us + rig.chirp.ramp_end_us + RECOVERY_US) * 1e-6
@@ -587,9 +604,9 @@ class SimulatedCard:
         pulses = [Pulse(self._pulses + i, t) for i, t in enumerate(rising_ns)]
         self._pulses += len(pulses)
         for part in self._events.parts(pulses):
-            for kind, value in self._events.before(part[0]):
+            for kind, value in self._events.before_pulse(part[0]):
                 self._happen(kind, value, part[0])
-            self._frames(self._sync.frames(self._pulse_faults.seen(part)), track)
+            self._frames(self._sync.frames(self._pulse_faults.select_seen(part)), track)
             self._last_pulse_ns = part[-1].t_ns
         self.last_data_wall_s = self._clock_s()
 

@@ -17,19 +17,22 @@ from polysight_shared.errors import ProtocolError
 
 REQUEST_HEADER = 0xA55A
 REQUEST_FOOTER = 0xEEAA
-SOURCE_PORT = 1024  # of replies and data (seen)
+# Port from which replies and data come, as seen on a card.
+SOURCE_PORT = 1024
 # U32 sequence, u48 byte count
 DATA_HEADER_BYTES = 10
 # "packet size 1470" carries 1456 bytes of payload
 PACKET_OVERHEAD_BYTES = 14
-TAIL_S = 2.0  # from the last LVDS data to the short last packet (seen)
+# Time from the last LVDS data to the short last packet, as seen on a card.
+TAIL_S = 2.0
 # 2.8: bytes 02 04 (seen)
 FPGA_VERSION = 2 | 8 << 7
 DELAY_TICK_S = 8e-9
 TIMER_S = 30
 _MIN_PACKET = 48
 _MAX_PACKET = 1470
-_CHOICES = (2, 2, 2, 2, 3)  # of each byte of command 0x03 but the last, counted from 1
+# Number of choices of each byte of command 0x03 but the last, counted from 1.
+_CHOICES = (2, 2, 2, 2, 3)
 _LANES = {1: 4, 2: 2}
 
 Bytes2D = NDArray[np.uint8]
@@ -162,9 +165,9 @@ class Packetiser:
 
     def discard(self) -> int:
         """Discard bytes that are not sent yet; return their number."""
-        lost = len(self._rest)
+        lost_bytes = len(self._rest)
         self._rest = np.empty(0, np.uint8)
-        return lost
+        return lost_bytes
 
     def _pack(self, payload: Bytes2D) -> Bytes2D:
         n, size = payload.shape
@@ -306,15 +309,21 @@ class Card:
             return []
         self._last_data_s = now_s
         rows = self._packetiser.feed(data)
-        return [Packets(rows)] if len(rows) else []
+        if not len(rows):
+            return []
+        return [Packets(rows)]
 
     def overflow(self, status: Status = Status.LVDS_BUFFER_FULL) -> list[Output]:
         """Report LVDS data lost before packetising, which leaves no gap in the sequence numbers."""
-        return [message(Code.STATUS, status)] if self._recording else []
+        if not self._recording:
+            return []
+        return [message(Code.STATUS, status)]
 
     def end_record(self) -> list[Output]:
         """End the record now, as if the LVDS data had ended 2 s ago."""
-        return self._end(Status.RECORD_COMPLETED) if self._recording else []
+        if not self._recording:
+            return []
+        return self._end(Status.RECORD_COMPLETED)
 
     def tick(self, now_s: float) -> list[Output]:
         """End the record if :attr:`deadline_s` has passed: the short last packet, then the status."""

@@ -23,9 +23,9 @@ from polysight_simulators.faults import Faults
 Rows = NDArray[np.uint8]
 
 
-def fault_generator(seed: int, board_name: str, what: str) -> np.random.Generator:
+def fault_generator(seed: int, board_name: str, generator_name: str) -> np.random.Generator:
     """Return the generator of one kind of fault of one board."""
-    return np.random.default_rng([seed, zlib.crc32(f"{board_name}/{what}".encode())])
+    return np.random.default_rng([seed, zlib.crc32(f"{board_name}/{generator_name}".encode())])
 
 
 class NetworkFaults:
@@ -33,7 +33,11 @@ class NetworkFaults:
 
     def __init__(self, faults: Faults, seed: int, board_name: str, counts: Counter[str] | None = None) -> None:
         self._faults = faults
-        self._counts: Counter[str] = Counter() if counts is None else counts
+        self._counts: Counter[str]
+        if counts is None:
+            self._counts = Counter()
+        else:
+            self._counts = counts
         self._rng = fault_generator(seed, board_name, "network")
         self._corrupt_rng = fault_generator(seed, board_name, "corrupt")
         self._index = 0
@@ -45,23 +49,22 @@ class NetworkFaults:
         if not self._faults.disturbs_network:
             return [rows]
         arrived: list[Rows] = []
-        rows = self._corrupted(rows)
+        rows = self._corrupt(rows)
         draws = self._rng.random((len(rows), 5))
         suffers = [int(i) for i in np.flatnonzero(self._suffers(draws))]
-        at = 0
-        while at < len(rows):
-            if suffers and suffers[-1] >= at:
-                next_one = suffers[bisect_left(suffers, at)]
-            else:
-                next_one = len(rows)
-            if self._held or next_one == at:
-                arrived += self._one(rows[at : at + 1], draws[at], self._index)
+        first = 0
+        while first < len(rows):
+            next_one = len(rows)
+            if suffers and suffers[-1] >= first:
+                next_one = suffers[bisect_left(suffers, first)]
+            if self._held or next_one == first:
+                arrived += self._one(rows[first : first + 1], draws[first], self._index)
                 arrived += self._release(self._index)
-                next_one = at + 1
+                next_one = first + 1
             else:
-                arrived.append(rows[at:next_one])
-            self._index += next_one - at
-            at = next_one
+                arrived.append(rows[first:next_one])
+            self._index += next_one - first
+            first = next_one
         return arrived
 
     def _suffers(self, draws: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -99,7 +102,7 @@ class NetworkFaults:
             return [packet]
         return []
 
-    def _corrupted(self, rows: Rows) -> Rows:
+    def _corrupt(self, rows: Rows) -> Rows:
         f = self._faults
         if not f.corrupts:
             return rows
@@ -121,7 +124,8 @@ class NetworkFaults:
         """Skip packets that never reached the network, so that later draws do not change."""
         if self._faults.disturbs_network:
             self._rng.random((len(rows), 5))
-            self._corrupt_rng.random((len(rows) if self._faults.corrupts else 0, 3))
+            if self._faults.corrupts:
+                self._corrupt_rng.random((len(rows), 3))
             self._index += len(rows)
 
     def drain(self) -> list[Rows]:
@@ -131,14 +135,16 @@ class NetworkFaults:
     def _release(self, index: int | None) -> list[Rows]:
         if not self._held:
             return []
-        due = [p for at, p in self._held if index is None or at <= index]
-        self._held = [(at, p) for at, p in self._held if index is not None and at > index]
+        due = [p for release_index, p in self._held if index is None or release_index <= index]
+        self._held = [
+            (release_index, p) for release_index, p in self._held if index is not None and release_index > index
+        ]
         return due
 
-    def _count(self, what: str, lost_packet: Rows | None = None) -> None:
-        self._counts[what] += 1
+    def _count(self, kind: str, lost_packet: Rows | None = None) -> None:
+        self._counts[kind] += 1
         if lost_packet is not None:
-            self._counts[f"{what}_bytes"] += len(lost_packet) - DATA_HEADER_BYTES
+            self._counts[f"{kind}_bytes"] += len(lost_packet) - DATA_HEADER_BYTES
 
 
 def _turn_bit(row: Rows, bit: int) -> None:
@@ -169,7 +175,7 @@ class CommandFaults:
             return False
         return True
 
-    def refused(self, code: int) -> bool:
+    def refuses(self, code: int) -> bool:
         """True if the card refuses this command."""
         return code in self._faults.refuse
 
@@ -197,18 +203,20 @@ class PulseFaults:
         self._rng = fault_generator(seed, board_name, "pulses")
         self.missed = 0
 
-    def seen(self, pulses: list[Pulse]) -> list[Pulse]:
+    def select_seen(self, pulses: list[Pulse]) -> list[Pulse]:
         """Return the edges that the radar sees."""
         draws = self._rng.random(len(pulses))
-        seen = [
+        seen_pulses = [
             p for p, draw in zip(pulses, draws, strict=True) if p.number not in self._miss and draw >= self._probability
         ]
-        self.missed += len(pulses) - len(seen)
+        self.missed += len(pulses) - len(seen_pulses)
         for pulse in pulses:
             if pulse.number in self._spurious:
                 behind_ms = self._spurious[pulse.number]
-                seen.append(pulse._replace(t_ns=pulse.t_ns + round(behind_ms * 1e6)))
-        return sorted(seen, key=lambda p: p.t_ns) if self._spurious else seen
+                seen_pulses.append(pulse._replace(t_ns=pulse.t_ns + round(behind_ms * 1e6)))
+        if self._spurious:
+            return sorted(seen_pulses, key=lambda p: p.t_ns)
+        return seen_pulses
 
 
 class LvdsRun(NamedTuple):
@@ -224,8 +232,8 @@ class OverflowFaults:
 
     def __init__(self, faults: Faults, seed: int, board_name: str) -> None:
         self._kinds = [
-            (probability, status, fault_generator(seed, board_name, what))
-            for probability, status, what in (
+            (probability, status, fault_generator(seed, board_name, generator_name))
+            for probability, status, generator_name in (
                 (faults.overflow, Status.LVDS_BUFFER_FULL, "overflow"),
                 (faults.ddr_full, Status.DDR_FULL, "ddr_full"),
             )
@@ -234,18 +242,18 @@ class OverflowFaults:
 
     def split(self, frames: NDArray[np.int16]) -> list[LvdsRun]:
         """Split frames, int16 [n, ...], into runs with a loss at their end."""
-        lost: dict[int, Status] = {}
+        status_by_frame: dict[int, Status] = {}
         for probability, status, rng in self._kinds:
             for i in np.flatnonzero(rng.random(len(frames)) < probability):
-                lost.setdefault(int(i), status)
+                status_by_frame.setdefault(int(i), status)
         runs = []
         first = 0
-        for i in sorted(lost):
-            whole = frames[first:i].reshape(-1)
+        for i in sorted(status_by_frame):
+            whole_frames = frames[first:i].reshape(-1)
             frame = frames[i].reshape(-1)
-            kept = len(frame) // 2
-            run = np.concatenate([whole, frame[:kept]])
-            runs.append(LvdsRun(run, lost[i], (len(frame) - kept) * frame.itemsize))
+            kept_samples = len(frame) // 2
+            run = np.concatenate([whole_frames, frame[:kept_samples]])
+            runs.append(LvdsRun(run, status_by_frame[i], (len(frame) - kept_samples) * frame.itemsize))
             first = i + 1
         if first < len(frames):
             return [*runs, LvdsRun(frames[first:], None, 0)]
@@ -269,18 +277,23 @@ class PulseEvents:
         self._at: dict[int, list[tuple[EventKind, float]]] = {}
         for kind in EventKind:
             for entry in getattr(faults, kind.value):
-                pulse, value = entry if isinstance(entry, tuple) else (entry, 0.0)
+                pulse = entry
+                value = 0.0
+                if isinstance(entry, tuple):
+                    pulse, value = entry
                 self._at.setdefault(pulse, []).append((kind, value))
 
     def parts(self, pulses: list[Pulse]) -> list[list[Pulse]]:
         """Split the pulses before each one with an event."""
-        if not pulses or not self._at:
-            return [pulses] if pulses else []
+        if not pulses:
+            return []
+        if not self._at:
+            return [pulses]
         first = pulses[0].number
         end = pulses[0].number + len(pulses)
         cuts = sorted({0, len(pulses), *(n - first for n in self._at if first <= n < end)})
         return [pulses[a:b] for a, b in pairwise(cuts)]
 
-    def before(self, pulse: Pulse) -> list[tuple[EventKind, float]]:
+    def before_pulse(self, pulse: Pulse) -> list[tuple[EventKind, float]]:
         """Return the events before this pulse: kind, and its seconds or status bit."""
         return self._at.get(pulse.number, [])

@@ -14,7 +14,8 @@ from polysight_simulators.cards.sync_in import StageTrack
 from polysight_simulators.radars import LineServer, RadarSocket
 
 EDGES_PER_TURN = 2048
-GATHER_S = 0.01  # between reads of the wires with pulses: many frames per call cost less than a few
+# Time between reads of the wires with pulses: many frames per call cost less than a few.
+GATHER_S = 0.01
 IDLE_S = 0.1
 
 

@@ -14,7 +14,8 @@ from polysight_shared.units import us_to_ns
 from polysight_shared.wires import WireMotion
 from polysight_simulators.radars import RadarBoard
 
-RECOVERY_US = 150.0  # between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger)
+# Time between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger).
+RECOVERY_US = 150.0
 _KEEP = 4096
 
 
@@ -93,7 +94,10 @@ class StageTrack:
 
     def __init__(self, rig: Instrument, burst_motion: bool = True, backlash_mm: float = 0.0) -> None:
         self._backlash_mm = backlash_mm
-        self._middle_ns = None if burst_motion else round(burst_middle_s(rig.burst) * 1e9)
+        if burst_motion:
+            self._middle_ns = None
+        else:
+            self._middle_ns = round(burst_middle_s(rig.burst) * 1e9)
         self._plan = plan_raster(rig.grid)
         self._burst = rig.burst
         self._triggers: list[int] = []
@@ -126,28 +130,30 @@ class StageTrack:
 
         A retaken row thus keeps its numbers. A pulse that belongs to no point keeps its number.
         """
-        found: list[Pulse] = []
+        renumbered: list[Pulse] = []
         edge_ns = -1
         first = None
         for pulse in pulses:
-            at = bisect_right(self._triggers, pulse.t_ns)
-            if at and self._triggers[at - 1] != edge_ns:
-                edge_ns = self._triggers[at - 1]
-                first = self._first_of(edge_ns)
+            trigger_count = bisect_right(self._triggers, pulse.t_ns)
+            if trigger_count and self._triggers[trigger_count - 1] != edge_ns:
+                edge_ns = self._triggers[trigger_count - 1]
+                first = self._first_pulse(edge_ns)
             nth = (pulse.t_ns - edge_ns) // us_to_ns(self._burst.period_us)
-            if at and first is not None and nth < self._burst.pulses:
+            if trigger_count and first is not None and nth < self._burst.pulses:
                 pulse = pulse._replace(number=first + nth)
-            found.append(pulse)
-        return found
+            renumbered.append(pulse)
+        return renumbered
 
-    def _first_of(self, edge_ns: int) -> int | None:
+    def _first_pulse(self, edge_ns: int) -> int | None:
         """Return the number of the first pulse of the point with this trigger; None outside the plan."""
-        plan, (x, y, _) = self._plan, self._reported_mm([edge_ns])
+        plan = self._plan
+        x, y, _ = self._reported_mm([edge_ns])
         column = round(x[0] / plan.step_x_mm + (plan.columns - 1) / 2)
         row = round(y[0] / plan.step_y_mm + (plan.rows - 1) / 2)
         if not (0 <= column < plan.columns and 0 <= row < plan.rows):
             return None
-        point = plan.row(row).column(column)  # its own inverse
+        # The order of columns in a row is its own inverse.
+        point = plan.row(row).column(column)
         return (row * plan.columns + point) * self._burst.pulses
 
     def offsets_mm(self, t_ns: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -164,8 +170,8 @@ class StageTrack:
             return x, y, backwards
         for i, pulse_ns in enumerate(t_ns):
             t = pulse_ns
-            if self._middle_ns is not None and (at := bisect_right(self._triggers, t)):
-                t = self._triggers[at - 1] + self._middle_ns
+            if self._middle_ns is not None and (trigger_count := bisect_right(self._triggers, t)):
+                t = self._triggers[trigger_count - 1] + self._middle_ns
             line = self._lines[max(0, bisect_right(self._lines, t, key=lambda m: m.t_ns) - 1)]
             moved_um = line.vx_um_s * max(0, t - line.t_ns) * 1e-9
             x[i] = (line.x_um + moved_um) * 1e-3 - self._centre_mm[0]

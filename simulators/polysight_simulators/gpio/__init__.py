@@ -11,7 +11,7 @@ import shutil
 import signal
 from pathlib import Path
 
-from polysight_simulators.builds import compiled
+from polysight_simulators.builds import compile_once
 
 ENABLING_COMMAND = "sudo apt-get install gcc libc6-dev"
 VANISH = signal.SIGUSR1
@@ -29,7 +29,7 @@ def missing() -> list[str]:
 def shim() -> Path:
     """Compile the library; return its path. Raises DeviceError if it does not compile."""
     code = [str(p) for p in _SOURCES if p.suffix == ".c"]
-    return compiled(
+    return compile_once(
         "gpioshim.so",
         _SOURCES,
         [*_CC, "-o", "{folder}/gpioshim.so", *code, *_LIBRARIES],

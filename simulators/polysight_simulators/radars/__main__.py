@@ -35,7 +35,9 @@ def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> li
     if not trace.is_file():
         raise ValueError("not a regular file")
     lines = trace.read_text(encoding="utf-8").splitlines()
-    first = json.loads(lines[0]) if lines else None
+    first = None
+    if lines:
+        first = json.loads(lines[0])
     if len(lines) < 2 or not isinstance(first, dict) or first.get("trace") != 1:
         raise ValueError("not a trace of version 1, or an empty one")
     for number, line in enumerate(lines, 1):
@@ -77,7 +79,9 @@ def main() -> int:
     parser.add_argument("trace", type=Path, metavar="TRACE", help="file of `polysight radar check BOARD --trace FILE`")
     parser.add_argument("--empty-flash", action="store_true", help="simulate a new board")
     args = parser.parse_args()
-    flash = b"" if args.empty_flash else make_image()
+    flash = b""
+    if not args.empty_flash:
+        flash = make_image()
     try:
         differences = replay(args.trace, lambda now: RadarBoard(now, flash=flash))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as e:

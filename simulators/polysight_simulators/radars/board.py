@@ -200,14 +200,18 @@ class RadarBoard:
         if not self.ready_for_triggers:
             return False
         cores = self.cores
-        time_s = self.now() if pulse_s is None else pulse_s
+        if pulse_s is None:
+            time_s = self.now()
+        else:
+            time_s = pulse_s
         period = cores.period_s()
         too_soon = abs(time_s - self._pulse_s) < (period if self._dead_s is None else self._dead_s) - 1e-9
         if too_soon or self._pulses_seen - 1 in self._fault_pulses:
             cores.armed = False
             self._event(RF_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), 0.0)
             return False
-        self._pulse_s, cores.frame_ends = time_s, self.now() + period
+        self._pulse_s = time_s
+        cores.frame_ends = self.now() + period
         cores.frames_left -= 1
         if cores.frames_left == 0:
             cores.armed = False
@@ -231,11 +235,13 @@ class RadarBoard:
             del self._in[:16]
             self._offered = False
             if self._waiting:
-                self._out, self._ready_at = bytearray(self._waiting.popleft()), self.now() + DATA_S
+                self._out = bytearray(self._waiting.popleft())
+                self._ready_at = self.now() + DATA_S
         elif self._in[:4] == TO_DEVICE and len(self._in) >= 16:
             length = int.from_bytes(self._in[6:8], "little")
             if ones_sum(bytes(self._in[4:16])) != 0xFFFF:
-                self._in.clear()  # no response: the host has a timeout
+                # There is no response: the host has a timeout.
+                self._in.clear()
             elif len(self._in) >= 4 + length:
                 raw = bytes(self._in[4 : 4 + length])
                 del self._in[: 4 + length]
@@ -272,13 +278,23 @@ class RadarBoard:
 
     def _event(self, number: int, data: bytes, delay_s: float) -> None:
         main = number >= 0x4000
-        wide = self.cores.crc32_events if main else not self.cores.first_generation
+        if main:
+            wide = self.cores.crc32_events
+        else:
+            wide = not self.cores.first_generation
         block = struct.pack("<HH", number, len(data) + 4) + data
-        self._send(frame(6 if main else 2, EVENT, number // 32, block, 1, 0, wide), delay_s)
+        self._send(
+            frame(
+                direction=6 if main else 2, kind=EVENT, number=number // 32, body=block, count=1, sequence=0, wide=wide
+            ),
+            delay_s,
+        )
 
     def _message(self, raw: bytes) -> None:
         opcode, length, flags, remaining, count = struct.unpack_from("<5H", raw)
-        fault = self._faults.popleft() if self._faults else None
+        fault = None
+        if self._faults:
+            fault = self._faults.popleft()
         if fault is Fault.NO_ANSWER or self.destroyed or not self.powered or self.now() < self._busy_until:
             return
         direction = (opcode & 15) + 1
@@ -286,7 +302,10 @@ class RadarBoard:
         sequence = flags >> 12
         wide = self._answers_32_bit
         if fault is Fault.NACK or zlib.crc32(raw[: length - 4]) != int.from_bytes(raw[length - 4 :], "little"):
-            self._send(frame(direction, NACK, number, b"", 0, sequence, wide), 0.0)
+            self._send(
+                frame(direction=direction, kind=NACK, number=number, body=b"", count=0, sequence=sequence, wide=wide),
+                0.0,
+            )
             return
         if flags & 3 == 3 and self._last[0] == sequence and self._last[1]:
             # A retry: repeat the answer, without executing the command again
@@ -309,17 +328,38 @@ class RadarBoard:
             if error:
                 break
             delay += extra
-            blocks += struct.pack("<HH", block, len(data) + 4) + data if data else b""
+            if data:
+                blocks += struct.pack("<HH", block, len(data) + 4) + data
+            else:
+                blocks += b""
             body = body[size:]
         self._busy_until = self.now() + delay
         if error and (self.cores.first_generation or fault is Fault.REFUSE_BARE):
             # Like an AWR1243
-            answer = frame(direction, RESPONSE, 0, b"", 1, sequence, wide)
+            answer = frame(
+                direction=direction, kind=RESPONSE, number=0, body=b"", count=1, sequence=sequence, wide=wide
+            )
         elif error:
             # ICD 4.4
-            answer = frame(direction, RESPONSE, 0, struct.pack("<4H", 0, 8, error, block), 1, sequence, wide)
+            answer = frame(
+                direction=direction,
+                kind=RESPONSE,
+                number=0,
+                body=struct.pack("<4H", 0, 8, error, block),
+                count=1,
+                sequence=sequence,
+                wide=wide,
+            )
         else:
-            answer = frame(direction, RESPONSE, number, blocks, 1 if blocks else 0, sequence, wide)
+            answer = frame(
+                direction=direction,
+                kind=RESPONSE,
+                number=number,
+                body=blocks,
+                count=1 if blocks else 0,
+                sequence=sequence,
+                wide=wide,
+            )
         self._last = (sequence, answer)
         self._answer(answer, fault, delay)
 

@@ -75,7 +75,8 @@ class UsbChip:
                 self._board.reset(held=not (pins >> 6 & 1 and pins >> 7 & 1))
         else:
             # USB is slow
-            self._high_s = float("inf") if name == "A" and self._pins & _SELECT else self._high_s
+            if name == "A" and self._pins & _SELECT:
+                self._high_s = float("inf")
             self._pending[name] += data
             commands: dict[str, Callable[[bytearray], int]] = {"A": self._spi, "B": self._gpio}
             while self._pending[name]:
@@ -109,7 +110,7 @@ class UsbChip:
         if code == 0x80:
             return self._set_pins(data)
         if code not in (0x11, 0x20):
-            return self._unknown("A", code)
+            return self._refuse_code("A", code)
         if len(data) < 3:
             return 0
         count = 1 + int.from_bytes(data[1:3], "little")
@@ -142,11 +143,17 @@ class UsbChip:
         was_high = self._pins & _SELECT
         if pins & _SELECT:
             self._latched = 0
-            self._high_s = self._high_s + _PIN_S if was_high else _PIN_S
+            if was_high:
+                self._high_s += _PIN_S
+            else:
+                self._high_s = _PIN_S
         else:
             if was_high and self._high_s < 2 * _CLOCKS_S - 1e-9:
                 self.errors.append(f"chip select is high for {self._high_s * 1e9:.0f} ns between words")
-            self._low_s = _PIN_S if was_high else self._low_s + _PIN_S
+            if was_high:
+                self._low_s = _PIN_S
+            else:
+                self._low_s += _PIN_S
         self._pins = pins
         return 3
 
@@ -163,9 +170,9 @@ class UsbChip:
         if code == 0x81:
             self._answers["B"].append(self._board.interrupt << 5)
             return 1
-        return self._unknown("B", code)
+        return self._refuse_code("B", code)
 
-    def _unknown(self, name: str, code: int) -> int:
+    def _refuse_code(self, name: str, code: int) -> int:
         self.errors.append(f"unknown command 0x{code:02X} on channel {name}")
         self._answers[name] += bytes((0xFA, code))
         return 1
@@ -208,7 +215,8 @@ class _Server:
             ) from None
         self._listener.setblocking(False)
         self.address = f"tcp://{host}:{self._listener.getsockname()[1]}"
-        self._clients: dict[int, tuple[socket.socket, bytes]] = {}  # by descriptor, with incomplete requests
+        # Connections by descriptor, with incomplete requests.
+        self._clients: dict[int, tuple[socket.socket, bytes]] = {}
         self._ready = select.epoll()
         self._ready.register(self._listener, select.EPOLLIN)
 

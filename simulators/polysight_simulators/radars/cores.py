@@ -40,8 +40,12 @@ def ones_sum(head: bytes) -> int:
 
 def frame(direction: int, kind: int, number: int, body: bytes, count: int, sequence: int, wide: bool) -> bytes:
     """Encode a message with a CRC of 32 (`wide`) or 16 bits (ICD 2.3); the latter has its acknowledgement bits set."""
-    flags = sequence << 12 | (1 << 10 if wide else 0xC)
-    head = struct.pack("<5H", direction | kind << 4 | number << 6, 12 + len(body) + (4 if wide else 2), flags, 0, count)
+    flags = sequence << 12 | 0xC
+    crc_bytes = 2
+    if wide:
+        flags = sequence << 12 | 1 << 10
+        crc_bytes = 4
+    head = struct.pack("<5H", direction | kind << 4 | number << 6, 12 + len(body) + crc_bytes, flags, 0, count)
     head += struct.pack("<H", 0xFFFF - ones_sum(head))
     crc = zlib.crc32(head + body).to_bytes(4, "little")
     if not wide:
@@ -82,9 +86,10 @@ def boot_errors(image: bytes) -> int:
     return 0
 
 
-def patch_of(image: bytes, main: bool) -> bytes:
+def encode_patch_version(image: bytes, main: bool) -> bytes:
     """Return the last six bytes of a version answer (ICD tables 5.66, 5.157): major, minor, date, build and debug."""
-    offset = (_MAIN_AT if main else _RF_AT) + 0x48
+    start = _MAIN_AT if main else _RF_AT
+    offset = start + 0x48
     major, minor, build, debug, *date = image[offset : offset + 7]
     return bytes((major, minor, *date, build << 4 | debug))
 
@@ -212,7 +217,7 @@ class Cores:
         if number == 0x404C:
             self.crc32_events = data[0] == 1
         elif number == 0x4000 and (
-            self._patched() or not self.first_generation
+            self._read_patch() or not self.first_generation
         ):  # otherwise it never reports, as observed
             self.rf_up = True
             self.event(UP_RF, struct.pack("<4I", self.rf_tests, 2000, 0, 0), RF_UP_S)
@@ -232,14 +237,16 @@ class Cores:
             return struct.pack("<I10h", int(self.now() * 1e3) & 0xFFFFFFFF, 41, 41, 42, 42, 45, 46, 45, 40, 43, 0)
         return b""
 
-    def _patched(self) -> bytes:
+    def _read_patch(self) -> bytes:
         if self.ram and not boot_errors(self.ram):
             return self.ram
         return self._booted
 
     def _patch(self, main: bool) -> bytes:
-        image = self._patched()
-        return patch_of(image, main) if image else bytes(6)
+        image = self._read_patch()
+        if image:
+            return encode_patch_version(image, main)
+        return bytes(6)
 
     def _report_calibration(self, passed: int) -> None:
         self.event(CALIBRATED, struct.pack("<IIhHII", passed, passed, 41, 0, 500, 0), RF_INIT_S)
@@ -267,7 +274,9 @@ class Cores:
             0x0121: lambda: self.chirps.get(struct.unpack_from("<H", data)[0]),
             0x0122: lambda: self.settings.get(FRAME),
         }[number]()
-        return (5, b"") if stored is None else (0, stored)
+        if stored is None:
+            return 5, b""
+        return 0, stored
 
     def _calibration(self, number: int, data: bytes) -> tuple[int, bytes]:
         """Save or restore 672 bytes of calibration in three parts (ICD 5.2.11, 5.3.2)."""

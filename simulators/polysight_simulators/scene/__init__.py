@@ -10,7 +10,7 @@ the published data set's layout (`layouts`), with truth.json.
 
 from polysight_simulators.scene.cubes import reference_cube, synced_cube
 from polysight_simulators.scene.layouts import AuthorsLayout, OwnLayout, write_cube
-from polysight_simulators.scene.optics import layered, strips
+from polysight_simulators.scene.optics import reflect_layers, strips
 from polysight_simulators.scene.radar import PatternSource, SignalSource, SimulatedRig, pattern_frames
 from polysight_simulators.scene.scene_file import (
     Disturbances,
@@ -42,11 +42,11 @@ __all__ = [
     "apply_scene",
     "decode_scene",
     "draw_specimens",
-    "layered",
     "load_scene",
     "lost_bytes",
     "pattern_frames",
     "reference_cube",
+    "reflect_layers",
     "row_offsets_mm",
     "simulate",
     "strips",

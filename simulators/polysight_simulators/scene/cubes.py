@@ -51,7 +51,9 @@ def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) ->
     for board in rig.receivers:
         field = build_field(rig, ideal, board, f)
         direct_m = antennas(rig, board).direct_m
-        path_m = field.centre_path_m - (direct_m if remove_direct else 0.0 * direct_m)
+        path_m = np.full_like(direct_m, field.centre_path_m)
+        if remove_direct:
+            path_m = field.centre_path_m - direct_m
         cubes[board.name] = _read(field, rig, f, path_m, np.ones(len(path_m), np.complex64), 0.0)
     return cubes
 
@@ -102,7 +104,10 @@ def synced_cube(
         f = sample_frequencies_hz(rig)
     else:
         f = np.asarray(frequencies_hz, np.float64)
-    channels = list(range(len(rig.antennas.rx_mm))) if rx is None else list(rx)
+    if rx is None:
+        channels = list(range(len(rig.antennas.rx_mm)))
+    else:
+        channels = list(rx)
     field = build_field(rig, scene, board, f, cache_dir, channels)
     all_m = antennas(rig, board).direct_m
     direct_m = all_m[channels]
@@ -157,15 +162,20 @@ def _read(
     field: ObjectField, rig: Instrument, f: Real, away_m: Real, gains: NDArray[np.complexfloating], backlash_mm: float
 ) -> NDArray[np.complex64]:
     """Return the field at the true positions, [rx, row, column, frequency], with the phase of path `away_m` [rx]."""
-    base = np.eye(len(f)) if np.array_equal(field.nodes_hz, f) else node_matrix(field, f)[0]
+    if np.array_equal(field.nodes_hz, f):
+        base = np.eye(len(f))
+    else:
+        base = node_matrix(field, f)[0]
     turn = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(away_m, f)) * gains[:, None]
     expand = (base * turn[:, None]).astype(np.complex64)
     plan = plan_raster(rig.grid)
     travel = mean_burst_travel_mm(rig.burst, rig.stage)
     cube = np.empty((len(away_m), plan.rows, plan.columns, len(f)), dtype=np.complex64)
     for row in plan:
-        x = np.array(row.x_mm) + row.direction * travel + (backlash_mm if row.direction < 0 else 0.0)
-        nodes = field.at(x / 1e3, np.full(len(x), row.y_mm / 1e3))
+        x = np.array(row.x_mm) + row.direction * travel
+        if row.direction < 0:
+            x += backlash_mm
+        nodes = field.interpolate(x / 1e3, np.full(len(x), row.y_mm / 1e3))
         order = [row.column(i) for i in range(row.points)]
         cube[:, row.index, order] = np.einsum("prq,rqk->rpk", nodes, expand, optimize=True)
     return cube

@@ -49,10 +49,10 @@ from polysight_simulators.scene.optics import (
     Reflectivity,
     antennas,
     board_reflectivity,
+    conjugate,
     direct_factor,
     plate_scale,
     point_scale,
-    sampled,
 )
 from polysight_simulators.scene.scene_file import Facets, Scene, draw_specimens, facets, slopes
 from polysight_simulators.scene.shapes import shape_field
@@ -250,7 +250,7 @@ class _Level:
         everywhere = chebyshev.chebvander((2 * oblique - self.middle) / self.half, n - 1)
         return [everywhere @ row for row in at_nodes]
 
-    def lifted(self, lift_m: Real, wave: float, m: int) -> Complex | float:
+    def lift_phase(self, lift_m: Real, wave: float, m: int) -> Complex | float:
         """Return the phase factors of heights relative to the level, with the mean change of dpath/dz."""
         if not lift_m.any():
             return 1.0
@@ -274,7 +274,7 @@ class _Plane:
         points = self.scene.points
         heights = np.array([p.height_mm for p in (*plates, *points)])
         groups: list[list[float]] = []
-        for height in np.unique(heights) if len(heights) else [0.0]:
+        for height in np.unique(heights if len(heights) else 0.0):
             if groups and height - groups[-1][0] <= _LEVEL_MM:
                 groups[-1].append(float(height))
             else:
@@ -313,7 +313,17 @@ class _Plane:
         heights_m = z - self.ant.tx_m[2], z - self.ant.rx_m[0, 2]
         bend = float(sum((r**2 - h**2) / r**3 for r, h in zip((r1, r2), heights_m, strict=True)))
         nodes = (low + high) / 2 + half * cheb_nodes(n)
-        return _Level(members[0], members[1], lifts[0], lifts[1], legs, bend, nodes, (low + high) / 2, half)
+        return _Level(
+            plates=members[0],
+            points=members[1],
+            lift_m=lifts[0],
+            point_lift_m=lifts[1],
+            legs=legs,
+            bend=bend,
+            steepness=nodes,
+            middle=(low + high) / 2,
+            half=half,
+        )
 
     def plate_maps(self, level: _Level, series: Complex, f: float, m: int) -> list[NDArray[np.complex64]]:
         """Return the spectra of a level's plates by order of the local angle, with the phases of C_m."""
@@ -325,7 +335,7 @@ class _Plane:
         table = np.array([(*p.centre_mm, *p.size_mm) for p in plates]) / 1e3
         turn = wave * level.steepness[m] * np.array([slopes(p) for p in plates])
         weights = series[level.plates] * plate_scale(ant, self.scene, f)
-        weights = weights * np.reshape(level.lifted(level.lift_m, wave, m), (-1, 1))
+        weights = weights * np.reshape(level.lift_phase(level.lift_m, wave, m), (-1, 1))
         smooth = np.array([self.surfaces[i].height_m.size == 1 for i in level.plates])
         x = _spectra(self.x, ant.centre_m[0] + table[smooth, 0], table[smooth, 2], turn[smooth, 0])
         y = _spectra(self.y, ant.centre_m[1] + table[smooth, 1], table[smooth, 3], turn[smooth, 1])
@@ -358,7 +368,7 @@ class _Plane:
         none = np.zeros(len(table))
         x = _spectra(self.x, self.ant.centre_m[0] + table[:, 0], none)
         y = _spectra(self.y, self.ant.centre_m[1] + table[:, 1], none)
-        lifted = level.lifted(level.point_lift_m, 2 * np.pi * f / SPEED_OF_LIGHT_M_S, m)
+        lifted = level.lift_phase(level.point_lift_m, 2 * np.pi * f / SPEED_OF_LIGHT_M_S, m)
         return _outer(y, self.amplitudes[level.points] * lifted, x)
 
 
@@ -389,14 +399,25 @@ def compute(
         for q, f in enumerate(nodes_hz):
             total = np.zeros((len(rx), plane.y.points, plane.x.points), dtype=np.complex64)
             for level, angle, shares in kernels:
-                _add_level(total, plane, level, of_plates[:, q], f, centre, angle, shares)
+                _add_level(
+                    total=total,
+                    plane=plane,
+                    level=level,
+                    series=of_plates[:, q],
+                    f=f,
+                    centre_m=centre,
+                    angle=angle,
+                    shares=shares,
+                )
             for r, spectrum in enumerate(total):
-                values[:, :, r, q] += _oversampled(_oversampled(spectrum, plane.y, 0), plane.x, 1)
+                values[:, :, r, q] += _oversample(_oversample(spectrum, plane.y, 0), plane.x, 1)
     steps = ax.step / OVERSAMPLING, ay.step / OVERSAMPLING
     if scene.shapes:
         ant = planes[0].ant
         offsets = (ax.first_u + steps[0] * np.arange(ax.outputs), ay.first_u + steps[1] * np.arange(ay.outputs))
-        shape_echo = shape_field(rig, scene, board, offsets, nodes_hz, ant.centre_m, centre)
+        shape_echo = shape_field(
+            rig=rig, scene=scene, board=board, axes_m=offsets, nodes_hz=nodes_hz, centre_m=ant.centre_m, path_m=centre
+        )
         # As of plates: an infinite mirror gives object_gain d / path.
         values += np.complex64(scene.object_gain * ant.direct_m[0]) * shape_echo[:, :, list(rx)]
     return values, (ax.first_u, ay.first_u), steps, nodes_hz, centre
@@ -409,7 +430,7 @@ def _planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) -> list[
     """
     ant = antennas(rig, board)
     surfaces = tuple(facets(p, i, scene.seed) for i, p in enumerate(scene.plates))
-    amplitudes = sampled(np.array([complex(*p.amplitude) for p in scene.points])) * point_scale(ant)
+    amplitudes = conjugate(np.array([complex(*p.amplitude) for p in scene.points])) * point_scale(ant)
     amplitudes = amplitudes * direct_factor(board, scene)
     is_background = [p.background for p in scene.plates]
     if any(is_background) and not all(is_background):
@@ -427,7 +448,10 @@ def _planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) -> list[
             shapes=scene.shapes if is_first else (),
         )
         x, y = spectral_axes(rig, part, ant, top_hz)
-        own_amplitudes = amplitudes if is_first else amplitudes[:0]
+        if is_first:
+            own_amplitudes = amplitudes
+        else:
+            own_amplitudes = amplitudes[:0]
         planes.append(_Plane(ant, part, x, y, tuple(surfaces[i] for i in members), own_amplitudes))
     step_x = min(plane.x.step for plane in planes)
     step_y = min(plane.y.step for plane in planes)
@@ -488,7 +512,9 @@ def _add_level(
         point_map = plane.point_map(level, f, m)
         for r, spectrum in enumerate(bases):
             part = shares[r]
-            base = spectrum if part is None else spectrum * part[m]
+            base = spectrum
+            if part is not None:
+                base = spectrum * part[m]
             for j, plate_map in enumerate(maps):
                 kernel = (base * level.legs[r][3] * angle[r, :, :, j]).astype(np.complex64)
                 total[r] += plate_map * np.asarray(scipy.fft.ifft2(kernel, norm="forward"))
@@ -496,7 +522,7 @@ def _add_level(
                 total[r] += point_map * np.asarray(scipy.fft.ifft2(base.astype(np.complex64), norm="forward"))
 
 
-def _oversampled(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDArray[np.complex64]:
+def _oversample(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDArray[np.complex64]:
     """Return the inverse DFT along an axis on the finer output grid, limited to its offsets."""
     n = axis.points
     shape = list(spectrum.shape)
@@ -540,7 +566,7 @@ class ObjectField:
     nodes_hz: Real
     centre_path_m: float
 
-    def at(self, x_m: Real, y_m: Real) -> NDArray[np.complex64]:
+    def interpolate(self, x_m: Real, y_m: Real) -> NDArray[np.complex64]:
         """Return the field at stage offsets, complex64 [n, rx, node], without the phase of the centre path.
 
         Raises
@@ -641,7 +667,8 @@ def build_field(
         if a cached file cannot be read.
     """
     scene = draw_specimens(scene)
-    rx = range(len(rig.antennas.rx_mm)) if rx is None else rx
+    if rx is None:
+        rx = range(len(rig.antennas.rx_mm))
     if cache_dir is None:
         return ObjectField(*compute(rig, scene, board, samples_hz, rx))
     d = scene.disturbances

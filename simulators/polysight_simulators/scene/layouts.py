@@ -110,7 +110,9 @@ def _calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, s
             "crc32": f"{crc32(source.read_bytes()):08x}",
             "copied_from": str(source),
         }
-    return {"calibration": facts} if facts else {}
+    if not facts:
+        return {}
+    return {"calibration": facts}
 
 
 class OwnLayout:
@@ -298,7 +300,10 @@ class AuthorsLayout:
         """Write one file per board, named by the grid index of the row's start, and its packet log."""
         step_s = abs(row.step_mm) / self._rig.stage.speed_mm_s
         start = row.column(0)
-        stem = f"{row.index}_{start}" if self._by_columns else f"{start}_{row.index}"
+        if self._by_columns:
+            stem = f"{row.index}_{start}"
+        else:
+            stem = f"{start}_{row.index}"
         for name, payload in payloads.items():
             skipped = self._skipped.get((name, row.index), frozenset())
             points = [i for i in range(row.points) if i not in skipped]
@@ -411,13 +416,17 @@ def _radars(rig: Instrument) -> dict[str, Any]:
 def _turn(board: Board, axis: str, which: int) -> float:
     """Return a mount's rotation about an axis, degrees; 0 without one."""
     turns = [s.turn_deg for s in board.mount if s.about == axis and s.turn_deg is not None]
-    return turns[which] if turns else 0.0
+    if not turns:
+        return 0.0
+    return turns[which]
 
 
 def _last_shift(board: Board) -> float:
     """Return the last shift of a mount along x, mm: the origin of the board."""
     shifts = [s.shift_mm[0] for s in board.mount if s.shift_mm is not None]
-    return shifts[-1] if shifts else 0.0
+    if not shifts:
+        return 0.0
+    return shifts[-1]
 
 
 def write_cube(

@@ -70,7 +70,7 @@ def slab(
     return s * (1 - e) / (1 - s * s * e), p * (1 - e) / (1 - p * p * e)
 
 
-def layered(
+def reflect_layers(
     layers: Sequence[Layer], frequency_hz: float, theta_rad: NDArray[np.floating] | float
 ) -> tuple[Complex, Complex]:
     """Return the reflection coefficients of a stack of layers in air, as transmission lines in series.
@@ -135,7 +135,7 @@ def plate_reflection(plate: Plate, frequency_hz: float, theta_rad: NDArray[np.fl
         return minus_one, minus_one.copy()
     first = plate.stack[0]
     if len(plate.stack) > 1:
-        return layered(plate.stack, frequency_hz, theta_rad)
+        return reflect_layers(plate.stack, frequency_hz, theta_rad)
     if first.thickness_mm is None:
         return half_space(first.epsilon, theta_rad)
     return slab(first.epsilon, first.thickness_mm / 1e3, frequency_hz, theta_rad)
@@ -188,7 +188,7 @@ def antennas(rig: Instrument, board: Board) -> Antennas:
     return Antennas(tx, rx, rig.geometry.object_distance_mm / 1e3, centre)
 
 
-def sampled(factor: Any) -> Any:
+def conjugate(factor: Any) -> Any:
     """Return a wave's complex factor (reflection, leakage) as it appears in samples: its conjugate."""
     return np.conj(factor)
 
@@ -204,11 +204,11 @@ def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
 
     def h(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
         s, p = turned_reflection(plate, frequency_hz, theta)
-        return sampled(s + leak_h * p)
+        return conjugate(s + leak_h * p)
 
     def v(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
         s, p = turned_reflection(plate, frequency_hz, theta)
-        return sampled(p + leak_v * s)
+        return conjugate(p + leak_v * s)
 
     return h if board.role == "receive_h" else v
 
@@ -229,7 +229,8 @@ def turned_reflection(plate: Plate, frequency_hz: float, theta: Real) -> tuple[C
 def direct_factor(board: Board, scene: Scene) -> complex:
     """Return the direct path in a board's samples: s and p are equal, so the wave is 1 + leakage."""
     d = scene.disturbances
-    return sampled(1.0 + complex(*(d.leakage_h if board.role == "receive_h" else d.leakage_v)))
+    leakage = d.leakage_h if board.role == "receive_h" else d.leakage_v
+    return conjugate(1.0 + complex(*leakage))
 
 
 def plate_scale(ant: Antennas, scene: Scene, frequency_hz: float) -> complex:
@@ -294,7 +295,7 @@ def field_exact(
         px, py = ant.centre_m[:2] + np.array(point.position_mm) / 1e3
         z = ant.plane_z_m + point.height_mm / 1e3
         r1, r2, _, _ = ant.legs(px - offsets_m[:, 0], py - offsets_m[:, 1], rx, z)
-        spread = sampled(complex(*point.amplitude)) * point_scale(ant) * direct_factor(board, scene) / (r1 * r2)
+        spread = conjugate(complex(*point.amplitude)) * point_scale(ant) * direct_factor(board, scene) / (r1 * r2)
         phase = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(r1 + r2, frequencies_hz))
         out += spread[:, None] * phase
     return out

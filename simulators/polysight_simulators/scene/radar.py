@@ -94,7 +94,10 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
     rng = np.random.default_rng(stream_key(seed, "power", board.name))
     spread_db = rng.uniform(-1, 1, len(rig.antennas.rx_mm)) * d.rx_gain_spread_db
     spread_rad = np.radians(rng.uniform(-1, 1, len(rig.antennas.rx_mm)) * d.rx_phase_spread_deg)
-    board_db = d.hv_gain_db / 2 if board.role == "receive_h" else -d.hv_gain_db / 2
+    if board.role == "receive_h":
+        board_db = d.hv_gain_db / 2
+    else:
+        board_db = -d.hv_gain_db / 2
     gains = 10 ** ((spread_db + board_db) / 20) * np.exp(1j * spread_rad)
 
     t = np.arange(chirp.samples) / chirp.sample_rate_hz
@@ -154,7 +157,8 @@ def per_chirp(receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool) -> 
 # Chirps per batch: their arrays fit in the cache
 _BATCH = 64
 _FULL_SCALE = 32767
-_LEAKAGE_DELAY_S = 0.2e-9  # from TX to RX on the transmit board: some centimetres
+# Delay from TX to RX on the transmit board: some centimetres.
+_LEAKAGE_DELAY_S = 0.2e-9
 _LEAKAGE_AMPLITUDE = 2.0
 
 
@@ -281,7 +285,10 @@ class SimulatedRig:
         """Return :meth:`chirps` before the ADC: complex64 [n, rx, sample], direct path of RX1 about 1, with noise."""
         board = self.rig.by_name(board_name)
         x_mm, y_mm = np.broadcast_arrays(np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64))
-        first = self._next_pulse[board_name] if first_pulse is None else first_pulse
+        if first_pulse is None:
+            first = self._next_pulse[board_name]
+        else:
+            first = first_pulse
         self._next_pulse[board_name] = first + len(x_mm)
         out = np.empty((len(x_mm), len(self.rig.antennas.rx_mm), self.rig.chirp.samples), dtype=np.complex64)
         for start in range(0, len(x_mm), _BATCH):
@@ -339,7 +346,7 @@ class SimulatedRig:
         nodes = np.zeros((len(x_m), *receiver.direct.shape[1:2], receiver.expand.shape[1]), dtype=np.complex64)
         if inside.any():
             gains = echo_drift(self.rig, d, board, pulses[inside])[:, None] * receiver.receiver.gains
-            nodes[inside] = receiver.field.at(x_m[inside], y_m[inside]) * gains[:, :, None]
+            nodes[inside] = receiver.field.interpolate(x_m[inside], y_m[inside]) * gains[:, :, None]
         # One small product per chirp: BLAS runs larger ones in threads, which is slow beside other processes.
         # [chirp, 2, rx, sample]
         ideal = np.matmul(nodes[:, None], receiver.expand)
@@ -425,6 +432,9 @@ class PatternSource:
     ) -> NDArray[np.int16]:
         """Return the frames of len(x_mm) pulses from `first_pulse` on; None: continue after the last call."""
         del y_mm
-        first = self._next[board_name] if first_pulse is None else first_pulse
+        if first_pulse is None:
+            first = self._next[board_name]
+        else:
+            first = first_pulse
         self._next[board_name] = first + len(x_mm)
         return pattern_frames(self._board[board_name], first, len(x_mm), self._samples)

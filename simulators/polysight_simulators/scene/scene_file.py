@@ -79,7 +79,8 @@ PartsPerMillion = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 Hertz = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 Microseconds = Annotated[float, msgspec.Meta(ge=0.001, le=1e6)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=0.5)]
-Degrees = Annotated[float, msgspec.Meta(ge=-10, le=10)]  # of tilt: the fast field is checked up to 2
+# Tilt of a plate; the fast field is checked up to 2 degrees.
+Degrees = Annotated[float, msgspec.Meta(ge=-10, le=10)]
 Tilt = tuple[Degrees, Degrees]
 Height = Annotated[float, msgspec.Meta(ge=-50, le=50)]
 SteepTilt = Annotated[float, msgspec.Meta(ge=-60, le=60)]
@@ -318,7 +319,8 @@ OFF: dict[str, Any] = {
     "leakage_v": [0.0, 0.0],
     "burst_motion": False,
     "direct_snr_db": None,
-    "adc_full_scale": 4.0,  # finer steps: 8192 counts for the direct path
+    # Finer steps: 8192 counts for the direct path.
+    "adc_full_scale": 4.0,
     "packet_loss": 0.0,
     "backlash_mm": 0.0,
     "sync_skew_ns": {},
@@ -381,7 +383,9 @@ def _apply_switches(table: Any, source: str) -> Any:
             "write true or false",
             code=ErrorCode.TYPE_WRONG,
         )
-    result: dict[str, Any] = dict(OFF) if ideal else {}
+    result: dict[str, Any] = {}
+    if ideal:
+        result = dict(OFF)
     for key, value in values.items():
         if value == "off" or value is False:
             if key not in OFF and key in Disturbances.__struct_fields__:

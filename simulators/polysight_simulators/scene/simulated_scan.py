@@ -173,15 +173,34 @@ def simulate(
     radar = SimulatedRig(rig, _wider(scene, rig) if by_columns else scene, seed, cache_dir)
     rig = apply_scene(rig, scene)
     plan = _plan(rig, by_columns)
-    started_s = time.time() if started_s is None else started_s
+    if started_s is None:
+        started_s = time.time()
     scan_id = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
     facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id}
     if layout == "own":
         stamp = datetime.fromtimestamp(started_s, UTC).isoformat(timespec="seconds")
         own_layout = OwnLayout(out, rig, plan, scan_id, stamp)
-        return _write_scan(own_layout, radar, plan, rig.recorded, by_columns, progress, facts)
-    authors = AuthorsLayout(out, rig, scan_id, started_s, zero_filling, by_columns, skipped)
-    _write_scan(authors, radar, plan, rig.boards, by_columns, progress, facts)
+        return _write_scan(
+            writer=own_layout,
+            radar=radar,
+            plan=plan,
+            boards=rig.recorded,
+            by_columns=by_columns,
+            progress=progress,
+            facts=facts,
+        )
+    authors = AuthorsLayout(
+        path=out,
+        rig=rig,
+        scan_id=scan_id,
+        started_s=started_s,
+        zero_filling=zero_filling,
+        by_columns=by_columns,
+        skipped=skipped,
+    )
+    _write_scan(
+        writer=authors, radar=radar, plan=plan, boards=rig.boards, by_columns=by_columns, progress=progress, facts=facts
+    )
     # The authors' files contain neither geometry nor filter nor leakage.
     (authors.folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
     return authors.folder
@@ -211,7 +230,10 @@ def _write_scan(
 
 def _plan(rig: Instrument, by_columns: bool) -> RasterPlan:
     """Return the plan of the rig's grid. Raises ConfigError if a burst does not end before the next point."""
-    grid = _by_columns(rig.grid) if by_columns else rig.grid
+    if by_columns:
+        grid = _by_columns(rig.grid)
+    else:
+        grid = rig.grid
     check_burst_fits(grid, rig.burst, rig.stage)
     _check_row_size(rig, grid)
     return plan_raster(grid)
@@ -240,7 +262,8 @@ def _write_rows(
     """Write every row of the plan for these boards; `by_columns`: the stage runs along y."""
     for row in plan:
         x, y = row_offsets_mm(radar, row)
-        x, y = (y, x) if by_columns else (x, y)
+        if by_columns:
+            x, y = y, x
         first = row.index * len(x)
         payloads = {b.name: radar.chirps(b.name, x, y, first) for b in boards}
         writer.write_row(row, payloads, {b.name: lost_bytes(radar, b.name, row) for b in boards})

@@ -84,7 +84,7 @@ class SerialPort:
             poll.register(self._master, select.POLLIN)
         poll.poll(timeout_ms)
 
-    def opened(self) -> bool:
+    def was_opened(self) -> bool:
         """Take note of opening and closing. True when DTR rose, which resets an UNO, however shortly it had been low.
 
         The kernel raises DTR when a serial port is opened, and lowers it at the last close unless HUPCL was taken away.
@@ -145,12 +145,15 @@ def serve(
     while not stop.is_set():
         port.wait(STEP_POLL_MS if stage.stepping else REST_POLL_MS)
         now = time.monotonic_ns()
-        leap = min(now - wall, LONGEST_LEAP_NS) if stage.stepping else now - wall
+        if stage.stepping:
+            leap = min(now - wall, LONGEST_LEAP_NS)
+        else:
+            leap = now - wall
         wall = now
         ticks += leap * time_scale * TICK_HZ * 1e-9
         now_ms = (now - started) // NS_PER_MS
         # Opening the port resets the board; its boot loader ignores bytes until it ends
-        if port.opened():
+        if port.was_opened():
             boots_at = now + boot_ms * NS_PER_MS
             running = False
         is_open = port.is_open
@@ -198,7 +201,9 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(args: argparse.Namespace, stop: Signal) -> None:
     rig = load_instrument(args.config)
-    gxx = None if args.python else sketch_compiler()
+    gxx = None
+    if not args.python:
+        gxx = sketch_compiler()
     if gxx is not None:
         program = str(build_sketch(gxx))
         command = [program, "--link", str(args.link), "--time-scale", repr(args.time_scale)]
@@ -209,7 +214,10 @@ def _run(args: argparse.Namespace, stop: Signal) -> None:
         os.execv(program, command)
     if not args.python:
         sys.stderr.write("stage: no C++ compiler or no sketch here: the Python stand-in runs instead\n")
-    wires = WireClient(args.wires) if args.wires else None
+    if args.wires:
+        wires = WireClient(args.wires)
+    else:
+        wires = None
     with closing(SerialPort(args.link)) as port:
         announce_ready(str(args.link))
         stage = PythonStage(Rig(rig.stage.steps_per_mm, rig.pi.trigger_in))

@@ -184,9 +184,14 @@ class StageLogic:
         if self._phase == 3:
             self._engine.set_accel(self.parameters[Parameter.ACCEL])
             return self._end()
-        distance = -2 * STEPS_PER_MM if self._phase == 1 else STEPS_PER_MM
+        distance = STEPS_PER_MM
+        if self._phase == 1:
+            distance = -2 * STEPS_PER_MM
         self._phase += 1
-        leg = Leg(distance, 0, CREEP_RATE) if self._buzz_x else Leg(0, distance, CREEP_RATE)
+        if self._buzz_x:
+            leg = Leg(distance, 0, CREEP_RATE)
+        else:
+            leg = Leg(0, distance, CREEP_RATE)
         self._arm(self._engine.start(leg))
         return Event.NONE
 
@@ -207,13 +212,19 @@ class StageLogic:
         _require(width_us * rate < min(spacing, 4000) * 1_000_000, StageError.OUT_OF_RANGE)
         backlash = self.parameters[Parameter.BACKLASH]
         lead = self._engine.ramp_steps(rate) + max(spacing, backlash)
-        run_up = lead if pitch > 0 else -lead
+        if pitch > 0:
+            run_up = lead
+        else:
+            run_up = -lead
         _require(self._within(x0 - run_up, y) and self._within(last + run_up, y), StageError.NO_RUN_UP)
         _require(y >= backlash, StageError.NO_RUN_UP)
         self._row_leg = Leg(last - x0 + 2 * run_up, 0, rate, lead, spacing, points)
         self._begin("travel")
         self._row_y = y
-        from_below = y - backlash if self._engine.y > y - backlash else y
+        if self._engine.y > y - backlash:
+            from_below = y - backlash
+        else:
+            from_below = y
         self._go(x0 - run_up, from_below, self.parameters[Parameter.TRAVEL_SPEED])
 
     def _within(self, x: int, y: int) -> bool:
@@ -306,7 +317,9 @@ class StageLogic:
             self._arm(engine.resume())
         if engine.hold and self.activity == "row":
             self.held = True
-        return self._next_leg() if engine.finished else Event.NONE
+        if engine.finished:
+            return self._next_leg()
+        return Event.NONE
 
     def _next_leg(self) -> Event:
         if self.activity == "travel" and self._engine.y != self._row_y:
@@ -340,10 +353,16 @@ class StageLogic:
             if self._engine.reached != (self._phase % 3 != 2):
                 return self._raise(StageError.HOMING_FAILED, True)
             if self._phase == 2:
-                self.lost_x = -self._engine.x if self._knew else 0
+                if self._knew:
+                    self.lost_x = -self._engine.x
+                else:
+                    self.lost_x = 0
                 self._engine.x = 0
             if self._phase == 5:
-                self.lost_y = -self._engine.y if self._knew else 0
+                if self._knew:
+                    self.lost_y = -self._engine.y
+                else:
+                    self.lost_y = 0
                 self._engine.y = 0
             self._phase += 1
             self._searched = 0

@@ -88,7 +88,9 @@ class StepEngine:
         self.error = self.major // 2
         self.x_direction = (leg.dx > 0) - (leg.dx < 0)
         self.y_direction = (leg.dy > 0) - (leg.dy < 0)
-        self.left, self.ramp, self.ramp_full = self.major, 0, self.ramp_steps(leg.rate)
+        self.left = self.major
+        self.ramp = 0
+        self.ramp_full = self.ramp_steps(leg.rate)
         self.to_trigger = leg.lead
         self.points_left = leg.points
         self.reached = self.cruise = False
@@ -97,7 +99,9 @@ class StepEngine:
     def resume(self) -> int:
         """End a hold; return the ticks to the next step if the stage was at rest, else 0."""
         self.hold = False
-        return 0 if self.stepping else self._from_rest()
+        if self.stepping:
+            return 0
+        return self._from_rest()
 
     def _from_rest(self) -> int:
         if self.left == 0 or self.hold:
@@ -113,7 +117,10 @@ class StepEngine:
 
     def look(self, inputs: int) -> None:
         """Read and debounce the switches: a change counts after :data:`LOOKS` equal readings."""
-        self._looks = 0 if inputs == self.stable else self._looks + 1
+        if inputs == self.stable:
+            self._looks = 0
+        else:
+            self._looks += 1
         if self._looks >= LOOKS:
             self.stable = inputs
             self._looks = 0
@@ -158,7 +165,12 @@ class StepEngine:
         if not self.cruise or self.hold or self.leg.until or self.stable:
             return 0, 0, 0, 0
         rate = self.leg.rate
-        clear_major, clear_minor = (clear_x, clear_y) if self.x_major else (clear_y, clear_x)
+        if self.x_major:
+            clear_major = clear_x
+            clear_minor = clear_y
+        else:
+            clear_major = clear_y
+            clear_minor = clear_x
         n = min(self.left - self.ramp - 1, ((wait_ticks + 1) * rate - 1 - self.carry) // TICK_HZ + 1, clear_major)
         if self.points_left:
             n = min(n, self.to_trigger - 1)
@@ -169,15 +181,20 @@ class StepEngine:
             return 0, 0, 0, 0
         self._looks = 0
         dx, dy, _ = self._advance(n)
-        before = ((n - 1) * TICK_HZ + self.carry) // rate
+        ticks_before = ((n - 1) * TICK_HZ + self.carry) // rate
         ticks, self.carry = divmod(n * TICK_HZ + self.carry, rate)
-        self.ticks = ticks - before
+        self.ticks = ticks - ticks_before
         return n, dx, dy, ticks
 
     def _advance(self, n: int) -> tuple[int, int, bool]:
         self.left -= n
-        others, self.error = divmod(self.error + n * self.minor, self.major)
-        nx, ny = (n, others) if self.x_major else (others, n)
+        minor_steps, self.error = divmod(self.error + n * self.minor, self.major)
+        if self.x_major:
+            nx = n
+            ny = minor_steps
+        else:
+            nx = minor_steps
+            ny = n
         dx = nx * self.x_direction
         dy = ny * self.y_direction
         self.x += dx

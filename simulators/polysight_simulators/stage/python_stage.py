@@ -115,7 +115,10 @@ class PythonStage:
 
     def _steps(self, until: int) -> None:
         engine = self._engine
-        end = until if self._fall is None else min(until, self._fall - 1)
+        if self._fall is None:
+            end = until
+        else:
+            end = min(until, self._fall - 1)
         n = dx = dy = ticks = 0
         if end > self.tick and not self._inputs():
             n, dx, dy, ticks = engine.skip(end - self.tick, abs(self._x) - 1, abs(self._y) - 1)
@@ -262,7 +265,9 @@ class PythonStage:
     def _done(self) -> bytes:
         engine = self._engine
         logic = self._logic
-        fields = {"points": engine.points, "pulses": engine.pulses} if logic.row_command else {}
+        fields = {}
+        if logic.row_command:
+            fields = {"points": engine.points, "pulses": engine.pulses}
         fields |= {"x": engine.x, "y": engine.y}
         if logic.row_command:
             fields["held"] = int(logic.held)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import PolysightError
-from polysight_simulators.process import command_line, die_with_parent, exit_status_of
+from polysight_simulators.process import command_line, die_with_parent, run_program
 from polysight_simulators.stage import homing_zero
 from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
@@ -30,13 +30,13 @@ def main(argv: list[str] | None = None) -> int:
     if not args.time_scale > 0:
         p.error("--time-scale must be positive")
     die_with_parent()
-    return exit_status_of(lambda: _run(args))
+    return run_program(lambda: _run(args))
 
 
 def _run(args: argparse.Namespace) -> None:
     if lacking := missing():
-        what = f"not installed: {' '.join(lacking)}"
-        raise PolysightError(what, "the emulated board is compiled here", ENABLING_COMMAND)
+        problem = f"not installed: {' '.join(lacking)}"
+        raise PolysightError(problem, "the emulated board is compiled here", ENABLING_COMMAND)
     rig = load_instrument(args.config)
     zero = homing_zero()
     program = str(emulator())

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from polysight_shared.errors import DeviceError
-from polysight_simulators.builds import SKETCH_DIR, compiled
+from polysight_simulators.builds import SKETCH_DIR, compile_once
 
 CORE_DIR = Path("/usr/share/arduino/hardware/arduino/avr/cores/arduino")
 ENABLING_COMMAND = (
@@ -36,13 +36,15 @@ class PinEdge(NamedTuple):
     x: int
     left: int
     right: int
-    step_cycle: int  # of the last rising PUL edge
+    # Cycle of the last rising PUL edge.
+    step_cycle: int
 
 
 class Cost(NamedTuple):
     """Worst cases since the last call of :meth:`EmulatedUno.cost`, in cycles."""
 
-    interrupts: dict[int, int]  # by vector number: from entry to the end of reti
+    # Cycles from entry to the end of reti, by vector number.
+    interrupts: dict[int, int]
     # Shortest
     step_pulse: int
     # Shortest time from DIR to PUL
@@ -191,7 +193,7 @@ def missing() -> list[str]:
 def emulator() -> Path:
     """Compile the emulator; return its path. Raises DeviceError if it does not compile."""
     code = [str(p) for p in _SOURCES if p.suffix == ".c"]
-    return compiled("unosim", _SOURCES, [*_CC, "-o", "{folder}/unosim", *code, *_LIBRARIES], _ON_FAILURE)
+    return compile_once("unosim", _SOURCES, [*_CC, "-o", "{folder}/unosim", *code, *_LIBRARIES], _ON_FAILURE)
 
 
 def firmware(compiler: Path | None = None) -> Path:
@@ -215,5 +217,6 @@ def firmware(compiler: Path | None = None) -> Path:
         )
     sources = [p for p in SKETCH_DIR.iterdir() if p.suffix in (".cpp", ".h", ".ino", ".mk")]
     command = ["make", "-s", "-C", str(SKETCH_DIR), "firmware", "AVR_B={folder}"]
-    command += [f"AVR={compiler}/avr-"] if compiler else []
-    return compiled("arduino_stage.hex", sources, command, _ON_FAILURE)
+    if compiler:
+        command += [f"AVR={compiler}/avr-"]
+    return compile_once("arduino_stage.hex", sources, command, _ON_FAILURE)

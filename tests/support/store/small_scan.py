@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from polysight.acquisition import scan as host_run
-from polysight.acquisition.scan import ScanProgress, ScanResult, resume_scan, run_scan
+from polysight.acquisition.progress import ScanProgress, ScanResult
+from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Evidence, place_record
 from polysight.capture.receiver import RowCapture

@@ -1,0 +1,226 @@
+"""Plot of permittivities, loss over real part: estimates with error ellipses, and the truth as crosses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse
+from matplotlib.patheffects import withStroke
+
+from polysight.products import ProcessedScan
+from polysight.report.style import (
+    INK,
+    MUTED,
+    RIGHT_IN,
+    assign_colours,
+    dress,
+    new_figure,
+    patch_colour,
+    patch_label,
+    png,
+    set_margins,
+    short_label,
+    style_legend,
+)
+from polysight.results import PatchFigures, PermittivityFigures
+
+SHARES = {0.68: 2.279, 0.95: 5.991}
+"""Share of draws to the squared radius that holds it: quantiles of chi-squared with two degrees of freedom."""
+_STYLES: dict[float, dict[str, Any]] = {
+    0.68: {"linestyle": "-", "linewidth": 1.2},
+    0.95: {"linestyle": "--", "linewidth": 0.8},
+}
+# Size of a patch's number and of its point in `permittivity_figure`, in points of 1/72 inch, measured on its PNG.
+_LABEL_PT = (9.0, 9.0)
+_POINT_PT = 5.0
+# Places that `place_numbers` tries: rings around the point, and directions on each.
+_RADII_PT = (11, 17, 25, 34, 45, 58)
+_ANGLES = 16
+Array = npt.NDArray[np.float64]
+Point = tuple[float, float]
+Estimate = tuple[PatchFigures, PermittivityFigures]
+
+
+def fit_ellipse(matrix: Array, share: float) -> tuple[float, float, float]:
+    """Return width, height and angle in degrees of the ellipse that holds a share of draws with a covariance [2, 2]."""
+    values, vectors = np.linalg.eigh(matrix)
+    width, height = 2 * np.sqrt(np.maximum(values, 0.0) * SHARES[share])
+    return float(width), float(height), math.degrees(math.atan2(vectors[1, 0], vectors[0, 0]))
+
+
+def place_numbers(points: Array, obstacles: Array) -> Array:
+    """Place a label beside each point so that labels cover neither one another nor a point.
+
+    Parameters
+    ----------
+    points
+        [n, 2], in points of 1/72 inch.
+    obstacles
+        [m, 2]: further points to keep clear of.
+
+    Returns
+    -------
+    [n, 2]: the labels' middles: for each the nearest free place, else the one that covers least.
+    """
+    taken: list[Array] = []
+    solid = np.concatenate([points, obstacles.reshape(-1, 2)])
+    turns = np.radians(45 + np.arange(_ANGLES) * 360 / _ANGLES)
+    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    candidates = np.concatenate([radius * ring for radius in _RADII_PT])
+    for point in points:
+        best = point + candidates[0]
+        least_cost = math.inf
+        for place in point + candidates:
+            labels = sum(bool((np.abs(place - other) < _LABEL_PT).all()) for other in taken)
+            covered = (np.abs(solid - place) < np.array(_LABEL_PT) / 2 + _POINT_PT / 2).all(axis=1).sum()
+            cost = 2.0 * labels + covered
+            if cost < least_cost:
+                best = place
+                least_cost = cost
+            if least_cost == 0:
+                break
+        taken.append(best)
+    return np.array(taken).reshape(-1, 2)
+
+
+def permittivity_figure(scan: ProcessedScan) -> bytes | None:
+    """Return a PNG of the estimates with ellipses of 68 % and 95 %, and the truth as crosses; None without estimates.
+
+    Patches are numbered; a legend names them. Without a covariance, bars show the spread of the pixels.
+    """
+    estimates = [(patch, patch.permittivity) for patch in scan.segments if patch.permittivity is not None]
+    if not estimates:
+        return None
+    colours = assign_colours(scan)
+    size_in = (7.8, max(4.4, 1.5 + 0.19 * len(estimates)))
+    fig = new_figure(*size_in, RIGHT_IN)
+    ax = fig.add_subplot()
+    truths = [t for patch, _ in estimates if (t := _truth(patch))]
+    title = "Permittivity"
+    if truths:
+        title += ", estimate and truth"
+    dress(ax, title, scan.stamped)
+    ax.set_aspect("auto")
+    ax.set_facecolor("white")
+    ax.grid(color="#e6e9ee", linewidth=0.8)
+    ax.set_axisbelow(True)
+    ax.set_xlabel("real part ε′", fontsize=9, color=MUTED)
+    ax.set_ylabel("loss ε″", fontsize=9, color=MUTED)
+    for patch, e in estimates:
+        _draw_estimate(ax, e, _truth(patch), patch_colour(patch, colours))
+    _set_limits(ax, [e for _, e in estimates], truths)
+    low = ax.get_ylim()[0]
+    ax.axhspan(low, 0, color="#f0e7e6", zorder=0)
+    ax.annotate(
+        "ε″ < 0: gain", (0, 0), xycoords="axes fraction", xytext=(4, 3), textcoords="offset points", fontsize=7,
+        color=MUTED, zorder=1,
+    )  # fmt: skip
+    legend = _legend(fig, estimates, colours, bool(truths))
+    set_margins(fig, legend.get_window_extent().width / fig.dpi + RIGHT_IN)
+    _write_numbers(fig, ax, estimates, truths)
+    return png(fig)
+
+
+def _truth(patch: PatchFigures) -> Point | None:
+    truth = patch.true_permittivity
+    if truth is None:
+        return None
+    return truth.real, -truth.imag
+
+
+def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour: str) -> None:
+    centre = (e.real, e.loss)
+    if e.spread is not None:
+        for share, style in _STYLES.items():
+            w, h, angle = fit_ellipse(e.spread.matrix, share)
+            ax.add_patch(Ellipse(centre, w, h, angle=angle, facecolor="none", edgecolor=colour, zorder=2.5, **style))
+            if share == min(_STYLES):
+                ax.add_patch(Ellipse(centre, w, h, angle=angle, facecolor=colour, alpha=0.18, linewidth=0, zorder=2))
+    elif e.real_p30_p70 and e.imag_p30_p70:
+        r0, r1 = e.real_p30_p70
+        i0, i1 = e.imag_p30_p70
+        ax.errorbar(
+            *centre, color=colour, linewidth=1.2, zorder=3,
+            xerr=[[max(e.real - r0, 0)], [max(r1 - e.real, 0)]],
+            yerr=[[max(e.loss + i1, 0)], [max(-i0 - e.loss, 0)]],
+        )  # fmt: skip
+    ax.plot(*centre, "o", color=colour, markersize=6, markeredgecolor=INK, markeredgewidth=0.6, zorder=3)
+    if truth:
+        ax.plot([centre[0], truth[0]], [centre[1], truth[1]], color=MUTED, linewidth=0.8, zorder=2)
+        ax.plot(*truth, "x", color=INK, markersize=6, markeredgewidth=1.5, zorder=4)
+
+
+def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequence[Point]) -> None:
+    """Set limits around estimates, truths and ellipses; one very uncertain patch must not shrink all others."""
+    centres = np.array([(e.real, e.loss) for e in estimates])
+    certain = np.concatenate([centres, np.array(truths, float).reshape(-1, 2)])
+    half = np.array([_half_size(e) for e in estimates])
+    low = certain.min(axis=0)
+    high = certain.max(axis=0)
+    span = np.maximum(high - low, (0.5, 0.3))
+    low = np.minimum(low, np.maximum((centres - half).min(axis=0), low - 0.75 * span)) - 0.08 * span
+    high = np.maximum(high, np.minimum((centres + half).max(axis=0), high + 0.75 * span)) + 0.08 * span
+    ax.set_xlim(low[0], high[0])
+    ax.set_ylim(min(low[1], -0.1), high[1])
+
+
+def _half_size(e: PermittivityFigures) -> Point:
+    """Return how far the drawing of an estimate reaches: its 95 % ellipse, or its bars."""
+    if e.spread is not None:
+        radius = math.sqrt(SHARES[0.95])
+        return radius * e.spread.real_std, radius * e.spread.loss_std
+    real = max(abs(end - e.real) for end in e.real_p30_p70 or (e.real,))
+    return real, max(abs(end - e.imag) for end in e.imag_p30_p70 or (e.imag,))
+
+
+def _legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str], with_truth: bool) -> Legend:
+    dot: dict[str, Any] = {
+        "marker": "o",
+        "linestyle": "",
+        "markersize": 6,
+        "markeredgecolor": INK,
+        "markeredgewidth": 0.6,
+    }
+    handles = []
+    for patch, _ in estimates:
+        label = f"{patch.label}  {short_label(patch_label(patch))}"
+        handles.append(Line2D([], [], color=patch_colour(patch, colours), label=label, **dot))
+    if any(e.spread for _, e in estimates):
+        handles += [
+            Line2D([], [], color=MUTED, **style, label=f"{100 * share:.0f} % region")
+            for share, style in _STYLES.items()
+        ]
+    if with_truth:
+        handles.append(Line2D([], [], color=INK, marker="x", linestyle="", markeredgewidth=1.5, label="truth"))
+    legend = fig.legend(handles=handles, loc="upper right", fontsize=7.5, frameon=False)
+    style_legend(legend)
+    return legend
+
+
+def _write_numbers(fig: Figure, ax: Axes, estimates: Sequence[Estimate], truths: Sequence[Point]) -> None:
+    """Write the patches' numbers beside their points, with a line to numbers that are further away."""
+    per_point = fig.dpi / 72
+    values = np.array([(e.real, e.loss) for _, e in estimates])
+    points = ax.transData.transform(values) / per_point
+    crosses = ax.transData.transform(np.array(truths, float).reshape(-1, 2)) / per_point
+    places = place_numbers(points, crosses)
+    line = {"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkA": 3, "shrinkB": 3}
+    for (patch, e), place, point in zip(estimates, places, points, strict=True):
+        offset = place - point
+        arrow = None
+        if np.hypot(*offset) > _RADII_PT[0] + 1:
+            arrow = line
+        ax.annotate(
+            str(patch.label), (e.real, e.loss), textcoords="offset points",
+            xytext=(float(offset[0]), float(offset[1])), ha="center", va="center", fontsize=8, color=INK, zorder=5,
+            fontweight="bold", path_effects=[withStroke(linewidth=2, foreground="white")],
+            arrowprops=arrow,
+        )  # fmt: skip

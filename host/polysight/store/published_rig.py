@@ -1,0 +1,223 @@
+"""Settings of the published data set as a rig: grid, burst, chirp, distances and mount angles.
+
+`read_settings` reads the JSON files of a scan, `build_rig` puts their values into a rig file, and `mirror_rig` swaps x
+and y for scans that were recorded column by column.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+
+from polysight_shared import files
+from polysight_shared.config import Board, Instrument, MountStep
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+from polysight_shared.tables import decode
+
+COLLECTION = "data_collection_cfg.json"
+DEVICES = "devices_comm_cfg.json"
+
+
+class ChirpConfig(msgspec.Struct, frozen=True):
+    """One of `chirp_configs`, in SI or in the units of TI's tools (GHz, MHz/us, us, ksps)."""
+
+    f0: float
+    slope: float
+    ramp_time: float
+    adc_start_time: float
+    num_adc: int
+    Fs: float
+
+
+class Collection(msgspec.Struct, frozen=True):
+    """The keys of the JSON files that are used. Lengths in mm, times in ms, angles in degrees, `board_dist` in m."""
+
+    dx: float
+    dy: float
+    total_x: int
+    total_y: int
+    num_trigger: int
+    period_frame: float
+    num_adc: int
+    object_distance: float
+    board_dist: float | None = None
+    txboard_angle_y: float | None = None
+    rxboard_v_angle_y: float | None = None
+    rxboard_angle_y: float | None = None
+    rxboard_angle_z: float | None = None
+    rxboard_tilt_offset: tuple[float, float, float] | None = None
+    moving_direction: str = "row"
+    num_chirp: int = 1
+    packet_zero_filling: bool = True
+    description: str = ""
+    chirp_configs: tuple[ChirpConfig, ...] = ()
+
+    @property
+    def by_columns(self) -> bool:
+        """True if the stage ran along y, column after column."""
+        return self.moving_direction == "col"
+
+
+class Rig(NamedTuple):
+    """The rig of a scan, x from TX to RX, and notices on how the settings were read."""
+
+    instrument: Instrument
+    notices: tuple[str, ...]
+
+
+def read_json(path: Path, missing_ok: bool = False) -> dict[str, Any]:
+    """Read a JSON object from a file; with `missing_ok`, {} for a missing file. Raises DataError."""
+    if missing_ok and not path.exists():
+        return {}
+    cause = "the download is not complete"
+    remedy = "fetch the file again"
+    try:
+        content = files.read_json(path)
+    except (OSError, ValueError) as e:
+        raise DataError(f"{path}: not JSON: {e}", cause, remedy, code=ErrorCode.FILE_DAMAGED) from None
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: not a JSON object", cause, remedy, code=ErrorCode.FILE_FOREIGN)
+    return content
+
+
+def read_settings(path: Path) -> Collection:
+    """Read the settings of an `unsynced/<scan>` or `raw/<scan>` folder. Raises DataError or ConfigError."""
+    content = {**read_json(path / DEVICES, missing_ok=True), **read_json(path / COLLECTION)}
+    s = decode(content, Collection, str(path / COLLECTION))
+    if s.moving_direction not in ("row", "col") or not s.chirp_configs or s.num_chirp != 1:
+        raise DataError(
+            f"{path}: moving_direction {s.moving_direction!r}, {len(s.chirp_configs)} chirp configs,"
+            f" {s.num_chirp} chirps a frame",
+            "only scans by row or by column with one chirp a frame are read",
+            "this scan cannot be processed",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    return s
+
+
+def build_rig(s: Collection, base: Instrument, path: Path) -> Rig:
+    """Return the base rig with the scan's settings; values missing in the JSON stay the base's. Raises ConfigError."""
+    c = s.chirp_configs[0]
+    grid = {"columns": s.total_x, "rows": s.total_y, "step_x_mm": s.dx, "step_y_mm": s.dy}
+    # The grid was within their stage's travel.
+    travel = (
+        max(base.stage.travel_x_mm, s.total_x * s.dx + 2 * base.stage.run_up_mm(s.dx)),
+        max(base.stage.travel_y_mm, s.total_y * s.dy + 2 * base.stage.run_up_mm(s.dy)),
+    )
+    table = msgspec.to_builtins(base)
+    table["grid"] = grid
+    table["stage"] |= {"travel_x_mm": travel[0], "travel_y_mm": travel[1]}
+    table["stage"] |= {"centre_x_mm": travel[0] / 2, "centre_y_mm": travel[1] / 2}
+    table["burst"] |= {"pulses": s.num_trigger, "period_us": s.period_frame * 1e3}
+    table["geometry"]["object_distance_mm"] = s.object_distance
+    table["chirp"] |= {
+        "start_hz": _to_large_unit(c.f0, least=1e6, factor=1e9),
+        "slope_hz_per_s": _to_large_unit(c.slope, least=1e6, factor=1e12),
+        "ramp_end_us": _to_large_unit(c.ramp_time, least=1, factor=1e6),
+        "adc_start_us": _to_large_unit(c.adc_start_time, least=1e-2, factor=1e6),
+        "samples": c.num_adc,
+        "sample_rate_hz": _to_large_unit(c.Fs, least=1e5, factor=1e3),
+        "linear_samples": [min(n, c.num_adc) for n in base.chirp.linear_samples],
+    }
+    rig = decode(table, Instrument, str(path))
+    notices: list[str] = []
+    boards = tuple(msgspec.structs.replace(b, mount=_mount(b, s, notices)) for b in rig.boards)
+    return Rig(msgspec.structs.replace(rig, boards=boards), tuple(notices))
+
+
+def _to_large_unit(value: float, least: float, factor: float) -> float:
+    """Return a value in the wanted unit: their files have some in SI, some in the units of TI's tools.
+
+    No chirp has a value below `least` in the wanted unit; such a value is in the other one and is multiplied.
+    """
+    if value < least:
+        return value * factor
+    return value
+
+
+def _mount(board: Board, s: Collection, notices: list[str]) -> tuple[MountStep, ...]:
+    """Replace the angles and offsets of the base rig's mount by the scan's.
+
+    The last turn about y points the board at the object, the last about z tilts the receivers, and the shift between
+    them is the tilt's offset; the V board has another turn about y before. The last shift is half the distance between
+    the board origins.
+    """
+    steps = list(board.mount)
+    transmits = board.role == "transmit"
+    key = "txboard_angle_y" if transmits else "rxboard_angle_y"
+    facing = getattr(s, key)
+    # The transmitter stands at negative x and faces +x, receivers the other way round.
+    side = -1 if transmits else 1
+    if facing is not None and (turns := _turns(steps, "y")):
+        # Its normal, (sin a, 0, cos a), would point away from the other boards.
+        if facing * side > 0:
+            notices.append(
+                f"{board.name}: {key} = {facing:g} would turn the board away from the object;"
+                f" read with the other sense of rotation, {-facing:g}"
+            )
+            facing = -facing
+        steps[turns[-1]] = MountStep(turn_deg=facing, about="y")
+    if not transmits:
+        if s.rxboard_angle_z is not None and (turns := _turns(steps, "z")):
+            steps[turns[-1]] = MountStep(turn_deg=s.rxboard_angle_z, about="z")
+        turns_y = _turns(steps, "y")
+        if board.role == "receive_v" and s.rxboard_v_angle_y is not None and len(turns_y) > 1:
+            steps[turns_y[0]] = MountStep(turn_deg=s.rxboard_v_angle_y, about="y")
+        shifts = _shifts(steps)
+        if s.rxboard_tilt_offset is not None and len(shifts) > 1:
+            steps[shifts[-2]] = MountStep(shift_mm=s.rxboard_tilt_offset)
+    last = None
+    if steps:
+        last = steps[-1].shift_mm
+    if s.board_dist is not None and last is not None:
+        steps[-1] = MountStep(shift_mm=(side * s.board_dist * 1e3 / 2, last[1], last[2]))
+    return tuple(steps)
+
+
+def _turns(steps: list[MountStep], axis: str) -> list[int]:
+    return [i for i, step in enumerate(steps) if step.about == axis]
+
+
+def _shifts(steps: list[MountStep]) -> list[int]:
+    return [i for i, step in enumerate(steps) if step.shift_mm is not None]
+
+
+def mirror_rig(rig: Instrument) -> Instrument:
+    """Mirror the rig in x = y; mirroring twice gives the rig itself.
+
+    The mirrored rig records row by row the same path lengths as the rig column by column. A turn about an axis becomes
+    the opposite turn about the swapped axis.
+    """
+    stage = rig.stage
+    grid = rig.grid
+    image = rig.image
+    replace = msgspec.structs.replace
+    return replace(
+        rig,
+        grid=replace(grid, columns=grid.rows, rows=grid.columns, step_x_mm=grid.step_y_mm, step_y_mm=grid.step_x_mm),
+        image=replace(image, columns=image.rows, rows=image.columns),
+        stage=replace(
+            stage,
+            travel_x_mm=stage.travel_y_mm,
+            travel_y_mm=stage.travel_x_mm,
+            centre_x_mm=stage.centre_y_mm,
+            centre_y_mm=stage.centre_x_mm,
+        ),
+        antennas=replace(
+            rig.antennas,
+            rx_mm=tuple((y, x, z) for x, y, z in rig.antennas.rx_mm),
+            tx_mm=tuple((y, x, z) for x, y, z in rig.antennas.tx_mm),
+        ),
+        boards=tuple(replace(b, mount=tuple(_mirror_step(s) for s in b.mount)) for b in rig.boards),
+    )
+
+
+def _mirror_step(step: MountStep) -> MountStep:
+    if step.shift_mm is not None:
+        x, y, z = step.shift_mm
+        return MountStep(shift_mm=(y, x, z))
+    axes: dict[str, Literal["x", "y", "z"]] = {"x": "y", "y": "x", "z": "z"}
+    return MountStep(turn_deg=-(step.turn_deg or 0.0), about=axes[step.about or "z"])

@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks.coverage import CHI2_68, CHI2_95, GRID, PLACES, Cubes
 from polysight.data import packaged
-from polysight.jobs.process import plane_of
+from polysight.jobs.process import make_plane_reference
 from polysight.materials import METAL, Layer, LayerFit, fit_row, match_truth, truth_plates
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference
@@ -142,8 +142,8 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
     plates = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
     pipeline = _imaged(rig, msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0))
-    parts = tuple(plane_of(pipeline, part) for part in pipeline.sub_bands.finish(pipeline.source.mirrored))
-    return replace(plane_of(pipeline, pipeline.form_images()), bands=parts)
+    parts = tuple(make_plane_reference(pipeline, part) for part in pipeline.sub_bands.finish(pipeline.source.mirrored))
+    return replace(make_plane_reference(pipeline, pipeline.form_images()), bands=parts)
 
 
 def rows_of(seed: int, rig: Instrument, scene: Scene, metal: PlaneReference) -> tuple[dict[str, PatchFigures], float]:

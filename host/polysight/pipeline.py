@@ -50,10 +50,10 @@ class Pipeline:
         return process.map_boards(self.quality.boards, lambda board: self._synchronise(board, row), self.images.live)
 
     def _synchronise(self, board: str, row: int) -> sync.SyncedRow:
-        with self.quality.timed("read and synchronise"):
+        with self.quality.measure_time("read and synchronise"):
             recorded = self.source.read_row(board, row)
             synced, frames_whole = self.synchroniser.synchronise(board, recorded)
-        with self.quality.timed("reduce"):
+        with self.quality.measure_time("reduce"):
             self.images.add_row(board, row, synced)
             self.sub_bands.add_row(board, row, synced)
         self.quality.boards[board].add(row, recorded, frames_whole, synced)
@@ -63,7 +63,7 @@ class Pipeline:
         """Form both images on the rig file's plane, divided by the footprint, not referenced; `from_sums`: live."""
         if self.settings.sparse and not from_sums:
             self.sub_bands = self.samples.fill_missing()
-        with self.quality.timed("image"):
+        with self.quality.measure_time("image"):
             if from_sums:
                 images = self.images.current()
             else:
@@ -75,7 +75,7 @@ class Pipeline:
 
     def place_plane(self, images: imaging.Images, move: bool = True) -> imaging.Images:
         """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
-        with self.quality.timed("plane"):
+        with self.quality.measure_time("plane"):
             masks = materials.insides(images)
             swapped = self.source.mirrored
             self.plane, images = imaging.move_to_plane(self.samples.filled, images, masks, swapped, move)
@@ -88,7 +88,7 @@ class Pipeline:
         classifier: materials.Classifier | None = None,
     ) -> materials.MaterialsResult:
         """Find patches (unless known), metal reference, permittivities and names; in sub-bands too, if imaged."""
-        with self.quality.timed("materials"):
+        with self.quality.measure_time("materials"):
             rig = self.plane.applied_to(self.rig)
             std = self.plane.incidence_std_rad(self.rig)
             angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, self.settings.incidence)
@@ -96,7 +96,7 @@ class Pipeline:
             result = materials.analyse(images, optics, known, classifier)
             plane = None if known is None else known.plane
             self.quality.note_materials(result, angles, images.valid, plane)
-        with self.quality.timed("sub-bands"):
+        with self.quality.measure_time("sub-bands"):
             parts = self.sub_bands.finish(self.source.mirrored, self.plane.moved_m)
             if parts:
                 result = materials.with_bands(result, self.sub_bands.bands, parts, optics, plane)

@@ -12,7 +12,7 @@ from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 
 from polysight.cli.main import build_parser, main
-from polysight.cli.options import joined
+from polysight.cli.options import join_negative_values
 from polysight.materials.library import SIMULATED_LIBRARY
 from polysight.products import write_json
 from polysight_pi.cli import main as polysight_pi
@@ -108,7 +108,7 @@ def test_a_shift_of_the_plane_is_a_length_in_the_lab(text):
     [(["--metal-box", "-65,-20,-25,20"], (-65, -20, -25, 20)), (["--metal-box=-.5,-1,1,2"], (-0.5, -1, 1, 2))],
 )  # fmt: skip
 def test_a_place_left_of_the_middle_needs_no_equals_sign(words, value):
-    given = joined(["process", "scan", *words, "--out", "o"])
+    given = join_negative_values(["process", "scan", *words, "--out", "o"])
     assert build_parser().parse_args(given).metal == value
 
 
@@ -130,7 +130,7 @@ def test_both_programs_take_a_tilde(tmp_path, monkeypatch, capsys):
 
 
 def test_the_earlier_form_of_a_box_is_read_with_a_notice(capsys):
-    given = joined(["process", "scan", "--metal", "-45,0,40,40", "--out", "o"])
+    given = join_negative_values(["process", "scan", "--metal", "-45,0,40,40", "--out", "o"])
     assert build_parser().parse_args(given).metal == (-65, -20, -25, 20)
     assert "--metal-box -65,-20,-25,20" in capsys.readouterr().err
     assert build_parser().parse_args(["permittivity", "out", "--segment", "3"]).patch == 3
@@ -143,12 +143,12 @@ def test_a_box_has_a_lower_left_and_an_upper_right_corner(text):
 
 def test_other_words_are_left_as_they_are():
     words = ["process", "-x", "--out", "-o", "--json", "-1", "--a=b"]
-    assert joined(words) == words
+    assert join_negative_values(words) == words
 
 
 @pytest.mark.parametrize("place", ["-60,0", "-.5,-1", "60,-1"])
 def test_a_place_in_the_left_half_is_no_option(place):
-    given = build_parser().parse_args(joined(["probe", "scan", place]))
+    given = build_parser().parse_args(join_negative_values(["probe", "scan", place]))
     assert given.at == tuple(map(float, place.split(",")))
 
 

@@ -13,7 +13,7 @@ from tests.support.calibration import remaining
 from polysight.cli.main import main
 from polysight.imaging import Images
 from polysight.jobs.calibrate import load_reference
-from polysight.jobs.process import imaged
+from polysight.jobs.process import form_scan_images
 from polysight.materials import parse_layer, read_truth
 from polysight.materials.analyse import KnownScene
 from polysight.materials.layers import fit_layer
@@ -101,7 +101,7 @@ def reference(scan) -> PlaneReference:
 def test_layers_are_recovered_where_a_half_space_is_wrong(scan, reference, rig, name):
     """Water behind 3 mm of glass within 10 % in both parts; thin sheets within 5 %; Eq. 3 is beside in every row."""
     layers, truth = STACKS[name]
-    pipeline, images = imaged(scan(name), Settings(bands=BANDS, incidence="pixel"))
+    pipeline, images = form_scan_images(scan(name), Settings(bands=BANDS, incidence="pixel"))
     (row,) = pipeline.find_materials(images, KnownScene(metal=reference)).rows()
     bands = bands_of_row(row, rig.chirp, BANDS)
     assert bands is not None
@@ -195,7 +195,7 @@ def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytes
     }
     scene = decode_scene(raw, "test")
     folder = simulate(rig, scene, tmp_path / "scan")
-    pipeline, images = imaged(folder, Settings(bands=BANDS))
+    pipeline, images = form_scan_images(folder, Settings(bands=BANDS))
     found = pipeline.find_materials(images, known=KnownScene(plates=read_truth(folder / "truth.json")))
     assert len(found.patches) == 6
     for row in found.rows():

@@ -14,7 +14,7 @@ from tests.support.products import judged_products
 from tests.support.refusals import refused
 
 from polysight.cli.main import build_parser
-from polysight.cli.options import joined
+from polysight.cli.options import join_negative_values
 from polysight.serve.commands import (
     MAX_POSITIONS,
     ExportRequest,
@@ -128,7 +128,7 @@ def test_a_request_is_a_command_line_that_the_parser_takes(started, root, path, 
     assert status == 200, answer
     (words,) = commands
     assert words[0] == path.partition("?")[0].replace("start", "scan")
-    given = vars(build_parser(words[0]).parse_args(joined(words)))
+    given = vars(build_parser(words[0]).parse_args(join_negative_values(words)))
 
     shown = {name: plain(given[name], root) for name in values}
     assert shown == {name: plain(value, root) for name, value in values.items()}

@@ -118,5 +118,5 @@ def test_the_size_of_a_dead_folder_is_not_waited_for(dead, root, monkeypatch):
     monkeypatch.setattr(site, "SIZE_S", LIMIT_S)
     dead.stop(site, "folder_bytes")
     sizes = site.Sizes()
-    assert sizes.of(root / "dead") is None
-    wait_for(lambda: sizes.of(root / "alive") is not None, "the size of another folder")
+    assert sizes.read_size(root / "dead") is None
+    wait_for(lambda: sizes.read_size(root / "alive") is not None, "the size of another folder")

@@ -71,7 +71,7 @@ def holds(scan: ScanFolder, data: bytes, missing: list[tuple[int, int]]) -> None
 def test_rows_with_the_same_result_are_not_touched(tmp_path):
     scan, data = scan_with(tmp_path / "scan", lost=9)
     before = {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()}
-    assert [(r.changed, r.left) for r in replace_rows(scan)] == [(False, "")] * 2
+    assert [(r.changed, r.why_unchanged) for r in replace_rows(scan)] == [(False, "")] * 2
     assert {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()} == before
     holds(scan, data, [(9 * 1456, 10 * 1456)])
 
@@ -150,5 +150,5 @@ def test_a_row_without_its_packets_is_left(tmp_path):
     scan, _ = scan_with(tmp_path / "scan", lost=9)
     (scan.path / f"raw/RH/0000{PACKETS}").unlink()
     (scan.path / f"raw/RV/0000{PACKETS}").write_bytes(b"no")
-    assert [bool(r.left) for r in replace_rows(scan)] == [True, True]
+    assert [bool(r.why_unchanged) for r in replace_rows(scan)] == [True, True]
     assert len(errors(scan.path)) == 2

@@ -94,7 +94,7 @@ def test_only_bytes_that_were_committed_are_dropped(scan):
     other = bytes(board.bytes)
     (scan.path / board.file).write_bytes(other)
     processed = {n: {r.row: r.boards[n].crc32 for r in scan.committed_rows().values()} for n in row.boards}
-    kept = droppable(scan, processed).kept
+    kept = droppable(scan, processed).kept_files
     assert [line for line in kept if board.file in line]
     drop(scan, processed, scan.path)
     assert (scan.path / board.file).read_bytes() == other
@@ -247,7 +247,7 @@ def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):
     os.truncate(scan.path / board.file, 1 << 42)
     with refused(ErrorCode.FILE_DAMAGED, 1 << 42):
         _ = scan.read_row(name, 0).payload
-    assert board.file in str(droppable(scan, {name: {0: board.crc32}}).kept)
+    assert board.file in str(droppable(scan, {name: {0: board.crc32}}).kept_files)
 
 
 @pytest.mark.parametrize("file", ["manifest.jsonl", "raw/{board}/0000.idx", "raw/{board}/0000.pkt"])

@@ -20,8 +20,6 @@ from polysight.acquisition.control import (
     started_ticks,
 )
 from polysight.acquisition.pi_client import PiClient, RefusedError
-from polysight.acquisition.ready import make_ready, stage_differences
-from polysight.acquisition.row import FaultKind
 from polysight.acquisition.progress import (
     OnProgress,
     OnRow,
@@ -30,6 +28,8 @@ from polysight.acquisition.progress import (
     time_left,
     typical_row_s,
 )
+from polysight.acquisition.ready import make_ready, stage_differences
+from polysight.acquisition.row import FaultKind
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.acquisition.states import BADGES, STATES, Button, StateLevel
 

@@ -127,7 +127,7 @@ def compare(first: Scan | PathText, second: Scan | PathText) -> xarray.Dataset:
     import xarray
 
     scans = [scan if isinstance(scan, Scan) else open_scan(scan) for scan in (first, second)]
-    pixels = [Pixels.of(scan.processed()) for scan in scans]
+    pixels = [Pixels.from_scan(scan.processed()) for scan in scans]
     found = compare_pixels(*pixels, names=(str(scans[0].folder), str(scans[1].folder)))
     pairs = found.figures.patches
     differences = [pair.difference for pair in pairs]

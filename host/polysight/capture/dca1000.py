@@ -94,7 +94,7 @@ class Counters:
     byte_count: int
     sequence: int
 
-    def after(self, size: int, packets: int) -> Counters:
+    def advance(self, size: int, packets: int) -> Counters:
         """Return the counters `size` bytes and `packets` packets later."""
         return Counters(
             (self.byte_count + size) % (1 << BYTE_COUNT_BITS), (self.sequence + packets) % (1 << SEQUENCE_BITS)

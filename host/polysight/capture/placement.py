@@ -418,7 +418,7 @@ def _past_after(record: _Record, why: _Doubt) -> Past:
     is_certain = not why.text or why.frames_missing
     if not is_certain or not record.of_row.any() or record.later.any():
         return Past(lost=True)
-    return Past(start=record.start.after(record.length, -(-record.length // record.full)))
+    return Past(start=record.start.advance(record.length, -(-record.length // record.full)))
 
 
 def _count_packets(

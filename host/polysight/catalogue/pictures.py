@@ -42,7 +42,7 @@ class Pixels(ProcessedScan):
     """Saved products with permittivity and errors of each pixel. Arrays are [ny, nx], row 0 the smallest y."""
 
     @classmethod
-    def of(cls, scan: ProcessedScan) -> Self:
+    def from_scan(cls, scan: ProcessedScan) -> Self:
         """Return the pixels of a result, saved or just computed."""
         pixels = cls(scan.folder)
         vars(pixels).update(vars(scan))

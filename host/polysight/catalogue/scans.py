@@ -371,8 +371,8 @@ def explain_failure(program: Program | None) -> Finding | None:
         name, _, text = line.strip().partition(": ")
         if name in parts:
             parts[name] = text[:500]
-    what = lines[start].partition(": ")[2]
-    return Finding("error", what[:300], parts["why"], parts["do"])
+    problem = lines[start].partition(": ")[2]
+    return Finding("error", problem[:300], parts["why"], parts["do"])
 
 
 def log_tail(path: Path) -> str:

@@ -99,10 +99,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     """Parse the words and run the command; what it printed is written when this returns."""
-    from polysight.cli.options import joined
+    from polysight.cli.options import join_negative_values
 
     try:
-        args = build_parser(words[0] if words else None).parse_args(joined(words))
+        args = build_parser(words[0] if words else None).parse_args(join_negative_values(words))
     except SystemExit:
         flush_standard_output()
         raise

@@ -172,7 +172,7 @@ def _four_numbers(text: str, form: str) -> Box:
     return a, b, c, d
 
 
-def joined(words: Sequence[str]) -> list[str]:
+def join_negative_values(words: Sequence[str]) -> list[str]:
     """Return the words such that argparse takes `-45,0,40,40` for a value: `--metal-box -45,0,40,40`, `probe -60,0`."""
     out: list[str] = []
     for word in words:

@@ -393,7 +393,7 @@ def _add_leakage(add: Add) -> None:
     sub.add_argument("plate", type=Path, metavar="PLATE", help="scan of a whole metal plate over the plane")
     sub.add_argument(
         "--strips",
-        type=_turned,
+        type=_parse_strips,
         action="append",
         required=True,
         metavar="DEG=SCAN",
@@ -404,7 +404,7 @@ def _add_leakage(add: Add) -> None:
     add_json_option(sub)
 
 
-def _turned(text: str) -> tuple[float, Path]:
+def _parse_strips(text: str) -> tuple[float, Path]:
     degrees, _, folder = text.partition("=")
     try:
         angle = float(degrees)

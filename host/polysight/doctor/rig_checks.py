@@ -603,8 +603,8 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
         missed = signal.chirps - signal.if_hz.size
         observed = f"no direct path in {missed} of {signal.chirps} chirps; {predicted}"
         if outside:
-            why = "its IF is outside the receiver's band, so it is filtered out or aliased"
-            return error(observed, why, _better_start(rig, board, expected), **facts)
+            cause = "its IF is outside the receiver's band, so it is filtered out or aliased"
+            return error(observed, cause, _better_start(rig, board, expected), **facts)
         return error(
             observed,
             "the transmitter is off or not armed, something stands between the boards, or the start frequencies"
@@ -680,11 +680,11 @@ def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
         "later_ns": {name: mean * 1e9 for name, (mean, _) in delay.items()},
         "crystal_ppm": ppm,
     }
-    why = "cables of unequal length, a slow edge, or a start_offset_hz that differs from the programmed one"
+    cause = "cables of unequal length, a slow edge, or a start_offset_hz that differs from the programmed one"
     remedy = "use a clock buffer (docs/how-to/wiring.md); compare SYNC_IN at the boards with an oscilloscope"
     if abs(skew) > _SKEW_WARNING_S:
         finding = error if abs(skew) > _SKEW_ERROR_S else warning
-        return finding(observed, why, remedy, **facts)
+        return finding(observed, cause, remedy, **facts)
     if jitter > _MAX_JITTER_S:
         return warning(
             f"{observed}; {jitter * 1e9:.1f} ns from chirp to chirp",

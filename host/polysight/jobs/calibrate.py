@@ -25,7 +25,7 @@ from polysight.calibration import (
 )
 from polysight.imaging import Image, Mask
 from polysight.jobs.output import print_json, print_lines, say, steps
-from polysight.jobs.process import imaged, load_reference, plane_of
+from polysight.jobs.process import form_scan_images, load_reference, make_plane_reference
 from polysight.polarimetry import Leakage, leakage_from_images, specular_incidence_rad
 from polysight.settings import Settings, path_text
 from polysight_shared.config import Instrument, load_instrument
@@ -219,15 +219,15 @@ def leakage_of_scans(
         when the scans are of different rigs, do not show metal at the same pixels, or are too alike in orientation.
     """
     settings = Settings(config=path_text(config))
-    pipeline, images = imaged(plate, settings)
-    plate_reference = plane_of(pipeline, images)
+    pipeline, images = form_scan_images(plate, settings)
+    plate_reference = make_plane_reference(pipeline, images)
     theta = specular_incidence_rad(pipeline.rig)
     mask = plate_reference.valid & images.valid
     turned = []
     names = [pipeline.source.scan_id]
     simulated = pipeline.source.simulated
     for degrees, folder in strips:
-        strips_pipeline, strip_images = imaged(folder, settings)
+        strips_pipeline, strip_images = form_scan_images(folder, settings)
         plate_reference.check_rig(strips_pipeline.calibration.imaged_with(strips_pipeline.rig), str(plate))
         plate_reference.check_axes(strip_images.x_m, strip_images.y_m)
         mask = mask & strip_images.valid

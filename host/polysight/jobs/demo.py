@@ -60,7 +60,7 @@ def simulate_scene(scene: Path, config: Path, out: Path, seed: int | None = None
         command += ["--seed", str(seed)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise _error_of(done.returncode, done.stderr)
+        raise _simulator_error(done.returncode, done.stderr)
     sys.stderr.write(done.stderr)
 
 
@@ -76,10 +76,10 @@ def check_scenes(scenes: Iterable[Path], config: Path) -> None:
     command = [sys.executable, "-m", "polysight_simulators", "check", *map(str, scenes), "--config", str(config)]
     checked = subprocess.run(command, capture_output=True, text=True, check=False)
     if checked.returncode != 0:
-        raise _error_of(checked.returncode, checked.stderr)
+        raise _simulator_error(checked.returncode, checked.stderr)
 
 
-def _error_of(status: int, output: str) -> PolysightError:
+def _simulator_error(status: int, output: str) -> PolysightError:
     """Return the error of a simulator that failed: its message and exit status."""
     kind = {e.exit_status: e for e in (ConfigError, DataError)}.get(status, DeviceError)
     return kind(output.strip().removeprefix("error: ") or f"a simulator ended with status {status}, without a message")
@@ -142,7 +142,7 @@ def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
                 return Path(line.removeprefix("ready ").strip())
             if not line:
                 output = rig.stderr.read()
-                raise _error_of(rig.wait(), output)
+                raise _simulator_error(rig.wait(), output)
     raise DeviceError(
         f"the simulated rig was not ready within {_START_LIMIT_S:.0f} s",
         "an overloaded machine",

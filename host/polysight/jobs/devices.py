@@ -30,7 +30,7 @@ from polysight.radar import (
     read_firmware,
     read_image,
     require,
-    traced,
+    trace_words,
 )
 from polysight_shared.config import Board, Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DeviceError
@@ -330,7 +330,7 @@ def _open(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, sl
     words = open_board(rig.radar.native[name].place, slow or rig.radar.slow_spi)
     if trace is None:
         return words
-    return traced(words, clock, trace, rig, name)
+    return trace_words(words, clock, trace, rig, name)
 
 
 def _native(config: Path) -> Instrument:

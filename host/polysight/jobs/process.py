@@ -78,7 +78,7 @@ def pixel_axes(pipeline: Pipeline) -> Axes:
     return grid.x_m, grid.y_m
 
 
-def imaged(data: Path, settings: Settings = DEFAULT) -> tuple[Pipeline, Images]:
+def form_scan_images(data: Path, settings: Settings = DEFAULT) -> tuple[Pipeline, Images]:
     """Process a recorded scan of any layout up to its images. Raises PolysightError."""
     pipeline = processed_rows(open_source(data, settings.path("config"), dropped=True), data, settings)
     return pipeline, pipeline.form_images()
@@ -171,7 +171,7 @@ def _no_pixel_error(pipeline: Pipeline, data: Path | None = None) -> DataError:
     )
 
 
-def plane_of(pipeline: Pipeline, images: Images) -> PlaneReference:
+def make_plane_reference(pipeline: Pipeline, images: Images) -> PlaneReference:
     """Make a reference from images of a metal plate. Raises DataError if they show none."""
     reference = plane_reference(images.level(images.valid), name=pipeline.source.scan_id)
     return replace(reference, made_with=pipeline.calibration.imaged_with(pipeline.rig))
@@ -189,9 +189,9 @@ def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> 
     """
     if is_given_images(folder):
         return make_reference(read_given_images(folder, rig_of_images(config)))
-    pipeline, images = imaged(folder, Settings(config=path_text(config), bands=bands))
-    parts = tuple(plane_of(pipeline, band) for band in pipeline.sub_bands.finish(pipeline.source.mirrored))
-    return replace(plane_of(pipeline, images), bands=parts)
+    pipeline, images = form_scan_images(folder, Settings(config=path_text(config), bands=bands))
+    parts = tuple(make_plane_reference(pipeline, band) for band in pipeline.sub_bands.finish(pipeline.source.mirrored))
+    return replace(make_plane_reference(pipeline, images), bands=parts)
 
 
 def load_inputs(settings: Settings) -> Inputs:

@@ -270,7 +270,11 @@ def replace_folder(folder: Path, as_json: bool) -> int:
 
 
 def _replaced_lines(folder: Path, rows: list[Replaced]) -> list[str]:
-    changed = [f"row {r.row} of {r.board}: {r.before} bytes missing before, {r.after} now" for r in rows if r.changed]
-    unchanged = [f"row {r.row} of {r.board}: left as it is: {r.left}" for r in rows if r.left]
-    same = sum(not (r.changed or r.left) for r in rows)
+    changed = [
+        f"row {r.row} of {r.board}: {r.missing_before} bytes missing before, {r.missing_after} now"
+        for r in rows
+        if r.changed
+    ]
+    unchanged = [f"row {r.row} of {r.board}: left as it is: {r.why_unchanged}" for r in rows if r.why_unchanged]
+    same = sum(not (r.changed or r.why_unchanged) for r in rows)
     return [*changed, *unchanged, f"{folder}: {same} of {len(rows)} files come out as they were committed"]

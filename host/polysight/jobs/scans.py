@@ -224,10 +224,10 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
 def _drop(scan: ScanFolder, folder: Path, products: Path, yes: bool) -> int:
     processed = processed_digests(products)
     rows = droppable(scan, processed)
-    for line in rows.kept:
+    for line in rows.kept_files:
         sys.stdout.write(f"kept: {line}\n")
     if not rows.files:
-        if rows.kept:
+        if rows.kept_files:
             raise DataError(
                 f"{folder}: nothing can be dropped",
                 f"{products} is made from none of its rows",

@@ -329,11 +329,11 @@ class ScanHistory:
         if not fact.committed_utc:
             # Made in one step, by `polysight simulate`.
             return
-        at = seconds(fact.committed_utc)
+        committed_s = seconds(fact.committed_utc)
         self.last_row_utc = fact.committed_utc
         if self.last_commit_s > self.run_started_s:
-            self._row_seconds.append(at - self.last_commit_s)
-        self.last_commit_s = at
+            self._row_seconds.append(committed_s - self.last_commit_s)
+        self.last_commit_s = committed_s
 
     # --- the Pi's events ---
 

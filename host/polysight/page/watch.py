@@ -271,9 +271,9 @@ class ManifestTail:
         raw = self.file.look()
         if self.file.replaced:
             self.content = Manifest()
-        before = self.content.length
+        length_before = self.content.length
         facts = self.content.feed(raw)
-        self.file.take(self.content.length - before)
+        self.file.take(self.content.length - length_before)
         return facts
 
 

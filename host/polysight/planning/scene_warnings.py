@@ -63,8 +63,8 @@ def read_scene(path: Path, rig: Instrument) -> tuple[Instrument, list[Plate]]:
 
 
 def _plate(raw: Mapping[str, Any], path: Path) -> Plate:
-    known = {key: value for key, value in raw.items() if key in Plate.__struct_fields__}
-    return decode(known, Plate, f"{path}: plates")
+    known_keys = {key: value for key, value in raw.items() if key in Plate.__struct_fields__}
+    return decode(known_keys, Plate, f"{path}: plates")
 
 
 def warn_of_scene(rig: Instrument, plates: Sequence[Plate]) -> Iterator[Finding]:

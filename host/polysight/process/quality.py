@@ -328,7 +328,7 @@ class Quality:
 
     def note_imaging(self, builder: ImageBuilder, images: Images) -> None:
         """Add the point response of the aperture to quality.json."""
-        with self.timed("point response"):
+        with self.measure_time("point response"):
             self.note(imaging=imaging_facts(builder, images))
 
     def note_filled(self, filled: Mapping[str, ReconstructedPositions]) -> None:
@@ -345,7 +345,7 @@ class Quality:
             self.note(metal_reference=plane.facts())
 
     @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
+    def measure_time(self, stage: str) -> Iterator[None]:
         """Add the wall time of a block to a stage; parallel rows add up."""
         began = time.perf_counter()
         try:

@@ -250,7 +250,7 @@ class KeptSamples:
 
     def fill_missing(self) -> SubBandImages:
         """Reconstruct missing positions from the rows so far: set `filled`, and return the images of sub-bands."""
-        with self._quality.timed("reconstruct missing positions"):
+        with self._quality.measure_time("reconstruct missing positions"):
             self.filled, errors = fill_missing(self.images)
             sub_bands = fill_sub_bands(self.sub_bands)
         self._quality.note_filled(errors)

@@ -19,7 +19,7 @@ from polysight.radar.control import (
     radar_control,
     read_firmware,
 )
-from polysight.radar.diagnosis import ReplayedWords, Row, check_board, traced
+from polysight.radar.diagnosis import ReplayedWords, Row, check_board, trace_words
 from polysight.radar.firmware import Image, read_image
 from polysight.radar.usb import Clock, SystemClock, WordLink
 
@@ -47,5 +47,5 @@ __all__ = [
     "read_firmware",
     "read_image",
     "require",
-    "traced",
+    "trace_words",
 ]

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.calibration_data import NO_DIE, CalibrationFiles
 from polysight.radar.commands import constraints, direct_if_hz, program, require
-from polysight.radar.diagnosis import TracedWords, new_trace, traced
+from polysight.radar.diagnosis import TracedWords, new_trace, trace_words
 from polysight.radar.firmware import Image, read_image
 from polysight.radar.messages import command, encode
 from polysight.radar.usb import SCHEME, Clock, SystemClock, WordLink, open_tcp, open_usb
@@ -270,7 +270,7 @@ class NativeRadars(RadarControl):
         if not folder:
             return words
         try:
-            log = traced(words, self._clock, new_trace(Path(folder), name), self._rig, name)
+            log = trace_words(words, self._clock, new_trace(Path(folder), name), self._rig, name)
         # A full disk, for instance: continue without a trace.
         except OSError:
             return words
@@ -439,7 +439,7 @@ class LineServers(RadarControl):
         ended = select.poll()
         # A reset, or the end of both directions
         ended.register(connection, 0)
-        while _unacknowledged(connection):
+        while _count_unacknowledged(connection):
             if ended.poll(_POLL_MS):
                 return
             if time.monotonic() > deadline:
@@ -465,7 +465,7 @@ class LineServers(RadarControl):
         return DeviceError(message, cause, _START_SERVER, code=ErrorCode.NO_ANSWER)
 
 
-def _unacknowledged(connection: socket.socket) -> int:
+def _count_unacknowledged(connection: socket.socket) -> int:
     """Return the sent bytes that the other kernel has not acknowledged (SIOCOUTQ, tcp(7))."""
     # Modules of POSIX systems: this file is imported on laptops, too.
     import fcntl

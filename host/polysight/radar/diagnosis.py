@@ -224,7 +224,7 @@ class TracedWords:
             self.ended = f"ended early: {e.strerror}"
 
 
-def traced(words: WordLink, clock: Clock, file: Path, rig: Instrument, board: str) -> TracedWords:
+def trace_words(words: WordLink, clock: Clock, file: Path, rig: Instrument, board: str) -> TracedWords:
     """Log a board's link to `file`, whose first line has board, place, rig, version and time."""
     place = rig.radar.native[board].place
     now = round(time.time(), 3)

@@ -64,8 +64,8 @@ def check_plate(plate: CheckPlate, patches: Sequence[PatchFigures]) -> CheckResu
     covariance[0, 1] *= -1
     covariance[1, 0] *= -1
     total = covariance + np.diag(np.square(plate.std))
-    off = np.array([value.real, -value.imag]) - plate.permittivity
-    sigmas = float(np.sqrt(off @ np.linalg.solve(total, off)))
+    difference = np.array([value.real, -value.imag]) - plate.permittivity
+    sigmas = float(np.sqrt(difference @ np.linalg.solve(total, difference)))
     level = "good"
     if sigmas > WARNING_SIGMAS:
         level = "action" if sigmas > ACTION_SIGMAS else "warning"

@@ -303,13 +303,15 @@ def level_reasons(levels: Mapping[str, float | None]) -> list[Finding]:
         if is_known(level) and level > 0 and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
             weak = level > DIRECT_LEVELS[1]
             state = "weak" if weak else "strong"
-            what = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB relative to it"
+            problem = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB relative to it"
             if weak:
-                why = "something in its way weakens the direct path; the object disturbs its estimate"
+                cause = "something in its way weakens the direct path; the object disturbs its estimate"
             else:
-                why = "the object is far weaker than the direct path: the antennas point elsewhere, or it is not metal"
+                cause = (
+                    "the object is far weaker than the direct path: the antennas point elsewhere, or it is not metal"
+                )
             do = "clear the line of sight from transmitter to receivers, and check the antennas' direction"
-            out.append(reason("care", what, why, do, 3.5))
+            out.append(reason("care", problem, cause, do, 3.5))
     return out
 
 
@@ -324,15 +326,15 @@ def signal_reasons(refused: Mapping[int, str], patches: int, left_out: int = 0) 
             "check that the object lies on the plane and in the image (polysight image)", 9.0,
         )]  # fmt: skip
     if len(refused) == patches:
-        why = sorted(set(refused.values()))
+        faults = sorted(set(refused.values()))
         return [reason(
-            "none", f"none of the {patches} patches is a plate: {'; '.join(why)}",
+            "none", f"none of the {patches} patches is a plate: {'; '.join(faults)}",
             "there is no flat object on the plane, or the data are noise",
             "look at the images; check the direct path and the range profile (polysight doctor)", 9.0,
         )]  # fmt: skip
     by_reason: dict[str, list[int]] = {}
-    for label, what in refused.items():
-        by_reason.setdefault(what, []).append(label)
+    for label, fault in refused.items():
+        by_reason.setdefault(fault, []).append(label)
     if left_out:
         aside = [
             reason(
@@ -348,12 +350,12 @@ def signal_reasons(refused: Mapping[int, str], patches: int, left_out: int = 0) 
     return aside + [
         reason(
             "care",
-            f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {what}",
+            f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {fault}",
             "results hold for one flat plate per patch",
             "move the plates apart, or draw their boxes (polysight label; process --labels)",
             2.0,
         )
-        for what, labels in by_reason.items()
+        for fault, labels in by_reason.items()
     ]
 
 
@@ -392,10 +394,10 @@ def metal_reasons(
             "care", f"the metal reference ({patch}) is likely metal, not certainly",
             "a wet or conducting plate could look like it; all permittivities depend on it", do, 2.8,
         )]  # fmt: skip
-    why = "relative to it the other patches are impossible materials, or too few of them give evidence"
+    cause = "relative to it the other patches are impossible materials, or too few of them give evidence"
     if only_patch:
-        why = "nothing else in the scene can show that it is metal"
-    return [reason("none", f"no metal reference: {patch} is not shown to be metal", why, do, 8.0)]
+        cause = "nothing else in the scene can show that it is metal"
+    return [reason("none", f"no metal reference: {patch} is not shown to be metal", cause, do, 8.0)]
 
 
 def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> list[Finding]:
@@ -548,11 +550,11 @@ def passivity_reasons(gaining: Mapping[int, str]) -> list[Finding]:
     """Judge patches whose permittivity is impossible for a passive material: number to the fault."""
     return [
         reason(
-            "care", f"patch {label} has no permittivity: {what}",
+            "care", f"patch {label} has no permittivity: {fault}",
             "it points to leakage, a layered plate, a wrong metal reference, or H and V not on the same place",
             "measure leakage; if the plate is thin, fit it as a layer (polysight permittivity --layer)", 2.2,
         )
-        for label, what in gaining.items()
+        for label, fault in gaining.items()
     ]  # fmt: skip
 
 

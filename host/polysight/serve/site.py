@@ -147,7 +147,7 @@ class Site:
 
     def size(self, name: str) -> int | None:
         """Bytes of a scan on the disk; None while they are being counted."""
-        return self._sizes.of(self.scans.root / name)
+        return self._sizes.read_size(self.scans.root / name)
 
     @property
     def logs(self) -> Path:
@@ -270,7 +270,7 @@ class Sizes:
         self._counting_since: dict[Path, float] = {}
         self._lock = threading.Lock()
 
-    def of(self, folder: Path) -> int | None:
+    def read_size(self, folder: Path) -> int | None:
         """Size in bytes at the last count; None before the first."""
         size, counted_at = self._counted.get(folder, (None, float("-inf")))
         now = time.monotonic()

@@ -48,7 +48,7 @@ class Droppable:
     files: dict[int, dict[str, Path]]
     bytes: int
     # Files that must be kept, with the reason
-    kept: list[str] = field(default_factory=list)
+    kept_files: list[str] = field(default_factory=list)
 
 
 def require_raw(scan: ScanFolder) -> None:
@@ -171,11 +171,11 @@ class Replaced:
     row: int
     board: str
     # Missing bytes as committed
-    before: int
+    missing_before: int
     # Missing bytes now
-    after: int
+    missing_after: int
     # Why the row was left unchanged
-    left: str = ""
+    why_unchanged: str = ""
     changed: bool = False
     # Left unchanged because its files differ from the commit or are unreadable
     damaged: bool = False
@@ -238,18 +238,18 @@ def _place(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[Replac
     path = scan.path / board.file
     unchanged = Replaced(row.row, name, board.missing_bytes, board.missing_bytes)
     if not board.packets_crc32:
-        return replace(unchanged, left="its packets were not kept"), None
+        return replace(unchanged, why_unchanged="its packets were not kept"), None
     try:
         if faults := board_faults(scan, board, row.pulses):
-            return replace(unchanged, left="; ".join(map(to_text, faults)), damaged=True), None
+            return replace(unchanged, why_unchanged="; ".join(map(to_text, faults)), damaged=True), None
         again = place_again(path)
     except DataError as e:
-        return replace(unchanged, left=str(e), damaged=True), None
+        return replace(unchanged, why_unchanged=str(e), damaged=True), None
     if again.moved:
-        return replace(unchanged, left="its frames were placed by their pulses"), None
+        return replace(unchanged, why_unchanged="its frames were placed by their pulses"), None
     missing_now = sum(b - a for a, b in again.placed.missing)
     same = again.missing == again.placed.missing and f"{crc32(again.out.tobytes()):08x}" == board.crc32
-    return replace(unchanged, after=missing_now, changed=not same), again
+    return replace(unchanged, missing_after=missing_now, changed=not same), again
 
 
 def _commit(scan: ScanFolder, writer: ManifestWriter, row: RowCommitted, changed: dict[str, PlacedAgain]) -> None:

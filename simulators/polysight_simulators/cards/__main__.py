@@ -99,22 +99,20 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     rig = load_instrument(args.config)
     board_names = tuple(b.name for b in rig.boards)
     names = _check_arguments(args, board_names)
-    if args.scene is None:
-        scene = None
-    else:
-        scene = load_scene(args.scene)
-    if scene is not None and args.offset_in_rig:
-        scene = without_offset(scene)
+    scene = None
+    seed = 0
     base = {}
-    if scene is not None:
-        base = {"loss": scene.disturbances.packet_loss}
-    faults = read_faults(args.faults, args.fault, board_names, base, rig.radar.control)
+    disturbances = Disturbances()
+    if args.scene is not None:
+        scene = load_scene(args.scene)
+        if args.offset_in_rig:
+            scene = without_offset(scene)
+        seed = scene.seed
+        disturbances = scene.disturbances
+        base = {"loss": disturbances.packet_loss}
     if args.seed is not None:
         seed = args.seed
-    elif scene is None:
-        seed = 0
-    else:
-        seed = scene.seed
+    faults = read_faults(args.faults, args.fault, board_names, base, rig.radar.control)
     source = _source(args, rig, scene, names)
     power_cycle = Event()
     signal.signal(signal.SIGUSR1, lambda _signal, _frame: power_cycle.set())
@@ -122,26 +120,20 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     cards: list[SimulatedCard] = []
     open_things.callback(lambda: _report(cards, args.report))
     for name in names:
-        board = rig.by_name(name)
-        cards.append(
-            SimulatedCard(
-                rig=rig,
-                board=board,
-                source=source,
-                faults=faults[name],
-                seed=seed,
-                time_scale=args.time_scale,
-                clock_s=time.monotonic,
-                pace=pace,
-            )
+        card = SimulatedCard(
+            rig=rig,
+            board=rig.by_name(name),
+            source=source,
+            faults=faults[name],
+            seed=seed,
+            time_scale=args.time_scale,
+            clock_s=time.monotonic,
+            pace=pace,
         )
+        cards.append(card)
     lines = tuple(sorted({card.line for card in cards} | {rig.pi.trigger_in}))
     wires = open_things.enter_context(closing(WireClient(args.wires, lines, motion=True)))
-    if scene is None:
-        disturbed = Disturbances()
-    else:
-        disturbed = scene.disturbances
-    track = StageTrack(rig, disturbed.burst_motion, disturbed.backlash_mm)
+    track = StageTrack(rig, disturbances.burst_motion, disturbances.backlash_mm)
     control: list[LineServer] = []
     chips: list[RadarSocket] = []
     for card in cards:

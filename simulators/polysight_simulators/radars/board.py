@@ -330,36 +330,26 @@ class RadarBoard:
             delay += extra
             if data:
                 blocks += struct.pack("<HH", block, len(data) + 4) + data
-            else:
-                blocks += b""
             body = body[size:]
         self._busy_until = self.now() + delay
+        sub_blocks = int(bool(blocks))
+        if error:
+            number = 0
+            sub_blocks = 1
+            # ICD 4.4: the sub-block of a refusal names the error and the command.
+            blocks = struct.pack("<4H", 0, 8, error, block)
         if error and (self.cores.first_generation or fault is Fault.REFUSE_BARE):
-            # Like an AWR1243
-            answer = frame(
-                direction=direction, kind=RESPONSE, number=0, body=b"", count=1, sequence=sequence, wide=wide
-            )
-        elif error:
-            # ICD 4.4
-            answer = frame(
-                direction=direction,
-                kind=RESPONSE,
-                number=0,
-                body=struct.pack("<4H", 0, 8, error, block),
-                count=1,
-                sequence=sequence,
-                wide=wide,
-            )
-        else:
-            answer = frame(
-                direction=direction,
-                kind=RESPONSE,
-                number=number,
-                body=blocks,
-                count=1 if blocks else 0,
-                sequence=sequence,
-                wide=wide,
-            )
+            # An AWR1243 announces this sub-block, but does not send it.
+            blocks = b""
+        answer = frame(
+            direction=direction,
+            kind=RESPONSE,
+            number=number,
+            body=blocks,
+            count=sub_blocks,
+            sequence=sequence,
+            wide=wide,
+        )
         self._last = (sequence, answer)
         self._answer(answer, fault, delay)
 

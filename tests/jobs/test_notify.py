@@ -7,7 +7,7 @@ import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
-from polysight.jobs.notify import notify
+from polysight.jobs.live_scan import notify
 from polysight_shared.config import Notify
 
 

@@ -6,7 +6,10 @@ Rows go into the images as they are committed, so that the products are there so
 
 from __future__ import annotations
 
+import json
+import shlex
 import shutil
+import subprocess
 import sys
 import traceback
 from collections.abc import Callable
@@ -14,6 +17,8 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
+from urllib.error import URLError
+from urllib.request import Request, urlopen
 
 from msgspec.structs import replace
 from rich.console import Console
@@ -30,7 +35,6 @@ from polysight.acquisition import (
     resume_scan,
     run_scan,
 )
-from polysight.jobs.notify import notify
 from polysight.settings import Settings
 from polysight.store import MANIFEST, TRUTH, ScanFolder, check_same_scan, manifest, require_raw
 from polysight_shared.config import Notify, load_instrument
@@ -39,6 +43,8 @@ from polysight_shared.errors import ConfigError, PolysightError, ScanError, advi
 if TYPE_CHECKING:
     from polysight.jobs.process import LiveProcessing
 
+# A web address that does not answer must not hold up the end of a command.
+NOTIFY_TIMEOUT_S = 20.0
 _BESIDE = ("program", "operator.json")
 """Entries allowed in a folder before its scan begins: a program's log, notes."""
 RunScan = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
@@ -259,3 +265,34 @@ def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: boo
         )
 
     return _run(folder, processing, run_rows, notifier)
+
+
+def notify(settings: Notify, folder: Path, state: str, text: str) -> None:
+    """Tell that a scan has ended, as `[notify]` of the rig file says: what goes wrong with it is only a note.
+
+    Run the command with the text as its last argument, and send `{"scan", "state", "text"}` to the address.
+    `state` is `finished`, `stopped` or `failed`.
+    """
+    message = f"{folder.name}: {text}"
+    if settings.command:
+        _report_failure(lambda: _run_command([*shlex.split(settings.command), message]), "notify.command")
+    if settings.url:
+        content = json.dumps({"scan": folder.name, "state": state, "text": message}).encode()
+        _report_failure(lambda: _post(settings.url, content), "notify.url")
+
+
+def _run_command(words: list[str]) -> None:
+    subprocess.run(words, check=True, timeout=NOTIFY_TIMEOUT_S, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+
+
+def _post(url: str, content: bytes) -> None:
+    with urlopen(Request(url, content, {"Content-Type": "application/json"}), timeout=NOTIFY_TIMEOUT_S):
+        pass
+
+
+def _report_failure(send: Callable[[], None], name: str) -> None:
+    try:
+        send()
+    except (OSError, ValueError, subprocess.SubprocessError, URLError) as e:
+        with suppress(OSError):
+            sys.stderr.write(f"note: {name} of the rig file did not work: {type(e).__name__}\n")

@@ -127,12 +127,12 @@ def _cause(faults: Sequence[RowFault]) -> tuple[str, str]:
 
 def notice_of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[RowFault], utc: str) -> Finding:
     """Notice of a rejected take; one that somebody asked for is no fault."""
-    why, do = _cause(faults)
-    do = do or "Nothing: the row is retaken automatically"
+    cause, remedy = _cause(faults)
+    remedy = remedy or "Nothing: the row is retaken automatically"
     if is_on_request(faults):
-        notice = _row_notice(row, f"Row {row} was ended on request", (why, do), reasons, utc)
+        notice = _row_notice(row, f"Row {row} was ended on request", (cause, remedy), reasons, utc)
         return msgspec.structs.replace(notice, level="note")
-    return _row_notice(row, f"Row {row}, take {take}, was rejected", (why, do), reasons, utc)
+    return _row_notice(row, f"Row {row}, take {take}, was rejected", (cause, remedy), reasons, utc)
 
 
 def is_on_request(faults: Sequence[RowFault]) -> bool:

@@ -341,16 +341,16 @@ def sync_notices(shown: Shown, columns: int) -> list[Finding]:
         row = max(rows)
         sync = rows[row]
         if sync.masked > MASKED_SHARE * columns:
-            what = f"{board}: {sync.masked} of {columns} positions of row {row} have no usable direct path"
+            problem = f"{board}: {sync.masked} of {columns} positions of row {row} have no usable direct path"
             why = "Something stands between the transmitter and this board, or frames are missing"
             do = "Clear the line of sight; look at the board's frames"
         elif sync.direct_rad > DIRECT_RAD:
-            what = f"{board}: synchronisation leaves {sync.direct_rad:.2f} rad in row {row}; 0.004 is usual"
+            problem = f"{board}: synchronisation leaves {sync.direct_rad:.2f} rad in row {row}; 0.004 is usual"
             why = "A weak direct path, or a strong reflector near it"
             do = "Check the antennas' aim; look at the range profile"
         else:
             continue
-        notices.append(Finding("warning", what, why, do, where=f"row {row}"))
+        notices.append(Finding("warning", problem, why, do, where=f"row {row}"))
     return notices
 
 
@@ -446,9 +446,9 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
     if ended.exit_status == "abort":
         key = "aborted" if ended.asked == "abort" else "stopped"
         return say(key, asker=ended.asker or "somebody", safe=safe, folder=folder)
-    what = f"{sentence(ended.reason)}."
+    problem = f"{sentence(ended.reason)}."
     do = sentence(ended.remedy) or f"`polysight resume {folder}`"
-    return say("failed", what=what, safe=safe, why=sentence(ended.why) or "See its terminal", do=do)
+    return say("failed", what=problem, safe=safe, why=sentence(ended.why) or "See its terminal", do=do)
 
 
 def _judge_result(inputs: Inputs, gaps: str) -> Status:

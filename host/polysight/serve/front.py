@@ -31,8 +31,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from polysight.acquisition import BADGES, LAPSE_S, STATES, Life, ScanCommand, send_command
 from polysight.catalogue import Scans
-from polysight.serve.errors import HANDLERS, refuse, tell_no_page
-from polysight.serve.guard import Access, Guard, cookie_name
+from polysight.serve.guard import HANDLERS, Access, Guard, cookie_name, refuse, tell_no_page
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 

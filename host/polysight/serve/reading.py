@@ -41,7 +41,7 @@ from polysight.catalogue import (
 )
 from polysight.page import Watch
 from polysight.products import REPORT, read_products
-from polysight.serve.errors import refuse
+from polysight.serve.guard import refuse
 from polysight.serve.queue import Waiting
 from polysight.serve.site import THUMBNAIL, Site, compare_products, draw_map
 from polysight_shared.error_codes import ErrorCode

@@ -31,9 +31,8 @@ from starlette.types import ASGIApp
 from polysight.catalogue import Scans
 from polysight.page import Watch
 from polysight.serve.commands import command_routes, start_waiting
-from polysight.serve.errors import HANDLERS
 from polysight.serve.front import Front, Reader, counted_connections, make_app
-from polysight.serve.guard import HEAD_BYTES, Access
+from polysight.serve.guard import HANDLERS, HEAD_BYTES, Access
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import Programs, Site, Watches
 from polysight_shared.error_codes import ErrorCode

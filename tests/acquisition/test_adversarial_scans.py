@@ -100,9 +100,9 @@ def test_committed_bytes_are_right_or_masked(request, tmp_path):
         try:
             for attempt in range(6):
                 run = resume_scan if attempt else run_scan
-                where = (folder,) if attempt else (rig.instrument, folder)
+                arguments = (folder,) if attempt else (rig.instrument, folder)
                 try:
-                    result = run(*where, keep_incomplete=number % 2 == 1)
+                    result = run(*arguments, keep_incomplete=number % 2 == 1)
                 except ScanError as e:
                     assert "not complete after" in e.what  # noqa: PT017 - how an attempt ends is drawn
                     continue

@@ -175,8 +175,8 @@ def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished, t
     assert answer[4:] == ["row_committed", "row_committed", "scan_ended"]
     assert validate(scan.path) == []
     rows = ScanFolder.load(scan.path).committed_rows()
-    others = ScanFolder.load(finished).committed_rows()
-    assert {r: c.boards for r, c in rows.items()} == {r: c.boards for r, c in others.items()}
+    other_items = ScanFolder.load(finished).committed_rows()
+    assert {r: c.boards for r, c in rows.items()} == {r: c.boards for r, c in other_items.items()}
 
 
 def test_a_paused_scan_can_be_stopped(samples, tmp_path):

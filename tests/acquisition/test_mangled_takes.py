@@ -64,15 +64,15 @@ def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
         events = pulses[:, -1] + 2 * MS
         frames = place_frames(pulses, events, placed.arrivals, frame, PAYLOAD, FRAME_NS)
     timed = frames is not None and not frames.reason
-    whole = placed.complete and not (timed and frames is not None and frames.contradicted)
+    is_whole = placed.complete and not (timed and frames is not None and frames.contradicted)
     untimed = frames.uncertain if timed and frames is not None else pulses.size
     missing = placed.missing
     placed_out = out
     if (moved := frames_to_move(placed, frames)) is not None:
         untimed -= len(moved.doubtful)
         out, missing = move_frames(out, placed.holes, int(placed.arrivals[-1, 1]), moved.slots, frame)
-        untimed = untimed if whole else 0
-    return Kept(placed, frames, out, mask_of(out.size, missing), whole, untimed, placed_out)
+        untimed = untimed if is_whole else 0
+    return Kept(placed, frames, out, mask_of(out.size, missing), is_whole, untimed, placed_out)
 
 
 def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, Sent, int]]:
@@ -85,12 +85,12 @@ def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, Sent, int]]:
         troubles = tuple(chance.sample(TROUBLES, chance.randint(1, 3)))
         pulses = pulse_times(points, count) + number * 10**11
         sent = card.take(pulses.reshape(-1), troubles)
-        kept = keep(sent, past, pulses, frame)
-        past = kept.placed.past
+        judged_take = keep(sent, past, pulses, frame)
+        past = judged_take.placed.past
         if past.lost:
             card.reset_by_host()
             past = Past.after_reset()
-        yield troubles, kept, sent, frame
+        yield troubles, judged_take, sent, frame
 
 
 def wrong_bytes(kept: Kept, sent: Sent) -> int:
@@ -102,9 +102,14 @@ def test_no_wrong_byte_is_kept(request: pytest.FixtureRequest):
     """A whole row may hold one in frames that the manifest says were not seen at their pulses; a kept row none."""
     first = int(os.environ.get("MANGLED_FIRST", "0"))
     for seed in range(first, first + (5_000 if request.config.getoption("--long") else 250)):
-        for troubles, kept, sent, frame in takes(seed):
-            wrong = wrong_bytes(kept, sent)
-            assert wrong <= (kept.untimed * frame if kept.whole else 0), (seed, troubles, wrong, kept.placed.reason)
+        for troubles, take, sent, frame in takes(seed):
+            wrong = wrong_bytes(take, sent)
+            assert wrong <= (take.untimed * frame if take.whole else 0), (
+                seed,
+                troubles,
+                wrong,
+                take.placed.reason,
+            )
 
 
 @pytest.mark.parametrize("grid", range(len(GRIDS)))
@@ -118,9 +123,9 @@ def test_a_perfect_take_after_trouble_is_committed(grid):
     for number in range(40):
         at = pulses + number * 10**11
         troubles = tuple(chance.sample(TROUBLES, 2)) if number % 2 == 0 else ()
-        kept = keep(card.take(at.reshape(-1), troubles), past, at, frame)
-        refused += not troubles and not kept.whole
-        past = kept.placed.past
+        judged_take = keep(card.take(at.reshape(-1), troubles), past, at, frame)
+        refused += not troubles and not judged_take.whole
+        past = judged_take.placed.past
         if past.lost:
             card.reset_by_host()
             past = Past.after_reset()
@@ -145,5 +150,5 @@ def test_rows_that_were_once_kept_with_wrong_bytes(case, points, count, frame):
         card = Adversary(random.Random(f"{case} {seed}"), frame)
         pulses = pulse_times(points, count)
         sent = card.take(pulses.reshape(-1), CASES[case])
-        kept = keep(sent, Past.after_reset(), pulses, frame)
-        assert wrong_bytes(kept, sent) <= (kept.untimed * frame if kept.whole else 0)
+        judged_take = keep(sent, Past.after_reset(), pulses, frame)
+        assert wrong_bytes(judged_take, sent) <= (judged_take.untimed * frame if judged_take.whole else 0)

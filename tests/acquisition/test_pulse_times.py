@@ -142,9 +142,9 @@ def edges_of(pulses: np.ndarray, faults: tuple[str, ...], rng: np.random.Generat
     edges = pulses.reshape(-1)
     truth = np.arange(pulses.size)
     if "missed" in faults:
-        gone = rng.choice(edges.size, rng.integers(1, 4), replace=False)
-        edges = np.delete(edges, gone)
-        truth = np.delete(truth, gone)
+        lost_frames = rng.choice(edges.size, rng.integers(1, 4), replace=False)
+        edges = np.delete(edges, lost_frames)
+        truth = np.delete(truth, lost_frames)
     if "near" in faults:
         k = int(rng.integers(edges.size))
         edges = edges.copy()
@@ -156,9 +156,9 @@ def edges_of(pulses: np.ndarray, faults: tuple[str, ...], rng: np.random.Generat
             extra = int(rng.integers(pulses[0, 0], pulses[-1, -1]))
             # An edge within a frame or just behind it starts none; at a missed pulse it makes that pulse's frame.
             if np.abs(np.append(edges, pulses) - extra).min() > 350 * US:
-                at = int(np.searchsorted(edges, extra))
-                edges = np.insert(edges, at, extra)
-                truth = np.insert(truth, at, -2)
+                place = int(np.searchsorted(edges, extra))
+                edges = np.insert(edges, place, extra)
+                truth = np.insert(truth, place, -2)
     return edges[: pulses.size], truth[: pulses.size]
 
 
@@ -176,16 +176,20 @@ def test_whatever_happens_no_frame_is_at_a_wrong_pulse(request):
         pulses = pulse_times(bursts, count)
         edges, truth = edges_of(pulses, faults, rng)
         if "lost" in faults:
-            lost = frozenset(rng.choice(edges.size * frame // PAYLOAD, 2).tolist())
+            lost_packets = frozenset(rng.choice(edges.size * frame // PAYLOAD, 2).tolist())
         else:
-            lost = frozenset()
+            lost_packets = frozenset()
         load = Load(20, 3) if "stalled" in faults else QUIET
-        arrivals, answer = receive(edges, pulses, frame, rng, load, lost)
+        arrivals, answer = receive(edges, pulses, frame, rng, load, lost_packets)
         result = place(pulses, answer, arrivals, frame)
         placed = np.flatnonzero(result.slots >= 0)
         wrong = placed[result.slots[placed] != truth[placed]]
         assert not wrong.size, (seed, bursts, count, frame, faults, wrong[:5], result.slots[wrong[:5]])
         if edges.size == pulses.size and frame >= PAYLOAD and not {"lost", "stalled"} & {*faults}:
-            off = np.flatnonzero(truth != np.arange(truth.size))
-            is_blurred = off.size > 0.1 * truth.size
-            assert result.contradicted or is_blurred or {*off.tolist()} <= {*result.doubtful}, (seed, faults, off)
+            misplaced = np.flatnonzero(truth != np.arange(truth.size))
+            is_blurred = misplaced.size > 0.1 * truth.size
+            assert result.contradicted or is_blurred or {*misplaced.tolist()} <= {*result.doubtful}, (
+                seed,
+                faults,
+                misplaced,
+            )

@@ -222,10 +222,10 @@ def test_radar_in_fault_is_not_scanned_with_but_armed_again(rig, tmp_path):
 def test_radar_that_faults_within_a_row_ends_it_at_once(rig, tmp_path):
     rig.pi.hang_at = {0}
     radars = Native(RadarState.ARMED)
-    seen = []
+    calls = []
 
     def progress(p) -> None:
-        seen.append(p.state)
+        calls.append(p.state)
         if p.state == "running" and (p.row, p.take) == (0, 1):
             radars._script = (RadarState.FAULT, RadarState.ARMED)
             radars.armed = radars.armed[:1]
@@ -234,7 +234,7 @@ def test_radar_that_faults_within_a_row_ends_it_at_once(rig, tmp_path):
 
     result = run_scan(rig.instrument, tmp_path / "s", radars=radars, progress=progress)
     assert (result.exit_status, result.retakes) == ("success", 1)
-    assert "aborting" in seen
+    assert "aborting" in calls
     assert any("RF core fault 7" in r for r in reasons(result.folder))
 
 
@@ -283,15 +283,15 @@ def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_
 
 def test_simulated_server_arms_once_a_line_and_has_its_faults():
     armed = []
-    made = LineServer("127.0.0.1:0", lambda: armed.append(1), Faults(retrigger_fails=(1,), retrigger_resets=(3,)))
-    address = f"127.0.0.1:{made._listener.getsockname()[1]}"
+    server = LineServer("127.0.0.1:0", lambda: armed.append(1), Faults(retrigger_fails=(1,), retrigger_resets=(3,)))
+    address = f"127.0.0.1:{server._listener.getsockname()[1]}"
     with LineServers({"RH": address}, 5.0) as radars:
         for n, want in enumerate([1, 1, 2, 2], 1):
             radars.arm(1)
-            wait_for(lambda n=n: made.serve() or made.lines == n, "radar")
+            wait_for(lambda n=n: server.serve() or server.lines == n, "radar")
             assert len(armed) == want
         wait_for(lambda: radars.states()["RH"].state is RadarState.FAULT, "radar")
         radars.arm(1)
-        wait_for(lambda: made.serve() or made.lines == 5, "radar")
+        wait_for(lambda: server.serve() or server.lines == 5, "radar")
         assert len(armed) == 3
-    made.close()
+    server.close()

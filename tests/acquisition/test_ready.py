@@ -104,9 +104,9 @@ def test_plan_and_doctor_tell_the_size_of_a_scan(make_instrument):
 
 @pytest.mark.parametrize("key", ["steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2"])
 def test_a_pi_that_places_rows_elsewhere_is_refused_before_a_folder_is_made(rig, tmp_path, key):
-    own = rig.instrument.stage.placement_settings[key]
-    rig.pi.stage = {**rig.pi.stage, key: own + 0.5}
-    with refused(ErrorCode.STAGE_DIFFERS, key, f"{own:g}", f"{own + 0.5:g}"):
+    own_value = rig.instrument.stage.placement_settings[key]
+    rig.pi.stage = {**rig.pi.stage, key: own_value + 0.5}
+    with refused(ErrorCode.STAGE_DIFFERS, key, f"{own_value:g}", f"{own_value + 0.5:g}"):
         run_scan(rig.instrument, tmp_path / "s")
     assert not (tmp_path / "s").exists()
     assert rig.pi.commands[-1:] == rig.pi.commands[:1], "nothing but Hello was asked"

@@ -51,14 +51,14 @@ def test_every_state_can_be_reached_and_left_or_is_an_end():
 
 
 def test_messages_exist():
-    known = {
+    documented = {
         "Pi": vars(messages), "receivers": vars(receiver_words), "cards": Code.__members__, "radars": vars(RadarControl)
     }  # fmt: skip
     for state, party, said in table("Messages"):
         assert words(state)[0] in set(RowState)
         assert words(said)
         for word in words(said):
-            assert word in known[party.split()[0]], (party, word)
+            assert word in documented[party.split()[0]], (party, word)
 
 
 def test_radar_backends_and_states_are_described():

@@ -42,8 +42,8 @@ def digests(scan: ScanFolder) -> dict[str, str]:
 
 def test_whole_scan_is_bit_exact_and_valid(rig, payload, tmp_path):
     rows = []
-    seen = []
-    result = run_scan(rig.instrument, tmp_path / "s", on_row=rows.append, progress=seen.append)
+    calls = []
+    result = run_scan(rig.instrument, tmp_path / "s", on_row=rows.append, progress=calls.append)
     assert (result.exit_status, result.processing_error) == ("success", None)
     assert rows == [0, 1, 2, 3]
     scan = ScanFolder.load(tmp_path / "s")
@@ -60,8 +60,8 @@ def test_whole_scan_is_bit_exact_and_valid(rig, payload, tmp_path):
     assert [e.seq for e in events] == list(range(1, len(events) + 1))
     assert (type(events[0]), type(events[-1])) == (RunStarted, RunStopped)
     assert sum(isinstance(e, Capture) for e in events) == rig.instrument.grid.columns * rig.instrument.grid.rows
-    assert {p.phase for p in seen} >= {"connect", "home", "row", "committed", "end"}
-    assert seen[-1].committed == 4
+    assert {p.phase for p in calls} >= {"connect", "home", "row", "committed", "end"}
+    assert calls[-1].committed == 4
 
 
 def test_lost_events_are_fetched_from_the_journal(rig, tmp_path):
@@ -147,7 +147,7 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     assert result.exit_status == "abort"
     assert list(result.folder.committed_rows()) == [0, 1]
-    before = digests(result.folder)
+    state_before = digests(result.folder)
     (tmp_path / "s" / "raw" / "RH" / "0002.part").write_bytes(b"half a row")
     with (tmp_path / "s" / "manifest.jsonl").open("ab") as f:
         f.write(b'{"fact": "row_comm')
@@ -155,8 +155,8 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
     result = resume_scan(tmp_path / "s", on_row=rows.append)
     assert result.exit_status == "success"
     assert rows == [0, 1, 2, 3]
-    after = digests(result.folder)
-    assert {k: after[k] for k in before} == before
+    state_after = digests(result.folder)
+    assert {k: state_after[k] for k in state_before} == state_before
     assert result.folder.read_row("RV", 3).payload.tobytes() == payload("RV", 3, rig.instrument.row_bytes)
     assert errors(tmp_path / "s") == []
     assert set(takes_so_far(result.folder)) == {0, 1, 2, 3}
@@ -176,12 +176,12 @@ def test_killed_host_resumes_and_committed_rows_stay(rig, config, payload, tmp_p
     rig.pi.finish_hanging()
     rig.pi.hang_at = set()
     scan = ScanFolder.load(tmp_path / "s")
-    before = digests(scan)
+    state_before = digests(scan)
     assert list(scan.rows()) == [0, 1]
     assert errors(tmp_path / "s") == []
     result = resume_scan(tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 0)
-    assert {k: v for k, v in digests(result.folder).items() if k in before} == before
+    assert {k: v for k, v in digests(result.folder).items() if k in state_before} == state_before
     assert [r.take for r in result.folder.committed_rows().values()] == [1, 1, 2, 1]
     assert result.folder.read_row("RH", 2).payload.tobytes() == payload("RH", 2, rig.instrument.row_bytes)
     assert validate(tmp_path / "s") == []
@@ -219,8 +219,8 @@ def test_radar_without_data_is_not_a_mute_card(rig, tmp_path):
 
 def test_port_in_use_is_named(rig, tmp_path):
     board = rig.instrument.by_name("RV")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind((board.host_address, board.data_port))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other_socket:
+        other_socket.bind((board.host_address, board.data_port))
         with refused(ErrorCode.BUSY, f"{board.host_address}:{board.data_port}", "ss -ulnp"):
             run_scan(rig.instrument, tmp_path / "s")
 
@@ -234,10 +234,10 @@ def test_a_receive_buffer_below_two_bursts_ends_the_scan_before_it_begins(rig, t
 
 def test_existing_scan_is_not_overwritten(rig, tmp_path):
     run_scan(rig.instrument, tmp_path / "s")
-    before = digests(ScanFolder.load(tmp_path / "s"))
+    state_before = digests(ScanFolder.load(tmp_path / "s"))
     with refused(ErrorCode.FILE_EXISTS, "manifest"):
         run_scan(rig.instrument, tmp_path / "s")
-    assert digests(ScanFolder.load(tmp_path / "s")) == before
+    assert digests(ScanFolder.load(tmp_path / "s")) == state_before
 
 
 TAIL_S = 0.6  # from the last data to the short last packet; 2 s of a real card
@@ -264,11 +264,11 @@ class LateCard(FakeCard):
         if not self.recording:
             return
         data = payload_of(self.board.name, row, self.row_bytes)[: self.cut.get((row, take), self.row_bytes)]
-        whole = len(data) // FULL * FULL
-        for a in range(0, whole, FULL):
+        whole_packets = len(data) // FULL * FULL
+        for a in range(0, whole_packets, FULL):
             self._rest = data[a : a + FULL]
             self._send_packet(FULL)
-        self._tail = self._record, data[whole:]
+        self._tail = self._record, data[whole_packets:]
         threading.Timer(TAIL_S, self._finish, [self._record]).start()
 
     def _finish(self, record: int) -> None:

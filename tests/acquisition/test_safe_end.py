@@ -226,12 +226,14 @@ class ClosedPipe(io.TextIOWrapper):
 @pytest.mark.parametrize("kind", [FullDisk, ClosedPipe])
 def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, monkeypatch, kind):
     """In row 1 the terminal closes (SIGHUP), and stdout and stderr fail."""
-    made = []
+    commands = []
     streams = [kind(), kind()]
     monkeypatch.setattr(processing, "check_inputs", lambda *_: None)
     monkeypatch.setattr(processing, "Pipeline", lambda *_, **__: SimpleNamespace(add_row=lambda _: None))
     monkeypatch.setattr(
-        processing, "make_products", lambda *given: made.append(given) or SimpleNamespace(summary=str, exit_status=0)
+        processing,
+        "make_products",
+        lambda *given: commands.append(given) or SimpleNamespace(summary=str, exit_status=0),
     )
     monkeypatch.setattr(processing, "publish_images", lambda *_: None)
     update = progress.ScanBar.update
@@ -252,22 +254,22 @@ def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, mon
     for stream in streams:
         stream.close()
     assert validate(tmp_path / "s") == []
-    assert len(made) == 1
+    assert len(commands) == 1
 
 
 def test_lost_terminal_is_ignored_and_then_as_before():
-    heard = []
-    before = signal.signal(signal.SIGHUP, lambda *_: heard.append(1))
+    signals = []
+    state_before = signal.signal(signal.SIGHUP, lambda *_: signals.append(1))
     try:
         with ignore_hangup():
             os.kill(os.getpid(), signal.SIGHUP)
             time.sleep(0.01)
-        assert heard == []
+        assert signals == []
         os.kill(os.getpid(), signal.SIGHUP)
         time.sleep(0.01)
-        assert heard == [1]
+        assert signals == [1]
     finally:
-        signal.signal(signal.SIGHUP, before)
+        signal.signal(signal.SIGHUP, state_before)
 
 
 @pytest.mark.parametrize("error", [ValueError("oops"), ScanError("no images", "", "look")])

@@ -118,9 +118,9 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
 def test_words_follow_the_kind_alone():
     """The cause shown depends on the kind of the fault, not on the text of the reason."""
     answer = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
-    for kind, (why, do) in CAUSES.items():
+    for kind, (cause, do) in CAUSES.items():
         notice = notice_of_rejection(0, 1, [answer], [TakeFault(kind, answer, "RV").fact()], "")
-        assert (notice.why, notice.do) == (why, do)
+        assert (notice.why, notice.do) == (cause, do)
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
     notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).why.lower()

@@ -89,7 +89,9 @@ def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
     assert result.exit_status == "success"
     assert [f["fact"] for f in facts_of(result.folder, "scan_paused")] == ["scan_paused"]
     assert [t for t in answer if isinstance(t[0], int)] == [(n, (4 - n) * ROW_S) for n in (1, 2, 3, 4)]
-    assert [left for word, left in answer if isinstance(word, str)] == [2 * ROW_S] * 2, "before the pause and after it"
+    assert [remaining for word, remaining in answer if isinstance(word, str)] == [2 * ROW_S] * 2, (
+        "before the pause and after it"
+    )
 
 
 def test_the_page_has_the_same_time_left(rig, tmp_path):

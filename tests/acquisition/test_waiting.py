@@ -205,7 +205,7 @@ def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
     rig.pi.hang_after_captures = True
     stop = StopRequest()
     points = []
-    asked = []
+    requests = []
     aborted = []
     sleeps: list[float] = []  # of the loop, in ms; None would be for ever
 
@@ -214,7 +214,7 @@ def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
             if any(points) and not stop.now:
                 stop.request()
                 stop.request()
-                asked.append((len(sleeps), len(rig.pi.commands)))
+                requests.append((len(sleeps), len(rig.pi.commands)))
             sleeps.append(timeout)
             return super().poll(timeout)
 
@@ -223,7 +223,8 @@ def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
     monkeypatch.setattr(row.PiClient, "abort", lambda *words: aborted.append(len(sleeps)) or abort(*words))
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=lambda p: points.append(p.points))
     assert result.exit_status == "abort"
-    (first, commands), until = asked[0], aborted[0]
+    first, commands = requests[0]
+    until = aborted[0]
     assert until - first == 1, "the turn in hand is the last one"
     assert 0 <= max(sleeps[:until]) <= 100, "ms: a request is seen though nothing comes"
     assert isinstance(rig.pi.commands[commands], m.Abort)

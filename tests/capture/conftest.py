@@ -27,9 +27,9 @@ def small_rig() -> Instrument:
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Instrument:
-    made = small_rig()
-    (tmp_path / "instrument.toml").write_text(tomli_w.dumps(to_builtins(made)))
-    return made
+    small = small_rig()
+    (tmp_path / "instrument.toml").write_text(tomli_w.dumps(to_builtins(small)))
+    return small
 
 
 @pytest.fixture
@@ -44,12 +44,12 @@ def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
     with ExitStack() as stack:
 
         def start(*names: str, streams: Path | None = None, more: tuple[Board, ...] = (), **faults: Faults) -> Cards:
-            made = Cards()
-            stack.callback(made.close)
+            cards = Cards()
+            stack.callback(cards.close)
             for board in (*(rig.by_name(n) for n in names), *more):
-                made.add(board.name, made.network_of(board), faults.get(board.name, Faults()), streams)
-            made.start()
-            return made
+                cards.add(board.name, cards.network_of(board), faults.get(board.name, Faults()), streams)
+            cards.start()
+            return cards
 
         yield start
 

@@ -111,13 +111,13 @@ class Rows(RuleBasedStateMachine):
         spoils = {"truncate", "turn_header_bit", "two_paths", "reset_between"}
         if not (self.sure and self.past.start and sent.whole and self.card.resets == 0) or spoils & {*sent.troubles}:
             return
-        came = {a.packet[:10] for a in sent.arrivals if a.record == sent.number}
+        received_heads = {a.packet[:10] for a in sent.arrivals if a.record == sent.number}
         start = self.past.start.byte_count
-        heads = {(int.from_bytes(head[4:], "little") - start) % 2**48 for head in came}
+        heads = {(int.from_bytes(head[4:], "little") - start) % 2**48 for head in received_heads}
         if max(heads, default=0) + FULL >= self.size and self.size > FULL:
             assert placed.located, placed.reason
-            lost = [(a, min(a + FULL, self.size)) for a in range(0, self.size, FULL) if a not in heads]
-            assert (mask_of(self.size, placed.missing) == mask_of(self.size, lost)).all()
+            lost_ranges = [(a, min(a + FULL, self.size)) for a in range(0, self.size, FULL) if a not in heads]
+            assert (mask_of(self.size, placed.missing) == mask_of(self.size, lost_ranges)).all()
 
     @rule(
         troubles=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3, unique=True).map(tuple),

@@ -67,7 +67,7 @@ def test_every_hop_of_every_card(cards, card):
 
 
 def test_a_mute_card_is_named_and_its_neighbour_is_sound(cards, card):
-    made = cards("RH", "RV", RV=Faults(mute=True))
+    running_cards = cards("RH", "RV", RV=Faults(mute=True))
     done = card("--json")
     assert done.status == 1
     hops = verdicts(done)
@@ -78,7 +78,7 @@ def test_a_mute_card_is_named_and_its_neighbour_is_sound(cards, card):
     assert hops["RV"]["receiver"]["verdict"] == "not checked"
     # Nobody plays LS
     assert [s["silent_hop"] for s in json.loads(done.out)] == ["card", "", "card"]
-    assert made.endpoints["RV"].counts["requests"] > 0
+    assert running_cards.endpoints["RV"].counts["requests"] > 0
     text = card().out
     assert "error       card" in text
     assert "not checked receiver, buffer, radar" in text
@@ -126,14 +126,14 @@ def test_a_buffer_below_two_bursts_is_an_error_with_a_remedy(cards, card, rig, t
     ],
 )
 def test_refused_commands_write_nothing(cards, card, words, says):
-    made = cards("RH")
-    before = made.endpoints["RH"].card.network
+    running_cards = cards("RH")
+    state_before = running_cards.endpoints["RH"].card.network
     done = card(*words)
     assert done.status == 2, done
     assert says in done.err
     assert "\n  do: " in done.err
-    made.power_cycle("RH")
-    assert made.endpoints["RH"].card.network == before
+    running_cards.power_cycle("RH")
+    assert running_cards.endpoints["RH"].card.network == state_before
 
 
 def programmed(made, name: str, folder: Path, typed: str, *words: str) -> str:
@@ -158,33 +158,33 @@ def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):
     """From the address all cards are sold with to the board's own, typed, and seen there after a power cycle."""
     old = rig.by_name("LS")
     board = rig.by_name("RV")
-    made = cards(more=(old,))
-    at = f"{old.card_address}:{old.command_port}"
-    text = programmed(made, "LS", tmp_path, board.card_address, "RV", "--at", at)
+    running_cards = cards(more=(old,))
+    address = f"{old.card_address}:{old.command_port}"
+    text = programmed(running_cards, "LS", tmp_path, board.card_address, "RV", "--at", address)
     for part in ("cannot be read back", NEW_MAC, "switch the card off and on", "FPGA 2.8", f"at {board.card_address}"):
         assert part in text
-    assert made.endpoints["LS"].card.network == made.network_of(board)._replace(
+    assert running_cards.endpoints["LS"].card.network == running_cards.network_of(board)._replace(
         mac=bytes.fromhex(NEW_MAC.replace(":", ""))
     )
 
 
 def test_a_card_that_stays_where_it_was_must_have_been_off(cards, card, rig, tmp_path):
-    made = cards("RH", RH=Faults(boot_s=4.0))
+    running_cards = cards("RH", RH=Faults(boot_s=4.0))
     done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "1")
     assert done.status == 5
     assert "written, but the card was not switched off" in done.err
     done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "0")
     assert (done.status, "`polysight card` tells" in done.out) == (0, True)
-    assert "it answers at" in programmed(made, "RH", tmp_path, rig.by_name("RH").card_address, "RH")
-    assert made.endpoints["RH"].card.network.mac.hex(":") == NEW_MAC
+    assert "it answers at" in programmed(running_cards, "RH", tmp_path, rig.by_name("RH").card_address, "RH")
+    assert running_cards.endpoints["RH"].card.network.mac.hex(":") == NEW_MAC
 
 
 def test_reset(cards, card):
-    made = cards("RH")
-    made.endpoints["RH"].card._packetiser.sequence = 77
+    running_cards = cards("RH")
+    running_cards.endpoints["RH"].card._packetiser.sequence = 77
     done = card("reset", "RH", "--radar")
     assert (done.status, "armed again" in done.out) == (0, True)
-    assert made.endpoints["RH"].card._packetiser.sequence == 77
+    assert running_cards.endpoints["RH"].card._packetiser.sequence == 77
     done = card("reset", "RH")
     assert (done.status, "configures it anew" in done.out) == (0, True), done
-    assert made.endpoints["RH"].card._packetiser.sequence == 1
+    assert running_cards.endpoints["RH"].card._packetiser.sequence == 1

@@ -149,11 +149,11 @@ def test_real_interfaces_tell_the_hops_apart():
     assert done.returncode == 0, done.stderr
     said = {line.split(" | ")[0]: line for line in done.stdout.splitlines()}
     assert "| host | LS commands: 192.168.33.30 is not an address of this machine" in said["no-address"]
-    for name, hop, why in (
+    for name, hop, cause in (
         ("no-route", "route", "| no route"),
         ("no-link", "link", "| no link: network interface c0"),
         ("no-device", "card", "no device has the address 192.168.33.180"),
         ("mute", "card", "the card is mute"),
     ):
         assert f"| {hop} |" in said[name]
-        assert why in said[name]
+        assert cause in said[name]

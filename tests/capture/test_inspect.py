@@ -129,10 +129,10 @@ def test_too_small_or_absent(tmp_path):
 @pytest.mark.parametrize(("order", "magic", "tick"), [("<", 0xA1B2C3D4, 1000), (">", 0xA1B23C4D, 1)])
 def test_pcap_forms(tmp_path, order, magic, tick):
     write_pcap(tmp_path / "x.pcap", [b"hello", b"x" * 100], order, magic)
-    found = list(read_pcap(tmp_path / "x.pcap"))
-    assert [d.payload for d in found] == [b"hello", b"x" * 100]
-    assert found[0].t_s == pytest.approx(100 + 5e-9 * tick, abs=1e-10)
-    assert found[0].source == ("192.168.33.180", 1024)
+    packets = list(read_pcap(tmp_path / "x.pcap"))
+    assert [d.payload for d in packets] == [b"hello", b"x" * 100]
+    assert packets[0].t_s == pytest.approx(100 + 5e-9 * tick, abs=1e-10)
+    assert packets[0].source == ("192.168.33.180", 1024)
 
 
 def test_pcapng_gives_the_same_datagrams(tmp_path):
@@ -226,15 +226,15 @@ def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):
     done = polysight("rig.bin", "--config", RIG_FILE, "--plot", "rig.png")
     assert (done.status, "note" in done.out) == (0, False), done
     assert (tmp_path / "rig.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    found = json.loads(polysight("other.bin", "--samples", "128", "--lanes", "2", "--q-first", "--json").out)
-    assert (found["lanes"], found["samples"], found["q_first"], found["remarks"]) == (2, 128, True, [])
+    document = json.loads(polysight("other.bin", "--samples", "128", "--lanes", "2", "--q-first", "--json").out)
+    assert (document["lanes"], document["samples"], document["q_first"], document["remarks"]) == (2, 128, True, [])
     assert polysight("rig.bin", "--plot", "absent/x.png").status == 5
 
 
 def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
-    both = [packet for packet in encode_packets(row(4, False).tobytes(), 1, 0) for _ in range(2)]
+    each_packet_twice = [packet for packet in encode_packets(row(4, False).tobytes(), 1, 0) for _ in range(2)]
     # Known by its first bytes, not by its name
-    write_pcap(tmp_path / "both", both, cards=(CARD, OTHER))
+    write_pcap(tmp_path / "both", each_packet_twice, cards=(CARD, OTHER))
     done = polysight("both")
     assert done.status == 3
     assert "192.168.33.180 and 192.168.33.181" in done.err

@@ -33,17 +33,17 @@ def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start
     size = frame * frames
     many = -(-size // FULL)
     assume(many > 2)
-    at = 1 + int(cut * (many - 2))
+    restart_packet = 1 + int(cut * (many - 2))
     card = Card(size, *start)
     past = Past(Counters(*start))
     for _ in range(rows):
         placed, _ = place(size, card.record().packets, past, frame, batch)
         assert not others_than(placed.counts)
         past = placed.past
-    record = card.record(resets=(at,))
+    record = card.record(resets=(restart_packet,))
     placed, out = place(size, record.packets, past, frame, batch)
     assert is_original_or_masked(record, placed, out)
-    assert (placed.counts.placed, placed.counts.restarted) == (at, many - at), placed.reason
+    assert (placed.counts.placed, placed.counts.restarted) == (restart_packet, many - restart_packet), placed.reason
     assert not others_than(placed.counts, "restarted")
     assert not placed.located
 
@@ -111,18 +111,18 @@ def test_one_anomaly_is_counted_once_and_by_its_name(grid, kind, where, batch):
     assert placed.counts.placed == len(record.packets)
 
 
-@given(grid=st.sampled_from(GRIDS), lost=st.integers(1, 5), batch=st.sampled_from([1, 7, 64]))
-def test_late_packets_of_the_record_before_are_left_over(grid, lost, batch):
+@given(grid=st.sampled_from(GRIDS), lost_packets=st.integers(1, 5), batch=st.sampled_from([1, 7, 64]))
+def test_late_packets_of_the_record_before_are_left_over(grid, lost_packets, batch):
     frame, frames = grid
     size = frame * frames
     card = Card(size, 145_600_123, 100_001)
     past = place(size, card.record().packets, None, frame, batch)[0].past
-    before = card.record()
-    lost = min(lost, len(before.packets) - 1)
-    past = place(size, before.packets[lost:], past, frame, batch)[0].past
+    state_before = card.record()
+    lost_packets = min(lost_packets, len(state_before.packets) - 1)
+    past = place(size, state_before.packets[lost_packets:], past, frame, batch)[0].past
     record = card.record()
-    mixed = [*record.packets[:2], *before.packets[:lost], *record.packets[2:]]
+    mixed = [*record.packets[:2], *state_before.packets[:lost_packets], *record.packets[2:]]
     placed, _ = place(size, mixed, past, frame, batch)
     assert placed.complete
-    assert placed.counts.leftover == lost
+    assert placed.counts.leftover == lost_packets
     assert not others_than(placed.counts, "leftover")

@@ -55,17 +55,17 @@ def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, c
     placed, out = place(len(record.data), [p for _, p in order], Counters(count, sequence), frame, batch)
     assert is_original_or_masked(record, placed, out)
     got = {k for k, _ in sent}
-    lost = mask_of(out.size, [record.bytes_of(k) for k in range(len(record.packets)) if k not in got])
-    assert placed.received == (~lost).sum()
+    lost_bytes = mask_of(out.size, [record.bytes_of(k) for k in range(len(record.packets)) if k not in got])
+    assert placed.received == (~lost_bytes).sum()
     assert placed.counts.placed == len(got)
     assert placed.counts.duplicates == len(sent) - len(got)
     assert placed.counts.outside == placed.counts.disagreeing == placed.counts.malformed == 0
     mask = mask_of(out.size, placed.missing)
-    assert (mask | ~lost).all()
+    assert (mask | ~lost_bytes).all()
     if len(record.packets) - 1 in got:
         assert placed.located
     if placed.located:
-        assert (mask == lost).all()
+        assert (mask == lost_bytes).all()
         assert not out[mask].any()
     else:
         assert mask.all()
@@ -129,13 +129,13 @@ def test_every_disorder_at_once(
     sent.sort(key=lambda s: s[0])
     arriving = [(k, packet) for _, k, packet in sent]
     leftovers = malformed = 0
-    for at in range(len(arriving), 1, -1):
+    for position in range(len(arriving), 1, -1):
         if chance.random() < strange:
             back = chance.randint(1, 5)
-            arriving.insert(at, (-1, encode_packet(sequence - back, count - back * FULL, bytes([0xEE]) * FULL)))
+            arriving.insert(position, (-1, encode_packet(sequence - back, count - back * FULL, bytes([0xEE]) * FULL)))
             leftovers += 1
         if chance.random() < strange:
-            arriving.insert(at, (-2, chance.choice([b"", b"0123456789", bytes(1467), bytes(1536)])))
+            arriving.insert(position, (-2, chance.choice([b"", b"0123456789", bytes(1467), bytes(1536)])))
             malformed += 1
     oracle = Oracle(size)
     for k, packet in arriving:
@@ -152,9 +152,9 @@ def test_every_disorder_at_once(
         assert (c.placed, c.duplicates, c.late) == (oracle.placed, oracle.duplicates, oracle.late)
         assert (c.leftover, c.outside) == (leftovers, 0)
         assert placed.received == oracle.there.sum()
-        lost = placed.losses
-        assert lost.head_bytes + lost.gap_bytes + lost.tail_bytes == size - placed.received
-        assert lost.tail_bytes == size - oracle.extent
+        losses = placed.losses
+        assert losses.head_bytes + losses.gap_bytes + losses.tail_bytes == size - placed.received
+        assert losses.tail_bytes == size - oracle.extent
         if placed.located:
             assert (mask_of(size, placed.missing) == ~oracle.there).all()
             assert not out[~oracle.there].any()
@@ -188,8 +188,8 @@ def test_counters_go_on_and_are_not_proportional(frames, frame, records, count, 
 
 def test_losses_are_counted_by_kind():
     record = Record.make(30 * FULL, 0, 1)
-    kept = [p for k, p in enumerate(record.packets) if k not in (0, 1, 7, 12, 13, 29)]
-    placed, _ = place(30 * FULL, [kept[1], kept[0], *kept[2:]], Counters(0, 1), 65536)
+    received = [p for k, p in enumerate(record.packets) if k not in (0, 1, 7, 12, 13, 29)]
+    placed, _ = place(30 * FULL, [received[1], received[0], *received[2:]], Counters(0, 1), 65536)
     assert placed.losses == Losses(head_bytes=2 * FULL, gaps=2, gap_bytes=3 * FULL, tail_bytes=FULL)
     assert (placed.counts.late, placed.counts.late_by_bytes) == (1, 2 * FULL)
 
@@ -202,16 +202,16 @@ def test_logging_allocates_nothing_that_stays():
     block = np.frombuffer(b"".join(record.packets), dtype=np.uint8).reshape(batch, 10 + FULL).copy()
     lengths = np.full(batch, 10 + FULL, dtype=np.uint32)
     log = PacketLog(size * 1000)
-    kept = []
+    kept_arrays = []
     for n in range(1000):
         k = np.arange(n * batch, (n + 1) * batch)
         block[:, 0:4] = (k + 1).astype("<u4")[:, None].view(np.uint8)
         block[:, 4:10] = (k * FULL).astype("<u8")[:, None].view(np.uint8)[:, :6]
         log.add(block, lengths, n)
         if n in (9, 999):
-            kept.append(sys.getallocatedblocks())
+            kept_arrays.append(sys.getallocatedblocks())
     assert log.count == 256_000
-    assert kept[1] - kept[0] < 200
+    assert kept_arrays[1] - kept_arrays[0] < 200
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=SLOW)
@@ -231,12 +231,12 @@ def test_unknown_start_is_original_or_masked(
     """Nothing is known of the counters before: frames of 128 bytes to 64 KiB, lost, doubled, in any order."""
     size = max(1, packets * FULL // frame) * frame
     record = Record.make(size, count, sequence)
-    kept = [kp for kp in enumerate(record.packets) if chance.random() >= loss]
-    sent = kept + [kp for kp in kept if chance.random() < double]
+    kept_packets = [kp for kp in enumerate(record.packets) if chance.random() >= loss]
+    sent = kept_packets + [kp for kp in kept_packets if chance.random() < double]
     sent.sort(key=lambda kp: kp[0] + chance.uniform(0, lateness))
     placed, out = place(size, [packet for _, packet in sent], None, frame)
     assert is_original_or_masked(record, placed, out)
-    if len(kept) == len(record.packets) and lateness == 0:
+    if len(kept_packets) == len(record.packets) and lateness == 0:
         assert placed.complete
 
 
@@ -279,11 +279,13 @@ def test_truncated_packet(cut, which, count, known):
 @settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
 @given(missed=st.integers(1, 5), count=near_wrap, known=st.booleans(), at=st.integers(0, 14))
 def test_missed_frames_are_never_placed_as_if_nothing_was_missing(missed, count, known, at):
-    whole = Record.make(20 * 4096, count, 9)
-    data = whole.data[: at * 4096] + whole.data[(at + missed) * 4096 :]
-    placed, _ = place(len(whole.data), encode_packets(data, 9, count), Counters(count, 9) if known else None, 4096)
+    whole_record = Record.make(20 * 4096, count, 9)
+    data = whole_record.data[: at * 4096] + whole_record.data[(at + missed) * 4096 :]
+    placed, _ = place(
+        len(whole_record.data), encode_packets(data, 9, count), Counters(count, 9) if known else None, 4096
+    )
     assert not placed.located
-    assert placed.missing == [(0, len(whole.data))]
+    assert placed.missing == [(0, len(whole_record.data))]
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
@@ -397,9 +399,9 @@ def test_of_a_card_that_counts_anew_in_every_record_every_second_take_is_kept(si
 def test_a_restart_within_a_row_gives_no_wrong_byte(size, before, start):
     card = Card(size, start.byte_count, start.sequence)
     row = card.record((before,))
-    for known in (Past(start), Past()):
-        for lost in (0, 1, 4):
-            placed, out = place(size, row.packets[: len(row.packets) - lost], known, FRAME)
+    for past in (Past(start), Past()):
+        for lost_packets in (0, 1, 4):
+            placed, out = place(size, row.packets[: len(row.packets) - lost_packets], past, FRAME)
             assert is_original_or_masked(row, placed, out)
             assert not placed.slipped
 
@@ -407,9 +409,9 @@ def test_a_restart_within_a_row_gives_no_wrong_byte(size, before, start):
 def test_overlapping_payload_is_compared():
     """A second network path brings one packet with other bytes: both are masked, and counted under their own name."""
     record = Record.make(20 * FULL + 100, 5000, 7)
-    other = bytearray(record.packets[7])
-    other[500] ^= 1
-    packets = [*record.packets, bytes(other), record.packets[9]]
+    conflicting_packet = bytearray(record.packets[7])
+    conflicting_packet[500] ^= 1
+    packets = [*record.packets, bytes(conflicting_packet), record.packets[9]]
     placed, out = place(len(record.data), packets, Counters(5000, 7), FRAME)
     assert placed.missing == [(7 * FULL, 8 * FULL)]
     assert (placed.counts.conflicting, placed.counts.duplicates) == (1, 1)
@@ -420,16 +422,16 @@ def test_overlapping_payload_is_compared():
 def test_placing_leaves_the_logged_payload_as_it_came(trouble, tmp_path):
     """The row's packet file is written from it afterwards, and gives the same result again."""
     record = Record.make(20 * FULL + 100, 0, 1)
-    other = encode_packet(8, 7 * FULL, bytes(255 - b for b in record.packets[7][10:]))
+    late_packet = encode_packet(8, 7 * FULL, bytes(255 - b for b in record.packets[7][10:]))
     end = FULL if "short" in trouble else 0
     size = len(record.data) + end
     elsewhere = encode_packet(99, 5 * size, bytes([9] * 99))
-    packets = [*record.packets, *([other] if "conflict" in trouble else []), elsewhere]
+    packets = [*record.packets, *([late_packet] if "conflict" in trouble else []), elsewhere]
     log = log_of(size, packets)
     past = Past.after_reset()
-    came = log.payload[: log.payload_bytes].copy()
+    payload_before = log.payload[: log.payload_bytes].copy()
     placed, out = place_record(log, FRAME, past)
-    assert (log.payload[: came.size] == came).all()
+    assert (log.payload[: payload_before.size] == payload_before).all()
     write_packets(tmp_path / "0000.pkt", log, Evidence(size, FRAME, past=past), placed)
     again, same = place_record(read_packets(tmp_path / "0000.pkt", out)[1], FRAME, past)
     assert (again.counts, again.missing) == (placed.counts, placed.missing)
@@ -454,7 +456,7 @@ def test_a_whole_record_elsewhere_is_not_the_rows():
     twin = Card(SHORT_END, 5_000_000, 40_000)
     placed, _ = place(SHORT_END, twin.record().packets, Past(Counters(70_000, 9)), FRAME)
     assert not placed.located
-    own = Record.make(SHORT_END, 0, 1)
-    mixed = [p for pair in zip(own.packets, twin.record().packets, strict=True) for p in pair]
+    earlier_record = Record.make(SHORT_END, 0, 1)
+    mixed = [p for pair in zip(earlier_record.packets, twin.record().packets, strict=True) for p in pair]
     placed, out = place(SHORT_END, mixed, Past.after_reset(), FRAME)
-    assert is_original_or_masked(own, placed, out)
+    assert is_original_or_masked(earlier_record, placed, out)

@@ -58,25 +58,25 @@ def test_segments(board, tmp_path):
     counts = rng.integers(-900, 900, (2, 4, FRAMES, SAMPLES))
     truth = counts[0] + 1j * counts[1]
     sent = counts.transpose(2, 3, 0, 1).astype("<i2").tobytes()
-    gone = (20 * 1456, 21 * 1456)
+    lost_range = (20 * 1456, 21 * 1456)
     path = tmp_path / "0000.bin"
     with ReceiverProcess(board, 1 << 20) as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as card:
         card.bind((board.card_address, 1024))
         receiver.begin_row(0, 1, len(sent), 4096, path)
         for packet in encode_packets(sent, 1, 0):
-            if decode_packet_header(packet)[1] != gone[0]:
+            if decode_packet_header(packet)[1] != lost_range[0]:
                 card.sendto(packet, (board.host_address, board.data_port))
         wait_for(lambda: receiver.report().received == len(sent) - 1456, "packets")
         row = receiver.end_row()
     index, arrivals, samples = read_row(path)
-    assert index["missing"] == [list(gone)]
+    assert index["missing"] == [list(lost_range)]
     assert (index["expected"], index["received"], index["gaps"]) == (len(sent), len(sent) - 1456, 1)
     assert arrivals[-1].tolist() == [row.last_arrival_ns, len(sent)]
     assert zlib.crc32(path.read_bytes()) == row.crc32
-    whole = np.ones(FRAMES, dtype=bool)
-    whole[gone[0] // 4096 : (gone[1] - 1) // 4096 + 1] = False
-    assert whole.sum() == FRAMES - (1 if gone[0] // 4096 == (gone[1] - 1) // 4096 else 2)
-    np.testing.assert_array_equal(samples[:, whole], truth[:, whole])
+    is_present = np.ones(FRAMES, dtype=bool)
+    is_present[lost_range[0] // 4096 : (lost_range[1] - 1) // 4096 + 1] = False
+    assert is_present.sum() == FRAMES - (1 if lost_range[0] // 4096 == (lost_range[1] - 1) // 4096 else 2)
+    np.testing.assert_array_equal(samples[:, is_present], truth[:, is_present])
 
 
 def test_events(tmp_path):
@@ -89,9 +89,9 @@ def test_events(tmp_path):
         writer.append(Capture(**event))
     writer.sync()
     writer.close()
-    found = read_events(path)
-    assert [event.pop("version") for event in found] == ["1.0"] * 5
-    assert found == [{"type": "Capture"} | event for event in sent]
+    events = read_events(path)
+    assert [event.pop("version") for event in events] == ["1.0"] * 5
+    assert events == [{"type": "Capture"} | event for event in sent]
 
 
 def test_manifest(tmp_path):
@@ -141,12 +141,12 @@ def test_journal(tmp_path):
     journal.close()
     raw = (tmp_path / "s.journal").read_bytes()
     assert raw[:8] == b"PSJRNL1\n"
-    at = 8
-    found = []
-    while at < len(raw):
-        length, seq, crc = struct.unpack_from("<III", raw, at)
-        payload = raw[at + 12 : at + 12 + length]
+    offset = 8
+    collected = []
+    while offset < len(raw):
+        length, seq, crc = struct.unpack_from("<III", raw, offset)
+        payload = raw[offset + 12 : offset + 12 + length]
         assert crc == zlib.crc32(struct.pack("<I", seq) + payload)
-        found.append(msgpack.unpackb(payload))
-        at += 12 + length
-    assert found == [{"type": "RunStopped", "version": "1.0", **event} for event in sent]
+        collected.append(msgpack.unpackb(payload))
+        offset += 12 + length
+    assert collected == [{"type": "RunStopped", "version": "1.0", **event} for event in sent]

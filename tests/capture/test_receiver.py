@@ -103,8 +103,8 @@ def test_data_counts_from_any_source_port(board, tmp_path, source_port):
 
 def test_strangers_and_stale_packets_are_not_data(board, card, tmp_path):
     data = noise(20_000, 4)
-    other = (board.host_address, 0)
-    with ReceiverProcess(board, 1 << 20) as receiver, closing(bind_udp(*other, "stranger")) as stranger:
+    stranger_address = (board.host_address, 0)
+    with ReceiverProcess(board, 1 << 20) as receiver, closing(bind_udp(*stranger_address, "stranger")) as stranger:
         send(card, board, encode_packets(noise(5000, 5), 1, 0))
         wait_for(lambda: _waiting(board) > 0, "packets")
         assert receiver.begin_row(0, 1, len(data), 1, tmp_path / "a.part") == 4
@@ -185,8 +185,8 @@ def test_ends_when_its_host_is_killed(board, tmp_path):
 
 def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
     """Two receivers, one swamped while it is stopped: only its row counts drops, and only in the row they fell in."""
-    other = Board("RV", "receive_v", board.card_address, board.host_address, 4202, 4203, ())
-    with ReceiverProcess(board, 1 << 16) as swamped, ReceiverProcess(other, 1 << 16) as quiet:
+    other_board = Board("RV", "receive_v", board.card_address, board.host_address, 4202, 4203, ())
+    with ReceiverProcess(board, 1 << 16) as swamped, ReceiverProcess(other_board, 1 << 16) as quiet:
         for receiver in (swamped, quiet):
             receiver.begin_row(0, 1, 2000 * FULL, FULL, tmp_path / f"{receiver.board.name}.part")
         os.kill(swamped.pid, signal.SIGSTOP)
@@ -194,7 +194,7 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
         for packet in some:
             card.sendto(packet, (board.host_address, board.data_port))
         for packet in some[:20]:
-            card.sendto(packet, (other.host_address, other.data_port))
+            card.sendto(packet, (other_board.host_address, other_board.data_port))
         os.kill(swamped.pid, signal.SIGCONT)
         wait_for(lambda: quiet.report().received == 20 * FULL, "packets")
         hit = swamped.end_row()

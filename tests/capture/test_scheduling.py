@@ -68,12 +68,12 @@ def test_missing_permissions_are_warnings(monkeypatch):
     for name in ("sched_setaffinity", "sched_setscheduler", "setpriority"):
         monkeypatch.setattr(os, name, refuse)
     assert take_core(None) == (None, "")
-    core, why = take_core(1)
+    core, cause = take_core(1)
     assert core is None
-    assert "not pinned to core 1" in why
-    priority, why = take_priority()
+    assert "not pinned to core 1" in cause
+    priority, cause = take_priority()
     assert priority.startswith("nice ")
-    assert why == "no real-time priority: Operation not permitted; nice -5: Operation not permitted"
+    assert cause == "no real-time priority: Operation not permitted; nice -5: Operation not permitted"
 
 
 def test_buffer_below_two_bursts_is_refused_with_the_command(tmp_path):

@@ -36,16 +36,16 @@ def test_a_place_tells_its_own_pixel(processed):
 def test_the_error_of_a_pixel_is_that_of_draws(processed):
     """Of P as it is drawn with its standard deviation, in each part."""
     pixels = Pixels(processed / "one" / "products")
-    at = pixels.nearest(*CENTRE)
+    pixel = pixels.nearest(*CENTRE)
     # small: the law is of first order
-    p = complex(pixels.p[at])
-    sigma = float(pixels.p_std[at]) / 20
+    p = complex(pixels.p[pixel])
+    sigma = float(pixels.p_std[pixel]) / 20
     rng = np.random.default_rng(1)
     drawn = permittivity_from_ratio(
         p + sigma * (rng.standard_normal(4000) + 1j * rng.standard_normal(4000)), pixels.theta_rad
     )
-    assert float(pixels.permittivity_sigma[at]) / 20 == pytest.approx(np.std(drawn.real), rel=0.06)
-    assert float(pixels.permittivity_sigma[at]) / 20 == pytest.approx(np.std(drawn.imag), rel=0.06)
+    assert float(pixels.permittivity_sigma[pixel]) / 20 == pytest.approx(np.std(drawn.real), rel=0.06)
+    assert float(pixels.permittivity_sigma[pixel]) / 20 == pytest.approx(np.std(drawn.imag), rel=0.06)
 
 
 def test_the_range_profile_has_its_peak_at_the_plate(processed):
@@ -76,22 +76,22 @@ def test_without_a_result_nothing_is_told_of_materials(tmp_path):
 
 
 def test_a_scan_does_not_differ_from_itself(processed):
-    found = compare(processed / "one", processed / "one")
-    assert np.nanmax(np.abs(found.p)) == 0
-    assert found.figures.significant_share == 0
-    assert all(pair.sigmas == 0 for pair in found.figures.patches if pair.difference)
+    comparison = compare(processed / "one", processed / "one")
+    assert np.nanmax(np.abs(comparison.p)) == 0
+    assert comparison.figures.significant_share == 0
+    assert all(pair.sigmas == 0 for pair in comparison.figures.patches if pair.difference)
 
 
 def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed):
-    found = compare(processed / "one", processed / "two")
-    answer = [pair.sigmas for pair in found.figures.patches if pair.sigmas is not None]
+    comparison = compare(processed / "one", processed / "two")
+    answer = [pair.sigmas for pair in comparison.figures.patches if pair.sigmas is not None]
     assert answer
     assert max(answer) < 3
     # Few pixels that are independent of each other
-    assert (found.sigmas > 5).mean() < 0.05
+    assert (comparison.sigmas > 5).mean() < 0.05
     back = compare(processed / "two", processed / "one")
-    both = np.isfinite(found.p) & np.isfinite(back.p)
-    assert np.array_equal(found.p[both], -back.p[both])
+    finite_in_both = np.isfinite(comparison.p) & np.isfinite(back.p)
+    assert np.array_equal(comparison.p[finite_in_both], -back.p[finite_in_both])
 
 
 def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
@@ -103,16 +103,17 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
 
     shutil.copytree(processed / "one" / "products", tmp_path / "changed")
     saved = pixels = Pixels(processed / "one" / "products")
-    v, (x, y) = saved.v.copy(), CENTRE
+    v = saved.v.copy()
+    x, y = CENTRE
     inside = np.ix_(abs(pixels.y_mm - y) < 15, abs(pixels.x_mm - x) < 15)
     v[inside] *= 1.3
     with np.errstate(invalid="ignore", divide="ignore"):
         p = saved.h / v
     write_image(tmp_path / "changed" / "image.npz", replace(saved.images, v=v, p=p))
-    found = compare(processed / "one", tmp_path / "changed")
-    answer = np.nan_to_num(found.sigmas)
+    comparison = compare(processed / "one", tmp_path / "changed")
+    answer = np.nan_to_num(comparison.sigmas)
     # A copy, which shares its errors
-    assert found.figures.scatter == 0.1
+    assert comparison.figures.scatter == 0.1
     expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.images.p_sigma) / 0.1
     assert np.allclose(answer[inside], expected[inside], rtol=1e-4)
     assert answer[inside].min() > 0.5
@@ -146,15 +147,15 @@ def test_every_map_is_drawn_in_the_size_of_the_image(processed):
 
     pixels = Pixels(processed / "one" / "products")
     for name in MAPS:
-        made = draw_products(pixels, name)
-        assert imread(io.BytesIO(made.png)).shape[:2] == pixels.valid.shape
-        assert made.low < made.high
+        picture = draw_products(pixels, name)
+        assert imread(io.BytesIO(picture.png)).shape[:2] == pixels.valid.shape
+        assert picture.low < picture.high
     shared = draw_products(pixels, "h_amplitude", (-20.0, 0.0))
     assert (shared.low, shared.high) == (-20.0, 0.0)
-    found = compare(processed / "one", processed / "two")
+    comparison = compare(processed / "one", processed / "two")
     for name in ("p", "sigmas", "permittivity", "loss"):
-        assert imread(io.BytesIO(draw_comparison(found, name).png)).shape[:2] == pixels.valid.shape
-    for draw in (lambda: draw_products(pixels, "x"), lambda: draw_comparison(found, "x")):
+        assert imread(io.BytesIO(draw_comparison(comparison, name).png)).shape[:2] == pixels.valid.shape
+    for draw in (lambda: draw_products(pixels, "x"), lambda: draw_comparison(comparison, "x")):
         with pytest.raises(DataError):
             draw()
 

@@ -25,8 +25,8 @@ def root(processed: Path, tmp_path: Path) -> Path:
         shutil.copytree(processed / "one", tmp_path / name, ignore=shutil.ignore_patterns("raw", "samples", "figures"))
     facts = facts_of(tmp_path / "done")
     ended = {"fact": "scan_ended", "exit_status": "abort", "reason": "asked to", "rows_committed": 3}
-    for name, kept in (("week/stopped", [*facts[:4], ended]), ("week/lost", facts[:6])):
-        (tmp_path / name / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept))
+    for name, kept_facts in (("week/stopped", [*facts[:4], ended]), ("week/lost", facts[:6])):
+        (tmp_path / name / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept_facts))
         os.utime(tmp_path / name / MANIFEST, (1e9, 1e9))
     judged_products(tmp_path / "out" / "one", "none")
     (tmp_path / "empty").mkdir()
@@ -34,19 +34,23 @@ def root(processed: Path, tmp_path: Path) -> Path:
 
 
 def test_every_scan_is_listed_with_its_state(root):
-    found = {s.name: s for s in Scans(root).list()}
-    assert {n: (s.state, s.committed, s.rows) for n, s in found.items()} == {
+    summaries = {s.name: s for s in Scans(root).list()}
+    assert {n: (s.state, s.committed, s.rows) for n, s in summaries.items()} == {
         "done": ("finished", 17, 17), "week/stopped": ("stopped", 3, 17), "week/lost": ("lost", 5, 17),
         "out/one": ("products", 0, 0),
     }  # fmt: skip
-    assert (found["done"].simulated, found["done"].processed, found["out/one"].verdict) == (True, True, "none")
+    assert (summaries["done"].simulated, summaries["done"].processed, summaries["out/one"].verdict) == (
+        True,
+        True,
+        "none",
+    )
 
 
 def test_images_without_materials_are_no_result(root):
     """As after a kill of `process`, or by `polysight image`."""
     (root / "done" / "products" / "materials.json").unlink()
-    found = Scans(root).summary("done")
-    assert (found.processed, found.images_only, found.verdict, found.materials) == (False, True, "", ())
+    summary = Scans(root).summary("done")
+    assert (summary.processed, summary.images_only, summary.verdict, summary.materials) == (False, True, "", ())
 
 
 def test_a_scan_that_has_not_ended_runs_or_pauses_while_its_program_lives(root):
@@ -69,9 +73,9 @@ def test_rows_are_counted_as_the_scan_folder_counts_them(root):
     lines = [manifest.encode_line(f) for f in [*facts, *again]]
     lines[7] = lines[7].replace(b'"row":', b'"rov":')
     path.write_bytes(b"".join(lines) + b'{"fact":"row_committed","pulses":3,"row":999')
-    shown = Scans(root).summary("done")
-    assert shown.committed >= len(ScanFolder.load(root / "done").committed_rows())
-    assert shown.committed <= shown.rows
+    summary = Scans(root).summary("done")
+    assert summary.committed >= len(ScanFolder.load(root / "done").committed_rows())
+    assert summary.committed <= summary.rows
 
 
 def test_what_has_not_changed_is_not_read_again(root, monkeypatch):
@@ -98,15 +102,15 @@ def test_damaged_scans_are_listed_and_break_nothing(root):
         (root / f"bad{k}" / MANIFEST).write_bytes(content)
     (root / "done" / "products" / "materials.json").write_text("[")
     (root / "done" / NOTES).write_text("{")
-    found = {s.name: s for s in Scans(root).list()}
-    assert {found[f"bad{k}"].state for k in range(5)} == {"damaged"}
-    assert (found["done"].state, found["done"].verdict) == ("finished", "damaged")
+    summaries = {s.name: s for s in Scans(root).list()}
+    assert {summaries[f"bad{k}"].state for k in range(5)} == {"damaged"}
+    assert (summaries["done"].state, summaries["done"].verdict) == ("finished", "damaged")
 
 
 def test_links_hidden_folders_and_unprintable_names_are_not_followed(root, tmp_path_factory):
-    other = tmp_path_factory.mktemp("elsewhere")
-    shutil.copytree(root / "done", other / "secret")
-    (root / "link").symlink_to(other / "secret")
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    shutil.copytree(root / "done", elsewhere / "secret")
+    (root / "link").symlink_to(elsewhere / "secret")
     (root / ".hidden").mkdir()
     shutil.copytree(root / "done", root / ".hidden" / "one")
     shutil.copytree(root / "done", root / "a\u202eb")
@@ -149,8 +153,8 @@ def test_pipes_and_links_in_a_folder_keep_no_list_waiting(root, tmp_path_factory
         (root / f"odd{k}" / name).unlink(missing_ok=True)
         os.mkfifo(root / f"odd{k}" / name)
     (root / "done" / f".{NOTES}.part").symlink_to(victim)
-    found = {s.name: s for s in Scans(root).list()}
-    assert (found["odd0"].state, found["odd1"].notes) == ("products", "")
+    summaries = {s.name: s for s in Scans(root).list()}
+    assert (summaries["odd0"].state, summaries["odd1"].notes) == ("products", "")
     write_notes(root / "done", Notes("mine"))
     assert victim.read_text() == "as it was"
     assert read_notes(root / "done").notes == "mine"

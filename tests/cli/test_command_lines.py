@@ -117,8 +117,8 @@ def test_a_tilde_that_the_shell_left_is_the_home_folder(words, monkeypatch):
     monkeypatch.setenv("HOME", "/home/somebody")
     given = [word.format("~/scans/one") for word in words]
     assert expand_home(given) == [word.format("/home/somebody/scans/one") for word in words]
-    kept = ["~", "~other/x", "a ~/b", "--text", "see a=b ~/c"]
-    assert expand_home(kept) == kept
+    unchanged_words = ["~", "~other/x", "a ~/b", "--text", "see a=b ~/c"]
+    assert expand_home(unchanged_words) == unchanged_words
 
 
 def test_both_programs_take_a_tilde(tmp_path, monkeypatch, capsys):
@@ -130,8 +130,8 @@ def test_both_programs_take_a_tilde(tmp_path, monkeypatch, capsys):
 
 
 def test_the_earlier_form_of_a_box_is_read_with_a_notice(capsys):
-    given = join_negative_values(["process", "scan", "--metal", "-45,0,40,40", "--out", "o"])
-    assert build_parser().parse_args(given).metal == (-65, -20, -25, 20)
+    joined_words = join_negative_values(["process", "scan", "--metal", "-45,0,40,40", "--out", "o"])
+    assert build_parser().parse_args(joined_words).metal == (-65, -20, -25, 20)
     assert "--metal-box -65,-20,-25,20" in capsys.readouterr().err
     assert build_parser().parse_args(["permittivity", "out", "--segment", "3"]).patch == 3
 
@@ -148,8 +148,8 @@ def test_other_words_are_left_as_they_are():
 
 @pytest.mark.parametrize("place", ["-60,0", "-.5,-1", "60,-1"])
 def test_a_place_in_the_left_half_is_no_option(place):
-    given = build_parser().parse_args(join_negative_values(["probe", "scan", place]))
-    assert given.at == tuple(map(float, place.split(",")))
+    words = build_parser().parse_args(join_negative_values(["probe", "scan", place]))
+    assert words.at == tuple(map(float, place.split(",")))
 
 
 def test_materials_of_a_scan_or_of_its_products(scan, capsys):

@@ -93,9 +93,9 @@ def test_the_command_writes_a_bundle_although_the_rig_file_is_damaged(tmp_path: 
     (tmp_path / "rig.toml").write_text("grid = ")
     out = tmp_path / "found.zip"
     assert main(["doctor", "--config", str(tmp_path / "rig.toml"), "--out", str(tmp_path), "--bundle", str(out)]) == 1
-    found = contents(out)
-    assert json.loads(found["findings.json"])[0]["verdict"] == "error"
-    assert found["rig.toml"] == b"grid = "
+    contents_of_bundle = contents(out)
+    assert json.loads(contents_of_bundle["findings.json"])[0]["verdict"] == "error"
+    assert contents_of_bundle["rig.toml"] == b"grid = "
 
 
 def test_a_missing_folder_is_refused_before_the_checks_run(tmp_path: Path) -> None:

@@ -48,8 +48,8 @@ def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(tomli_w.dumps(to_builtins(programmed_rig(stage={"speed_mm_s": 200.0, "accel_mm_s2": 2000.0}))))
     with CheckContext(DoctorOptions(path), QUICK) as context:
-        found = next(run_checks(context))
-    assert (found.where, found.level) == ("config", "error")
+        finding = next(run_checks(context))
+    assert (finding.where, finding.level) == ("config", "error")
 
 
 def join_reasons(context, name):
@@ -108,10 +108,10 @@ def test_the_disk_probe_leaves_nothing_behind(tmp_path, monkeypatch):
 
 
 def test_the_published_scan_takes_two_hours(tmp_path):
-    found = check_time(context_of(RIG, tmp_path))
+    finding = check_time(context_of(RIG, tmp_path))
     # 35 s a row, and its ends
-    assert found.facts["seconds"] == pytest.approx(200 * 38, rel=0.05)
-    assert found.facts["bytes"] == 2 * 70_000 * 65_536
+    assert finding.facts["seconds"] == pytest.approx(200 * 38, rel=0.05)
+    assert finding.facts["bytes"] == 2 * 70_000 * 65_536
 
 
 def kernel_root(tmp_path, mtu=1500, speed=1000, lost=0):
@@ -139,16 +139,16 @@ def kernel_root(tmp_path, mtu=1500, speed=1000, lost=0):
     ],
 )
 def test_an_unsuitable_network_interface_is_a_warning_and_unknown_values_are_ok(tmp_path, interface, verdict):
-    found = check_network(context_of(RIG, system=kernel_root(tmp_path, **interface)), RIG.by_name("RH"))
-    assert found.level == verdict
-    assert "eth7" in found.what
+    finding = check_network(context_of(RIG, system=kernel_root(tmp_path, **interface)), RIG.by_name("RH"))
+    assert finding.level == verdict
+    assert "eth7" in finding.what
 
 
 def test_every_need_is_a_check_before_it():
-    known = set()
+    checked = set()
     for check in CHECKS:
-        assert set(check.needs) | set(check.unless) <= known
-        known.add(check.name)
+        assert set(check.needs) | set(check.unless) <= checked
+        checked.add(check.name)
 
 
 def simulated_checks(failing):

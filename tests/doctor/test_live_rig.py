@@ -42,13 +42,13 @@ def skipped(findings, cause):
 def test_all_checks_of_a_healthy_rig_pass(live, capsys):
     status = run_doctor(DoctorOptions(live.config, live.folder, move=True), as_json=True, system=QUICK)
     document = json.loads(capsys.readouterr().out)
-    found = {f["check"]: f for f in document["findings"]}
+    findings = {f["check"]: f for f in document["findings"]}
     assert (status, document["ok"], document["simulated"]) == (0, True, True)
-    assert {n for n, f in found.items() if f["verdict"] not in ("ok", "warning")} == set()
-    assert found["trigger line"]["facts"]["edges"] == 8
-    assert found["radar RH"]["facts"]["frames"] == found["pulses"]["facts"]["pulses"] == 64
-    assert abs(found["pi clock"]["facts"]["offset_s"]) < 60
-    assert abs(found["trigger skew"]["facts"]["skew_ns"]) < 3
+    assert {n for n, f in findings.items() if f["verdict"] not in ("ok", "warning")} == set()
+    assert findings["trigger line"]["facts"]["edges"] == 8
+    assert findings["radar RH"]["facts"]["frames"] == findings["pulses"]["facts"]["pulses"] == 64
+    assert abs(findings["pi clock"]["facts"]["offset_s"]) < 60
+    assert abs(findings["trigger skew"]["facts"]["skew_ns"]) < 3
 
 
 def test_nothing_moves_and_no_pulse_is_sent_by_default(live):
@@ -57,53 +57,53 @@ def test_nothing_moves_and_no_pulse_is_sent_by_default(live):
             status = pi.status()
             return status.x_mm, status.y_mm, status.state
 
-    before = place()
-    found = live.doctor(pulse=False)
-    assert place() == before
-    assert_failed(found)
-    assert {n for n, f in found.items() if f.level == "note"} == {
+    state_before = place()
+    findings = live.doctor(pulse=False)
+    assert place() == state_before
+    assert_failed(findings)
+    assert {n for n, f in findings.items() if f.level == "note"} == {
         "trigger line", "pulses", "radar RH", "radar RV", "level RH", "level RV", "direct path RH", "direct path RV",
         "trigger skew",
     }  # fmt: skip
 
 
 def test_the_pis_clock_is_off(live):
-    found = live.doctor(system=dataclasses.replace(QUICK, wall_ns=lambda: time.time_ns() + 3_600_000_000_000))
-    assert_failed(found, "pi clock")
-    assert found["pi clock"].facts["offset_s"] == pytest.approx(-3600, abs=10)
+    findings = live.doctor(system=dataclasses.replace(QUICK, wall_ns=lambda: time.time_ns() + 3_600_000_000_000))
+    assert_failed(findings, "pi clock")
+    assert findings["pi clock"].facts["offset_s"] == pytest.approx(-3600, abs=10)
 
 
 def test_a_pi_that_hangs(live):
     with live.stopped("polysight-pi"):
-        found = live.doctor(pulse=True)
-    assert_failed(found, "pi")
-    assert skipped(found, "pi") == [
+        findings = live.doctor(pulse=True)
+    assert_failed(findings, "pi")
+    assert skipped(findings, "pi") == [
         "pi clock", "rig is free", "stage", "trigger line", "pulses", "radar RH", "radar RV", "level RH", "level RV",
         "direct path RH", "direct path RV", "trigger skew",
     ]  # fmt: skip
-    assert found["card RH"].level == "ok"
+    assert findings["card RH"].level == "ok"
 
 
 def test_a_card_that_is_mute(live):
     with live.stopped("--boards RV"):
-        found = live.doctor(pulse=True)
-    assert_failed(found, "card RV")
-    assert skipped(found, "card RV") == ["buffer RV", "radar RV", "level RV", "direct path RV", "trigger skew"]
+        findings = live.doctor(pulse=True)
+    assert_failed(findings, "card RV")
+    assert skipped(findings, "card RV") == ["buffer RV", "radar RV", "level RV", "direct path RV", "trigger skew"]
     # The other board is checked to its end
-    assert found["direct path RH"].level == "ok"
+    assert findings["direct path RH"].level == "ok"
 
 
 def test_a_receive_buffer_that_is_too_small(live):
-    found = live.doctor(live.variant(lambda table: table["card"].update(receive_buffer_bytes=4096)))
-    assert_failed(found, "buffer RH", "buffer RV")
+    findings = live.doctor(live.variant(lambda table: table["card"].update(receive_buffer_bytes=4096)))
+    assert_failed(findings, "buffer RH", "buffer RV")
 
 
 def test_a_sync_in_wire_that_is_cut(live):
     with live.cut(live.instrument.pi.sync_out[0]):
-        found = live.doctor(pulse=True)
-    assert_failed(found, "radar RH", "radar RV")
+        findings = live.doctor(pulse=True)
+    assert_failed(findings, "radar RH", "radar RV")
     # The Pi cannot know
-    assert found["pulses"].level == "ok"
+    assert findings["pulses"].level == "ok"
 
 
 def test_a_scan_in_progress_is_not_disturbed(live):
@@ -111,20 +111,20 @@ def test_a_scan_in_progress_is_not_disturbed(live):
     run = BeginRun(scan_id="another", plan=plan_raster(rig.grid), pulses=16, period_us=1500, width_us=1, speed_mm_s=20)
     with live.pi() as pi:
         pi.begin_run(run)
-        found = live.doctor(pulse=True, move=True)
+        findings = live.doctor(pulse=True, move=True)
         with refused(ErrorCode.REFUSED_BY_PEER, "another"):
             pi.pulse(16, 1500, 1)
         pi.end_run("another", "abort", "test")
-    assert_failed(found, "rig is free")
-    assert {"card RH", "card RV", "pulses", "trigger line"} <= set(skipped(found, "rig is free"))
+    assert_failed(findings, "rig is free")
+    assert {"card RH", "card RV", "pulses", "trigger line"} <= set(skipped(findings, "rig is free"))
 
 
 def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
     board = BoardFilter([180.5, 355.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
-    other = BoardFilter([172.5, 347.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
+    other_filter = BoardFilter([172.5, 347.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
     sources = [SourceScan("sweep", "scans/sweep", True, 6)]
     path = write_calibration(
-        FilterFile(**header("hpf", sources), boards={"RH": board, "RV": other}), live.folder / "calibration"
+        FilterFile(**header("hpf", sources), boards={"RH": board, "RV": other_filter}), live.folder / "calibration"
     )
 
     def small(table):
@@ -147,10 +147,10 @@ def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
 
 def test_a_trigger_wire_that_is_cut(live):
     with live.cut(live.instrument.pi.trigger_in):
-        found = live.doctor(move=True)
+        findings = live.doctor(move=True)
     try:
-        assert_failed(found, "trigger line")
-        assert found["trigger line"].facts["edges"] == 0
+        assert_failed(findings, "trigger line")
+        assert findings["trigger line"].facts["edges"] == 0
     finally:
         live.home()
 
@@ -160,11 +160,11 @@ def test_a_stage_that_is_silent(live):
         with live.stopped("--trigger-line" if sketch_compiler() else "polysight_simulators.stage"):
             with live.pi() as pi:
                 wait_for(lambda: pi.status().state == "fault", "the fault")
-            found = live.doctor(move=True)
-        assert_failed(found, "stage")
-        assert found["stage"].facts["fault"] == 101
-        assert skipped(found, "stage") == ["trigger line"]
-        assert found["card RV"].level == "ok"
+            findings = live.doctor(move=True)
+        assert_failed(findings, "stage")
+        assert findings["stage"].facts["fault"] == 101
+        assert skipped(findings, "stage") == ["trigger line"]
+        assert findings["card RV"].level == "ok"
     finally:
         live.home()
 
@@ -179,10 +179,10 @@ def reply(**changes):
 
 def test_a_pi_of_this_release_is_ok(unanswered):
     with answering(unanswered.instrument, reply()):
-        found = unanswered.doctor()
-    assert found["pi"].level == found["stage"].level == found["rig is free"].level == "ok"
-    assert found["pi clock"].level == "note"
-    assert [n for n, f in found.items() if f.level == "error"] == ["card RH", "card RV"]
+        findings = unanswered.doctor()
+    assert findings["pi"].level == findings["stage"].level == findings["rig is free"].level == "ok"
+    assert findings["pi clock"].level == "note"
+    assert [n for n, f in findings.items() if f.level == "error"] == ["card RH", "card RV"]
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_a_pi_of_this_release_is_ok(unanswered):
 )
 def test_a_pi_of_another_release_is_an_error(unanswered, changes, version, check, skips):
     with answering(unanswered.instrument, reply(**changes), version):
-        found = unanswered.doctor()
-    assert found[check].level == "error"
-    assert all(value in found[check].what for value in changes.values())
-    assert skips in skipped(found, check)
+        findings = unanswered.doctor()
+    assert findings[check].level == "error"
+    assert all(value in findings[check].what for value in changes.values())
+    assert skips in skipped(findings, check)

@@ -29,25 +29,25 @@ def with_frames(words, **row):
 
 def test_a_direct_path_at_the_expected_if_is_ok():
     for name in ("RH", "RV"):
-        found = judged(name)
-        assert found.level == "ok", found
-        assert found.facts["heard"] == FRAMES
+        findings = judged(name)
+        assert findings.level == "ok", findings
+        assert findings.facts["heard"] == FRAMES
 
 
 def test_a_missing_direct_path_is_an_error():
-    found = judged(direct_loss_db=60.0)
-    assert found.level == "error"
-    assert "if_hz" not in found.facts
+    findings = judged(direct_loss_db=60.0)
+    assert findings.level == "error"
+    assert "if_hz" not in findings.facts
 
 
 @pytest.mark.parametrize("offset_hz", [2.6e6, -900e3])
 def test_a_direct_path_beyond_the_band_is_an_error_with_a_better_start_offset(offset_hz):
     rig = programmed_rig(offset_hz)
-    found = judged("RH", rig)
-    assert found.level == "error"
+    findings = judged("RH", rig)
+    assert findings.level == "error"
     unshifted = programmed_rig(0.0)
     middle = 0.45 * RIG.chirp.sample_rate_hz - direct_if_hz(unshifted, unshifted.by_name("RH"))
-    assert offset_in(found) == pytest.approx(middle, abs=1e3)
+    assert offset_in(findings) == pytest.approx(middle, abs=1e3)
 
 
 def offset_in(finding):
@@ -56,25 +56,25 @@ def offset_in(finding):
 
 
 def test_a_direct_path_at_the_edge_of_the_band_is_an_error():
-    found = judged("RH", RIG, if_offset_hz=-850e3)
-    assert found.level == "error"
-    assert offset_in(found) == pytest.approx(RIG.by_name("RH").start_offset_hz + 850e3, abs=100e3)
+    findings = judged("RH", RIG, if_offset_hz=-850e3)
+    assert findings.level == "error"
+    assert offset_in(findings) == pytest.approx(RIG.by_name("RH").start_offset_hz + 850e3, abs=100e3)
 
 
 def test_another_start_frequency_than_in_the_rig_file_is_recovered():
     """The board was programmed 490 kHz higher than the rig file says; its crystal's share is removed."""
-    found = judged("RH", programmed_rig(300e3), if_offset_hz=490e3, crystal_ppm={"receive_h": 1.5})
-    assert found.level == "warning"
-    assert offset_in(found) == pytest.approx(790e3, abs=5 * 2.1e-9 / 32**0.5 * 38.8e12)
+    findings = judged("RH", programmed_rig(300e3), if_offset_hz=490e3, crystal_ppm={"receive_h": 1.5})
+    assert findings.level == "warning"
+    assert offset_in(findings) == pytest.approx(790e3, abs=5 * 2.1e-9 / 32**0.5 * 38.8e12)
 
 
 @pytest.mark.parametrize(("skew_ns", "verdict"), [(0.0, "ok"), (-13.0, "warning"), (21.5, "error")])
 def test_trigger_skew_between_the_boards_is_recovered(skew_ns, verdict):
     skew = {"sync_skew_ns": {"receive_h": 1.0 - skew_ns / 2, "receive_v": 1.0 + skew_ns / 2}}
-    found = judge_skew(RIG, {name: signal_of(name, **skew) for name in ("RH", "RV")})
-    assert found.facts["skew_ns"] == pytest.approx(skew_ns, abs=5 * found.facts["standard_error_ns"])
-    assert found.level == verdict
-    assert found.facts["later_ns"]["RH"] == pytest.approx(1.0 - skew_ns / 2, abs=2.5)
+    finding = judge_skew(RIG, {name: signal_of(name, **skew) for name in ("RH", "RV")})
+    assert finding.facts["skew_ns"] == pytest.approx(skew_ns, abs=5 * finding.facts["standard_error_ns"])
+    assert finding.level == verdict
+    assert finding.facts["later_ns"]["RH"] == pytest.approx(1.0 - skew_ns / 2, abs=2.5)
 
 
 @pytest.mark.parametrize("ppm", [-2.0, 0.0, 1.5])
@@ -90,15 +90,15 @@ def test_clipped_chirps_are_an_error_and_a_few_a_warning():
     words = np.repeat(frames_of("RH"), 8, axis=0)
     assert check_level(with_frames(words), RIG.by_name("RH")).level == "ok"
     words[3, 5, 0, 1] = 32767  # one chirp of 256
-    found = check_level(with_frames(words), RIG.by_name("RH"))
-    assert (found.level, found.facts["clipped_chirps"]) == ("warning", 1)
+    finding = check_level(with_frames(words), RIG.by_name("RH"))
+    assert (finding.level, finding.facts["clipped_chirps"]) == ("warning", 1)
 
 
 def test_an_rx_without_a_signal_is_an_error():
     words = frames_of("RH")
     words[..., 2] = 0
-    found = check_level(with_frames(words), RIG.by_name("RH"))
-    assert (found.level, found.facts["rms"][2]) == ("error", 0)
+    finding = check_level(with_frames(words), RIG.by_name("RH"))
+    assert (finding.level, finding.facts["rms"][2]) == ("error", 0)
 
 
 @pytest.mark.parametrize(

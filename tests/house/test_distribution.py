@@ -51,8 +51,8 @@ def test_a_files_tests_run_in_one_worker_and_each_once():
     files = [{test.partition("::")[0] for test in worker} for worker in got]
     assert not files[0] & files[1] | files[1] & files[2] | files[2] & files[0]
     assert all(files)
-    for file, other in TOGETHER.items():
-        assert any({file, other} <= worker for worker in files)
+    for file, partner in TOGETHER.items():
+        assert any({file, partner} <= worker for worker in files)
     for room in ROOMS:
         assert sum(any(file.startswith(room) for file in worker) for worker in files) == 1
 

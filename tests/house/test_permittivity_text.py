@@ -21,19 +21,19 @@ WRITER = "host/polysight/materials/measure.py"
 
 def built_by_hand(text: str) -> list[int]:
     """Lines of Python whose f-string puts a number behind `- j`."""
-    found = []
+    collected = []
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.JoinedStr):
-            for part, after in zip(node.values, node.values[1:], strict=False):
+            for part, state_after in zip(node.values, node.values[1:], strict=False):
                 if isinstance(part, ast.Constant) and isinstance(part.value, str):
                     written = part.value
                 else:
                     written = ""
-                if isinstance(after, ast.FormattedValue) and BY_HAND.search(written):
-                    found.append(node.lineno)
+                if isinstance(state_after, ast.FormattedValue) and BY_HAND.search(written):
+                    collected.append(node.lineno)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and OTHERS.search(node.value):
-            found.append(node.lineno)
-    return found
+            collected.append(node.lineno)
+    return collected
 
 
 def test_no_text_is_built_by_hand():
@@ -79,7 +79,7 @@ def test_parts_line_up_in_columns():
 
 @given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
 def test_what_is_written_reads_back(real, imag):
-    found = re.fullmatch(r"(-?[0-9.]+) ([-+]) j([0-9.]+)", format_permittivity(complex(real, imag)))
-    assert found is not None
-    assert float(found[1]) == pytest.approx(real, abs=0.006)
-    assert float(found[2] + found[3]) == pytest.approx(imag, abs=0.006)
+    match = re.fullmatch(r"(-?[0-9.]+) ([-+]) j([0-9.]+)", format_permittivity(complex(real, imag)))
+    assert match is not None
+    assert float(match[1]) == pytest.approx(real, abs=0.006)
+    assert float(match[2] + match[3]) == pytest.approx(imag, abs=0.006)

@@ -100,13 +100,13 @@ def test_a_room_says_what_it_is(room):
 
 
 def imports(file: Path) -> list[tuple[int, str]]:
-    found = []
+    collected = []
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module:
-            found.append((node.lineno, node.module))
+            collected.append((node.lineno, node.module))
         elif isinstance(node, ast.Import):
-            found += [(node.lineno, alias.name) for alias in node.names]
-    return found
+            collected += [(node.lineno, alias.name) for alias in node.names]
+    return collected
 
 
 def room_of(file: Path) -> str:
@@ -179,5 +179,5 @@ def test_the_pi_half_needs_only_what_its_wheel_brings():
     allowed = {*sys.stdlib_module_names, "polysight_pi", "polysight_shared", "gpiod", "msgpack", "msgspec", "serial"}
     allowed.add("zmq")
     files = [f for top in ("shared", "pi_controller") for f in (ROOT / top / PROJECTS[top]).glob("*.py")]
-    more = {f"{f.name}: {m}" for f in files for _, m in imports(f) if m.split(".")[0] not in allowed}
-    assert more == set()
+    foreign_imports = {f"{f.name}: {m}" for f in files for _, m in imports(f) if m.split(".")[0] not in allowed}
+    assert foreign_imports == set()

@@ -24,10 +24,10 @@ def stops() -> list[tuple[int, Path, str]]:
 def functions(file: Path) -> set[str]:
     """Names of functions, methods as `Class.method`."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
-    found = {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
+    names = {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
     for c in (n for n in tree.body if isinstance(n, ast.ClassDef)):
-        found |= {f"{c.name}.{n.name}" for n in c.body if isinstance(n, ast.FunctionDef)}
-    return found
+        names |= {f"{c.name}.{n.name}" for n in c.body if isinstance(n, ast.FunctionDef)}
+    return names
 
 
 def test_there_are_at_most_twelve_and_they_are_numbered():

@@ -30,8 +30,8 @@ def run(*words: str) -> Command:
 
 def save_library(folder: Path) -> int:
     """The end of `polysight train`."""
-    known = Library.load(SIMULATED_LIBRARY)
-    Library(known.entries[:4], {}, "new").save(folder / "one" / "library.npz")
+    library = Library.load(SIMULATED_LIBRARY)
+    Library(library.entries[:4], {}, "new").save(folder / "one" / "library.npz")
     return 0
 
 
@@ -74,29 +74,29 @@ def written(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("fault", ["full", "short", "killed", "killed within", "worst power cut"])
 def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(before, tmp_path, name, fault):
     command = COMMANDS[name]
-    whole = Path(shutil.copytree(before, tmp_path / "whole"))
-    with FaultyDisk(whole)() as disk:
-        assert command(whole) == 0
+    whole_scan = Path(shutil.copytree(before, tmp_path / "whole"))
+    with FaultyDisk(whole_scan)() as disk:
+        assert command(whole_scan) == 0
     old = written(before)
-    new = written(whole)
+    new = written(whole_scan)
     assert old.keys() != new.keys() or old != new
     (last_rename,) = [step.split()[1] for step in disk.done if step.startswith("rename")][-1:]
     (committing,) = [name for name in new if name.endswith(f"/{last_rename}") and new[name] != old.get(name)]
-    for at in range(1, len(disk.done) + 1):
-        folder = Path(shutil.copytree(before, tmp_path / f"{at}"))
+    for position in range(1, len(disk.done) + 1):
+        folder = Path(shutil.copytree(before, tmp_path / f"{position}"))
         try:
-            with FaultyDisk(folder, fault, at)():
+            with FaultyDisk(folder, fault, position)():
                 status = command(folder)
         except (Killed, OSError, PolysightError):
             status = 1
-        left = written(folder)
-        committed = left == new
+        remaining = written(folder)
+        committed = remaining == new
         if status == 0:
-            assert committed, (at, disk.done[at - 1])
+            assert committed, (position, disk.done[position - 1])
         if fault in ("full", "short"):
             assert not list(folder.rglob(".*.part")), "what failed leaves nothing behind"
         if not committed:
             # A picture may be new already: the file that makes it count is the old one.
-            assert left.get(committing) == old.get(committing), (at, disk.done[at - 1])
-        assert command(folder) == 0, (at, disk.done[at - 1])
+            assert remaining.get(committing) == old.get(committing), (position, disk.done[position - 1])
+        assert command(folder) == 0, (position, disk.done[position - 1])
         assert written(folder) == new

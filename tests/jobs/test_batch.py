@@ -84,9 +84,9 @@ def job_of(data, out, **options):
 
 
 def jobs(folder, *names):
-    found = find_scans([folder])
-    assert sorted(p.name for p in found) == sorted(names)
-    return make_jobs([(data, Settings()) for data in found], folder.parent / "out")
+    scans_found = find_scans([folder])
+    assert sorted(p.name for p in scans_found) == sorted(names)
+    return make_jobs([(data, Settings()) for data in scans_found], folder.parent / "out")
 
 
 def runs(folder):
@@ -140,10 +140,10 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
         assert not is_finished(job(**change)), change
     (folder / "RH").mkdir()
     for path in (library, rig, folder / "RH" / "0_0.bin"):
-        before = path.read_bytes() if path.exists() else b""
+        state_before = path.read_bytes() if path.exists() else b""
         path.write_bytes(b"2")
         assert not is_finished(job()), path
-        path.write_bytes(before)
+        path.write_bytes(state_before)
     (folder / "RH" / "0_0.bin").unlink()
     assert is_finished(job())
     (tmp_path / "out" / "a" / "image.npz").unlink()
@@ -157,7 +157,7 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
 def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothing_else(tmp_path):
     """Notes, programs of the page, exports and labels are no data; manifest, rows, calibration and truth are."""
     folder = write_scan(tmp_path / "in" / "scan")
-    kept = folder / "samples" / "RH.npy"
+    sample_file = folder / "samples" / "RH.npy"
     process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
 
     def done():
@@ -171,21 +171,21 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
     for name in ("manifest.jsonl", "raw/RH/0000.bin", "raw/RV/0001.idx", "truth.json"):
         file = folder / name
         file.parent.mkdir(exist_ok=True)
-        before = file.read_bytes() if file.exists() else None
+        state_before = file.read_bytes() if file.exists() else None
         times = file.stat().st_mtime_ns if file.exists() else 0
         with file.open("a") as appended:
             appended.write("\n")
         assert not done(), name
-        if before is None:
+        if state_before is None:
             file.unlink()
         else:
-            file.write_bytes(before)
+            file.write_bytes(state_before)
             os.utime(file, ns=(times, times))
         assert done(), name
     drop(ScanFolder.load(folder), raw_digests(folder), tmp_path / "out" / "scan")
     process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
     assert done()
-    kept.write_text("other samples")
+    sample_file.write_text("other samples")
     assert not done()  # they are all that is left
 
 
@@ -208,16 +208,16 @@ def test_ended_early_its_programs_end_too(tmp_path):
 
 
 def test_names_folders_and_what_is_a_scan(tmp_path):
-    found = scans(tmp_path / "unsynced", "s1", "s2")
+    scans_found = scans(tmp_path / "unsynced", "s1", "s2")
     (tmp_path / "unsynced" / "notes").mkdir()
     raw = tmp_path / "raw" / "s1"
     raw.mkdir(parents=True)
     (raw / "RH_synced.npy").touch()
-    assert find_scans([tmp_path / "unsynced"]) == found
-    assert find_scans([raw, found[1]]) == [raw, found[1]]
+    assert find_scans([tmp_path / "unsynced"]) == scans_found
+    assert find_scans([raw, scans_found[1]]) == [raw, scans_found[1]]
     assert find_scans([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
     with refused(ErrorCode.NAME_TAKEN, "s1"):
-        make_jobs([(found[0], Settings()), (raw, Settings())], tmp_path / "out")
+        make_jobs([(scans_found[0], Settings()), (raw, Settings())], tmp_path / "out")
 
 
 def test_scans_at_a_time_follow_cores_and_memory():

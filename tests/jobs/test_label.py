@@ -31,14 +31,14 @@ def boxes(folder):
 
 def answering(*answers):
     """Answers to questions, and the questions that were asked."""
-    left = list(answers)
+    remaining = list(answers)
     questions = []
 
     def ask(question):
         questions.append(question)
-        if not left:
+        if not remaining:
             raise EOFError
-        return left.pop(0)
+        return remaining.pop(0)
 
     return ask, questions
 
@@ -46,27 +46,27 @@ def answering(*answers):
 def test_patches_get_names_by_their_numbers(products, capsys):
     assert main(["label", str(products), *NAMED]) == 0
     answer = capsys.readouterr().out
-    found = boxes(products)
-    assert list(found.boxes) == ["copper", "\u6a61\u6728"]
-    assert (found.unit, found.metal, found.by_hand) == ("mm", "copper", True)
+    named_boxes = boxes(products)
+    assert list(named_boxes.boxes) == ["copper", "\u6a61\u6728"]
+    assert (named_boxes.unit, named_boxes.metal, named_boxes.by_hand) == ("mm", "copper", True)
     # 9 mm inside the patch
-    assert found.boxes["copper"] == pytest.approx((-41.0, -11.0, -29.0, 11.0))
+    assert named_boxes.boxes["copper"] == pytest.approx((-41.0, -11.0, -29.0, 11.0))
     assert "left out, without a name: 3" in answer
     assert "\u6a61\u6728" in answer
     assert (products / "labels.png").read_bytes().startswith(b"\x89PNG")
-    assert find_labels(products)[1] == found
+    assert find_labels(products)[1] == named_boxes
 
 
 def test_boxes_are_drawn_moved_renamed_and_removed(products):
-    where = str(products)
-    assert main(["label", where, "--box", "sheet=-40,-10,-30,10", "--box", "oak=0,0,10,10", "--metal", "sheet"]) == 0
-    assert main(["label", where, "--rename", "sheet=tin plate", "--specimen", "oak=board 7"]) == 0
-    assert main(["label", where, "--box", "oak#left=20,0,30,10"]) == 0
-    found = boxes(products)
-    assert list(found.boxes) == ["tin plate", "oak", "oak#left"]
-    assert found.metal == "tin plate"
-    assert [found.specimen(n) for n in found.boxes] == [None, "board 7", "left"]
-    assert main(["label", where, "--remove", "oak", "--box", "oak=0,-20,10,-5"]) == 0
+    scan = str(products)
+    assert main(["label", scan, "--box", "sheet=-40,-10,-30,10", "--box", "oak=0,0,10,10", "--metal", "sheet"]) == 0
+    assert main(["label", scan, "--rename", "sheet=tin plate", "--specimen", "oak=board 7"]) == 0
+    assert main(["label", scan, "--box", "oak#left=20,0,30,10"]) == 0
+    named_boxes = boxes(products)
+    assert list(named_boxes.boxes) == ["tin plate", "oak", "oak#left"]
+    assert named_boxes.metal == "tin plate"
+    assert [named_boxes.specimen(n) for n in named_boxes.boxes] == [None, "board 7", "left"]
+    assert main(["label", scan, "--remove", "oak", "--box", "oak=0,-20,10,-5"]) == 0
     assert boxes(products).boxes["oak"] == (0, -20, 10, -5)
     assert boxes(products).specimen("oak") is None
 
@@ -79,10 +79,13 @@ def test_a_patch_told_to_be_metal_is_called_so(products):
 
 
 def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
-    found = find_products(products)
+    result = find_products(products)
     # -40 dB
-    dim = np.where(found.x_m > 0.02, 0.01, 1.0).astype(np.float32)
-    write_image(products / "image.npz", replace(found.images, h=found.h * dim, v=found.v * dim, p_sigma=None))
+    dim = np.where(result.x_m > 0.02, 0.01, 1.0).astype(np.float32)
+    write_image(
+        products / "image.npz",
+        replace(result.images, h=result.h * dim, v=result.v * dim, p_sigma=None),
+    )
     assert main(["label", str(products), "--box", "oak=-40,-10,-20,10", "--metal", "oak"]) == 0
     assert "note: dark" not in capsys.readouterr().out
     assert main(["label", str(products), "--box", "nothing=30,-10,50,10"]) == 0
@@ -128,11 +131,11 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
     assert "the name pet" in capsys.readouterr().out
     assert label(products, Edits(), ask=answering("yes", "oak", "glass", "", "nothing", "glass")[0]) == 0
     assert boxes(products).metal == "glass"
-    before = (products / "labels.json").read_bytes()
+    state_before = (products / "labels.json").read_bytes()
     for answers, code in ((["no"], ErrorCode.VALUE_INVALID), (["yes", "copper"], ErrorCode.KEY_MISSING)):
         with refused(code):
             label(products, Edits(), ask=answering(*answers)[0])
-    assert (products / "labels.json").read_bytes() == before
+    assert (products / "labels.json").read_bytes() == state_before
 
 
 def test_without_a_terminal_patches_are_listed(products, capsys):
@@ -148,9 +151,9 @@ def test_labels_of_a_scan_folder_lie_beside_its_rows(tmp_path):
     scan = tmp_path / "scan"
     judged_products(scan / "products", "good")
     (scan / "manifest.jsonl").write_text("")
-    for given in (scan, scan / "products"):
-        assert main(["label", str(given), *NAMED]) == 0
-        assert find_labels(given)[0].resolve() == (scan / "labels.json").resolve()
+    for folder_given in (scan, scan / "products"):
+        assert main(["label", str(folder_given), *NAMED]) == 0
+        assert find_labels(folder_given)[0].resolve() == (scan / "labels.json").resolve()
     assert not (scan / "products" / "labels.json").exists()
 
 

@@ -45,8 +45,8 @@ def test_scans_are_listed_and_found_by_their_notes_and_tags(root, capsys):
         "two": ("products", True),
     }
     for words, names in ((["--tag", "oak"], {"one"}), (["--find", "BRETT"], {"one"}), (["--find", "pet"], {"two"})):
-        found = json.loads(answer(capsys, "scans", root, "--json", *words))["scans"]
-        assert {r["name"] for r in found} == names
+        document = json.loads(answer(capsys, "scans", root, "--json", *words))["scans"]
+        assert {r["name"] for r in document} == names
     assert "2 scans" in answer(capsys, "scans", root)
 
 

@@ -36,10 +36,10 @@ def scene(seed: int) -> dict[str, Any]:
 def scans(tmp_path_factory) -> list[Path]:
     """Three scans of copper and a board, without truth.json: what a real rig would leave. All are called alike."""
     folder = tmp_path_factory.mktemp("own")
-    made = [simulate(published_rig(), decode_scene(scene(s), "test"), folder / f"s{s}") for s in (1, 2, 3)]
-    for scan in made:
+    simulated_scans = [simulate(published_rig(), decode_scene(scene(s), "test"), folder / f"s{s}") for s in (1, 2, 3)]
+    for scan in simulated_scans:
         (scan / "truth.json").unlink()
-    return made
+    return simulated_scans
 
 
 def drawn() -> list[str]:
@@ -47,7 +47,9 @@ def drawn() -> list[str]:
 
 
 def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path, capsys):
-    (first, second, third), elsewhere, out = scans, tmp_path / "second", tmp_path / "out"
+    first, second, third = scans
+    elsewhere = tmp_path / "second"
+    out = tmp_path / "out"
     library = tmp_path / "own.npz"
     assert main(["train", str(first), str(second), "--out", str(library)]) == 3
     assert f"do: polysight label {first}" in capsys.readouterr().err
@@ -71,8 +73,8 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
 
     assert main(["process", str(third), "--out", str(out), "--library", str(library)]) == 0
     segments = json.loads((out / "materials.json").read_text(encoding="utf-8"))["segments"]
-    mine = [s for s in segments if s["name"] == MINE]
-    assert [np.hypot(*np.subtract(np.reshape(s["box_mm"], (2, 2)).mean(0), PLACES[1])) < 10 for s in mine] == [True]
+    patches = [s for s in segments if s["name"] == MINE]
+    assert [np.hypot(*np.subtract(np.reshape(s["box_mm"], (2, 2)).mean(0), PLACES[1])) < 10 for s in patches] == [True]
     assert {s["name"] for s in segments} <= {MINE, "unknown", None}
     assert MINE in (out / "report.html").read_text(encoding="utf-8")
     capsys.readouterr()
@@ -94,10 +96,10 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
     (scan / "labels.json").write_bytes((out / "labels.json").read_bytes())
     rows, images = (entries_of(training_scan(folder, RIG_FILE)) for folder in (scan, out))
     assert [e.name for e in rows] == [e.name for e in images] == ["copper", MINE]
-    for one, other in zip(rows, images, strict=True):
-        assert one.incidence_deg == pytest.approx(other.incidence_deg, abs=0.05)
-        assert np.median(one.h) == pytest.approx(np.median(other.h), rel=0.02)
-        assert abs(np.median(one.p) / np.median(other.p) - 1) < 0.02
+    for first_item, second_item in zip(rows, images, strict=True):
+        assert first_item.incidence_deg == pytest.approx(second_item.incidence_deg, abs=0.05)
+        assert np.median(first_item.h) == pytest.approx(np.median(second_item.h), rel=0.02)
+        assert abs(np.median(first_item.p) / np.median(second_item.p) - 1) < 0.02
 
 
 def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
@@ -107,8 +109,8 @@ def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
     assert [(name, unknown) for name, _, unknown in answer] == [("copper", True), ("board", False)]
     assert len({specimen for _, specimen, _ in answer}) == 2
     again = simulate(published_rig(), decode_scene({**spread, "seed": 1004}, "test"), tmp_path / "again")
-    others = {e.specimen for e in entries_of(training_scan(again, RIG_FILE))}
-    assert not others & {specimen for _, specimen, _ in answer}, "another simulation of a scene draws other specimens"
+    redrawn = {e.specimen for e in entries_of(training_scan(again, RIG_FILE))}
+    assert not redrawn & {specimen for _, specimen, _ in answer}, "another simulation of a scene draws other specimens"
     boxes = {"tin": [-60, -10, -20, 30], f"{MINE}#left": [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
     answer = [(e.name, e.specimen) for e in entries_of(training_scan(scan, RIG_FILE))]

@@ -40,9 +40,9 @@ def test_counts_are_those_of_the_scan_folder(finished):
     assert history.takes == {row: r.take for row, r in rows.items()}
     assert history.ended is not None
     for board in history.boards:
-        each = [r.boards[board.name] for r in rows.values()]
-        assert board.frames_expected == sum(b.frames_expected for b in each)
-        assert board.frames_received == sum(b.frames_received for b in each)
+        board_rows = [r.boards[board.name] for r in rows.values()]
+        assert board.frames_expected == sum(b.frames_expected for b in board_rows)
+        assert board.frames_received == sum(b.frames_received for b in board_rows)
 
 
 def test_trigger_health_is_the_worst_of_all_bursts(finished):
@@ -127,7 +127,7 @@ def test_resumed_is_not_ended(finished):
 
 def test_facts_of_newer_releases_are_passed_over(begun):
     history, _ = begun
-    before = dict(vars(history))
+    state_before = dict(vars(history))
     for name in ("takes", "boards", "rows", "ended", "something_new"):
         add_fact(history, {"fact": name})
-    assert vars(history) == before
+    assert vars(history) == state_before

@@ -93,11 +93,11 @@ def test_faults_stay_until_a_row_ends_well(pi):
 
 def test_words_of_strangers_are_named_and_survived(pi):
     tell, listener = pi
-    before = listener.state
+    state_before = listener.state
     listener._receive(b"\xc1 no message")
     assert listener.state.deaf is not None
     assert listener.state.deaf.do or listener.state.deaf.why
-    assert (listener.state.row, listener.state.state) == (before.row, before.state)
+    assert (listener.state.row, listener.state.state) == (state_before.row, state_before.state)
     tell(m.Heartbeat(**OF, seq=0, state="idle", period_ms=100))
     wait_for(lambda: listener.state.state == "idle", "the next event")
     assert listener.state.deaf is None

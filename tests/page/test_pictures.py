@@ -26,11 +26,11 @@ def pixels(png: bytes) -> np.ndarray:
 
 @pytest.fixture
 def images() -> Images:
-    one = np.full((NY, NX), 0.01, np.complex64)
+    h = np.full((NY, NX), 0.01, np.complex64)
     # Smallest y, largest x
-    one[0, -1] = 1.0
+    h[0, -1] = 1.0
     axes = (np.arange(NX, dtype=float), np.arange(NY, dtype=float))
-    return Images(one, one.copy(), *axes, np.ones((NY, NX), bool))
+    return Images(h, h.copy(), *axes, np.ones((NY, NX), bool))
 
 
 def test_smallest_y_is_at_the_bottom(images):
@@ -41,11 +41,11 @@ def test_smallest_y_is_at_the_bottom(images):
 
 
 def test_what_no_row_has_lit_is_transparent(images):
-    seen = np.ones((NY, NX), bool)
-    seen[:3] = False
-    for picture in draw(replace(images, valid=seen)).values():
+    is_lit = np.ones((NY, NX), bool)
+    is_lit[:3] = False
+    for picture in draw(replace(images, valid=is_lit)).values():
         assert (pixels(picture.png)[-3:, :, 3] == 0).all()
-    assert (pixels(draw(replace(images, valid=seen))["h_amplitude"].png)[:-3, :, 3] == 1).all()
+    assert (pixels(draw(replace(images, valid=is_lit))["h_amplitude"].png)[:-3, :, 3] == 1).all()
 
 
 def test_nothing_lit_is_drawn_all_the_same(images):

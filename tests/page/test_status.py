@@ -105,8 +105,8 @@ def test_a_row_taken_again_is_a_warning_for_a_while(history):
 
 @pytest.mark.parametrize(("direct_rad", "masked", "level"), [(0.004, 0, "good"), (0.3, 0, "warn"), (0.004, 2, "warn")])
 def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, level):
-    shown = Shown(sync={"RH": {0: RowSync(0.02, direct_rad, masked)}})
-    s = status(history, shown=shown)
+    pictures = Shown(sync={"RH": {0: RowSync(0.02, direct_rad, masked)}})
+    s = status(history, shown=pictures)
     assert s.level == level
     assert bool(s.do) == (level == "warn")
 

@@ -153,11 +153,11 @@ def test_looking_on_changes_nothing_in_the_folder(finished, watching, tmp_path):
     def content():
         return {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(folder.rglob("*"))}
 
-    before = content()
+    state_before = content()
     watch = watching(folder, control=True)
     watch.wait_for(shows(3))
     watch.close()
-    assert content() == before
+    assert content() == state_before
 
 
 def test_a_manifest_of_another_release_is_not_taken_for_none(growing, watching):
@@ -177,24 +177,24 @@ CUTS = st.lists(st.floats(0, 1), max_size=12)
 def test_any_pieces_give_the_whole(finished, tmp_path_factory, name, tail):
     raw = (finished / name).read_bytes()
     if name == MANIFEST:
-        whole = manifest.parse(raw).facts
+        all_facts = manifest.parse(raw).facts
     else:
-        whole = read_events(finished / name).events
-    assert len(whole) > 4
+        all_facts = read_events(finished / name).events
+    assert len(all_facts) > 4
 
     @settings(max_examples=20)
     @given(CUTS)
     def pieces(cuts: list[float]) -> None:
         path = tmp_path_factory.mktemp("pieces") / name
         tailing = tail(path)
-        found = []
+        collected = []
         ends = sorted({int(c * len(raw)) for c in cuts} | {len(raw)})
-        for before, end in zip([0, *ends], ends, strict=False):
+        for state_before, end in zip([0, *ends], ends, strict=False):
             with path.open("ab") as f:
-                f.write(raw[before:end])
-            found += tailing.look()
-            assert found == whole[: len(found)]
-        assert found == whole
+                f.write(raw[state_before:end])
+            collected += tailing.look()
+            assert collected == all_facts[: len(collected)]
+        assert collected == all_facts
         assert tailing.look() == []
 
     pieces()
@@ -219,13 +219,13 @@ def test_another_and_longer_file_is_found_after_a_single_look(finished, tmp_path
     """Before anything else was appended to the one that was read."""
     path = tmp_path / MANIFEST
     raw = (finished / MANIFEST).read_bytes()
-    others = [{"fact": "scan_ended", "reason": "another scan" * 50} for _ in raw.splitlines()]
+    other_items = [{"fact": "scan_ended", "reason": "another scan" * 50} for _ in raw.splitlines()]
     path.write_bytes(raw)
     tail = ManifestTail(path)
-    assert len(tail.look()) == len(others)
-    (tmp_path / "new").write_bytes(b"".join(map(manifest.encode_line, others)))
+    assert len(tail.look()) == len(other_items)
+    (tmp_path / "new").write_bytes(b"".join(map(manifest.encode_line, other_items)))
     (tmp_path / "new").rename(path)
-    assert tail.look() == [typed(fact) for fact in others]
+    assert tail.look() == [typed(fact) for fact in other_items]
     assert tail.file.replaced
 
 
@@ -238,8 +238,8 @@ def test_the_verdict_follows_the_products(tmp_path):
     for level in ("care", "none", None, "good"):
         shutil.rmtree(tmp_path / "products", ignore_errors=True)
         judged_products(tmp_path / "products", level)
-        found = tail.look("")
-        assert (found.level if found else None) == level
+        verdict = tail.look("")
+        assert (verdict.level if verdict else None) == level
     (tmp_path / "products" / "materials.json").write_text("{", encoding="utf-8")
     assert tail.look("") is None
 

@@ -81,18 +81,18 @@ def out(dataset, tmp_path_factory):
 def test_table_2_is_recovered_from_both_kinds_of_files(out):
     content = json.loads((out / "table2.json").read_text())
     assert content["simulated"] is True
-    found = {(r["source"], r["number"]): r for r in content["materials"]}
-    assert {n for s, n in found if s == MATERIALS} == set(CHOSEN)
-    assert {n for s, n in found if s == LABELS} == {1, 3, 12}
-    for (_, number), row in found.items():
+    rows_by_number = {(r["source"], r["number"]): r for r in content["materials"]}
+    assert {n for s, n in rows_by_number if s == MATERIALS} == set(CHOSEN)
+    assert {n for s, n in rows_by_number if s == LABELS} == {1, 3, 12}
+    for (_, number), row in rows_by_number.items():
         assert row["metal_like"] == (number == 1)
         if number == 1:
             continue
         true = ROWS[number].permittivity
-        seen = complex(*row["without_leakage"].values())
-        assert abs(seen - true) < 0.08 * abs(true)
+        without_leakage = complex(*row["without_leakage"].values())
+        assert abs(without_leakage - true) < 0.08 * abs(true)
         # The files hold leakage
-        assert abs(complex(*row["as_is"].values()) - true) > abs(seen - true)
+        assert abs(complex(*row["as_is"].values()) - true) > abs(without_leakage - true)
 
 
 def test_the_figures_stand_beside_the_published_values(out):
@@ -193,10 +193,10 @@ def test_pairs_of_scans_share_no_scan_and_both_angles_are_seen(dataset):
     samples = task_samples(data, MATERIALS, "solids, two angles")
     assert samples is not None
     assert samples.x.shape[1] == 8
-    held = repeated(samples)
-    assert held is not None
-    one = Library(tuple(e for e in first.entries if e.scan == first.scans[0]))
-    assert paired(one, second)[0].scans == (f"{first.scans[0]} and {second.scans[0]}",)
+    repeated_samples = repeated(samples)
+    assert repeated_samples is not None
+    first_library = Library(tuple(e for e in first.entries if e.scan == first.scans[0]))
+    assert paired(first_library, second)[0].scans == (f"{first.scans[0]} and {second.scans[0]}",)
 
 
 def test_nothing_to_classify_is_refused(dataset):
@@ -210,8 +210,8 @@ def test_leakage_is_taken_out_exactly_and_the_recipe_undoes_its_own_constants():
     np.testing.assert_allclose(without_leakage((t + 0.05) / (1 + 0.05 * t), 0.05), t)
     eps = 4.0 - 0.5j
     p = complex(ratio_from_permittivity(eps, np.radians(60.0))) * 0.8
-    seen = np.full(9, (p + 0.05) / (1 + 0.05 * p))
-    assert authors_recipe(seen, 60.0) == pytest.approx(eps, rel=1e-6)
+    measured = np.full(9, (p + 0.05) / (1 + 0.05 * p))
+    assert authors_recipe(measured, 60.0) == pytest.approx(eps, rel=1e-6)
 
 
 def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, capsys, monkeypatch):
@@ -231,24 +231,24 @@ def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, ca
             true = complex(ratio_from_permittivity(eps, np.radians(e.incidence_deg)))
         assert np.median(e.p.real) + 1j * np.median(e.p.imag) == pytest.approx(true, rel=0.08)
         np.testing.assert_allclose(abs(e.p), e.h / e.v, rtol=1e-5)
-    shown = capsys.readouterr()
-    assert "unobtainium" in shown.err
-    assert "60 degrees: on scans left out" in shown.out
+    output = capsys.readouterr()
+    assert "unobtainium" in output.err
+    assert "60 degrees: on scans left out" in output.out
 
 
 def test_training_on_one_scan_of_each_material_claims_no_accuracy(tmp_path, capsys, monkeypatch):
     """Metal stands in both scans, and is what all is relative to: that it is recognised says nothing."""
     monkeypatch.setattr(classify, "GRID", (1.0,))
-    for k, other in enumerate((3, 12)):
-        for number in (1, other):
+    for k, material_index in enumerate((3, 12)):
+        for number in (1, material_index):
             write_material(tmp_path / "materials", material(number), 60, f"set{k}", 30, ERRORS, 10 * k + number)
     out = tmp_path / "library.npz"
     assert main(["train", "--authors", str(tmp_path), "--out", str(out)]) == 0
-    shown = capsys.readouterr().out
-    assert "1.0" not in shown
-    assert "100" not in shown
-    assert "{" not in shown
-    assert "accuracy not known" in shown
+    output = capsys.readouterr().out
+    assert "1.0" not in output
+    assert "100" not in output
+    assert "{" not in output
+    assert "accuracy not known" in output
     library = Library.load(out)
     assert library.fit["angles"]["60"]["pixel_accuracy"] is None
     assert "100.0 %" not in classify.classifier_sentence(classify.Classifier(library))

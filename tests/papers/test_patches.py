@@ -19,12 +19,12 @@ QUIET = Errors(0.0, 0.0)
 @pytest.mark.parametrize("name", ["solids", "liquids", "powders"])
 def test_without_errors_a_pixel_is_fresnel_s_reflection_relative_to_metal(name):
     group = groups()[name]
-    seen = draw(group.materials, group.angle_deg, QUIET, seed=0, scans=2, pixels=3)
+    drawn = draw(group.materials, group.angle_deg, QUIET, seed=0, scans=2, pixels=3)
     eps = np.array([m.permittivity for m in group.materials])
     r_s, r_p = fresnel(eps, np.radians(group.angle_deg))
-    assert np.allclose(seen.h, -r_s[:, None])
-    assert np.allclose(seen.v, -r_p[:, None])
-    assert np.allclose(permittivity_from_ratio(seen.h / seen.v, np.radians(group.angle_deg)), eps[:, None])
+    assert np.allclose(drawn.h, -r_s[:, None])
+    assert np.allclose(drawn.v, -r_p[:, None])
+    assert np.allclose(permittivity_from_ratio(drawn.h / drawn.v, np.radians(group.angle_deg)), eps[:, None])
 
 
 def test_the_groups_are_the_table_s_36_rows():
@@ -34,9 +34,9 @@ def test_the_groups_are_the_table_s_36_rows():
 @pytest.mark.parametrize("shared", [0.0, 0.5, 1.0])
 def test_errors_have_the_size_and_the_share_that_was_asked_for(shared):
     metal = groups()["solids"].materials[:1]
-    seen = draw(metal, 60.0, Errors(0.02, 0.03, shared), seed=1, scans=3000, pixels=8)
+    samples_drawn = draw(metal, 60.0, Errors(0.02, 0.03, shared), seed=1, scans=3000, pixels=8)
     r_s, _ = fresnel(metal[0].permittivity, np.radians(60.0))
-    for values, std in ((np.log(np.abs(seen.h / r_s)), 0.02), (np.angle(seen.h / -r_s), 0.03)):
+    for values, std in ((np.log(np.abs(samples_drawn.h / r_s)), 0.02), (np.angle(samples_drawn.h / -r_s), 0.03)):
         within = values.var(axis=2, ddof=1).mean()
         between = values.mean(axis=2).var() - within / 8
         assert within == pytest.approx((1 - shared) * std**2, rel=0.1, abs=1e-7)
@@ -46,8 +46,8 @@ def test_errors_have_the_size_and_the_share_that_was_asked_for(shared):
 
 def test_h_and_v_err_independently():
     metal = groups()["solids"].materials[:1]
-    seen = draw(metal, 60.0, Errors(0.02, 0.0), seed=2, scans=3000, pixels=2)
-    assert abs(np.corrcoef(np.abs(seen.h).ravel(), np.abs(seen.v).ravel())[0, 1]) < 0.06
+    samples_drawn = draw(metal, 60.0, Errors(0.02, 0.0), seed=2, scans=3000, pixels=2)
+    assert abs(np.corrcoef(np.abs(samples_drawn.h).ravel(), np.abs(samples_drawn.v).ravel())[0, 1]) < 0.06
 
 
 @pytest.mark.parametrize("name", ["liquids", "powders"])
@@ -57,35 +57,35 @@ def test_the_noise_reaches_the_published_accuracy_of_h_on_draws_it_was_not_set_o
 
 
 def test_the_phase_error_is_the_published_residual_and_nothing_but_h_was_looked_at(monkeypatch):
-    seen = []
+    calls = []
 
     def spy(samples, model, channels="H+V+P", by_pixel=False, folds=8):
-        seen.append((model, channels, by_pixel))
+        calls.append((model, channels, by_pixel))
         return score(samples, model, channels, by_pixel, folds)
 
     monkeypatch.setattr(patches, "score", spy)
     errors = inspect.unwrap(calibrated_errors)("powders", 1)
     assert errors.phase_rad == 0.022
-    assert set(seen) == {(PAPER, "H", True)}
+    assert set(calls) == {(PAPER, "H", True)}
 
 
 def test_v_and_p_add_to_what_h_tells():
     group = groups()["powders"]
-    seen = draw(group.materials, group.angle_deg, calibrated_errors("powders", 1), seed=3).samples()
-    h, all_three = (score(seen, PAPER, c).pixels for c in ("H", "H+V+P"))
+    samples_drawn = draw(group.materials, group.angle_deg, calibrated_errors("powders", 1), seed=3).samples()
+    h, all_three = (score(samples_drawn, PAPER, c).pixels for c in ("H", "H+V+P"))
     assert all_three > h + 0.2
 
 
 def test_no_classifier_passes_the_bound_and_the_better_one_comes_near():
     group = groups()["powders"]
     errors = Errors(0.03, 0.06)
-    found = [score(draw(group.materials, 60.0, errors, seed).samples(), DISCRIMINANT) for seed in range(12)]
+    scores = [score(draw(group.materials, 60.0, errors, seed).samples(), DISCRIMINANT) for seed in range(12)]
     alone = pixel_bound(group.materials, (60.0,), errors, True, 1)
     known = pixel_bound(group.materials, (60.0,), errors, False, 1)
     patch = pixel_bound(group.materials, (60.0,), errors, False, 12)
     assert alone < known < patch
     for share, bound in (("pixels", alone), ("in_scan", known), ("by_patch", patch)):
-        mean = np.mean([getattr(s, share) for s in found])
+        mean = np.mean([getattr(s, share) for s in scores])
         # Chance of twelve draws
         assert bound - 0.08 < mean < bound + 0.03, share
 
@@ -96,19 +96,21 @@ def test_the_bound_is_one_without_errors_and_falls_to_chance():
     assert bounds[0] == 1.0
     assert sorted(bounds, reverse=True) == bounds
     assert bounds[-1] == pytest.approx(0.25, abs=0.05)
-    one, two = (pixel_bound(materials, angles, Errors(0.05, 0.05), True, 1) for angles in ((60.0,), (60.0, 55.0)))
-    assert two > one
+    bound_one_angle, two = (
+        pixel_bound(materials, angles, Errors(0.05, 0.05), True, 1) for angles in ((60.0,), (60.0, 55.0))
+    )
+    assert two > bound_one_angle
 
 
 def test_confusions_stand_in_the_order_of_table_2():
     from polysight_papers.sensys2026.classification import confusion_figure
 
     group = groups()["powders"]
-    found = score(draw(group.materials, 60.0, Errors(0.03, 0.06), 0).samples(), DISCRIMINANT)
-    figure = confusion_figure(group.materials, [(found, found.confusion, "title")])
+    scores = score(draw(group.materials, 60.0, Errors(0.03, 0.06), 0).samples(), DISCRIMINANT)
+    figure = confusion_figure(group.materials, [(scores, scores.confusion, "title")])
     labels = [t.get_text() for t in figure.axes[0].get_xticklabels()]
     assert labels == [str(m.number) for m in group.materials]
-    shown = figure.axes[0].images[0].get_array()
+    matrix = figure.axes[0].images[0].get_array()
     salt = [m.name for m in group.materials].index("Salt (with plastic)")
-    at = found.names.index("Salt (with plastic)")
-    assert shown[salt, salt] == pytest.approx(100 * found.confusion[at, at])
+    at = scores.names.index("Salt (with plastic)")
+    assert matrix[salt, salt] == pytest.approx(100 * scores.confusion[at, at])

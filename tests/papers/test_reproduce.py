@@ -83,16 +83,16 @@ def test_published_numbers_stand_in_the_data_file_alone():
 
 @pytest.mark.parametrize("key", ["fig3", "fig21", "table2"])
 def test_items_are_made_and_stand_beside_the_published_values(key, tmp_path):
-    made = report.MAKERS[key](Run(quick=True))
-    assert made.key == key
-    assert made.tables
-    assert made.pictures
-    assert report.write_item(tmp_path, made)
+    item = report.MAKERS[key](Run(quick=True))
+    assert item.key == key
+    assert item.tables
+    assert item.pictures
+    assert report.write_item(tmp_path, item)
     if key == "table2":
-        errors = [m["relative_error"] for m in made.data["materials"] if "relative_error" in m]
+        errors = [m["relative_error"] for m in item.data["materials"] if "relative_error" in m]
         assert len(errors) == 35
         assert max(errors) < 0.1
-        assert "published ε′" in made.tables[0].head
+        assert "published ε′" in item.tables[0].head
     if key == "fig21":
-        assert made.data["published_median_error_percent"] == 1.548
-        assert 0 < made.data["median_error_percent"] < 3
+        assert item.data["published_median_error_percent"] == 1.548
+        assert 0 < item.data["median_error_percent"] < 3

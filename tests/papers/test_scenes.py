@@ -18,10 +18,10 @@ from polysight_shared.error_codes import ErrorCode
 
 @pytest.mark.parametrize("seed", range(20))
 def test_random_places_never_overlap_and_stay_on_the_plane(seed):
-    at = places(seed)
-    assert all(abs(c) <= REACH_MM for xy in at for c in xy)
-    for i, a in enumerate(at):
-        assert all(max(abs(a[0] - b[0]), abs(a[1] - b[1])) >= APART_MM for b in at[:i])
+    box_places = places(seed)
+    assert all(abs(c) <= REACH_MM for xy in box_places for c in xy)
+    for i, a in enumerate(box_places):
+        assert all(max(abs(a[0] - b[0]), abs(a[1] - b[1])) >= APART_MM for b in box_places[:i])
 
 
 def test_the_rig_side_by_side_sees_the_plane_front_on(tmp_path):
@@ -47,8 +47,8 @@ def test_a_tone_s_frequency_and_amplitude_are_found(if_hz):
     chirp = published_rig().chirp
     t = np.arange(chirp.samples) / chirp.sample_rate_hz
     gains = np.array([1.0, 1j, -0.5, 0.25])[:, None, None]
-    found, amplitude = tones((gains * 40 * np.exp(2j * np.pi * if_hz * t)).astype(np.complex64), chirp)
-    assert found[0] == pytest.approx(if_hz, abs=300)
+    frequency, amplitude = tones((gains * 40 * np.exp(2j * np.pi * if_hz * t)).astype(np.complex64), chirp)
+    assert frequency[0] == pytest.approx(if_hz, abs=300)
     assert amplitude[0] == pytest.approx(40 * np.sqrt((np.abs(gains) ** 2).sum()), rel=2e-3)
 
 

@@ -72,11 +72,11 @@ def test_a_value_that_is_no_quantity_is_a_usage_error(option):
 
 def test_the_lines_of_a_plan_make_the_rig_file_that_plan(capsys, tmp_path):
     """Inserted into the rig file as printed, they give the plan's own figures without any option."""
-    asked = [*SMALL, "--accel-mm-s2", "345", "--object-distance-mm", "480", "--width-mm", "120"]
+    arguments = [*SMALL, "--accel-mm-s2", "345", "--object-distance-mm", "480", "--width-mm", "120"]
     minutes = ["--minutes", "3", "--count", "1"]
-    assert main(["plan", *RIG, *asked, *minutes]) == 0
+    assert main(["plan", *RIG, *arguments, *minutes]) == 0
     lines = capsys.readouterr().out.rpartition("all that differ:\n\n")[2]
-    assert main(["plan", *RIG, *asked, *minutes, "--json"]) == 0
+    assert main(["plan", *RIG, *arguments, *minutes, "--json"]) == 0
     proposed = json.loads(capsys.readouterr().out)["plans"][0]
     table = tomllib.loads(RIG_FILE.read_text())
     changed = tomllib.loads(lines)
@@ -139,12 +139,12 @@ def planned(capsys):
 
 def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, planned):
     without = planned()
-    alike = planned("--like", scan)
+    same_plan = planned("--like", scan)
     # 16 chirps
-    assert alike["position_snr_db"] == pytest.approx(SNR_DB + 12.04, abs=0.7)
-    assert "simulated scan quiet" in alike["noise_source"]
-    assert abs(without["position_snr_db"] - alike["position_snr_db"]) > 5
-    assert alike["time_s"]["standstill"] == without["time_s"]["standstill"]  # without a Pi there are no times
+    assert same_plan["position_snr_db"] == pytest.approx(SNR_DB + 12.04, abs=0.7)
+    assert "simulated scan quiet" in same_plan["noise_source"]
+    assert abs(without["position_snr_db"] - same_plan["position_snr_db"]) > 5
+    assert same_plan["time_s"]["standstill"] == without["time_s"]["standstill"]  # without a Pi there are no times
     small = Changes(columns=COLUMNS, rows=ROWS, pulses=PULSES).apply(rig)
     grid = small.grid
     stage = small.stage
@@ -155,8 +155,8 @@ def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, planned):
 
 
 def test_a_scan_without_rows_has_no_noise(scan, tmp_path):
-    made = ScanFolder.load(scan)
-    empty = ScanFolder.create(tmp_path / "empty", made.instrument, made.plan, simulated=True)
+    empty_scan = ScanFolder.load(scan)
+    empty = ScanFolder.create(tmp_path / "empty", empty_scan.instrument, empty_scan.plan, simulated=True)
     with refused(ErrorCode.NOT_ENOUGH_DATA):
         measure_noise(empty)
 

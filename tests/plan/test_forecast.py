@@ -33,10 +33,10 @@ def test_a_plan_whose_rows_exceed_the_travel_is_refused_by_the_rig_file_s_rule(r
 
 
 def test_noise_falls_with_chirps_and_positions(rig):
-    one, four = (predict_noise(Changes(pulses=n).apply(rig), Noise(0.0, "")) for n in (4, 16))
-    assert four.position_db - one.position_db == pytest.approx(10 * np.log10(4))
-    assert four.image_db - one.image_db == pytest.approx(10 * np.log10(4))
-    assert one.direct_phase_rad / four.direct_phase_rad == pytest.approx(2.0)
+    noise_of_one, four = (predict_noise(Changes(pulses=n).apply(rig), Noise(0.0, "")) for n in (4, 16))
+    assert four.position_db - noise_of_one.position_db == pytest.approx(10 * np.log10(4))
+    assert four.image_db - noise_of_one.image_db == pytest.approx(10 * np.log10(4))
+    assert noise_of_one.direct_phase_rad / four.direct_phase_rad == pytest.approx(2.0)
     half = predict_noise(Changes(step_y_mm=4.0).apply(rig), Noise(0.0, ""))
     assert predict_noise(rig, Noise(0.0, "")).image_db - half.image_db == pytest.approx(
         10 * np.log10(200 / 101), abs=0.05
@@ -147,8 +147,8 @@ def test_the_published_plan_is_possible_and_takes_two_hours(rig):
 )
 def test_a_plan_with_a_fault_has_one_warning_about_it(rig, changes, topic, value, refused):
     warnings = find_warnings(changes.apply(rig), Noise())
-    found = [w for w in warnings if w.where == topic and value in w.what]
-    assert [w.level == "error" for w in found] == [refused], warnings
+    matching_warnings = [w for w in warnings if w.where == topic and value in w.what]
+    assert [w.level == "error" for w in matching_warnings] == [refused], warnings
     assert [w.level for w in warnings] == sorted(w.level for w in warnings)
 
 

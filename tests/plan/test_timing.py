@@ -92,9 +92,9 @@ def test_the_estimate_is_the_time_of_the_simulated_stage(rig, speed, step_x, ste
 
 def test_one_more_row_adds_its_motion_turn_overhead_and_tail(rig):
     ten, eleven = (scan_time(Changes(rows=n).apply(rig), 0.25) for n in (10, 11))
-    more = row_motion_s(rig.grid, rig.stage) + turn_s(rig.grid, rig.stage) + 0.25 + tail_s(rig)
+    longer_duration = row_motion_s(rig.grid, rig.stage) + turn_s(rig.grid, rig.stage) + 0.25 + tail_s(rig)
     # The first row is half a step nearer to the corner.
-    assert eleven.total_s - ten.total_s == pytest.approx(more + eleven.approach_s - ten.approach_s)
+    assert eleven.total_s - ten.total_s == pytest.approx(longer_duration + eleven.approach_s - ten.approach_s)
 
 
 @settings(max_examples=50)
@@ -108,10 +108,10 @@ def test_moves_take_no_less_than_at_full_speed_and_no_less_than_acceleration_all
 
 def test_a_row_of_whole_packets_has_no_wait_for_the_last_packet(rig):
     # 350 columns x 13 frames x 4096 bytes = 12,800 packets of 1456 bytes.
-    whole = Changes(pulses=13).apply(rig)
+    whole_rig = Changes(pulses=13).apply(rig)
     short = Changes(pulses=16).apply(rig)
-    assert whole_packets(whole)
+    assert whole_packets(whole_rig)
     assert not whole_packets(short)
-    assert tail_s(whole) == 0.0
+    assert tail_s(whole_rig) == 0.0
     run_out = (row_motion_s(short.grid, short.stage) - 698 / 20) / 2
     assert tail_s(short) == pytest.approx(CARD_TAIL_S + 15 * 1.5e-3 - run_out)

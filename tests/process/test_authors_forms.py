@@ -40,8 +40,9 @@ def images(folder):
 
 def correlation(a, b, channel):
     """Normalised correlation of two images where both are valid; 1 is the same up to a factor."""
-    at = a.valid & b.valid
-    x, y = getattr(a, channel)[at], getattr(b, channel)[at]
+    valid_in_both = a.valid & b.valid
+    x = getattr(a, channel)[valid_in_both]
+    y = getattr(b, channel)[valid_in_both]
     return abs(np.vdot(x, y)) / np.sqrt(np.vdot(x, x).real * np.vdot(y, y).real)
 
 
@@ -57,12 +58,12 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
     folder = simulate(
         RIG, scene, tmp_path, layout="authors", by_columns=True, zero_filling=False, skipped={("RV", 3): {0, 7}}
     )
-    made, pipeline = images(folder)
-    assert made.h.shape == quiet.h.shape == (50, 60)
-    np.testing.assert_allclose(made.x_m, quiet.x_m, atol=1e-12)
-    np.testing.assert_allclose(made.y_m, quiet.y_m, atol=1e-12)
+    image, pipeline = images(folder)
+    assert image.h.shape == quiet.h.shape == (50, 60)
+    np.testing.assert_allclose(image.x_m, quiet.x_m, atol=1e-12)
+    np.testing.assert_allclose(image.y_m, quiet.y_m, atol=1e-12)
     for channel in ("h", "v"):
-        assert correlation(made, quiet, channel) > 0.98
+        assert correlation(image, quiet, channel) > 0.98
     facts = pipeline.quality.notes["recording"]
     assert facts.direction == "col"
     assert facts.boards["RV"]["positions_missing"] == 2
@@ -76,9 +77,9 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
 )
 def test_a_synchronised_cube_of_any_convention_makes_the_same_image(quiet, tmp_path, form):
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path, **form)
-    made, pipeline = images(folder)
+    image, pipeline = images(folder)
     for channel in ("h", "v"):
-        assert correlation(made, quiet, channel) > 0.999
+        assert correlation(image, quiet, channel) > 0.999
     assert set(pipeline.quality.notes["recording"].cubes) == {"RH", "RV"}
     assert pipeline.quality.result().boards["RH"].positions_masked == 0
 
@@ -89,15 +90,16 @@ def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros
     for board in ("RH", "RV"):
         file = folder / f"{board}_synced.npy"
         cube = np.load(file)
-        turn, bins = rng.uniform(0, 1, cube.shape[1:3]), rng.uniform(40, 60, cube.shape[1:3])
+        turn = rng.uniform(0, 1, cube.shape[1:3])
+        bins = rng.uniform(40, 60, cube.shape[1:3])
         time = np.arange(256) / 256
         cube *= np.exp(2j * np.pi * (turn[..., None] + bins[..., None] * time)).astype(np.complex64)
         cube[:, 4, 5] = 0
         cube[:, 5, 6] = np.nan
         np.save(file, cube)
-    made, pipeline = images(folder)
+    image, pipeline = images(folder)
     for channel in ("h", "v"):
-        assert correlation(made, quiet, channel) > 0.99
+        assert correlation(image, quiet, channel) > 0.99
     assert pipeline.quality.result().boards["RH"].positions_masked == 2
 
 

@@ -14,7 +14,9 @@ from polysight.store.open import open_source
 from polysight_shared.files import read_json
 from polysight_shared.tables import to_builtins
 
-BANDS, COLUMNS, ROWS = 2, 13, 17
+BANDS = 2
+COLUMNS = 13
+ROWS = 17
 IMAGE = {"columns": 50, "rows": 40, "pixel_mm": 4.0}
 RIG = rig_with(image=IMAGE)
 
@@ -28,15 +30,16 @@ def scan(scan_of, tmp_path_factory):
 def test_sub_bands_have_the_pixels_of_the_whole_band(scan, tmp_path):
     box = (-55.0, -5.0, -25.0, 25.0)
     pipeline = pipeline_of(open_source(scan, RIG), bands=BANDS, model="none", metal_box_mm=box)
-    whole, parts = pipeline.form_images(), pipeline.sub_bands.finish(pipeline.source.mirrored)
-    assert whole.h.shape == (IMAGE["rows"], IMAGE["columns"])
+    whole_band = pipeline.form_images()
+    parts = pipeline.sub_bands.finish(pipeline.source.mirrored)
+    assert whole_band.h.shape == (IMAGE["rows"], IMAGE["columns"])
     assert len(parts) == BANDS
     for part in parts:
-        np.testing.assert_array_equal(part.x_m, whole.x_m)
-        np.testing.assert_array_equal(part.y_m, whole.y_m)
-        assert part.valid.shape == whole.valid.shape
+        np.testing.assert_array_equal(part.x_m, whole_band.x_m)
+        np.testing.assert_array_equal(part.y_m, whole_band.y_m)
+        assert part.valid.shape == whole_band.valid.shape
         for name in ("h", "v"):
-            a, b = (np.abs(getattr(image, name)[whole.valid & part.valid]) for image in (part, whole))
+            a, b = (np.abs(getattr(image, name)[whole_band.valid & part.valid]) for image in (part, whole_band))
             assert np.corrcoef(a, b)[0, 1] > 0.8
     # scan.json contains the rig of the images: rows along x, as in the rig file.
     pipeline.finish(tmp_path)

@@ -22,7 +22,9 @@ from polysight.store.scan_folder import MANIFEST
 from polysight_shared.files import read_json
 
 METAL = "-40,10,30,30"  # inside the copper
-COLUMNS, ROWS, PULSES = 15, 17, 2
+COLUMNS = 15
+ROWS = 17
+PULSES = 2
 FRAMES = 2 * COLUMNS * ROWS * PULSES
 
 
@@ -36,39 +38,42 @@ def without_rows(scan: Path, to: Path, *rows: int) -> Path:
 
 
 def test_a_complete_scan_has_all_planned_rows_and_frames(two_plates, tmp_path):
-    scan, out = shutil.copytree(two_plates, tmp_path / "scan"), tmp_path / "out"
-    shown = output_of("process", scan, "--out", out, "--metal", METAL)
+    scan = shutil.copytree(two_plates, tmp_path / "scan")
+    out = tmp_path / "out"
+    output = output_of("process", scan, "--out", out, "--metal", METAL)
     assert read_json(out / "quality.json")["coverage"] == {
         "rows_planned": ROWS, "rows_recorded": ROWS, "rows_absent": [], "positions_planned": COLUMNS * ROWS,
         "positions_absent": 0, "frames_planned": FRAMES, "frames_received": FRAMES, "manifest": [],
     }  # fmt: skip
-    assert f"100 % of {FRAMES} planned" in shown
+    assert f"100 % of {FRAMES} planned" in output
 
 
 def test_terminal_and_report_count_all_plates_of_the_scene(two_plates, tmp_path):
     """Two plates more stand in the truth than in the scene: they are not found, and count as not named right."""
-    scan, out = shutil.copytree(two_plates, tmp_path / "scan"), tmp_path / "out"
+    scan = shutil.copytree(two_plates, tmp_path / "scan")
+    out = tmp_path / "out"
     truth = read_json(scan / "truth.json")
     plate = next(plate for plate in truth["plates"] if not plate.get("metal"))
     truth["plates"] += [plate | {"centre_mm": [80.0, y], "name": "oak"} for y in (-60.0, 60.0)]
     (scan / "truth.json").write_text(json.dumps(truth))
-    shown = output_of("process", scan, "--out", out, "--metal", METAL)
-    counted = re.search(r"(\d of 3) plates named right", shown)
-    assert counted, shown
+    output = output_of("process", scan, "--out", out, "--metal", METAL)
+    counted = re.search(r"(\d of 3) plates named right", output)
+    assert counted, output
     assert f"{counted[1]}</b><span>plates named right" in (out / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("command", ["process", "image"])
 def test_missing_rows_are_counted_as_absent(two_plates, tmp_path, command):
-    scan, out = without_rows(two_plates, tmp_path / "scan", 1, 15), tmp_path / "out"
-    shown = output_of(command, scan, "--out", out, *(["--metal", METAL] if command == "process" else []))
+    scan = without_rows(two_plates, tmp_path / "scan", 1, 15)
+    out = tmp_path / "out"
+    output = output_of(command, scan, "--out", out, *(["--metal", METAL] if command == "process" else []))
     coverage = read_json(out / "quality.json")["coverage"]
     assert (coverage["rows_planned"], coverage["rows_recorded"], coverage["rows_absent"]) == (ROWS, ROWS - 2, [1, 15])
     assert (coverage["positions_planned"], coverage["positions_absent"]) == (COLUMNS * ROWS, 2 * COLUMNS)
     assert (coverage["frames_planned"], coverage["frames_received"]) == (FRAMES, FRAMES * (ROWS - 2) // ROWS)
     assert [line.split(":")[0] for line in coverage["manifest"]] == ["manifest.jsonl line 3", "manifest.jsonl line 16"]
     for value in ("15 of 17", "11.8 %", f"88.2 % of {FRAMES}", "manifest.jsonl line 3"):
-        assert value in shown
+        assert value in output
     if command == "process":
         report = (out / "report.html").read_text(encoding="utf-8")
         assert "100 %</b><span>of" not in report
@@ -88,14 +93,19 @@ class Lossy:
 
     def __init__(self, scan: ScanFolder) -> None:
         self._scan = scan
-        self.instrument, self.plan, self.path = scan.instrument, scan.plan, scan.path
-        self.simulated, self.scan_id, self.rows = scan.simulated, scan.scan_id, scan.rows
+        self.instrument = scan.instrument
+        self.plan = scan.plan
+        self.path = scan.path
+        self.simulated = scan.simulated
+        self.scan_id = scan.scan_id
+        self.rows = scan.rows
         self.recording_facts = scan.recording_facts
 
     def read_row(self, board: str, row: int) -> RowData:
-        whole, size = self._scan.read_row(board, row), self.instrument.burst.pulses * self.instrument.frame_bytes
+        row_data = self._scan.read_row(board, row)
+        size = self.instrument.burst.pulses * self.instrument.frame_bytes
         missing = [(point * size, (point + 1) * size) for point in LOST.get(row, ())]
-        return RowData(whole.pieces, missing, whole.frames_expected)
+        return RowData(row_data.pieces, missing, row_data.frames_expected)
 
 
 def test_lost_positions_of_odd_rows_are_counted_by_column(scan_of, tmp_path):
@@ -111,7 +121,8 @@ def test_lost_positions_of_odd_rows_are_counted_by_column(scan_of, tmp_path):
         row = source.plan.row(index)
         columns = np.round((np.array(row.x_mm)[points] - min(row.x_mm)) / source.plan.step_x_mm).astype(int)
         expected[index, columns] = True
-    nothing, axis = np.zeros((1, 1), np.complex64), np.zeros(1)
+    nothing = np.zeros((1, 1), np.complex64)
+    axis = np.zeros(1)
     images = Images(nothing, nothing, axis, axis, nothing.astype(bool), nothing)
     scan = ProcessedScan.from_results(Path(), images=images, quality=quality, facts=ScanFacts(), plan=source.plan)
     for masked in masked_positions(scan).values():

@@ -23,9 +23,9 @@ def found(imaged):
 
 def again(scan, path, plates=()):
     inputs = Inputs(labels=read_labels(path))
-    known = replace(boxes_as_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m), plates=plates)
+    scene = replace(boxes_as_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m), plates=plates)
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
-    return scan.pipeline.find_materials(scan.images, known, classifier), known.names
+    return scan.pipeline.find_materials(scan.images, scene, classifier), scene.names
 
 
 def test_labels_of_products_give_the_same_materials_again(imaged, found, tmp_path):
@@ -44,9 +44,11 @@ def test_drawn_boxes_are_the_patches_and_copper_is_the_reference(imaged, tmp_pat
     """Two boxes give two patches; the one named copper is the metal reference, with a ratio of 1."""
     scan = imaged("nine-materials")
     copper = next(p for p in scan.plates if p.metal)
-    other = next(p for p in scan.plates if not p.metal)
-    x, y = scan.images.x_m * 1e3, scan.images.y_m * 1e3
-    x, y = x - (x[0] + x[-1]) / 2, y - (y[0] + y[-1]) / 2
+    other_plate = next(p for p in scan.plates if not p.metal)
+    x = scan.images.x_m * 1e3
+    y = scan.images.y_m * 1e3
+    x = x - (x[0] + x[-1]) / 2
+    y = y - (y[0] + y[-1]) / 2
 
     def pixels(box_mm):
         x0, y0, x1, y1 = box_mm
@@ -54,9 +56,9 @@ def test_drawn_boxes_are_the_patches_and_copper_is_the_reference(imaged, tmp_pat
         return [int(inside[0][0]), int(inside[1][0]), int(inside[0][-1]) + 1, int(inside[1][-1]) + 1]
 
     path = tmp_path / "drawn.json"
-    path.write_text(json.dumps({"labels": {"mine": pixels(other.box_mm), "copper foil": pixels(copper.box_mm)}}))
+    path.write_text(json.dumps({"labels": {"mine": pixels(other_plate.box_mm), "copper foil": pixels(copper.box_mm)}}))
     result, names = again(scan, path)
     assert names == {1: "mine", 2: "copper foil"}
     assert result.metal.label == 2
     assert np.nanmedian(np.abs(result.p[result.metal.mask])) == pytest.approx(1, abs=0.02)
-    assert result.patches[0].permittivity.value.real == pytest.approx(other.permittivity.real, rel=0.1)
+    assert result.patches[0].permittivity.value.real == pytest.approx(other_plate.permittivity.real, rel=0.1)

@@ -54,7 +54,8 @@ def test_a_folder_of_that_name_gives_a_note_and_no_file_none(tmp_path, capsys):
 
 
 def test_a_scan_with_a_foreign_truth_is_processed_but_not_trained_on(two_plates, tmp_path, capsys):
-    scan, out = shutil.copytree(two_plates, tmp_path / "scan"), tmp_path / "out"
+    scan = shutil.copytree(two_plates, tmp_path / "scan")
+    out = tmp_path / "out"
     (scan / "truth.json").write_bytes(FOREIGN["other keys"])
     assert main(["process", str(scan), "--out", str(out), "--metal", "-40,10,30,30"]) == 0
     assert "truth.json" in capsys.readouterr().err

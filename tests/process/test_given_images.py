@@ -57,8 +57,8 @@ def saved(tmp_path, pair):
 
 
 def analysed(path, rig, **settings):
-    given = read_given_images(path, rig)
-    return analyse_given_images(given, Settings(model="none", **settings), Inputs(), rig)[0]
+    pair = read_given_images(path, rig)
+    return analyse_given_images(pair, Settings(model="none", **settings), Inputs(), rig)[0]
 
 
 def permittivities(scan):
@@ -84,23 +84,24 @@ def test_permittivities_are_those_of_the_plates(labels_folder, rig):
     for s in analysed(labels_folder, rig, incidence_deg=ANGLE).segments:
         if s.permittivity is not None:
             true = MATERIALS[s.box].permittivity
-            away = complex(s.permittivity.real, s.permittivity.imag) - true
-            assert abs(away) < 0.2 * abs(true)
-            assert abs(away) < 3 * np.hypot(s.permittivity.real_std, s.permittivity.imag_std)
+            difference = complex(s.permittivity.real, s.permittivity.imag) - true
+            assert abs(difference) < 0.2 * abs(true)
+            assert abs(difference) < 3 * np.hypot(s.permittivity.real_std, s.permittivity.imag_std)
 
 
 def test_the_direction_of_an_axis_does_not_matter(saved, pair, rig):
     x = 1.3 + np.arange(150) * 2e-3
-    one = analysed(saved(x_m=x, y_m=x), rig)
+    upwards = analysed(saved(x_m=x, y_m=x), rig)
     turned = {name: image[::-1, ::-1] for name, image in pair.items()}
-    other = analysed(saved(x_m=x[::-1], y_m=x[::-1], **turned), rig)
-    np.testing.assert_array_equal(one.images.h, other.images.h)
-    assert permittivities(one) == permittivities(other)
-    assert one.images.x_m[0] == 1.3
+    downwards = analysed(saved(x_m=x[::-1], y_m=x[::-1], **turned), rig)
+    np.testing.assert_array_equal(upwards.images.h, downwards.images.h)
+    assert permittivities(upwards) == permittivities(downwards)
+    assert upwards.images.x_m[0] == 1.3
 
 
 def test_the_angle_of_the_option_comes_before_that_of_the_file_and_the_rigs(saved, rig):
-    with_angle, without = saved(), saved("bare", incidence_deg=None)
+    with_angle = saved()
+    without = saved("bare", incidence_deg=None)
     for path, option, deg, source in (
         (with_angle, 60.0, 60.0, "option"),
         (with_angle, None, ANGLE, "file"),
@@ -113,8 +114,8 @@ def test_the_angle_of_the_option_comes_before_that_of_the_file_and_the_rigs(save
 
 
 def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented(saved, rig):
-    known = np.arange(150) * 2e-3
-    scan = analysed(saved(x_m=known, y_m=known), rig)
+    axis = np.arange(150) * 2e-3
+    scan = analysed(saved(x_m=axis, y_m=axis), rig)
     assert scan.verdict.level == "care"
     assert scan.quality.given_images.assumed == []
     bare = analysed(saved("bare", incidence_deg=None), rig)
@@ -256,7 +257,8 @@ PUBLISHED = os.environ.get("POLYSIGHT_PUBLISHED_IMAGES")
 def test_the_published_picture_has_nine_plates_and_copper_is_the_reference(rig, tmp_path, form, with_boxes):
     source = Path(PUBLISHED or "") / "20250612_142257_multi.npz"
     boxes = json.loads(source.with_suffix(".json").read_text())["boxes_px"]
-    path, drawn = source, None
+    path = source
+    drawn = None
     if form == "npz" and with_boxes:
         drawn = Labels({name: (b[0], b[1], b[2], b[3]) for name, b in boxes.items()})
     if form == "labels":

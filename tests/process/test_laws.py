@@ -28,7 +28,8 @@ def correlation(a, b):
 def test_points_focus_within_half_a_pixel_in_both_channels(imaged):
     scan = imaged("point-targets")
     truth = {"middle": (0.0, 0.0), "right": (50.0, 10.0), "upper left": (-40.0, 60.0), "lower": (20.0, -55.0)}
-    x, y = axis_mm(scan.images.x_m), axis_mm(scan.images.y_m)
+    x = axis_mm(scan.images.x_m)
+    y = axis_mm(scan.images.y_m)
     for image in (scan.images.h_raw, scan.images.v_raw):
         for px, py in truth.values():
             near = (np.abs(x[None, :] - px) < 15) & (np.abs(y[:, None] - py) < 15)
@@ -39,11 +40,12 @@ def test_points_focus_within_half_a_pixel_in_both_channels(imaged):
 
 def test_synchronisation_undoes_every_disturbance(imaged):
     """All disturbances on, against all off: the images agree."""
-    disturbed, ideal = imaged("nine-materials"), imaged("nine-materials", ideal=True)
-    at = disturbed.images.valid & ideal.images.valid
+    disturbed = imaged("nine-materials")
+    ideal = imaged("nine-materials", ideal=True)
+    valid_in_both = disturbed.images.valid & ideal.images.valid
     for channel in ("h", "v"):
-        on, off = (getattr(s.images, channel)[at] for s in (disturbed, ideal))
-        assert correlation(on, off) > 0.995, channel
+        on, ideal_values = (getattr(s.images, channel)[valid_in_both] for s in (disturbed, ideal))
+        assert correlation(on, ideal_values) > 0.995, channel
 
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
@@ -60,11 +62,12 @@ def test_each_stage_of_synchronisation_shrinks_the_offsets(imaged, board):
 
 def test_metal_gives_one_at_every_pixel_within_noise(imaged):
     """A metal plate over the whole plane, referenced to its middle: P = 1 everywhere, up to the noise of a pixel."""
-    scan, again = imaged("metal-plate"), imaged("metal-plate", seed=1003)
-    at = inside(scan, "copper", rim_mm=150.0)
-    assert at.sum() > 1000
+    scan = imaged("metal-plate")
+    again = imaged("metal-plate", seed=1003)
+    plate_pixels = inside(scan, "copper", rim_mm=150.0)
+    assert plate_pixels.sum() > 1000
     middle = box_mask((-20, -20, 20, 20), scan.images.x_m, scan.images.y_m)
-    first, second = (calibrate(s.images, middle).p[at] for s in (scan, again))
+    first, second = (calibrate(s.images, middle).p[plate_pixels] for s in (scan, again))
     noise = np.std(first - second) / np.sqrt(2)
     assert np.abs(first - 1).max() < 0.02 + 5 * noise
     assert np.abs(first.mean() - 1) < 0.01
@@ -80,10 +83,8 @@ def test_the_set_gain_is_recovered_and_does_not_reach_the_images(imaged):
         c = calibrate(scan.images, inside(scan, "copper"))
         return 20 * np.log10(h / v), 20 * np.log10(abs(c.metal_h) / abs(c.metal_v))
 
-    (received, image), (received_other, image_other) = (
-        gains_db(imaged("nine-materials")),
-        gains_db(imaged("nine-materials", **OTHER)),
-    )
+    received, image = gains_db(imaged("nine-materials"))
+    received_other, image_other = gains_db(imaged("nine-materials", **OTHER))
     assert received - received_other == pytest.approx(1.5 + 3.0, abs=0.1)
     assert image == pytest.approx(image_other, abs=0.1)
 
@@ -95,24 +96,24 @@ def test_the_set_leakage_is_recovered_from_a_known_material(imaged, disturbances
     c = calibrate(scan.images, inside(scan, "copper"))
     theta = scan.pipeline.find_materials(scan.images, known=KnownScene(plates=scan.plates)).theta_rad[0, 0]
     true = complex(ratio_from_permittivity(4.75 - 2.43j, theta))
-    at = inside(scan, "ceramic")
-    measured = np.sum(c.h[at]) / np.sum(c.v[at])
+    plate_pixels = inside(scan, "ceramic")
+    measured = np.sum(c.h[plate_pixels]) / np.sum(c.v[plate_pixels])
     estimate = (measured - true) / (1 - measured * true)  # from P = (t + a) / (1 + a t)
     assert abs(estimate - leakage) < 0.012
     h, v = correct_leakage(c.h, c.v, leakage, leakage)
-    assert abs(np.sum(h[at]) / np.sum(v[at]) / true - 1) < 0.05
+    assert abs(np.sum(h[plate_pixels]) / np.sum(v[plate_pixels]) / true - 1) < 0.05
 
 
 def test_the_demo_scene_is_named_right_and_its_permittivities_found(imaged):
     scan = imaged("nine-materials")
-    found = named_materials(scan)
-    assert len(found.patches) == 9
-    named = [p for p in found.patches if p.verdict is not None]
-    assert [p.truth.name for p in found.patches if p.verdict is None] == ["copper"]  # the reference
+    names = named_materials(scan)
+    assert len(names.patches) == 9
+    named = [p for p in names.patches if p.verdict is not None]
+    assert [p.truth.name for p in names.patches if p.verdict is None] == ["copper"]  # the reference
     assert sum(p.verdict.name == p.truth.name for p in named) >= 7
-    assert pixel_accuracy(found) > 0.85
-    assert found.metal.certain
-    for p in found.patches:
+    assert pixel_accuracy(names) > 0.85
+    assert names.metal.certain
+    for p in names.patches:
         if p.truth.metal:
             assert p.permittivity.value is None
         else:
@@ -126,11 +127,11 @@ def test_a_scan_of_an_ideal_rig_is_not_corrected_and_all_plates_are_named_right(
     assert (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz) == (0.0, 0.0)
     assert rig.polarimetry.leakage_h == rig.polarimetry.leakage_v == (0.0, 0.0)
     assert all(setup.equaliser is None for setup in scan.pipeline.synchroniser.setups.values())
-    found = named_materials(scan)
-    named = [p for p in found.patches if p.verdict is not None]
+    names = named_materials(scan)
+    named = [p for p in names.patches if p.verdict is not None]
     assert [p.verdict.name for p in named] == [p.truth.name for p in named]
     assert len(named) == 8
-    assert found.metal.certain
+    assert names.metal.certain
 
 
 def test_the_library_was_not_trained_on_the_demo_scene():

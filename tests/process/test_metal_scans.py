@@ -45,14 +45,14 @@ STACKS = {
 @pytest.fixture(scope="module")
 def scan(rig: Instrument, tmp_path_factory):
     """`scan("plate", **disturbances)`: the folder of a small scan of one plate that covers the plane."""
-    made: dict[str, Path] = {}
+    folders: dict[str, Path] = {}
 
     def make(name: str, **disturbances) -> Path:
         key = f"{name} {disturbances}"
-        if key not in made:
+        if key not in folders:
             raw = {
                 "name": name,
-                "seed": 3 + len(made),  # another power cycle each
+                "seed": 3 + len(folders),  # another power cycle each
                 "grid": {"columns": 16, "rows": 12, "step_x_mm": 12.0, "step_y_mm": 10.0},
                 "burst": {"pulses": 4},
                 "image": {"columns": 40, "rows": 40, "pixel_mm": 4.0},
@@ -60,8 +60,8 @@ def scan(rig: Instrument, tmp_path_factory):
                 "disturbances": {"leakage_measured": 0.0005, **disturbances},
             }
             scene = decode_scene(raw, "test")
-            made[key] = simulate(rig, scene, tmp_path_factory.mktemp("metal") / "scan")
-        return made[key]
+            folders[key] = simulate(rig, scene, tmp_path_factory.mktemp("metal") / "scan")
+        return folders[key]
 
     return make
 
@@ -79,8 +79,8 @@ def test_leakage_of_both_boards_is_recovered_from_metal_at_two_orientations(scan
     plate, upright, lying = (scan(name, **LEAKAGE) for name in ("plate", "upright", "lying"))
     assert main(["leakage", str(plate), "--strips", f"0={upright}", "--strips", f"90={lying}", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    found, truth = (Leakage(complex(*x["leakage_h"]), complex(*x["leakage_v"]), 1.0, 0.0) for x in (printed, LEAKAGE))
-    crosstalk, imbalance = remaining_at_same_plate(found, truth)
+    leakage, truth = (Leakage(complex(*x["leakage_h"]), complex(*x["leakage_v"]), 1.0, 0.0) for x in (printed, LEAKAGE))
+    crosstalk, imbalance = remaining_at_same_plate(leakage, truth)
     assert crosstalk < 0.01
     assert imbalance < 0.025
     assert printed["simulated"]
@@ -135,11 +135,12 @@ def test_amplitude_and_sub_bands_resolve_an_ambiguous_layer(products, capsys):
         return json.loads(capsys.readouterr().out)[0]["layer"]
 
     assert fit("--amplitude", "0")["warnings"]
-    one, three = fit(), fit("--bands", "3")
-    assert one["rivals"] == three["rivals"] == []
-    assert 0.5 < three["std_real"] / one["std_real"] < 2  # the bands share what metal and edges are off by
-    for found in (one, three):
-        assert complex(*found["permittivity"]) == pytest.approx(4.00 + 0.40j, rel=0.05)
+    single_band = fit()
+    three = fit("--bands", "3")
+    assert single_band["rivals"] == three["rivals"] == []
+    assert 0.5 < three["std_real"] / single_band["std_real"] < 2  # the bands share what metal and edges are off by
+    for layers in (single_band, three):
+        assert complex(*layers["permittivity"]) == pytest.approx(4.00 + 0.40j, rel=0.05)
     assert main(["permittivity", str(products), "--layer", "acrylic,?,3", "--bands", "4"]) != 0
     assert "--bands 4" in capsys.readouterr().err
 
@@ -159,10 +160,10 @@ def test_incidence_and_reference_are_in_quality_json(products):
 def test_the_reference_is_valid_after_a_power_cycle(scan, reference):
     """Samples are referenced to the direct path: gains of the boards drop out of both scans."""
     again = load_reference(scan("plate", hv_gain_db=-2.0))
-    at = reference.valid & again.valid
-    assert at.sum() > 200
+    valid_in_both = reference.valid & again.valid
+    assert valid_in_both.sum() > 200
     plate = Images(reference.h, reference.v, reference.x_m, reference.y_m, reference.valid)
-    p = again.apply(plate).p[at]
+    p = again.apply(plate).p[valid_in_both]
     assert np.abs(p - 1).max() < 0.06
     assert np.abs(p.mean() - 1) < 0.01
 
@@ -196,9 +197,9 @@ def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytes
     scene = decode_scene(raw, "test")
     folder = simulate(rig, scene, tmp_path / "scan")
     pipeline, images = form_scan_images(folder, Settings(bands=BANDS))
-    found = pipeline.find_materials(images, known=KnownScene(plates=read_truth(folder / "truth.json")))
-    assert len(found.patches) == 6
-    for row in found.rows():
+    analysis = pipeline.find_materials(images, known=KnownScene(plates=read_truth(folder / "truth.json")))
+    assert len(analysis.patches) == 6
+    for row in analysis.rows():
         name = row.truth.name
         assert row.metal_reference == (name == "copper")
         if name == "copper":
@@ -215,7 +216,7 @@ def test_no_finding_shows_nan_with_a_reference_that_covers_part_of_the_image(sca
     """Beyond the reference's plate its gains are NaN; the level of the direct path is judged where they are known."""
     out = tmp_path / "out"
     main(["process", str(scan("acrylic 3")), "--reference", str(scan("plate")), "--out", str(out)])
-    shown = capsys.readouterr().out
+    output = capsys.readouterr().out
     quality = json.loads((out / "quality.json").read_text())
-    told = [text for reason in quality["verdict"]["reasons"] for text in reason.values()] + shown.split()
-    assert not [text for text in told if "nan" in text.lower().split() or "+nan" in text.lower()]
+    texts = [text for reason in quality["verdict"]["reasons"] for text in reason.values()] + output.split()
+    assert not [text for text in texts if "nan" in text.lower().split() or "+nan" in text.lower()]

@@ -36,16 +36,16 @@ def scan(two_plates: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_image_is_written_before_anything_is_derived_from_it(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seen: list[bool] = []
+    calls: list[bool] = []
     finish = Pipeline.finish
 
     def finished(self: Pipeline, *words: object) -> object:
-        seen.append(read_products(tmp_path / "out").valid.any())
+        calls.append(read_products(tmp_path / "out").valid.any())
         return finish(self, *words)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Pipeline, "finish", finished)
     assert main(["process", str(scan), "--out", str(tmp_path / "out")]) in (0, 5)
-    assert seen == [True]
+    assert calls == [True]
     assert str(tmp_path / "out" / "image.npz") in capsys.readouterr().err
     assert (tmp_path / "out" / "report.html").exists()
 
@@ -53,11 +53,12 @@ def test_the_image_is_written_before_anything_is_derived_from_it(
 def test_images_published_beside_a_scan_are_those_of_all_rows_at_once(scan: Path, tmp_path: Path) -> None:
     pipeline = pipeline_of(ScanFolder.load(scan), live=True)
     publish_images(pipeline, tmp_path)
-    first, whole = read_products(tmp_path), pipeline.form_images()
-    assert (first.valid == whole.valid).mean() > 0.999
-    at = first.valid & whole.valid
-    for one, other in ((first.h, whole.h), (first.v, whole.v)):
-        assert np.abs(one - other)[at].max() < 1e-5 * np.abs(other[at]).max()
+    first = read_products(tmp_path)
+    whole_band = pipeline.form_images()
+    assert (first.valid == whole_band.valid).mean() > 0.999
+    valid_in_both = first.valid & whole_band.valid
+    for first_item, second_item in ((first.h, whole_band.h), (first.v, whole_band.v)):
+        assert np.abs(first_item - second_item)[valid_in_both].max() < 1e-5 * np.abs(second_item[valid_in_both]).max()
 
 
 def test_an_earlier_report_stays_until_the_new_one_is_complete(scan: Path, tmp_path: Path) -> None:
@@ -72,7 +73,8 @@ def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monke
     def fails(*_: object) -> None:
         raise DataError("no metal", code=ErrorCode.NO_DATA)
 
-    pipeline, out = processed_rows(ScanFolder.load(scan), scan), tmp_path / "out"
+    pipeline = processed_rows(ScanFolder.load(scan), scan)
+    out = tmp_path / "out"
     publish_images(pipeline, out)
     monkeypatch.setattr(Pipeline, "examine", fails)
     with refused(ErrorCode.NO_DATA):
@@ -94,8 +96,8 @@ def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
 
     def examine_tilted(self: Pipeline, *words: object) -> object:
         findings = examine(self, *words)  # type: ignore[arg-type]
-        first, *others = findings.analysis.patches
-        patches = (replace(first, refused=STEEP if is_steep else None), *others)
+        first, *other_items = findings.analysis.patches
+        patches = (replace(first, refused=STEEP if is_steep else None), *other_items)
         return replace(findings, analysis=replace(findings.analysis, patches=patches))
 
     monkeypatch.setattr(Pipeline, "examine", examine_tilted)
@@ -106,10 +108,10 @@ def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
 
 
 def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path) -> None:
-    there = tmp_path / "scan"
-    shutil.copytree(scan, there)
-    shutil.rmtree(there / "raw")  # the samples are enough
-    output_of("image", there, "--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
+    scan_folder = tmp_path / "scan"
+    shutil.copytree(scan, scan_folder)
+    shutil.rmtree(scan_folder / "raw")  # the samples are enough
+    output_of("image", scan_folder, "--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
     products = read_products(tmp_path / "out")
     assert products.h.shape == (30, 60)
     np.testing.assert_allclose(np.diff(products.x_m), 2.5e-3)
@@ -135,12 +137,13 @@ def rename_pet(scan: Path, name: str) -> None:
 
 
 def test_right_names_are_counted_and_the_mark_of_an_earlier_run_is_removed(two_plates: Path, tmp_path: Path) -> None:
-    scan, out = shutil.copytree(two_plates, tmp_path / "scan"), tmp_path / "out"
+    scan = shutil.copytree(two_plates, tmp_path / "scan")
+    out = tmp_path / "out"
     rename_pet(scan, "no such material")
-    shown = output_of("process", scan, "--out", out, "--metal", METAL)
+    output = output_of("process", scan, "--out", out, "--metal", METAL)
     segments = read_json(out / "materials.json")["segments"]
     for value in (f"{len(segments)} patches", "0 of 1 plates", out / "report.html", f"{out}/"):
-        assert str(value) in shown
+        assert str(value) in output
     assert read_json(out / "quality.json")["verdict"]["level"] == "care"
 
     (out / FINISHED).write_text("{}")

@@ -53,14 +53,16 @@ def without_raw(folder: Path) -> Path:
 
 
 def test_images_and_quality_from_samples_are_bit_exact(two_plates: Path, kept: Path) -> None:
-    expected, found = processed(two_plates, "none"), processed(without_raw(kept))
-    assert same(found.form_images(), expected.form_images())
+    expected = processed(two_plates, "none")
+    reprocessed = processed(without_raw(kept))
+    assert same(reprocessed.form_images(), expected.form_images())
     for key in ("boards", "coverage"):
-        assert getattr(found.quality.result(), key) == getattr(expected.quality.result(), key)
+        assert getattr(reprocessed.quality.result(), key) == getattr(expected.quality.result(), key)
 
 
 def test_rows_on_several_threads_make_the_same_products(two_plates: Path, scan: Path) -> None:
-    serial, threaded = processed(two_plates, "none"), Pipeline(ScanFolder.load(scan), samples="keep")
+    serial = processed(two_plates, "none")
+    threaded = Pipeline(ScanFolder.load(scan), samples="keep")
     rows = list(threaded.source.rows())
     assert list(map_rows(threaded.add_row, rows, threads=4)) == rows
     assert same(threaded.form_images(), serial.form_images())
@@ -82,9 +84,10 @@ def test_the_first_error_stops_all_threads() -> None:
 
 def test_samples_with_sub_bands_can_be_used_without_them(two_plates: Path, scan: Path) -> None:
     processed(scan, bands=3)
-    expected, found = processed(two_plates, "none", bands=3), processed(without_raw(scan), bands=3)
-    for one, other in zip(found.sub_bands.finish(), expected.sub_bands.finish(), strict=True):
-        assert same(one, other)
+    expected = processed(two_plates, "none", bands=3)
+    reprocessed = processed(without_raw(scan), bands=3)
+    for first_item, second_item in zip(reprocessed.sub_bands.finish(), expected.sub_bands.finish(), strict=True):
+        assert same(first_item, second_item)
     assert same(processed(scan).form_images(), processed(two_plates, "none").form_images())
 
 
@@ -99,13 +102,13 @@ def test_samples_without_the_sub_bands_asked_for_are_not_used(kept: Path) -> Non
 )
 def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kept: Path, view: dict[str, Any]) -> None:
     expected = processed(two_plates, "none", **view).form_images()
-    found = processed(without_raw(kept), **view).form_images()
-    np.testing.assert_array_equal(found.x_m, expected.x_m)
-    pairs = [(found.h_raw, expected.h_raw), (found.v_raw, expected.v_raw)]
-    pairs += zip(found.illumination.footprints, expected.illumination.footprints, strict=True)
-    for one, other in pairs:
+    reprocessed = processed(without_raw(kept), **view).form_images()
+    np.testing.assert_array_equal(reprocessed.x_m, expected.x_m)
+    pairs = [(reprocessed.h_raw, expected.h_raw), (reprocessed.v_raw, expected.v_raw)]
+    pairs += zip(reprocessed.illumination.footprints, expected.illumination.footprints, strict=True)
+    for first_item, second_item in pairs:
         # The gates differ, and with them the noise.
-        assert np.abs(one - other).max() < 2e-3 * np.abs(other).max()
+        assert np.abs(first_item - second_item).max() < 2e-3 * np.abs(second_item).max()
 
 
 def test_a_plane_beyond_what_was_kept_needs_raw_data(kept: Path) -> None:
@@ -116,16 +119,17 @@ def test_a_plane_beyond_what_was_kept_needs_raw_data(kept: Path) -> None:
 
 
 def test_other_planes_do_not_change_the_kept_samples(kept: Path) -> None:
-    before = {p.name: p.read_bytes() for p in (kept / "samples").iterdir()}
+    state_before = {p.name: p.read_bytes() for p in (kept / "samples").iterdir()}
     processed(kept, depth_mm=300.0)
     processed(kept, depth_range_mm=50.0)
-    assert {p.name: p.read_bytes() for p in (kept / "samples").iterdir()} == before
+    assert {p.name: p.read_bytes() for p in (kept / "samples").iterdir()} == state_before
 
 
 @pytest.mark.parametrize("what", ["record", "torn line", "line", "head", "array gone", "array short"])
 def test_damaged_samples_are_made_again(two_plates: Path, kept: Path, what: str) -> None:
     folder = kept / "samples"
-    rows, array = folder / "rows.jsonl", folder / "RH.npy"
+    rows = folder / "rows.jsonl"
+    array = folder / "RH.npy"
     if what == "record":
         data = bytearray(array.read_bytes())
         data[-5000] ^= 1
@@ -171,8 +175,8 @@ def test_a_scan_is_processed_even_if_samples_cannot_be_written(
     two_plates: Path, scan: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (scan / "samples").write_text("a file is in the way")
-    found = processed(scan).form_images()
-    assert same(found, processed(two_plates, "none").form_images())
+    reprocessed = processed(scan).form_images()
+    assert same(reprocessed, processed(two_plates, "none").form_images())
     assert str(scan / "samples") in caplog.text
 
 
@@ -207,8 +211,9 @@ def test_samples_can_be_read_as_the_specification_says(kept: Path) -> None:
 def test_an_invalid_head_is_ignored(two_plates: Path, kept: Path, head) -> None:
     path = kept / "samples" / "samples.json"
     path.write_text(json.dumps(head(json.loads(path.read_text()))))
-    expected, found = processed(two_plates, "none"), processed(kept, "read")
-    assert same(found.form_images(), expected.form_images())
+    expected = processed(two_plates, "none")
+    reprocessed = processed(kept, "read")
+    assert same(reprocessed.form_images(), expected.form_images())
 
 
 @pytest.mark.parametrize(
@@ -237,10 +242,10 @@ def damaged_raw(monkeypatch: pytest.MonkeyPatch, change: Callable[[str, np.ndarr
     read_row = ScanFolder.read_row
 
     def changed(self: ScanFolder, board: str, row: int) -> RowData:
-        found = read_row(self, board, row)
-        words = found.payload.view("<i2").reshape(-1, 8).copy()
+        row_data = read_row(self, board, row)
+        words = row_data.payload.view("<i2").reshape(-1, 8).copy()
         change(board, words)
-        return RowData(split_pieces(words.view(np.uint8).ravel()), [], found.frames_expected, found.crc32)
+        return RowData(split_pieces(words.view(np.uint8).ravel()), [], row_data.frames_expected, row_data.crc32)
 
     monkeypatch.setattr(ScanFolder, "read_row", changed)
 

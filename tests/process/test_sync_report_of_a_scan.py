@@ -15,7 +15,9 @@ from polysight_shared.files import read_json
 from polysight_shared.geometry import rx_positions_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-COLUMNS, ROWS, PULSES = 10, 3, 8
+COLUMNS = 10
+ROWS = 3
+PULSES = 8
 SYNC_NS = 5.0  # each board samples SYNC_IN up to this much late, uniformly distributed
 TRUE_KHZ = [350.0, 1400.0]  # the receivers' filters; the chirp profile has others
 NAMES = {"frequency_hz_std": "frequency_std_hz", "phase_rad_std": "phase_std_rad", "amplitude_std": "amplitude_std"}
@@ -25,12 +27,14 @@ NAMES = {"frequency_hz_std": "frequency_std_hz", "phase_rad_std": "phase_std_rad
 def scan(scan_of, tmp_path_factory):
     """A scan whose filters were measured before it."""
     folder = tmp_path_factory.mktemp("sync")
-    found = BoardFilter(TRUE_KHZ, [1.0, 1.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
-    made = header("hpf", [SourceScan("sweep", "sweep", True, 3)])
-    path = write_calibration(FilterFile(**made, boards={"RH": found, "RV": found}), folder / "calibration")
+    true_filter = BoardFilter(TRUE_KHZ, [1.0, 1.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
+    head = header("hpf", [SourceScan("sweep", "sweep", True, 3)])
+    path = write_calibration(FilterFile(**head, boards={"RH": true_filter, "RV": true_filter}), folder / "calibration")
     true = rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
-    more = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}
-    scan = scan_of(folder / "scan", scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **more), true)
+    scene_changes = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}
+    scan = scan_of(
+        folder / "scan", scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **scene_changes), true
+    )
     _believe_programmed(scan)
     return scan
 
@@ -43,15 +47,17 @@ def _believe_programmed(scan):
 
 
 def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path):
-    shown = output_of("sync-report", scan, "--out", tmp_path / "report")
+    output = output_of("sync-report", scan, "--out", tmp_path / "report")
     output_of("image", scan, "--out", tmp_path / "image")
-    report, quality = read_json(tmp_path / "report" / "sync.json"), read_json(tmp_path / "image" / "quality.json")
+    report = read_json(tmp_path / "report" / "sync.json")
+    quality = read_json(tmp_path / "image" / "quality.json")
     assert report["simulated"] is True
     slope = published_rig().chirp.slope_hz_per_s
     for name in ("RH", "RV"):
-        found, stages = report["boards"][name], report["boards"][name]["stages"]
-        assert (found["positions"], found["chirps"]) == (COLUMNS * ROWS, COLUMNS * ROWS * PULSES)
-        assert str(found["chirps"]) in shown
+        figures = report["boards"][name]
+        stages = report["boards"][name]["stages"]
+        assert (figures["positions"], figures["chirps"]) == (COLUMNS * ROWS, COLUMNS * ROWS * PULSES)
+        assert str(figures["chirps"]) in output
         # Two boards sample the trigger, each evenly within SYNC_NS; the direct path's phase then is any.
         two_boards_hz = slope * SYNC_NS * 1e-9 * np.sqrt(2 / 12)
         assert stages["received"]["frequency_hz_std"] == pytest.approx(two_boards_hz, rel=0.15)
@@ -67,16 +73,18 @@ def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path
 
 def test_the_if_of_the_direct_path_follows_from_its_length_and_the_start_frequencies(scan_of, tmp_path):
     """In quality.json: smallest, median and largest IF over the positions."""
-    offset_hz, rig = 500e3, published_rig()
+    offset_hz = 500e3
+    rig = published_rig()
     disturbances = {"ideal": True, "if_offset_hz": offset_hz, "sync_uncertainty_ns": SYNC_NS}
     scene = scene_of(EVERYWHERE, columns=12, rows=2, pulses=1, disturbances=disturbances)
     output_of("image", scan_of(tmp_path / "scan", scene), "--out", tmp_path / "out")
-    boards, tx = read_json(tmp_path / "out" / "quality.json")["boards"], np.array(tx_position_m(rig))
+    boards = read_json(tmp_path / "out" / "quality.json")["boards"]
+    tx = np.array(tx_position_m(rig))
     reach_hz = rig.chirp.slope_hz_per_s * SYNC_NS * 1e-9  # by which the boards' starts differ at most
     for board in rig.receivers:
         path_m = np.linalg.norm(np.array(rx_positions_m(rig, board)) - tx, axis=1).mean()
         expected = offset_hz + rig.chirp.slope_hz_per_s * path_m / SPEED_OF_LIGHT_M_S
-        found = boards[board.name]["direct_path_hz"]
-        assert expected - reach_hz < found["min"] < expected - 0.3 * reach_hz
-        assert expected + 0.3 * reach_hz < found["max"] < expected + reach_hz
-        assert found["median"] == pytest.approx(expected, abs=0.3 * reach_hz)
+        direct_path_hz = boards[board.name]["direct_path_hz"]
+        assert expected - reach_hz < direct_path_hz["min"] < expected - 0.3 * reach_hz
+        assert expected + 0.3 * reach_hz < direct_path_hz["max"] < expected + reach_hz
+        assert direct_path_hz["median"] == pytest.approx(expected, abs=0.3 * reach_hz)

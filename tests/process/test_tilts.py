@@ -23,8 +23,14 @@ def tilted(rig):
 
 def _images(rig, tilts):
     plates = [
-        {"name": "a", "centre_mm": list(at), "size_mm": [45.0, 45.0], "permittivity": [4.0, 0.4], "tilt_deg": list(t)}
-        for at, t in zip(PLACES, tilts, strict=True)
+        {
+            "name": "a",
+            "centre_mm": list(place),
+            "size_mm": [45.0, 45.0],
+            "permittivity": [4.0, 0.4],
+            "tilt_deg": list(t),
+        }
+        for place, t in zip(PLACES, tilts, strict=True)
     ]
     grid = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}
     scene = {"name": "tilts", "object_distance_mm": 499.0, "grid": grid, "plates": plates}
@@ -44,15 +50,17 @@ def _turned():
     t = np.conj(1 / ratio_from_permittivity(4.0 - 0.4j, np.radians(55.0)))
     d = np.sin(np.radians(55.0)) * np.radians([y for _, y in TILTS_DEG])
     leak = 0.05  # of the rig's channels
-    turned_h, turned_v = (1 - d) - d * t, (1 + d) * t + d
-    h, v = turned_h + leak * turned_v, turned_v + leak * turned_h
+    turned_h = (1 - d) - d * t
+    turned_v = (1 + d) * t + d
+    h = turned_h + leak * turned_v
+    v = turned_v + leak * turned_h
     return h / (1 + leak * t), v / h / ((t + leak) / (1 + leak * t))
 
 
 def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted):
     images = tilted[0]
-    found = [images.illumination.rise(images.h, images.v, mask) for mask in _insides(images)]
-    assert np.degrees(found) == pytest.approx(np.array(TILTS_DEG), abs=0.12)
+    rises = [images.illumination.rise(images.h, images.v, mask) for mask in _insides(images)]
+    assert np.degrees(rises) == pytest.approx(np.array(TILTS_DEG), abs=0.12)
 
 
 def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(tilted):
@@ -62,9 +70,11 @@ def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(ti
     corrected = correct_tilt(images, masks, rises)
     h_turned, ratio_turned = _turned()
     truth = _ratios(level.h, level.v, masks) * ratio_turned
-    before, after = (np.abs(_ratios(*c, masks) / truth - 1) for c in ((images.h, images.v), (corrected.h, corrected.v)))
-    assert before.max() > 0.02
-    assert after.max() < 0.02  # the turn is a first order in the rise
+    state_before, state_after = (
+        np.abs(_ratios(*c, masks) / truth - 1) for c in ((images.h, images.v), (corrected.h, corrected.v))
+    )
+    assert state_before.max() > 0.02
+    assert state_after.max() < 0.02  # the turn is a first order in the rise
     brightness = [np.median(np.abs(corrected.h[m])) / np.median(np.abs(level.h[m])) for m in masks] / np.abs(h_turned)
     across = [i for i, (x, _) in enumerate(TILTS_DEG) if x == 0]
     assert np.array(brightness)[across] == pytest.approx(1, abs=0.015)
@@ -76,9 +86,10 @@ def test_tilts_follow_a_transposed_image(tilted):
     assert (images.illumination.across, turned.illumination.across) == (1, 0)
     for mask in _insides(images):
         rise = images.illumination.rise(images.h, images.v, mask)
-        other = turned.illumination.rise(turned.h, turned.v, mask.T)
-        assert other[::-1] == pytest.approx(rise, abs=1e-9)
-        factors, swapped = images.illumination.to_level(mask, rise), turned.illumination.to_level(mask.T, other)
+        transposed_rise = turned.illumination.rise(turned.h, turned.v, mask.T)
+        assert transposed_rise[::-1] == pytest.approx(rise, abs=1e-9)
+        factors = images.illumination.to_level(mask, rise)
+        swapped = turned.illumination.to_level(mask.T, transposed_rise)
         assert np.sort(swapped, axis=1) == pytest.approx(np.sort(factors, axis=1), rel=1e-6)
 
 

@@ -32,19 +32,20 @@ def rig_file(tmp_path):
 def test_scans_and_their_scenes_give_the_same_library(scan_of, rig_file, tmp_path):
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes" / "second.toml").write_bytes(tomli_w.dumps(scene("second")).encode())
-    scan, out = scan_of(tmp_path / "first", scene("first")), tmp_path / "library.npz"
-    shown = output_of("train", scan, "--simulate", tmp_path / "scenes", "--config", rig_file, "--out", out)
-    assert "6 patches of 3 materials from 2 scans" in shown
+    scan = scan_of(tmp_path / "first", scene("first"))
+    out = tmp_path / "library.npz"
+    output = output_of("train", scan, "--simulate", tmp_path / "scenes", "--config", rig_file, "--out", out)
+    assert "6 patches of 3 materials from 2 scans" in output
     library = Library.load(out)
     assert (library.names, library.scans) == (NAMES, ("first", "second"))
     assert library.fit
     first, second = ([e for e in library.entries if e.scan == name] for name in library.scans)
-    for one, other in zip(first, second, strict=True):
-        assert one.simulated
-        assert one.h.size >= 10
+    for first_item, second_item in zip(first, second, strict=True):
+        assert first_item.simulated
+        assert first_item.h.size >= 10
         for key in ("h", "v", "p"):
-            np.testing.assert_array_equal(getattr(one, key), getattr(other, key))
-        assert (one.name, one.permittivity) == (other.name, other.permittivity)
+            np.testing.assert_array_equal(getattr(first_item, key), getattr(second_item, key))
+        assert (first_item.name, first_item.permittivity) == (second_item.name, second_item.permittivity)
     # Relative to the copper of the same scan.
     level = {name: np.median([np.median(e.h) for e in library.entries if e.name == name]) for name in NAMES}
     assert level["copper"] == pytest.approx(1.0, abs=0.1)

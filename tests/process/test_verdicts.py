@@ -57,10 +57,11 @@ def distances(findings, true):
     """Squared distance of each patch's true permittivity in its region."""
     out = []
     for r in findings.analysis.patches:
-        plate, e = true.get(r.patch.label), r.permittivity
+        plate = true.get(r.patch.label)
+        e = r.permittivity
         if plate is not None and plate.permittivity is not None and e.value is not None:
-            away = e.value - plate.permittivity
-            pair = np.array([away.real, away.imag])
+            difference = e.value - plate.permittivity
+            pair = np.array([difference.real, difference.imag])
             out.append(float(pair @ np.linalg.solve(e.covariance, pair)))
     return np.array(out)
 
@@ -91,8 +92,8 @@ def test_an_undeclared_thin_sheet_is_reported_and_affects_no_other_patch(examine
     (label,) = [label for label, plate in true.items() if plate.name == "acrylic"]
     assert findings.verdict.level == "care"
     assert f"patch {label} " in reasons(findings)
-    others = {k: plate for k, plate in true.items() if k != label}
-    assert np.sqrt(distances(findings, others).mean() / 2) < 1.5
+    other_items = {k: plate for k, plate in true.items() if k != label}
+    assert np.sqrt(distances(findings, other_items).mean() / 2) < 1.5
 
 
 @pytest.mark.parametrize("names", [("ceramic", "acrylic", "PET", "wood", "rubber"), ("ceramic",), ("ceramic", "wood")])
@@ -177,16 +178,16 @@ def test_products_without_a_result_hold_images_and_no_name(rig, tmp_path):
 def test_p_sigma_covers_the_error_of_p(examine):
     scene = world(disturbances={"leakage_measured": 0.003})
     findings, true = examine(scene)
-    found, sigma = findings.analysis, findings.analysis.p_sigma(findings.images.valid)
+    analysis, sigma = findings.analysis, findings.analysis.p_sigma(findings.images.valid)
     inside = []
-    for r in found.patches:
+    for r in analysis.patches:
         plate = true.get(r.patch.label)
         if plate is None or plate.permittivity is None or abs(1 / r.permittivity.ratio) < 0.03:
             continue
-        q = np.sqrt(plate.permittivity - np.sin(found.theta_rad[0, 0]) ** 2)
-        cos = np.cos(found.theta_rad[0, 0])
+        q = np.sqrt(plate.permittivity - np.sin(analysis.theta_rad[0, 0]) ** 2)
+        cos = np.cos(analysis.theta_rad[0, 0])
         p = (cos - q) / (cos + q) * (q + plate.permittivity * cos) / (q - plate.permittivity * cos)
-        at = r.patch.interior
-        inside.append(np.mean(np.abs(found.calibrated.p[at] - p) < 2 * np.sqrt(2) * sigma[at]))
+        interior = r.patch.interior
+        inside.append(np.mean(np.abs(analysis.calibrated.p[interior] - p) < 2 * np.sqrt(2) * sigma[interior]))
     assert len(inside) >= 3
     assert np.mean(inside) > 0.8

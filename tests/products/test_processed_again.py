@@ -82,16 +82,16 @@ def test_labels_among_the_products_that_they_replace(made):
 )
 def test_an_invalid_input_changes_nothing(made, option, path, value, capsys):
     boxes(made, {"far": [4000, 0, 4010, 10]})
-    before = contents(made)
+    state_before = contents(made)
     assert process(made, option, made / path) == 3
     assert value in capsys.readouterr().err
-    assert contents(made) == before
+    assert contents(made) == state_before
 
 
 def test_a_report_is_not_replaced_by_images_without_one(made, capsys):
-    before = contents(made / "out")
+    state_before = contents(made / "out")
     assert process(made, "--metal", "900,900,10,10") == 3
-    assert contents(made / "out") == before
+    assert contents(made / "out") == state_before
     shutil.rmtree(made / "out")
     assert process(made, "--metal", "900,900,10,10") == 3
     assert str(made / "out" / "image.npz") in capsys.readouterr().err.splitlines()[-1]
@@ -100,12 +100,12 @@ def test_a_report_is_not_replaced_by_images_without_one(made, capsys):
 
 def test_products_whose_raw_rows_were_dropped_stay(made, capsys):
     assert main(["drop-raw", str(made / "scan"), "--products", str(made / "out"), "--yes"]) == 0
-    before = contents(made / "out")
-    other = simulate(published_rig(), decode_scene({**SCENE, "name": "another"}, "test"), made / "other")
+    state_before = contents(made / "out")
+    other_scan = simulate(published_rig(), decode_scene({**SCENE, "name": "another"}, "test"), made / "other")
     for command in ("process", "image"):
-        assert main([command, str(other), "--out", str(made / "out")]) == 2
+        assert main([command, str(other_scan), "--out", str(made / "out")]) == 2
         assert ScanFolder.load(made / "scan").scan_id in capsys.readouterr().err
-    assert contents(made / "out") == before
+    assert contents(made / "out") == state_before
 
 
 @pytest.fixture
@@ -119,14 +119,16 @@ def other_angle(made) -> Path:
 
 def test_at_another_angle_than_the_librarys_nothing_is_named(made, other_angle, capsys):
     assert process(made, *METAL, "--library", other_angle) == 0
-    shown = capsys.readouterr()
-    assert "other.npz" in shown.err
-    assert "other.npz" in shown.out
+    output = capsys.readouterr()
+    assert "other.npz" in output.err
+    assert "other.npz" in output.out
     materials = json.loads((made / "out" / "materials.json").read_text())
     assert materials["model"] is None
-    other = next(s for s in materials["segments"] if not s["metal_reference"])
-    assert other["name"] is None
-    assert (other["permittivity"] is None) == (other["refused"] is not None)  # so coarse a scan may give no result
+    other_patch = next(s for s in materials["segments"] if not s["metal_reference"])
+    assert other_patch["name"] is None
+    assert (other_patch["permittivity"] is None) == (
+        other_patch["refused"] is not None
+    )  # so coarse a scan may give no result
     assert "other.npz" in (made / "out" / "report.html").read_text()
 
 
@@ -145,9 +147,9 @@ def test_a_library_of_another_angle_is_reported_before_the_rig_is_used(made, oth
     assert main([*scan, "--library", str(other_angle)]) == 5
     message = capsys.readouterr().err
     assert 0 < message.index("other.npz") < message.index("127.0.0.1:1")
-    for given in (["--labels", made / "no.json"], ["--labels", boxes(made, {"far": [4000, 0, 4010, 10]})],
+    for option in (["--labels", made / "no.json"], ["--labels", boxes(made, {"far": [4000, 0, 4010, 10]})],
                   ["--library", made / "no.npz"], ["--truth", no_pi]):  # fmt: skip
-        assert main([*scan, *map(str, given)]) == 3
+        assert main([*scan, *map(str, option)]) == 3
         assert "127.0.0.1" not in capsys.readouterr().err
     assert not (made / "new").exists()
 

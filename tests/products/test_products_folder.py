@@ -97,11 +97,11 @@ def test_after_a_kill_at_any_step_the_next_run_finds_old_or_new_products(out, ex
         replace(out)
     if exchange == "one step":
         assert read(out) in (OLD, NEW)
-    found = {}
+    collected = {}
     with suppress(DataError), making_products(out, "s"):
-        found = read(out)
+        collected = read(out)
         raise DataError("nothing")
-    assert found in (OLD, NEW)
+    assert collected in (OLD, NEW)
     replace(out)
     assert read(out) == NEW
     assert list(out.parent.iterdir()) == [out]
@@ -148,10 +148,10 @@ def test_a_folder_that_must_not_be_replaced_is_refused(out, monkeypatch):
 
 def test_the_only_products_of_a_scan_are_not_replaced_by_those_of_another(out):
     write_json(out / "quality.json", {"raw_dropped": {"scan_id": "first", "dropped_utc": "2026-01-02T03:04:05"}})
-    before = read(out)
+    state_before = read(out)
     with refused(ErrorCode.NAME_TAKEN, "first", "2026-01-02"), making_products(out, "second"):
         pytest.fail("it began")
-    assert read(out) == before
+    assert read(out) == state_before
     with making_products(out, "first") as new:  # from a copy that has its raw rows
         write(new, NEW)
     assert read(out) == NEW
@@ -164,6 +164,6 @@ def test_products_that_cannot_replace_the_old_ones_are_kept_and_named(out, monke
     monkeypatch.setattr(products_folder, "_exchange", busy)
     with pytest.raises(DeviceError) as e:
         replace(out)
-    kept = out.with_name(".one.new")
-    assert str(kept) in e.value.remedy
-    assert (read(kept), read(out)) == (NEW, OLD)
+    unfinished_folder = out.with_name(".one.new")
+    assert str(unfinished_folder) in e.value.remedy
+    assert (read(unfinished_folder), read(out)) == (NEW, OLD)

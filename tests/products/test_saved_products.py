@@ -46,18 +46,18 @@ def part_of(inverse: complex) -> dict:
 def folder(tmp_path, monkeypatch):
     """Products of water behind glass, measured with USED; the current folder has the published rig file."""
     layers = [parse_layer(STACK[0]), Layer("water", WATER)]
-    whole, parts = (predict(layers, Spectrum.of(USED.chirp, n), np.radians(ANGLE_DEG))[0] for n in (1, 3))
+    whole_band, parts = (predict(layers, Spectrum.of(USED.chirp, n), np.radians(ANGLE_DEG))[0] for n in (1, 3))
     bands = [
         part_of(complex(q)) | {"first_hz": b.first_hz, "last_hz": b.last_hz}
         for q, b in zip(parts, sub_bands(USED.chirp, 3), strict=True)
     ]
     row = {"label": 3, "name": "liquid", "incidence_deg": ANGLE_DEG, "permittivity": None, "bands": bands}
-    made = tmp_path / "made"
-    write_json(made / "materials.json", {"segments": [row | part_of(complex(whole[0]))]})
-    write_json(made / "scan.json", {"scan_id": "s", "simulated": True, "instrument": to_builtins(USED)})
+    made_folder = tmp_path / "made"
+    write_json(made_folder / "materials.json", {"segments": [row | part_of(complex(whole_band[0]))]})
+    write_json(made_folder / "scan.json", {"scan_id": "s", "simulated": True, "instrument": to_builtins(USED)})
     shutil.copy(RIG_FILE, tmp_path / "instrument.toml")
     monkeypatch.chdir(tmp_path)
-    return made
+    return made_folder
 
 
 def found(capsys, *arguments: object) -> complex:

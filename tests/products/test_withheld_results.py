@@ -105,11 +105,11 @@ def test_products_of_earlier_releases_are_read_as_before(tmp_path):
 
 
 def test_p_sigma_has_the_shape_of_the_image(tmp_path):
-    one = np.ones((2, 2), np.complex64)
+    image = np.ones((2, 2), np.complex64)
     axis = np.array([0.0, 0.1])
     valid = np.ones((2, 2), bool)
     with refused(ErrorCode.MISMATCH, "p_sigma"):
-        write_image(tmp_path / "i.npz", Images(one, one, axis, axis, valid, one, np.ones((3, 2))))
+        write_image(tmp_path / "i.npz", Images(image, image, axis, axis, valid, image, np.ones((3, 2))))
     write_json(tmp_path / "materials.json", {"segments": []})
-    write_image(tmp_path / "i.npz", Images(one, one, axis, axis, valid, one, np.full((2, 2), np.nan)))
+    write_image(tmp_path / "i.npz", Images(image, image, axis, axis, valid, image, np.full((2, 2), np.nan)))
     assert read_image(tmp_path / "i.npz").p_sigma.dtype == np.float32

@@ -58,10 +58,10 @@ def test_every_step_is_reported_once_in_order(radar, board):
 
 
 def test_only_the_transmitter_transmits(rig):
-    for at in rig.boards:
-        made = program(rig, at)
-        masks = [c.tx for c in (*made.basic, *made.waveform) if hasattr(c, "tx")]
-        assert masks == ([0b010] * 2 if at.role == "transmit" else [0, 0])
+    for position in rig.boards:
+        messages = program(rig, position)
+        masks = [c.tx for c in (*messages.basic, *messages.waveform) if hasattr(c, "tx")]
+        assert masks == ([0b010] * 2 if position.role == "transmit" else [0, 0])
 
 
 def test_a_board_is_armed_only_after_the_radar_reported_it(radar, monkeypatch):
@@ -234,14 +234,14 @@ IMAGE = check_image(make_image(), "image.bin")
 @pytest.mark.parametrize(("flash", "commands", "step"), [(make_image(), 25, 1), (b"", 60, 7)], ids=["flash", "RAM"])
 def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, commands, step):
     """In place of each answer of a bring-up and an arming: the cause is the restart, not the rig file or the image."""
-    for after in range(1, commands + 1, step):
+    for state_after in range(1, commands + 1, step):
         board = simulated.RadarBoard(lambda: clock.time, flash=flash)
-        words = Restarts(board, clock, after)
+        words = Restarts(board, clock, state_after)
         radar = RadarBoard("RH", words, clock, program(rig, rig.by_name("RH")), IMAGE)
         began = clock.time
         with refused(ErrorCode.RADAR_RESTARTED, "RH"):
             radar.arm(FRAMES)
-        assert clock.time - began < 8.0, after
+        assert clock.time - began < 8.0, state_after
         assert radar.state is State.FAULT
         radar.arm(FRAMES)
         assert radar.state is State.ARMED

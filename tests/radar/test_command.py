@@ -60,8 +60,8 @@ def test_the_plan_lists_every_message_of_every_board(rig, rig_file, capsys):
     sent = [decode(bytes.fromhex(line.split()[-1])).blocks for line in out.splitlines() if "34122143" in line]
     expected = []
     for board in rig.boards:
-        made = program(rig, board)
-        expected += [(c.block(),) for c in (*made.basic, *made.waveform, *made.frames(5600))]
+        messages = program(rig, board)
+        expected += [(c.block(),) for c in (*messages.basic, *messages.waveform, *messages.frames(5600))]
     assert sent == expected
 
 
@@ -137,8 +137,8 @@ def test_firmware_goes_to_ram_and_to_the_flash_only_with_flash(rig_file, words, 
 def test_a_file_that_is_no_image_is_refused_without_opening_a_board(rig_file, opened, capsys, tmp_path):
     image = tmp_path / "notes.txt"
     image.write_text("not firmware")
-    for more in ((), ("--flash",)):
-        assert run(rig_file(), "firmware", "RH", str(image), *more) == 2
+    for options in ((), ("--flash",)):
+        assert run(rig_file(), "firmware", "RH", str(image), *options) == 2
         assert "is no firmware" in capsys.readouterr().err
     assert opened == []
 
@@ -150,8 +150,8 @@ def test_an_unknown_board_is_refused(rig_file, capsys):
 
 def test_a_rig_without_native_boards_is_refused(rig, rig_file, capsys):
     path = rig_file(msgspec.structs.replace(rig, radar=type(rig.radar)()))
-    for what in (("plan",), ("check", "RH")):
-        assert run(path, *what) == 2
+    for description in (("plan",), ("check", "RH")):
+        assert run(path, *description) == 2
         assert "usb_serial" in capsys.readouterr().err
 
 
@@ -268,8 +268,8 @@ def test_devices_pipes_folders_and_huge_files_are_refused_unread(rig, rig_file, 
             file.truncate(3 * 2**30)
     text = "bytes" if kind == "sparse" else "not a regular file"
     with_it = with_radar(rig, firmware=str(path))
-    here = rig_file()
-    for file, args in ((here, ("firmware", "RH", str(path))), (here, ("replay", str(path)))):
+    rig_path = rig_file()
+    for file, args in ((rig_path, ("firmware", "RH", str(path))), (rig_path, ("replay", str(path)))):
         assert run(file, *args) == 3
         assert text in capsys.readouterr().err
     assert run(rig_file(with_it), "check", "RH") == 3
@@ -291,11 +291,11 @@ def test_an_interrupted_flash_write_reports_the_parts_written(rig_file, words, b
     image = tmp_path / "image.bin"
     image.write_bytes(make_image())
     write = words.write
-    seen = []
+    calls = []
 
     def stop_at_part_7(sent):
-        seen.extend(w for w in sent[:1] if w == 0x1234)
-        if len(seen) == 8:
+        calls.extend(w for w in sent[:1] if w == 0x1234)
+        if len(calls) == 8:
             raise KeyboardInterrupt
         write(sent)
 
@@ -329,5 +329,5 @@ def test_a_trace_is_replayed_to_a_simulated_board(rig_file, tmp_path):
     assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
     same = replay(trace, lambda now: RadarBoard(now, flash=make_image()))
     assert same == []
-    other = replay(trace, RadarBoard)  # its flash is empty
-    assert other
+    empty_board = replay(trace, RadarBoard)  # its flash is empty
+    assert empty_board

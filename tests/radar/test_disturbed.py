@@ -42,8 +42,8 @@ class FlippingWords(BoardWords):
 
 
 def _faults_of_one_command() -> st.SearchStrategy[list[Fault]]:
-    lost = st.lists(LOST, max_size=2)
-    return st.one_of(lost, st.tuples(lost, HARMLESS).map(lambda t: [*t[0], t[1]]))
+    lost_words = st.lists(LOST, max_size=2)
+    return st.one_of(lost_words, st.tuples(lost_words, HARMLESS).map(lambda t: [*t[0], t[1]]))
 
 
 @settings(deadline=None)

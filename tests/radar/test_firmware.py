@@ -273,11 +273,11 @@ def test_a_restart_during_a_download_ends_it_at_once(clock, part):
 
 def test_a_refused_part_is_an_error_with_its_number(new, clock, monkeypatch):
     obey = new.cores._download
-    seen = []
+    calls = []
 
     def refuse_seventh(data, remaining):
-        seen.append(remaining)
-        return (7, b"", 0.0) if len(seen) == 7 else obey(data, remaining)
+        calls.append(remaining)
+        return (7, b"", 0.0) if len(calls) == 7 else obey(data, remaining)
 
     monkeypatch.setattr(new.cores, "_download", refuse_seventh)
     with refused(ErrorCode.REFUSED_BY_PEER, "part 7 of 35 of image.bin", "error 7"):

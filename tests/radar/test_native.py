@@ -86,8 +86,8 @@ def usb(rig, clock) -> Usb:
 
 @pytest.fixture
 def radars(rig, usb, clock):
-    with NativeRadars(rig, usb.open, clock) as made:
-        yield made
+    with NativeRadars(rig, usb.open, clock) as native_radars:
+        yield native_radars
 
 
 def test_each_board_is_identified_by_its_serial_number(rig, radars, usb):
@@ -129,8 +129,8 @@ def test_two_names_for_one_board_are_refused(rig, usb, clock):
 def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock, tmp_path):
     for board in usb.boards.values():
         board.cores.die = 0
-    kept = with_radar(rig, calibration_dir=str(tmp_path))
-    with NativeRadars(kept, usb.open, clock):
+    rig_with_calibration = with_radar(rig, calibration_dir=str(tmp_path))
+    with NativeRadars(rig_with_calibration, usb.open, clock):
         assert list(tmp_path.iterdir()) == []
 
 
@@ -175,8 +175,8 @@ def test_a_broken_constraint_is_refused_before_anything_is_sent(rig, usb, clock)
     wrong = with_radar(rig, rx_gain_db=31)
     with refused(ErrorCode.VALUE_INVALID, "RX gain step"):
         NativeRadars(wrong, never, clock)
-    with NativeRadars(rig, usb.open, clock) as made, refused(ErrorCode.VALUE_INVALID, "frames"):
-        made.arm(65536)
+    with NativeRadars(rig, usb.open, clock) as native_radars, refused(ErrorCode.VALUE_INVALID, "frames"):
+        native_radars.arm(65536)
 
 
 def test_a_board_that_fails_at_the_start_closes_the_others(rig, usb, clock):
@@ -236,8 +236,8 @@ def test_a_link_that_cannot_be_reopened_is_a_fault_of_that_board_only(radars, us
 
 
 def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
-    kept = with_radar(rig, trace_dir=str(tmp_path / "traces"))
-    with NativeRadars(kept, usb.open, clock) as radars:
+    traced_rig = with_radar(rig, trace_dir=str(tmp_path / "traces"))
+    with NativeRadars(traced_rig, usb.open, clock) as radars:
         assert run_row(radars, usb) == ALL_DONE
         usb.unplug(0.0)
         assert run_row(radars, usb) == ALL_DONE
@@ -249,15 +249,15 @@ def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
     assert any(line.error is not None for line in lines)
     # The first link's trace replays the bring-up without the board.
     replayed = ReplayedWords(files[0])
-    made = radar_board(rig, "LS", replayed, replayed, None)
-    made.configure()
-    made.arm(FRAMES)
+    replayed_board = radar_board(rig, "LS", replayed, replayed, None)
+    replayed_board.configure()
+    replayed_board.arm(FRAMES)
 
 
 def test_a_full_disk_ends_a_trace_but_no_row(rig, usb, clock, tmp_path, monkeypatch):
     monkeypatch.setattr("polysight.radar.control.new_trace", lambda *_: Path("/dev/full"))
-    kept = with_radar(rig, trace_dir=str(tmp_path))
-    with NativeRadars(kept, usb.open, clock) as radars:
+    traced_rig = with_radar(rig, trace_dir=str(tmp_path))
+    with NativeRadars(traced_rig, usb.open, clock) as radars:
         assert run_row(radars, usb) == ALL_DONE
         result = traces(radars)
     assert len(result) == 3

@@ -54,17 +54,17 @@ class FaultyWords(BoardWords):
             super().write([self.flip(word)])
 
     def read(self, count: int) -> list[int]:
-        found = []
+        collected = []
         for _ in range(count):
             self._next()
             (word,) = super().read(1)
-            found.append(self.flip(word) if self.dead is None else self.dead)
-        return found
+            collected.append(self.flip(word) if self.dead is None else self.dead)
+        return collected
 
     def interrupt(self) -> bool:
         self._next()
-        found = super().interrupt()
-        return found if self.stuck is None else self.stuck
+        is_high = super().interrupt()
+        return is_high if self.stuck is None else self.stuck
 
     def reset(self, held: bool) -> None:
         self._next()
@@ -99,12 +99,12 @@ def _flip_once(rng: random.Random) -> Case:
 
 
 def _noise(rng: random.Random) -> Case:
-    own = random.Random(rng.random())
+    draws = random.Random(rng.random())
     share = rng.choice((0.01, 0.05, 0.3))
     return Case(
         "noise from here on",
         NOISE + "|MISO",
-        lambda words: setattr(words, "flip", lambda w: w ^ (1 << own.randrange(16) if own.random() < share else 0)),
+        lambda words: setattr(words, "flip", lambda w: w ^ (1 << draws.randrange(16) if draws.random() < share else 0)),
     )
 
 
@@ -137,9 +137,9 @@ def _flood(rng: random.Random) -> Case:
 
 def draw(rng: random.Random) -> tuple[Case, int]:
     """Draw a fault and the transfer at which it happens."""
-    at = round(10 ** rng.uniform(0.0, 3.7))
+    transfer = round(10 ** rng.uniform(0.0, 3.7))
     once = [f for f in Fault if f is not Fault.REFUSE and f is not Fault.REFUSE_BARE]
-    made = {
+    cases = {
         "flip": lambda: _flip_once(rng),
         "noise": lambda: _noise(rng),
         "event": lambda: _event(rng),
@@ -177,7 +177,7 @@ def draw(rng: random.Random) -> tuple[Case, int]:
             "new board, unplugged", "unplugged", lambda w: setattr(w.board, "plugged", False), b"", IMAGE
         ),
     }
-    return made[rng.choice(list(made))](), at
+    return cases[rng.choice(list(cases))](), transfer
 
 
 @dataclass
@@ -239,9 +239,9 @@ NAMED = 0.95
 @pytest.fixture(scope="module")
 def clean() -> Simulated:
     """A board after a row without any fault."""
-    found = run(Case("none", ""), 10**9)
-    assert found.error is None
-    return found.board
+    outcome = run(Case("none", ""), 10**9)
+    assert outcome.error is None
+    return outcome.board
 
 
 def accepted_rightly(found: Outcome, clean: Simulated) -> bool:
@@ -262,17 +262,17 @@ def test_random_faults(clean, request):
     unnamed = []
     kinds: Counter[str] = Counter()
     for number in range(cases):
-        case, at = draw(random.Random(number))
-        found = run(case, at)
-        assert found.seconds < LONGEST_S, (number, case.name, at)
+        case, transfer = draw(random.Random(number))
+        outcome = run(case, transfer)
+        assert outcome.seconds < LONGEST_S, (number, case.name, transfer)
         kinds[case.name.split(" 0x")[0]] += 1
-        if found.error is None:
-            assert accepted_rightly(found, clean), (number, case.name, at)
+        if outcome.error is None:
+            assert accepted_rightly(outcome, clean), (number, case.name, transfer)
             continue
         failed += 1
-        text = f"{found.error.what} {found.error.why} {' '.join(found.radar.warnings)}"
+        text = f"{outcome.error.what} {outcome.error.why} {' '.join(outcome.radar.warnings)}"
         if not re.search(case.cause, text, re.DOTALL):
-            unnamed.append((number, case.name, at, text))
+            unnamed.append((number, case.name, transfer, text))
     print(f"{cases} faults, {failed} ended in an error, {len(unnamed)} of these without the right cause", dict(kinds))  # noqa: T201
     for line in unnamed[:20]:
         print(line)  # noqa: T201
@@ -286,13 +286,13 @@ OF_THE_BOARD = ("flash", "another board", "jumpers")
 def test_after_a_repaired_fault_the_next_row_runs():
     """A reset and a configuration recover every board without a defect of its own."""
     for number in range(60):
-        case, at = draw(random.Random(number))
+        case, transfer = draw(random.Random(number))
         if case.name.startswith(OF_THE_BOARD):
             continue
-        found = run(case, at)
-        found.heal()
-        found.radar.arm(FRAMES)
-        assert found.radar.state is State.ARMED, (number, case.name, at)
+        outcome = run(case, transfer)
+        outcome.heal()
+        outcome.radar.arm(FRAMES)
+        assert outcome.radar.state is State.ARMED, (number, case.name, transfer)
 
 
 def test_most_drawn_faults_happen_within_the_run(clean):

@@ -183,7 +183,7 @@ def test_an_answer_in_chunks_is_joined():
 
 @pytest.mark.parametrize("chunks", [[(1, 0x40E0)], [(2, 0x40E0), (0, 0x40E2)]], ids=["last", "middle"])
 def test_an_answer_with_a_missing_chunk_is_no_answer(chunks):
-    line, _ = connect(*[chunk(*each, bytes(16)) for each in chunks])
+    line, _ = connect(*[chunk(*fields, bytes(16)) for fields in chunks])
     with refused(ErrorCode.NO_ANSWER):
         line.call(GET_MAIN_VERSION)
 

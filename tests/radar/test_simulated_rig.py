@@ -40,58 +40,60 @@ def test_offsets_give_the_same_signals_from_scene_rig_file_and_program(tmp_path:
     """The same start frequencies, from the scene, the rig file or native control, give the same samples."""
     result = derive(published_rig(), EMPTY, tmp_path)
     native = derive(published_rig(), EMPTY, tmp_path, native=True)
-    at = np.zeros(2)
-    a = SimulatedRig(published_rig(), EMPTY, 5).signals("RH", at, at)
-    b = SimulatedRig(result, without_offset(EMPTY), 5).signals("RH", at, at)
+    origin_mm = np.zeros(2)
+    a = SimulatedRig(published_rig(), EMPTY, 5).signals("RH", origin_mm, origin_mm)
+    b = SimulatedRig(result, without_offset(EMPTY), 5).signals("RH", origin_mm, origin_mm)
     np.testing.assert_array_equal(a, b)
-    np.testing.assert_array_equal(a, SimulatedRig(native, EMPTY, 5).signals("RH", at, at))
+    np.testing.assert_array_equal(a, SimulatedRig(native, EMPTY, 5).signals("RH", origin_mm, origin_mm))
     assert {b.start_offset_hz for b in result.recorded} == {EMPTY.disturbances.if_offset_hz}
     moved = tuple(
         msgspec.structs.replace(x, start_offset_hz=x.start_offset_hz + 1e5) if x.name == "RH" else x
         for x in native.boards
     )
-    other = SimulatedRig(msgspec.structs.replace(native, boards=moved), EMPTY, 5).signals("RH", at, at)
-    assert not np.allclose(a, other)
+    programmed = SimulatedRig(msgspec.structs.replace(native, boards=moved), EMPTY, 5).signals(
+        "RH", origin_mm, origin_mm
+    )
+    assert not np.allclose(a, programmed)
 
 
 @pytest.fixture
 def served():
     """A simulated board at a TCP address, served by a thread."""
     board = Simulated(time.monotonic, flash=make_image())
-    made = RadarSocket("tcp://127.0.0.1:0", board)
+    radar_socket = RadarSocket("tcp://127.0.0.1:0", board)
     stop = threading.Event()
 
     def serve() -> None:
         while not stop.wait(0.0005):
-            made.serve()
+            radar_socket.serve()
 
     thread = threading.Thread(target=serve)
     thread.start()
-    yield made, board
+    yield radar_socket, board
     stop.set()
     thread.join()
-    made.close()
+    radar_socket.close()
 
 
 def test_a_board_runs_a_row_over_its_socket(rig, served):
-    made, board = served
-    radar = RadarBoard("LS", open_board(made.address), SystemClock(), program(rig, rig.by_name("LS")))
+    radar_socket, board = served
+    radar = RadarBoard("LS", open_board(radar_socket.address), SystemClock(), program(rig, rig.by_name("LS")))
     radar.configure()
     radar.arm(2)
     for n in range(2):
         assert board.trigger(n * 1.5e-3)
     wait_for(lambda: radar.poll() is State.DONE, "the end of the row")
-    assert made.chip.errors == []
+    assert radar_socket.chip.errors == []
     radar.close()
 
 
 def test_a_board_unplugged_behind_its_socket_is_a_fault_with_its_address(rig, served):
-    made, board = served
-    radar = RadarBoard("LS", open_board(made.address), SystemClock(), program(rig, rig.by_name("LS")))
+    radar_socket, board = served
+    radar = RadarBoard("LS", open_board(radar_socket.address), SystemClock(), program(rig, rig.by_name("LS")))
     radar.configure()
     board.plugged = False
     assert radar.poll() is State.FAULT
-    assert made.address in radar.reason
+    assert radar_socket.address in radar.reason
     radar.close()
 
 
@@ -105,9 +107,9 @@ def test_an_address_without_a_server_is_an_error():
 
 
 def test_a_split_request_is_processed(served):
-    made, _ = served
+    radar_socket, _ = served
     ask = struct.pack("<ccH", b"B", b"W", 2) + b"\x81\x87" + struct.pack("<ccH", b"B", b"R", 1)
-    with socket.create_connection(("127.0.0.1", int(made.address.rpartition(":")[2]))) as client:
+    with socket.create_connection(("127.0.0.1", int(radar_socket.address.rpartition(":")[2]))) as client:
         client.settimeout(HANG_S)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         for byte in ask:

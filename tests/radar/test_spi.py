@@ -24,15 +24,15 @@ def sent() -> list[bytes]:
 @pytest.fixture
 def link(words, clock, sent) -> Link:
     """A link to a board whose both cores are up."""
-    made = Link("RH", words, clock, sent.append)
+    connection = Link("RH", words, clock, sent.append)
     words.reset(held=True)
     words.reset(held=False)
-    made.wait_for((MAIN_POWER_UP,), 1.0, ignored)
-    made.call(DEVICE_CONFIGURATION)
-    made.call(RF_POWER_UP)
-    made.wait_for((RF_POWER_UP_DONE,), 1.0, ignored)
+    connection.wait_for((MAIN_POWER_UP,), 1.0, ignored)
+    connection.call(DEVICE_CONFIGURATION)
+    connection.call(RF_POWER_UP)
+    connection.wait_for((RF_POWER_UP_DONE,), 1.0, ignored)
     sent.clear()
-    return made
+    return connection
 
 
 def commands(sent: list[bytes]):
@@ -54,12 +54,12 @@ def test_every_read_starts_with_the_ready_word(link, sent):
 
 @pytest.mark.parametrize("fault", [Fault.BAD_CRC, Fault.BAD_CHECKSUM, Fault.LOST_INTERRUPT, Fault.NO_ANSWER])
 def test_a_lost_answer_is_retried_with_the_same_sequence_number(link, board, sent, fault):
-    before = list(board.executed)
+    state_before = list(board.executed)
     board.inject(fault)
     link.call(LOW_POWER_OFF)
     assert [(m.sequence, m.retry) for m in commands(sent)] == [(2, False), (2, True)]
     # Obeyed once
-    assert board.executed == [*before, LOW_POWER_OFF.ID]
+    assert board.executed == [*state_before, LOW_POWER_OFF.ID]
     assert "sent 2 times" in link.warnings[-1]
     link.call(LOW_POWER_OFF)
     assert commands(sent)[-1].sequence == 3

@@ -23,14 +23,14 @@ FRAMES = 4
 @pytest.fixture
 def bus(monkeypatch):
     """An empty bus, and a pyftdi that knows of nothing."""
-    made = usb_bus.Bus()
-    monkeypatch.setattr(usb_bus, "BUS", made)
+    usb = usb_bus.Bus()
+    monkeypatch.setattr(usb_bus, "BUS", usb)
     monkeypatch.setattr(UsbTools, "BACKENDS", ("tests.support.radar.usb_bus",))
     for name in ("Devices", "UsbDevices"):
         monkeypatch.setattr(UsbTools, name, {})
     monkeypatch.setattr(Ftdi, "VENDOR_IDS", dict(Ftdi.VENDOR_IDS))
     monkeypatch.setattr(Ftdi, "PRODUCT_IDS", dict(Ftdi.PRODUCT_IDS))
-    return made
+    return usb
 
 
 def chip(board: RadarBoard, serial: str, path: tuple[int, ...] = (1,)) -> usb_bus.Chip:
@@ -39,9 +39,9 @@ def chip(board: RadarBoard, serial: str, path: tuple[int, ...] = (1,)) -> usb_bu
 
 @pytest.fixture
 def plugged(bus, board) -> usb_bus.Chip:
-    made = chip(board, "FT1234", (4, 2))
-    bus.plug(made)
-    return made
+    usb_chip = chip(board, "FT1234", (4, 2))
+    bus.plug(usb_chip)
+    return usb_chip
 
 
 def test_four_channels_in_their_modes(plugged):
@@ -71,32 +71,32 @@ def test_split_answers_are_joined(bus, clock, packet):
 def test_slow_mode_is_one_word_a_transfer(plugged):
     words = open_usb("FT1234", slow=True)
     assert plugged.chip.spi_hz == 1e6
-    before = plugged.transfers
+    state_before = plugged.transfers
     words.write([1, 2, 3])
-    assert plugged.transfers == before + 3
+    assert plugged.transfers == state_before + 3
     assert plugged.chip.words_written == [1, 2, 3]
     words.close()
 
 
 def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged):
     """pyftdi opens any of the chips when given a bus address alone, in the order of a set."""
-    others = [chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
-    for other in others:
-        bus.plug(other)
+    other_items = [chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
+    for foreign_serial in other_items:
+        bus.plug(foreign_serial)
     open_usb("usb:1-4.2").write([0x1234])
     assert plugged.chip.words_written == [0x1234]
-    assert all(o.chip.words_written == [] and o.modes == {} for o in others)
+    assert all(o.chip.words_written == [] and o.modes == {} for o in other_items)
     with refused(ErrorCode.NO_ANSWER, "usb:1-7", "1-4.1, 1-4.2"):
         open_usb("usb:1-7")
 
 
 def test_a_serial_number_of_two_chips_opens_neither_and_lists_their_paths(bus, plugged):
-    other = chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3))
-    bus.plug(other)
+    second_chip = chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3))
+    bus.plug(second_chip)
     with refused(ErrorCode.VALUES_CONFLICT, "1-4.2, 1-4.3") as caught:
         open_usb("FT1234")
     assert "usb_path" in caught.value.remedy
-    assert plugged.modes == other.modes == {}
+    assert plugged.modes == second_chip.modes == {}
 
 
 @pytest.mark.parametrize(
@@ -146,12 +146,12 @@ def test_a_replugged_chip_is_found_and_the_old_one_closed(bus, plugged, closed):
 def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged):
     """At each transfer of an opening in turn: an error that names the chip, nothing left open, and it comes back."""
     words = open_usb("FT1234")
-    whole = plugged.transfers
+    transfers = plugged.transfers
     words.close()
-    for at in range(1, whole + 1):
+    for position in range(1, transfers + 1):
         bus.plug(plugged)
         plugged.transfers = 0
-        plugged.pull_at = at
+        plugged.pull_at = position
         with refused(ErrorCode.NO_ANSWER, "FT1234"):
             open_usb("FT1234")
         assert UsbTools.Devices == {}
@@ -163,8 +163,8 @@ def test_a_scan_survives_a_replug_of_one_board(bus, rig, clock):
     native = enumerate(rig.radar.native.values(), 1)
     boards = {n.place: RadarBoard(lambda: clock.time, flash=make_image(), die=k) for k, n in native}
     chips = {place: chip(b, place, (n,)) for n, (place, b) in enumerate(boards.items(), 1)}
-    for made in chips.values():
-        bus.plug(made)
+    for usb_chip in chips.values():
+        bus.plug(usb_chip)
 
     def row(radars: NativeRadars) -> set[RadarState]:
         radars.arm(FRAMES)

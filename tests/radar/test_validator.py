@@ -26,9 +26,9 @@ def changed(rig: Instrument, table: str, **values) -> Instrument:
     part = msgspec.structs.replace(getattr(rig, table))
     for key, value in values.items():
         msgspec.structs.force_setattr(part, key, value)
-    whole = msgspec.structs.replace(rig)
-    msgspec.structs.force_setattr(whole, table, part)
-    return whole
+    copied_rig = msgspec.structs.replace(rig)
+    msgspec.structs.force_setattr(copied_rig, table, part)
+    return copied_rig
 
 
 def broken(rig: Instrument, frames: int = FRAMES) -> set[str]:
@@ -126,7 +126,7 @@ def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, fram
     rig = of_receiver(native_rig(), start_offset_hz=offset_hz)
     wrong = floats | ints
     for table in sorted({table for table, _ in wrong}):
-        rig = changed(rig, table, **{key: value for (at, key), value in wrong.items() if at == table})
+        rig = changed(rig, table, **{key: value for (section, key), value in wrong.items() if section == table})
     if all(c.holds for c in constraints(rig, frames)):
         for board in rig.boards:
             for sent in program(rig, board).frames(frames):
@@ -192,11 +192,11 @@ def test_ldo_bypass_needs_this_boards_serial(rig):
 
 def test_expected_if_is_slope_times_path_plus_offset(rig):
     for name in ("RH", "RV"):
-        at = rig.by_name(name)
-        mean_m = math.fsum(direct_path_m(rig, at)) / 4
-        expected = rig.chirp.slope_hz_per_s * mean_m / 299_792_458 + at.start_offset_hz
+        board = rig.by_name(name)
+        mean_m = math.fsum(direct_path_m(rig, board)) / 4
+        expected = rig.chirp.slope_hz_per_s * mean_m / 299_792_458 + board.start_offset_hz
         # Two roundings of 53.6 Hz
-        assert direct_if_hz(rig, at) == pytest.approx(expected, abs=120.0)
+        assert direct_if_hz(rig, board) == pytest.approx(expected, abs=120.0)
 
 
 @pytest.mark.parametrize(("mode", "offset", "holds"), [

@@ -34,15 +34,18 @@ def folder(tmp_path):
     """Products that somebody else sent: no raw data, no patches.npz."""
     rng = np.random.default_rng(3)
     h, v = (rng.standard_normal((2, 6, 11)) + 1j * rng.standard_normal((2, 6, 11))).astype(np.complex64)
-    made = tmp_path / "one"
-    x, y = np.linspace(-0.1, 0.1, 11), np.linspace(0.05, 0.15, 6)
-    write_image(made / "image.npz", Images(h, v, x, y, rng.uniform(size=h.shape) < 0.8, h / v))
-    write_json(made / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
+    products = tmp_path / "one"
+    x = np.linspace(-0.1, 0.1, 11)
+    y = np.linspace(0.05, 0.15, 6)
+    write_image(products / "image.npz", Images(h, v, x, y, rng.uniform(size=h.shape) < 0.8, h / v))
+    write_json(products / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
     rig = to_builtins(load_instrument(REPO / "instrument.toml"))
-    write_json(made / "scan.json", {"scan_id": "s", "simulated": True, "versions": {"numpy": "2"}, "instrument": rig})
+    write_json(
+        products / "scan.json", {"scan_id": "s", "simulated": True, "versions": {"numpy": "2"}, "instrument": rig}
+    )
     boards = {"RH": {"positions": 9, "positions_masked": 2, "rows_recorded": [0, 1, 5]}}
-    write_json(made / "quality.json", {"boards": boards})
-    return made
+    write_json(products / "quality.json", {"boards": boards})
+    return products
 
 
 def exported(folder: Path) -> xarray.Dataset:
@@ -70,7 +73,8 @@ def test_the_file_holds_the_products(folder):
 
 def test_the_table_is_that_of_the_materials(folder):
     dataset = exported(folder)
-    pet, metal = dataset.sel(patch=4), dataset.sel(patch=5)
+    pet = dataset.sel(patch=4)
+    metal = dataset.sel(patch=5)
     assert (pet["name"], pet["runner_up"], metal["name"]) == ("PET", "glass", "")
     assert (pet["confidence"], pet["runner_up_share"]) == (0.75, 0.2)
     assert complex(pet["permittivity"]) == 3.5 - 0.25j
@@ -104,7 +108,7 @@ def test_netcdf_has_no_complex_variables(folder):
 
 
 def test_splitting_and_joining_is_the_identity():
-    made = {
+    variables = {
         "a": (
             "t",
             np.array([1 + 2j, complex(np.nan, np.nan), complex(0, np.inf)], np.complex64),
@@ -113,11 +117,11 @@ def test_splitting_and_joining_is_the_identity():
         "b_real": ("t", [1.0, 2.0, 3.0], {"units": "m", "long_name": "not a part of anything"}),
         "c": ("t", np.array([1e-300 + 1e300j, 0, 1]), {"units": "V", "long_name": "c"}),
     }
-    dataset = xarray.Dataset(made, attrs={"title": "x"})
+    dataset = xarray.Dataset(variables, attrs={"title": "x"})
     split = split_complex(dataset)
     assert set(split.data_vars) == {"a_real", "a_imag", "b_real", "c_real", "c_imag"}
     joined = join_complex(split)
-    xarray.testing.assert_identical(joined[sorted(made)], dataset[sorted(made)])
+    xarray.testing.assert_identical(joined[sorted(variables)], dataset[sorted(variables)])
     assert {name: v.dtype for name, v in joined.items()} == {name: v.dtype for name, v in dataset.items()}
 
 

@@ -24,15 +24,16 @@ def folder(tmp_path):
     rng = np.random.default_rng(7)
     h, v = (rng.standard_normal((2, 5, 7)) + 1j * rng.standard_normal((2, 5, 7))).astype(np.complex64)
     valid = rng.uniform(size=(5, 7)) < 0.8
-    x, y = np.linspace(-0.1, 0.1, 7), np.linspace(0.05, 0.15, 5)
-    made = tmp_path / "one"
-    write_image(made / "image.npz", Images(h, v, x, y, valid, h / v))
-    write_json(made / "materials.json", {"scan_id": "s", "simulated": True, "segments": segments("good")})
-    write_json(made / "quality.json", {"boards": {"RH": {"frames_expected": 7}}})
+    x = np.linspace(-0.1, 0.1, 7)
+    y = np.linspace(0.05, 0.15, 5)
+    products = tmp_path / "one"
+    write_image(products / "image.npz", Images(h, v, x, y, valid, h / v))
+    write_json(products / "materials.json", {"scan_id": "s", "simulated": True, "segments": segments("good")})
+    write_json(products / "quality.json", {"boards": {"RH": {"frames_expected": 7}}})
     rig = rig_table()
     versions = {"polysight": "0.1.0", "numpy": np.__version__}
-    write_json(made / "scan.json", {"scan_id": "s", "simulated": True, "versions": versions, "instrument": rig})
-    return made
+    write_json(products / "scan.json", {"scan_id": "s", "simulated": True, "versions": versions, "instrument": rig})
+    return products
 
 
 def same_arrays(found, products):
@@ -44,16 +45,16 @@ def same_arrays(found, products):
 def test_matlab_round_trip(folder, tmp_path):
     products = read_products(folder)
     (tmp_path / "image.mat").write_bytes(pack_mat(products))
-    found = scipy.io.loadmat(tmp_path / "image.mat", simplify_cells=True)
-    same_arrays(lambda name: found[name].astype(getattr(products, name).dtype), products)
-    assert np.array_equal(found["x_m"], products.x_m)
-    assert np.array_equal(found["y_m"], products.y_m)
-    config = found["config"]
+    content = scipy.io.loadmat(tmp_path / "image.mat", simplify_cells=True)
+    same_arrays(lambda name: content[name].astype(getattr(products, name).dtype), products)
+    assert np.array_equal(content["x_m"], products.x_m)
+    assert np.array_equal(content["y_m"], products.y_m)
+    config = content["config"]
     assert config["chirp"]["start_hz"] == products.facts.instrument["chirp"]["start_hz"]
     assert list(config["boards"][1]["mount"][0]["shift_mm"]) == [15.837, -3.35, 0.0]
-    assert found["versions"]["polysight"] == "0.1.0"
-    assert json.loads(found["materials_json"]) == to_plain(products.materials)
-    assert bool(found["simulated"]) is True
+    assert content["versions"]["polysight"] == "0.1.0"
+    assert json.loads(content["materials_json"]) == to_plain(products.materials)
+    assert bool(content["simulated"]) is True
 
 
 def test_images_without_materials_export_too(folder, tmp_path):

@@ -62,7 +62,8 @@ EXPECTED = {
 @pytest.fixture
 def exported(tmp_path):
     """The folder of exports of products that hold these two patches."""
-    products, ones = tmp_path / "products", np.ones((2, 3), np.complex64)
+    products = tmp_path / "products"
+    ones = np.ones((2, 3), np.complex64)
     axes = (np.array([-0.1, 0.0, 0.1]), np.array([0.0, 0.1]))
     write_image(products / "image.npz", Images(ones, ones, *axes, np.ones((2, 3), bool), ones))
     write_json(products / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
@@ -86,7 +87,7 @@ def same(values, expected) -> bool:
 
 
 def test_matlab(exported):
-    found = scipy.io.loadmat(exported / "image.mat", simplify_cells=True)["materials"]
-    assert set(found) == set(EXPECTED)
+    content = scipy.io.loadmat(exported / "image.mat", simplify_cells=True)["materials"]
+    assert set(content) == set(EXPECTED)
     for name, expected in EXPECTED.items():
-        assert same(found[name], expected), name
+        assert same(content[name], expected), name

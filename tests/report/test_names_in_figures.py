@@ -77,8 +77,8 @@ def test_the_page_says_which_name_a_label_stands_for():
 
 def test_an_installed_font_that_has_the_glyph_draws_the_name(monkeypatch):
     """A font of mathematical signs stands in for one of CJK: both are tried after matplotlib's own."""
-    own, other = (set(get_font(findfont(f)).get_charmap()) for f in (style.OWN, "STIXGeneral"))
-    glyph = chr(min(other - own))
+    own_glyphs, other_glyphs = (set(get_font(findfont(f)).get_charmap()) for f in (style.OWN, "STIXGeneral"))
+    glyph = chr(min(other_glyphs - own_glyphs))
     assert not is_drawable(glyph)
     monkeypatch.setattr(style, "FALLBACKS", ("no such family", "STIXGeneral"))
     caches = (style.font_families, style._glyphs)

@@ -29,7 +29,9 @@ class Page(HTMLParser):
 
     def __init__(self, html):
         super().__init__()
-        self.sources, self.text, self.tags = [], [], []
+        self.sources = []
+        self.text = []
+        self.tags = []
         self._hidden = 0
         self.feed(html)
 
@@ -90,9 +92,12 @@ def two_plates():
     h = 0.02 * (rng.standard_normal((61, 61)) + 1j * rng.standard_normal((61, 61)))
     v = 0.02 * (rng.standard_normal((61, 61)) + 1j * rng.standard_normal((61, 61)))
     segments = np.zeros((61, 61), np.int32)
-    segments[20:40, 5:25], segments[20:40, 35:55] = 1, 2
-    h[segments == 1], v[segments == 1] = 1, 1
-    h[segments == 2], v[segments == 2] = 0.52, 0.12 - 0.02j
+    segments[20:40, 5:25] = 1
+    segments[20:40, 35:55] = 2
+    h[segments == 1] = 1
+    v[segments == 1] = 1
+    h[segments == 2] = 0.52
+    v[segments == 2] = 0.12 - 0.02j
     v[0, 0] = 0
     with np.errstate(divide="ignore"):
         p = (h / v).astype(np.complex64)
@@ -253,8 +258,8 @@ def test_runs_and_their_mask_are_the_same(scan):
     for share in (0.0, 0.3, 1.0):
         rows = rng.uniform(size=(4, 6)) < share
         runs = {str(i): masked_runs(row) for i, row in enumerate(rows) if row.any()}
-        found = masked_positions(scanned(scan, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}}))
-        assert (found["RH"] == rows).all()
+        masks = masked_positions(scanned(scan, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}}))
+        assert (masks["RH"] == rows).all()
 
 
 def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(scan):
@@ -325,8 +330,8 @@ def with_every_number(content, value):
     """The content with each number that is no count replaced."""
     if isinstance(content, dict):
         # What is made of a number that is none has no permittivity and no ratio.
-        given = ("permittivity", "ratio", "seconds_per_stage")
-        return {key: item if key in given else with_every_number(item, value) for key, item in content.items()}
+        required = ("permittivity", "ratio", "seconds_per_stage")
+        return {key: item if key in required else with_every_number(item, value) for key, item in content.items()}
     if isinstance(content, list):
         return [with_every_number(item, value) for item in content]
     return value if isinstance(content, float) else content

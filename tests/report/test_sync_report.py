@@ -16,7 +16,8 @@ def row(snr_db=7.2, n=4000, seed=0):
     rng = np.random.default_rng(seed)
     errors = {name: rng.standard_normal((3, n)) * np.array(scale)[:, None] for name, scale in SCALES.items()}
     errors["referenced"] = np.zeros((3, 0))
-    valid, zero = np.ones(n, bool), np.zeros(n)
+    valid = np.ones(n, bool)
+    zero = np.zeros(n)
     noise = np.full(n, 500.0**2 * 10 ** (-snr_db / 10))
     return SyncedRow(
         np.zeros((4, n, 1), np.complex64),

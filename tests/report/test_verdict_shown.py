@@ -58,20 +58,21 @@ def processed(folder, rows=None) -> ProcessedScan:
 
 def drawn_text(make) -> str:
     """All text that a figure is made with."""
-    found: list[str] = []
-    plain, noted = Axes.text, Axes.annotate
+    collected: list[str] = []
+    plain = Axes.text
+    noted = Axes.annotate
 
     def text(self, x, y, s, *a, **k):
-        found.append(str(s))
+        collected.append(str(s))
         return plain(self, x, y, s, *a, **k)
 
     def annotate(self, s, *a, **k):
-        found.append(str(s))
+        collected.append(str(s))
         return noted(self, s, *a, **k)
 
     with patch.object(Axes, "text", text), patch.object(Axes, "annotate", annotate):
         make()
-    return "\n".join(found)
+    return "\n".join(collected)
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -97,9 +98,9 @@ def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_
     page = unescape((folder / "report.html").read_text(encoding="utf-8"))
     for part in (text, page[page.index("<main>") :]):
         assert [word for word in RESULTS if word in part] == []
-    made = {path.stem for path in (folder / "figures").iterdir()}
-    assert {"amplitude_h", "amplitude_v", "amplitude_p", "phase_p", "materials"} <= made
-    assert not {"permittivity", "permittivity_map", "truth"} & made
+    figure_names = {path.stem for path in (folder / "figures").iterdir()}
+    assert {"amplitude_h", "amplitude_v", "amplitude_p", "phase_p", "materials"} <= figure_names
+    assert not {"permittivity", "permittivity_map", "truth"} & figure_names
 
 
 def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path):
@@ -149,8 +150,8 @@ def test_an_ellipse_leans_as_real_part_and_loss_do():
 def test_numbers_of_close_points_do_not_cover_one_another(apart_pt):
     grid = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), axis=-1).reshape(-1, 2) * apart_pt
     places = place_numbers(grid, np.empty((0, 2)))
-    apart = np.abs(places[:, None] - places[None]).max(axis=2) + 100 * np.eye(len(grid))
-    assert apart.min() >= 9
+    distances = np.abs(places[:, None] - places[None]).max(axis=2) + 100 * np.eye(len(grid))
+    assert distances.min() >= 9
     if apart_pt:
         assert np.hypot(*(places - grid).T).max() < 60
     assert place_numbers(np.empty((0, 2)), np.empty((0, 2))).shape == (0, 2)
@@ -168,7 +169,7 @@ def test_long_names_of_close_patches_become_numbers_that_do_not_touch(tmp_path):
     labels = draw_materials(fig.add_subplot(), scan)
     assert shorten_labels(fig, labels) == labels
     fig.draw_without_rendering()
-    boxes = [one.text.get_window_extent() for one in labels]
+    boxes = [label.text.get_window_extent() for label in labels]
     assert not any(Bbox.intersection(a, b) for i, a in enumerate(boxes) for b in boxes[:i])
     assert permittivity_map(scan) is not None
 

@@ -42,8 +42,8 @@ def scans(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def view(scans: Path) -> Iterator[Served]:
-    with served_folder(scans, TOKEN, config=RIG_FILE) as made:
-        yield made
+    with served_folder(scans, TOKEN, config=RIG_FILE) as served:
+        yield served
 
 
 @pytest.mark.parametrize(
@@ -120,26 +120,26 @@ def test_a_pair_is_compared_once_for_all_its_maps(view, scans, monkeypatch):
 
 
 def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):
-    both = threading.Barrier(2, timeout=3.0)
+    barrier = threading.Barrier(2, timeout=3.0)
     real = control._check_free
 
     def together(site: object) -> None:
         real(site)
         with suppress(threading.BrokenBarrierError):
             # Neither sees the other's program unless checking and starting are one step
-            both.wait()
+            barrier.wait()
 
     monkeypatch.setattr(control, "_check_free", together)
-    found: list[int] = []
+    collected: list[int] = []
     threads = [
-        threading.Thread(target=lambda n=name: found.append(post(view, "/api/start", {"name": n})[0]))
+        threading.Thread(target=lambda n=name: collected.append(post(view, "/api/start", {"name": n})[0]))
         for name in ("first", "second")
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert sorted(found) == [200, 409]
+    assert sorted(collected) == [200, 409]
     assert sum((scans / name).exists() for name in ("first", "second")) == 1
 
 
@@ -200,15 +200,15 @@ def test_a_request_can_be_repeated_and_is_checked_again(view, scans):
 
 def test_a_page_gets_products_of_one_generation(view, scans):
     """Of the one that it shows, or an answer that there is another."""
-    shown = get(view, "/api/result?scan=one")["generation"]
-    assert get(view, "/api/scan?scan=one")["generation"] == shown
-    assert ask(view, f"/api/map/h_amplitude?scan=one&generation={shown}")[0] == 200
+    generation = get(view, "/api/result?scan=one")["generation"]
+    assert get(view, "/api/scan?scan=one")["generation"] == generation
+    assert ask(view, f"/api/map/h_amplitude?scan=one&generation={generation}")[0] == 200
     shutil.move(scans / "one" / "products", scans / "old")
     judged_products(scans / "one" / "products", "none")
-    status, body, _ = ask(view, f"/api/map/h_amplitude?scan=one&generation={shown}")
+    status, body, _ = ask(view, f"/api/map/h_amplitude?scan=one&generation={generation}")
     assert (status, json.loads(body)["code"]) == (409, ErrorCode.MISMATCH)
     result = get(view, "/api/result?scan=one")
-    assert result["generation"] != shown
+    assert result["generation"] != generation
     assert result["verdict"]["level"] == "none"
 
 
@@ -247,9 +247,9 @@ def test_exports_stay_in_the_scan(view, scans, tmp_path):
 
 @pytest.mark.parametrize(("base", "saved"), [(None, 40), ({"notes": "", "tags": []}, 1)])
 def test_notes_that_somebody_else_has_changed_are_not_overwritten(view, scans, base, saved):
-    with ThreadPoolExecutor(2) as both:
+    with ThreadPoolExecutor(2) as pool:
         texts = ({"notes": f"{k}", "base": base} for k in range(40))
-        answers = list(both.map(lambda body: post(view, "/api/notes?scan=one", body), texts))
+        answers = list(pool.map(lambda body: post(view, "/api/notes?scan=one", body), texts))
     assert [status for status, _ in answers].count(200) == saved
     assert {(status, body.get("code")) for status, body in answers} <= {(200, None), (409, ErrorCode.MISMATCH)}
     assert [p.name for p in (scans / "one").glob(".*.part")] == []

@@ -53,24 +53,24 @@ def test_names_of_others_are_not_answered_to(scans):
 
 
 def test_other_sites_may_not_ask(scans):
-    own = "http://127.0.0.1"
+    own_origin = "http://127.0.0.1"
     with served_folder(scans, TOKEN) as view:
-        before = compute_digest(scans)
-        for origin in ("https://evil.example", "null", own, f"{own}:1", f"https://127.0.0.1:{view.port}"):
+        state_before = compute_digest(scans)
+        for origin in ("https://evil.example", "null", own_origin, f"{own_origin}:1", f"https://127.0.0.1:{view.port}"):
             status, reported = post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=origin)
             assert (status, reported["code"]) == (403, ErrorCode.ORIGIN_FOREIGN), origin
         # Same-site: another port of this machine
-        for where in ("cross-site", "same-site"):
-            assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Sec_Fetch_Site=where)[0] == 403
-            assert ask(view, "/api/scans", Sec_Fetch_Site=where)[0] == 403
+        for site in ("cross-site", "same-site"):
+            assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Sec_Fetch_Site=site)[0] == 403
+            assert ask(view, "/api/scans", Sec_Fetch_Site=site)[0] == 403
         for path, expected in (("/", 200), ("/api/scans", 403), ("/api/bar/phase", 403)):
             status, _, headers = ask(view, path, Origin="https://evil.example")
             assert status == expected
             assert not [name for name in headers if name.startswith("access-control")]
             assert "default-src 'self'" in headers["content-security-policy"]
             assert "unsafe" not in headers["content-security-policy"]
-        assert compute_digest(scans) == before
-        assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=f"{own}:{view.port}")[0] == 200
+        assert compute_digest(scans) == state_before
+        assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=f"{own_origin}:{view.port}")[0] == 200
 
 
 def test_beyond_loopback_reading_needs_the_token_too(scans):
@@ -102,7 +102,7 @@ def test_beyond_loopback_reading_needs_the_token_too(scans):
 
 def test_large_bodies_are_refused_and_nothing_is_kept(scans):
     with served_folder(scans, TOKEN) as view:
-        before = compute_digest(scans)
+        state_before = compute_digest(scans)
         large = b"x" * (guard.BODY_BYTES + 1)
         status, _, _ = ask(view, "/api/notes?scan=one", "POST", large, **{TOKEN_HEADER: TOKEN})
         assert status == 413
@@ -112,7 +112,7 @@ def test_large_bodies_are_refused_and_nothing_is_kept(scans):
         for size in (17_000, 70_000, 1 << 20):
             answer = raw(view, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"y" * size + b"\r\n\r\n")[:40]
             assert b" 400 " in answer or b" 431 " in answer or answer == b""
-        assert compute_digest(scans) == before
+        assert compute_digest(scans) == state_before
 
 
 def test_open_connections_and_unread_answers_lock_nobody_out(scans):
@@ -208,19 +208,19 @@ def test_no_name_leads_out_of_the_folder(scans, tmp_path):
     from urllib.parse import quote
 
     with served_folder(scans, TOKEN) as view:
-        before = compute_digest(tmp_path)
+        state_before = compute_digest(tmp_path)
         for name in NAMES:
-            given = quote(name, safe="")
-            for what in READ:
-                status, body, _ = ask(view, f"/api/{what}?scan={given}&x=0&y=0")
-                assert status in (400, 404), (name, what, status, body[:200])
+            quoted_name = quote(name, safe="")
+            for description in READ:
+                status, body, _ = ask(view, f"/api/{description}?scan={quoted_name}&x=0&y=0")
+                assert status in (400, 404), (name, description, status, body[:200])
                 assert SECRET.encode() not in body
             boxes = {"boxes": {"a": [0, 0, 9, 9]}}
-            for what, asked in (("notes", {"notes": "x"}), ("labels", boxes), ("control/abort", {})):
-                assert post(view, f"/api/{what}?scan={given}", asked)[0] in (400, 404), (name, what)
+            for description, asked in (("notes", {"notes": "x"}), ("labels", boxes), ("control/abort", {})):
+                assert post(view, f"/api/{description}?scan={quoted_name}", asked)[0] in (400, 404), (name, description)
         for name in ("../secret.txt", "..%2f..%2fmanifest.jsonl", "manifest.jsonl", "figures", "%00"):
             assert ask(view, f"/api/file/{name}?scan=one")[0] in (400, 404)
-        assert compute_digest(tmp_path) == before
+        assert compute_digest(tmp_path) == state_before
 
 
 def test_a_link_among_products_is_not_served(scans, tmp_path):
@@ -264,7 +264,7 @@ NO_HEADS = (b"", b"\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b
 
 def hostile(port: int) -> list[bytes]:
     """Requests that nobody well-meaning sends, as bytes; some with the right token."""
-    own = f"Host: 127.0.0.1:{port}"
+    host_line = f"Host: 127.0.0.1:{port}"
     token = f"{TOKEN_HEADER}: {TOKEN}"
 
     def request(line: str, *headers: str, body: bytes = b"") -> bytes:
@@ -272,36 +272,36 @@ def hostile(port: int) -> list[bytes]:
 
     out = list(NO_HEADS)
     for path in POSTS:
-        wrong = [[own, f"{TOKEN_HEADER}: {t}"] for t in ("", "x", TOKEN[:-1], "\xff")]
-        wrong += [[own], ["Host: evil.example", token], [own, token, "Sec-Fetch-Site: cross-site"]]
-        wrong += [[own, token, f"Origin: {o}"] for o in ("https://evil.example", "null")]
+        wrong = [[host_line, f"{TOKEN_HEADER}: {t}"] for t in ("", "x", TOKEN[:-1], "\xff")]
+        wrong += [[host_line], ["Host: evil.example", token], [host_line, token, "Sec-Fetch-Site: cross-site"]]
+        wrong += [[host_line, token, f"Origin: {o}"] for o in ("https://evil.example", "null")]
         out += [request(f"POST /api/{path}", *w, "Content-Length: 2", body=b"{}") for w in wrong]
     methods = ("GET", "PUT", "DELETE", "OPTIONS", "TRACE", "CONNECT", "BREW")
-    out += [request(f"{method} /api/{POSTS[0]}", own, token) for method in methods]
-    for what in ("scan", "result", "file/image.npz", "thumbnail"):
-        out += [request(f"GET /api/{what}?scan={name}", own) for name in NO_NAMES]
-    out += [request(f"GET /{path}", own) for path in NO_PATHS]
-    notes = f"POST /api/{POSTS[1]}", own, token
+    out += [request(f"{method} /api/{POSTS[0]}", host_line, token) for method in methods]
+    for description in ("scan", "result", "file/image.npz", "thumbnail"):
+        out += [request(f"GET /api/{description}?scan={name}", host_line) for name in NO_NAMES]
+    out += [request(f"GET /{path}", host_line) for path in NO_PATHS]
+    notes = f"POST /api/{POSTS[1]}", host_line, token
     out += [request(*notes, f"Content-Length: {length}", body=b"{") for length in NO_LENGTHS]
     out += [request(*notes, f"Content-Length: {len(body)}", body=body) for body in NO_NOTES]
-    for headers in ([f"X: {'y' * 40000}"], ["Upgrade: websocket", "Connection: Upgrade"], [own]):
-        out.append(request("GET /", own, *headers))
+    for headers in ([f"X: {'y' * 40000}"], ["Upgrade: websocket", "Connection: Upgrade"], [host_line]):
+        out.append(request("GET /", host_line, *headers))
     return out
 
 
 @pytest.mark.slow
 def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, tmp_path):
     with served_folder(scans, TOKEN) as view:
-        before = compute_digest(tmp_path)
+        state_before = compute_digest(tmp_path)
         requests = list(islice(cycle(hostile(view.port)), 1000))
-        held: list[socket.socket] = []
+        open_sockets: list[socket.socket] = []
 
         def send(part: list[bytes]) -> None:
             for data in part:
                 s = socket.create_connection(("127.0.0.1", view.port), LIMIT_S)
                 s.sendall(data)
                 # Left open: nobody reads the answer, nobody closes
-                held.append(s)
+                open_sockets.append(s)
 
         threads = [threading.Thread(target=send, args=(requests[k::8],)) for k in range(8)]
         for thread in threads:
@@ -310,9 +310,9 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, t
             assert get(view, "/api/scans")["scans"]
             assert post(view, "/api/session")[0] == 200
             time.sleep(0.01)
-        for s in held:
+        for s in open_sockets:
             s.close()
-        assert compute_digest(tmp_path) == before
+        assert compute_digest(tmp_path) == state_before
         assert post(view, "/api/notes?scan=one", {"notes": "the operator's", "tags": ["a"]})[0] == 200
         assert get(view, "/api/scan?scan=one")["notes"] == "the operator's"
 

@@ -165,8 +165,8 @@ def test_a_scan_that_is_not_there_shows_the_error_alone(page):
     page.browser.errors.clear()
     page.open("/scan?scan=nowhere")
     page.browser.wait("document.getElementById('told').innerText.includes('nowhere')", "the error")
-    shown = "[...document.querySelectorAll('main section, #side')].filter(s => s.checkVisibility()).map(s => s.id)"
-    assert page.browser.value(shown) == ["head"]
+    sections = "[...document.querySelectorAll('main section, #side')].filter(s => s.checkVisibility()).map(s => s.id)"
+    assert page.browser.value(sections) == ["head"]
 
 
 def test_a_processed_scan_is_watched_with_the_way_to_its_result(page):
@@ -188,9 +188,9 @@ def test_the_list_is_searched_and_two_are_compared(page):
         "location.pathname == '/compare' && document.querySelector('#rows tr')",
         "the comparison",
     )
-    for how in ("pair", "difference", "swipe"):
-        page.browser.click(f"button[value={how}]")
-        page.browser.wait("document.querySelector('#scale img')?.naturalWidth > 1", how)
+    for mode in ("pair", "difference", "swipe"):
+        page.browser.click(f"button[value={mode}]")
+        page.browser.wait("document.querySelector('#scale img')?.naturalWidth > 1", mode)
         page.whole()
     assert "% of" in page.browser.text("share")
 
@@ -345,9 +345,9 @@ def test_a_view_that_is_read_only_has_no_buttons_that_ask(browser, scans):
         for path in ("/", "/scan?scan=one"):
             page.open(path, token="")
             page.whole()
-            shown = "[...document.querySelectorAll('button')].filter(b => b.checkVisibility()).map(b => b.innerText)"
+            buttons = "[...document.querySelectorAll('button')].filter(b => b.checkVisibility()).map(b => b.innerText)"
             asking = {"Label", "Process again", "Resume", "Save", "Write", "Make a library", "Start the scan"}
-            assert not asking & set(browser.value(shown))
+            assert not asking & set(browser.value(buttons))
 
 
 @pytest.mark.slow
@@ -389,9 +389,9 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
     page.browser.value("document.getElementById('library').value = 'mine'")
     page.browser.click("#process button:not([type=button])")
     page.browser.wait("document.getElementById('rows').innerText.includes('my plastic')", "the new name")
-    found = find_program(scans / "one", "process")
-    assert found is not None
-    assert "--labels" in found.words
+    program = find_program(scans / "one", "process")
+    assert program is not None
+    assert "--labels" in program.words
     named = [s.name for s in ProcessedScan(scans / "one" / "products").segments if not s.metal_reference]
     assert named == ["my plastic"]
     page.whole()

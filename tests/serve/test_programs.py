@@ -27,9 +27,9 @@ from polysight_shared.errors import ConfigError, DeviceError
 
 @pytest.fixture
 def programs() -> Iterator[Programs]:
-    made = Programs()
-    yield made
-    made.close()
+    running_programs = Programs()
+    yield running_programs
+    running_programs.close()
 
 
 def ended(folder: Path, kind: str) -> None:
@@ -39,15 +39,15 @@ def ended(folder: Path, kind: str) -> None:
 def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
     programs.start(tmp_path, "export", ["--version"])
     wait_for(lambda: find_program(tmp_path, "export").status is not None, "its status")
-    found = find_program(tmp_path, "export")
-    assert (found.status, found.words, found.log.split()[0]) == (0, ("polysight", "--version"), "polysight")
+    program = find_program(tmp_path, "export")
+    assert (program.status, program.words, program.log.split()[0]) == (0, ("polysight", "--version"), "polysight")
     programs.start(tmp_path, "export", ["validate", tmp_path])
     wait_for(lambda: find_program(tmp_path, "export").status is not None, "its status")
-    found = find_program(tmp_path, "export")
-    assert found.status == 3
-    assert "why:" in found.log
+    program = find_program(tmp_path, "export")
+    assert program.status == 3
+    assert "why:" in program.log
     # The log of the earlier one stays in the file
-    assert "--version" not in found.log
+    assert "--version" not in program.log
 
 
 @pytest.fixture
@@ -84,8 +84,8 @@ def test_one_program_of_a_kind_runs_in_a_folder(programs, sleeping):
 def test_a_made_up_number_is_no_program_that_runs(tmp_path, content):
     (tmp_path / PROGRAM).mkdir()
     (tmp_path / PROGRAM / "scan.json").write_bytes(content)
-    found = find_program(tmp_path, "scan")
-    assert found is None or not found.running
+    program = find_program(tmp_path, "scan")
+    assert program is None or not program.running
 
 
 def test_a_log_is_shown_without_what_moves_a_terminal(tmp_path):
@@ -108,8 +108,8 @@ def test_a_scan_may_begin_beside_its_program_and_its_notes(tmp_path):
 def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
     with served_folder(tmp_path, TOKEN, config=RIG_FILE) as view:
         wrong = [
-            {"name": "a"} | more
-            for more in ({"plan": {"rows": 0}}, {"x": 1}, {"plan": {"columns": 1999}}, {"library": "no"})
+            {"name": "a"} | wrong_plan
+            for wrong_plan in ({"plan": {"rows": 0}}, {"x": 1}, {"plan": {"columns": 1999}}, {"library": "no"})
         ]
         for body, status in [({"name": "../out"}, 404), ({"name": ".hidden"}, 404), *((body, 400) for body in wrong)]:
             assert post(view, "/api/start", body)[0] == status, body
@@ -140,12 +140,12 @@ def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
 
 def test_what_a_page_leaves_beside_a_scan_is_no_fault_of_it(finished, tmp_path):
     shutil.copytree(finished, tmp_path / "one")
-    before = validate(tmp_path / "one")
+    state_before = validate(tmp_path / "one")
     (tmp_path / "one" / PROGRAM).mkdir()
     (tmp_path / "one" / PROGRAM / "scan.log").touch()
     (tmp_path / "one" / "operator.json").write_text('{"notes": "", "tags": []}')
     (tmp_path / "one" / "export").mkdir()
-    assert validate(tmp_path / "one") == before
+    assert validate(tmp_path / "one") == state_before
 
 
 @pytest.mark.parametrize("name", ["", "scan.log", "scan.json", "scan.status", "scan.part"])

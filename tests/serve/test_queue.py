@@ -42,11 +42,11 @@ def rig() -> Rig:
 @pytest.fixture
 def queue(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Queue]:
     monkeypatch.setattr(serve_queue, "LOOK_S", 0.01)
-    made = Queue(tmp_path / "queue", rig.start, lambda name: rig.states.get(name, "finished"))
+    rig_queue = Queue(tmp_path / "queue", rig.start, lambda name: rig.states.get(name, "finished"))
     for name in ("first", "second", "third"):
-        made.add(name, json.dumps({"name": name}).encode())
-    yield made
-    made.close()
+        rig_queue.add(name, json.dumps({"name": name}).encode())
+    yield rig_queue
+    rig_queue.close()
 
 
 def test_scans_start_in_order_when_the_rig_is_free(queue, rig):

@@ -85,14 +85,14 @@ def root(tmp_path) -> Path:
 @pytest.fixture
 def started(root, monkeypatch) -> Iterator[tuple[Any, list[list[str]]]]:
     """A server, and the command lines of the programs that it would start."""
-    found: list[list[str]] = []
+    collected: list[list[str]] = []
 
     def start(_self: Programs, _folder: Path, _kind: str, words: list[str | Path]) -> None:
-        found.append([str(word) for word in words])
+        collected.append([str(word) for word in words])
 
     monkeypatch.setattr(Programs, "start", start)
     with served_folder(root, TOKEN, config=RIG_FILE) as view:
-        yield view, found
+        yield view, collected
 
 
 def plain(value: Any, root: Path) -> Any:
@@ -130,8 +130,8 @@ def test_a_request_is_a_command_line_that_the_parser_takes(started, root, path, 
     assert words[0] == path.partition("?")[0].replace("start", "scan")
     given = vars(build_parser(words[0]).parse_args(join_negative_values(words)))
 
-    shown = {name: plain(given[name], root) for name in values}
-    assert shown == {name: plain(value, root) for name, value in values.items()}
+    arguments_shown = {name: plain(given[name], root) for name in values}
+    assert arguments_shown == {name: plain(value, root) for name, value in values.items()}
 
 
 def test_boxes_drawn_on_the_page_are_used_when_it_processes(started, root):

@@ -32,9 +32,9 @@ def desk(growing):
 def test_only_a_post_with_the_token_asks(desk, watching):
     folder, stop = desk
     with served(watching(folder, control=True), TOKEN) as view:
-        for given in ({}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN + "s"}, {TOKEN_HEADER: TOKEN[:-1]}):
+        for headers in ({}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN + "s"}, {TOKEN_HEADER: TOKEN[:-1]}):
             for command in ScanCommand:
-                status, body, _ = ask(view, f"/api/control/{command}?token={TOKEN}", "POST", **given)
+                status, body, _ = ask(view, f"/api/control/{command}?token={TOKEN}", "POST", **headers)
                 assert (status, "token" in json.loads(body)["what"]) == (403, True)
         for method in ("GET", "HEAD", "PUT", "DELETE", "OPTIONS", "TRACE", "PATCH"):
             assert ask(view, "/api/control/abort", method, **{TOKEN_HEADER: TOKEN})[0] in (404, 405)
@@ -49,8 +49,8 @@ def test_a_view_is_read_only_unless_told_otherwise(desk, watching):
     folder, stop = desk
     watch = watching(folder)
     with served(watch) as view:
-        for given in ({}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN}):
-            status, body, _ = ask(view, "/api/control/abort", "POST", **given)
+        for headers in ({}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN}):
+            status, body, _ = ask(view, "/api/control/abort", "POST", **headers)
             assert (status, json.loads(body)["code"]) == (403, ErrorCode.READ_ONLY)
     assert json.loads(watch.state.data)["control"] is False
     assert not stop.after_row
@@ -80,8 +80,8 @@ def test_loopback_is_the_default():
 
 def test_the_page_needs_nothing_from_elsewhere():
     for path in STATIC.iterdir():
-        found = set(re.findall(r"https?://[^\s\"'<)]+", path.read_text(encoding="utf-8")))
-        assert found <= {"http://www.w3.org/2000/svg"}, path
+        addresses = set(re.findall(r"https?://[^\s\"'<)]+", path.read_text(encoding="utf-8")))
+        assert addresses <= {"http://www.w3.org/2000/svg"}, path
     assert 'src="' in (STATIC / "watch.html").read_text()
 
 
@@ -91,17 +91,17 @@ def test_a_page_that_never_reads_holds_nobody_up(growing, watching):
     with served(watch) as view:
         deaf = []
         for _ in range(8):
-            one = socket.socket()
-            one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
-            one.connect(("127.0.0.1", view.port))
-            one.sendall(b"GET /api/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-            deaf.append(one)
+            connection = socket.socket()
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            connection.connect(("127.0.0.1", view.port))
+            connection.sendall(b"GET /api/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            deaf.append(connection)
         for rows in range(3):
             growing.grow_to("row_committed")
             watch.wait_for(lambda s, n=rows + 1: (s.get("pictures") or {}).get("rows") == n)
             assert json.loads(ask(view, "/api/state")[1])["pictures"]["rows"] == rows + 1
-        for one in deaf:
-            one.close()
+        for connection in deaf:
+            connection.close()
 
 
 def test_the_page_offers_every_format_of_exports():

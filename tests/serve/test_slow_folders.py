@@ -42,9 +42,9 @@ class DeadFolder:
 def dead(monkeypatch: pytest.MonkeyPatch) -> Iterator[DeadFolder]:
     monkeypatch.setattr(site, "READ_S", LIMIT_S)
     monkeypatch.setattr(scans, "READ_S", LIMIT_S)
-    made = DeadFolder(monkeypatch)
-    yield made
-    made.back.set()
+    dead_folder = DeadFolder(monkeypatch)
+    yield dead_folder
+    dead_folder.back.set()
 
 
 @pytest.fixture
@@ -57,8 +57,8 @@ def root(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def view(root: Path) -> Iterator[Served]:
-    with served_folder(root, TOKEN) as made:
-        yield made
+    with served_folder(root, TOKEN) as served:
+        yield served
 
 
 def wait_until_answered(view: Served, address: str) -> None:
@@ -70,12 +70,12 @@ def test_other_scans_are_read_while_one_folder_hangs(dead, view):
     dead.stop(reading, "read_result")
     answers: list[tuple[int, bytes, dict[str, str]]] = []
     many = [threading.Thread(target=lambda: answers.append(ask(view, "/api/result?scan=dead"))) for _ in range(20)]
-    for one in many:
-        one.start()
+    for request in many:
+        request.start()
     wait_until_answered(view, "/api/result?scan=alive")
     wait_until_answered(view, "/api/scans")
-    for one in many:
-        one.join()
+    for request in many:
+        request.join()
     assert {status for status, _, _ in answers} == {503}
     assert len(answers) == 20
     assert ErrorCode.NO_ANSWER.encode() in answers[0][1]
@@ -93,9 +93,9 @@ def test_notes_and_names_of_a_dead_folder_hold_nobody_up(dead, view):
 
 def test_a_list_shows_a_folder_that_does_not_answer_and_what_it_knew_of_it(dead, root):
     known = Scans(root)
-    before = known.list()
+    state_before = known.list()
     dead.stop(scans, "is_scan")
-    assert [s.name for s in known.list()] == [s.name for s in before]
+    assert [s.name for s in known.list()] == [s.name for s in state_before]
     assert {s.name: s.state for s in known.list()}["dead"] == "silent"
     listed = Scans(root)
     threads = threading.active_count()

@@ -89,8 +89,8 @@ def test_every_state_says_what_the_table_says(browser: Browser, still, size):
         )
         pressed = browser.value("[...document.getElementById('buttons').children].map(b => b.id).join()")
         assert set(filter(None, pressed.split(","))) == set(state.press), key
-        shown = browser.value("document.body.innerText")
-        assert not [phrase for phrase in state.never if phrase.casefold() in shown.casefold()], (key, shown)
+        page_text = browser.value("document.body.innerText")
+        assert not [phrase for phrase in state.never if phrase.casefold() in page_text.casefold()], (key, page_text)
         assert browser.value("document.documentElement.scrollWidth <= innerWidth"), key
         if state.do:
             assert browser.text("do"), key

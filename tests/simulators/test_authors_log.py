@@ -36,7 +36,7 @@ def positions_by_pauses(log: Path) -> list[int]:
     sizes = table[:, 1].astype(int)
     times = table[:, 2]
     frames: list[int] = []
-    packet = held = position = gathered = 0
+    packet = held_bytes = position = gathered = 0
     while packet < len(sizes):
         while (pause := times[gathered + 1] - times[gathered]) < 0.045:
             gathered += 1
@@ -44,10 +44,10 @@ def positions_by_pauses(log: Path) -> list[int]:
         if gathered < len(sizes) - 1:
             position += max(0, int(pause // 0.09) - 1)
         while packet < gathered:
-            while held < FRAME:
-                held += sizes[packet]
+            while held_bytes < FRAME:
+                held_bytes += sizes[packet]
                 packet += 1
-            held -= FRAME
+            held_bytes -= FRAME
             frames.append(position)
         position += 1
     return frames
@@ -90,6 +90,6 @@ def test_the_host_reads_rows_whose_last_packet_comes_late(
     for row in (0, 1):
         for board in ("RH", "RV"):
             missing = source.read_row(board, row).missing  # type: ignore[union-attr]
-            gone = sorted(skipped.get((board, row), ()))
+            skipped_positions = sorted(skipped.get((board, row), ()))
             burst = PULSES * FRAME
-            assert missing == [(i * burst, (i + 1) * burst) for i in gone]
+            assert missing == [(i * burst, (i + 1) * burst) for i in skipped_positions]

@@ -221,9 +221,9 @@ def test_the_receivers_queue_is_seen(rig: Instrument) -> None:
     with bound_udp(board.host_address, board.data_port) as receiver, bound_udp(board.card_address, 1024) as sender:
         assert queue.look() == (0, 0)
         sender.sendto(bytes(1000), (board.host_address, board.data_port))
-        seen = queue.look()
-        assert seen is not None
-        assert seen[0] >= 1000
+        queue_state = queue.look()
+        assert queue_state is not None
+        assert queue_state[0] >= 1000
         receiver.recv(2000)
         assert queue.look() == (0, 0)
     queue.close()

@@ -93,9 +93,9 @@ def test_the_same_seed_gives_the_same_bytes_and_the_counts_are_the_truth(rig: In
     assert len(places) == count("packets_made") - count("lost")
     arrived = sum(len(p) - 10 for p in packets)
     assert arrived == count("bytes_sent")
-    lost = count("lost_bytes") + count("truncated_bytes")
+    lost_bytes = count("lost_bytes") + count("truncated_bytes")
     extra = sum(len(p) - 10 for i, p in enumerate(packets) if p in packets[:i])
-    assert arrived == count("bytes_made") - lost + extra
+    assert arrived == count("bytes_made") - lost_bytes + extra
     assert count("bytes_made") == 100 * FRAME - count("overflow_bytes")
     assert count("overflow_bytes") == count("overflows") * FRAME // 2
     statuses = count("statuses") - 1
@@ -104,13 +104,13 @@ def test_the_same_seed_gives_the_same_bytes_and_the_counts_are_the_truth(rig: In
 
 def test_a_turned_bit_is_one_bit_of_the_payload_or_of_the_header(rig: Instrument) -> None:
     clean = packets_of_40_pulses(rig)
-    for key, at in (("corrupt", slice(10, None)), ("corrupt_header", slice(0, 10))):
+    for key, part in (("corrupt", slice(10, None)), ("corrupt_header", slice(0, 10))):
         dirty = packets_of_40_pulses(rig, **{key: 1.0})
         assert len(dirty) == len(clean)
         for a, b in zip(clean, dirty, strict=True):
             turned = np.bitwise_xor(np.frombuffer(a, np.uint8), np.frombuffer(b, np.uint8))
             assert np.unpackbits(turned).sum() == 1
-            assert np.unpackbits(turned[at]).sum() == 1
+            assert np.unpackbits(turned[part]).sum() == 1
 
 
 def test_the_ddr_overflow_has_its_own_bit_and_leaves_no_gap_in_the_sequence(
@@ -120,11 +120,11 @@ def test_the_ddr_overflow_has_its_own_bit_and_leaves_no_gap_in_the_sequence(
     bench.record(50)
     answer = bench.messages()
     packets = bench.packets()
-    lost = int(bench.counts["overflows"] or 0)
-    assert lost > 0
-    assert answer == [reply(0x0A, 1 << 7)] * lost + [reply(0x0A, 1 << 8)]
+    lost_frames = int(bench.counts["overflows"] or 0)
+    assert lost_frames > 0
+    assert answer == [reply(0x0A, 1 << 7)] * lost_frames + [reply(0x0A, 1 << 8)]
     assert [struct.unpack_from("<I", p)[0] for p in packets] == list(range(1, len(packets) + 1))
-    assert len(payload(packets)) == 50 * FRAME - lost * FRAME // 2
+    assert len(payload(packets)) == 50 * FRAME - lost_frames * FRAME // 2
 
 
 def test_the_link_is_down_for_a_time(rig: Instrument, sockets: ExitStack) -> None:
@@ -139,22 +139,22 @@ def test_the_link_is_down_for_a_time(rig: Instrument, sockets: ExitStack) -> Non
     bench.end()
     packets = bench.packets()
     counts = bench.counts
-    whole = bench.pattern(0, 30)
+    all_packets = bench.pattern(0, 30)
     for p in packets:
-        at = int.from_bytes(p[4:10], "little")
-        assert p[10:] == whole[at : at + len(p) - 10]
-    assert len(payload(packets)) == len(whole) - int(counts["link_down_bytes"] or 0)
+        byte_count = int.from_bytes(p[4:10], "little")
+        assert p[10:] == all_packets[byte_count : byte_count + len(p) - 10]
+    assert len(payload(packets)) == len(all_packets) - int(counts["link_down_bytes"] or 0)
     # Packets leave when they are full: the one that began before and was filled while the link was down is lost too.
     assert counts["link_down_packets"] == 20 * FRAME // 1456 - 10 * FRAME // 1456
     assert counts["requests_unheard"] == 1
 
 
 def test_a_link_that_is_down_does_not_shift_other_faults(rig: Instrument) -> None:
-    others = {"loss": 0.3, "corrupt": 0.3}
-    whole = set(packets_of_40_pulses(rig, **others))
-    broken = set(packets_of_40_pulses(rig, **others, link_down=[[10, 0.015]]))
-    assert broken < whole
-    assert {p[4:10] for p in whole - broken} <= {n.to_bytes(6, "little") for n in range(9 * FRAME, 20 * FRAME)}
+    other_items = {"loss": 0.3, "corrupt": 0.3}
+    all_packets = set(packets_of_40_pulses(rig, **other_items))
+    broken = set(packets_of_40_pulses(rig, **other_items, link_down=[[10, 0.015]]))
+    assert broken < all_packets
+    assert {p[4:10] for p in all_packets - broken} <= {n.to_bytes(6, "little") for n in range(9 * FRAME, 20 * FRAME)}
 
 
 def test_the_end_of_a_record_is_lost_with_the_link(rig: Instrument, sockets: ExitStack) -> None:

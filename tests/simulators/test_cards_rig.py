@@ -33,12 +33,12 @@ def launch(tmp_path):
 
 def children(program: Program) -> dict[str, int]:
     """Process ids below the rig, by module."""
-    found = {}
+    collected = {}
     pid = program.process.pid
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         words = Path(f"/proc/{child}/cmdline").read_bytes().decode().split("\0")
-        found[next((w for w in words if w.startswith("polysight_simulators.")), words[0])] = int(child)
-    return found
+        collected[next((w for w in words if w.startswith("polysight_simulators.")), words[0])] = int(child)
+    return collected
 
 
 def test_the_rig_starts_writes_its_rig_file_and_truth_and_ends_everything(launch, tmp_path):

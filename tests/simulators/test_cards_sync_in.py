@@ -82,10 +82,10 @@ def test_without_burst_motion_all_pulses_of_a_burst_are_at_its_middle() -> None:
         # The next trigger may be known already
         track.trigger(trigger + 100_000_000)
     x, _ = moving.offsets_mm(times)
-    held, _ = frozen.offsets_mm(times)
+    frozen_x_mm, _ = frozen.offsets_mm(times)
     assert np.ptp(x) == pytest.approx(0.45)
-    assert np.ptp(held) == 0.0
-    assert held[0] == pytest.approx(np.mean(x))
+    assert np.ptp(frozen_x_mm) == 0.0
+    assert frozen_x_mm[0] == pytest.approx(np.mean(x))
 
 
 @pytest.mark.parametrize("disturbed", [{}, {"backlash_mm": 0.3}, {"backlash_mm": -2.5, "burst_motion": False}])
@@ -97,8 +97,8 @@ def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, 
         track = StageTrack(RIG, d.burst_motion, d.backlash_mm)
         bursts = [at_point(track, index, row.column(i), 10**9 + i * 10**8) for i in range(row.points)]
         sent = [pulse for burst in bursts for pulse in burst]
-        at = track.offsets_mm([pulse.t_ns for pulse in sent])
-        for answer, true in zip(at, row_offsets_mm(radar, row), strict=True):
+        offsets_mm = track.offsets_mm([pulse.t_ns for pulse in sent])
+        for answer, true in zip(offsets_mm, row_offsets_mm(radar, row), strict=True):
             np.testing.assert_allclose(answer, true, atol=1e-3)
         first = index * row.points * RIG.burst.pulses
         assert [p.number for p in track.places(sent)] == list(range(first, first + len(sent)))
@@ -121,8 +121,8 @@ def test_a_pulse_has_the_number_of_its_place_whenever_it_comes(row: int, column:
     first = (row * RIG.grid.columns + point) * RIG.burst.pulses
     track = StageTrack(RIG)
     for again in (0, 10**11):
-        found = track.places(at_point(track, row, column, t_ns + again))
-        assert [p.number for p in found] == list(range(first, first + RIG.burst.pulses))
+        numbered = track.places(at_point(track, row, column, t_ns + again))
+        assert [p.number for p in numbered] == list(range(first, first + RIG.burst.pulses))
 
 
 def test_a_pulse_of_no_point_keeps_its_number() -> None:

@@ -33,11 +33,11 @@ def rows(n: int) -> np.ndarray:
 def arrivals(faults: Faults, sizes: list[int], seed: int = 1, board: str = "RH") -> list[bytes]:
     network = NetworkFaults(faults, seed, board)
     data = rows(sum(sizes))
-    at = 0
+    first = 0
     out = []
     for size in sizes:
-        out += [r.tobytes() for part in network.carry(data[at : at + size]) for r in part]
-        at += size
+        out += [r.tobytes() for part in network.carry(data[first : first + size]) for r in part]
+        first += size
     assert (data == rows(sum(sizes))).all(), "what was sent stays as it was"
     return out + [r.tobytes() for part in network.drain() for r in part]
 
@@ -85,19 +85,19 @@ def test_overflow_takes_the_second_half_of_single_frames() -> None:
     frames = np.arange(100 * 8, dtype=np.int16).reshape(100, 2, 4)
     runs = OverflowFaults(Faults(overflow=0.3), 5, "RH").split(frames)
     assert {run.status for run in runs} <= {None, Status.LVDS_BUFFER_FULL}
-    lost = sum(run.status is not None for run in runs)
-    assert 10 < lost < 60
-    assert sum(run.lost_bytes for run in runs) == lost * 8
+    overflows = sum(run.status is not None for run in runs)
+    assert 10 < overflows < 60
+    assert sum(run.lost_bytes for run in runs) == overflows * 8
     joined = np.concatenate([run.data.reshape(-1) for run in runs])
-    assert len(joined) == 100 * 8 - lost * 4
+    assert len(joined) == 100 * 8 - overflows * 4
     assert np.all(np.diff(joined) > 0)
 
 
 def test_missed_pulses_are_those_named() -> None:
     pulses = [Pulse(i, 1000 * i) for i in range(10)]
     faults = PulseFaults(Faults(miss_pulses=(0, 4)), 0, "RH")
-    seen = faults.select_seen(pulses[:5]) + faults.select_seen(pulses[5:])
-    assert [p.number for p in seen] == [1, 2, 3, 5, 6, 7, 8, 9]
+    pulses_seen = faults.select_seen(pulses[:5]) + faults.select_seen(pulses[5:])
+    assert [p.number for p in pulses_seen] == [1, 2, 3, 5, 6, 7, 8, 9]
     assert faults.missed == 2
 
 
@@ -133,6 +133,6 @@ def test_a_fault_file_holds_faults_only(tmp_path: Path) -> None:
 )
 def test_a_fault_that_cannot_happen_with_the_rigs_radars_is_refused(fault: str, control: str) -> None:
     assert read_faults(None, [fault], ("RH",), control=control)["RH"] != Faults()
-    for other in {"endless", "line_server", "native"} - {control}:
-        with refused(ErrorCode.VALUES_CONFLICT, fault.partition("=")[0], other):
-            read_faults(None, [fault], ("RH",), control=other)
+    for foreign_control in {"endless", "line_server", "native"} - {control}:
+        with refused(ErrorCode.VALUES_CONFLICT, fault.partition("=")[0], foreign_control):
+            read_faults(None, [fault], ("RH",), control=foreign_control)

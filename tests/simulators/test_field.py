@@ -92,12 +92,12 @@ def test_a_metal_plate_in_the_middle_is_within_a_factor_of_1_5_of_the_direct_pat
 
 
 def test_echoes_add_up() -> None:
-    rig, both = setup(plates=PLATES)
+    rig, both_plates = setup(plates=PLATES)
     parts = [setup(plates=[p])[1] for p in PLATES]
     offsets = np.array([[0.01, 0.02]])
     f = np.array([77e9, 80e9])
     for board in rig.receivers:
-        total = field_exact(rig, both, board, offsets, f)
+        total = field_exact(rig, both_plates, board, offsets, f)
         assert np.allclose(total, sum(field_exact(rig, s, board, offsets, f) for s in parts), atol=1e-12)
 
 
@@ -146,8 +146,8 @@ def test_a_cached_field_is_the_same_field(tmp_path: Path) -> None:
     assert np.array_equal(first.values, second.values)
     assert first.start_m == second.start_m
     assert first.step_m == second.step_m
-    other = build_field(rig, scene.with_disturbances(leakage_h=[0.2, 0.0]), board, samples, tmp_path)
-    assert not np.array_equal(first.values, other.values)
+    leaking_field = build_field(rig, scene.with_disturbances(leakage_h=[0.2, 0.0]), board, samples, tmp_path)
+    assert not np.array_equal(first.values, leaking_field.values)
     for path in tmp_path.iterdir():
         path.write_bytes(b"torn")
     with refused(ErrorCode.FILE_DAMAGED):
@@ -188,6 +188,6 @@ def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None
     inside_m = 2 * thick_m * np.sqrt(eps - np.sin(theta) ** 2)
     for board in rig.receivers:
         reflect = board_reflectivity(board, Scene("one sheet", plates=(sheet,)).with_disturbances(ideal=True))
-        seen = np.abs(later @ np.array([complex(reflect(sheet, hz, theta)) for hz in f]))
-        back = np.where(np.abs(path_m) > 0.15, seen, 0)
+        amplitudes = np.abs(later @ np.array([complex(reflect(sheet, hz, theta)) for hz in f]))
+        back = np.where(np.abs(path_m) > 0.15, amplitudes, 0)
         assert abs(path_m[np.argmax(back)] - inside_m) < 0.01

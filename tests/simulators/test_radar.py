@@ -98,13 +98,13 @@ def test_an_undisturbed_chirp_repeats() -> None:
 def test_pulses_do_not_depend_on_the_batch() -> None:
     x = np.linspace(-30, 30, 70)
     y = np.full(70, 5.0)
-    whole = default_radar().chirps("RH", x, y)
-    other = default_radar()
-    parts = [other.chirps("RH", x[a:b], y[a:b]) for a, b in ((0, 1), (1, 17), (17, 70))]
+    all_chirps = default_radar().chirps("RH", x, y)
+    batched_radar = default_radar()
+    parts = [batched_radar.chirps("RH", x[a:b], y[a:b]) for a, b in ((0, 1), (1, 17), (17, 70))]
     # A rounding of float32
-    assert np.abs(whole.astype(int) - np.concatenate(parts)).max() <= 1
+    assert np.abs(all_chirps.astype(int) - np.concatenate(parts)).max() <= 1
     late = default_radar().chirps("RH", x[40:], y[40:], first_pulse=40)
-    assert np.abs(whole[40:].astype(int) - late).max() <= 1
+    assert np.abs(all_chirps[40:].astype(int) - late).max() <= 1
 
 
 def test_the_same_seed_repeats_and_another_seed_or_take_does_not() -> None:
@@ -112,8 +112,8 @@ def test_the_same_seed_repeats_and_another_seed_or_take_does_not() -> None:
     y = np.zeros(4)
     first = default_radar(seed=5).chirps("RV", x, y, 0)
     assert np.array_equal(first, default_radar(seed=5).chirps("RV", x, y, 0))
-    for other in (default_radar(seed=6).chirps("RV", x, y, 0), default_radar(seed=5).chirps("RV", x, y, 4)):
-        assert np.mean(first == other) < 0.1
+    for chirps in (default_radar(seed=6).chirps("RV", x, y, 0), default_radar(seed=5).chirps("RV", x, y, 4)):
+        assert np.mean(first == chirps) < 0.1
 
 
 def test_random_numbers_of_pulses_are_uniform_and_independent_of_batches() -> None:
@@ -130,9 +130,9 @@ def test_random_numbers_of_pulses_are_uniform_and_independent_of_batches() -> No
 
 def test_timing_shifts_the_if_by_slope_times_delay_and_turns_the_phase() -> None:
     on = radar(sync_uncertainty_ns=5.0)
-    off = radar()
+    undisturbed = radar()
     n = 40
-    ratio = on.signals("RH", np.zeros(n), np.zeros(n)) / off.signals("RH", np.zeros(n), np.zeros(n))
+    ratio = on.signals("RH", np.zeros(n), np.zeros(n)) / undisturbed.signals("RH", np.zeros(n), np.zeros(n))
     h = on.rig.by_name("RH")
     tx = on.rig.transmitter
     pulses = np.arange(n)
@@ -164,13 +164,13 @@ def test_h_and_v_have_independent_timing_relative_to_the_transmitter() -> None:
 
 def test_one_ppm_of_crystal_is_76_khz_and_a_slope_error() -> None:
     on = radar(crystal_ppm={"receive_h": 1.0})
-    off = radar()
-    turn = np.angle(on.signals("RH", ZERO, ZERO)[0, 0] / off.signals("RH", ZERO, ZERO)[0, 0])
+    undisturbed = radar()
+    turn = np.angle(on.signals("RH", ZERO, ZERO)[0, 0] / undisturbed.signals("RH", ZERO, ZERO)[0, 0])
     t = np.arange(256) / on.rig.chirp.sample_rate_hz
     c2, c1, _ = np.polyfit(t, np.unwrap(turn) / 2 / np.pi, 2)
     assert abs(c1 - 1e-6 * on.rig.chirp.first_sample_hz) < 10
     assert abs(2 * c2 / (2e-6 * on.rig.chirp.slope_hz_per_s) - 1) < 0.01
-    assert np.array_equal(on.signals("RV", ZERO, ZERO), off.signals("RV", ZERO, ZERO))
+    assert np.array_equal(on.signals("RV", ZERO, ZERO), undisturbed.signals("RV", ZERO, ZERO))
 
 
 def test_the_direct_path_sits_near_1_05_mhz_and_inside_the_band() -> None:
@@ -208,8 +208,8 @@ def test_phase_is_uniform_from_chirp_to_chirp() -> None:
 def test_the_chirp_bends_only_after_the_linear_samples(board: str) -> None:
     for seed in range(3):
         on = radar(seed, bend_hz=300e3, ripple_hz=3e3)
-        off = radar(seed)
-        turn = np.unwrap(np.angle(on.signals(board, ZERO, ZERO)[0, 0] / off.signals(board, ZERO, ZERO)[0, 0]))
+        undisturbed = radar(seed)
+        turn = np.unwrap(np.angle(on.signals(board, ZERO, ZERO)[0, 0] / undisturbed.signals(board, ZERO, ZERO)[0, 0]))
         k = np.arange(192)
         rest = turn[:192] - np.polyval(np.polyfit(k, turn[:192], 1), k)
         assert 1e-4 < np.abs(rest).max() < 0.1
@@ -218,9 +218,9 @@ def test_the_chirp_bends_only_after_the_linear_samples(board: str) -> None:
 
 
 def test_the_filter_has_3_db_at_each_corner() -> None:
-    for corner, other in ((175e3, 350e3), (350e3, 175e3)):
+    for corner, other_corner in ((175e3, 350e3), (350e3, 175e3)):
         h, _ = high_pass(np.array(corner), RIG.chirp)
-        section = h * (1 - 1j * other / corner)
+        section = h * (1 - 1j * other_corner / corner)
         assert abs(abs(section) ** 2 - 0.5) < 1e-12
     far, _ = high_pass(np.array(1e9), RIG.chirp)
     assert abs(far - 1) < 1e-3
@@ -234,9 +234,9 @@ def test_the_filter_has_3_db_at_each_corner() -> None:
 
 def test_each_path_goes_through_the_filter_at_its_own_if() -> None:
     on = radar(tables={"points": [POINT]}, hpf=True, if_offset_hz=870e3)
-    off = radar(tables={"points": [POINT]}, if_offset_hz=870e3)
+    undisturbed = radar(tables={"points": [POINT]}, if_offset_hz=870e3)
     direct = radar(if_offset_hz=870e3).signals("RH", ZERO, ZERO)[0, 0]
-    echo = off.signals("RH", ZERO, ZERO)[0, 0] - direct
+    echo = undisturbed.signals("RH", ZERO, ZERO)[0, 0] - direct
     ant = antennas(on.rig, on.rig.by_name("RH"))
     target = ant.centre_m + np.array([*POINT["position_mm"], 0.0]) / 1e3
     path = np.linalg.norm(target - ant.tx_m) + np.linalg.norm(target - ant.rx_m[0])
@@ -250,8 +250,8 @@ def test_each_path_goes_through_the_filter_at_its_own_if() -> None:
 
 def test_gains_are_within_their_spread_fixed_for_a_power_cycle_and_new_in_the_next() -> None:
     on = radar(3, rx_gain_spread_db=1.0, rx_phase_spread_deg=20.0)
-    off = radar(3)
-    gain = on.signals("RV", np.zeros(2), np.zeros(2)) / off.signals("RV", np.zeros(2), np.zeros(2))
+    undisturbed = radar(3)
+    gain = on.signals("RV", np.zeros(2), np.zeros(2)) / undisturbed.signals("RV", np.zeros(2), np.zeros(2))
     assert np.allclose(gain, gain[:1, :, :1], atol=1e-5)
     per_rx = gain[0, :, 0]
     assert np.abs(20 * np.log10(np.abs(per_rx))).max() <= 1.0
@@ -272,7 +272,7 @@ def test_leakage_reaches_direct_path_and_object() -> None:
     tables = {"plates": [{**PLATE, "metal": False, "permittivity": [4.0, 0.4]}]}
     leak = [0.06, -0.03]
     on = radar(tables=tables, leakage_v=leak)
-    off = radar(tables=tables)
+    undisturbed = radar(tables=tables)
     empty_on = radar(leakage_v=leak)
     empty_off = radar()
     ratio = empty_on.signals("RV", ZERO, ZERO) / empty_off.signals("RV", ZERO, ZERO)
@@ -281,16 +281,16 @@ def test_leakage_reaches_direct_path_and_object() -> None:
     echo = (on.signals("RV", ZERO, ZERO) - empty_on.signals("RV", ZERO, ZERO))[0, 0, 100]
     exact = field_exact(on.rig, on.scene, on.rig.by_name("RV"), np.zeros((1, 2)), f)[0, 0]
     assert abs(echo - exact) < 2e-3 * abs(exact)
-    plain = (off.signals("RV", ZERO, ZERO) - empty_off.signals("RV", ZERO, ZERO))[0, 0, 100]
+    plain = (undisturbed.signals("RV", ZERO, ZERO) - empty_off.signals("RV", ZERO, ZERO))[0, 0, 100]
     assert abs(echo / plain - 1) > 0.05
-    assert np.array_equal(on.signals("RH", ZERO, ZERO), off.signals("RH", ZERO, ZERO))
+    assert np.array_equal(on.signals("RH", ZERO, ZERO), undisturbed.signals("RH", ZERO, ZERO))
 
 
 def test_noise_has_the_set_ratio_on_every_channel_and_averages_down() -> None:
     on = radar(direct_snr_db=5.5, rx_gain_spread_db=1.0)
-    off = radar(rx_gain_spread_db=1.0)
+    undisturbed = radar(rx_gain_spread_db=1.0)
     n = 160
-    clean = off.signals("RH", ZERO, ZERO)
+    clean = undisturbed.signals("RH", ZERO, ZERO)
     noise = on.signals("RH", np.zeros(n), np.zeros(n)) - clean
     snr = 10 * np.log10(np.mean(np.abs(clean) ** 2, axis=(0, 2)) / np.mean(np.abs(noise) ** 2, axis=(0, 2)))
     assert np.allclose(snr, 5.5, atol=0.15)
@@ -319,10 +319,10 @@ def test_clipping_is_bounded_and_counted() -> None:
     loud = radar(adc_full_scale=0.5)
     quiet = radar(adc_full_scale=2.0)
     frames = loud.chirps("RH", ZERO, ZERO)
-    wanted = quiet.signals("RH", ZERO, ZERO).view(np.float32)
+    expected = quiet.signals("RH", ZERO, ZERO).view(np.float32)
     assert frames.max() == 32767
     assert frames.min() == -32768
-    assert loud.clipped["RH"] == int(np.sum(np.rint(np.abs(wanted) * np.float32(32767 / 0.5)) > 32767))
+    assert loud.clipped["RH"] == int(np.sum(np.rint(np.abs(expected) * np.float32(32767 / 0.5)) > 32767))
     assert loud.clipped["RH"] > 0
     quiet.chirps("RH", ZERO, ZERO)
     assert quiet.clipped == {"LS": 0, "RH": 0, "RV": 0}

@@ -44,10 +44,10 @@ def fields(n: int = 12, role: str = "receive_h", rx: int = 1, **tables: Any) -> 
     samples = sample_frequencies_hz(rig)
     field = build_field(rig, scene, board, samples)
     offsets = np.random.default_rng(0).uniform(-1, 1, (n, 2)) * [0.1, 0.07]
-    at = [0, 128, 255]
-    carrier = np.exp(2j * np.pi * samples[at] * field.centre_path_m / SPEED_OF_LIGHT_M_S)
-    fast = field.interpolate(offsets[:, 0], offsets[:, 1])[:, rx] @ node_matrix(field, samples)[0][:, at] * carrier
-    return fast, field_exact(rig, scene, board, offsets, samples[at], rx)
+    nodes = [0, 128, 255]
+    carrier = np.exp(2j * np.pi * samples[nodes] * field.centre_path_m / SPEED_OF_LIGHT_M_S)
+    fast = field.interpolate(offsets[:, 0], offsets[:, 1])[:, rx] @ node_matrix(field, samples)[0][:, nodes] * carrier
+    return fast, field_exact(rig, scene, board, offsets, samples[nodes], rx)
 
 
 def rms_error(fast: np.ndarray, exact: np.ndarray) -> float:
@@ -103,13 +103,13 @@ def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
 def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_rig() -> None:
     rig, shifted = setup(plates=[PLATE], plane_shift_mm=1.5)
     assert rig.geometry.object_distance_mm == 499.0
-    there, distant = setup(plates=[PLATE], object_distance_mm=500.5)
+    nearer, distant = setup(plates=[PLATE], object_distance_mm=500.5)
     board = rig.receivers[0]
     offsets = np.array([[0.01, -0.02], [0.04, 0.03]])
     f = np.array([77e9, 80e9])
     got = field_exact(rig, shifted, board, offsets, f)
     # The image centre does not depend on the distance: both boards' antennas lie at z = 0.
-    assert np.abs(got - field_exact(there, distant, board, offsets, f)).max() < 1e-3 * np.abs(got).max()
+    assert np.abs(got - field_exact(nearer, distant, board, offsets, f)).max() < 1e-3 * np.abs(got).max()
 
 
 def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitude() -> None:
@@ -136,10 +136,10 @@ def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitu
 def test_a_tilted_plates_image_stays_where_it_is() -> None:
     """The direct sum over the aperture, at the true plane, has its middle at the plate's centre for any tilt."""
     centre = np.array([20.0, -12.0])
-    found = [middle_of_image({**PLATE, "centre_mm": centre.tolist(), "tilt_deg": [t, t]}) for t in (0.0, 1.0)]
-    for middle in found:
+    summaries = [middle_of_image({**PLATE, "centre_mm": centre.tolist(), "tilt_deg": [t, t]}) for t in (0.0, 1.0)]
+    for middle in summaries:
         assert np.abs(middle - centre).max() < 3.0
-    assert np.abs(found[1] - found[0]).max() < 2.0
+    assert np.abs(summaries[1] - summaries[0]).max() < 2.0
 
 
 def middle_of_image(plate: dict[str, Any]) -> np.ndarray:

@@ -146,10 +146,10 @@ def test_a_connected_socket_gets_no_replies_because_they_come_from_port_1024(pla
 
 def test_each_record_plays_it_again_and_stop_ends_a_loop(play: Play, recording: Path) -> None:
     client = play(recording, "--loop", "--rate-mbit", "80")
-    whole = recording.read_bytes() * 3
+    all_bytes = recording.read_bytes() * 3
     assert client.send(START) == OK[5]
     n = (2 * len(recording.read_bytes())) // 1456 * 1456
-    assert client.packets(n) == whole[:n]
+    assert client.packets(n) == all_bytes[:n]
     assert client.send(STOP) == OK[6]
     assert client.commands.recv(100) == bytes.fromhex("5aa50a000001aaee")
 

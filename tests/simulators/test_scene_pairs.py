@@ -78,12 +78,12 @@ def changed(scene: dict[str, Any], path: Path_, value: Any) -> dict[str, Any]:
 def allowed(path: Path_) -> list[Any]:
     """Values with which the scene is accepted when nothing else is changed."""
     rig = published_rig()
-    found = []
+    collected = []
     for value in VALUES:
         with contextlib.suppress(ConfigError):
             apply_scene(rig, decode_scene(changed(SCENE, path, value), "t"))
-            found.append(value)
-    return found
+            collected.append(value)
+    return collected
 
 
 class Hangs(Exception):  # noqa: N818 (a fault of the program, raised in it)

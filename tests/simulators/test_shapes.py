@@ -45,11 +45,11 @@ def test_a_level_plate_is_the_same_as_a_shape_and_as_a_plate(medium, error):
     of_plates = reference_cube(RIG, scene(plates=[{"name": "plate", **place}]))
     ratios = []
     for name in of_shapes:
-        seen = of_shapes[name]
+        spectrum = of_shapes[name]
         expected = of_plates[name]
-        ratio = np.vdot(expected, seen) / np.vdot(expected, expected)
+        ratio = np.vdot(expected, spectrum) / np.vdot(expected, expected)
         ratios.append(ratio)
-        assert np.linalg.norm(seen - ratio * expected) < 0.15 * np.linalg.norm(expected)
+        assert np.linalg.norm(spectrum - ratio * expected) < 0.15 * np.linalg.norm(expected)
     # Two models of antennas and obliquity; the phase is the same.
     assert ratios == pytest.approx([1, 1], abs=error)
 
@@ -64,8 +64,8 @@ def test_a_recorded_scan_of_a_sphere_is_processed_to_the_samples_it_was_made_of(
     first, last = RIG.chirp.linear_samples
     for name, row in pipeline.synchronise_row(2).items():
         assert row.valid.all()
-        made = synced_cube(RIG, ball, name)[:, 2, :, first:last]
-        blocks = flatten(fold(np.ascontiguousarray(made, np.complex64)))
+        cube = synced_cube(RIG, ball, name)[:, 2, :, first:last]
+        blocks = flatten(fold(np.ascontiguousarray(cube, np.complex64)))
         common = np.vdot(blocks, row.samples) / np.vdot(blocks, blocks)
         assert np.linalg.norm(row.samples / common - blocks) < 0.015 * np.linalg.norm(blocks)
 

@@ -112,13 +112,13 @@ def test_truth_json_has_plates_and_points(folder: Path) -> None:
 
 
 def test_the_authors_layout_contains_the_same_bytes(tmp_path: Path) -> None:
-    own = simulate(RIG, LOSSY, tmp_path / "own", started_s=0.0)
+    own_folder = simulate(RIG, LOSSY, tmp_path / "own", started_s=0.0)
     theirs = simulate(RIG, LOSSY, tmp_path / "theirs", layout="authors", started_s=100.0)
     assert theirs.parent == tmp_path / "theirs" / "unsynced"
     for row, stem in enumerate(("0_0", "4_1", "0_2")):
         for board in ("RH", "RV"):
             assert (theirs / board / f"{stem}.bin").read_bytes() == (
-                own / "raw" / board / f"{row:04d}.bin"
+                own_folder / "raw" / board / f"{row:04d}.bin"
             ).read_bytes()
         assert (theirs / "LS" / f"{stem}.bin").stat().st_size == 5 * 16 * 4096
     cfg = json.loads((theirs / "data_collection_cfg.json").read_text())

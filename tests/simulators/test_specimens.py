@@ -40,8 +40,8 @@ def test_draws_depend_on_seed_and_index_and_repeating_changes_nothing() -> None:
     drawn = draw_specimens(two)
     assert draw_specimens(drawn) == drawn == draw_specimens(two)
     assert drawn.plates[0].permittivity != drawn.plates[1].permittivity
-    other = scene(plates=[PLATE, PLATE], specimen_spread=[0.05, 0.3], seed=2)
-    assert draw_specimens(other).plates[0].permittivity != drawn.plates[0].permittivity
+    other_seed = scene(plates=[PLATE, PLATE], specimen_spread=[0.05, 0.3], seed=2)
+    assert draw_specimens(other_seed).plates[0].permittivity != drawn.plates[0].permittivity
     assert draw_specimens(scene()) == scene()
 
 
@@ -74,12 +74,15 @@ def test_shift_and_tilt_of_the_plane_apply_to_its_plates_and_points() -> None:
 
 def test_facets_fill_the_plate_and_have_the_given_roughness() -> None:
     plate = scene(plates=[{**PLATE, "rough_mm": 0.2, "rough_length_mm": 1.0}]).plates[0]
-    found = facets(plate, 0, 1)
-    assert found.height_m.shape == (30, 45)
-    assert found.height_m.std() == pytest.approx(0.2e-3, rel=0.05)
-    assert np.allclose([found.x_m[-1] + found.size_m[0] / 2, found.y_m[0] - found.size_m[1] / 2], [22.5e-3, -15e-3])
-    assert not np.array_equal(found.height_m, facets(plate, 1, 1).height_m)
-    assert np.array_equal(found.height_m, facets(plate, 0, 1).height_m)
+    drawn = facets(plate, 0, 1)
+    assert drawn.height_m.shape == (30, 45)
+    assert drawn.height_m.std() == pytest.approx(0.2e-3, rel=0.05)
+    assert np.allclose(
+        [drawn.x_m[-1] + drawn.size_m[0] / 2, drawn.y_m[0] - drawn.size_m[1] / 2],
+        [22.5e-3, -15e-3],
+    )
+    assert not np.array_equal(drawn.height_m, facets(plate, 1, 1).height_m)
+    assert np.array_equal(drawn.height_m, facets(plate, 0, 1).height_m)
 
 
 @pytest.mark.parametrize(
@@ -136,9 +139,9 @@ def test_the_rig_contains_leakage_as_measured() -> None:
 def test_measured_leakage_has_its_standard_error() -> None:
     errors = []
     for seed in range(200):
-        one = scene(seed=seed, disturbances={"ideal": True, "leakage_measured": 0.01})
-        p = apply_scene(RIG, one).polarimetry
-        assert apply_scene(apply_scene(RIG, one), one).polarimetry == p
+        drawn_scene = scene(seed=seed, disturbances={"ideal": True, "leakage_measured": 0.01})
+        p = apply_scene(RIG, drawn_scene).polarimetry
+        assert apply_scene(apply_scene(RIG, drawn_scene), drawn_scene).polarimetry == p
         errors += [*p.leakage_h, *p.leakage_v]
     assert np.std(errors) == pytest.approx(0.01, rel=0.1)
 

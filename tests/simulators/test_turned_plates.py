@@ -41,19 +41,19 @@ def test_a_tilted_dielectric_changes_as_in_vector_physical_optics(permittivity):
         material = {"metal": True}
     else:
         material = {"permittivity": (permittivity.real, -permittivity.imag)}
-    seen = []
+    calls = []
     expected = []
     for rise_deg in (0.0, 1.0, -1.0):
         world = World((PlateOfWorlds("a", (x_m, y_m), (0.05, 0.05), stack, tilt_y_deg=rise_deg),))
         images = simulate(world, pixels=30)
         middle = slice(8, 22)
-        seen.append(images.v[middle, middle].sum() / images.h[middle, middle].sum())
+        calls.append(images.v[middle, middle].sum() / images.h[middle, middle].sum())
         if permittivity is None:
             material = {"metal": True}
         else:
             material = {"permittivity": (permittivity.real, -permittivity.imag)}
         h, v = turned_reflection(plate(rise_deg, **material), 78e9, np.array(THETA))
         expected.append(complex(v) / complex(h))
-    change, predicted = (np.array(ratios[1:]) / ratios[0] - 1 for ratios in (seen, expected))
+    change, predicted = (np.array(ratios[1:]) / ratios[0] - 1 for ratios in (calls, expected))
     # First order; boards see it from 53 to 58 degrees
     assert change == pytest.approx(predicted, rel=0.12, abs=2e-3)

@@ -41,7 +41,8 @@ class Undisturbed(SmallScan):
         self._of = samples
         self._folder = folder
         assert self.run().exit_status == "success"
-        self.digests, self.final_image = self.rows(), self.image()
+        self.digests = self.rows()
+        self.final_image = self.image()
 
     def copy(self, folder: Path) -> SmallScan:
         """The same scan and journal in another folder, replaced if it is there."""

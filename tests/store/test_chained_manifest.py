@@ -36,25 +36,25 @@ def lines(tmp_path_factory) -> list[bytes]:
 
 
 def test_a_whole_chain_has_no_faults_and_facts_are_without_it(lines):
-    found = parse(b"".join(lines))
-    assert (len(found.facts), found.faults) == (len(SOME), [])
+    content = parse(b"".join(lines))
+    assert (len(content.facts), content.faults) == (len(SOME), [])
 
 
 @given(st.integers(0, len(SOME) - 2), st.integers(1, 3))
 def test_lines_taken_out_are_missed_and_the_others_stand(lines, at, many):
-    left = [*lines[:at], *lines[min(at + many, len(SOME) - 1) :]]
-    found = parse(b"".join(left))
-    assert len(found.facts) == len(left)
-    assert [(f.facts["line"], f.facts["lost"]) for f in found.faults] == [(at + 1, len(lines) - len(left))]
+    remaining = [*lines[:at], *lines[min(at + many, len(SOME) - 1) :]]
+    content = parse(b"".join(remaining))
+    assert len(content.facts) == len(remaining)
+    assert [(f.facts["line"], f.facts["lost"]) for f in content.faults] == [(at + 1, len(lines) - len(remaining))]
 
 
 def test_a_line_that_was_replaced_is_missed(lines):
-    other = json.loads(lines[3])
-    other["row"] = 77
-    del other["crc"]
-    found = parse(b"".join([*lines[:3], encode_line(other), *lines[4:]]))
-    assert [f.facts["line"] for f in found.faults] == [5]
-    assert "line before" in found.faults[0].what
+    changed_fact = json.loads(lines[3])
+    changed_fact["row"] = 77
+    del changed_fact["crc"]
+    content = parse(b"".join([*lines[:3], encode_line(changed_fact), *lines[4:]]))
+    assert [f.facts["line"] for f in content.faults] == [5]
+    assert "line before" in content.faults[0].what
 
 
 def test_repeated_lines_are_noticed(lines):
@@ -64,13 +64,13 @@ def test_repeated_lines_are_noticed(lines):
 @pytest.mark.parametrize("damage", [b"{}\n", b"\x00\xff\n", b""])
 def test_a_damaged_line_is_one_fault_and_the_chain_goes_on_behind_it(tmp_path, damage):
     lines = chained(tmp_path)
-    left = [*lines[:3], damage, *lines[4:]]
-    (tmp_path / MANIFEST).write_bytes(b"".join(left))
+    remaining = [*lines[:3], damage, *lines[4:]]
+    (tmp_path / MANIFEST).write_bytes(b"".join(remaining))
     with ManifestWriter(tmp_path / MANIFEST, create=False) as writer:
         writer.append({"fact": "scan_resumed"})
-    found = manifest.read(tmp_path / MANIFEST)
-    assert found.facts[-1] == typed({"fact": "scan_resumed"})
-    assert [f.facts["line"] for f in found.faults] == [4]
+    content = manifest.read(tmp_path / MANIFEST)
+    assert content.facts[-1] == typed({"fact": "scan_resumed"})
+    assert [f.facts["line"] for f in content.faults] == [4]
 
 
 def test_a_manifest_without_chain_reads_as_before_and_goes_on_with_one(tmp_path):
@@ -103,12 +103,12 @@ def without(folder: Path, *numbers: int) -> None:
 def test_a_row_s_line_that_is_gone_is_an_error_that_names_line_and_row(scan):
     assert validate(scan) == []
     without(scan, 4)
-    found = "\n".join(errors(scan))
-    assert "manifest.jsonl line 4" in found
-    assert "row 2 " in found
-    found = ScanFolder.load(scan)
-    assert list(found.rows()) == [0, 1, 3]
-    assert {f.facts["line"] for f in found.manifest_faults} == {4}
+    error_text = "\n".join(errors(scan))
+    assert "manifest.jsonl line 4" in error_text
+    assert "row 2 " in error_text
+    error_text = ScanFolder.load(scan)
+    assert list(error_text.rows()) == [0, 1, 3]
+    assert {f.facts["line"] for f in error_text.manifest_faults} == {4}
 
 
 def test_the_last_row_s_line_that_is_gone_is_missed_by_the_end(scan):
@@ -116,17 +116,17 @@ def test_the_last_row_s_line_that_is_gone_is_missed_by_the_end(scan):
     facts = [json.loads(line) for line in lines]
     plain = [{k: v for k, v in f.items() if k not in ("crc", "count", "previous")} for f in facts]
     (scan / MANIFEST).write_bytes(b"".join(encode_line(f) for f in plain if f.get("row") != 3))
-    found = "\n".join(errors(scan))
-    assert "scan_ended counts 4 rows" in found
-    assert "row 3 " in found
+    error_text = "\n".join(errors(scan))
+    assert "scan_ended counts 4 rows" in error_text
+    assert "row 3 " in error_text
 
 
 def test_a_row_taken_again_makes_the_gap_a_note(scan):
-    lost = facts_of(scan, "row_committed")[2]
+    lost_row = facts_of(scan, "row_committed")[2]
     without(scan, 4)
     with ScanFolder.load(scan).writer() as writer:
         writer.append({"fact": "scan_resumed", "rows_missing": 1})
-        writer.append({**lost, "take": 2})
+        writer.append({**lost_row, "take": 2})
         writer.append({"fact": "scan_ended", "exit_status": "success", "reason": "", "rows_committed": 4})
     assert errors(scan) == []
     assert "line 4" in "\n".join(map(to_text, validate(scan)))

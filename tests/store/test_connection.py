@@ -67,21 +67,21 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
             node = node[key]
         node[path[-1]] = other(value)
         try:
-            given = decode(table, Instrument, "given")
+            given_rig = decode(table, Instrument, "given")
         except ConfigError:
             continue  # no rig file says this
-        assert given != begun
+        assert given_rig != begun
         if may_change(path):
-            check_same_scan(begun, given, "mine.toml")
-            assert with_connection(begun, extract_connection(given)) == given
+            check_same_scan(begun, given_rig, "mine.toml")
+            assert with_connection(begun, extract_connection(given_rig)) == given_rig
             taken += 1
         elif does_not_matter(path):
-            check_same_scan(begun, given, "mine.toml")
-            assert with_connection(begun, extract_connection(given)) == begun
+            check_same_scan(begun, given_rig, "mine.toml")
+            assert with_connection(begun, extract_connection(given_rig)) == begun
         else:
             name = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
             with pytest.raises(ConfigError) as e:
-                check_same_scan(begun, given, "mine.toml")
+                check_same_scan(begun, given_rig, "mine.toml")
             assert f"{name} is {value!r} in the scan and {other(value)!r} there" in e.value.what
             refused += 1
     assert taken > 20
@@ -107,7 +107,8 @@ def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
         assert resume_scan(small.path).folder.instrument == now
     scan = ScanFolder.load(small.path)
     assert scan.instrument == now
-    started, (first, second) = facts_of(scan, "scan_started")[0], facts_of(scan, "scan_resumed")
+    started = facts_of(scan, "scan_started")[0]
+    first, second = facts_of(scan, "scan_resumed")
     assert decode(started["instrument"], Instrument, "begun") == begun
     assert (first["rig"], "rig" in second) == (extract_connection(now), False)
     story = begin_history(started)
@@ -120,7 +121,7 @@ def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
 
 def test_another_rig_is_refused_before_anything_is_written(undisturbed, tmp_path, capsys):
     small = undisturbed.copy(tmp_path / "other")
-    before = (small.path / "manifest.jsonl").read_bytes()
+    state_before = (small.path / "manifest.jsonl").read_bytes()
     table = to_builtins(moved(ScanFolder.load(small.path).instrument))
     table["grid"] |= {"columns": 5}
     table["chirp"] |= {"samples": table["chirp"]["samples"] - 1}
@@ -130,4 +131,4 @@ def test_another_rig_is_refused_before_anything_is_written(undisturbed, tmp_path
     assert "grid.columns is 3 in the scan and 5 there" in said
     assert "chirp.samples" in said
     assert "pi." not in said.partition("why:")[0]
-    assert (small.path / "manifest.jsonl").read_bytes() == before
+    assert (small.path / "manifest.jsonl").read_bytes() == state_before

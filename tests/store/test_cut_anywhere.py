@@ -64,12 +64,12 @@ def is_row(event: object) -> bool:
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [-2, -1], ids=["row_committed", "scan_ended"])
 def test_manifest(undisturbed, tmp_path, sample, record, tail):
-    whole = lines(undisturbed.path / "manifest.jsonl")
-    before = b"".join(whole[: len(whole) + record])
-    last = whole[record]
+    whole_lines = lines(undisturbed.path / "manifest.jsonl")
+    state_before = b"".join(whole_lines[: len(whole_lines) + record])
+    last = whole_lines[record]
     for cut in sample(range(len(last)), 8):
         scan = undisturbed.copy(tmp_path / "s")
-        (scan.path / "manifest.jsonl").write_bytes(before + last[:cut] + tail)
+        (scan.path / "manifest.jsonl").write_bytes(state_before + last[:cut] + tail)
         assert faults(scan) == []
         torn = [n for n in faults(scan, "note") if "torn" in n]
         assert len(torn) == bool(last[:cut] + tail)
@@ -78,18 +78,18 @@ def test_manifest(undisturbed, tmp_path, sample, record, tail):
 
 @pytest.mark.parametrize("record", [1, -2, -1], ids=["row 0", "row 2, the last", "scan_ended"])
 def test_bit_of_the_manifest(undisturbed, tmp_path, sample, record):
-    whole = lines(undisturbed.path / "manifest.jsonl")
-    at = len(b"".join(whole[:record]))
-    for bit in sample(range(8 * len(whole[record])), 8):
+    whole_lines = lines(undisturbed.path / "manifest.jsonl")
+    offset = len(b"".join(whole_lines[:record]))
+    for bit in sample(range(8 * len(whole_lines[record])), 8):
         scan = undisturbed.copy(tmp_path / "s")
-        turn(scan.path / "manifest.jsonl", 8 * at + bit)
+        turn(scan.path / "manifest.jsonl", 8 * offset + bit)
         # The line end: this line and the next are one
-        end = bit // 8 == len(whole[record]) - 1
+        end = bit // 8 == len(whole_lines[record]) - 1
         named = faults(scan) + [n for n in faults(scan, "note") if "torn" in n or "damaged" in n]
         assert len(named) == 1
         # The last line is cut off, others stay where they are
-        kept = record == -1 or (record == -2 and end)
-        again = resumed(scan, undisturbed, damaged_lines=0 if kept else 1)
+        is_kept = record == -1 or (record == -2 and end)
+        again = resumed(scan, undisturbed, damaged_lines=0 if is_kept else 1)
         assert again == {1: {0, 1} if end else {0}, -2: {2}, -1: set()}[record]
 
 
@@ -138,8 +138,8 @@ def test_bit_of_the_event_log(undisturbed, tmp_path, sample):
             continue
         assert resumed(scan, undisturbed) == set()
         assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
-        kept = (scan.path / "events.msgpack.damaged").read_bytes()
-        assert raw[: -len(kept)] + kept == turned
+        damaged_log = (scan.path / "events.msgpack.damaged").read_bytes()
+        assert raw[: -len(damaged_log)] + damaged_log == turned
 
 
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
@@ -184,12 +184,12 @@ def test_journal_that_is_lost_as_a_whole(undisturbed, tmp_path, left):
 
 def goes_on_behind(scan: SmallScan, undisturbed, lost: int, rows: set[int] = frozenset()) -> None:
     """Resume: the host is told how much the journal lost, and keeps all it had."""
-    before = (scan.path / "events.msgpack").read_bytes()
+    state_before = (scan.path / "events.msgpack").read_bytes()
     assert resumed(scan, undisturbed) == rows
     assert any(f"ends {lost} events before" in text for text in scan.messages)
-    after = (scan.path / "events.msgpack").read_bytes()
-    assert after.startswith(before)
-    assert len(after) > len(before)
+    state_after = (scan.path / "events.msgpack").read_bytes()
+    assert state_after.startswith(state_before)
+    assert len(state_after) > len(state_before)
     with journal_of(scan).open("rb") as file:
         seqs = [seq for _, seq, _ in records(file)]
     assert seqs[-1] == read_events(scan.path / "events.msgpack").events[-1].seq
@@ -226,11 +226,11 @@ def test_bit_of_a_committed_row(undisturbed, tmp_path, sample, suffix):
 
 @pytest.mark.parametrize("suffix", [".part", ".bin", ".idx"])
 def test_row_that_is_not_committed_may_be_anything(undisturbed, tmp_path, sample, suffix):
-    whole = lines(undisturbed.path / "manifest.jsonl")
+    whole_lines = lines(undisturbed.path / "manifest.jsonl")
     raw = (undisturbed.path / f"raw/RV/0002{suffix.replace('part', 'bin')}").read_bytes()
     for cut in sample(range(len(raw)), 4):
         scan = undisturbed.copy(tmp_path / "s")
-        (scan.path / "manifest.jsonl").write_bytes(b"".join(whole[:-2]))
+        (scan.path / "manifest.jsonl").write_bytes(b"".join(whole_lines[:-2]))
         (scan.path / f"raw/RV/0002{suffix}").write_bytes(raw[:cut])
         assert faults(scan) == []
         assert resumed(scan, undisturbed) == {2}

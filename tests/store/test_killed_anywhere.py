@@ -47,11 +47,11 @@ def broken_off(scan: SmallScan, disk: FaultyDisk) -> bool:
 
 def goes_on(scan: SmallScan, undisturbed, where: str) -> None:
     """The scan is finished as if nothing had been, with at most one row taken again."""
-    before = scan.rows() if scan.begun else {}
+    state_before = scan.rows() if scan.begun else {}
     assert scan.run().exit_status == "success", where
     assert validate(scan.path) == [], where
     assert scan.rows() == undisturbed.digests, where
-    assert {name: undisturbed.digests[name] for name in before} == before, where
+    assert {name: undisturbed.digests[name] for name in state_before} == state_before, where
     assert len(retaken(scan.path)) <= 1, where
 
 
@@ -69,12 +69,12 @@ def test_scan_is_killed_at_every_operation(samples, undisturbed, tmp_path, fault
     done = operations(samples, tmp_path / "count")
     assert len(done) > 100
     draws = POWER_CUTS if fault == "power cut" else 1
-    for at, seed in sample([(at, seed) for at in range(1, len(done) + 1) for seed in range(draws)], 12):
-        folder = tmp_path / f"{at}-{seed}"
+    for step, seed in sample([(step, seed) for step in range(1, len(done) + 1) for seed in range(draws)], 12):
+        folder = tmp_path / f"{step}-{seed}"
         scan = SmallScan(samples, folder)
         folder.mkdir()
-        assert broken_off(scan, FaultyDisk(folder, fault, at, seed))
-        goes_on(scan, undisturbed, f"{fault} at {at} ({done[at - 1]}), seed {seed}")
+        assert broken_off(scan, FaultyDisk(folder, fault, step, seed))
+        goes_on(scan, undisturbed, f"{fault} at {step} ({done[step - 1]}), seed {seed}")
         shutil.rmtree(folder)
 
 
@@ -83,28 +83,32 @@ def test_nothing_unsynced_is_relied_on(samples, undisturbed, tmp_path):
     folder = tmp_path / "count"
     done = operations(samples, folder)
     folders = {f"fsync {path.name}" for path in (folder, *folder.rglob("*")) if path.is_dir()}
-    steps = [at for at, what in enumerate(done, 1) if what in folders or what.endswith(" manifest.jsonl")]
+    steps = [
+        position
+        for position, description in enumerate(done, 1)
+        if description in folders or description.endswith(" manifest.jsonl")
+    ]
     assert len(steps) > 16
-    for at in sorted({*steps, *(at + 1 for at in steps if at < len(done))}):
-        folder = tmp_path / str(at)
+    for position in sorted({*steps, *(position + 1 for position in steps if position < len(done))}):
+        folder = tmp_path / str(position)
         scan = SmallScan(samples, folder)
         folder.mkdir()
-        assert broken_off(scan, FaultyDisk(folder, "worst power cut", at))
-        goes_on(scan, undisturbed, f"power cut at {at} ({done[at - 1]})")
+        assert broken_off(scan, FaultyDisk(folder, "worst power cut", position))
+        goes_on(scan, undisturbed, f"power cut at {position} ({done[position - 1]})")
         shutil.rmtree(folder)
 
 
 @pytest.mark.parametrize("fault", ["killed within", "power cut"])
 def test_resume_is_killed_at_every_operation_too(samples, undisturbed, tmp_path, fault, sample):
     done = operations(samples, tmp_path / "count")
-    first = next(i for i, what in enumerate(done, 1) if what == "write 0001.idx")  # within row 1
+    first = next(i for i, description in enumerate(done, 1) if description == "write 0001.idx")  # within row 1
     killed = 0
-    for at in sample(range(1, len(done)), 12):
-        folder = tmp_path / str(at)
+    for position in sample(range(1, len(done)), 12):
+        folder = tmp_path / str(position)
         folder.mkdir()
         scan = SmallScan(samples, folder)
         assert broken_off(scan, FaultyDisk(folder, "killed within", first))
-        killed += broken_off(scan, FaultyDisk(folder, fault, at, seed=at))
-        goes_on(scan, undisturbed, f"{fault} at {at} of the resume")
+        killed += broken_off(scan, FaultyDisk(folder, fault, position, seed=position))
+        goes_on(scan, undisturbed, f"{fault} at {position} of the resume")
         shutil.rmtree(folder)
     assert killed > 4

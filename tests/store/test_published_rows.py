@@ -71,32 +71,32 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
     rng = np.random.default_rng(seed)
     plan = plan_of(by_columns)
     skipped = {}
-    lost = {}
+    losses = {}
     for row in plan:
         for board in ("RH", "RV"):
-            gone = np.flatnonzero(rng.random(plan.columns) < 0.25)
-            skipped[board, row.index] = set(gone.tolist())
-            left = (plan.columns - gone.size) * BURST // PACKET
-            numbers = np.flatnonzero(rng.random(left) < 0.03)
-            lost[board, row.index] = packets(*numbers.tolist())
-    folder, sent = record(tmp_path, skipped, lost, zero_filling, by_columns)
+            missing_positions = np.flatnonzero(rng.random(plan.columns) < 0.25)
+            skipped[board, row.index] = set(missing_positions.tolist())
+            remaining = (plan.columns - missing_positions.size) * BURST // PACKET
+            numbers = np.flatnonzero(rng.random(remaining) < 0.03)
+            losses[board, row.index] = packets(*numbers.tolist())
+    folder, sent = record(tmp_path, skipped, losses, zero_filling, by_columns)
     scan = open_source(folder, BASE)
     assert list(scan.rows()) == list(range(plan.rows))
     for row in plan:
         for board in ("RH", "RV"):
             mask = check(scan.read_row(board, row.index), sent[board, row.index])
-            gone = skipped[board, row.index]
-            missing = len(gone) * BURST + sum(b - a for a, b in lost[board, row.index])
-            assert mask.reshape(plan.columns, -1)[sorted(gone)].all()
+            missing_positions = skipped[board, row.index]
+            missing = len(missing_positions) * BURST + sum(b - a for a, b in losses[board, row.index])
+            assert mask.reshape(plan.columns, -1)[sorted(missing_positions)].all()
             # The transmitter's board was never missing: it tells all places
             assert mask.sum() in (missing, mask.size)
-            assert mask.sum() == missing or len(gone) > plan.columns - 3
+            assert mask.sum() == missing or len(missing_positions) > plan.columns - 3
     answer = scan.recording_facts()["recording"].boards
     for board in ("RH", "RV"):
         assert answer[board]["positions_short"] == 0
         if not answer[board]["rows_not_placed"]:
             assert answer[board]["positions_missing"] == sum(len(skipped[board, r.index]) for r in plan)
-            count = sum((b - a) // PACKET for r in plan for a, b in lost[board, r.index])
+            count = sum((b - a) // PACKET for r in plan for a, b in losses[board, r.index])
             assert answer[board]["packets_lost"] == count
 
 
@@ -178,10 +178,10 @@ def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling):
     for k, start in enumerate(range(0, raw.size, PACKET)):
         end = min(start + PACKET, raw.size) - 1
         true_end = end if end < cut.start else end + FRAME
-        at = times[true_end // PACKET, 2] if true_end // PACKET < len(times) else times[-1, 2]
+        pulse_time = times[true_end // PACKET, 2] if true_end // PACKET < len(times) else times[-1, 2]
         # The card holds what is left, not a whole packet, back
-        at += late_s if end + 1 == raw.size else 0.0
-        lines.append(f"{k + 1},{end + 1 - start},{at:.6f}")
+        pulse_time += late_s if end + 1 == raw.size else 0.0
+        lines.append(f"{k + 1},{end + 1 - start},{pulse_time:.6f}")
     log.write_text("\n".join(lines))
     scan = open_source(folder, BASE)
     mask = check(scan.read_row("RH", 0), sent["RH", 0])
@@ -217,13 +217,13 @@ def test_columns_are_rows_of_the_mirrored_rig(tmp_path):
 
 
 def test_a_mirror_changes_no_path_and_twice_is_nothing():
-    other = mirror_rig(BASE)
-    assert mirror_rig(other) == BASE
-    assert incidence_deg(other, other.receivers[0]) == pytest.approx(incidence_deg(BASE, BASE.receivers[0]))
-    assert tx_position_m(other) == pytest.approx(
+    mirrored = mirror_rig(BASE)
+    assert mirror_rig(mirrored) == BASE
+    assert incidence_deg(mirrored, mirrored.receivers[0]) == pytest.approx(incidence_deg(BASE, BASE.receivers[0]))
+    assert tx_position_m(mirrored) == pytest.approx(
         (tx_position_m(BASE)[1], tx_position_m(BASE)[0], tx_position_m(BASE)[2])
     )
-    for a, b in zip(BASE.receivers, other.receivers, strict=True):
-        assert direct_path_m(BASE, a) == pytest.approx(direct_path_m(other, b))
-        for p, q in zip(rx_positions_m(BASE, a), rx_positions_m(other, b), strict=True):
+    for a, b in zip(BASE.receivers, mirrored.receivers, strict=True):
+        assert direct_path_m(BASE, a) == pytest.approx(direct_path_m(mirrored, b))
+        for p, q in zip(rx_positions_m(BASE, a), rx_positions_m(mirrored, b), strict=True):
             assert q == pytest.approx((p[1], p[0], p[2]))

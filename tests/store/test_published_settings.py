@@ -12,7 +12,10 @@ from polysight.store.published import PublishedCubes
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.geometry import rx_positions_m, tx_position_m
 
-COLUMNS, ROWS, PULSES, SAMPLES = 7, 4, 4, 256
+COLUMNS = 7
+ROWS = 4
+PULSES = 4
+SAMPLES = 256
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +124,8 @@ def test_each_mount_angle_of_the_scan_turns_its_boards(write, base, key, value, 
     rig = open_source(folder, base).instrument
     assert {b.name for b, old in zip(rig.boards, base.boards, strict=True) if b.mount != old.mount} == moved
     for name in moved:  # by hand: undo what comes after the turn, and turn by the difference
-        old, new = base.by_name(name), rig.by_name(name)
+        old = base.by_name(name)
+        new = rig.by_name(name)
         if key == "rxboard_tilt_offset":
             turn = np.radians(-55.0)
             shift = np.array([np.cos(turn) * -8.3 + np.sin(turn) * 1.0, 0, -np.sin(turn) * -8.3 + np.cos(turn) * 1.0])
@@ -130,7 +134,8 @@ def test_each_mount_angle_of_the_scan_turns_its_boards(write, base, key, value, 
         if key in ("txboard_angle_y", "rxboard_angle_y"):
             by = np.radians(value - ANGLES[key])
             place = tx_position_m if name == "LS" else lambda r, board=new: rx_positions_m(r, r.by_name(board.name))[0]
-            a, b = np.array(place(base)), np.array(place(rig))
+            a = np.array(place(base))
+            b = np.array(place(rig))
             origin = np.array([-0.75875 if name == "LS" else 0.75875, 0, 0])
             x, y, z = a - origin
             turned = [np.cos(by) * x + np.sin(by) * z, y, -np.sin(by) * x + np.cos(by) * z]

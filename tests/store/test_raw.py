@@ -81,10 +81,10 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     assert done.returncode == 0, done.stderr
     assert not payloads(scan)
     said = json.loads(products.pop("quality.json"))
-    kept = contents(scan / "products")
-    dropped = json.loads(kept.pop("quality.json"))
+    products_before = contents(scan / "products")
+    dropped = json.loads(products_before.pop("quality.json"))
     assert dropped.pop("raw_dropped")["scan_id"] == ScanFolder.load(scan).scan_id
-    assert (kept, dropped) == (products, said)
+    assert (products_before, dropped) == (products, said)
     products = contents(scan / "products")
     # Arrivals and gaps stay, where there were any
     assert len(list(scan.glob("raw/*/*.idx"))) in (0, ROWS * BOARDS)
@@ -115,9 +115,9 @@ def test_products_replaced_after_a_drop_in_between_keep_its_mark(scan):
 
 @pytest.mark.parametrize("what", ["image only", "being made", "being processed", "sample", "no samples", "settings"])
 def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what):
-    before = payloads(scan)
+    state_before = payloads(scan)
     samples = scan / "samples"
-    with ExitStack() as others:
+    with ExitStack() as other_items:
         code = ErrorCode.BUSY
         named = "products"
         if what == "image only":  # as after a kill of `process`
@@ -125,9 +125,9 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
             code = ErrorCode.FILE_MISSING
             named = REPORT
         elif what == "being made":
-            others.enter_context(making_products(scan / "products", ScanFolder.load(scan).scan_id))
+            other_items.enter_context(making_products(scan / "products", ScanFolder.load(scan).scan_id))
         elif what == "being processed":
-            others.enter_context(locked_samples(ScanFolder.load(scan)))
+            other_items.enter_context(locked_samples(ScanFolder.load(scan)))
             named = "rows.jsonl"
         elif what == "sample":
             flip(samples / "RH.npy", row=2)
@@ -144,7 +144,7 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
             named = "samples.json"
         with refused(code, named):
             drop_raw(scan, None, yes=True)
-    assert payloads(scan) == before
+    assert payloads(scan) == state_before
     assert not facts_of(scan, "raw_dropped")
 
 
@@ -156,26 +156,26 @@ def flip(path: Path, row: int) -> None:
 
 
 def test_a_damaged_sample_of_a_dropped_row_is_named_and_costs_this_row(scan, tmp_path, caplog):
-    whole = tmp_path / "whole"
+    whole_scan = tmp_path / "whole"
     assert drop_raw(scan, None, yes=True) == 0
-    assert main(["image", str(scan), "--out", str(whole)]) == 0
+    assert main(["image", str(scan), "--out", str(whole_scan)]) == 0
     flip(scan / "samples" / "RH.npy", row=2)
     assert errors(scan) == [e for e in errors(scan) if "samples/RH.npy" in e and "row 2" in e] != []
     assert main(["image", str(scan), "--out", str(tmp_path / "less")]) == 0
     assert "rows 2 are left out" in caplog.text
     coverage = json.loads((tmp_path / "less" / "quality.json").read_text())["coverage"]
     assert coverage["rows_absent"] == [2]
-    before = contents(scan / "products")
+    state_before = contents(scan / "products")
     with refused(ErrorCode.NOT_ENOUGH_DATA, "products"):
         process(scan, scan / "products")
-    assert contents(scan / "products") == before
+    assert contents(scan / "products") == state_before
     (scan / "samples" / "rows.jsonl").unlink()
     with refused(ErrorCode.NO_DATA, ROWS):
         process(scan, scan / "products")
 
 
 def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypatch, capsys):
-    before = payloads(scan)
+    state_before = payloads(scan)
     for typed in ("", "yes\n"):
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
         with pytest.raises(ConfigError):
@@ -197,7 +197,7 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
     (scan / "products" / "image.npz").write_bytes(b"half of it")
     with refused(ErrorCode.FILE_DAMAGED):
         drop_raw(scan, None, yes=True)
-    assert payloads(scan) == before
+    assert payloads(scan) == state_before
     assert not facts_of(scan, "raw_dropped")
 
 
@@ -208,8 +208,8 @@ def test_only_rows_in_the_products_are_dropped(scan):
     drop(ScanFolder.load(scan), digests, scan / "products")
     assert payloads(scan) == {scan / "raw" / board / "0002.bin"}
     assert errors(scan) == []
-    kept = scan / "raw" / board / "0002.bin"
-    kept.write_bytes(b"damaged")
+    undropped_file = scan / "raw" / board / "0002.bin"
+    undropped_file.write_bytes(b"damaged")
     assert any("0002.bin" in e for e in errors(scan))
 
 
@@ -254,13 +254,13 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
         patched.setattr(AppendFile, "append", before(append))
         with pytest.raises(PowerCut):
             drop(ScanFolder.load(scan), digests, scan / "products")
-    left = ScanFolder.load(scan)
-    gone = {str(b.file) for row in left.committed_rows().values() for b in row.boards.values()} - {
+    remaining = ScanFolder.load(scan)
+    gone = {str(b.file) for row in remaining.committed_rows().values() for b in row.boards.values()} - {
         str(path.relative_to(scan)) for path in payloads(scan)
     }
-    assert gone <= set(dropped_files(left))
+    assert gone <= set(dropped_files(remaining))
     assert errors(scan) == []
-    assert damaged_rows(left) == {}
+    assert damaged_rows(remaining) == {}
     drop(ScanFolder.load(scan), digests, scan / "products")
     assert not payloads(scan)
     assert errors(scan) == []
@@ -272,8 +272,14 @@ def test_what_remains_is_on_the_disk_before_raw_data_is_deleted(scan):
     disk = FaultyDisk(scan)
     with disk():
         drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
-    first = next(at for at, what in enumerate(disk.done) if what.startswith("unlink") and what.endswith(".bin"))
-    synced = {what.removeprefix("fsync ") for what in disk.done[:first] if what.startswith("fsync ")}
+    first = next(
+        position
+        for position, description in enumerate(disk.done)
+        if description.startswith("unlink") and description.endswith(".bin")
+    )
+    synced = {
+        description.removeprefix("fsync ") for description in disk.done[:first] if description.startswith("fsync ")
+    }
     remains = {file.name for name in ("samples", "products") for file in (scan / name).iterdir() if file.is_file()}
     assert {"rows.jsonl", "RH.npy", "image.npz"} < remains
     assert remains | {"samples", "products"} <= synced

@@ -42,14 +42,16 @@ def test_a_simulated_scan_folder_is_whole(tmp_path: Path, loss: float) -> None:
 @pytest.mark.parametrize("zero_filling", [True, False])
 def test_both_layouts_read_alike(tmp_path: Path, loss: float, zero_filling: bool) -> None:
     scene = decode_scene(RAW, "t").with_disturbances(packet_loss=loss)
-    own = open_source(simulate(RIG, scene, tmp_path / "own"))
+    own_source = open_source(simulate(RIG, scene, tmp_path / "own"))
     theirs = open_source(simulate(RIG, scene, tmp_path / "a", layout="authors", zero_filling=zero_filling), RIG)
-    assert isinstance(own, ScanFolder)
+    assert isinstance(own_source, ScanFolder)
     assert theirs.simulated
-    assert theirs.plan == own.plan
-    assert theirs.instrument.chirp == own.instrument.chirp
-    for row in own.rows():
+    assert theirs.plan == own_source.plan
+    assert theirs.instrument.chirp == own_source.instrument.chirp
+    for row in own_source.rows():
         for board in ("RH", "RV"):
-            a, b = own.read_row(board, row), theirs.read_row(board, row)  # type: ignore[union-attr]
+            # type: ignore[union-attr]
+            a = own_source.read_row(board, row)
+            b = theirs.read_row(board, row)
             assert np.array_equal(a.payload, b.payload)
             assert a.missing == b.missing

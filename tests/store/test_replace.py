@@ -30,8 +30,8 @@ def scan_with(folder: Path, lost: int, wrong: bool = False) -> tuple[ScanFolder,
     size = rig.row_bytes
     frame = rig.frame_bytes
     record = Record.make(size, 5000, 7)
-    before = Record.make(2000, 3000, 5)
-    packets = [before.packets[1], *record.packets[:lost], *record.packets[lost + 1 :], record.packets[4]]
+    state_before = Record.make(2000, 3000, 5)
+    packets = [state_before.packets[1], *record.packets[:lost], *record.packets[lost + 1 :], record.packets[4]]
     boards = {}
     with scan.writer() as writer:
         for board in rig.recorded:
@@ -54,9 +54,9 @@ def scan_with(folder: Path, lost: int, wrong: bool = False) -> tuple[ScanFolder,
 
 
 def commit(writer: ManifestWriter, boards: dict, pulses: int) -> None:
-    kept = {"kept_incomplete": ["a test"], "faults": []}
+    incomplete = {"kept_incomplete": ["a test"], "faults": []}
     row = {"fact": "row_committed", "row": 0, "take": 1, "direction": 1, "boards": boards, "pulses": pulses}
-    writer.append({**row, **kept})
+    writer.append({**row, **incomplete})
 
 
 def holds(scan: ScanFolder, data: bytes, missing: list[tuple[int, int]]) -> None:
@@ -70,9 +70,9 @@ def holds(scan: ScanFolder, data: bytes, missing: list[tuple[int, int]]) -> None
 
 def test_rows_with_the_same_result_are_not_touched(tmp_path):
     scan, data = scan_with(tmp_path / "scan", lost=9)
-    before = {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()}
+    state_before = {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()}
     assert [(r.changed, r.why_unchanged) for r in replace_rows(scan)] == [(False, "")] * 2
-    assert {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()} == before
+    assert {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()} == state_before
     holds(scan, data, [(9 * 1456, 10 * 1456)])
 
 
@@ -102,13 +102,13 @@ def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fau
     counting = FaultyDisk(tmp_path / "count")
     with counting():
         replace_rows(scan)
-    for at in range(1, len(counting.done) + 1):
-        folder = tmp_path / str(at)
+    for position in range(1, len(counting.done) + 1):
+        folder = tmp_path / str(position)
         scan, data = scan_with(folder / "scan", lost=9, wrong=True)
-        with pytest.raises(Killed), FaultyDisk(folder, fault, at, seed=at)():
+        with pytest.raises(Killed), FaultyDisk(folder, fault, position, seed=position)():
             replace_rows(scan)
         scan = ScanFolder.load(scan.path)
-        assert errors(scan.path) == [], counting.done[at - 1]
+        assert errors(scan.path) == [], counting.done[position - 1]
         replace_rows(scan)
         holds(scan, data, [(9 * 1456, 10 * 1456)])
     # Files that nobody closed are this test's, not the next one's
@@ -131,8 +131,8 @@ def test_a_damaged_file_is_reported_and_never_placed(tmp_path, suffix, other):
     board = "RV" if other else "RH"
     with refused(ErrorCode.FILE_DAMAGED):
         inspect_placement(scan.path / f"raw/{board}/0000.bin", as_json=False)
-    left = {r.board: r.damaged for r in replace_rows(scan)}
-    assert left == {"RH": not other, "RV": other}
+    remaining = {r.board: r.damaged for r in replace_rows(scan)}
+    assert remaining == {"RH": not other, "RV": other}
 
 
 def test_batches_that_take_packets_back_are_damage(tmp_path):

@@ -38,25 +38,25 @@ facts = st.dictionaries(st.text(max_size=6).filter(lambda k: k not in ("fact", "
 @given(st.lists(facts, max_size=4))
 def test_manifest_round_trip(some):
     raw = b"".join(map(encode_line, some))
-    found = parse(raw)
-    assert found.facts == [typed(fact) for fact in some]
-    assert (found.length, found.torn, found.faults) == (len(raw), False, [])
+    content = parse(raw)
+    assert content.facts == [typed(fact) for fact in some]
+    assert (content.length, content.torn, content.faults) == (len(raw), False, [])
 
 
 @given(st.lists(facts, min_size=1, max_size=3), st.data())
 def test_flipped_bit_is_never_a_fact(some, data):
     """One flipped bit in a line: that line is refused, all others stand."""
     lines = [encode_line(f) for f in some]
-    which = data.draw(st.integers(0, len(lines) - 1))
-    bad = bytearray(lines[which])
+    line_number = data.draw(st.integers(0, len(lines) - 1))
+    bad = bytearray(lines[line_number])
     bit = data.draw(st.integers(0, 8 * len(bad) - 1))
     bad[bit // 8] ^= 1 << bit % 8
-    lines[which] = bytes(bad)
-    found = parse(b"".join(lines))
-    if found.torn or found.faults:
-        assert len(found.facts) < len(some)
+    lines[line_number] = bytes(bad)
+    content = parse(b"".join(lines))
+    if content.torn or content.faults:
+        assert len(content.facts) < len(some)
     else:
-        assert found.facts == [typed(fact) for fact in some]
+        assert content.facts == [typed(fact) for fact in some]
 
 
 def test_after_every_truncation_the_lines_before_it_stand_and_the_chain_goes_on(tmp_path):
@@ -69,15 +69,19 @@ def test_after_every_truncation_the_lines_before_it_stand_and_the_chain_goes_on(
             ends.append(path.stat().st_size)
     raw = path.read_bytes()
     for n in range(len(raw) + 1):
-        whole = max(k for k, e in enumerate(ends) if e <= n)
-        found = parse(raw[:n])
-        assert (found.facts, found.torn, found.faults) == ([typed(fact) for fact in some[:whole]], n not in ends, [])
+        whole_lines = max(k for k, e in enumerate(ends) if e <= n)
+        content = parse(raw[:n])
+        assert (content.facts, content.torn, content.faults) == (
+            [typed(fact) for fact in some[:whole_lines]],
+            n not in ends,
+            [],
+        )
         path.write_bytes(raw[:n])
         with ManifestWriter(path, create=False) as writer:
             writer.append({"fact": "scan_resumed"})
-        after = manifest.read(path)
-        assert after.facts == [*map(typed, some[:whole]), ScanResumed()]
-        assert (after.torn, after.faults) == (False, [])
+        state_after = manifest.read(path)
+        assert state_after.facts == [*map(typed, some[:whole_lines]), ScanResumed()]
+        assert (state_after.torn, state_after.faults) == (False, [])
 
 
 def test_two_writers_never_share_a_scan(tmp_path):
@@ -141,10 +145,10 @@ DAMAGE = {
 
 @pytest.mark.parametrize("kind", DAMAGE)
 def test_validate_names_each_damage(whole, kind):
-    damage, where, what = DAMAGE[kind]
+    damage, place, description = DAMAGE[kind]
     damage(whole)
-    found = [f for f in validate(whole) if f.level == "error"]
-    assert any(where in f.where and what in f.what for f in found), to_json(found)
+    errors = [f for f in validate(whole) if f.level == "error"]
+    assert any(place in f.where and description in f.what for f in errors), to_json(errors)
 
 
 def test_events_behind_the_last_commit_may_be_damaged_by_a_power_cut(undisturbed, tmp_path):
@@ -182,10 +186,10 @@ def test_notes_damage_nothing(whole):
     (whole / "raw/RH/0009.part").write_bytes(b"half")
     with (whole / "events.msgpack").open("ab") as f:
         f.write(b"\x84\xa4")
-    found = validate(whole)
-    assert {f.level for f in found} == {"note"}
-    assert len(found) == 4
-    assert "0009.part" in str(found)
+    notes = validate(whole)
+    assert {f.level for f in notes} == {"note"}
+    assert len(notes) == 4
+    assert "0009.part" in str(notes)
 
 
 def test_a_scan_that_is_being_recorded_has_not_ended(whole):

@@ -56,11 +56,11 @@ def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed, monkeypatch, 
 
 def test_row_whose_file_is_gone_is_taken_again(undisturbed, monkeypatch):
     scan = ScanFolder.load(undisturbed.path)
-    gone = undisturbed.path / next(iter(scan.committed_rows()[1].boards.values())).file
+    missing_file = undisturbed.path / next(iter(scan.committed_rows()[1].boards.values())).file
     opened = Path.open
 
     def absent(path: Path, *how, **more):
-        if path == gone:
+        if path == missing_file:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
         return opened(path, *how, **more)
 
@@ -74,7 +74,7 @@ def needs_space(samples: Samples, folder: Path, whose: str) -> list[int]:
     disk = FaultyDisk(folder / whose)
     with disk():
         SmallScan(samples, folder).run()
-    return [i for i, what in enumerate(disk.done, 1) if what.split()[0] in GROWS]
+    return [i for i, description in enumerate(disk.done, 1) if description.split()[0] in GROWS]
 
 
 def failure(scan: SmallScan, disk: FaultyDisk) -> PolysightError | None:
@@ -90,28 +90,28 @@ def failure(scan: SmallScan, disk: FaultyDisk) -> PolysightError | None:
 @pytest.mark.parametrize("fault", ["full", "short"])
 @pytest.mark.parametrize("whose", ["scan", "journal"])
 def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed, tmp_path, sample, fault, whose):
-    seen = 0
-    for at in sample(needs_space(samples, tmp_path / "count", whose), 10):
-        folder = tmp_path / str(at)
+    writes = 0
+    for position in sample(needs_space(samples, tmp_path / "count", whose), 10):
+        folder = tmp_path / str(position)
         folder.mkdir()
         scan = SmallScan(samples, folder)
-        error = failure(scan, FaultyDisk(folder / whose, fault, at))
+        error = failure(scan, FaultyDisk(folder / whose, fault, position))
         if error is not None:
-            seen += 1
+            writes += 1
             assert os.strerror(errno.ENOSPC) in error.what
             assert error.remedy
         committed = set(ScanFolder.load(scan.path).committed_rows()) if scan.begun else set()
         assert scan.acknowledged <= committed
         if scan.begun:
             assert errors(scan.path) == []
-        before = scan.rows() if scan.begun else {}
+        state_before = scan.rows() if scan.begun else {}
         # There is space again
         assert scan.run().exit_status == "success"
         assert validate(scan.path) == []
         assert scan.rows() == undisturbed.digests
-        assert before.items() <= undisturbed.digests.items()
+        assert state_before.items() <= undisturbed.digests.items()
         shutil.rmtree(folder)
-    assert seen > 5
+    assert writes > 5
 
 
 def test_disk_that_has_space_again_while_the_program_still_runs(samples, tmp_path):

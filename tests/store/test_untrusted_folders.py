@@ -91,13 +91,13 @@ def test_only_bytes_that_were_committed_are_dropped(scan):
     row = scan.committed_rows()[0]
     name, board = next(iter(row.boards.items()))
     other_board = next(n for n in row.boards if n != name)
-    other = bytes(board.bytes)
-    (scan.path / board.file).write_bytes(other)
+    zeros = bytes(board.bytes)
+    (scan.path / board.file).write_bytes(zeros)
     processed = {n: {r.row: r.boards[n].crc32 for r in scan.committed_rows().values()} for n in row.boards}
-    kept = droppable(scan, processed).kept_files
-    assert [line for line in kept if board.file in line]
+    kept_files = droppable(scan, processed).kept_files
+    assert [line for line in kept_files if board.file in line]
     drop(scan, processed, scan.path)
-    assert (scan.path / board.file).read_bytes() == other
+    assert (scan.path / board.file).read_bytes() == zeros
     assert not (scan.path / row.boards[other_board].file).exists()
 
 
@@ -148,10 +148,10 @@ def test_a_packet_log_that_claims_too_much_is_refused(scan, change):
     path = (scan.path / board.file).with_suffix(PACKETS)
     line, _, tail = path.read_bytes().partition(b"\n")
     head = json.loads(line)
-    at = 16 * head["batches"]
+    batches_end = 16 * head["batches"]
     end = 16 * head["batches"] + RUN.itemsize * head["runs"]
-    runs = change(head, np.frombuffer(tail[at:end], RUN))
-    path.write_bytes(json.dumps(head).encode() + b"\n" + tail[:at] + runs.tobytes() + tail[end:])
+    runs = change(head, np.frombuffer(tail[batches_end:end], RUN))
+    path.write_bytes(json.dumps(head).encode() + b"\n" + tail[:batches_end] + runs.tobytes() + tail[end:])
     with refused(ErrorCode.FILE_DAMAGED):
         read_packets(path, np.fromfile(scan.path / board.file, dtype=np.uint8))
 
@@ -168,12 +168,12 @@ def test_a_scan_with_a_link_out_of_it_is_refused_before_anything_is_read_or_writ
     target = victim
     if link.exists() and link.is_file():
         target = link.rename(victim / "theirs")
-    before = {p: p.read_bytes() for p in victim.iterdir()}
+    state_before = {p: p.read_bytes() for p in victim.iterdir()}
     link.symlink_to(target)
     out = ["--out", str(tmp_path / "out")]
     for command in (["resume"], ["process", *out], ["drop-raw", "--yes"], ["validate", "--replace"], ["focus", *out]):
         assert main([command[0], str(scan.path), *command[1:]]) != 0
-    assert {p: p.read_bytes() for p in victim.iterdir()} == before
+    assert {p: p.read_bytes() for p in victim.iterdir()} == state_before
 
 
 def test_links_within_a_scan_and_of_its_products_folder_are_allowed(scan, tmp_path):
@@ -305,8 +305,8 @@ def test_a_netcdf_file_with_arrays_in_other_files_is_refused(make, tmp_path):
 
 def test_a_pickle_whose_lists_are_one_list_is_refused_by_its_size(tmp_path):
     row = [1.0] * 1000
-    one = [np.ones(1, np.complex64)] * 3
-    content = {"values": [[row] * 1000] * 3, "ref_values": one, "name": "a", "incident_angle": 55.0}
+    shared_list = [np.ones(1, np.complex64)] * 3
+    content = {"values": [[row] * 1000] * 3, "ref_values": shared_list, "name": "a", "incident_angle": 55.0}
     (tmp_path / "a.pkl").write_bytes(pickle.dumps({**content, "collection_name": "s", "ref_name": "m"}))
     with pytest.raises(DataError):
         read_material(tmp_path / "a.pkl")

@@ -289,8 +289,8 @@ def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels)
     ],
 )
 def test_each_reason_says_what_was_found(reasons, said, never):
-    (one,) = reasons
-    text = f"{one.what}; {one.why}"
+    (only_reason,) = reasons
+    text = f"{only_reason.what}; {only_reason.why}"
     assert all(part in text for part in said), text
     assert never not in text, text
 
@@ -343,7 +343,7 @@ STRANGE = (math.nan, math.inf, -math.inf, 0.0, None)
 def test_no_verdict_shows_a_number_that_is_none(x):
     """Each rule with a figure that is not finite: what is not known is said so, or not judged."""
     number = 0.0 if x is None else x
-    found = [
+    reasons = [
         *direct_path_reasons("RH", x, x, 1.0),
         *direct_path_reasons("RH", x, 0.2, 1.0),
         *level_reasons({"H": x, "V": 30.0}),
@@ -358,9 +358,9 @@ def test_no_verdict_shows_a_number_that_is_none(x):
         *incidence_reasons(55.0, x),
         *reconstruction_reasons([("RH", 0.3, x)]),
     ]
-    assert len(found) > 4
-    shown = " ".join(join_reasons(found).lines())
-    assert not re.search(r"\b(nan|inf)\b", shown), shown
+    assert len(reasons) > 4
+    text = " ".join(join_reasons(reasons).lines())
+    assert not re.search(r"\b(nan|inf)\b", text), text
 
 
 def test_a_terminal_shows_the_heaviest_reasons_and_how_many_more_there_are():

@@ -17,13 +17,13 @@ from polysight.cli.main import main
 from polysight.materials import Library, classify
 from polysight.polarimetry import ratio_from_permittivity
 from polysight_papers.sensys2026 import dataset_items as authors_items
-from polysight_papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, read_authors, read_names, row_of
+from polysight_papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, find_row, read_authors, read_names
 from polysight_papers.sensys2026.dataset_items import (
     Judgements,
     authors_fig20,
     authors_recipe,
-    paired,
-    repeated,
+    pair_scans,
+    select_repeated,
     task_samples,
     without_leakage,
 )
@@ -138,14 +138,14 @@ def test_what_a_name_means_can_be_said(dataset, tmp_path):
 
 def test_every_row_of_table_2_means_itself_and_a_stranger_none():
     for m in table2():
-        assert row_of(m.name, m.thickness_mm) == m.number
-    assert row_of("copper_plate") == 1
-    assert row_of("PET", 0.5) == 5
-    assert row_of("pet_1mm") == 6
-    assert row_of("Cane Sugar (3.8%, \\w glass)") == 29
-    assert row_of("unobtainium") is None
+        assert find_row(m.name, m.thickness_mm) == m.number
+    assert find_row("copper_plate") == 1
+    assert find_row("PET", 0.5) == 5
+    assert find_row("pet_1mm") == 6
+    assert find_row("Cane Sugar (3.8%, \\w glass)") == 29
+    assert find_row("unobtainium") is None
     # Two rows
-    assert row_of("PLA") is None
+    assert find_row("PLA") is None
 
 
 def test_images_made_here_are_turned_to_lie_as_the_authors_own(dataset, tmp_path):
@@ -186,17 +186,17 @@ def test_a_hostile_or_damaged_file_is_refused_and_named_and_stops_no_other(datas
 
 def test_pairs_of_scans_share_no_scan_and_both_angles_are_seen(dataset):
     data = read_authors(dataset, RIG_FILE)
-    first, second = (data.at(MATERIALS, range(1, 24), a) for a in (60.0, 55.0))
-    a, b = paired(first, second)
+    first, second = (data.select(MATERIALS, range(1, 24), a) for a in (60.0, 55.0))
+    a, b = pair_scans(first, second)
     assert a.scans == b.scans
     assert len(a.scans) == 3
     samples = task_samples(data, MATERIALS, "solids, two angles")
     assert samples is not None
     assert samples.x.shape[1] == 8
-    repeated_samples = repeated(samples)
+    repeated_samples = select_repeated(samples)
     assert repeated_samples is not None
     first_library = Library(tuple(e for e in first.entries if e.scan == first.scans[0]))
-    assert paired(first_library, second)[0].scans == (f"{first.scans[0]} and {second.scans[0]}",)
+    assert pair_scans(first_library, second)[0].scans == (f"{first.scans[0]} and {second.scans[0]}",)
 
 
 def test_nothing_to_classify_is_refused(dataset):

@@ -10,7 +10,7 @@ from polysight.materials.train import score
 from polysight.polarimetry import fresnel, permittivity_from_ratio
 from polysight_papers.sensys2026 import patches
 from polysight_papers.sensys2026.classification import pixel_bound
-from polysight_papers.sensys2026.item import published
+from polysight_papers.sensys2026.item import published_values
 from polysight_papers.sensys2026.patches import Errors, calibrated_errors, draw, groups, h_accuracy
 
 QUIET = Errors(0.0, 0.0)
@@ -52,7 +52,7 @@ def test_h_and_v_err_independently():
 
 @pytest.mark.parametrize("name", ["liquids", "powders"])
 def test_the_noise_reaches_the_published_accuracy_of_h_on_draws_it_was_not_set_on(name):
-    answer = published()["classification"][name]["h_percent"] / 100
+    answer = published_values()["classification"][name]["h_percent"] / 100
     assert h_accuracy(groups()[name], calibrated_errors(name, 1), (5, 6, 7)) == pytest.approx(answer, abs=0.06)
 
 

@@ -8,7 +8,7 @@ from tests.support.rigs import published_rig
 
 from polysight.polarimetry import specular_incidence_rad
 from polysight_papers.sensys2026 import run as catalogue
-from polysight_papers.sensys2026.images import FIG13_DISTANCE_MM, front_on, plate, scanned
+from polysight_papers.sensys2026.images import FIG13_DISTANCE_MM, front_on, plate, simulate_scan
 from polysight_papers.sensys2026.item import Run
 from polysight_papers.sensys2026.permittivities import APART_MM, REACH_MM, places
 from polysight_papers.sensys2026.synchronisation import tones
@@ -54,7 +54,7 @@ def test_a_tone_s_frequency_and_amplitude_are_found(if_hz):
 
 def test_a_simulated_scan_is_there_and_gone_again():
     grid = {"columns": 3, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
-    with scanned("small", [plate("copper", None, 0, 0)], RIG_FILE, seed=1, grid=grid) as (source, truth):
+    with simulate_scan("small", [plate("copper", None, 0, 0)], RIG_FILE, seed=1, grid=grid) as (source, truth):
         assert source.simulated
         assert [p.metal for p in truth] == [True]
         folder = source.path
@@ -65,7 +65,7 @@ def test_a_simulated_scan_is_there_and_gone_again():
 def test_a_scene_that_cannot_be_simulated_is_named():
     with (
         refused(ErrorCode.VALUE_INVALID, "broken"),
-        scanned("broken", [plate("x", 0.5 + 0j, 0, 0)], RIG_FILE, seed=1),
+        simulate_scan("broken", [plate("x", 0.5 + 0j, 0, 0)], RIG_FILE, seed=1),
     ):
         pass
 

@@ -27,7 +27,17 @@ from polysight.materials import (
 )
 from polysight.polarimetry import fresnel
 from polysight.report import INK, PALETTE
-from polysight_papers.sensys2026.item import Item, Picture, Published, Run, Table, dress, new_figure, percent, published
+from polysight_papers.sensys2026.item import (
+    Item,
+    Picture,
+    Published,
+    Run,
+    Table,
+    dress,
+    new_figure,
+    percent,
+    published_values,
+)
 from polysight_papers.sensys2026.patches import Errors, calibrated_errors, draw, groups, spread_table
 
 SECOND_ANGLE_DEG = 55.0
@@ -58,7 +68,7 @@ def task_samples(task: str, seed: int, quick: bool) -> Samples:
 
 
 @cache
-def judged(task: str, model: str, channels: str, by_pixel: bool, quick: bool) -> Score:
+def score_simulated(task: str, model: str, channels: str, by_pixel: bool, quick: bool) -> Score:
     """Return the score of a model on the draw for the results."""
     return score(task_samples(task, RESULT, quick), model, channels, by_pixel)
 
@@ -67,8 +77,9 @@ def noise_text(tasks: Iterable[str], quick: bool) -> str:
     """Return a sentence with the calibrated amplitude errors."""
     names = sorted({t.partition(", ")[0] for t in tasks})
     printed = ", ".join(f"{100 * calibrated_errors(n, _draws(quick)).amplitude:.2f} % ({n})" for n in names)
+    phase_std_rad = published_values()["phase_std_rad"]
     return (
-        f"Amplitude errors set on H alone: {printed}; phase error {published()['phase_std_rad']:g} rad. A scan is one"
+        f"Amplitude errors set on H alone: {printed}; phase error {phase_std_rad:g} rad. A scan is one"
         " placement of all materials with its own metal reference; eight scans, 12 pixels a patch."
     )
 
@@ -117,7 +128,7 @@ def unknowns(quick: bool) -> Table:
         rows.append(
             (
                 f"{len(missed)} {task}",
-                percent(judged(task, DISCRIMINANT, "H+V+P", False, quick).unknown),
+                percent(score_simulated(task, DISCRIMINANT, "H+V+P", False, quick).unknown),
                 percent(float(np.mean(list(missed.values())))),
                 ", ".join(never) or "–",
             )
@@ -140,10 +151,10 @@ class TaskScores:
     h_pixel: Score
 
     @staticmethod
-    def of(task: str, quick: bool) -> TaskScores:
+    def score(task: str, quick: bool) -> TaskScores:
         """Judge both models on a task."""
         scores = [
-            judged(task, model, channels, by_pixel, quick)
+            score_simulated(task, model, channels, by_pixel, quick)
             for model, channels in ((PAPER, "H+V+P"), (DISCRIMINANT, "H+V+P"), (PAPER, "H"))
             for by_pixel in (False, True)
         ]
@@ -152,7 +163,7 @@ class TaskScores:
     def row(self) -> tuple[str, ...]:
         """Return a line of the table, published shares beside simulated ones."""
         name, _, two = self.task.partition(", ")
-        printed = published()["classification"][name]
+        printed = published_values()["classification"][name]
         return (
             f"{len(self.knn.names)} {self.task}",
             percent(None if two else printed["h_percent"] / 100),
@@ -166,7 +177,7 @@ class TaskScores:
             percent(self.discriminant.by_patch),
         )
 
-    def plain(self, quick: bool) -> dict[str, Any]:
+    def to_json(self, quick: bool) -> dict[str, Any]:
         """Return the content of the JSON file."""
         return {
             "published_percent": _published_percent(self.task),
@@ -195,12 +206,12 @@ class TaskScores:
 
 def _published_percent(task: str) -> float:
     name, _, two = task.partition(", ")
-    return published()["classification"][name]["two_angles_percent" if two else "all_percent"]
+    return published_values()["classification"][name]["two_angles_percent" if two else "all_percent"]
 
 
 def fig18(run: Run) -> Item:
     """Accuracy of the paper's KNN and of the discriminant under both splits, with confusion matrices."""
-    scores = [TaskScores.of(task, run.quick) for task in TASKS]
+    scores = [TaskScores.score(task, run.quick) for task in TASKS]
     head = (
         "Task",
         "H, published",
@@ -236,13 +247,13 @@ def fig18(run: Run) -> Item:
             unknowns(run.quick),
         ),
         {s.task.replace(", ", "-").replace(" ", "-"): s.picture() for s in scores},
-        {s.task: s.plain(run.quick) for s in scores},
+        {s.task: s.to_json(run.quick) for s in scores},
     )
 
 
 def fig20(run: Run) -> Item:
     """H, V, P alone and together: the paper's KNN under both splits."""
-    printed = published()["channels_percent"]
+    printed = published_values()["channels_percent"]
     rows = []
     data = {}
     tasks = ("solids", "liquids", "powders")
@@ -251,7 +262,9 @@ def fig20(run: Run) -> Item:
     ax = fig.subplots()
     bars = []
     for channel in CHANNELS:
-        by_pixel, left_out = ([judged(t, PAPER, channel, p, run.quick).pixels for t in tasks] for p in (True, False))
+        by_pixel, left_out = (
+            [score_simulated(t, PAPER, channel, p, run.quick).pixels for t in tasks] for p in (True, False)
+        )
         means = [float(np.average(x, weights=weight)) for x in (by_pixel, left_out)]
         rows.append((channel, f"{printed[channel]:.2f} %", *(percent(x) for x in (*means, *left_out))))
         bars.append((printed[channel], 100 * means[0], 100 * means[1]))
@@ -301,7 +314,7 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
     axes = (fig.subplots(2, 2) if many else fig.subplots(1, len(panels), squeeze=False)).ravel()
     if many:
         axes[3].set_axis_off()
-        axes[3].text(0.02, 0.98, _confused(panels[1:]), va="top", fontsize=9, color=INK, linespacing=1.5)
+        axes[3].text(0.02, 0.98, _list_confusions(panels[1:]), va="top", fontsize=9, color=INK, linespacing=1.5)
     image = None
     for ax, (scored, table, title) in zip(axes[: len(panels)], panels, strict=True):
         order = [scored.names.index(m.name) for m in materials]
@@ -325,7 +338,7 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
     return fig
 
 
-def _confused(panels: Sequence[Panel], shown: int = 5) -> str:
+def _list_confusions(panels: Sequence[Panel], shown: int = 5) -> str:
     """The largest confusions of each panel."""
     lines = []
     for scored, table, title in panels:

@@ -87,7 +87,7 @@ class AuthorsData:
         """True if any of it was simulated."""
         return any(library.simulated for library in self.sources.values())
 
-    def at(self, source: str, numbers: range, angle_deg: float) -> Library:
+    def select(self, source: str, numbers: range, angle_deg: float) -> Library:
         """Return the entries of a source for these rows of Table 2, under about this angle."""
         names = {m.name for m in table2() if m.number in numbers}
         library = self.sources[source]
@@ -138,7 +138,9 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
             libraries[IMAGES] = _entries(ours, angles, notices)
     elif images is not None:
         notices.append("images made here are left out: labels/ holds no boxes to look at them with")
-    meaning, sources = _named({k: e for k, e in libraries.items() if e}, read_names(names) if names else {}, notices)
+    meaning, sources = _rename_entries(
+        {k: e for k, e in libraries.items() if e}, read_names(names) if names else {}, notices
+    )
     if not sources:
         raise DataError(
             f"{folder}: neither materials/*.pkl nor labels/<scan> with a known material is in it",
@@ -174,8 +176,8 @@ def _angle(folder: Path, scan: LabelledScan, base: Instrument, notices: list[str
     for form in ("unsynced", "raw"):
         path = folder / form / scan.scan
         if (path / COLLECTION).exists():
-            rig, found = build_rig(read_settings(path), base, path)
-            notices += found
+            rig, notices_of_rig = build_rig(read_settings(path), base, path)
+            notices += notices_of_rig
             return incidence_deg(rig, rig.receivers[0])
     if (angle := angle_in_text([scan.description, scan.scan])) is not None:
         return angle
@@ -217,24 +219,24 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-30))
 
 
-def _named(
-    found: Mapping[str, list[Entry]], given: Mapping[str, int], notices: list[str]
+def _rename_entries(
+    entries_by_source: Mapping[str, list[Entry]], given: Mapping[str, int], notices: list[str]
 ) -> tuple[dict[str, int], dict[str, Library]]:
     """Rename the entries as in Table 2; entries of unknown names are skipped and listed in the notices."""
-    rows = rows_of(((e.name, e.thickness_mm) for entries in found.values() for e in entries), given)
+    rows = find_rows(((e.name, e.thickness_mm) for entries in entries_by_source.values() for e in entries), given)
     titles = {m.number: m.name for m in table2()}
     sources = {}
     unknown = set()
-    for source, entries in found.items():
-        kept = []
+    for source, entries in entries_by_source.items():
+        renamed_entries = []
         for e in entries:
             number = rows.get((e.name, e.thickness_mm))
             if number is None:
                 unknown.add(e.name)
             else:
-                kept.append(replace(e, name=titles[number]))
-        if kept:
-            sources[source] = Library(tuple(kept), {}, source)
+                renamed_entries.append(replace(e, name=titles[number]))
+        if renamed_entries:
+            sources[source] = Library(tuple(renamed_entries), {}, source)
     if unknown:
         skipped = ", ".join(sorted(unknown))
         notices.append(
@@ -280,7 +282,7 @@ def _share_of_common_words(theirs: frozenset[str], row: Published) -> float:
     return len(ours & theirs) / len(union)
 
 
-def row_of(name: str, thickness_mm: float | None = None) -> int | None:
+def find_row(name: str, thickness_mm: float | None = None) -> int | None:
     """Return the number of the row of Table 2 for a name, or None."""
     theirs = words(name)
     if "metal" in theirs:
@@ -316,11 +318,11 @@ def read_names(path: Path) -> dict[str, int]:
     return numbers
 
 
-def rows_of(
+def find_rows(
     names: Iterable[tuple[str, float | None]], given: Mapping[str, int] | None = None
 ) -> dict[tuple[str, float | None], int]:
     """Return the rows of names with their thicknesses; names without a row are skipped."""
-    rows = {(n, t): (given or {}).get(n) or row_of(n, t) for n, t in set(names)}
+    rows = {(n, t): (given or {}).get(n) or find_row(n, t) for n, t in set(names)}
     return {key: number for key, number in rows.items() if number is not None}
 
 

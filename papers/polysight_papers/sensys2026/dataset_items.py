@@ -42,7 +42,7 @@ from polysight_papers.sensys2026.item import (
     dress,
     new_figure,
     percent,
-    published,
+    published_values,
     table2,
 )
 from polysight_papers.sensys2026.patches import groups
@@ -64,15 +64,15 @@ def task_samples(data: AuthorsData, source: str, task: str) -> Samples | None:
     name, _, two = task.partition(", ")
     group = groups()[name]
     numbers = range(group.materials[0].number, group.materials[-1].number + 1)
-    first = data.at(source, numbers, group.angle_deg)
+    first = data.select(source, numbers, group.angle_deg)
     if not two:
         if len(first.names) <= 1:
             return None
         return _samples(first)
-    second = data.at(source, numbers, SECOND_ANGLE_DEG)
+    second = data.select(source, numbers, SECOND_ANGLE_DEG)
     if not first.entries or not second.entries:
         return None
-    first, second = paired(first, second)
+    first, second = pair_scans(first, second)
     shared = {(e.name, e.scan) for e in first.entries} & {(e.name, e.scan) for e in second.entries}
     if len({name for name, _ in shared}) < 2:
         return None
@@ -84,7 +84,7 @@ def _samples(library: Library) -> Samples:
     return Samples.of(library, max(AT_LEAST, ALL // len(library.entries)))
 
 
-def paired(first: Library, second: Library) -> tuple[Library, Library]:
+def pair_scans(first: Library, second: Library) -> tuple[Library, Library]:
     """Scans of two angles in pairs, those with most materials in common first; a pair has one name in both.
 
     No scan is in two pairs, so that a pair can be left out as a whole. Scans without a partner are left out.
@@ -99,13 +99,13 @@ def paired(first: Library, second: Library) -> tuple[Library, Library]:
         if s not in names[0] and t not in names[1]:
             names[0][s] = names[1][t] = f"{s} and {t}"
 
-    def renamed(library: Library, to: dict[str, str]) -> Library:
+    def rename_scans(library: Library, to: dict[str, str]) -> Library:
         return Library(tuple(replace(e, scan=to[e.scan]) for e in library.entries if e.scan in to), {}, library.note)
 
-    return renamed(first, names[0]), renamed(second, names[1])
+    return rename_scans(first, names[0]), rename_scans(second, names[1])
 
 
-def repeated(samples: Samples) -> Samples | None:
+def select_repeated(samples: Samples) -> Samples | None:
     """The materials that at least two scans hold; None when these are fewer than two, or the scans fewer than three.
 
     The classifiers fit their weights with scans kept apart: two must remain when one is left out.
@@ -142,7 +142,7 @@ class Judgements:
             self._samples[source, task] = task_samples(self.data, source, task)
         return self._samples[source, task]
 
-    def found(self, tasks: tuple[str, ...]) -> list[tuple[str, str, Samples]]:
+    def list_tasks(self, tasks: tuple[str, ...]) -> list[tuple[str, str, Samples]]:
         """Return source, task and pixels of all that can be judged. Raises DataError if there is nothing."""
         tasks_with_samples = [
             (s, t, x) for s in self.data.sources for t in tasks if (x := self.samples(s, t)) is not None
@@ -156,7 +156,7 @@ class Judgements:
             )
         return tasks_with_samples
 
-    def judged(self, source: str, task: str, model: str, channels: str = "H+V+P") -> tuple[Score, Score | None]:
+    def score(self, source: str, task: str, model: str, channels: str = "H+V+P") -> tuple[Score, Score | None]:
         """Return the scores of a model by pixel, and with whole scans left out if possible."""
         key = source, task, model, channels
         samples = self.samples(source, task)
@@ -165,7 +165,7 @@ class Judgements:
                 f"{source} has no {task}", "the data set is not complete", "download it again", code=ErrorCode.NO_DATA
             )
         if key not in self._scores:
-            several = repeated(samples)
+            several = select_repeated(samples)
             mixed = score(_split_one_scan(samples), model, channels, by_pixel=True)
             self._scores[key] = (
                 mixed,
@@ -201,16 +201,16 @@ FIG18_NOTES = (
 
 def authors_fig18(judge: Judgements) -> Item:
     """Accuracy of the paper's KNN and of the discriminant, with confusion matrices. Raises DataError."""
-    printed = published()["classification"]
+    printed = published_values()["classification"]
     rows = []
     content = {}
     pictures = {}
-    for source, task, samples in judge.found(TASKS):
+    for source, task, samples in judge.list_tasks(TASKS):
         name, _, two = task.partition(", ")
         paper = printed[name]["two_angles_percent" if two else "all_percent"] / 100
-        several = repeated(samples)
-        scores = [s for m in (PAPER, DISCRIMINANT) for s in judge.judged(source, task, m)]
-        h_only = judge.judged(source, task, PAPER, "H")
+        several = select_repeated(samples)
+        scores = [s for m in (PAPER, DISCRIMINANT) for s in judge.score(source, task, m)]
+        h_only = judge.score(source, task, PAPER, "H")
         names = np.unique(samples.names)
         material_count = 0
         if several is not None:
@@ -264,18 +264,18 @@ def authors_fig18(judge: Judgements) -> Item:
 
 def authors_fig20(judge: Judgements) -> Item:
     """H, V, P alone and together by the paper's KNN. Raises DataError."""
-    printed = published()["channels_percent"]
+    printed = published_values()["channels_percent"]
     tasks = ("solids", "liquids", "powders")
     rows = []
     content = {}
-    judged_tasks = judge.found(tasks)
+    judged_tasks = judge.list_tasks(tasks)
     sources = list(dict.fromkeys(s for s, _, _ in judged_tasks))
     bars = [("published", [printed[c] for c in CHANNELS])]
     for source in sources:
         own_tasks = [(t, x) for s, t, x in judged_tasks if s == source]
         means: dict[str, tuple[float, float | None]] = {}
         for channel in CHANNELS:
-            pairs = [judge.judged(source, t, PAPER, channel) for t, _ in own_tasks]
+            pairs = [judge.score(source, t, PAPER, channel) for t, _ in own_tasks]
             weight = [np.unique(x.names).size for _, x in own_tasks]
             mixed = float(np.average([p[0].pixels for p in pairs], weights=weight))
             scores_without_scan = [(p[1], len(p[1].names)) for p in pairs if p[1] is not None]
@@ -404,13 +404,13 @@ def reproduce_authors(
     _check_keys(keys)
     data = read_authors(folder, config, images, names)
     make_folder(out)
-    origin = origin_of(data)
+    origin = describe_origin(data)
     judge = Judgements(data)
     for notice in data.notices:
         sys.stderr.write(f"note: {notice}\n")
 
     def show(item: Item) -> None:
-        tables = "".join(f"{text_of(table)}\n" for table in item.tables)
+        tables = "".join(f"{format_table(table)}\n" for table in item.tables)
         sys.stdout.write(f"\n{item.title} ({origin.word})\n{tables}")
 
     makers = {key: partial(make, judge) for key, make in MAKERS.items()}
@@ -428,7 +428,7 @@ def _check_keys(keys: Sequence[str]) -> None:
             )
 
 
-def origin_of(data: AuthorsData) -> Origin:
+def describe_origin(data: AuthorsData) -> Origin:
     """Return the notes on the data for the page."""
     contents = "; ".join(
         f"{source}: {len(lib.entries)} boxes of {len(lib.names)} materials in {len(lib.scans)} scans"
@@ -456,10 +456,10 @@ def origin_of(data: AuthorsData) -> Origin:
     )
 
 
-def text_of(table: Table) -> str:
+def format_table(table: Table) -> str:
     """Format a table for the terminal: columns as wide as their cells, long heads over several lines."""
     limit = [max([9, *(len(row[k]) for row in table.rows)]) for k in range(len(table.head))]
-    heads = [_wrapped(head, width) for head, width in zip(table.head, limit, strict=True)]
+    heads = [_wrap(head, width) for head, width in zip(table.head, limit, strict=True)]
     width = [max([n, *map(len, lines)]) for n, lines in zip(limit, heads, strict=True)]
     tall = max(map(len, heads))
     lines = [[h[k - tall + len(h)] if k >= tall - len(h) else "" for h in heads] for k in range(tall)]
@@ -472,7 +472,7 @@ def text_of(table: Table) -> str:
     return "\n".join([table.caption, *map(line, rows)]) + "\n"
 
 
-def _wrapped(text: str, width: int) -> list[str]:
+def _wrap(text: str, width: int) -> list[str]:
     out = [""]
     for word in text.split():
         if out[-1] and len(out[-1]) + 1 + len(word) > width:
@@ -498,12 +498,12 @@ def authors_recipe(p: Complex, angle_deg: float) -> complex:
 def _pixels_of_material(data: AuthorsData, source: str, m: Published) -> tuple[Complex, float, int] | None:
     """Ratios of a material's pixels, their angle, and how many scans: at the paper's angle, or else the first."""
     paper = next(g.angle_deg for g in groups().values() if m in g.materials)
-    entries = list(data.at(source, range(m.number, m.number + 1), paper).entries)
+    entries = list(data.select(source, range(m.number, m.number + 1), paper).entries)
     if not entries:
         other_angles = sorted(e.incidence_deg for e in data.sources[source].entries if e.name == m.name)
         if not other_angles:
             return None
-        entries = list(data.at(source, range(m.number, m.number + 1), other_angles[0]).entries)
+        entries = list(data.select(source, range(m.number, m.number + 1), other_angles[0]).entries)
     p = np.concatenate([e.p for e in entries]).astype(np.complex128)
     angle = float(np.mean([e.incidence_deg for e in entries]))
     return p[np.isfinite(p) & (p != 0)], angle, len({e.scan for e in entries})
@@ -559,7 +559,7 @@ def authors_table2(data: AuthorsData) -> Item:
         {"permittivity": Picture(_figure(estimates), "From the files against published; the dotted line is equality.")},
         {
             "materials": [
-                _plain(source, e) for source, estimates_of_source in estimates.items() for e in estimates_of_source
+                _to_json(source, e) for source, estimates_of_source in estimates.items() for e in estimates_of_source
             ]
         },
     )
@@ -614,7 +614,7 @@ def _cells(value: complex | None) -> tuple[str, str]:
     return (f"{value.real:.2f}", f"{-value.imag:.2f}")
 
 
-def _plain(source: str, e: Estimate) -> dict[str, Any]:
+def _to_json(source: str, e: Estimate) -> dict[str, Any]:
     """Return the content of the JSON file."""
     return {
         "source": source,

@@ -11,7 +11,7 @@ import numpy as np
 from polysight.materials import Entry, Library, concentrations, fit_concentration, polarisation_angle_rad
 from polysight.report import INK, PALETTE
 from polysight_papers.sensys2026.dataset import AuthorsData
-from polysight_papers.sensys2026.item import Item, Picture, Table, dress, new_figure, published
+from polysight_papers.sensys2026.item import Item, Picture, Table, dress, new_figure, published_values
 from polysight_papers.sensys2026.permittivities import WATER_IN_GLASS
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -25,7 +25,7 @@ FIG21_NOTE = (
 
 def authors_fig21(data: AuthorsData) -> Item:
     """Concentration of sugar by a line through the other concentrations. Raises DataError."""
-    printed = published()["sugar_median_error_percent"]
+    printed = published_values()["sugar_median_error_percent"]
     tables = []
     content = {}
     plots = []

@@ -55,7 +55,7 @@ def plate(name: str, eps: complex | None, x_mm: float, y_mm: float) -> dict[str,
 
 
 @contextmanager
-def scanned(
+def simulate_scan(
     name: str, plates: Sequence[Mapping[str, Any]], config: Path, seed: int, **more: Any
 ) -> Iterator[tuple[ScanFolder, tuple[TruthPlate, ...]]]:
     """Simulate a scan of plates with all disturbances; yield it with its truth. Its files are deleted afterwards.
@@ -84,7 +84,7 @@ class Imaged:
     y_m: npt.NDArray[np.float64]
 
 
-def imaged(source: RawSource, plates: tuple[TruthPlate, ...]) -> Imaged:
+def process_scan(source: RawSource, plates: tuple[TruthPlate, ...]) -> Imaged:
     """Process a scan with known positions of its plates (the paper segments by hand), referenced to its metal plate."""
     pipeline = Pipeline(source)
     for row in source.rows():
@@ -143,8 +143,8 @@ def _scan(
     """A copper plate in the middle and plates with the permittivities of these rows of Table 2 around it, mm."""
     plates = [plate("copper", None, 0.0, 0.0)]
     plates += [plate(table2()[n - 1].name, table2()[n - 1].permittivity, *xy) for n, xy in zip(rows, at, strict=True)]
-    with scanned(name, plates, config, seed=seed, **more) as (source, truth):
-        imaged_scan = imaged(source, truth)
+    with simulate_scan(name, plates, config, seed=seed, **more) as (source, truth):
+        imaged_scan = process_scan(source, truth)
     scan = ProcessedScan.from_results(
         Path(),
         images=imaged_scan.result.calibrated,

@@ -124,7 +124,7 @@ def table2() -> tuple[Published, ...]:
 
 
 @cache
-def published() -> dict[str, Any]:
+def published_values() -> dict[str, Any]:
     """Return the content of `published.json`; percentages as in the paper."""
     return json.loads(
         resources.files("polysight_papers.sensys2026").joinpath("published.json").read_text(encoding="utf-8")

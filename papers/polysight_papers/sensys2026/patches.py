@@ -37,7 +37,7 @@ from polysight.materials import (
     score,
 )
 from polysight.polarimetry import fresnel
-from polysight_papers.sensys2026.item import Published, Table, percent, published, table2
+from polysight_papers.sensys2026.item import Published, Table, percent, published_values, table2
 
 Complex = npt.NDArray[np.complex128]
 SCANS = 8
@@ -176,9 +176,9 @@ def calibrated_errors(group_name: str, draws: int = 3, shared: float = 0.5) -> E
     Bisection over the logarithm of the amplitude error, on draws that no result is made from.
     """
     group = groups()[group_name]
-    target = published()["classification"][group_name]["h_percent"] / 100
+    target = published_values()["classification"][group_name]["h_percent"] / 100
     seeds = tuple(range(1000, 1000 + draws))
-    start = Errors(0.0, published()["phase_std_rad"], shared)
+    start = Errors(0.0, published_values()["phase_std_rad"], shared)
 
     def excess(log_amplitude: float) -> float:
         return h_accuracy(group, replace(start, amplitude=float(np.exp(log_amplitude))), seeds) - target
@@ -238,9 +238,9 @@ def by_patch(model: Model, test: Samples) -> tuple[npt.NDArray[np.bool_], npt.ND
     rows = []
     for scan in np.unique(test.groups):
         scan_samples = test.take(test.groups == scan)
-        found = model.by_scan(scan_samples.x, scan_samples.patches)
-        truth = scan_samples.names[[np.flatnonzero(scan_samples.patches == p)[0] for p in found.patches]]
-        rows.append((found.distance <= 1, found.names == truth, found.confidence))
+        classifications = model.by_scan(scan_samples.x, scan_samples.patches)
+        truth = scan_samples.names[[np.flatnonzero(scan_samples.patches == p)[0] for p in classifications.patches]]
+        rows.append((classifications.distance <= 1, classifications.names == truth, classifications.confidence))
     named, right, sure = (np.concatenate(column) for column in zip(*rows, strict=True))
     return named, right, sure
 
@@ -298,9 +298,9 @@ def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, i
         model = MODELS[DISCRIMINANT]("H+V+P").fit(taught_others)
         for scan in scans:
             scan_samples = test.take(test.groups == scan)
-            found = model.by_scan(scan_samples.x, scan_samples.patches)
+            classifications = model.by_scan(scan_samples.x, scan_samples.patches)
             strange = np.unique(scan_samples.patches[scan_samples.names == name])
-            named += (found.distance[np.searchsorted(found.patches, strange)] <= 1).tolist()
+            named += (classifications.distance[np.searchsorted(classifications.patches, strange)] <= 1).tolist()
             outside += _outside(scan_samples.take(np.isin(scan_samples.patches, strange)), taught_others).tolist()
     far = np.array(outside)
     return int(np.sum(named)), len(named), int(np.array(named)[far].sum()), int(far.sum())

@@ -26,7 +26,7 @@ from polysight.materials import (
 )
 from polysight.polarimetry import brewster_angle_rad, fresnel, permittivity_from_ratio, ratio_from_permittivity
 from polysight.report import INK, PALETTE
-from polysight_papers.sensys2026.images import imaged, plate, scanned
+from polysight_papers.sensys2026.images import plate, process_scan, simulate_scan
 from polysight_papers.sensys2026.item import (
     MARKERS,
     Item,
@@ -36,7 +36,7 @@ from polysight_papers.sensys2026.item import (
     Table,
     dress,
     new_figure,
-    published,
+    published_values,
     table2,
 )
 from polysight_papers.sensys2026.patches import calibrated_errors, draw, groups
@@ -254,17 +254,17 @@ def fig17(run: Run) -> Item:
     pixels: dict[str, list[Complex]] = {name: [] for name in true}
     centres = []
     for i in range(count):
-        at = places(i)
-        plates = [plate("copper", None, *at[0])]
-        plates += [plate(name, eps, *xy) for (name, eps), xy in zip(true.items(), at[1:], strict=True)]
-        with scanned(f"placement {i + 1}", plates, run.config, seed=1700 + i) as (source, truth):
-            result = imaged(source, truth).result
+        box_places = places(i)
+        plates = [plate("copper", None, *box_places[0])]
+        plates += [plate(name, eps, *xy) for (name, eps), xy in zip(true.items(), box_places[1:], strict=True)]
+        with simulate_scan(f"placement {i + 1}", plates, run.config, seed=1700 + i) as (source, truth):
+            result = process_scan(source, truth).result
         for patch in result.patches:
             if patch.truth is not None and patch.truth.name in pixels:
                 inside = patch.patch.interior & np.isfinite(result.p)
                 theta = np.broadcast_to(result.theta_rad, result.p.shape)[inside]
                 pixels[patch.truth.name].append(permittivity_from_ratio(result.p[inside], theta))
-        centres.append(dict(zip(("copper", *true), at, strict=True)))
+        centres.append(dict(zip(("copper", *true), box_places, strict=True)))
     return _item(true, pixels, centres)
 
 
@@ -277,16 +277,16 @@ def _item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: l
             ax.plot(values.real, -values.imag, MARKERS[i % 10], ms=3, color=PALETTE[i], label=f"placement {i + 1}")
         ax.plot(eps.real, -eps.imag, "x", color=INK, ms=11, mew=2.2, label="truth", zorder=5)
         dress(ax, name, "real part ε′", "loss ε″")
-        every = np.concatenate(pixels[name])
+        all_pixels = np.concatenate(pixels[name])
         medians = np.array([np.median(v.real) - 1j * np.median(-v.imag) for v in pixels[name]])
-        printed = published()["location_variance"][name]
+        printed = published_values()["location_variance"][name]
         for part, take, key in (("ε′", np.real, "real"), ("ε″", np.imag, "loss")):
             within = float(np.mean([take(v).var() for v in pixels[name]]))
-            row = {"published": printed[key], "all": float(take(every).var()), "within": within}
+            row = {"published": printed[key], "all": float(take(all_pixels).var()), "within": within}
             row["between"] = float(take(medians).var())
             data[f"{name} {key}"] = row
             rows.append((name, part, *(f"{x:.4f}" for x in row.values())))
-        offset = np.mean(every) - eps
+        offset = np.mean(all_pixels) - eps
         data[f"{name} offset"] = complex(offset)
         data[f"{name} pixels"] = [len(v) for v in pixels[name]]
     ax = fig.axes[1]
@@ -331,7 +331,7 @@ def fig21(run: Run) -> Item:
     materials = tuple(m for m in table2() if m.name == WATER_IN_GLASS or m.name.startswith("Cane Sugar"))
     library = draw(materials, group.angle_deg, errors, seed=21).library()
     result = fit_concentration(library, {WATER_IN_GLASS: 0.0})
-    printed = published()["sugar_median_error_percent"]
+    printed = published_values()["sugar_median_error_percent"]
     value = concentrations(library.names, {WATER_IN_GLASS: 0.0})
     fig = new_figure(11.5, 4.2)
     left_axes, centre, right = fig.subplots(1, 3)

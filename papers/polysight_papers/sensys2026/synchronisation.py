@@ -21,8 +21,8 @@ from polysight.capture import decode_row, row_words
 from polysight.imaging import ImageBuilder
 from polysight.report import INK, PALETTE, QUANTITIES, SyncReport
 from polysight.sync import STAGES, BoardSetup, HighPass, fit_high_pass, high_pass, synchronise_row
-from polysight_papers.sensys2026.images import plate, scanned
-from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, published
+from polysight_papers.sensys2026.images import plate, simulate_scan
+from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, published_values
 from polysight_shared.config import Chirp, load_instrument
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
@@ -70,7 +70,7 @@ def sync_scan(run: Run) -> SyncScan:
     scan, so that the object lies in the range gate at all; "after" is the pipeline's.
     """
     plates = [plate("copper", None, 0.0, 0.0), plate("left", None, -60.0, 40.0), plate("right", None, 60.0, -40.0)]
-    with scanned("three metal plates", plates, run.config, seed=1200) as (source, _):
+    with simulate_scan("three metal plates", plates, run.config, seed=1200) as (source, _):
         rig = source.instrument
         chirp = rig.chirp
         board = rig.receivers[0].name
@@ -122,7 +122,7 @@ def fig12(run: Run) -> Item:
     ):
         level = 20 * np.log10(np.maximum(profile / profile.max(), 1e-4))
         extent = (float(scan.range_m[0]), float(scan.range_m[-1]), 0.0, float(len(profile)))
-        shown = line[0].imshow(
+        picture = line[0].imshow(
             level,
             extent=extent,
             origin="lower",
@@ -133,13 +133,13 @@ def fig12(run: Run) -> Item:
             interpolation="nearest",
         )
         dress(line[0], f"{when}: range profiles", "path beyond the direct path (m)", "position in the middle row")
-        fig.colorbar(shown, ax=line[0], fraction=0.046, pad=0.02).set_label("dB", fontsize=8)
+        fig.colorbar(picture, ax=line[0], fraction=0.046, pad=0.02).set_label("dB", fontsize=8)
         level = 20 * np.log10(np.maximum(image / image.max(), 1e-4))
-        shown = line[1].imshow(
+        picture = line[1].imshow(
             level, extent=scan.extent_mm, origin="lower", cmap="cividis", vmin=-30, vmax=0, interpolation="nearest"
         )
         dress(line[1], f"{when}: image of H", "x (mm)", "y (mm)")
-        fig.colorbar(shown, ax=line[1], fraction=0.046, pad=0.02).set_label("dB, 0 = its maximum", fontsize=8)
+        fig.colorbar(picture, ax=line[1], fraction=0.046, pad=0.02).set_label("dB, 0 = its maximum", fontsize=8)
         for ax in line:
             ax.grid(visible=False)
         contrast.append(float(20 * np.log10(image.max() / np.median(image))))
@@ -159,7 +159,7 @@ def fig12(run: Run) -> Item:
 
 def fig15(run: Run) -> Item:
     """Standard deviation of frequency, phase and amplitude after each stage, and the Cramer-Rao bounds."""
-    printed = published()
+    printed = published_values()
     limits = {"frequency_hz": printed["frequency_std_hz"], "phase_rad": printed["phase_std_rad"]}
     summary: dict[str, Any] = {name: r.summary() for name, r in sync_scan(run).reports.items()}
     fig = new_figure(11.5, 4.4)
@@ -252,7 +252,7 @@ def _sweep(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
     example = np.zeros((1, 1, chirp.samples), np.complex64)
     for offset in OFFSETS_HZ:
         disturbances = {"if_offset_hz": offset}
-        with scanned("direct path", (), run.config, 900, grid=GRID, disturbances=disturbances) as (source, _):
+        with simulate_scan("direct path", (), run.config, 900, grid=GRID, disturbances=disturbances) as (source, _):
             data = source.read_row(source.instrument.receivers[0].name, 0)
             chirps, valid = decode_row(data.payload, data.missing, data.frames_expected, chirp.samples)
         swept.append(tones(chirps[:, valid], chirp))

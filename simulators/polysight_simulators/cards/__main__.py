@@ -134,12 +134,8 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     lines = tuple(sorted({card.line for card in cards} | {rig.pi.trigger_in}))
     wires = open_things.enter_context(closing(WireClient(args.wires, lines, motion=True)))
     track = StageTrack(rig, disturbances.burst_motion, disturbances.backlash_mm)
+    chips = _open_chips(rig, cards, open_things)
     control: list[LineServer] = []
-    chips: list[RadarSocket] = []
-    for card in cards:
-        if card.radar is not None:
-            chips.append(RadarSocket(rig.radar.native[card.board.name].usb_serial, card.radar))
-            open_things.callback(chips[-1].close)
     if rig.radar.control == "line_server":
         for card in cards:
             name = card.board.name
@@ -159,6 +155,16 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     open_things.callback(server.close)
     announce_ready(", ".join(f"{c.board.name} at {c.board.card_address}" for c in cards))
     server.serve(stop)
+
+
+def _open_chips(rig: Instrument, cards: list[SimulatedCard], open_things: ExitStack) -> list[RadarSocket]:
+    """Open a socket in place of the USB chip of each radar that the cards simulate."""
+    chips: list[RadarSocket] = []
+    for card in cards:
+        if card.radar is not None:
+            chips.append(RadarSocket(rig.radar.native[card.board.name].usb_serial, card.radar))
+            open_things.callback(chips[-1].close)
+    return chips
 
 
 def _report(cards: list[SimulatedCard], path: Path | None) -> None:

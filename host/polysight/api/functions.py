@@ -17,7 +17,7 @@ import tomli_w
 from polysight.api.scan import RIG, Scan, open_scan
 from polysight.catalogue import Pixels, compare_pixels
 from polysight.data import packaged
-from polysight.jobs.check import check_scan, checked_scans
+from polysight.jobs.check import check_scan, check_scans
 from polysight.jobs.demo import simulate_scene
 from polysight.planning import Changes, Forecast, describe, forecast_scene
 from polysight.products import PLANE, image_dataset
@@ -183,7 +183,7 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
         if isinstance(scan, Scan):
             checked.append((scan.scan_id, check_scan(scan.processed())))
         else:
-            checked += [(below.scan_id, result) for below, result in checked_scans([Path(scan)])]
+            checked += [(below.scan_id, result) for below, result in check_scans([Path(scan)])]
     results = [result for _, result in checked]
     unknown = (np.nan, np.nan)
     measured = np.array([result.measured or unknown for result in results])

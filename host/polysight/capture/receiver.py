@@ -54,13 +54,13 @@ def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[Core 
     return [Core(usable[k % len(usable)], exclusive) for k in range(receivers)]
 
 
-def take_core(core: int | None, own: bool = True, urgent: bool = True) -> tuple[int | None, str]:
+def take_core(core: int | None, exclusive: bool = True, urgent: bool = True) -> tuple[int | None, str]:
     """Pin this process to a core; return the core (None: any) and a warning ("" if there is none).
 
-    A core shared with other receivers (`own` False) is used only with real-time priority (`urgent`): ordinary processes
-    pinned to one core lose far more packets than processes that the kernel may move.
+    A core shared with other receivers (`exclusive` False) is used only with real-time priority (`urgent`): ordinary
+    processes pinned to one core lose far more packets than processes that the kernel may move.
     """
-    if core is None or not (own or urgent):
+    if core is None or not (exclusive or urgent):
         return None, ""
     try:
         os.sched_setaffinity(0, {core})
@@ -78,7 +78,8 @@ def take_priority(real_time: int = REAL_TIME, nice: int = NICE) -> tuple[str, st
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(real_time))
     except (AttributeError, OSError) as e:
-        refused = f"no real-time priority: {e.strerror if isinstance(e, OSError) else e}"
+        # An AttributeError, where the system has no such call, has no `strerror`.
+        refused = f"no real-time priority: {getattr(e, 'strerror', e)}"
     else:
         return f"real-time priority {real_time}", ""
     try:
@@ -117,7 +118,7 @@ class BeginRow(_Message, frozen=True):
     expected_bytes: int
     frame_bytes: int
     path: str
-    # The card was reset just before: its counters begin anew
+    # The card was reset just before: its counters begin at zero again.
     after_reset: bool = False
 
 
@@ -160,9 +161,9 @@ class Progress(_Message, frozen=True):
     take: int
     received: int
     complete: bool
-    # Monotonic clock; 0 before the first packet
+    # On the monotonic clock; 0 before the first packet.
     last_arrival_ns: int
-    # The furthest packet is short, as only the last of a record is
+    # The furthest packet is short, as only the last one of a record is.
     ended: bool = False
 
 
@@ -273,8 +274,8 @@ class ReceiverProcess:
     buffer_bytes
         Requested receive buffer.
     core
-        Core to pin the process to, as chosen by :func:`receiver_cores`; None: any. A
-        shared core is used only with real-time priority.
+        Core to pin the process to, as chosen by :func:`receiver_cores`; None: any. A shared core is used only with
+        real-time priority.
 
     Raises
     ------

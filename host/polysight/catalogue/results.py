@@ -338,7 +338,10 @@ def _profile(folder: Path, x_m: float, y_m: float) -> tuple[FocusedProfile | Non
 
 @lru_cache(maxsize=2)
 def _restore_rows(scan: Path, changed_ns: int) -> Pipeline | None:
-    """A pipeline that holds the kept samples of every row; None where some are not kept."""
+    """A pipeline that holds the kept samples of every row; None where some are not kept.
+
+    `changed_ns` is a part of the cache's key: changed samples are read again.
+    """
     del changed_ns
     pipeline = Pipeline(ScanFolder.load(scan), samples="read")
     rows = list(pipeline.source.rows())

@@ -40,7 +40,7 @@ def check_scan(scan: ProcessedScan) -> CheckResult:
     return result
 
 
-def checked_scans(folders: Sequence[Path]) -> list[tuple[ProcessedScan, CheckResult]]:
+def check_scans(folders: Sequence[Path]) -> list[tuple[ProcessedScan, CheckResult]]:
     """Return the scans with a check plate in these folders; those of a folder of scans oldest first.
 
     Raises
@@ -71,20 +71,21 @@ def checked_scans(folders: Sequence[Path]) -> list[tuple[ProcessedScan, CheckRes
 def check(folders: Sequence[Path], chart: Path | None, as_json: bool) -> int:
     """Print the check plate of each scan, and draw the control chart; return 1 if one is beyond its action limit.
 
-    Raises PolysightError as :func:`checked_scans`.
+    Raises PolysightError as :func:`check_scans`.
     """
-    checked = checked_scans(folders)
+    checked = check_scans(folders)
     if chart is not None:
         write_atomically(chart, draw_control_chart(checked))
     if as_json:
         print_json([{"scan_id": scan.scan_id, **to_plain(result)} for scan, result in checked])
     else:
-        print_lines([_line(scan, result) for scan, result in checked])
+        print_lines([_describe(scan, result) for scan, result in checked])
     return int(any(result.level in ("action", "missing") for _, result in checked))
 
 
-def _line(scan: ProcessedScan, result: CheckResult) -> str:
-    head = f"{scan.scan_id}{' (simulated)' if scan.simulated else ''}: {result.name}"
+def _describe(scan: ProcessedScan, result: CheckResult) -> str:
+    stamp = " (simulated)" if scan.simulated else ""
+    head = f"{scan.scan_id}{stamp}: {result.name}"
     if result.measured is None or result.measured_std is None:
         return f"{head} missing: {result.why}"
     real, loss = result.measured
@@ -103,20 +104,28 @@ def draw_control_chart(checked: Sequence[tuple[ProcessedScan, CheckResult]]) -> 
     fig = Figure(figsize=CHART_IN, dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(fig)
     axes = fig.subplots(2, 1, sharex=True)
-    measured = [(scan, result) for scan, result in checked if result.measured and result.measured_std]
-    names = [scan.scan_id for scan, _ in measured]
+    names = []
+    measured = []
+    errors = []
+    for scan, result in checked:
+        if result.measured and result.measured_std:
+            names.append(scan.scan_id)
+            measured.append(result.measured)
+            errors.append([WARNING_SIGMAS * std for std in result.measured_std])
+    # The known value and its band are those of the latest scan.
+    _, latest = checked[-1]
     for part, (ax, title) in enumerate(zip(axes, ("real part", "loss"), strict=True)):
-        values = [(result.measured or (0, 0))[part] for _, result in measured]
-        errors = [WARNING_SIGMAS * (result.measured_std or (0, 0))[part] for _, result in measured]
-        ax.errorbar(range(len(values)), values, yerr=errors, fmt="o", capsize=3)
-        expected = checked[-1][1].expected[part]
-        limit = WARNING_SIGMAS * checked[-1][1].expected_std[part]
+        values = [value[part] for value in measured]
+        bars = [error[part] for error in errors]
+        ax.errorbar(range(len(values)), values, yerr=bars, fmt="o", capsize=3)
+        expected = latest.expected[part]
+        limit = WARNING_SIGMAS * latest.expected_std[part]
         ax.axhline(expected, color="black", linewidth=1)
         ax.axhspan(expected - limit, expected + limit, color="green", alpha=0.15)
         ax.set_ylabel(title)
     axes[-1].set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=8)
     stamp = " (simulated)" if any(scan.simulated is not False for scan, _ in checked) else ""
-    fig.suptitle(f"Check plate {checked[-1][1].name}{stamp}: bars and band hold 95 % of good scans", fontsize=11)
+    fig.suptitle(f"Check plate {latest.name}{stamp}: bars and band hold 95 % of good scans", fontsize=11)
     buffer = io.BytesIO()
     fig.savefig(buffer, format="png")
     return buffer.getvalue()

@@ -56,7 +56,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.findings import Finding
 
-# Relative: far above rounding, far below any other chirp
+# Relative difference of two frequencies that are the same: far above rounding, far below any other chirp.
 _SAME_FREQUENCY = 1e-6
 # Reasons of a verdict that the terminal shows.
 _REASONS = 3
@@ -341,7 +341,7 @@ def report(folder: Path) -> int:
     saved = find_products(folder, REPORT)
     if saved is None:
         if not is_source(folder):
-            # Raises with the reason
+            # There is nothing to make a report of: this raises, with the reason.
             read_products(folder, REPORT)
         from polysight.jobs.process import process
 
@@ -472,8 +472,8 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
     else:
         _print_names(content, several=len(scans) > 1)
         _print_right(content["patches"], library.names)
-        if once := content["patches_not_in_every_scan"]:
-            sys.stdout.write(f"{once} patches were not seen in every scan and are not named\n")
+        if unmatched := content["patches_not_in_every_scan"]:
+            sys.stdout.write(f"{unmatched} patches were not seen in every scan and are not named\n")
         sys.stdout.write(content["library"] + "\n")
     return 0
 
@@ -522,8 +522,9 @@ def _contradictions(
         return []
     alone = []
     for i, angle_deg in enumerate(angles_deg):
+        # Features of the angles stand side by side; evidence has a row for each.
         features = [np.split(m.features, len(angles_deg), 1)[i] for m in matched]
-        evidence = [None if m.evidence is None else m.evidence[i : i + 1] for m in matched]
+        evidence = [m.evidence if m.evidence is None else m.evidence[i : i + 1] for m in matched]
         alone.append(Classifier(library, model=model, angles_deg=[angle_deg]).scan(features, evidence))
     out = []
     for m, together, *single_scans in zip(matched, named, *alone, strict=True):
@@ -552,24 +553,33 @@ def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
 
 def _nothing_named(products: Sequence[ProcessedScan]) -> dict[str, Any]:
     """JSON of `classify` if a scan has no result: its patches without names."""
-    scan = next(p for p in products if p.verdict is not None and not p.verdict.usable)
     nothing = {"name": None, "confidence": None, "votes": {}, "probabilities": {}}
-    return {
-        "products": str(scan.folder),
-        "verdict": None if scan.verdict is None else scan.verdict.to_dict(),
-        "patches": [{"label": patch.label, **nothing} for patch in scan.segments],
-    }
+    for scan in products:
+        if scan.verdict is not None and not scan.verdict.usable:
+            return {
+                "products": str(scan.folder),
+                "verdict": scan.verdict.to_dict(),
+                "patches": [{"label": patch.label, **nothing} for patch in scan.segments],
+            }
+    raise ValueError("every scan has a result")
 
 
 def _row(matched: MatchedPatch, verdict: PatchName, pixels: npt.NDArray[np.str_]) -> dict[str, Any]:
+    """Return a named patch as JSON; `pixels` are the names of its pixels."""
+    distance = None
+    if np.isfinite(verdict.distance):
+        distance = verdict.distance
+    pixels_right = None
+    if matched.truth:
+        pixels_right = float((pixels == matched.truth).mean())
     return {
         "label": matched.label,
         "name": verdict.name,
         "confidence": verdict.confidence,
         "votes": verdict.votes,
         "probabilities": verdict.probabilities,
-        "distance": verdict.distance if np.isfinite(verdict.distance) else None,
+        "distance": distance,
         "pixels": verdict.pixels,
         "truth": matched.truth,
-        "pixels_right": float((pixels == matched.truth).mean()) if matched.truth else None,
+        "pixels_right": pixels_right,
     }

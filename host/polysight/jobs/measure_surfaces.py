@@ -65,6 +65,7 @@ def take_board_samples(board: BoardSamples, is_mirrored: bool) -> Samples:
     )
     if not is_mirrored:
         return samples
+    # The pipeline holds x and y exchanged; z stays.
     swap = [1, 0, 2]
     return replace(
         samples,
@@ -79,11 +80,12 @@ def take_board_samples(board: BoardSamples, is_mirrored: bool) -> Samples:
 def find_uncertainty(rig: Instrument, *, places_known: bool) -> Uncertainty:
     """Return the standard errors of leakage, axes and places of a rig."""
     polarimetry = rig.polarimetry
-    # Unmeasured, its size is that of a complex number.
+    # The prior is the size of the complex leakage; an error is that of one of its two parts.
     leakage = polarimetry.leakage_prior / np.sqrt(2)
     if polarimetry.leakage_std is not None:
         leakage = polarimetry.leakage_std
-    return Uncertainty(float(leakage), AXIS_STD_RAD, CALIBRATED_PLACE_STD_M if places_known else PLACE_STD_M)
+    place_std_m = CALIBRATED_PLACE_STD_M if places_known else PLACE_STD_M
+    return Uncertainty(float(leakage), AXIS_STD_RAD, place_std_m)
 
 
 def make_rig_optics(rig: Instrument) -> Optics:
@@ -118,13 +120,17 @@ def load_sphere_points(file: SphereFile) -> Seen:
 
 
 def _parse_echoes(rows: np.ndarray) -> Echoes:
+    """Return the echoes of a calibration file.
+
+    Columns: position (3), path, slope (2), bend (xx, xy, yy), amplitude (real, imaginary), its error, rise over the
+    band.
+    """
     count = len(rows)
     bend = np.stack([rows[:, [6, 7]], rows[:, [7, 8]]], axis=1)
     # Files of older versions end before the rise over the band: none is assumed then.
+    band_rise = np.zeros(count)
     if rows.shape[1] > 12:
         band_rise = rows[:, 12]
-    else:
-        band_rise = np.zeros(count)
     return Echoes(
         at_m=rows[:, :3],
         path_m=rows[:, 3],

@@ -3,6 +3,8 @@
 A board is `ARMED` only after the radar reported that it waits for triggers, and `DONE` only after it reported the end
 of its frames. A fatal event leads to `FAULT`, which only a reset leaves. docs/spec/mmwavelink.md ("Power-up") lists the
 errors that healthy boards report at power-up and that are ignored. Not run on hardware yet.
+
+In this file `c` is the module of commands, `e` that of events.
 """
 
 from __future__ import annotations
@@ -153,7 +155,7 @@ class BringUp:
         patch_after = self._main_patch()
         self._verify(patch_after, patch_before, image)
         self._refuse_damaged()
-        # Only readable after the RF power-up
+        # The die id is only readable after the RF power-up.
         if self._board.die_id:
             self._rf_up()
             self._read_die()
@@ -288,17 +290,18 @@ class BringUp:
     def _check_versions(self) -> str:
         facts = self._board.facts
         for core, question in (("RF", c.GET_RF_VERSION), ("main", c.GET_MAIN_VERSION)):
-            v = self._board.ask(question, 16)
-            hardware = v[:3]
-            release = v[3:7]
-            patch = (*v[10:12], v[15] >> 4, v[15] & 15)
+            answer = self._board.ask(question, 16)
+            # Layout of the answer: ICD tables 5.66 and 5.157.
+            hardware = answer[:3]
+            release = answer[3:7]
+            patch = (*answer[10:12], answer[15] >> 4, answer[15] & 15)
             version = ".".join(map(str, release)) + " patch " + ".".join(map(str, patch))
             facts.hardware = ".".join(map(str, hardware))
             if core == "RF":
                 facts.rf_firmware = version
             else:
                 facts.main_firmware = version
-            require_family(self._board.name, core, v)
+            require_family(self._board.name, core, answer)
             if not any(patch):
                 raise DeviceError(
                     f"{self._board.name}: its {core} firmware has no patch (version {version})",
@@ -307,11 +310,11 @@ class BringUp:
                     code=ErrorCode.RADAR_NO_FIRMWARE,
                 )
             if self._board.firmware is not None and core == "RF":
-                self._verify_rf(_patch(v), self._board.firmware)
+                self._verify_rf(_patch(answer), self._board.firmware)
             elif self._board.firmware is not None:
-                self._verify(_patch(v), self._flash_patch, self._board.firmware)
+                self._verify(_patch(answer), self._flash_patch, self._board.firmware)
         if self._board.die_id:
-            # Before the RF part of a wrong board is powered
+            # A wrong board is refused before its RF part is configured.
             self._read_die()
         return f"RF {facts.rf_firmware}, main {facts.main_firmware}"
 
@@ -364,7 +367,7 @@ class BringUp:
         except DeviceError as error:
             if self._board.die_id or error.code is not ErrorCode.REFUSED_BY_PEER:
                 raise
-            # A firmware without this command
+            # This firmware does not have the command.
             self._board.log_event(error.what)
             return "unknown"
         die = "-".join(f"{word:08x}" for word in struct.unpack_from("<4I", data))
@@ -621,7 +624,7 @@ class RadarBoard:
             if self.poll() in (State.ARMED, State.RUNNING):
                 self._stop()
         except DeviceError:
-            # The link is closed in any case
+            # The board does not answer any more; its link is closed in any case.
             pass
         finally:
             self.words.close()
@@ -670,5 +673,8 @@ class RadarBoard:
         try:
             yield
         except BaseException as error:
-            self.fail(error.what if isinstance(error, PolysightError) else str(error))
+            reason = str(error)
+            if isinstance(error, PolysightError):
+                reason = error.what
+            self.fail(reason)
             raise

@@ -96,7 +96,7 @@ class RadarControl(ABC):
 
 
 _POLL_S = 0.005
-# USB needs some time to find a chip again
+# USB needs some time to find a chip again that was reset or replugged.
 _REOPEN_TIMEOUT_S = 5.0
 _REOPEN_INTERVAL_S = 0.25
 _STATES = {
@@ -136,7 +136,12 @@ def plan_lines(rig: Instrument) -> tuple[list[str], bool]:
     """
     frames = rig.grid.columns * rig.burst.pulses
     checked = constraints(rig, frames)
-    lines = [f"holds   {c}" if c.holds else f"BROKEN  {c}\n        do: {c.remedy}" for c in checked]
+    lines = []
+    for constraint in checked:
+        if constraint.holds:
+            lines.append(f"holds   {constraint}")
+        else:
+            lines.append(f"BROKEN  {constraint}\n        do: {constraint.remedy}")
     if not all(c.holds for c in checked):
         return [*lines, "\nnothing would be sent"], False
     for board in rig.boards:
@@ -245,7 +250,7 @@ class NativeRadars(RadarControl):
             try:
                 board.arm(frames)
             except DeviceError:
-                # A chip that was disconnected and came back leaves a dead link
+                # A chip that was disconnected and came back leaves a dead link.
                 if self._reopen(board):
                     with suppress(DeviceError):
                         board.arm(frames)
@@ -271,15 +276,15 @@ class NativeRadars(RadarControl):
             return words
         try:
             log = trace_words(words, self._clock, new_trace(Path(folder), name), self._rig, name)
-        # A full disk, for instance: continue without a trace.
         except OSError:
+            # The disk is full, for instance: continue without a trace.
             return words
         self._traces.append(log)
         return log
 
     def _reopen(self, board: RadarBoard) -> bool:
         """Reopen a failed board's link; return False after the timeout."""
-        # The device is gone
+        # Closing fails if the device was unplugged.
         with suppress(OSError):
             board.close()
         deadline = self._clock.now() + _REOPEN_TIMEOUT_S
@@ -356,7 +361,7 @@ class LineServers(RadarControl):
         self._servers = dict(servers)
         self._timeout_s = timeout_s
         self._sockets: dict[str, socket.socket] = {}
-        # Boards whose server broke the connection since the last line
+        # Boards whose server broke the connection since the last line.
         self._reset: set[str] = set()
         try:
             for board in self._servers:
@@ -437,7 +442,7 @@ class LineServers(RadarControl):
         """Wait until the other machine acknowledged the line, or the connection ended."""
         connection = self._sockets[board]
         ended = select.poll()
-        # A reset, or the end of both directions
+        # With no events requested, poll reports a reset, or the end of both directions.
         ended.register(connection, 0)
         while _count_unacknowledged(connection):
             if ended.poll(_POLL_MS):
@@ -467,7 +472,7 @@ class LineServers(RadarControl):
 
 def _count_unacknowledged(connection: socket.socket) -> int:
     """Return the sent bytes that the other kernel has not acknowledged (SIOCOUTQ, tcp(7))."""
-    # Modules of POSIX systems: this file is imported on laptops, too.
+    # These modules exist on POSIX systems only; this file is imported on others, too.
     import fcntl
     import termios
 

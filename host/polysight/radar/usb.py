@@ -21,7 +21,7 @@ from polysight_shared.errors import ConfigError, DeviceError
 # The FT4232H over USB.
 VENDOR = 0x0451
 PRODUCT = 0xFD03
-# Prefix of a USB path, "usb:1-4.2"; without it, a serial number
+# A place begins with this prefix if it is a path, such as "usb:1-4.2"; without it, it is a serial number.
 PATH = "usb:"
 _READ_TIMEOUT_S = 0.5
 _LATENCY_MS = 1
@@ -32,13 +32,13 @@ SCHEME = "tcp://"
 _HEAD = struct.Struct("<ccH")
 _TIMEOUT_S = 30.0
 
-# Pins and MPSSE commands.
-# Clock, data out, chip select, PMIC reset are outputs
+# Pins and MPSSE commands (FTDI AN_108). A direction has a 1 for each output.
+# Channel A: clock, data out, chip select and PMIC reset are outputs.
 SPI_DIRECTION = 0b0100_1011
 SELECTED_WRITE = 0xC0
 SELECTED_READ = 0xC2
 IDLE = 0xC8
-# Bit 5, the interrupt, is an input
+# Channel B: bit 5, the interrupt, is an input.
 INTERRUPT_DIRECTION = 0b0101_1011
 INTERRUPT_IDLE = 0b0001_0011
 INTERRUPT_BIT = 5
@@ -46,7 +46,7 @@ RESET_DIRECTION = 0b1111_1001
 RESET_PIN = 6
 WARM_RESET_PIN = 7
 SENSE_DIRECTION = 0b1111_1111
-# D4 = 1, D3 = D2 = 0
+# Sense-on-power mode 4: D4 = 1, D3 = D2 = 0.
 FUNCTIONAL_MODE = 0b0001_0000
 # Directions of channels A to D, and True for bit-bang mode.
 _CHANNELS = ((SPI_DIRECTION, False), (INTERRUPT_DIRECTION, False), (RESET_DIRECTION, True), (SENSE_DIRECTION, True))
@@ -61,7 +61,7 @@ _NO_THREE_PHASE = 0x8D
 _THREE_PHASE = 0x8C
 _DIVISOR = 0x86
 _NO_LOOPBACK = 0x85
-# 60 MHz / (2 x (2 + 1)) = 10 MHz; 1 MHz
+# The clock is 60 MHz / (2 x (divisor + 1)): 10 MHz, and 1 MHz for a slow link.
 SPI_DIVISOR = 2
 SLOW_DIVISOR = 29
 # One pin command holds its pins for 0.2 us (FTDI AN_114), two clocks at 10 MHz; ICD 3.2.4 wants two at least.
@@ -292,8 +292,7 @@ class FtdiPort:
         try:
             self._ftdi.close(freeze=True)
         except (*self._library.errors, TypeError):
-            # Lost, or not opened completely by pyftdi
-            # Otherwise pyftdi counts it as open
+            # The chip is lost, or was not opened completely. Without this call pyftdi would count it as open.
             self._library.tools.release_device(device)
 
 
@@ -309,7 +308,8 @@ _PULLED = "the cable was pulled, or the board lost power"
 
 
 def _usb_error(what: str, e: BaseException | None, otherwise: str) -> DeviceError:
-    """Return an error with the likely cause by errno, also of the errors behind `e`, where pyftdi keeps libusb's."""
+    """Return an error with the likely cause by errno; `otherwise` is the cause for any other number."""
+    # pyftdi raises errors of its own; the number is that of libusb's error behind them.
     while e is not None and getattr(e, "errno", None) not in _CAUSES:
         e = e.__cause__ or e.__context__
     number = getattr(e, "errno", 0)
@@ -419,7 +419,7 @@ def _library() -> _Library:
             "pip install pyftdi",
             code=ErrorCode.PACKAGE_MISSING,
         ) from None
-    # FtdiError and USBError are OSErrors
+    # FtdiError and USBError are OSErrors.
     return _Library(Ftdi, UsbTools, (OSError, ValueError, UsbToolsError), find)
 
 

@@ -51,6 +51,7 @@ def check_plate(plate: CheckPlate, patches: Sequence[PatchFigures]) -> CheckResu
     """Compare the patch at the place of the check plate with its permittivity; None without a plate in the rig file."""
     if not plate.name:
         return None
+    # The result of a plate that was not measured; it is filled in below.
     missing = CheckResult(name=plate.name, level="missing", expected=plate.permittivity, expected_std=plate.std)
     x_mm, y_mm = plate.place_mm
     patch = next((patch for patch in patches if _holds(patch, x_mm, y_mm)), None)
@@ -67,8 +68,10 @@ def check_plate(plate: CheckPlate, patches: Sequence[PatchFigures]) -> CheckResu
     difference = np.array([value.real, -value.imag]) - plate.permittivity
     sigmas = float(np.sqrt(difference @ np.linalg.solve(total, difference)))
     level = "good"
-    if sigmas > WARNING_SIGMAS:
-        level = "action" if sigmas > ACTION_SIGMAS else "warning"
+    if sigmas > ACTION_SIGMAS:
+        level = "action"
+    elif sigmas > WARNING_SIGMAS:
+        level = "warning"
     return msgspec.structs.replace(
         missing,
         level=level,
@@ -87,14 +90,15 @@ def check_reasons(result: CheckResult | None) -> list[Finding]:
     """Judge the check plate: "care" beyond the action limit, and where it is missing."""
     if result is None or result.level in ("good", "warning"):
         return []
-    do = "scan it again; if it stays, check calibration, antennas and the metal reference (polysight doctor)"
+    remedy = "scan it again; if it stays, check calibration, antennas and the metal reference (polysight doctor)"
     if result.measured is None:
-        why = "the rig file says that it lies in every scan"
-        return [reason("care", f"the check plate {result.name} was not measured: {result.why}", why, do, 2.0)]
+        problem = f"the check plate {result.name} was not measured: {result.why}"
+        return [reason("care", problem, "the rig file says that it lies in every scan", remedy, 2.0)]
     real, loss = result.measured
     known_real, known_loss = result.expected
-    what = (
+    problem = (
         f"the check plate {result.name} was measured as {real:.2f}, loss {loss:.2f}, instead of {known_real:.2f}, loss"
         f" {known_loss:.2f}: {result.sigmas:.1f} standard deviations"
     )
-    return [reason("care", what, "three good scans in a thousand are so far off: the rig has changed", do, 3.8)]
+    cause = "three good scans in a thousand are so far off: the rig has changed"
+    return [reason("care", problem, cause, remedy, 3.8)]

@@ -86,45 +86,45 @@ def read_json(path: Path, missing_ok: bool = False) -> dict[str, Any]:
 def read_settings(path: Path) -> Collection:
     """Read the settings of an `unsynced/<scan>` or `raw/<scan>` folder. Raises DataError or ConfigError."""
     content = {**read_json(path / DEVICES, missing_ok=True), **read_json(path / COLLECTION)}
-    s = decode(content, Collection, str(path / COLLECTION))
-    if s.moving_direction not in ("row", "col") or not s.chirp_configs or s.num_chirp != 1:
+    settings = decode(content, Collection, str(path / COLLECTION))
+    if settings.moving_direction not in ("row", "col") or not settings.chirp_configs or settings.num_chirp != 1:
         raise DataError(
-            f"{path}: moving_direction {s.moving_direction!r}, {len(s.chirp_configs)} chirp configs,"
-            f" {s.num_chirp} chirps a frame",
+            f"{path}: moving_direction {settings.moving_direction!r}, {len(settings.chirp_configs)} chirp configs,"
+            f" {settings.num_chirp} chirps a frame",
             "only scans by row or by column with one chirp a frame are read",
             "this scan cannot be processed",
             code=ErrorCode.VALUE_INVALID,
         )
-    return s
+    return settings
 
 
-def build_rig(s: Collection, base: Instrument, path: Path) -> Rig:
+def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
     """Return the base rig with the scan's settings; values missing in the JSON stay the base's. Raises ConfigError."""
-    c = s.chirp_configs[0]
-    grid = {"columns": s.total_x, "rows": s.total_y, "step_x_mm": s.dx, "step_y_mm": s.dy}
+    chirp = settings.chirp_configs[0]
+    grid = {"columns": settings.total_x, "rows": settings.total_y, "step_x_mm": settings.dx, "step_y_mm": settings.dy}
     # The grid was within their stage's travel.
     travel = (
-        max(base.stage.travel_x_mm, s.total_x * s.dx + 2 * base.stage.run_up_mm(s.dx)),
-        max(base.stage.travel_y_mm, s.total_y * s.dy + 2 * base.stage.run_up_mm(s.dy)),
+        max(base.stage.travel_x_mm, settings.total_x * settings.dx + 2 * base.stage.run_up_mm(settings.dx)),
+        max(base.stage.travel_y_mm, settings.total_y * settings.dy + 2 * base.stage.run_up_mm(settings.dy)),
     )
     table = msgspec.to_builtins(base)
     table["grid"] = grid
     table["stage"] |= {"travel_x_mm": travel[0], "travel_y_mm": travel[1]}
     table["stage"] |= {"centre_x_mm": travel[0] / 2, "centre_y_mm": travel[1] / 2}
-    table["burst"] |= {"pulses": s.num_trigger, "period_us": s.period_frame * 1e3}
-    table["geometry"]["object_distance_mm"] = s.object_distance
+    table["burst"] |= {"pulses": settings.num_trigger, "period_us": settings.period_frame * 1e3}
+    table["geometry"]["object_distance_mm"] = settings.object_distance
     table["chirp"] |= {
-        "start_hz": _to_large_unit(c.f0, least=1e6, factor=1e9),
-        "slope_hz_per_s": _to_large_unit(c.slope, least=1e6, factor=1e12),
-        "ramp_end_us": _to_large_unit(c.ramp_time, least=1, factor=1e6),
-        "adc_start_us": _to_large_unit(c.adc_start_time, least=1e-2, factor=1e6),
-        "samples": c.num_adc,
-        "sample_rate_hz": _to_large_unit(c.Fs, least=1e5, factor=1e3),
-        "linear_samples": [min(n, c.num_adc) for n in base.chirp.linear_samples],
+        "start_hz": _to_large_unit(chirp.f0, least=1e6, factor=1e9),
+        "slope_hz_per_s": _to_large_unit(chirp.slope, least=1e6, factor=1e12),
+        "ramp_end_us": _to_large_unit(chirp.ramp_time, least=1, factor=1e6),
+        "adc_start_us": _to_large_unit(chirp.adc_start_time, least=1e-2, factor=1e6),
+        "samples": chirp.num_adc,
+        "sample_rate_hz": _to_large_unit(chirp.Fs, least=1e5, factor=1e3),
+        "linear_samples": [min(n, chirp.num_adc) for n in base.chirp.linear_samples],
     }
     rig = decode(table, Instrument, str(path))
     notices: list[str] = []
-    boards = tuple(msgspec.structs.replace(b, mount=_mount(b, s, notices)) for b in rig.boards)
+    boards = tuple(msgspec.structs.replace(b, mount=_adapt_mount(b, settings, notices)) for b in rig.boards)
     return Rig(msgspec.structs.replace(rig, boards=boards), tuple(notices))
 
 
@@ -138,7 +138,7 @@ def _to_large_unit(value: float, least: float, factor: float) -> float:
     return value
 
 
-def _mount(board: Board, s: Collection, notices: list[str]) -> tuple[MountStep, ...]:
+def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tuple[MountStep, ...]:
     """Replace the angles and offsets of the base rig's mount by the scan's.
 
     The last turn about y points the board at the object, the last about z tilts the receivers, and the shift between
@@ -148,32 +148,32 @@ def _mount(board: Board, s: Collection, notices: list[str]) -> tuple[MountStep, 
     steps = list(board.mount)
     transmits = board.role == "transmit"
     key = "txboard_angle_y" if transmits else "rxboard_angle_y"
-    facing = getattr(s, key)
+    facing_deg = getattr(settings, key)
     # The transmitter stands at negative x and faces +x, receivers the other way round.
     side = -1 if transmits else 1
-    if facing is not None and (turns := _turns(steps, "y")):
+    if facing_deg is not None and (turns := _turns(steps, "y")):
         # Its normal, (sin a, 0, cos a), would point away from the other boards.
-        if facing * side > 0:
+        if facing_deg * side > 0:
             notices.append(
-                f"{board.name}: {key} = {facing:g} would turn the board away from the object;"
-                f" read with the other sense of rotation, {-facing:g}"
+                f"{board.name}: {key} = {facing_deg:g} would turn the board away from the object;"
+                f" read with the other sense of rotation, {-facing_deg:g}"
             )
-            facing = -facing
-        steps[turns[-1]] = MountStep(turn_deg=facing, about="y")
+            facing_deg = -facing_deg
+        steps[turns[-1]] = MountStep(turn_deg=facing_deg, about="y")
     if not transmits:
-        if s.rxboard_angle_z is not None and (turns := _turns(steps, "z")):
-            steps[turns[-1]] = MountStep(turn_deg=s.rxboard_angle_z, about="z")
+        if settings.rxboard_angle_z is not None and (turns := _turns(steps, "z")):
+            steps[turns[-1]] = MountStep(turn_deg=settings.rxboard_angle_z, about="z")
         turns_y = _turns(steps, "y")
-        if board.role == "receive_v" and s.rxboard_v_angle_y is not None and len(turns_y) > 1:
-            steps[turns_y[0]] = MountStep(turn_deg=s.rxboard_v_angle_y, about="y")
+        if board.role == "receive_v" and settings.rxboard_v_angle_y is not None and len(turns_y) > 1:
+            steps[turns_y[0]] = MountStep(turn_deg=settings.rxboard_v_angle_y, about="y")
         shifts = _shifts(steps)
-        if s.rxboard_tilt_offset is not None and len(shifts) > 1:
-            steps[shifts[-2]] = MountStep(shift_mm=s.rxboard_tilt_offset)
-    last = None
+        if settings.rxboard_tilt_offset is not None and len(shifts) > 1:
+            steps[shifts[-2]] = MountStep(shift_mm=settings.rxboard_tilt_offset)
+    last_shift_mm = None
     if steps:
-        last = steps[-1].shift_mm
-    if s.board_dist is not None and last is not None:
-        steps[-1] = MountStep(shift_mm=(side * s.board_dist * 1e3 / 2, last[1], last[2]))
+        last_shift_mm = steps[-1].shift_mm
+    if settings.board_dist is not None and last_shift_mm is not None:
+        steps[-1] = MountStep(shift_mm=(side * settings.board_dist * 1e3 / 2, last_shift_mm[1], last_shift_mm[2]))
     return tuple(steps)
 
 

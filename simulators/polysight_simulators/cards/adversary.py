@@ -16,34 +16,51 @@ from numpy.typing import NDArray
 from polysight_simulators.cards.dca1000 import DATA_HEADER_BYTES, Packetiser
 
 KINDS = (
-    "lose",  # packets
-    "lose_tail",  # the last packets of a record
+    # Packets are lost: anywhere, at the end or the beginning of a record, or all of them.
+    "lose",
+    "lose_tail",
     "lose_head",
     "lose_all",
-    "delay",  # packets, into the next record, before or after its first pulse
-    "backlog",  # the last packets come after the stop, before the next record or in it
+    # Packets come into the next record, before or after its first pulse.
+    "delay",
+    # The last packets come after the stop, before the next record or in it.
+    "backlog",
     "duplicate",
-    "two_paths",  # every packet comes twice, the second path being later
+    # Every packet comes twice; the second path is slower.
+    "two_paths",
     "reorder",
-    "flows",  # a switch sends packets by turns over queues of different length
+    # A switch sends packets by turns over queues of different length.
+    "flows",
     "truncate",
     "turn_header_bit",
-    "reset",  # the card restarts in mid-stream
-    "reset_early",  # in the record's first packets
-    "reset_between",  # before the record
-    "miss_frames",  # triggers are missed: the record is shorter
-    "end_early",  # the card ends the record and starts another: two short packets in one stream
-    "drop_inside",  # the card drops bytes before numbering them, and its status message is lost
-    "drop_frames",  # exactly the bytes of one to three frames
-    "two_drops",  # at two places, together the bytes of one or two frames
-    "twin",  # a second card with the same address sends a record, too
-    "twin_alone",  # and this card's own record is lost
+    # The card restarts: in mid-stream, in the record's first packets, or before the record.
+    "reset",
+    "reset_early",
+    "reset_between",
+    # Triggers are missed: the record is shorter.
+    "miss_frames",
+    # The card ends the record and starts another: two short packets in one stream.
+    "end_early",
+    # The card drops bytes before it numbers them, and its status message is lost.
+    "drop_inside",
+    # The dropped bytes are exactly one to three frames.
+    "drop_frames",
+    # Bytes are dropped at two places; together they are one or two frames.
+    "two_drops",
+    # A second card with the same address sends a record, too.
+    "twin",
+    # The record of the second card comes, and this card's own is lost.
+    "twin_alone",
 )
 RADAR = (
-    "missed",  # SYNC_IN pulses
-    "spurious",  # edges nobody sent; the radar counts its frames and ignores as many pulses at the end
-    "near",  # an edge beside a pulse that the radar missed
-    "endless",  # the radar does not count its frames
+    # SYNC_IN pulses are missed.
+    "missed",
+    # Nobody sent these edges; the radar counts its frames and ignores as many pulses at the end.
+    "spurious",
+    # An edge comes beside a pulse that the radar missed.
+    "near",
+    # The radar does not count its frames.
+    "endless",
 )
 """What a radar can do, in :meth:`Adversary.take`: only the times of its frames tell."""
 _FRAME_NS = 128_000

@@ -58,7 +58,7 @@ class NetworkFaults:
             if suffers and suffers[-1] >= first:
                 next_one = suffers[bisect_left(suffers, first)]
             if self._held or next_one == first:
-                arrived += self._one(rows[first : first + 1], draws[first], self._index)
+                arrived += self._carry_one(rows[first : first + 1], draws[first], self._index)
                 arrived += self._release(self._index)
                 next_one = first + 1
             else:
@@ -78,24 +78,26 @@ class NetworkFaults:
             suffers |= numbers >= f.stop_after_packets
         return suffers
 
-    def _one(self, packet: Rows, draw: NDArray[np.float64], index: int) -> list[Rows]:
+    def _carry_one(self, packet: Rows, draws: NDArray[np.float64], index: int) -> list[Rows]:
+        """Return a packet with its faults, [n, size]; `draws` has a number for each kind of fault."""
         f = self._faults
+        loss, reorder, late, truncate, duplicate = draws
         if f.stop_after_packets is not None and index >= f.stop_after_packets:
             self._count("not_sent", packet[0])
-        elif draw[0] < f.loss or index in self._lose:
+        elif loss < f.loss or index in self._lose:
             self._count("lost", packet[0])
-        elif draw[1] < f.reorder:
+        elif reorder < f.reorder:
             self._count("reordered")
             self._held.append((index + 1, packet))
-        elif draw[2] < f.late:
+        elif late < f.late:
             self._count("late")
             self._held.append((index + f.late_packets, packet))
-        elif draw[3] < f.truncate:
+        elif truncate < f.truncate:
             half = packet[:, : packet.shape[1] // 2]
             self._count("truncated")
             self._counts["truncated_bytes"] += packet.shape[1] - max(half.shape[1], DATA_HEADER_BYTES)
             return [half]
-        elif draw[4] < f.duplicate:
+        elif duplicate < f.duplicate:
             self._count("duplicated")
             return [packet, packet]
         else:

@@ -16,6 +16,7 @@ from polysight_simulators.radars import RadarBoard
 
 # Time between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger).
 RECOVERY_US = 150.0
+# Number of motion lines, and of triggers, that are remembered.
 _KEEP = 4096
 
 
@@ -36,16 +37,16 @@ class SyncInput:
     def __init__(self, rig: Instrument, radar: RadarBoard | None = None) -> None:
         self._radar = radar
         self._row_frames = rig.grid.columns * rig.burst.pulses
-        self._left: int | None = 0 if rig.radar.control == "line_server" else None
+        self._frames_left: int | None = 0 if rig.radar.control == "line_server" else None
         self.rearmed = self.unarmed = 0
-        later_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
-        self._dead_ns = us_to_ns(later_us + rig.chirp.ramp_end_us + RECOVERY_US)
+        last_chirp_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
+        self._dead_ns = us_to_ns(last_chirp_us + rig.chirp.ramp_end_us + RECOVERY_US)
         self._last_ns: int | None = None
         self.too_soon = 0
 
     def arm(self) -> None:
         """Arm the radar for the pulses of one row; frames left of the last row are dropped."""
-        self._left = self._row_frames
+        self._frames_left = self._row_frames
         self.rearmed += 1
 
     def frames(self, pulses: list[Pulse]) -> list[Pulse]:
@@ -54,7 +55,7 @@ class SyncInput:
             return self._native(self._radar, pulses)
         started = []
         for pulse in pulses:
-            if self._left == 0:
+            if self._frames_left == 0:
                 self.unarmed += 1
                 continue
             # A time that jumps back by more than the dead time is of a new wire clock: the stage restarted.
@@ -62,8 +63,8 @@ class SyncInput:
                 self.too_soon += 1
                 continue
             self._last_ns = pulse.t_ns
-            if self._left is not None:
-                self._left -= 1
+            if self._frames_left is not None:
+                self._frames_left -= 1
             started.append(pulse)
         return started
 
@@ -138,9 +139,9 @@ class StageTrack:
             if trigger_count and self._triggers[trigger_count - 1] != edge_ns:
                 edge_ns = self._triggers[trigger_count - 1]
                 first = self._first_pulse(edge_ns)
-            nth = (pulse.t_ns - edge_ns) // us_to_ns(self._burst.period_us)
-            if trigger_count and first is not None and nth < self._burst.pulses:
-                pulse = pulse._replace(number=first + nth)
+            pulse_of_burst = (pulse.t_ns - edge_ns) // us_to_ns(self._burst.period_us)
+            if trigger_count and first is not None and pulse_of_burst < self._burst.pulses:
+                pulse = pulse._replace(number=first + pulse_of_burst)
             renumbered.append(pulse)
         return renumbered
 

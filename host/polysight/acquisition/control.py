@@ -31,7 +31,7 @@ CONTROL = "control"
 ALIVE = "alive"
 _POLL_S = 0.2
 _ALIVE_INTERVAL_S = 1.0
-# For a scan to accept a command.
+# Time in which a scan accepts a command.
 _TIMEOUT_S = 5.0
 LAPSE_S = 15.0
 """Without a sign of life for so long, a scan's program hangs, or runs on a machine that is gone."""
@@ -67,7 +67,9 @@ class StopRequest:
             return ScanCommand.ABORT
         if self.after_row:
             return ScanCommand.STOP
-        return ScanCommand.PAUSE if self.paused else ""
+        if self.paused:
+            return ScanCommand.PAUSE
+        return ""
 
     @property
     def after_row(self) -> bool:
@@ -133,12 +135,12 @@ def delay_interrupts() -> Iterator[None]:
 class ScanCommand(StrEnum):
     """Commands for a running scan; the values are the names of their files."""
 
-    # After the current row, until `continue`.
+    # Wait after the current row, until `continue`.
     PAUSE = "pause"
     CONTINUE = "continue"
-    # After the current row.
+    # End the scan after the current row.
     STOP = "stop"
-    # Now.
+    # End the scan now, in the middle of a row.
     ABORT = "abort"
 
 
@@ -218,10 +220,9 @@ class ControlFolder:
                     for command in ScanCommand:
                         self._obey(command)
                 pending = self._stop.pending
+                asker = ""
                 if pending:
                     asker = self._stop.asker
-                else:
-                    asker = ""
                 life = Life(os.getpid(), ticks, socket.gethostname(), self._doing, pending, asker)
                 if life != written or time.monotonic() >= next_alive_s:
                     self._write(life)

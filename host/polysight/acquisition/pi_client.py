@@ -55,19 +55,19 @@ from polysight_shared.messages import (
 )
 from polysight_shared.sockets import HandshakeMonitor, requester, subscriber
 
-# To send a command.
+# Number of times that a command is sent before the Pi counts as silent.
 ATTEMPTS = 3
 # Real-time priority of the heartbeat: below the receiver processes.
 REAL_TIME = 1
-# More than after which the Pi considers a host dead.
+# Heartbeats to wait for the end of a killed program's run: more than the Pi waits before it considers a host dead.
 _SILENT_BEATS = 10
-# For a reply to `Alive`, before it is sent again.
+# Time to wait for a reply to `Alive` before it is sent again.
 _ALIVE_TIMEOUT_S = 1.0
 # States that change without a command.
 MOVING: tuple[State, ...] = ("homing", "running", "held", "done")
 _REST_TIMEOUT_S = 10.0
 _POLL_S = 0.05
-# Events.
+# Events that one reply brings from the Pi's journal.
 _REPLAY_LIMIT = 1000
 R = TypeVar("R", bound=AnyReply)
 
@@ -89,11 +89,11 @@ class HostHeartbeat:
         self._thread.start()
 
     def _beat(self) -> None:
-        # Without permission for that, a busy machine may cause a retake.
+        # Without permission for real time, a busy machine may delay a heartbeat and so cause a retake.
         take_priority(REAL_TIME)
         try:
             while not self._stop.wait(self._interval_s):
-                # No connection: the Pi will notice the missing heartbeat.
+                # Without a connection nothing is sent: the Pi notices the missing heartbeat.
                 with suppress(zmq.Again):
                     self._socket.send(self._alive)
                 waited_s = 0.0
@@ -147,7 +147,7 @@ class PiClient:
         self._pending: deque[AnyEvent] = deque()
         # Events that PUB lost and the journal contained.
         self.gaps_filled = 0
-        # In the last heartbeat.
+        # State of the Pi in its last heartbeat.
         self.state: State = "idle"
 
     @property
@@ -214,7 +214,7 @@ class PiClient:
         for _ in range(ATTEMPTS):
             reply = self._once(command, self._timeout_s / ATTEMPTS)
             if isinstance(reply, Accepted):
-                # Newer than the last heartbeat.
+                # The reply is newer than the last heartbeat.
                 self.state = reply.state
                 return
             status = self.status()
@@ -266,8 +266,8 @@ class PiClient:
         """Send once and return the reply, None after the timeout. A new request replaces the old (relaxed REQ)."""
         try:
             self._commands.send(pack(command))
-        # There is no connection.
         except zmq.Again:
+            # There is no connection.
             return None
         if not self._commands.poll(round(timeout_s * 1e3)):
             return None
@@ -314,7 +314,7 @@ class PiClient:
             elif event.seq > self._last_seq:
                 self._catch_up(event.seq)
         if time.monotonic() - self._last_heard_s > self._silence_s:
-            # No heartbeats: check that it answers.
+            # Heartbeats are missing: check that the Pi answers commands.
             self._catch_up(self.status().last_seq)
         out = list(self._pending)
         self._pending.clear()

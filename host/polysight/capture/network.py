@@ -29,22 +29,24 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
 from polysight_shared.units import NS_PER_S
 
-# Linux; may exceed net.core.rmem_max, needs CAP_NET_ADMIN.
+# Socket options of Linux (asm-generic/socket.h), which Python does not name.
+# Request a buffer that may exceed net.core.rmem_max; this needs CAP_NET_ADMIN.
 SO_RCVBUFFORCE = 33
-# Linux: nine 32-bit words about the socket's memory.
+# Read nine 32-bit words about the socket's memory.
 SO_MEMINFO = 55
-# Linux: each packet comes with the time at which the kernel got it.
+# Each packet comes with the time at which the kernel got it.
 SO_TIMESTAMPNS = 35
-# Of a receive buffer that a full packet occupies (measured).
+# Bytes of a receive buffer that a full packet occupies (measured).
 KERNEL_BYTES_A_PACKET = 2304
+# Index of the dropped packets among the words of SO_MEMINFO.
 _MEMINFO_DROPS = 8
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
-# Between two reads NTP moves the clock by far less.
+# A larger jump between two reads means that somebody set the clock: NTP moves it by far less.
 _CLOCK_WAS_SET_NS = 1_000_000
 # Bytes per packet: more than the largest, to detect longer ones.
 _STRIDE = 1536
-_MSG_DONTWAIT = socket.MSG_DONTWAIT if hasattr(socket, "MSG_DONTWAIT") else 0x40
-# flags in /proc/net/route
+_MSG_DONTWAIT = getattr(socket, "MSG_DONTWAIT", 0x40)
+# Flags in /proc/net/route.
 _GATEWAY = 0x2
 _UP = 0x1
 # Flag in /proc/net/arp.
@@ -77,7 +79,7 @@ class _Message(ctypes.Structure):
 
 
 def bind_udp(address: str, port: int, problem: str) -> socket.socket:
-    """Return a bound, non-blocking, unconnected UDP socket; `what` names it in errors.
+    """Return a bound, non-blocking, unconnected UDP socket; errors begin with `problem`.
 
     Raises
     ------
@@ -258,12 +260,14 @@ def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int,
     except (OSError, ValueError):
         limit = "net.core.rmem_max limits it"
     if usable_packets(granted) * MAX_PAYLOAD_BYTES < 2 * burst_bytes:
-        raise DeviceError(
-            f"{name}: the kernel grants a receive buffer of {granted} bytes, less than two bursts of {burst_bytes}",
-            limit if granted < wanted else "card.receive_buffer_bytes asks for no more",
-            remedy if granted < wanted else f"card.receive_buffer_bytes = {enough} in instrument.toml; {remedy}",
-            code=ErrorCode.VALUE_INVALID,
+        problem = (
+            f"{name}: the kernel grants a receive buffer of {granted} bytes, less than two bursts of {burst_bytes}"
         )
+        cause = limit
+        if granted >= wanted:
+            cause = "card.receive_buffer_bytes asks for no more"
+            remedy = f"card.receive_buffer_bytes = {enough} in instrument.toml; {remedy}"
+        raise DeviceError(problem, cause, remedy, code=ErrorCode.VALUE_INVALID)
     if granted < wanted:
         return f"{name}: receive buffer of {granted} bytes granted, {wanted} requested ({limit}); {remedy}"
     return ""
@@ -295,7 +299,9 @@ def silent_hop(card_address: str, root: Path = _ROOT) -> Hop:
     neighbour = neighbour_answers(card_address, root)
     if neighbour is None:
         return Hop.UNKNOWN
-    return Hop.CARD if neighbour else Hop.NEIGHBOUR
+    if neighbour:
+        return Hop.CARD
+    return Hop.NEIGHBOUR
 
 
 def route_interface(address: str, root: Path = _ROOT) -> str | None:
@@ -356,7 +362,7 @@ def neighbour_answers(address: str, root: Path = _ROOT) -> bool | None:
 
 
 def silent_card(board: Board, problem: str, root: Path = _ROOT) -> DeviceError:
-    """Return the error for a card that does not answer: `what` happened, and the hop that does not work, if known."""
+    """Return the error for a card that does not answer: the `problem`, and the hop that does not work, if known."""
     hop = silent_hop(board.card_address, root)
     interface = route_interface(board.card_address, root)
     if hop is Hop.ROUTE:
@@ -401,10 +407,9 @@ def silent_radar(board: Board, row: RowCapture | None = None) -> DeviceError:
     """Return the error for a card that replies but sends no data, with the likeliest cause from the capture `row`."""
     problem = f"no data from {board.name} (card {board.card_address} to {board.host_address}:{board.data_port})"
     remedy = "arm the radar, check the SYNC_IN wire (`polysight doctor` sends pulses), the data port in the EEPROM"
+    status = Status(0)
     if row is not None:
         status = Status(row.card_status)
-    else:
-        status = Status(0)
     if row is not None and row.strangers:
         cause = f"{row.strangers} packets came from another address than {board.card_address}"
         remedy = (

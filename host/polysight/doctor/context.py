@@ -57,19 +57,19 @@ _DROP_COUNTERS = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
 _PROBE_BYTES = 64 << 20
 _PROBE_S = 2.0
 
-# A card sends its short last packet two seconds after the last data
+# A card sends its short last packet two seconds after the last data.
 _LAST_PACKET_S = 2.5
 _POLL_S = 0.05
 
 
 def clock_is_synchronised() -> bool | None:
     """Return the kernel's synchronisation flag (adjtimex(2)); None if the system does not provide it."""
-    # Larger than struct timex; modes = 0 only reads
+    # The buffer is larger than struct timex; its zeros (modes = 0) request a read.
     timex = ctypes.create_string_buffer(512)
     adjtimex = getattr(ctypes.CDLL(None, use_errno=True), "adjtimex", None)
     if adjtimex is None or adjtimex(timex) < 0:
         return None
-    # Modes, offset, freq, maxerror, esterror, status
+    # The fields are modes, offset, freq, maxerror, esterror, status.
     *_, status = struct.unpack_from("@illlli", timex.raw)
     return not status & _STA_UNSYNC
 
@@ -96,7 +96,9 @@ def read_interface(name: str, root: Path = Path("/")) -> NetworkInterface:
         except (OSError, ValueError):
             return None
         # The kernel writes -1 for an interface that is down.
-        return None if value < 0 else value
+        if value < 0:
+            return None
+        return value
 
     ring = ring_max = None
     if root == Path("/"):
@@ -136,7 +138,7 @@ def write_speed(folder: Path) -> float:
 
 # Time of a packet beyond its configured delay: delays of 5, 10, 25, 50 us give 706, 545, 325, 193 Mbit/s (TI).
 PACKET_TIME_US = 11.0
-# Duration of each rate
+# Duration of the load at each rate.
 _RATE_S = 1.5
 _DRAIN_S = 5.0
 _SENDER = Path(__file__).with_name("send_packets.py")
@@ -161,7 +163,10 @@ class LoadResult:
 def card_rates(rig: Instrument) -> list[float]:
     """Packet rates of a card, packets/s, ascending: during bursts, while emptying its memory, and its maximum."""
     burst = rig.frame_bytes / MAX_PAYLOAD_BYTES / (rig.burst.period_us * 1e-6)
-    return sorted({burst, *(1e6 / (delay_us + PACKET_TIME_US) for delay_us in (rig.card.packet_delay_us, 5.0))})
+    emptying = 1e6 / (rig.card.packet_delay_us + PACKET_TIME_US)
+    # 5 us is the shortest delay that a card accepts.
+    maximum = 1e6 / (5.0 + PACKET_TIME_US)
+    return sorted({burst, emptying, maximum})
 
 
 def measure_receivers(rig: Instrument, rates: list[float], seconds: float = _RATE_S) -> tuple[list[LoadResult], str]:

@@ -316,8 +316,8 @@ def _notices(inputs: Inputs) -> list[Finding]:
     """All notices, the newest first, each once."""
     notices = []
     if inputs.problem:
-        why = "It was written by another release, or is damaged"
-        notices.append(Finding("warning", inputs.problem, why, f"`polysight validate {inputs.folder}`"))
+        cause = "It was written by another release, or is damaged"
+        notices.append(Finding("warning", inputs.problem, cause, f"`polysight validate {inputs.folder}`"))
     history = inputs.history
     if inputs.failure is not None:
         notices.append(inputs.failure)
@@ -342,15 +342,15 @@ def sync_notices(shown: Shown, columns: int) -> list[Finding]:
         sync = rows[row]
         if sync.masked > MASKED_SHARE * columns:
             problem = f"{board}: {sync.masked} of {columns} positions of row {row} have no usable direct path"
-            why = "Something stands between the transmitter and this board, or frames are missing"
-            do = "Clear the line of sight; look at the board's frames"
+            cause = "Something stands between the transmitter and this board, or frames are missing"
+            remedy = "Clear the line of sight; look at the board's frames"
         elif sync.direct_rad > DIRECT_RAD:
             problem = f"{board}: synchronisation leaves {sync.direct_rad:.2f} rad in row {row}; 0.004 is usual"
-            why = "A weak direct path, or a strong reflector near it"
-            do = "Check the antennas' aim; look at the range profile"
+            cause = "A weak direct path, or a strong reflector near it"
+            remedy = "Check the antennas' aim; look at the range profile"
         else:
             continue
-        notices.append(Finding("warning", problem, why, do, where=f"row {row}"))
+        notices.append(Finding("warning", problem, cause, remedy, where=f"row {row}"))
     return notices
 
 
@@ -497,7 +497,7 @@ def _judge_request(life: Life, history: ScanHistory, folder: str) -> Status | No
 def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
     """A rig that has stopped, is held, or homes."""
     pi = inputs.pi
-    every_row = len(history.takes) == history.plan.rows
+    all_rows_are_safe = len(history.takes) == history.plan.rows
     if pi.state == "fault" and pi.faults:
         return say_finding("rig_fault", pi.faults[-1])
     if pi.state == "fault":
@@ -505,13 +505,13 @@ def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
         return say("rig_fault", what="It occurred before this view.", why="See the Pi's log", do=do)
     if pi.state == "held":
         return say("held")
-    if every_row:
-        if pi.state == "homing":
-            return say("homing_again")
+    if all_rows_are_safe and pi.state == "homing":
+        return say("homing_again")
+    if all_rows_are_safe:
         return say("finishing")
-    if pi.state != "homing":
-        return None
-    return say("homing")
+    if pi.state == "homing":
+        return say("homing")
+    return None
 
 
 def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:

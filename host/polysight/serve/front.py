@@ -51,7 +51,7 @@ CONNECT_INTERVAL_S = 0.1
 CHUNK_BYTES = 1 << 16
 # Running scans are looked for at most this often, however many pages ask.
 RUNNING_AGE_S = 0.5
-# Who has not seen by then that a scan was killed, sees it in the list.
+# The header of every page shows a killed scan for this long; later, only the list of scans does.
 KILLED_SHOWN_S = 3600.0
 # Headers of one connection, and those that this process adds by itself.
 OWN_HEADERS = (b"connection", b"keep-alive", b"transfer-encoding", b"date", b"server")
@@ -124,9 +124,15 @@ def page_routes(front: Front) -> list[Route]:
     async def describe_page(request: Request) -> Response:
         access = front.access
         may_read = not access.token or access.loopback or access.has_session(request.scope)
-        known = may_read or access.has_token(request.headers)
         states = {key: msgspec.to_builtins(STATES[key]) for key in ("offline", "server_frozen")}
-        facts = PageFacts(access.control, front.starts, known, front.scans.only, dict(BADGES), states)
+        facts = PageFacts(
+            control=access.control,
+            starts=front.starts,
+            known=may_read or access.has_token(request.headers),
+            only=front.scans.only,
+            badges=dict(BADGES),
+            states=states,
+        )
         return Response(msgspec.json.encode(facts), media_type="application/json")
 
     pages = [Route(path, show_page) for path in PAGES]
@@ -218,7 +224,7 @@ class Reader:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward one request, and its answer until the browser is gone."""
-        # The guard has read it whole.
+        # The guard has read the body already, and passes it on as one message.
         body = b""
         if scope["method"] == "POST":
             body = (await receive()).get("body", b"")
@@ -250,7 +256,7 @@ class Reader:
             finally:
                 writer.close()
         except (OSError, h11.RemoteProtocolError):
-            # It was ended in the middle, and is started again. Half an answer is cut off.
+            # The reading process was ended in the middle, and is started again. Half an answer stays cut off.
             if not is_answered:
                 problem = "The reading part of the server does not answer"
                 do = "load the page again; control goes on without it"
@@ -375,7 +381,7 @@ class CountedConnection(H11Protocol):
         descriptor = self.transport.get_extra_info("socket").fileno()
         if descriptor < 0:
             return False
-        # Modules of POSIX systems: the page's results are imported on laptops, too.
+        # These modules exist on POSIX systems only; this file is imported on others, too.
         import fcntl
         import termios
 

@@ -142,7 +142,9 @@ async def _scan(site: Site, request: Request) -> Response:
 
 async def _queue(site: Site, request: Request) -> Response:
     del request
-    return json_answer(await site.read("", lambda: site.queue.waiting() if site.starts else Waiting([])))
+    if not site.starts:
+        return json_answer(Waiting([]))
+    return json_answer(await site.read("", site.queue.waiting))
 
 
 async def _thumbnail(site: Site, request: Request) -> Response:
@@ -243,7 +245,6 @@ async def _map(site: Site, request: Request) -> Response:
     if "low" in request.query_params and "high" in request.query_params:
         low = _number(request, "low")
         high = _number(request, "high")
-        limits = None
         if low < high:
             limits = (low, high)
     return _picture_answer(await _read_products(site, request, lambda folder: draw_map(folder, name, limits)))
@@ -260,19 +261,17 @@ async def _probe(site: Site, request: Request) -> Response:
 async def _file(site: Site, request: Request) -> Response:
     """One of the files that the result lists; nothing in it may act as a page of this server."""
     name = request.path_params["name"]
-    of = request.query_params.get("of", "products")
+    kind = request.query_params.get("of", "products")
 
     def find_file(folder: Path) -> tuple[str, Path]:
-        if not any(file.name == name and file.of == of for file in list_files(folder)):
+        if not any(file.name == name and file.of == kind for file in list_files(folder)):
             raise DataError(
                 f"no file is called {name[:80]!r}", "it was not made, or the name is wrong", "see the scan's page",
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
-        if of == EXPORT:
-            place = folder / EXPORT
-        else:
-            place = read_products(folder).folder
-        return folder.name, place / name
+        if kind == EXPORT:
+            return folder.name, folder / EXPORT / name
+        return folder.name, read_products(folder).folder / name
 
     scan, path = await site.read_scan(request, find_file)
     if name == REPORT:
@@ -334,9 +333,9 @@ async def _use_comparison(site: Site, request: Request, use: Callable[[Compariso
 
 
 async def _compare(site: Site, request: Request) -> Response:
-    return json_answer(await _use_comparison(site, request, lambda both_scans: both_scans.figures))
+    return json_answer(await _use_comparison(site, request, lambda comparison: comparison.figures))
 
 
 async def _compare_map(site: Site, request: Request) -> Response:
     name = request.path_params["name"]
-    return _picture_answer(await _use_comparison(site, request, lambda both_scans: draw_comparison(both_scans, name)))
+    return _picture_answer(await _use_comparison(site, request, lambda comparison: draw_comparison(comparison, name)))

@@ -88,7 +88,7 @@ def extract_connection(rig: Instrument) -> dict[str, Any]:
 
 def with_connection(begun: Instrument, connection: Mapping[str, Any]) -> Instrument:
     """Return the rig with other connection settings. Raises ConfigError."""
-    return decode(_with(to_builtins(begun), connection), Instrument, "scan_resumed")
+    return decode(_replace_connection(to_builtins(begun), connection), Instrument, "scan_resumed")
 
 
 def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
@@ -100,7 +100,7 @@ def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
         with every other key that differs; `name` is the rig file's in the message.
     """
     table = to_builtins(begun)
-    given_table = _with(to_builtins(given), extract_connection(begun))
+    given_table = _replace_connection(to_builtins(given), extract_connection(begun))
     given_table["stage"] = {**given_table["stage"], **{key: table["stage"][key] for key in SERIAL}}
     given_table["calibration"] = table["calibration"]
     differences = list(_differences(table, given_table, ""))
@@ -113,7 +113,7 @@ def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
         )
 
 
-def _with(table: dict[str, Any], connection: Mapping[str, Any]) -> dict[str, Any]:
+def _replace_connection(table: dict[str, Any], connection: Mapping[str, Any]) -> dict[str, Any]:
     boards = [{**b, **connection["boards"].get(b["name"], {})} for b in table["boards"]]
     radar = {**table["radar"], "servers": connection["servers"]}
     return {**table, **{section: connection[section] for section in SECTIONS}, "boards": boards, "radar": radar}
@@ -184,7 +184,7 @@ class ScanFolder:
         self.plan: RasterPlan = self.started.plan
         self.scan_id = self.started.scan_id
         self.simulated = self.started.simulated
-        self.instrument = self._latest()
+        self.instrument = self._latest_rig()
 
     def _unreadable(self, number: int, fact: OtherFact) -> ConfigError:
         return ConfigError(
@@ -194,7 +194,7 @@ class ScanFolder:
             code=ErrorCode.VALUE_INVALID,
         )
 
-    def _latest(self) -> Instrument:
+    def _latest_rig(self) -> Instrument:
         """Return the scan's rig with the connection settings of the last resume. Raises ConfigError."""
         connections = [fact.rig for fact in self.facts(ScanResumed) if fact.rig]
         if connections:
@@ -248,7 +248,7 @@ class ScanFolder:
     def reload(self) -> None:
         """Read the manifest again."""
         self.content = manifest.read(self.path / MANIFEST)
-        self.instrument = self._latest()
+        self.instrument = self._latest_rig()
 
     def writer(self) -> ManifestWriter:
         """Open the scan for appending and cut off a torn last line. Raises DeviceError if the scan is in use."""
@@ -350,7 +350,7 @@ class ScanFolder:
             )
         path = self.path / board.file
         chirps = board.frames_expected * self.instrument.burst.chirps
-        missing = self._missing(path.with_suffix(".idx"), board)
+        missing = self._read_missing(path.with_suffix(".idx"), board)
         return RowData(partial(self._read_pieces, path, board), missing, chirps, board.crc32)
 
     def _read_pieces(self, path: Path, board: BoardRow, size: int) -> Iterator[NDArray[np.uint8]]:
@@ -380,7 +380,7 @@ class ScanFolder:
                 code=ErrorCode.FILE_DAMAGED,
             )
 
-    def _missing(self, path: Path, board: BoardRow) -> list[tuple[int, int]]:
+    def _read_missing(self, path: Path, board: BoardRow) -> list[tuple[int, int]]:
         if board.missing_bytes == 0:
             return []
         facts, _ = read_index(path)

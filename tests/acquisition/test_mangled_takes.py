@@ -47,7 +47,7 @@ class Kept:
     placed_out: np.ndarray  # as the packets' counters say
 
 
-def logged(sent: Sent, expected: int) -> PacketLog:
+def log_packets(sent: Sent, expected: int) -> PacketLog:
     """The packets as a receiver that is always awake logs them."""
     log = PacketLog(expected)
     for a in sent.arrivals:
@@ -57,7 +57,7 @@ def logged(sent: Sent, expected: int) -> PacketLog:
 
 def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
     """Place a take and decide what is kept of it, as acquisition does."""
-    log = logged(sent, pulses.size * frame)
+    log = log_packets(sent, pulses.size * frame)
     placed, out = place_record(log, frame, past, int(pulses[0, 0]) - 5 * MS)
     frames = None
     if placed.located or placed.slipped:

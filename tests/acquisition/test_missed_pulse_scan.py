@@ -15,7 +15,7 @@ PULSES = 6
 
 
 @pytest.fixture
-def paced(make_instrument):
+def paced_rig(make_instrument):
     """Rows of 8 points and 6 pulses, their frames sent at the times of their pulses."""
     fake = FakeRig(make_instrument(columns=POINTS, rows=2, pulses=PULSES, row_retakes=1))
     fake.start()
@@ -33,10 +33,10 @@ def check_unmasked(result, payload, name: str) -> np.ndarray:
     return mask.reshape(POINTS * PULSES, -1)
 
 
-def test_missed_pulses_are_found_and_the_row_is_taken_again(paced, payload, tmp_path):
-    paced.cards["RH"].missed[0, 1] = {20}
-    paced.cards["RV"].missed[0, 1] = {0, 47}
-    result = run_scan(paced.instrument, tmp_path / "s")
+def test_missed_pulses_are_found_and_the_row_is_taken_again(paced_rig, payload, tmp_path):
+    paced_rig.cards["RH"].missed[0, 1] = {20}
+    paced_rig.cards["RV"].missed[0, 1] = {0, 47}
+    result = run_scan(paced_rig.instrument, tmp_path / "s")
     assert result.exit_status == "success"
     reasons = facts_of(result.folder, "row_rejected")[0]["reasons"]
     assert any(r.startswith("RH") and "SYNC_IN" in r for r in reasons)
@@ -45,12 +45,12 @@ def test_missed_pulses_are_found_and_the_row_is_taken_again(paced, payload, tmp_
         check_unmasked(result, payload, name)
 
 
-def test_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(paced, payload, tmp_path):
+def test_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(paced_rig, payload, tmp_path):
     missed = {"RH": {20}, "RV": {0, 30, 31, 47}}
     for name, pulses in missed.items():
         for take in (1, 2):
-            paced.cards[name].missed[0, take] = pulses
-    result = run_scan(paced.instrument, tmp_path / "s", keep_incomplete=True)
+            paced_rig.cards[name].missed[0, take] = pulses
+    result = run_scan(paced_rig.instrument, tmp_path / "s", keep_incomplete=True)
     assert (result.exit_status, result.incomplete_rows) == ("success", [0])
     assert errors(result.folder.path) == []
     for name, pulses in missed.items():
@@ -58,14 +58,14 @@ def test_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(paced, payload, 
         assert facts_of(result.folder, "row_committed")[0]["boards"][name]["pulses_missed"] == len(pulses)
 
 
-def test_row_with_a_spurious_edge_is_not_complete(paced, payload, tmp_path):
+def test_row_with_a_spurious_edge_is_not_complete(paced_rig, payload, tmp_path):
     """A radar that counts frames sees a spurious edge: as many frames as pulses, but all behind the edge off by one."""
     for take in (1, 2):
-        paced.cards["RV"].extra[0, take] = 20
+        paced_rig.cards["RV"].extra[0, take] = 20
     # A machine too busy to tell sees nothing
     for number in range(20):
-        paced.pi.rows_run.clear()
-        result = run_scan(paced.instrument, tmp_path / str(number), keep_incomplete=True)
+        paced_rig.pi.rows_run.clear()
+        result = run_scan(paced_rig.instrument, tmp_path / str(number), keep_incomplete=True)
         assert result.exit_status == "success"
         assert errors(result.folder.path) == []
         slipped = {"kind": "slipped", "board": "RV"}

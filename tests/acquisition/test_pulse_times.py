@@ -137,7 +137,7 @@ def test_a_whole_row_is_never_taken_for_a_slipped_one(load, seed, drift, frame):
 FAULTS = ("missed", "spurious", "near", "lost", "stalled")
 
 
-def edges_of(pulses: np.ndarray, faults: tuple[str, ...], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def draw_edges(pulses: np.ndarray, faults: tuple[str, ...], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return the edges that a radar takes for pulses, and the pulse of each, -2 for a spurious one."""
     edges = pulses.reshape(-1)
     truth = np.arange(pulses.size)
@@ -174,7 +174,7 @@ def test_whatever_happens_no_frame_is_at_a_wrong_pulse(request):
         bursts, count = [(12, 16), (30, 1), (7, 13), (7, 12), (40, 2)][chance.integers(5)]
         frame = int(chance.choice([512, 1456, 4096]))
         pulses = pulse_times(bursts, count)
-        edges, truth = edges_of(pulses, faults, rng)
+        edges, truth = draw_edges(pulses, faults, rng)
         if "lost" in faults:
             lost_packets = frozenset(rng.choice(edges.size * frame // PAYLOAD, 2).tolist())
         else:

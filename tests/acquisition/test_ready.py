@@ -165,7 +165,7 @@ def test_a_scan_begun_without_comparison_resumes_with_a_warning(rig, tmp_path):
     assert any("not compared" in w and "centre_x_mm" in w for w in result.warnings)
 
 
-def scanned(rig, folder, **stage):
+def start_scan(rig, folder, **stage):
     """Run a scan with these settings of [stage]; return its result and its `scan_ended`."""
     replace = msgspec.structs.replace
     result = run_scan(replace(rig.instrument, stage=replace(rig.instrument.stage, **stage)), folder)
@@ -175,20 +175,20 @@ def scanned(rig, folder, **stage):
 @pytest.mark.parametrize(("lost_mm", "answer"), [((0.0, 0.0), False), ((0.03, -0.04), False), ((0.0, -1.2), True)])
 def test_what_was_lost_is_in_the_manifest_and_what_matters_is_a_warning(rig, tmp_path, lost_mm, answer):
     rig.pi.lost_mm = lost_mm
-    result, ended = scanned(rig, tmp_path / "s")
+    result, ended = start_scan(rig, tmp_path / "s")
     assert (result.exit_status, rig.pi.homings) == ("success", 2)
     assert ended["lost_mm"] == list(lost_mm)
     assert any(f"{lost_mm[1]:.3f} mm in y" in w for w in result.warnings) == answer
 
 
 def test_a_stage_without_switches_is_not_homed_again(rig, tmp_path):
-    result, ended = scanned(rig, tmp_path / "s", home_after_scan=False)
+    result, ended = start_scan(rig, tmp_path / "s", home_after_scan=False)
     assert (result.exit_status, rig.pi.homings, "lost_mm" in ended) == ("success", 1, False)
 
 
 def test_homing_that_fails_after_the_last_row_ends_no_scan(rig, tmp_path):
     rig.pi.home_fails = {2}
-    result, ended = scanned(rig, tmp_path / "s")
+    result, ended = start_scan(rig, tmp_path / "s")
     assert (result.exit_status, ended["exit_status"], "lost_mm" in ended) == ("success", "success", False)
     assert any("switch was not found" in w for w in result.warnings)
     assert ScanFolder.load(tmp_path / "s").complete

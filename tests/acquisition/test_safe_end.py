@@ -127,10 +127,10 @@ def test_homing_that_another_program_started_is_waited_for():
     status = SimpleNamespace(scan_id="s", homed=True, fault=0, reason="")
     socket = SimpleNamespace(poll=lambda _: None)
 
-    def asked():
+    def next_status():
         return SimpleNamespace(**vars(status), state=next(states))
 
-    pi = SimpleNamespace(status=asked, event_socket=socket, events=list, home=None)
+    pi = SimpleNamespace(status=next_status, event_socket=socket, events=list, home=None)
     assert make_ready(pi, StopRequest(), lambda *_: None, "s", first=False)
 
 
@@ -238,14 +238,14 @@ def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, mon
     monkeypatch.setattr(processing, "publish_images", lambda *_: None)
     update = progress.ScanBar.update
 
-    def updated(bar, p) -> None:
+    def update_progress(bar, p) -> None:
         if (p.phase, p.state, p.row) == ("state", "running", 1):
             os.kill(os.getpid(), signal.SIGHUP)
             for stream in streams:
                 stream.break_off()
         update(bar, p)
 
-    monkeypatch.setattr(progress.ScanBar, "update", updated)
+    monkeypatch.setattr(progress.ScanBar, "update", update_progress)
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", streams[0])
         patch.setattr(sys, "stdout", streams[1])

@@ -37,7 +37,7 @@ def held(rig) -> None:
     rig.pi.notes[0, 1] = HELD
 
 
-def unlocated(rig) -> None:
+def make_unlocated(rig) -> None:
     """The first packet is lost, and the record ends neither where it should nor at a whole packet."""
     rig.cards["RV"].drop[0, 1] = {0}
     rig.cards["RV"].short[0, 1] = 5 * rig.instrument.frame_bytes // 2
@@ -54,7 +54,7 @@ def pi_fault(rig) -> None:
         (no_data, {"kind": "no_data", "board": "RV"}),
         (frames_missing, {"kind": "frames_missing", "board": "RV"}),
         (held, {"kind": "held", "board": "RV"}),
-        (unlocated, {"kind": "unlocated", "board": "RV"}),
+        (make_unlocated, {"kind": "unlocated", "board": "RV"}),
         (pi_fault, {"kind": "pi_fault", "number": 103}),
     ],
     ids=lambda x: x.__name__ if callable(x) else "",

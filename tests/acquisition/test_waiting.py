@@ -28,7 +28,7 @@ from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
 
 
-def limited(instrument, **limits):
+def limit_rows(instrument, **limits):
     return msgspec.structs.replace(instrument, limits=msgspec.structs.replace(instrument.limits, **limits))
 
 
@@ -48,7 +48,7 @@ def test_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
             at_wait.append((p.message, list(started)))
             release.set()
 
-    result = run_scan(limited(rig.instrument, rows_waiting=1), tmp_path / "s", on_row=on_row, progress=progress)
+    result = run_scan(limit_rows(rig.instrument, rows_waiting=1), tmp_path / "s", on_row=on_row, progress=progress)
     assert result.exit_status == "success"
     message, begun = at_wait[0]
     assert (message[0], begun) == ("2", [0, 1]), "two rows wait"
@@ -67,7 +67,7 @@ def test_stop_while_waiting_for_processing(rig, tmp_path):
             release.set()
 
     result = run_scan(
-        limited(rig.instrument, rows_waiting=1), tmp_path / "s", on_row=lambda _: release.wait(HANG_S) and None,
+        limit_rows(rig.instrument, rows_waiting=1), tmp_path / "s", on_row=lambda _: release.wait(HANG_S) and None,
         progress=progress, stop=stop,
     )  # fmt: skip
     assert (result.exit_status, sorted(result.folder.committed_rows())) == ("abort", [0, 1])

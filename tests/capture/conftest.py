@@ -55,7 +55,7 @@ def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
 
 
 @pytest.fixture
-def scripted(rig: Instrument) -> Iterator[Callable[..., tuple[CardClient, ScriptedCard]]]:
+def scripted_card(rig: Instrument) -> Iterator[Callable[..., tuple[CardClient, ScriptedCard]]]:
     """Makes a client and a card with scripted answers, of board RV."""
     board = rig.by_name("RV")
     with ExitStack() as stack:

@@ -38,7 +38,7 @@ GRIDS = [
 MAX_REFUSED = 1
 
 
-def logged(sent: Sent, expected: int, batch: int) -> PacketLog:
+def log_packets(sent: Sent, expected: int, batch: int) -> PacketLog:
     """The arrivals as a receiver logs them, some at a time."""
     log = PacketLog(expected)
     for k in range(0, len(sent.arrivals), batch):
@@ -90,7 +90,7 @@ class Rows(RuleBasedStateMachine):
 
     def take(self, troubles: tuple[str, ...], batch: int, pulses_known: bool) -> tuple[Sent, Placed]:
         sent = self.card.record(self.frames, troubles)
-        log = logged(sent, self.size, batch)
+        log = log_packets(sent, self.size, batch)
         placed, out = place_record(log, self.frame, self.past, sent.first_pulse_ns if pulses_known else 0)
         assert wrong_bytes(sent, placed, out) == 0, (troubles, placed.reason)
         c = placed.counts
@@ -124,7 +124,7 @@ class Rows(RuleBasedStateMachine):
         batch=st.sampled_from([1, 7, 64]),
         pulses_known=st.booleans(),
     )
-    def disturbed(self, troubles, batch, pulses_known):
+    def take_disturbed(self, troubles, batch, pulses_known):
         self.take(troubles, batch, pulses_known)
         self.refused = 0
 

@@ -21,8 +21,8 @@ from polysight_simulators.cards import Network
 from polysight_simulators.faults import Faults
 
 
-def test_configures_as_seen_on_a_real_card(scripted):
-    client, card = scripted(lambda code, _: [reply(code, 0x0402 if code == Code.VERSION else 0)])
+def test_configures_as_seen_on_a_real_card(scripted_card):
+    client, card = scripted_card(lambda code, _: [reply(code, 0x0402 if code == Code.VERSION else 0)])
     client.alive()
     client.configure(Card())
     assert str(client.version()) == "2.8"
@@ -43,9 +43,9 @@ def test_configures_as_seen_on_a_real_card(scripted):
 
 
 @pytest.mark.parametrize("source_port", [1024, 4098, 0])
-def test_replies_and_status_count_from_any_source_port(scripted, source_port):
+def test_replies_and_status_count_from_any_source_port(scripted_card, source_port):
     """Only the address tells a card: the sockets have no peer."""
-    client, _ = scripted(
+    client, _ = scripted_card(
         lambda code, _: [reply(Code.STATUS, Status.NO_LVDS_DATA), reply(code, 0x0402)], source_port=source_port
     )
     assert str(client.version()) == "2.8"
@@ -55,8 +55,8 @@ def test_replies_and_status_count_from_any_source_port(scripted, source_port):
         client._socket.getpeername()
 
 
-def test_status_messages_are_not_replies(scripted):
-    client, card = scripted(
+def test_status_messages_are_not_replies(scripted_card):
+    client, card = scripted_card(
         lambda code, _: [reply(Code.STATUS, Status.LVDS_BUFFER_FULL), reply(Code.VERSION, 1), b"noise", reply(code)]
     )
     client.alive()
@@ -68,45 +68,45 @@ def test_status_messages_are_not_replies(scripted):
     assert client.strangers == 2
 
 
-def test_lost_reply_is_retried(scripted):
-    client, card = scripted(lambda code, n: [] if n == 1 else [reply(code)], timeout_s=6.0)
+def test_lost_reply_is_retried(scripted_card):
+    client, card = scripted_card(lambda code, n: [] if n == 1 else [reply(code)], timeout_s=6.0)
     client.alive()
     assert [c for c, _ in card.seen] == [Code.ALIVE, Code.ALIVE]
 
 
-def test_record_start_is_never_sent_twice_without_a_stop(scripted):
-    client, card = scripted(
+def test_record_start_is_never_sent_twice_without_a_stop(scripted_card):
+    client, card = scripted_card(
         lambda code, n: [] if code == Code.RECORD_START and n == 1 else [reply(code)], timeout_s=6.0
     )
     client.record_start()
     assert [c for c, _ in card.seen] == [Code.RECORD_START, Code.RECORD_STOP, Code.RECORD_START]
 
 
-def test_refusal_is_an_error_but_not_for_stop(scripted):
-    client, _ = scripted(lambda code, _: [reply(code, 1)])
+def test_refusal_is_an_error_but_not_for_stop(scripted_card):
+    client, _ = scripted_card(lambda code, _: [reply(code, 1)])
     client.record_stop()
     with refused(ErrorCode.REFUSED_BY_PEER, "CONFIGURE_FPGA"):
         client.configure(Card())
 
 
-def test_silent_card_is_named(scripted):
-    client, card = scripted(lambda *_: [], timeout_s=0.15)
+def test_silent_card_is_named(scripted_card):
+    client, card = scripted_card(lambda *_: [], timeout_s=0.15)
     with refused(ErrorCode.NO_ANSWER, "RV", ":4202", "ALIVE", "EEPROM"):
         client.alive()
     wait_for(lambda: len(card.seen) == 3, "three requests")
 
 
-def test_command_port_in_use(scripted):
-    client, _ = scripted(lambda *_: [])
+def test_command_port_in_use(scripted_card):
+    client, _ = scripted_card(lambda *_: [])
     with refused(ErrorCode.BUSY, 4202, "ss -ulnp"):
         CardClient(client.board, 1.0)
 
 
 @pytest.mark.parametrize("between", [True, False])
-def test_end_of_the_record_before_is_not_that_of_this_one(scripted, between):
+def test_end_of_the_record_before_is_not_that_of_this_one(scripted_card, between):
     """It came after the stop: before the next start was sent, or between that and its reply."""
     late = [reply(Code.STATUS, Status.RECORD_COMPLETED)]
-    client, card = scripted(
+    client, card = scripted_card(
         lambda code, n: [*(late if between and code == Code.RECORD_START and n == 2 else []), reply(code)]
     )
     client.record_start()
@@ -118,14 +118,14 @@ def test_end_of_the_record_before_is_not_that_of_this_one(scripted, between):
     assert client.take_status() == Status(0)
 
 
-def test_wait_for_a_completed_record_has_a_timeout(scripted):
+def test_wait_for_a_completed_record_has_a_timeout(scripted_card):
     def answers(code, _):
         yield reply(code)
         if code == Code.RECORD_STOP:
             time.sleep(0.1)
             yield reply(Code.STATUS, Status.RECORD_COMPLETED)
 
-    client, _ = scripted(answers)
+    client, _ = scripted_card(answers)
     client.record_start()
     client.record_stop()
     client.wait_completed(60.0)
@@ -178,7 +178,7 @@ def test_a_card_that_could_not_be_reached_is_refused(given):
         EepromSettings(**(good | given))
 
 
-def settings_of(client: CardClient) -> EepromSettings:
+def read_settings(client: CardClient) -> EepromSettings:
     return EepromSettings.of_board(client.board, "12:34:56:78:90:13")
 
 
@@ -193,18 +193,18 @@ def card_that(status: int = 0, answer: int | None = 0):
     return answers
 
 
-def test_written_once_confirmed(scripted):
-    client, card = scripted(card_that())
-    settings = settings_of(client)
+def test_written_once_confirmed(scripted_card):
+    client, card = scripted_card(card_that())
+    settings = read_settings(client)
     program_eeprom(client, settings, settings.confirmation)
     assert card.seen == [(Code.ALIVE, b""), (Code.CONFIGURE_EEPROM, settings.encode())]
 
 
 @pytest.mark.parametrize("confirmed", ["", "yes", "192.168.33.180"])
-def test_nothing_is_sent_unconfirmed(scripted, confirmed):
-    client, card = scripted(card_that())
+def test_nothing_is_sent_unconfirmed(scripted_card, confirmed):
+    client, card = scripted_card(card_that())
     with refused(ErrorCode.VALUE_INVALID, client.board.card_address):
-        program_eeprom(client, settings_of(client), confirmed)
+        program_eeprom(client, read_settings(client), confirmed)
     assert card.seen == []
 
 
@@ -216,9 +216,9 @@ def test_nothing_is_sent_unconfirmed(scripted, confirmed):
         (0, None, ErrorCode.NO_ANSWER),
     ],
 )
-def test_a_card_that_could_not_write_it(scripted, status, answer, code):
-    client, card = scripted(card_that(status, answer), timeout_s=3.0)
-    settings = settings_of(client)
+def test_a_card_that_could_not_write_it(scripted_card, status, answer, code):
+    client, card = scripted_card(card_that(status, answer), timeout_s=3.0)
+    settings = read_settings(client)
     with refused(code):
         program_eeprom(client, settings, settings.confirmation)
     assert [code for code, _ in card.seen].count(Code.CONFIGURE_EEPROM) == 1

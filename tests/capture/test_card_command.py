@@ -136,7 +136,7 @@ def test_refused_commands_write_nothing(cards, card, words, says):
     assert running_cards.endpoints["RH"].card.network == state_before
 
 
-def programmed(made, name: str, folder: Path, typed: str, *words: str) -> str:
+def program_card(made, name: str, folder: Path, typed: str, *words: str) -> str:
     """What `polysight card program` says while the card `name` is switched off and on once it asks for that."""
     answer = folder / "told.txt"
     with answer.open("w") as out:
@@ -160,7 +160,7 @@ def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):
     board = rig.by_name("RV")
     running_cards = cards(more=(old,))
     address = f"{old.card_address}:{old.command_port}"
-    text = programmed(running_cards, "LS", tmp_path, board.card_address, "RV", "--at", address)
+    text = program_card(running_cards, "LS", tmp_path, board.card_address, "RV", "--at", address)
     for part in ("cannot be read back", NEW_MAC, "switch the card off and on", "FPGA 2.8", f"at {board.card_address}"):
         assert part in text
     assert running_cards.endpoints["LS"].card.network == running_cards.network_of(board)._replace(
@@ -175,7 +175,7 @@ def test_a_card_that_stays_where_it_was_must_have_been_off(cards, card, rig, tmp
     assert "written, but the card was not switched off" in done.err
     done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "0")
     assert (done.status, "`polysight card` tells" in done.out) == (0, True)
-    assert "it answers at" in programmed(running_cards, "RH", tmp_path, rig.by_name("RH").card_address, "RH")
+    assert "it answers at" in program_card(running_cards, "RH", tmp_path, rig.by_name("RH").card_address, "RH")
     assert running_cards.endpoints["RH"].card.network.mac.hex(":") == NEW_MAC
 
 

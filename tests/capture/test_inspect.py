@@ -65,7 +65,7 @@ def test_zeros_have_their_own_exit_status(tmp_path, capsys):
     assert "every sample is zero" in capsys.readouterr().out
 
 
-def altered(words: np.ndarray, fault: str) -> np.ndarray:
+def alter_file(words: np.ndarray, fault: str) -> np.ndarray:
     """A recording with a fault of the radar, the card or the program that wrote it."""
     if fault == "constant offset of":
         return words + np.int16(4000)
@@ -82,7 +82,7 @@ def altered(words: np.ndarray, fault: str) -> np.ndarray:
     "fault", ["constant offset of", "5 bytes after", "full scale", "I and Q", "RX 0 ", "RX 3 ", "no clear peak"]
 )
 def test_a_fault_is_the_only_remark(tmp_path, fault):
-    altered(row(4, False), fault).tofile(tmp_path / "x.bin")
+    alter_file(row(4, False), fault).tofile(tmp_path / "x.bin")
     r = inspect_bin(tmp_path / "x.bin")
     assert [fault in remark for remark in r.remarks] == [True]
     assert (r.clipped > 0) is (fault == "full scale")

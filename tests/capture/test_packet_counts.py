@@ -79,14 +79,14 @@ def spoilt(packets: list[bytes], kind: str, k: int) -> list[bytes]:
     extra = {
         "duplicates": packets[k],
         "conflicting": head + payload[::-1],
-        "outside": encode_packet(*after(packets[-1]), bytes(FULL)),
+        "outside": encode_packet(*end_state(packets[-1]), bytes(FULL)),
         "disagreeing": head[:4] + bytes(x ^ 0x55 for x in head[4:10]) + payload,
         "malformed": head,
     }[kind]
     return [*packets[: k + 1], extra, *packets[k + 1 :]]
 
 
-def after(packet: bytes) -> tuple[int, int]:
+def end_state(packet: bytes) -> tuple[int, int]:
     sequence, count = decode_packet_header(packet)
     return sequence + 1, count + len(packet) - 10
 

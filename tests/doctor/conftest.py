@@ -30,7 +30,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRig]:
 
 
 @pytest.fixture
-def unanswered(tmp_path: Path) -> LiveRig:
+def deaf_rig(tmp_path: Path) -> LiveRig:
     """A rig file on a free subnet without any device."""
     path = tmp_path / "instrument.toml"
     path.write_text(tomli_w.dumps(to_builtins(on_free_subnet(impatient_rig()))))

@@ -154,7 +154,7 @@ def test_every_need_is_a_check_before_it():
 def simulated_checks(failing):
     """All checks replaced: the one with this title fails, the others are ok."""
 
-    def replaced(check):
+    def replace_check(check):
         def run(context, board=None):
             if check.name == "config":
                 context.loaded_rig = RIG
@@ -163,7 +163,7 @@ def simulated_checks(failing):
 
         return dataclasses.replace(check, run=run)
 
-    return tuple(map(replaced, CHECKS))
+    return tuple(map(replace_check, CHECKS))
 
 
 @pytest.mark.parametrize(

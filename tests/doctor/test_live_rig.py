@@ -34,7 +34,7 @@ def assert_failed(findings, *names):
     assert [n for n, f in findings.items() if f.level == "error"] == list(names), findings
 
 
-def skipped(findings, cause):
+def list_skipped(findings, cause):
     """Checks that were skipped because this one failed."""
     return [n for n, f in findings.items() if f.level == "note" and f.what == f"{cause} failed"]
 
@@ -77,7 +77,7 @@ def test_a_pi_that_hangs(live):
     with live.stopped("polysight-pi"):
         findings = live.doctor(pulse=True)
     assert_failed(findings, "pi")
-    assert skipped(findings, "pi") == [
+    assert list_skipped(findings, "pi") == [
         "pi clock", "rig is free", "stage", "trigger line", "pulses", "radar RH", "radar RV", "level RH", "level RV",
         "direct path RH", "direct path RV", "trigger skew",
     ]  # fmt: skip
@@ -88,7 +88,7 @@ def test_a_card_that_is_mute(live):
     with live.stopped("--boards RV"):
         findings = live.doctor(pulse=True)
     assert_failed(findings, "card RV")
-    assert skipped(findings, "card RV") == ["buffer RV", "radar RV", "level RV", "direct path RV", "trigger skew"]
+    assert list_skipped(findings, "card RV") == ["buffer RV", "radar RV", "level RV", "direct path RV", "trigger skew"]
     # The other board is checked to its end
     assert findings["direct path RH"].level == "ok"
 
@@ -116,7 +116,7 @@ def test_a_scan_in_progress_is_not_disturbed(live):
             pi.pulse(16, 1500, 1)
         pi.end_run("another", "abort", "test")
     assert_failed(findings, "rig is free")
-    assert {"card RH", "card RV", "pulses", "trigger line"} <= set(skipped(findings, "rig is free"))
+    assert {"card RH", "card RV", "pulses", "trigger line"} <= set(list_skipped(findings, "rig is free"))
 
 
 def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
@@ -163,7 +163,7 @@ def test_a_stage_that_is_silent(live):
             findings = live.doctor(move=True)
         assert_failed(findings, "stage")
         assert findings["stage"].facts["fault"] == 101
-        assert skipped(findings, "stage") == ["trigger line"]
+        assert list_skipped(findings, "stage") == ["trigger line"]
         assert findings["card RV"].level == "ok"
     finally:
         live.home()
@@ -177,9 +177,9 @@ def reply(**changes):
     return HelloReply(**{**values, "scan_id": "", "last_seq": 0, "t_unix_ns": 0, **changes})
 
 
-def test_a_pi_of_this_release_is_ok(unanswered):
-    with answering(unanswered.instrument, reply()):
-        findings = unanswered.doctor()
+def test_a_pi_of_this_release_is_ok(deaf_rig):
+    with answering(deaf_rig.instrument, reply()):
+        findings = deaf_rig.doctor()
     assert findings["pi"].level == findings["stage"].level == findings["rig is free"].level == "ok"
     assert findings["pi clock"].level == "note"
     assert [n for n, f in findings.items() if f.level == "error"] == ["card RH", "card RV"]
@@ -195,9 +195,9 @@ def test_a_pi_of_this_release_is_ok(unanswered):
     ],
     ids=["release", "wire version", "sketch", "no sketch"],
 )
-def test_a_pi_of_another_release_is_an_error(unanswered, changes, version, check, skips):
-    with answering(unanswered.instrument, reply(**changes), version):
-        findings = unanswered.doctor()
+def test_a_pi_of_another_release_is_an_error(deaf_rig, changes, version, check, skips):
+    with answering(deaf_rig.instrument, reply(**changes), version):
+        findings = deaf_rig.doctor()
     assert findings[check].level == "error"
     assert all(value in findings[check].what for value in changes.values())
-    assert skips in skipped(findings, check)
+    assert skips in list_skipped(findings, check)

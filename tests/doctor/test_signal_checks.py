@@ -11,7 +11,7 @@ from polysight.doctor.rig_checks import check_direct_path, check_level, check_ra
 from polysight.radar.commands import direct_if_hz
 
 
-def judged(board="RH", rig=RIG, **disturbances):
+def judge_signal(board="RH", rig=RIG, **disturbances):
     return judge_direct_path(rig, rig.by_name(board), signal_of(board, rig, **disturbances))
 
 
@@ -29,13 +29,13 @@ def with_frames(words, **row):
 
 def test_a_direct_path_at_the_expected_if_is_ok():
     for name in ("RH", "RV"):
-        findings = judged(name)
+        findings = judge_signal(name)
         assert findings.level == "ok", findings
         assert findings.facts["heard"] == FRAMES
 
 
 def test_a_missing_direct_path_is_an_error():
-    findings = judged(direct_loss_db=60.0)
+    findings = judge_signal(direct_loss_db=60.0)
     assert findings.level == "error"
     assert "if_hz" not in findings.facts
 
@@ -43,7 +43,7 @@ def test_a_missing_direct_path_is_an_error():
 @pytest.mark.parametrize("offset_hz", [2.6e6, -900e3])
 def test_a_direct_path_beyond_the_band_is_an_error_with_a_better_start_offset(offset_hz):
     rig = programmed_rig(offset_hz)
-    findings = judged("RH", rig)
+    findings = judge_signal("RH", rig)
     assert findings.level == "error"
     unshifted = programmed_rig(0.0)
     middle = 0.45 * RIG.chirp.sample_rate_hz - direct_if_hz(unshifted, unshifted.by_name("RH"))
@@ -56,14 +56,14 @@ def offset_in(finding):
 
 
 def test_a_direct_path_at_the_edge_of_the_band_is_an_error():
-    findings = judged("RH", RIG, if_offset_hz=-850e3)
+    findings = judge_signal("RH", RIG, if_offset_hz=-850e3)
     assert findings.level == "error"
     assert offset_in(findings) == pytest.approx(RIG.by_name("RH").start_offset_hz + 850e3, abs=100e3)
 
 
 def test_another_start_frequency_than_in_the_rig_file_is_recovered():
     """The board was programmed 490 kHz higher than the rig file says; its crystal's share is removed."""
-    findings = judged("RH", programmed_rig(300e3), if_offset_hz=490e3, crystal_ppm={"receive_h": 1.5})
+    findings = judge_signal("RH", programmed_rig(300e3), if_offset_hz=490e3, crystal_ppm={"receive_h": 1.5})
     assert findings.level == "warning"
     assert offset_in(findings) == pytest.approx(790e3, abs=5 * 2.1e-9 / 32**0.5 * 38.8e12)
 

@@ -20,7 +20,7 @@ ENTERED_BY_MODULE = ("cli", "jobs")
 ALSO_SOURCE = (".cpp", ".c", ".h", ".js")
 
 
-def tracked(*suffixes: str) -> list[Path]:
+def list_tracked(*suffixes: str) -> list[Path]:
     listed = subprocess.run(
         ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=False
     )
@@ -31,7 +31,7 @@ def tracked(*suffixes: str) -> list[Path]:
 
 
 def test_no_file_is_over_700_lines():
-    sizes = {f: len(f.read_text(encoding="utf-8").splitlines()) for f in tracked(".py", *ALSO_SOURCE)}
+    sizes = {f: len(f.read_text(encoding="utf-8").splitlines()) for f in list_tracked(".py", *ALSO_SOURCE)}
     assert {str(f.relative_to(ROOT)): n for f, n in sizes.items() if n > LINES} == {}
 
 
@@ -49,7 +49,7 @@ def count_code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef, lines: li
 
 def test_no_function_is_over_60_lines_of_code():
     long = {}
-    for file in tracked(".py"):
+    for file in list_tracked(".py"):
         text = file.read_text(encoding="utf-8")
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -78,7 +78,7 @@ def errors_without_three_parts(file: Path) -> list[int]:
 
 
 def test_every_error_says_what_why_and_what_to_do():
-    files = [file for file in tracked(".py") if file.relative_to(ROOT).parts[0] in PROGRAM_FOLDERS]
+    files = [file for file in list_tracked(".py") if file.relative_to(ROOT).parts[0] in PROGRAM_FOLDERS]
     incomplete = {str(file.relative_to(ROOT)): errors_without_three_parts(file) for file in files}
     assert {name: lines for name, lines in incomplete.items() if lines} == {}
 
@@ -109,7 +109,7 @@ def imports(file: Path) -> list[tuple[int, str]]:
     return collected
 
 
-def room_of(file: Path) -> str:
+def find_room(file: Path) -> str:
     """The room of the host that a file stands in; "" elsewhere."""
     if file.is_relative_to(HOST):
         return file.relative_to(HOST).parts[0]
@@ -121,7 +121,7 @@ def test_neighbours_import_only_from_a_rooms_front():
     for file in (f for top in (HOST, PAPERS) for f in top.rglob("*.py")):
         for line, module in imports(file):
             parts = module.split(".")
-            inside = (room_of(file), *ENTERED_BY_MODULE)
+            inside = (find_room(file), *ENTERED_BY_MODULE)
             if parts[0] == "polysight" and len(parts) > 2 and parts[1] not in inside and file != HOST / "__init__.py":
                 past.append(f"{file.relative_to(ROOT)}:{line} {module}")
     assert past == []
@@ -137,7 +137,7 @@ def test_no_module_is_taken_from_behind_a_front():
             parts = (node.module or "").split(".")
             if node.level:
                 past.append(f"{file.relative_to(ROOT)}:{node.lineno} a relative import")
-            elif parts[0] == "polysight" and len(parts) == 2 and parts[1] not in (room_of(file), *ENTERED_BY_MODULE):
+            elif parts[0] == "polysight" and len(parts) == 2 and parts[1] not in (find_room(file), *ENTERED_BY_MODULE):
                 room = HOST / parts[1]
                 # pipeline.py
                 if not room.is_dir():

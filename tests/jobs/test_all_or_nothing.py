@@ -46,7 +46,7 @@ COMMANDS = {
 
 
 @pytest.fixture(scope="module")
-def before(tmp_path_factory) -> Path:
+def scan_before(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("before")
     for name in ("one", "two"):
         judged_products(folder / name, "good")
@@ -72,18 +72,18 @@ def written(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("fault", ["full", "short", "killed", "killed within", "worst power cut"])
-def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(before, tmp_path, name, fault):
+def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(scan_before, tmp_path, name, fault):
     command = COMMANDS[name]
-    whole_scan = Path(shutil.copytree(before, tmp_path / "whole"))
+    whole_scan = Path(shutil.copytree(scan_before, tmp_path / "whole"))
     with FaultyDisk(whole_scan)() as disk:
         assert command(whole_scan) == 0
-    old = written(before)
+    old = written(scan_before)
     new = written(whole_scan)
     assert old.keys() != new.keys() or old != new
     (last_rename,) = [step.split()[1] for step in disk.done if step.startswith("rename")][-1:]
     (committing,) = [name for name in new if name.endswith(f"/{last_rename}") and new[name] != old.get(name)]
     for position in range(1, len(disk.done) + 1):
-        folder = Path(shutil.copytree(before, tmp_path / f"{position}"))
+        folder = Path(shutil.copytree(scan_before, tmp_path / f"{position}"))
         try:
             with FaultyDisk(folder, fault, position)():
                 status = command(folder)

@@ -78,7 +78,7 @@ def scans(folder, *names):
     return [folder / n for n in names]
 
 
-def job_of(data, out, **options):
+def make_job(data, out, **options):
     text = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
     return make_jobs([(data, Settings(**text))], out)[0]
 
@@ -131,7 +131,7 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
 
     def job(config=rig, **changes):
         options = {"library": library, "config": config, **changes}
-        return job_of(folder, tmp_path / "out", **options)
+        return make_job(folder, tmp_path / "out", **options)
 
     assert not is_finished(job())
     process_many([job()], tmp_path / "out", 1)

@@ -31,10 +31,10 @@ def test_without_a_terminal_rows_are_counted_in_lines(capsys, monkeypatch):
 
 
 def test_a_closed_stderr_stops_nothing(monkeypatch):
-    def closed(text: str) -> None:
+    def raise_closed(text: str) -> None:
         raise BrokenPipeError(text)
 
-    monkeypatch.setattr(output.sys.stderr, "write", closed)
+    monkeypatch.setattr(output.sys.stderr, "write", raise_closed)
     output.say("images")
 
 

@@ -58,7 +58,7 @@ def capture(point: int, scan: str = "mine") -> m.Capture:
     )  # fmt: skip
 
 
-def finished(status: m.RowStatus) -> m.RowFinished:
+def row_finished(status: m.RowStatus) -> m.RowFinished:
     return m.RowFinished(**OF, seq=9, row_index=7, take=2, status=status, points=1, edges=1, bursts=1, pulses=1)
 
 
@@ -76,7 +76,7 @@ def test_a_row_as_it_runs_and_nobody_else_s(pi):
     tell(capture(4))
     wait_for(lambda: listener.state.point == 5, "the newest point")
     assert (listener.state.row, listener.state.take, listener.state.state) == (7, 2, "running")
-    tell(finished("done"))
+    tell(row_finished("done"))
     wait_for(lambda: listener.state.row == -1, "the row's end")
 
 
@@ -84,10 +84,10 @@ def test_faults_stay_until_a_row_ends_well(pi):
     tell, listener = pi
     tell(m.Fault(**OF, seq=4, number=101, what="the stage does not answer"))
     wait_for(lambda: listener.state.faults, "the fault")
-    tell(finished("fault"), m.Heartbeat(**OF, seq=9, state="fault", period_ms=100))
+    tell(row_finished("fault"), m.Heartbeat(**OF, seq=9, state="fault", period_ms=100))
     wait_for(lambda: listener.state.state == "fault", "the state")
     assert listener.state.faults[0].level == "error"
-    tell(finished("done"))
+    tell(row_finished("done"))
     wait_for(lambda: not listener.state.faults, "that it is over")
 
 
@@ -130,17 +130,17 @@ def test_the_pi_forgets_a_view_that_hangs(tmp_path):
     address = events.getsockopt_string(zmq.LAST_ENDPOINT)
     looker = subprocess.Popen([sys.executable, "-c", LOOKER, address], cwd=REPO)
 
-    def happened(kind: zmq.Event) -> bool:
+    def row_happened(kind: zmq.Event) -> bool:
         events.send_multipart([EVENT_TOPIC, b"x"])
         return bool(monitor.poll(0)) and recv_monitor_message(monitor)["event"] == kind
 
     try:
-        wait_for(lambda: happened(zmq.Event.HANDSHAKE_SUCCEEDED), "the subscriber")
+        wait_for(lambda: row_happened(zmq.Event.HANDSHAKE_SUCCEEDED), "the subscriber")
         for go_s in (3, 10, 30):  # it may hang before its first sign of life; then nothing is known of it yet
             time.sleep(go_s)
             os.kill(looker.pid, signal.SIGSTOP)
             with suppress(AssertionError):
-                wait_for(lambda: happened(zmq.Event.DISCONNECTED), "that it is forgotten", 15)
+                wait_for(lambda: row_happened(zmq.Event.DISCONNECTED), "that it is forgotten", 15)
                 break
             os.kill(looker.pid, signal.SIGCONT)
         else:

@@ -41,7 +41,7 @@ def status(history, signs=LIVELY, heard=RUNNING, shown=Shown(), **more):  # noqa
     return judge(Inputs(FOLDER, history, signs, heard, shown, **more))
 
 
-def asked(command, doing="rows"):
+def signs_asked(command, doing="rows"):
     return replace(LIVELY, life=Life(asked=command, asker="the page", doing=doing))
 
 
@@ -52,7 +52,7 @@ def test_all_is_well_needs_nothing_done(history):
 
 
 def test_a_dead_program_outranks_everything_but_the_end(history):
-    gone = replace(asked("abort"), alive=False, killed=True, alive_s=1.7e9, pi_silent_s=99.0)
+    gone = replace(signs_asked("abort"), alive=False, killed=True, alive_s=1.7e9, pi_silent_s=99.0)
     s = status(history, gone, replace(RUNNING, state="fault"))
     assert (s.level, s.headline) == ("bad", "The scan program was killed")
     assert f"polysight resume {FOLDER}" in s.do
@@ -112,13 +112,13 @@ def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, le
 
 
 def test_requests_are_said_with_who_sent_them_until_they_come_to_pass(history):
-    s = status(history, asked("pause"))
+    s = status(history, signs_asked("pause"))
     assert (s.headline, s.press) == ("Pausing after this row", ("continue", "stop", "abort"))
     assert "the page" in s.detail
     add_fact(history, {"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"})
-    assert status(history, asked("pause")).headline == "Paused"
-    assert status(history, asked("stop")).press == ("abort",)
-    assert status(history, asked("abort")).headline == "Stopping now"
+    assert status(history, signs_asked("pause")).headline == "Paused"
+    assert status(history, signs_asked("stop")).press == ("abort",)
+    assert status(history, signs_asked("abort")).headline == "Stopping now"
 
 
 def test_an_abort_is_no_fault(history):
@@ -128,7 +128,7 @@ def test_an_abort_is_no_fault(history):
     fault = notice_of_fault(Fault(scan_id="s", seq=1, t_mono_ns=1, number=PiFault.ABORTED, what="aborted"))
     history.notices.append(fault)
     stopped = replace(RUNNING, state="fault", faults=(fault,))
-    assert status(history, asked("abort"), stopped).key == "aborting"
+    assert status(history, signs_asked("abort"), stopped).key == "aborting"
     assert [notice.level for notice in history.notices] == ["note", "note"]
     end = {"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request", "asked": "abort"}
     add_fact(history, end | {"asker": "the page"})
@@ -144,13 +144,13 @@ def test_there_is_no_result_before_materials(history):
     assert status(history, heard=replace(RUNNING, row=-1)).key == "finishing"
     add_fact(history, {"fact": "scan_ended", "exit_status": "success", "reason": ""})
     good = Verdict("good")
-    assert status(history, asked("", "materials"), verdict=good).key == "materials"
-    assert make_snapshot(Inputs(FOLDER, history, asked("", "materials"), verdict=good)).verdict is None
+    assert status(history, signs_asked("", "materials"), verdict=good).key == "materials"
+    assert make_snapshot(Inputs(FOLDER, history, signs_asked("", "materials"), verdict=good)).verdict is None
     for level in ("good", "care", "none"):
         assert status(history, replace(LIVELY, life=None), verdict=Verdict(level)).key == f"result_{level}"
     running = Program("process", True, None, (), "2026-01-01T00:00:00", "")
     assert status(history, replace(LIVELY, life=None), verdict=good, program=running).key == "processing"
-    killed = replace(asked("", "materials"), alive=False, killed=True)
+    killed = replace(signs_asked("", "materials"), alive=False, killed=True)
     assert "killed" in status(history, killed).detail
 
 

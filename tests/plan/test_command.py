@@ -128,7 +128,7 @@ def taken_by_a_pi(scan, rig, gap_s: float) -> None:
 
 
 @pytest.fixture
-def planned(capsys):
+def read_plan(capsys):
     def plan(*more: object) -> dict:
         arguments = ["plan", *RIG, "--rows", "30", "--pulses", "16", "--json", *more]
         assert main(list(map(str, arguments))) == 0
@@ -137,9 +137,9 @@ def planned(capsys):
     return plan
 
 
-def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, planned):
-    without = planned()
-    same_plan = planned("--like", scan)
+def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, read_plan):
+    without = read_plan()
+    same_plan = read_plan("--like", scan)
     # 16 chirps
     assert same_plan["position_snr_db"] == pytest.approx(SNR_DB + 12.04, abs=0.7)
     assert "simulated scan quiet" in same_plan["noise_source"]
@@ -151,7 +151,7 @@ def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, planned):
     ramps_s = row_motion_s(grid, stage) - (COLUMNS - 1) * grid.step_x_mm / stage.speed_mm_s
     motion_s = ramps_s + turn_s(grid, stage) + tail_s(small)
     taken_by_a_pi(scan, rig, GAP_S)
-    assert planned("--like", scan)["time_s"]["standstill"] == pytest.approx(30 * (GAP_S - motion_s))
+    assert read_plan("--like", scan)["time_s"]["standstill"] == pytest.approx(30 * (GAP_S - motion_s))
 
 
 def test_a_scan_without_rows_has_no_noise(scan, tmp_path):
@@ -161,8 +161,8 @@ def test_a_scan_without_rows_has_no_noise(scan, tmp_path):
         measure_noise(empty)
 
 
-def test_options_override_the_scan(scan, rig, planned):
+def test_options_override_the_scan(scan, rig, read_plan):
     taken_by_a_pi(scan, rig, GAP_S)
-    values = planned("--like", scan, "--snr-db", "3", "--row-overhead-s", "0.5")
+    values = read_plan("--like", scan, "--snr-db", "3", "--row-overhead-s", "0.5")
     assert values["position_snr_db"] == pytest.approx(3 + 12.04, abs=0.01)
     assert values["time_s"]["standstill"] == pytest.approx(15.0)

@@ -54,7 +54,7 @@ class Stage:
         return (self.board.tick - began) / TICK_HZ
 
 
-def scanned(rig: Instrument) -> tuple[float, list[int]]:
+def time_scan(rig: Instrument) -> tuple[float, list[int]]:
     """Motion of a whole scan from the home corner, seconds, and the times of its triggers, ns."""
     stage = Stage(rig)
     total = sum(
@@ -81,7 +81,7 @@ def test_the_estimate_is_the_time_of_the_simulated_stage(rig, speed, step_x, ste
     )
     rig = msgspec.structs.replace(rig, stage=msgspec.structs.replace(rig.stage, backlash_mm=backlash))
     estimate = scan_time(rig, 0.0)
-    total, edges = scanned(rig)
+    total, edges = time_scan(rig)
     # Ramps begin at some steps/s, not at rest, and the clock is read every millisecond: a few ms a leg.
     legs = 3 * rig.grid.rows
     assert estimate.total_s - estimate.tail_s == pytest.approx(total, abs=0.02 * legs)

@@ -14,7 +14,7 @@ from polysight.settings import DEFAULT
 
 
 @pytest.fixture
-def found(imaged):
+def drawn_result(imaged):
     scan = imaged("nine-materials")
     return scan.pipeline.find_materials(
         scan.images, known=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
@@ -28,14 +28,14 @@ def again(scan, path, plates=()):
     return scan.pipeline.find_materials(scan.images, scene, classifier), scene.names
 
 
-def test_labels_of_products_give_the_same_materials_again(imaged, found, tmp_path):
+def test_labels_of_products_give_the_same_materials_again(imaged, drawn_result, tmp_path):
     scan = imaged("nine-materials")
-    (tmp_path / "labels.json").write_bytes(pack_labels(labels_of(found)))
+    (tmp_path / "labels.json").write_bytes(pack_labels(labels_of(drawn_result)))
     boxes = read_labels(tmp_path / "labels.json")
-    assert len(boxes.boxes) == len(found.patches) == 9
+    assert len(boxes.boxes) == len(drawn_result.patches) == 9
     second, names = again(scan, tmp_path / "labels.json", scan.plates)
     assert names[second.metal.label] == "metal"
-    assert [p.truth.name for p in second.patches] == [p.truth.name for p in found.patches]
+    assert [p.truth.name for p in second.patches] == [p.truth.name for p in drawn_result.patches]
     for p in second.patches:
         assert p.patch.label == second.metal.label or p.verdict.name == p.truth.name
 

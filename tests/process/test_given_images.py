@@ -45,7 +45,7 @@ def pair(labels_folder):
 
 
 @pytest.fixture
-def saved(tmp_path, pair):
+def save_images(tmp_path, pair):
     """`saved(h=..., x_m=None)`: the pair as a file, with changed arrays; None leaves one out."""
 
     def save(name="plates", **changed):
@@ -56,7 +56,7 @@ def saved(tmp_path, pair):
     return save
 
 
-def analysed(path, rig, **settings):
+def analyse_file(path, rig, **settings):
     pair = read_given_images(path, rig)
     return analyse_given_images(pair, Settings(model="none", **settings), Inputs(), rig)[0]
 
@@ -65,10 +65,10 @@ def permittivities(scan):
     return {(round(s.centre_x_mm), round(s.centre_y_mm)): s.permittivity for s in scan.segments}
 
 
-def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, saved, rig):
+def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, save_images, rig):
     """The folder brings boxes and has its top row first; the file has neither."""
-    by_folder = analysed(labels_folder, rig)
-    by_file = analysed(saved(), rig)
+    by_folder = analyse_file(labels_folder, rig)
+    by_file = analyse_file(save_images(), rig)
     assert {s.box for s in by_folder.segments} == set(BOXES)
     assert len(by_file.segments) == len(by_folder.segments)
     upside_down = {(x, -y): e for (x, y), e in permittivities(by_file).items()}
@@ -81,7 +81,7 @@ def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, sav
 
 
 def test_permittivities_are_those_of_the_plates(labels_folder, rig):
-    for s in analysed(labels_folder, rig, incidence_deg=ANGLE).segments:
+    for s in analyse_file(labels_folder, rig, incidence_deg=ANGLE).segments:
         if s.permittivity is not None:
             true = MATERIALS[s.box].permittivity
             difference = complex(s.permittivity.real, s.permittivity.imag) - true
@@ -89,36 +89,36 @@ def test_permittivities_are_those_of_the_plates(labels_folder, rig):
             assert abs(difference) < 3 * np.hypot(s.permittivity.real_std, s.permittivity.imag_std)
 
 
-def test_the_direction_of_an_axis_does_not_matter(saved, pair, rig):
+def test_the_direction_of_an_axis_does_not_matter(save_images, pair, rig):
     x = 1.3 + np.arange(150) * 2e-3
-    upwards = analysed(saved(x_m=x, y_m=x), rig)
+    upwards = analyse_file(save_images(x_m=x, y_m=x), rig)
     turned = {name: image[::-1, ::-1] for name, image in pair.items()}
-    downwards = analysed(saved(x_m=x[::-1], y_m=x[::-1], **turned), rig)
+    downwards = analyse_file(save_images(x_m=x[::-1], y_m=x[::-1], **turned), rig)
     np.testing.assert_array_equal(upwards.images.h, downwards.images.h)
     assert permittivities(upwards) == permittivities(downwards)
     assert upwards.images.x_m[0] == 1.3
 
 
-def test_the_angle_of_the_option_comes_before_that_of_the_file_and_the_rigs(saved, rig):
-    with_angle = saved()
-    without = saved("bare", incidence_deg=None)
+def test_the_angle_of_the_option_comes_before_that_of_the_file_and_the_rigs(save_images, rig):
+    with_angle = save_images()
+    without = save_images("bare", incidence_deg=None)
     for path, option, deg, source in (
         (with_angle, 60.0, 60.0, "option"),
         (with_angle, None, ANGLE, "file"),
         (without, None, 54.9, "rig file"),
     ):
-        scan = analysed(path, rig, incidence_deg=option)
+        scan = analyse_file(path, rig, incidence_deg=option)
         assert scan.quality.incidence.one_deg == pytest.approx(deg, abs=0.05)
         assert scan.quality.given_images.incidence_from == source
         assert {round(s.incidence_deg, 1) for s in scan.segments} == {round(scan.quality.incidence.one_deg, 1)}
 
 
-def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented(saved, rig):
+def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented(save_images, rig):
     axis = np.arange(150) * 2e-3
-    scan = analysed(saved(x_m=axis, y_m=axis), rig)
+    scan = analyse_file(save_images(x_m=axis, y_m=axis), rig)
     assert scan.verdict.level == "care"
     assert scan.quality.given_images.assumed == []
-    bare = analysed(saved("bare", incidence_deg=None), rig)
+    bare = analyse_file(save_images("bare", incidence_deg=None), rig)
     assert len(bare.verdict.reasons) == len(scan.verdict.reasons) + 2  # pixels and angle
     for unknown in (scan.rig, scan.rows, scan.plan):
         assert unknown is None
@@ -126,11 +126,11 @@ def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented
     assert scan.simulated is False
 
 
-def test_pixels_marked_invalid_are_left_out(saved, pair, rig):
+def test_pixels_marked_invalid_are_left_out(save_images, pair, rig):
     valid = np.ones((150, 150), bool)
     valid[80:] = False
     holed = {name: np.where(valid, image, np.nan) for name, image in pair.items()}
-    scan = analysed(saved(valid=valid, **holed), rig)
+    scan = analyse_file(save_images(valid=valid, **holed), rig)
     assert len(scan.segments) == 3
     assert not scan.images.valid[80:].any()
 
@@ -152,8 +152,8 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("changed", "code", "named"), WRONG.values(), ids=WRONG.keys())
-def test_wrong_files_are_refused_by_name(saved, rig, changed, code, named):
-    path = saved(**changed)
+def test_wrong_files_are_refused_by_name(save_images, rig, changed, code, named):
+    path = save_images(**changed)
     with refused(code, path, named) as caught:
         read_given_images(path, rig)
     assert caught.value.why
@@ -173,15 +173,15 @@ def test_files_that_are_no_archive_are_refused(tmp_path, rig):
 
 
 @pytest.mark.parametrize("options", [["--incidence", "pixel"], ["--bands", "3"], ["--sparse"]])
-def test_options_that_need_rows_are_refused(saved, tmp_path, capsys, options):
-    assert main(["process", str(saved()), "--out", str(tmp_path / "out"), *options]) != 0
+def test_options_that_need_rows_are_refused(save_images, tmp_path, capsys, options):
+    assert main(["process", str(save_images()), "--out", str(tmp_path / "out"), *options]) != 0
     assert options[0] in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_every_reader_of_products_reads_them(saved, tmp_path, capsys):
+def test_every_reader_of_products_reads_them(save_images, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["process", str(saved()), "--out", str(out), "--metal", "-94,-94,40,40"]) == 0
+    assert main(["process", str(save_images()), "--out", str(out), "--metal", "-94,-94,40,40"]) == 0
     for command in (
         ["materials", out],
         ["permittivity", out],
@@ -202,7 +202,7 @@ def test_every_reader_of_products_reads_them(saved, tmp_path, capsys):
         _ = scan.rig
 
 
-def test_the_tilt_of_a_plate_is_read_from_its_phase(saved, pair, rig):
+def test_the_tilt_of_a_plate_is_read_from_its_phase(save_images, pair, rig):
     """A mirror's echo from TX over the plate to RX grows by (cos + cos) of both legs times the height."""
     degrees = (0.6, -0.8)
     axis = np.arange(150) * 2e-3
@@ -213,7 +213,7 @@ def test_the_tilt_of_a_plate_is_read_from_its_phase(saved, pair, rig):
     pair = {name: image * ramp for name, image in pair.items()}
     tilted = {name: image * np.exp(-2j * wave * np.cos(np.radians(ANGLE)) * height_m) for name, image in pair.items()}
     level, rising = (
-        analysed(saved(name, x_m=axis, y_m=axis, **images), rig, incidence_deg=ANGLE)
+        analyse_file(save_images(name, x_m=axis, y_m=axis, **images), rig, incidence_deg=ANGLE)
         for name, images in (("level", pair), ("rising", tilted))
     )
     changes = [
@@ -225,11 +225,11 @@ def test_the_tilt_of_a_plate_is_read_from_its_phase(saved, pair, rig):
     assert np.median(changes) == pytest.approx(degrees[1], abs=0.05)
 
 
-def test_a_plate_over_the_plane_is_the_reference_of_every_pixel(saved, pair, tmp_path):
+def test_a_plate_over_the_plane_is_the_reference_of_every_pixel(save_images, pair, tmp_path):
     """Its gains need not be even: they are divided out."""
     uneven = np.exp(np.add.outer(np.linspace(0, 0.5, 150), np.linspace(0, 0.3j, 150)))
-    plate = saved("plate", h=-uneven, v=-0.5 * uneven)
-    scene = saved(h=-pair["h"] * uneven, v=-0.5 * pair["v"] * uneven)
+    plate = save_images("plate", h=-uneven, v=-0.5 * uneven)
+    scene = save_images(h=-pair["h"] * uneven, v=-0.5 * pair["v"] * uneven)
     out = tmp_path / "out"
     assert main(["process", str(scene), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 0
     assert ProcessedScan(out).materials.metal_reference.certain

@@ -8,7 +8,7 @@ from polysight.materials.segment import axis_mm, box_mask
 from polysight.polarimetry import calibrate, correct_leakage, ratio_from_permittivity
 
 
-def inside(scan, name, rim_mm=11.0):
+def plate_mask(scan, name, rim_mm=11.0):
     """Pixels of a plate without its rim of about a resolution cell; bool [ny, nx]."""
     x0, y0, x1, y1 = next(p.box_mm for p in scan.plates if p.name == name)
     box = (x0 + rim_mm, y0 + rim_mm, x1 - rim_mm, y1 - rim_mm)
@@ -64,7 +64,7 @@ def test_metal_gives_one_at_every_pixel_within_noise(imaged):
     """A metal plate over the whole plane, referenced to its middle: P = 1 everywhere, up to the noise of a pixel."""
     scan = imaged("metal-plate")
     again = imaged("metal-plate", seed=1003)
-    plate_pixels = inside(scan, "copper", rim_mm=150.0)
+    plate_pixels = plate_mask(scan, "copper", rim_mm=150.0)
     assert plate_pixels.sum() > 1000
     middle = box_mask((-20, -20, 20, 20), scan.images.x_m, scan.images.y_m)
     first, second = (calibrate(s.images, middle).p[plate_pixels] for s in (scan, again))
@@ -80,7 +80,7 @@ OTHER = {"hv_gain_db": -3.0, "leakage_h": [0.08, 0.03], "leakage_v": [0.08, 0.03
 def test_the_set_gain_is_recovered_and_does_not_reach_the_images(imaged):
     def gains_db(scan):
         h, v = (np.abs(scan.images.rx_gains[b.name]).mean() for b in scan.rig.receivers)
-        c = calibrate(scan.images, inside(scan, "copper"))
+        c = calibrate(scan.images, plate_mask(scan, "copper"))
         return 20 * np.log10(h / v), 20 * np.log10(abs(c.metal_h) / abs(c.metal_v))
 
     received, image = gains_db(imaged("nine-materials"))
@@ -93,10 +93,10 @@ def test_the_set_gain_is_recovered_and_does_not_reach_the_images(imaged):
 def test_the_set_leakage_is_recovered_from_a_known_material(imaged, disturbances):
     scan = imaged("nine-materials", **disturbances)
     leakage = complex(*disturbances.get("leakage_h", [0.05, 0.0]))
-    c = calibrate(scan.images, inside(scan, "copper"))
+    c = calibrate(scan.images, plate_mask(scan, "copper"))
     theta = scan.pipeline.find_materials(scan.images, known=KnownScene(plates=scan.plates)).theta_rad[0, 0]
     true = complex(ratio_from_permittivity(4.75 - 2.43j, theta))
-    plate_pixels = inside(scan, "ceramic")
+    plate_pixels = plate_mask(scan, "ceramic")
     measured = np.sum(c.h[plate_pixels]) / np.sum(c.v[plate_pixels])
     estimate = (measured - true) / (1 - measured * true)  # from P = (t + a) / (1 + a t)
     assert abs(estimate - leakage) < 0.012

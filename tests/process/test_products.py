@@ -39,11 +39,11 @@ def test_the_image_is_written_before_anything_is_derived_from_it(
     calls: list[bool] = []
     finish = Pipeline.finish
 
-    def finished(self: Pipeline, *words: object) -> object:
+    def finish_scan(self: Pipeline, *words: object) -> object:
         calls.append(read_products(tmp_path / "out").valid.any())
         return finish(self, *words)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Pipeline, "finish", finished)
+    monkeypatch.setattr(Pipeline, "finish", finish_scan)
     assert main(["process", str(scan), "--out", str(tmp_path / "out")]) in (0, 5)
     assert calls == [True]
     assert str(tmp_path / "out" / "image.npz") in capsys.readouterr().err

@@ -27,7 +27,7 @@ from polysight_shared.errors import DataError
 PIXELS = ("h", "v", "h_raw", "v_raw", "valid")
 
 
-def processed(folder: Path, samples: Use = "keep", **settings: Any) -> Pipeline:
+def process_scan(folder: Path, samples: Use = "keep", **settings: Any) -> Pipeline:
     return pipeline_of(ScanFolder.load(folder), samples=samples, **settings)
 
 
@@ -43,7 +43,7 @@ def scan(two_plates: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def kept(scan: Path) -> Path:
-    processed(scan)
+    process_scan(scan)
     return scan
 
 
@@ -53,21 +53,21 @@ def without_raw(folder: Path) -> Path:
 
 
 def test_images_and_quality_from_samples_are_bit_exact(two_plates: Path, kept: Path) -> None:
-    expected = processed(two_plates, "none")
-    reprocessed = processed(without_raw(kept))
+    expected = process_scan(two_plates, "none")
+    reprocessed = process_scan(without_raw(kept))
     assert same(reprocessed.form_images(), expected.form_images())
     for key in ("boards", "coverage"):
         assert getattr(reprocessed.quality.result(), key) == getattr(expected.quality.result(), key)
 
 
 def test_rows_on_several_threads_make_the_same_products(two_plates: Path, scan: Path) -> None:
-    serial = processed(two_plates, "none")
+    serial = process_scan(two_plates, "none")
     threaded = Pipeline(ScanFolder.load(scan), samples="keep")
     rows = list(threaded.source.rows())
     assert list(map_rows(threaded.add_row, rows, threads=4)) == rows
     assert same(threaded.form_images(), serial.form_images())
     assert threaded.quality.result().boards == serial.quality.result().boards
-    assert same(processed(without_raw(scan)).form_images(), serial.form_images())
+    assert same(process_scan(without_raw(scan)).form_images(), serial.form_images())
 
 
 def test_the_first_error_stops_all_threads() -> None:
@@ -83,26 +83,26 @@ def test_the_first_error_stops_all_threads() -> None:
 
 
 def test_samples_with_sub_bands_can_be_used_without_them(two_plates: Path, scan: Path) -> None:
-    processed(scan, bands=3)
-    expected = processed(two_plates, "none", bands=3)
-    reprocessed = processed(without_raw(scan), bands=3)
+    process_scan(scan, bands=3)
+    expected = process_scan(two_plates, "none", bands=3)
+    reprocessed = process_scan(without_raw(scan), bands=3)
     for first_item, second_item in zip(reprocessed.sub_bands.finish(), expected.sub_bands.finish(), strict=True):
         assert same(first_item, second_item)
-    assert same(processed(scan).form_images(), processed(two_plates, "none").form_images())
+    assert same(process_scan(scan).form_images(), process_scan(two_plates, "none").form_images())
 
 
 def test_samples_without_the_sub_bands_asked_for_are_not_used(kept: Path) -> None:
-    again = processed(kept, bands=2)
+    again = process_scan(kept, bands=2)
     assert len(again.sub_bands.finish()) == 2
-    assert processed(without_raw(kept), bands=2).sub_bands.bands == again.sub_bands.bands
+    assert process_scan(without_raw(kept), bands=2).sub_bands.bands == again.sub_bands.bands
 
 
 @pytest.mark.parametrize(
     "view", [{"depth_mm": 8.0}, {"depth_mm": -12.0}, {"columns": 31, "rows": 24, "pixel_mm": 5.0}, {"pixel_mm": 2.0}]
 )
 def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kept: Path, view: dict[str, Any]) -> None:
-    expected = processed(two_plates, "none", **view).form_images()
-    reprocessed = processed(without_raw(kept), **view).form_images()
+    expected = process_scan(two_plates, "none", **view).form_images()
+    reprocessed = process_scan(without_raw(kept), **view).form_images()
     np.testing.assert_array_equal(reprocessed.x_m, expected.x_m)
     pairs = [(reprocessed.h_raw, expected.h_raw), (reprocessed.v_raw, expected.v_raw)]
     pairs += zip(reprocessed.illumination.footprints, expected.illumination.footprints, strict=True)
@@ -113,15 +113,15 @@ def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kep
 
 def test_a_plane_beyond_what_was_kept_needs_raw_data(kept: Path) -> None:
     beyond = 1e3 * PLANE_REACH_M + 200
-    processed(kept, depth_mm=beyond)
+    process_scan(kept, depth_mm=beyond)
     with pytest.raises(DataError):
-        processed(without_raw(kept), depth_mm=beyond)
+        process_scan(without_raw(kept), depth_mm=beyond)
 
 
 def test_other_planes_do_not_change_the_kept_samples(kept: Path) -> None:
     state_before = {p.name: p.read_bytes() for p in (kept / "samples").iterdir()}
-    processed(kept, depth_mm=300.0)
-    processed(kept, depth_range_mm=50.0)
+    process_scan(kept, depth_mm=300.0)
+    process_scan(kept, depth_range_mm=50.0)
     assert {p.name: p.read_bytes() for p in (kept / "samples").iterdir()} == state_before
 
 
@@ -144,21 +144,21 @@ def test_damaged_samples_are_made_again(two_plates: Path, kept: Path, what: str)
         array.unlink()
     else:
         array.write_bytes(array.read_bytes()[:-3000])
-    expected = processed(two_plates, "none").form_images()
-    assert same(processed(kept).form_images(), expected)
-    assert same(processed(without_raw(kept)).form_images(), expected)
+    expected = process_scan(two_plates, "none").form_images()
+    assert same(process_scan(kept).form_images(), expected)
+    assert same(process_scan(without_raw(kept)).form_images(), expected)
 
 
 def test_rows_with_other_raw_data_are_synchronised_again(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As after a retake or a new placement of the row: the committed digest differs."""
     committed = ScanFolder.committed_rows
 
-    def changed(self: ScanFolder) -> dict:
+    def change_row(self: ScanFolder) -> dict:
         rows = committed(self)
         rows[2].boards["RV"] = msgspec.structs.replace(rows[2].boards["RV"], index_crc32="00000000")
         return rows
 
-    monkeypatch.setattr(ScanFolder, "committed_rows", changed)
+    monkeypatch.setattr(ScanFolder, "committed_rows", change_row)
     pipeline = Pipeline(ScanFolder.load(kept), samples="read")
     assert [row for row in pipeline.source.rows() if not pipeline.samples.restore(row)] == [2]
 
@@ -175,8 +175,8 @@ def test_a_scan_is_processed_even_if_samples_cannot_be_written(
     two_plates: Path, scan: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (scan / "samples").write_text("a file is in the way")
-    reprocessed = processed(scan).form_images()
-    assert same(reprocessed, processed(two_plates, "none").form_images())
+    reprocessed = process_scan(scan).form_images()
+    assert same(reprocessed, process_scan(two_plates, "none").form_images())
     assert str(scan / "samples") in caplog.text
 
 
@@ -190,7 +190,7 @@ def test_samples_can_be_read_as_the_specification_says(kept: Path) -> None:
     assert cube.shape[:2] == (17, 4)
     assert cube.shape[2] == len(head["frequencies_hz"]["samples"])
     assert [line["row"] for line in lines] == list(range(17))
-    expected = processed(kept, "none").images.boards["RH"]._cube
+    expected = process_scan(kept, "none").images.boards["RH"]._cube
     np.testing.assert_array_equal(np.moveaxis(cube, 0, 2), expected)
 
 
@@ -211,8 +211,8 @@ def test_samples_can_be_read_as_the_specification_says(kept: Path) -> None:
 def test_an_invalid_head_is_ignored(two_plates: Path, kept: Path, head) -> None:
     path = kept / "samples" / "samples.json"
     path.write_text(json.dumps(head(json.loads(path.read_text()))))
-    expected = processed(two_plates, "none")
-    reprocessed = processed(kept, "read")
+    expected = process_scan(two_plates, "none")
+    reprocessed = process_scan(kept, "read")
     assert same(reprocessed.form_images(), expected.form_images())
 
 
@@ -232,22 +232,22 @@ def test_a_row_with_invalid_figures_is_made_again(two_plates: Path, kept: Path, 
     entry = facts[4]["boards"]["RH"]
     entry["figures"] = change if change is None else {**entry["figures"], **change}
     path.write_bytes(b"".join(encode_line({k: v for k, v in f.items() if k != "crc"}) for f in facts))
-    expected = processed(two_plates, "none").form_images()
-    assert same(processed(kept).form_images(), expected)
-    assert same(processed(without_raw(kept)).form_images(), expected)
+    expected = process_scan(two_plates, "none").form_images()
+    assert same(process_scan(kept).form_images(), expected)
+    assert same(process_scan(without_raw(kept)).form_images(), expected)
 
 
 def damaged_raw(monkeypatch: pytest.MonkeyPatch, change: Callable[[str, np.ndarray], None]) -> None:
     """Change the words int16 [chirp and sample, 2 x RX] of every row that is read."""
     read_row = ScanFolder.read_row
 
-    def changed(self: ScanFolder, board: str, row: int) -> RowData:
+    def change_row(self: ScanFolder, board: str, row: int) -> RowData:
         row_data = read_row(self, board, row)
         words = row_data.payload.view("<i2").reshape(-1, 8).copy()
         change(board, words)
         return RowData(split_pieces(words.view(np.uint8).ravel()), [], row_data.frames_expected, row_data.crc32)
 
-    monkeypatch.setattr(ScanFolder, "read_row", changed)
+    monkeypatch.setattr(ScanFolder, "read_row", change_row)
 
 
 @pytest.mark.parametrize("dead", [("RH", "RV"), ("RV",)])
@@ -275,9 +275,9 @@ def test_rows_of_dead_receivers_are_kept(
         words[:, [1, 2, 3, 5, 6, 7]] = 0
 
     damaged_raw(monkeypatch, one_rx)
-    first = processed(scan)
+    first = process_scan(scan)
     assert not caplog.text
-    again = processed(without_raw(scan))
+    again = process_scan(without_raw(scan))
     assert same(again.form_images(), first.form_images())
     assert again.quality.result().boards == first.quality.result().boards
 
@@ -293,6 +293,6 @@ def test_a_link_out_of_the_scan_is_not_written_through(scan: Path, tmp_path: Pat
     else:
         (scan / "samples").symlink_to(elsewhere)
     with pytest.raises(DataError):
-        processed(scan)
+        process_scan(scan)
     assert [p.name for p in elsewhere.iterdir()] == ["mine.txt"]
     assert (elsewhere / "mine.txt").read_text() == "not to be lost"

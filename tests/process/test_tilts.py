@@ -16,7 +16,7 @@ TILTS_DEG = [(0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-0.7, 0.7), (0.5,
 
 
 @pytest.fixture(scope="module")
-def tilted(rig):
+def tilted_images(rig):
     """Images of six plates of one material, each tilted as TILTS_DEG; and of the same six, level."""
     return [_images(rig, tilts) for tilts in (TILTS_DEG, [(0.0, 0.0)] * 6)]
 
@@ -45,7 +45,7 @@ def _ratios(h, v, masks):
     return np.array([np.median((v[m] / h[m]).real) + 1j * np.median((v[m] / h[m]).imag) for m in masks])
 
 
-def _turned():
+def _turn_polarisation():
     """Change of H and of V / H by each plate's turn of the polarisations: that of a tilted mirror's image."""
     t = np.conj(1 / ratio_from_permittivity(4.0 - 0.4j, np.radians(55.0)))
     d = np.sin(np.radians(55.0)) * np.radians([y for _, y in TILTS_DEG])
@@ -57,18 +57,18 @@ def _turned():
     return h / (1 + leak * t), v / h / ((t + leak) / (1 + leak * t))
 
 
-def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted):
-    images = tilted[0]
+def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted_images):
+    images = tilted_images[0]
     rises = [images.illumination.rise(images.h, images.v, mask) for mask in _insides(images)]
     assert np.degrees(rises) == pytest.approx(np.array(TILTS_DEG), abs=0.12)
 
 
-def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(tilted):
-    images, level = tilted
+def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(tilted_images):
+    images, level = tilted_images
     masks = _insides(images)
     rises = [images.illumination.rise(images.h, images.v, mask) for mask in masks]
     corrected = correct_tilt(images, masks, rises)
-    h_turned, ratio_turned = _turned()
+    h_turned, ratio_turned = _turn_polarisation()
     truth = _ratios(level.h, level.v, masks) * ratio_turned
     state_before, state_after = (
         np.abs(_ratios(*c, masks) / truth - 1) for c in ((images.h, images.v), (corrected.h, corrected.v))
@@ -80,8 +80,8 @@ def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(ti
     assert np.array(brightness)[across] == pytest.approx(1, abs=0.015)
 
 
-def test_tilts_follow_a_transposed_image(tilted):
-    images = tilted[0]
+def test_tilts_follow_a_transposed_image(tilted_images):
+    images = tilted_images[0]
     turned = images.transposed()
     assert (images.illumination.across, turned.illumination.across) == (1, 0)
     for mask in _insides(images):

@@ -33,7 +33,7 @@ def world(names=tuple(PLATES), disturbances=None, **scene):
     return decode_scene(raw | scene, "world")
 
 
-def imaged(source):
+def form_images(source):
     pipeline = pipeline_of(source)
     return pipeline, pipeline.form_images()
 
@@ -44,7 +44,7 @@ def examine(rig):
 
     def make(scene, drop_rows=0):
         source = Cubes(rig, scene, drop_rows)
-        pipeline, images = imaged(source)
+        pipeline, images = form_images(source)
         findings = pipeline.examine(images)
         plates = truth_plates(truth(source.instrument, scene, scene.seed))
         true = match_truth([r.patch for r in findings.analysis.patches], plates)
@@ -154,7 +154,7 @@ def test_an_empty_table_is_no_result(examine):
 def test_without_a_direct_path_there_is_no_result(rig, tmp_path, plates):
     small = {"columns": 31, "rows": 25, "step_x_mm": 14.0, "step_y_mm": 10.0}
     folder = simulate(rig, world(plates, {"direct_loss_db": "absent"}, grid=small), tmp_path / "scan")
-    pipeline, images = imaged(open_source(folder, None))
+    pipeline, images = form_images(open_source(folder, None))
     findings = pipeline.examine(images)
     assert findings.verdict.level == "none"
     assert "direct path" in findings.verdict.reasons[0].what
@@ -162,7 +162,7 @@ def test_without_a_direct_path_there_is_no_result(rig, tmp_path, plates):
 
 
 def test_products_without_a_result_hold_images_and_no_name(rig, tmp_path):
-    pipeline, _ = imaged(Cubes(rig, world(("ceramic", "wood"))))
+    pipeline, _ = form_images(Cubes(rig, world(("ceramic", "wood"))))
     products = pipeline.finish(tmp_path / "out")
     assert products.exit_status == 7
     content = json.loads((tmp_path / "out/materials.json").read_text())

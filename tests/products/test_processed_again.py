@@ -34,7 +34,7 @@ METAL = ["--metal", "-36,0,30,40"]
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory) -> Path:
+def recorded_scan(tmp_path_factory) -> Path:
     """A simulated scan, and its products."""
     folder = tmp_path_factory.mktemp("recorded")
     simulate(published_rig(), decode_scene(SCENE, "test"), folder / "scan")
@@ -43,31 +43,31 @@ def recorded(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def made(recorded, tmp_path) -> Path:
+def made_folder(recorded_scan, tmp_path) -> Path:
     """A copy of both, in `scan` and `out`."""
-    return Path(shutil.copytree(recorded, tmp_path / "lab"))
+    return Path(shutil.copytree(recorded_scan, tmp_path / "lab"))
 
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def process(made: Path, *more: object) -> int:
-    return main(["process", str(made / "scan"), "--out", str(made / "out"), *map(str, more)])
+def process(made_folder: Path, *more: object) -> int:
+    return main(["process", str(made_folder / "scan"), "--out", str(made_folder / "out"), *map(str, more)])
 
 
-def boxes(made: Path, labels: dict[str, list[float]]) -> Path:
-    (made / "mine.json").write_text(json.dumps({"labels": labels}))
-    return made / "mine.json"
+def boxes(made_folder: Path, labels: dict[str, list[float]]) -> Path:
+    (made_folder / "mine.json").write_text(json.dumps({"labels": labels}))
+    return made_folder / "mine.json"
 
 
-def test_labels_among_the_products_that_they_replace(made):
+def test_labels_among_the_products_that_they_replace(made_folder):
     """The file is read before its folder is replaced; its two boxes become the patches of the new products."""
-    labels = made / "out" / "labels.json"
+    labels = made_folder / "out" / "labels.json"
     labels.write_text(json.dumps({"labels": {"metal": [7, 10, 12, 20], "drawn": [27, 10, 32, 20]}}))
-    assert process(made, "--labels", labels, "--model", "none") == 0
+    assert process(made_folder, "--labels", labels, "--model", "none") == 0
     assert set(json.loads(labels.read_text())["labels"]) == {"metal", "drawn"}
-    assert (made / "out" / "report.html").exists()
+    assert (made_folder / "out" / "report.html").exists()
 
 
 @pytest.mark.parametrize(
@@ -80,83 +80,84 @@ def test_labels_among_the_products_that_they_replace(made):
         ("--reference", "nowhere", "nowhere"),
     ],
 )
-def test_an_invalid_input_changes_nothing(made, option, path, value, capsys):
-    boxes(made, {"far": [4000, 0, 4010, 10]})
-    state_before = contents(made)
-    assert process(made, option, made / path) == 3
+def test_an_invalid_input_changes_nothing(made_folder, option, path, value, capsys):
+    boxes(made_folder, {"far": [4000, 0, 4010, 10]})
+    state_before = contents(made_folder)
+    assert process(made_folder, option, made_folder / path) == 3
     assert value in capsys.readouterr().err
-    assert contents(made) == state_before
+    assert contents(made_folder) == state_before
 
 
-def test_a_report_is_not_replaced_by_images_without_one(made, capsys):
-    state_before = contents(made / "out")
-    assert process(made, "--metal", "900,900,10,10") == 3
-    assert contents(made / "out") == state_before
-    shutil.rmtree(made / "out")
-    assert process(made, "--metal", "900,900,10,10") == 3
-    assert str(made / "out" / "image.npz") in capsys.readouterr().err.splitlines()[-1]
-    assert (made / "out" / "image.npz").exists()
+def test_a_report_is_not_replaced_by_images_without_one(made_folder, capsys):
+    state_before = contents(made_folder / "out")
+    assert process(made_folder, "--metal", "900,900,10,10") == 3
+    assert contents(made_folder / "out") == state_before
+    shutil.rmtree(made_folder / "out")
+    assert process(made_folder, "--metal", "900,900,10,10") == 3
+    assert str(made_folder / "out" / "image.npz") in capsys.readouterr().err.splitlines()[-1]
+    assert (made_folder / "out" / "image.npz").exists()
 
 
-def test_products_whose_raw_rows_were_dropped_stay(made, capsys):
-    assert main(["drop-raw", str(made / "scan"), "--products", str(made / "out"), "--yes"]) == 0
-    state_before = contents(made / "out")
-    other_scan = simulate(published_rig(), decode_scene({**SCENE, "name": "another"}, "test"), made / "other")
+def test_products_whose_raw_rows_were_dropped_stay(made_folder, capsys):
+    assert main(["drop-raw", str(made_folder / "scan"), "--products", str(made_folder / "out"), "--yes"]) == 0
+    state_before = contents(made_folder / "out")
+    other_scan = simulate(published_rig(), decode_scene({**SCENE, "name": "another"}, "test"), made_folder / "other")
     for command in ("process", "image"):
-        assert main([command, str(other_scan), "--out", str(made / "out")]) == 2
-        assert ScanFolder.load(made / "scan").scan_id in capsys.readouterr().err
-    assert contents(made / "out") == state_before
+        assert main([command, str(other_scan), "--out", str(made_folder / "out")]) == 2
+        assert ScanFolder.load(made_folder / "scan").scan_id in capsys.readouterr().err
+    assert contents(made_folder / "out") == state_before
 
 
 @pytest.fixture
-def other_angle(made) -> Path:
+def other_angle(made_folder) -> Path:
     """The simulated library, shifted by two degrees of incidence."""
     library = Library.load(SIMULATED_LIBRARY)
     moved = (replace(e, incidence_deg=e.incidence_deg + 2) for e in library.entries)
-    Library(tuple(moved), library.fit, library.note).save(made / "other.npz")
-    return made / "other.npz"
+    Library(tuple(moved), library.fit, library.note).save(made_folder / "other.npz")
+    return made_folder / "other.npz"
 
 
-def test_at_another_angle_than_the_librarys_nothing_is_named(made, other_angle, capsys):
-    assert process(made, *METAL, "--library", other_angle) == 0
+def test_at_another_angle_than_the_librarys_nothing_is_named(made_folder, other_angle, capsys):
+    assert process(made_folder, *METAL, "--library", other_angle) == 0
     output = capsys.readouterr()
     assert "other.npz" in output.err
     assert "other.npz" in output.out
-    materials = json.loads((made / "out" / "materials.json").read_text())
+    materials = json.loads((made_folder / "out" / "materials.json").read_text())
     assert materials["model"] is None
     other_patch = next(s for s in materials["segments"] if not s["metal_reference"])
     assert other_patch["name"] is None
     assert (other_patch["permittivity"] is None) == (
         other_patch["refused"] is not None
     )  # so coarse a scan may give no result
-    assert "other.npz" in (made / "out" / "report.html").read_text()
+    assert "other.npz" in (made_folder / "out" / "report.html").read_text()
 
 
 @pytest.fixture
-def no_pi(made) -> Path:
+def no_pi(made_folder) -> Path:
     """A rig file with an address at which no Pi answers."""
     table = to_builtins(published_rig())
     table["pi"] |= {"command_address": "tcp://127.0.0.1:1", "event_address": "tcp://127.0.0.1:2"}
     table["limits"] |= {"command_timeout_s": 0.2}
-    (made / "rig.toml").write_text(tomli_w.dumps(table))
-    return made / "rig.toml"
+    (made_folder / "rig.toml").write_text(tomli_w.dumps(table))
+    return made_folder / "rig.toml"
 
 
-def test_a_library_of_another_angle_is_reported_before_the_rig_is_used(made, other_angle, no_pi, capsys):
-    scan = ["scan", "--config", str(no_pi), "--out", str(made / "new")]
+def test_a_library_of_another_angle_is_reported_before_the_rig_is_used(made_folder, other_angle, no_pi, capsys):
+    scan = ["scan", "--config", str(no_pi), "--out", str(made_folder / "new")]
     assert main([*scan, "--library", str(other_angle)]) == 5
     message = capsys.readouterr().err
     assert 0 < message.index("other.npz") < message.index("127.0.0.1:1")
-    for option in (["--labels", made / "no.json"], ["--labels", boxes(made, {"far": [4000, 0, 4010, 10]})],
-                  ["--library", made / "no.npz"], ["--truth", no_pi]):  # fmt: skip
+    far_box = boxes(made_folder, {"far": [4000, 0, 4010, 10]})
+    for option in (["--labels", made_folder / "no.json"], ["--labels", far_box],
+                   ["--library", made_folder / "no.npz"], ["--truth", no_pi]):  # fmt: skip
         assert main([*scan, *map(str, option)]) == 3
         assert "127.0.0.1" not in capsys.readouterr().err
-    assert not (made / "new").exists()
+    assert not (made_folder / "new").exists()
 
 
-def test_retaken_and_incomplete_rows_of_every_run_are_counted(made):
+def test_retaken_and_incomplete_rows_of_every_run_are_counted(made_folder):
     """They come from the manifest, however often the scan was resumed."""
-    scan = ScanFolder.load(made / "scan")
+    scan = ScanFolder.load(made_folder / "scan")
     rows = {f["row"]: f for f in facts_of(scan, "row_committed")}
     with scan.writer() as writer:
         for row, take in ((2, 1), (2, 2), (5, 1)):
@@ -165,7 +166,7 @@ def test_retaken_and_incomplete_rows_of_every_run_are_counted(made):
         writer.append({**rows[7], "take": 1, "kept_incomplete": ["RH: a gap"]})
         writer.append({"fact": "row_withdrawn", "row": 7, "take": 1, "reasons": ["short"]})
         writer.append({**rows[7], "take": 2})
-    assert manifest.read(made / "scan" / MANIFEST).length
-    assert process(made, *METAL, "--model", "none") == 0
-    quality = json.loads((made / "out" / "quality.json").read_text())
+    assert manifest.read(made_folder / "scan" / MANIFEST).length
+    assert process(made_folder, *METAL, "--model", "none") == 0
+    quality = json.loads((made_folder / "out" / "quality.json").read_text())
     assert (quality["rows_retaken"], quality["rows_incomplete"]) == (3, [2])

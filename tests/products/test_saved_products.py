@@ -37,7 +37,7 @@ STACK = ["glass,5.5,0.05,3", "water,?"]
 ANGLE_DEG = 55.0
 
 
-def part_of(inverse: complex) -> dict:
+def write_part(inverse: complex) -> dict:
     ratio = 1 / inverse
     return {"ratio": {"real": ratio.real, "imag": ratio.imag}, "inverse_ratio_std": 0.005}
 
@@ -48,19 +48,19 @@ def folder(tmp_path, monkeypatch):
     layers = [parse_layer(STACK[0]), Layer("water", WATER)]
     whole_band, parts = (predict(layers, Spectrum.of(USED.chirp, n), np.radians(ANGLE_DEG))[0] for n in (1, 3))
     bands = [
-        part_of(complex(q)) | {"first_hz": b.first_hz, "last_hz": b.last_hz}
+        write_part(complex(q)) | {"first_hz": b.first_hz, "last_hz": b.last_hz}
         for q, b in zip(parts, sub_bands(USED.chirp, 3), strict=True)
     ]
     row = {"label": 3, "name": "liquid", "incidence_deg": ANGLE_DEG, "permittivity": None, "bands": bands}
     made_folder = tmp_path / "made"
-    write_json(made_folder / "materials.json", {"segments": [row | part_of(complex(whole_band[0]))]})
+    write_json(made_folder / "materials.json", {"segments": [row | write_part(complex(whole_band[0]))]})
     write_json(made_folder / "scan.json", {"scan_id": "s", "simulated": True, "instrument": to_builtins(USED)})
     shutil.copy(RIG_FILE, tmp_path / "instrument.toml")
     monkeypatch.chdir(tmp_path)
     return made_folder
 
 
-def found(capsys, *arguments: object) -> complex:
+def read_fit(capsys, *arguments: object) -> complex:
     layers = [word for layer in STACK for word in ("--layer", layer)]
     assert main(["permittivity", *map(str, arguments), *layers, "--json"]) == 0
     real, loss = json.loads(capsys.readouterr().out)[0]["layer"]["permittivity"]
@@ -69,12 +69,12 @@ def found(capsys, *arguments: object) -> complex:
 
 @pytest.mark.parametrize("bands", [1, 3])
 def test_permittivity_is_computed_with_the_chirp_of_the_products(folder, capsys, bands):
-    assert abs(found(capsys, folder, "--bands", bands) - WATER) < 1e-2
+    assert abs(read_fit(capsys, folder, "--bands", bands) - WATER) < 1e-2
 
 
 def test_a_rig_file_may_replace_the_chirp_unless_sub_bands_contradict_it(folder, capsys):
     Path("used.toml").write_text(tomli_w.dumps(to_builtins(USED)))
-    assert abs(found(capsys, folder, "--config", "used.toml") - WATER) < 1e-2
+    assert abs(read_fit(capsys, folder, "--config", "used.toml") - WATER) < 1e-2
     arguments = ["permittivity", str(folder), "--config", "instrument.toml", "--layer", "water,?"]
     for bands in ("1", "3"):
         assert main([*arguments, "--bands", bands]) == DataError.exit_status
@@ -85,7 +85,7 @@ def test_a_rig_file_may_replace_the_chirp_unless_sub_bands_contradict_it(folder,
     # Nothing contradicts the given chirp
     del materials["segments"][0]["bands"]
     write_json(folder / MATERIALS, materials)
-    assert abs(found(capsys, folder, "--config", "instrument.toml") - WATER) > 1
+    assert abs(read_fit(capsys, folder, "--config", "instrument.toml") - WATER) > 1
 
 
 def test_a_missing_chirp_is_not_guessed(folder, capsys):
@@ -100,7 +100,7 @@ def test_a_scan_folder_may_be_given_for_its_products(folder, tmp_path, capsys):
     scan = tmp_path / "scan"
     scan.mkdir()
     folder.rename(scan / "products")
-    assert abs(found(capsys, scan) - WATER) < 1e-2
+    assert abs(read_fit(capsys, scan) - WATER) < 1e-2
 
 
 @pytest.mark.parametrize("name", ["materials.json", "scan.json"])
@@ -137,6 +137,6 @@ def test_gains_are_relative_to_each_boards_first_rx():
         "RV": np.array([5j, 5j], np.complex128),
     }
     images = Images(none, none, axis, axis, np.ones((1, 1), bool), rx_gains=gains)
-    found = {name: [(g.gain_db, g.phase_deg) for g in board] for name, board in rx_gains(images).items()}
-    assert found["RH"] == [pytest.approx(g) for g in ((0.0, 0.0), (20.0, 0.0), (0.0, 90.0), (-20.0, 180.0))]
-    assert found["RV"] == [pytest.approx((0.0, 0.0))] * 2
+    read_fit = {name: [(g.gain_db, g.phase_deg) for g in board] for name, board in rx_gains(images).items()}
+    assert read_fit["RH"] == [pytest.approx(g) for g in ((0.0, 0.0), (20.0, 0.0), (0.0, 90.0), (-20.0, 180.0))]
+    assert read_fit["RV"] == [pytest.approx((0.0, 0.0))] * 2

@@ -23,15 +23,15 @@ FRAMES = 4
 
 
 @pytest.fixture
-def made(rig, words, clock):
+def make_board(rig, words, clock):
     def make(calibration=None) -> RadarBoard:
         return RadarBoard("RH", words, clock, program(rig, rig.by_name("RH")), calibration=calibration)
 
     return make
 
 
-def test_settings_are_read_back_as_sent(made, board):
-    radar = made()
+def test_settings_are_read_back_as_sent(make_board, board):
+    radar = make_board()
     radar.configure()
     radar.arm(FRAMES)
     assert radar.read_back() == []
@@ -40,15 +40,15 @@ def test_settings_are_read_back_as_sent(made, board):
     assert difference.startswith("0x0100: sent ")
 
 
-def test_a_calibration_is_saved_and_restored_at_the_next_start(made, board, tmp_path):
+def test_a_calibration_is_saved_and_restored_at_the_next_start(make_board, board, tmp_path):
     files = CalibrationFiles(tmp_path / "kept", b"settings")
-    first = made(files)
+    first = make_board(files)
     first.configure()
     assert first.facts.calibration_restored is False
     (file,) = (tmp_path / "kept").iterdir()
     assert json.loads(file.read_text())["die_id"] == first.facts.die_id
     board.executed.clear()
-    again = made(files)
+    again = make_board(files)
     again.configure()
     assert again.facts.calibration_restored is True
     assert board.executed.count(RestoreCalibration.ID) == 3
@@ -78,29 +78,29 @@ def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp
     assert 0x0100 not in board.executed
 
 
-def test_a_calibration_folder_that_cannot_be_written_is_named(made, tmp_path):
+def test_a_calibration_folder_that_cannot_be_written_is_named(make_board, tmp_path):
     (tmp_path / "kept").write_text("a file in place of the folder")
     with refused(ErrorCode.FILE_UNWRITABLE, tmp_path / "kept", "calibration_dir"):
-        made(CalibrationFiles(tmp_path / "kept", b"settings")).configure()
+        make_board(CalibrationFiles(tmp_path / "kept", b"settings")).configure()
 
 
-def test_other_settings_and_other_dies_have_their_own_calibration(made, board, tmp_path):
-    made(CalibrationFiles(tmp_path, b"settings")).configure()
-    made(CalibrationFiles(tmp_path, b"others")).configure()
+def test_other_settings_and_other_dies_have_their_own_calibration(make_board, board, tmp_path):
+    make_board(CalibrationFiles(tmp_path, b"settings")).configure()
+    make_board(CalibrationFiles(tmp_path, b"others")).configure()
     board.cores.die = 7
-    made(CalibrationFiles(tmp_path, b"settings")).configure()
+    make_board(CalibrationFiles(tmp_path, b"settings")).configure()
     assert len(list(tmp_path.iterdir())) == 3
 
 
 @pytest.mark.parametrize(
     "spoil", [lambda t: t[: len(t) // 2], lambda t: t.replace('"crc32": ', '"crc32": 1'), lambda t: t[:0] + "[]"]
 )
-def test_a_damaged_calibration_is_not_sent_to_a_board(made, board, tmp_path, spoil):
+def test_a_damaged_calibration_is_not_sent_to_a_board(make_board, board, tmp_path, spoil):
     files = CalibrationFiles(tmp_path, b"settings")
-    made(files).configure()
+    make_board(files).configure()
     (file,) = tmp_path.iterdir()
     file.write_text(spoil(file.read_text()))
     board.executed.clear()
     with refused(ErrorCode.FILE_DAMAGED, file):
-        made(files).configure()
+        make_board(files).configure()
     assert RestoreCalibration.ID not in board.executed

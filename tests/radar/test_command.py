@@ -36,7 +36,7 @@ def rig_file(rig, tmp_path):
 
 
 @pytest.fixture
-def opened(words, clock, monkeypatch):
+def opened_boards(words, clock, monkeypatch):
     """The command reaches the simulated board `RH`, in virtual time."""
     places = []
 
@@ -65,13 +65,13 @@ def test_the_plan_lists_every_message_of_every_board(rig, rig_file, capsys):
     assert sent == expected
 
 
-def test_a_sound_board_passes_every_step(rig_file, opened, capsys):
+def test_a_sound_board_passes_every_step(rig_file, opened_boards, capsys):
     assert run(rig_file(), "check", "RH", "--json", "--slow") == 0
     result = json.loads(capsys.readouterr().out)
     assert [s["step"] for s in result["steps"]] == STEPS
     assert all(s["holds"] for s in result["steps"])
     assert result["report"]["die_id"].startswith("5eed0001")
-    assert opened == [("FTRH", True)]
+    assert opened_boards == [("FTRH", True)]
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_a_sound_board_passes_every_step(rig_file, opened, capsys):
         (lambda board: setattr(board, "plugged", False), "reset", ("unplugged",)),
     ],
 )
-@pytest.mark.usefixtures("opened")
+@pytest.mark.usefixtures("opened_boards")
 def test_a_failed_step_has_the_expected_outcome_and_a_remedy(rig_file, board, capsys, spoil, step, text):
     spoil(board)
     assert run(rig_file(), "check", "RH") == 1
@@ -107,7 +107,7 @@ def test_a_failed_step_has_the_expected_outcome_and_a_remedy(rig_file, board, ca
     ],
 )
 def test_a_plan_with_a_broken_constraint_fails_without_opening_a_board(
-    rig, rig_file, opened, capsys, table, key, value
+    rig, rig_file, opened_boards, capsys, table, key, value
 ):
     part = msgspec.structs.replace(getattr(rig, table), **{key: value})
     path = rig_file(msgspec.structs.replace(rig, **{table: part}))
@@ -117,10 +117,10 @@ def test_a_plan_with_a_broken_constraint_fails_without_opening_a_board(
     assert "34122143" not in out
     assert run(path, "check", "RH") == 2
     assert "the radars would refuse" in capsys.readouterr().err
-    assert opened == []
+    assert opened_boards == []
 
 
-@pytest.mark.usefixtures("opened")
+@pytest.mark.usefixtures("opened_boards")
 def test_firmware_goes_to_ram_and_to_the_flash_only_with_flash(rig_file, words, board, capsys, tmp_path):
     board.cores.flash = b""
     image = tmp_path / "image.bin"
@@ -134,13 +134,13 @@ def test_firmware_goes_to_ram_and_to_the_flash_only_with_flash(rig_file, words, 
     assert words.closed
 
 
-def test_a_file_that_is_no_image_is_refused_without_opening_a_board(rig_file, opened, capsys, tmp_path):
+def test_a_file_that_is_no_image_is_refused_without_opening_a_board(rig_file, opened_boards, capsys, tmp_path):
     image = tmp_path / "notes.txt"
     image.write_text("not firmware")
     for options in ((), ("--flash",)):
         assert run(rig_file(), "firmware", "RH", str(image), *options) == 2
         assert "is no firmware" in capsys.readouterr().err
-    assert opened == []
+    assert opened_boards == []
 
 
 def test_an_unknown_board_is_refused(rig_file, capsys):
@@ -163,7 +163,7 @@ SPOILT = [
 
 
 @pytest.mark.parametrize("spoil", SPOILT, ids=["sound", "flash empty", "jumpers"])
-@pytest.mark.usefixtures("opened")
+@pytest.mark.usefixtures("opened_boards")
 def test_a_replayed_trace_has_the_same_result(rig_file, board, capsys, tmp_path, spoil):
     spoil(board)
     trace = str(tmp_path / "day.jsonl")
@@ -178,10 +178,10 @@ def test_a_replayed_trace_has_the_same_result(rig_file, board, capsys, tmp_path,
 @pytest.mark.parametrize("after_s", [0.0, 1e-4, 1.5e-3, 5e-3, 0.02, 0.5])
 @pytest.mark.parametrize("look_s", [0.0, 1.25e-4, 1e-3])
 def test_an_event_at_any_time_after_power_up_replays(
-    rig_file, words, board, clock, capsys, tmp_path, opened, look_s, after_s
+    rig_file, words, board, clock, capsys, tmp_path, opened_boards, look_s, after_s
 ):
     """A trace counts looks, each of which takes its time over USB: the line rises in a replay where it was seen to."""
-    del opened
+    del opened_boards
     look = words.interrupt
     boot = board.cores.boot
 
@@ -203,7 +203,7 @@ def test_an_event_at_any_time_after_power_up_replays(
     assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")] == result
 
 
-@pytest.mark.usefixtures("opened")
+@pytest.mark.usefixtures("opened_boards")
 def test_a_trace_has_both_directions_and_every_change_of_a_line(rig_file, tmp_path):
     trace = tmp_path / "day.jsonl"
     assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
@@ -218,7 +218,7 @@ def test_a_trace_has_both_directions_and_every_change_of_a_line(rig_file, tmp_pa
     assert all(a["t"] <= b["t"] for a, b in pairwise(lines[1:]))
 
 
-@pytest.mark.usefixtures("opened")
+@pytest.mark.usefixtures("opened_boards")
 def test_a_replay_with_another_rig_file_reports_the_first_different_line(rig, rig_file, capsys, tmp_path):
     trace = str(tmp_path / "day.jsonl")
     assert run(rig_file(), "check", "RH", "--trace", trace) == 0
@@ -255,7 +255,7 @@ def test_an_invalid_line_of_a_trace_is_refused_by_its_number(rig_file, capsys, t
 
 
 @pytest.mark.parametrize("kind", ["device", "pipe", "sparse", "folder"])
-def test_devices_pipes_folders_and_huge_files_are_refused_unread(rig, rig_file, capsys, tmp_path, opened, kind):
+def test_devices_pipes_folders_and_huge_files_are_refused_unread(rig, rig_file, capsys, tmp_path, opened_boards, kind):
     path = tmp_path / "odd"
     if kind == "device":
         path = Path("/dev/zero")
@@ -274,19 +274,19 @@ def test_devices_pipes_folders_and_huge_files_are_refused_unread(rig, rig_file, 
         assert text in capsys.readouterr().err
     assert run(rig_file(with_it), "check", "RH") == 3
     assert text in capsys.readouterr().err
-    assert opened == []
+    assert opened_boards == []
 
 
-def test_an_existing_trace_is_not_overwritten(rig_file, opened, capsys, tmp_path):
+def test_an_existing_trace_is_not_overwritten(rig_file, opened_boards, capsys, tmp_path):
     trace = tmp_path / "day.jsonl"
     trace.write_text("of another day")
     assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 2
     assert "there already" in capsys.readouterr().err
     assert trace.read_text() == "of another day"
-    assert opened == []
+    assert opened_boards == []
 
 
-@pytest.mark.usefixtures("opened")
+@pytest.mark.usefixtures("opened_boards")
 def test_an_interrupted_flash_write_reports_the_parts_written(rig_file, words, board, capsys, tmp_path):
     image = tmp_path / "image.bin"
     image.write_bytes(make_image())
@@ -311,7 +311,7 @@ def test_the_simulated_board_refuses_an_empty_trace(tmp_path):
         replay(tmp_path / "a", RadarBoard)
 
 
-@pytest.mark.usefixtures("opened")
+@pytest.mark.usefixtures("opened_boards")
 def test_a_truncated_trace_replays_to_its_end(rig_file, capsys, tmp_path):
     trace = tmp_path / "day.jsonl"
     assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
@@ -323,7 +323,7 @@ def test_a_truncated_trace_replays_to_its_end(rig_file, capsys, tmp_path):
         assert "the trace ends here" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("opened")
+@pytest.mark.usefixtures("opened_boards")
 def test_a_trace_is_replayed_to_a_simulated_board(rig_file, tmp_path):
     trace = tmp_path / "day.jsonl"
     assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0

@@ -106,11 +106,11 @@ class PowerCut(BoardWords):
         super().write(words)
 
 
-def made(board: Simulated, clock: VirtualClock, firmware=None, words=None) -> RadarBoard:
+def make_board(board: Simulated, clock: VirtualClock, firmware=None, words=None) -> RadarBoard:
     return RadarBoard("RH", words or BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")), firmware)
 
 
-def ignored(sent: int, of: int) -> None: ...
+def ignore(sent: int, of: int) -> None: ...
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def new(clock) -> Simulated:
 @pytest.mark.parametrize("fault_at", ["power-up", "download", "never"])
 def test_a_new_board_runs_from_ram_and_its_flash_stays_empty(clock, fault_at):
     board = Simulated(lambda: clock.time, fault_at=fault_at)
-    radar = made(board, clock, IMAGE)
+    radar = make_board(board, clock, IMAGE)
     radar.configure()
     assert radar.state is State.CONFIGURED
     assert board.cores.flash == b""
@@ -135,21 +135,21 @@ def test_a_new_board_runs_from_ram_and_its_flash_stays_empty(clock, fault_at):
 
 
 def test_without_an_image_a_new_board_is_refused(new, clock):
-    radar = made(new, clock)
+    radar = make_board(new, clock)
     with refused(ErrorCode.RADAR_NO_FIRMWARE) as caught:
         radar.configure()
     assert "image header" in caught.value.why  # from its boot status
 
 
 def test_an_image_in_the_flash_is_not_downloaded_again(board, clock):
-    made(board, clock, IMAGE).configure()
+    make_board(board, clock, IMAGE).configure()
     assert 0x4080 not in board.executed
 
 
 @pytest.mark.parametrize("fault_at", ["power-up", "download", "never"])
 def test_a_flash_write_is_verified_by_a_start_from_the_flash(clock, fault_at):
     board = Simulated(lambda: clock.time, fault_at=fault_at)
-    radar = made(board, clock)
+    radar = make_board(board, clock)
     result: list[tuple[int, int]] = []
     assert "2.2.2.0 from flash" in radar.write_flash(IMAGE, lambda sent, of: result.append((sent, of)))
     assert board.cores.flash == DATA
@@ -160,7 +160,7 @@ def test_a_flash_write_is_verified_by_a_start_from_the_flash(clock, fault_at):
 
 def test_a_slow_erase_does_not_time_out(clock):
     board = Simulated(lambda: clock.time, erase_s=0.9 * CHUNK_TIMEOUT_S)
-    made(board, clock).write_flash(IMAGE, ignored)
+    make_board(board, clock).write_flash(IMAGE, ignore)
     assert board.cores.flash == DATA
 
 
@@ -172,14 +172,14 @@ def test_a_board_that_reports_a_hardware_fault_is_refused_after_any_download(clo
     board = Simulated(lambda: clock.time, flash=flash)
     board.cores.hardware_bits = 1 << bit
     with pytest.raises(DeviceError):
-        made(board, clock, image).configure()
+        make_board(board, clock, image).configure()
     assert 0x4000 not in board.executed
     with pytest.raises(DeviceError):
-        made(board, clock).write_flash(IMAGE, ignored)
+        make_board(board, clock).write_flash(IMAGE, ignore)
     assert board.cores.flash == DATA
 
 
-@pytest.mark.parametrize("use", [lambda radar: radar.write_flash(IMAGE, ignored), lambda radar: radar.configure()])
+@pytest.mark.parametrize("use", [lambda radar: radar.write_flash(IMAGE, ignore), lambda radar: radar.configure()])
 def test_the_rf_part_of_another_board_is_not_configured(clock, use):
     board = Simulated(lambda: clock.time, flash=DATA)
     radar = RadarBoard("LS", BoardWords(board, clock), clock, program(RIG, RIG.by_name("LS")), die_id="5eed0002-0-0-0")
@@ -191,7 +191,7 @@ def test_the_rf_part_of_another_board_is_not_configured(clock, use):
 @pytest.mark.parametrize(("tests", "text"), [(0, "0x7FFFFFF"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
 def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, text):
     board.cores.rf_tests = tests
-    radar = made(board, clock)
+    radar = make_board(board, clock)
     result = []
     radar.configure(lambda step, came: result.append(came) if step.name == "RF power-up" else None)
     assert (text in result[0]) if text else result == ["RF core is up"]
@@ -203,9 +203,9 @@ def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, text
 def test_an_image_for_another_rom_is_not_sent(clock, rom, flash):
     board = Simulated(lambda: clock.time, flash=flash)
     board.cores.main_rom = rom
-    for use in (lambda r: r.write_flash(IMAGE, ignored), lambda r: r.configure()):
+    for use in (lambda r: r.write_flash(IMAGE, ignore), lambda r: r.configure()):
         with refused(ErrorCode.MISMATCH, ".".join(map(str, rom))):
-            use(made(board, clock, IMAGE))
+            use(make_board(board, clock, IMAGE))
     assert 0x4080 not in board.executed
     assert board.cores.flash == flash
 
@@ -221,7 +221,7 @@ def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, 
     board = Simulated(lambda: clock.time, flash=DATA)
     setattr(board.cores, core, rom)
     with refused(ErrorCode.MISMATCH, text):
-        made(board, clock, image).configure()
+        make_board(board, clock, image).configure()
     assert set(board.executed) <= {0x404C, 0x4000, 0x0220, 0x40E0}
 
 
@@ -231,7 +231,7 @@ def test_another_patch_of_the_rf_core_is_a_warning(clock, monkeypatch, flash):
     effect = board.cores._effect
     old = bytes((2, 1, 20, 1, 1, 0))
     monkeypatch.setattr(board.cores, "_effect", lambda n, d: effect(n, d)[:10] + old if n == 0x0220 else effect(n, d))
-    radar = made(board, clock, IMAGE)
+    radar = make_board(board, clock, IMAGE)
     radar.configure()
     (result,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
     assert "2.2.4.0" in result
@@ -241,23 +241,23 @@ def test_another_patch_of_the_rf_core_is_a_warning(clock, monkeypatch, flash):
 @pytest.mark.parametrize("broken", [b"", DATA[:100], DATA[:-1], bytes(9000), DATA[:400] + b"\xff" + DATA[401:]])
 def test_a_download_repairs_any_content_of_the_flash(clock, broken):
     board = Simulated(lambda: clock.time, flash=broken)
-    made(board, clock).write_flash(IMAGE, ignored)
-    made(board, clock).configure()
+    make_board(board, clock).write_flash(IMAGE, ignore)
+    make_board(board, clock).configure()
 
 
 @pytest.mark.parametrize("part", range(1, 37))
 def test_a_power_failure_at_any_part_is_recoverable(clock, part):
     """Part 36 is the version question after the last part; the first two messages are questions too."""
     board = Simulated(lambda: clock.time, flash=make_image(4000))
-    radar = made(board, clock, words=PowerCut(board, clock, part + 1))
+    radar = make_board(board, clock, words=PowerCut(board, clock, part + 1))
     with pytest.raises(DeviceError):
-        radar.write_flash(IMAGE, ignored)
+        radar.write_flash(IMAGE, ignore)
     board.power(True)
-    rescued = made(board, clock, IMAGE)
+    rescued = make_board(board, clock, IMAGE)
     rescued.configure()  # from RAM, with any content of the flash
     assert rescued.state is State.CONFIGURED
-    made(board, clock).write_flash(IMAGE, ignored)
-    made(board, clock).configure()
+    make_board(board, clock).write_flash(IMAGE, ignore)
+    make_board(board, clock).configure()
 
 
 @pytest.mark.parametrize("part", range(1, 36))
@@ -266,7 +266,7 @@ def test_a_restart_during_a_download_ends_it_at_once(clock, part):
     board = Simulated(lambda: clock.time, flash=DATA, erase_s=0.1)
     words = Restarts(board, clock, part + 1)
     with refused(ErrorCode.RADAR_RESTARTED, f"part {part} of 35"):
-        made(board, clock, words=words).write_flash(IMAGE, ignored)
+        make_board(board, clock, words=words).write_flash(IMAGE, ignore)
     assert words.later == 0
     assert clock.time < 5.0
 
@@ -281,7 +281,7 @@ def test_a_refused_part_is_an_error_with_its_number(new, clock, monkeypatch):
 
     monkeypatch.setattr(new.cores, "_download", refuse_seventh)
     with refused(ErrorCode.REFUSED_BY_PEER, "part 7 of 35 of image.bin", "error 7"):
-        made(new, clock).write_flash(IMAGE, ignored)
+        make_board(new, clock).write_flash(IMAGE, ignore)
 
 
 def test_a_flash_that_loses_data_is_an_error(new, clock, monkeypatch):
@@ -294,7 +294,7 @@ def test_a_flash_that_loses_data_is_an_error(new, clock, monkeypatch):
 
     monkeypatch.setattr(new.cores, "_download", forget)
     with pytest.raises(DeviceError):
-        made(new, clock).write_flash(IMAGE, ignored)
+        make_board(new, clock).write_flash(IMAGE, ignore)
 
 
 @pytest.mark.parametrize(("reported", "warned"), [((2, 9, 20, 1, 1, 0x30), True), ((0,) * 6, False)])
@@ -309,7 +309,7 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
         return result
 
     monkeypatch.setattr(new.cores, "_effect", answer)
-    radar = made(new, clock, IMAGE)
+    radar = make_board(new, clock, IMAGE)
     if warned:
         radar.configure()
         assert any("reports patch 2.9.3.0 after the download" in line for line in radar.warnings)
@@ -317,12 +317,12 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
     with refused(ErrorCode.RADAR_NO_FIRMWARE):
         radar.configure()
     with refused(ErrorCode.MISMATCH, "0.0.0.0"):
-        radar.write_flash(IMAGE, ignored)
+        radar.write_flash(IMAGE, ignore)
 
 
 @pytest.mark.parametrize("fault", [Fault.BAD_CRC, Fault.LOST_INTERRUPT, Fault.NACK, Fault.BAD_CHECKSUM])
 def test_a_disturbed_download_is_complete(new, clock, fault):
-    radar = made(new, clock)
+    radar = make_board(new, clock)
     radar.words.board.inject(fault, fault)
-    radar.write_flash(IMAGE, ignored)
+    radar.write_flash(IMAGE, ignore)
     assert new.cores.flash == DATA

@@ -57,7 +57,7 @@ def test_offsets_give_the_same_signals_from_scene_rig_file_and_program(tmp_path:
 
 
 @pytest.fixture
-def served():
+def served_board():
     """A simulated board at a TCP address, served by a thread."""
     board = Simulated(time.monotonic, flash=make_image())
     radar_socket = RadarSocket("tcp://127.0.0.1:0", board)
@@ -75,8 +75,8 @@ def served():
     radar_socket.close()
 
 
-def test_a_board_runs_a_row_over_its_socket(rig, served):
-    radar_socket, board = served
+def test_a_board_runs_a_row_over_its_socket(rig, served_board):
+    radar_socket, board = served_board
     radar = RadarBoard("LS", open_board(radar_socket.address), SystemClock(), program(rig, rig.by_name("LS")))
     radar.configure()
     radar.arm(2)
@@ -87,8 +87,8 @@ def test_a_board_runs_a_row_over_its_socket(rig, served):
     radar.close()
 
 
-def test_a_board_unplugged_behind_its_socket_is_a_fault_with_its_address(rig, served):
-    radar_socket, board = served
+def test_a_board_unplugged_behind_its_socket_is_a_fault_with_its_address(rig, served_board):
+    radar_socket, board = served_board
     radar = RadarBoard("LS", open_board(radar_socket.address), SystemClock(), program(rig, rig.by_name("LS")))
     radar.configure()
     board.plugged = False
@@ -106,8 +106,8 @@ def test_an_address_without_a_server_is_an_error():
         open_board("tcp://nonsense")
 
 
-def test_a_split_request_is_processed(served):
-    radar_socket, _ = served
+def test_a_split_request_is_processed(served_board):
+    radar_socket, _ = served_board
     ask = struct.pack("<ccH", b"B", b"W", 2) + b"\x81\x87" + struct.pack("<ccH", b"B", b"R", 1)
     with socket.create_connection(("127.0.0.1", int(radar_socket.address.rpartition(":")[2]))) as client:
         client.settimeout(HANG_S)

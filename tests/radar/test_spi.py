@@ -12,7 +12,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.radars import Fault
 
 
-def ignored(_):
+def ignore(_):
     """Discard an event."""
 
 
@@ -27,10 +27,10 @@ def link(words, clock, sent) -> Link:
     connection = Link("RH", words, clock, sent.append)
     words.reset(held=True)
     words.reset(held=False)
-    connection.wait_for((MAIN_POWER_UP,), 1.0, ignored)
+    connection.wait_for((MAIN_POWER_UP,), 1.0, ignore)
     connection.call(DEVICE_CONFIGURATION)
     connection.call(RF_POWER_UP)
-    connection.wait_for((RF_POWER_UP_DONE,), 1.0, ignored)
+    connection.wait_for((RF_POWER_UP_DONE,), 1.0, ignore)
     sent.clear()
     return connection
 
@@ -115,7 +115,7 @@ def test_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
     link = Link("RH", words, clock, sent.append)
     words.reset(held=True)
     words.reset(held=False)
-    link.wait_for((MAIN_POWER_UP,), 1.0, ignored)
+    link.wait_for((MAIN_POWER_UP,), 1.0, ignore)
     board.inject(fault)
     with refused(ErrorCode.NO_ANSWER):
         link.call(RF_POWER_UP)
@@ -132,4 +132,4 @@ def test_an_unplugged_link_is_an_error_at_once(link, board):
 
 def test_an_event_that_does_not_come_is_a_timeout_with_its_number(link):
     with refused(ErrorCode.NO_ANSWER, "0x100B", "2 s"):
-        link.wait_for((0x100B,), 2.0, ignored)
+        link.wait_for((0x100B,), 2.0, ignore)

@@ -38,23 +38,23 @@ def chip(board: RadarBoard, serial: str, path: tuple[int, ...] = (1,)) -> usb_bu
 
 
 @pytest.fixture
-def plugged(bus, board) -> usb_bus.Chip:
+def plugged_chip(bus, board) -> usb_bus.Chip:
     usb_chip = chip(board, "FT1234", (4, 2))
     bus.plug(usb_chip)
     return usb_chip
 
 
-def test_four_channels_in_their_modes(plugged):
+def test_four_channels_in_their_modes(plugged_chip):
     words = open_usb("FT1234")
-    assert plugged.modes == {1: (2, 0x4B), 2: (2, 0x5B), 3: (1, 0xF9), 4: (1, 0xFF)}
-    assert set(plugged.latency_ms.values()) == {1}
+    assert plugged_chip.modes == {1: (2, 0x4B), 2: (2, 0x5B), 3: (1, 0xF9), 4: (1, 0xFF)}
+    assert set(plugged_chip.latency_ms.values()) == {1}
     assert not words.interrupt()
     words.close()
-    assert plugged.errors == plugged.chip.errors == []
+    assert plugged_chip.errors == plugged_chip.chip.errors == []
 
 
 @pytest.mark.parametrize("packet", [1, 2, 3, 7, 61, 510])
-@pytest.mark.usefixtures("plugged")
+@pytest.mark.usefixtures("plugged_chip")
 def test_split_answers_are_joined(bus, clock, packet):
     bus.packet = packet
     words = open_usb("FT1234")
@@ -68,49 +68,49 @@ def test_split_answers_are_joined(bus, clock, packet):
     words.close()
 
 
-def test_slow_mode_is_one_word_a_transfer(plugged):
+def test_slow_mode_is_one_word_a_transfer(plugged_chip):
     words = open_usb("FT1234", slow=True)
-    assert plugged.chip.spi_hz == 1e6
-    state_before = plugged.transfers
+    assert plugged_chip.chip.spi_hz == 1e6
+    state_before = plugged_chip.transfers
     words.write([1, 2, 3])
-    assert plugged.transfers == state_before + 3
-    assert plugged.chip.words_written == [1, 2, 3]
+    assert plugged_chip.transfers == state_before + 3
+    assert plugged_chip.chip.words_written == [1, 2, 3]
     words.close()
 
 
-def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged):
+def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged_chip):
     """pyftdi opens any of the chips when given a bus address alone, in the order of a set."""
     other_items = [chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
     for foreign_serial in other_items:
         bus.plug(foreign_serial)
     open_usb("usb:1-4.2").write([0x1234])
-    assert plugged.chip.words_written == [0x1234]
+    assert plugged_chip.chip.words_written == [0x1234]
     assert all(o.chip.words_written == [] and o.modes == {} for o in other_items)
     with refused(ErrorCode.NO_ANSWER, "usb:1-7", "1-4.1, 1-4.2"):
         open_usb("usb:1-7")
 
 
-def test_a_serial_number_of_two_chips_opens_neither_and_lists_their_paths(bus, plugged):
+def test_a_serial_number_of_two_chips_opens_neither_and_lists_their_paths(bus, plugged_chip):
     second_chip = chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3))
     bus.plug(second_chip)
     with refused(ErrorCode.VALUES_CONFLICT, "1-4.2, 1-4.3") as caught:
         open_usb("FT1234")
     assert "usb_path" in caught.value.remedy
-    assert plugged.modes == second_chip.modes == {}
+    assert plugged_chip.modes == second_chip.modes == {}
 
 
 @pytest.mark.parametrize(
     ("number", "code", "cause"),
     [(errno.EBUSY, ErrorCode.BUSY, "another program"), (errno.EACCES, ErrorCode.NO_ANSWER, "udev rule")],
 )
-@pytest.mark.usefixtures("plugged")
+@pytest.mark.usefixtures("plugged_chip")
 def test_a_chip_that_cannot_be_claimed_is_an_error_with_the_cause(bus, number, code, cause):
     bus.refuses = number
     with refused(code, "FT1234", cause):
         open_usb("FT1234")
 
 
-@pytest.mark.usefixtures("plugged")
+@pytest.mark.usefixtures("plugged_chip")
 def test_a_missing_chip_is_an_error_with_its_serial_number():
     with refused(ErrorCode.NO_ANSWER, "FT9"):
         open_usb("FT9")
@@ -125,37 +125,37 @@ def test_a_chip_that_is_plugged_in_later_is_found(bus, board):
 
 
 @pytest.mark.parametrize("closed", ["before", "after"])
-def test_a_replugged_chip_is_found_and_the_old_one_closed(bus, plugged, closed):
+def test_a_replugged_chip_is_found_and_the_old_one_closed(bus, plugged_chip, closed):
     words = open_usb("FT1234")
     if closed == "before":
         words.close()
-    bus.pull(plugged)
+    bus.pull(plugged_chip)
     if closed == "after":
         with refused(ErrorCode.NO_ANSWER, "FT1234", "No such device"):
             words.write([1])
         words.close()
     assert UsbTools.Devices == {}
-    bus.plug(plugged)
+    bus.plug(plugged_chip)
     again = open_usb("FT1234")
     again.write([0x4321])
-    assert plugged.chip.words_written == [0x4321]
+    assert plugged_chip.chip.words_written == [0x4321]
     again.close()
     assert UsbTools.Devices == {}
 
 
-def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged):
+def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged_chip):
     """At each transfer of an opening in turn: an error that names the chip, nothing left open, and it comes back."""
     words = open_usb("FT1234")
-    transfers = plugged.transfers
+    transfers = plugged_chip.transfers
     words.close()
     for position in range(1, transfers + 1):
-        bus.plug(plugged)
-        plugged.transfers = 0
-        plugged.pull_at = position
+        bus.plug(plugged_chip)
+        plugged_chip.transfers = 0
+        plugged_chip.pull_at = position
         with refused(ErrorCode.NO_ANSWER, "FT1234"):
             open_usb("FT1234")
         assert UsbTools.Devices == {}
-    bus.plug(plugged)
+    bus.plug(plugged_chip)
     open_usb("FT1234").close()
 
 

@@ -21,7 +21,7 @@ from polysight_shared.geometry import direct_path_m
 FRAMES = 5600
 
 
-def changed(rig: Instrument, table: str, **values) -> Instrument:
+def change_rig(rig: Instrument, table: str, **values) -> Instrument:
     """A rig with values that its own declaration might refuse, too."""
     part = msgspec.structs.replace(getattr(rig, table))
     for key, value in values.items():
@@ -77,7 +77,7 @@ def test_the_published_chirp_with_centred_receivers_holds(rig):
     ],
 )
 def test_a_broken_constraint_is_reported_with_formula_limits_and_value(rig, name, table, values):
-    wrong = changed(rig, table, **values)
+    wrong = change_rig(rig, table, **values)
     assert name in broken(wrong)
     with pytest.raises(ConfigError) as caught:
         require(wrong, FRAMES)
@@ -92,14 +92,14 @@ def test_76_ghz_is_inside_the_band_to_the_code(rig):
     """The ICD's lowest code stands for a little less than 76 GHz."""
     transmitter = msgspec.structs.replace(rig.transmitter, start_offset_hz=0.0)
     for start, holds in ((76e9, True), (0x5471C71B * 3.6e9 / 2**26, True), (0x5471C71A * 3.6e9 / 2**26, False)):
-        wrong = changed(rig, "chirp", start_hz=start)
+        wrong = change_rig(rig, "chirp", start_hz=start)
         assert (f"start frequency of {transmitter.name}" not in broken(wrong)) is holds
 
 
 def test_only_simulated_radars_may_have_no_filters(rig):
     native = {n: NativeRadar(usb_serial=f"tcp://127.0.{k}.1:2000") for k, n in enumerate(rig.radar.native)}
     served = with_radar(rig, native=native)
-    assert broken(changed(served, "chirp", hpf1_khz=0.0, hpf2_khz=0.0)) == set()
+    assert broken(change_rig(served, "chirp", hpf1_khz=0.0, hpf2_khz=0.0)) == set()
 
 
 FLOATS = [("chirp", key) for key in ("start_hz", "slope_hz_per_s", "adc_start_us", "sample_rate_hz", "ramp_end_us")]
@@ -126,7 +126,7 @@ def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, fram
     rig = of_receiver(native_rig(), start_offset_hz=offset_hz)
     wrong = floats | ints
     for table in sorted({table for table, _ in wrong}):
-        rig = changed(rig, table, **{key: value for (section, key), value in wrong.items() if section == table})
+        rig = change_rig(rig, table, **{key: value for (section, key), value in wrong.items() if section == table})
     if all(c.holds for c in constraints(rig, frames)):
         for board in rig.boards:
             for sent in program(rig, board).frames(frames):
@@ -150,8 +150,8 @@ def test_pulse_gap(rig, monkeypatch):
 def test_the_shortest_burst_period_leaves_300_us_after_the_chirps(rig):
     """idle + ramp + 0.01 + 300 us, and 200 us to the next pulse."""
     edge = 100.0 + 128.5 + 0.01 + 300.0 + 200.0
-    assert "inter-frame time" not in broken(changed(rig, "burst", period_us=edge + 1e-6))
-    assert "inter-frame time" in broken(changed(rig, "burst", period_us=edge - 1e-3))
+    assert "inter-frame time" not in broken(change_rig(rig, "burst", period_us=edge + 1e-6))
+    assert "inter-frame time" in broken(change_rig(rig, "burst", period_us=edge - 1e-3))
 
 
 @pytest.mark.parametrize(("chirp_us", "holds"), [(228.51, True), (228.5, False), (300.0, False)])
@@ -204,7 +204,7 @@ def test_expected_if_is_slope_times_path_plus_offset(rig):
     ("complex2x", 0.0, True), ("complex2x", -1.1e6, False), ("complex2x", 700e3, False),
 ])  # fmt: skip
 def test_if_budget(rig, mode, offset, holds):
-    wrong = changed(of_receiver(rig, start_offset_hz=offset), "chirp", if_mode=mode, ramp_end_us=128.4)
+    wrong = change_rig(of_receiver(rig, start_offset_hz=offset), "chirp", if_mode=mode, ramp_end_us=128.4)
     assert ("IF budget of RH" not in broken(wrong)) is holds
 
 

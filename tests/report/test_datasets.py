@@ -48,7 +48,7 @@ def folder(tmp_path):
     return products
 
 
-def exported(folder: Path) -> xarray.Dataset:
+def export_folder(folder: Path) -> xarray.Dataset:
     """The NetCDF file of a folder of products, read."""
     out = folder.parent / "out"
     assert main(["export", str(folder), "--netcdf", "--out", str(out)]) == 0
@@ -56,7 +56,7 @@ def exported(folder: Path) -> xarray.Dataset:
 
 
 def test_the_file_holds_the_products(folder):
-    dataset = exported(folder)
+    dataset = export_folder(folder)
     with np.load(folder / "image.npz") as saved:
         for name in ("h", "v", "p", "valid"):
             np.testing.assert_array_equal(dataset[name], saved[name])
@@ -72,7 +72,7 @@ def test_the_file_holds_the_products(folder):
 
 
 def test_the_table_is_that_of_the_materials(folder):
-    dataset = exported(folder)
+    dataset = export_folder(folder)
     pet = dataset.sel(patch=4)
     metal = dataset.sel(patch=5)
     assert (pet["name"], pet["runner_up"], metal["name"]) == ("PET", "glass", "")
@@ -90,7 +90,7 @@ def test_the_table_is_that_of_the_materials(folder):
 
 
 def test_the_attributes_say_where_it_comes_from(folder):
-    attributes = exported(folder).attrs
+    attributes = export_folder(folder).attrs
     assert attributes["scan_id"] == "s"
     assert attributes["simulated"] is True
     assert attributes["rows_missing"].startswith("2-4, 6-")
@@ -99,7 +99,7 @@ def test_the_attributes_say_where_it_comes_from(folder):
 
 
 def test_netcdf_has_no_complex_variables(folder):
-    exported(folder)
+    export_folder(folder)
     with h5py.File(folder.parent / "out" / "image.nc") as f:
         assert {"h_real", "h_imag", "p_real", "p_imag", "permittivity_real", "permittivity_imag"} <= set(f)
         assert not {"h", "permittivity"} & set(f)
@@ -128,7 +128,7 @@ def test_splitting_and_joining_is_the_identity():
 def test_images_alone_export_too(folder):
     for name in ("materials.json", "scan.json", "quality.json"):
         (folder / name).unlink()
-    dataset = exported(folder)
+    dataset = export_folder(folder)
     assert set(dataset.dims) == {"y_mm", "x_mm"}
     assert dataset.attrs["simulated"] == "unknown"
     assert dataset.attrs["metal_reference"].startswith("none")

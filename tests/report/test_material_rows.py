@@ -60,7 +60,7 @@ EXPECTED = {
 
 
 @pytest.fixture
-def exported(tmp_path):
+def exported_folder(tmp_path):
     """The folder of exports of products that hold these two patches."""
     products = tmp_path / "products"
     ones = np.ones((2, 3), np.complex64)
@@ -71,8 +71,8 @@ def exported(tmp_path):
     return tmp_path / "out"
 
 
-def test_csv_keeps_every_digit(exported):
-    with (exported / "materials.csv").open(newline="", encoding="utf-8") as f:
+def test_csv_keeps_every_digit(exported_folder):
+    with (exported_folder / "materials.csv").open(newline="", encoding="utf-8") as f:
         header, *rows = csv.reader(f)
     assert dict(zip(header, map(list, zip(*rows, strict=True)), strict=True)) == {
         name: ["" if value is None else str(value) for value in values] for name, values in EXPECTED.items()
@@ -86,8 +86,8 @@ def same(values, expected) -> bool:
     return np.array_equal(np.asarray(values, float), [np.nan if e is None else e for e in expected], equal_nan=True)
 
 
-def test_matlab(exported):
-    content = scipy.io.loadmat(exported / "image.mat", simplify_cells=True)["materials"]
+def test_matlab(exported_folder):
+    content = scipy.io.loadmat(exported_folder / "image.mat", simplify_cells=True)["materials"]
     assert set(content) == set(EXPECTED)
     for name, expected in EXPECTED.items():
         assert same(content[name], expected), name

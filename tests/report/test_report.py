@@ -243,13 +243,13 @@ def test_numbers_read_well():
     assert format_heading("rows_retaken") == "rows retaken"
 
 
-def scanned(scan, boards):
+def with_boards(scan, boards):
     return changed(scan, plan=RasterPlan(6, 4, 10.0, 5.0), quality=ScanQuality.decode({"boards": boards}))
 
 
 def test_masked_positions_come_out_of_runs_and_of_rows_that_are_absent(scan):
     boards = {"RH": {"masked_columns": {"2": [[0, 2], [5, 6]]}, "rows_recorded": [0, 1, 2]}}
-    mask = masked_positions(scanned(scan, boards))["RH"]
+    mask = masked_positions(with_boards(scan, boards))["RH"]
     assert np.argwhere(mask).tolist() == [[2, 0], [2, 1], [2, 5], *([3, c] for c in range(6))]
 
 
@@ -258,7 +258,7 @@ def test_runs_and_their_mask_are_the_same(scan):
     for share in (0.0, 0.3, 1.0):
         rows = rng.uniform(size=(4, 6)) < share
         runs = {str(i): masked_runs(row) for i, row in enumerate(rows) if row.any()}
-        masks = masked_positions(scanned(scan, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}}))
+        masks = masked_positions(with_boards(scan, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}}))
         assert (masks["RH"] == rows).all()
 
 
@@ -266,7 +266,7 @@ def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(scan):
     boards = {"RH": {"masked_columns": {"2": [[0, 3]]}, "rows_recorded": [0, 1, 2, 3], "raw_crc32": {"0": "deadbeef"}}}
     gains = {"RH": [RxGain(0.0, 0.0), RxGain(1.25, -8.1)]}
     rig = rig_table() | {"name": "a <rig>"}
-    answer = changed(scanned(scan, boards), facts=ScanFacts(simulated=True, rx_gains=gains, instrument=rig))
+    answer = changed(with_boards(scan, boards), facts=ScanFacts(simulated=True, rx_gains=gains, instrument=rig))
     picture = png(coverage_figure(answer, masked_positions(answer)))
     page = Page(render(answer, {"coverage": picture}))
     assert base64.b64encode(picture).decode() in page.sources[0]
@@ -279,7 +279,7 @@ def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(scan):
 
 def test_without_anything_masked_that_is_said(scan):
     boards = {"RH": {"masked_columns": {}, "rows_recorded": [0, 1, 2, 3]}}
-    assert "Every position of every board has data." in Page(render(scanned(scan, boards), {})).words
+    assert "Every position of every board has data." in Page(render(with_boards(scan, boards), {})).words
 
 
 def test_the_maps_of_amplitude_keep_their_order_in_grey_and_the_phase_map_is_cyclic():
@@ -292,7 +292,7 @@ def test_the_maps_of_amplitude_keep_their_order_in_grey_and_the_phase_map_is_cyc
 
 def test_a_board_s_figures_stand_one_by_one_and_keep_their_units(scan):
     board = {"frames_expected": 7, "direct_path_hz": {"median": 123.0, "min": 9, "max": 200}, "stage_backlash_mm": None}
-    words = Page(render(scanned(scan, {"RH": board}), {})).words
+    words = Page(render(with_boards(scan, {"RH": board}), {})).words
     assert "direct path median (Hz) 123" in words
     assert "direct path min (Hz) 9" in words
     assert "stage backlash (mm) –" in words

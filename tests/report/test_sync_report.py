@@ -33,7 +33,7 @@ def row(snr_db=7.2, n=4000, seed=0):
     )
 
 
-def report_of(*rows, rx=4):
+def make_report(*rows, rx=4):
     report = SyncReport(2.15e6, (0, 192), rx)
     for r in rows:
         report.add(r)
@@ -41,7 +41,7 @@ def report_of(*rows, rx=4):
 
 
 def test_spreads_are_those_of_the_errors():
-    summary = report_of(row(seed=1), row(seed=2)).summary()
+    summary = make_report(row(seed=1), row(seed=2)).summary()
     assert summary["chirps"] == 2 * 4000 * 16
     for name, scale in SCALES.items():
         stage = summary["stages"][name]
@@ -52,21 +52,21 @@ def test_spreads_are_those_of_the_errors():
 
 
 def test_the_papers_figures_are_the_bound_of_one_tone_at_7_2_db():
-    f, phase, _ = report_of(row(7.2), rx=1).bounds()["aligned"]
+    f, phase, _ = make_report(row(7.2), rx=1).bounds()["aligned"]
     assert f == pytest.approx(PAPER["frequency_hz"], rel=0.01)
     assert phase == pytest.approx(PAPER["phase_rad"], rel=0.02)
 
 
 def test_four_receivers_and_16_chirps_are_worth_64_times_the_power():
-    bounds = report_of(row(7.2)).bounds()
-    alone = report_of(row(7.2), rx=1).bounds()["aligned"]
+    bounds = make_report(row(7.2)).bounds()
+    alone = make_report(row(7.2), rx=1).bounds()["aligned"]
     assert bounds["averaged"] == pytest.approx(np.array(alone) / 8)
     assert bounds["aligned"] == pytest.approx(np.array(alone) / 2)
 
 
 @pytest.mark.parametrize("simulated", [True, False])
 def test_files_and_words(tmp_path, simulated):
-    text = write_sync_report(tmp_path, {"RH": report_of(row())}, "scan one", simulated)
+    text = write_sync_report(tmp_path, {"RH": make_report(row())}, "scan one", simulated)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sync-RH.png", "sync.json", "sync.txt"]
     assert (tmp_path / "sync-RH.png").read_bytes().startswith(b"\x89PNG")
     facts = json.loads((tmp_path / "sync.json").read_text())
@@ -84,5 +84,5 @@ def test_a_scan_without_a_valid_position_is_reported_as_such(tmp_path):
         np.zeros(3, int),
         *(np.zeros(3) for _ in range(4)),
     )
-    text = write_sync_report(tmp_path, {"RH": report_of(empty)}, "nothing", True)
+    text = write_sync_report(tmp_path, {"RH": make_report(empty)}, "nothing", True)
     assert "0 chirps at 0 positions" in text

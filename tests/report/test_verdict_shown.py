@@ -40,7 +40,7 @@ from polysight.results.verdict import LEVELS
 RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
 
 
-def processed(folder, rows=None) -> ProcessedScan:
+def write_products(folder, rows=None) -> ProcessedScan:
     """What processing hands to the report: names in patches, pixels and truth, and quality.json."""
     saved = read_products(folder)
     interior = np.zeros(saved.h.shape, bool)
@@ -79,7 +79,7 @@ def drawn_text(make) -> str:
 def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
     folder = judged_products(tmp_path, level)
     with unrendered():
-        page = unescape(write_report(folder, processed(folder)).read_text(encoding="utf-8"))
+        page = unescape(write_report(folder, write_products(folder)).read_text(encoding="utf-8"))
     head = page[page.index("<main>") : page.index('<ul class="keys">')]
     assert f'<span class="badge">{LEVELS[level]}</span>' in head
     for part in REASON.values():
@@ -93,7 +93,7 @@ def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
 def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, careless):
     folder = judged_products(tmp_path, "none", careless)
     with unrendered():
-        text = drawn_text(lambda: write_report(folder, processed(folder)))
+        text = drawn_text(lambda: write_report(folder, write_products(folder)))
     text += drawn_text(lambda: open_scan(folder).plot())
     page = unescape((folder / "report.html").read_text(encoding="utf-8"))
     for part in (text, page[page.index("<main>") :]):
@@ -105,7 +105,7 @@ def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_
 
 def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path):
     folder = judged_products(tmp_path, "care")
-    page = unescape(write_report(folder, processed(folder)).read_text(encoding="utf-8"))
+    page = unescape(write_report(folder, write_products(folder)).read_text(encoding="utf-8"))
     assert "2.90 ± 0.20" in page
     assert "0.20 ± 0.10" in page
     assert "leakage (60 %)" in page
@@ -117,7 +117,7 @@ def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path)
 def test_products_of_earlier_releases_have_no_verdict_and_no_budget(tmp_path):
     folder = judged_products(tmp_path, None)
     with unrendered():
-        page = unescape(write_report(folder, processed(folder, segments(None))).read_text(encoding="utf-8"))
+        page = unescape(write_report(folder, write_products(folder, segments(None))).read_text(encoding="utf-8"))
     assert 'class="verdict' not in page
     assert "Error budget" not in page
     assert "2.90 ± 0.20" in page
@@ -163,7 +163,7 @@ def test_long_names_of_close_patches_become_numbers_that_do_not_touch(tmp_path):
          "box_mm": [16 * k - 24, 16 * i - 24, 16 * k - 10, 16 * i - 10]}
         for i in range(3) for k in range(3)
     ]  # fmt: skip
-    scan = changed(processed(judged_products(tmp_path, "good"), rows), pixel_names={}, plates=())
+    scan = changed(write_products(judged_products(tmp_path, "good"), rows), pixel_names={}, plates=())
     fig = Figure(figsize=(4.6, 4.6), dpi=160, layout="constrained")
     FigureCanvasAgg(fig)
     labels = draw_materials(fig.add_subplot(), scan)
@@ -175,7 +175,7 @@ def test_long_names_of_close_patches_become_numbers_that_do_not_touch(tmp_path):
 
 
 def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path):
-    scan = processed(judged_products(tmp_path, "good"))
+    scan = write_products(judged_products(tmp_path, "good"))
     p = np.exp(1j * np.radians(np.where(np.arange(30) % 2, 170.0, -170.0)))[None, :] * np.ones((20, 1))
     limits = phase_limits_deg(changed(scan, images=replace(scan.images, p=p)))
     assert limits is not None
@@ -189,7 +189,7 @@ def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path
 
 def test_a_ratio_of_nearly_one_has_no_negative_zero(tmp_path):
     rows = [{**segments("good")[0], "ratio": {"real": 0.9999, "imag": -1e-4}}]
-    scan = processed(judged_products(tmp_path, "good"), rows)
+    scan = write_products(judged_products(tmp_path, "good"), rows)
     text = drawn_text(lambda: [channel_figure(scan, key) for key in ("amplitude_p", "phase_p")])
     assert {"0.0", "0°"} <= set(text.split("\n"))
 

@@ -74,7 +74,7 @@ class Page:
         ):
             self.browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 
-    def whole(self) -> None:
+    def check_whole(self) -> None:
         """The page fits, and everything in it comes from its server."""
         self.browser.check_whole(self.view.address)
 
@@ -136,7 +136,7 @@ def test_every_page_fits_and_can_be_read(page, path, size, tmp_path):
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         page.browser.call("Emulation.setEmulatedMedia", features=[scheme])
         page.open(path, size)
-        page.whole()
+        page.check_whole()
         # WCAG AA
         assert page.browser.value(CONTRAST) == []
         assert page.browser.value(NAMELESS) == []
@@ -191,7 +191,7 @@ def test_the_list_is_searched_and_two_are_compared(page):
     for mode in ("pair", "difference", "swipe"):
         page.browser.click(f"button[value={mode}]")
         page.browser.wait("document.querySelector('#scale img')?.naturalWidth > 1", mode)
-        page.whole()
+        page.check_whole()
     assert "% of" in page.browser.text("share")
 
 
@@ -214,7 +214,7 @@ def test_a_place_is_probed_by_keyboard_alone(page):
     assert page.browser.value("document.querySelectorAll('#profile path').length") == 2
     page.press("+", "+")
     page.browser.wait("document.querySelector('tr.here')", "its row in the table")
-    page.whole()
+    page.check_whole()
 
 
 def test_what_is_named_to_harm_is_shown_as_text(page, scans):
@@ -229,15 +229,15 @@ def test_what_is_named_to_harm_is_shown_as_text(page, scans):
     (scans / "one" / "operator.json").write_text(json.dumps({"notes": evil, "tags": [evil[:40]]}))
     shutil.move(scans / "two", scans / "<b onclick=x>two")
     page.open("/")
-    page.whole()
+    page.check_whole()
     assert evil in page.browser.text("list")
     page.open("/scan?scan=one")
-    page.whole()
+    page.check_whole()
     assert page.browser.value("document.querySelectorAll('[onerror], [onclick]').length") == 0
     assert "broken" not in page.browser.value("document.title")
     page.open("/compare?a=one&b=%3Cb+onclick%3Dx%3Etwo")
     page.browser.wait("document.querySelector('#rows tr')", "the comparison")
-    page.whole()
+    page.check_whole()
 
 
 def test_notes_are_kept_beside_the_scan(page, scans):
@@ -259,7 +259,7 @@ def test_every_page_has_the_abort_of_the_running_scan(page, scans, size):
         with open_control(scans / "two") as stop:
             page.open(path, size)
             page.browser.wait(f"{abort}?.checkVisibility()", path)
-            page.whole()
+            page.check_whole()
             page.browser.value(f"{abort}.click()")
             page.browser.click("#confirm button[value=yes]")
             wait_for(lambda s=stop: s.now, "the abort")
@@ -278,7 +278,7 @@ def test_a_plan_is_repeated_and_waits_in_the_queue(page, scans, monkeypatch):
         again.browser.fill("#name", "over-night")
         again.browser.click("#enqueue")
         again.browser.wait("document.querySelectorAll('#waiting li').length == 1", "that it waits")
-        again.whole()
+        again.check_whole()
         again.browser.click("#waiting button")
         again.browser.wait("document.querySelectorAll('#waiting li').length == 0", "that it is out")
 
@@ -306,7 +306,7 @@ def test_metal_is_drawn_for_processing_again(page):
     page.browser.wait("/mm$/.test(document.getElementById('draw-metal').innerText)", "the box")
     sides = page.browser.text("draw-metal").partition(": ")[2].replace("\u2212", "-").removesuffix(" mm").split(", ")
     assert [float(side) for side in sides] == pytest.approx([x - 12, y - 12, x + 12, y + 12], abs=1.5)
-    page.whole()
+    page.check_whole()
 
 
 def test_the_page_follows_products_that_another_program_has_made(page, scans):
@@ -344,7 +344,7 @@ def test_a_view_that_is_read_only_has_no_buttons_that_ask(browser, scans):
         page = Page(browser, view)
         for path in ("/", "/scan?scan=one"):
             page.open(path, token="")
-            page.whole()
+            page.check_whole()
             buttons = "[...document.querySelectorAll('button')].filter(b => b.checkVisibility()).map(b => b.innerText)"
             asking = {"Label", "Process again", "Resume", "Save", "Write", "Make a library", "Start the scan"}
             assert not asking & set(browser.value(buttons))
@@ -373,7 +373,7 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
         labels = read_labels(scans / name / "labels.json")
         assert labels.metal == "copper"
         assert labels.boxes["my plastic"] == pytest.approx([24, -6, 48, 18], abs=1.5)
-        page.whole()
+        page.check_whole()
     page.open("/")
     page.browser.value("document.querySelectorAll('#list input').forEach(i => i.click())")
     page.browser.click("#train-open")
@@ -394,7 +394,7 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
     assert "--labels" in program.words
     named = [s.name for s in ProcessedScan(scans / "one" / "products").segments if not s.metal_reference]
     assert named == ["my plastic"]
-    page.whole()
+    page.check_whole()
 
 
 def test_two_hundred_scans_are_shown_at_once(browser, tmp_path):
@@ -405,7 +405,7 @@ def test_two_hundred_scans_are_shown_at_once(browser, tmp_path):
         page = Page(browser, view)
         page.open("/?all", token="")
         browser.wait("document.querySelectorAll('#list li').length == 200", "all of them")
-        page.whole()
+        page.check_whole()
         drawn = [url for url in browser.requests if "thumbnail" in url]
         # Pictures come as they are scrolled to
         assert len(drawn) < 100

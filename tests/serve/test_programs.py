@@ -32,7 +32,7 @@ def programs() -> Iterator[Programs]:
     running_programs.close()
 
 
-def ended(folder: Path, kind: str) -> None:
+def end_program(folder: Path, kind: str) -> None:
     wait_for(lambda: not (find_program(folder, kind) or pytest.fail("none")).running, "its end")
 
 
@@ -123,7 +123,7 @@ def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
         assert get(view, "/api/scan?scan=week/one")["state"] == "begun"
         assert post(view, "/api/start", {"name": "two"})[0] == 409  # one rig
         assert not (tmp_path / "two").exists()
-        ended(folder, "scan")
+        end_program(folder, "scan")
         wait_for(lambda: find_program(folder, "scan").status is not None, "its status")
         assert find_program(folder, "scan").status != 0
         wait_for(lambda: get(view, "/api/scan?scan=week/one")["state"] == "failed", "the state")
@@ -135,7 +135,7 @@ def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
         # Once more, by the same name
         assert post(view, "/api/start", {"name": "week/one"})[0] == 200
         assert get(view, "/api/scan?scan=week/one")["notes"] == "n"
-        ended(folder, "scan")
+        end_program(folder, "scan")
 
 
 def test_what_a_page_leaves_beside_a_scan_is_no_fault_of_it(finished, tmp_path):

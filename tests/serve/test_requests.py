@@ -83,7 +83,7 @@ def root(tmp_path) -> Path:
 
 
 @pytest.fixture
-def started(root, monkeypatch) -> Iterator[tuple[Any, list[list[str]]]]:
+def start_program(root, monkeypatch) -> Iterator[tuple[Any, list[list[str]]]]:
     """A server, and the command lines of the programs that it would start."""
     collected: list[list[str]] = []
 
@@ -95,10 +95,10 @@ def started(root, monkeypatch) -> Iterator[tuple[Any, list[list[str]]]]:
         yield view, collected
 
 
-def plain(value: Any, root: Path) -> Any:
+def to_plain(value: Any, root: Path) -> Any:
     """Paths as text, `%` for the folder of scans."""
     if isinstance(value, list):
-        return [plain(item, root) for item in value]
+        return [to_plain(item, root) for item in value]
     if isinstance(value, str | Path):
         return str(value).replace(str(root), "%")
     return value
@@ -122,20 +122,20 @@ def plain(value: Any, root: Path) -> Any:
          {"products": "%/one", "csv": True, "netcdf": True, "mat": False, "out": "%/one/export"}),
     ],
 )  # fmt: skip
-def test_a_request_is_a_command_line_that_the_parser_takes(started, root, path, body, values):
-    view, commands = started
+def test_a_request_is_a_command_line_that_the_parser_takes(start_program, root, path, body, values):
+    view, commands = start_program
     status, answer = post(view, f"/api/{path}", body)
     assert status == 200, answer
     (words,) = commands
     assert words[0] == path.partition("?")[0].replace("start", "scan")
     given = vars(build_parser(words[0]).parse_args(join_negative_values(words)))
 
-    arguments_shown = {name: plain(given[name], root) for name in values}
-    assert arguments_shown == {name: plain(value, root) for name, value in values.items()}
+    arguments_shown = {name: to_plain(given[name], root) for name in values}
+    assert arguments_shown == {name: to_plain(value, root) for name, value in values.items()}
 
 
-def test_boxes_drawn_on_the_page_are_used_when_it_processes(started, root):
-    view, commands = started
+def test_boxes_drawn_on_the_page_are_used_when_it_processes(start_program, root):
+    view, commands = start_program
     status, saved = post(view, "/api/labels?scan=one", {"boxes": {"oak": [0, 0, 10, 10]}, "specimens": {"oak": "7"}})
     assert status == 200, saved
     assert post(view, "/api/process?scan=one", {"labels": True})[0] == 200

@@ -17,7 +17,7 @@ TOKEN = "0123456789"
 PICTURES = "[...document.querySelectorAll('.view img')]"
 
 
-def opened(browser: Browser, view, size=DESK, token: str = "") -> None:
+def open_page(browser: Browser, view, size=DESK, token: str = "") -> None:
     """The page, told what there is."""
     browser.visit(view.address + (f"/#token={token}" if token else "/"), size)
     browser.wait("document.title.length > 9", "the first state")
@@ -28,7 +28,7 @@ def test_a_finished_scan_at_a_glance(browser, finished, watching, tmp_path, size
     watch = watching(finished)
     watch.wait_for(lambda s: s["pictures"]["rows"] == 3)
     with served(watch) as view:
-        opened(browser, view, size)
+        open_page(browser, view, size)
         browser.wait(f"{PICTURES}.length == 6 && {PICTURES}.every(i => i.naturalWidth == 12)", "six pictures")
         assert browser.text("headline") == "The scan is finished"
         assert browser.text("count") == "3 of 3 rows"
@@ -49,7 +49,7 @@ def test_a_finished_scan_at_a_glance(browser, finished, watching, tmp_path, size
 def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watching):
     watch = watching(growing.path, lapse_s=1e6)
     with served(watch) as view:
-        opened(browser, view)
+        open_page(browser, view)
         assert browser.text("headline") == "No scan here yet"
         growing.live()
         for row in range(3):
@@ -63,7 +63,7 @@ def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watc
 def test_buttons_reach_the_scan(browser, growing, watching):
     growing.grow_to("row_committed")
     with open_control(growing.path) as stop, served(watching(growing.path, control=True), TOKEN) as view:
-        opened(browser, view, token=TOKEN)
+        open_page(browser, view, token=TOKEN)
         browser.click("#pause")
         assert TOKEN not in browser.value("location.href")
         wait_for(lambda: stop.paused, "the pause")
@@ -87,7 +87,7 @@ def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, wa
     host, _, port = rig.pi.command_address.removeprefix("tcp://").rpartition(":")
     watch = watching(finished)
     with served(watch, host=host, port=int(port)) as view:
-        opened(browser, view)
+        open_page(browser, view)
     browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")
     assert browser.text("headline") == STATES["offline"].headline
     # Some of its attempts to come back fail

@@ -107,15 +107,15 @@ def test_leakage_mixes_the_two_polarisations() -> None:
     f = np.array([78e9])
     h, v = rig.receivers
 
-    def at(board: Any, **d: Any) -> complex:
+    def interpolate_field(board: Any, **d: Any) -> complex:
         return complex(field_exact(rig, scene.with_disturbances(ideal=True, **d), board, offsets, f)[0, 0])
 
     # From no leakage to full leakage H gains all of p: linear in between.
-    s_only = at(h)
-    s_and_p = at(h, leakage_h=[1.0, 0.0])
-    assert np.isclose(at(h, leakage_h=[0.05, 0.02]), s_only + np.conj(0.05 + 0.02j) * (s_and_p - s_only))
-    assert np.isclose(at(h, leakage_v=[0.1, 0.0]), s_only)
-    assert not np.isclose(at(v, leakage_v=[0.1, 0.0]), at(v))
+    s_only = interpolate_field(h)
+    s_and_p = interpolate_field(h, leakage_h=[1.0, 0.0])
+    assert np.isclose(interpolate_field(h, leakage_h=[0.05, 0.02]), s_only + np.conj(0.05 + 0.02j) * (s_and_p - s_only))
+    assert np.isclose(interpolate_field(h, leakage_v=[0.1, 0.0]), s_only)
+    assert not np.isclose(interpolate_field(v, leakage_v=[0.1, 0.0]), interpolate_field(v))
     leaky = scene.with_disturbances(leakage_v=[0.0, 0.1])
     assert direct_factor(v, leaky) == 1 - 0.1j  # as sampled
 

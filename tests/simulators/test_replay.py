@@ -187,17 +187,17 @@ def test_it_replays_at_the_given_rate(recording: Path, bytes_per_s: float) -> No
 def test_a_recording_is_read_completely_looped_or_cut(recording: Path) -> None:
     data = recording.read_bytes()
 
-    def all_of(source: Recording, most: int) -> bytes:
+    def read_all(source: Recording, most: int) -> bytes:
         got = b""
         while len(got) < most and not source.ended:
             got += source.read(1000).tobytes()
         return got
 
-    assert all_of(Recording(recording), 10**9) == data
-    assert all_of(Recording(recording, 5000), 10**9) == data[:5000]
-    assert all_of(Recording(recording, 10**9), 10**9) == data
-    assert all_of(Recording(recording, 100_000, loop=True), 10**9) == (data * 3)[:100_000]
-    assert all_of(Recording(recording, loop=True), 200_000)[:200_000] == (data * 5)[:200_000]
+    assert read_all(Recording(recording), 10**9) == data
+    assert read_all(Recording(recording, 5000), 10**9) == data[:5000]
+    assert read_all(Recording(recording, 10**9), 10**9) == data
+    assert read_all(Recording(recording, 100_000, loop=True), 10**9) == (data * 3)[:100_000]
+    assert read_all(Recording(recording, loop=True), 200_000)[:200_000] == (data * 5)[:200_000]
 
 
 def test_rows_of_a_scan_folder_are_those_committed_last(tmp_path: Path) -> None:

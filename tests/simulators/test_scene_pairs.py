@@ -64,7 +64,7 @@ def keys() -> list[Path_]:
     return [*((key,) for key in Scene.__struct_fields__), *inner, ("disturbances", "ideal"), *each_role]
 
 
-def changed(scene: dict[str, Any], path: Path_, value: Any) -> dict[str, Any]:
+def change_scene(scene: dict[str, Any], path: Path_, value: Any) -> dict[str, Any]:
     """Return a scene with one key set; as it was if an earlier change took its table away."""
     scene = copy.deepcopy(scene)
     node: Any = scene
@@ -75,13 +75,13 @@ def changed(scene: dict[str, Any], path: Path_, value: Any) -> dict[str, Any]:
     return scene
 
 
-def allowed(path: Path_) -> list[Any]:
+def is_allowed(path: Path_) -> list[Any]:
     """Values with which the scene is accepted when nothing else is changed."""
     rig = published_rig()
     collected = []
     for value in VALUES:
         with contextlib.suppress(ConfigError):
-            apply_scene(rig, decode_scene(changed(SCENE, path, value), "t"))
+            apply_scene(rig, decode_scene(change_scene(SCENE, path, value), "t"))
             collected.append(value)
     return collected
 
@@ -154,10 +154,10 @@ def test_two_keys_of_a_scene_give_a_scan_or_a_message(tmp_path: Path, pytestconf
         values = []
         for path in pair:
             if path not in of_key:
-                of_key[path] = allowed(path)
+                of_key[path] = is_allowed(path)
             usual = bool(of_key[path]) and rng.random() < 0.8
             values.append(rng.choice(of_key[path] if usual else VALUES))
-            scene = changed(scene, path, values[-1])
+            scene = change_scene(scene, path, values[-1])
         try:
             scans += check(scene, tmp_path, str(number))
         except Exception as e:
@@ -192,7 +192,7 @@ def test_what_exceeds_the_memory_is_refused(
 ) -> None:
     scene = SCENE
     for path, value in changes:
-        scene = changed(scene, path, value)
+        scene = change_scene(scene, path, value)
     file = tmp_path / "scene.toml"
     file.write_text(tomli_w.dumps(scene))
     assert main(["simulate", str(file), "--config", str(REPO / "instrument.toml"), "--out", str(tmp_path / "o")]) == 2

@@ -25,7 +25,7 @@ def scene(**content: object) -> Scene:
 
 
 @pytest.fixture
-def installed(tmp_path, monkeypatch):
+def is_installed(tmp_path, monkeypatch):
     """The worlds' entry point as an installation writes it, whatever this environment was installed from."""
     package = tmp_path / "offers_shapes-1.dist-info"
     package.mkdir()

@@ -22,7 +22,7 @@ from polysight_simulators.scene import decode_scene, simulate
 SOME = [{"fact": "scan_started"}, *({"fact": "row_committed", "row": k} for k in range(5)), {"fact": "scan_ended"}]
 
 
-def chained(path: Path, facts=SOME) -> list[bytes]:
+def chain_lines(path: Path, facts=SOME) -> list[bytes]:
     """The lines that a writer makes of facts."""
     with ManifestWriter(path / MANIFEST, create=True) as writer:
         for fact in facts:
@@ -32,7 +32,7 @@ def chained(path: Path, facts=SOME) -> list[bytes]:
 
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory) -> list[bytes]:
-    return chained(tmp_path_factory.mktemp("chain"))
+    return chain_lines(tmp_path_factory.mktemp("chain"))
 
 
 def test_a_whole_chain_has_no_faults_and_facts_are_without_it(lines):
@@ -63,7 +63,7 @@ def test_repeated_lines_are_noticed(lines):
 
 @pytest.mark.parametrize("damage", [b"{}\n", b"\x00\xff\n", b""])
 def test_a_damaged_line_is_one_fault_and_the_chain_goes_on_behind_it(tmp_path, damage):
-    lines = chained(tmp_path)
+    lines = chain_lines(tmp_path)
     remaining = [*lines[:3], damage, *lines[4:]]
     (tmp_path / MANIFEST).write_bytes(b"".join(remaining))
     with ManifestWriter(tmp_path / MANIFEST, create=False) as writer:
@@ -94,7 +94,7 @@ def scan(tmp_path) -> Path:
     return write_scan(tmp_path / "scan")
 
 
-def without(folder: Path, *numbers: int) -> None:
+def remove_line(folder: Path, *numbers: int) -> None:
     """Take lines (from 1) out of a manifest."""
     lines = (folder / MANIFEST).read_bytes().splitlines(keepends=True)
     (folder / MANIFEST).write_bytes(b"".join(line for n, line in enumerate(lines, 1) if n not in numbers))
@@ -102,7 +102,7 @@ def without(folder: Path, *numbers: int) -> None:
 
 def test_a_row_s_line_that_is_gone_is_an_error_that_names_line_and_row(scan):
     assert validate(scan) == []
-    without(scan, 4)
+    remove_line(scan, 4)
     error_text = "\n".join(errors(scan))
     assert "manifest.jsonl line 4" in error_text
     assert "row 2 " in error_text
@@ -123,7 +123,7 @@ def test_the_last_row_s_line_that_is_gone_is_missed_by_the_end(scan):
 
 def test_a_row_taken_again_makes_the_gap_a_note(scan):
     lost_row = facts_of(scan, "row_committed")[2]
-    without(scan, 4)
+    remove_line(scan, 4)
     with ScanFolder.load(scan).writer() as writer:
         writer.append({"fact": "scan_resumed", "rows_missing": 1})
         writer.append({**lost_row, "take": 2})
@@ -141,5 +141,5 @@ def test_a_row_withdrawn_after_the_end_is_no_fault_of_the_manifest(scan):
 def test_simulated_scans_are_chained_and_counted(tmp_path):
     folder = simulate(published_rig(), decode_scene(scene_of(COPPER, PET, columns=2, rows=3), "t"), tmp_path / "scan")
     assert ScanFolder.load(folder).manifest_faults == ()
-    without(folder, 3)
+    remove_line(folder, 3)
     assert {f.facts["line"] for f in ScanFolder.load(folder).manifest_faults} == {3}

@@ -88,7 +88,7 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
     assert refused > 40
 
 
-def moved(rig: Instrument) -> Instrument:
+def move_rig(rig: Instrument) -> Instrument:
     table = to_builtins(rig)
     table["pi"] |= {"command_address": "tcp://10.1.2.3:4", "event_address": "tcp://10.1.2.3:5"}
     table["boards"][1] |= {"card_address": "10.1.2.9"}
@@ -101,7 +101,7 @@ def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
     small = undisturbed.copy(tmp_path / "moved")
     scan = ScanFolder.load(small.path)
     begun = scan.instrument
-    now = moved(scan.instrument)
+    now = move_rig(scan.instrument)
     with small._connected():
         assert resume_scan(small.path, rig_now=now).folder.instrument == now
         assert resume_scan(small.path).folder.instrument == now
@@ -122,7 +122,7 @@ def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
 def test_another_rig_is_refused_before_anything_is_written(undisturbed, tmp_path, capsys):
     small = undisturbed.copy(tmp_path / "other")
     state_before = (small.path / "manifest.jsonl").read_bytes()
-    table = to_builtins(moved(ScanFolder.load(small.path).instrument))
+    table = to_builtins(move_rig(ScanFolder.load(small.path).instrument))
     table["grid"] |= {"columns": 5}
     table["chirp"] |= {"samples": table["chirp"]["samples"] - 1}
     (tmp_path / "rig.toml").write_text(tomli_w.dumps(table))

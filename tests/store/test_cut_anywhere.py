@@ -31,7 +31,7 @@ def lines(path: Path) -> list[bytes]:
     return path.read_bytes().splitlines(keepends=True)
 
 
-def journal_of(scan: SmallScan) -> Path:
+def read_journal(scan: SmallScan) -> Path:
     return next(scan.journals.glob("*.journal"))
 
 
@@ -39,7 +39,7 @@ def faults(scan: SmallScan, severity: str = "error") -> list[str]:
     return [to_text(f) for f in validate(scan.path) if f.level == severity]
 
 
-def resumed(scan: SmallScan, undisturbed, image: bool = False, damaged_lines: int = 0) -> set[int]:
+def resume(scan: SmallScan, undisturbed, image: bool = False, damaged_lines: int = 0) -> set[int]:
     """Resume; everything is as if nothing had been. Returns the rows that were taken again."""
     assert scan.run().exit_status == "success"
     notes = faults(scan, "note")
@@ -73,7 +73,7 @@ def test_manifest(undisturbed, tmp_path, sample, record, tail):
         assert faults(scan) == []
         torn = [n for n in faults(scan, "note") if "torn" in n]
         assert len(torn) == bool(last[:cut] + tail)
-        assert resumed(scan, undisturbed, image=not cut) == ({2} if record == -2 else set())
+        assert resume(scan, undisturbed, image=not cut) == ({2} if record == -2 else set())
 
 
 @pytest.mark.parametrize("record", [1, -2, -1], ids=["row 0", "row 2, the last", "scan_ended"])
@@ -89,7 +89,7 @@ def test_bit_of_the_manifest(undisturbed, tmp_path, sample, record):
         assert len(named) == 1
         # The last line is cut off, others stay where they are
         is_kept = record == -1 or (record == -2 and end)
-        again = resumed(scan, undisturbed, damaged_lines=0 if is_kept else 1)
+        again = resume(scan, undisturbed, damaged_lines=0 if is_kept else 1)
         assert again == {1: {0, 1} if end else {0}, -2: {2}, -1: set()}[record]
 
 
@@ -120,7 +120,7 @@ def test_event_log(undisturbed, tmp_path, sample, record, tail):
         else:
             assert "resume fetches" in faults(scan)[0]
         assert len([n for n in faults(scan, "note") if "torn" in n]) == (cut > start or bool(tail))
-        assert resumed(scan, undisturbed) == set()
+        assert resume(scan, undisturbed) == set()
         assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
 
 
@@ -136,7 +136,7 @@ def test_bit_of_the_event_log(undisturbed, tmp_path, sample):
         assert any("events.msgpack" in f for f in faults(scan)), bit
         if readable:
             continue
-        assert resumed(scan, undisturbed) == set()
+        assert resume(scan, undisturbed) == set()
         assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
         damaged_log = (scan.path / "events.msgpack.damaged").read_bytes()
         assert raw[: -len(damaged_log)] + damaged_log == turned
@@ -146,7 +146,7 @@ def test_bit_of_the_event_log(undisturbed, tmp_path, sample):
 @pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
 def test_journal_of_the_pi(undisturbed, tmp_path, sample, record, tail):
     """The journal is shorter than the host's event log: the sequence goes on behind what the host has."""
-    path = journal_of(undisturbed)
+    path = read_journal(undisturbed)
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
     raw = path.read_bytes()
@@ -154,17 +154,17 @@ def test_journal_of_the_pi(undisturbed, tmp_path, sample, record, tail):
     stop = [*starts, len(raw)][len(starts) - record + 1]
     for cut in sample(range(start, stop), 8):
         scan = undisturbed.copy(tmp_path / "s")
-        journal_of(scan).write_bytes(raw[:cut] + tail)
+        read_journal(scan).write_bytes(raw[:cut] + tail)
         goes_on_behind(scan, undisturbed, lost=record)
 
 
 def test_bit_of_the_journal(undisturbed, tmp_path, sample):
-    path = journal_of(undisturbed)
+    path = read_journal(undisturbed)
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
     for bit in sample(range(8 * starts[0], 8 * path.stat().st_size), 16):
         scan = undisturbed.copy(tmp_path / "s")
-        turn(journal_of(scan), bit)
+        turn(read_journal(scan), bit)
         goes_on_behind(scan, undisturbed, lost=sum(s > bit // 8 for s in starts[1:]) + 1)
 
 
@@ -172,9 +172,9 @@ def test_bit_of_the_journal(undisturbed, tmp_path, sample):
 def test_journal_that_is_lost_as_a_whole(undisturbed, tmp_path, left):
     scan = undisturbed.copy(tmp_path / "s")
     if left is None:
-        journal_of(scan).unlink()
+        read_journal(scan).unlink()
     else:
-        journal_of(scan).write_bytes(left)
+        read_journal(scan).write_bytes(left)
     manifest_path = scan.path / "manifest.jsonl"
     # Row 2 is to be taken yet
     manifest_path.write_bytes(b"".join(lines(manifest_path)[:-2]))
@@ -185,12 +185,12 @@ def test_journal_that_is_lost_as_a_whole(undisturbed, tmp_path, left):
 def goes_on_behind(scan: SmallScan, undisturbed, lost: int, rows: set[int] = frozenset()) -> None:
     """Resume: the host is told how much the journal lost, and keeps all it had."""
     state_before = (scan.path / "events.msgpack").read_bytes()
-    assert resumed(scan, undisturbed) == rows
+    assert resume(scan, undisturbed) == rows
     assert any(f"ends {lost} events before" in text for text in scan.messages)
     state_after = (scan.path / "events.msgpack").read_bytes()
     assert state_after.startswith(state_before)
     assert len(state_after) > len(state_before)
-    with journal_of(scan).open("rb") as file:
+    with read_journal(scan).open("rb") as file:
         seqs = [seq for _, seq, _ in records(file)]
     assert seqs[-1] == read_events(scan.path / "events.msgpack").events[-1].seq
 
@@ -208,7 +208,7 @@ def test_committed_row_cut_short(undisturbed, tmp_path, sample, suffix):
             with refused(ErrorCode.FILE_DAMAGED):
                 _ = ScanFolder.load(scan.path).read_row("RV", 1).payload
         # Row 1 is taken last now
-        assert resumed(scan, undisturbed, image=not cut) == {1}
+        assert resume(scan, undisturbed, image=not cut) == {1}
         withdrawn = facts_of(scan.path, "row_withdrawn")
         assert [(f["row"], f["take"]) for f in withdrawn] == [(1, 1)]
         assert name in withdrawn[0]["reasons"][0]
@@ -221,7 +221,7 @@ def test_bit_of_a_committed_row(undisturbed, tmp_path, sample, suffix):
         scan = undisturbed.copy(tmp_path / "s")
         turn(scan.path / name, bit)
         assert [name in f for f in faults(scan)] == [True]
-        assert resumed(scan, undisturbed) == {2}
+        assert resume(scan, undisturbed) == {2}
 
 
 @pytest.mark.parametrize("suffix", [".part", ".bin", ".idx"])
@@ -233,7 +233,7 @@ def test_row_that_is_not_committed_may_be_anything(undisturbed, tmp_path, sample
         (scan.path / "manifest.jsonl").write_bytes(b"".join(whole_lines[:-2]))
         (scan.path / f"raw/RV/0002{suffix}").write_bytes(raw[:cut])
         assert faults(scan) == []
-        assert resumed(scan, undisturbed) == {2}
+        assert resume(scan, undisturbed) == {2}
 
 
 def test_withdrawn_row_counts_again_once_it_is_taken(undisturbed, tmp_path):

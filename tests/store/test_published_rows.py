@@ -29,7 +29,7 @@ BURST = PULSES * FRAME
 PACKET = 1456
 
 
-def plan_of(by_columns):
+def make_plan(by_columns):
     grid = RIG.grid
     if by_columns:
         grid = Grid(columns=ROWS, rows=COLUMNS, step_x_mm=2.0, step_y_mm=2.0)
@@ -41,7 +41,7 @@ def record(folder, skipped=None, lost=None, zero_filling=True, by_columns=False)
     layout = AuthorsLayout(folder, RIG, "scan", 1.7e9, zero_filling, by_columns, skipped)
     layout.start()
     sent = {}
-    for row in plan_of(by_columns):
+    for row in make_plan(by_columns):
         payloads = {}
         for k, board in enumerate(RIG.boards):
             rng = np.random.default_rng([k, row.index])
@@ -69,7 +69,7 @@ def check(data, sent):
 @pytest.mark.parametrize("seed", range(6))
 def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path, seed, zero_filling, by_columns):
     rng = np.random.default_rng(seed)
-    plan = plan_of(by_columns)
+    plan = make_plan(by_columns)
     skipped = {}
     losses = {}
     for row in plan:

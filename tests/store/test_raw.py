@@ -45,7 +45,7 @@ def polysight(*words: object, typed: str = "") -> subprocess.CompletedProcess[st
 
 
 @pytest.fixture(scope="module")
-def processed(tmp_path_factory) -> Path:
+def processed_scan(tmp_path_factory) -> Path:
     """A simulated scan with its images."""
     folder = tmp_path_factory.mktemp("processed")
     (folder / "scene.toml").write_text(SCENE)
@@ -58,9 +58,9 @@ def processed(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def scan(processed, tmp_path) -> Path:
+def scan(processed_scan, tmp_path) -> Path:
     """A copy of it, to be dropped from."""
-    return Path(shutil.copytree(processed, tmp_path / "scan"))
+    return Path(shutil.copytree(processed_scan, tmp_path / "scan"))
 
 
 def payloads(scan: Path) -> set[Path]:
@@ -241,7 +241,7 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
     unlink = Path.unlink
     append = AppendFile.append
 
-    def before(step):
+    def fail_before(step):
         def call(*args, **kwargs):
             if next(steps) == cut_after:
                 raise PowerCut
@@ -250,8 +250,8 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
         return call
 
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "unlink", before(unlink))
-        patched.setattr(AppendFile, "append", before(append))
+        patched.setattr(Path, "unlink", fail_before(unlink))
+        patched.setattr(AppendFile, "append", fail_before(append))
         with pytest.raises(PowerCut):
             drop(ScanFolder.load(scan), digests, scan / "products")
     remaining = ScanFolder.load(scan)

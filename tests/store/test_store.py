@@ -95,14 +95,14 @@ def test_two_writers_never_share_a_scan(tmp_path):
 
 
 @pytest.fixture
-def whole(tmp_path) -> Path:
+def whole_scan(tmp_path) -> Path:
     """A scan folder of four rows; row 1 of RV lacks some bytes."""
     return write_scan(tmp_path / "scan", {("RV", 1): [(100, 200), (5000, 6000)]})
 
 
-def test_whole_scan_is_valid_and_reads_back(whole):
-    assert validate(whole) == []
-    scan: RawSource = ScanFolder.load(whole)
+def test_whole_scan_is_valid_and_reads_back(whole_scan):
+    assert validate(whole_scan) == []
+    scan: RawSource = ScanFolder.load(whole_scan)
     assert list(scan.rows()) == [0, 1, 2, 3]
     assert scan.simulated
     data = scan.read_row("RV", 1)
@@ -114,8 +114,8 @@ def test_whole_scan_is_valid_and_reads_back(whole):
     assert data.frames_expected == scan.instrument.burst.pulses * scan.instrument.grid.columns
 
 
-def test_last_take_wins(whole):
-    scan = ScanFolder.load(whole)
+def test_last_take_wins(whole_scan):
+    scan = ScanFolder.load(whole_scan)
     fact = facts_of(scan, "row_committed")[2]
     with scan.writer() as writer:
         writer.append({**fact, "take": 7})
@@ -144,10 +144,10 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_validate_names_each_damage(whole, kind):
+def test_validate_names_each_damage(whole_scan, kind):
     damage, place, description = DAMAGE[kind]
-    damage(whole)
-    errors = [f for f in validate(whole) if f.level == "error"]
+    damage(whole_scan)
+    errors = [f for f in validate(whole_scan) if f.level == "error"]
     assert any(place in f.where and description in f.what for f in errors), to_json(errors)
 
 
@@ -172,47 +172,47 @@ def test_events_behind_the_last_commit_may_be_damaged_by_a_power_cut(undisturbed
         ({"boards": {}}, "boards"),
     ],
 )
-def test_validate_compares_with_the_plan(whole, change, what):
-    scan = ScanFolder.load(whole)
+def test_validate_compares_with_the_plan(whole_scan, change, what):
+    scan = ScanFolder.load(whole_scan)
     fact = facts_of(scan, "row_committed")[0]
     with scan.writer() as writer:
         writer.append({**fact, **change})
-    assert any(what in f.what for f in validate(whole) if f.level == "error")
+    assert any(what in f.what for f in validate(whole_scan) if f.level == "error")
 
 
-def test_notes_damage_nothing(whole):
-    raw = (whole / "manifest.jsonl").read_bytes()
-    (whole / "manifest.jsonl").write_bytes(raw[:-5])
-    (whole / "raw/RH/0009.part").write_bytes(b"half")
-    with (whole / "events.msgpack").open("ab") as f:
+def test_notes_damage_nothing(whole_scan):
+    raw = (whole_scan / "manifest.jsonl").read_bytes()
+    (whole_scan / "manifest.jsonl").write_bytes(raw[:-5])
+    (whole_scan / "raw/RH/0009.part").write_bytes(b"half")
+    with (whole_scan / "events.msgpack").open("ab") as f:
         f.write(b"\x84\xa4")
-    notes = validate(whole)
+    notes = validate(whole_scan)
     assert {f.level for f in notes} == {"note"}
     assert len(notes) == 4
     assert "0009.part" in str(notes)
 
 
-def test_a_scan_that_is_being_recorded_has_not_ended(whole):
+def test_a_scan_that_is_being_recorded_has_not_ended(whole_scan):
     """Rows to come, the row that is recorded now and a line half written are no faults; a damaged row is one."""
-    lines = (whole / "manifest.jsonl").read_bytes().splitlines(keepends=True)
-    (whole / "manifest.jsonl").write_bytes(b"".join(lines[:3]))
-    (whole / "raw/RH/0002.part").write_bytes(b"half")
-    with ScanFolder.load(whole).writer():
-        with (whole / "manifest.jsonl").open("ab") as f:
+    lines = (whole_scan / "manifest.jsonl").read_bytes().splitlines(keepends=True)
+    (whole_scan / "manifest.jsonl").write_bytes(b"".join(lines[:3]))
+    (whole_scan / "raw/RH/0002.part").write_bytes(b"half")
+    with ScanFolder.load(whole_scan).writer():
+        with (whole_scan / "manifest.jsonl").open("ab") as f:
             f.write(lines[3][:20])
-        with (whole / "events.msgpack").open("ab") as f:
+        with (whole_scan / "events.msgpack").open("ab") as f:
             f.write(b"\x84\xa4")
-        (note,) = validate(whole)
+        (note,) = validate(whole_scan)
         assert note.level == "note"
         assert "2 of 4 rows" in note.what
-        flip(whole / "raw/RH/0001.bin")
-        assert [f.level for f in validate(whole)] == ["error", "note"]
-    assert any("resume" in f.do for f in validate(whole)), "the program has ended: rows are missing"
+        flip(whole_scan / "raw/RH/0001.bin")
+        assert [f.level for f in validate(whole_scan)] == ["error", "note"]
+    assert any("resume" in f.do for f in validate(whole_scan)), "the program has ended: rows are missing"
 
 
-def test_read_row_refuses_damage(whole):
-    flip(whole / "raw/RH/0002.bin")
-    scan = ScanFolder.load(whole)
+def test_read_row_refuses_damage(whole_scan):
+    flip(whole_scan / "raw/RH/0002.bin")
+    scan = ScanFolder.load(whole_scan)
     with refused(ErrorCode.FILE_DAMAGED, "0002.bin"):
         _ = scan.read_row("RH", 2).payload
     with refused(ErrorCode.FILE_DAMAGED, "0002.bin"):
@@ -225,36 +225,36 @@ def test_read_row_refuses_damage(whole):
 
 
 @pytest.mark.parametrize("size", [1, 7, 100, 1 << 20, 0])
-def test_pieces_of_any_size_are_the_payload(whole, size):
-    row = ScanFolder.load(whole).read_row("RH", 1)
-    assert b"".join(piece.tobytes() for piece in row.pieces(size)) == (whole / "raw/RH/0001.bin").read_bytes()
+def test_pieces_of_any_size_are_the_payload(whole_scan, size):
+    row = ScanFolder.load(whole_scan).read_row("RH", 1)
+    assert b"".join(piece.tobytes() for piece in row.pieces(size)) == (whole_scan / "raw/RH/0001.bin").read_bytes()
     assert row.payload.tobytes() == b"".join(piece.tobytes() for piece in split_pieces(row.payload)(size))
 
 
-def test_other_folders_are_refused(whole, tmp_path):
+def test_other_folders_are_refused(whole_scan, tmp_path):
     with refused(ErrorCode.FILE_MISSING):
         validate(tmp_path / "nothing")
-    (whole / "manifest.jsonl").write_bytes(b"")
+    (whole_scan / "manifest.jsonl").write_bytes(b"")
     with refused(ErrorCode.FILE_DAMAGED, "scan_started"):
-        ScanFolder.load(whole)
-    (whole / "manifest.jsonl").write_bytes(encode_line({"fact": "scan_started", "instrument": {}, "plan": {}}))
+        ScanFolder.load(whole_scan)
+    (whole_scan / "manifest.jsonl").write_bytes(encode_line({"fact": "scan_started", "instrument": {}, "plan": {}}))
     with pytest.raises(ConfigError):
-        ScanFolder.load(whole)
-    assert validate(whole)[0].level == "error"
+        ScanFolder.load(whole_scan)
+    assert validate(whole_scan)[0].level == "error"
 
 
-def test_every_truncation_of_the_manifest_loads_or_is_refused_clearly(whole):
-    raw = (whole / "manifest.jsonl").read_bytes()
+def test_every_truncation_of_the_manifest_loads_or_is_refused_clearly(whole_scan):
+    raw = (whole_scan / "manifest.jsonl").read_bytes()
     first = raw.index(b"\n") + 1
     for n in [*range(0, first + 1, 97), *range(first, len(raw), 61), len(raw)]:
-        (whole / "manifest.jsonl").write_bytes(raw[:n])
+        (whole_scan / "manifest.jsonl").write_bytes(raw[:n])
         try:
-            rows = list(ScanFolder.load(whole).rows())
+            rows = list(ScanFolder.load(whole_scan).rows())
         except PolysightError:
             assert n < first
             continue
         assert rows == list(range(min(4, raw[:n].count(b"\n") - 1)))
-        assert [f for f in validate(whole) if f.level == "error"] == []
+        assert [f for f in validate(whole_scan) if f.level == "error"] == []
 
 
 @settings(deadline=None, max_examples=30)

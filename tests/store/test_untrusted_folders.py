@@ -291,11 +291,11 @@ def external(f: h5py.File) -> None:
     f.create_dataset("h", (4,), "u1", external=[("/etc/passwd", 0, 4)])
 
 
-def linked(f: h5py.File) -> None:
+def link_folder(f: h5py.File) -> None:
     f["h"] = h5py.ExternalLink("/etc/other.h5", "/h")
 
 
-@pytest.mark.parametrize("make", [external, linked])
+@pytest.mark.parametrize("make", [external, link_folder])
 def test_a_netcdf_file_with_arrays_in_other_files_is_refused(make, tmp_path):
     with h5py.File(tmp_path / "a.nc", "w") as f:
         make(f)

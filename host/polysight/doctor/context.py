@@ -164,7 +164,7 @@ def card_rates(rig: Instrument) -> list[float]:
     """Packet rates of a card, packets/s, ascending: during bursts, while emptying its memory, and its maximum."""
     burst = rig.frame_bytes / MAX_PAYLOAD_BYTES / (rig.burst.period_us * 1e-6)
     emptying = 1e6 / (rig.card.packet_delay_us + PACKET_TIME_US)
-    # 5 us is the shortest delay that a card accepts.
+    # 5 us is the shortest delay for which TI gives a rate.
     maximum = 1e6 / (5.0 + PACKET_TIME_US)
     return sorted({burst, emptying, maximum})
 

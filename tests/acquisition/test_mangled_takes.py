@@ -72,7 +72,15 @@ def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
         untimed -= len(moved.doubtful)
         out, missing = move_frames(out, placed.holes, int(placed.arrivals[-1, 1]), moved.slots, frame)
         untimed = untimed if is_whole else 0
-    return Kept(placed, frames, out, mask_of(out.size, missing), is_whole, untimed, placed_out)
+    return Kept(
+        placed=placed,
+        frames=frames,
+        out=out,
+        masked=mask_of(out.size, missing),
+        whole=is_whole,
+        untimed=untimed,
+        placed_out=placed_out,
+    )
 
 
 def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, Sent, int]]:

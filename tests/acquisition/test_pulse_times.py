@@ -30,7 +30,15 @@ def place_missed(missed: list[int], seed: int, load: Load = QUIET, drift: float 
     """Place a row whose radar missed these pulses; check that no frame is at a wrong one."""
     pulses = pulse_times(BURSTS)
     truth = np.delete(np.arange(ALL), missed)
-    arrivals, answer = receive(pulses.reshape(-1)[truth], pulses, FRAME, np.random.default_rng(seed), load, lost, drift)
+    arrivals, answer = receive(
+        edges_ns=pulses.reshape(-1)[truth],
+        pulses_ns=pulses,
+        frame_bytes=FRAME,
+        rng=np.random.default_rng(seed),
+        load=load,
+        lost=lost,
+        drift=drift,
+    )
     result = place(pulses, answer, arrivals)
     is_placed = result.slots >= 0
     np.testing.assert_array_equal(result.slots[is_placed], truth[: result.slots.size][is_placed])

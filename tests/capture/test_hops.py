@@ -25,7 +25,15 @@ from polysight.capture.receiver import RowCapture
 from polysight_shared.config import Board
 
 CARD = "192.168.33.180"
-BOARD = Board("RH", "receive_h", CARD, "192.168.33.30", 4096, 4098, ())
+BOARD = Board(
+    name="RH",
+    role="receive_h",
+    card_address=CARD,
+    host_address="192.168.33.30",
+    command_port=4096,
+    data_port=4098,
+    mount=(),
+)
 ROUTES = "Iface Destination Gateway Flags RefCnt Use Metric Mask MTU Window IRTT\n"
 LOCAL = "eth1 0021A8C0 00000000 0001 0 0 0 00FFFFFF 0 0 0\n"
 GATEWAY = "eth0 00000000 0102A8C0 0003 0 0 100 00000000 0 0 0\n"

@@ -185,7 +185,15 @@ def test_ends_when_its_host_is_killed(board, tmp_path):
 
 def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
     """Two receivers, one swamped while it is stopped: only its row counts drops, and only in the row they fell in."""
-    other_board = Board("RV", "receive_v", board.card_address, board.host_address, 4202, 4203, ())
+    other_board = Board(
+        name="RV",
+        role="receive_v",
+        card_address=board.card_address,
+        host_address=board.host_address,
+        command_port=4202,
+        data_port=4203,
+        mount=(),
+    )
     with ReceiverProcess(board, 1 << 16) as swamped, ReceiverProcess(other_board, 1 << 16) as quiet:
         for receiver in (swamped, quiet):
             receiver.begin_row(0, 1, 2000 * FULL, FULL, tmp_path / f"{receiver.board.name}.part")

@@ -57,7 +57,15 @@ def join_reasons(context, name):
 
 
 def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
-    board = BoardFilter([180.5, 355.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
+    board = BoardFilter(
+        corners_khz=[180.5, 355.0],
+        standard_error_khz=[1.0, 2.0],
+        programmed_khz=[175.0, 350.0],
+        if_from_khz=100.0,
+        if_to_khz=1900.0,
+        chirps=640,
+        residual_db=0.05,
+    )
     file = FilterFile(**header("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board, "RV": board})
     context = context_of(programmed_rig(calibration={"hpf": str(write_calibration(file, tmp_path))}))
     hello = HelloReply(pi_release="", firmware="", backend=WIRES, state="homed", scan_id="", last_seq=0)

@@ -120,8 +120,24 @@ def test_a_scan_in_progress_is_not_disturbed(live):
 
 
 def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
-    board = BoardFilter([180.5, 355.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
-    other_filter = BoardFilter([172.5, 347.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
+    board = BoardFilter(
+        corners_khz=[180.5, 355.0],
+        standard_error_khz=[1.0, 2.0],
+        programmed_khz=[175.0, 350.0],
+        if_from_khz=100.0,
+        if_to_khz=1900.0,
+        chirps=640,
+        residual_db=0.05,
+    )
+    other_filter = BoardFilter(
+        corners_khz=[172.5, 347.0],
+        standard_error_khz=[1.0, 2.0],
+        programmed_khz=[175.0, 350.0],
+        if_from_khz=100.0,
+        if_to_khz=1900.0,
+        chirps=640,
+        residual_db=0.05,
+    )
     sources = [SourceScan("sweep", "scans/sweep", True, 6)]
     path = write_calibration(
         FilterFile(**header("hpf", sources), boards={"RH": board, "RV": other_filter}), live.folder / "calibration"

@@ -78,7 +78,16 @@ def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
     echo = 1 + 0.3 * np.exp(2j * np.pi * f * path_m / SPEED_OF_LIGHT_M_S)
     samples = np.tile(echo.astype(np.complex64), (4, 5, 1))
     zeros = np.zeros(5)
-    row = SyncedRow(samples, f, np.ones(5, bool), np.ones(5, int), zeros, zeros, zeros, zeros)
+    row = SyncedRow(
+        samples=samples,
+        sweep_hz=f,
+        valid=np.ones(5, bool),
+        chirps=np.ones(5, int),
+        direct_hz=zeros,
+        direct_amplitude=zeros,
+        freq_residual_hz=zeros,
+        phase_residual_rad=zeros,
+    )
     where = np.linspace(-0.2, 1.0, 601)
     level = range_profile_db(row, chirp, where)
     assert abs(where[level.argmax()]) < 0.01

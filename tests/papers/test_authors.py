@@ -58,12 +58,37 @@ def dataset(tmp_path_factory):
         for number in CHOSEN:
             for angle in angles(number):
                 seed += 1
-                write_material(folder / "materials", material(number), angle, f"set{k}_{angle}", 60, ERRORS, seed)
-    write_material(folder / "materials", Material("unobtainium", 3.0 - 0.1j), 60, "set0_60", 60, ERRORS, 999)
+                write_material(
+                    folder=folder / "materials",
+                    material=material(number),
+                    angle_deg=angle,
+                    scan=f"set{k}_{angle}",
+                    pixels=60,
+                    errors=ERRORS,
+                    seed=seed,
+                )
+    write_material(
+        folder=folder / "materials",
+        material=Material("unobtainium", 3.0 - 0.1j),
+        angle_deg=60,
+        scan="set0_60",
+        pixels=60,
+        errors=ERRORS,
+        seed=999,
+    )
     boxes = {"copper": (10, 10, 40, 40), "Acrylic (3 mm)": (60, 10, 90, 40), "ceramic": (10, 60, 40, 90)}
     named = {"copper": material(1), "Acrylic (3 mm)": material(3), "ceramic": material(12)}
     for k in range(2):
-        write_labels(folder / "labels", f"scan{k}", boxes, named, 60, ERRORS, 500 + k, upside_down=True)
+        write_labels(
+            folder=folder / "labels",
+            scan=f"scan{k}",
+            boxes=boxes,
+            materials=named,
+            angle_deg=60,
+            errors=ERRORS,
+            seed=500 + k,
+            upside_down=True,
+        )
     return folder
 
 
@@ -241,7 +266,15 @@ def test_training_on_one_scan_of_each_material_claims_no_accuracy(tmp_path, caps
     monkeypatch.setattr(classify, "GRID", (1.0,))
     for k, material_index in enumerate((3, 12)):
         for number in (1, material_index):
-            write_material(tmp_path / "materials", material(number), 60, f"set{k}", 30, ERRORS, 10 * k + number)
+            write_material(
+                folder=tmp_path / "materials",
+                material=material(number),
+                angle_deg=60,
+                scan=f"set{k}",
+                pixels=30,
+                errors=ERRORS,
+                seed=10 * k + number,
+            )
     out = tmp_path / "library.npz"
     assert main(["train", "--authors", str(tmp_path), "--out", str(out)]) == 0
     output = capsys.readouterr().out
@@ -271,7 +304,15 @@ def test_few_scans_of_few_pixels_give_figures_or_are_refused(tmp_path, monkeypat
         for k, boxes in enumerate(stand):
             for number, pixels in boxes:
                 drawn = 100 * seed + 10 * k + number
-                write_material(folder, material(number), 60, f"set{k}", pixels, ERRORS, drawn)
+                write_material(
+                    folder=folder,
+                    material=material(number),
+                    angle_deg=60,
+                    scan=f"set{k}",
+                    pixels=pixels,
+                    errors=ERRORS,
+                    seed=drawn,
+                )
         try:
             table = make(Judgements(read_authors(folder.parent, RIG_FILE))).tables[0]
         except DataError:

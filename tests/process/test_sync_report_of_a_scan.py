@@ -27,7 +27,15 @@ NAMES = {"frequency_hz_std": "frequency_std_hz", "phase_rad_std": "phase_std_rad
 def scan(scan_of, tmp_path_factory):
     """A scan whose filters were measured before it."""
     folder = tmp_path_factory.mktemp("sync")
-    true_filter = BoardFilter(TRUE_KHZ, [1.0, 1.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
+    true_filter = BoardFilter(
+        corners_khz=TRUE_KHZ,
+        standard_error_khz=[1.0, 1.0],
+        programmed_khz=[175.0, 350.0],
+        if_from_khz=100.0,
+        if_to_khz=1900.0,
+        chirps=640,
+        residual_db=0.05,
+    )
     head = header("hpf", [SourceScan("sweep", "sweep", True, 3)])
     path = write_calibration(FilterFile(**head, boards={"RH": true_filter, "RV": true_filter}), folder / "calibration")
     true = rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})

@@ -178,7 +178,8 @@ def test_products_without_a_result_hold_images_and_no_name(rig, tmp_path):
 def test_p_sigma_covers_the_error_of_p(examine):
     scene = world(disturbances={"leakage_measured": 0.003})
     findings, true = examine(scene)
-    analysis, sigma = findings.analysis, findings.analysis.p_sigma(findings.images.valid)
+    analysis = findings.analysis
+    sigma = analysis.p_sigma(findings.images.valid)
     inside = []
     for r in analysis.patches:
         plate = true.get(r.patch.label)

@@ -109,7 +109,13 @@ def test_p_sigma_has_the_shape_of_the_image(tmp_path):
     axis = np.array([0.0, 0.1])
     valid = np.ones((2, 2), bool)
     with refused(ErrorCode.MISMATCH, "p_sigma"):
-        write_image(tmp_path / "i.npz", Images(image, image, axis, axis, valid, image, np.ones((3, 2))))
+        write_image(
+            tmp_path / "i.npz",
+            Images(h=image, v=image, x_m=axis, y_m=axis, valid=valid, p=image, p_sigma=np.ones((3, 2))),
+        )
     write_json(tmp_path / "materials.json", {"segments": []})
-    write_image(tmp_path / "i.npz", Images(image, image, axis, axis, valid, image, np.full((2, 2), np.nan)))
+    write_image(
+        tmp_path / "i.npz",
+        Images(h=image, v=image, x_m=axis, y_m=axis, valid=valid, p=image, p_sigma=np.full((2, 2), np.nan)),
+    )
     assert read_image(tmp_path / "i.npz").p_sigma.dtype == np.float32

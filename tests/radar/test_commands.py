@@ -48,8 +48,33 @@ from polysight.radar.commands import (
 from polysight.radar.firmware import file_chunks
 from polysight.radar.messages import command, decode, encode
 
-PUBLISHED = Profile(76.01e9, 38.816929e12, 100.0, 7.0, 128.5, 256, 2.15e6, 175.0, 350.0, 30, 30)
-OTHER = Profile(76.01087e9, 38.816929e12, 100.0, 6.5, 128.5, 512, 5e6, 350.0, 2800.0, 40, 36, 3)
+PUBLISHED = Profile(
+    start_hz=76.01e9,
+    slope_hz_per_s=38.816929e12,
+    idle_us=100.0,
+    adc_start_us=7.0,
+    ramp_end_us=128.5,
+    samples=256,
+    sample_rate_hz=2.15e6,
+    hpf1_khz=175.0,
+    hpf2_khz=350.0,
+    rx_gain_db=30,
+    rf_gain_target_db=30,
+)
+OTHER = Profile(
+    start_hz=76.01087e9,
+    slope_hz_per_s=38.816929e12,
+    idle_us=100.0,
+    adc_start_us=6.5,
+    ramp_end_us=128.5,
+    samples=512,
+    sample_rate_hz=5e6,
+    hpf1_khz=350.0,
+    hpf2_khz=2800.0,
+    rx_gain_db=40,
+    rf_gain_target_db=36,
+    tx_backoff_db=3,
+)
 # What TI's mmWaveLink library writes to its SPI driver for these parameters (run beside this project).
 VECTORS: list[tuple[Command, str]] = [
     (DEVICE_CONFIGURATION, "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"),
@@ -99,17 +124,17 @@ VECTORS: list[tuple[Command, str]] = [
 
 # The same without the request of an acknowledgement.
 _PROFILE = Profile(
-    1435384036 * START_HZ_PER_CODE,
-    414 * SLOPE_HZ_PER_S_PER_CODE,
-    10.0,
-    7.0,
-    60.0,
-    64,
-    5e6,
-    175.0,
-    350.0,
-    40,
-    36,
+    start_hz=1435384036 * START_HZ_PER_CODE,
+    slope_hz_per_s=414 * SLOPE_HZ_PER_S_PER_CODE,
+    idle_us=10.0,
+    adc_start_us=7.0,
+    ramp_end_us=60.0,
+    samples=64,
+    sample_rate_hz=5e6,
+    hpf1_khz=175.0,
+    hpf2_khz=350.0,
+    rx_gain_db=40,
+    rf_gain_target_db=36,
     index=3,
 )
 WITHOUT_ACKNOWLEDGEMENT: list[tuple[Command, str]] = [

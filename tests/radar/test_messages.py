@@ -31,13 +31,13 @@ def message(draw) -> Message:
     sizes = st.binary(max_size=40).filter(lambda b: len(b) % 4 == 0)
     blocks = draw(st.lists(st.builds(SubBlock, numbers, sizes), max_size=5))
     return Message(
-        draw(st.sampled_from(Direction)),
-        draw(st.sampled_from(Kind)),
-        ident,
-        tuple(blocks),
-        draw(st.integers(0, 15)),
-        draw(st.booleans()),
-        draw(st.integers(0, 0xFFFF)),
+        direction=draw(st.sampled_from(Direction)),
+        kind=draw(st.sampled_from(Kind)),
+        message_id=ident,
+        blocks=tuple(blocks),
+        sequence=draw(st.integers(0, 15)),
+        retry=draw(st.booleans()),
+        remaining_chunks=draw(st.integers(0, 0xFFFF)),
     )
 
 

@@ -229,7 +229,16 @@ def run(case: Case, at: int) -> Outcome:
             raise DeviceError("the radar did not report its frames' end", "; ".join(radar.warnings), "")
     except DeviceError as e:
         error = e
-    return Outcome(case, at, error, clock.time, words.begun is not None, radar, board, words)
+    return Outcome(
+        case=case,
+        at=at,
+        error=error,
+        seconds=clock.time,
+        struck=words.begun is not None,
+        radar=radar,
+        board=board,
+        words=words,
+    )
 
 
 LONGEST_S = 45.0  # of virtual time: a bring-up whose every command is sent three times would be given up long before

@@ -150,7 +150,9 @@ def test_a_refusal_with_message_id_0_is_the_answer_to_its_sequence():
 
 @pytest.mark.parametrize(("direction", "kind"), [(2, 1), (5, 1), (1, 1), (6, 0)])
 def test_a_response_of_another_core_is_no_answer(direction, kind):
-    line, _ = connect(*[frame(direction, kind, 0x202, b"", 0, 0, True)] * 3)
+    line, _ = connect(
+        *[frame(direction=direction, kind=kind, number=0x202, body=b"", count=0, sequence=0, wide=True)] * 3
+    )
     with refused(ErrorCode.NO_ANSWER):
         line.call(DEVICE_CONFIGURATION)
 
@@ -169,7 +171,17 @@ def test_a_refusal_of_another_sequence_is_late():
 
 def chunk(remaining: int, block: int, data: bytes) -> bytes:
     """One of an answer's chunks, from the simulated device's encoder."""
-    raw = bytearray(frame(6, 1, 0x207, struct.pack("<2H", block, len(data) + 4) + data, 1, 0, True))
+    raw = bytearray(
+        frame(
+            direction=6,
+            kind=1,
+            number=0x207,
+            body=struct.pack("<2H", block, len(data) + 4) + data,
+            count=1,
+            sequence=0,
+            wide=True,
+        )
+    )
     raw[10:12] = remaining.to_bytes(2, "little")
     raw[14:16] = b"\0\0"
     raw[14:16] = (0xFFFF - ones_sum(bytes(raw[4:14]))).to_bytes(2, "little")

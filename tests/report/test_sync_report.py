@@ -20,16 +20,16 @@ def row(snr_db=7.2, n=4000, seed=0):
     zero = np.zeros(n)
     noise = np.full(n, 500.0**2 * 10 ** (-snr_db / 10))
     return SyncedRow(
-        np.zeros((4, n, 1), np.complex64),
-        np.zeros(1),
-        valid,
-        np.full(n, 16),
-        zero,
-        zero + 500,
-        zero,
-        zero,
-        errors,
-        noise,
+        samples=np.zeros((4, n, 1), np.complex64),
+        sweep_hz=np.zeros(1),
+        valid=valid,
+        chirps=np.full(n, 16),
+        direct_hz=zero,
+        direct_amplitude=zero + 500,
+        freq_residual_hz=zero,
+        phase_residual_rad=zero,
+        errors=errors,
+        noise=noise,
     )
 
 

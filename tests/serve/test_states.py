@@ -47,7 +47,9 @@ class StillWatch:
 
     def show(self, key: str) -> None:
         """Publish a state of the table."""
-        signs = LifeSigns(Life(), True, False, 0.0, 0.1, 6.0, 1.8e9)
+        signs = LifeSigns(
+            life=Life(), alive=True, killed=False, alive_s=0.0, pi_silent_s=0.1, pi_limit_s=6.0, now_s=1.8e9
+        )
         history = None if key in WITHOUT_SCAN else self._history
         snapshot = make_snapshot(Inputs(self.folder, history, signs, control=True))
         verdict = Verdict(key.removeprefix("result_")) if key.startswith("result_") else None  # type: ignore[arg-type]

@@ -35,7 +35,16 @@ class Bench:
         self.track = StageTrack(rig)
         settings = [f"{key}={value!r}" for key, value in faults.items()]  # as from the command line
         table = read_faults(None, settings, ("RH",))["RH"]
-        self.card = SimulatedCard(rig, self.board, PatternSource(rig), table, seed, 1.0, lambda: self.now, Pace(False))
+        self.card = SimulatedCard(
+            rig=rig,
+            board=self.board,
+            source=PatternSource(rig),
+            faults=table,
+            seed=seed,
+            time_scale=1.0,
+            clock_s=lambda: self.now,
+            pace=Pace(False),
+        )
         sockets.callback(self.card.close)
         self.pulse = 0
 

@@ -304,4 +304,6 @@ def test_packets_in_calls_of_many_keep_the_delay_as_a_mean_also_after_a_pause(
 def test_an_address_of_another_machine_is_an_error() -> None:
     network = Network("127.0.0.30", "203.0.113.5", bytes(6), 4096, 4098)
     with refused(ErrorCode.BUSY, "203.0.113.5:4096"):
-        CardEndpoint("RH", network, Faults(), 0, 1.0, lambda: 0.0, Pace())
+        CardEndpoint(
+            name="RH", network=network, faults=Faults(), seed=0, time_scale=1.0, clock_s=lambda: 0.0, pace=Pace()
+        )

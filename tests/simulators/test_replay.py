@@ -174,7 +174,18 @@ def test_it_replays_at_the_given_rate(recording: Path, bytes_per_s: float) -> No
     now_s = 50.0
     subnet = free_subnet()
     network = Network(f"{subnet}.30", f"{subnet}.180", MAC, 4096, 4098)
-    with closing(CardEndpoint("card", network, Faults(), 0, 1.0, lambda: now_s, Pace(), lanes=None)) as endpoint:
+    with closing(
+        CardEndpoint(
+            name="card",
+            network=network,
+            faults=Faults(),
+            seed=0,
+            time_scale=1.0,
+            clock_s=lambda: now_s,
+            pace=Pace(),
+            lanes=None,
+        )
+    ) as endpoint:
         player = Player(endpoint, repeat(Recording(recording, loop=True)), bytes_per_s, lambda: now_s)
         endpoint.card.command(bytes.fromhex(START), now_s)
         player.turn()

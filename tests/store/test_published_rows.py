@@ -38,7 +38,15 @@ def make_plan(by_columns):
 
 def record(folder, skipped=None, lost=None, zero_filling=True, by_columns=False):
     """Write random rows; returns the folder and what was sent, {(board, row): bytes of the whole row}."""
-    layout = AuthorsLayout(folder, RIG, "scan", 1.7e9, zero_filling, by_columns, skipped)
+    layout = AuthorsLayout(
+        path=folder,
+        rig=RIG,
+        scan_id="scan",
+        started_s=1.7e9,
+        zero_filling=zero_filling,
+        by_columns=by_columns,
+        skipped=skipped,
+    )
     layout.start()
     sent = {}
     for row in make_plan(by_columns):

@@ -104,9 +104,10 @@ class CardClient:
         macs.discard("")
         if len(versions) > 1 or len(macs) > 1:
             answers = f"{len(versions)} answers to one request (FPGA {', '.join(map(str, versions))})"
+            if len(macs) > 1:
+                answers += f", MAC addresses {' and '.join(sorted(macs))}"
             raise DeviceError(
-                f"{self._name()}: {answers}"
-                + (f", MAC addresses {' and '.join(sorted(macs))}" if len(macs) > 1 else ""),
+                f"{self._name()}: {answers}",
                 "two cards have this address, or the network doubles packets: rows of either look like the other's",
                 "give each card its own address (`polysight card`, docs/how-to/install.md), or unplug the second one;"
                 f" `arping {self.board.card_address}` shows who answers",

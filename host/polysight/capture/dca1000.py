@@ -84,7 +84,10 @@ class Version:
     playback: bool
 
     def __str__(self) -> str:
-        return f"{self.major}.{self.minor}{' (playback)' if self.playback else ''}"
+        version = f"{self.major}.{self.minor}"
+        if self.playback:
+            version += " (playback)"
+        return version
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,8 @@ def configure_fpga_data(lanes: int = 4, timer: int = 30) -> bytes:
     """Encode the body of 0x03: raw mode, LVDS lanes (4: AWR2243, 2: xWR16xx/18xx/68xx), Ethernet, 16 bit, timer."""
     if lanes not in (2, 4):
         raise ProtocolError(f"the card captures 2 or 4 LVDS lanes, not {lanes}", code=ErrorCode.VALUE_INVALID)
-    return bytes([1, 1 if lanes == 4 else 2, 1, 2, 3, timer])
+    lane_mode = 1 if lanes == 4 else 2
+    return bytes([1, lane_mode, 1, 2, 3, timer])
 
 
 def configure_packet_data(packet_bytes: int, delay_us: float) -> bytes:

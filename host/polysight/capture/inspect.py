@@ -179,7 +179,9 @@ def inspect_bin(path: Path, layout: Layout = Layout()) -> Report:
         remedy = "give a row (.bin) or a packet capture (.pcap)"
         raise DataError(problem, "a card records samples", remedy, code=ErrorCode.FILE_FOREIGN)
     packets = packets_in_file(payload)
-    report = inspect_payload(path, place_packets(packets)[0] if packets else payload, layout)
+    if packets:
+        payload, _ = place_packets(packets)
+    report = inspect_payload(path, payload, layout)
     if packets:
         report.remarks.append("whole packets, not payload: programs must remove the counters of each packet first")
     if size > MAX_BYTES:
@@ -360,8 +362,9 @@ def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") 
     data = [d for d in packets if len(d.payload) > dca1000.PACKET_HEADER_BYTES]
     if not data:
         if not card.replies:
+            place = f" at {card_address}" if card_address else ""
             raise DataError(
-                f"{path}: contains nothing from a DCA1000{f' at {card_address}' if card_address else ''}",
+                f"{path}: contains nothing from a DCA1000{place}",
                 "another capture, or another card",
                 "record on the card's interface",
                 code=ErrorCode.NO_DATA,

@@ -209,6 +209,11 @@ class Receiver:
         losses = vars(placed.losses)
         arrivals = placed.arrivals
         counts["packets"] = counts.pop("placed")
+        first_arrival_ns = 0
+        last_arrival_ns = 0
+        if arrivals.size:
+            first_arrival_ns = int(arrivals[0, 0])
+            last_arrival_ns = int(arrivals[-1, 0])
         return messages.RowCapture(
             row=begun.row,
             take=begun.take,
@@ -220,8 +225,8 @@ class Receiver:
             strangers=self._batches.strangers - row.strangers,
             stale=row.stale,
             kernel_drops=kernel_drops(self._socket) - row.drops,
-            first_arrival_ns=int(arrivals[0, 0]) if arrivals.size else 0,
-            last_arrival_ns=int(arrivals[-1, 0]) if arrivals.size else 0,
+            first_arrival_ns=first_arrival_ns,
+            last_arrival_ns=last_arrival_ns,
             crc32=crc,
             index_crc32=index_crc,
             packets_crc32=write_packets(path.with_suffix(PACKETS), log, evidence, placed),

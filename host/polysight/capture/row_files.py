@@ -39,12 +39,13 @@ def _find_scan(path: Path) -> Path:
 
 def write_error(path: Path, done: str, e: OSError) -> DeviceError:
     """Return the error for a file of a scan that cannot be `done`: written, opened, renamed..."""
-    full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    is_full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    code = ErrorCode.DISK_FULL if is_full else ErrorCode.FILE_UNWRITABLE
     return DeviceError(
         f"{path}: cannot be {done}: {e.strerror}",
         "the disk is full, read-only or fails",
         f"free space, then `polysight resume {_find_scan(path)}` continues after the last committed row",
-        code=ErrorCode.DISK_FULL if full else ErrorCode.FILE_UNWRITABLE,
+        code=code,
     )
 
 
@@ -219,10 +220,10 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
         if (np.diff(batches[:, 1], prepend=0) < 0).any():
             raise ValueError("the number of packets decreases between two batches")
         log = _restore_log(evidence.expected, runs, batches, row, stored_payload)
-        is_whole = (head["packets"], head["own_bytes"]) == (
-            int(batches[-1, 1]) if len(batches) else 0,
-            stored_payload.size,
-        )
+        packets = 0
+        if len(batches):
+            packets = int(batches[-1, 1])
+        is_whole = (head["packets"], head["own_bytes"]) == (packets, stored_payload.size)
         if not is_whole or log.count != head["kept"] or head["format"] not in (1, FORMAT):
             raise ValueError("its counts are wrong")
         log.malformed = int(head["malformed"])

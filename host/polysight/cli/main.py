@@ -71,7 +71,9 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    words = expand_home(sys.argv[1:] if argv is None else argv)
+    if argv is None:
+        argv = sys.argv[1:]
+    words = expand_home(argv)
     name = " ".join(["polysight", *words[:1]])
     open_standard_streams()
     try:
@@ -102,7 +104,8 @@ def _run(words: list[str]) -> int:
     from polysight.cli.options import join_negative_values
 
     try:
-        args = build_parser(words[0] if words else None).parse_args(join_negative_values(words))
+        parser = build_parser(next(iter(words), None))
+        args = parser.parse_args(join_negative_values(words))
     except SystemExit:
         flush_standard_output()
         raise

@@ -52,12 +52,18 @@ def _incidence(text: str) -> str | float:
 
 def process_settings(args: argparse.Namespace, data: Path) -> Settings:
     """The settings of `polysight process` for one scan. Raises ConfigError."""
+    # `--incidence` takes the word of a method, or the degrees of given images.
+    method = args.incidence
+    degrees = None
+    if isinstance(args.incidence, float):
+        method = "one"
+        degrees = args.incidence
     return msgspec.structs.replace(
         material_settings(args),
         config=path_text(rig_file(args.config, data)),
         reference=path_text(args.reference),
-        incidence="one" if isinstance(args.incidence, float) else args.incidence,
-        incidence_deg=args.incidence if isinstance(args.incidence, float) else None,
+        incidence=method,
+        incidence_deg=degrees,
         bands=args.bands,
         sparse=args.sparse,
     )

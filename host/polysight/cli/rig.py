@@ -68,6 +68,9 @@ def _plan(args: argparse.Namespace) -> int:
     from polysight.planning import Changes, PlanOptions, run_plan
 
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
+    scene = None
+    if args.scene is not None:
+        scene = packaged(args.scene)
     options = PlanOptions(
         minutes=args.minutes,
         count=args.count,
@@ -75,7 +78,7 @@ def _plan(args: argparse.Namespace) -> int:
         snr_db=args.snr_db,
         row_overhead_s=args.row_overhead_s,
         scene_mm=args.scene_mm,
-        scene=None if args.scene is None else packaged(args.scene),
+        scene=scene,
         as_json=args.json,
     )
     return run_plan(args.config, Changes(**{name: getattr(args, name) for name in names}), options)

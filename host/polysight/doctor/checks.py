@@ -95,7 +95,10 @@ def run_checks(context: CheckContext) -> Iterator[Finding]:
         if check.each_board and context.loaded_rig is not None:
             boards = tuple(context.loaded_rig.recorded)
         for board in boards:
-            key = (check.name, "" if board is None else board.name)
+            board_name = ""
+            if board is not None:
+                board_name = board.name
+            key = (check.name, board_name)
             title = " ".join(key).rstrip()
             if failed := _failed_prerequisite(check, board, blocked):
                 blocked[key] = failed

@@ -24,11 +24,11 @@ from polysight.calibration import (
     write_calibration,
 )
 from polysight.imaging import Image, Mask
-from polysight.jobs.output import print_json, print_lines, say, steps
+from polysight.jobs.output import load_rig_file, print_json, print_lines, say, steps
 from polysight.jobs.process import form_scan_images, load_reference, make_plane_reference
 from polysight.polarimetry import Leakage, leakage_from_images, specular_incidence_rad
 from polysight.settings import Settings, path_text
-from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.tables import to_builtins
@@ -74,14 +74,11 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     from polysight.calibration import Prior, calibration_of_scan, fit_places, load_echoes, places_file, read_target
 
     points = read_target(target)
-    rig_file = None
-    if config is not None:
-        rig_file = load_instrument(config)
+    rig_file = load_rig_file(config)
     source = open_raw(scan, rig_file)
-    if rig_file is None:
-        rig = source.instrument
-    else:
-        rig = take_antenna_places(source.instrument, rig_file)
+    rig = source.instrument
+    if rig_file is not None:
+        rig = take_antenna_places(rig, rig_file)
     calibration = calibration_of_scan(source)
     filters = {b.name: calibration.high_pass(b.name) for b in rig.receivers}
     say("places of boards and plane")
@@ -114,9 +111,7 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
     """Calibrate the receivers' high-pass filters with scans at several start frequencies. Raises PolysightError."""
     from polysight.calibration import fit_filter
 
-    rig = None
-    if config is not None:
-        rig = load_instrument(config)
+    rig = load_rig_file(config)
     sources = [open_raw(folder, rig) for folder in scans]
     chirps = {(s.instrument.chirp.hpf1_khz, s.instrument.chirp.hpf2_khz) for s in sources}
     if len(chirps) > 1:
@@ -145,7 +140,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
     from polysight.calibration import MetalFile, read_calibration, write_metal
     from polysight.imaging import sub_bands
 
-    source = open_raw(scan, None if config is None else load_instrument(config))
+    source = open_raw(scan, load_rig_file(config))
     parts = ()
     if bands > 1:
         parts = sub_bands(source.instrument.chirp, bands)
@@ -170,7 +165,7 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
     """Choose start offsets that centre the direct paths in the IF band. Raises PolysightError."""
     from polysight.calibration import fit_start
 
-    source = open_raw(scan, None if config is None else load_instrument(config))
+    source = open_raw(scan, load_rig_file(config))
     names = [b.name for b in source.instrument.receivers]
     boards = {name: fit_start(source, name) for name in steps(names, [f"direct path of {name}" for name in names])}
     file = StartFile(**header("start_frequency", [source_scan(source, scan)]), boards=boards)

@@ -69,9 +69,12 @@ def _facts(survey: CardSurvey) -> dict[str, object]:
 
 def _hop(finding: Finding) -> dict[str, str]:
     """One hop as plain data; a note says that the hop was not checked."""
+    verdict = finding.level
+    if verdict == "note":
+        verdict = "not checked"
     return {
         "hop": finding.where,
-        "verdict": "not checked" if finding.level == "note" else finding.level,
+        "verdict": verdict,
         "found": finding.what,
         "why": finding.why,
         "remedy": finding.do,
@@ -247,7 +250,9 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
     sys.stdout.write(f"{image.name}: whole, for an AWR2243, patches {' and '.join(checked.patches)}\n")
     _check_trace(trace)
     words = _open(rig, name, clock, trace, slow)
-    board = radar_board(rig, name, words, clock, None if flash else checked)
+    # A flash is written by a board that was started without this image.
+    image_for_ram = None if flash else checked
+    board = radar_board(rig, name, words, clock, image_for_ram)
     try:
         if flash:
             sys.stdout.write(f"{name}: {_write_flash(board, image, checked)}\n")

@@ -353,7 +353,8 @@ def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missi
         if not answer:
             return "", False
         try:
-            name = box_name(METAL if is_metal else answer)
+            name = METAL if is_metal else answer
+            name = box_name(name)
             if name not in boxes:
                 _refuse_twin(name, boxes)
                 return name, is_metal

@@ -6,8 +6,11 @@ import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar
+
+from polysight_shared.config import Instrument, load_instrument
 
 if TYPE_CHECKING:
     from polysight.process import Progress
@@ -20,6 +23,13 @@ _LINE_S = 5.0
 def exit_status(worked: bool) -> int:
     """Exit status of a command: 0 if it worked, else 1."""
     return int(not worked)
+
+
+def load_rig_file(config: Path | None) -> Instrument | None:
+    """Return the rig of a file; None without one. Raises ConfigError."""
+    if config is None:
+        return None
+    return load_instrument(config)
 
 
 def simulated_scan(scan_id: str, is_simulated: bool) -> str:

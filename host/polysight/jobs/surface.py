@@ -16,7 +16,7 @@ from polysight.jobs.measure_surfaces import (
     see_rows,
     thin_out,
 )
-from polysight.jobs.output import print_json, print_lines, say
+from polysight.jobs.output import load_rig_file, print_json, print_lines, say
 from polysight.jobs.process import processed_rows
 from polysight.pipeline import Pipeline
 from polysight.settings import Settings, path_text
@@ -36,7 +36,7 @@ from polysight.surfaces import (
     plain_segment,
     summary_lines,
 )
-from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 
@@ -135,7 +135,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
     """`polysight calibrate sphere`: keep points of a metal sphere as reference of surfaces. Raises PolysightError."""
     from polysight.jobs.calibrate import print_result, rig_file_keys
 
-    raw = open_raw(scan, None if config is None else load_instrument(config))
+    raw = open_raw(scan, load_rig_file(config))
     _, optics, points = seen_by(scan, config)
     metal = points[points.segment == 0]
     if len(metal) < LEAST_METAL_POINTS:

@@ -307,7 +307,8 @@ def with_unique_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
 
 
 def _count(number: int, singular: str, plural: str) -> str:
-    return f"{number} {singular if number == 1 else plural}"
+    noun = singular if number == 1 else plural
+    return f"{number} {noun}"
 
 
 def _summary(out: Path, library: Library) -> list[str]:

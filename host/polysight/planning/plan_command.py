@@ -473,7 +473,10 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
     noise, overhead = _assumptions(options)
     if options.minutes is None:
         f = forecast_scene(original, changes, options.scene, noise, overhead, options.scene_mm)
-        sys.stdout.write(json.dumps(forecast_values(f), indent=1) + "\n" if options.as_json else describe(f))
+        if options.as_json:
+            sys.stdout.write(json.dumps(forecast_values(f), indent=1) + "\n")
+        else:
+            sys.stdout.write(describe(f))
         return int(not f.possible)
     plans = propose(rig, options.minutes, options.count, noise, overhead, options.scene_mm)
     if options.as_json:

@@ -151,7 +151,9 @@ class AdcOutput(Command):
 
     def data(self) -> bytes:
         """Pack bits, full scale reduction 0, format."""
-        return struct.pack("<IHH", 2 | (1 if self.if_mode == "complex1x" else 2) << 16, 0, 0)
+        # 2 stands for 16 bits of resolution; the format is in the upper half of the word.
+        output = 1 if self.if_mode == "complex1x" else 2
+        return struct.pack("<IHH", 2 | output << 16, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -518,7 +520,9 @@ def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
 
 def _chirp(rig: Instrument) -> Iterator[Constraint]:
     c = rig.chirp
-    end = c.adc_start_us + (c.samples / c.sample_rate_hz * 1e6 if c.sample_rate_hz else inf)
+    end = inf
+    if c.sample_rate_hz:
+        end = c.adc_start_us + c.samples / c.sample_rate_hz * 1e6
     longer = "raise chirp.ramp_end_us"
     yield Constraint("ADC window", "ADC start + samples / rate", end, "us", longer, high=c.ramp_end_us)
     memory = c.samples * len(rig.antennas.rx_mm) * 4

@@ -82,14 +82,19 @@ def check_board(
     try:
         board.configure(on_step)
     except PolysightError as error:
-        on_row(_row_of_failure(board.steps[len(done)] if len(done) < len(board.steps) else None, error))
+        failed_step = None
+        if len(done) < len(board.steps):
+            failed_step = board.steps[len(done)]
+        on_row(_row_of_failure(failed_step, error))
         return board
     _frame_and_read_back(board, transmits, on_row)
     return board
 
 
 def _frame_and_read_back(board: RadarBoard, transmits: bool, on_row: Callable[[Row], None]) -> None:
-    expected = "frame end, 1 frame" + (" (this board transmits)" if transmits else "")
+    expected = "frame end, 1 frame"
+    if transmits:
+        expected += " (this board transmits)"
     try:
         on_row(Row("one frame", True, expected, board.run_one_frame()))
     except PolysightError as error:

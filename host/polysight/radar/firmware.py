@@ -139,12 +139,17 @@ def require_family(name: str, core: str, version: bytes) -> None:
     if release[0] == GENERATION:
         return
     rom = ".".join(map(str, release))
-    stuck = set(release) in ({0x00}, {0xFF})
+    cause = "the board has another device"
+    remedy = "use an AWR2243 board; docs/spec/mmwavelink.md, Other boards"
+    # All zeros or all ones come from a line that nothing drives.
+    if set(release) in ({0x00}, {0xFF}):
+        cause = "the board's data line is stuck"
+        remedy = "check the 60-pin connector"
     raise ConfigError(
         f"{name}: its {core} core's ROM is {rom}, generation {release[0]} ({_family(release[0])});"
         " only AWR2243 is supported",
-        "the board's data line is stuck" if stuck else "the board has another device",
-        "check the 60-pin connector" if stuck else "use an AWR2243 board; docs/spec/mmwavelink.md, Other boards",
+        cause,
+        remedy,
         code=ErrorCode.MISMATCH,
     )
 

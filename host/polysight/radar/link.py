@@ -123,7 +123,8 @@ class Link:
         """
         problems: list[Finding] = []
         retry = False
-        for _ in range(1 if sent is RF_POWER_UP else ATTEMPTS):
+        attempts = 1 if sent is RF_POWER_UP else ATTEMPTS
+        for _ in range(attempts):
             request = command((sent.block(),), sequence=self.sequence, retry=retry, remaining=remaining)
             self._write(encode(request))
             answer, problem = self._await_answer(request, timeout_s)

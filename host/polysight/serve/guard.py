@@ -124,7 +124,10 @@ class Guard:
             receive = _replay(body or b"", receive)
             if body is None:
                 refusal = refuse_body()
-        await (_close_after(refusal) if refusal else self._app)(scope, receive, _add_headers(send))
+        application = self._app
+        if refusal:
+            application = _close_after(refusal)
+        await application(scope, receive, _add_headers(send))
 
     def _check_head(self, scope: Scope, headers: Headers) -> Response | None:
         """The refusal of a request for its size, host, method or origin; None if these are allowed."""

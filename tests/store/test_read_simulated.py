@@ -50,7 +50,6 @@ def test_both_layouts_read_alike(tmp_path: Path, loss: float, zero_filling: bool
     assert theirs.instrument.chirp == own_source.instrument.chirp
     for row in own_source.rows():
         for board in ("RH", "RV"):
-            # type: ignore[union-attr]
             a = own_source.read_row(board, row)
             b = theirs.read_row(board, row)
             assert np.array_equal(a.payload, b.payload)

@@ -311,8 +311,8 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
         for future in as_completed(list(named)):
             if future.status == "finished":
                 yield future.result()
-            # The worker was lost after it wrote the mark.
             elif is_finished(jobs_by_name[named[future]]):
+                # The worker was lost after it wrote the mark.
                 yield _done(jobs_by_name[named[future]])
             else:
                 yield Outcome(named[future], "failed", message=f"its workers were lost: {future.exception()}")
@@ -407,11 +407,11 @@ def _positions(data: Path) -> int:
     """Number of positions of a scan; of the published grid if it cannot be read quickly."""
     try:
         if (data / COLLECTION).exists():
-            s = read_json(data / COLLECTION)
-            return int(s["total_x"]) * int(s["total_y"])
+            settings = read_json(data / COLLECTION)
+            return int(settings["total_x"]) * int(settings["total_y"])
         return ScanFolder.load(data).plan.positions
-    # The program that processes the scan will say what is wrong.
     except (PolysightError, OSError, ValueError, KeyError, TypeError):
+        # The program that processes the scan will say what is wrong.
         return 350 * 200
 
 

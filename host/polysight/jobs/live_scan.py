@@ -106,7 +106,7 @@ class ScanBar:
             self._bars.update(self._points, description=text, total=p.row_points, completed=p.points, visible=True)
         if p.phase in ("warning", "retake", "home", "check", "connect", "stop", "held", "wait"):
             self._console.print(f"{p.phase}: {p.message}", highlight=False)
-        # Processing may still take a while; the error comes behind it
+        # Processing may still take a while, and the error is only printed after it: say now why the rows ended.
         if p.phase == "end" and p.committed < p.rows:
             self._console.print(f"{p.phase}: {p.message}", highlight=False)
         if not self._console.is_terminal and p.phase == "committed":
@@ -141,7 +141,7 @@ def _run_rows(folder: Path, processing: LiveProcessing | None, run_rows: RunScan
 
         def show(progress: ScanProgress) -> None:
             if progress.phase != "connect":
-                # The scan folder is there, and locked by this program
+                # From here on the scan folder exists and is locked by this program.
                 control.open()
             bar.update(progress)
 
@@ -155,10 +155,9 @@ def _run_rows(folder: Path, processing: LiveProcessing | None, run_rows: RunScan
         if result.processing_error is not None:
             raise _add_advice(folder, result, result.processing_error)
         if result.exit_status != "success":
+            asker = ""
             if stop.asker:
                 asker = f" (asked by {stop.asker})"
-            else:
-                asker = ""
             raise ScanError(f"{folder}: {result.reason}{asker}", "", f"polysight resume {folder}")
         if processing is None:
             return 0
@@ -188,8 +187,9 @@ def _add_advice(folder: Path, result: ScanResult, e: BaseException) -> Polysight
     )
 
 
-def _processing(folder: Path, settings: Settings) -> LiveProcessing:
-    """Return the processing of a running scan: imported here, so that a scan that is only recorded loads none of it."""
+def _start_processing(folder: Path, settings: Settings) -> LiveProcessing:
+    """Return the processing of a running scan."""
+    # Imported here, so that a scan that is only recorded loads nothing of the processing.
     from polysight.jobs.process import LiveProcessing
 
     return LiveProcessing(folder, settings)
@@ -222,13 +222,13 @@ def scan(
         raise ConfigError(f"{truth}: no such file", "--truth names it", "give truth.json, or leave --truth out")
     processing = None
     if process:
-        processing = _processing(folder, settings)
+        processing = _start_processing(folder, settings)
         processing.check_new(rig, truth)
 
     def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
         def show(progress: ScanProgress) -> None:
             if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
-                # Noted below: a row is worth more
+                # A copy that fails must not cost a row; it is noted below.
                 with suppress(OSError):
                     shutil.copyfile(truth, folder / TRUTH)
             on_progress(progress)
@@ -256,7 +256,7 @@ def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: boo
         notifier = rig_now.notify
     processing = None
     if process:
-        processing = _processing(folder, settings)
+        processing = _start_processing(folder, settings)
         processing.check_resumed(source)
 
     def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:

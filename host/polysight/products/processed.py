@@ -57,7 +57,7 @@ QUALITY = "quality.json"
 MATERIALS = "materials.json"
 LABELS = "labels.json"
 REPORT = "report.html"
-# Settings of the products, written by batch processing
+# File with the settings of the products, which batch processing writes.
 FINISHED = ".finished.json"
 _ARRAYS = {
     "h": np.complex64,
@@ -68,7 +68,7 @@ _ARRAYS = {
     "valid": np.bool_,
     "p_sigma": np.float32,
 }
-# Arrays of image.npz that earlier releases did not write
+# Arrays of image.npz that earlier releases did not write.
 _OPTIONAL = ("p_sigma",)
 
 

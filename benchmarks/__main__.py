@@ -15,6 +15,7 @@ NAMES = (
     "image",
     "whole",
     "waits",
+    "gpu",
     "scaling",
     "accuracy",
     "coverage",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks import accuracy, image, measure, sync, waits, whole
+from benchmarks import accuracy, gpu, image, measure, sync, waits, whole
 from benchmarks.__main__ import main
 from benchmarks.measure import THREADS
 
@@ -42,3 +43,23 @@ def test_quick_trial(
 def test_verdict(value: float, higher: bool, verdict: str) -> None:
     limits = (10.0, 25.0) if higher else (25.0, 10.0)
     assert measure.Line("x", "", "", value, *limits, higher_is_better=higher).verdict == verdict
+
+
+def test_without_a_gpu_nothing_is_claimed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gpu, "libraries", list)
+    assert main(["--out", str(tmp_path), "gpu", "--quick"]) == 0
+    assert "not measured" in capsys.readouterr().out
+    assert not (tmp_path / "gpu.json").exists()
+
+
+def test_another_library_is_measured_beside_numpy_and_the_exact_sum(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strict = gpu.Library("array-api-strict", importlib.import_module("array_api_strict"), None, "no card")
+    monkeypatch.setattr(gpu, "libraries", lambda: [strict])
+    assert main(["--out", str(tmp_path), "gpu", "--quick", "--folder", str(tmp_path)]) == 0
+    figures = json.loads((tmp_path / "gpu.json").read_text())["array-api-strict"]
+    assert set(figures["seconds"]) >= {"image", "cube on disk to image", "exact sum"}
+    assert max(figures["differences"].values()) < 1e-4

@@ -7,7 +7,7 @@ import re
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tests.support.radar.boards import native_rig, with_radar
 from tests.support.refusals import refused
@@ -122,6 +122,8 @@ ANY_INT = st.one_of(st.integers(-70_000, 70_000), st.integers())
     st.one_of(st.just(790e3), ANY_FLOAT),
     st.integers(-1, 70_000),
 )
+# The sum is infinite
+@example({("chirp", "start_hz"): 9e307}, {}, 9e307, 0)
 def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, frames):
     rig = of_receiver(native_rig(), start_offset_hz=offset_hz)
     wrong = floats | ints

@@ -409,7 +409,8 @@ TRIGGER_UNCERTAINTY_S = 5e-9
 # Share of the sample rate that the receiver passes.
 PASSBAND = 0.9
 MAX_SLOPE_CODE = 5510
-_LARGEST = 1.7e308
+# No radar has such values, and sums and products of a few of them are finite
+_LARGEST = 1e30
 # Regular ADC mode, 20 MHz IF (ICD 85)
 MAX_RATE_HZ = {"complex1x": 22.5e6, "complex2x": 45e6}
 

@@ -194,7 +194,7 @@ def image_error(rig: Instrument, board: Board) -> float:
     grid = builder.grid
     plan = plan_raster(rig.grid)
     chirp = rig.chirp
-    antennas = Antennas.of(rig, board)
+    antennas = Antennas.from_rig(rig, board)
     margin = 0.02
     points = np.column_stack(
         [rng.uniform(a[0] + margin, a[-1] - margin, POINTS) for a in (grid.x_m, grid.y_m)]
@@ -241,9 +241,9 @@ def _matched(
 ) -> NDArray[np.complex128]:
     """Sum over RX, positions and all linear samples, normalised as the imager does, complex128 [voxel]."""
     chirp, (a, b) = rig.chirp, rig.chirp.linear_samples
-    all_antennas = tuple(Antennas.of(rig, receiver) for receiver in rig.receivers)
+    all_antennas = tuple(Antennas.from_rig(rig, receiver) for receiver in rig.receivers)
     gate = reduction(chirp, scene_gate_m(all_antennas, plan_raster(rig.grid), builder.grid))
-    antennas = Antennas.of(rig, board)
+    antennas = Antennas.from_rig(rig, board)
     window = np.asarray(scipy.signal.get_window("hann", b - a + 2, fftbins=False), float)[1:-1]
     sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(a, b)
     total = np.zeros(len(voxels_m), complex)

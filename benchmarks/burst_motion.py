@@ -45,7 +45,7 @@ def images(
     rig = apply_scene(load_instrument(RIG), scene)
     radar = SimulatedRig(rig, scene)
     board = rig.receivers[0]
-    setup = BoardSetup.of(rig, board, compensate_filter=False)
+    setup = BoardSetup.from_rig(rig, board, compensate_filter=False)
     kept = {name: ImageBuilder(rig).boards[board.name] for name in TREATMENTS}
     travel_m = mean_burst_travel_mm(rig.burst, rig.stage) / 1e3
     for row in plan_raster(rig.grid):

@@ -167,7 +167,7 @@ def count(host: str, port: str, buffer_bytes: str) -> None:
 
 def process(rig_path: str, row_file: str) -> None:
     rig = load_instrument(Path(rig_path))
-    setups = [BoardSetup.of(rig, board) for board in rig.receivers]
+    setups = [BoardSetup.from_rig(rig, board) for board in rig.receivers]
     size = np.fromfile(row_file, dtype=np.uint8, count=350 * rig.burst.pulses * rig.frame_bytes).size
     frames = size // rig.frame_bytes // rig.burst.pulses * rig.burst.pulses
     done = 0

@@ -21,7 +21,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.imaging import PlaneEstimate
 from polysight.materials import (
     UNKNOWN,
@@ -190,7 +190,7 @@ def _imaged(source: Any, model: str | None = "none", inputs: Inputs = NO_INPUTS)
 
 def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Instrument, Findings, PlaneEstimate]:
     """One scene, drawn, simulated and judged."""
-    rig = load_instrument(packaged(Path("instrument.toml")))
+    rig = load_instrument(find_packaged(Path("instrument.toml")))
     scene = draw_scene(seed, kind)
     model = None if kind == "named" else "none"
     inputs = NO_INPUTS

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from polysight.imaging.geometry import Antennas, image_grid, row_offsets_m
 from polysight.imaging.samples import scene_gate_m
 from polysight.store.source import RowData
-from polysight.sync import SyncedRow, sweep_of
+from polysight.sync import SyncedRow, sample_frequencies_hz
 from polysight_shared.config import Board, Instrument, load_instrument
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan, Row, plan_raster
@@ -151,7 +151,7 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
     grid = image_grid(rig)
     chirp = rig.chirp
     plan = plan_raster(rig.grid)
-    antennas = Antennas.of(rig, board)
+    antennas = Antennas.from_rig(rig, board)
     quarters = [np.linspace(axis[0], axis[-1], 5)[1:-1] for axis in (grid.x_m, grid.y_m)]
     points = np.array([(x, y, float(np.mean(grid.z_m))) for x in quarters[0] for y in quarters[1]])
     sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
@@ -170,4 +170,6 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
 def as_synced(rig: Instrument, samples: NDArray[np.complex64], valid: NDArray[np.bool_] | None = None) -> SyncedRow:
     """The part of a synchronised row that the imagers read: samples [rx, position, sample] and valid [position]."""
     valid = np.ones(samples.shape[1], bool) if valid is None else valid
-    return cast(SyncedRow, SimpleNamespace(samples=samples, sweep_hz=sweep_of(rig.chirp), valid=valid, turn=None))
+    return cast(
+        SyncedRow, SimpleNamespace(samples=samples, sweep_hz=sample_frequencies_hz(rig.chirp), valid=valid, turn=None)
+    )

@@ -90,7 +90,7 @@ class Chain:
 
     def __init__(self, rig: Instrument, board: Board, path: Path) -> None:
         grid = image_grid(rig)
-        antennas = Antennas.of(rig, board)
+        antennas = Antennas.from_rig(rig, board)
         self.gate = reduction(rig.chirp, scene_gate_m((antennas,), plan_raster(rig.grid), grid), "boxcar")
         self.aperture = Aperture(antennas, scan_offsets_m(rig), self.gate.frequencies_hz, grid)
         self.path = path

@@ -63,7 +63,7 @@ class Bench:
         """The cube through the range gate alone, complex64 [rx, frequency, row, column], and its aperture."""
         plan = plan_raster(self.rig.grid)
         grid = image_grid(self.rig)
-        antennas = Antennas.of(self.rig, self.board)
+        antennas = Antennas.from_rig(self.rig, self.board)
         gate = reduction(self.rig.chirp, scene_gate_m((antennas,), plan, grid), window)
         maps = gate.matrix.astype(np.complex64)
         cube = np.load(self.path, mmap_mode="r")

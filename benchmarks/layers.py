@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 
 from benchmarks.coverage import CHI2_68, CHI2_95, GRID, PLACES, Cubes
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.jobs.process import make_plane_reference
 from polysight.materials import METAL, Layer, LayerFit, fit_row, match_truth, truth_plates
 from polysight.pipeline import Pipeline
@@ -199,7 +199,7 @@ def judged(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -> C
 
 def cases(seeds: Sequence[int]) -> list[Case]:
     """All stacks of the scenes of one rig."""
-    rig = load_instrument(packaged(Path("instrument.toml")))
+    rig = load_instrument(find_packaged(Path("instrument.toml")))
     out = list[Case]()
     metal = metal_scan(rig, draw_scene(seeds[0]))
     for seed in seeds:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.worlds import table_2_classifier
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.materials import Labels, Library, fit_library
 from polysight.process import Inputs, analyse_given_images, read_given_images
 from polysight.products import ProcessedScan
@@ -87,7 +87,7 @@ def forms_of(source: Path, boxes: dict[str, list[int]], scratch: Path) -> list[F
 
 def process(form: Form, boxes: dict[str, list[int]], library: Path | None) -> tuple[ProcessedScan, dict[str, int]]:
     """Process one form; return the result, and the patch number of each box."""
-    rig = load_instrument(packaged(Path("instrument.toml")))
+    rig = load_instrument(find_packaged(Path("instrument.toml")))
     pair = read_given_images(form.path, rig)
     drawn = None
     if form.with_boxes and pair.labels is None:

@@ -57,7 +57,7 @@ def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilde
     true = ImageBuilder(rig)
     nominal = ImageBuilder(rig)
     for board in rig.receivers:
-        setup = BoardSetup.of(rig, board)
+        setup = BoardSetup.from_rig(rig, board)
         for row in plan:
             x, y = row_offsets_mm(radar, row)
             payload = radar.chirps(board.name, x, y, row.index * len(x)).view(np.uint8).ravel()
@@ -113,7 +113,7 @@ def named(rig: Instrument, images: Images, plates: tuple[TruthPlate, ...]) -> Ma
     """Patches, permittivities and names."""
     angles = incidence_choice(rig, images.x_m, images.y_m, "one")
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
-    return analyse(images, Optics.of(rig, angles), known=KnownScene(plates=plates), classifier=classifier)
+    return analyse(images, Optics.from_rig(rig, angles), known=KnownScene(plates=plates), classifier=classifier)
 
 
 def measure(

@@ -190,7 +190,7 @@ def form_image(
     ny, nx = grid.shape
     y = _lattice(grid.y_m, rows)
     x = _lattice(grid.x_m, columns)
-    excess = Antennas.of(rig, board).excess_m(x[None, :], y[:, None], grid.z_m)
+    excess = Antennas.from_rig(rig, board).excess_m(x[None, :], y[:, None], grid.z_m)
     start_hz = chirp.first_sample_hz + chirp.hz_per_sample * a
     full = rows + y.size - 1, columns + x.size - 1
     shape = tuple(int(scipy.fft.next_fast_len(n) or n) for n in full) if tuned else full

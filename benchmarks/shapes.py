@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.surfaces import (
     Gains,
     Optics,
@@ -56,7 +56,7 @@ from polysight_worlds import (
 from polysight_worlds.shape_scenes import FREQUENCIES_HZ
 
 CHI2_95 = 5.991
-RIG_FILE = packaged(Path("instrument.toml"))
+RIG_FILE = find_packaged(Path("instrument.toml"))
 # Paths over fronts of objects and over the table behind them.
 GATE_M = (1.45, 2.2)
 # Points farther from the object's surface than this are of something else.

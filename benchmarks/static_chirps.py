@@ -36,7 +36,7 @@ def run(out: Path, positions: int, board_name: str, snr_db: float = SNR_DB) -> s
     board = radar.rig.by_name(board_name)
     chirp = radar.rig.chirp
     row = 350
-    setup = replace(BoardSetup.of(radar.rig, board), examined=row)
+    setup = replace(BoardSetup.from_rig(radar.rig, board), examined=row)
     report = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))
     for at in range(0, positions, row):
         still = np.zeros(min(row, positions - at) * radar.rig.burst.pulses)

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.imaging import Antennas, Illumination, Images, illumination_geometry
 from polysight.materials import (
     UNKNOWN,
@@ -162,10 +162,10 @@ def table_2_classifier(theta_rad: float) -> Classifier:
 
 def illumination_of_worlds(shape: tuple[int, int], pixel_m: float) -> Illumination:
     """Return what the phase says about tilts on the published rig; the footprints are not known, and taken as even."""
-    rig = load_instrument(packaged(Path("instrument.toml")))
+    rig = load_instrument(find_packaged(Path("instrument.toml")))
     middle_hz = rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2
     plane_m = rig.geometry.object_distance_mm / 1e3
-    boards = [illumination_geometry(Antennas.of(rig, board), plane_m, middle_hz) for board in rig.receivers]
+    boards = [illumination_geometry(Antennas.from_rig(rig, board), plane_m, middle_hz) for board in rig.receivers]
     moved = np.stack([moved for moved, _ in boards])
     steep = np.array([steepness for _, steepness in boards])
     return Illumination(np.ones((2, *shape), np.complex64), moved, steep, (pixel_m, pixel_m))

@@ -20,7 +20,7 @@ scan = ScanFolder.load(Path("out/points"))
 rig = scan.instrument
 builder = ImageBuilder(rig)
 for board in rig.receivers:
-    setup = BoardSetup.of(rig, board)
+    setup = BoardSetup.from_rig(rig, board)
     for row in scan.rows():
         raw = scan.read_row(board.name, row)
         frames, valid = row_words(raw.payload, raw.missing, raw.frames_expected, rig.chirp.samples)

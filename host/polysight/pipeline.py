@@ -70,7 +70,7 @@ class Pipeline:
                 images = self.samples.filled.finish()
         self.quality.note(**self.synchroniser.recording_facts())
         if self.source.mirrored:
-            return images.transposed()
+            return images.transpose()
         return images
 
     def place_plane(self, images: imaging.Images, move: bool = True) -> imaging.Images:
@@ -89,10 +89,10 @@ class Pipeline:
     ) -> materials.MaterialsResult:
         """Find patches (unless known), metal reference, permittivities and names; in sub-bands too, if imaged."""
         with self.quality.measure_time("materials"):
-            rig = self.plane.applied_to(self.rig)
+            rig = self.plane.apply_to_rig(self.rig)
             std = self.plane.incidence_std_rad(self.rig)
             angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, self.settings.incidence)
-            optics = materials.Optics.of(self.rig, angles, std, self.synchroniser.direct_path_known)
+            optics = materials.Optics.from_rig(self.rig, angles, std, self.synchroniser.direct_path_known)
             result = materials.analyse(images, optics, known, classifier)
             plane = None if known is None else known.plane
             self.quality.note_materials(result, angles, images.valid, plane)

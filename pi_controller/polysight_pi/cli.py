@@ -283,8 +283,8 @@ def _parser() -> argparse.ArgumentParser:
         p.add_argument(
             "--config", type=Path, default=Path("instrument.toml"), metavar="FILE", help="rig file (%(default)s)"
         )
-        for flags, how in options:
-            p.add_argument(*flags, **how)
+        for flags, settings in options:
+            p.add_argument(*flags, **settings)
     return parser
 
 

@@ -259,7 +259,15 @@ def _send_bits(
         fault = int(PiFault.PERIOD_TOO_SHORT)
     elif lines.check_width and width_ns > MAX_WIDTH_NS:
         fault = int(PiFault.PULSE_TOO_LONG)
-    return BurstRecord(spec.pulses, first_ns, last_ns, after_ns, width_ns, jitter_ns, fault)
+    return BurstRecord(
+        pulses=spec.pulses,
+        first_ns=first_ns,
+        last_ns=last_ns,
+        end_ns=after_ns,
+        width_max_ns=width_ns,
+        jitter_ns=jitter_ns,
+        fault=fault,
+    )
 
 
 def send_bench(

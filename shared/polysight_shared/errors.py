@@ -90,8 +90,8 @@ class DataError(PolysightError):
 def no_such(path: Path) -> DataError:
     """Return the error for a missing file or folder."""
     if path.is_file():
-        what = f"{path}: is a file"
-        return DataError(what, "a folder is needed here", "give a folder", code=ErrorCode.FILE_FOREIGN)
+        problem = f"{path}: is a file"
+        return DataError(problem, "a folder is needed here", "give a folder", code=ErrorCode.FILE_FOREIGN)
     try:
         names_beside = [p.name for p in path.parent.iterdir()]
         cause = "the path is wrong"
@@ -120,7 +120,7 @@ class DeviceError(PolysightError):
 
 def os_error(
     e: OSError,
-    why: str = "the disk is full, a path is wrong, or you may not write there",
+    cause: str = "the disk is full, a path is wrong, or you may not write there",
     remedy: str = "check the path, its permissions and the free space (df -h)",
 ) -> DeviceError:
     """Turn an OSError into a DeviceError with cause and remedy, so that a command ends without a traceback."""
@@ -129,11 +129,11 @@ def os_error(
         summary = f"{e.filename}: {summary}"
     if e.errno == errno.ENOENT:
         # A folder that was renamed is no full disk.
-        why = "it was moved, renamed or deleted"
+        cause = "it was moved, renamed or deleted"
     code = ErrorCode.OTHER
     if e.errno in (errno.ENOSPC, errno.EDQUOT):
         code = ErrorCode.DISK_FULL
-    return DeviceError(summary, why, advice(remedy, *getattr(e, "__notes__", ())), code=code)
+    return DeviceError(summary, cause, advice(remedy, *getattr(e, "__notes__", ())), code=code)
 
 
 class ScanError(PolysightError):

@@ -58,8 +58,8 @@ def read_bounded(path: Path, max_bytes: int) -> bytes:
         size = os.fstat(file.fileno()).st_size
         data = file.read(max_bytes + 1) if size <= max_bytes else b""
     if (size := max(size, len(data))) > max_bytes:
-        what = f"{path}: {size} bytes, the limit is {max_bytes}"
-        raise DataError(what, "it is another kind of file", "check the path", code=ErrorCode.FILE_TOO_LARGE)
+        problem = f"{path}: {size} bytes, the limit is {max_bytes}"
+        raise DataError(problem, "it is another kind of file", "check the path", code=ErrorCode.FILE_TOO_LARGE)
     return data
 
 
@@ -80,7 +80,7 @@ def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
 
 
 @contextmanager
-def named(path: Path) -> Iterator[None]:
+def name_in_errors(path: Path) -> Iterator[None]:
     """Add this path to an OSError of the block that has none, such as a full disk during a write."""
     try:
         yield
@@ -118,7 +118,7 @@ def write_together(files: Mapping[Path, bytes]) -> None:
         for path, data in files.items():
             # A name of its own: two programs may write the same file at once.
             part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-            with named(path):
+            with name_in_errors(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with part.open("xb") as f:
                     parts[path] = part
@@ -126,7 +126,7 @@ def write_together(files: Mapping[Path, bytes]) -> None:
                     f.flush()
                     os.fsync(f.fileno())
         for path, part in parts.items():
-            with named(path):
+            with name_in_errors(path):
                 part.replace(path)
     except BaseException:
         for part in parts.values():

@@ -23,7 +23,7 @@ SEND_TIMEOUT_MS = 200
 HANDSHAKE_TIMEOUT_MS = 5000  # then a connection without a handshake is closed
 
 
-def host_of(address: str) -> str:
+def host_name(address: str) -> str:
     """Return the host of `tcp://host:port`. Raises ConfigError for another form."""
     scheme, _, rest = address.partition("://")
     host, _, port = rest.rpartition(":")
@@ -39,7 +39,7 @@ def host_of(address: str) -> str:
 
 def is_loopback(address: str) -> bool:
     """Return True if the address is reachable only from this machine."""
-    host = host_of(address)
+    host = host_name(address)
     if host == "localhost":
         return True
     try:
@@ -87,7 +87,7 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
 def _make(
     context: zmq.Context[Any], kind: int, address: str, key_dir: Path, bind: bool, options: dict[int, int | bytes]
 ) -> Socket:
-    host_of(address)
+    host_name(address)
     socket: Socket = context.socket(kind)
     socket.setsockopt(zmq.LINGER, 0)
     for option, value in options.items():
@@ -167,7 +167,7 @@ class HandshakeMonitor:
         self._monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
         self._refused = False
 
-    def refused(self) -> bool:
+    def is_refused(self) -> bool:
         """Return True if so far the server refused this client's key, or this client the server's."""
         while self._monitor.poll(0):
             recv_monitor_message(self._monitor)

@@ -21,7 +21,7 @@ def library():
     """Six scans of the packaged library, few pixels of each patch."""
     whole = Library.load(SIMULATED_LIBRARY)
     angle = whole.angles_deg[0]
-    return Library(tuple(entry for entry in whole.at(angle).entries if entry.scan in whole.scans[:6]))
+    return Library(tuple(entry for entry in whole.at_angle(angle).entries if entry.scan in whole.scans[:6]))
 
 
 @pytest.mark.parametrize("measure", ["log", "paper"])
@@ -41,7 +41,7 @@ def test_its_metric_is_the_distance_that_it_votes_with(library):
 
 def test_it_names_as_the_model_of_libraries(library):
     X, _, _ = library.columns()
-    samples = Samples.of(library)
+    samples = Samples.from_library(library)
     model = PaperKnn(weights=Weights(0.7, 1.3, 1.0, "inverse", 5)).fit(samples)
     knn = PaperKNeighborsClassifier(5, weight_h=0.7, weight_v=1.3, measure="inverse")
     knn.fit(ratio_columns(samples.x), samples.names)

@@ -17,7 +17,7 @@ SHEET = Layer("sheet", 3.4 - 0.1j, 1.7e-3)
 @pytest.fixture
 def done(tmp_path):
     """A metal reference, and a sheet in air."""
-    q, h = predict([SHEET], Spectrum.of(CHIRP), np.radians(55.0))
+    q, h = predict([SHEET], Spectrum.from_chirp(CHIRP), np.radians(55.0))
     ratio = complex(1 / q[0])
     sheet = {"label": 2, "incidence_deg": 55.0, "ratio": {"real": ratio.real, "imag": ratio.imag}}
     sheet |= {"inverse_ratio_std": 0.003, "amplitude_h": float(h[0]), "metal_reference": False}

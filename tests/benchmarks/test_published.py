@@ -44,7 +44,7 @@ def cube(world: tuple[Instrument, Scene]) -> NDArray[np.complex64]:
 def truth(world: tuple[Instrument, Scene], cube: NDArray[np.complex64]) -> NDArray[np.complex128]:
     """Matched filter of that object at its true positions, in double precision, from every twelfth sample."""
     rig, _ = world
-    antennas = Antennas.of(rig, rig.by_name("RH"))
+    antennas = Antennas.from_rig(rig, rig.by_name("RH"))
     grid = image_grid(rig)
     chirp = rig.chirp
     chosen = np.arange(*chirp.linear_samples, 12)

@@ -20,7 +20,7 @@ def aperture() -> Aperture:
     rig, _ = published(quick=True)
     rng = np.random.default_rng(1)
     offsets = np.pad(rng.uniform(-0.2, 0.2, (ROWS, COLUMNS, 2)), ((0, 0), (0, 0), (0, 1)))
-    return Aperture(Antennas.of(rig, rig.receivers[1]), offsets, np.linspace(76.3e9, 79.7e9, 14), image_grid(rig))
+    return Aperture(Antennas.from_rig(rig, rig.receivers[1]), offsets, np.linspace(76.3e9, 79.7e9, 14), image_grid(rig))
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight.calibration.direct_signal import BIN_HZ, MIN_CHIRPS, binned
+from polysight.calibration.direct_signal import BIN_HZ, MIN_CHIRPS, average_in_bins
 from polysight.calibration.files import FilterFile, load_calibration, read_calibration
 from polysight.cli.main import main
 from polysight.pipeline import Pipeline
@@ -72,12 +72,12 @@ def test_bins_hold_the_mean_signal_of_enough_chirps_each():
     rng = np.random.default_rng(1)
     f = rng.uniform(0.2e6, 1.2e6, 3000)
     noise = np.full(f.size, 4.0)
-    middles, level = binned(f, (f / 1e4) ** 2 + noise, noise)
+    middles, level = average_in_bins(f, (f / 1e4) ** 2 + noise, noise)
     np.testing.assert_allclose(level, middles / 1e4, rtol=BIN_HZ / 0.2e6)
     assert np.all(np.diff(middles) > 0)
     few = np.ones(MIN_CHIRPS - 1)
-    assert binned(1e5 * few, few, 0 * few)[0].size == 0
+    assert average_in_bins(1e5 * few, few, 0 * few)[0].size == 0
     enough = np.ones(MIN_CHIRPS)
-    assert binned(-1e5 * enough, enough, 0 * enough)[0].size == 0
+    assert average_in_bins(-1e5 * enough, enough, 0 * enough)[0].size == 0
     # Noise
-    assert binned(1e5 * enough, enough, enough / 2)[0].size == 0
+    assert average_in_bins(1e5 * enough, enough, enough / 2)[0].size == 0

@@ -160,10 +160,10 @@ def test_an_object_plane_calibrated_after_the_plate_is_refused(plate, make_rig):
     """The rig file is the same, but the active positions are not."""
     reference = load_reference(plate)
     rig = make_rig(**SMALL)
-    reference.check_rig(ImagedWith.of(rig, {}))
+    reference.check_rig(ImagedWith.from_rig(rig, {}))
     deeper = msgspec.structs.replace(rig.geometry, object_distance_mm=rig.geometry.object_distance_mm + 0.2)
     with refused(ErrorCode.MISMATCH):
-        reference.check_rig(ImagedWith.of(msgspec.structs.replace(rig, geometry=deeper), {}))
+        reference.check_rig(ImagedWith.from_rig(msgspec.structs.replace(rig, geometry=deeper), {}))
 
 
 def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows(plate, make_rig, scan_of, tmp_path):

@@ -81,7 +81,7 @@ def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):
     np.testing.assert_array_less(np.abs(values - truth), 5 * np.array(errors))
     assert file.explained > 0.9
     for name, board in file.boards.items():
-        antennas = Antennas.of(true, true.by_name(name))
+        antennas = Antennas.from_rig(true, true.by_name(name))
         direct_mm = np.linalg.norm(antennas.rx_m[0] - antennas.tx_m) * 1e3
         # What was wrong
         assert abs(board.direct_path_was_mm - direct_mm) > 0.5
@@ -93,7 +93,7 @@ def test_an_active_calibration_corrects_every_antenna(case, file):
     corrected = Calibration(places=file).rig(believed)
     assert corrected.geometry.object_distance_mm == pytest.approx(true.geometry.object_distance_mm, abs=0.5)
     for name in SHIFTS:
-        there, thought = (Antennas.of(r, r.by_name(name)).rx_m for r in (true, corrected))
+        there, thought = (Antennas.from_rig(r, r.by_name(name)).rx_m for r in (true, corrected))
         np.testing.assert_allclose(thought, there, atol=0.6e-3)
     assert corrected.transmitter == believed.transmitter
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.calibration.direct_signal import by_geometry, fit_start, start_of, unwrapped
+from polysight.calibration.direct_signal import by_geometry, choose_start_offset, fit_start, unwrap_if
 from polysight.calibration.files import StartFile, open_raw, read_calibration
 from polysight.cli.main import main
 from polysight.radar.commands import direct_if_hz
@@ -34,7 +34,7 @@ def test_whatever_the_true_if_its_alias_in_the_band_gives_the_offset_to_the_midd
     rng = np.random.default_rng(3)
     for true_hz in rng.uniform(-4e6, 6e6, 50):
         seen = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
-        found = start_of(rig, board, true_hz + rng.uniform(-0.4, 0.4) * rate, seen, 1.0, 10)
+        found = choose_start_offset(rig, board, true_hz + rng.uniform(-0.4, 0.4) * rate, seen, 1.0, 10)
         assert true_hz + found.start_offset_hz - board.start_offset_hz == pytest.approx(middle, abs=1.0)
 
 
@@ -47,7 +47,7 @@ def test_jitter_across_the_bands_edge_does_not_tear_the_mean_apart(make_rig, if_
     for centre in np.linspace(-1, 1, 9) * rate:
         true_hz = centre + 0.03 * rate * rng.standard_normal(64)
         seen = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
-        apart = (unwrapped(seen, rig) - true_hz) / rate
+        apart = (unwrap_if(seen, rig) - true_hz) / rate
         np.testing.assert_allclose(apart, np.round(apart[0]), atol=1e-9)
 
 

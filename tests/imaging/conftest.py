@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from polysight.imaging.geometry import Antennas, row_offsets_m
-from polysight.sync import SyncedRow, sweep_of
+from polysight.sync import SyncedRow, sample_frequencies_hz
 from polysight_shared.config import Board, Instrument
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -36,7 +36,7 @@ def synced_row(rig):
         valid = np.ones(n, bool) if valid is None else valid
         zero = np.zeros(n)
         samples = np.where(valid[:, None], samples, 0).astype(np.complex64)
-        return SyncedRow(samples, sweep_of(rig.chirp), valid, np.full(n, 16), zero, zero, zero, zero, {})
+        return SyncedRow(samples, sample_frequencies_hz(rig.chirp), valid, np.full(n, 16), zero, zero, zero, zero, {})
 
     return make
 
@@ -57,7 +57,7 @@ def points_rows(synced_row):
         jitter_m=None,
     ) -> Iterator[tuple[int, SyncedRow]]:
         rng = np.random.default_rng(4)
-        antennas = Antennas.of(rig, board)
+        antennas = Antennas.from_rig(rig, board)
         f = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
         for row in plan_raster(rig.grid):
             u = np.column_stack([row_offsets_m(rig, row), np.zeros(row.points)])

@@ -41,7 +41,7 @@ def library(request):
 def aperture(make_rig):
     rig = make_rig(15, 6, 4.0, 4.0, (12, 10))
     grid = image_grid(rig)
-    antennas = Antennas.of(rig, rig.receivers[0])
+    antennas = Antennas.from_rig(rig, rig.receivers[0])
     return Aperture(antennas, scan_offsets_m(rig), np.linspace(76.3e9, 79.7e9, 7), grid)
 
 

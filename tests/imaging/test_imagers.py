@@ -34,7 +34,7 @@ def aperture(make_rig):
         rig = make_rig(columns, rows, step_x, step_y, pixels, pixel)
         plan = plan_raster(rig.grid)
         grid = image_grid(rig)
-        antennas = Antennas.of(rig, rig.receivers[board])
+        antennas = Antennas.from_rig(rig, rig.receivers[board])
         offsets = scan_offsets_m(rig)
         if shifts_m is not None:
             offsets[..., 0] += np.asarray(shifts_m)[:, None]
@@ -199,4 +199,4 @@ def test_steps_without_a_common_divisor_are_irregular(make_rig):
     rig = make_rig(5, 5, step_y=2.137)
     grid = image_grid(rig)
     offsets = scan_offsets_m(rig)
-    assert irregular(Aperture(Antennas.of(rig, rig.receivers[0]), offsets, np.array([77e9]), grid)) is not None
+    assert irregular(Aperture(Antennas.from_rig(rig, rig.receivers[0]), offsets, np.array([77e9]), grid)) is not None

@@ -73,7 +73,7 @@ def plane_rows(synced_row):
     """Rows of a uniform mirror of reflectivity r; positions in `holes` are missing."""
 
     def make(rig, board, r=1.0, holes=()):
-        antennas = Antennas.of(rig, board)
+        antennas = Antennas.from_rig(rig, board)
         samples = r * mirror_samples(antennas, image_grid(rig).z_m, rig.chirp) + 1 / antennas.direct_m[:, None]
         for row in plan_raster(rig.grid):
             valid = np.array([(row.index, i) not in holes for i in range(row.points)])
@@ -103,7 +103,7 @@ def test_the_image_of_a_sheet_has_its_reflection_coefficient(make_rig, plane_row
     f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     wave, _ = multilayer([4 - 0.4j, 1.0], [3e-3, np.inf], f, np.radians(55))
     images = _build(rig, lambda b: plane_rows(rig, b, wave.conj())).finish()
-    spectrum = Spectrum.of(chirp)
+    spectrum = Spectrum.from_chirp(chirp)
     expected = multilayer([4 - 0.4j, 1.0], [3e-3, np.inf], spectrum.frequency_hz[0], np.radians(55))[0]
     mean = (expected * spectrum.weight[0]).sum()
     # Large enough to detect a wrong sign
@@ -168,7 +168,7 @@ def test_random_offsets_of_every_chirp_do_not_change_the_image(make_rig, points_
     ideal = _build(rig, lambda b: points_rows(rig, b, points, amplitudes, direct=0.0)).finish()
 
     def disturbed(board):
-        setup = BoardSetup.of(rig, board, compensate_filter=False)
+        setup = BoardSetup.from_rig(rig, board, compensate_filter=False)
         steering = setup.path.steering  # as received, RX differ by their direct path
         n = np.arange(256)
         for index, row in points_rows(rig, board, points, amplitudes):
@@ -306,7 +306,7 @@ def test_the_image_is_the_float64_matched_filter_over_all_samples(make_rig, sync
     rig = make_rig(31, 21, 8.0, 8.0, pixels=(12, 10))
     board = rig.receivers[1]
     chirp = rig.chirp
-    antennas = Antennas.of(rig, board)
+    antennas = Antennas.from_rig(rig, board)
     grid = image_grid(rig)
     plan = plan_raster(rig.grid)
     a, b = chirp.linear_samples
@@ -318,7 +318,7 @@ def test_the_image_is_the_float64_matched_filter_over_all_samples(make_rig, sync
     )
     echo = np.exp(2j * np.pi * f * (d - antennas.direct_m[:, None, None])[..., None] / SPEED_OF_LIGHT_M_S)
     builder = ImageBuilder(rig, taper="boxcar")
-    gate = reduction(chirp, scene_gate_m(tuple(Antennas.of(rig, r) for r in rig.receivers), plan, grid))
+    gate = reduction(chirp, scene_gate_m(tuple(Antennas.from_rig(rig, r) for r in rig.receivers), plan, grid))
     # A direct path of 1 / d_rx keeps the receivers' gains at 1; what the echo leaks into its estimate is put back.
     echo -= (echo @ gate.direct)[..., None]
     samples = (echo + 1 / antennas.direct_m[:, None, None, None]).astype(np.complex64)

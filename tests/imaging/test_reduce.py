@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from polysight.imaging.geometry import Antennas, image_grid
 from polysight.imaging.samples import reduction, scene_gate_m
-from polysight.sync import block_sweep_of, decimation
+from polysight.sync import block_frequencies_hz, decimation
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S as C
 
@@ -57,7 +57,7 @@ def test_decimated_samples_give_what_all_samples_give(rig, gate_m, noise):
     gate = reduction(rig.chirp, gate_m)
     sweep = _sweep(rig.chirp)[a:b]
     every = gate.maps(_sweep(rig.chirp))[:, a:b]
-    few = gate.maps(block_sweep_of(rig.chirp))
+    few = gate.maps(block_frequencies_hz(rig.chirp))
     level = np.abs(every[:-1] @ np.exp(2j * np.pi * gate_m[0] / C * sweep)).max()
     # The middle of the band that noise and echoes give
     for off_m in (-0.1, 0.0, 0.1):
@@ -88,7 +88,7 @@ def test_the_gate_contains_every_pixel_at_every_position(make_rig):
     grid = image_grid(rig)
     plan = plan_raster(rig.grid)
     for board in rig.receivers:
-        antennas = Antennas.of(rig, board)
+        antennas = Antennas.from_rig(rig, board)
         low, high = scene_gate_m((antennas,), plan, grid)
         rng = np.random.default_rng(0)
         u = rng.uniform(-0.06, 0.06, (2, 500))

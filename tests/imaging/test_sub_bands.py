@@ -32,7 +32,7 @@ def test_they_cover_the_linear_samples_and_overlap_by_half(count):
 
 @given(st.integers(1, 15))
 def test_the_model_of_a_layer_averages_over_the_same_frequencies(count):
-    spectrum = Spectrum.of(CHIRP, count)
+    spectrum = Spectrum.from_chirp(CHIRP, count)
     for band, hz, weight in zip(sub_bands(CHIRP, count), spectrum.frequency_hz, spectrum.weight, strict=True):
         middle = (band.first_hz + band.last_hz) / 2
         # Whole samples

@@ -15,7 +15,7 @@ from tests.support.scenes import scene_of
 from polysight.cli.main import main
 from polysight.jobs.train import training_scan
 from polysight.materials import Library
-from polysight.materials.train import entries_of
+from polysight.materials.train import make_entries
 from polysight_shared.errors import DataError
 from polysight_simulators.scene import decode_scene, simulate
 
@@ -94,7 +94,7 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
     assert f"drawn as {MINE}" in (out / "report.html").read_text(encoding="utf-8")
     assert main(["label", str(out), *drawn()]) == 0
     (scan / "labels.json").write_bytes((out / "labels.json").read_bytes())
-    rows, images = (entries_of(training_scan(folder, RIG_FILE)) for folder in (scan, out))
+    rows, images = (make_entries(training_scan(folder, RIG_FILE)) for folder in (scan, out))
     assert [e.name for e in rows] == [e.name for e in images] == ["copper", MINE]
     for first_item, second_item in zip(rows, images, strict=True):
         assert first_item.incidence_deg == pytest.approx(second_item.incidence_deg, abs=0.05)
@@ -105,15 +105,15 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
 def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
     spread = {**scene(4), "specimen_spread": [0.02, 0.1]}
     scan = simulate(published_rig(), decode_scene(spread, "test"), tmp_path / "scan")
-    answer = [(e.name, e.specimen, e.permittivity is None) for e in entries_of(training_scan(scan, RIG_FILE))]
+    answer = [(e.name, e.specimen, e.permittivity is None) for e in make_entries(training_scan(scan, RIG_FILE))]
     assert [(name, unknown) for name, _, unknown in answer] == [("copper", True), ("board", False)]
     assert len({specimen for _, specimen, _ in answer}) == 2
     again = simulate(published_rig(), decode_scene({**spread, "seed": 1004}, "test"), tmp_path / "again")
-    redrawn = {e.specimen for e in entries_of(training_scan(again, RIG_FILE))}
+    redrawn = {e.specimen for e in make_entries(training_scan(again, RIG_FILE))}
     assert not redrawn & {specimen for _, specimen, _ in answer}, "another simulation of a scene draws other specimens"
     boxes = {"tin": [-60, -10, -20, 30], f"{MINE}#left": [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
-    answer = [(e.name, e.specimen) for e in entries_of(training_scan(scan, RIG_FILE))]
+    answer = [(e.name, e.specimen) for e in make_entries(training_scan(scan, RIG_FILE))]
     assert answer == [("tin", None), (MINE, "left")]
     boxes = {"tin": [-60, -10, 30, 30], MINE: [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")

@@ -13,7 +13,7 @@ from polysight.cli.main import main
 from polysight.materials import UNKNOWN, Classifier, Library, TrainingScan, fit_library
 from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, classifier_sentence
 from polysight.materials.result import PATCHES, match_patches, pack_patches, read_patches
-from polysight.materials.train import entries_of
+from polysight.materials.train import make_entries
 from polysight_papers.sensys2026.patches import Errors, draw, groups
 from polysight_shared.error_codes import ErrorCode
 
@@ -35,7 +35,7 @@ def seen(synthetic, analysed):
         entry
         for angle in ANGLES
         for seed in range(1000, 1004)
-        for entry in entries_of(TrainingScan(f"{angle:g}-{seed}", analysed(seed, angle), True, seed))
+        for entry in make_entries(TrainingScan(f"{angle:g}-{seed}", analysed(seed, angle), True, seed))
     ]
     scene = synthetic(1)
     packed = {angle: pack_patches(analysed(1, angle), scene.x_m, scene.y_m, simulated=True) for angle in ANGLES}
@@ -70,7 +70,7 @@ def test_models_are_judged_for_each_angle_and_for_both_and_the_one_with_probabil
         assert fit["pixel_accuracy"] == fit["judged"][fit["model"]]["pixels"]
         assert "4 scans" in fit["split"]
     for angles in ((55.0,), (60.0,), ANGLES):
-        fit = library.fit_of(angles)
+        fit = library.fit_for(angles)
         classifier = Classifier(library, angles_deg=angles)
         assert classifier.model == fit["model"]
         answer = classifier_sentence(classifier)
@@ -83,7 +83,7 @@ def test_models_are_judged_for_each_angle_and_for_both_and_the_one_with_probabil
 def test_two_scans_are_enough_to_learn_from():
     drawn = draw(groups()["powders"].materials, 60.0, Errors(0.003, 0.005), 3, scans=2, pixels=6)
     library = fit_library(drawn.library())
-    assert library.fit_of([60.0])["pixel_accuracy"] > 0.8
+    assert library.fit_for([60.0])["pixel_accuracy"] > 0.8
     named = Classifier(library).scan([s.x for s in [drawn.samples().take(drawn.samples().patches == 1)]])
     assert named[0].verdict.name == drawn.materials[1].name
 

@@ -7,7 +7,7 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.materials import SIMULATED_LIBRARY, UNKNOWN, Classifier, Library
-from polysight.materials.result import features_of
+from polysight.materials.result import pixel_features
 from polysight_shared.error_codes import ErrorCode
 
 ANGLE_DEG = 54.9
@@ -25,7 +25,7 @@ def test_an_unknown_patch_has_no_likelier_name(library, ratio, gain):
     rng = np.random.default_rng(5)
     h = 0.45 * gain * (1 + 0.006 * rng.standard_normal(60))
     p = ratio * (1 + 0.006 * rng.standard_normal(60))
-    found = Classifier(library, angles_deg=[ANGLE_DEG]).scan([features_of(h, np.abs(h / p), p)])[0].verdict
+    found = Classifier(library, angles_deg=[ANGLE_DEG]).scan([pixel_features(h, np.abs(h / p), p)])[0].verdict
     if found.name == UNKNOWN:
         assert max(found.probabilities, key=lambda n: found.probabilities[n]) == UNKNOWN
         assert found.confidence >= 0.5

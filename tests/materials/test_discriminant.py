@@ -157,7 +157,7 @@ def test_metal_with_a_stray_pixel_tells_nothing_of_the_reference(stray):
 def test_two_angles_are_independent_and_tell_more():
     one = drawn(0, pixel=0.1, patch=0.05)
     two = drawn(1, pixel=0.1, patch=0.05)
-    both = one.joined(two)
+    both = one.join(two)
     model = ErrorDiscriminant().fit(both)
     for covariance in (model.scan, model.between, model.within):
         assert np.abs(covariance[:3, 3:]).max() < 1e-12

@@ -18,7 +18,7 @@ from polysight.results import ScanMaterials
 
 THETA = np.radians(55.0)
 CHIRP = published_rig().chirp
-BANDS = Spectrum.of(CHIRP, 4)
+BANDS = Spectrum.from_chirp(CHIRP, 4)
 RANGE = (0.3e-3, 6e-3)
 NEAR = (1e-3, 2.4e-3)
 SHEET = Layer("sheet", 3.4 - 0.1j, 1.7e-3)

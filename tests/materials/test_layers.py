@@ -17,7 +17,7 @@ THETA = np.radians(55.0)
 WATER = 9.37 - 18.0j
 GLASS = Layer("glass", 5.5 - 0.05j, 3e-3)
 CHIRP = published_rig().chirp
-BANDS = Spectrum.of(CHIRP, 4)
+BANDS = Spectrum.from_chirp(CHIRP, 4)
 
 
 def measured(stack, sigma=1e-4, sigma_h=None, spectrum=BANDS, rng=None):
@@ -125,7 +125,7 @@ def test_stacks_that_cannot_be_fitted_are_refused(stack, code):
 
 
 def test_fewer_data_than_unknowns_are_refused():
-    bands = measured([Layer("sheet", 3.0, 1e-3)], spectrum=Spectrum.of(CHIRP, 1))
+    bands = measured([Layer("sheet", 3.0, 1e-3)], spectrum=Spectrum.from_chirp(CHIRP, 1))
     with refused(ErrorCode.NOT_ENOUGH_DATA):
         fit_layer(bands, [Layer("sheet", None, 1e-3)], THETA, (0.5e-3, 2e-3))
 

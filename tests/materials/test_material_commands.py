@@ -30,7 +30,7 @@ def products(folder: Path, inverse: complex, std: float = 0.005) -> Path:
 
 
 def test_water_behind_glass_as_typed(tmp_path, capsys):
-    spectrum = Spectrum.of(published_rig().chirp)
+    spectrum = Spectrum.from_chirp(published_rig().chirp)
     inverse = complex(predict([GLASS, Layer("water", 9.37 - 18j)], spectrum, np.radians(55.0))[0][0])
     folder = products(tmp_path / "out", inverse)
     layers = ["--layer", "glass,5.5,0.05,3", "--layer", "water,?"]

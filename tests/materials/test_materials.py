@@ -25,7 +25,7 @@ from polysight.materials.analyse import Optics
 from polysight.materials.classify import Weights
 from polysight.materials.library import FORMAT, majority, ratio_distance
 from polysight.materials.measure import median_ratio
-from polysight.materials.result import features_of
+from polysight.materials.result import pixel_features
 from polysight.polarimetry import fresnel
 from polysight.results import to_plain
 from polysight_papers.sensys2026.item import table2
@@ -173,8 +173,8 @@ def test_distances_are_distances():
 
 
 def test_pixels_that_are_not_finite_are_unknown(library):
-    some = features_of([0.5, np.nan, 0.5], [0.1, 0.1, 0.1], [4 + 1j, 4 + 1j, 0])
-    found, empty = Classifier(library, Weights()).scan([some, features_of([], [], [])])
+    some = pixel_features([0.5, np.nan, 0.5], [0.1, 0.1, 0.1], [4 + 1j, 4 + 1j, 0])
+    found, empty = Classifier(library, Weights()).scan([some, pixel_features([], [], [])])
     assert found.names[1] == found.names[2] == UNKNOWN
     assert found.names[0] != UNKNOWN
     assert np.isinf(found.distance[1:]).all()

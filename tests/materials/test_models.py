@@ -115,7 +115,7 @@ def test_a_second_angle_helps():
     """The KNN; the discriminant is in test_discriminant."""
     model = PAPER
     one = samples(groups=6, pixels=12, offset=0.02, seed=1)
-    both = one.joined(samples(groups=6, pixels=12, offset=0.02, seed=2, angle=0.05))
+    both = one.join(samples(groups=6, pixels=12, offset=0.02, seed=2, angle=0.05))
     assert both.x.shape[1] == 2 * one.x.shape[1]
     assert score(both, model).pixels > score(one, model).pixels
 
@@ -125,7 +125,7 @@ def test_joining_angles_pairs_whole_patches():
     two = samples(groups=3, pixels=4, seed=2)
     other = Samples(two.x, two.names, np.char.add("at 55 ", two.groups), two.patches + 1000)
     for there in (two, other):
-        both = one.joined(there)
+        both = one.join(there)
         # The fewer pixels of each patch
         assert both.names.size == 3 * 6 * 4
         for patch in np.unique(both.patches):
@@ -136,7 +136,7 @@ def test_joining_angles_pairs_whole_patches():
             assert np.unique(there.patches[partner]).size == 1
             assert set(there.names[partner]) == set(both.names[at])
     with refused(ErrorCode.MISMATCH):
-        one.joined(Samples(two.x, np.char.add("x", two.names), two.groups, two.patches))
+        one.join(Samples(two.x, np.char.add("x", two.names), two.groups, two.patches))
 
 
 def test_channels_alone_know_less():

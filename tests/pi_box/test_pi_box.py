@@ -108,7 +108,7 @@ def test_a_host_with_the_keys_is_answered_and_one_without_is_refused(pi: Install
     assert refused.number == PiFault.NOT_OWNER
     stranger = requester(context, pi.addresses()[0], tmp_path / "second")
     refusals = HandshakeMonitor(stranger)
-    pi.box.wait(refusals.refused, "a revoked key is refused at the door", 60)
+    pi.box.wait(refusals.is_refused, "a revoked key is refused at the door", 60)
     refusals.close()
     context.destroy(linger=0)
 

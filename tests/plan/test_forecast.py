@@ -66,7 +66,7 @@ def test_image_noise_is_that_of_a_weighted_sum(rig):
 def test_the_loss_by_motion_is_that_of_the_sum_over_the_pulses(rig):
     moving = Changes(speed_mm_s=100.0, period_us=1200.0).apply(rig)
     burst = predict_burst(moving)
-    antennas = Antennas.of(moving, moving.receivers[0])
+    antennas = Antennas.from_rig(moving, moving.receivers[0])
     middle = np.array(specular_midpoint_m(moving, moving.receivers[0]))
     f = moving.chirp.first_sample_hz + moving.chirp.hz_per_sample * 96
     x = -(moving.grid.columns - 1) / 2 * 2e-3 + 100e-3 * 1.2e-3 * (np.arange(16) - 7.5)
@@ -88,7 +88,7 @@ def test_ghosts_are_at_the_same_place_as_in_a_backprojected_image(rig, axis):
     free_m = field_limits(changed).alias_free_mm[axis] / 1e3
     f = np.array([rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * 192])
     slope = PhaseSlope(rig, axis)
-    a = Antennas.of(rig, rig.receivers[0])
+    a = Antennas.from_rig(rig, rig.receivers[0])
     # From the middle of the aperture's middle half the object and its ghost lie symmetrically.
     middle = np.array(specular_midpoint_m(rig, rig.receivers[0]))
     unit = np.eye(3)[axis]
@@ -105,7 +105,7 @@ def test_ghosts_are_at_the_same_place_as_in_a_backprojected_image(rig, axis):
     image = np.abs(backproject(samples, f, a.tx_m + offsets, a.rx_m[0] + offsets, voxels, reference))
     ghost = places[int(np.argmax(image))]
     assert image.max() > 0.8 * len(offsets)
-    assert slope.at(ghost - free_m / 2, float(f[0])) > slope.at(-free_m / 2, float(f[0]))
+    assert slope.slope(ghost - free_m / 2, float(f[0])) > slope.slope(-free_m / 2, float(f[0]))
     assert ghost == pytest.approx(free_m, rel=0.3)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from polysight.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library
 from polysight.materials.labels import pack_labels, read_labels
-from polysight.materials.result import labels_of
+from polysight.materials.result import make_labels
 from polysight.process import Inputs, boxes_as_patches
 from polysight.settings import DEFAULT
 
@@ -30,7 +30,7 @@ def again(scan, path, plates=()):
 
 def test_labels_of_products_give_the_same_materials_again(imaged, drawn_result, tmp_path):
     scan = imaged("nine-materials")
-    (tmp_path / "labels.json").write_bytes(pack_labels(labels_of(drawn_result)))
+    (tmp_path / "labels.json").write_bytes(pack_labels(make_labels(drawn_result)))
     boxes = read_labels(tmp_path / "labels.json")
     assert len(boxes.boxes) == len(drawn_result.patches) == 9
     second, names = again(scan, tmp_path / "labels.json", scan.plates)

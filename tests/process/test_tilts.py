@@ -82,7 +82,7 @@ def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(ti
 
 def test_tilts_follow_a_transposed_image(tilted_images):
     images = tilted_images[0]
-    turned = images.transposed()
+    turned = images.transpose()
     assert (images.illumination.across, turned.illumination.across) == (1, 0)
     for mask in _insides(images):
         rise = images.illumination.rise(images.h, images.v, mask)

@@ -29,7 +29,7 @@ def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
     noise = 1 + 0.02 * (rng.standard_normal((2, *x.shape)) + 1j * rng.standard_normal((2, *x.shape)))
     plate_seen = Images(gain * noise[0], 0.7 * noise[1], grid.x_m, grid.y_m, np.ones(x.shape, bool))
     plate = plane_reference(plate_seen, smooth_mm=4.0, name="plate")
-    return replace(plate, made_with=ImagedWith.of(rig, {}))
+    return replace(plate, made_with=ImagedWith.from_rig(rig, {}))
 
 
 def remaining(found: Leakage, truth: Leakage) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.surfaces import (
     SURFACE,
     Uncertainty,
@@ -163,7 +163,7 @@ def test_metal_of_curvature_turns_p_by_the_known_phase():
 
 def test_the_published_grid_shows_normals_of_15_and_22_degrees():
     """As the grid's reach and the distance say: 0.349 m and 0.199 m at half a metre, 55 degrees of incidence."""
-    seen = visible_normals(load_instrument(packaged(Path("instrument.toml"))))
+    seen = visible_normals(load_instrument(find_packaged(Path("instrument.toml"))))
     assert seen.x_deg == pytest.approx(15, abs=1)
     assert seen.y_deg == pytest.approx(22, abs=1)
     assert min(seen.alias_deg) > 50

@@ -19,7 +19,7 @@ def echoes(rig):
         raw = {"name": "t", "points": points, "grid": {"columns": 64, "rows": rows, "step_x_mm": 2.0, "step_y_mm": 2.0}}
         radar = SimulatedRig(rig, decode_scene(raw, "t").with_disturbances(backlash_mm=backlash_mm))
         board = radar.rig.receivers[0]
-        setup = BoardSetup.of(radar.rig, board)
+        setup = BoardSetup.from_rig(radar.rig, board)
         weights, out = object_filter(radar.rig, board, setup.path.sweep_hz), {}
         for row in plan_raster(radar.rig.grid):
             x, y = row_offsets_mm(radar, row)

@@ -53,7 +53,7 @@ def row(small, paths, noise):
 
 @pytest.fixture(scope="module")
 def setup(small):
-    return BoardSetup.of(small, small.receivers[1], compensate_filter=False)
+    return BoardSetup.from_rig(small, small.receivers[1], compensate_filter=False)
 
 
 def _relative_error(row, ideal, inside=slice(None)):
@@ -79,7 +79,7 @@ def test_offsets_have_no_effect_beyond_noise(row, setup):
 
 def test_the_high_pass_filter_is_compensated(row, small, setup):
     frames, valid, ideal = row(filtered=True, snr_db=30)
-    undone = synchronise_row(frames, valid, BoardSetup.of(small, small.receivers[1]))
+    undone = synchronise_row(frames, valid, BoardSetup.from_rig(small, small.receivers[1]))
     left = synchronise_row(frames, valid, setup)
     assert _relative_error(undone, ideal, slice(3, None)) < 0.04
     assert _relative_error(undone, ideal, slice(3, None)) < 0.4 * _relative_error(left, ideal, slice(3, None))

@@ -73,7 +73,7 @@ def same(one: AlignedRow, other: AlignedRow):
 
 
 def equaliser_of(rig):
-    return Equaliser.of(high_pass(rig.chirp), rig.chirp, 4)
+    return Equaliser.from_model(high_pass(rig.chirp), rig.chirp, 4)
 
 
 @pytest.mark.parametrize("other", ["silent", "clipped"])

@@ -147,7 +147,7 @@ def test_both_forms_leave_out_the_same(received, counts):
 
 
 def test_chirps_left_out_are_counted(rig, received, counts):
-    setup = BoardSetup.of(rig, rig.receivers[0], compensate_filter=False)
+    setup = BoardSetup.from_rig(rig, rig.receivers[0], compensate_filter=False)
     rng = np.random.default_rng(4)
     chosen = choose(2, rng)
     chosen[:4] = False

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.sync.high_pass_filter import Equaliser, HighPass, filtered, fit_high_pass, high_pass
+from polysight.sync.high_pass_filter import Equaliser, HighPass, apply_filter, fit_high_pass, high_pass
 from polysight_shared.error_codes import ErrorCode
 
 
@@ -47,7 +47,7 @@ def test_three_taps_are_the_inverse_over_the_signals_band(rig, mode, if_hz, wors
     model, rate = high_pass(chirp), chirp.sample_rate_hz
     if mode == "complex2x" and if_hz > rate / 2:
         if_hz -= rate
-    taps = Equaliser.of(model, chirp, 4).taps(np.array([if_hz / rate]))[0]
+    taps = Equaliser.from_model(model, chirp, 4).taps(np.array([if_hz / rate]))[0]
     away = np.linspace(-40e3, 40e3, 81)
     response = np.exp(2j * np.pi * np.outer(away / rate, 4 * np.array([-1, 0, 1]))) @ taps
     np.testing.assert_allclose(response * model.response(if_hz + away), 1, atol=worst)
@@ -59,15 +59,15 @@ def test_two_tones_are_restored_up_to_the_ends_of_the_record(rig):
     tones = np.array([-15e3, 17e3])
     clean = np.exp(2j * np.pi * np.outer(tones, n * step)).sum(axis=0)
     weak = (model.response(centre + tones)[:, None] * np.exp(2j * np.pi * np.outer(tones, n * step))).sum(axis=0)
-    taps = Equaliser.of(model, chirp, 4).taps(np.array([[centre / chirp.sample_rate_hz]])).astype(np.complex64)
-    restored = filtered(weak[None, None, None].astype(np.complex64), taps)[0, 0, 0]
+    taps = Equaliser.from_model(model, chirp, 4).taps(np.array([[centre / chirp.sample_rate_hz]])).astype(np.complex64)
+    restored = apply_filter(weak[None, None, None].astype(np.complex64), taps)[0, 0, 0]
     assert np.abs(weak - clean).max() > 0.3
     np.testing.assert_allclose(restored[1:-1], clean[1:-1], atol=2e-3)
     np.testing.assert_allclose(restored, clean, atol=2e-2)
 
 
 def test_without_corners_the_taps_are_the_identity(rig):
-    taps = Equaliser.of(HighPass(), rig.chirp, 4).taps(np.array([0.1, 0.6]))
+    taps = Equaliser.from_model(HighPass(), rig.chirp, 4).taps(np.array([0.1, 0.6]))
     np.testing.assert_allclose(taps, [[0, 1, 0]] * 2, atol=1e-12)
 
 

@@ -38,7 +38,7 @@ def synchronised(burst: Burst, speed_mm_s: float):
     words = radar.chirps("RH", x, y, 0)
     payload = words.reshape(-1).view(np.uint8)
     decoded, valid = row_words(payload, [], len(x), rig.chirp.samples)
-    return synchronise_row(decoded, valid, BoardSetup.of(rig, rig.by_name("RH")))
+    return synchronise_row(decoded, valid, BoardSetup.from_rig(rig, rig.by_name("RH")))
 
 
 @pytest.mark.parametrize(("burst", "speed_mm_s"), [(MANY, 20.0), (ONE, 20.0), (ONE, 100.0)])

@@ -111,7 +111,9 @@ def simulate(
         true_rx: Antenna = getattr(true_rig, channel)
         echoes = record(true_rig, true_rx, true_world, seed=nuisances.seed)
         direct = receive_direct(true_rig.tx, true_rx, true_rig.frequencies_hz)
-        data = disturb_data(rng, nominal, echoes, direct, nuisances, channel, positions)
+        data = disturb_data(
+            rng=rng, rig=nominal, echoes=echoes, direct=direct, nuisances=nuisances, channel=channel, dark=positions
+        )
         images.append(backproject(nominal, getattr(nominal, channel), data, pixels, kaiser_beta))
     x_m, y_m = pixel_centres(nominal, pixels)
     return ImagePair(

@@ -278,7 +278,7 @@ class PiClient:
         return reply
 
     def _no_answer(self, command: str) -> DeviceError:
-        if self._handshake.refused():
+        if self._handshake.is_refused():
             return DeviceError(
                 f"the Pi at {self._address} refuses this host's key",
                 "the key was revoked or never allowed, or pi.key here is another Pi's",

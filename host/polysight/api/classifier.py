@@ -15,7 +15,7 @@ import numpy.typing as npt
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.jobs.train import train_from_scans
 from polysight.materials import (
     SHORT,
@@ -67,7 +67,7 @@ def train(
         if a scan has no labels, or fewer than two scans were given.
     """
     folders = [scan if isinstance(scan, str | os.PathLike) else scan.folder for scan in scans]
-    config = packaged(RIG) if rig is None else Path(rig)
+    config = find_packaged(RIG) if rig is None else Path(rig)
     return train_from_scans([Path(folder) for folder in folders], config, note)
 
 
@@ -128,7 +128,7 @@ class Classifier(ClassifierMixin, BaseEstimator):
         DataError
             if no material is in two scans.
         """
-        return score(Samples.of(library), SHORT[self.model])
+        return score(Samples.from_library(library), SHORT[self.model])
 
 
 def _samples(X: Columns, y: Names, groups: npt.ArrayLike | None) -> Samples:

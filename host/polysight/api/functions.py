@@ -16,7 +16,7 @@ import tomli_w
 
 from polysight.api.scan import RIG, Scan, open_scan
 from polysight.catalogue import Pixels, compare_pixels
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.jobs.check import check_scan, check_scans
 from polysight.jobs.demo import simulate_scene
 from polysight.planning import Changes, Forecast, describe, forecast_scene
@@ -127,16 +127,16 @@ def compare(first: Scan | PathText, second: Scan | PathText) -> xarray.Dataset:
     import xarray
 
     scans = [scan if isinstance(scan, Scan) else open_scan(scan) for scan in (first, second)]
-    pixels = [Pixels.from_scan(scan.processed()) for scan in scans]
-    found = compare_pixels(*pixels, names=(str(scans[0].folder), str(scans[1].folder)))
-    pairs = found.figures.patches
+    pixels = [Pixels.from_scan(scan.read_or_process()) for scan in scans]
+    comparison = compare_pixels(*pixels, names=(str(scans[0].folder), str(scans[1].folder)))
+    pairs = comparison.figures.patches
     differences = [pair.difference for pair in pairs]
     unknown = complex(np.nan, np.nan)
     values = [unknown if d is None else complex(d.real, d.imag) for d in differences]
     table: dict[str, Any] = {
-        "p_difference": (PLANE, found.p, {"units": "1", "long_name": "difference of P"}),
-        "permittivity_difference": (PLANE, found.permittivity, {"units": "1", "long_name": "difference"}),
-        "sigmas": (PLANE, found.sigmas, {"units": "1", "long_name": "difference of P in standard deviations"}),
+        "p_difference": (PLANE, comparison.p, {"units": "1", "long_name": "difference of P"}),
+        "permittivity_difference": (PLANE, comparison.permittivity, {"units": "1", "long_name": "difference"}),
+        "sigmas": (PLANE, comparison.sigmas, {"units": "1", "long_name": "difference of P in standard deviations"}),
         "pair_x_mm": ("pair", [pair.place_mm[0] for pair in pairs], {"units": "mm", "long_name": "x from the centre"}),
         "pair_y_mm": ("pair", [pair.place_mm[1] for pair in pairs], {"units": "mm", "long_name": "y from the centre"}),
         "first_name": ("pair", [pair.names[0] or "" for pair in pairs]),
@@ -144,15 +144,15 @@ def compare(first: Scan | PathText, second: Scan | PathText) -> xarray.Dataset:
         "pair_difference": ("pair", values, {"units": "1", "long_name": "difference of the permittivity"}),
         "pair_sigmas": ("pair", [np.nan if pair.sigmas is None else pair.sigmas for pair in pairs]),
     }
-    image = image_dataset(scans[0].processed())
+    image = image_dataset(scans[0].read_or_process())
     attributes = {
         "first": scans[0].scan_id,
         "second": scans[1].scan_id,
-        "notes": "; ".join(found.figures.notes),
-        "compared": found.figures.compared,
+        "notes": "; ".join(comparison.figures.notes),
+        "compared": comparison.figures.compared,
     }
-    if found.figures.significant_share is not None:
-        attributes["significant_share"] = found.figures.significant_share
+    if comparison.figures.significant_share is not None:
+        attributes["significant_share"] = comparison.figures.significant_share
     return xarray.Dataset(table, image.drop_vars(list(image.data_vars)).coords, attributes)
 
 
@@ -181,7 +181,7 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
     checked: list[tuple[str, CheckResult]] = []
     for scan in scans:
         if isinstance(scan, Scan):
-            checked.append((scan.scan_id, check_scan(scan.processed())))
+            checked.append((scan.scan_id, check_scan(scan.read_or_process())))
         else:
             checked += [(below.scan_id, result) for below, result in check_scans([Path(scan)])]
     results = [result for _, result in checked]
@@ -203,7 +203,7 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
 
 
 def _rig_path(rig: PathText | None) -> Path:
-    return packaged(RIG) if rig is None else Path(rig)
+    return find_packaged(RIG) if rig is None else Path(rig)
 
 
 @contextmanager
@@ -212,7 +212,7 @@ def _scene_file(scene: Scene | None) -> Iterator[Path | None]:
     if scene is None:
         yield None
     elif isinstance(scene, str | os.PathLike):
-        yield packaged(Path(scene))
+        yield find_packaged(Path(scene))
     else:
         with tempfile.TemporaryDirectory(prefix="polysight-scene-") as folder:
             path = Path(folder) / "scene.toml"

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET
 
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.imaging import Images
 from polysight.jobs.label import save_labels
 from polysight.materials import (
@@ -168,7 +168,7 @@ def _analyse_images(path: Path, rig: str | os.PathLike[str] | Instrument | None,
     if settings.bands > 1:
         raise ConfigError(f"bands = {settings.bands} with given images", "it needs the rows of a scan", "leave it out")
     if not isinstance(rig, Instrument):
-        rig = load_instrument(packaged(RIG) if rig is None else Path(rig))
+        rig = load_instrument(find_packaged(RIG) if rig is None else Path(rig))
     scan, _, _ = analyse_given_images(read_given_images(path, rig), settings, Inputs(), rig)
     return scan
 
@@ -186,7 +186,7 @@ def _products_only(path: Path, settings: Settings, anew: bool) -> Scan:
 def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
     """Open recorded data of any layout; without `rig`, with the rig file beside it or the packaged one."""
     if rig is None:
-        rig = path / RIG if (path / RIG).exists() else packaged(RIG)
+        rig = path / RIG if (path / RIG).exists() else find_packaged(RIG)
     return open_source(path, rig if isinstance(rig, Instrument) else Path(rig), dropped=True)
 
 
@@ -238,7 +238,7 @@ class Scan:
 
         Processes recorded rows where there are no products. Raises as :meth:`image`.
         """
-        done = self._saved or self.processed()
+        done = self._saved or self.read_or_process()
         return done.verdict
 
     @property
@@ -253,7 +253,7 @@ class Scan:
         if self._saved is not None and self._saved.rig is not None:
             return self._saved.rig
         if self._source is None:
-            raise self._unknown("rig")
+            raise self._unknown_error("rig")
         return self._processing.pipeline.rig
 
     @property
@@ -262,7 +262,7 @@ class Scan:
         if self._source is not None:
             return Rows(self._source.plan.rows, tuple(self._source.rows()))
         if self._saved is None or self._saved.rows is None:
-            raise self._unknown("rows")
+            raise self._unknown_error("rows")
         return self._saved.rows
 
     def image(self, *, metal_referenced: bool = True) -> xarray.Dataset:
@@ -285,7 +285,7 @@ class Scan:
         DataError
             when no row is whole, no metal is found, or the products hold the other kind and the rows are not there.
         """
-        return image_dataset(self.processed(metal_referenced))
+        return image_dataset(self.read_or_process(metal_referenced))
 
     def patches(self) -> xarray.Dataset:
         """Patches found in the image, with everything known about each.
@@ -302,7 +302,7 @@ class Scan:
         DataError
             as :meth:`image`.
         """
-        return patch_dataset(self.processed(True))
+        return patch_dataset(self.read_or_process(True))
 
     def permittivity(self) -> xarray.Dataset:
         """Relative permittivity eps' - j eps'' of each patch; not a number where P is too close to metal.
@@ -321,10 +321,9 @@ class Scan:
         DataError
             as :meth:`image`.
         """
-        return self._columns(
-            *_PERMITTIVITY, "ratio", "inverse_ratio_standard_error", "patch_incidence_deg", "patch_incidence_rad",
-            "name", "pixels", "true_permittivity",
-        )  # fmt: skip
+        angles = ("patch_incidence_deg", "patch_incidence_rad")
+        ratios = ("ratio", "inverse_ratio_standard_error")
+        return self._columns((*_PERMITTIVITY, *ratios, *angles, "name", "pixels", "true_permittivity"))
 
     def permittivity_map(self) -> xarray.Dataset:
         """Permittivity of each pixel as a half space, with its standard errors.
@@ -341,7 +340,7 @@ class Scan:
         DataError
             as :meth:`image`; when the verdict is "no result".
         """
-        return permittivity_dataset(self.processed())
+        return permittivity_dataset(self.read_or_process())
 
     def probe(self, x_mm: float, y_mm: float) -> xarray.Dataset:
         """All results at the pixel nearest to a place, mm from the image's centre. Raises as :meth:`image`."""
@@ -365,9 +364,9 @@ class Scan:
         DataError
             as :meth:`image`; when the products do not say which pixels are inside.
         """
-        done = self.processed()
+        done = self.read_or_process()
         if done.interior is None:
-            raise self._unknown("pixels inside the patches")
+            raise self._unknown_error("pixels inside the patches")
         inside = done.interior & (done.labels > 0) & np.isfinite(done.p)
         p = done.p[inside]
         X = np.stack([np.abs(done.h[inside]), np.abs(done.v[inside]), p.real, p.imag], axis=1)
@@ -400,7 +399,7 @@ class Scan:
         """
         # Images of another program are one file: its folder takes the labels.
         place = label_folder(self.folder if self.folder.is_dir() else self.folder.parent)
-        save_labels(place, self.processed(), Labels(dict(boxes), "mm", metal, dict(specimens or {})))
+        save_labels(place, self.read_or_process(), Labels(dict(boxes), "mm", metal, dict(specimens or {})))
         return place / LABELS
 
     def materials(self) -> xarray.Dataset:
@@ -422,7 +421,7 @@ class Scan:
             as :meth:`image`.
         """
         names = ("name", "confidence", "runner_up", "runner_up_share", "metal_reference", "pixels")
-        return self._columns(*names, *_PERMITTIVITY, "true_name")
+        return self._columns((*names, *_PERMITTIVITY, "true_name"))
 
     def layers(self, *stack: str, bands: int | None = None, amplitude_percent: float = 10.0) -> xarray.Dataset:
         """Permittivity and thickness of the one unknown layer of a stack, on dimension `patch`, with standard errors.
@@ -431,7 +430,7 @@ class Scan:
         are the sub-bands used (None: all where a thickness is fitted), `amplitude_percent` says how far |H| may be
         trusted. `ambiguous` and `notes` tell what the data leave open. Raises as :meth:`image`, and ConfigError.
         """
-        return layer_dataset(self.processed(True), self.rig.chirp, stack, bands, amplitude_percent)
+        return layer_dataset(self.read_or_process(True), self.rig.chirp, stack, bands, amplitude_percent)
 
     def surface(self, *, reference: str | os.PathLike[str] | None = None) -> xarray.Dataset:
         """Shape and permittivity of curved and tilted objects, as `polysight surface` finds them.
@@ -454,7 +453,7 @@ class Scan:
         from polysight.jobs.surface import make_surface
 
         if self._source is None:
-            raise self._unknown("surface")
+            raise self._unknown_error("surface")
         config = None if self._settings.config is None else Path(self._settings.config)
         surface = make_surface(self.folder, config, None if reference is None else Path(reference))
         return surface_dataset(surface)
@@ -471,7 +470,7 @@ class Scan:
         """
         from polysight.api.plot import plot_scan
 
-        return plot_scan(self.processed(metal_referenced))
+        return plot_scan(self.read_or_process(metal_referenced))
 
     def to_netcdf(self, path: str | os.PathLike[str], *, metal_referenced: bool = True) -> None:
         """Write all results as one NetCDF file: complex variables as `h_real` and `h_imag`, see :func:`read_netcdf`.
@@ -483,7 +482,7 @@ class Scan:
         DataError
             as :meth:`image`.
         """
-        write_netcdf(Path(path), full_dataset(self.processed(metal_referenced)))
+        write_netcdf(Path(path), full_dataset(self.read_or_process(metal_referenced)))
 
     def __repr__(self) -> str:
         simulated = "SIMULATED, " if self.simulated else ""
@@ -547,7 +546,7 @@ class Scan:
             )
         return origin
 
-    def processed(self, metal_referenced: bool = True) -> ProcessedScan:
+    def read_or_process(self, metal_referenced: bool = True) -> ProcessedScan:
         """Saved products of this kind, otherwise processed rows: what the datasets are made of. Raises as `image`."""
         if self._saved is not None and self._saved.metal_referenced == metal_referenced:
             return self._saved
@@ -569,13 +568,13 @@ class Scan:
             "open the scan folder, or ask for metal_referenced=True", code=ErrorCode.MISMATCH,
         )  # fmt: skip
 
-    def _unknown(self, what: str) -> DataError:
+    def _unknown_error(self, what: str) -> DataError:
         return DataError(
             f"{self.folder}: the {what} of the products is unknown", "an earlier release made them, or scan.json or"
             " quality.json is missing", "open the scan folder instead", code=ErrorCode.KEY_MISSING,
         )  # fmt: skip
 
-    def _columns(self, *names: str) -> xarray.Dataset:
+    def _columns(self, names: Sequence[str]) -> xarray.Dataset:
         """These variables of the patches, where they exist, with the coordinates of their dimension."""
         patches = self.patches()
         chosen = patches[[name for name in names if name in patches]]

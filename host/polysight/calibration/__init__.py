@@ -14,7 +14,7 @@ from polysight.calibration.direct_signal import (
     fit_filter,
     fit_start,
     jitter_hz,
-    unwrapped,
+    unwrap_if,
 )
 from polysight.calibration.files import (
     Calibration,
@@ -63,7 +63,7 @@ __all__ = [
     "read_calibration",
     "read_target",
     "source_scan",
-    "unwrapped",
+    "unwrap_if",
     "write_calibration",
     "write_metal",
 ]

@@ -100,7 +100,7 @@ class DirectSignal:
         chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
         middle_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * (a + b - 1) / 2
         expected = self.expected_hz + self.crystal_ppm(rig) * 1e-6 * middle_hz
-        delay = (expected - unwrapped(self.if_hz, rig)) / chirp.slope_hz_per_s
+        delay = (expected - unwrap_if(self.if_hz, rig)) / chirp.slope_hz_per_s
         return float(delay.mean()), float(delay.std(ddof=1) / np.sqrt(delay.size)) if delay.size > 1 else np.inf
 
 
@@ -112,7 +112,7 @@ def band_hz(rig: Instrument) -> tuple[float, float]:
     return (-width / 2, width / 2)
 
 
-def unwrapped(if_hz: NDArray[np.float64], rig: Instrument) -> NDArray[np.float64]:
+def unwrap_if(if_hz: NDArray[np.float64], rig: Instrument) -> NDArray[np.float64]:
     """Unwrap the IFs [chirp] of one direct path around their circular mean, where jitter crosses the band edge."""
     rate = rig.chirp.sample_rate_hz
     middle = np.angle(np.exp(2j * np.pi * if_hz / rate).sum()) * rate / (2 * np.pi)
@@ -132,7 +132,7 @@ def find_direct(
 
     `setup` is that of the board, if it exists already.
     """
-    setup = setup or BoardSetup.of(rig, board)
+    setup = setup or BoardSetup.from_rig(rig, board)
     chirp = rig.chirp
     shape = (len(words) // setup.pulses, setup.pulses)
     aligned = align_row(
@@ -193,7 +193,7 @@ def fit_start(source: RawSource, board_name: str) -> BoardStart:
     """
     rig = source.instrument
     board = rig.by_name(board_name)
-    setup = BoardSetup.of(rig, board)
+    setup = BoardSetup.from_rig(rig, board)
     signals = [find_direct(rig, board, words, ok, setup) for _, words, ok in board_rows(source, board_name, ROWS)]
     if_hz = np.concatenate([s.if_hz for s in signals])
     chirps = sum(s.chirps for s in signals)
@@ -205,11 +205,13 @@ def fit_start(source: RawSource, board_name: str) -> BoardStart:
             f"by geometry alone start_offset_hz = {by_geometry(rig, board):.0f} for {board_name}; scan again with it",
             code=ErrorCode.NO_DATA,
         )
-    if_hz = unwrapped(if_hz, rig)
-    return start_of(rig, board, expected, float(if_hz.mean()), float(if_hz.std() / np.sqrt(if_hz.size)), if_hz.size)
+    if_hz = unwrap_if(if_hz, rig)
+    return choose_start_offset(
+        rig, board, expected, float(if_hz.mean()), float(if_hz.std() / np.sqrt(if_hz.size)), if_hz.size
+    )
 
 
-def start_of(
+def choose_start_offset(
     rig: Instrument, board: Board, expected_hz: float, seen_hz: float, error_hz: float, chirps: int
 ) -> BoardStart:
     """Return the start offset that moves a direct path, aliased to `seen_hz`, to the middle of the IF band."""
@@ -218,7 +220,14 @@ def start_of(
     alias = round((expected_hz - seen_hz) / rate)
     offset = board.start_offset_hz + middle - (seen_hz + alias * rate)
     return BoardStart(
-        float(round(offset)), board.start_offset_hz, seen_hz, error_hz, expected_hz, middle, alias, chirps
+        start_offset_hz=float(round(offset)),
+        start_offset_was_hz=board.start_offset_hz,
+        direct_if_hz=seen_hz,
+        direct_if_standard_error_hz=error_hz,
+        expected_if_hz=expected_hz,
+        middle_hz=middle,
+        alias=alias,
+        chirps=chirps,
     )
 
 
@@ -235,7 +244,7 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
     setups: dict[str, BoardSetup] = {}
     powers = [_power_of_scan(scan, scan.instrument.by_name(board_name), setups) for scan in scans]
     if_hz, power, noise_power = (np.concatenate(parts) for parts in zip(*powers, strict=True))
-    middles, levels = binned(if_hz, power, noise_power)
+    middles, levels = average_in_bins(if_hz, power, noise_power)
     if middles.size == 0:
         raise DataError(
             f"no direct path of {board_name}", "see `polysight doctor`", "measure again", code=ErrorCode.NO_DATA
@@ -245,13 +254,13 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
     errors, residual = _errors(middles, levels, corners)
     chirp = scans[0].instrument.chirp
     return BoardFilter(
-        [float(c / 1e3) for c in corners],
-        [float(e / 1e3) for e in errors],
-        [chirp.hpf1_khz, chirp.hpf2_khz],
-        float(middles[0] / 1e3),
-        float(middles[-1] / 1e3),
-        int(if_hz.size),
-        residual,
+        corners_khz=[float(c / 1e3) for c in corners],
+        standard_error_khz=[float(e / 1e3) for e in errors],
+        programmed_khz=[chirp.hpf1_khz, chirp.hpf2_khz],
+        if_from_khz=float(middles[0] / 1e3),
+        if_to_khz=float(middles[-1] / 1e3),
+        chirps=int(if_hz.size),
+        residual_db=residual,
     )
 
 
@@ -261,7 +270,7 @@ def _power_of_scan(scan: RawSource, board: Board, setups: dict[str, BoardSetup])
     # Scans of one sweep share the setup
     key = f"{places_crc32(rig)} {rig.chirp} {rig.burst!r}"
     if key not in setups:
-        setups[key] = BoardSetup.of(rig, board)
+        setups[key] = BoardSetup.from_rig(rig, board)
     signals = [
         find_direct(rig, board, words, ok, setups[key]) for _, words, ok in board_rows(scan, board.name, FILTER_ROWS)
     ]
@@ -272,7 +281,7 @@ def _power_of_scan(scan: RawSource, board: Board, setups: dict[str, BoardSetup])
     )
 
 
-def binned(if_hz: Real, power: Real, noise_power: Real) -> tuple[Real, Real]:
+def average_in_bins(if_hz: Real, power: Real, noise_power: Real) -> tuple[Real, Real]:
     """Return mean IF and level without noise, in bins of `BIN_HZ` with enough chirps and signal; IF ascending.
 
     The level comes from the median power, so that chirps with a wrong direct path do not count.

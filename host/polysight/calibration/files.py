@@ -361,7 +361,7 @@ class Calibration:
                 "calibrate again with this rig file, or empty calibration.direct_path",
                 code=ErrorCode.MISMATCH,
             )
-        boards = tuple(self._shifted(b, self.places) for b in rig.boards)
+        boards = tuple(self._shift_board(b, self.places) for b in rig.boards)
         geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=self.places.object_distance_mm)
         return msgspec.structs.replace(rig, boards=boards, geometry=geometry)
 
@@ -372,18 +372,18 @@ class Calibration:
             board_filter = self.filters.boards.get(board.name) if self.filters else None
             if board_filter is None or [float(khz) for khz in board_filter.programmed_khz if khz] != programmed:
                 if board_filter is None:
-                    what = "is not in it"
+                    difference = "is not in it"
                 else:
-                    what = f"was measured with {board_filter.programmed_khz} kHz programmed"
+                    difference = f"was measured with {board_filter.programmed_khz} kHz programmed"
                 raise ConfigError(
-                    f"{self.path('hpf')}: {board.name} {what}, the rig file says {programmed}",
+                    f"{self.path('hpf')}: {board.name} {difference}, the rig file says {programmed}",
                     "the boards or chirp.hpf1_khz, hpf2_khz were changed after the calibration",
                     "calibrate again with this rig file, or empty calibration.hpf",
                     code=ErrorCode.MISMATCH,
                 )
 
     @staticmethod
-    def _shifted(board: Board, places: PlacesFile) -> Board:
+    def _shift_board(board: Board, places: PlacesFile) -> Board:
         board_places = places.boards.get(board.name)
         if board_places is None:
             return board
@@ -429,7 +429,7 @@ class Calibration:
 
     def imaged_with(self, placed: Instrument) -> ImagedWith:
         """Return the settings that the gains of images depend on; `placed` is a rig that :meth:`rig` returned."""
-        return ImagedWith.of(placed, self.high_passes(placed))
+        return ImagedWith.from_rig(placed, self.high_passes(placed))
 
     def facts(self) -> dict[str, CalibrationSource]:
         """Return path, date and origin of the active files, by kind, for quality.json."""
@@ -486,7 +486,7 @@ def calibration_of_scan(scan: Source) -> Calibration:
         named = {kind: name for kind, name in to_builtins(scan.instrument.calibration).items() if name}
         return load_calibration({kind: check_inside(scan.path, name) for kind, name in named.items()})
     paths: dict[str, Path] = {}
-    for kind, fact in _recorded(scan, recorded).items():
+    for kind, fact in _manifest_entries(scan, recorded).items():
         path = paths[kind] = check_inside(scan.path, fact["file"])
         if not path.is_file() or f"{zlib.crc32(path.read_bytes()):08x}" != fact["crc32"]:
             raise DataError(
@@ -498,7 +498,7 @@ def calibration_of_scan(scan: Source) -> Calibration:
     return load_calibration(paths)
 
 
-def _recorded(scan: ScanFolder, recorded: Any) -> dict[str, dict[str, str]]:
+def _manifest_entries(scan: ScanFolder, recorded: Any) -> dict[str, dict[str, str]]:
     """Return the manifest's entries for the scan's copies, by kind. Raises DataError if they are invalid."""
     try:
         return msgspec.convert(recorded, dict[str, dict[str, str]])

@@ -190,8 +190,8 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
     """Synchronise a board's scan, reduce it to the range gate, equalise its RX and whiten its noise."""
     board = rig.by_name(name)
     plan = plan_raster(rig.grid)
-    setup = BoardSetup.of(rig, board, model=model)
-    receivers = tuple(Antennas.of(rig, b) for b in rig.receivers)
+    setup = BoardSetup.from_rig(rig, board, model=model)
+    receivers = tuple(Antennas.from_rig(rig, b) for b in rig.receivers)
     gate = scene_gate_m(receivers, plan, image_grid(rig), DEPTH_M)
     maps = reduction(rig.chirp, gate)
     reduced = []
@@ -223,7 +223,7 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
     samples = (samples / gains[:, None, None]) @ white.T
     flat = np.concatenate(offsets)
     places = np.column_stack([flat, np.zeros(len(flat))])
-    return BoardEchoes(Antennas.of(rig, board), samples, white @ maps.model, places, maps.frequencies_hz)
+    return BoardEchoes(Antennas.from_rig(rig, board), samples, white @ maps.model, places, maps.frequencies_hz)
 
 
 def _places_m(centre: Real, mm: Real, unknown: Real) -> Real:
@@ -308,7 +308,7 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[Sour
     boards = {}
     for i, name in enumerate(fit.boards):
         board_values = slice(3 * i, 3 * i + 3)
-        antennas = Antennas.of(rig, rig.by_name(name))
+        antennas = Antennas.from_rig(rig, rig.by_name(name))
         vector_before = antennas.rx_m[0] - antennas.tx_m
         vector_after = vector_before + fit.values[board_values] / 1e3
         along = vector_after / np.linalg.norm(vector_after)

@@ -455,8 +455,8 @@ class _Row:
         self._record = record
         self._sizes = log.sizes
         self._starts = np.cumsum(log.sizes) - log.sizes
-        kept = np.arange(log.count) < log.kept
-        self._of_row = record.of_row & kept
+        is_kept = np.arange(log.count) < log.kept
+        self._of_row = record.of_row & is_kept
         self.offsets: Counts = np.full(log.count, -1, dtype=np.int64)
         # Sorted, joined.
         self.covered: list[Gap] = []

@@ -264,7 +264,7 @@ def _library_ratios(path: Path, changed_ns: int, angle_deg: float) -> dict[str, 
     """Mean of V / H and spread of its patches (of each part), by material. A file that has changed is read again."""
     del changed_ns
     patches: dict[str, list[complex]] = {}
-    for entry in Library.load(path).at(angle_deg).entries:
+    for entry in Library.load(path).at_angle(angle_deg).entries:
         inverse = 1 / entry.p
         patches.setdefault(entry.name, []).append(complex(np.median(inverse.real), np.median(inverse.imag)))
     ratios = {}

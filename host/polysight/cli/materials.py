@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from polysight.cli.options import Add, add_config_option, add_json_option, add_model_option, count, number
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 
@@ -216,7 +216,7 @@ def _train(args: argparse.Namespace) -> int:
 
     scenes = None
     if args.simulate is not None:
-        scenes = packaged(args.simulate)
+        scenes = find_packaged(args.simulate)
     return train(scenes, args.data, args.config, args.out, args.times)
 
 

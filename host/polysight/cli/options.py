@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.settings import Settings, path_text
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
@@ -201,7 +201,7 @@ def add_config_option(sub: argparse.ArgumentParser, shipped: bool = False) -> No
     default = RIG
     text = "instrument.toml"
     if shipped:
-        default = packaged(RIG)
+        default = find_packaged(RIG)
         text = "instrument.toml here, or the packaged one"
     sub.add_argument("--config", type=Path, default=default, metavar="FILE", help=f"rig file (default: {text})")
 

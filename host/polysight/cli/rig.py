@@ -22,7 +22,7 @@ from polysight.cli.options import (
     number,
     positive,
 )
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError
@@ -70,7 +70,7 @@ def _plan(args: argparse.Namespace) -> int:
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
     scene = None
     if args.scene is not None:
-        scene = packaged(args.scene)
+        scene = find_packaged(args.scene)
     options = PlanOptions(
         minutes=args.minutes,
         count=args.count,
@@ -430,14 +430,14 @@ def _add_scans(add: Add) -> None:
 def _demo(args: argparse.Namespace) -> int:
     from polysight.jobs.demo import run_demo
 
-    return run_demo(packaged(args.scene), args.config, args.out, args.time_scale)
+    return run_demo(find_packaged(args.scene), args.config, args.out, args.time_scale)
 
 
 def _simulate(args: argparse.Namespace) -> int:
     from polysight.jobs.demo import run_simulator
 
-    _warn_of_plates(packaged(args.scene), args.config)
-    command = ["simulate", str(packaged(args.scene)), "--config", str(args.config), "--out", str(args.out)]
+    _warn_of_plates(find_packaged(args.scene), args.config)
+    command = ["simulate", str(find_packaged(args.scene)), "--config", str(args.config), "--out", str(args.out)]
     command += ["--layout", args.layout]
     if args.seed is not None:
         command += ["--seed", str(args.seed)]
@@ -459,7 +459,7 @@ def _warn_of_plates(scene: Path, config: Path) -> None:
 def _reproduce(args: argparse.Namespace) -> int:
     from polysight.jobs.demo import require_package
 
-    if args.config != packaged(RIG):
+    if args.config != find_packaged(RIG):
         # Refuse a wrong one now, not with the first item that needs it
         load_instrument(args.config)
     require_package("polysight_papers", "papers")
@@ -499,7 +499,7 @@ def _add_simulated(add: Add) -> None:
     sub.add_argument(
         "--scene",
         type=Path,
-        default=packaged(Path("examples/demo.toml")),
+        default=find_packaged(Path("examples/demo.toml")),
         metavar="FILE",
         help="scene file (default: nine plates on a table, as in a lab)",
     )

@@ -11,7 +11,7 @@ _REPOSITORY = _PACKAGE.parents[2]
 FOLDER = _PACKAGE if (_PACKAGE / "instrument.toml").exists() else _REPOSITORY
 
 
-def packaged(path: Path) -> Path:
+def find_packaged(path: Path) -> Path:
     """`path` where it exists; otherwise the file or folder of that name that comes with the package, if there is one.
 
     So `instrument.toml` and `examples/demo.toml` are found from any folder, and a file of one's own comes

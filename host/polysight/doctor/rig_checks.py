@@ -26,7 +26,7 @@ from polysight.calibration import (
     checked_calibration,
     find_direct,
     jitter_hz,
-    unwrapped,
+    unwrap_if,
 )
 from polysight.capture import PRIORITY_REMEDY, RowCapture, route_interface, silent_radar
 from polysight.doctor.context import (
@@ -613,7 +613,7 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
             " frequencies of both boards",
             **facts,
         )
-    if_hz = unwrapped(signal.if_hz, rig)
+    if_hz = unwrap_if(signal.if_hz, rig)
     spread = jitter_hz(rig)
     median = float(np.median(if_hz))
     std = float(if_hz.std())
@@ -667,7 +667,7 @@ def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
     delay = {b.name: signals[b.name].start_delay_s(rig) for b in (h, v)}
     skew = delay[v.name][0] - delay[h.name][0]
     uncertainty = float(np.hypot(delay[h.name][1], delay[v.name][1]))
-    jitter = max(float(unwrapped(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s
+    jitter = max(float(unwrap_if(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s
     ppm = {b.name: signals[b.name].crystal_ppm(rig) for b in (h, v)}
     observed = f"{v.name} starts {skew * 1e9:+.2f} +- {uncertainty * 1e9:.2f} ns after {h.name}; " + ", ".join(
         f"{name} {mean * 1e9:+.1f} ns after the transmitter, crystal {ppm[name]:+.2f} ppm"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from polysight.imaging.geometry import Aperture, device_of, excess_path_m, namespace, turn
+from polysight.imaging.geometry import Aperture, excess_path_m, get_device, namespace, turn
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Products of position and voxel in memory
@@ -83,9 +83,9 @@ class _Scene:
     def __init__(
         self, samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any, like: Any = None
     ) -> None:
-        like = samples if like is None else like
-        self.xp = namespace(like)
-        self.device = device_of(like)
+        pattern = samples if like is None else like
+        self.xp = namespace(pattern)
+        self.device = get_device(pattern)
         shape = tuple(samples.shape) if hasattr(samples, "shape") else np.shape(samples)
         self.frequencies = [float(f) for f in frequencies_hz]
         if len(shape) != 2 or not self.frequencies or len(self.frequencies) != shape[1]:
@@ -121,7 +121,9 @@ class _Scene:
             tx = self.tx[part, None, :]
             rx = self.rx[part, None, :]
             reference = self.reference[part, None]
-            d = excess_path_m(self.xp, v[None, :, 0], v[None, :, 1], v[None, :, 2], tx, rx, reference)
+            d = excess_path_m(
+                xp=self.xp, x=v[None, :, 0], y=v[None, :, 1], z=v[None, :, 2], tx_m=tx, rx_m=rx, reference_m=reference
+            )
             yield part, d / SPEED_OF_LIGHT_M_S
 
 

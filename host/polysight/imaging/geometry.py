@@ -104,7 +104,7 @@ class Antennas:
     rx_m: NDArray[np.float64]
 
     @classmethod
-    def of(cls, rig: Instrument, board: Board) -> Antennas:
+    def from_rig(cls, rig: Instrument, board: Board) -> Antennas:
         """Return the transmit and receive antennas of a board's image."""
         return cls(np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board)))
 
@@ -118,7 +118,9 @@ class Antennas:
     ) -> NDArray[np.float64]:
         """Return the excess path of points at `(dx, dy, z)` relative to the stage offset, metres, [rx, ...]."""
         pairs = zip(self.rx_m, self.direct_m, strict=True)
-        return np.stack([excess_path_m(np, dx, dy, z, self.tx_m, rx, direct) for rx, direct in pairs])
+        return np.stack(
+            [excess_path_m(xp=np, x=dx, y=dy, z=z, tx_m=self.tx_m, rx_m=rx, reference_m=direct) for rx, direct in pairs]
+        )
 
     def mirror_m(self, z: float) -> NDArray[np.float64]:
         """Return the path from TX over a mirror in the plane `z` to each RX, [rx]: distance from TX's image."""
@@ -257,11 +259,11 @@ def namespace(array: Any) -> Any:
     return array_api_compat.array_namespace(array)
 
 
-def fft_of(xp: Any) -> ModuleType | Any:
+def fft_module(xp: Any) -> ModuleType | Any:
     """Return the Fourier transforms of a namespace; scipy's for numpy, which keep single precision."""
     return scipy.fft if xp is np else xp.fft
 
 
-def device_of(array: Any) -> Any:
+def get_device(array: Any) -> Any:
     """Return the device of an array."""
     return getattr(array, "device", None)

@@ -111,7 +111,7 @@ class Illumination:
         """Axis across the plane of incidence, 0 (x) or 1 (y), where a rise moves the specular point least."""
         return int(np.argmin(np.abs(np.diagonal(self.moved_m.mean(axis=0)))))
 
-    def transposed(self) -> Illumination:
+    def transpose(self) -> Illumination:
         """Return the illumination with x and y swapped."""
         turned = np.ascontiguousarray(self.footprints.transpose(0, 2, 1))
         return replace(self, footprints=turned, moved_m=self.moved_m[:, ::-1, ::-1], pixel_m=self.pixel_m[::-1])
@@ -242,14 +242,14 @@ class Images:
         """Return the images, valid only inside `area`, bool [ny, nx]."""
         return replace(self, valid=self.valid & area)
 
-    def transposed(self) -> Images:
+    def transpose(self) -> Images:
         """Return the images with x and y swapped."""
         turned = {
             f.name: np.ascontiguousarray(value.T)
             for f in fields(self)
             if isinstance(value := getattr(self, f.name), np.ndarray) and value.ndim == 2
         }
-        illumination = None if self.illumination is None else self.illumination.transposed()
+        illumination = None if self.illumination is None else self.illumination.transpose()
         return replace(self, **turned, x_m=self.y_m, y_m=self.x_m, illumination=illumination)
 
     def level(self, plate: Mask) -> Images:
@@ -314,7 +314,7 @@ class View:
     rows: int | None = None
     pixel_mm: float | None = None
 
-    def of(self, rig: Instrument, swapped: bool = False) -> Instrument:
+    def apply_to(self, rig: Instrument, swapped: bool = False) -> Instrument:
         """Return the rig with this plane and these pixels; `swapped`: the rig's x is the image's y."""
         columns, rows = (self.rows, self.columns) if swapped else (self.columns, self.rows)
         values = {"columns": columns, "rows": rows, "pixel_mm": self.pixel_mm}
@@ -329,7 +329,7 @@ AS_IN_RIG_FILE = View()
 
 def needed_gate_m(rig: Instrument, depth_m: float = 0.0) -> tuple[float, float]:
     """Return the smallest and largest excess path in a rig's image, with planes `depth_m` nearer and farther."""
-    antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
+    antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
     return scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig), depth_m)
 
 
@@ -370,7 +370,7 @@ class ImageBuilder:
             # Load it now instead of after the last row
             import_module("scipy.ndimage")
         plan = plan_raster(rig.grid)
-        antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
+        antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
         self.gate_m = needed_gate_m(rig, depth_m) if gate_m is None else gate_m
         self.taper = TAPERS[rig.image.apodisation] if taper is None else taper
         weights_y = window_weights(self.taper, plan.rows)
@@ -507,8 +507,8 @@ class SubBandImages:
 
         `transposed`: swap x and y. `offset_m`: as in :meth:`ImageBuilder.finish`.
         """
-        made = (builder.finish(offset_m) for builder in self.builders)
-        return tuple(images.transposed() if transposed else images for images in made)
+        band_images = (builder.finish(offset_m) for builder in self.builders)
+        return tuple(images.transpose() if transposed else images for images in band_images)
 
 
 def _part(rig: Instrument, band: SubBand) -> Instrument:
@@ -544,7 +544,7 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
     high_pass_khz: dict[str, list[float]]
 
     @classmethod
-    def of(cls, rig: Instrument, filters: Mapping[str, HighPass | None]) -> ImagedWith:
+    def from_rig(cls, rig: Instrument, filters: Mapping[str, HighPass | None]) -> ImagedWith:
         """Return the settings of a calibrated rig; `filters` by receiver, None or missing: as in the chirp profile."""
         chirp = rig.chirp
         first, last = chirp.linear_samples

@@ -89,7 +89,7 @@ class Focus:
         inside = abs(self.depth_mm) < 0.95 * self.depths_mm[-1] and max(map(abs, self.tilt_deg)) < 0.95 * _MAX_TILT_DEG
         return inside and float(max(self.sharpness[0], self.sharpness[-1])) < 0.98
 
-    def transposed(self) -> Focus:
+    def transpose(self) -> Focus:
         """Return the result with x and y swapped."""
         return replace(self, tilt_deg=(self.tilt_deg[1], self.tilt_deg[0]))
 
@@ -236,7 +236,7 @@ class PlaneEstimate:
         """Distance from the rig file's plane to that of the images: 0 if moving them is not worth it."""
         return self.offset_m if self.worth_moving else 0.0
 
-    def applied_to(self, rig: Instrument) -> Instrument:
+    def apply_to_rig(self, rig: Instrument) -> Instrument:
         """Return a rig with its object plane at the plates."""
         if not self.worth_moving:
             return rig
@@ -252,7 +252,7 @@ class PlaneEstimate:
         offset_std_m = float(np.hypot(self.offset_std_m, MOUNT_STD_M)) if self.known else PRIOR_STD_M
         return float(np.sin(theta) * np.cos(theta) / (rig.geometry.object_distance_mm / 1e3) * offset_std_m)
 
-    def transposed(self) -> PlaneEstimate:
+    def transpose(self) -> PlaneEstimate:
         """Return the estimate with x and y swapped."""
         return replace(self, tilt_rad=self.tilt_rad[::-1], tilt_std_rad=self.tilt_std_rad[::-1])
 
@@ -271,7 +271,15 @@ class PlaneEstimate:
         }
 
 
-UNKNOWN_PLANE = PlaneEstimate(0.0, np.inf, (0.0, 0.0), (np.inf, np.inf), np.zeros(0), False, 0)
+UNKNOWN_PLANE = PlaneEstimate(
+    offset_m=0.0,
+    offset_std_m=np.inf,
+    tilt_rad=(0.0, 0.0),
+    tilt_std_rad=(np.inf, np.inf),
+    heights_m=np.zeros(0),
+    by_phase=False,
+    plates=0,
+)
 """Plane undetermined: use the rig file's plane."""
 
 
@@ -304,7 +312,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     by_phase = False
     if fine.sum() >= 2:
         finer, fine_covariance = _fit(places[fine], phase[0][fine], np.full(int(fine.sum()), _PHASE_STD_M))
-        residual = phase[0][fine] - _height_at(finer, places[fine])
+        residual = phase[0][fine] - _plane_heights(finer, places[fine])
         agree = float(np.sqrt(np.mean((residual * phase[1]) ** 2))) < _PHASE_FITS_RAD
         # Thin sheets change the phase themselves: accept the plane only if the ranges agree.
         agrees = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, 3e-3, 3e-3]
@@ -315,13 +323,13 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
             by_phase = True
     std = np.sqrt(np.diag(covariance))
     return PlaneEstimate(
-        float(plane[0]),
-        float(std[0]),
-        (float(np.arctan(plane[1])), float(np.arctan(plane[2]))),
-        (float(std[1]), float(std[2])),
-        np.asarray(heights, np.float64),
-        by_phase,
-        int(determined.sum()),
+        offset_m=float(plane[0]),
+        offset_std_m=float(std[0]),
+        tilt_rad=(float(np.arctan(plane[1])), float(np.arctan(plane[2]))),
+        tilt_std_rad=(float(std[1]), float(std[2])),
+        heights_m=np.asarray(heights, np.float64),
+        by_phase=by_phase,
+        plates=int(determined.sum()),
     )
 
 
@@ -344,7 +352,7 @@ def move_to_plane(
     plane = find_plane(builder, [mask.T if transposed else mask for mask in masks])
     if move and plane.worth_moving:
         images = builder.finish(plane.offset_m)
-        images = images.transposed() if transposed else images
+        images = images.transpose() if transposed else images
     return plane, images
 
 
@@ -432,11 +440,11 @@ def _fit(
     information = rows.T @ rows + np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
     plane = np.asarray(np.linalg.solve(information, rows.T @ (heights / stds)), np.float64)
     covariance = np.linalg.inv(information)
-    residual = (heights - _height_at(plane, places)) / stds
+    residual = (heights - _plane_heights(plane, places)) / stds
     freedom = max(len(places) - 3, 1)
     return plane, np.asarray(covariance * max(1.0, float(np.sum(residual**2)) / freedom), np.float64)
 
 
-def _height_at(plane: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _plane_heights(plane: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the heights of a plane at places [patch, 2]."""
     return plane[0] + places @ plane[1:]

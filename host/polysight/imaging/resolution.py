@@ -90,12 +90,12 @@ def _blocks(aperture: Aperture, weights: NDArray[np.floating]) -> tuple[Aperture
     rows, columns = weights.shape
     at_rows, at_columns = (np.unique(np.linspace(0, n, _BLOCKS + 1).astype(int)[:-1]) for n in (rows, columns))
 
-    def summed(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    def sum_blocks(values: NDArray[np.floating]) -> NDArray[np.float64]:
         return np.add.reduceat(np.add.reduceat(values.astype(float), at_rows, axis=0), at_columns, axis=1)
 
-    count = summed(np.ones((rows, columns)))
-    offsets = np.stack([summed(aperture.offsets_m[..., i]) / count for i in range(3)], axis=-1)
-    return replace(aperture, offsets_m=offsets), summed(weights)
+    count = sum_blocks(np.ones((rows, columns)))
+    offsets = np.stack([sum_blocks(aperture.offsets_m[..., i]) / count for i in range(3)], axis=-1)
+    return replace(aperture, offsets_m=offsets), sum_blocks(weights)
 
 
 def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
@@ -180,14 +180,14 @@ def board_facts(board: BoardSamples) -> BoardImaging:
     return msgspec.structs.replace(
         facts,
         loss_db=round(-20 * float(np.log10(1 - masked)), 4) + 0.0,
-        point_width_mm=_rounded(response.width_mm),
-        point_limit_mm=_rounded(response.limit_mm),
-        point_paper_mm=_rounded(response.paper_mm),
-        point_sidelobe_db=_rounded(response.sidelobe_db),
+        point_width_mm=_round_pair(response.width_mm),
+        point_limit_mm=_round_pair(response.limit_mm),
+        point_paper_mm=_round_pair(response.paper_mm),
+        point_sidelobe_db=_round_pair(response.sidelobe_db),
     )
 
 
-def _rounded(pair: tuple[float, float]) -> Pair:
+def _round_pair(pair: tuple[float, float]) -> Pair:
     """Return (x, y) with three decimals, None for what is not finite."""
     x, y = (round(value, 3) if np.isfinite(value) else None for value in pair)
     return x, y
@@ -220,11 +220,11 @@ class PhaseSlope:
     """Phase slope of an echo against stage offset along an axis (0: x, 1: y) for the H receiver, rad/m."""
 
     def __init__(self, rig: Instrument, axis: int) -> None:
-        self._antennas = Antennas.of(rig, rig.receivers[0])
+        self._antennas = Antennas.from_rig(rig, rig.receivers[0])
         self._middle = np.array(specular_midpoint_m(rig, rig.receivers[0]))
         self._axis = axis
 
-    def at(self, place_m: float, frequency_hz: float) -> float:
+    def slope(self, place_m: float, frequency_hz: float) -> float:
         """Return the slope for an object at this distance from the specular midpoint along the axis."""
         point = self._middle.copy()
         point[self._axis] += place_m
@@ -244,7 +244,7 @@ def field_limits(rig: Instrument) -> FieldLimits:
     zone = []
     for axis, (count, step_mm) in enumerate(((grid.columns, grid.step_x_mm), (grid.rows, grid.step_y_mm))):
         slope = PhaseSlope(rig, axis)
-        change = (slope.at(_STEP_M, (low + high) / 2) - slope.at(-_STEP_M, (low + high) / 2)) / (2 * _STEP_M)
+        change = (slope.slope(_STEP_M, (low + high) / 2) - slope.slope(-_STEP_M, (low + high) / 2)) / (2 * _STEP_M)
         zone.append(1e3 * float(np.sqrt(2 * np.pi / change)))
         size_m = (count - 1) * step_mm / 1e3
         places = np.linspace(-size_m / 4, size_m / 4, _PLACES)
@@ -256,7 +256,7 @@ def _nearest_ghost_m(slope: PhaseSlope, frequency_hz: float, difference_rad_per_
     """Distance between two places around `centre_m` whose slopes differ by `difference_rad_per_m`."""
 
     def too_far(distance_m: float) -> bool:
-        far, near = (slope.at(centre_m + side * distance_m / 2, frequency_hz) for side in (1, -1))
+        far, near = (slope.slope(centre_m + side * distance_m / 2, frequency_hz) for side in (1, -1))
         return far - near >= difference_rad_per_m
 
     if not too_far(_MAX_DISTANCE_M):

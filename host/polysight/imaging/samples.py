@@ -42,7 +42,7 @@ from polysight.imaging.geometry import (
     window_weights,
 )
 from polysight.imaging.spectral import SLACK_M, IncrementalImager, SpectralImager
-from polysight.sync import FOLD, SyncedRow, decimation, sweep_of
+from polysight.sync import FOLD, SyncedRow, decimation, sample_frequencies_hz
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -150,7 +150,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
         Frequency samples beyond the time-bandwidth product.
     """
     a, b = chirp.linear_samples
-    sweep = sweep_of(chirp)[a:b]
+    sweep = sample_frequencies_hz(chirp)[a:b]
     weight = window_weights(window, b - a)
     weight = weight / weight.sum()
     band = sweep[-1] - sweep[0]
@@ -174,7 +174,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
     few = np.exp(2j * np.pi * np.outer(d, frequencies))
     from_few = np.linalg.lstsq(few, np.exp(2j * np.pi * np.outer(d, sweep)), rcond=1e-9)[0].T
     model = (matrix[:, a:b] @ from_few).astype(np.complex128)
-    return Reduction(frequencies, matrix, spectrum, model, gate_m, sweep_of(chirp))
+    return Reduction(frequencies, matrix, spectrum, model, gate_m, sample_frequencies_hz(chirp))
 
 
 def burst_filters(rig: Instrument) -> NDArray[np.float32]:
@@ -267,7 +267,7 @@ def choose_imager(aperture: Aperture) -> tuple[Imager, str | None]:
 def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.complex128]:
     """Return the referenced samples of a mirror, [rx, sample]; amplitude relative to a direct path of one metre."""
     path = antennas.mirror_m(z_m)
-    phase = 2j * np.pi * np.outer(path - antennas.direct_m, sweep_of(chirp)) / SPEED_OF_LIGHT_M_S
+    phase = 2j * np.pi * np.outer(path - antennas.direct_m, sample_frequencies_hz(chirp)) / SPEED_OF_LIGHT_M_S
     return (np.exp(phase) / path[:, None]).astype(np.complex128)
 
 
@@ -321,7 +321,7 @@ class BoardSamples:
         # Maps for pairs of real numbers and the samples they use, by the row's number of samples.
         self._maps: dict[int, tuple[slice, NDArray[np.float32]]] = {}
         self._filters = burst_filters(rig)
-        self._antennas = Antennas.of(rig, board)
+        self._antennas = Antennas.from_rig(rig, board)
         self._chirp = rig.chirp
         self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
         self._offsets = scan_offsets_m(rig)
@@ -364,7 +364,7 @@ class BoardSamples:
         """Taper of each position, 0 where not valid, float32 [row, column]."""
         return self.taper * self.valid
 
-    def _weights_of(self, index: int) -> NDArray[np.float32]:
+    def _row_weights(self, index: int) -> NDArray[np.float32]:
         """Return one row of :attr:`weights`."""
         return self.taper[index] * self.valid[index]
 
@@ -397,7 +397,7 @@ class BoardSamples:
                 f"row {index} of board {self.board.name} has {row.valid.size} positions, the plan {self._plan.columns}"
             )
         forward = slice(None, None, self._plan.row(index).direction)
-        reduced = self._reduced(row.samples, row.sweep_hz)
+        reduced = self._apply_gate(row.samples, row.sweep_hz)
         if row.turn is not None:
             reduced = undo_burst_motion(reduced, row.valid, row.turn, self._filters)
         reduced = reduced[..., forward]
@@ -405,10 +405,10 @@ class BoardSamples:
         self._put(index, ReducedRow(reduced[:, :-1] * valid, reduced[:, -1] * valid, valid), offsets_m, forward)
 
     def put(self, index: int, row: ReducedRow) -> None:
-        """Add a row from :meth:`reduced`, reduced by the same range gate."""
+        """Add a row from :meth:`read_reduced`, reduced by the same range gate."""
         self._put(index, row)
 
-    def reduced(self, index: int) -> ReducedRow:
+    def read_reduced(self, index: int) -> ReducedRow:
         """Return a row after the range gate."""
         return ReducedRow(self._cube[:, :, index], self._direct[:, index], self.valid[index])
 
@@ -432,11 +432,11 @@ class BoardSamples:
         self._image = None
         self._show(index, 1)
 
-    def _reduced(self, samples: NDArray[np.complex64], sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
+    def _apply_gate(self, samples: NDArray[np.complex64], sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Apply the range gate to a row; return samples and the direct path, [rx, frequency + 1, position]."""
         # Reversed positions make the product slow
         if samples.strides[1] < 0:
-            return self._reduced(samples[:, ::-1], sweep_hz)[..., ::-1]
+            return self._apply_gate(samples[:, ::-1], sweep_hz)[..., ::-1]
         if sweep_hz.size not in self._maps:
             self._maps[sweep_hz.size] = _on_pairs(self._reduction.maps(sweep_hz))
         used, maps = self._maps[sweep_hz.size]
@@ -456,11 +456,11 @@ class BoardSamples:
             self._padded = np.zeros((*self._cube.shape[:2], self._final.period), np.complex64)
             self._stale = set(range(len(self.valid)))
 
-    def _transformed(self, imager: SpectralImager, index: int) -> NDArray[np.complex64]:
+    def _row_spectra(self, imager: SpectralImager, index: int) -> NDArray[np.complex64]:
         """Return the spectra of a row, [rx, frequency, k]; row by row, so that results are bit-exact in any order."""
         if index in self._stale:
             row = self._padded[..., : self.taper.shape[1]]
-            np.multiply(self._cube[:, :, index], self._weights_of(index), out=row)
+            np.multiply(self._cube[:, :, index], self._row_weights(index), out=row)
             self._spectra[:, :, index] = imager.spectra_of_row(self._padded, index)
             self._stale.remove(index)
         return self._spectra[:, :, index]
@@ -506,12 +506,12 @@ class BoardSamples:
 
     def _show(self, index: int, sign: int) -> None:
         """Add a row to the live image, or subtract it (`sign` -1)."""
-        weights = sign * self._weights_of(index)
+        weights = sign * self._row_weights(index)
         if self._live is None or not weights.any():
             return
         if self._final is not None and not self._moved:
             white = self._final.spectra_of_row(weights.astype(np.complex64), index)
-            self._live.add_spectra(index, sign * self._transformed(self._final, index), white)
+            self._live.add_spectra(index, sign * self._row_spectra(self._final, index), white)
         else:
             start = float(row_starts_m(self._offsets)[index])
             self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
@@ -522,7 +522,7 @@ class BoardSamples:
         gain = total / max(1, int(self.valid.sum())) * self._antennas.direct_m
         return np.where(gain == 0, 1, gain)
 
-    def calibrated(self) -> NDArray[np.complex64]:
+    def calibrated_samples(self) -> NDArray[np.complex64]:
         """Return the samples divided by the gain of each RX, not weighted."""
         return self._cube * (1 / self.rx_calibration()).astype(np.complex64)[:, None, None, None]
 
@@ -556,13 +556,13 @@ class BoardSamples:
             self._prepare()
         if grid is None and self._final is not None:
             for index in range(len(self.valid)):
-                self._transformed(self._final, index)
+                self._row_spectra(self._final, index)
             imager: Imager = self._final
             image: Any = self._final.image_of_spectra(self._spectra, gains)
         else:
             imager, notice = self._imager(grid)
             image = imager.image(self._cube * (gains[:, None, None, None] * self.weights))
-        mirror = self.mirror if grid is None else self._mirror_at(float(np.mean(grid.z_m)))
+        mirror = self.mirror if grid is None else self._mirror_samples(float(np.mean(grid.z_m)))
         footprint: Any = imager.constant(mirror.astype(np.complex64), self.weights) / self.count
         return (image / self.count).astype(np.complex64), footprint.astype(np.complex64), notice
 
@@ -596,11 +596,11 @@ class BoardSamples:
 
     def mirror_image(self, height_m: float) -> Image:
         """Return the footprint of a mirror `height_m` behind the rig file's plane, complex64 [ny, nx]."""
-        return self._constant_image(self._mirror_at(float(np.mean(self._grid.z_m)) + height_m))
+        return self._constant_image(self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m))
 
     def mirror_slope(self, height_m: float) -> Image:
         """Return the derivative of :meth:`mirror_image` by range, see :meth:`range_slope`."""
-        return self._constant_image(self._mirror_at(float(np.mean(self._grid.z_m)) + height_m) * self._by_range())
+        return self._constant_image(self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m) * self._by_range())
 
     def _constant_image(self, echo: NDArray[np.complexfloating]) -> Image:
         imager, _ = self._imager(None)
@@ -611,7 +611,7 @@ class BoardSamples:
         f = self._reduction.frequencies_hz
         return (-2j * np.pi * (f - f.mean()) / SPEED_OF_LIGHT_M_S).astype(np.complex64)
 
-    def _mirror_at(self, z_m: float) -> NDArray[np.complex128]:
+    def _mirror_samples(self, z_m: float) -> NDArray[np.complex128]:
         return mirror_reduced(self._antennas, z_m, self._chirp, self._reduction)
 
     def _imager(self, grid: ImageGrid | None) -> tuple[Imager, str | None]:

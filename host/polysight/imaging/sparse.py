@@ -98,7 +98,7 @@ def reconstruct(
     """
     model = _Model(board)
     weights = np.sqrt(board.weights if used is None else board.weights * used)
-    data = board.calibrated() * weights
+    data = board.calibrated_samples() * weights
 
     def forward(x: NDArray[np.complex64]) -> NDArray[np.complex64]:
         return model.samples(x) * weights
@@ -214,7 +214,7 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
     """Predict the samples of a board's missing positions and put them in their place; return their errors."""
     model = _Model(board)
     recorded = board.valid.copy()
-    samples = board.calibrated()
+    samples = board.calibrated_samples()
     tested = _positions_to_test(recorded)
     first = reconstruct(board, iterations, used=~tested)
     error = None
@@ -224,7 +224,7 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
         error = _norm_of_image(model, wrong, weights) / _norm_of_image(model, samples, weights)
     last = reconstruct(board, max(1, iterations // 2), start=first.image)
     board.fill(model.samples(last.image))
-    samples = board.calibrated()
+    samples = board.calibrated_samples()
     reconstructed = _norm_of_image(model, samples, board.taper * ~recorded)
     share = reconstructed / _norm_of_image(model, samples, board.taper)
     return ReconstructedPositions(

@@ -23,7 +23,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.imaging.geometry import Aperture, column_step_m, excess_path_m, fft_of, pitch_y_m, row_starts_m, turn
+from polysight.imaging.geometry import Aperture, column_step_m, excess_path_m, fft_module, pitch_y_m, row_starts_m, turn
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Length of the cross-fade relative to the kernel's length in x
@@ -112,17 +112,17 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     stride_x = -(-band.size // columns)
     pitch = step / stride_x
     return Lattice(
-        columns * stride_x,
-        pitch,
-        stride_x,
-        (float(first), float(grid.y_m[0] - y.max())),
-        math.ceil((last - first) / pitch) + 1,
-        band,
-        row_stride * _fast(-(-lags // row_stride)),
-        pitch_y,
-        row_stride,
-        pixel_stride,
-        lags,
+        size_x=columns * stride_x,
+        pitch_x_m=pitch,
+        stride_x=stride_x,
+        first_lag_m=(float(first), float(grid.y_m[0] - y.max())),
+        exact_x=math.ceil((last - first) / pitch) + 1,
+        band=band,
+        size_y=row_stride * _fast(-(-lags // row_stride)),
+        pitch_y_m=pitch_y,
+        row_stride=row_stride,
+        pixel_stride=pixel_stride,
+        lags_y=lags,
     )
 
 
@@ -133,7 +133,9 @@ def delays_s(aperture: Aperture, x: Any, y: Any, xp: Any = np, device: Any = Non
     tx = xp.asarray(a.tx_m, device=device)
     places = xp.asarray(a.rx_m, device=device)
     for rx, direct in enumerate(a.direct_m):
-        path = excess_path_m(xp, x[None, :], y[:, None], z, tx, places[rx, :], float(direct))
+        path = excess_path_m(
+            xp=xp, x=x[None, :], y=y[:, None], z=z, tx_m=tx, rx_m=places[rx, :], reference_m=float(direct)
+        )
         yield path / SPEED_OF_LIGHT_M_S
 
 
@@ -179,7 +181,7 @@ def _fast(n: int) -> int:
     return int(scipy.fft.next_fast_len(n) or n)
 
 
-def cached(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+def get_cached(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
     """Return the cached arrays of a key, or make them; the least recently used are dropped beyond `KEEP_BYTES`."""
     if key not in _cache:
         _cache[key] = make()
@@ -209,7 +211,7 @@ def lattice_key(aperture: Aperture, slack_m: float) -> tuple[Any, ...]:
     return ("lattice", slack_m, float(grid.z_m), grid.pixel_m, *(n.tobytes() for n in numbers))
 
 
-def key_of(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tuple[Any, ...]:
+def kernel_key(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tuple[Any, ...]:
     """Return the cache key of kernels."""
     a = aperture.antennas
     grid = aperture.grid
@@ -228,7 +230,7 @@ def spectra_along_x(aperture: Aperture, lattice: Lattice, xp: Any = np, device: 
 
     One distance map per RX; a constant phase step leads from one frequency to the next.
     """
-    fft = fft_of(xp)
+    fft = fft_module(xp)
     n = lattice.size_x
     f = aperture.frequencies_hz
     fade = n - lattice.exact_x
@@ -265,8 +267,8 @@ class RowSpectra:
         self.aperture = aperture
         self.xp = xp
         self.device = device
-        self.lattice: Lattice = cached(lattice_key(aperture, slack_m), lambda: lattice(aperture, slack_m))
-        self._fft = fft_of(xp)
+        self.lattice: Lattice = get_cached(lattice_key(aperture, slack_m), lambda: lattice(aperture, slack_m))
+        self._fft = fft_module(xp)
         self.period = self.lattice.size_x // self.lattice.stride_x
         self._take = self.put(self.lattice.band % self.period)
         self._origin = float(row_starts_m(aperture.offsets_m).min())
@@ -284,7 +286,7 @@ class RowSpectra:
 
     def key(self, *more: Any) -> tuple[Any, ...]:
         """Return the cache key of an array made from the kernels."""
-        return (*more, *key_of(self.aperture, self.lattice, self.xp, self.device))
+        return (*more, *kernel_key(self.aperture, self.lattice, self.xp, self.device))
 
     def ramps(self, starts_m: Any) -> Any:
         """Return phase ramps that shift rows to their starts, complex64 [row, k]."""
@@ -334,7 +336,7 @@ class SpectralImager(RowSpectra):
         self._repeat = self.put(np.arange(sizes.size_y) % count)
         self._rows = self.put(np.arange(rows) * sizes.row_stride)
         self._pixel_rows = self.put(self._last + np.arange(lines) * sizes.pixel_stride)
-        self._kernels = cached(
+        self._kernels = get_cached(
             self.key("2d", self.lattice.size_y), lambda: self._fft.fft(self.kernels(), n=self.lattice.size_y, axis=-2)
         )
 
@@ -422,7 +424,7 @@ class IncrementalImager(RowSpectra):
         lines = aperture.grid.shape[0]
         self._last = self.lattice.row_stride * (rows - 1)
         self._span = self.lattice.pixel_stride * (lines - 1) + 1
-        self._kernels, self._components = cached(self.key("rows"), self._principal_kernels)
+        self._kernels, self._components = get_cached(self.key("rows"), self._principal_kernels)
         self._clear(np.zeros(aperture.shape[:2]) if echo is None else echo)
 
     def add_row(self, index: int, samples: Any, weights: Any, start_m: float) -> None:

@@ -27,7 +27,7 @@ from polysight.materials import (
     clean_name,
     format_box,
     image_extent_mm,
-    material_of,
+    material_name,
     name_taken,
     no_box,
     pack_labels,
@@ -360,7 +360,7 @@ def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missi
                 return name, is_metal
             piece = ask(f"  {name} is there already. Another piece of it? Its name, such as 2 (Enter: another name): ")
             if piece.strip():
-                name = box_name(f"{material_of(name)}{SPECIMEN}{piece}")
+                name = box_name(f"{material_name(name)}{SPECIMEN}{piece}")
                 _refuse_twin(name, boxes)
                 return name, is_metal
         except DataError as e:
@@ -382,7 +382,7 @@ def _table(labels: Labels) -> list[str]:
     rows = [("name", "specimen", "box", "")]
     for name, box in labels.boxes.items():
         text = "metal reference" if name == labels.metal else ""
-        rows.append((material_of(name), labels.specimen(name) or "-", format_box(box), text))
+        rows.append((material_name(name), labels.specimen(name) or "-", format_box(box), text))
     widths = [max(cell_len(row[i]) for row in rows) for i in range(3)]
     return ["  ".join(c + " " * (w - cell_len(c)) for c, w in zip(r, (*widths, 0), strict=True)).rstrip() for r in rows]
 

@@ -406,8 +406,8 @@ def _score_models(data: Path, as_json: bool) -> int:
     library = _load_library(data)
     if len(library.angles_deg) > 1:
         sys.stderr.write(f"{data}: angles {library.angles_deg} degrees; judged at {library.angles_deg[-1]:g}\n")
-        library = library.at(library.angles_deg[-1])
-    samples = Samples.of(library)
+        library = library.at_angle(library.angles_deg[-1])
+    samples = Samples.from_library(library)
     scores = [score(samples, model, by_pixel=by_pixel) for model in MODELS for by_pixel in (False, True)]
     source = _measured_or_simulated(library.simulated)
     if as_json:

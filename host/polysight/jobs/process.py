@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.calibration import Calibration, calibration_of_rig, calibration_of_scan
-from polysight.data import packaged
+from polysight.data import find_packaged
 from polysight.imaging import PLANE_REACH_M, Focus, Images, PlaneEstimate, focus_sweep, image_grid
 from polysight.jobs.measure_surfaces import add_surfaces, has_steep_patch
 from polysight.jobs.output import count_steps, current_step, print_lines, say, simulated_scan
@@ -234,7 +234,7 @@ def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | 
 
 def rig_of_images(config: Path | None) -> Instrument:
     """Return the rig file for given images: `config`, or the packaged one. Raises ConfigError."""
-    return load_instrument(config or packaged(Path("instrument.toml")))
+    return load_instrument(config or find_packaged(Path("instrument.toml")))
 
 
 def process_images(data: Path, out: Path, settings: Settings, inputs: Inputs) -> int:
@@ -371,8 +371,8 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     pictures = (board.image()[0], board.image(replace(grid, z_m=grid.z_m + depth_m))[0])
     # The builder's image is that of the mirrored rig
     if source.mirrored:
-        sharpest = sharpest.transposed()
-        plates = plates.transposed()
+        sharpest = sharpest.transpose()
+        plates = plates.transpose()
         pictures = (pictures[0].T, pictures[1].T)
     sweep = sharpest.to_dict() | {"plates": plates.to_dict()}
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
@@ -425,7 +425,7 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     chirp = rig.chirp
     reports = {}
     for board in rig.receivers:
-        setup = BoardSetup.of(rig, board, model=calibration.high_pass(board.name))
+        setup = BoardSetup.from_rig(rig, board, model=calibration.high_pass(board.name))
         report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))
         say(f"rows of {board.name}")
         for row in source.rows():

@@ -31,7 +31,7 @@ from polysight.materials import (
     analyse,
     check_labels,
     make_library,
-    material_of,
+    material_name,
     patches_from_plates,
     read_truth,
     specimen_seed,
@@ -160,7 +160,7 @@ def _read_optics(saved: ProcessedScan) -> Optics:
     path = saved.folder / SCAN
     if rig is None:
         raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
-    optics = Optics.of(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
+    optics = Optics.from_rig(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
     budget = (saved.materials and saved.materials.error_budget) or None
     if budget is None or budget.incidence is None or budget.leakage is None:
         return optics
@@ -188,7 +188,7 @@ def _with_labels(scan: str, materials: MaterialsResult, simulated: bool, labels:
     for patch in materials.patches:
         if patch.patch.label in boxes and not (patch.patch.interior & (materials.p != 0)).any():
             sys.stderr.write(f"note: {scan}: the box of {boxes[patch.patch.label]} holds no pixel that can be used\n")
-    names = {label: material_of(box) for label, box in boxes.items()}
+    names = {label: material_name(box) for label, box in boxes.items()}
     specimens = {label: piece for label, box in boxes.items() if (piece := labels.specimen(box)) is not None}
     return TrainingScan(scan, materials, simulated, versions=versions(), names=names, specimens=specimens)
 

@@ -25,7 +25,7 @@ from polysight.materials.inversion import (
     RigPrior,
     invert,
 )
-from polysight.materials.kinds import Kinds, RatioEvidence, inverse_ratio, literature, turned, weigh_kinds
+from polysight.materials.kinds import Kinds, RatioEvidence, inverse_ratio, literature, turn_covariance, weigh_kinds
 from polysight.materials.labels import TruthPlate, match_truth
 from polysight.materials.measure import (
     AMPLIFIES,
@@ -41,10 +41,10 @@ from polysight.materials.measure import (
     check_patches,
     common_change,
     measure_patch,
+    measure_scatter,
     median_ratio,
     permittivity_of_patch,
     relative_errors,
-    scatter_of,
     usual_scatter,
 )
 from polysight.materials.metal import (
@@ -59,7 +59,7 @@ from polysight.materials.metal import (
     no_metal,
 )
 from polysight.materials.names import UNKNOWN, NamedPatch, PatchName, add_explanation, name_patch
-from polysight.materials.result import MaterialsResult, PatchResult, Tilts, features_of
+from polysight.materials.result import MaterialsResult, PatchResult, Tilts, pixel_features
 from polysight.materials.segment import (
     Box,
     Patch,
@@ -112,7 +112,7 @@ class Optics:
     smooth_px: float = 2.0
 
     @classmethod
-    def of(
+    def from_rig(
         cls, rig: Instrument, angles: IncidenceChoice, theta_std_rad: float = 1e-3, channels_known: bool = False
     ) -> Optics:
         """Return the optics of a rig under the chosen incidence angles.
@@ -189,11 +189,11 @@ def _tilts(images: Images, illumination: Illumination, found: Segmentation) -> T
         for label, rise in rises.items()
         if max(map(abs, rise)) > MAX_RISE or max(map(abs, bends[label])) > MAX_BEND
     )
-    usable_rises = {label: (_modelled(x), _modelled(y)) for label, (x, y) in rises.items()}
+    usable_rises = {label: (_limit_rise(x), _limit_rise(y)) for label, (x, y) in rises.items()}
     return Tilts(usable_rises, illumination.across, steep)
 
 
-def _modelled(rise: float) -> float:
+def _limit_rise(rise: float) -> float:
     """Return a rise, 0 if it is not known or steeper than what is modelled."""
     return rise if abs(rise) < MAX_RISE else 0.0
 
@@ -241,22 +241,31 @@ def analyse(
     A scene without patches, metal or a valid pixel is no error; see `metal` and `refused` of the result.
     Raises DataError if the given metal box or patch number does not exist.
     """
-    known = known or KnownScene()
-    plane = known.plane
+    known_scene = known or KnownScene()
+    plane = known_scene.plane
     if plane is not None:
         plane.check_axes(images.x_m, images.y_m)
         images = images.within(plane.valid)
     images, apart_mm = align(images)
-    segmentation = _patches(images, known)
+    segmentation = _patches(images, known_scene)
     images, tilts = level(images, segmentation)
-    reference = _reference(images, known, segmentation)
+    reference = _reference(images, known_scene, segmentation)
     raw = to_metal(images, reference, plane)
     rh, rv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (raw.h, raw.v))
     refused = check_patches(segmentation, rh, rv, background(raw.h, raw.v, segmentation, images.usable), reference.mask)
     refused |= {p.label: STEEP for p in segmentation.patches if p.label in tilts.steep}
     judged = [p for p in segmentation.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
-    scene = Seen.of((rh, rv), raw, judged, segmentation, reference, plane, images, tilts)
+    scene = Seen.collect(
+        channels=(rh, rv),
+        raw=raw,
+        judged=judged,
+        found=segmentation,
+        reference=reference,
+        plane=plane,
+        images=images,
+        tilts=tilts,
+    )
     prior = scene.prior(optics.prior, float(np.hypot(*apart_mm)))
     measured = [scene.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
     kinds = _kinds(classifier, float(np.mean(theta)))
@@ -279,12 +288,13 @@ def analyse(
     }
     refused |= _impossible(patches, estimates, kinds)
     named = _names(classifier, (sh, sv, sp), inversion, judged)
-    truth = match_truth(segmentation.patches, known.plates)
+    truth = match_truth(segmentation.patches, known_scene.plates)
     labelled = [(p, p.label) for p in segmentation.patches]
     results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in labelled)
     return MaterialsResult(
-        calibrated, sh, sv, sp, reference, segmentation, results, theta, inversion, prior, tilts=tilts,
-        boxes=dict(known.names), library=() if classifier is None else classifier.names,
+        calibrated=calibrated, h=sh, v=sv, p=sp, metal=reference, segmentation=segmentation, patches=results,
+        theta_rad=theta, inversion=inversion, prior=prior, tilts=tilts,
+        boxes=dict(known_scene.names), library=() if classifier is None else classifier.names,
         brightness_off={label: ln for label, ln in brightness_off.items() if np.isfinite(ln)},
         evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
         apart_mm=apart_mm, drift=scene.change, halo=scene.halo.level, behind=scene.usual_background(measured),
@@ -333,7 +343,7 @@ class Seen:
     behind: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(
+    def collect(
         cls,
         channels: tuple[Image, Image],
         raw: Images,
@@ -348,11 +358,11 @@ class Seen:
 
         `channels` are relative to metal and smoothed inside patches, `raw` is relative to metal.
         """
-        scatter_by_label = {p.label: scatter_of(p.interior, *channels, images.x_m, images.y_m) for p in judged}
+        scatter_by_label = {p.label: measure_scatter(p.interior, *channels, images.x_m, images.y_m) for p in judged}
         scatter = {label: s for label, s in scatter_by_label.items() if s is not None}
         metal = None
         if plane is None and reference.mask.any():
-            metal = scatter_of(reference.mask, *channels, images.x_m, images.y_m)
+            metal = measure_scatter(reference.mask, *channels, images.x_m, images.y_m)
         scatters = [*scatter.values(), *([] if metal is None else [metal])]
         spread = None if plane is None else plane.spread
         metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
@@ -361,7 +371,18 @@ class Seen:
         change = None if metal is None else common_change(scatters, metal.centre_m, at_border)
         halo = NO_HALO if metal is None else find_halo(reference.mask, found.patches, images)
         behind = background_mean(raw.h, raw.v, found, images.usable)
-        return cls(scatter, usual_scatter(scatters), metal, change, spread, tilts, evenly, metal_rise, halo, behind)
+        return cls(
+            scatter=scatter,
+            usual=usual_scatter(scatters),
+            metal=metal,
+            change=change,
+            metal_spread=spread,
+            tilts=tilts,
+            lit_evenly=evenly,
+            metal_rise=metal_rise,
+            halo=halo,
+            behind=behind,
+        )
 
     @property
     def relief_rad(self) -> float:
@@ -393,8 +414,17 @@ class Seen:
         rise = self.tilts.in_plane(patch.label)
         change = None
         if scatter is not None and self.change is not None:
-            change = self.change.of(list(self.scatter).index(patch.label))
-        patch_measurement = measure_patch(patch, *channels, theta_rad, scatter, self.usual, change, local_std, rise)
+            change = self.change.log_ratio(list(self.scatter).index(patch.label))
+        patch_measurement = measure_patch(
+            patch,
+            *channels,
+            theta_rad,
+            scatter=scatter,
+            usual=self.usual,
+            change=change,
+            local_std=local_std,
+            rise=rise,
+        )
         if not patch_measurement.brightness:
             return patch_measurement
         around = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0) / patch_measurement.brightness
@@ -435,14 +465,15 @@ def _names(
     for patch, estimate in zip(judged, inversion.patches, strict=True):
         if estimate.evidence is None:
             continue
-        at = patch.interior
+        interior = patch.interior
         if classifier.model == PAPER:
             # The paper's classifier compares pixels, which get the corrections of their patch.
-            corrected = estimate.evidence.inverse_ratio * median_ratio(h[at], v[at])
-            pixels = features_of(np.abs(h[at]), np.abs(v[at]), p[at].astype(np.complex128) / corrected)
+            corrected = estimate.evidence.inverse_ratio * median_ratio(h[interior], v[interior])
+            pixels_p = p[interior].astype(np.complex128) / corrected
+            pixels = pixel_features(np.abs(h[interior]), np.abs(v[interior]), pixels_p)
             (name,) = classifier.scan([pixels])
         else:
-            inverse = 1 / p[at].astype(np.complex128)
+            inverse = 1 / p[interior].astype(np.complex128)
             name = name_patch(classifier.kinds, [estimate.evidence], inverse[:, None])
         named[patch.label] = add_explanation(
             name, estimate.permittivity, estimate.covariance, classifier.permittivities
@@ -462,7 +493,7 @@ def name_permittivity(permittivity: complex, covariance: npt.NDArray[np.float64]
     evidence = RatioEvidence(
         theta_rad=kinds.theta_rad,
         inverse_ratio=inverse,
-        covariance=turned(slope, covariance),
+        covariance=turn_covariance(slope, covariance),
         library_share=0.5,
     )
     return name_patch((kinds,), (evidence,), np.array([[inverse]])).verdict

@@ -317,7 +317,7 @@ class Classifier:
                 "give the incidence angle of the scan",
                 code=ErrorCode.KEY_MISSING,
             )
-        parts = [library.at(a) for a in angles_deg or library.angles_deg]
+        parts = [library.at_angle(a) for a in angles_deg or library.angles_deg]
         if len({p.angles_deg[0] for p in parts}) < len(parts):
             raise DataError(
                 f"scans under {' and '.join(f'{a:.1f}' for a in angles_deg or ())} degrees",
@@ -325,7 +325,7 @@ class Classifier:
                 "give scans of the same patches under different angles, or one at a time",
                 code=ErrorCode.VALUES_CONFLICT,
             )
-        fit = parts[0].fit if len(parts) == 1 else library.fit_of([p.angles_deg[0] for p in parts])
+        fit = parts[0].fit if len(parts) == 1 else library.fit_for([p.angles_deg[0] for p in parts])
         self.library = library
         self.fit = fit
         self.angles_deg = tuple(p.angles_deg[0] for p in parts)
@@ -336,9 +336,9 @@ class Classifier:
             self._model = PaperKnn(weights=weights, thresholds=fit.get("thresholds"))
         else:
             self._model = MODELS[self.model]("H+V+P")
-        samples = Samples.of(parts[0])
+        samples = Samples.from_library(parts[0])
         for part in parts[1:]:
-            samples = samples.joined(Samples.of(part))
+            samples = samples.join(Samples.from_library(part))
         self._model.fit(samples)
         self.distributions = self._model.distributions
         self.names = library.names

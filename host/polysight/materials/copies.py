@@ -62,13 +62,13 @@ def _copies_in(patches: Sequence[Patch], amplitude: np.ndarray, pixel_mm: float)
         for plate in bright:
             dx, dy = ((a - b) for a, b in zip(copy.centre_mm, plate.centre_mm, strict=True))
             shift_px = (round(dy / pixel_mm), round(dx / pixel_mm))
-            copies = _copies_at(weak, plates, hidden, amplitude, shift_px, pixel_mm)
+            copies = _find_copies_at_shift(weak, plates, hidden, amplitude, shift_px, pixel_mm)
             if copies is not None and (best is None or len(copies.labels) > len(best.labels)):
                 best = copies
     return best
 
 
-def _copies_at(
+def _find_copies_at_shift(
     weak: Sequence[Patch],
     plates: Mask,
     hidden: Mask,

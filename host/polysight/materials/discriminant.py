@@ -11,7 +11,7 @@ On ln|H|, ln|V| and arg P errors of gain and of phase are additive. A pixel of m
 with e the pixel's own error (speckle), u_p the error of the whole patch (placement, uneven illumination), g_s that of
 the scan's metal reference, common to all its patches, and d the deviation of the specimen from its material in ln eps'
 and ln eps'', which F_m converts to features (`specimens.py`): a linear model with random effects (Searle, Casella and
-McCulloch, Variance Components, chapter 5). If V nearly vanishes its error is additive (`softened`). The covariances are
+McCulloch, Variance Components, chapter 5). If V nearly vanishes its error is additive (`soft_modulus`). The covariances are
 estimated from the library: by residual mean squares of pixels, patches and scans; that of patches is divided into
 placement and specimen by expectation maximisation. A decision uses them as follows:
 
@@ -78,15 +78,15 @@ def estimate_common_error(mean: Real, own: Real, prior: Real, level: float) -> t
     for _ in range(COMMON_ERROR_ROUNDS):
         distance2, cost = costs(mean - value, own + covariance)
         share = shares_of_materials(cost)
-        known = scipy.special.expit(level - distance2.min(axis=1))
+        weight = scipy.special.expit(level - distance2.min(axis=1))
         middle = np.einsum("pk,pkd->pd", share, mean)
-        off = mean - middle[:, None]
-        spread = np.einsum("pk,pkde->pde", share, own + off[..., :, None] * off[..., None, :])
-        information = known[:, None, None] * np.linalg.inv(spread)
+        difference = mean - middle[:, None]
+        spread = np.einsum("pk,pkde->pde", share, own + difference[..., :, None] * difference[..., None, :])
+        information = weight[:, None, None] * np.linalg.inv(spread)
         covariance = np.linalg.inv(np.linalg.inv(prior) + information.sum(axis=0))
-        before = value
+        last_value = value
         value = covariance @ (information @ middle[..., None]).sum(axis=0)[:, 0]
-        if np.abs(value - before).max() < 1e-7:
+        if np.abs(value - last_value).max() < 1e-7:
             break
     return value, covariance
 
@@ -101,15 +101,15 @@ class ErrorDiscriminant(Model):
 
     def fit(self, samples: Samples) -> ErrorDiscriminant:
         """Estimate means and covariances."""
-        self.names, of = np.unique(samples.names, return_inverse=True)
+        self.names, material_index = np.unique(samples.names, return_inverse=True)
         self.angles_rad = [math.radians(a) for a in samples.angles_deg]
-        self._anchor(samples.x, of)
-        d = self._deviations(samples.x)[np.arange(of.size), of]
+        self._anchor(samples.x, material_index)
+        d = self._deviations(samples.x)[np.arange(material_index.size), material_index]
         width = d.shape[1]
         _, patch, count = np.unique(samples.patches, return_inverse=True, return_counts=True)
         first = np.zeros(count.size, np.intp)
-        first[patch[::-1]] = np.arange(of.size)[::-1]
-        material = of[first]
+        first[patch[::-1]] = np.arange(material_index.size)[::-1]
+        material = material_index[first]
         scan = np.unique(samples.groups, return_inverse=True)[1][first]
         plate = samples.plates[first]
         mean = np.stack([np.bincount(patch, c) for c in d.T], axis=1) / count[:, None]
@@ -131,14 +131,14 @@ class ErrorDiscriminant(Model):
         self._fit_patches(
             residual[informative] * np.sqrt(informative.sum() / dof), material[informative], plate[informative], dof
         )
-        each = max(informative.sum() / scans, 1.0)
+        pixels_per_scan = max(informative.sum() / scans, 1.0)
         common = self._independent(_covariance(offset[np.unique(scan[informative])], max(scans - 1, 1)))
-        self.scan = _positive(common - self.between / each) + 1e-8 * np.eye(width)
+        self.scan = _positive(common - self.between / pixels_per_scan) + 1e-8 * np.eye(width)
         self._set_thresholds(
             (mean - self.level[material])[informative],
             material[informative],
-            (d - self.level[of])[used],
-            of[used],
+            (d - self.level[material_index])[used],
+            material_index[used],
             float(dof),
         )
         return self
@@ -157,16 +157,16 @@ class ErrorDiscriminant(Model):
         kinds = zip(self.names[dielectric], self._anchor_t[dielectric], strict=True)
         return {str(name): apparent_permittivity(t, self.angles_rad) for name, t in kinds}
 
-    def apart(self) -> Real:
+    def distances(self) -> Real:
         """Return the distances of the materials in standard deviations of a patch, [material, material].
 
         Of the models of all channels only: the features are ln|H|, ln|V| and arg P.
         """
         log_h = self._anchor_h[:, None] - self._anchor_h
-        off = self._chosen(relative(log_h, self._anchor_t[:, None] - self._anchor_t, self._anchor_t))
+        differences = self._chosen(relative(log_h, self._anchor_t[:, None] - self._anchor_t, self._anchor_t))
         of_patch = self._patch_covariances(self.pixels) + self.scan
         inverse = np.linalg.inv((of_patch[:, None] + of_patch) / 2)
-        return np.sqrt(np.einsum("abd,abde,abe->ab", off, inverse, off))
+        return np.sqrt(np.einsum("abd,abde,abe->ab", differences, inverse, differences))
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Classify each pixel independently: return its name, and its distance over the threshold."""
@@ -188,11 +188,11 @@ class ErrorDiscriminant(Model):
         deviations = self._deviations(x) - self.level
         mean = np.stack([deviations[patch == i].mean(axis=0) for i in range(ids.size)])
         pixels = float(min([self.pixels, *np.bincount(patch).tolist()]))
-        own = self._patch_covariances(pixels)
+        patch_covariances = self._patch_covariances(pixels)
         informative = ~self._metal_like(x, patch)
-        shift, spread = estimate_common_error(mean[informative], own, self.scan, self.patch_level)
+        shift, spread = estimate_common_error(mean[informative], patch_covariances, self.scan, self.patch_level)
 
-        distance2, cost = costs(mean - shift, own + spread)
+        distance2, cost = costs(mean - shift, patch_covariances + spread)
         probability = _with_none(shares_of_materials(cost), distance2 - self.patch_level)
         row = np.arange(ids.size)
         best = cost.argmin(axis=1)
@@ -229,17 +229,17 @@ class ErrorDiscriminant(Model):
 
     def _specimen_effects(self) -> Real:
         """Return the effect of specimens' deviations on the features of each material, [materials, features, 2]."""
-        every = np.stack([effect(t, self.angles_rad) for t in self._anchor_t])
-        apart = every.reshape(*self._anchor_t.shape, 3, 2).transpose(0, 3, 1, 2)
-        return self._chosen(apart).swapaxes(1, 2)
+        anchor_effects = np.stack([effect(t, self.angles_rad) for t in self._anchor_t])
+        effect_matrices = anchor_effects.reshape(*self._anchor_t.shape, 3, 2).transpose(0, 3, 1, 2)
+        return self._chosen(effect_matrices).swapaxes(1, 2)
 
     def _anchor(self, x: Real, of: npt.NDArray[np.intp]) -> None:
         """Set the expansion point of each material's features: the means of its pixels."""
         h, v, t = by_angle(x)
         logs = np.log(np.maximum(h, 1e-6)), np.log(np.maximum(v, 1e-6))
-        each = [of == k for k in range(self.names.size)]
+        of_material = [of == k for k in range(self.names.size)]
         self._anchor_h, self._anchor_v, self._anchor_t = (
-            np.stack([c[at].mean(axis=0) for at in each]) for c in (*logs, t)
+            np.stack([c[members].mean(axis=0) for members in of_material]) for c in (*logs, t)
         )
         width = len(self._chosen(np.zeros((1, 1, 3)))[0])
         features = width * h.shape[1]
@@ -280,9 +280,9 @@ class ErrorDiscriminant(Model):
 
         It includes the error of the material's mean, known from a limited number of placements and specimens.
         """
-        known = (1 + 1 / self.placements)[:, None, None]
+        placement_factor = (1 + 1 / self.placements)[:, None, None]
         differ = self._effects * (self.spread * (1 + 1 / self.plates[:, None]))[:, None]
-        return self.within / pixels + self.between * known + differ @ self._effects.mT
+        return self.within / pixels + self.between * placement_factor + differ @ self._effects.mT
 
     def _pixel_covariances(self) -> Real:
         return self._patch_covariances(1.0) + self.scan
@@ -316,11 +316,11 @@ def _two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: 
     level = np.zeros((material.max() + 1, mean.shape[1]))
     for _ in range(TWO_WAY_ROUNDS):
         for k in np.unique(material):
-            at = material == k
-            level[k] = (mean[at] - offset[scan[at]] * informative[at, None]).mean(axis=0)
+            of_material = material == k
+            level[k] = (mean[of_material] - offset[scan[of_material]] * informative[of_material, None]).mean(axis=0)
         for s in np.unique(scan[informative]):
-            at = (scan == s) & informative
-            offset[s] = (mean[at] - level[material[at]]).mean(axis=0)
+            of_material = (scan == s) & informative
+            offset[s] = (mean[of_material] - level[material[of_material]]).mean(axis=0)
         offset -= offset[np.unique(scan[informative])].mean(axis=0)
     return offset, level
 
@@ -342,5 +342,5 @@ def _with_none(probability: Real, beyond: Real) -> Real:
     At the threshold half of the probability goes to none of the materials, far beyond it all, so that a patch called
     unknown for its distance has no likelier name.
     """
-    known = probability * scipy.special.expit(-beyond)
-    return np.concatenate([known, 1 - known.sum(axis=1, keepdims=True)], axis=1)
+    member_probability = probability * scipy.special.expit(-beyond)
+    return np.concatenate([member_probability, 1 - member_probability.sum(axis=1, keepdims=True)], axis=1)

@@ -37,7 +37,7 @@ from polysight.materials.kinds import (
     RatioEvidence,
     at_angle,
     pair,
-    turned,
+    turn_covariance,
 )
 from polysight.materials.specimens import METAL_WITHOUT_BRIGHTNESS, METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import permittivity_from_ratio
@@ -130,7 +130,7 @@ class PatchMeasurement:
     def covariance(self) -> Real:
         """Covariance of real and imaginary part of V / H, float64 [2, 2]."""
         std = max(self.std, LEAST_RATIO_STD)
-        return std**2 * np.eye(2) + turned(self.inverse_ratio, np.diag(np.square(self.relative_std)))
+        return std**2 * np.eye(2) + turn_covariance(self.inverse_ratio, np.diag(np.square(self.relative_std)))
 
 
 @dataclass(frozen=True)
@@ -315,9 +315,9 @@ class _Scene:
             return np.zeros((0, 2, 2))
         nominal = np.zeros((1, WIDTH))
         step = 1e-4 * np.maximum(np.abs(self.measured), 1e-3)
-        at_measured = self._ratios_of(self.measured, nominal)[0]
-        beside = self._ratios_of(self.measured + step, nominal)[0]
-        return turned((beside - at_measured) / step, np.stack([s.covariance for s in seen]))
+        at_measured = self._correct_ratios(self.measured, nominal)[0]
+        beside = self._correct_ratios(self.measured + step, nominal)[0]
+        return turn_covariance((beside - at_measured) / step, np.stack([s.covariance for s in seen]))
 
     def _maps(self, kinds: Kinds) -> tuple[DensityMap, ...]:
         """Return the density of each patch's ratio over its possible values."""
@@ -370,9 +370,9 @@ class _Scene:
 
     def ratios(self, z: Real) -> Complex:
         """Return t of every patch, [..., patch]."""
-        return self._ratios_of(self.measured, z)
+        return self._correct_ratios(self.measured, z)
 
-    def _ratios_of(self, measured: Complex, z: Real) -> Complex:
+    def _correct_ratios(self, measured: Complex, z: Real) -> Complex:
         """Return t of measured V / H [patch], [..., patch]."""
         a, b = self.leakage_of_patches(z)
         rho = self.prior.reference_std * _complex(z, REFERENCE)
@@ -428,7 +428,7 @@ class _Scene:
         log_others = np.log1p(-library_share)
         of_patches = []
         for i, density in enumerate(self.maps):
-            of_library, of_others = density.at(t[..., i])
+            of_library, of_others = density.log_densities(t[..., i])
             of_patches.append(np.logaddexp(log_ours + of_library, log_others + of_others))
         return np.concatenate([of_brightness, np.stack(of_patches, axis=-1)], axis=-1)
 

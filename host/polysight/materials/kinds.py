@@ -101,9 +101,9 @@ def at_angle(t: Complex, theta_rad: npt.ArrayLike, other_rad: float) -> Complex:
     other2 = np.sin(other_rad) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         q = (1 + t) / (1 - t) * sine2 / np.cos(theta_rad)
-        there = np.sqrt(q**2 + sine2 - other2)
-        there = np.where((there * np.conj(q)).real < 0, -there, there) * np.cos(other_rad) / other2
-        moved = (there - 1) / (there + 1)
+        root = np.sqrt(q**2 + sine2 - other2)
+        root = np.where((root * np.conj(q)).real < 0, -root, root) * np.cos(other_rad) / other2
+        moved = (root - 1) / (root + 1)
     return np.where(np.isfinite(moved), moved, t)
 
 
@@ -119,7 +119,7 @@ def pair(value: npt.ArrayLike) -> Real:
     return np.stack([value.real, value.imag], axis=-1)
 
 
-def turned(factor: npt.ArrayLike, covariance: npt.ArrayLike) -> Real:
+def turn_covariance(factor: npt.ArrayLike, covariance: npt.ArrayLike) -> Real:
     """Return the covariance [..., 2, 2] of a complex number with `covariance`, times a complex `factor` [...]."""
     factor = np.asarray(factor, np.complex128)
     matrix = np.stack([pair(factor), pair(1j * factor)], axis=-1)
@@ -165,10 +165,10 @@ class Kinds:
         """Return the densities of the library's kinds and of all others on a rectangle of t, for quick looking up."""
         real = np.linspace(low.real, high.real, cells)
         imag = np.linspace(low.imag, high.imag, cells)
-        others = self.other * self.any_half_space(real[None, :] + 1j * imag[:, None], covariance)
+        other_density = self.other * self.any_half_space(real[None, :] + 1j * imag[:, None], covariance)
         if self.sheet_share:
-            others += self.sheet_share * _histogram(self.sheets, real, imag, covariance)
-        density = np.stack([np.zeros_like(others), others])
+            other_density += self.sheet_share * _histogram(self.sheets, real, imag, covariance)
+        density = np.stack([np.zeros_like(other_density), other_density])
         summed = self.covariance + covariance
         reach = 4.5 * np.sqrt(summed[:, (0, 1), (0, 1)])
         columns = np.searchsorted(real, self.t.real + np.array([-1, 1])[:, None] * reach[:, 0])
@@ -218,7 +218,7 @@ class DensityMap:
     high: complex
     log_density: Real
 
-    def at(self, t: Complex) -> Real:
+    def log_densities(self, t: Complex) -> Real:
         """Return the logarithms of both densities at t [...], [2, ...]; beyond the rectangle those of its border."""
         _, rows, columns = self.log_density.shape
         parts = pair(t)

@@ -152,7 +152,7 @@ def is_metal(name: str) -> bool:
     return any(word in METALS for word in re.findall(r"[a-z]+", name.lower()))
 
 
-def material_of(name: str) -> str:
+def material_name(name: str) -> str:
     """Return the material of a box named material or material#specimen."""
     return name.partition(SPECIMEN)[0]
 
@@ -194,7 +194,7 @@ class Labels:
         """Return true if this box is the metal reference, or has a metal's name if the file has no reference."""
         if self.metal is not None:
             return name == self.metal
-        return is_metal(material_of(name))
+        return is_metal(material_name(name))
 
     def specimen(self, name: str) -> str | None:
         """Return the physical piece in a box: as given, or the part of its name after `#`; None if not known."""
@@ -209,12 +209,12 @@ class Labels:
         dx = float(x[1] - x[0])
         dy = float(y[1] - y[0])
 
-        def converted(box: Box) -> Box:
+        def convert_box(box: Box) -> Box:
             x0, x1 = (float(x[0]) + (edge - 0.5) * dx for edge in (box[0], box[2]))
             y0, y1 = (float(y[0]) + (edge - 0.5) * dy for edge in (box[1], box[3]))
             return x0, y0, x1, y1
 
-        return replace(self, boxes={n: converted(b) for n, b in self.boxes.items()}, unit="mm")
+        return replace(self, boxes={n: convert_box(b) for n, b in self.boxes.items()}, unit="mm")
 
     def patches(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[Segmentation, dict[int, str]]:
         """Return patches of the boxes, and the box name of each; see :func:`patches_from_labels`."""
@@ -411,8 +411,8 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
                 "draw it where labels.png shows the material",
                 code=ErrorCode.NO_DATA,
             )
-    for (one, a), (other_name, b) in combinations(boxes.items(), 2):
-        _check_apart(one, a, other_name, b)
+    for (first_name, a), (other_name, b) in combinations(boxes.items(), 2):
+        _check_apart(first_name, a, other_name, b)
     specimens = {box_name(n): clean_name(s, "specimen") for n, s in labels_mm.specimens.items()}
     metal = None if labels_mm.metal is None else box_name(labels_mm.metal)
     missing = [n for n in (*specimens, *([] if metal is None else [metal])) if n not in boxes]
@@ -427,7 +427,7 @@ def name_taken(name: str, twin: str) -> DataError:
     return DataError(
         f"the name {name} exists already{as_said}",
         "each box needs its own name",
-        f"name a second piece of the same material {material_of(name)}{SPECIMEN}2;"
+        f"name a second piece of the same material {material_name(name)}{SPECIMEN}2;"
         f" to move a box: --remove {twin} --box {twin}=x0,y0,x1,y1",
         code=ErrorCode.NAME_TAKEN,
     )
@@ -475,7 +475,7 @@ def _check_apart(one: str, a: Box, other: str, b: Box) -> None:
 
 def _metal_by_name(boxes: Mapping[str, Box]) -> str | None:
     """Return the only box with a metal's name. Raises DataError if there are several boxes and not exactly one."""
-    metals = [name for name in boxes if is_metal(material_of(name))]
+    metals = [name for name in boxes if is_metal(material_name(name))]
     if len(metals) == 1:
         return metals[0]
     if len(boxes) > 1:

@@ -15,6 +15,7 @@ as rivals.
 from __future__ import annotations
 
 import itertools
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
@@ -52,7 +53,7 @@ class Spectrum:
     weight: Real
 
     @classmethod
-    def of(cls, chirp: Chirp, bands: int = 1, window: str = "hann") -> Spectrum:
+    def from_chirp(cls, chirp: Chirp, bands: int = 1, window: str = "hann") -> Spectrum:
         """Return sub-bands of the linear part of a chirp: windows that overlap by half, as in Welch's method.
 
         One band is the whole linear part under the image's own window
@@ -67,7 +68,7 @@ class Spectrum:
         frequency = chirp.first_sample_hz + chirp.hz_per_sample * (starts[:, None] + length * inside)
         return cls(frequency, np.tile(weight / weight.sum(), (bands, 1)))
 
-    def thinned(self, step: int) -> Spectrum:
+    def thin(self, step: int) -> Spectrum:
         """Return every `step`-th frequency, at least four: enough for start values."""
         step = max(1, min(step, self.weight.shape[1] // 4))
         weight = self.weight[:, step // 2 :: step]
@@ -368,11 +369,12 @@ def fit_layer(
             "give more sub-bands, the amplitude, or the thickness",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
-    rough = sorted((model.solve(start, precision=1e-3) for start in model.starts()), key=lambda one: one.chi2)
+    by_fit = operator.attrgetter("chi2")
+    rough = sorted((model.solve(start, precision=1e-3) for start in model.starts()), key=by_fit)
     level = rough[0].chi2 + 3 * RIVAL * model.fit(rough[0], drawn=False).stretch
-    solutions = sorted((model.solve(one.x) for one in _apart(rough, level, 0.01)), key=lambda one: one.chi2)
+    solutions = sorted((model.solve(solution.x) for solution in _drop_repetitions(rough, level, 0.01)), key=by_fit)
     level = solutions[0].chi2 + RIVAL * model.fit(solutions[0], drawn=False).stretch
-    near = [model.fit(one, drawn=True) for one in _apart(solutions, level, 1e-3)]
+    near = [model.fit(solution, drawn=True) for solution in _drop_repetitions(solutions, level, 1e-3)]
     best = near[0]
     rivals = list[LayerFit]()
     for rival in near[1:]:
@@ -414,7 +416,7 @@ class _Solution:
     active: npt.NDArray[np.intp]
 
 
-def _apart(found: Sequence[_Solution], level: float, relative: float) -> list[_Solution]:
+def _drop_repetitions(found: Sequence[_Solution], level: float, relative: float) -> list[_Solution]:
     """Return solutions up to a chi-square `level`, without repetitions (closer than `relative`), best first."""
     out: list[_Solution] = []
     for solution in found:
@@ -469,7 +471,7 @@ class _Model:
         if self.sized:
             thick[self.at] = wide[..., 2] * 1e-3
         theta = self.theta_rad + (self.bands.theta_std_rad * wide[..., -1] if self.turned else 0.0)
-        spectrum = self.bands.spectrum.thinned(thin) if thin > 1 else self.bands.spectrum
+        spectrum = self.bands.spectrum.thin(thin) if thin > 1 else self.bands.spectrum
         q, h = average(eps, thick, spectrum, theta)
         if self.turned:
             q = q * np.exp(1j * self.bands.phase_per_angle * self.bands.theta_std_rad * x[..., -1:])
@@ -543,13 +545,13 @@ class _Model:
         std = np.sqrt(np.maximum(np.diag(own_covariance), 0.0))
         ends = zip(("the real part", "the loss", "the thickness"), one.active, (True, False, True), strict=False)
         return LayerFit(
-            complex(one.x[0], -one.x[1]),
-            float(one.x[2]) * 1e-3 if self.sized else self.stack[self.at].thickness_m,
-            float(std[0]),
-            float(std[1]),
-            float(std[2]) if self.sized else 0.0,
-            one.chi2,
-            self.freedom,
+            permittivity=complex(one.x[0], -one.x[1]),
+            thickness_m=float(one.x[2]) * 1e-3 if self.sized else self.stack[self.at].thickness_m,
+            std_real=float(std[0]),
+            std_loss=float(std[1]),
+            std_thickness_m=float(std[2]) if self.sized else 0.0,
+            chi2=one.chi2,
+            freedom=self.freedom,
             at_limit=tuple(
                 name for name, end, two_sided in itertools.islice(ends, n) if end > 0 or (two_sided and end < 0)
             ),

@@ -104,7 +104,7 @@ class Library:
                 out.append([angle])
         return tuple(round(sum(a) / len(a), 1) for a in out)
 
-    def at(self, angle_deg: float) -> Library:
+    def at_angle(self, angle_deg: float) -> Library:
         """Return the entries under an incidence angle, with their fit.
 
         Raises DataError if there are none: |P| changes by 10 % in a degree, so other angles cannot be used.
@@ -119,7 +119,7 @@ class Library:
             )
         angle = min(near, key=lambda a: abs(a - angle_deg))
         entries_of_angle = tuple(e for e in self.entries if abs(e.incidence_deg - angle) <= SAME_ANGLE_DEG)
-        return Library(entries_of_angle, self.fit_of([angle]), self.note)
+        return Library(entries_of_angle, self.fit_for([angle]), self.note)
 
     def columns(self) -> tuple[Real, npt.NDArray[np.str_], npt.NDArray[np.str_]]:
         """Return X [n, 4] (|H|, |V|, Re P, Im P), the material y [n] and the scan [n] of each pixel."""
@@ -131,7 +131,7 @@ class Library:
         usable_rows = usable(x)
         return x[usable_rows], names[usable_rows], scans[usable_rows]
 
-    def fit_of(self, angles_deg: Sequence[float]) -> dict[str, Any]:
+    def fit_for(self, angles_deg: Sequence[float]) -> dict[str, Any]:
         """Return the fit for an angle, or for several together; may be empty."""
         angles = self.fit.get("angles")
         if angles is None:
@@ -376,7 +376,7 @@ class Samples:
         return self.groups_of_material > 1
 
     @classmethod
-    def of(cls, library: Library, pixels_per_patch: int | None = None) -> Samples:
+    def from_library(cls, library: Library, pixels_per_patch: int | None = None) -> Samples:
         """Return the pixels of a library of one angle, grouped by scan; of each patch at most so many, at random.
 
         Raises DataError if no pixel is usable.
@@ -409,7 +409,7 @@ class Samples:
         specimens = None if self.specimens is None else self.specimens[at]
         return Samples(self.x[at], self.names[at], self.groups[at], self.patches[at], specimens, self.angles_deg)
 
-    def joined(self, other: Samples) -> Samples:
+    def join(self, other: Samples) -> Samples:
         """Join with samples of a second angle, patch by patch.
 
         Scans of the same name are paired; without common names, scans are paired in their order. In a pair of scans

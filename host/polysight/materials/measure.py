@@ -105,11 +105,11 @@ def background_mean(h: Image, v: Image, found: Segmentation, usable: Mask) -> tu
     if not widths:
         return 0.0, 0.0
     width_px = max(1, round(float(np.median(widths))))
-    window_is_whole = _windowed(background_mask.astype(np.complex128), width_px).real > 1 - 1e-6
+    window_is_whole = _window_mean(background_mask.astype(np.complex128), width_px).real > 1 - 1e-6
     if not window_is_whole.any():
         return 0.0, 0.0
     behind_h, behind_v = (
-        _windowed(np.where(background_mask, channel, 0), width_px)[window_is_whole] for channel in (h, v)
+        _window_mean(np.where(background_mask, channel, 0), width_px)[window_is_whole] for channel in (h, v)
     )
     return _rms(behind_h), _rms(behind_v)
 
@@ -122,7 +122,7 @@ def _away_from_patches(h: Image, v: Image, found: Segmentation, usable: Mask) ->
     return background_mask
 
 
-def _windowed(values: Image, width_px: int) -> Image:
+def _window_mean(values: Image, width_px: int) -> Image:
     """Return the mean over a square window around each pixel, with zeros beyond the image."""
     return np.asarray(scipy.ndimage.uniform_filter(values, width_px, mode="constant"), np.complex128)
 
@@ -229,7 +229,7 @@ class Scatter:
     relief_rad: float = 0.0
 
 
-def scatter_of(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Scatter | None:
+def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Scatter | None:
     """Return how V / H scatters over the pixels of a mask; None with fewer than `LEAST_PIXELS` usable ones."""
     pixels = mask & np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
     rows, columns = np.nonzero(pixels)
@@ -255,7 +255,15 @@ def scatter_of(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Scatter 
     about = complex(*(1.4826 * float(np.median(np.abs(part - np.median(part)))) for part in (rest.real, rest.imag)))
     unit = np.sqrt(np.diag(np.linalg.inv(information)) * rows.size / blocks)
     x, y = places.mean(axis=0).tolist()
-    return Scatter(amplitude, phase, blocks, slope_of, unit * about, (x, y), _relief(h[pixels], centred))
+    return Scatter(
+        amplitude=amplitude,
+        phase=phase,
+        blocks=blocks,
+        slope=slope_of,
+        slope_std=unit * about,
+        centre_m=(x, y),
+        relief_rad=_relief(h[pixels], centred),
+    )
 
 
 def _relief(h: Image, centred: Real) -> float:
@@ -300,7 +308,7 @@ class CommonChange:
         amplitude, phase = (float(part.max()) for part in parts)
         return amplitude, phase
 
-    def of(self, plate: int) -> tuple[complex, tuple[float, float]]:
+    def log_ratio(self, plate: int) -> tuple[complex, tuple[float, float]]:
         """Return ln(V / H) of a plate relative to the origin, and the standard deviations of both of its parts."""
         std = complex(self.std[plate])
         amplitude = float(np.hypot(std.real, RIPPLE_M * self.ripple.real))
@@ -417,10 +425,10 @@ def measure_patch(
     theta_rad
         Its angle of incidence.
     scatter, usual
-        The patch's :func:`scatter_of`, and the scene's :func:`usual_scatter`.
+        The patch's :func:`measure_scatter`, and the scene's :func:`usual_scatter`.
     change
         Drift of ln(V / H) at the patch relative to the metal, which is removed, and its standard deviations
-        (:meth:`CommonChange.of`); None if the reference covers the plane.
+        (:meth:`CommonChange.log_ratio`); None if the reference covers the plane.
     local_std
         Relative error of a metal reference that varies over the plane; 0 if it is a single number.
     rise

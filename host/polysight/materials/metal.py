@@ -132,7 +132,7 @@ def metal_evidence(
 
     def other_patches(own_t: npt.NDArray[np.complex128]) -> npt.NDArray[np.float64]:
         """Return log densities of the measured q if the judged patch has t [...], [..., patch]."""
-        usual = np.exp(density.at(own_t[..., None] * q)[1]) * np.abs(own_t[..., None]) ** 2
+        usual = np.exp(density.log_densities(own_t[..., None] * q)[1]) * np.abs(own_t[..., None]) ** 2
         return np.log((1 - _ODD_PATCH) * usual + _ODD_PATCH * _ODD_DENSITY)
 
     theta = np.array([s.theta_rad for s in measurements])

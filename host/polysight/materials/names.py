@@ -136,7 +136,7 @@ def _either(names: Sequence[str]) -> str:
 
 
 def name_patch(
-    kinds: Sequence[Kinds], seen: Sequence[RatioEvidence], inverse_ratios: npt.NDArray[np.complex128]
+    kinds: Sequence[Kinds], kind_evidence: Sequence[RatioEvidence], inverse_ratios: npt.NDArray[np.complex128]
 ) -> NamedPatch:
     """Name a patch and its pixels by what one scan, or several under different angles, say of its ratio.
 
@@ -148,7 +148,7 @@ def name_patch(
     ----------
     kinds
         What patches may be, at each scan's angle.
-    seen
+    kind_evidence
         What the scans say of the patch, in their order.
     inverse_ratios
         complex [n, scan]: V / H of the pixels, NaN where not usable.
@@ -156,8 +156,8 @@ def name_patch(
     good = np.isfinite(inverse_ratios).all(axis=1)
     if not good.any():
         return nothing_named(good.size)
-    seen = [at_kinds(evidence, at) for evidence, at in zip(seen, kinds, strict=True)]
-    odds = weigh_kinds(kinds, seen)
+    kind_evidence = [at_kinds(evidence, kind) for evidence, kind in zip(kind_evidence, kinds, strict=True)]
+    odds = weigh_kinds(kinds, kind_evidence)
     at_first = kinds[0]
     names = np.array(at_first.names)
     foreign_name, in_foreign_name = name_of_literature(at_first, odds)
@@ -166,10 +166,10 @@ def name_patch(
     # Pixels get the corrections of their patch: leakage, tilt, and the common change over the plane.
     middle = np.median(inverse_ratios[good].real, axis=0) + 1j * np.median(inverse_ratios[good].imag, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        correction = np.array([evidence.inverse_ratio for evidence in seen]) / middle
+        correction = np.array([evidence.inverse_ratio for evidence in kind_evidence]) / middle
     corrected = inverse_ratios * np.where(np.isfinite(correction), correction, 1.0)
     called = np.where(at_first.ours, names, np.where(in_foreign_name, foreign_name, UNKNOWN))
-    pixel_names, pixel_distance, confidence = _name_pixels(kinds, seen, corrected, odds.kinds, called)
+    pixel_names, pixel_distance, confidence = _name_pixels(kinds, kind_evidence, corrected, odds.kinds, called)
     return NamedPatch(pixel_names, pixel_distance, replace(verdict, votes=share_of_pixels(pixel_names)), confidence)
 
 
@@ -312,7 +312,7 @@ def add_explanation(
         else:
             explanation = f"rather a thin plate{near}"
     elif name.from_literature:
-        values = _values_of(name.literature)
+        values = _list_values(name.literature)
         explanation = f"{estimate} is like {values} of the literature; not measured by this library{near}"
     else:
         explanation = f"{estimate} matches the library's {nearest_text}{_rivals(name)}"
@@ -323,9 +323,9 @@ def add_explanation(
 
 def _rivals(name: PatchName) -> str:
     """Say which other names are likely; nothing of the KNN, which has no probabilities."""
-    others = [f"{n} {100 * p:.0f} %" for n, p in name.probabilities.items() if n not in (name.name, UNKNOWN)]
-    if others:
-        return f"; it could also be {' or '.join(others[:2])}"
+    other_names = [f"{n} {100 * p:.0f} %" for n, p in name.probabilities.items() if n not in (name.name, UNKNOWN)]
+    if other_names:
+        return f"; it could also be {' or '.join(other_names[:2])}"
     if name.probabilities:
         return "; no other material is likely"
     return ""
@@ -341,7 +341,7 @@ def _estimate(permittivity: complex | None, covariance: npt.NDArray[np.float64] 
     return f"{text} (+- {real:.2f}, {loss:.2f})"
 
 
-def _values_of(literature: Mapping[str, float]) -> str:
+def _list_values(literature: Mapping[str, float]) -> str:
     """The likeliest materials of the literature with their permittivities."""
     values = {material.name: material.permittivity for material in load_catalogue()}
     return ", ".join(_with_permittivity(name, values.get(name)) for name in list(literature)[:MOST_NAMES])

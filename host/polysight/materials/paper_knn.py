@@ -99,16 +99,16 @@ class PaperKNeighborsClassifier(KNeighborsClassifier):
         check_is_fitted(self)
         pixels = self._fit_X if X is None else cast(Any, validate_data)(self, X, reset=False)
         available = self.n_samples_fit_ - (X is None)
-        asked: Any = n_neighbors or self.n_neighbors
-        count = min(int(asked), available)
+        neighbours: Any = n_neighbors or self.n_neighbors
+        count = min(int(neighbours), available)
         nearest = np.empty((len(pixels), count), np.intp)
         distances = np.empty((len(pixels), count))
         for rows in gen_batches(len(pixels), _CHUNK):
             distance = self.metric(pixels[rows], self._fit_X)
             if X is None:
                 # A pixel is no neighbour of itself.
-                own = np.arange(rows.start, rows.stop)
-                distance[own - rows.start, own] = np.inf
+                row_indices = np.arange(rows.start, rows.stop)
+                distance[row_indices - rows.start, row_indices] = np.inf
             nearest[rows] = find_neighbours(distance, count)
             distances[rows] = np.take_along_axis(distance, nearest[rows], axis=1)
         return (distances, nearest) if return_distance else nearest

@@ -344,13 +344,13 @@ class MatchedPatch:
     evidence: tuple[RatioEvidence, ...] | None = None
 
 
-def features_of(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
+def pixel_features(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
     """Return features [n, 4] of pixels; not finite for unusable pixels."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return feature_matrix(np.ravel(h), np.ravel(v), np.ravel(p))
 
 
-def labels_of(found: MaterialsResult, description: str = "") -> Labels:
+def make_labels(found: MaterialsResult, description: str = "") -> Labels:
     """Return boxes around the interiors of a result's patches, in pixels, with unique names as drawn or classified."""
     out: dict[str, Box] = {}
     for r in found.patches:
@@ -374,7 +374,7 @@ def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike,
         pixels = r.patch.interior
         iy, ix = np.nonzero(pixels)
         places.append(np.stack([x[ix], y[iy]], axis=1))
-        features.append(features_of(found.h[pixels], found.v[pixels], found.p[pixels]))
+        features.append(pixel_features(found.h[pixels], found.v[pixels], found.p[pixels]))
         truth = r.truth.name if r.truth else None
         rows.append({"label": r.patch.label, "centre_mm": r.patch.centre_mm, "truth": truth, "pixels": int(ix.size)})
     angle = float(np.degrees(np.mean(found.theta_rad)))
@@ -452,8 +452,8 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
         partners = [p for other_scan in scans[1:] if (p := _partner(patch, scans[0], other_scan)) is not None]
         if len(partners) < len(scans) - 1:
             continue
-        every = zip(scans, (patch, *partners), strict=True)
-        evidence = tuple(scan.evidence[p.label] for scan, p in every if p.label in scan.evidence)
+        pairs = zip(scans, (patch, *partners), strict=True)
+        evidence = tuple(scan.evidence[p.label] for scan, p in pairs if p.label in scan.evidence)
         places = patch.places_mm - patch.centre_mm
         columns = [patch.features]
         near_enough = np.ones(len(places), bool)
@@ -472,11 +472,11 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
 
 def _partner(patch: ScanPatch, here: ScanPatches, there: ScanPatches) -> ScanPatch | None:
     def nearest(to: ScanPatch, among: ScanPatches) -> ScanPatch | None:
-        def apart(p: ScanPatch) -> float:
+        def distance_mm(p: ScanPatch) -> float:
             return float(np.hypot(p.centre_mm[0] - to.centre_mm[0], p.centre_mm[1] - to.centre_mm[1]))
 
-        best = min(among.patches, key=apart, default=None)
-        return best if best is not None and apart(best) <= APART_MM else None
+        best = min(among.patches, key=distance_mm, default=None)
+        return best if best is not None and distance_mm(best) <= APART_MM else None
 
     partner = nearest(patch, there)
     if partner is not None and nearest(partner, here) is patch:

@@ -351,7 +351,7 @@ def _regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -
 
     for threshold in np.arange(float(level[usable].max()), cfg.floor_db, -STEP_DB) - STEP_DB:
         grown: list[_Growing] = []
-        for region in _components(_opened((level > threshold) & rest, opening_px)):
+        for region in _components(_open_mask((level > threshold) & rest, opening_px)):
             inside = [node for node in growing if (node.mask & region).any()]
             complete = [node for node in inside if node.level_db - threshold >= cfg.least_contrast_db]
             overflows = any(region.sum() > OVERFLOW * node.mask.sum() for node in complete)
@@ -373,11 +373,11 @@ def _smooth_outline(mask: Mask) -> Mask:
     """Fill the holes of a region and cut off what is narrower than half of it: speckle, and bridges to a neighbour."""
     filled = np.asarray(scipy.ndimage.binary_fill_holes(mask), bool)
     half_width = float(np.asarray(scipy.ndimage.distance_transform_edt(np.pad(filled, 1))).max())
-    body = max(_components(_opened(filled, BODY * half_width)), key=lambda part: int(part.sum()), default=filled)
+    body = max(_components(_open_mask(filled, BODY * half_width)), key=lambda part: int(part.sum()), default=filled)
     return np.asarray(scipy.ndimage.gaussian_filter(body.astype(float), 1.0) > 0.5, bool)
 
 
-def _opened(mask: Mask, radius_px: float) -> Mask:
+def _open_mask(mask: Mask, radius_px: float) -> Mask:
     """Remove what is narrower than a disk of this radius (morphological opening, by distances)."""
     depth = np.asarray(scipy.ndimage.distance_transform_edt(np.pad(mask, 1)))[1:-1, 1:-1]
     core = depth > radius_px
@@ -466,7 +466,7 @@ def reduce_variation(level: Real, weight: float) -> Real:
 def drop_corners(outline: Real, tolerance: float) -> Real:
     """Return the corners of an outline [n, 2] that keep it within a tolerance (Douglas and Peucker 1973)."""
     last = len(outline) - 1
-    kept = {0, last}
+    kept_indices = {0, last}
     parts = [(0, last)]
     while parts:
         start, end = parts.pop()
@@ -479,6 +479,6 @@ def drop_corners(outline: Real, tolerance: float) -> Real:
         distances = np.hypot(*(between - along[:, None] * side).T)
         if distances.size and distances.max() > tolerance:
             corner = start + 1 + int(distances.argmax())
-            kept.add(corner)
+            kept_indices.add(corner)
             parts += [(start, corner), (corner, end)]
-    return outline[sorted(kept)]
+    return outline[sorted(kept_indices)]

@@ -46,7 +46,7 @@ _SETTLED = 1e-3
 _LEAST_LOSS = 1e-3
 
 
-def softened(t: npt.ArrayLike) -> Real:
+def soft_modulus(t: npt.ArrayLike) -> Real:
     """Return the scale of errors of t = V / H, `sqrt(|t|^2 + SOFT^2)`: V may vanish (Brewster's angle)."""
     return np.asarray(np.hypot(np.abs(t), SOFT), np.float64)
 
@@ -77,9 +77,9 @@ def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
 def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
     """Convert deviations of ln|H| and of t, [..., angles] each, to those of ln|H|, ln|V| and arg P, [..., angles, 3].
 
-    To first order; with :func:`softened` instead of |t|, so that they stay finite if V vanishes.
+    To first order; with :func:`soft_modulus` instead of |t|, so that they stay finite if V vanishes.
     """
-    along = dt * np.exp(-1j * np.angle(t)) / softened(t)
+    along = dt * np.exp(-1j * np.angle(t)) / soft_modulus(t)
     return np.stack([log_h, log_h + along.real, -along.imag], axis=-1)
 
 
@@ -104,7 +104,7 @@ def fit_spread(
     `residuals` [patches, d] are patch means minus their material's mean, `material` and `specimen` the numbers of each
     patch (specimens are numbered over all materials), `effects` [materials, d, 2] those of :func:`effect`, `noise`
     [d, d] the covariance to start from. With `gains_alike` the features are ln|H|, ln|V|, arg P of each angle, with
-    equal gain errors of H and V (:func:`alike`).
+    equal gain errors of H and V (:func:`average_channels`).
 
     Return the variances of ln eps' and ln eps'' of each material, [materials, 2], and the covariance of placements,
     [d, d]. The spread is that of all materials together, with the published spread as prior, corrected by each
@@ -134,7 +134,7 @@ def fit_spread(
         residuals_left = residuals - np.einsum("gda,ga->gd", f, mean)[group]
         blur = np.einsum("g,gda,gab,geb->de", count.astype(float), f, spread, f)
         placement = (residuals_left.T @ residuals_left + blur) / len(residuals)
-        placement = alike(placement) if gains_alike else placement
+        placement = average_channels(placement) if gains_alike else placement
         if np.abs(pooled / pooled_before - 1).max() < _SETTLED:
             break
     return _each(pooled, second, kind, telling), placement
@@ -149,7 +149,7 @@ def _each(pooled: Real, second: Real, kind: npt.NDArray[np.intp], telling: npt.N
     return spreads
 
 
-def alike(covariance: Real) -> Real:
+def average_channels(covariance: Real) -> Real:
     """Return a covariance of ln|H|, ln|V|, arg P, [3 * angles, 3 * angles], with equal gain errors of H and V.
 
     A specimen's deviation changes mostly V, so that the gain error of V cannot be separated from it; that of H can.

@@ -34,7 +34,7 @@ from polysight.materials.analyse import Optics, level, reference_spread, smooth_
 from polysight.materials.inversion import ratio_slopes
 from polysight.materials.layers import METAL, THICKNESS_RANGE_M, Bands, Layer, LayerFit, Spectrum, fit_layer
 from polysight.materials.library import Library
-from polysight.materials.measure import LEAST_STD, NOT_PASSIVE, median_ratio, relative_errors, scatter_of
+from polysight.materials.measure import LEAST_STD, NOT_PASSIVE, measure_scatter, median_ratio, relative_errors
 from polysight.materials.result import MaterialsResult
 from polysight.polarimetry import PlaneReference, inverse_spread, remove_leakage
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, ScanMaterials
@@ -127,14 +127,14 @@ def band_rows(
             pixels = r.patch.interior & band_images.valid
             full_band = (found.h[pixels], found.v[pixels])
             parts[r.patch.label].append(_measure_band(band, h[pixels], v[pixels], full_band, error))
-    own = {r.patch.label: _own_std(found, r.patch.interior) for r in found.patches}
-    return {label: _with_covariance(rows, found, own[label]) for label, rows in parts.items()}
+    std_by_label = {r.patch.label: _own_std(found, r.patch.interior) for r in found.patches}
+    return {label: _with_covariance(rows, found, std_by_label[label]) for label, rows in parts.items()}
 
 
 def _own_std(found: MaterialsResult, interior: Mask) -> float:
     """Return the standard error of a patch's V / H, each part, by what scatters over the plate; NaN if not known."""
     images = found.calibrated
-    scatter = scatter_of(interior, found.h, found.v, images.x_m, images.y_m)
+    scatter = measure_scatter(interior, found.h, found.v, images.x_m, images.y_m)
     if scatter is None:
         return float("nan")
     inverse = 1 / median_ratio(found.h[interior], found.v[interior])
@@ -246,7 +246,7 @@ def bands_of_row(
         return None
     inverse = 1 / np.array(ratios, np.complex128)
     sigma = np.array(errors)
-    spectrum = Spectrum.of(chirp, count)
+    spectrum = Spectrum.from_chirp(chirp, count)
     level = [part.amplitude_h for part in parts]
     shared = [part.covariance for part in row.bands or () if part.covariance]
     covariance = None
@@ -255,16 +255,20 @@ def bands_of_row(
     else:
         # Products of earlier releases have no covariance: K bands are then no better than one.
         sigma = np.sqrt(count) * sigma
+    theta_std = 0.0
+    phase_per_angle = 0.0
     if theta_std_rad:
-        turn = (float(np.hypot(theta_std_rad, LAYERED_STD_RAD)), PHASE_PER_ANGLE)
-    else:
-        turn = (0.0, 0.0)
+        theta_std = float(np.hypot(theta_std_rad, LAYERED_STD_RAD))
+        phase_per_angle = PHASE_PER_ANGLE
+    bands = Bands(
+        spectrum, inverse, sigma, covariance=covariance, theta_std_rad=theta_std, phase_per_angle=phase_per_angle
+    )
     if not amplitude_error or any(a is None for a in level):
-        return Bands(spectrum, inverse, sigma, None, None, covariance, 0.0, *turn)
+        return bands
     h = np.array(level, np.float64)
     if covariance is None:
-        return Bands(spectrum, inverse, sigma, h, np.sqrt(count) * amplitude_error * h, None, 0.0, *turn)
-    return Bands(spectrum, inverse, sigma, h, BAND_AMPLITUDE_STD * h, covariance, amplitude_error, *turn)
+        return replace(bands, amplitude_h=h, sigma_h=np.sqrt(count) * amplitude_error * h)
+    return replace(bands, amplitude_h=h, sigma_h=BAND_AMPLITUDE_STD * h, common_h=amplitude_error)
 
 
 LAYER_FORMS = (
@@ -280,7 +284,7 @@ def parse_layer(text: str) -> Layer:
     if rest == ["metal"]:
         return Layer(name, METAL)
     if rest and rest[0] == "?" and len(rest) <= 2:
-        return _unknown(name, *rest[1:])
+        return _parse_unknown_layer(name, *rest[1:])
     if len(rest) not in (2, 3):
         raise ValueError(text)
     real, loss, *thickness = (float(part) for part in rest)
@@ -289,7 +293,7 @@ def parse_layer(text: str) -> Layer:
     return Layer(name, complex(real, -loss), _metres(thickness[0]) if thickness else None)
 
 
-def _unknown(name: str, size: str = "") -> Layer:
+def _parse_unknown_layer(name: str, size: str = "") -> Layer:
     if not size:
         return Layer(name)
     if size == "?":

@@ -113,7 +113,7 @@ class LabelledScan:
             )
         return mask
 
-    def oriented(self, how: str) -> LabelledScan:
+    def orient(self, how: str) -> LabelledScan:
         """Return the scan with its images in another orientation, a key of `ORIENTATIONS`."""
         turn = ORIENTATIONS[how]
         return LabelledScan(self.scan, self.description, turn(self.h), turn(self.v), self.boxes, self.simulated)
@@ -180,7 +180,7 @@ def image_orientation(scans: Sequence[LabelledScan]) -> str:
     shares = {}
     for orientation in ORIENTATIONS:
         try:
-            shares[orientation] = float(np.mean([explained_variance(s.oriented(orientation)) for s in scans]))
+            shares[orientation] = float(np.mean([explained_variance(s.orient(orientation)) for s in scans]))
         except DataError:
             # A box outside the image
             shares[orientation] = -1.0
@@ -564,10 +564,10 @@ def fit_library(library: Library) -> Library:
 
     Raises DataError with fewer than two scans of an angle: a split by pixel would be too optimistic.
     """
-    samples = {f"{angle:g}": Samples.of(library.at(angle), PIXELS) for angle in library.angles_deg}
+    samples = {f"{angle:g}": Samples.from_library(library.at_angle(angle), PIXELS) for angle in library.angles_deg}
     fits = {angle: fit_samples(angle_samples) for angle, angle_samples in samples.items()}
     if len(samples) > 1:
-        fits["+".join(samples)] = fit_samples(reduce(Samples.joined, samples.values()))
+        fits["+".join(samples)] = fit_samples(reduce(Samples.join, samples.values()))
     return Library(library.entries, {"angles": fits}, library.note)
 
 
@@ -640,7 +640,7 @@ class TrainingScan:
     specimens: Mapping[int, str] | None = None
 
 
-def entries_of(scan: TrainingScan) -> list[Entry]:
+def make_entries(scan: TrainingScan) -> list[Entry]:
     """Return the library entries of one scan: each patch of known material, with up to `PIXELS` interior pixels.
 
     Pixels are taken at even intervals, so that the same scan always gives the same entries.
@@ -680,7 +680,7 @@ def make_library(scans: Iterable[TrainingScan], note: str = "") -> Library:
 
     Raises DataError with no patch of known material, or fewer than two scans with one.
     """
-    entries = [e for scan in scans for e in entries_of(scan)]
+    entries = [e for scan in scans for e in make_entries(scan)]
     if not entries:
         raise DataError(
             "no patch of known material in these scans",

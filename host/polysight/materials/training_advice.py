@@ -63,24 +63,24 @@ def _confidence_lines(angle: str, fit: Mapping[str, Any]) -> list[str]:
     if abs(misfit) > max(2 * chance, LEAST_MISFIT):
         kind = "overconfident" if misfit > 0 else "underconfident"
         if misfit < 0 and not fit["specimen_freedom"]:
-            why = "no second specimen of a material is known: how they differ counts as an error of placement"
+            cause = "no second specimen of a material is known: how they differ counts as an error of placement"
         elif misfit < 0:
-            why = "its specimens differ less than the published spread says, which counts as 4 specimens"
+            cause = "its specimens differ less than the published spread says, which counts as 4 specimens"
         elif fit["scans"] < FEW_SCANS:
-            why = f"the errors of metal reference and placement are known from {fit['scans']} scans only"
+            cause = f"the errors of metal reference and placement are known from {fit['scans']} scans only"
         elif missing:
-            why = "specimens left out differ more from those learnt than these from each other"
+            cause = "specimens left out differ more from those learnt than these from each other"
         else:
-            why = "errors of its scans are not alike: a scan may be disturbed, or a label wrong"
+            cause = "errors of its scans are not alike: a scan may be disturbed, or a label wrong"
         lines.append(
             f"{angle} degrees: {kind}: names are said with {100 * fit['said']:.0f} % and {100 * fit['right']:.0f} % are"
-            f" right: {why}"
+            f" right: {cause}"
         )
     if missing:
         lines.append(f"{angle} degrees: {need}")
-    for one, other, distance in fit["alike"][:SHOWN_PAIRS]:
+    for first, second, distance in fit["alike"][:SHOWN_PAIRS]:
         lines.append(
-            f"{angle} degrees: {one} and {other} lie {distance:.1f} standard deviations apart: more specimens do not"
+            f"{angle} degrees: {first} and {second} lie {distance:.1f} standard deviations apart: more specimens do not"
             " separate them; a second angle may, or one name for both"
         )
     return lines
@@ -89,7 +89,7 @@ def _confidence_lines(angle: str, fit: Mapping[str, Any]) -> list[str]:
 def alike_pairs(samples: Samples) -> list[tuple[str, str, float]]:
     """Return pairs of materials that a patch hardly tells apart, and their distance in standard deviations."""
     model = ErrorDiscriminant().fit(samples)
-    distances = model.apart()
+    distances = model.distances()
     pairs = []
     for i, j in zip(*np.triu_indices(len(model.names), 1), strict=True):
         if distances[i, j] < ALIKE_STD:

@@ -94,7 +94,7 @@ UNATTENDED_ROWS = 3.0
 
 def scene_m(rig: Instrument) -> tuple[float, float]:
     """Excess paths that the scene can have: nearest and farthest, metres."""
-    antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
+    antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
     return scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig))
 
 

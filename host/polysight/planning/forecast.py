@@ -275,7 +275,7 @@ def forecast(
 def describe_aperture(rig: Instrument) -> tuple[Aperture, Real]:
     """Return the aperture of the H receiver and its taper [row, column]."""
     grid = image_grid(rig)
-    antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
+    antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
     frequencies = reduction(
         rig.chirp, scene_gate_m(antennas, plan_raster(rig.grid), grid), _FAST_TIME_WINDOW
     ).frequencies_hz
@@ -294,7 +294,7 @@ def predict_burst(rig: Instrument) -> BurstForecast:
     travel_mm = stage.speed_mm_s * burst_duration_s(rig.burst)
     middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * sum(rig.chirp.linear_samples) / 2
     half_m = (grid.columns - 1) / 2 * grid.step_x_mm / 1e3
-    change_rad = travel_mm / 1e3 * abs(PhaseSlope(rig, 0).at(half_m, middle_hz))
+    change_rad = travel_mm / 1e3 * abs(PhaseSlope(rig, 0).slope(half_m, middle_hz))
     return BurstForecast(
         duration_ms=rig.burst.pulses * rig.burst.period_us * 1e-3,
         between_ms=1e3 * grid.step_x_mm / stage.speed_mm_s,

@@ -387,7 +387,7 @@ def measure_noise(source: RawSource) -> Noise:
     spread = np.linspace(0, len(rows) - 1, min(_NOISE_ROWS, len(rows))).astype(int)
     ratios = []
     for board in rig.receivers:
-        setup = BoardSetup.of(rig, board)
+        setup = BoardSetup.from_rig(rig, board)
         report = SyncReport(rig.chirp.sample_rate_hz, rig.chirp.linear_samples, len(rig.antennas.rx_mm))
         for row in (rows[i] for i in spread):
             data = source.read_row(board.name, row)

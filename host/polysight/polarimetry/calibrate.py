@@ -333,7 +333,9 @@ def plane_reference(
     description = (
         f"a metal plate scanned on its own{f' ({name})' if name else ''}, by position on {share:.0f} % of the image"
     )
-    return PlaneReference(metal_h, metal_v, inside, images.x_m, images.y_m, spread, description)
+    return PlaneReference(
+        h=metal_h, v=metal_v, valid=inside, x_m=images.x_m, y_m=images.y_m, spread=spread, how=description
+    )
 
 
 def _disk(radius: int) -> npt.NDArray[np.bool_]:

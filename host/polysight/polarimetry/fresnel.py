@@ -283,7 +283,7 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         angle, path = _half_bistatic(rig, i, points)
         specular, shortest = _half_bistatic(rig, i, middle)
         weight = np.exp(-((2 * np.pi / wavelength * (path - shortest)) ** 2) / 8)
-        deviation, mass = (_convolved(visited, map_part) for map_part in (weight * (angle - specular), weight))
+        deviation, mass = (_convolve(visited, map_part) for map_part in (weight * (angle - specular), weight))
         # Sample (row, column) of the full convolution is the pixel at offset + displacement from the midpoint.
         column = (x - middle[0]) / step[0] + (count[0] - 1) / 2 + reach[0]
         row = (y - middle[1]) / step[1] + (count[1] - 1) / 2 + reach[1]
@@ -295,7 +295,7 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
     return total / len(rig.receivers)
 
 
-def _convolved(a: Real, b: Real) -> Real:
+def _convolve(a: Real, b: Real) -> Real:
     """Return the full linear convolution of two images; scipy.signal would load scipy.stats, which takes a second."""
     shape = [m + n - 1 for m, n in zip(a.shape, b.shape, strict=True)]
     fast = [scipy.fft.next_fast_len(n, real=True) for n in shape]

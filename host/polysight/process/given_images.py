@@ -297,7 +297,7 @@ def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
     """Read `labels/<scan>`; row 0 of its images is the top of the published pictures."""
     scan = read_labelled_scan(folder)
     orientation = image_orientation([scan])
-    scan = scan.oriented(orientation)
+    scan = scan.orient(orientation)
     arrays = {"h": scan.h, "v": scan.v}
     _check_channels(folder, arrays)
     x_m = _axis(folder, arrays, "x_m", scan.h.shape[1], rig, [])
@@ -376,7 +376,7 @@ def describe_illumination(images: Images, rig: Instrument) -> Illumination:
     chirp = rig.chirp
     middle_hz = chirp.first_sample_hz + chirp.hz_per_sample * float(np.mean(chirp.linear_samples))
     plane_m = rig.geometry.object_distance_mm / 1e3
-    boards = [illumination_geometry(Antennas.of(rig, board), plane_m, middle_hz) for board in rig.receivers]
+    boards = [illumination_geometry(Antennas.from_rig(rig, board), plane_m, middle_hz) for board in rig.receivers]
     pitch_m = float(images.x_m[1] - images.x_m[0])
     return Illumination(
         footprints=np.ones((2, *images.h.shape), np.complex64),
@@ -463,7 +463,7 @@ def analyse_given_images(
         images = images.within(plane.valid_on(images.x_m, images.y_m))
         scene = replace(scene, metal=plane)
     everywhere = np.full(images.h.shape, np.radians(angle.deg))
-    optics = Optics.of(
+    optics = Optics.from_rig(
         rig, IncidenceChoice("one", everywhere, everywhere), theta_std_rad=UNKNOWN_PLANE.incidence_std_rad(rig)
     )
     scene = replace(scene, plates=plates)

@@ -62,11 +62,11 @@ def why_unnamed(settings: Settings, rig: Instrument) -> str:
     angle = incidence_deg(rig, rig.receivers[0])
     known_angles = Library.load(path).angles_deg
     # Classifier refuses an empty library.
-    if not known_angles or any(abs(known - angle) <= SAME_ANGLE_DEG for known in known_angles):
+    if not known_angles or any(abs(library_angle - angle) <= SAME_ANGLE_DEG for library_angle in known_angles):
         return ""
     return (
         f"Nothing was named: the scan looks at {angle:.1f} degrees of incidence, and {path.name} holds"
-        f" {' and '.join(f'{known:g}' for known in known_angles)} degrees only (|P| changes by a tenth in a degree)."
+        f" {' and '.join(f'{a:g}' for a in known_angles)} degrees only (|P| changes by a tenth in a degree)."
         " Train a library at this angle, and process the scan again with --library."
     )
 

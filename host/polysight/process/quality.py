@@ -61,7 +61,7 @@ from polysight.results import (
     tilt_reasons,
 )
 from polysight.store import CubeRow, RowData, Source
-from polysight.sync import SyncedRow, block_sweep_of, estimate_backlash, object_filter, sweep_of
+from polysight.sync import SyncedRow, block_frequencies_hz, estimate_backlash, object_filter, sample_frequencies_hz
 from polysight_shared.config import Board, CheckPlate, Instrument
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
@@ -128,7 +128,7 @@ class BoardRows:
     rows: dict[int, RowQuality] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        sweeps = sweep_of(self.rig.chirp), block_sweep_of(self.rig.chirp)
+        sweeps = sample_frequencies_hz(self.rig.chirp), block_frequencies_hz(self.rig.chirp)
         self._filters = {sweep.size: object_filter(self.rig, self.board, sweep) for sweep in sweeps}
 
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:

@@ -78,7 +78,7 @@ _log = logging.getLogger(__name__)
 
 def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
     """Return the settings that samples depend on besides raw data and gate: the calibrated rig and its filters."""
-    imaged = msgspec.to_builtins(ImagedWith.of(rig, filters))
+    imaged = msgspec.to_builtins(ImagedWith.from_rig(rig, filters))
     imaged.pop("apodisation")
     parts = {name: msgspec.to_builtins(getattr(rig, name)) for name in ("chirp", "burst", "grid")}
     return json.loads(json.dumps({"making": MAKING, **imaged, **parts, "speed_mm_s": rig.stage.speed_mm_s}))
@@ -193,7 +193,7 @@ class KeptSamples:
         self._arrays: dict[str, NDArray[Any]] = {}
         self._lock = threading.Lock()
         self._head = self._read_head()
-        viewed = view.of(rig, source.mirrored)
+        viewed = view.apply_to(rig, source.mirrored)
         gate = self._gate_m(rig, needed_gate_m(viewed, depth_m), needed_gate_m(rig, PLANE_REACH_M))
         self.images = ImageBuilder(viewed, live=live, gate_m=gate)
         self.sub_bands = SubBandImages(viewed, self._bands, gate)
@@ -375,7 +375,7 @@ class KeptSamples:
         out = np.zeros((), self._type(board))
         forward = slice(None, None, self._plan.row(row).direction)
         for name, builder in self._builders.items():
-            out[name], out[f"{name}_direct"], out["valid"] = builder.boards[board].reduced(row)
+            out[name], out[f"{name}_direct"], out["valid"] = builder.boards[board].read_reduced(row)
         quality = self._quality.boards[board].rows[row]
         out["echo"] = quality.echo[:, forward]
         out["direct_hz"] = quality.direct_hz[forward]

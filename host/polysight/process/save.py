@@ -15,7 +15,7 @@ from polysight.materials import (
     TruthPlate,
     classifier_sentence,
     expected_pixel_accuracy,
-    labels_of,
+    make_labels,
     pack_labels,
     pack_patches,
     pixel_accuracy,
@@ -200,7 +200,7 @@ def save_materials(out: Path, scan: ProcessedScan, result: MaterialsResult, unna
     from polysight.report import write_report
 
     save_images(out, scan)
-    boxes = labels_of(result, f"patches of scan {scan.scan_id}, in pixels of image.npz")
+    boxes = make_labels(result, f"patches of scan {scan.scan_id}, in pixels of image.npz")
     write_atomically(out / LABELS, pack_labels(boxes))
     write_atomically(out / PATCHES, pack_patches(result, scan.images.x_m, scan.images.y_m, scan.stamped))
     write_json(out / MATERIALS, scan.materials)

@@ -292,7 +292,7 @@ def _keep_inside(ax: Axes, text: Text, top_mm: float) -> None:
 def _crop(ax: Axes, scan: ProcessedScan) -> None:
     """Set limits around patches and plates: square, inside the image, the same for map and truth."""
     boxes = [patch.box_mm for patch in scan.segments] + [plate.box_mm for plate in scan.plates]
-    left, right, bottom, top = extent_mm(scan)
+    left_mm, right, bottom, top = extent_mm(scan)
     if boxes:
         b = np.array(boxes)
         x0 = b[:, 0].min() - 20
@@ -302,11 +302,11 @@ def _crop(ax: Axes, scan: ProcessedScan) -> None:
         half = max(x1 - x0, y1 - y0) / 2
         cx = (x0 + x1) / 2
         cy = (y0 + y1) / 2
-        left = max(left, cx - half)
+        left_mm = max(left_mm, cx - half)
         right = min(right, cx + half)
         bottom = max(bottom, cy - half)
         top = min(top, cy + half)
-    ax.set_xlim(left, right)
+    ax.set_xlim(left_mm, right)
     ax.set_ylim(bottom, top)
 
 
@@ -314,7 +314,7 @@ def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[MapLabe
     """Draw the true plates. Return the labels."""
     colours = assign_colours(scan)
     _crop(ax, scan)
-    left, right = ax.get_xlim()
+    left_mm, right = ax.get_xlim()
     bottom, top = ax.get_ylim()
     labels = []
     for number, plate in enumerate(scan.plates, 1):
@@ -327,7 +327,7 @@ def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[MapLabe
             _keep_inside(ax, text, y1)
         else:
             # The plate is larger than the image: a name above it would be far outside the picture.
-            text = write_label(ax, (max(x0, left) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size)
+            text = write_label(ax, (max(x0, left_mm) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size)
         labels.append(MapLabel(text, str(number), name, colour))
     return labels
 

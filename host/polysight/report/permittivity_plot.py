@@ -79,7 +79,7 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
         best = point + candidates[0]
         least_cost = math.inf
         for place in point + candidates:
-            labels = sum(bool((np.abs(place - other) < _LABEL_PT).all()) for other in taken)
+            labels = sum(bool((np.abs(place - taken_place) < _LABEL_PT).all()) for taken_place in taken)
             covered = (np.abs(solid - place) < np.array(_LABEL_PT) / 2 + _POINT_PT / 2).all(axis=1).sum()
             cost = 2.0 * labels + covered
             if cost < least_cost:

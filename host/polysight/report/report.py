@@ -197,7 +197,9 @@ def _remedies(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
     for row in rows:
         if row["do"]:
             patches_by_remedy.setdefault((row["dominated_by"], row["do"]), []).append(str(row["label"]))
-    return [{"what": what, "do": do, "patches": ", ".join(labels)} for (what, do), labels in patches_by_remedy.items()]
+    return [
+        {"what": problem, "do": do, "patches": ", ".join(labels)} for (problem, do), labels in patches_by_remedy.items()
+    ]
 
 
 def _replaced_names(scan: ProcessedScan) -> list[str]:

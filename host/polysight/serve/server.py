@@ -120,8 +120,8 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
         raise ConfigError(f"{root}: no such folder", "scans are listed under it", "make it, or give another")
     if config is not None:
         config = config.absolute()
-    shown = Shown(root.absolute(), None, control, config)
-    return _run(shown, place, f"scans in {root}")
+    shown_scans = Shown(root.absolute(), None, control, config)
+    return _run(shown_scans, place, f"scans in {root}")
 
 
 def preview(folder: Path, place: Place, control: bool) -> int:

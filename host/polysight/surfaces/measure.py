@@ -152,8 +152,8 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
         for index, near in zip(members, neighbours, strict=True):
             if len(near) < MIN_NEIGHBOURS:
                 continue
-            bend[index], left = fit_bend(echoes, int(index), members[near])
-            slope_std[index] = np.maximum(slope_std[index], left)
+            bend[index], residuals = fit_bend(echoes, int(index), members[near])
+            slope_std[index] = np.maximum(slope_std[index], residuals)
     return replace(echoes, bend=bend, slope_std=slope_std)
 
 
@@ -161,10 +161,10 @@ def fit_bend(echoes: Echoes, index: int, others: NDArray[np.int_]) -> tuple[Arra
     """Symmetric curvature [2, 2] from the slopes of neighbours, and what it leaves of these, root mean square [2]."""
     d = (echoes.at_m[others] - echoes.at_m[index])[:, :2]
     zero = np.zeros(len(d))
-    one = np.ones(len(d))
+    ones = np.ones(len(d))
     # Unknown: g_x, g_y, Q_xx, Q_xy, Q_yy.
-    along_x = np.stack([one, zero, d[:, 0], d[:, 1], zero], axis=1)
-    along_y = np.stack([zero, one, zero, d[:, 0], d[:, 1]], axis=1)
+    along_x = np.stack([ones, zero, d[:, 0], d[:, 1], zero], axis=1)
+    along_y = np.stack([zero, ones, zero, d[:, 0], d[:, 1]], axis=1)
     slopes = np.concatenate(list(echoes.slope[others].T))
     # The windows' own curvatures count as slopes at this distance.
     weight_m = LEVER_OF_WINDOW_M * np.sqrt(len(d))
@@ -172,6 +172,6 @@ def fit_bend(echoes: Echoes, index: int, others: NDArray[np.int_]) -> tuple[Arra
     matrix = np.concatenate([along_x, along_y, weight_m * np.eye(5)[2:]])
     right = np.concatenate([slopes, weight_m * np.array([bend[0, 0], bend[0, 1], bend[1, 1]])])
     fitted = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    left = (slopes - matrix[: len(slopes)] @ fitted).reshape(2, -1)
+    residuals = (slopes - matrix[: len(slopes)] @ fitted).reshape(2, -1)
     freedom = max(1.0, len(d) - 2.5)
-    return np.array([[fitted[2], fitted[3]], [fitted[3], fitted[4]]]), np.sqrt(np.sum(left**2, axis=1) / freedom)
+    return np.array([[fitted[2], fitted[3]], [fitted[3], fitted[4]]]), np.sqrt(np.sum(residuals**2, axis=1) / freedom)

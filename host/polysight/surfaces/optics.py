@@ -48,7 +48,7 @@ class Antenna:
         vector = self.wanted + self.leakage * self.other
         return _carry(self.boresight, directions, vector)
 
-    def turned(self, angle_rad: float) -> Antenna:
+    def turn(self, angle_rad: float) -> Antenna:
         """Return the antenna with its polarisation turned about the boresight."""
         cos = np.cos(angle_rad)
         sin = np.sin(angle_rad)

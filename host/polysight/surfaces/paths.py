@@ -119,7 +119,7 @@ class Echoes:
         """Return all echoes of several parts."""
         return Echoes(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Echoes)})
 
-    def moved(self, at_m: Array, wave_number: float) -> Echoes:
+    def move(self, at_m: Array, wave_number: float) -> Echoes:
         """Return the echoes at other stage offsets [n, 3] near by: path, slope and phase follow the fitted path."""
         d = (at_m - self.at_m)[:, :2]
         rise = np.einsum("np,np->n", self.slope, d) + np.einsum("np,npq,nq->n", d, self.bend, d) / 2

@@ -113,7 +113,7 @@ def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Vol
         at_m = seen_from[channel]
         path, _, _ = predict_echo(*solid, at_m, tx_m, receiver.at_m)
         spread = spreading(*solid, at_m, tx_m, receiver.at_m)
-        b.append(echoes.moved(at_m, k).amplitude * np.exp(1j * k * path) / spread)
+        b.append(echoes.move(at_m, k).amplitude * np.exp(1j * k * path) / spread)
         std.append(echoes.amplitude_std / spread)
         rows.append(polarisation_row(shape.points, shape.normals, at_m, optics.tx, receiver))
     _, back, *_ = unit_legs(shape.points, seen_from["v"], tx_m, optics.v.at_m)
@@ -183,7 +183,7 @@ class Gains:
         """ln|gain of H|, [n]."""
         return self._basis(arrival) @ self.level_terms
 
-    def unknown(self, arrival: Array) -> Array:
+    def unknown_std(self, arrival: Array) -> Array:
         """Standard deviation of ln(H / V) by directions that the reference does not cover, [n]."""
         low, high = self.covered
         beyond = np.linalg.norm(np.maximum(0, np.maximum(low - arrival, arrival - high)), axis=1)
@@ -429,7 +429,7 @@ def disturb_optics(optics: Optics, uncertainty: Uncertainty) -> list[tuple[str, 
         for axis in np.eye(3):
             moved = replace(antenna, at_m=antenna.at_m + uncertainty.place_m * axis)
             rigs.append(("places", replace(optics, **{name: moved})))
-        rigs.append(("axes", replace(optics, **{name: antenna.turned(uncertainty.axis_rad)})))
+        rigs.append(("axes", replace(optics, **{name: antenna.turn(uncertainty.axis_rad)})))
     for name in ("h", "v"):
         antenna = getattr(optics, name)
         for part in (1, 1j):
@@ -467,13 +467,14 @@ def add_common_errors(
     coefficients = reflect_points(fit.eps, v, wave_number)
     miss = find_misses(v, gains, coefficients)
     changes: list[tuple[str, Complex]] = []
-    for other in disturbed:
-        disturbed_coefficients = reflect_points(fit.eps, other.voltages, wave_number)
-        changes.append((other.source, find_misses(other.voltages, other.gains, disturbed_coefficients) - miss))
+    for disturbed_values in disturbed:
+        disturbed_coefficients = reflect_points(fit.eps, disturbed_values.voltages, wave_number)
+        disturbed_miss = find_misses(disturbed_values.voltages, disturbed_values.gains, disturbed_coefficients)
+        changes.append((disturbed_values.source, disturbed_miss - miss))
 
     # An error of ln(H / V) of the reference turns and scales b_H.
     of_h = miss + v.b[:, 1] * receive(v, coefficients)[:, 0]
-    reference_change = of_h * gains.unknown(v.arrival)
+    reference_change = of_h * gains.unknown_std(v.arrival)
     flat = np.stack(reflect_flat(fit.eps, v.theta), axis=1)
     first_order = find_misses(v, gains, flat) - miss
     model_change = first_order * (expansion_parameter(v, wave_number) + CURVATURE_ERROR)

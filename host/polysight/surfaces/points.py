@@ -56,9 +56,9 @@ def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -
 def find_normals(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array]:
     """Normals towards the antennas [n, 3], and cosines of incidence [n]."""
     t, r, *_ = unit_legs(points_m, at_m, tx_m, rx_m)
-    both = t + r
-    length = np.linalg.norm(both, axis=1)
-    return -both / length[:, None], length / 2
+    bisector = t + r
+    length = np.linalg.norm(bisector, axis=1)
+    return -bisector / length[:, None], length / 2
 
 
 def tangents(normals: Array) -> Array:

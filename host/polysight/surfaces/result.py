@@ -103,7 +103,7 @@ class Surface:
 
 
 def analyse_surface(
-    seen: Seen,
+    echoes: Seen,
     optics: Optics,
     reference: Reference | None,
     *,
@@ -113,20 +113,20 @@ def analyse_surface(
 ) -> Surface:
     """Return shape and permittivity of the points seen; without a reference, the shape alone."""
     gains = None if reference is None else reference(optics)
-    seen = drop_edges(seen, optics, gains)
-    shape = find_shape(seen.h, optics)
-    numbers = np.unique(seen.segment)
-    segments = [describe_segment(int(number), shape[seen.segment == number]) for number in numbers]
-    permittivity = np.full(len(seen), complex(np.nan, np.nan))
-    covariance = np.full((len(seen), 2, 2), np.nan)
+    echoes = drop_edges(echoes, optics, gains)
+    shape = find_shape(echoes.h, optics)
+    numbers = np.unique(echoes.segment)
+    segments = [describe_segment(int(number), shape[echoes.segment == number]) for number in numbers]
+    permittivity = np.full(len(echoes), complex(np.nan, np.nan))
+    covariance = np.full((len(echoes), 2, 2), np.nan)
     if reference is None or gains is None:
         reason = "no metal reference: calibrate with a sphere, or give --reference"
         segments = [replace(segment, reason=reason) for segment in segments]
     else:
-        voltages = find_voltages(seen, optics, shape)
-        disturbed = disturb_scan(seen, optics, reference, uncertainty)
+        voltages = find_voltages(echoes, optics, shape)
+        disturbed = disturb_scan(echoes, optics, reference, uncertainty)
         for index, segment in enumerate(segments):
-            members = seen.segment == segment.number
+            members = echoes.segment == segment.number
             own_voltages = voltages[members]
             judged, fit = judge_segment(segment, own_voltages, gains, optics.wave_number)
             segments[index] = judged
@@ -142,7 +142,7 @@ def analyse_surface(
             common = sum((c for name, c in sources.items() if name != "scatter"), np.zeros((2, 2)))
             permittivity[members] = point_permittivity(own_voltages, gains, optics.wave_number)
             covariance[members] = point_covariance(own_voltages, gains, fit, optics.wave_number) + common
-    position_std_m, normal_std_rad = find_shape_errors(seen.h, shape, optics, uncertainty)
+    position_std_m, normal_std_rad = find_shape_errors(echoes.h, shape, optics, uncertainty)
     return Surface(
         scan_id=scan_id,
         simulated=simulated,
@@ -154,7 +154,7 @@ def analyse_surface(
         covariance=covariance,
         position_std_m=position_std_m,
         normal_std_deg=np.degrees(normal_std_rad),
-        segment=seen.segment,
+        segment=echoes.segment,
         segments=tuple(segments),
     )
 
@@ -218,11 +218,11 @@ def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty:
     tangent = tangents(shape.normals)
 
     def find_changes(moved: Shape) -> tuple[Array, Array]:
-        away = moved.points - shape.points
+        shift_m = moved.points - shape.points
         turn = np.einsum("nij,ni->nj", tangent, moved.normals - shape.normals)
-        slide = np.einsum("nij,ni->nj", tangent, away)
+        slide = np.einsum("nij,ni->nj", tangent, shift_m)
         bent = np.einsum("njk,nk->nj", shape.curvature, slide)
-        return np.einsum("ni,ni->n", away, shape.normals), turn - bent
+        return np.einsum("ni,ni->n", shift_m, shape.normals), turn - bent
 
     rigs = [rig for source, rig in disturb_optics(optics, uncertainty) if source == "places"]
     changes = [find_changes(find_shape(echoes, rig)) for rig in rigs]

@@ -12,7 +12,14 @@ from polysight.sync.chain import STAGES, BoardSetup, RowSynchroniser, SyncedRow,
 from polysight.sync.decimate import FOLD, decimation
 from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
 from polysight.sync.loops import cis
-from polysight.sync.offsets import AlignedRow, align_row, block_sweep_of, reference, sweep_of, whole_blocks
+from polysight.sync.offsets import (
+    AlignedRow,
+    align_row,
+    block_frequencies_hz,
+    reference,
+    sample_frequencies_hz,
+    whole_blocks,
+)
 
 __all__ = [
     "FOLD",
@@ -23,7 +30,7 @@ __all__ = [
     "RowSynchroniser",
     "SyncedRow",
     "align_row",
-    "block_sweep_of",
+    "block_frequencies_hz",
     "cis",
     "decimation",
     "estimate_backlash",
@@ -31,7 +38,7 @@ __all__ = [
     "high_pass",
     "object_filter",
     "reference",
-    "sweep_of",
+    "sample_frequencies_hz",
     "synchronise_row",
     "whole_blocks",
 ]

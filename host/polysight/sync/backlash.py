@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.sync.offsets import excess_path_m, sweep_of
+from polysight.sync.offsets import excess_path_m, sample_frequencies_hz
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.raster import mean_burst_travel_mm, plan_raster
@@ -31,7 +31,7 @@ def object_filter(rig: Instrument, board: Board, sweep_hz: NDArray[np.float64]) 
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
     excess = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).mean()
     a, b = rig.chirp.linear_samples
-    first, last = sweep_of(rig.chirp)[[a, b - 1]]
+    first, last = sample_frequencies_hz(rig.chirp)[[a, b - 1]]
     linear = np.flatnonzero((sweep_hz >= first) & (sweep_hz <= last))
     weights = np.zeros(sweep_hz.size, np.complex64)
     weights[linear] = np.hanning(linear.size + 2)[1:-1] / linear.size
@@ -95,10 +95,10 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     shift, without = 0.0, np.zeros(_GROUPS)
     for _ in range(_STEPS):
         s = sums(shift)
-        left = s.sum(axis=0) - s  # sums without one group: jackknife, Efron 1982
-        if s[:, 1].sum() == 0 or left[:, 1].min() <= 0 or s[:, 3].sum() > _ALIASED * s[:, 2].sum():
+        sums_without_one = s.sum(axis=0) - s  # sums without one group: jackknife, Efron 1982
+        if s[:, 1].sum() == 0 or sums_without_one[:, 1].min() <= 0 or s[:, 3].sum() > _ALIASED * s[:, 2].sum():
             return None
-        without = shift + left[:, 0] / left[:, 1]
+        without = shift + sums_without_one[:, 0] / sums_without_one[:, 1]
         shift += float(np.clip(s[:, 0].sum() / s[:, 1].sum(), -plan.step_x_mm / 2, plan.step_x_mm / 2))
     std = float(np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((without - without.mean()) ** 2)))
     return Backlash(shift, std) if std < plan.step_x_mm / 4 else None

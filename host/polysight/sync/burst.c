@@ -117,7 +117,7 @@ static int choose_coherent(const double *coherence, const uint8_t *usable, int c
     return count;
 }
 
-/* `offsets._disturbed`: drop chirps from `whole` that the others explain badly in a part; returns their number. */
+/* `offsets._find_disturbed`: drop chirps from `whole` that the others explain badly in a part; returns their number. */
 static int drop_disturbed(const Work *w, Chirps *c, int count)
 {
     int chirps = w->chirps, usable = 0, dropped = 0;

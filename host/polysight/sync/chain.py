@@ -30,7 +30,7 @@ from polysight.store import CubeRow, RowData, Source
 from polysight.sync import high_pass_filter as hpf
 from polysight.sync import loops
 from polysight.sync.decimate import FOLD, flatten, fold
-from polysight.sync.loops import Complex, Real, block_edges, block_times, cis, energy_of, phasor, refine
+from polysight.sync.loops import Complex, Real, block_edges, block_times, cis, phasor, refine, signal_energy
 from polysight.sync.offsets import (
     AlignedRow,
     DirectPath,
@@ -40,7 +40,7 @@ from polysight.sync.offsets import (
     half_scale,
     prepare,
     reference,
-    sweep_of,
+    sample_frequencies_hz,
     whole_blocks,
 )
 from polysight_shared.config import Board, Chirp, Instrument
@@ -84,7 +84,7 @@ _ALONE = 0.8
 
 @dataclass(frozen=True)
 class BoardSetup:
-    """Parameters of synchronisation for a board and a whole scan. Create with :meth:`of`.
+    """Parameters of synchronisation for a board and a whole scan. Create with :meth:`from_rig`.
 
     `examined` is the largest number of positions per row used for residuals (`errors`).
     """
@@ -96,7 +96,7 @@ class BoardSetup:
     examined: int = EXAMINED
 
     @classmethod
-    def of(
+    def from_rig(
         cls, rig: Instrument, board: Board, compensate_filter: bool = True, model: hpf.HighPass | None = None
     ) -> BoardSetup:
         """Return the setup of a board of a rig.
@@ -105,7 +105,7 @@ class BoardSetup:
         `compensate_filter=False` does not compensate the filter.
         """
         model = (model or hpf.high_pass(rig.chirp)) if compensate_filter else hpf.HighPass()
-        equaliser = hpf.Equaliser.of(model, rig.chirp, FOLD) if model.corners_hz else None
+        equaliser = hpf.Equaliser.from_model(model, rig.chirp, FOLD) if model.corners_hz else None
         return cls(rig.chirp, rig.burst.chirps_a_position, equaliser, prepare(rig, board))
 
 
@@ -206,30 +206,30 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
     chirps, rate = aligned.good.sum(axis=1), setup.chirp.sample_rate_hz
     residual = np.sqrt((aligned.error**2).sum(axis=-1) / np.maximum(chirps, 1)[:, None])
     return SyncedRow(
-        done.samples,
-        setup.path.sweep_hz,
-        done.found,
-        chirps,
-        done.frequency * rate,
-        np.abs(done.amplitude),
-        residual[:, 0] * rate,
-        residual[:, 1],
-        errors(aligned, done, setup.path, rate, setup.examined),
-        done.noise,
-        _turn_along(done.samples),
-        int(aligned.clipped.sum()),
-        int((received & ~aligned.clipped & ~aligned.good).sum()),
-        int((aligned.clipped.any(axis=1) & (aligned.clipped == received).all(axis=1)).sum()),
+        samples=done.samples,
+        sweep_hz=setup.path.sweep_hz,
+        valid=done.found,
+        chirps=chirps,
+        direct_hz=done.frequency * rate,
+        direct_amplitude=np.abs(done.amplitude),
+        freq_residual_hz=residual[:, 0] * rate,
+        phase_residual_rad=residual[:, 1],
+        errors=errors(aligned, done, setup.path, rate, setup.examined),
+        noise=done.noise,
+        turn=_turn_along(done.samples),
+        chirps_clipped=int(aligned.clipped.sum()),
+        chirps_disturbed=int((received & ~aligned.clipped & ~aligned.good).sum()),
+        positions_clipped=int((aligned.clipped.any(axis=1) & (aligned.clipped == received).all(axis=1)).sum()),
     )
 
 
 def _bursts(pieces: Iterable[NDArray[np.int16]], frames: int, setup: BoardSetup) -> Iterator[NDArray[np.int16]]:
     """Return pieces [frame, sample, 2, rx] as bursts [position, chirp, sample, 2, rx]; check that they are whole."""
     for words in pieces:
-        found, samples, _, rx = words.shape
-        frames -= found
-        if (rx, samples) != setup.path.steering.shape or found % setup.pulses or frames < 0:
-            raise _mismatch(found, (rx, samples), setup)
+        chirps, samples, _, rx = words.shape
+        frames -= chirps
+        if (rx, samples) != setup.path.steering.shape or chirps % setup.pulses or frames < 0:
+            raise _mismatch(chirps, (rx, samples), setup)
         yield words.reshape(-1, setup.pulses, samples, 2, rx)
     if frames:
         raise DataError(
@@ -274,14 +274,14 @@ class RowSynchroniser:
         # Loaded now, with its warning, and not by the first of several threads.
         loops.library()
         self._source = source
-        self.setups = {b.name: BoardSetup.of(rig, b, model=filters.get(b.name)) for b in rig.receivers}
+        self.setups = {b.name: BoardSetup.from_rig(rig, b, model=filters.get(b.name)) for b in rig.receivers}
         self._forms: dict[str, CubeForm] = {}
 
     def synchronise(self, board: str, recorded: RowData | CubeRow) -> tuple[SyncedRow, int]:
         """Synchronise a row of a board; return it and the number of whole frames. Raises DataError."""
         rig = self._source.instrument
         if isinstance(recorded, CubeRow):
-            synced = self._form(board).synced(recorded.cube, rig.burst.chirps_a_position)
+            synced = self._form(board).convert_row(recorded.cube, rig.burst.chirps_a_position)
             return synced, int(synced.valid.sum())
         valid = valid_frames(recorded.missing, recorded.frames_expected, rig.frame_bytes // rig.burst.chirps)
         return synchronise_pieces(self._words(recorded), valid, self.setups[board]), int(valid.sum())
@@ -327,14 +327,14 @@ def errors(
     if not done.found.any():
         return {}
     valid = np.flatnonzero(done.found)
-    found = np.zeros_like(done.found)
-    found[valid[np.linspace(0, valid.size - 1, min(most, valid.size)).astype(int)]] = True
-    good = aligned.good[found]
+    is_found = np.zeros_like(done.found)
+    is_found[valid[np.linspace(0, valid.size - 1, min(most, valid.size)).astype(int)]] = True
+    good = aligned.good[is_found]
     received = np.stack(
         [
-            done.frequency[found, None] + aligned.frequency[found],
-            np.angle(done.amplitude)[found, None] + aligned.phase[found],
-            np.abs(done.amplitude)[found, None] * aligned.amplitude[found] / aligned.gain[found],
+            done.frequency[is_found, None] + aligned.frequency[is_found],
+            np.angle(done.amplitude)[is_found, None] + aligned.phase[is_found],
+            np.abs(done.amplitude)[is_found, None] * aligned.amplitude[is_found] / aligned.gain[is_found],
         ]
     )[:, good]
     turns = cis(received[1])
@@ -342,16 +342,17 @@ def errors(
     received[1] = np.angle(turns * np.conj(turns.mean()))
     received[2] = received[2] / received[2].mean() - 1
 
-    own = (aligned.amplitude[found] * good).sum(axis=1) / good.sum(axis=1)
-    one = np.stack([*aligned.error[found].swapaxes(0, 1), aligned.amplitude[found] / own[:, None] - 1])[:, good]
+    mean_amplitude = (aligned.amplitude[is_found] * good).sum(axis=1) / good.sum(axis=1)
+    amplitude_error = aligned.amplitude[is_found] / mean_amplitude[:, None] - 1
+    chirp_errors = np.stack([*aligned.error[is_found].swapaxes(0, 1), amplitude_error])[:, good]
 
-    two = found & (aligned.good.sum(axis=1) > 1)
+    two = is_found & (aligned.good.sum(axis=1) > 1)
     halves = _referenced_halves(aligned, done, two) * half_scale(aligned.good[two])[..., None, None]
     with np.errstate(divide="ignore", invalid="ignore"):  # dead RX have no direct path: their figures are not finite
         out = {
             "received": received,
-            "aligned": one,
-            "averaged": _direct_path_errors(done.samples[:, found].swapaxes(0, 1), path),
+            "aligned": chirp_errors,
+            "averaged": _direct_path_errors(done.samples[:, is_found].swapaxes(0, 1), path),
             "referenced": _object_errors(halves, path) if two.any() else np.zeros((3, 0)),
         }
     for values in out.values():
@@ -396,7 +397,7 @@ def _object_errors(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[n
     edges = block_edges(n)
     tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
     # Amplitudes relative to the mean of both halves.
-    energy, common = np.stack([energy_of(echo[:, h]) for h in (0, 1)], axis=1), product.sum(axis=1)
+    energy, common = np.stack([signal_energy(echo[:, h]) for h in (0, 1)], axis=1), product.sum(axis=1)
     size = np.abs(energy + np.stack([common, common.conj()], axis=1))
     contrast = (size[:, 0] - size[:, 1]) / np.maximum(size.sum(axis=1), 1e-30)
     # Keep positions whose halves are more coherent than noise would be by chance.
@@ -437,22 +438,31 @@ class CubeForm:
     chirp: Chirp
     how: str
 
-    def synced(self, cube: NDArray[np.complex64], pulses: int) -> SyncedRow:
+    def convert_row(self, cube: NDArray[np.complex64], pulses: int) -> SyncedRow:
         """Convert a row of the cube, complex64 [rx, position, sample] in order of recording; zeros are masked.
 
         The receiver's filter is not compensated.
         """
         valid = np.isfinite(cube).all(axis=(0, 2)) & (cube != 0).any(axis=(0, 2))
-        samples = self._turned(np.where(valid[:, None], cube, 0)) + self.constant[:, None, None]
+        samples = self._turn_cube(np.where(valid[:, None], cube, 0)) + self.constant[:, None, None]
         samples *= valid[:, None]
         zeros = np.zeros(valid.size)
         if self.path is not None:
-            samples, valid, hz, amplitude = _referenced(samples, valid, self.path, self.chirp)
+            samples, valid, hz, amplitude = _reference_cube(samples, valid, self.path, self.chirp)
         else:
             hz, amplitude = zeros, np.abs(samples.mean(axis=(0, 2))).astype(np.float64)
-        return SyncedRow(samples, sweep_of(self.chirp), valid, np.where(valid, pulses, 0), hz, amplitude, zeros, zeros)
+        return SyncedRow(
+            samples=samples,
+            sweep_hz=sample_frequencies_hz(self.chirp),
+            valid=valid,
+            chirps=np.where(valid, pulses, 0),
+            direct_hz=hz,
+            direct_amplitude=amplitude,
+            freq_residual_hz=zeros,
+            phase_residual_rad=zeros,
+        )
 
-    def _turned(self, cube: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    def _turn_cube(self, cube: NDArray[np.complex64]) -> NDArray[np.complex64]:
         return ((cube.conj() if self.conjugate else cube) * self.turn[:, None]).astype(np.complex64)
 
 
@@ -501,17 +511,17 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
         else:
             form.append("each RX referenced to its own direct path")
     else:
-        own = prepare(rig, board)
-        _, found, _, _ = _referenced(cube.astype(np.complex64), np.ones(cube.shape[1], bool), own, chirp)
-        if found.mean() > _MIN_FOUND and _share(cube[..., a:b], gate) < _ALONE:
-            path = own
+        direct_path = prepare(rig, board)
+        _, is_found, _, _ = _reference_cube(cube.astype(np.complex64), np.ones(cube.shape[1], bool), direct_path, chirp)
+        if is_found.mean() > _MIN_FOUND and _share(cube[..., a:b], gate) < _ALONE:
+            path = direct_path
             form.append("not referenced to a direct path; referenced here")
         else:
             level = np.sqrt(np.mean(np.abs(cube) ** 2))
             constant = level * direct_m[0] / direct_m
             form.append("the direct path was removed; equal RX are assumed")
-    how = "; ".join(form) + "; the receiver's filter is not compensated"
-    return CubeForm(conjugate, turn.astype(np.complex64), constant.astype(np.complex64), path, chirp, how)
+    description = "; ".join(form) + "; the receiver's filter is not compensated"
+    return CubeForm(conjugate, turn.astype(np.complex64), constant.astype(np.complex64), path, chirp, description)
 
 
 def _sign_and_origin(
@@ -570,7 +580,7 @@ def _share(part: NDArray[np.complexfloating], gate: NDArray[np.complex128]) -> f
     return float((np.abs(inside) ** 2).sum() / (np.abs(part) ** 2).sum())
 
 
-def _referenced(
+def _reference_cube(
     cube: NDArray[np.complex64], valid: NDArray[np.bool_], path: DirectPath, chirp: Chirp
 ) -> tuple[NDArray[np.complex64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
     """Reference positions to their direct path; return samples, mask of found positions, IF (Hz) and amplitude.
@@ -583,24 +593,24 @@ def _referenced(
     middle, still = (a + b - 1) / 2, np.zeros(centre.size)
     mixed = cube * phasor(-centre, still, samples, middle)
     halves = flatten(fold(mixed[..., a:b])).swapaxes(0, 1) / 2
-    one, none = valid[:, None], np.zeros((centre.size, 1))
+    first_chirp, none = valid[:, None], np.zeros((centre.size, 1))
     aligned = AlignedRow(
-        np.ascontiguousarray(np.stack([halves, halves], axis=1), np.complex64),
-        centre,
-        one,
-        none,
-        none,
-        none + 1,
-        none + 1,
-        np.zeros((2, centre.size, 1)),
-        none + 1,
-        ~one,
+        halves=np.ascontiguousarray(np.stack([halves, halves], axis=1), np.complex64),
+        centre=centre,
+        good=first_chirp,
+        frequency=none,
+        phase=none,
+        amplitude=none + 1,
+        gain=none + 1,
+        error=np.zeros((2, centre.size, 1)),
+        coherence=none + 1,
+        clipped=~first_chirp,
     )
     near_zero = bool(abs(np.median(centre)) < 0.4)  # mixed down already, so any IF is within the band
     done = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x") if near_zero else chirp)
     time = np.arange(samples) - middle
     steering = path.steering * np.exp(-0.5j * done.drift * time**2)
-    left = (done.frequency - centre + 0.5) % 1.0 - 0.5
-    turn = phasor(-left, -np.angle(done.amplitude), samples, middle) * done.found[:, None]
+    residual_cycles = (done.frequency - centre + 0.5) % 1.0 - 0.5
+    turn = phasor(-residual_cycles, -np.angle(done.amplitude), samples, middle) * done.found[:, None]
     referenced = (mixed * steering[:, None] * turn).astype(np.complex64)
     return referenced, done.found, done.frequency * chirp.sample_rate_hz, np.abs(done.amplitude)

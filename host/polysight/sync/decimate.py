@@ -78,11 +78,11 @@ def decimator() -> Decimator:
         equations = np.concatenate([model.real, model.imag, small])
         goal = np.concatenate([weight, np.zeros(cycles.size + FLAT)])
         flat.append(np.linalg.lstsq(equations, goal, rcond=None)[0])
-    both = np.zeros(FOLD * (FLAT - 1) + TAPS)
+    combined_taps = np.zeros(FOLD * (FLAT - 1) + TAPS)
     for k, part in enumerate(flat[-1]):
-        both[FOLD * k : FOLD * k + TAPS] += part * inner
+        combined_taps[FOLD * k : FOLD * k + TAPS] += part * inner
     taps = np.stack([first, inner, first]).astype(np.float32)
-    return Decimator(taps, np.stack(flat).astype(np.float32), float((both**2).sum()))
+    return Decimator(taps, np.stack(flat).astype(np.float32), float((combined_taps**2).sum()))
 
 
 def _low_pass() -> NDArray[np.float64]:

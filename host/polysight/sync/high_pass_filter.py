@@ -79,7 +79,7 @@ class Equaliser:
     reach: float
 
     @classmethod
-    def of(cls, model: HighPass, chirp: Chirp, spacing: int) -> Equaliser:
+    def from_model(cls, model: HighPass, chirp: Chirp, spacing: int) -> Equaliser:
         """Return the equaliser of a chirp: exact at the signal's centre and `REACH_BINS` IF bins away."""
         a, b = chirp.linear_samples
         return cls(model, chirp.sample_rate_hz, chirp.if_mode == "complex2x", spacing, REACH_BINS / (b - a))
@@ -90,21 +90,21 @@ class Equaliser:
         f = ((f + 0.5) % 1.0 - 0.5 if self.signed else f % 1.0) * self.sample_rate_hz
         low, middle, high = np.moveaxis(self.model.inverse(f), -1, 0)
         w = 2 * np.pi * self.reach * self.spacing
-        both = ((low + high) / 2 - middle) / (np.cos(w) - 1)
-        apart = (high - low) / (2j * np.sin(w))
-        return np.stack([(both - apart) / 2, middle - both, (both + apart) / 2], axis=-1)
+        even_part = ((low + high) / 2 - middle) / (np.cos(w) - 1)
+        odd_part = (high - low) / (2j * np.sin(w))
+        return np.stack([(even_part - odd_part) / 2, middle - even_part, (even_part + odd_part) / 2], axis=-1)
 
 
-def filtered(signal: NDArray[np.complex64], taps: NDArray[np.complex64]) -> NDArray[np.complex64]:
+def apply_filter(signal: NDArray[np.complex64], taps: NDArray[np.complex64]) -> NDArray[np.complex64]:
     """Filter a signal [position, chirp, rx, block] with taps [position, chirp, 3], one block apart.
 
     Beyond its ends the signal is extrapolated by the parabola through three of its samples.
     """
-    before = 3 * (signal[..., :1] - signal[..., 1:2]) + signal[..., 2:3]
-    after = 3 * (signal[..., -1:] - signal[..., -2:-1]) + signal[..., -3:-2]
-    whole = np.concatenate([before, signal, after], axis=-1)
+    block_before = 3 * (signal[..., :1] - signal[..., 1:2]) + signal[..., 2:3]
+    block_after = 3 * (signal[..., -1:] - signal[..., -2:-1]) + signal[..., -3:-2]
+    extended = np.concatenate([block_before, signal, block_after], axis=-1)
     t = taps[..., None, None, :]
-    out = t[..., 0] * whole[..., :-2] + t[..., 1] * whole[..., 1:-1] + t[..., 2] * whole[..., 2:]
+    out = t[..., 0] * extended[..., :-2] + t[..., 1] * extended[..., 1:-1] + t[..., 2] * extended[..., 2:]
     return out.astype(np.complex64, copy=False)
 
 

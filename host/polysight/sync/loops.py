@@ -159,14 +159,14 @@ def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
     size = z.shape[-1]
     spectrum: NDArray[np.complex64] = np.asarray(scipy.fft.fft(z, axis=-1, overwrite_x=True)).reshape(-1, size)
     top = np.argmax(spectrum.real**2 + spectrum.imag**2, axis=-1)
-    every = np.arange(len(spectrum))
-    left, at, right = (spectrum[every, (top + d) % size] for d in (-1, 0, 1))
-    part = peak_between(np.abs(left), np.abs(at), np.abs(right))
-    whole = np.where(top < size // 2, top, top - size) / size
+    spectrum_rows = np.arange(len(spectrum))
+    bin_below, bin_value, bin_above = (spectrum[spectrum_rows, (top + d) % size] for d in (-1, 0, 1))
+    part = peak_between(np.abs(bin_below), np.abs(bin_value), np.abs(bin_above))
+    bin_frequency = np.where(top < size // 2, top, top - size) / size
     # The transform of a symmetrical window is real, so the phase of the bin is that of the tone at the centre.
-    amplitude = at * cis(2 * np.pi * whole * (samples - 1) / 2)
+    amplitude = bin_value * cis(2 * np.pi * bin_frequency * (samples - 1) / 2)
     shape = z.shape[:-1]
-    return Tone((whole + part / size).reshape(shape), amplitude.reshape(shape))
+    return Tone((bin_frequency + part / size).reshape(shape), amplitude.reshape(shape))
 
 
 def estimate_tone(z: NDArray[np.complex64], steps: int = 3) -> Tone:
@@ -265,7 +265,7 @@ def reduce_chirps(
     """
     a, b = linear
     turn = phasor(-frequency, np.zeros(frequency.shape), b - a, (b - a - 1) / 2)
-    return hpf.filtered(fold(_complex(words[:, :, a:b]) * turn[:, :, None]), taps)
+    return hpf.apply_filter(fold(_complex(words[:, :, a:b]) * turn[:, :, None]), taps)
 
 
 def against_others(
@@ -304,16 +304,18 @@ def against_others(
     halves = np.stack([product[:, :, 0::2].sum(axis=2), product[:, :, 1::2].sum(axis=2)])
     sums = np.add.reduceat(halves, starts, axis=-1).astype(complex)
     energy = (reduced.real**2 + reduced.imag**2).sum(axis=2)
-    own = np.add.reduceat(energy, starts, axis=-1).astype(np.float64)
+    own_energy = np.add.reduceat(energy, starts, axis=-1).astype(np.float64)
     level = np.add.reduceat((total.real**2 + total.imag**2).sum(axis=(1, 2)), starts, axis=-1).astype(np.float64)
-    both = sums[0] + sums[1]
-    with_others = both - np.where(good[..., None], own, 0)
-    others = level[:, None] - np.where(good[..., None], 2 * both.real - own, 0)
-    left = own - np.divide(np.abs(with_others) ** 2, others, out=own.copy(), where=others > 1e-30)
+    correlation = sums[0] + sums[1]
+    with_others = correlation - np.where(good[..., None], own_energy, 0)
+    others_energy = level[:, None] - np.where(good[..., None], 2 * correlation.real - own_energy, 0)
+    has_others = others_energy > 1e-30
+    explained = np.divide(np.abs(with_others) ** 2, others_energy, out=own_energy.copy(), where=has_others)
+    residual_energy = own_energy - explained
     tone = refine(with_others, times, steps=2)
     split = refine(sums * cis(-2 * np.pi * tone.frequency[..., None] * times), times, steps=1)
-    apart = split.frequency[0] - split.frequency[1], np.angle(split.amplitude[0] * split.amplitude[1].conj())
-    return tone, own.sum(axis=-1).astype(np.float32), level, np.stack(apart), left
+    half_difference = split.frequency[0] - split.frequency[1], np.angle(split.amplitude[0] * split.amplitude[1].conj())
+    return tone, own_energy.sum(axis=-1).astype(np.float32), level, np.stack(half_difference), residual_energy
 
 
 def average(
@@ -358,7 +360,7 @@ def _preference(size: int) -> NDArray[np.float32]:
     return np.sinc(np.fft.fftfreq(size)).astype(np.float32)
 
 
-def energy_of(signal: NDArray[np.complex64]) -> NDArray[np.float32]:
+def signal_energy(signal: NDArray[np.complex64]) -> NDArray[np.float32]:
     """Return the energy over RX and blocks of signals [position, rx, block]."""
     parts = np.ascontiguousarray(signal).view(np.float32)
     return np.einsum("prn,prn->p", parts, parts)
@@ -455,15 +457,15 @@ class NumpyLoops:
         zero = step = np.zeros(positions)
         reach = 1 / (n * FOLD)
 
-        def estimate_at(frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+        def amplitude_estimate(frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
             return np.einsum("pkn,pn->pk", g, phasor(-frequency * FOLD, zero, n, (n - 1) / 2)).astype(complex)
 
-        estimate = estimate_at(frequency)
+        estimate = amplitude_estimate(frequency)
         for _ in range(steps):
             amplitude = np.where(estimate[:, 0] != 0, estimate[:, 0], np.inf)
             step = np.clip(np.real(estimate[:, 1] / amplitude) / (2 * np.pi), -reach, reach)
             frequency = frequency + step
-            estimate = estimate_at(frequency)
+            estimate = amplitude_estimate(frequency)
         return frequency, estimate, step
 
     @staticmethod
@@ -497,8 +499,8 @@ class NumpyLoops:
         n = halves.shape[-1]
         turn = phasor(-frequency * FOLD, -phase, n, (n - 1) / 2) * found[:, None]
         turned = (halves[:, 0] + halves[:, 1]) * steering * turn[:, None]
-        apart = complex64(halves[:, 0] * scale[:, 0, None, None] - halves[:, 1] * scale[:, 1, None, None])
-        return complex64(turned.swapaxes(0, 1)), energy_of(apart)
+        half_difference = complex64(halves[:, 0] * scale[:, 0, None, None] - halves[:, 1] * scale[:, 1, None, None])
+        return complex64(turned.swapaxes(0, 1)), signal_energy(half_difference)
 
 
 class LoadError(Exception):
@@ -552,13 +554,9 @@ class Library:
         filters = [1.0, 1 / 8 / FOLD, 0.0]
         if equaliser is not None:
             filters = [equaliser.sample_rate_hz, equaliser.reach, equaliser.signed, *equaliser.model.corners_hz]
-        self._call(
-            "align",
-            *(words, valid),
-            *(positions, chirps, samples, a, b, search_size(b - a), full_scale),
-            *(np.array(filters), len(filters) - 3, self._decimator.taps, self._decimator.flat),
-            *into,
-        )
+        sizes = (positions, chirps, samples, a, b, search_size(b - a), full_scale)
+        taps = (np.array(filters), len(filters) - 3, self._decimator.taps, self._decimator.flat)
+        self._call("align", (words, valid, *sizes, *taps, *into))
 
     def search(
         self,
@@ -572,7 +570,7 @@ class Library:
         positions, blocks = halves.shape[0], halves.shape[-1]
         bins, median = np.empty((2, positions), np.int32), np.empty(positions)
         sizes = positions, blocks, size, *object_bins
-        self._call("search", halves, weights, _preference(size), *sizes, np.array([comparable]), bins, median)
+        self._call("search", (halves, weights, _preference(size), *sizes, np.array([comparable]), bins, median))
         return bins, median
 
     def refine(
@@ -585,10 +583,10 @@ class Library:
     ) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64]]:
         """See `NumpyLoops.refine`."""
         positions, blocks, rows = halves.shape[0], halves.shape[-1], len(estimator)
-        found, estimate, step = frequency.copy(), np.empty((positions, rows), complex), np.empty(positions)
+        frequencies, estimate, step = frequency.copy(), np.empty((positions, rows), complex), np.empty(positions)
         parts = np.stack([estimator.real, estimator.imag], axis=1)
-        self._call("refine", halves, steering, parts, positions, blocks, rows, steps, found, estimate, step)
-        return found, estimate, step
+        self._call("refine", (halves, steering, parts, positions, blocks, rows, steps, frequencies, estimate, step))
+        return frequencies, estimate, step
 
     def turn(
         self,
@@ -601,17 +599,24 @@ class Library:
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """See `NumpyLoops.turn`."""
         positions, _, rx, blocks = halves.shape
-        out, apart = np.empty((rx, positions, blocks), np.complex64), np.empty(positions, np.float32)
+        out, half_difference = np.empty((rx, positions, blocks), np.complex64), np.empty(positions, np.float32)
         turns = phase / (2 * np.pi)
-        self._call("turn", halves, steering, positions, blocks, frequency, turns, found, scale, out, apart)
-        return out, apart
+        self._call("turn", (halves, steering, positions, blocks, frequency, turns, found, scale, out, half_difference))
+        return out, half_difference
 
-    def _call(self, name: str, *arguments: NDArray[Any] | float) -> None:
+    def _call(self, name: str, arguments: Sequence[NDArray[Any] | float]) -> None:
         """Call a loop with arrays as pointers and numbers as int. Raises MemoryError."""
         arrays = [np.ascontiguousarray(x) if isinstance(x, np.ndarray) else x for x in arguments]
-        given = [ctypes.c_void_p(x.ctypes.data) if isinstance(x, np.ndarray) else ctypes.c_int(int(x)) for x in arrays]
-        if getattr(self._loaded, f"{name}_{self.bits}")(*given):
+        c_arguments = [_c_argument(x) for x in arrays]
+        if getattr(self._loaded, f"{name}_{self.bits}")(*c_arguments):
             raise MemoryError(f"no memory for {name}")
+
+
+def _c_argument(value: NDArray[Any] | float) -> ctypes.c_void_p | ctypes.c_int:
+    """Return a contiguous array as a pointer, a number as int."""
+    if isinstance(value, np.ndarray):
+        return ctypes.c_void_p(value.ctypes.data)
+    return ctypes.c_int(int(value))
 
 
 def library() -> Library | None:

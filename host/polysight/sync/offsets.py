@@ -186,12 +186,12 @@ def align_pieces(
     for words in pieces:
         if row is None:
             row = _empty_row(valid.shape, words.shape, (linear[1] - linear[0]) // FOLD)
-        here = slice(done, done + len(words))
-        if words.shape[:2] != valid[here].shape:
+        rows = slice(done, done + len(words))
+        if words.shape[:2] != valid[rows].shape:
             raise ValueError(f"bursts {words.shape[:2]} at position {done} of {valid.shape}")
         align = by or _choose_loop(words.shape[1], words.shape[-1])
-        align(words, valid[here], linear, equaliser, full_scale, row.part(here))
-        done = here.stop
+        align(words, valid[rows], linear, equaliser, full_scale, row.part(rows))
+        done = rows.stop
     if row is None or done != len(valid):
         raise ValueError(f"{done} of {len(valid)} positions")
     return row
@@ -214,9 +214,9 @@ def align_in_numpy(
     """Align and average positions in NumPy, for any number of RX: the readable form of `burst.c`."""
     words = np.ascontiguousarray(words)
     for i in range(0, len(valid), loops.CHUNK):
-        here = slice(i, i + loops.CHUNK)
-        for field, values in zip(into, _align(words[here], valid[here], linear, equaliser, full_scale), strict=True):
-            field[here] = values
+        rows = slice(i, i + loops.CHUNK)
+        for field, values in zip(into, _align(words[rows], valid[rows], linear, equaliser, full_scale), strict=True):
+            field[rows] = values
 
 
 def _empty_row(bursts: tuple[int, ...], words: tuple[int, ...], blocks: int) -> AlignedRow:
@@ -245,16 +245,16 @@ def _align(
 ) -> AlignedRow:
     """Align and average a few positions; bursts with disturbed chirps again without these."""
     clipped = find_clipped(words, valid, full_scale)
-    whole = valid & ~clipped
-    row, disturbed = _align_round(words, whole, clipped, linear, equaliser)
+    usable = valid & ~clipped
+    row, disturbed = _align_round(words, usable, clipped, linear, equaliser)
     for _ in range(_ROUNDS - 1):
         again = np.flatnonzero(disturbed.any(axis=1))
         if again.size == 0:
             break
-        whole[again] &= ~disturbed[again]
-        redone, left = _align_round(words[again], whole[again], clipped[again], linear, equaliser)
+        usable[again] &= ~disturbed[again]
+        redone, residual_energy = _align_round(words[again], usable[again], clipped[again], linear, equaliser)
         disturbed[:] = False
-        disturbed[again] = left
+        disturbed[again] = residual_energy
         for field, values in zip(row, redone, strict=True):
             field[again] = values
     return row
@@ -290,38 +290,40 @@ def _align_round(
 
     # Second pass: each chirp against the sum of the others.
     reduced = loops.reduce_chirps(words, frequency, complex64(taps * cis(-start)[..., None]), linear)
-    tone, own, levels, apart, left = loops.against_others(reduced, good)
+    tone, own_energy, levels, half_difference, residual_energy = loops.against_others(reduced, good)
     n = good.sum(axis=1)
-    disturbed = whole & _disturbed(left, levels / np.maximum(n, 1)[:, None] ** 2, usable)
+    disturbed = whole & _find_disturbed(residual_energy, levels / np.maximum(n, 1)[:, None] ** 2, usable)
     level = np.maximum(levels.sum(axis=1) / np.maximum(n, 1) ** 2, 1e-30)[:, None]
-    others = n[:, None] - good
+    other_chirps = n[:, None] - good
     # A single chirp is the mean itself.
-    amplitude = np.where(others > 0, np.abs(tone.amplitude) / np.maximum(others, 1) / level, 1.0)
+    amplitude = np.where(other_chirps > 0, np.abs(tone.amplitude) / np.maximum(other_chirps, 1) / level, 1.0)
     # The difference from the mean of all chirps is smaller than that from the mean of the others.
-    part = others / np.maximum(n, 1)[:, None]
+    part = other_chirps / np.maximum(n, 1)[:, None]
     correction, shift = part * tone.frequency, part * np.angle(tone.amplitude)
-    coherence = amplitude * np.sqrt(level / np.maximum(own, 1e-30))
+    coherence = amplitude * np.sqrt(level / np.maximum(own_energy, 1e-30))
     good = _coherent(coherence, usable)
 
     second_half = np.cumsum(good, axis=1) % 2 == 0
     weights = good / np.maximum(good.sum(axis=1), 1)[:, None]
     split = np.stack([weights * ~second_half, weights * second_half], axis=1).astype(np.float32)
     row = AlignedRow(
-        loops.average(reduced, correction, shift, split),
-        centre,
-        good,
-        first.frequency + correction,
-        np.angle(cis(start + shift)),
-        amplitude,
-        np.abs(taps.sum(axis=-1)),
-        _centred(apart / 2, good).swapaxes(0, 1),
-        coherence,
-        clipped,
+        halves=loops.average(reduced, correction, shift, split),
+        centre=centre,
+        good=good,
+        frequency=first.frequency + correction,
+        phase=np.angle(cis(start + shift)),
+        amplitude=amplitude,
+        gain=np.abs(taps.sum(axis=-1)),
+        error=_subtract_mean(half_difference / 2, good).swapaxes(0, 1),
+        coherence=coherence,
+        clipped=clipped,
     )
     return row, disturbed
 
 
-def _disturbed(left: NDArray[np.float64], level: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _find_disturbed(
+    left: NDArray[np.float64], level: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Return the chirps [position, chirp] with a part that the others explain badly, as with interference.
 
     `left` [position, chirp, part] is energy that the others' sum does not explain, `level` [position, part] the energy
@@ -365,7 +367,7 @@ def _against_one(
     usable = whole & words.any(axis=(2, 3, 4))
     count = usable.sum(axis=1)
     order = np.argsort(~usable, axis=1, kind="stable")  # the usable ones, first to last
-    reference, every = order[:, 0].copy(), np.arange(positions)
+    reference, all_positions = order[:, 0].copy(), np.arange(positions)
     frequency, amplitude, centre = np.zeros(whole.shape), np.zeros(whole.shape, complex), np.zeros(positions)
     coherence, best_sum = np.zeros(whole.shape), np.full(positions, -1.0)
     todo = np.flatnonzero(count)
@@ -374,9 +376,9 @@ def _against_one(
             break
         tried = order[todo, attempt]
         offset, product, middle, energy = loops.match(words[todo], tried, linear)
-        at = np.arange(todo.size), tried
-        c = np.abs(product) / np.sqrt(np.maximum(energy * energy[at][:, None], 1e-30)) * usable[todo]
-        c[at] = 0  # a chirp always matches itself
+        tried_pair = np.arange(todo.size), tried
+        c = np.abs(product) / np.sqrt(np.maximum(energy * energy[tried_pair][:, None], 1e-30)) * usable[todo]
+        c[tried_pair] = 0  # a chirp always matches itself
         total = c.sum(axis=1)
         better = total > best_sum[todo]
         won = todo[better]
@@ -385,7 +387,8 @@ def _against_one(
         matching = (c > noise).sum(axis=1)
         todo = todo[(2 * matching < count[todo] - 1) & (attempt + 1 < count[todo])]
     best = coherence.max(axis=1)
-    coherence[every, reference] = np.where(usable[every, reference], best, 0)  # as good as its best match
+    # A reference is as good as its best match
+    coherence[all_positions, reference] = np.where(usable[all_positions, reference], best, 0)
     return Tone(frequency, amplitude), centre, coherence, usable
 
 
@@ -401,7 +404,7 @@ def _coherent(coherence: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDAr
     return usable & (coherence >= _GOOD * _median(coherence, usable, axis=1)[:, None])
 
 
-def _centred(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _subtract_mean(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Subtract the mean over a position's good chirps from values [..., position, chirp]; zero where not good."""
     mean = (values * good).sum(axis=-1) / np.maximum(good.sum(axis=-1), 1)
     return (values - mean[..., None]) * good
@@ -479,22 +482,22 @@ def excess_path_m(
     return out - np.linalg.norm(rx_m - tx_m, axis=-1)[:, None]
 
 
-def sweep_of(chirp: Chirp) -> NDArray[np.float64]:
+def sample_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
     """Return the transmit frequency of every sample of a chirp, Hz."""
     return chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples, dtype=np.float64)
 
 
-def block_sweep_of(chirp: Chirp) -> NDArray[np.float64]:
+def block_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
     """Return the transmit frequency in the middle of every block of linear samples, Hz."""
     a, b = whole_blocks(chirp.linear_samples)
-    return sweep_of(chirp)[a:b].reshape(-1, FOLD).mean(axis=1)
+    return sample_frequencies_hz(chirp)[a:b].reshape(-1, FOLD).mean(axis=1)
 
 
 def prepare(rig: Instrument, board: Board) -> DirectPath:
     """Return steering, search beam and estimators of a board, from geometry alone."""
     chirp = rig.chirp
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
-    sweep, middles = sweep_of(chirp), block_sweep_of(chirp)
+    sweep, middles = sample_frequencies_hz(chirp), block_frequencies_hz(chirp)
     direct = np.linalg.norm(rx - tx, axis=-1)
     lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
 
@@ -513,21 +516,21 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     covariance = ((flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + noise).astype(np.complex128)
     time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
     model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
-    own = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
+    channels_of_half = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
 
     centre = echoes[:, :, n // 2]
     spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE * np.eye(n_rx)
     beam = np.linalg.solve(spatial, np.ones(n_rx)).conj()
     bins = chirp.hz_per_sample * FOLD * _FFT / SPEED_OF_LIGHT_M_S
     return DirectPath(
-        cis(-2 * np.pi * sweep * lag_s),
-        cis(-2 * np.pi * middles * lag_s),
-        _least_squares(model[:, :2], covariance),
-        _least_squares(model, covariance),
-        np.stack([_least_squares(model[at, :2], covariance[np.ix_(at, at)]) for at in own]),
-        (beam / beam.sum()).astype(np.complex64),
-        (float(excess.min() * bins), float(excess.max() * bins)),
-        middles,
+        steering=cis(-2 * np.pi * sweep * lag_s),
+        folded_steering=cis(-2 * np.pi * middles * lag_s),
+        estimator=_least_squares(model[:, :2], covariance),
+        drift_estimator=_least_squares(model, covariance),
+        half_estimators=np.stack([_least_squares(model[c, :2], covariance[np.ix_(c, c)]) for c in channels_of_half]),
+        beam=(beam / beam.sum()).astype(np.complex64),
+        object_bins=(float(excess.min() * bins), float(excess.max() * bins)),
+        sweep_hz=middles,
     )
 
 
@@ -567,30 +570,39 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     drift = float(np.median(drifts)) if usable.any() else 0.0
     flat = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
     frequency, estimate, step = run.refine(aligned.halves, flat, two, frequency, _STEPS)
-    _try_others(aligned.halves, peaks, usable, (run, flat, two), frequency, estimate, step)
+    _try_others(aligned.halves, peaks, usable, how=(run, flat, two), found=(frequency, estimate, step))
 
     # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
     amplitude = estimate[:, 0]
-    heard = aligned.centre + frequency
-    heard = heard % 1.0 if chirp.if_mode == "complex1x" else (heard + 0.5) % 1.0 - 0.5
-    band = heard < 0.9 if chirp.if_mode == "complex1x" else np.abs(heard) < 0.45
+    if_frequency = aligned.centre + frequency
+    if_frequency = if_frequency % 1.0 if chirp.if_mode == "complex1x" else (if_frequency + 0.5) % 1.0 - 0.5
+    band = if_frequency < 0.9 if chirp.if_mode == "complex1x" else np.abs(if_frequency) < 0.45
     strength = np.abs(amplitude)
     chirps = np.maximum(aligned.good.sum(axis=1), 1)
     # All chirps of a row have the same noise.
     floor = np.median((floor * chirps)[usable]) / chirps if usable.any() else floor
     noise = floor / (np.abs(path.beam) ** 2).sum()  # noise power of an averaged sample of one RX
     present = strength**2 > _PRESENT * noise * (np.abs(path.estimator[0]) ** 2).sum()
-    found = usable & band & present & (np.abs(step) < 0.02 / (b - a))
-    if found.any():
-        found &= strength > _LOST * np.median(strength[found])
+    is_found = usable & band & present & (np.abs(step) < 0.02 / (b - a))
+    if is_found.any():
+        is_found &= strength > _LOST * np.median(strength[is_found])
 
     scale = half_scale(aligned.good)
-    samples, apart = run.turn(aligned.halves, flat, frequency, np.angle(amplitude), found, scale)
+    samples, half_difference = run.turn(aligned.halves, flat, frequency, np.angle(amplitude), is_found, scale)
     # A half of k of the K good chirps was scaled by K / k, so its noise is that of a chirp divided by k.
     two = aligned.good.sum(axis=1) > 1
     noise_power = np.full(len(two), np.nan)
-    noise_power[two] = (apart * chirps / (len(path.beam) * n) / decimator().noise)[two] / scale[two].sum(axis=1)
-    return Referenced(samples, heard, amplitude, found, drift, noise_power, flat)
+    chirp_noise = half_difference * chirps / (len(path.beam) * n) / decimator().noise
+    noise_power[two] = chirp_noise[two] / scale[two].sum(axis=1)
+    return Referenced(
+        samples=samples,
+        frequency=if_frequency,
+        amplitude=amplitude,
+        found=is_found,
+        drift=drift,
+        noise=noise_power,
+        steering=flat,
+    )
 
 
 def half_scale(good: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -605,7 +617,7 @@ def _try_others(
     peaks: NDArray[np.float64],
     usable: NDArray[np.bool_],
     how: tuple[Loops, NDArray[np.complex64], NDArray[np.complex64]],
-    *found: NDArray[np.generic],
+    found: tuple[NDArray[np.generic], ...],
 ) -> None:
     """Use the second peak where the amplitude is an outlier in its row; changes `found` in place.
 
@@ -621,11 +633,11 @@ def _try_others(
     if odd.size == 0:
         return
     run, steering, estimator = how
-    other = run.refine(halves[odd], steering, estimator, peaks[1, odd], _STEPS)
-    other_level = np.log(np.maximum(np.abs(other[1][:, 0]), 1e-30))
+    second_try = run.refine(halves[odd], steering, estimator, peaks[1, odd], _STEPS)
+    other_level = np.log(np.maximum(np.abs(second_try[1][:, 0]), 1e-30))
     better = np.abs(other_level - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
-    for whole, part in zip(found, other, strict=True):
-        whole[odd[better]] = part[better]
+    for result_part, part in zip(found, second_try, strict=True):
+        result_part[odd[better]] = part[better]
 
 
 def _ratio(moment: NDArray[np.complex128], amplitude: NDArray[np.complex128]) -> NDArray[np.float64]:

@@ -64,7 +64,7 @@ def task_samples(task: str, seed: int, quick: bool) -> Samples:
     samples = draw(group.materials, group.angle_deg, errors, seed).samples()
     if not two:
         return samples
-    return samples.joined(draw(group.materials, SECOND_ANGLE_DEG, errors, seed).samples())
+    return samples.join(draw(group.materials, SECOND_ANGLE_DEG, errors, seed).samples())
 
 
 @cache

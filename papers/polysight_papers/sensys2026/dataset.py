@@ -130,7 +130,7 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
     if scans:
         orientation = image_orientation(scans)
         notices.append(f"boxes of labels/ are read with {orientation}: so they explain the images' brightness best")
-        turned = [s.oriented(orientation) for s in scans]
+        turned = [s.orient(orientation) for s in scans]
         angles = {s.scan: _angle(folder, s, base, notices) for s in scans}
         libraries[LABELS] = _entries(turned, angles, notices)
         if images is not None:
@@ -341,7 +341,7 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
     fits: dict[str, Any] = {}
     fitted: list[Entry] = []
     for angle in library.angles_deg:
-        own_library = library.at(angle)
+        own_library = library.at_angle(angle)
         try:
             fits |= fit_library(own_library).fit["angles"]
             fitted += own_library.entries

@@ -76,12 +76,12 @@ def task_samples(data: AuthorsData, source: str, task: str) -> Samples | None:
     shared = {(e.name, e.scan) for e in first.entries} & {(e.name, e.scan) for e in second.entries}
     if len({name for name, _ in shared}) < 2:
         return None
-    return _samples(first).joined(_samples(second))
+    return _samples(first).join(_samples(second))
 
 
 def _samples(library: Library) -> Samples:
     """Return pixels of a library, of each patch so few that all can be compared with all."""
-    return Samples.of(library, max(AT_LEAST, ALL // len(library.entries)))
+    return Samples.from_library(library, max(AT_LEAST, ALL // len(library.entries)))
 
 
 def pair_scans(first: Library, second: Library) -> tuple[Library, Library]:

@@ -216,7 +216,7 @@ def both_angles(group: str, angles_deg: tuple[float, ...], errors: Errors, seed:
         draw(groups()[group].materials, a, errors, seed, scans).samples() for a in angles_deg
     )
     for next_samples in further_samples:
-        joined_samples = joined_samples.joined(next_samples)
+        joined_samples = joined_samples.join(next_samples)
     return joined_samples
 
 

@@ -74,7 +74,7 @@ def sync_scan(run: Run) -> SyncScan:
         rig = source.instrument
         chirp = rig.chirp
         board = rig.receivers[0].name
-        setups = {b.name: BoardSetup.of(rig, b) for b in rig.receivers}
+        setups = {b.name: BoardSetup.from_rig(rig, b) for b in rig.receivers}
         reports = {n: SyncReport(chirp.sample_rate_hz, chirp.linear_samples, 4) for n in setups}
         builder_before = ImageBuilder(rig)
         builder_after = ImageBuilder(rig)

@@ -20,7 +20,7 @@ from polysight_shared import __version__
 from polysight_shared.config import Board, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
-from polysight_shared.files import named
+from polysight_shared.files import name_in_errors
 from polysight_shared.messages import AnyEvent, Capture, RowFinished, RowStarted, RunStarted, RunStopped, pack_with_crc
 from polysight_shared.raster import FIRST_PULSE_DELAY_S, RasterPlan, Row, burst_duration_s
 from polysight_shared.tables import to_builtins
@@ -154,7 +154,7 @@ class OwnLayout:
             raw = blank(payload, gaps[name])
             file = Path("raw") / name / f"{row.index:04d}.bin"
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
-            with named(self.folder / file):
+            with name_in_errors(self.folder / file):
                 (self.folder / file).write_bytes(raw)
             missing = sum(stop - start for start, stop in gaps[name])
             partial = {
@@ -193,14 +193,14 @@ class OwnLayout:
         record["crc"] = f"{crc32(plain.encode()):08x}"
         line = json.dumps(record, sort_keys=True, separators=(",", ":"))
         path = self.folder / "manifest.jsonl"
-        with named(path), path.open("a", encoding="utf-8") as f:
+        with name_in_errors(path), path.open("a", encoding="utf-8") as f:
             f.write(line + "\n")
         self._lines = self._lines + 1
         self._digest = sha256(line.encode()).hexdigest()[:16]
 
     def _event(self, *events: AnyEvent) -> None:
         path = self.folder / "events.msgpack"
-        with named(path), path.open("ab") as f:
+        with name_in_errors(path), path.open("ab") as f:
             f.write(b"".join(map(pack_with_crc, events)))
 
     def _stamp(self) -> dict[str, Any]:
@@ -317,7 +317,7 @@ class AuthorsLayout:
                 pieces = [raw[a:b] for a, b in zip(ends[::2], ends[1::2], strict=True)]
             else:
                 pieces = [raw]
-            with named(folder / f"{stem}.bin"):
+            with name_in_errors(folder / f"{stem}.bin"):
                 (folder / f"{stem}.bin").write_bytes(b"".join(pieces))
             (folder / f"{stem}_log.csv").write_text(self._log(len(raw), lost_ranges, points, step_s), encoding="ascii")
         self._now_s += row.points * step_s + LATE_S + 2.0

@@ -33,7 +33,7 @@ def frames_of(board, rig=RIG, **disturbances):
     return radar.chirps(board, np.zeros(FRAMES), np.zeros(FRAMES)).reshape(FRAMES, -1, 2, 4)
 
 
-setup_of = functools.cache(lambda board: BoardSetup.of(RIG, RIG.by_name(board)))  # no start frequency changes it
+setup_of = functools.cache(lambda board: BoardSetup.from_rig(RIG, RIG.by_name(board)))  # no start frequency changes it
 
 
 def signal_of(board, rig=RIG, **disturbances):

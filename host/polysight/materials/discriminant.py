@@ -11,8 +11,8 @@ On ln|H|, ln|V| and arg P errors of gain and of phase are additive. A pixel of m
 with e the pixel's own error (speckle), u_p the error of the whole patch (placement, uneven illumination), g_s that of
 the scan's metal reference, common to all its patches, and d the deviation of the specimen from its material in ln eps'
 and ln eps'', which F_m converts to features (`specimens.py`): a linear model with random effects (Searle, Casella and
-McCulloch, Variance Components, chapter 5). If V nearly vanishes its error is additive (`soft_modulus`). The covariances are
-estimated from the library: by residual mean squares of pixels, patches and scans; that of patches is divided into
+McCulloch, Variance Components, chapter 5). If V nearly vanishes its error is additive (`soft_modulus`). The covariances
+are estimated from the library: by residual mean squares of pixels, patches and scans; that of patches is divided into
 placement and specimen by expectation maximisation. A decision uses them as follows:
 
 * a single pixel has all errors;

@@ -219,13 +219,13 @@ def image_error(rig: Instrument, board: Board) -> float:
     weights = builder.boards[board.name].weights
     taper = np.concatenate([weights[r.index, :: r.direction][used[r.index]] for r in plan])
     true = _matched(
-        rig,
-        board,
-        np.concatenate(samples, axis=1).astype(complex) / builder.rx_calibration(board.name)[:, None, None],
-        np.concatenate(shifts),
-        taper.astype(float),
-        grid.voxels_m[chosen],
-        builder,
+        rig=rig,
+        board=board,
+        samples=np.concatenate(samples, axis=1).astype(complex) / builder.rx_calibration(board.name)[:, None, None],
+        shifts_m=np.concatenate(shifts),
+        taper=taper.astype(float),
+        voxels_m=grid.voxels_m[chosen],
+        builder=builder,
     )
     return float(np.abs(image.ravel()[chosen] - true).max() / np.abs(image).max())
 

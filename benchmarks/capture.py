@@ -152,7 +152,20 @@ class Receivers:
         packets = blocks * PACKETS
         before = ask(beside)
         cpu = [cpu_s(r.pid) for r in self._receivers]
-        trial = Trial(rate, 0, 0, 0, 0, 0, True, [], 0, 0, 0, 0)
+        trial = Trial(
+            wanted=rate,
+            rate=0,
+            seconds=0,
+            packets=0,
+            lost=0,
+            kernel_drops=0,
+            exact=True,
+            cpu=[],
+            queue=0,
+            turn_s=0,
+            rows_beside=0,
+            load=0,
+        )
         began = time.perf_counter()
         ended = 0.0
         for _ in range(rows):
@@ -231,18 +244,18 @@ class PlainLoops:
         wall = time.perf_counter() - began
         total = packets * len(self._loops)
         return Trial(
-            rate,
-            total / took,
-            took,
-            total,
-            total - sum(a["received"] for a in answers),
-            sum(a["drops"] for a in answers),
-            True,
-            [a["cpu_s"] / took for a in answers],
-            0.0,
-            0.0,
-            (ask(beside)["rows"] - before["rows"]) / wall,
-            os.getloadavg()[0],
+            wanted=rate,
+            rate=total / took,
+            seconds=took,
+            packets=total,
+            lost=total - sum(a["received"] for a in answers),
+            kernel_drops=sum(a["drops"] for a in answers),
+            exact=True,
+            cpu=[a["cpu_s"] / took for a in answers],
+            queue=0.0,
+            turn_s=0.0,
+            rows_beside=(ask(beside)["rows"] - before["rows"]) / wall,
+            load=os.getloadavg()[0],
         )
 
 

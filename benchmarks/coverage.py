@@ -225,17 +225,17 @@ def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigur
         values = np.linalg.eigvalsh(e.covariance)
         out.append(
             PatchFigures(
-                seed,
-                plate.name,
-                next(k for k, top in CLASSES.items() if tangent <= top),
-                float(difference @ np.linalg.solve(e.covariance, difference)),
-                float(np.hypot(*difference)) / size,
-                float(np.sqrt(values.mean())) / size,
-                float(np.sqrt(values[0])) / size,
-                result.prior.leakage_measured,
-                any(p.metal for p in scene.plates),
-                findings.verdict.level,
-                plate.thickness_mm is not None,
+                scene=seed,
+                material=plate.name,
+                kind=next(k for k, top in CLASSES.items() if tangent <= top),
+                distance2=float(difference @ np.linalg.solve(e.covariance, difference)),
+                relative_error=float(np.hypot(*difference)) / size,
+                relative_std=float(np.sqrt(values.mean())) / size,
+                smallest_std=float(np.sqrt(values[0])) / size,
+                leakage_measured=result.prior.leakage_measured,
+                metal_in_scene=any(p.metal for p in scene.plates),
+                level=findings.verdict.level,
+                sheet=plate.thickness_mm is not None,
             )
         )
     return out

@@ -179,21 +179,21 @@ def judged(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -> C
     difference = np.array([fit.permittivity.real - true[0], -fit.permittivity.imag - true[1]])
     found_mm = 1e3 * (fit.thickness_m or 0.0)
     return Case(
-        seed,
-        kind,
-        setting,
-        true,
-        size_mm,
-        (fit.permittivity.real, -fit.permittivity.imag),
-        found_mm,
-        float(np.hypot(*difference) / np.hypot(*true)),
-        abs(found_mm / size_mm - 1) if size_mm else 0.0,
-        float(difference @ np.linalg.solve(fit.covariance[:2, :2], difference)),
-        fit.relative_std,
-        fit.ambiguous,
-        len(fit.rivals),
-        fit.chi2 / fit.freedom,
-        any("does not explain" in w for w in fit.warnings()),
+        scene=seed,
+        kind=kind,
+        setting=setting,
+        permittivity=true,
+        thickness_mm=size_mm,
+        found=(fit.permittivity.real, -fit.permittivity.imag),
+        found_mm=found_mm,
+        error=float(np.hypot(*difference) / np.hypot(*true)),
+        thickness_error=abs(found_mm / size_mm - 1) if size_mm else 0.0,
+        distance2=float(difference @ np.linalg.solve(fit.covariance[:2, :2], difference)),
+        relative_std=fit.relative_std,
+        ambiguous=fit.ambiguous,
+        rivals=len(fit.rivals),
+        chi2=fit.chi2 / fit.freedom,
+        unexplained=any("does not explain" in w for w in fit.warnings()),
     )
 
 

@@ -153,10 +153,17 @@ def table_2_classifier(theta_rad: float) -> Classifier:
                 t = complex(inverse_ratio(permittivity, theta_rad))
                 level = abs(complex(fresnel(permittivity, theta_rad)[0]))
             pixels = t * np.exp(0.003 * (rng.standard_normal(30) + 1j * rng.standard_normal(30)))
-            entries.append(Entry(
-                name, f"scan {piece}", np.full(30, level, np.float32), (level * abs(pixels)).astype(np.float32),
-                (1 / pixels).astype(np.complex64), float(np.degrees(theta_rad)), True, specimen=f"{name} {piece}",
-            ))  # fmt: skip
+            entry = Entry(
+                name=name,
+                scan=f"scan {piece}",
+                h=np.full(30, level, np.float32),
+                v=(level * abs(pixels)).astype(np.float32),
+                p=(1 / pixels).astype(np.complex64),
+                incidence_deg=float(np.degrees(theta_rad)),
+                simulated=True,
+                specimen=f"{name} {piece}",
+            )
+            entries.append(entry)
     return Classifier(fit_library(Library(tuple(entries))))
 
 
@@ -282,7 +289,16 @@ def declared_figures(nuisance: str, patch: PatchResult, plate: Plate) -> PatchFi
         error = abs(away) / abs(plate.stack.below)
     name = UNKNOWN if patch.verdict is None else patch.verdict.name
     confidence = 0.0 if patch.verdict is None else patch.verdict.confidence
-    return PatchFigures(nuisance, plate.name, distance2, half_width, error, name, confidence, refused)
+    return PatchFigures(
+        nuisance=nuisance,
+        material=plate.name,
+        distance2=distance2,
+        half_width=half_width,
+        error=error,
+        name=name,
+        confidence=confidence,
+        refused=refused,
+    )
 
 
 METAL_KINDS = ("copper declared", "dielectric declared", "no metal")

@@ -36,7 +36,17 @@ def synced_row(rig):
         valid = np.ones(n, bool) if valid is None else valid
         zero = np.zeros(n)
         samples = np.where(valid[:, None], samples, 0).astype(np.complex64)
-        return SyncedRow(samples, sample_frequencies_hz(rig.chirp), valid, np.full(n, 16), zero, zero, zero, zero, {})
+        return SyncedRow(
+            samples=samples,
+            sweep_hz=sample_frequencies_hz(rig.chirp),
+            valid=valid,
+            chirps=np.full(n, 16),
+            direct_hz=zero,
+            direct_amplitude=zero,
+            freq_residual_hz=zero,
+            phase_residual_rad=zero,
+            errors={},
+        )
 
     return make
 

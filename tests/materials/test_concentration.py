@@ -16,7 +16,15 @@ SUGAR = {"water": 0.0, "sugar (1.3%)": 1.3, "sugar (3.8%)": 3.8, "sugar (5.1%)":
 
 def entry(name, angle_rad, scan="a", incidence_deg=55.0):
     p = np.full(9, np.tan(angle_rad) * np.exp(0.3j), np.complex64)
-    return Entry(name, scan, np.ones(9, np.float32), np.ones(9, np.float32), p, incidence_deg, True)
+    return Entry(
+        name=name,
+        scan=scan,
+        h=np.ones(9, np.float32),
+        v=np.ones(9, np.float32),
+        p=p,
+        incidence_deg=incidence_deg,
+        simulated=True,
+    )
 
 
 def library(rng=None, noise=0.0, slope=-20.0, patches=3):

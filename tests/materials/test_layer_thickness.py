@@ -38,7 +38,16 @@ def measured(stack, offset=0j, theta_std=0.0, covariance=None):
     q, h = predict(stack, BANDS, THETA)
     covariance = shared_covariance() if covariance is None else covariance
     sigma = np.sqrt(np.diag(covariance)[::2])
-    return Bands(BANDS, q + offset, sigma, h, 0.003 * h, covariance, 0.1, theta_std)
+    return Bands(
+        spectrum=BANDS,
+        inverse_ratio=q + offset,
+        sigma=sigma,
+        amplitude_h=h,
+        sigma_h=0.003 * h,
+        covariance=covariance,
+        common_h=0.1,
+        theta_std_rad=theta_std,
+    )
 
 
 @pytest.mark.parametrize(
@@ -97,10 +106,26 @@ def test_two_thicknesses_that_fit_are_both_told_in_millimetres():
 
 
 def test_a_thickness_that_is_not_determined_is_told_ambiguous():
-    answer = LayerFit(4 - 0.1j, 2e-3, 0.02, 0.02, 0.1e-3, 5.0, 9)
+    answer = LayerFit(
+        permittivity=4 - 0.1j,
+        thickness_m=2e-3,
+        std_real=0.02,
+        std_loss=0.02,
+        std_thickness_m=0.1e-3,
+        chi2=5.0,
+        freedom=9,
+    )
     assert answer.ambiguous
     assert any("ambiguous" in words for words in answer.warnings())
-    assert not LayerFit(4 - 0.1j, 2e-3, 0.02, 0.02, 0.02e-3, 5.0, 9).ambiguous
+    assert not LayerFit(
+        permittivity=4 - 0.1j,
+        thickness_m=2e-3,
+        std_real=0.02,
+        std_loss=0.02,
+        std_thickness_m=0.02e-3,
+        chi2=5.0,
+        freedom=9,
+    ).ambiguous
 
 
 def test_an_uncertain_angle_widens_the_error_bars():

@@ -139,7 +139,9 @@ def test_a_solution_at_the_end_of_what_is_looked_for_says_so():
 
 def test_what_one_scan_in_a_thousand_would_miss_is_said_and_its_rivals_are_kept():
     # Probability 0.97e-3
-    fit = LayerFit(4 - 0.4j, 3e-3, 0.03, 0.03, 0.0, 24.4, 7)
+    fit = LayerFit(
+        permittivity=4 - 0.4j, thickness_m=3e-3, std_real=0.03, std_loss=0.03, std_thickness_m=0.0, chi2=24.4, freedom=7
+    )
     assert any("does not explain" in words for words in fit.warnings())
     assert not any("does not explain" in words for words in replace(fit, chi2=24.0).warnings())
     # Two sheets that the data tell apart only as far as the model fits them.

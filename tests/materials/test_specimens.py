@@ -108,13 +108,13 @@ def entries(samples):
         q = samples.x[at, 2] + 1j * samples.x[at, 3]
         out.append(
             Entry(
-                str(samples.names[at][0]),
-                f"scan {samples.groups[at][0]}",
-                h.astype(np.float32),
-                v.astype(np.float32),
-                (1 / q).astype(np.complex64),
-                60.0,
-                True,
+                name=str(samples.names[at][0]),
+                scan=f"scan {samples.groups[at][0]}",
+                h=h.astype(np.float32),
+                v=v.astype(np.float32),
+                p=(1 / q).astype(np.complex64),
+                incidence_deg=60.0,
+                simulated=True,
                 specimen=str(samples.specimens[at][0]),
             )
         )

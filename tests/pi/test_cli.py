@@ -116,7 +116,9 @@ def test_an_impossible_speed_is_a_usage_error(config, speed):
 
 
 def test_pulse_reports_faults(command, config, monkeypatch):
-    late = BurstRecord(2, 0, 1, 2, 1000, 900, PiFault.PERIOD_TOO_SHORT)
+    late = BurstRecord(
+        pulses=2, first_ns=0, last_ns=1, end_ns=2, width_max_ns=1000, jitter_ns=900, fault=PiFault.PERIOD_TOO_SHORT
+    )
     records = iter([late, late._replace(fault=0), late])
     monkeypatch.setattr("polysight_pi.lines.open_lines", lambda *_: FakeLines())
     monkeypatch.setattr("polysight_pi.trigger.send_burst", lambda *_: next(records))

@@ -16,7 +16,15 @@ SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
 
 def filter_file(corner_khz: float = 180.5) -> FilterFile:
     """Both receivers with the same corners, measured with the published rig's."""
-    board = BoardFilter([corner_khz, 355.25], [1.5, 2.5], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
+    board = BoardFilter(
+        corners_khz=[corner_khz, 355.25],
+        standard_error_khz=[1.5, 2.5],
+        programmed_khz=[175.0, 350.0],
+        if_from_khz=100.0,
+        if_to_khz=1900.0,
+        chirps=640,
+        residual_db=0.05,
+    )
     return FilterFile(**header("hpf", SOURCES), boards={"RH": board, "RV": board})
 
 

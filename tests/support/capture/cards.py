@@ -31,7 +31,9 @@ class Cards:
         self._thread = threading.Thread(target=self._serve)
 
     def add(self, name: str, network: Network, faults: Faults, recording: Path | None) -> None:
-        endpoint = CardEndpoint(name, network, faults, 0, 1.0, time.monotonic, Pace())
+        endpoint = CardEndpoint(
+            name=name, network=network, faults=faults, seed=0, time_scale=1.0, clock_s=time.monotonic, pace=Pace()
+        )
         self.endpoints[name] = endpoint
         if recording is not None:
             plays = (Recording(path) for path in repeat(recording))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from polysight.imaging.geometry import Antennas, image_grid, row_offsets_m
 from polysight.imaging.samples import scene_gate_m
-from polysight.store.source import RowData
+from polysight.store.source import RowData, allocate_pages
 from polysight.sync import SyncedRow, sample_frequencies_hz
 from polysight_shared.config import Board, Instrument, load_instrument
 from polysight_shared.findings import Finding
@@ -111,7 +111,7 @@ class RepeatedRows:
 
 def _repeated(path: Path, wanted: int, size: int) -> Iterator[NDArray[np.uint8]]:
     """Read pieces of a file, from its start again where it ends, `wanted` bytes in all."""
-    memory = np.empty(min(size, wanted) or wanted, np.uint8)
+    memory = allocate_pages(min(size, wanted) or wanted)
     with path.open("rb") as file:
         while wanted:
             piece = memory[:wanted]

@@ -18,7 +18,7 @@ from polysight.store import manifest
 from polysight.store.logs import EventWriter, crc32, read_events
 from polysight.store.manifest import ManifestWriter, RowCommitted, ScanResumed, encode_line, parse
 from polysight.store.scan_folder import ScanFolder
-from polysight.store.source import RawSource, split_pieces
+from polysight.store.source import RawSource, allocate_pages, split_pieces
 from polysight.store.validation import to_json, validate
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError
@@ -222,6 +222,14 @@ def test_read_row_refuses_damage(whole_scan):
         scan.read_row("LS", 2)
     with refused(ErrorCode.NO_DATA):
         scan.read_row("RH", 17)
+
+
+@pytest.mark.parametrize("size", [1, 4096, 2 << 20])
+def test_memory_to_read_a_file_into_starts_at_a_page(size):
+    memory = allocate_pages(size)
+    assert memory.size == size
+    assert memory.ctypes.data % 4096 == 0
+    memory[:] = 255
 
 
 @pytest.mark.parametrize("size", [1, 7, 100, 1 << 20, 0])

@@ -47,7 +47,7 @@ from polysight.store.manifest import (
     lock_file,
     manifest_fault,
 )
-from polysight.store.source import HEADER_LOCK, RowData
+from polysight.store.source import HEADER_LOCK, RowData, allocate_pages
 from polysight_shared import __version__
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
@@ -356,7 +356,7 @@ class ScanFolder:
     def _read_pieces(self, path: Path, board: BoardRow, size: int) -> Iterator[NDArray[np.uint8]]:
         """Read a payload in pieces of `size` bytes (0: everything), all in the same memory, and check its CRC."""
         digest = 0
-        memory = np.empty(min(size, board.bytes) or board.bytes or 1, np.uint8)
+        memory = allocate_pages(min(size, board.bytes) or board.bytes or 1)
         try:
             with path.open("rb") as file:
                 size_on_disk = os.fstat(file.fileno()).st_size

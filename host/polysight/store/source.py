@@ -29,6 +29,22 @@ HEADER_LOCK = threading.Lock()
 ("AST constructor recursion depth mismatch") when two threads are in it."""
 
 
+# Bytes of a page of memory and of the page cache.
+_PAGE = 4096
+
+
+def allocate_pages(size: int) -> NDArray[np.uint8]:
+    """Return uninitialised memory of `size` bytes that starts at a page, to read a file into from its start.
+
+    Large arrays of NumPy start 16 bytes behind a page's start. There Zen 3 copies a file's pages at a sixth of the
+    speed (64 KB: 34 us instead of 5.5): loads wait for the stores before them, which have nearly the same place in
+    another page.
+    """
+    memory = np.empty(size + _PAGE, np.uint8)
+    first = -memory.ctypes.data % _PAGE
+    return memory[first : first + size]
+
+
 def split_pieces(payload: NDArray[np.uint8]) -> Pieces:
     """Return the pieces of a payload in memory."""
     return lambda size: (

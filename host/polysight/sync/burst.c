@@ -29,7 +29,7 @@ static Complex inverse(const Equaliser *e, double frequency)
         f = 1;
     for (int i = 0; i < e->corners; i++)
         h = times(h, (Complex){1, -e->corners_hz[i] / f});
-    double gain = h.re * h.re + h.im * h.im, part = gain * limit > 1 ? 1 / (gain * limit) : 1;
+    double gain = squared(h), part = gain * limit > 1 ? 1 / (gain * limit) : 1;
     return (Complex){h.re * part, h.im * part};
 }
 

@@ -47,23 +47,24 @@ static inline void medians(const int32_t *restrict powers, int size, int lanes, 
     }
 }
 
-/* `NumpyLoops.search` for one spectrum, strongest at the bin top. */
+/* `NumpyLoops.search` for one spectrum, strongest at the bin top; by powers, which rise with magnitudes. */
 static inline void choose_peaks(const Table *t, const float *re, const float *im, int top, int nearest, int farthest,
                                 double comparable, int32_t *first, int32_t *second)
 {
     const int last = t->size - 1;
     int lower = top;
-    double best = 0;
+    double best = 0, above = squared(value_at(re, im, t->place[(top - nearest + 1) & last]));
+    double here = squared(value_at(re, im, t->place[(top - nearest) & last]));
     for (int d = nearest; d <= farthest; d++) {
-        double value = magnitude(value_at(re, im, t->place[(top - d) & last]));
-        int is_peak = value >= magnitude(value_at(re, im, t->place[(top - d - 1) & last])) &&
-                      value >= magnitude(value_at(re, im, t->place[(top - d + 1) & last]));
-        if (is_peak && value > best) {
-            best = value;
+        double below = squared(value_at(re, im, t->place[(top - d - 1) & last]));
+        if (here >= below && here >= above && here > best) {
+            best = here;
             lower = (top - d) & last;
         }
+        above = here;
+        here = below;
     }
-    int is_object = best > comparable * magnitude(value_at(re, im, t->place[top]));
+    int is_object = best > comparable * comparable * squared(value_at(re, im, t->place[top & last]));
     *first = is_object ? lower : top;
     *second = is_object ? top : lower;
 }
@@ -89,8 +90,6 @@ int NAME(search)(const float *halves, const float *weights, const float *prefere
     for (int first = 0; first < positions; first += LANES) {
         int lanes = positions - first < LANES ? positions - first : LANES;
         int32_t at[LANES];
-        memset(re, 0, sizeof *re * LANES * size);
-        memset(im, 0, sizeof *im * LANES * size);
         for (int k = 0; k < lanes; k++) {
             weighted(halves + 4 * (size_t)(first + k) * count, weights, count, x, y);
             for (int m = 0; m < blocks; m++) {
@@ -98,7 +97,7 @@ int NAME(search)(const float *halves, const float *weights, const float *prefere
                 im[LANES * m + k] = (y[m] + y[blocks + m]) + (y[2 * blocks + m] + y[3 * blocks + m]);
             }
         }
-        transform(re, im, size, &table);
+        transform(re, im, blocks, size, &table);
         for (int i = 0; i < LANES * size; i++) {
             float weight = preference[table.bin[i / LANES]];
             power[i] = re[i] * re[i] + im[i] * im[i];
@@ -132,17 +131,6 @@ static void estimate_at(const float *g_re, const float *g_im, int rows, int bloc
     }
 }
 
-/* Add (e + j f) (x + j y) to re + j im. */
-static inline void add_products(const float *restrict e, const float *restrict f, const float *restrict x,
-                                const float *restrict y, int count, float *restrict re, float *restrict im)
-{
-    VECTOR
-    for (int m = 0; m < count; m++) {
-        re[m] += e[m] * x[m] - f[m] * y[m];
-        im[m] += e[m] * y[m] + f[m] * x[m];
-    }
-}
-
 /* `NumpyLoops.refine`: steering [rx][block], estimator [row][2][rx][block], real and imaginary part; changes frequency
    [position]. */
 int NAME(refine)(const float *halves, const float *steering, const float *estimator, int positions, int blocks, int rows,
@@ -161,12 +149,18 @@ int NAME(refine)(const float *halves, const float *steering, const float *estima
         memset(re, 0, sizeof *re * 2 * rows * blocks);
         for (int i = 0; i < rows * RX; i++) { /* the same demodulation for all RX: sum over them first */
             const float *e = estimator + (i / RX * 2 * RX + i % RX) * blocks, *f = e + count;
-            add_products(e, f, x + i % RX * blocks, y + i % RX * blocks, blocks, re + i / RX * blocks, im + i / RX * blocks);
+            const float *u = x + i % RX * blocks, *v = y + i % RX * blocks;
+            float *to_re = re + i / RX * blocks, *to_im = im + i / RX * blocks;
+            VECTOR
+            for (int m = 0; m < blocks; m++) {
+                to_re[m] += e[m] * u[m] - f[m] * v[m];
+                to_im[m] += e[m] * v[m] + f[m] * u[m];
+            }
         }
         estimate_at(re, im, rows, blocks, frequency[p], c, s, estimate);
         for (int i = 0; i < count_steps; i++) {
             Complex a = estimate[0], aw = estimate[1];
-            double size = a.re * a.re + a.im * a.im;
+            double size = squared(a);
             double step = size > 0 ? (aw.re * a.re + aw.im * a.im) / size / TURN : 0;
             steps[p] = step < -reach ? -reach : step > reach ? reach : step;
             frequency[p] += steps[p];

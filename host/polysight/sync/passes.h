@@ -12,7 +12,6 @@
 #define FLAT 9      /* `decimate.FLAT` */
 #define BESIDE ((TAPS - FOLD) / 2)
 #define WORDS (2 * RX) /* of a sample */
-#define MOST 256       /* chirps of a burst, whole groups, `loops.MOST_CHIRPS` */
 
 /* Sizes, tables and work arrays. */
 typedef struct {
@@ -93,13 +92,6 @@ static inline Complex interpolated(const Work *w, const float *re, const float *
     return times(peak, cis(whole * (w->n - 1) / 2));
 }
 
-/* Zeros after the samples of the records to transform. */
-static inline void clear(Work *w, int samples, int size)
-{
-    memset(w->re + LANES * samples, 0, sizeof *w->re * LANES * (size - samples));
-    memset(w->im + LANES * samples, 0, sizeof *w->im * LANES * (size - samples));
-}
-
 /* `loops.find_band`: middle of the band of a chirp of words, cycles per sample 0..1. The records are quarters of the RX. */
 static double centre_of_band(Work *w, const int16_t *chirp)
 {
@@ -111,8 +103,7 @@ static double centre_of_band(Work *w, const int16_t *chirp)
                 w->re[LANES * m + RX * quarter + r] = word[0];
                 w->im[LANES * m + RX * quarter + r] = word[RX];
             }
-    clear(w, samples, size);
-    transform(w->re, w->im, size, &w->table);
+    transform(w->re, w->im, samples, size, &w->table);
     float *power = w->row_re, *smooth = w->row_im;
     for (int i = 0; i < size; i++) {
         float sum = 0;
@@ -138,8 +129,7 @@ static double match(Work *w, const int16_t *burst, int reference, double *freque
     for (int first = 0; first < w->chirps; first += LANES) {
         int32_t at[LANES];
         correlate(w->words + (size_t)first * WORDS * w->n, w->chosen, w->n, w->re, w->im, energy + first);
-        clear(w, w->n, w->table.size);
-        transform(w->re, w->im, w->table.size, &w->table);
+        transform(w->re, w->im, w->n, w->table.size, &w->table);
         strongest(w->re, w->im, w->table.size, at);
         for (int k = 0; k < LANES; k++)
             product[first + k] = interpolated(w, w->re + k, w->im + k, at[k], frequency + first + k);
@@ -281,23 +271,23 @@ static double against_others(Work *w, const uint8_t *good, double *frequency, Co
     int values = RX * w->blocks, chirps = w->chirps, all = w->parts * chirps;
     double *even_re = w->sums, *even_im = even_re + all, *odd_re = even_im + all, *odd_im = odd_re + all;
     double *rest_re = odd_im + all, *rest_im = rest_re + all, level = 0;
+    static const double at_zero[MOST];
+    float used[MOST];
+    for (int k = 0; k < LANES * w->groups; k++)
+        used[k] = k < chirps && good[k];
     memset(w->all_re, 0, sizeof(float) * values);
     memset(w->all_im, 0, sizeof(float) * values);
-    for (int g = 0; g < w->groups; g++) {
-        float used[LANES];
-        for (int k = 0; k < LANES; k++)
-            used[k] = g * LANES + k < chirps && good[g * LANES + k];
+    for (int first = 0; first < chirps; first += LANES)
         for (int i = 0; i < values; i++) {
-            const size_t at = LANES * ((size_t)g * values + i);
-            float x = 0, y = 0;
-            for (int k = 0; k < LANES; k++) {
-                x += w->folded_re[at + k] * used[k];
-                y += w->folded_im[at + k] * used[k];
+            const size_t at = (size_t)first * values + LANES * i;
+            Vector x = {0}, y = {0};
+            for (int part = 0; part < LANES; part += STEP) {
+                x += load(w->folded_re + at + part) * load(used + first + part);
+                y += load(w->folded_im + at + part) * load(used + first + part);
             }
-            w->all_re[i] += x;
-            w->all_im[i] += y;
+            w->all_re[i] += total(x);
+            w->all_im[i] += total(y);
         }
-    }
     memset(energy, 0, sizeof *energy * chirps);
     for (int p = 0; p < w->parts; p++) {
         int from = RX * w->edges[p], to = RX * w->edges[p + 1];
@@ -313,8 +303,8 @@ static double against_others(Work *w, const uint8_t *good, double *frequency, Co
             VECTOR
             for (int k = 0; k < count; k++) {
                 double a = sums[0][k], b = sums[1][k], c = sums[2][k], d = sums[3][k], own = sums[4][k];
-                double inside = good[first + k] ? own : 0, re = a + c - inside, im = b + d;
-                double others = whole - (good[first + k] ? 2 * (a + c) - own : 0);
+                double re = a + c - used[first + k] * own, im = b + d;
+                double others = whole - used[first + k] * (2 * (a + c) - own);
                 even_re[j + k] = a, even_im[j + k] = b, odd_re[j + k] = c, odd_im[j + k] = d;
                 rest_re[j + k] = re, rest_im[j + k] = im;
                 left[j + k] = own - (others > 1e-30 ? (re * re + im * im) / others : own);
@@ -322,7 +312,7 @@ static double against_others(Work *w, const uint8_t *good, double *frequency, Co
             }
         }
     }
-    newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, NULL, frequency, tone);
+    newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, at_zero, frequency, tone);
     newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, frequency, frequency, tone);
     newton_step(even_re, even_im, w->part_times, w->parts, chirps, frequency, apart_f, w->even_tone);
     newton_step(odd_re, odd_im, w->part_times, w->parts, chirps, frequency, w->odd_frequency, w->odd_tone);

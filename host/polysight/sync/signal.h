@@ -16,6 +16,7 @@
 
 #define RX 4    /* of an AWR2243 */
 #define FOLD 4  /* samples averaged before fine estimates, `loops.FOLD` */
+#define MOST 256 /* chirps of a burst, whole groups, `loops.MOST_CHIRPS` */
 #define LANES 16  /* FOLD x RX; also the number of records transformed together */
 
 #define JOIN(name, width) name##_##width
@@ -33,9 +34,9 @@ typedef struct { double re, im; } Complex;
 static inline Complex cis(double turns)
 {
     double x = TURN / 2 * (turns - floor(turns + 0.5)), q = x * x, s, c;
-    s = -1 / 5040.0 + q * (1 / 362880.0 + q * (-1 / 39916800.0 + q / 6227020800.0));
+    s = -1 / 5040.0 + q * (1 / 362880.0 + q * (-1 / 39916800.0 + q * (1 / 6227020800.0)));
     s = x * (1 + q * (-1 / 6.0 + q * (1 / 120.0 + q * s)));
-    c = 1 / 40320.0 + q * (-1 / 3628800.0 + q / 479001600.0);
+    c = 1 / 40320.0 + q * (-1 / 3628800.0 + q * (1 / 479001600.0));
     c = 1 + q * (-1 / 2.0 + q * (1 / 24.0 + q * (-1 / 720.0 + q * c)));
     return (Complex){1 - 2 * s * s, 2 * s * c};
 }
@@ -47,7 +48,8 @@ static inline Complex times(Complex a, Complex b)
 
 static inline Complex plus(Complex a, double factor, Complex b) { return (Complex){a.re + factor * b.re, a.im + factor * b.im}; }
 static inline Complex conjugate(Complex a) { return (Complex){a.re, -a.im}; }
-static inline double magnitude(Complex a) { return sqrt(a.re * a.re + a.im * a.im); }
+static inline double squared(Complex a) { return a.re * a.re + a.im * a.im; }
+static inline double magnitude(Complex a) { return sqrt(squared(a)); }
 
 /* Angle, within 1e-10: the arc tangent's series below an eighth of a turn; without calls, which the compiler vectorises. */
 static inline double angle(Complex a)
@@ -116,6 +118,13 @@ static inline Vector add_product(Vector sum, Vector a, Vector b) { return sum + 
 static inline Vector load(const float *at) { return *(const Vector *)at; }
 static inline void store(float *at, Vector x) { *(Vector *)at = x; }
 static inline Vector all(float x) { return x - (Vector){0}; }
+static inline float total(Vector x)
+{
+    float sum = 0;
+    for (int k = 0; k < STEP; k++)
+        sum += x[k];
+    return sum;
+}
 
 /* Size of a transform, roots of unity exp(-j 2 pi k / size), the bin at each index of its output, the index of each bin. */
 typedef struct { int size, *bin, *place; float *c, *s; } Table;
@@ -165,10 +174,12 @@ static inline void butterfly(float *restrict re, float *restrict im, int row, co
     }
 }
 
-/* Fourier transforms of sixteen records [size][LANES] in place, decimation in frequency. The table may be that of four
-   times the size: then its bins are, too. */
-static inline void transform(float *restrict re, float *restrict im, int size, const Table *table)
+/* Fourier transforms of sixteen records [size][LANES] in place, decimation in frequency; zeros follow the samples. The
+   table may be that of four times the size: then its bins are, too. */
+static inline void transform(float *restrict re, float *restrict im, int samples, int size, const Table *table)
 {
+    memset(re + LANES * samples, 0, sizeof *re * LANES * (size - samples));
+    memset(im + LANES * samples, 0, sizeof *im * LANES * (size - samples));
     const float *c = table->c, *s = table->s;
     int n = size;
     for (; n >= 4; n /= 4) {
@@ -209,27 +220,32 @@ static inline void strongest(const float *re, const float *im, int size, int32_t
 
 static inline Complex value_at(const float *re, const float *im, int i) { return (Complex){re[LANES * i], im[LANES * i]}; }
 
-/* A step of Newton's method on the periodograms of records [part][record], `loops.refine`, from a frequency in cycles per
-   sample; NULL: from zero. */
+/* A step of Newton's method on the periodograms of records [part][record], `loops.refine`, from a frequency in cycles
+   per sample. */
 static inline void newton_step(const double *restrict re, const double *restrict im, const double *restrict t, int parts,
                                int count, const double *start, double *f, Complex *restrict tone)
 {
     double limit = TURN / (t[parts - 1] - t[0]);
+    Complex sums[3][MOST]; /* of the demodulated parts, times powers zero to two of the time */
+    for (int k = 0; k < count; k++)
+        sums[0][k] = sums[1][k] = sums[2][k] = (Complex){0, 0};
+    for (int p = 0; p < parts; p++) {
+        VECTOR
+        for (int k = 0; k < count; k++) {
+            Complex value = times((Complex){re[p * count + k], im[p * count + k]}, cis(-start[k] * t[p]));
+            sums[0][k] = plus(sums[0][k], 1, value);
+            sums[1][k] = plus(sums[1][k], t[p], value);
+            sums[2][k] = plus(sums[2][k], t[p] * t[p], value);
+        }
+    }
     VECTOR
     for (int k = 0; k < count; k++) {
-        Complex s0 = {0, 0}, s1 = {0, 0}, s2 = {0, 0};
-        for (int p = 0; p < parts; p++) {
-            Complex turn = start ? cis(-start[k] * t[p]) : (Complex){1, 0};
-            Complex value = times((Complex){re[(size_t)p * count + k], im[(size_t)p * count + k]}, turn);
-            s0 = plus(s0, 1, value);
-            s1 = plus(s1, t[p], value);
-            s2 = plus(s2, t[p] * t[p], value);
-        }
+        Complex s0 = sums[0][k], s1 = sums[1][k], s2 = sums[2][k];
         double slope = s0.re * s1.im - s0.im * s1.re;
-        double curvature = s1.re * s1.re + s1.im * s1.im - (s0.re * s2.re + s0.im * s2.im);
+        double curvature = squared(s1) - (s0.re * s2.re + s0.im * s2.im);
         double d = curvature < 0 ? -slope / curvature : 0;
         d = d < -limit ? -limit : d > limit ? limit : d;
-        f[k] = (start ? start[k] : 0) + d / TURN;
+        f[k] = start[k] + d / TURN;
         tone[k] = plus(plus(s0, d, (Complex){s1.im, -s1.re}), -d * d / 2, s2);
     }
 }

@@ -109,8 +109,8 @@ def rig() -> Instrument:
 def _browser_of_worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     if find_chromium() is None:
         pytest.skip("no chromium here: sudo apt-get install chromium")
-    with Browser(tmp_path_factory.mktemp("browser")) as made:
-        yield made
+    with Browser(tmp_path_factory.mktemp("browser")) as browser:
+        yield browser
 
 
 @pytest.fixture(scope="module")

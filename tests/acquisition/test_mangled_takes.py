@@ -129,9 +129,9 @@ def test_a_perfect_take_after_trouble_is_committed(grid):
     pulses = pulse_times(points, count)
     refused = 0
     for number in range(40):
-        at = pulses + number * 10**11
+        start_ns = pulses + number * 10**11
         troubles = tuple(chance.sample(TROUBLES, 2)) if number % 2 == 0 else ()
-        judged_take = keep(card.take(at.reshape(-1), troubles), past, at, frame)
+        judged_take = keep(card.take(start_ns.reshape(-1), troubles), past, start_ns, frame)
         refused += not troubles and not judged_take.whole
         past = judged_take.placed.past
         if past.lost:

@@ -47,9 +47,9 @@ class Server:
 
 @pytest.fixture
 def server():
-    made = Server()
-    yield made
-    made.close()
+    simulated_server = Server()
+    yield simulated_server
+    simulated_server.close()
 
 
 def test_each_row_sends_the_line_once_over_one_connection(server):

@@ -48,8 +48,8 @@ class HomingPi:
         if self._began is None:
             return SimpleNamespace(**answer | {"state": "idle"})
         if self.now > self._began + self._limit_s:
-            lost = {"fault": int(PiFault.STAGE_LOST), "reason": f"not homed after {self._limit_s} s"}
-            return SimpleNamespace(**answer | {"state": "fault"} | lost)
+            stage_lost = {"fault": int(PiFault.STAGE_LOST), "reason": f"not homed after {self._limit_s} s"}
+            return SimpleNamespace(**answer | {"state": "fault"} | stage_lost)
         return SimpleNamespace(**answer | {"state": "homing"})
 
     def events(self) -> list:

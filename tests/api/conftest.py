@@ -44,6 +44,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def products(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `polysight process` makes of a copy of it, in which it keeps the samples."""
-    made = tmp_path_factory.mktemp("processed")
-    command("process", shutil.copytree(folder, made / "scan"), "--out", made / "products")
-    return made / "products"
+    products_folder = tmp_path_factory.mktemp("processed")
+    command("process", shutil.copytree(folder, products_folder / "scan"), "--out", products_folder / "products")
+    return products_folder / "products"

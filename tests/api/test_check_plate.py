@@ -84,12 +84,12 @@ def test_the_command_says_and_draws_it(saved, tmp_path, capsys, permittivity, st
     with_plate(saved, CheckPlate(name="PET", permittivity=permittivity, place_mm=(x_mm, y_mm)))
     chart = tmp_path / "chart.png"
     assert main(["check", str(saved), "--chart", str(chart), "--json"]) == status
-    (shown,) = json.loads(capsys.readouterr().out)
-    assert (shown["level"] == "action") == bool(status)
+    (check,) = json.loads(capsys.readouterr().out)
+    assert (check["level"] == "action") == bool(status)
     assert chart.read_bytes().startswith(b"\x89PNG")
     table = polysight.check(saved)
-    assert table["level"].item() == shown["level"]
-    assert table["sigmas"].item() == shown["sigmas"]
+    assert table["level"].item() == check["level"]
+    assert table["sigmas"].item() == check["sigmas"]
 
 
 def test_a_rig_file_without_a_plate_is_an_error(saved, capsys):

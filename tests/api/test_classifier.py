@@ -19,9 +19,11 @@ NOT_CHECKED = {"check_array_api_input", "check_classifiers_multilabel_output_for
 @pytest.fixture(scope="module")
 def library():
     """Six scans of the packaged library, few pixels of each patch."""
-    whole = Library.load(SIMULATED_LIBRARY)
-    angle = whole.angles_deg[0]
-    return Library(tuple(entry for entry in whole.at_angle(angle).entries if entry.scan in whole.scans[:6]))
+    simulated_library = Library.load(SIMULATED_LIBRARY)
+    angle = simulated_library.angles_deg[0]
+    return Library(
+        tuple(entry for entry in simulated_library.at_angle(angle).entries if entry.scan in simulated_library.scans[:6])
+    )
 
 
 @pytest.mark.parametrize("measure", ["log", "paper"])

@@ -60,9 +60,9 @@ def test_the_map_of_permittivity_agrees_with_the_patch_and_knows_its_error(scan)
     assert bool(inside["mask"].mean() > 0.9)
     metal = eps.sel(x_mm=slice(-60, -30), y_mm=slice(-15, 15))
     assert not metal["mask"].any()
-    at = scan.probe(45, 0)
-    assert complex(at["permittivity"]) == complex(eps["permittivity"].sel(x_mm=45, y_mm=0, method="nearest"))
-    assert int(at["label"]) == 2
+    pixel = scan.probe(45, 0)
+    assert complex(pixel["permittivity"]) == complex(eps["permittivity"].sel(x_mm=45, y_mm=0, method="nearest"))
+    assert int(pixel["label"]) == 2
 
 
 def test_the_errors_of_the_map_are_those_of_its_ratio(scan):
@@ -137,15 +137,15 @@ def test_a_scene_can_be_written_in_python(tmp_path):
         "burst": {"pulses": 2},
         "plates": [COPPER],
     }
-    made = polysight.simulate(scene, tmp_path / "scan", seed=5)
-    assert made.simulated is True
-    assert made.rows.planned == 9
+    simulated_scan = polysight.simulate(scene, tmp_path / "scan", seed=5)
+    assert simulated_scan.simulated is True
+    assert simulated_scan.rows.planned == 9
     with refused(ErrorCode.OTHER):
         polysight.simulate({"name": "wrong", "plates": [{"nme": "x"}]}, tmp_path / "other")
 
 
 def test_a_scan_shows_itself_without_processing(products, tmp_path):
     assert "recorded rows" in open_scan(simulated(tmp_path / "scan"))._repr_html_()
-    shown = open_scan(products)._repr_html_()
+    page = open_scan(products)._repr_html_()
     for text in ("SIMULATED", "<td>metal reference</td>", "verdict"):
-        assert text in shown
+        assert text in page

@@ -27,21 +27,21 @@ def done(tmp_path):
 
 def test_the_unknown_layer_of_each_patch(done):
     """Nothing is said of the metal reference."""
-    found = layer_dataset(done, CHIRP, ["sheet,?,1.7"], None, 10.0)
-    assert found["patch"].values.tolist() == [1, 2]
-    eps = found["permittivity"].values
+    layers = layer_dataset(done, CHIRP, ["sheet,?,1.7"], None, 10.0)
+    assert layers["patch"].values.tolist() == [1, 2]
+    eps = layers["permittivity"].values
     assert np.isnan(eps[0])
     assert eps[1] == pytest.approx(SHEET.permittivity, rel=0.01)
-    assert found["thickness_mm"].values[1] == pytest.approx(1.7)
-    assert found["thickness_mm"].attrs["units"] == "mm"
+    assert layers["thickness_mm"].values[1] == pytest.approx(1.7)
+    assert layers["thickness_mm"].attrs["units"] == "mm"
     same = layer_dataset(done, CHIRP, [Layer("sheet", None, 1.7e-3)], 1, 10.0)
-    assert same.equals(found)
+    assert same.equals(layers)
 
 
 def test_a_free_thickness_by_one_band_is_told_ambiguous(done):
-    found = layer_dataset(done, CHIRP, ["sheet,?,0.5-4"], None, 10.0)
-    assert bool(found["ambiguous"].values[1])
-    assert " mm" in found["notes"].values[1]
+    layers = layer_dataset(done, CHIRP, ["sheet,?,0.5-4"], None, 10.0)
+    assert bool(layers["ambiguous"].values[1])
+    assert " mm" in layers["notes"].values[1]
 
 
 def test_other_forms_of_a_layer_are_refused(done):

@@ -35,8 +35,8 @@ def scan(folder):
 def without_rows(folder: Path, out: Path, *rows: int) -> Path:
     """A copy of a scan folder in which these rows were never committed."""
     shutil.copytree(folder, out)
-    kept = [f for f in facts_of(out) if f["fact"] != "row_committed" or f["row"] not in rows]
-    (out / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept))
+    kept_facts = [f for f in facts_of(out) if f["fact"] != "row_committed" or f["row"] not in rows]
+    (out / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept_facts))
     return out
 
 
@@ -85,12 +85,12 @@ def test_patches_are_where_the_plates_are(scan):
     patches = scan.patches()
     assert list(patches["patch"]) == [1, 2]
     for patch, plate in zip((1, 2), (COPPER, PET), strict=True):
-        one = patches.sel(patch=patch)
-        assert [float(one["centre_x_mm"]), float(one["centre_y_mm"])] == pytest.approx(plate["centre_mm"], abs=6)
-        here = patches["label"].sel(x_mm=one["centre_x_mm"], y_mm=one["centre_y_mm"], method="nearest")
-        assert here == patch
+        row = patches.sel(patch=patch)
+        assert [float(row["centre_x_mm"]), float(row["centre_y_mm"])] == pytest.approx(plate["centre_mm"], abs=6)
+        label = patches["label"].sel(x_mm=row["centre_x_mm"], y_mm=row["centre_y_mm"], method="nearest")
+        assert label == patch
         inside = patches["interior"] & (patches["label"] == patch)
-        assert inside.sum() == one["pixels"]
+        assert inside.sum() == row["pixels"]
         assert (patches["label"].where(patches["interior"]) != 0).all()
 
 
@@ -179,10 +179,10 @@ def test_saved_products_of_a_scan_folder_are_used_while_they_hold_its_rows(folde
     shutil.rmtree(scan / "samples", ignore_errors=True)
     assert "saved products" in repr(open_scan(scan))
     same_image(open_scan(scan).image(), saved / "image.npz")
-    for asked in (open_scan(scan, fresh=True), open_scan(scan, model="none")):
-        assert "recorded rows" in repr(asked)
+    for opened in (open_scan(scan, fresh=True), open_scan(scan, model="none")):
+        assert "recorded rows" in repr(opened)
         with pytest.raises(DataError):
-            asked.image()
+            opened.image()
 
 
 def test_products_of_other_rows_are_not_used(folder, products, tmp_path):
@@ -196,16 +196,16 @@ def test_products_of_other_rows_are_not_used(folder, products, tmp_path):
 @pytest.mark.parametrize("by_columns", [False, True])
 def test_the_published_layout_opens(tmp_path, monkeypatch, by_columns):
     monkeypatch.chdir(tmp_path)
-    made = simulated(tmp_path / "data", COPPER, PET, layout="authors", by_columns=by_columns)
-    opened = open_scan(made)
+    data = simulated(tmp_path / "data", COPPER, PET, layout="authors", by_columns=by_columns)
+    opened = open_scan(data)
     assert "SIMULATED" in repr(opened)
     assert opened.rows.missing == ()
     assert opened.rows.planned == (31 if by_columns else 27)
-    command("process", made, "--out", tmp_path / "out")  # with the instrument.toml beside the data
+    command("process", data, "--out", tmp_path / "out")  # with the instrument.toml beside the data
     same_image(opened.image(), tmp_path / "out" / "image.npz")
     assert open_scan(tmp_path / "out").rows == opened.rows
-    (made / "instrument.toml").unlink()
-    assert open_scan(made).rig == open_scan(made, rig=load_instrument(REPO / "instrument.toml")).rig
+    (data / "instrument.toml").unlink()
+    assert open_scan(data).rig == open_scan(data, rig=load_instrument(REPO / "instrument.toml")).rig
 
 
 # --- rows, laziness, side effects -------------------------------------------------------------------------------------
@@ -244,11 +244,11 @@ def test_rows_are_read_once_and_only_when_asked_for(folder, tmp_path, monkeypatc
 
 
 def test_results_are_the_callers_to_change(scan):
-    before = scan.image()
+    image_before = scan.image()
     changed = scan.image()
     changed["h"][:] = 0
     changed["x_mm"].attrs.clear()
-    xarray.testing.assert_identical(scan.image(), before)
+    xarray.testing.assert_identical(scan.image(), image_before)
 
 
 def state(folder: Path) -> dict[str, tuple[int, int]]:
@@ -259,14 +259,14 @@ def test_nothing_is_written_unless_asked(folder, products, tmp_path, monkeypatch
     scan = shutil.copytree(folder, tmp_path / "scan")
     saved = shutil.copytree(products, tmp_path / "products")
     monkeypatch.chdir(tmp_path)
-    before = state(tmp_path)
+    state_before = state(tmp_path)
     for path in (scan, saved):
-        one = open_scan(path)
-        repr(one)
+        opened = open_scan(path)
+        repr(opened)
         for name in DATASETS:
-            getattr(one, name)()
-        one.plot()
-    assert state(tmp_path) == before
+            getattr(opened, name)()
+        opened.plot()
+    assert state(tmp_path) == state_before
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -283,10 +283,10 @@ def same_dataset(found: xarray.Dataset, expected: xarray.Dataset) -> None:
 def test_netcdf_keeps_every_value(products, tmp_path):
     scan = open_scan(products)
     scan.to_netcdf(tmp_path / "image.nc")
-    found = read_netcdf(tmp_path / "image.nc")
-    same_dataset(found, scan.image().assign(scan.patches().data_vars))
-    assert found.attrs.items() >= {**scan.image().attrs, **scan.patches().attrs}.items()
-    assert scan.rig.name in found.attrs["instrument"]
+    dataset = read_netcdf(tmp_path / "image.nc")
+    same_dataset(dataset, scan.image().assign(scan.patches().data_vars))
+    assert dataset.attrs.items() >= {**scan.image().attrs, **scan.patches().attrs}.items()
+    assert scan.rig.name in dataset.attrs["instrument"]
 
 
 # --- the figure -------------------------------------------------------------------------------------------------------

@@ -81,9 +81,9 @@ def test_imager_makes_the_matched_filters_image(
 ) -> None:
     rig, _ = world
     grid = image_grid(rig)
-    found = [correlation(form_image(cube, rig, rig.by_name("RH"), grid, n), truth) for n in SETTINGS]
-    assert found[0] > 0.98
-    assert found == sorted(found), "finer range bins must not make it worse"
+    correlations = [correlation(form_image(cube, rig, rig.by_name("RH"), grid, n), truth) for n in SETTINGS]
+    assert correlations[0] > 0.98
+    assert correlations == sorted(correlations), "finer range bins must not make it worse"
 
 
 @pytest.mark.parametrize("tuned", [False, True])

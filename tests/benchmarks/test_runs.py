@@ -24,12 +24,12 @@ def test_quick_trial(
     for variable in THREADS:
         monkeypatch.setenv(variable, "1")
     assert main(["--out", str(tmp_path), name, "--quick", "--folder", str(tmp_path)]) == 0
-    found = json.loads((tmp_path / f"{name}.json").read_text())
+    result = json.loads((tmp_path / f"{name}.json").read_text())
     printed = capsys.readouterr().out
-    assert found["simulated"]
-    assert found["machine"]["cores"]
-    assert found["lines"]
-    for line in found["lines"]:
+    assert result["simulated"]
+    assert result["machine"]["cores"]
+    assert result["lines"]
+    for line in result["lines"]:
         assert np.isfinite(line["value"])
         assert line["quantity"] in printed
     assert "not a measurement" in printed

@@ -25,9 +25,9 @@ def test_a_drawn_sphere_is_found_where_it_is():
 
 
 def test_distances_in_regions_and_angles_are_those_of_their_definitions():
-    away = np.array([3 + 4j, 0.1j])
+    deviations = np.array([3 + 4j, 0.1j])
     covariances = np.array([np.eye(2), np.diag([1.0, 0.01])])
-    assert squared_distances(away, covariances) == pytest.approx([25, 1])
+    assert squared_distances(deviations, covariances) == pytest.approx([25, 1])
     turned = np.array([[0.0, np.sin(0.01), np.cos(0.01)]])
     assert angles_deg(turned, np.array([[0.0, 0.0, 1.0]])) == pytest.approx(np.degrees(0.01))
 
@@ -37,7 +37,7 @@ def test_every_option_has_a_default_and_every_kind_a_line():
     shapes.add_arguments(parser)
     options = parser.parse_args([])
     for kind in options.kinds.split(","):
-        seen = ObjectFigures(
+        figures = ObjectFigures(
             kind=kind,
             seed=1,
             disturbance="none",
@@ -47,4 +47,4 @@ def test_every_option_has_a_default_and_every_kind_a_line():
             points=0,
             stray=0,
         )
-        assert line_of(kind, [seen], shapes.MUST_HOLD.get(kind)).startswith(kind)
+        assert line_of(kind, [figures], shapes.MUST_HOLD.get(kind)).startswith(kind)

@@ -51,9 +51,9 @@ def create(folder, rig) -> ScanFolder:
 
 
 def test_a_filter_measured_with_other_corners_or_not_on_every_receiver_is_refused(make_rig, tmp_path):
-    whole = filter_file()
-    partial = msgspec.structs.replace(whole, boards={"RH": whole.boards["RH"]})
-    for i, (file, khz, value) in enumerate([(whole, 350.0, "[175.0, 350.0] kHz"), (partial, 175.0, "RV")]):
+    filter_path = filter_file()
+    partial = msgspec.structs.replace(filter_path, boards={"RH": filter_path.boards["RH"]})
+    for i, (file, khz, value) in enumerate([(filter_path, 350.0, "[175.0, 350.0] kHz"), (partial, 175.0, "RV")]):
         path = write_calibration(file, tmp_path / str(i))
         rig = make_rig(chirp={"hpf1_khz": khz}, calibration={"hpf": str(path)}, grid={"columns": 2, "rows": 2})
         with refused(ErrorCode.MISMATCH, path, value):
@@ -104,14 +104,14 @@ def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, 
     scan = create(tmp_path / "scan", rig_naming(hpf=hpf, metal=metal))
     assert sorted(facts_of(scan, "scan_started")[0]["calibration"]) == ["hpf", "metal"]
     assert not [f for f in validate(scan.path) if f.level == "error"]
-    before = calibration_of_scan(scan)
+    copies_before = calibration_of_scan(scan)
     for original in hpf.parent.iterdir():
         original.unlink()
-    after = calibration_of_scan(ScanFolder.load(scan.path))
-    assert after.filters == before.filters
-    assert after.high_pass("RH").corners_hz == (180.5e3, 355.25e3)
-    np.testing.assert_array_equal(after.reference().h, before.reference().h)
-    assert set(after.files()) == {"hpf", "metal"}
+    copies_after = calibration_of_scan(ScanFolder.load(scan.path))
+    assert copies_after.filters == copies_before.filters
+    assert copies_after.high_pass("RH").corners_hz == (180.5e3, 355.25e3)
+    np.testing.assert_array_equal(copies_after.reference().h, copies_before.reference().h)
+    assert set(copies_after.files()) == {"hpf", "metal"}
 
 
 def test_files_of_one_name_in_two_folders_are_both_kept(tmp_path, make_rig, rig_naming, hpf):
@@ -164,8 +164,8 @@ def test_a_metal_reference_survives_its_file(tmp_path, make_rig):
 
 def test_images_of_another_metal_reference_are_refused(tmp_path, make_rig):
     path = write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "one")
-    other = write_metal(metal_reference(make_rig(), 1), SOURCES, tmp_path / "two")
-    path.with_suffix(".npz").write_bytes(other.with_suffix(".npz").read_bytes())
+    other_reference = write_metal(metal_reference(make_rig(), 1), SOURCES, tmp_path / "two")
+    path.with_suffix(".npz").write_bytes(other_reference.with_suffix(".npz").read_bytes())
     with refused(ErrorCode.FILE_DAMAGED, path.with_suffix(".npz")):
         load_calibration({"metal": path}).reference()
 

@@ -18,7 +18,7 @@ TRUE_KHZ = (235.0, 700.0)
 def scans(tmp_path_factory, make_rig, scan_of):
     """One power cycle of a rig with other filters than its rig file says, at several start frequencies."""
     folder = tmp_path_factory.mktemp("sweep")
-    made = []
+    folders = []
     for k, offset_hz in enumerate(OFFSETS_HZ):
 
         def programmed(table, offset_hz=offset_hz):
@@ -30,8 +30,8 @@ def scans(tmp_path_factory, make_rig, scan_of):
         believed = make_rig(programmed, **tables)
         corners = {"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}
         true = make_rig(programmed, chirp=corners, **tables)
-        made.append(scan_of(folder / f"{k}", true, believed, seed=2, disturbances={"if_offset_hz": 0.0}))
-    return made
+        folders.append(scan_of(folder / f"{k}", true, believed, seed=2, disturbances={"if_offset_hz": 0.0}))
+    return folders
 
 
 @pytest.fixture(scope="module")

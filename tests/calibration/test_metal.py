@@ -21,8 +21,8 @@ from polysight_shared.error_codes import ErrorCode
 
 def board(name, **more):
     def change(table):
-        (found,) = (b for b in table["boards"] if b["name"] == name)
-        found.update(more)
+        (board,) = (b for b in table["boards"] if b["name"] == name)
+        board.update(more)
 
     return change
 
@@ -31,8 +31,8 @@ def mount(name, first=(), last=()):
     """Add steps before and after a board's mount."""
 
     def change(table):
-        (found,) = (b for b in table["boards"] if b["name"] == name)
-        found["mount"] = [*first, *found["mount"], *last]
+        (board,) = (b for b in table["boards"] if b["name"] == name)
+        board["mount"] = [*first, *board["mount"], *last]
 
     return change
 
@@ -96,9 +96,9 @@ def test_filters_measured_after_the_plate_may_differ_only_slightly(metal, make_r
 
 
 def test_a_file_of_an_older_release_without_its_rig_is_refused(metal, make_rig):
-    before, _, after = metal.read_text().partition("[imaged_with]")
-    assert after
-    metal.write_text(before)
+    text_before, _, text_after = metal.read_text().partition("[imaged_with]")
+    assert text_after
+    metal.write_text(text_before)
     with refused(ErrorCode.KEY_MISSING, metal):
         checked_calibration(make_rig(calibration={"metal": str(metal)}), True)
 
@@ -168,9 +168,9 @@ def test_an_object_plane_calibrated_after_the_plate_is_refused(plate, make_rig):
 
 def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows(plate, make_rig, scan_of, tmp_path):
     """V moved between the two scans: the axes are the same, the phases are not."""
-    other = scan_of(tmp_path / "other", make_rig(MATTERS["V moved"][0], **SMALL), plates=[PLATE])
+    other_scan = scan_of(tmp_path / "other", make_rig(MATTERS["V moved"][0], **SMALL), plates=[PLATE])
     out = tmp_path / "out"
-    assert main(["process", str(other), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 3
+    assert main(["process", str(other_scan), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 3
     assert not (out / "image.npz").exists()
 
 
@@ -188,13 +188,13 @@ def metal_plane(pipeline, bands=1, in_scene=False):
 
 
 def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band(plate, banded, taken_with):
-    found = load_calibration({"metal": banded}).reference()
+    reference = load_calibration({"metal": banded}).reference()
     expected = load_reference(plate, bands=BANDS)
-    assert len(found.bands) == len(expected.bands) == BANDS
-    for read, made in zip((found, *found.bands), (expected, *expected.bands), strict=True):
+    assert len(reference.bands) == len(expected.bands) == BANDS
+    for read, actual in zip((reference, *reference.bands), (expected, *expected.bands), strict=True):
         for name in ("h", "v", "valid"):
-            np.testing.assert_array_equal(getattr(read, name), getattr(made, name))
-        assert (read.spread, read.how) == (made.spread, made.how)
+            np.testing.assert_array_equal(getattr(read, name), getattr(actual, name))
+        assert (read.spread, read.how) == (actual.spread, actual.how)
     pipeline = Pipeline(taken_with(banded))
     assert len(metal_plane(pipeline, BANDS).bands) == BANDS
     assert metal_plane(pipeline) is not None
@@ -213,8 +213,8 @@ def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded, taken_wit
     for row in pipeline.source.rows():
         pipeline.add_row(row)
     reference = metal_plane(pipeline, BANDS)
-    (found,) = pipeline.find_materials(pipeline.form_images(), KnownScene(metal=reference)).rows()
-    assert len(found.bands) == BANDS
-    for ratio in (found.ratio, *(band.ratio for band in found.bands)):
+    (metal_row,) = pipeline.find_materials(pipeline.form_images(), KnownScene(metal=reference)).rows()
+    assert len(metal_row.bands) == BANDS
+    for ratio in (metal_row.ratio, *(band.ratio for band in metal_row.bands)):
         assert ratio.value == pytest.approx(1.0, abs=0.02)
     assert pipeline.quality.notes["metal_reference"].sub_bands == BANDS

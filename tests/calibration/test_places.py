@@ -55,11 +55,11 @@ def found(case, tmp_path_factory):
     """Output of the command, and the file it writes."""
     folder, target, _, _ = case
     out = tmp_path_factory.mktemp("out") / "c"
-    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    shown = output_of("calibrate", "direct-path", folder, "--target", target, "--out", out)
+    bytes_before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    output = output_of("calibrate", "direct-path", folder, "--target", target, "--out", out)
     # The scan is not touched
-    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
-    return shown, next(out.iterdir())
+    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == bytes_before
+    return output, next(out.iterdir())
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +93,8 @@ def test_an_active_calibration_corrects_every_antenna(case, file):
     corrected = Calibration(places=file).rig(believed)
     assert corrected.geometry.object_distance_mm == pytest.approx(true.geometry.object_distance_mm, abs=0.5)
     for name in SHIFTS:
-        there, thought = (Antennas.from_rig(r, r.by_name(name)).rx_m for r in (true, corrected))
-        np.testing.assert_allclose(thought, there, atol=0.6e-3)
+        expected_m, thought = (Antennas.from_rig(r, r.by_name(name)).rx_m for r in (true, corrected))
+        np.testing.assert_allclose(thought, expected_m, atol=0.6e-3)
     assert corrected.transmitter == believed.transmitter
 
 
@@ -104,9 +104,9 @@ def test_it_is_refused_after_a_change_of_mounts_in_the_rig_file(case, file):
 
 
 def test_the_command_shows_the_changes_and_the_line_for_the_rig_file(found, file):
-    shown, path = found
-    assert f"{file.object_distance_was_mm:.2f} -> {file.object_distance_mm:.2f}" in shown
-    assert f'direct_path = "{path}"' in shown
+    output, path = found
+    assert f"{file.object_distance_was_mm:.2f} -> {file.object_distance_mm:.2f}" in output
+    assert f'direct_path = "{path}"' in output
     assert file.sources[0].simulated
     assert load_calibration({"direct_path": path}).places == file
 
@@ -143,6 +143,6 @@ def test_a_target_needs_three_points(tmp_path):
 
 def test_another_rig_files_places_are_taken_and_nothing_else(make_rig):
     scanned = make_rig(grid={"columns": 5})
-    other = make_rig(geometry={"object_distance_mm": 600.0})
-    taken = take_antenna_places(scanned, other)
-    assert (taken.geometry, taken.grid) == (other.geometry, scanned.grid)
+    other_rig = make_rig(geometry={"object_distance_mm": 600.0})
+    taken = take_antenna_places(scanned, other_rig)
+    assert (taken.geometry, taken.grid) == (other_rig.geometry, scanned.grid)

@@ -33,9 +33,9 @@ def test_whatever_the_true_if_its_alias_in_the_band_gives_the_offset_to_the_midd
     middle = 0.45 * rate if if_mode == "complex1x" else 0.0
     rng = np.random.default_rng(3)
     for true_hz in rng.uniform(-4e6, 6e6, 50):
-        seen = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
-        found = choose_start_offset(rig, board, true_hz + rng.uniform(-0.4, 0.4) * rate, seen, 1.0, 10)
-        assert true_hz + found.start_offset_hz - board.start_offset_hz == pytest.approx(middle, abs=1.0)
+        alias_hz = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
+        start_offset = choose_start_offset(rig, board, true_hz + rng.uniform(-0.4, 0.4) * rate, alias_hz, 1.0, 10)
+        assert true_hz + start_offset.start_offset_hz - board.start_offset_hz == pytest.approx(middle, abs=1.0)
 
 
 @pytest.mark.parametrize("if_mode", ["complex1x", "complex2x"])
@@ -46,9 +46,9 @@ def test_jitter_across_the_bands_edge_does_not_tear_the_mean_apart(make_rig, if_
     rng = np.random.default_rng(5)
     for centre in np.linspace(-1, 1, 9) * rate:
         true_hz = centre + 0.03 * rate * rng.standard_normal(64)
-        seen = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
-        apart = (unwrap_if(seen, rig) - true_hz) / rate
-        np.testing.assert_allclose(apart, np.round(apart[0]), atol=1e-9)
+        alias_hz = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
+        difference = (unwrap_if(alias_hz, rig) - true_hz) / rate
+        np.testing.assert_allclose(difference, np.round(difference[0]), atol=1e-9)
 
 
 def test_by_geometry_alone_the_expectation_is_in_the_middle(make_rig):
@@ -67,8 +67,8 @@ def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_ri
         folder = scan_of(tmp_path / name, rig, seed=4, disturbances=wrong)
         assert main(["calibrate", "start-frequency", str(folder), "--out", str(tmp_path / name / "c")]) == 0
         boards = read_calibration(next((tmp_path / name / "c").iterdir()), StartFile, "start_frequency").boards
-        shown = capsys.readouterr().out
-        assert all(f"start_offset_hz = {b.start_offset_hz:.0f}" in shown for b in boards.values())
+        output = capsys.readouterr().out
+        assert all(f"start_offset_hz = {b.start_offset_hz:.0f}" in output for b in boards.values())
         return {n: to_builtins(b) for n, b in boards.items()}
 
     first = advice(make_rig(offset(300e3), **TABLES), "first")

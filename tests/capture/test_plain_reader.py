@@ -103,12 +103,12 @@ def test_manifest(tmp_path):
         for fact in facts:
             writer.append(fact)
     lines = (tmp_path / "manifest.jsonl").read_bytes().splitlines()
-    found = [json.loads(line) for line in lines]
-    for count, fact in enumerate(found):
+    lines_as_facts = [json.loads(line) for line in lines]
+    for count, fact in enumerate(lines_as_facts):
         take_crc(fact)
         assert fact.pop("count") == count
         assert fact.pop("previous") == (hashlib.sha256(lines[count - 1]).hexdigest()[:16] if count else "")
-    assert found == facts
+    assert lines_as_facts == facts
 
 
 def test_whole_scan(tmp_path):

@@ -108,15 +108,15 @@ def test_a_shift_of_the_plane_is_a_length_in_the_lab(text):
     [(["--metal-box", "-65,-20,-25,20"], (-65, -20, -25, 20)), (["--metal-box=-.5,-1,1,2"], (-0.5, -1, 1, 2))],
 )  # fmt: skip
 def test_a_place_left_of_the_middle_needs_no_equals_sign(words, value):
-    given = join_negative_values(["process", "scan", *words, "--out", "o"])
-    assert build_parser().parse_args(given).metal == value
+    joined_words = join_negative_values(["process", "scan", *words, "--out", "o"])
+    assert build_parser().parse_args(joined_words).metal == value
 
 
 @pytest.mark.parametrize("words", [["{}"], ["--out={}"], ["--out", "{}"], ["--strips", "90={}"]])
 def test_a_tilde_that_the_shell_left_is_the_home_folder(words, monkeypatch):
     monkeypatch.setenv("HOME", "/home/somebody")
-    given = [word.format("~/scans/one") for word in words]
-    assert expand_home(given) == [word.format("/home/somebody/scans/one") for word in words]
+    home_words = [word.format("~/scans/one") for word in words]
+    assert expand_home(home_words) == [word.format("/home/somebody/scans/one") for word in words]
     unchanged_words = ["~", "~other/x", "a ~/b", "--text", "see a=b ~/c"]
     assert expand_home(unchanged_words) == unchanged_words
 

@@ -156,8 +156,8 @@ def test_a_command_that_never_ends_is_a_failure_and_is_ended(tmp_path):
 
 
 def test_the_script_has_the_lines_of_the_page(tmp_path):
-    made = page(tmp_path, RUN)
-    lines = script_of(made).splitlines()
+    page_path = page(tmp_path, RUN)
+    lines = script_of(page_path).splitlines()
     assert lines[3] == "echo first > made"
     assert lines[8] == "cat made"
     assert sum(bool(line) for line in lines) == 4

@@ -28,15 +28,15 @@ def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]
 
 
 def parsers() -> list[argparse.ArgumentParser]:
-    found = [parser_of(module) for module in MODULES]
-    return [leaf for parser in found if parser is not None for leaf in leaves(parser)]
+    all_parsers = [parser_of(module) for module in MODULES]
+    return [leaf for parser in all_parsers if parser is not None for leaf in leaves(parser)]
 
 
 @pytest.mark.parametrize("parser", parsers(), ids=lambda p: p.prog.replace(" ", "-"))
 def test_help_has_an_example_that_works(parser):
     text = parser.format_help()
-    _, found, examples = text.partition("example")
-    assert found, f"`{parser.prog} --help` shows no example"
+    _, heading, examples = text.partition("example")
+    assert heading, f"`{parser.prog} --help` shows no example"
     lines = re.findall(r"^(?:s?: *|  +)((?:polysight|python -m)\S*(?: .*)?)$", examples, re.MULTILINE)
     # A remark may follow
     lines = [re.split(r", |   ", line)[0].strip() for line in lines]
@@ -55,12 +55,12 @@ def test_help_begins_with_a_sentence_an_example_and_the_options_used_most():
         assert sentence.endswith(".")
         assert sentence.count(". ") == 0, f"{parser.prog}: one sentence"
         first = re.search(r"\noptions:\n(.*?)(?:\n\n|\Z)", text, re.DOTALL)
-        shown = re.findall(r"^  (-\S+)", first[1], re.MULTILINE) if first else []
-        assert len([option for option in shown if option != "-h,"]) <= 3, f"{parser.prog}: {shown}"
-        told = [
+        listed_options = re.findall(r"^  (-\S+)", first[1], re.MULTILINE) if first else []
+        assert len([option for option in listed_options if option != "-h,"]) <= 3, f"{parser.prog}: {listed_options}"
+        missing = [
             a for a in parser._actions if a.help is not argparse.SUPPRESS
         ]  # removed options say what to use instead
-        assert all(name in text for a in told for name in a.option_strings), parser.prog
+        assert all(name in text for a in missing for name in a.option_strings), parser.prog
 
 
 @pytest.mark.parametrize("parser", parsers(), ids=lambda p: p.prog.replace(" ", "-"))

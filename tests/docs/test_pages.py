@@ -77,6 +77,6 @@ def test_the_label_file_that_is_shown_can_be_learnt_from(tmp_path):
     (block,) = [b for b in read_page(ROOT / "docs/spec/labels.md").blocks if b.language == "json"]
     (tmp_path / "labels.json").write_text(block.text, encoding="utf-8")
     axis_m = np.linspace(-0.1, 0.1, 101)
-    found = check_labels(read_labels(tmp_path / "labels.json"), axis_m, axis_m)
-    assert [found.specimen(name) for name in found.boxes] == [None, "board 7", "2"]
-    assert (found.metal, found.by_hand) == ("copper", True)
+    boxes = check_labels(read_labels(tmp_path / "labels.json"), axis_m, axis_m)
+    assert [boxes.specimen(name) for name in boxes.boxes] == [None, "board 7", "2"]
+    assert (boxes.metal, boxes.by_hand) == ("copper", True)

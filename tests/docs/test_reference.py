@@ -49,5 +49,5 @@ def test_a_link_that_leads_nowhere_is_found(tmp_path, link):
 
 
 def test_a_package_without_public_names_has_a_page_for_each_module():
-    found = list(modules_of("polysight_shared"))
-    assert {"polysight_shared", "polysight_shared.errors", "polysight_shared.config"} <= set(found)
+    modules = list(modules_of("polysight_shared"))
+    assert {"polysight_shared", "polysight_shared.errors", "polysight_shared.config"} <= set(modules)

@@ -67,9 +67,9 @@ def test_commands_are_found_in_messages():
     assert commands_in("polysight label 8 --metal NAME, or measure") == ["polysight label 8 --metal NAME"]
     assert commands_in("polysight label 8 --box A=1,2,3,4; then go") == ["polysight label 8 --box A=1,2,3,4"]
     assert commands_in("the polysight of today") == []
-    every = [command for path in SOURCES for _, text in texts_of(path) for command in commands_in(text)]
-    assert len(every) > 100
-    assert sum(map(is_whole, every)) > 50
+    commands = [command for path in SOURCES for _, text in texts_of(path) for command in commands_in(text)]
+    assert len(commands) > 100
+    assert sum(map(is_whole, commands)) > 50
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
@@ -78,6 +78,6 @@ def test_a_command_that_a_message_names_is_one(path):
     for line, text in texts_of(path):
         for command in commands_in(text):
             pasted = command.removesuffix("...").replace("COMMAND", "scan")
-            found = command_faults(pasted) if is_whole(command) else mention_faults(pasted)
-            faults += [f"{path}:{line}: {command}: {fault}" for fault in found]
+            problems = command_faults(pasted) if is_whole(command) else mention_faults(pasted)
+            faults += [f"{path}:{line}: {command}: {fault}" for fault in problems]
     assert not faults, "\n".join(faults)

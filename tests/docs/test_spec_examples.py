@@ -38,9 +38,9 @@ def rows(page: str, heading: str) -> list[list[str]]:
 def shown(page: str, *labels: str) -> bytes:
     """The bytes behind a label (a line's first words) in a text block of a page."""
     label = " +".join(map(re.escape, labels))
-    found = re.search(rf"^{label} +((?:[0-9a-f]{{2,12}} ?)+)(?: |$)", text(page), re.MULTILINE)
-    assert found, labels
-    return bytes.fromhex(found[1])
+    match = re.search(rf"^{label} +((?:[0-9a-f]{{2,12}} ?)+)(?: |$)", text(page), re.MULTILINE)
+    assert match, labels
+    return bytes.fromhex(match[1])
 
 
 # --- Pi and host ------------------------------------------------------------------------------------------------------
@@ -178,19 +178,24 @@ def test_data_packet_headers():
 
 def test_sub_blocks_are_those_of_the_published_rig():
     rig = native_rig()
-    made = program(rig, rig.by_name("RH"))
-    sent: list[Command] = [DEVICE_CONFIGURATION, *made.basic, *made.waveform, *made.frames(rig.grid.columns * 16)]
+    board_program = program(rig, rig.by_name("RH"))
+    sent: list[Command] = [
+        DEVICE_CONFIGURATION,
+        *board_program.basic,
+        *board_program.waveform,
+        *board_program.frames(rig.grid.columns * 16),
+    ]
     table = {row[0]: row[3] for row in rows("mmwavelink.md", "Sub-blocks")}
-    for one in sent:
-        number = f"0x{one.ID:04X}"
+    for message in sent:
+        number = f"0x{message.ID:04X}"
         answer = table[number]
         if answer == "see below":
             raw = shown("mmwavelink.md", number)
         else:
             raw = bytes.fromhex(answer.strip("`"))
-        assert raw == one.block().data, number
+        assert raw == message.block().data, number
     order = [row[0] for row in rows("mmwavelink.md", "Sub-blocks")]
-    places = [order.index(f"0x{one.ID:04X}") for one in sent]
+    places = [order.index(f"0x{message.ID:04X}") for message in sent]
     assert places == sorted(places)
 
 
@@ -203,10 +208,10 @@ def test_the_page_names_every_sub_block_that_is_sent():
 
 
 def test_whole_messages():
-    for label, number, what in (("frame start", 3, 1), ("stop 4", 4, 4)):
+    for label, number, message_kind in (("frame start", 3, 1), ("stop 4", 4, 4)):
         answer = decode(shown("mmwavelink.md", f"{label}, sequence {number}"))
         assert (answer.direction, answer.kind, answer.sequence) == (Direction.HOST_TO_RF, Kind.COMMAND, number)
-        assert answer.blocks == (SubBlock(0x0140, struct.pack("<HH", what, 0)),)
+        assert answer.blocks == (SubBlock(0x0140, struct.pack("<HH", message_kind, 0)),)
 
 
 def test_events():

@@ -22,21 +22,21 @@ def running_rig() -> Callable[..., AbstractContextManager[Rig]]:
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
-    made = Bench(tmp_path)
-    yield made
-    made.close()
+    new_bench = Bench(tmp_path)
+    yield new_bench
+    new_bench.close()
 
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
-    with running(tmp_path) as made:
-        yield made
+    with running(tmp_path) as new_rig:
+        yield new_rig
 
 
 @pytest.fixture
 def rig_without_compiler(tmp_path: Path) -> Iterator[Rig]:
-    with running(tmp_path, env={"PATH": str(tmp_path)}) as made:
-        yield made
+    with running(tmp_path, env={"PATH": str(tmp_path)}) as new_rig:
+        yield new_rig
 
 
 @pytest.fixture

@@ -18,8 +18,8 @@ from polysight_shared.messages import RowStarted
 @pytest.fixture
 def rig(tmp_path, running_rig):
     """Slow enough to be met in the middle of a row on a busy machine."""
-    with running_rig(tmp_path, time_scale=15.0) as made:
-        yield made
+    with running_rig(tmp_path, time_scale=15.0) as new_rig:
+        yield new_rig
 
 
 def digests(path):
@@ -31,8 +31,8 @@ def digests(path):
 def check_whole(rig, before):
     """The scan is finished, valid, and what was committed before has not changed."""
     path = rig.folder / "scan"
-    after = digests(path)
-    assert {file: after[file] for file in before} == before
+    digests_after = digests(path)
+    assert {file: digests_after[file] for file in before} == before
     assert len(ScanFolder.load(path).committed_rows()) == 6
     validated = rig.here("validate", path)
     assert (validated.status, validated.out, validated.err) == (0, f"{path}: whole\n", "")
@@ -49,15 +49,15 @@ def test_interrupted(rig, times):
         scan.interrupt()
     ended = scan.wait(30)
     path = rig.folder / "scan"
-    left = 6 - rig.committed()
+    rows_to_come = 6 - rig.committed()
     assert ended.status == 6
-    assert f"{left} of 6 rows are missing" in ended.message
+    assert f"{rows_to_come} of 6 rows are missing" in ended.message
     assert f"polysight resume {path}" in ended.message
-    assert 3 - times <= 6 - left < 6
+    assert 3 - times <= 6 - rows_to_come < 6
     assert times == 2 or not list(path.glob("raw/*/*.part")), "the running row was ended, not cut"
-    before = digests(path)
+    digests_before = digests(path)
     assert rig.polysight("resume", path, "--no-process").status == 0
-    check_whole(rig, before)
+    check_whole(rig, digests_before)
 
 
 def test_full_disk_on_the_pi(rig):
@@ -72,8 +72,8 @@ def test_full_disk_on_the_pi(rig):
     assert ended.status == 6
     assert "the journal cannot be written" in ended.message
     assert f"polysight resume {rig.folder / 'scan'}" in ended.message
-    before = digests(rig.folder / "scan")
+    digests_before = digests(rig.folder / "scan")
     resource.prlimit(rig.pi.process.pid, resource.RLIMIT_FSIZE, (unlimited, unlimited))
     resumed = rig.polysight("resume", rig.folder / "scan", "--no-process")
     assert resumed.status == 0, resumed.err
-    check_whole(rig, before)
+    check_whole(rig, digests_before)

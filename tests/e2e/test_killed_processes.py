@@ -145,8 +145,10 @@ class Killed:
     def check_died(status: int | None, place: Place, hits: Path) -> None:
         """A program that came to its place died of it, and any other did not."""
         operation, suffix, nth = place
-        came = hits.read_text().splitlines().count(f"{operation}:{suffix}")
-        assert (status == -signal.SIGKILL) == (came >= nth), f"{place}: {came} times there, exit status {status}"
+        matching_hits = hits.read_text().splitlines().count(f"{operation}:{suffix}")
+        assert (status == -signal.SIGKILL) == (matching_hits >= nth), (
+            f"{place}: {matching_hits} times there, exit status {status}"
+        )
 
     def strike(self, kill: Kill, folder: Path) -> None:
         """Begin a scan, kill as told, and wait until nothing of it runs any more."""
@@ -155,8 +157,8 @@ class Killed:
             self.restart_pi(places)
         host = self.scan(folder, places if kill.host else ())
         if kill.place is None:
-            there = lambda: host.process.poll() is not None or len(committed(folder)) >= kill.rows  # noqa: E731
-            self.rig.wait_for(there, f"{kill.rows} rows")
+            has_ended = lambda: host.process.poll() is not None or len(committed(folder)) >= kill.rows  # noqa: E731
+            self.rig.wait_for(has_ended, f"{kill.rows} rows")
             time.sleep(kill.wait_s)
             if kill.host:
                 host.kill()
@@ -177,13 +179,13 @@ class Killed:
         self.strike(kill, folder)
         again = []
         for place in [*kill.resumes, None]:
-            before = safe(folder, self.rows)
+            safe_before = safe(folder, self.rows)
             ended = self.scan(folder, [place] if place else counted(RESUME_PLACES)).wait()
             assert ended.status == 0 or (place and ended.status == -signal.SIGKILL), f"{kill}\n{ended.err}"
             if place:
                 self.check_died(ended.status, place, self.hits)
             self.note("resume", self.hits)
-            assert before.items() <= safe(folder, self.rows).items(), kill
+            assert safe_before.items() <= safe(folder, self.rows).items(), kill
             again.append(len(retaken(folder)))
         assert validate(folder) == [], kill
         assert rows(folder) == self.rows, kill
@@ -215,9 +217,9 @@ def safe(folder: Path, truth: dict[str, str]) -> dict[str, str]:
     if not begun(folder):
         return {}
     assert [f for f in validate(folder) if f.level == "error"] == []
-    found = rows(folder)
-    assert found.items() <= truth.items()
-    return found
+    row_states = rows(folder)
+    assert row_states.items() <= truth.items()
+    return row_states
 
 
 def retaken(folder: Path) -> set[int]:
@@ -260,15 +262,15 @@ def test_killed(killed: Killed, number: int, record_property):
 def test_every_kind_of_place_is_come_to(killed: Killed):
     """Else its kills are none: a file has another name by now, or is written in another way."""
 
-    def never(who: str, places: Sequence[Place]) -> list[Place]:
-        return [place for place in counted(places) if not killed.met[f"{who} {place[0]}:{place[1]}"]]
+    def never(program: str, places: Sequence[Place]) -> list[Place]:
+        return [place for place in counted(places) if not killed.met[f"{program} {place[0]}:{place[1]}"]]
 
     for number, place in ((100, ("pwrite", "manifest.jsonl", 4)), (101, ("pwrite", "events.msgpack", 3))):
         # Run alone, or not by the kills above: of a torn manifest, of torn events
         if never("resume", RESUME_PLACES):
             killed.check(Kill(number, host=True, pi=False, place=place))
-    for who, places in (("host", HOST_PLACES), ("Pi", PI_PLACES), ("resume", RESUME_PLACES)):
-        assert never(who, places) == [], f"{who}: {killed.met}"
+    for program, places in (("host", HOST_PLACES), ("Pi", PI_PLACES), ("resume", RESUME_PLACES)):
+        assert never(program, places) == [], f"{program}: {killed.met}"
 
 
 def test_products_of_a_killed_scan(killed: Killed):
@@ -286,9 +288,9 @@ def test_products_of_a_killed_scan(killed: Killed):
         assert live.files == undisturbed.files
         for name in live.files:
             np.testing.assert_array_equal(live[name], undisturbed[name])
-    found = [json.loads((products / "materials.json").read_bytes()) for products in (folder / "products", out)]
-    assert found[0].pop("scan_id") != found[1].pop("scan_id")
-    assert found[0] == found[1]
+    documents = [json.loads((products / "materials.json").read_bytes()) for products in (folder / "products", out)]
+    assert documents[0].pop("scan_id") != documents[1].pop("scan_id")
+    assert documents[0] == documents[1]
 
 
 def test_pi_is_lost_with_its_journal(killed: Killed):
@@ -301,18 +303,18 @@ def test_pi_is_lost_with_its_journal(killed: Killed):
     assert ended.status == 5
     assert ended.message.startswith("polysight scan: the Pi at tcp://")
     assert "polysight-pi" in ended.message
-    before = safe(folder, killed.rows)
+    safe_before = safe(folder, killed.rows)
     refused = killed.scan(folder).wait()
     assert refused.status == 5
     assert "the Pi at tcp://" in refused.message
-    known = len(read_events(folder / "events.msgpack").events)
+    known_events = len(read_events(folder / "events.msgpack").events)
     scan_id = ScanFolder.load(folder).scan_id
     (killed.rig.folder / "rig" / "journal" / f"{scan_id}.journal").unlink()
     killed.restart_pi()
     resumed = killed.scan(folder).wait()
     assert resumed.status == 0, resumed.err
-    assert f"journal of this scan ends {known} events before" in " ".join(resumed.err.split())
-    assert before.items() <= rows(folder).items()
+    assert f"journal of this scan ends {known_events} events before" in " ".join(resumed.err.split())
+    assert safe_before.items() <= rows(folder).items()
     assert (validate(folder), rows(folder)) == ([], killed.rows)
     assert len(retaken(folder)) <= 1
 

@@ -28,9 +28,9 @@ class View:
     def __init__(self, rig) -> None:
         self._program = rig.start("polysight", "preview", rig.folder / "scan", "--port", "0", "--control")
         rig.wait_for(lambda: "token=" in self._program.err, "the address of the live view")
-        found = re.search(r"(http://127\.0\.0\.1:\d+)/#token=(\S+)", self._program.err)
-        assert found is not None, self._program.err
-        self._address, self._token = found.groups()
+        shown_address = re.search(r"(http://127\.0\.0\.1:\d+)/#token=(\S+)", self._program.err)
+        assert shown_address is not None, self._program.err
+        self._address, self._token = shown_address.groups()
 
     @property
     def pid(self) -> int:
@@ -76,8 +76,8 @@ def shown(state: dict[str, Any]) -> int:
 @pytest.fixture
 def slow_rig(running_rig, tmp_path) -> Iterator[Any]:
     """A rig that takes a while for its many short rows."""
-    with running_rig(tmp_path, time_scale=10.0, scene=SCENE) as made:
-        yield made
+    with running_rig(tmp_path, time_scale=10.0, scene=SCENE) as new_rig:
+        yield new_rig
 
 
 def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):
@@ -100,12 +100,12 @@ def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):
     view.wait(lambda s: shown(s) > rows, "rows after the pause")
 
     scan.kill()
-    gone = view.wait_headline("The scan program was killed")
-    assert "polysight resume" in gone["status"]["do"]
+    headline = view.wait_headline("The scan program was killed")
+    assert "polysight resume" in headline["status"]["do"]
 
     again = rig.start("polysight", "resume", rig.folder / "scan", "--no-process")
     view.wait(lambda s: s["running"], "that the scan goes on is seen")
-    view.wait(lambda s: s["scan"]["committed"] > gone["scan"]["committed"], "rows after the kill")
+    view.wait(lambda s: s["scan"]["committed"] > headline["scan"]["committed"], "rows after the kill")
     view.ask("abort")
     ended = view.wait_headline("Aborted on request")
     assert ended["scan"]["committed"] < ROWS

@@ -39,9 +39,9 @@ class Lab:
             "polysight", "serve", self.scans, "--config", self.rig.config, "--port", "0"
         )
         self.rig.wait_for(lambda: "token=" in self.server.err, "the server's address")
-        found = re.search(r"(http://127\.0\.0\.1:\d+)/#token=(\S+)", self.server.err)
-        assert found is not None, self.server.err
-        self.address, self.token = found.groups()
+        shown_address = re.search(r"(http://127\.0\.0\.1:\d+)/#token=(\S+)", self.server.err)
+        assert shown_address is not None, self.server.err
+        self.address, self.token = shown_address.groups()
 
     def open(self, path: str, size: tuple[int, int, bool] = DESK) -> None:
         """Go to a page with the token."""
@@ -63,8 +63,8 @@ class Lab:
         self.browser.wait("document.querySelector('.time')", "the plan")
         self.fill(name=name, **changes)
         self.click("start")
-        there = "location.pathname == '/watch' && document.getElementById('headline')"
-        self.browser.wait(there, "the live view")
+        is_watching = "location.pathname == '/watch' && document.getElementById('headline')"
+        self.browser.wait(is_watching, "the live view")
         return self.scans / name
 
     def wait_headline(self, text: str) -> None:
@@ -84,9 +84,9 @@ class Lab:
 
 
 def _program(folder: Path) -> Any:
-    found = find_program(folder, "scan")
-    assert found is not None
-    return found
+    program = find_program(folder, "scan")
+    assert program is not None
+    return program
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +98,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[
 def test_a_scan_is_planned_started_and_shown(lab):
     lab.open("/new")
     lab.browser.wait("document.querySelector('.time')", "the plan")
-    whole = lab.browser.value("document.querySelector('.time').innerText")
+    duration = lab.browser.value("document.querySelector('.time').innerText")
     lab.fill(rows=5)
-    lab.browser.wait(f"document.querySelector('.time')?.innerText != {json.dumps(whole)}", "the plan of five rows")
+    lab.browser.wait(f"document.querySelector('.time')?.innerText != {json.dumps(duration)}", "the plan of five rows")
     lab.fill(columns=1999)
     lab.browser.wait("document.getElementById('start').disabled", "that too long rows are refused")
     assert "travel" in lab.browser.text("forecast")
@@ -146,7 +146,7 @@ def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
 def test_a_scan_outlives_its_server_and_the_next_one_finds_it(lab):
     folder = lab.start("third", rows=ROWS)
     lab.wait_rows(folder, 1)
-    before = json.loads((folder / PROGRAM / "scan.json").read_text())
+    program_before = json.loads((folder / PROGRAM / "scan.json").read_text())
     lab.server.kill()
     lab.browser.wait("document.body.classList.contains('lost')", "that the page says so")
     rows = len(ScanFolder.load(folder).committed_rows())
@@ -154,7 +154,7 @@ def test_a_scan_outlives_its_server_and_the_next_one_finds_it(lab):
     lab.serve()
     lab.open("/watch?scan=third", PHONE)
     lab.wait_headline("All is well")
-    assert json.loads((folder / PROGRAM / "scan.json").read_text()) == before
+    assert json.loads((folder / PROGRAM / "scan.json").read_text()) == program_before
     assert _program(folder).running
     lab.click("pause")
     lab.wait_headline("Paused")

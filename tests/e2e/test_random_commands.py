@@ -89,10 +89,12 @@ def each_number(name: str, parser: argparse.ArgumentParser) -> Iterator[list[str
     options = [action for action in parser._actions if action.option_strings and action.nargs != 0]
     places = ["scan" for action in parser._actions if not action.option_strings]
     for option in options:
-        required = [other for other in options if other.required and other is not option]
-        others = [word for other in required for word in (other.option_strings[-1], "out/x")]
+        required = [
+            option_needed for option_needed in options if option_needed.required and option_needed is not option
+        ]
+        words_needed = [word for option_needed in required for word in (option_needed.option_strings[-1], "out/x")]
         for number in NUMBERS:
-            yield [name, *places, *others, f"{option.option_strings[-1]}={number}"]
+            yield [name, *places, *words_needed, f"{option.option_strings[-1]}={number}"]
 
 
 def check_end(words: list[str]) -> None:
@@ -104,14 +106,14 @@ def check_end(words: list[str]) -> None:
             status = main(words)
     except SystemExit as e:  # of argparse
         status = e.code
-    shown = out.getvalue() + err.getvalue()
+    output = out.getvalue() + err.getvalue()
     assert isinstance(status, int), words
-    assert shown.strip() or status == 0, words
-    assert "Traceback" not in shown, words
+    assert output.strip() or status == 0, words
+    assert "Traceback" not in output, words
     # A note says what was written into it.
     numbers = {word.strip("(),;:+-").lower() for word in out.getvalue().split() if words[0] != "note"}
     assert status != 0 or not {"nan", "inf"} & numbers, (words, out.getvalue())
-    assert status not in (2, 3, 5, 6) or "usage:" in shown or "\n  do: " in shown, (words, shown)
+    assert status not in (2, 3, 5, 6) or "usage:" in output or "\n  do: " in output, (words, output)
 
 
 def test_random_command_lines_end_with_a_message(folder, monkeypatch, request):

@@ -149,8 +149,8 @@ def test_folder_that_is_no_scan(bench, command):
     (bench.folder / "empty").mkdir()
     (bench.folder / "other").mkdir()
     (bench.folder / "other" / "notes.txt").write_text("not a scan")
-    every = ("missing", "empty", "other", "other/notes.txt")
-    for name in every if command == "validate" else ("missing", "other"):
+    folders = ("missing", "empty", "other", "other/notes.txt")
+    for name in folders if command == "validate" else ("missing", "other"):
         refused(bench.here(command, name, *out), name, status=3)
     assert not (bench.folder / "out").exists()
 
@@ -180,16 +180,16 @@ def test_nothing_to_refer_to(bench, scan):
 
 
 def test_out_is_taken(bench, scan):
-    mine = bench.folder / "mine"
-    mine.mkdir()
-    (mine / "thesis.tex").write_text("precious")
+    own_folder = bench.folder / "mine"
+    own_folder.mkdir()
+    (own_folder / "thesis.tex").write_text("precious")
     for command in (["image", scan], ["demo", "--config", RIG_FILE], ["scan", "--config", RIG_FILE]):
-        refused(bench.here(*command, "--out", mine), str(mine), "--out", status=2)
+        refused(bench.here(*command, "--out", own_folder), str(own_folder), "--out", status=2)
     for command in (["image", scan], ["demo", "--config", RIG_FILE]):
-        refused(bench.here(*command, "--out", mine / "thesis.tex"), "thesis.tex", "--out", status=2)
+        refused(bench.here(*command, "--out", own_folder / "thesis.tex"), "thesis.tex", "--out", status=2)
     refused(bench.here("scan", "--config", RIG_FILE, "--out", scan), f"polysight resume {scan}", status=2)
-    assert (mine / "thesis.tex").read_text() == "precious"
-    assert list(mine.iterdir()) == [mine / "thesis.tex"]
+    assert (own_folder / "thesis.tex").read_text() == "precious"
+    assert list(own_folder.iterdir()) == [own_folder / "thesis.tex"]
     assert bench.here("image", scan, "--out", "out").status == 0
     assert bench.here("image", scan, "--out", "out").status == 0, "earlier products may be replaced"
 
@@ -216,8 +216,8 @@ def wires(bench):
 def listening(address: str) -> socket.socket:
     """A socket that holds a `tcp://` address."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
-    held = socket.create_server((host, int(port)))
-    return held
+    server = socket.create_server((host, int(port)))
+    return server
 
 
 def test_pi_ports_in_use(bench, lonely, lonely_instrument, wires):
@@ -283,8 +283,8 @@ def test_interrupted_while_simulating(bench):
 def test_cards_that_do_not_serve(rig):
     """The simulated rig runs; one card after another is wrong."""
     board = rig.instrument.by_name("RV")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind((board.host_address, board.data_port))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreign_socket:
+        foreign_socket.bind((board.host_address, board.data_port))
         ended = rig.scan().wait(30)
         refused(ended, f"{board.host_address}:{board.data_port}", "ss -ulnp", status=5)
     table = to_builtins(rig.instrument)

@@ -28,10 +28,10 @@ def code_lines(cells: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    made = tmp_path_factory.mktemp("examples")
+    new_folder = tmp_path_factory.mktemp("examples")
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(made)
-        yield made
+        patch.chdir(new_folder)
+        yield new_folder
 
 
 def test_raw_to_image(folder):
@@ -43,8 +43,8 @@ def test_raw_to_image(folder):
     images = run("raw_to_image")["images"]
     row, column = np.unravel_index(np.argmax(np.abs(images.h_raw)), images.h_raw.shape)
     centre = (images.x_m.mean(), images.y_m.mean())
-    found = 1e3 * (images.x_m[column] - centre[0]), 1e3 * (images.y_m[row] - centre[1])
-    assert found == pytest.approx((10.0, -6.0), abs=2.0)
+    brightest_mm = 1e3 * (images.x_m[column] - centre[0]), 1e3 * (images.y_m[row] - centre[1])
+    assert brightest_mm == pytest.approx((10.0, -6.0), abs=2.0)
     assert (folder / "out" / "points-h.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -57,11 +57,13 @@ def test_own_scene_then_own_material(folder, capsys):
     run("own_scene")
     assert (folder / "out" / "own-products" / "report.html").exists()
     segments = json.loads((folder / "out" / "own-products" / "materials.json").read_text())["segments"]
-    mine = next(s for s in segments if s["truth"] and s["truth"]["name"] == "my material")
-    assert mine["permittivity"]["real"] == pytest.approx(6.0, rel=0.1)
+    own_segment = next(s for s in segments if s["truth"] and s["truth"]["name"] == "my material")
+    assert own_segment["permittivity"]["real"] == pytest.approx(6.0, rel=0.1)
     capsys.readouterr()
     answer = run("own_material")
-    assert abs(answer["expected"]) == pytest.approx(np.hypot(mine["ratio"]["real"], mine["ratio"]["imag"]), rel=0.1)
+    assert abs(answer["expected"]) == pytest.approx(
+        np.hypot(own_segment["ratio"]["real"], own_segment["ratio"]["imag"]), rel=0.1
+    )
     assert "expected: |P|" in capsys.readouterr().out
     assert "my material" in Library.load(folder / "out" / "own-library.npz").names
 

@@ -28,18 +28,18 @@ def handed_out(tests: list[str], workers: int) -> list[list[str]]:
     """What each worker gets when all are equally fast."""
     option = SimpleNamespace(loadscopereorder=True, tx=["popen"] * workers, numprocesses=workers, px=[])
     scheduler = ByFile(SimpleNamespace(option=option, getvalue=lambda name: getattr(option, name)))  # type: ignore[arg-type]
-    made = [_Worker() for _ in range(workers)]
-    for worker in made:
+    started_workers = [_Worker() for _ in range(workers)]
+    for worker in started_workers:
         scheduler.add_node(worker)  # type: ignore[arg-type]
         scheduler.add_node_collection(worker, tests)  # type: ignore[arg-type]
     scheduler.schedule()
     done = dict.fromkeys(range(workers), 0)
-    while any(done[n] < len(worker.indices) for n, worker in enumerate(made)):
-        for n, worker in enumerate(made):
+    while any(done[n] < len(worker.indices) for n, worker in enumerate(started_workers)):
+        for n, worker in enumerate(started_workers):
             if done[n] < len(worker.indices):
                 scheduler.mark_test_complete(worker, worker.indices[done[n]])  # type: ignore[arg-type]
                 done[n] += 1
-    return [[tests[i] for i in worker.indices] for worker in made]
+    return [[tests[i] for i in worker.indices] for worker in started_workers]
 
 
 def test_a_files_tests_run_in_one_worker_and_each_once():

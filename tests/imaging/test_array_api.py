@@ -59,15 +59,15 @@ def test_images_and_samples_are_those_of_numpy(aperture, library, make):
     echo = samples[:, :, 0, 0]
     weights = rng.uniform(size=aperture.shape[2:]).astype(np.float32)
     plain = make(aperture)
-    other = make(aperture) if make is DirectImager else make(aperture, xp=xp, device=device)
+    imager = make(aperture) if make is DirectImager else make(aperture, xp=xp, device=device)
 
     def put(array):
         return xp.asarray(array, device=device)
 
     for got, want in (
-        (other.image(put(samples)), plain.image(samples)),
-        (other.constant(put(echo), put(weights)), plain.constant(echo, weights)),
-        (other.samples(put(pixels)), plain.samples(pixels)),
+        (imager.image(put(samples)), plain.image(samples)),
+        (imager.constant(put(echo), put(weights)), plain.constant(echo, weights)),
+        (imager.samples(put(pixels)), plain.samples(pixels)),
     ):
         assert type(got) is type(put(samples))
         assert np.abs(_back(got) - want).max() < 1e-5 * np.abs(want).max()

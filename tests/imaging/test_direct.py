@@ -28,8 +28,8 @@ def test_a_monostatic_radar_referenced_to_the_scene_centre_focuses_in_three_dime
     x, y = np.meshgrid(*axes)
     voxels = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.2)])
     image = np.abs(backproject(samples, f, radar, radar, voxels, reference)) / samples.size
-    at = voxels[np.argmax(image)]
-    assert np.abs(at - points[0]).max() < 1e-9
+    brightest_voxel = voxels[np.argmax(image)]
+    assert np.abs(brightest_voxel - points[0]).max() < 1e-9
     assert image.max() == pytest.approx(1, abs=0.15)
     along_z = points[0] + np.linspace(-1, 1, 21)[:, None] * [0, 0, 1]
     focus = backproject(samples, f, radar, radar, along_z, reference) / samples.size

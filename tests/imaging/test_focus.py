@@ -31,14 +31,14 @@ def _swept(make_rig, points_rows, depth_mm=0.0, tilt_deg=(0.0, 0.0), noise=0.3):
 def test_a_plane_wrong_by_3_mm_or_1_degree_is_found_within_half_a_millimetre_and_0_2_degrees(
     make_rig, points_rows, depth_mm, tilt_deg
 ):
-    found = _swept(make_rig, points_rows, depth_mm, tilt_deg)
-    assert found.depth_mm == pytest.approx(depth_mm, abs=0.5)
-    np.testing.assert_allclose(found.tilt_deg, tilt_deg, atol=0.2)
-    assert found.gain >= 1 - 1e-6
-    assert found.certain
-    np.testing.assert_allclose(found.depths_mm, np.linspace(-8, 8, 9))
-    assert found.sharpness.max() == 1
-    assert abs(found.depths_mm[np.argmax(found.sharpness)] - depth_mm) <= 2
+    focus = _swept(make_rig, points_rows, depth_mm, tilt_deg)
+    assert focus.depth_mm == pytest.approx(depth_mm, abs=0.5)
+    np.testing.assert_allclose(focus.tilt_deg, tilt_deg, atol=0.2)
+    assert focus.gain >= 1 - 1e-6
+    assert focus.certain
+    np.testing.assert_allclose(focus.depths_mm, np.linspace(-8, 8, 9))
+    assert focus.sharpness.max() == 1
+    assert abs(focus.depths_mm[np.argmax(focus.sharpness)] - depth_mm) <= 2
 
 
 def test_a_narrow_scan_gives_no_certain_result(make_rig, points_rows):

@@ -26,11 +26,11 @@ def test_focus_of_a_too_narrow_scan_writes_figure_and_numbers_that_are_not_certa
     simulate(RIG, decode_scene(SCENE, "t"), tmp_path / "scan")
     assert main(["focus", str(tmp_path / "scan"), "--out", str(tmp_path / "focus"), "--depth", "6"]) == 0
     assert "object_distance_mm = " in capsys.readouterr().out
-    found = json.loads((tmp_path / "focus" / "focus.json").read_text())
-    assert found["simulated"]
-    assert not found["certain"]
-    assert (found["depths_mm"][0], found["depths_mm"][-1]) == (-6, 6)
-    assert max(found["sharpness"]) == 1
+    focus = json.loads((tmp_path / "focus" / "focus.json").read_text())
+    assert focus["simulated"]
+    assert not focus["certain"]
+    assert (focus["depths_mm"][0], focus["depths_mm"][-1]) == (-6, 6)
+    assert max(focus["sharpness"]) == 1
     assert (tmp_path / "focus" / "focus.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -46,10 +46,10 @@ def test_x_and_y_are_the_rigs_for_scans_by_rows_and_by_columns(tmp_path, capsys,
     monkeypatch.setattr(offline, "focus_sweep", lambda *_, **__: swept)
     monkeypatch.setattr(report, "focus_figure", lambda *given: drawn.append(given) or b"")
     assert main(["focus", str(data), "--out", str(tmp_path / "focus")]) == 0
-    shown = capsys.readouterr().out
-    assert 0 < shown.index("+2.00") < shown.index("-1.00")
-    found = json.loads((tmp_path / "focus" / "focus.json").read_text())
-    assert tuple(found["tilt_deg"]) == tilt
+    output = capsys.readouterr().out
+    assert 0 < output.index("+2.00") < output.index("-1.00")
+    focus = json.loads((tmp_path / "focus" / "focus.json").read_text())
+    assert tuple(focus["tilt_deg"]) == tilt
     ((sweep, *pictures, x_m, y_m, _),) = drawn
     assert tuple(sweep["tilt_deg"]) == tilt
     assert (x_m.size, y_m.size) == (24, 20)

@@ -92,8 +92,8 @@ def test_a_uniform_plane_is_flat_after_division_with_missing_positions(make_rig,
     assert images.valid.mean() > 0.9
     for flat, raw in ((images.h, images.h_raw), (images.v, images.v_raw)):
         np.testing.assert_allclose(flat[images.valid], np.conj(0.5j), atol=2e-3)
-        shown = np.abs(raw[images.valid])
-        assert shown.max() > 1.3 * shown.min()  # not flat before the division
+        level = np.abs(raw[images.valid])
+        assert level.max() > 1.3 * level.min()  # not flat before the division
 
 
 def test_the_image_of_a_sheet_has_its_reflection_coefficient(make_rig, plane_rows):
@@ -207,9 +207,9 @@ def test_the_live_image_after_every_row_is_the_image_of_the_rows_so_far(make_rig
         for builder in (live, plain):
             builder.add_row(name, index, row)
         now = live.current()
-        made = plain.finish()
-        pairs = [(now.h_raw, made.h_raw), (now.v_raw, made.v_raw)]
-        pairs += zip(now.illumination.footprints, made.illumination.footprints, strict=True)
+        image = plain.finish()
+        pairs = [(now.h_raw, image.h_raw), (now.v_raw, image.v_raw)]
+        pairs += zip(now.illumination.footprints, image.illumination.footprints, strict=True)
         for got, want in pairs:
             assert np.abs(got - want).max() <= 2e-5 * max(np.abs(want).max(), 0.2)
     for channel in ("h", "v", "valid"):
@@ -223,16 +223,18 @@ def test_measured_offsets_of_rows_improve_the_focus(make_rig, points_rows):
     point = np.array(specular_midpoint_m(rig, board))
     shifts = [1.2e-3 * (row.index % 2) for row in plan_raster(rig.grid)]
     good = ImageBuilder(rig)
-    known = ImageBuilder(rig)
+    informed = ImageBuilder(rig)
     ignored = ImageBuilder(rig)
     for index, row in points_rows(rig, board, [point], [1.0]):
         good.add_row(board.name, index, row)
     for index, row in points_rows(rig, board, [point], [1.0], shifts_m=shifts):
         ignored.add_row(board.name, index, row)
         planned = row_offsets_m(rig, plan_raster(rig.grid).row(index))
-        known.add_row(board.name, index, row, np.add(planned, [shifts[index], 0]))
+        informed.add_row(board.name, index, row, np.add(planned, [shifts[index], 0]))
     want = good.finish().h_raw
-    error_known, error_ignored = (np.abs(b.finish().h_raw - want).max() / np.abs(want).max() for b in (known, ignored))
+    error_known, error_ignored = (
+        np.abs(b.finish().h_raw - want).max() / np.abs(want).max() for b in (informed, ignored)
+    )
     assert error_known < 0.01
     assert error_ignored > 10 * error_known
 
@@ -244,18 +246,18 @@ def test_jittered_positions_are_imaged_exactly_with_a_notice(make_rig, points_ro
     grid = image_grid(rig)
     point = np.array([grid.x_m[4], grid.y_m[4], grid.z_m])
     jitter = rng.normal(0, 3e-4, (rig.grid.rows, rig.grid.columns, 3))
-    known = ImageBuilder(rig, live=True)
+    informed = ImageBuilder(rig, live=True)
     ignored = ImageBuilder(rig)
     for index, row in points_rows(rig, board, [point], [1.0], jitter_m=jitter):
         ignored.add_row(board.name, index, row)
         plan_row = plan_raster(rig.grid).row(index)
-        known.add_row(board.name, index, row, np.pad(row_offsets_m(rig, plan_row), ((0, 0), (0, 1))) + jitter[index])
-    images = known.finish()
+        informed.add_row(board.name, index, row, np.pad(row_offsets_m(rig, plan_row), ((0, 0), (0, 1))) + jitter[index])
+    images = informed.finish()
     assert abs(images.h_raw[4, 4] - 1) < 0.01
     assert abs(ignored.finish().h_raw[4, 4]) < 0.95
     assert images.notices
     assert caplog.records
-    np.testing.assert_array_equal(known.current().h_raw, images.h_raw)
+    np.testing.assert_array_equal(informed.current().h_raw, images.h_raw)
 
 
 def test_a_row_far_from_its_planned_position_is_imaged_correctly(make_rig, synced_row):
@@ -271,15 +273,15 @@ def test_a_row_far_from_its_planned_position_is_imaged_correctly(make_rig, synce
 def test_a_masked_position_equals_one_that_was_not_scanned(make_rig, synced_row):
     rig = make_rig(15, 9, pixels=(16, 14))
     rng = np.random.default_rng(12)
-    kept = rng.uniform(size=(9, 15)) > 0.4
+    is_scanned = rng.uniform(size=(9, 15)) > 0.4
     masked = ImageBuilder(rig, live=True)
     never = ImageBuilder(rig)
     for name, index, row in _random_rows(rig, synced_row, rng):
         masked.add_row(name, index, row)
-        met = kept[index][:: plan_raster(rig.grid).row(index).direction]
+        met = is_scanned[index][:: plan_raster(rig.grid).row(index).direction]
         never.add_row(name, index, synced_row(row.samples, row.valid & met))
     for board in masked.boards.values():
-        board.keep(kept)
+        board.keep(is_scanned)
     np.testing.assert_array_equal(masked.current().h_raw, never.finish().h_raw)
     np.testing.assert_array_equal(masked.rx_calibration("RV"), never.rx_calibration("RV"))
 
@@ -337,5 +339,5 @@ def test_the_image_is_the_float64_matched_filter_over_all_samples(make_rig, sync
         all_samples = (echo[rx, ..., a:b] * window).reshape(len(place), -1)
         want += backproject(all_samples, f[a:b], *pairs)
     want /= 4 * plan.positions
-    at = np.array([got[j, i] for i, j in pixels])
-    assert np.abs(at - want).max() < 2e-6 * np.abs(want).max()
+    pixel_values = np.array([got[j, i] for i, j in pixels])
+    assert np.abs(pixel_values - want).max() < 2e-6 * np.abs(want).max()

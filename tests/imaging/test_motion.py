@@ -53,8 +53,8 @@ def test_masked_positions_have_no_influence_and_ends_are_not_changed(fast):
     turn = rng.uniform(-1, 1, COUNT)
     filters = burst_filters(fast)
     first = undo_burst_motion(samples, valid, turn, filters)
-    other = np.where(valid, samples, 1e6).astype(np.complex64)
-    np.testing.assert_array_equal(undo_burst_motion(other, valid, turn, filters)[:, valid], first[:, valid])
+    changed = np.where(valid, samples, 1e6).astype(np.complex64)
+    np.testing.assert_array_equal(undo_burst_motion(changed, valid, turn, filters)[:, valid], first[:, valid])
     for alone in (0, COUNT - 1, 19, 22):
         np.testing.assert_array_equal(first[:, alone], samples[:, alone])
 
@@ -65,6 +65,6 @@ def test_a_row_in_the_other_direction_is_filtered_equally(fast):
     valid = rng.uniform(size=COUNT) < 0.9
     turn = rng.uniform(-1, 1, COUNT)
     filters = burst_filters(fast)
-    there = undo_burst_motion(samples, valid, turn, filters)
+    reverse = undo_burst_motion(samples, valid, turn, filters)
     back = undo_burst_motion(samples[:, ::-1], valid[::-1], -turn[::-1], filters)
-    np.testing.assert_allclose(back[:, ::-1], there, atol=1e-5)
+    np.testing.assert_allclose(back[:, ::-1], reverse, atol=1e-5)

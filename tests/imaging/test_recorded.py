@@ -45,9 +45,9 @@ def _cut(recorded, axis, step_m, samples=None, reference_m=None):
 
 
 def _half_power_width(cut, step_m):
-    at = int(np.argmax(cut))
-    low = at - np.argmax(cut[at::-1] < cut[at] / np.sqrt(2))
-    high = at + np.argmax(cut[at:] < cut[at] / np.sqrt(2))
+    peak = int(np.argmax(cut))
+    low = peak - np.argmax(cut[peak::-1] < cut[peak] / np.sqrt(2))
+    high = peak + np.argmax(cut[peak:] < cut[peak] / np.sqrt(2))
     return (high - low - 1) * step_m
 
 
@@ -70,6 +70,6 @@ def test_without_pulse_to_pulse_phase_or_with_a_wrong_range_there_is_no_focus(re
     rng = np.random.default_rng(0)
     s, _, _, reference = recorded
     focused = _cut(recorded, 1, 0.06).max()
-    lost = s * np.exp(2j * np.pi * rng.uniform(size=(len(s), 1)))
-    assert _cut(recorded, 1, 0.06, samples=lost).max() < focused / 4
+    unfocused = s * np.exp(2j * np.pi * rng.uniform(size=(len(s), 1)))
+    assert _cut(recorded, 1, 0.06, samples=unfocused).max() < focused / 4
     assert _cut(recorded, 1, 0.06, reference_m=reference + rng.normal(0, 0.02, reference.size)).max() < focused / 3

@@ -56,21 +56,21 @@ def test_decimated_samples_give_what_all_samples_give(rig, gate_m, noise):
     a, b = rig.chirp.linear_samples
     gate = reduction(rig.chirp, gate_m)
     sweep = _sweep(rig.chirp)[a:b]
-    every = gate.maps(_sweep(rig.chirp))[:, a:b]
+    all_weights = gate.maps(_sweep(rig.chirp))[:, a:b]
     few = gate.maps(block_frequencies_hz(rig.chirp))
-    level = np.abs(every[:-1] @ np.exp(2j * np.pi * gate_m[0] / C * sweep)).max()
+    level = np.abs(all_weights[:-1] @ np.exp(2j * np.pi * gate_m[0] / C * sweep)).max()
     # The middle of the band that noise and echoes give
     for off_m in (-0.1, 0.0, 0.1):
         middle_m = sum(gate_m) / 4 + off_m
         decimated = decimation(b - a, middle_m * rig.chirp.hz_per_sample / C)
 
         def off(path_m, blocks=few @ decimated):
-            return np.abs((blocks - every) @ np.exp(2j * np.pi * path_m / C * sweep))
+            return np.abs((blocks - all_weights) @ np.exp(2j * np.pi * path_m / C * sweep))
 
         assert max(off(d).max() for d in (0.0, *np.linspace(*gate_m, 30))) < 6e-4
         assert max(off(d).max() for d in (0.7, 0.9, 1.1)) < 2e-3
         assert max(off(d)[:-1].max() for d in (1.5, 2.0, 2.5)) < 0.02 * level
-        assert np.linalg.norm((few @ decimated - every)[:-1]) < noise * np.linalg.norm(every[:-1])
+        assert np.linalg.norm((few @ decimated - all_weights)[:-1]) < noise * np.linalg.norm(all_weights[:-1])
 
 
 @pytest.mark.parametrize("window", ["hann", "boxcar"])

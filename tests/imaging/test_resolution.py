@@ -73,10 +73,10 @@ def test_missing_positions_cost_what_is_reported(make_rig, points_rows):
     assert facts.masked_positions == (~board.valid).sum() > 10
     assert facts.masked == pytest.approx(facts.masked_positions / facts.positions, abs=1e-6)
     summed = np.abs(board.image()[0]).max() * float(board.count) / (board.valid.size * 4)
-    whole = np.abs(board.image()[0]).max()
-    assert -20 * np.log10(summed / whole) == pytest.approx(facts.loss_db, abs=1e-3)
+    peak = np.abs(board.image()[0]).max()
+    assert -20 * np.log10(summed / peak) == pytest.approx(facts.loss_db, abs=1e-3)
     # Image amplitudes do not change
-    assert whole == pytest.approx(1, abs=0.03)
+    assert peak == pytest.approx(1, abs=0.03)
 
 
 def test_without_data_there_is_no_response(make_rig):

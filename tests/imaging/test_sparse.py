@@ -30,49 +30,49 @@ def board(make_rig, points_rows):
 
 
 def _kept(name):
-    kept = np.zeros((40, 60), bool)
+    is_kept = np.zeros((40, 60), bool)
     if name == "every second row":
-        kept[::2] = True
+        is_kept[::2] = True
     elif name == "every second column":
-        kept[:, ::2] = True
+        is_kept[:, ::2] = True
     else:
-        kept = np.random.default_rng(0).uniform(size=kept.shape) < 0.25
-    return kept
+        is_kept = np.random.default_rng(0).uniform(size=is_kept.shape) < 0.25
+    return is_kept
 
 
 @pytest.mark.parametrize("name", ["every second row", "every second column", "a random quarter"])
 def test_points_of_a_sparse_scan_are_reconstructed_without_aliases(board, name):
     samples = board(_kept(name))
-    found = reconstruct(samples, iterations=40, strength=0.03)
+    reconstruction = reconstruct(samples, iterations=40, strength=0.03)
     truth = np.zeros((40, 40), complex)
     truth[tuple(np.transpose(AT))] = AMPLITUDES
     matched = samples.image()[0]
 
     # Strongest pixel away from the points
     def outside(image):
-        away = np.ones(image.shape, bool)
+        is_away = np.ones(image.shape, bool)
         for j, i in AT:
-            away[j - 3 : j + 4, i - 3 : i + 4] = False
-        return np.abs(image[away]).max()
+            is_away[j - 3 : j + 4, i - 3 : i + 4] = False
+        return np.abs(image[is_away]).max()
 
-    assert outside(found.image) < 0.25 * outside(matched)
-    sums = np.array([found.image[j - 1 : j + 2, i - 1 : i + 2].sum() for j, i in AT])
+    assert outside(reconstruction.image) < 0.25 * outside(matched)
+    sums = np.array([reconstruction.image[j - 1 : j + 2, i - 1 : i + 2].sum() for j, i in AT])
     np.testing.assert_allclose(sums, AMPLITUDES, atol=0.15)
-    assert np.linalg.norm(found.image - truth) < 0.5 * np.linalg.norm(matched - truth)
-    assert found.residual[-1] < 0.25 < found.residual[0]
+    assert np.linalg.norm(reconstruction.image - truth) < 0.5 * np.linalg.norm(matched - truth)
+    assert reconstruction.residual[-1] < 0.25 < reconstruction.residual[0]
 
 
 def test_weak_reflectors_beside_a_strong_one_are_kept(board):
     """Thin wood has 0.42 of the amplitude of metal in H and 0.035 in V."""
     amplitudes = np.array([1.0, 0.035j, -0.42])
-    found = reconstruct(board(_kept("every second column"), amplitudes), iterations=25)
-    sums = np.array([found.image[j - 1 : j + 2, i - 1 : i + 2].sum() for j, i in AT])
+    reconstruction = reconstruct(board(_kept("every second column"), amplitudes), iterations=25)
+    sums = np.array([reconstruction.image[j - 1 : j + 2, i - 1 : i + 2].sum() for j, i in AT])
     np.testing.assert_allclose(sums / amplitudes, 1, atol=0.2)
 
 
 def test_no_data_gives_an_empty_image(make_rig):
-    found = reconstruct(ImageBuilder(make_rig(5, 5, pixels=(6, 6))).boards["RH"], iterations=2)
-    assert not found.image.any()
+    reconstruction = reconstruct(ImageBuilder(make_rig(5, 5, pixels=(6, 6))).boards["RH"], iterations=2)
+    assert not reconstruction.image.any()
 
 
 # --- missing positions are filled ---
@@ -107,11 +107,11 @@ def image_error(found, whole):
     ("name", "factor"), [("every second row", 10), ("every second column", 1.2), ("a random quarter", 10)]
 )
 def test_the_image_with_filled_positions_is_nearer_to_that_of_the_whole_scan(scan, name, factor):
-    whole = scan(np.ones((40, 60), bool)).finish()
+    full_image = scan(np.ones((40, 60), bool)).finish()
     thin = scan(_kept(name))
     filled, errors = fill_missing(thin)
-    error = image_error(filled.finish(), whole)
-    assert error < image_error(thin.finish(), whole) / factor
+    error = image_error(filled.finish(), full_image)
+    assert error < image_error(thin.finish(), full_image) / factor
     assert errors["RH"].missing_share == pytest.approx(1 - _kept(name).mean())
     assert error < 2 * errors["RH"].image_error
 
@@ -129,16 +129,16 @@ def test_steps_too_wide_for_the_image_are_divided(scan):
     assert added_steps(coarse.rig)[0] > 1
     filled, _ = fill_missing(coarse)
     assert filled.rig.grid.rows == added_steps(coarse.rig)[0] * 19 + 1
-    away = np.ones((40, 40), bool)
+    is_away = np.ones((40, 40), bool)
     for j, i in AT:
-        away[j - 4 : j + 5, i - 4 : i + 5] = False
-    ghosts = [np.abs(builder.finish().h_raw[away]).max() for builder in (coarse, filled)]
+        is_away[j - 4 : j + 5, i - 4 : i + 5] = False
+    ghosts = [np.abs(builder.finish().h_raw[is_away]).max() for builder in (coarse, filled)]
     assert ghosts[1] < 0.5 * ghosts[0]
 
 
 def test_an_aperture_that_needs_the_direct_sum_is_refused_at_once(scan):
     """Rows 6 mm apart and pixels of 5 mm: each of a hundred images would take seconds."""
-    kept = np.ones((10, 60), bool)
-    kept[4] = False
+    is_kept = np.ones((10, 60), bool)
+    is_kept[4] = False
     with pytest.raises(ConfigError):
-        fill_missing(scan(kept, step_y_mm=6.0))
+        fill_missing(scan(is_kept, step_y_mm=6.0))

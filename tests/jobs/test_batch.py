@@ -191,7 +191,7 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
 
 def raw_digests(folder):
     committed = ScanFolder.load(folder).committed_rows()
-    return {name: {row: at.boards[name].crc32 for row, at in committed.items()} for name in ("RH", "RV")}
+    return {name: {row: take.boards[name].crc32 for row, take in committed.items()} for name in ("RH", "RV")}
 
 
 @pytest.mark.usefixtures("worker")

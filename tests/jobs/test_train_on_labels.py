@@ -62,12 +62,12 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
     answer = capsys.readouterr().out
     assert f"  {MINE}: 2 patches in 2 scans" in answer
     assert "which piece" not in answer
-    known = Library.load(library)
-    assert known.names == ("copper", MINE)
-    assert known.scans == ("small", "small (2)")
-    assert {e.specimen for e in known.entries if e.name == MINE} == {"board 7"}
-    assert {e.specimen for e in known.entries if e.name == "copper"} == {None}
-    assert known.simulated  # without a truth it is simulated all the same, and says so
+    trained_library = Library.load(library)
+    assert trained_library.names == ("copper", MINE)
+    assert trained_library.scans == ("small", "small (2)")
+    assert {e.specimen for e in trained_library.entries if e.name == MINE} == {"board 7"}
+    assert {e.specimen for e in trained_library.entries if e.name == "copper"} == {None}
+    assert trained_library.simulated  # without a truth it is simulated all the same, and says so
     assert main(["train", str(first), str(first / "products"), "--out", str(library)]) == 3
     assert "is given twice" in capsys.readouterr().err
 

@@ -43,9 +43,9 @@ class Synthetic:
         return Images(self.h, self.v, self.x_m, self.y_m, np.ones(self.h.shape, bool))
 
     def analyse(self, leakage=(0.0, 0.0), metal=None, segmentation=None, classifier=None, pair=None):
-        known = KnownScene(segmentation, metal, plates=self.plates)
+        known_scene = KnownScene(segmentation, metal, plates=self.plates)
         prior = RigPrior(1e-3, leakage, 0.003, leakage_measured=True)
-        return analyse(pair or self.pair, Optics(self.theta, prior), known, classifier)
+        return analyse(pair or self.pair, Optics(self.theta, prior), known_scene, classifier)
 
 
 def smooth_field(rng, shape, correlation_px):

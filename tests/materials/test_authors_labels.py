@@ -34,9 +34,9 @@ def labelled(folder, seed=1, name="scan_7", **more):
 @pytest.mark.parametrize("upside_down", [False, True])
 def test_boxes_give_the_materials_ratios_relative_to_metal(tmp_path, upside_down):
     scan = read_labelled_scan(labelled(tmp_path, upside_down=upside_down))
-    how = image_orientation([scan])
-    assert ("last row" in how) == upside_down
-    entries = {e.name: e for e in entries_of_boxes(scan.orient(how), 60.0)}
+    orientation = image_orientation([scan])
+    assert ("last row" in orientation) == upside_down
+    entries = {e.name: e for e in entries_of_boxes(scan.orient(orientation), 60.0)}
     assert set(entries) == set(BOXES)
     for name, e in entries.items():
         eps = MATERIALS[name].permittivity

@@ -105,10 +105,10 @@ def test_no_other_name_is_admitted(tmp_path, module, name):
 
 
 def test_damaged_files_are_errors_at_every_length(tmp_path):
-    whole = pickle.dumps(content(4))
+    content_bytes = pickle.dumps(content(4))
     path = tmp_path / "x.pkl"
-    for n in range(0, len(whole), 7):
-        path.write_bytes(whole[:n])
+    for n in range(0, len(content_bytes), 7):
+        path.write_bytes(content_bytes[:n])
         with pytest.raises(DataError):
             read_material(path)
 

@@ -120,10 +120,10 @@ def test_names_of_one_material():
 
 def test_same_is_symmetric():
     names = ["wood", "plywood", "PMMA", "acrylic", "glass", "Pyrex", "water", "copper", "cardboard (rough)"]
-    for one in names:
-        assert same_material(one, one)
-        for other in names:
-            assert same_material(one, other) == same_material(other, one)
+    for first_name in names:
+        assert same_material(first_name, first_name)
+        for second_name in names:
+            assert same_material(first_name, second_name) == same_material(second_name, first_name)
 
 
 def test_a_spread_is_of_the_line_or_the_default_of_the_kind(tmp_path):
@@ -131,11 +131,11 @@ def test_a_spread_is_of_the_line_or_the_default_of_the_kind(tmp_path):
     text = f'materials = [{{ name = "a", {line} }}, {{ name = "b", spread = [0.01, 0.2], {line} }}]\n'
     path = tmp_path / "catalogue.toml"
     path.write_text(text + '[sources]\nOwn = "Own"\n[kinds]\nfelt = { generic = ["textile"], spread = [0.1, 0.5] }\n')
-    default, own = read_catalogue(path)
+    default, own_spread = read_catalogue(path)
     assert default.spread_is_default
     assert default.spread == (0.1, 0.5)
-    assert not own.spread_is_default
-    assert own.spread == (0.01, 0.2)
+    assert not own_spread.spread_is_default
+    assert own_spread.spread == (0.01, 0.2)
 
 
 def test_a_bad_file_is_refused(tmp_path):

@@ -117,12 +117,14 @@ def test_patches_under_two_angles_are_named_together(seen, scans, model):
 
 
 def test_patches_match_by_place_alone(scans):
-    there = scans[1]
-    reordered = replace(there, patches=there.patches[::-1])
+    second_scan = scans[1]
+    reordered = replace(second_scan, patches=second_scan.patches[::-1])
     assert [m.label for m in match_patches([scans[0], reordered])] == [m.label for m in match_patches(scans)]
-    far = replace(there, patches=tuple(replace(p, centre_mm=(p.centre_mm[0] + 300, 0.0)) for p in there.patches))
+    far = replace(
+        second_scan, patches=tuple(replace(p, centre_mm=(p.centre_mm[0] + 300, 0.0)) for p in second_scan.patches)
+    )
     assert match_patches([scans[0], far]) == []
-    without = replace(there, patches=there.patches[1:])
+    without = replace(second_scan, patches=second_scan.patches[1:])
     assert len(match_patches([scans[0], without])) == 8
 
 
@@ -130,12 +132,12 @@ def test_a_pixel_that_cannot_be_used_is_unknown_and_an_empty_patch_too(seen, sca
     classifier = Classifier(seen[0], model="discriminant", angles_deg=[55.0])
     x = scans[0].patches[0].features.copy()
     x[0, 2] = np.nan
-    broken, empty, lost = classifier.scan([x, np.zeros((0, 4)), np.full((2, 4), np.nan)])
+    broken, empty, all_nan = classifier.scan([x, np.zeros((0, 4)), np.full((2, 4), np.nan)])
     assert broken.names[0] == UNKNOWN
     assert np.isinf(broken.distance[0])
     assert broken.verdict.pixels == len(x) - 1
-    assert empty.verdict.name == lost.verdict.name == UNKNOWN
-    assert lost.names.tolist() == [UNKNOWN] * 2
+    assert empty.verdict.name == all_nan.verdict.name == UNKNOWN
+    assert all_nan.names.tolist() == [UNKNOWN] * 2
 
 
 def test_two_scans_as_typed(folders, capsys):
@@ -154,21 +156,28 @@ def test_two_scans_as_typed(folders, capsys):
 
 
 def test_patches_exchanged_between_two_angles_are_told(folders, scans, capsys):
-    there = scans[1]
+    second_scan = scans[1]
     angle = "60"
     truths = {"wood": "ceramic", "ceramic": "wood"}
-    like = {p.truth: p for p in there.patches}
-    swap = {a: b for a in like for key, other in truths.items() if a and key in a for b in like if b and other in b}
+    patch_by_truth = {p.truth: p for p in second_scan.patches}
+    swap = {
+        a: b
+        for a in patch_by_truth
+        for key, other_truth in truths.items()
+        if a and key in a
+        for b in patch_by_truth
+        if b and other_truth in b
+    }
     assert len(swap) == 2
     with np.load(folders / angle / PATCHES) as stored:
         content = dict(stored)
     features = content["features"].copy()
-    first = np.cumsum([0, *[len(p.features) for p in there.patches]])
-    where = {p.truth: np.arange(first[i], first[i + 1]) for i, p in enumerate(there.patches)}
-    one, other = swap
-    middle = {name: np.median(features[where[name]], axis=0) for name in swap}
-    features[where[one]] = middle[other]
-    features[where[other]] = middle[one]
+    first = np.cumsum([0, *[len(p.features) for p in second_scan.patches]])
+    rows_of_patch = {p.truth: np.arange(first[i], first[i + 1]) for i, p in enumerate(second_scan.patches)}
+    first_truth, other_truth = swap
+    middle = {name: np.median(features[rows_of_patch[name]], axis=0) for name in swap}
+    features[rows_of_patch[first_truth]] = middle[other_truth]
+    features[rows_of_patch[other_truth]] = middle[first_truth]
     content["features"] = features
     np.savez(folders / angle / PATCHES, **content)
     command = ["classify", str(folders / "55"), str(folders / angle), "--library", str(folders / "library.npz")]

@@ -52,8 +52,8 @@ def test_a_concentration_is_judged_without_its_own_patches():
     """One concentration that lies off the line: the others do not hide it."""
     entries = [*library().entries, *(entry("sugar (9.0%)", 1.25, f"scan{i}") for i in range(3))]
     result = fit_concentration(Library(tuple(entries)), {"water": 0.0})
-    off = [r for r in result.left_out if r.true_percent == 9.0]
-    assert all(abs(r.percent - 9.0) > 5.0 for r in off)
+    judged = [r for r in result.left_out if r.true_percent == 9.0]
+    assert all(abs(r.percent - 9.0) > 5.0 for r in judged)
 
 
 def test_prediction_intervals_cover_as_often_as_they_say():
@@ -89,8 +89,8 @@ def test_what_cannot_be_fitted_is_refused():
 
 def test_a_material_that_is_not_used_is_named(tmp_path, capsys):
     path = tmp_path / "library.npz"
-    known = library()
-    Library((*known.entries, entry("copper", 0.785), entry("water", 0.7)), {}, "").save(path)
+    known_library = library()
+    Library((*known_library.entries, entry("copper", 0.785), entry("water", 0.7)), {}, "").save(path)
     assert main(["concentration", str(path), "--value", "water=0"]) == 0
     (note,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note")]
     assert "copper" in note

@@ -25,12 +25,12 @@ def test_an_unknown_patch_has_no_likelier_name(library, ratio, gain):
     rng = np.random.default_rng(5)
     h = 0.45 * gain * (1 + 0.006 * rng.standard_normal(60))
     p = ratio * (1 + 0.006 * rng.standard_normal(60))
-    found = Classifier(library, angles_deg=[ANGLE_DEG]).scan([pixel_features(h, np.abs(h / p), p)])[0].verdict
-    if found.name == UNKNOWN:
-        assert max(found.probabilities, key=lambda n: found.probabilities[n]) == UNKNOWN
-        assert found.confidence >= 0.5
+    verdict = Classifier(library, angles_deg=[ANGLE_DEG]).scan([pixel_features(h, np.abs(h / p), p)])[0].verdict
+    if verdict.name == UNKNOWN:
+        assert max(verdict.probabilities, key=lambda n: verdict.probabilities[n]) == UNKNOWN
+        assert verdict.confidence >= 0.5
     else:
-        assert max(found.probabilities, key=lambda n: found.probabilities[n]) == found.name
+        assert max(verdict.probabilities, key=lambda n: verdict.probabilities[n]) == verdict.name
 
 
 def test_one_angle_given_twice_is_refused(library):

@@ -38,11 +38,11 @@ def together(one, other):
 
 
 def test_the_sizes_of_the_errors_are_found():
-    found = [ErrorDiscriminant().fit(drawn(seed, scans=40)) for seed in range(6)]
+    models = [ErrorDiscriminant().fit(drawn(seed, scans=40)) for seed in range(6)]
     for covariances, size in (
-        ([f.within for f in found], 0.03),
-        ([f.between for f in found], 0.01),
-        ([f.scan for f in found], 0.02),
+        ([f.within for f in models], 0.03),
+        ([f.between for f in models], 0.01),
+        ([f.scan for f in models], 0.02),
     ):
         mean = np.mean(covariances, axis=0)
         assert np.sqrt(np.diag(mean)) == pytest.approx(size, rel=0.15)
@@ -58,11 +58,11 @@ def test_an_error_that_all_patches_of_a_scan_share_changes_no_name():
     v = test.x[:, 1] * gains[0][1]
     p = gains[1] * gains[0][0] / gains[0][1] / (test.x[:, 2] + 1j * test.x[:, 3])
     moved = feature_matrix(h, v, p)
-    here = model.by_scan(test.x, test.patches)
-    there = model.by_scan(moved, test.patches)
-    assert here.names.tolist() == there.names.tolist() == [f"m{i}" for i in range(5)]
+    verdicts = model.by_scan(test.x, test.patches)
+    moved_verdicts = model.by_scan(moved, test.patches)
+    assert verdicts.names.tolist() == moved_verdicts.names.tolist() == [f"m{i}" for i in range(5)]
     alone = (model.by_pixel(moved)[0] == test.names).mean()
-    assert (there.pixel_names == test.names).mean() > alone
+    assert (moved_verdicts.pixel_names == test.names).mean() > alone
 
 
 def test_a_phase_of_180_degrees_is_no_edge():
@@ -73,11 +73,11 @@ def test_a_patch_alone_is_named_as_before_and_scans_do_not_touch_each_other():
     model = ErrorDiscriminant().fit(drawn(0))
     test = drawn(3, scans=1)
     for patch in np.unique(test.patches):
-        at = test.patches == patch
-        one = model.by_scan(test.x[at], test.patches[at])
-        assert one.patches.tolist() == [patch]
-        assert one.names[0] == test.names[at][0]
-        assert one.pixel_names.tolist() == model.by_pixel(test.x[at])[0].tolist()
+        of_patch = test.patches == patch
+        alone = model.by_scan(test.x[of_patch], test.patches[of_patch])
+        assert alone.patches.tolist() == [patch]
+        assert alone.names[0] == test.names[of_patch][0]
+        assert alone.pixel_names.tolist() == model.by_pixel(test.x[of_patch])[0].tolist()
 
 
 def test_known_patches_are_called_unknown_at_the_stated_rate():
@@ -93,9 +93,9 @@ def test_probabilities_mean_what_they_say():
     right = []
     for seed in range(60):
         test = drawn(100 + seed, scans=1, means=near)
-        found = model.by_scan(test.x, test.patches)
-        sure += found.confidence.tolist()
-        right += [name == f"m{i}" for i, name in enumerate(found.names)]
+        verdicts = model.by_scan(test.x, test.patches)
+        sure += verdicts.confidence.tolist()
+        right += [name == f"m{i}" for i, name in enumerate(verdicts.names)]
     assert 0.4 < np.mean(right) < 0.95
     assert np.mean(sure) == pytest.approx(np.mean(right), abs=0.1)
 
@@ -136,11 +136,11 @@ def with_metal(samples, stray):
 def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
     samples = with_metal(drawn(8), 0)
     turned = samples.take(np.arange(len(samples.x))[::-1])
-    here = ErrorDiscriminant().fit(samples)
-    there = ErrorDiscriminant().fit(turned)
-    np.testing.assert_allclose(here.scan, there.scan, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(here.level, there.level, rtol=1e-9, atol=1e-12)
-    assert here.patch_level == pytest.approx(there.patch_level)
+    model = ErrorDiscriminant().fit(samples)
+    turned_model = ErrorDiscriminant().fit(turned)
+    np.testing.assert_allclose(model.scan, turned_model.scan, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(model.level, turned_model.level, rtol=1e-9, atol=1e-12)
+    assert model.patch_level == pytest.approx(turned_model.patch_level)
 
 
 @pytest.mark.parametrize("stray", [0, 5])
@@ -148,28 +148,28 @@ def test_metal_with_a_stray_pixel_tells_nothing_of_the_reference(stray):
     """The reference has no error of its own: whether it is looked at changes nothing of the others."""
     model = ErrorDiscriminant().fit(with_metal(drawn(8), 0))
     test = with_metal(drawn(9, scans=1), stray)
-    others = test.take(test.names != "metal")
-    alone, beside = (model.by_scan(s.x, s.patches) for s in (others, test))
+    without_metal = test.take(test.names != "metal")
+    alone, beside = (model.by_scan(s.x, s.patches) for s in (without_metal, test))
     np.testing.assert_allclose(beside.distance[: len(alone.distance)], alone.distance, rtol=1e-9)
     assert beside.names[-1] == "metal"
 
 
 def test_two_angles_are_independent_and_tell_more():
-    one = drawn(0, pixel=0.1, patch=0.05)
+    first_angle = drawn(0, pixel=0.1, patch=0.05)
     two = drawn(1, pixel=0.1, patch=0.05)
-    both = one.join(two)
-    model = ErrorDiscriminant().fit(both)
+    both_angles = first_angle.join(two)
+    model = ErrorDiscriminant().fit(both_angles)
     for covariance in (model.scan, model.between, model.within):
         assert np.abs(covariance[:3, 3:]).max() < 1e-12
-    assert score(both, DISCRIMINANT).pixels > score(one, DISCRIMINANT).pixels
+    assert score(both_angles, DISCRIMINANT).pixels > score(first_angle, DISCRIMINANT).pixels
 
 
 def with_lonely(samples, scans=1):
     """The same scans with another material beside, in the first few of them, unlike all others."""
     only = drawn(11, scans=scans, means=[[-1.5, -3.5, 1.5]])
     names = np.full(len(only.x), "lonely")
-    more = Samples(only.x, names, only.groups, samples.patches.max() + 1 + only.patches)
-    return together(samples, more)
+    lonely_samples = Samples(only.x, names, only.groups, samples.patches.max() + 1 + only.patches)
+    return together(samples, lonely_samples)
 
 
 @pytest.mark.parametrize("model", [DISCRIMINANT, PAPER])
@@ -207,20 +207,20 @@ def test_a_material_of_two_scans_among_many_is_judged():
 
 def test_scans_without_a_common_material_are_refused():
     samples = drawn(14, scans=5)
-    apart = samples.take(np.char.lstrip(samples.names, "m") == np.char.lstrip(samples.groups, "s"))
+    disjoint = samples.take(np.char.lstrip(samples.names, "m") == np.char.lstrip(samples.groups, "s"))
     with refused(ErrorCode.NOT_ENOUGH_DATA):
-        score(apart, DISCRIMINANT)
+        score(disjoint, DISCRIMINANT)
 
 
 def test_the_report_and_the_table_of_models_name_what_was_not_judged(tmp_path, capsys):
     samples = with_lonely(drawn(12, scans=3, pixels=4))
     entries = []
     for patch in np.unique(samples.patches):
-        at = samples.patches == patch
-        h = samples.x[at, 0]
-        v = samples.x[at, 1]
-        q = samples.x[at, 2] + 1j * samples.x[at, 3]
-        (name, *_), (scan, *_) = samples.names[at], samples.groups[at]
+        of_patch = samples.patches == patch
+        h = samples.x[of_patch, 0]
+        v = samples.x[of_patch, 1]
+        q = samples.x[of_patch, 2] + 1j * samples.x[of_patch, 3]
+        (name, *_), (scan, *_) = samples.names[of_patch], samples.groups[of_patch]
         plain = (h.astype(np.float32), v.astype(np.float32), (1 / q).astype(np.complex64))
         entries.append(Entry(str(name), str(scan), *plain, 55.0, True))
     fit = {"model": DISCRIMINANT, "judged": {DISCRIMINANT: {"pixels": 1.0, "patches": 1.0}}}

@@ -47,8 +47,8 @@ def drawn_leakage(rng):
 def distances(found, eps=EPS):
     out = []
     for p, truth in zip(found.patches, eps, strict=True):
-        away = p.permittivity - truth
-        pair = np.array([away.real, away.imag])
+        errors = p.permittivity - truth
+        pair = np.array([errors.real, errors.imag])
         out.append(float(pair @ np.linalg.solve(p.covariance, pair)))
     return out
 
@@ -78,10 +78,10 @@ def test_slope_is_the_derivative(tr, ti):
 
 def test_without_errors_the_truth_comes_back():
     leak = (0.04 + 0.02j, -0.03j)
-    found = invert(
+    result = invert(
         world(np.random.default_rng(0), leak, 1e-9, 0.0), RigPrior(1e-6, leak, 1e-6, True, reference_std=1e-6)
     )
-    for p, truth in zip(found.patches, EPS, strict=True):
+    for p, truth in zip(result.patches, EPS, strict=True):
         assert p.permittivity == pytest.approx(truth, rel=2e-5)
 
 
@@ -93,13 +93,13 @@ def test_regions_hold_the_truth_as_often_as_they_say(measured, request):
         leak = (drawn_leakage(rng), drawn_leakage(rng))
         angle = 2e-3 * rng.standard_normal()
         reference = 0.005 * complex(*rng.standard_normal(2))
-        seen = world(rng, leak, angle=angle, reference=reference)
+        patches = world(rng, leak, angle=angle, reference=reference)
         if measured:
-            known = tuple(x + 0.003 * complex(*rng.standard_normal(2)) for x in leak)
+            measured_leakage = tuple(x + 0.003 * complex(*rng.standard_normal(2)) for x in leak)
         else:
-            known = (0j, 0j)
-        prior = RigPrior(2e-3, known, 0.003 if measured else 0.041, measured, reference_std=0.005)
-        d += distances(invert(seen, prior))
+            measured_leakage = (0j, 0j)
+        prior = RigPrior(2e-3, measured_leakage, 0.003 if measured else 0.041, measured, reference_std=0.005)
+        d += distances(invert(patches, prior))
     d = np.array(d)
     # The patches of a scene share leakage, angle and reference: 25 scenes are not 200 independent draws.
     assert 0.58 < np.mean(d < 2.279) < 0.80
@@ -110,25 +110,25 @@ def test_regions_hold_the_truth_as_often_as_they_say(measured, request):
 def test_leakage_that_was_not_measured_is_within_the_error_bars_whatever_its_phase():
     for phase in np.linspace(0, 2 * np.pi, 8, endpoint=False):
         leak = 0.05 * np.exp(1j * phase)
-        found = invert(world(np.random.default_rng(1), (leak, leak)), RigPrior(2e-3))
-        assert np.sqrt(np.mean(distances(found)) / 2) < 1.5
-        assert all(p.dominated_by == "leakage" for p in found.patches)
+        result = invert(world(np.random.default_rng(1), (leak, leak)), RigPrior(2e-3))
+        assert np.sqrt(np.mean(distances(result)) / 2) < 1.5
+        assert all(p.dominated_by == "leakage" for p in result.patches)
 
 
 def test_where_even_plates_tell_the_leakage_it_is_found():
     leak = (0.05j, 0.05j)
-    seen = world(np.random.default_rng(2), leak, noise=5e-4, dull=0.0)
-    found = invert(seen, RigPrior(1e-5, reference_std=5e-4, brightness_range=(0.002, 0.002)))
-    assert found.leakage_std[1] < 0.3 * found.prior_std  # of s into V, which decides
-    for p, truth in zip(found.patches, EPS, strict=True):
+    patches = world(np.random.default_rng(2), leak, noise=5e-4, dull=0.0)
+    result = invert(patches, RigPrior(1e-5, reference_std=5e-4, brightness_range=(0.002, 0.002)))
+    assert result.leakage_std[1] < 0.3 * result.prior_std  # of s into V, which decides
+    for p, truth in zip(result.patches, EPS, strict=True):
         assert abs(p.permittivity - truth) < 0.03 * abs(truth)
 
 
 def test_shares_add_up_and_a_better_measurement_shrinks_what_it_dominates():
-    seen = world(np.random.default_rng(3), (0j, 0j))
-    wide = invert(seen, RigPrior(2e-3))
-    known = invert(seen, RigPrior(2e-3, (0j, 0j), 0.001, True))
-    for a, b in zip(wide.patches, known.patches, strict=True):
+    patches = world(np.random.default_rng(3), (0j, 0j))
+    wide = invert(patches, RigPrior(2e-3))
+    measured = invert(patches, RigPrior(2e-3, (0j, 0j), 0.001, True))
+    for a, b in zip(wide.patches, measured.patches, strict=True):
         assert set(a.shares) == set(SOURCES)
         assert sum(a.shares.values()) == pytest.approx(1.0, abs=1e-6)
         assert np.trace(b.covariance) < 0.2 * np.trace(a.covariance)
@@ -137,9 +137,9 @@ def test_shares_add_up_and_a_better_measurement_shrinks_what_it_dominates():
 
 def test_metal_like_patches_get_no_permittivity():
     for t in (1.0, 0.98 + 0.02j, 1.1 - 0.05j):
-        found = invert([PatchMeasurement(complex(t), 0.01, THETA, 1.0)], RigPrior(2e-3))
-        assert found.patches[0].permittivity is None
-        assert found.patches[0].covariance is None
+        result = invert([PatchMeasurement(complex(t), 0.01, THETA, 1.0)], RigPrior(2e-3))
+        assert result.patches[0].permittivity is None
+        assert result.patches[0].covariance is None
 
 
 def test_drawn_covariance_agrees_with_the_slope_where_both_hold():
@@ -147,40 +147,43 @@ def test_drawn_covariance_agrees_with_the_slope_where_both_hold():
     noises = (0.01, 0.03)
     ratios = []
     for noise in noises:
-        seen = [
+        patches = [
             PatchMeasurement(s.inverse_ratio, noise, THETA, None)
             for s in world(np.random.default_rng(4), (0j, 0j), 1e-9, eps=eps)
         ]
-        found = invert(seen, RigPrior(1e-4, (0j, 0j), 1e-4, True, reference_std=1e-4))
-        ratios.append(np.sqrt(np.trace(found.patches[0].covariance)) / noise)
+        result = invert(patches, RigPrior(1e-4, (0j, 0j), 1e-4, True, reference_std=1e-4))
+        ratios.append(np.sqrt(np.trace(result.patches[0].covariance)) / noise)
     assert ratios[1] == pytest.approx(ratios[0], rel=0.3)
 
 
 def test_a_thin_sheet_does_not_pull_the_others():
-    seen = world(np.random.default_rng(5), (0j, 0j), dull=0.01)
-    odd = [*seen[:-1], PatchMeasurement(seen[-1].inverse_ratio, seen[-1].std, THETA, 0.3 * seen[-1].brightness)]
-    before = invert(seen, RigPrior(2e-3))
-    after = invert(odd, RigPrior(2e-3))
-    for a, b in zip(before.patches[:-1], after.patches[:-1], strict=True):
+    patches = world(np.random.default_rng(5), (0j, 0j), dull=0.01)
+    odd = [
+        *patches[:-1],
+        PatchMeasurement(patches[-1].inverse_ratio, patches[-1].std, THETA, 0.3 * patches[-1].brightness),
+    ]
+    result_before = invert(patches, RigPrior(2e-3))
+    result_after = invert(odd, RigPrior(2e-3))
+    for a, b in zip(result_before.patches[:-1], result_after.patches[:-1], strict=True):
         assert abs(a.permittivity - b.permittivity) < np.sqrt(np.trace(a.covariance))
 
 
 def test_ratio_error_is_that_of_draws():
     prior = RigPrior(2e-3)
-    found = invert([PatchMeasurement(0.2 + 0.1j, 0.003, THETA, None)], prior)
+    result = invert([PatchMeasurement(0.2 + 0.1j, 0.003, THETA, None)], prior)
     rng = np.random.default_rng(6)
     t = np.array([0.1 + 0.05j, -0.2j, 0.5])
-    z = rng.multivariate_normal(np.zeros(6), found.nuisance_covariance, 20000)
+    z = rng.multivariate_normal(np.zeros(6), result.nuisance_covariance, 20000)
     a = prior.leakage_std * (z[:, 0] + 1j * z[:, 1])
     b = prior.leakage_std * (z[:, 2] + 1j * z[:, 3])
     rho = prior.reference_std * (z[:, 4] + 1j * z[:, 5])
-    for value, stated in zip(t, ratio_error(found, prior, t), strict=True):
-        away = np.array([measured_ratio(value, *x) - value for x in zip(a, b, rho, strict=True)])
-        assert stated == pytest.approx(np.sqrt(np.mean(np.abs(away) ** 2) / 2), rel=0.06)
+    for value, stated in zip(t, ratio_error(result, prior, t), strict=True):
+        deviations = np.array([measured_ratio(value, *x) - value for x in zip(a, b, rho, strict=True)])
+        assert stated == pytest.approx(np.sqrt(np.mean(np.abs(deviations) ** 2) / 2), rel=0.06)
 
 
 def test_brightness_is_that_of_eq_2():
     r_s, r_p = fresnel(EPS, THETA)
-    seen = world(np.random.default_rng(7), (0j, 0j), 1e-9, 0.0)
-    np.testing.assert_allclose([s.brightness for s in seen], np.abs(r_s))
-    np.testing.assert_allclose([s.inverse_ratio for s in seen], r_p / r_s, atol=1e-7)
+    patches = world(np.random.default_rng(7), (0j, 0j), 1e-9, 0.0)
+    np.testing.assert_allclose([s.brightness for s in patches], np.abs(r_s))
+    np.testing.assert_allclose([s.inverse_ratio for s in patches], r_p / r_s, atol=1e-7)

@@ -68,9 +68,9 @@ def test_boxes_and_names_that_cannot_be_used_for_training_are_refused(boxes, mor
 
 
 def test_boxes_may_touch_and_reach_the_edge_of_the_image():
-    found = checked({"copper": (-50.0, -50.0, 0.0, 50.0), "oak": (0.0, -50.0, 50.0, 50.0)})
-    assert (found.metal, list(found.boxes)) == ("copper", ["copper", "oak"])
-    segmentation, names = found.patches(X_M, Y_M)
+    boxes = checked({"copper": (-50.0, -50.0, 0.0, 50.0), "oak": (0.0, -50.0, 50.0, 50.0)})
+    assert (boxes.metal, list(boxes.boxes)) == ("copper", ["copper", "oak"])
+    segmentation, names = boxes.patches(X_M, Y_M)
     assert [p.pixels for p in segmentation.patches] == [1250, 1250]
     assert names == {1: "copper", 2: "oak"}
 
@@ -84,8 +84,8 @@ def test_a_box_where_nothing_was_scanned_is_refused():
 
 def test_one_box_needs_no_metal_and_a_second_piece_has_a_name_of_its_own():
     assert checked({"oak": OAK}).metal is None
-    found = checked({"copper": COPPER, "oak": (10, -10, 20, 10), "oak#2": (30, -10, 40, 10)}, specimens={"oak": "1"})
-    assert [found.specimen(name) for name in found.boxes] == [None, "1", "2"]
+    boxes = checked({"copper": COPPER, "oak": (10, -10, 20, 10), "oak#2": (30, -10, 40, 10)}, specimens={"oak": "1"})
+    assert [boxes.specimen(name) for name in boxes.boxes] == [None, "1", "2"]
 
 
 @pytest.mark.parametrize(
@@ -110,9 +110,9 @@ def test_marks_that_show_nothing_are_no_part_of_a_name(mark):
 
 def test_label_files_are_read_back_and_pixels_become_millimetres(tmp_path):
     path = tmp_path / "labels.json"
-    given = checked({"copper": COPPER, "\u6a61\u6728": OAK}, specimens={"\u6a61\u6728": "board 7"})
-    path.write_bytes(pack_labels(given))
-    assert read_labels(path) == given
+    labels = checked({"copper": COPPER, "\u6a61\u6728": OAK}, specimens={"\u6a61\u6728": "board 7"})
+    path.write_bytes(pack_labels(labels))
+    assert read_labels(path) == labels
     assert "\u6a61\u6728" in path.read_text(encoding="utf-8")
     path.write_text(json.dumps({"labels": {"copper": [5, 20, 20, 30]}}))  # as earlier releases wrote them
     old = read_labels(path)
@@ -142,8 +142,8 @@ def test_boxes_by_hand_are_judged_before_a_scan_is_processed_with_them():
 
 
 def test_libraries_keep_the_specimen_and_old_files_have_none(tmp_path):
-    one = np.ones(3, np.float32)
-    entry = Entry("oak", "a", one, one, np.ones(3, np.complex64), 55.0, simulated=False, specimen="board 7")
+    ones = np.ones(3, np.float32)
+    entry = Entry("oak", "a", ones, ones, np.ones(3, np.complex64), 55.0, simulated=False, specimen="board 7")
     Library((entry,)).save(tmp_path / "l.npz")
     assert Library.load(tmp_path / "l.npz").entries[0].specimen == "board 7"
     with np.load(tmp_path / "l.npz") as z:

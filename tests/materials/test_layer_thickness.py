@@ -74,8 +74,8 @@ def test_infinite_permittivity_is_metal_behind_a_layer():
 
 def test_an_error_that_all_bands_share_is_no_misfit_and_moves_little():
     """Two deviations of the common error: the data still fit, within the error bars."""
-    for stack, asked in (([SHEET], [Layer("sheet")]), ([SHEET, PLATE], [Layer("sheet"), PLATE])):
-        fit = fit_layer(measured(stack, offset=2 * COMMON * np.exp(0.7j)), asked, THETA, NEAR)
+    for stack, layers in (([SHEET], [Layer("sheet")]), ([SHEET, PLATE], [Layer("sheet"), PLATE])):
+        fit = fit_layer(measured(stack, offset=2 * COMMON * np.exp(0.7j)), layers, THETA, NEAR)
         assert fit.chi2 < 8
         assert not any("does not explain" in words for words in fit.warnings())
         assert abs(fit.permittivity.real - 3.4) < 3 * fit.std_real
@@ -85,10 +85,10 @@ def test_an_error_that_all_bands_share_is_no_misfit_and_moves_little():
 def test_differences_between_bands_are_known_better_than_each():
     """With the same error of each band, the thickness is known better where most of it is common to all."""
     alone = np.eye(8) * (OWN**2 + COMMON**2)
-    shared, apart = (
+    shared, independent = (
         fit_layer(measured([SHEET], covariance=c), [Layer("sheet")], THETA, NEAR) for c in (shared_covariance(), alone)
     )
-    assert shared.std_thickness_m < 0.7 * apart.std_thickness_m
+    assert shared.std_thickness_m < 0.7 * independent.std_thickness_m
 
 
 def test_two_thicknesses_that_fit_are_both_told_in_millimetres():
@@ -98,7 +98,7 @@ def test_two_thicknesses_that_fit_are_both_told_in_millimetres():
     bands = Bands(band, q, np.full(2, 0.003), h, 0.05 * h)
     fit = fit_layer(bands, [Layer("sheet")], THETA, RANGE)
     again = SHEET.thickness_m + 299792458.0 / 76.35e9 / 2 / np.sqrt(3.4 - np.sin(THETA) ** 2)
-    sizes = [one.thickness_m for one in (fit, *fit.rivals)]
+    sizes = [solution.thickness_m for solution in (fit, *fit.rivals)]
     for true in (SHEET.thickness_m, again):
         assert min(abs(size / true - 1) for size in sizes) < 0.05
     assert fit.ambiguous

@@ -46,17 +46,9 @@ def test_water_behind_glass_as_typed(tmp_path, capsys):
 
 
 def sugar() -> list[Entry]:
-    one = np.ones(5, np.float32)
+    ones = np.ones(5, np.float32)
     return [
-        Entry(
-            name=name,
-            scan=scan,
-            h=one,
-            v=one,
-            p=np.full(5, np.tan(1.2 - percent / 400), np.complex64),
-            incidence_deg=55.0,
-            simulated=True,
-        )
+        Entry(name, scan, ones, ones, np.full(5, np.tan(1.2 - percent / 400), np.complex64), 55.0, True)
         for name, percent in (("water", 0.0), ("sugar (1.3%)", 1.3), ("sugar (3.8%)", 3.8), ("sugar (7.4%)", 7.4))
         for scan in ("a", "b")
     ]
@@ -71,9 +63,9 @@ def test_concentration_of_a_library_and_of_published_files(tmp_path, capsys, for
         path = tmp_path / "materials"
         write_materials(path, sugar())
     assert main(["concentration", str(path), "--value", "water=0", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["median_error_percent"] < 1e-3
-    assert found["source"] == "simulated"  # in the published form too
+    result = json.loads(capsys.readouterr().out)
+    assert result["median_error_percent"] < 1e-3
+    assert result["source"] == "simulated"  # in the published form too
     assert main(["concentration", str(path), "--value", "watr=0"]) != 0
     assert "watr" in capsys.readouterr().err
     assert main(["concentration", str(path), "--value", "water=0"]) == 0

@@ -71,9 +71,9 @@ def test_pickles_and_damaged_files_are_refused(tmp_path, library):
     library.save(tmp_path / "good.npz")
     cut = tmp_path / "cut.npz"
     cut.write_bytes((tmp_path / "good.npz").read_bytes()[:2000])
-    other = tmp_path / "other.npz"
+    other_path = tmp_path / "other.npz"
     meta = np.frombuffer(json.dumps({"format": "polysight-library-99"}).encode(), np.uint8)
-    np.savez(other, meta=meta, h=np.zeros(0), v=np.zeros(0), p=np.zeros(0))
+    np.savez(other_path, meta=meta, h=np.zeros(0), v=np.zeros(0), p=np.zeros(0))
     short = tmp_path / "short.npz"
     meta = np.frombuffer(
         json.dumps({"format": FORMAT, "fit": {}, "note": "", "entries": [{"pixels": 3, "name": "a"}]}).encode(),
@@ -82,7 +82,7 @@ def test_pickles_and_damaged_files_are_refused(tmp_path, library):
     np.savez(short, meta=meta, h=np.zeros(0), v=np.zeros(0), p=np.zeros(0))
     codes = {
         **dict.fromkeys((bomb, raw, cut), ErrorCode.FILE_UNREADABLE),
-        other: ErrorCode.VERSION_UNSUPPORTED,
+        other_path: ErrorCode.VERSION_UNSUPPORTED,
         short: ErrorCode.FILE_DAMAGED,
         tmp_path / "absent.npz": ErrorCode.FILE_MISSING,
     }
@@ -174,21 +174,21 @@ def test_distances_are_distances():
 
 def test_pixels_that_are_not_finite_are_unknown(library):
     some = pixel_features([0.5, np.nan, 0.5], [0.1, 0.1, 0.1], [4 + 1j, 4 + 1j, 0])
-    found, empty = Classifier(library, Weights()).scan([some, pixel_features([], [], [])])
-    assert found.names[1] == found.names[2] == UNKNOWN
-    assert found.names[0] != UNKNOWN
-    assert np.isinf(found.distance[1:]).all()
+    verdicts, empty = Classifier(library, Weights()).scan([some, pixel_features([], [], [])])
+    assert verdicts.names[1] == verdicts.names[2] == UNKNOWN
+    assert verdicts.names[0] != UNKNOWN
+    assert np.isinf(verdicts.distance[1:]).all()
     assert empty.verdict.name == UNKNOWN
 
 
 def test_a_majority_names_the_patch():
     names = np.array(["a", "b", "a", "c"])
     distance = np.array([0.1, 0.2, 0.3, 9.0])
-    found = majority(names, distance, np.array([7, 7, 7, 9]))
-    assert found.patches.tolist() == [7, 9]
-    assert found.names.tolist() == ["a", "c"]
-    assert found.confidence == pytest.approx([2 / 3, 1.0])
-    assert found.distance.tolist() == [0.2, 9.0]
+    majority_names = majority(names, distance, np.array([7, 7, 7, 9]))
+    assert majority_names.patches.tolist() == [7, 9]
+    assert majority_names.names.tolist() == ["a", "c"]
+    assert majority_names.confidence == pytest.approx([2 / 3, 1.0])
+    assert majority_names.distance.tolist() == [0.2, 9.0]
 
 
 @pytest.mark.parametrize("row", [m for m in table2() if m.number not in (1, 23)], ids=lambda m: m.name)
@@ -257,9 +257,9 @@ def test_rows_are_plain_json(synthetic, library):
     assert metal["permittivity"] is None
     assert metal["metal_like"]
     assert metal["truth"]["metal"]
-    other = next(r for r in rows if not r["metal_reference"])
-    assert other["permittivity"]["real_p30_p70"][0] <= other["permittivity"]["real_p30_p70"][1]
-    assert other["incidence_deg"] == pytest.approx(55.0)
+    dielectric_row = next(r for r in rows if not r["metal_reference"])
+    assert dielectric_row["permittivity"]["real_p30_p70"][0] <= dielectric_row["permittivity"]["real_p30_p70"][1]
+    assert dielectric_row["incidence_deg"] == pytest.approx(55.0)
 
 
 def test_truth_is_carried_but_never_used(synthetic, library):

@@ -34,11 +34,11 @@ def scene(rng, plates, metal, patterns_db=1.0):
     v = v * 10 ** (patterns_db * rng.standard_normal() / 20) + 0.004 * h * rng.standard_normal(r_s.size)
     best = int(np.argmax(np.abs(h * v)))
     rest = [i for i in range(h.size) if i != best]
-    seen = [
+    patches = [
         PatchMeasurement(complex(v[i] / h[i] / (v[best] / h[best])), 0.005, THETA, float(abs(h[i] / h[best])))
         for i in rest
     ]
-    return seen, metal and best == plates, complex(v[best] / h[best])
+    return patches, metal and best == plates, complex(v[best] / h[best])
 
 
 @pytest.fixture
@@ -50,18 +50,18 @@ def scenes(request):
 @pytest.mark.parametrize("plates", [1, 2, 3, 4, 6, 9])
 def test_no_dielectric_is_taken_for_metal(plates, scenes):
     for seed in range(scenes):
-        seen, _, channel = scene(np.random.default_rng([plates, seed]), plates, False)
-        assert not metal_evidence(dict(enumerate(seen)), RigPrior(3e-3), channel, KINDS).enough
+        patches, _, channel = scene(np.random.default_rng([plates, seed]), plates, False)
+        assert not metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough
 
 
 @pytest.mark.parametrize(("plates", "least"), [(2, 0.6), (4, 0.8), (8, 0.8)])
 def test_metal_among_dielectrics_is_mostly_recognised(plates, least, scenes):
-    found = []
+    is_recognised = []
     for seed in range(scenes):
-        seen, metal, channel = scene(np.random.default_rng([plates, seed]), plates, True)
+        patches, metal, channel = scene(np.random.default_rng([plates, seed]), plates, True)
         assert metal
-        found.append(metal_evidence(dict(enumerate(seen)), RigPrior(3e-3), channel, KINDS).enough)
-    assert np.mean(found) >= least
+        is_recognised.append(metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough)
+    assert np.mean(is_recognised) >= least
 
 
 def test_alone_nothing_is_shown():
@@ -72,7 +72,7 @@ def test_alone_nothing_is_shown():
 
 def test_a_patch_that_looks_the_same_is_no_witness():
     """Water beside water looks like metal beside metal."""
-    alike = [PatchMeasurement(1.01 - 0.02j, 0.005, THETA, 1.02)] * 5
-    evidence = metal_evidence(dict(enumerate(alike)), RigPrior(3e-3), 1.0 + 0j, KINDS)
+    equal_patches = [PatchMeasurement(1.01 - 0.02j, 0.005, THETA, 1.02)] * 5
+    evidence = metal_evidence(dict(enumerate(equal_patches)), RigPrior(3e-3), 1.0 + 0j, KINDS)
     assert evidence.others == 0
     assert not evidence.enough

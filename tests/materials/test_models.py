@@ -52,9 +52,9 @@ def test_no_model_finds_what_is_not_there(model):
 def test_with_shuffled_names_the_discriminant_is_as_good_as_chance():
     """The same of the KNN, and its gain by a split by pixel, is in test_materials."""
     data = samples(groups=8, pixels=12, offset=0.02, noise=0.002)
-    held = [score(permuted(data, seed), DISCRIMINANT) for seed in range(4)]
-    assert np.mean([s.pixels for s in held]) == pytest.approx(1 / 6, abs=0.1)
-    assert np.mean([s.patches for s in held]) == pytest.approx(1 / 6, abs=0.12)
+    scores = [score(permuted(data, seed), DISCRIMINANT) for seed in range(4)]
+    assert np.mean([s.pixels for s in scores]) == pytest.approx(1 / 6, abs=0.1)
+    assert np.mean([s.patches for s in scores]) == pytest.approx(1 / 6, abs=0.12)
 
 
 @pytest.mark.parametrize("folds", [2, 3, 8])
@@ -88,7 +88,7 @@ def test_order_does_not_matter():
 
 
 def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
-    seen = []
+    groups_seen = []
 
     class Spy(Model):
         def fit(self, samples):
@@ -97,7 +97,7 @@ def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
             return self
 
         def by_pixel(self, x):
-            seen.append(any(row.tobytes() in self.known for row in x))
+            groups_seen.append(any(row.tobytes() in self.known for row in x))
             return np.full(len(x), self.name), np.zeros(len(x))
 
     monkeypatch.setitem(MODELS, "spy", lambda _: Spy())
@@ -106,37 +106,37 @@ def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
     # Twins within a patch
     copied.x[1::2] = copied.x[::2]
     score(copied, "spy")
-    assert not any(seen)
+    assert not any(groups_seen)
     score(copied, "spy", by_pixel=True)
-    assert any(seen)
+    assert any(groups_seen)
 
 
 def test_a_second_angle_helps():
     """The KNN; the discriminant is in test_discriminant."""
     model = PAPER
-    one = samples(groups=6, pixels=12, offset=0.02, seed=1)
-    both = one.join(samples(groups=6, pixels=12, offset=0.02, seed=2, angle=0.05))
-    assert both.x.shape[1] == 2 * one.x.shape[1]
-    assert score(both, model).pixels > score(one, model).pixels
+    first_angle = samples(groups=6, pixels=12, offset=0.02, seed=1)
+    both_angles = first_angle.join(samples(groups=6, pixels=12, offset=0.02, seed=2, angle=0.05))
+    assert both_angles.x.shape[1] == 2 * first_angle.x.shape[1]
+    assert score(both_angles, model).pixels > score(first_angle, model).pixels
 
 
 def test_joining_angles_pairs_whole_patches():
-    one = samples(groups=3, pixels=5)
+    first_angle = samples(groups=3, pixels=5)
     two = samples(groups=3, pixels=4, seed=2)
-    other = Samples(two.x, two.names, np.char.add("at 55 ", two.groups), two.patches + 1000)
-    for there in (two, other):
-        both = one.join(there)
+    renamed = Samples(two.x, two.names, np.char.add("at 55 ", two.groups), two.patches + 1000)
+    for second_angle in (two, renamed):
+        both_angles = first_angle.join(second_angle)
         # The fewer pixels of each patch
-        assert both.names.size == 3 * 6 * 4
-        for patch in np.unique(both.patches):
-            at = both.patches == patch
-            source = {tuple(row) for row in one.x[one.patches == patch]}
-            assert all(tuple(row) in source for row in both.x[at, :4])
-            partner = [np.flatnonzero((there.x == row).all(axis=1))[0] for row in both.x[at, 4:]]
-            assert np.unique(there.patches[partner]).size == 1
-            assert set(there.names[partner]) == set(both.names[at])
+        assert both_angles.names.size == 3 * 6 * 4
+        for patch in np.unique(both_angles.patches):
+            of_patch = both_angles.patches == patch
+            source = {tuple(row) for row in first_angle.x[first_angle.patches == patch]}
+            assert all(tuple(row) in source for row in both_angles.x[of_patch, :4])
+            partner = [np.flatnonzero((second_angle.x == row).all(axis=1))[0] for row in both_angles.x[of_patch, 4:]]
+            assert np.unique(second_angle.patches[partner]).size == 1
+            assert set(second_angle.names[partner]) == set(both_angles.names[of_patch])
     with refused(ErrorCode.MISMATCH):
-        one.join(Samples(two.x, np.char.add("x", two.names), two.groups, two.patches))
+        first_angle.join(Samples(two.x, np.char.add("x", two.names), two.groups, two.patches))
 
 
 def test_channels_alone_know_less():
@@ -158,9 +158,9 @@ def test_the_paper_s_distance_is_what_scikit_learn_votes_with():
     from sklearn.neighbors import KNeighborsClassifier
 
     data = samples(noise=0.02)
-    asked = samples(noise=0.02, seed=9)
-    ours, _ = PaperKnn(weights=Weights(3.0, 0.7, 0.0, neighbours=7)).fit(data).by_pixel(asked.x)
-    scaled = [d.x[:, :2] * [3.0, 0.7] for d in (data, asked)]
+    queries = samples(noise=0.02, seed=9)
+    ours, _ = PaperKnn(weights=Weights(3.0, 0.7, 0.0, neighbours=7)).fit(data).by_pixel(queries.x)
+    scaled = [d.x[:, :2] * [3.0, 0.7] for d in (data, queries)]
     theirs = KNeighborsClassifier(7, metric="manhattan").fit(scaled[0], data.names).predict(scaled[1])
     # Ties may fall either way
     assert (ours == theirs).mean() > 0.99
@@ -173,8 +173,8 @@ def test_weights_are_fitted_and_turn_from_a_channel_that_tells_nothing():
     without_h = fit_weights(Samples(noisy, data.names, data.groups, data.patches))
     without_v = data.x.copy()
     without_v[:, 1] += np.random.default_rng(3).standard_normal(len(noisy))
-    other = fit_weights(Samples(without_v, data.names, data.groups, data.patches))
-    assert without_h.weights.h / without_h.weights.v < other.weights.h / other.weights.v
+    other_weights = fit_weights(Samples(without_v, data.names, data.groups, data.patches))
+    assert without_h.weights.h / without_h.weights.v < other_weights.weights.h / other_weights.weights.v
     assert without_h.by_channel["h"] < 0.35 < without_h.by_channel["v"]
 
 

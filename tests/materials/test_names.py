@@ -20,9 +20,9 @@ AT_ANGLES = tuple(Kinds(KINDS, angle, sheets=True) for angle in ANGLES)
 def name_of(*ratios: complex, std: float = 0.004, share: float = 0.5):
     kinds = AT_ANGLES[: len(ratios)]
     covariance = std**2 * np.eye(2)
-    seen = [RatioEvidence(at.theta_rad, t, covariance, share) for at, t in zip(kinds, ratios, strict=True)]
+    evidence = [RatioEvidence(kind.theta_rad, t, covariance, share) for kind, t in zip(kinds, ratios, strict=True)]
     pixels = np.tile(np.array(ratios, np.complex128), (20, 1))
-    return name_patch(kinds, seen, pixels)
+    return name_patch(kinds, evidence, pixels)
 
 
 @settings(max_examples=40, deadline=None)
@@ -55,9 +55,9 @@ def test_what_only_the_literature_explains_is_said_as_like_it():
 def test_a_second_angle_makes_a_true_name_surer():
     t = inverse_ratio(LIBRARY["acrylic"], np.array(ANGLES))
     alone = name_of(t[0], std=0.03).verdict.probabilities["acrylic"]
-    both = name_of(*t, std=0.03).verdict
-    assert both.name == "acrylic"
-    assert both.confidence > alone
+    verdict = name_of(*t, std=0.03).verdict
+    assert verdict.name == "acrylic"
+    assert verdict.confidence > alone
 
 
 def test_what_is_no_half_space_but_a_thin_plate_is_a_possible_layer():

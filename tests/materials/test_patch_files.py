@@ -17,8 +17,8 @@ from polysight_shared.error_codes import ErrorCode
 def named_again(found, scene, classifier, path):
     """Names of a result's patches, by number, from its file alone."""
     path.write_bytes(pack_patches(found, scene.x_m, scene.y_m, simulated=True))
-    seen = read_patches(path)
-    matched = [m for m in match_patches([seen]) if m.label in seen.evidence]
+    patches = read_patches(path)
+    matched = [m for m in match_patches([patches]) if m.label in patches.evidence]
     again = classifier.scan([m.features for m in matched], [m.evidence for m in matched])
     return {m.label: n.verdict for m, n in zip(matched, again, strict=True)}
 
@@ -26,9 +26,9 @@ def named_again(found, scene, classifier, path):
 def test_a_scan_is_named_again_as_it_was_named(synthetic, library, tmp_path):
     scene = synthetic(3)
     classifier = Classifier(library)
-    found = scene.analyse(classifier=classifier)
-    again = named_again(found, scene, classifier, tmp_path / "patches.npz")
-    for r in found.patches:
+    analysis = scene.analyse(classifier=classifier)
+    again = named_again(analysis, scene, classifier, tmp_path / "patches.npz")
+    for r in analysis.patches:
         if r.named is not None:
             assert again[r.patch.label].name == r.named.verdict.name
             assert again[r.patch.label].probabilities == pytest.approx(r.named.verdict.probabilities, abs=1e-3)
@@ -43,8 +43,8 @@ def test_brightness_that_all_plates_share_does_not_change_their_names(gain, synt
     metal = plain.segmentation.labels == plain.metal.label
     factor = np.where(metal, 1.0, gain)
     pair = Images(scene.h * factor, scene.v * factor, scene.x_m, scene.y_m, np.ones(scene.h.shape, bool))
-    found = scene.analyse(classifier=classifier, pair=pair)
-    again = named_again(found, scene, classifier, tmp_path / "patches.npz")
+    analysis = scene.analyse(classifier=classifier, pair=pair)
+    again = named_again(analysis, scene, classifier, tmp_path / "patches.npz")
     names = {r.patch.label: r.named.verdict.name for r in plain.patches if r.named is not None}
     wrong = {n: (names[n], v.name) for n, v in again.items() if n in names and v.name not in (names[n], UNKNOWN)}
     assert not wrong
@@ -53,20 +53,20 @@ def test_brightness_that_all_plates_share_does_not_change_their_names(gain, synt
 
 def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, tmp_path):
     scene = synthetic(3)
-    found = scene.analyse(classifier=Classifier(library))
+    analysis = scene.analyse(classifier=Classifier(library))
     path = tmp_path / "patches.npz"
-    path.write_bytes(pack_patches(found, scene.x_m, scene.y_m, simulated=True))
+    path.write_bytes(pack_patches(analysis, scene.x_m, scene.y_m, simulated=True))
     with np.load(path) as z:
-        kept = {k: z[k] for k in z if not k.startswith("evidence_")}
-    meta = json.loads(kept["meta"].tobytes())
+        old_arrays = {k: z[k] for k in z if not k.startswith("evidence_")}
+    meta = json.loads(old_arrays["meta"].tobytes())
     del meta["judged"]
     out = io.BytesIO()
-    np.savez(out, **{**kept, "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)})
+    np.savez(out, **{**old_arrays, "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)})
     path.write_bytes(out.getvalue())
-    seen = read_patches(path)
-    assert not seen.evidence
-    assert len(seen.patches) == len(found.patches)
-    matched = match_patches([seen])
+    patches = read_patches(path)
+    assert not patches.evidence
+    assert len(patches.patches) == len(analysis.patches)
+    matched = match_patches([patches])
     names = [n.verdict.name for n in Classifier(library).scan([m.features for m in matched])]
     true = [m.truth for m in matched]
     assert not [n for n, t in zip(names, true, strict=True) if n in library.names and n != t]
@@ -77,9 +77,9 @@ def test_a_budget_of_other_patches_is_refused(synthetic, tmp_path):
     path = tmp_path / "patches.npz"
     path.write_bytes(pack_patches(scene.analyse(), scene.x_m, scene.y_m, simulated=True))
     with np.load(path) as z:
-        kept = {k: z[k] for k in z}
+        arrays = {k: z[k] for k in z}
     out = io.BytesIO()
-    np.savez(out, **{**kept, "evidence_ratio": kept["evidence_ratio"][:-1]})
+    np.savez(out, **{**arrays, "evidence_ratio": arrays["evidence_ratio"][:-1]})
     path.write_bytes(out.getvalue())
     with refused(ErrorCode.FILE_UNREADABLE, path):
         read_patches(path)

@@ -24,7 +24,10 @@ def plates(ratio=0.25, seed=0):
         h[y0 : y0 + 23, x0 : x0 + 23] = 1.0
         v[y0 : y0 + 23, x0 : x0 + 23] = 1.0 if number == 0 else ratio
     noise = 0.003 * (rng.standard_normal((2, SIDE, SIDE)) + 1j * rng.standard_normal((2, SIDE, SIDE)))
-    return [ndimage.gaussian_filter(channel.real, 1.0) + one for channel, one in zip((h, v), noise, strict=True)]
+    return [
+        ndimage.gaussian_filter(channel.real, 1.0) + noise_part
+        for channel, noise_part in zip((h, v), noise, strict=True)
+    ]
 
 
 def images(h, v):
@@ -61,29 +64,29 @@ def scattered(slope_of):
 
 
 def test_slopes_that_all_plates_have_alike_are_theirs():
-    found = common_change(scattered(lambda _x, _y: (0.7 + 0.5j, 0.4j)), ORIGIN_M)
-    assert np.abs(found.value).max() < 0.01
+    change = common_change(scattered(lambda _x, _y: (0.7 + 0.5j, 0.4j)), ORIGIN_M)
+    assert np.abs(change.value).max() < 0.01
 
 
 def test_a_drift_over_the_rows_is_followed_within_its_error():
     """ln(V / H) = 0.06 cos(20 y): both parts, slopes along y."""
-    found = common_change(scattered(lambda _x, y: (0j, -(1 + 1j) * 0.06 * 20 * np.sin(20 * y))), ORIGIN_M)
+    change = common_change(scattered(lambda _x, y: (0j, -(1 + 1j) * 0.06 * 20 * np.sin(20 * y))), ORIGIN_M)
     true = (1 + 1j) * 0.06 * (np.cos(20 * np.array(PLACES_M)[:, 1]) - 1)
-    off = found.value - true
-    assert (np.abs(off.real) <= 2 * found.std.real + 1e-6).all()
-    assert np.abs(off).max() < 0.6 * np.abs(true).max()
-    assert max(found.largest()) > 0.03
+    deviation = change.value - true
+    assert (np.abs(deviation.real) <= 2 * change.std.real + 1e-6).all()
+    assert np.abs(deviation).max() < 0.6 * np.abs(true).max()
+    assert max(change.largest()) > 0.03
 
 
 def test_slopes_along_a_row_are_no_drift():
-    found = common_change(scattered(lambda x, _y: (20 * x, 0j)), ORIGIN_M)
-    assert np.abs(found.value).max() < 0.005
+    change = common_change(scattered(lambda x, _y: (20 * x, 0j)), ORIGIN_M)
+    assert np.abs(change.value).max() < 0.005
 
 
 def test_plates_at_the_border_say_nothing_of_a_drift():
     steep = scattered(lambda _x, y: (0j, 8.0 if y > 0.05 else 0j))
-    found = common_change(steep, ORIGIN_M, [place[1] > 0.05 for place in PLACES_M])
-    assert np.abs(found.value[:6]).max() < 0.01
+    change = common_change(steep, ORIGIN_M, [place[1] > 0.05 for place in PLACES_M])
+    assert np.abs(change.value[:6]).max() < 0.01
 
 
 def test_an_overdriven_receiver_shows_as_a_halo_of_v_alone():
@@ -93,7 +96,7 @@ def test_an_overdriven_receiver_shows_as_a_halo_of_v_alone():
     metal = next(p for p in patches if np.median(np.abs(v[p.interior])) > 0.8)
     assert find_halo(metal.interior, patches, pair).level == 0
     glow = 0.3 * ndimage.gaussian_filter(metal.mask.astype(float), 8.0)
-    found = find_halo(metal.interior, patches, images(h, v + glow))
-    assert found.level > 0.005
-    assert max(found.around, key=lambda label: found.around[label]) == metal.label
+    halo = find_halo(metal.interior, patches, images(h, v + glow))
+    assert halo.level > 0.005
+    assert max(halo.around, key=lambda label: halo.around[label]) == metal.label
     assert find_halo(metal.interior, patches, images(h + glow, v + glow)).level == 0

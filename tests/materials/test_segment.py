@@ -14,18 +14,18 @@ from polysight_shared.error_codes import ErrorCode
 @pytest.mark.parametrize("seed", range(6))
 def test_nine_plates_and_no_more(synthetic, seed):
     scene = synthetic(seed, noise=0.03, uneven=0.05)
-    found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-    matched = match_truth(found.patches, scene.plates)
-    assert len(found.patches) == 9
+    segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+    matched = match_truth(segmentation.patches, scene.plates)
+    assert len(segmentation.patches) == 9
     assert len(matched) == 9
-    for patch in found.patches:
+    for patch in segmentation.patches:
         truth = matched[patch.label].box_mm
         np.testing.assert_allclose(patch.box_mm, truth, atol=5.0)
         inside = box_mask(truth, scene.x_m, scene.y_m)
         assert not (patch.interior & ~inside).any()
         assert patch.interior.sum() > 80
         assert patch.pixels == patch.mask.sum()
-        assert (found.labels[patch.mask] == patch.label).all()
+        assert (segmentation.labels[patch.mask] == patch.label).all()
 
 
 WEAK_AND_STRONG = {
@@ -43,11 +43,11 @@ def found_right(synthetic, seeds, **scene_facts):
     right = extra = plates = 0
     for seed in seeds:
         scene = synthetic(seed, **scene_facts)
-        found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-        matched = match_truth(found.patches, scene.plates)
+        segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+        matched = match_truth(segmentation.patches, scene.plates)
         plates += len(scene.plates)
-        extra += len(found.patches) - len(matched)
-        for patch in found.patches:
+        extra += len(segmentation.patches) - len(matched)
+        for patch in segmentation.patches:
             truth = matched.get(patch.label)
             right += truth is not None and bool(np.allclose(patch.box_mm, truth.box_mm, rtol=0, atol=6.0))
     return right, plates, extra
@@ -76,8 +76,8 @@ def test_their_number_is_not_told(synthetic, nine, count):
 
 def test_dim_plate_beside_bright_one_is_found(synthetic):
     scene = synthetic(5, {"copper": None, "wood": 2.61 - 0.01j, "second": None}, pitch_mm=54.0, jitter_mm=0.0)
-    found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-    assert len(found.patches) == 3
+    segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+    assert len(segmentation.patches) == 3
 
 
 def test_noise_alone_has_no_patches(synthetic):
@@ -96,9 +96,9 @@ def test_invalid_part_is_left_out(synthetic):
     scene = synthetic(2)
     valid = np.ones(scene.h.shape, bool)
     valid[:, :75] = False
-    found = segment(scene.h, scene.v, scene.x_m, scene.y_m, valid)
-    assert found.patches
-    assert not found.labels[:, :75].any()
+    segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m, valid)
+    assert segmentation.patches
+    assert not segmentation.labels[:, :75].any()
     with refused(ErrorCode.NO_DATA):
         segment(scene.h, scene.v, scene.x_m, scene.y_m, np.zeros_like(valid))
     with refused(ErrorCode.MISMATCH):
@@ -115,9 +115,9 @@ def test_outline_encloses_the_patch(synthetic):
 def test_metal_is_found_by_itself_whatever_the_gains(synthetic):
     for seed in range(4):
         scene = synthetic(seed, gain_v=0.05j)
-        found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-        metal = find_metal(scene.h, scene.v, found)
-        assert match_truth(found.patches, scene.plates)[metal.label].name == "copper"
+        segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+        metal = find_metal(scene.h, scene.v, segmentation)
+        assert match_truth(segmentation.patches, scene.plates)[metal.label].name == "copper"
         assert scene.analyse().metal.certain
         assert "brightest in both channels" in metal.how
 
@@ -139,15 +139,15 @@ def test_scene_without_metal_is_called_uncertain(synthetic, nine, names):
 
 def test_metal_by_box_and_label(synthetic):
     scene = synthetic(0)
-    found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+    segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
     copper = next(p for p in scene.plates if p.metal)
-    by_box = metal_in_box(copper.box_mm, found, scene.x_m, scene.y_m)
+    by_box = metal_in_box(copper.box_mm, segmentation, scene.x_m, scene.y_m)
     assert by_box.label is not None
-    assert (by_box.mask == metal_by_label(by_box.label, found).mask).all()
+    assert (by_box.mask == metal_by_label(by_box.label, segmentation).mask).all()
     with refused(ErrorCode.NO_DATA):
-        metal_in_box((1e3, 1e3, 2e3, 2e3), found, scene.x_m, scene.y_m)
+        metal_in_box((1e3, 1e3, 2e3, 2e3), segmentation, scene.x_m, scene.y_m)
     with refused(ErrorCode.NO_DATA, 99):
-        metal_by_label(99, found)
+        metal_by_label(99, segmentation)
 
 
 def test_label_files_round_trip_and_make_patches(tmp_path, synthetic):
@@ -155,11 +155,11 @@ def test_label_files_round_trip_and_make_patches(tmp_path, synthetic):
     boxes = {"acrylic": (10.0, 20.0, 30.0, 35.0), "copper": (60.0, 60.0, 80.0, 82.0)}
     (tmp_path / "l.json").write_bytes(pack_labels(Labels(boxes)))
     assert read_labels(tmp_path / "l.json").boxes == boxes
-    found, names = patches_from_labels(boxes, scene.x_m, scene.y_m)
+    segmentation, names = patches_from_labels(boxes, scene.x_m, scene.y_m)
     assert names == {1: "acrylic", 2: "copper"}
-    assert found.patches[0].pixels == 20 * 15
-    assert found.labels[20, 10] == 1
-    assert found.labels[35, 10] == 0
+    assert segmentation.patches[0].pixels == 20 * 15
+    assert segmentation.labels[20, 10] == 1
+    assert segmentation.labels[35, 10] == 0
     with refused(ErrorCode.NO_DATA, "far"):
         patches_from_labels({"far": (500.0, 0.0, 600.0, 10.0)}, scene.x_m, scene.y_m)
 

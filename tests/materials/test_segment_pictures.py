@@ -101,19 +101,19 @@ def test_sheets_that_only_h_shows_are_found(seed):
 def test_a_plate_at_the_border_is_cut_and_refused(x0, cut):
     plates = {(60, 60, 84, 84): (0.0, COPPER), (x0, 20, min(x0 + 24, SIDE), 44): (-2.0, 0.25)}
     h, v = draw(1, plates)
-    found = segment(h, v, AXIS, AXIS)
-    assert_found(found, plates)
-    patch = min(found.patches, key=lambda p: p.centre_mm[1])
+    segmentation = segment(h, v, AXIS, AXIS)
+    assert_found(segmentation, plates)
+    patch = min(segmentation.patches, key=lambda p: p.centre_mm[1])
     assert patch.cut is cut
-    why = check_patch(patch, h, v, background(h, v, found, np.ones(h.shape, bool)), 0.0)
-    assert (why is not None and "border" in why.what) is cut
+    refusal_cause = check_patch(patch, h, v, background(h, v, segmentation, np.ones(h.shape, bool)), 0.0)
+    assert (refusal_cause is not None and "border" in refusal_cause.what) is cut
 
 
 def refusal(h, v, box, amplitude_of_metal=0.0):
-    found, _ = patches_from_labels({"plate": box}, AXIS, AXIS)
-    patch = found.patches[0]
+    segmentation, _ = patches_from_labels({"plate": box}, AXIS, AXIS)
+    patch = segmentation.patches[0]
     uneven = max(amplitude_of_metal, halves_apart(h, v, patch.interior) if amplitude_of_metal else 0.0)
-    return check_patch(patch, h, v, background(h, v, found, np.ones(h.shape, bool)), uneven)
+    return check_patch(patch, h, v, background(h, v, segmentation, np.ones(h.shape, bool)), uneven)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -138,9 +138,9 @@ def test_clutter_of_a_plates_size_is_counted_but_no_patch():
     h, v = draw(3, plates)
     field = ndimage.gaussian_filter(rng.standard_normal((SIDE, SIDE)), 6)
     clutter = 10 ** ((-24 + 4 * field / field.std()) / 20)
-    found = segment(h + clutter, v + 0.3 * clutter, AXIS, AXIS)
-    assert_found(found, plates)
-    assert found.left_out > 0
+    segmentation = segment(h + clutter, v + 0.3 * clutter, AXIS, AXIS)
+    assert_found(segmentation, plates)
+    assert segmentation.left_out > 0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -163,12 +163,12 @@ def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_els
     with np.load(folder / "20250612_142257_multi.npz") as z:
         h = z["h"]
         v = z["v"]
-    found = segment(h, v, AXIS, AXIS)
-    assert len(found.patches) == len(boxes) == 9
+    segmentation = segment(h, v, AXIS, AXIS)
+    assert len(segmentation.patches) == len(boxes) == 9
     for name, (x0, y0, x1, y1) in boxes.items():
         drawn = np.zeros(h.shape, bool)
         drawn[y0:y1, x0:x1] = True
-        best = max(found.patches, key=lambda p: int((p.mask & drawn).sum()))
+        best = max(segmentation.patches, key=lambda p: int((p.mask & drawn).sum()))
         assert (best.mask & drawn).sum() >= 0.85 * drawn.sum(), name
         assert not best.cut
 
@@ -176,12 +176,12 @@ def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_els
 def test_a_background_that_is_alike_over_a_plates_size_does_not_average_away():
     """A table behind the plates adds one number to a plate; noise adds its mean over the plate's pixels."""
     plates = {(20, 20, 44, 44): (0.0, COPPER), (90, 90, 114, 114): (-6.0, 0.3)}
-    found = segment(*draw(1, plates, background_db=-60.0), AXIS, AXIS)
+    segmentation = segment(*draw(1, plates, background_db=-60.0), AXIS, AXIS)
     usable = np.ones((SIDE, SIDE), bool)
     noise = np.random.default_rng(2).standard_normal((2, SIDE, 2 * SIDE)).view(np.complex128) / np.sqrt(2)
     table = np.full((2, SIDE, SIDE), 0.08 + 0.06j)
-    width_px = np.sqrt(np.median([p.interior.sum() for p in found.patches]))
-    assert background_mean(*table, found, usable) == pytest.approx((0.1, 0.1), rel=1e-6)
-    assert background_mean(*noise, found, usable) == pytest.approx((1 / width_px, 1 / width_px), rel=0.35)
+    width_px = np.sqrt(np.median([p.interior.sum() for p in segmentation.patches]))
+    assert background_mean(*table, segmentation, usable) == pytest.approx((0.1, 0.1), rel=1e-6)
+    assert background_mean(*noise, segmentation, usable) == pytest.approx((1 / width_px, 1 / width_px), rel=0.35)
     everywhere = segment(np.ones((SIDE, SIDE), complex), np.ones((SIDE, SIDE), complex), AXIS, AXIS)
     assert background_mean(*table, everywhere, usable & False) == (0.0, 0.0)

@@ -26,10 +26,10 @@ def drawn(spread, scans, seed=0, pixels=8, gain=0.01, kinds=KINDS, labelled=True
     rng = np.random.default_rng(seed)
     eps = np.array(list(kinds.values()))
     shape = (scans, eps.size)
-    own = eps.real * np.exp(spread[0] * rng.standard_normal(shape)) + 1j * eps.imag * np.exp(
+    specimen_eps = eps.real * np.exp(spread[0] * rng.standard_normal(shape)) + 1j * eps.imag * np.exp(
         spread[1] * rng.standard_normal(shape)
     )
-    s, p = fresnel(own, ANGLE)
+    s, p = fresnel(specimen_eps, ANGLE)
 
     def channel(r):
         error = gain * (rng.standard_normal((*shape, 1)) + 1j * rng.standard_normal((*shape, 1)))
@@ -39,10 +39,10 @@ def drawn(spread, scans, seed=0, pixels=8, gain=0.01, kinds=KINDS, labelled=True
     h = channel(s)
     v = channel(p)
     i, k, _ = np.indices(h.shape)
-    which = np.char.add("s", i.ravel().astype(str)) if labelled else None
+    specimens = np.char.add("s", i.ravel().astype(str)) if labelled else None
     names = np.array(list(kinds))[k.ravel()]
     x = feature_matrix(h, v, h / v).reshape(-1, 4)
-    return Samples(x, names, i.ravel().astype(str), (i * eps.size + k).ravel(), which, (60.0,))
+    return Samples(x, names, i.ravel().astype(str), (i * eps.size + k).ravel(), specimens, (60.0,))
 
 
 def test_the_effect_of_a_specimen_is_what_eq_2_says():
@@ -51,22 +51,22 @@ def test_the_effect_of_a_specimen_is_what_eq_2_says():
     for eps in KINDS.values():
         log_h, t = features(eps, angles)
         for step in ((1e-3, 0.0), (0.0, 1e-2)):
-            there = features(complex(eps.real * np.exp(step[0]), eps.imag * np.exp(step[1])), angles)
-            moved = relative(there[0] - log_h, there[1] - t, t).ravel()
+            shifted = features(complex(eps.real * np.exp(step[0]), eps.imag * np.exp(step[1])), angles)
+            moved = relative(shifted[0] - log_h, shifted[1] - t, t).ravel()
             np.testing.assert_allclose(effect(t, angles) @ step, moved, rtol=0.02, atol=1e-6)
     assert not effect(np.array([1.0 + 0j]), [ANGLE]).any(), "metal has no specimens"
 
 
 def test_the_spread_is_found():
-    found = [np.sqrt(MODELS[DISCRIMINANT]("H+V+P").fit(drawn((0.03, 0.2), 40, seed)).spread) for seed in range(4)]
-    assert np.mean([f[:, 0].mean() for f in found]) == pytest.approx(0.03, rel=0.15)
-    assert np.mean([f[:, 1].mean() for f in found]) == pytest.approx(0.2, rel=0.2)
+    spreads = [np.sqrt(MODELS[DISCRIMINANT]("H+V+P").fit(drawn((0.03, 0.2), 40, seed)).spread) for seed in range(4)]
+    assert np.mean([f[:, 0].mean() for f in spreads]) == pytest.approx(0.03, rel=0.15)
+    assert np.mean([f[:, 1].mean() for f in spreads]) == pytest.approx(0.2, rel=0.2)
 
 
 def test_without_specimens_apart_the_published_spread_stands():
-    one = drawn((0.0, 0.0), 6, labelled=False)
+    samples = drawn((0.0, 0.0), 6, labelled=False)
     np.testing.assert_allclose(
-        MODELS[DISCRIMINANT]("H+V+P").fit(one).spread, [np.square(PUBLISHED_SPREAD)] * len(KINDS)
+        MODELS[DISCRIMINANT]("H+V+P").fit(samples).spread, [np.square(PUBLISHED_SPREAD)] * len(KINDS)
     )
 
 
@@ -78,8 +78,10 @@ def test_the_order_of_patches_does_not_matter_to_the_spread():
     effects = rng.standard_normal((3, 3, 2))
     noise = 1e-4 * np.eye(3)
     turn = rng.permutation(30)
-    here, there = (fit_spread(residual[at], kinds[at], plates[at], effects, noise) for at in (np.arange(30), turn))
-    for a, b in zip(here, there, strict=True):
+    forward_spread, shuffled_spread = (
+        fit_spread(residual[order], kinds[order], plates[order], effects, noise) for order in (np.arange(30), turn)
+    )
+    for a, b in zip(forward_spread, shuffled_spread, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
@@ -90,10 +92,10 @@ def test_probabilities_mean_what_they_say_of_specimens_never_seen():
     right = []
     for seed in range(40):
         test = drawn((0.03, 0.15), 1, 100 + seed, kinds=close)
-        found = model.by_scan(test.x, test.patches)
-        sure += found.confidence.tolist()
-        right += (found.names == list(close)).tolist()
-        np.testing.assert_allclose(found.probabilities.sum(axis=1), 1)
+        verdicts = model.by_scan(test.x, test.patches)
+        sure += verdicts.confidence.tolist()
+        right += (verdicts.names == list(close)).tolist()
+        np.testing.assert_allclose(verdicts.probabilities.sum(axis=1), 1)
     assert 0.4 < np.mean(right) < 0.95
     assert np.mean(sure) == pytest.approx(np.mean(right), abs=0.08)
 
@@ -102,20 +104,20 @@ def entries(samples):
     """A library of the same patches."""
     out = []
     for p in np.unique(samples.patches):
-        at = samples.patches == p
-        h = samples.x[at, 0]
-        v = samples.x[at, 1]
-        q = samples.x[at, 2] + 1j * samples.x[at, 3]
+        of_patch = samples.patches == p
+        h = samples.x[of_patch, 0]
+        v = samples.x[of_patch, 1]
+        q = samples.x[of_patch, 2] + 1j * samples.x[of_patch, 3]
         out.append(
             Entry(
-                name=str(samples.names[at][0]),
-                scan=f"scan {samples.groups[at][0]}",
-                h=h.astype(np.float32),
-                v=v.astype(np.float32),
-                p=(1 / q).astype(np.complex64),
-                incidence_deg=60.0,
-                simulated=True,
-                specimen=str(samples.specimens[at][0]),
+                str(samples.names[of_patch][0]),
+                f"scan {samples.groups[of_patch][0]}",
+                h.astype(np.float32),
+                v.astype(np.float32),
+                (1 / q).astype(np.complex64),
+                60.0,
+                True,
+                specimen=str(samples.specimens[of_patch][0]),
             )
         )
     return Library(tuple(out))
@@ -144,8 +146,8 @@ def test_liquids_of_a_small_library_are_seldom_called_unknown(own, monkeypatch):
     test = draw(liquids, 55.0, errors, 500, 12).samples()
     rejected = []
     for scan in np.unique(test.groups):
-        mine = test.take(test.groups == scan)
-        rejected += (model.by_scan(mine.x, mine.patches).distance > 1).tolist()
+        scan_samples = test.take(test.groups == scan)
+        rejected += (model.by_scan(scan_samples.x, scan_samples.patches).distance > 1).tolist()
     assert np.mean(rejected) < 0.1
 
 
@@ -159,8 +161,8 @@ def test_only_what_gives_probabilities_says_that_nothing_else_comes_near(model):
         add_explanation(n, eps, None, classifier.permittivities).verdict.why
         for n, eps in zip(named, KINDS.values(), strict=True)
     ]
-    assert all(n.verdict.name in why for n, why in zip(named, whys, strict=True))
-    assert any("no other material" in why for why in whys) == (model == "discriminant")
+    assert all(n.verdict.name in cause for n, cause in zip(named, whys, strict=True))
+    assert any("no other material" in cause for cause in whys) == (model == "discriminant")
 
 
 def test_a_patch_that_no_material_looks_like_is_told_with_the_nearest():
@@ -168,8 +170,8 @@ def test_a_patch_that_no_material_looks_like_is_told_with_the_nearest():
     classifier = Classifier(entries(drawn((0.01, 0.05), 12, 5)), model="discriminant", angles_deg=[60.0])
     x = drawn((0.0, 0.0), 1, 3, kinds={"glass": 7.5 - 0.05j, "water": 9.4 - 18j})
     named = classifier.scan([x.x[x.patches == p] for p in np.unique(x.patches)])
-    known = classifier.permittivities
+    permittivities = classifier.permittivities
     for n, eps in zip(named, (7.5 - 0.05j, 9.4 - 18j), strict=True):
         assert n.verdict.source != "library"
-        assert n.verdict.nearest in known
+        assert n.verdict.nearest in permittivities
         assert f"nearest: {n.verdict.nearest}" in add_explanation(n, eps, None, classifier.permittivities).verdict.why

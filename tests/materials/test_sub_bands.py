@@ -40,28 +40,30 @@ def found(scene):
 def half_of(mask):
     """The left half of a region."""
     columns = np.flatnonzero(mask.any(axis=0))
-    left = np.zeros_like(mask)
-    left[:, : int(np.median(columns))] = True
-    return mask & left
+    left_half = np.zeros_like(mask)
+    left_half[:, : int(np.median(columns))] = True
+    return mask & left_half
 
 
 def test_metal_that_a_sub_band_does_not_show_is_no_part_of_its_reference(scene, found):
     everywhere = np.ones(scene.h.shape, bool)
     without = everywhere & ~half_of(found.metal.mask)
-    whole, cut = (band_rows(found, [BAND], [channels(scene, at)], (0, 0), 1.5) for at in (everywhere, without))
+    full_rows, cut = (
+        band_rows(found, [BAND], [channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)
+    )
     for patch in found.patches:
-        (before,), (after,) = whole[patch.patch.label], cut[patch.patch.label]
-        assert after.amplitude_h == pytest.approx(before.amplitude_h, rel=0.02)
-        assert after.ratio.value == pytest.approx(before.ratio.value, rel=0.03)
+        (row_before,), (row_after,) = full_rows[patch.patch.label], cut[patch.patch.label]
+        assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
+        assert row_after.ratio.value == pytest.approx(row_before.ratio.value, rel=0.03)
 
 
 def test_a_patch_that_is_shown_in_part_is_not_darkened_by_the_rest(scene, found):
-    other = next(r for r in found.patches if r.patch.label != found.metal.label)
+    dielectric = next(r for r in found.patches if r.patch.label != found.metal.label)
     everywhere = np.ones(scene.h.shape, bool)
-    without = everywhere & ~half_of(other.patch.interior)
-    rows = [band_rows(found, [BAND], [channels(scene, at)], (0, 0), 1.5) for at in (everywhere, without)]
-    (before,), (after,) = (r[other.patch.label] for r in rows)
-    assert after.amplitude_h == pytest.approx(before.amplitude_h, rel=0.02)
+    without = everywhere & ~half_of(dielectric.patch.interior)
+    rows = [band_rows(found, [BAND], [channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)]
+    (row_before,), (row_after,) = (r[dielectric.patch.label] for r in rows)
+    assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
 
 
 def test_a_sub_band_without_metal_is_null_and_the_others_stay(scene, found):
@@ -69,9 +71,9 @@ def test_a_sub_band_without_metal_is_null_and_the_others_stay(scene, found):
     images = [channels(scene, everywhere), channels(scene, everywhere & ~found.metal.mask)]
     rows = band_rows(found, [BAND, BAND], images, (0, 0), 1.5)
     for patch in found.patches:
-        there, gone = rows[patch.patch.label]
-        assert there.ratio is not None
-        assert (gone.ratio, gone.inverse_ratio_std, gone.amplitude_h) == (None, None, None)
+        row_with_metal, row_without = rows[patch.patch.label]
+        assert row_with_metal.ratio is not None
+        assert (row_without.ratio, row_without.inverse_ratio_std, row_without.amplitude_h) == (None, None, None)
 
 
 def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, found):
@@ -79,30 +81,30 @@ def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, found)
     valid = ~half_of(found.metal.mask)
     cut = replace(scene, h=np.where(valid, scene.h, 0), v=np.where(valid, scene.v, 0))
     label = found.metal.label
-    whole, part = (
-        s.analyse(metal=label, segmentation=found.segmentation, pair=s.pair.within(at))
-        for s, at in ((scene, np.ones_like(valid)), (cut, valid))
+    full_result, part = (
+        s.analyse(metal=label, segmentation=found.segmentation, pair=s.pair.within(is_valid))
+        for s, is_valid in ((scene, np.ones_like(valid)), (cut, valid))
     )
-    for before, after in zip(whole.rows(), part.rows(), strict=True):
-        assert after.amplitude_h == pytest.approx(before.amplitude_h, rel=0.02)
+    for row_before, row_after in zip(full_result.rows(), part.rows(), strict=True):
+        assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
 
 
 def row_of(ratio, parts):
     """A segment of materials.json whose every part of the sweep says the same: a thick plate's."""
-    one = {
+    part_row = {
         "first_hz": 0.0,
         "last_hz": 1.0,
         "ratio": {"real": ratio.real, "imag": ratio.imag},
         "inverse_ratio_std": INVERSE_STD,
         "amplitude_h": abs(fresnel(THICK, THETA)[0]),
     }
-    return msgspec.convert(to_plain({"label": 1, **one, "bands": [one] * parts}), PatchFigures)
+    return msgspec.convert(to_plain({"label": 1, **part_row, "bands": [part_row] * parts}), PatchFigures)
 
 
 def bands_of(ratio, parts) -> Bands:
-    found = bands_of_row(row_of(ratio, parts), CHIRP, parts)
-    assert found is not None
-    return found
+    bands = bands_of_row(row_of(ratio, parts), CHIRP, parts)
+    assert bands is not None
+    return bands
 
 
 def test_errors_that_sub_bands_share_do_not_shrink_with_their_number():

@@ -21,33 +21,33 @@ def _scene():
     for eps, columns in ((LEFT, slice(0, 30)), (RIGHT, slice(30, 60))):
         h[20:, columns], v[20:, columns] = fresnel(eps, THETA)
     boxes = {"metal": (0, 0, 60, 18), "left": (2, 20, 30, 40), "right": (30, 20, 58, 40), "nowhere": (58, 20, 60, 40)}
-    found, names = patches_from_labels(boxes, X_M, Y_M, unit="pixel")
-    return h, v, found, {name: label for label, name in names.items()}
+    segmentation, names = patches_from_labels(boxes, X_M, Y_M, unit="pixel")
+    return h, v, segmentation, {name: label for label, name in names.items()}
 
 
 def test_each_box_is_filtered_by_itself():
-    h, _, found, labels = _scene()
-    smoothed = smooth_inside(h, found, 2.0)
+    h, _, segmentation, labels = _scene()
+    smoothed = smooth_inside(h, segmentation, 2.0)
     for name, eps in (("left", LEFT), ("right", RIGHT)):
-        at = next(p for p in found.patches if p.label == labels[name]).interior
-        np.testing.assert_allclose(smoothed[at], fresnel(eps, THETA)[0], atol=1e-6)
-    outside = ~np.logical_or.reduce([p.interior for p in found.patches])
+        interior = next(p for p in segmentation.patches if p.label == labels[name]).interior
+        np.testing.assert_allclose(smoothed[interior], fresnel(eps, THETA)[0], atol=1e-6)
+    outside = ~np.logical_or.reduce([p.interior for p in segmentation.patches])
     assert np.isnan(smoothed[outside]).all()
 
 
 def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
-    h, v, found, labels = _scene()
+    h, v, segmentation, labels = _scene()
     valid = np.ones(h.shape, bool)
     valid[:, :12] = valid[:, 58:] = False
     h[~valid] = v[~valid] = 0  # as images have it
     pair = Images(h, v, X_M, Y_M, valid)
     optics = Optics(THETA, smooth_px=1.0)
-    result = analyse(pair, optics, KnownScene(found, labels["metal"]))
+    result = analyse(pair, optics, KnownScene(segmentation, labels["metal"]))
     rows = {r.label: r for r in result.rows()}
-    left = rows[labels["left"]]
+    left_row = rows[labels["left"]]
     nowhere = rows[labels["nowhere"]]
-    assert abs(left.amplitude_h - abs(complex(fresnel(LEFT, THETA)[0]))) < 5e-4
-    assert abs(left.permittivity.value - LEFT) < 0.5 * left.permittivity.real_std
+    assert abs(left_row.amplitude_h - abs(complex(fresnel(LEFT, THETA)[0]))) < 5e-4
+    assert abs(left_row.permittivity.value - LEFT) < 0.5 * left_row.permittivity.real_std
     assert nowhere.interior_pixels == 0
     assert not nowhere.metal_like
     assert nowhere.permittivity is None
@@ -55,7 +55,7 @@ def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
 
 def test_plates_of_one_name_are_patches_each():
     plates = [TruthPlate("acrylic", box, 4 - 0.4j) for box in ((-50, -30, -20, 0), (10, -30, 40, 0))]
-    found, names = patches_from_plates(plates, X_M, Y_M, 0.0)
+    segmentation, names = patches_from_plates(plates, X_M, Y_M, 0.0)
     assert list(names.values()) == ["acrylic", "acrylic"]
-    assert [p.label for p in found.patches] == list(names)
-    assert not (found.patches[0].mask & found.patches[1].mask).any()
+    assert [p.label for p in segmentation.patches] == list(names)
+    assert not (segmentation.patches[0].mask & segmentation.patches[1].mask).any()

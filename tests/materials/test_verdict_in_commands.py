@@ -92,16 +92,16 @@ def test_report_says_the_verdict_and_where_the_page_is(tmp_path, capsys, level):
 
 @pytest.mark.parametrize("as_json", [False, True])
 def test_classify_names_nothing_without_a_result_and_no_refused_patch(tmp_path, capsys, as_json):
-    more = ["--json"] if as_json else []
+    options = ["--json"] if as_json else []
     none = with_pixels(judged_products(tmp_path / "none", "none"))
     good = with_pixels(judged_products(tmp_path / "good", "good"))
-    assert main(["classify", str(none), *more]) == NoResult.exit_status
+    assert main(["classify", str(none), *options]) == NoResult.exit_status
     out = capsys.readouterr().out
     if as_json:
         assert {(p["name"], p["confidence"]) for p in json.loads(out)["patches"]} == {(None, None)}
     else:
         assert "pixels:" not in out
-    assert main(["classify", str(good), *more]) == 0
+    assert main(["classify", str(good), *options]) == 0
     out = capsys.readouterr().out
     if as_json:
         # Patch 1 is the metal reference

@@ -46,8 +46,8 @@ def test_regions_hold_the_truth_and_sure_names_are_right(nuisance, least):
 @pytest.mark.parametrize("degrees", [(5.0, 0.0), (0.0, 5.0)], ids=["along", "across"])
 def test_a_plate_tilted_beyond_what_is_modelled_gets_no_permittivity(degrees):
     scene = world(half_space(3.5 - 0.3j), half_space(4 - 0.4j), tilt_x_deg=degrees[0], tilt_y_deg=degrees[1])
-    found, plates = analyse_world(simulate(scene))
-    for patch in found.patches:
+    analysis, plates = analyse_world(simulate(scene))
+    for patch in analysis.patches:
         if plates[patch.patch.label].name == "plate 1":
             assert patch.refused is not None
             assert "tilted" in patch.refused.what
@@ -67,13 +67,13 @@ def test_a_plate_tilted_beyond_what_is_modelled_gets_no_permittivity(degrees):
     ids=["a thin sheet", "liquid behind glass", "a lossy plate"],
 )
 def test_declared_copper_is_never_withdrawn(beside):
-    found, _ = analyse_world(simulate(world(half_space(4 - 0.4j), beside)))
-    assert not found.metal.evidence.against
-    assert found.metal.certain or found.metal.evidence.culprit is not None
+    analysis, _ = analyse_world(simulate(world(half_space(4 - 0.4j), beside)))
+    assert not analysis.metal.evidence.against
+    assert analysis.metal.certain or analysis.metal.evidence.culprit is not None
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("eps", [2.6 - 0.01j, 4 - 0.4j, 5 - 1.1j])
 def test_a_dielectric_declared_as_metal_is_found_out(eps):
-    found, _ = analyse_world(simulate(world(half_space(3.0 - 0.1j), half_space(eps))), declared="plate 1")
-    assert found.metal.evidence.against
+    analysis, _ = analyse_world(simulate(world(half_space(3.0 - 0.1j), half_space(eps))), declared="plate 1")
+    assert analysis.metal.evidence.against

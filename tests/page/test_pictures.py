@@ -88,12 +88,12 @@ def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
         freq_residual_hz=zeros,
         phase_residual_rad=zeros,
     )
-    where = np.linspace(-0.2, 1.0, 601)
-    level = range_profile_db(row, chirp, where)
-    assert abs(where[level.argmax()]) < 0.01
+    distances_m = np.linspace(-0.2, 1.0, 601)
+    level = range_profile_db(row, chirp, distances_m)
+    assert abs(distances_m[level.argmax()]) < 0.01
     assert level.max() == pytest.approx(0.0, abs=0.05)
-    beyond = np.where(np.abs(where) < 0.2, -200.0, level)
-    assert where[beyond.argmax()] == pytest.approx(path_m, abs=0.01)
+    beyond = np.where(np.abs(distances_m) < 0.2, -200.0, level)
+    assert distances_m[beyond.argmax()] == pytest.approx(path_m, abs=0.01)
     assert beyond.max() == pytest.approx(20 * np.log10(0.3), abs=0.5)
     none = replace(row, valid=np.zeros(5, bool))
-    assert np.ptp(range_profile_db(none, chirp, where)) == 0
+    assert np.ptp(range_profile_db(none, chirp, distances_m)) == 0

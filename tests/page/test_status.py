@@ -52,13 +52,13 @@ def test_all_is_well_needs_nothing_done(history):
 
 
 def test_a_dead_program_outranks_everything_but_the_end(history):
-    gone = replace(signs_asked("abort"), alive=False, killed=True, alive_s=1.7e9, pi_silent_s=99.0)
-    s = status(history, gone, replace(RUNNING, state="fault"))
+    killed_signs = replace(signs_asked("abort"), alive=False, killed=True, alive_s=1.7e9, pi_silent_s=99.0)
+    s = status(history, killed_signs, replace(RUNNING, state="fault"))
     assert (s.level, s.headline) == ("bad", "The scan program was killed")
     assert f"polysight resume {FOLDER}" in s.do
     assert "1 of 3 rows are safe" in s.detail
     add_fact(history, {"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request"})
-    assert status(history, gone).headline == "Stopped on request"
+    assert status(history, killed_signs).headline == "Stopped on request"
 
 
 @pytest.mark.parametrize(

@@ -81,10 +81,10 @@ def test_no_classifier_passes_the_bound_and_the_better_one_comes_near():
     errors = Errors(0.03, 0.06)
     scores = [score(draw(group.materials, 60.0, errors, seed).samples(), DISCRIMINANT) for seed in range(12)]
     alone = pixel_bound(group.materials, (60.0,), errors, True, 1)
-    known = pixel_bound(group.materials, (60.0,), errors, False, 1)
+    pixel_limit = pixel_bound(group.materials, (60.0,), errors, False, 1)
     patch = pixel_bound(group.materials, (60.0,), errors, False, 12)
-    assert alone < known < patch
-    for share, bound in (("pixels", alone), ("in_scan", known), ("by_patch", patch)):
+    assert alone < pixel_limit < patch
+    for share, bound in (("pixels", alone), ("in_scan", pixel_limit), ("by_patch", patch)):
         mean = np.mean([getattr(s, share) for s in scores])
         # Chance of twelve draws
         assert bound - 0.08 < mean < bound + 0.03, share
@@ -112,5 +112,5 @@ def test_confusions_stand_in_the_order_of_table_2():
     assert labels == [str(m.number) for m in group.materials]
     matrix = figure.axes[0].images[0].get_array()
     salt = [m.name for m in group.materials].index("Salt (with plastic)")
-    at = scores.names.index("Salt (with plastic)")
-    assert matrix[salt, salt] == pytest.approx(100 * scores.confusion[at, at])
+    index = scores.names.index("Salt (with plastic)")
+    assert matrix[salt, salt] == pytest.approx(100 * scores.confusion[index, index])

@@ -246,30 +246,30 @@ def ones(data: bytes) -> list[int]:
 @given(bursts)
 def test_one_set_bit_a_pulse_at_its_place(burst):
     pulses, period_ns, width_ns = burst
-    made = spi_burst(BurstSpec(pulses, period_ns, width_ns), ROOMY)
-    assert made.bit_ns == pytest.approx(width_ns, rel=1e-5), "the width that was asked for"
-    found = ones(made.data)
-    assert tuple(found) == made.bits
-    assert len(found) == pulses
-    for k, bit in enumerate(found):
-        assert abs((bit - found[0]) * made.bit_ns - k * period_ns) <= made.bit_ns / 2 + 1
-    for a, b in itertools.pairwise(found):
-        assert abs((b - a) * made.bit_ns - period_ns) <= made.bit_ns + 1
-    assert made.data[0] == made.data[-1] == 0, "low before and after"
-    assert len(made.data) >= MIN_BYTES
+    made_burst = spi_burst(BurstSpec(pulses, period_ns, width_ns), ROOMY)
+    assert made_burst.bit_ns == pytest.approx(width_ns, rel=1e-5), "the width that was asked for"
+    set_bits = ones(made_burst.data)
+    assert tuple(set_bits) == made_burst.bits
+    assert len(set_bits) == pulses
+    for k, bit in enumerate(set_bits):
+        assert abs((bit - set_bits[0]) * made_burst.bit_ns - k * period_ns) <= made_burst.bit_ns / 2 + 1
+    for a, b in itertools.pairwise(set_bits):
+        assert abs((b - a) * made_burst.bit_ns - period_ns) <= made_burst.bit_ns + 1
+    assert made_burst.data[0] == made_burst.data[-1] == 0, "low before and after"
+    assert len(made_burst.data) >= MIN_BYTES
 
 
 @given(bursts, st.integers(MIN_BYTES, 65_536))
 def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
-    needed = len(spi_burst(BurstSpec(*burst), ROOMY).data)
-    if needed > bufsiz:
+    needed_bytes = len(spi_burst(BurstSpec(*burst), ROOMY).data)
+    if needed_bytes > bufsiz:
         with refused(ErrorCode.VALUES_CONFLICT, bufsiz) as e:
             spi_burst(BurstSpec(*burst), bufsiz)
-        wanted = int(e.value.remedy.partition("bufsiz=")[2].partition("`")[0])
-        assert needed <= wanted
-        spi_burst(BurstSpec(*burst), wanted)
+        advised_bytes = int(e.value.remedy.partition("bufsiz=")[2].partition("`")[0])
+        assert needed_bytes <= advised_bytes
+        spi_burst(BurstSpec(*burst), advised_bytes)
     else:
-        assert len(spi_burst(BurstSpec(*burst), bufsiz).data) == needed
+        assert len(spi_burst(BurstSpec(*burst), bufsiz).data) == needed_bytes
 
 
 @pytest.mark.parametrize("width_ns", [MIN_WIDTH_NS, 499, 2001, MAX_WIDTH_NS])
@@ -280,10 +280,10 @@ def test_a_width_that_the_controller_cannot_make_is_refused(width_ns):
 
 def test_the_published_burst_fits_every_pi_as_it_comes():
     b = published_rig().burst
-    made = spi_burst(BurstSpec.from_burst(b))
+    burst = spi_burst(BurstSpec.from_burst(b))
     assert SpiWireLines.bufsiz == DEFAULT_BUFSIZ == 4096
-    assert (made.clock_hz, len(made.data)) == (1_000_000, 2815)
-    assert [y - x for x, y in itertools.pairwise(made.bits)] == [1500] * 15
+    assert (burst.clock_hz, len(burst.data)) == (1_000_000, 2815)
+    assert [y - x for x, y in itertools.pairwise(burst.bits)] == [1500] * 15
 
 
 class Controller:
@@ -311,10 +311,10 @@ class Controller:
     def close(self) -> None: ...
 
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
-        before = self.t
+        start_t = self.t
         self.t = self.t + self.late_ns + round(burst.duration_ns / self.rate)
-        self.sent.append((before + self.late_ns, burst))
-        return before, self.t
+        self.sent.append((start_t + self.late_ns, burst))
+        return start_t, self.t
 
 
 @pytest.mark.parametrize("late_ns", [0, 30_000, 200_000])
@@ -343,9 +343,9 @@ def test_no_position_is_lost_to_a_width_fault():
 
 def test_a_burst_can_be_stopped_only_before_it_begins():
     lines = Controller()
-    asked = []
-    record = send_burst(lines, SPEC, 0, None, lambda: bool(asked.append(1)))
-    assert (record.pulses, len(asked)) == (16, 1)
+    questions = []
+    record = send_burst(lines, SPEC, 0, None, lambda: bool(questions.append(1)))
+    assert (record.pulses, len(questions)) == (16, 1)
     assert send_burst(lines, SPEC, 50_000_000, None, lambda: True).pulses == 0
     assert len(lines.sent) == 1
 

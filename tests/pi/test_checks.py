@@ -55,12 +55,12 @@ def on_chip(write_config, stage, tmp_path):
 
 
 def test_a_whole_rig_is_all_ok(on_chip, rig_with):
-    found = on_chip(rig_with(one_shot=True), "slow:4")  # behind a one-shot, any width is good enough
+    findings = on_chip(rig_with(one_shot=True), "slow:4")  # behind a one-shot, any width is good enough
     rights = ["real time"]  # as this machine has it
     lines = ["GPIO chip", "trigger line 26", "SYNC_IN line 22", "pulses", "pulse width"]
     rest = ["stage", "journal", "keys", "command address", "event address"]
-    assert list(found) == ["plan", *rights, *lines, *rest]
-    assert {f["verdict"] for name, f in found.items() if name not in rights} == {"ok"}
+    assert list(findings) == ["plan", *rights, *lines, *rest]
+    assert {f["verdict"] for name, f in findings.items() if name not in rights} == {"ok"}
 
 
 @pytest.mark.parametrize(
@@ -76,18 +76,18 @@ def test_a_whole_rig_is_all_ok(on_chip, rig_with):
     ],
 )
 def test_faults_of_the_chip(on_chip, rig_with, settings, fault, name, words):
-    found = on_chip(rig_with(**settings), fault, port="/dev/none")
-    assert found[name]["verdict"] == "fail"
-    assert words in found[name]["found"]
-    assert found["stage"]["verdict"] == "fail"
-    assert "/dev/none" in found["stage"]["found"]
+    findings = on_chip(rig_with(**settings), fault, port="/dev/none")
+    assert findings[name]["verdict"] == "fail"
+    assert words in findings[name]["found"]
+    assert findings["stage"]["verdict"] == "fail"
+    assert "/dev/none" in findings["stage"]["found"]
 
 
 def test_line_release(rig_with, tmp_path):
     def of(model, **settings):
         (tmp_path / "model").write_bytes(model.encode() + b"\0")
-        found = check_lines(rig_with(**settings), tmp_path / "model", tmp_path)
-        return [f.level for f in found if f.where == "line release"]
+        findings = check_lines(rig_with(**settings), tmp_path / "model", tmp_path)
+        return [f.level for f in findings if f.where == "line release"]
 
     pi_4 = "Raspberry Pi 4 Model B Rev 1.4"
     assert of("QEMU Virtual Machine") == []
@@ -112,8 +112,8 @@ def test_one_pulse_too_long_refuses_a_line_without_a_one_shot():
 
 
 def test_spi_that_is_off_has_its_remedy(rig_with, tmp_path):
-    off = rig_with(wiring="spi", sync_out=(10,), spi_device=str(tmp_path / "spidev0.0"))
-    finding = attempt("pulse width", measure_clock, off)
+    rig_without_spi = rig_with(wiring="spi", sync_out=(10,), spi_device=str(tmp_path / "spidev0.0"))
+    finding = attempt("pulse width", measure_clock, rig_without_spi)
     assert (finding.level, "dtparam=spi=on" in finding.do) == ("error", True)
 
 
@@ -122,29 +122,29 @@ def test_journal_and_disk(tmp_path, monkeypatch):
     assert attempt("journal", checks._journal, tmp_path / "file" / "journal", 0).level == "error"
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(100, 99, 1 << 20))
-    found = attempt("journal", checks._journal, tmp_path, checks.JOURNAL_BYTES)
-    assert (found.level, "1 MiB" in found.what, "100 MiB" in found.what) == ("error", True, True)
+    finding = attempt("journal", checks._journal, tmp_path, checks.JOURNAL_BYTES)
+    assert (finding.level, "1 MiB" in finding.what, "100 MiB" in finding.what) == ("error", True, True)
 
 
 def test_keys(tmp_path):
     folder = tmp_path / "keys"
     addresses = ("tcp://127.0.0.1:1", "tcp://0.0.0.0:2")
     assert attempt("keys", checks._keys, folder, addresses[:1]).level == "ok"
-    found = attempt("keys", checks._keys, folder, addresses)
-    assert (found.level, found.do) == ("error", "polysight-pi keys")
+    finding = attempt("keys", checks._keys, folder, addresses)
+    assert (finding.level, finding.do) == ("error", "polysight-pi keys")
     make_keys(folder)
     assert attempt("keys", checks._keys, folder, addresses).level == "ok"
     (folder / "pi.key_secret").chmod(0o644)
-    found = attempt("keys", checks._keys, folder, addresses)
-    assert (found.level, "chmod 600" in found.do) == ("warning", True)
+    finding = attempt("keys", checks._keys, folder, addresses)
+    assert (finding.level, "chmod 600" in finding.do) == ("warning", True)
 
 
 def test_addresses_and_bursts(tmp_path, gpio_rig):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
         assert attempt("command address", checks._address, replier, address, tmp_path).level == "error"
-    found = attempt("event address", checks._address, publisher, "tcp://0.0.0.0:*", tmp_path)
-    assert (found.level, "polysight-pi keys" in found.do) == ("error", True)
+    finding = attempt("event address", checks._address, publisher, "tcp://0.0.0.0:*", tmp_path)
+    assert (finding.level, "polysight-pi keys" in finding.do) == ("error", True)
     assert attempt("event address", checks._address, publisher, "tcp//x", tmp_path).level == "error"
     slow = replace(gpio_rig, burst=replace(gpio_rig.burst, pulses=100))
     assert attempt("plan", checks._plan, slow).level == "error", "the burst does not end before the next point"

@@ -95,10 +95,10 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires):
     host.home()
     # A machine that was too busy for a row reports so, and the row is retaken
     for take in range(1, 6):
-        before = len(wires.rises(SYNC))
+        rises_before = len(wires.rises(SYNC))
         done = host.row(0, take)
         captures = [e for e in host.of(m.Capture) if e.take == take]
-        wires.until(lambda: len(wires.rises(SYNC)) - before == done.pulses)  # noqa: B023
+        wires.until(lambda: len(wires.rises(SYNC)) - rises_before == done.pulses)  # noqa: B023
         assert sum(c.pulses for c in captures) == done.pulses
         if done.status == "done":
             break
@@ -107,7 +107,7 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires):
     assert (done.points, done.edges, done.bursts, done.pulses) == (POINTS, POINTS, POINTS, 4 * POINTS)
     memory = Path(f"/proc/{program.popen.pid}/status").read_text().partition("VmHWM:")[2].split()[0]
     assert int(memory) < 60_000, f"more than 60 MB: {memory} KB"
-    rises = wires.rises(SYNC)[before:]
+    rises = wires.rises(SYNC)[rises_before:]
     for c, k in zip(captures, range(0, len(rises), 4), strict=True):
         burst = rises[k : k + 4]
         # The program's stamps are from before its call, the chip's from within it.
@@ -297,8 +297,8 @@ def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_
         printed = run("check", "--json", "--config", write_config(rig), **environment).stdout
         return {f["name"]: f for f in json.loads(printed)}
 
-    whole = next(f for _ in range(20) if (f := findings(spi_rig))["pulse width"]["verdict"] == "ok")
-    assert whole["SYNC_IN line 10"]["verdict"] == "ok"
+    last_findings = next(f for _ in range(20) if (f := findings(spi_rig))["pulse width"]["verdict"] == "ok")
+    assert last_findings["SYNC_IN line 10"]["verdict"] == "ok"
     for actual in ("400e6", "150e6"):
         wrong = findings(spi_rig, core_hz=f"250e6,{actual}")["pulse width"]
         assert (wrong["verdict"], "core_freq" in wrong["remedy"]) == ("fail", True)
@@ -373,10 +373,10 @@ def test_all_threads_are_scheduled_and_the_trigger_thread_first(start, gpio_rig)
     program, _ = start(gpio_rig, **gpio.environment(gpio_rig.pi.gpio_chip))
     # `ready` comes before the threads.
     wait_for(lambda: PRIORITY in priorities(program.popen.pid), "the trigger thread")
-    found = priorities(program.popen.pid)
-    assert found.count(PRIORITY) == 1
+    thread_priorities = priorities(program.popen.pid)
+    assert thread_priorities.count(PRIORITY) == 1
     # Main, stage, executor
-    assert found.count(OTHERS_PRIORITY) >= 3
+    assert thread_priorities.count(OTHERS_PRIORITY) >= 3
     assert "real-time" not in program.end()[2]
 
 

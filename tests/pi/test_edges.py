@@ -80,7 +80,7 @@ class Recorder:
         if early_hold_s is not None:
             begin_ns = self._tick * NS_PER_TICK + round(early_hold_s * 1e9)
             commands = [(begin_ns, "Hold"), (begin_ns + 600_000_000, "Resume")]
-        asked = next_status = 0
+        status_asked_ns = next_status = 0
         while True:
             self._advance(0.001)
             now_ns = self._tick * NS_PER_TICK
@@ -100,11 +100,11 @@ class Recorder:
                 raw = bytes(self._stage.replies)
                 self._stage.replies.clear()
                 for line in raw.splitlines(keepends=True):
-                    self._reply(Reply.decode(line), asked, now_ns)
+                    self._reply(Reply.decode(line), status_asked_ns, now_ns)
                 if b"done" in raw:
                     return self.happenings
             if now_ns >= next_status:
-                asked = now_ns
+                status_asked_ns = now_ns
                 next_status = now_ns + round(STATUS_S * 1e9)
                 self._stage.receive(Immediate.STATUS.sent)
 
@@ -142,12 +142,12 @@ def give(bench: Bench, what: Any, t_ns: int) -> None:
 def replay(recorder: Recorder, edges_ns: list[int]) -> m.RowFinished:
     """The row's end with these edges instead of its own."""
     bench = make_bench(recorder)
-    others = [h for h in recorder.happenings if h.what != "edge"]
+    other_happenings = [h for h in recorder.happenings if h.what != "edge"]
     edges = [Happening(t_ns, "edge") for t_ns in edges_ns]
-    for t_ns, what in sorted([*others, *edges], key=lambda h: h.t_ns):
+    for t_ns, happening in sorted([*other_happenings, *edges], key=lambda h: h.t_ns):
         if bench.machine.state not in ("running", "held"):
             break
-        give(bench, what, t_ns)
+        give(bench, happening, t_ns)
     if bench.machine.state in ("running", "held", "stopping"):
         bench.stage_says(Reply("alarm", number=StageError.STOPPED))
     bench.later(2.0)

@@ -140,11 +140,13 @@ def test_a_folder_in_the_journals_place_is_refused(pi, instrument):
 
 
 def test_a_message_of_64_mb_is_not_taken_into_memory(pi, stranger):
-    before = resident_bytes()
+    bytes_before = resident_bytes()
     big = msgpack.packb({"type": "Hello", "version": "1.0", "host_release": "x" * (64 << 20)})
-    mine = resident_bytes() - before
+    bytes_taken = resident_bytes() - bytes_before
     assert stranger.ask(big, limit_s=1.0) is None
-    assert resident_bytes() - before < mine + BOUND_BYTES + (64 << 20), "the sender's own copy and no second one"
+    assert resident_bytes() - bytes_before < bytes_taken + BOUND_BYTES + (64 << 20), (
+        "the sender's own copy and no second one"
+    )
     assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
 
 
@@ -160,14 +162,14 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
         m.Hello(), m.Status(), ALIVE, m.Home(), RUN, PULSE, REPLAY, m.Hold(), m.Resume(), m.Abort(), END,
         host.begin("other"), host.begin(),
     ]  # fmt: skip
-    sent = taken = before = 0
+    sent = taken = bytes_before = 0
     stage.pace_s = 0.05
     host.start_row(owner="mine")
     while sent < amount or not taken:
         assert stranger.ask(draw(rng, valid)) is not None
         sent += 1
         if sent == 1_000:
-            before = resident_bytes()
+            bytes_before = resident_bytes()
         if host.subscriber.poll(0):
             event = m.unpack_event(host.subscriber.recv_multipart()[-1])
             if isinstance(event, m.RowFinished):
@@ -176,7 +178,7 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
                 again = m.RunRow(scan_id="scan", row_index=0, take=taken + 1, owner="mine")
                 wait_for(lambda row=again: not isinstance(host.ask(row), m.Refused), "the next row")
             host.accepted(m.Alive(scan_id="scan", owner="mine"))
-    assert resident_bytes() - before < BOUND_BYTES
+    assert resident_bytes() - bytes_before < BOUND_BYTES
     assert pi.service.executor.crash is None
     host.accepted(m.Abort(owner="mine"))
     host.until_state("ready")
@@ -184,9 +186,9 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
     n = instrument.burst.pulses
     period_ns = round(instrument.burst.period_us * 1e3)
     rises = wires.rises(instrument.pi.sync_out[0])
-    whole = [burst for i in range(0, len(rises), n) if len(burst := rises[i : i + n]) == n]
-    assert len(whole) >= taken * instrument.grid.columns
-    assert all(t - b[0] == k * period_ns for b in whole for k, t in enumerate(b))
+    full_bursts = [burst for i in range(0, len(rises), n) if len(burst := rises[i : i + n]) == n]
+    assert len(full_bursts) >= taken * instrument.grid.columns
+    assert all(t - b[0] == k * period_ns for b in full_bursts for k, t in enumerate(b))
 
 
 # Lines
@@ -202,9 +204,9 @@ def test_an_impossible_position_is_ignored(pi, stage, sign):
     for alarm in (-HUGE, -1, 1000, HUGE):
         fields = {"state": "idle", "x": stage.x, "y": stage.y, "points": HUGE, "alarm": alarm}
         stage.say(Reply("status", fields={k: str(v) for k, v in fields.items()}))
-    seen = pi.host.wait(m.StageStatus, lambda e: e.points == HUGE)
-    assert (seen.x_mm, seen.y_mm) == (0.0, 0.0)
-    assert 0 <= seen.alarm < 1000
+    status = pi.host.wait(m.StageStatus, lambda e: e.points == HUGE)
+    assert (status.x_mm, status.y_mm) == (0.0, 0.0)
+    assert 0 <= status.alarm < 1000
     assert pi.host.ask(m.Status()).x_mm == 0.0
 
 
@@ -239,13 +241,13 @@ def test_a_flood_of_lines_keeps_commands_answered(pi, stage):
             stage.say_raw(raw)
         ended.set()
 
-    before = resident_bytes()
+    bytes_before = resident_bytes()
     thread = threading.Thread(target=flood)
     thread.start()
     while not ended.wait(0.05):
         assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
     thread.join()
-    assert resident_bytes() - before < BOUND_BYTES
+    assert resident_bytes() - bytes_before < BOUND_BYTES
     assert pi.service.executor.crash is None
     assert isinstance(pi.host.ask(m.Abort()), m.Accepted)
 
@@ -300,7 +302,7 @@ ATTACKS = {
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     """And the next one is served, by the same process with the same run."""
-    which, kind, more = ATTACKS[attack]
+    endpoint, kind, more_bytes = ATTACKS[attack]
     program, host = start(instrument, "--wires", hub)
     host.accepted(host.begin())
     host.home()
@@ -326,16 +328,16 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     sent = 0
     # ZeroMQ itself ends some of these connections: the client comes back until the program had to act.
     while highest[0] < MAX_BYTES and not has_cut() and sent < ENOUGH_BYTES:
-        with connected((program.ready[1], program.events[1])[which], kind) as peer, suppress(ConnectionError):
+        with connected((program.ready[1], program.events[1])[endpoint], kind) as peer, suppress(ConnectionError):
             # A connection that was cut may stall before it is closed
             peer.settimeout(0.1)
-            left = b""
+            remaining = b""
             while sent < ENOUGH_BYTES and not is_cut(peer):
                 with suppress(TimeoutError):
-                    left = left or more()
-                    taken = peer.send(left)
+                    remaining = remaining or more_bytes()
+                    taken = peer.send(remaining)
                     sent = sent + taken
-                    left = left[taken:]
+                    remaining = remaining[taken:]
     wait_for(has_cut, "the cut", HANG_S)
     cut_ns = time.monotonic_ns()
     ended.set()

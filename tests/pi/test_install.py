@@ -100,22 +100,24 @@ def test_the_unit_gives_what_the_program_asks_for(unit):
 def test_the_unit_exposes_little(analyze):
     """systemd's own measure: 0 is a program that can do nothing, 10 one without any limit."""
     done = analyze("security", "--offline=yes", "--no-pager")
-    found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", done.stdout)
-    if found is None:
+    exposure = re.search(r"Overall exposure level for \S+: ([0-9.]+)", done.stdout)
+    if exposure is None:
         pytest.skip(f"this systemd-analyze measures no file: {done.stderr.strip()}")
-    assert float(found[1]) <= 3.0, done.stdout
+    assert float(exposure[1]) <= 3.0, done.stdout
 
 
 def test_pinned_versions_are_what_the_wheels_ask_for():
     pins = dict(x.split("==") for x in (PI / "requirements.txt").read_text().split() if "==" in x)
     projects = [(REPO / name / "pyproject.toml").read_text() for name in ("shared", "pi_controller")]
-    asked = [pin for text in projects for pin in re.findall(r'"(\w+)>=([\d.]+)', text.partition("dependencies = [")[2])]
-    assert set(pins) == {name for name, _ in asked}
+    required_pins = [
+        pin for text in projects for pin in re.findall(r'"(\w+)>=([\d.]+)', text.partition("dependencies = [")[2])
+    ]
+    assert set(pins) == {name for name, _ in required_pins}
 
     def key(version):
         return [int(x) for x in version.split(".")]
 
-    assert all(key(pins[name]) >= key(least) for name, least in asked)
+    assert all(key(pins[name]) >= key(least) for name, least in required_pins)
 
 
 def test_udev_rules_are_well_formed():
@@ -166,21 +168,24 @@ def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_h
             log.unlink()
         done = subprocess.run(make, cwd=REPO, env=bench, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
-        asked = log.read_text()
-        assert asked.count("-m venv") == (rig_file is None), "made once, and kept with its libraries"
+        log_text = log.read_text()
+        assert log_text.count("-m venv") == (rig_file is None), "made once, and kept with its libraries"
         order = [
-            asked.index(w) for w in ("pip wheel", "pip install --quiet --retries", "--force-reinstall", "try-restart")
+            log_text.index(w)
+            for w in ("pip wheel", "pip install --quiet --retries", "--force-reinstall", "try-restart")
         ]
         assert order == sorted(order)
-        assert "--no-index" in asked, "what was built on the host needs no internet here"
+        assert "--no-index" in log_text, "what was built on the host needs no internet here"
     assert (tmp_path / "home/polysight/notes").read_text() == "mine"
     assert (root / "etc/polysight/instrument.toml").read_text() == "mine"
     assert (root / "etc/polysight/keys").stat().st_mode & 0o777 == 0o700
     for name in ("etc/systemd/system/polysight-pi.service", "etc/udev/rules.d/60-polysight.rules"):
         assert (root / name).read_text() == (PI / Path(name).name).read_text()
-    assert "--groups gpio,spi,dialout" in asked, "by hand, `polysight-pi check` as this user has no group from the unit"
+    assert "--groups gpio,spi,dialout" in log_text, (
+        "by hand, `polysight-pi check` as this user has no group from the unit"
+    )
     for words in ("useradd --system", "systemctl enable"):
-        assert words in asked
+        assert words in log_text
     assert PROGRAM in done.stdout
     opt = root / "opt/polysight"
     assert (opt / "venv").readlink() == Path("releases/2")
@@ -204,14 +209,14 @@ def test_a_release_that_cannot_be_installed_changes_nothing(install, tmp_path):
     assert install().returncode == 0
     opt = tmp_path / "root/opt/polysight"
     log = tmp_path / "log"
-    before = sorted(p.name for p in (opt / "releases").iterdir())
+    releases_before = sorted(p.name for p in (opt / "releases").iterdir())
     (opt / "venv/bin/python").write_text(STUB + "exit 1\n")
     log.unlink()
     failed = install()
     assert (failed.returncode, "internet" in failed.stderr) == (5, True)
     assert "systemctl" not in log.read_text(), "the running service goes on"
     assert (opt / "venv").readlink() == Path("releases/1")
-    assert sorted(p.name for p in (opt / "releases").iterdir()) == before
+    assert sorted(p.name for p in (opt / "releases").iterdir()) == releases_before
 
 
 def test_an_unfinished_release_is_never_used(install, tmp_path):
@@ -219,11 +224,11 @@ def test_an_unfinished_release_is_never_used(install, tmp_path):
     opt = tmp_path / "root/opt/polysight"
     assert install().returncode == 0
     python = opt / "venv/bin/python"
-    whole = python.read_text()
+    python_text = python.read_text()
     python.write_text(STUB + "kill -9 $PPID\n")
     assert install().returncode == -9
     assert (opt / "venv").readlink() == Path("releases/1")
-    python.write_text(whole)
+    python.write_text(python_text)
     assert install().returncode == 0
     assert install("--roll-back").returncode == 0
     assert (opt / "venv").readlink() == Path("releases/1")

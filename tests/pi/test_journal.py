@@ -41,9 +41,9 @@ def written(path, records):
 
 def reopened(path):
     j = JournalFile(path)
-    found = j.read(1, 10**6)
+    events = j.read(1, 10**6)
     j.close()
-    return found
+    return events
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -63,9 +63,9 @@ def test_cut_at_every_byte_leaves_the_whole_records_before_it(tmp_path_factory, 
         ends.append(ends[-1] + 12 + len(r))
     for cut in range(len(raw) + 1):
         path.write_bytes(raw[:cut])
-        whole = max(0, sum(e <= cut for e in ends) - 1)
-        assert reopened(path) == records[:whole]
-        assert path.stat().st_size == ends[whole]
+        complete_records = max(0, sum(e <= cut for e in ends) - 1)
+        assert reopened(path) == records[:complete_records]
+        assert path.stat().st_size == ends[complete_records]
 
 
 @given(records=st.lists(st.binary(min_size=1, max_size=40), min_size=1, max_size=8), data=st.data())
@@ -73,12 +73,12 @@ def test_cut_at_every_byte_leaves_the_whole_records_before_it(tmp_path_factory, 
 def test_a_damaged_byte_loses_only_what_lies_behind_it(tmp_path_factory, records, data):
     path = tmp_path_factory.mktemp("j") / "a.journal"
     raw = bytearray(written(path, records))
-    at = data.draw(st.integers(len(MAGIC), len(raw) - 1))
-    raw[at] ^= 1 << data.draw(st.integers(0, 7))
+    position = data.draw(st.integers(len(MAGIC), len(raw) - 1))
+    raw[position] ^= 1 << data.draw(st.integers(0, 7))
     path.write_bytes(raw)
-    found = reopened(path)
-    assert found == records[: len(found)]
-    assert len(MAGIC) + sum(12 + len(r) for r in records[: len(found)]) <= at
+    events = reopened(path)
+    assert events == records[: len(events)]
+    assert len(MAGIC) + sum(12 + len(r) for r in records[: len(events)]) <= position
 
 
 def test_a_batch_is_neither_stored_nor_published_until_committed(tmp_path):
@@ -99,13 +99,13 @@ def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
     j = JournalFile(tmp_path / "a.journal")
     j.write([b"kept"])
     real = os.pwrite
-    left = [room]
+    bytes_left = [room]
 
     def full(fd, data, offset):
-        if not left[0]:
+        if not bytes_left[0]:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        n = real(fd, data[: left[0]], offset)
-        left[0] -= n
+        n = real(fd, data[: bytes_left[0]], offset)
+        bytes_left[0] -= n
         return n
 
     monkeypatch.setattr(journal_module.os, "pwrite", full)
@@ -175,18 +175,18 @@ def test_a_new_journal_torn_by_a_power_cut_is_empty(tmp_path, left):
 def test_damage_in_the_middle_is_reported_and_the_original_kept(tmp_path):
     path = tmp_path / "a.journal"
     raw = bytearray(written(path, [b"one", b"two", b"three", b"four"]))
-    at = raw.index(b"two")
+    position = raw.index(b"two")
     # A second damage does not replace the first one's copy
     for number in ("", "2"):
-        raw[at] ^= 1
+        raw[position] ^= 1
         path.write_bytes(raw)
         j = JournalFile(path)
         copy = path.with_name(path.name + DAMAGED + number)
         assert (j.last_seq, j.read(1, 9), copy.read_bytes()) == (1, [b"one"], bytes(raw))
         assert str(copy) in j.damage
         j.close()
-        raw[at] ^= 1
-        at = raw.index(b"two") + 1
+        raw[position] ^= 1
+        position = raw.index(b"two") + 1
 
 
 @given(records=st.lists(st.binary(min_size=1, max_size=40), min_size=1, max_size=6), data=st.data())
@@ -252,8 +252,8 @@ def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     host.home()
     stage.pace_s = 0.0
     assert host.row(0, take=2).status == "done"
-    kept = host.replay()
-    assert [e.seq for e in kept] == list(range(1, len(kept) + 1))
+    replayed = host.replay()
+    assert [e.seq for e in replayed] == list(range(1, len(replayed) + 1))
 
 
 def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch):
@@ -286,6 +286,6 @@ def test_the_pis_client_prints_each_event_once_also_behind_a_lost_journal(pi, in
     for seq in (0, 5000):
         host.accepted(host.begin(last_seq=seq))
         host.accepted(stop)
-    where = msgspec.structs.replace(instrument.pi, command_address=pi.service.server.command_address)
-    printed = replay_events(msgspec.structs.replace(instrument, pi=where), "scan", 1)
+    pi_settings = msgspec.structs.replace(instrument.pi, command_address=pi.service.server.command_address)
+    printed = replay_events(msgspec.structs.replace(instrument, pi=pi_settings), "scan", 1)
     assert [e["seq"] for e in printed] == [1, 2, 5001, 5002]

@@ -35,16 +35,16 @@ def same(event: m.AnyEvent, other: tuple[type[m.AnyEvent], dict[str, Any]]) -> b
 
 @pytest.mark.parametrize("seed", range(5))
 def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
-    at = 0
+    position = 0
     ended = False
     added = events()
     while not ended:
-        at += 1
-        path = tmp_path / str(at)
+        position += 1
+        path = tmp_path / str(position)
         published = []
         journal = Journal(path, lambda raws, out=published: out.extend(map(m.unpack_event, raws)))
         try:
-            with FaultyDisk(path, "power cut", at, seed)():
+            with FaultyDisk(path, "power cut", position, seed)():
                 journal.open("s", PLAN, 0)
                 for event in added:
                     journal.add(event[0], **event[1])
@@ -57,13 +57,13 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
             os.close(journal._lock)  # as its end would
         again = Journal(path)
         again.open("s", PLAN, 0)
-        kept = [m.unpack_event(raw) for raw in again.read("s", 1, 1000)[0]]
-        assert [e.seq for e in kept] == list(range(1, len(kept) + 1))
-        assert all(map(same, kept, added)), "a prefix of what was added"
+        events_kept = [m.unpack_event(raw) for raw in again.read("s", 1, 1000)[0]]
+        assert [e.seq for e in events_kept] == list(range(1, len(events_kept) + 1))
+        assert all(map(same, events_kept, added)), "a prefix of what was added"
         synced = max((e.seq for e in published if not isinstance(e, m.Capture)), default=0)
-        assert len(kept) >= synced, "what was published as synced is on the disk"
+        assert len(events_kept) >= synced, "what was published as synced is on the disk"
         again.add(added[-1][0], **added[-1][1])
         again.commit()
-        assert again.last_seq == len(kept) + 1
+        assert again.last_seq == len(events_kept) + 1
         again.close()
-    assert at > 20
+    assert position > 20

@@ -73,18 +73,18 @@ def context():
 @pytest.fixture
 def client_of(context):
     """Makes clients with these keys (own secret, Pi's public); gives the socket, and a function: True if refused."""
-    made = []
+    sockets = []
 
     def make(kind, address, mine, pis):
         socket = context.socket(kind)
         socket.curve_publickey, socket.curve_secretkey = load_certificate(mine)
         socket.curve_serverkey = load_certificate(pis)[0]
-        made.append((HandshakeMonitor(socket), socket))
+        sockets.append((HandshakeMonitor(socket), socket))
         socket.connect(address.replace("0.0.0.0", "127.0.0.1"))
-        return socket, made[-1][0].refused
+        return socket, sockets[-1][0].refused
 
     yield make
-    for refusals, socket in made:
+    for refusals, socket in sockets:
         refusals.close()
         socket.close(linger=0)
 
@@ -98,10 +98,10 @@ KEYS = {
 
 @pytest.mark.parametrize("which", KEYS)
 def test_only_allowed_keys_connect(tmp_path, served, client_of, which):
-    mine, pis = (tmp_path / name for name in KEYS[which])
-    client, refused = client_of(zmq.REQ, served.command_address, mine, pis)
+    host_keys, pis = (tmp_path / name for name in KEYS[which])
+    client, refused = client_of(zmq.REQ, served.command_address, host_keys, pis)
     client.send(m.pack(m.Hello()))
-    listener, _ = client_of(zmq.SUB, served.event_address, mine, pis)
+    listener, _ = client_of(zmq.SUB, served.event_address, host_keys, pis)
     listener.subscribe(b"")
     if which == "allowed":
         assert client.poll(HANG_S * 1e3)
@@ -171,8 +171,8 @@ def test_without_a_list_the_host_key_is_allowed(tmp_path):
 
 def test_the_files_to_copy_are_enough_for_the_host(tmp_path, served, context):
     """And the Pi's secret is not among them."""
-    made = {p.name for p in (tmp_path / "keys").iterdir()}
-    assert "pi.key_secret" in made - set(HOST_KEYS)
+    copied_names = {p.name for p in (tmp_path / "keys").iterdir()}
+    assert "pi.key_secret" in copied_names - set(HOST_KEYS)
     (tmp_path / "host").mkdir()
     for name in HOST_KEYS:
         shutil.copy(tmp_path / "keys" / name, tmp_path / "host")
@@ -214,6 +214,6 @@ def test_keys_of_another_user_are_an_error_with_its_remedy(config, monkeypatch, 
     said = capsys.readouterr().err
     assert "Permission denied" in said
     assert "sudo -u polysight" in said
-    found = attempt("keys", checks._keys, config.parent / "keys", (ELSEWHERE,))
-    assert (found.level, "sudo -u polysight" in found.do) == ("error", True)
-    assert "pi.key_secret: Permission denied" in found.what
+    finding = attempt("keys", checks._keys, config.parent / "keys", (ELSEWHERE,))
+    assert (finding.level, "sudo -u polysight" in finding.do) == ("error", True)
+    assert "pi.key_secret: Permission denied" in finding.what

@@ -220,8 +220,8 @@ def test_a_wire_with_edges_is_never_reported_off(steps):
     """Statuses and edges in any order, statuses up to three points ahead of the edges seen when one follows soon."""
     watch = TriggerWatch()
     edges = 0
-    for ahead, more in steps:
-        edges += more + 1  # between two statuses at least one edge came
+    for ahead, later_ns in steps:
+        edges += later_ns + 1  # between two statuses at least one edge came
         assert not watch.is_silent(edges + ahead, edges)
 
 
@@ -272,13 +272,13 @@ def test_any_order_of_events(start, actions):
     if start == "in a row":
         bench.start()
     for action in actions:
-        before = machine.fault, machine.reason
+        fault_before = machine.fault, machine.reason
         with suppress(RefusedError):
             ACTIONS[action](bench)
             bench.run_posted()
             # These clear it
-            if before[0] and action not in ("home", "row"):
-                assert (machine.fault, machine.reason) == before, "the first fault wins"
+            if fault_before[0] and action not in ("home", "row"):
+                assert (machine.fault, machine.reason) == fault_before, "the first fault wins"
             assert bench.armed <= (machine.row is not None), "edges are answered only during a row"
             assert (machine.row is not None) == (machine.state in ROW_STATES)
             assert (machine.row is not None) == (len(bench.of(m.RowStarted)) == len(bench.of(m.RowFinished)) + 1)
@@ -298,13 +298,15 @@ def cells(row: str) -> list[list[str]]:
 
 
 def test_the_page_shows_the_rules():
-    shown = [cells(row) for row in SPEC_PAGE.splitlines() if row.startswith("| `")]
-    rules = [(e[0], tuple(s), tuple(to)) for e, s, to, *_ in (r for r in shown if len(r) == 4)]
+    table_rows = [cells(row) for row in SPEC_PAGE.splitlines() if row.startswith("| `")]
+    rules = [(e[0], tuple(s), tuple(next_states)) for e, s, next_states, *_ in (r for r in table_rows if len(r) == 4)]
     assert rules == [(r.event, tuple(r.states.split()), tuple(r.leads_to.split())) for r in RULES]
-    answer = {s[0]: (to[0] if to else s[0]) for s, to, *_ in (r for r in shown if len(r) == 3)}
+    answer = {
+        s[0]: (next_states[0] if next_states else s[0]) for s, next_states, *_ in (r for r in table_rows if len(r) == 3)
+    }
     assert answer == {s: WIRE_STATE.get(s, s) for s in get_args(State)}
     limits = {
-        row[0][0]: float(n[0]) for row in shown if len(row) == 3 for n in [row_seconds(SPEC_PAGE, row[0][0])] if n
+        row[0][0]: float(n[0]) for row in table_rows if len(row) == 3 for n in [row_seconds(SPEC_PAGE, row[0][0])] if n
     }
     assert limits == TIMEOUTS_S
 

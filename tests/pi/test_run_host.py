@@ -254,13 +254,13 @@ def test_a_person_at_the_pi_takes_over(pi, owner_in_row, instrument):
     key = Path(instrument.pi.journal_dir) / TAKE_OVER_KEY
     assert stat.S_IMODE(key.stat().st_mode) == 0o600
     replace = msgspec.structs.replace
-    here = replace(instrument, pi=replace(instrument.pi, command_address=pi.service.server.command_address))
-    assert take_over(here, "hold") == "held"
-    assert take_over(here, "resume") == "running"
-    take_over(here, "abort")
+    second_host = replace(instrument, pi=replace(instrument.pi, command_address=pi.service.server.command_address))
+    assert take_over(second_host, "hold") == "held"
+    assert take_over(second_host, "resume") == "running"
+    take_over(second_host, "abort")
     assert owner_in_row.wait(m.RowFinished).status == "aborted"
     owner_in_row.until_state("ready")
-    assert take_over(here, "end") == "homed"
+    assert take_over(second_host, "end") == "homed"
 
 
 def test_a_run_without_a_heartbeat_can_be_replaced(pi):

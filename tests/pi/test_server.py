@@ -29,9 +29,9 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     assert (done.status, done.points, done.edges, done.bursts) == ("done", n, n, n)
     assert (done.pulses, done.fault, done.timed_by) == (n * burst.pulses, 0, "one-shot")
     assert done.pulses_seen
-    seen = host.journalled
-    assert [e.seq for e in seen] == list(range(1, len(seen) + 1))
-    assert [type(e) for e in seen] == [m.RunStarted, m.RowStarted] + n * [m.Capture] + [m.RowFinished]
+    events = host.journalled
+    assert [e.seq for e in events] == list(range(1, len(events) + 1))
+    assert [type(e) for e in events] == [m.RunStarted, m.RowStarted] + n * [m.Capture] + [m.RowFinished]
     captures = host.of(m.Capture)
     assert [c.point for c in captures] == list(range(n))
     # Odd rows run towards -x
@@ -143,9 +143,9 @@ def test_a_new_host_aborts_the_row_of_the_dead_one(host_in_row, stage):
     host = host_in_row
     assert host.accepted(host.begin()).state == "ready"
     started = host.wait(m.RunStarted, lambda e: e.resumed)
-    before = host.journalled[-2]
-    assert isinstance(before, m.RowFinished)
-    assert (before.status, started.seq) == ("aborted", before.seq + 1)
+    event_before = host.journalled[-2]
+    assert isinstance(event_before, m.RowFinished)
+    assert (event_before.status, started.seq) == ("aborted", event_before.seq + 1)
     stage.pace_s = 0.0
     assert host.row(0, take=2).status == "done"
 
@@ -192,8 +192,8 @@ def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
     host.accepted(host.begin(heartbeat_ms=100))
     host.home()
     stage.pace_s = 0.2
-    where = msgspec.structs.replace(instrument.pi, command_address=pi.service.server.command_address)
-    beats = HostHeartbeat(host.context, msgspec.structs.replace(instrument, pi=where), "scan", 0.05)
+    pi_settings = msgspec.structs.replace(instrument.pi, command_address=pi.service.server.command_address)
+    beats = HostHeartbeat(host.context, msgspec.structs.replace(instrument, pi=pi_settings), "scan", 0.05)
     host.start_row()
     host.wait(m.Capture, lambda e: e.point == 4)
     beats.stop()

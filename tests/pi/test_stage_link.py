@@ -99,9 +99,9 @@ def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage, connect):
     link.ask_status_every(0.02)
     assert news.get(timeout=HANG_S).kind == "status"
     dry_stage.deaf = True
-    while not isinstance(lost := news.get(timeout=HANG_S), StageLost):
+    while not isinstance(stage_lost := news.get(timeout=HANG_S), StageLost):
         pass
-    assert "silent" in lost.reason
+    assert "silent" in stage_lost.reason
     with pytest.raises(StageLostError):
         link.request("SET", 1, 500)
 
@@ -110,12 +110,12 @@ def test_only_a_status_answers_a_status_request(dry_stage, connect):
     link, news = connect(heartbeat_s=0.2)
     dry_stage.deaf = True
     link.ask_status_every(0.02)
-    lost = None
+    stage_lost = None
     for _ in range(10_000):
         os.write(dry_stage.master, Reply("ok", 0).encode())
-        if isinstance(lost := news.get(timeout=HANG_S), StageLost):
+        if isinstance(stage_lost := news.get(timeout=HANG_S), StageLost):
             break
-    assert isinstance(lost, StageLost)
+    assert isinstance(stage_lost, StageLost)
 
 
 def test_an_old_sketch_is_named_as_such(dry_stage, instrument, monkeypatch):

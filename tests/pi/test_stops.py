@@ -83,7 +83,7 @@ def stop_is_sent(stage) -> bool:
 def test_abort_stops_and_is_answered_while_the_disk_hangs(owned, stage, disk):
     owned.start_row(owner=OWNER)
     owned.wait(m.Capture)
-    before = len(owned.journalled)
+    events_before = len(owned.journalled)
     disk.freeze()
     assert disk.blocked.wait(HANG_S)
     stage.bytes_seen.clear()
@@ -94,7 +94,7 @@ def test_abort_stops_and_is_answered_while_the_disk_hangs(owned, stage, disk):
     disk.thaw()
     assert owned.wait(m.RowFinished).status == "aborted"
     assert [e.seq for e in owned.replay()] == list(range(1, owned.journalled[-1].seq + 1))
-    assert len(owned.journalled) > before
+    assert len(owned.journalled) > events_before
 
 
 @pytest.mark.parametrize("beats", [True, False])
@@ -171,9 +171,9 @@ def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
     go_on = threading.Event()
     pi.service.executor.post(lambda: go_on.wait(HANG_S))
     wait_for(lambda: stop_is_sent(stage), "STOP")
-    asked = stage.bytes_seen.count(Immediate.STATUS)
+    status_requests = stage.bytes_seen.count(Immediate.STATUS)
     time.sleep(LATE_S)
-    assert stage.bytes_seen.count(Immediate.STATUS) == asked, "its own heartbeat stops it as well"
+    assert stage.bytes_seen.count(Immediate.STATUS) == status_requests, "its own heartbeat stops it as well"
     go_on.set()
     assert host.wait(m.RowFinished).fault == PiFault.STAGE_LOST
 

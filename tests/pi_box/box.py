@@ -199,12 +199,12 @@ class Box:
             trace.seek(size)
             text = trace.read().decode(errors="replace")
         pattern = re.compile(rf"@([\d.]+):{MEMORY_WRITE} .*addr 0x(\w+) value 0x(\w+) size 4 name 'bcm2835_gpio'")
-        found = []
+        writes = []
         for t, address, value in pattern.findall(text):
             offset = int(address, 16) & 0xFF
             if offset in (SET, CLEAR):
-                found.append(Write(float(t), offset == SET, int(value, 16)))
-        return found
+                writes.append(Write(float(t), offset == SET, int(value, 16)))
+        return writes
 
     def cut_power(self) -> None:
         """Power off and on again: what was not on the card is gone. Returns when somebody can log in."""

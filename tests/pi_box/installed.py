@@ -80,8 +80,8 @@ class InstalledPi:
     def fetch_keys(self, folder: Path, client: str) -> None:
         """A client's keys, under the names that a host's have."""
         folder.mkdir(mode=0o700)
-        for there, here in (("pi.key", "pi.key"), (f"{client}.key_secret", "host.key_secret")):
-            (folder / here).write_text(self.box.run(f"sudo cat /etc/polysight/keys/{there}"))
+        for name_on_box, name_on_host in (("pi.key", "pi.key"), (f"{client}.key_secret", "host.key_secret")):
+            (folder / name_on_host).write_text(self.box.run(f"sudo cat /etc/polysight/keys/{name_on_box}"))
 
     def systemctl(self, words: str) -> str:
         """`sudo systemctl ...`."""
@@ -112,11 +112,11 @@ class InstalledPi:
     def on_host(self, *words: str) -> str:
         """Run `polysight-pi` on the host, with a rig file that names the box and the host's keys; what it prints."""
         command, event = self.addresses()
-        there = msgspec.structs.replace(
+        pi_settings = msgspec.structs.replace(
             self.rig.pi, command_address=command, event_address=event, key_dir=str(self.keys)
         )
         config = self.work / "host.toml"
-        config.write_bytes(tomli_w.dumps(to_builtins(msgspec.structs.replace(self.rig, pi=there))).encode())
+        config.write_bytes(tomli_w.dumps(to_builtins(msgspec.structs.replace(self.rig, pi=pi_settings))).encode())
         program = [BIN / "polysight-pi", *words, "--config", config]
         done = subprocess.run(program, cwd=REPO, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr

@@ -135,8 +135,8 @@ def test_a_bench_burst_is_made_of_one_rise_and_one_fall_a_pulse(pi: InstalledPi,
         writes = pi.box.writes_during(lambda: replies.append(homed.ask(pulse)))  # noqa: B023
         assert isinstance(replies[0], m.Pulsed), replies
         assert [w.lines for w in writes] == [1 << SYNC_OUT] * len(writes), "no other line is touched"
-        before = [False, *(w.high for w in writes)]
-        edges = [w for w, was in zip(writes, before, strict=False) if w.high != was]
+        levels_before = [False, *(w.high for w in writes)]
+        edges = [w for w, was in zip(writes, levels_before, strict=False) if w.high != was]
         rises = edges[::2]
         falls = edges[1::2]
         assert len(rises) == len(falls) == replies[0].pulses > 0
@@ -186,8 +186,10 @@ def test_a_jog_by_hand_moves_the_motors_by_its_distance(bench: InstalledPi):
 
 def test_a_line_whose_program_is_killed_becomes_an_input(bench: InstalledPi):
     """What `check` cannot learn from Debian's driver: no pulse stays high when the program dies inside it."""
-    held = f"gpioset --mode=signal pinctrl-bcm2835 {SYNC_OUT}=1 >/dev/null & echo $!"  # its end is not waited for
-    number = bench.box.run(f"sudo sh -c '{held}' </dev/null 2>/dev/null").strip()
+    holding_command = (
+        f"gpioset --mode=signal pinctrl-bcm2835 {SYNC_OUT}=1 >/dev/null & echo $!"  # its end is not waited for
+    )
+    number = bench.box.run(f"sudo sh -c '{holding_command}' </dev/null 2>/dev/null").strip()
     bench.box.wait(lambda: bench.box.level(SYNC_OUT) == 1, "the line is high")
     assert bench.box.function(SYNC_OUT) == OUTPUT
     bench.box.run(f"sudo kill -9 {number}")
@@ -253,8 +255,8 @@ def test_a_stage_that_is_plugged_in_after_the_service_has_started_is_found(bench
 def test_update_and_roll_back(pi: InstalledPi):
     """Rig file, keys and journals stay; a service that runs goes on with the release that is in use."""
     files = "/etc/polysight/instrument.toml /etc/polysight/keys/* /var/lib/polysight/journal/*.journal"
-    kept = f"sudo sh -c 'sha256sum {files}'"
-    before = pi.box.run(kept)
+    checksum_command = f"sudo sh -c 'sha256sum {files}'"
+    sums_before = pi.box.run(checksum_command)
     first = pid_of(pi)
     begun = time.monotonic()
     pi.install()
@@ -272,8 +274,8 @@ def test_update_and_roll_back(pi: InstalledPi):
         f"sudo readlink /proc/{pid_of(pi)}/exe /opt/polysight/venv; pgrep -af polysight-pi"
     )
     assert pi.box.try_run("sudo ~/.cache/polysight-install/install.sh --roll-back").returncode == 5
-    after = pi.box.run(kept)
-    assert set(before.splitlines()) <= set(after.splitlines())
+    sums_after = pi.box.run(checksum_command)
+    assert set(sums_before.splitlines()) <= set(sums_after.splitlines())
 
 
 def test_a_power_cut_in_a_row_loses_no_event_that_was_told(pi: InstalledPi, homed: HostSide):

@@ -44,9 +44,9 @@ def test_leakage_and_gain_are_recovered_from_a_plate_and_two_orientations(a, b, 
     truth = Leakage(a, b, g, 0.0)
     rng = np.random.default_rng(seed)
     waves = (PLATE, strips_wave(UPRIGHT + turned, THETA), strips_wave(LYING + turned, THETA))
-    found = estimate_leakage([standard(truth, w, rng) for w in waves])
-    np.testing.assert_allclose([found.h, found.v, found.imbalance], [a, b, g], rtol=1e-6, atol=1e-8)
-    assert remaining(found, truth) == pytest.approx((0, 0), abs=1e-7)
+    leakage = estimate_leakage([standard(truth, w, rng) for w in waves])
+    np.testing.assert_allclose([leakage.h, leakage.v, leakage.imbalance], [a, b, g], rtol=1e-6, atol=1e-8)
+    assert remaining(leakage, truth) == pytest.approx((0, 0), abs=1e-7)
 
 
 @given(leak, leak, gain, seeds)
@@ -80,9 +80,9 @@ def test_one_orientation_gives_the_axial_ratio_of_two_equal_boards(a, g, seed):
     rng = np.random.default_rng(seed)
     for psi in (UPRIGHT, LYING, 0.4):
         strips = standard(truth, strips_wave(psi, THETA), rng)
-        found = estimate_axial_ratio(standard(truth, PLATE, rng), strips)
-        assert found.h == found.v
-        np.testing.assert_allclose(found.h, a, atol=1e-7)
+        ratio = estimate_axial_ratio(standard(truth, PLATE, rng), strips)
+        assert ratio.h == ratio.v
+        np.testing.assert_allclose(ratio.h, a, atol=1e-7)
 
 
 @given(leak, leak, gain, seeds)
@@ -97,8 +97,8 @@ def test_uneven_illumination_has_no_influence(a, b, g, seed):
         return light * (truth.matrix() @ np.array(wave))[:, None, None]
 
     strips = [(psi, *image(strips_wave(psi, THETA))) for psi in (UPRIGHT, LYING)]
-    found = leakage_from_images(tuple(image(PLATE)), strips, np.ones((20, 30), bool), THETA)
-    np.testing.assert_allclose([found.h, found.v], [a, b], atol=1e-7)
+    leakage = leakage_from_images(tuple(image(PLATE)), strips, np.ones((20, 30), bool), THETA)
+    np.testing.assert_allclose([leakage.h, leakage.v], [a, b], atol=1e-7)
 
 
 def test_strips_reflect_the_field_along_them():

@@ -40,18 +40,18 @@ def test_gains_over_the_plane_are_divided_out(seed, phase, tilt):
     reference = plane_reference(images_of(-light[0] * common, -light[1] * common))
     r = fresnel(4 - 0.4j, THETA)
     got = reference.apply(images_of(light[0] * r[0], light[1] * r[1]))
-    at = reference.valid
-    assert at.mean() > 0.9
-    np.testing.assert_allclose(got.p[at], r[0] / r[1], rtol=0.08)
-    np.testing.assert_allclose(np.abs(got.h[at]), abs(r[0]), rtol=0.08)
+    is_valid = reference.valid
+    assert is_valid.mean() > 0.9
+    np.testing.assert_allclose(got.p[is_valid], r[0] / r[1], rtol=0.08)
+    np.testing.assert_allclose(np.abs(got.h[is_valid]), abs(r[0]), rtol=0.08)
     # The window is one-sided at the rim; in the middle the error is smaller.
     np.testing.assert_allclose(got.p[15:-15, 15:-15], r[0] / r[1], rtol=0.012)
 
 
 def test_speckle_of_the_plate_is_smoothed_and_measured():
     rng = np.random.default_rng(3)
-    one = np.ones((Y.size, X.size), complex)
-    reference = plane_reference(images_of(noisy(one, rng, 0.05), noisy(one, rng, 0.05)))
+    ones = np.ones((Y.size, X.size), complex)
+    reference = plane_reference(images_of(noisy(ones, rng, 0.05), noisy(ones, rng, 0.05)))
     p = (reference.h / reference.v)[reference.valid]
     assert np.std(p) < 0.01
     # Each part of V / H: two channels, half of each

@@ -79,9 +79,9 @@ def test_loss_is_minus_imag_in_the_covariance_too(tmp_path):
     np.testing.assert_allclose(np.cov(draws[:, 0], -draws[:, 1]), spread.matrix, rtol=0.03)
     scan = open_scan(judged_products(tmp_path / "one", "good"))
     pet = scan.materials().sel(patch=2)
-    given = read_products(scan.folder).segments[1].permittivity.covariance
-    assert float(pet["permittivity_real_loss_covariance"]) == pytest.approx(-given[0][1])
-    assert float(pet["permittivity_loss_standard_error"]) == pytest.approx(given[1][1] ** 0.5)
+    given_covariance = read_products(scan.folder).segments[1].permittivity.covariance
+    assert float(pet["permittivity_real_loss_covariance"]) == pytest.approx(-given_covariance[0][1])
+    assert float(pet["permittivity_loss_standard_error"]) == pytest.approx(given_covariance[1][1] ** 0.5)
     assert str(pet["dominated_by"].values) == "leakage"
     assert str(scan.materials().sel(patch=3)["refused"].values).startswith("noise")
 

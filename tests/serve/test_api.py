@@ -86,8 +86,8 @@ def test_a_wrong_request_is_refused_in_plain_words(view, path, body, code, value
     ],
 )
 def test_errors_carry_their_code(view, path, status, code):
-    found, body, _ = ask(view, path)
-    assert (found, json.loads(body)["code"]) == (status, code)
+    answer_status, body, _ = ask(view, path)
+    assert (answer_status, json.loads(body)["code"]) == (status, code)
 
 
 def test_a_folder_inside_a_scan_is_no_scan(view, scans):

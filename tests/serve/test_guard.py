@@ -216,8 +216,11 @@ def test_no_name_leads_out_of_the_folder(scans, tmp_path):
                 assert status in (400, 404), (name, description, status, body[:200])
                 assert SECRET.encode() not in body
             boxes = {"boxes": {"a": [0, 0, 9, 9]}}
-            for description, asked in (("notes", {"notes": "x"}), ("labels", boxes), ("control/abort", {})):
-                assert post(view, f"/api/{description}?scan={quoted_name}", asked)[0] in (400, 404), (name, description)
+            for description, content in (("notes", {"notes": "x"}), ("labels", boxes), ("control/abort", {})):
+                assert post(view, f"/api/{description}?scan={quoted_name}", content)[0] in (400, 404), (
+                    name,
+                    description,
+                )
         for name in ("../secret.txt", "..%2f..%2fmanifest.jsonl", "manifest.jsonl", "figures", "%00"):
             assert ask(view, f"/api/file/{name}?scan=one")[0] in (400, 404)
         assert compute_digest(tmp_path) == state_before
@@ -243,10 +246,10 @@ def test_nothing_in_a_report_can_act(scans):
         for name in ("image.npz", "materials.json"):
             content = (scans / "one" / "products" / name).read_bytes()
             assert ask(view, f"/api/file/{name}?scan=one")[1] == content
-            found = ask(view, f"/api/file/{name}?scan=one", "HEAD")[2]
-            assert int(found["content-length"]) == len(content)
-            assert found["content-disposition"].startswith("attachment")
-            assert found["content-type"] == "application/octet-stream"
+            answer_headers = ask(view, f"/api/file/{name}?scan=one", "HEAD")[2]
+            assert int(answer_headers["content-length"]) == len(content)
+            assert answer_headers["content-disposition"].startswith("attachment")
+            assert answer_headers["content-type"] == "application/octet-stream"
 
 
 POSTS = ("control/abort?scan=one", "notes?scan=one", "labels?scan=one", "start", "train", "process?scan=one",

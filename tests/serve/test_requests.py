@@ -128,9 +128,9 @@ def test_a_request_is_a_command_line_that_the_parser_takes(start_program, root, 
     assert status == 200, answer
     (words,) = commands
     assert words[0] == path.partition("?")[0].replace("start", "scan")
-    given = vars(build_parser(words[0]).parse_args(join_negative_values(words)))
+    options = vars(build_parser(words[0]).parse_args(join_negative_values(words)))
 
-    arguments_shown = {name: to_plain(given[name], root) for name in values}
+    arguments_shown = {name: to_plain(options[name], root) for name in values}
     assert arguments_shown == {name: to_plain(value, root) for name, value in values.items()}
 
 

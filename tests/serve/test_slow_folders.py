@@ -92,11 +92,11 @@ def test_notes_and_names_of_a_dead_folder_hold_nobody_up(dead, view):
 
 
 def test_a_list_shows_a_folder_that_does_not_answer_and_what_it_knew_of_it(dead, root):
-    known = Scans(root)
-    state_before = known.list()
+    scan_list = Scans(root)
+    state_before = scan_list.list()
     dead.stop(scans, "is_scan")
-    assert [s.name for s in known.list()] == [s.name for s in state_before]
-    assert {s.name: s.state for s in known.list()}["dead"] == "silent"
+    assert [s.name for s in scan_list.list()] == [s.name for s in state_before]
+    assert {s.name: s.state for s in scan_list.list()}["dead"] == "silent"
     listed = Scans(root)
     threads = threading.active_count()
     silent = {"alive": "products", "dead": "silent", "other": "products"}

@@ -20,8 +20,8 @@ grids = st.builds(
 
 @given(grids)
 def test_every_position_is_met_exactly_once(grid: Grid):
-    seen = {(row.column(i), row.index) for row in plan_raster(grid) for i in range(row.points)}
-    assert seen == {(c, r) for c in range(grid.columns) for r in range(grid.rows)}
+    positions = {(row.column(i), row.index) for row in plan_raster(grid) for i in range(row.points)}
+    assert positions == {(c, r) for c in range(grid.columns) for r in range(grid.rows)}
 
 
 @given(grids)

@@ -61,10 +61,10 @@ def test_immediate_bytes_differ_from_all_others_in_two_bits_and_resume_in_three(
     used_in_lines = set(b"0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ-* \n")
     for byte in Immediate:
         if byte == Immediate.RESUME:
-            others = used_in_lines
+            other_bytes = used_in_lines
         else:
-            others = used_in_lines | set(range(0x20, 0x7F))
-        nearest = min((byte ^ other).bit_count() for other in others | set(Immediate) - {byte})
+            other_bytes = used_in_lines | set(range(0x20, 0x7F))
+        nearest = min((byte ^ other_byte).bit_count() for other_byte in other_bytes | set(Immediate) - {byte})
         assert nearest >= (3 if byte == Immediate.RESUME else 2)
 
 

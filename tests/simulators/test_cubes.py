@@ -37,13 +37,13 @@ SCENE = decode_scene(
 def rows_by_the_host(scene: Scene, folder: Path) -> dict[str, np.ndarray]:
     """Samples of a raw scan, synchronised, [rx, row, column, block of four samples] in ADC counts."""
     pipeline = Pipeline(ScanFolder.load(simulate(RIG, scene, folder / "scan")))
-    found: dict[str, list[np.ndarray]] = {"RH": [], "RV": []}
+    rows_of_board: dict[str, list[np.ndarray]] = {"RH": [], "RV": []}
     for index in pipeline.source.rows():
         for board, row in pipeline.synchronise_row(index).items():
             assert row.valid.all()
             samples = row.samples[:, ::-1] if index % 2 else row.samples
-            found[board].append(samples)
-    return {board: np.stack(rows, axis=1) for board, rows in found.items()}
+            rows_of_board[board].append(samples)
+    return {board: np.stack(rows, axis=1) for board, rows in rows_of_board.items()}
 
 
 def in_blocks(cube: np.ndarray) -> np.ndarray:
@@ -94,8 +94,8 @@ def test_the_noise_is_that_of_averaged_bursts(tmp_path: Path) -> None:
         power = np.mean(np.abs(off_by(raw, quiet)) ** 2)
         assert power == pytest.approx(np.mean(np.abs(drawn) ** 2), rel=0.05)
         ideal = SCENE.with_disturbances(ideal=True)
-        given = synced_cube(RIG, ideal, board, noise=0.3) - synced_cube(RIG, ideal, board)
-        assert np.mean(np.abs(given) ** 2) == pytest.approx(0.09, rel=0.05)
+        noise_only = synced_cube(RIG, ideal, board, noise=0.3) - synced_cube(RIG, ideal, board)
+        assert np.mean(np.abs(noise_only) ** 2) == pytest.approx(0.09, rel=0.05)
 
 
 @pytest.mark.parametrize("count", [3, 20])

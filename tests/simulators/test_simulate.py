@@ -144,12 +144,12 @@ def test_logs_list_the_received_packets(tmp_path: Path, zero_filling: bool) -> N
     radar = SimulatedRig(RIG, LOSSY)
     row = plan_raster(radar.rig.grid).row(0)
     gaps = lost_bytes(radar, "RH", row)
-    lost = sum(b - a for a, b in gaps)
-    assert lost > 0
+    bytes_lost = sum(b - a for a, b in gaps)
+    assert bytes_lost > 0
     log = np.loadtxt(folder / "RH" / "0_0_log.csv", delimiter=",")
     size = 5 * 16 * 4096
-    assert log[:, 1].sum() == size - lost
-    assert (folder / "RH" / "0_0.bin").stat().st_size == (size if zero_filling else size - lost)
+    assert log[:, 1].sum() == size - bytes_lost
+    assert (folder / "RH" / "0_0.bin").stat().st_size == (size if zero_filling else size - bytes_lost)
     starts = (log[:, 0].astype(int) - 1) * 1456
     assert not any(a <= s < b for s in starts for a, b in gaps)
     assert np.all(np.diff(log[:, 2]) >= 0)

@@ -51,9 +51,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
         pytest.skip(f"no firmware without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
     folder = tmp_path_factory.mktemp("firmware")
     command = ["make", "-C", str(SKETCH_DIR), "firmware", f"AVR_B={folder}"]
-    made = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert made.returncode == 0, made.stderr
-    return folder, made.stdout
+    compilation = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert compilation.returncode == 0, compilation.stderr
+    return folder, compilation.stdout
 
 
 @pytest.fixture(scope="session")
@@ -67,14 +67,14 @@ def uno_programs() -> tuple[Path, Path]:
 @pytest.fixture
 def make_uno(uno_programs: tuple[Path, Path]) -> Iterator[Callable[..., EmulatedUno]]:
     """Makes emulated boards; takes the further arguments of EmulatedUno, and another image."""
-    made: list[EmulatedUno] = []
+    unos: list[EmulatedUno] = []
 
     def make(image: Path = uno_programs[1], **arguments: object) -> EmulatedUno:
-        made.append(EmulatedUno(uno_programs[0], image, **arguments))
-        return made[-1]
+        unos.append(EmulatedUno(uno_programs[0], image, **arguments))
+        return unos[-1]
 
     yield make
-    for uno in made:
+    for uno in unos:
         uno.close()
 
 
@@ -129,12 +129,12 @@ def stage(request: pytest.FixtureRequest) -> Iterator[Driver]:
 @pytest.fixture
 def both(firmware_program: Path) -> Iterator[Callable[..., tuple[Driver, Driver]]]:
     """Makes the firmware and the stand-in side by side, with these steps per millimetre."""
-    made: list[Driver] = []
+    drivers: list[Driver] = []
 
     def make(steps_per_mm: float = 200.0) -> tuple[Driver, Driver]:
-        made.extend([FirmwareDriver(firmware_program, steps_per_mm), PythonDriver(steps_per_mm)])
-        return made[-2], made[-1]
+        drivers.extend([FirmwareDriver(firmware_program, steps_per_mm), PythonDriver(steps_per_mm)])
+        return drivers[-2], drivers[-1]
 
     yield make
-    for driver in made:
+    for driver in drivers:
         driver.close()

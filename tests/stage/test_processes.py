@@ -67,14 +67,14 @@ def test_rows_over_the_port(start: Start, speed: float):
     spacing = [b.t_ns - a.t_ns for a, b in itertools.pairwise(stage.rising[:5])]
     # 400 steps at 4000 steps/s
     assert all(abs(s - 100_000_000) <= 16_000 for s in spacing)
-    before = [messages[messages.index(e) - 1] for e in stage.rising]
-    at = [m for m in before if isinstance(m, WireMotion)]
-    assert [m.t_ns for m in at] == [e.t_ns for e in stage.rising]
-    assert [(m.x_um, m.y_um) for m in at] == ROW_POINTS
-    assert all(abs(abs(m.vx_um_s) - 20_000) <= 40 for m in at)
+    messages_before = [messages[messages.index(e) - 1] for e in stage.rising]
+    motions = [m for m in messages_before if isinstance(m, WireMotion)]
+    assert [m.t_ns for m in motions] == [e.t_ns for e in stage.rising]
+    assert [(m.x_um, m.y_um) for m in motions] == ROW_POINTS
+    assert all(abs(abs(m.vx_um_s) - 20_000) <= 40 for m in motions)
     assert stage.motions[-1].vx_um_s == 0
     # The x that each line predicts for the next one is right, to a step.
-    row = [m for m in stage.motions if at[0].t_ns <= m.t_ns <= at[4].t_ns]
+    row = [m for m in stage.motions if motions[0].t_ns <= m.t_ns <= motions[4].t_ns]
     for a, b in itertools.pairwise(row):
         assert abs(a.x_um + a.vx_um_s * (b.t_ns - a.t_ns) * 1e-9 - b.x_um) <= 5
 

@@ -83,17 +83,17 @@ def test_hold_resumes_on_the_exact_grid(stage, seed: int):
     stage.motion("MOVE", x0 - pitch, y, 10_000)
     stage.wires.clear()
     assert stage.command("ROW", x0, pitch, points, y, rate).kind == "ok"
-    held = 0
+    hold_count = 0
     for _ in range(3):
         stage.run_ms(rng.uniform(350, 650))
         stage.rx(bytes([Immediate.HOLD]))
         stage.run_ms(600)
-        held += stage.status().fields["state"] == "hold"
+        hold_count += stage.status().fields["state"] == "hold"
         assert motions(stage.wires)[-1].vx_um_s == 0
         stage.rx(Immediate.RESUME.sent)
     stage.rest()
     (done,) = stage.replies()
-    assert held == 3
+    assert hold_count == 3
     assert (done.integer("points"), done.integer("pulses"), done.integer("held")) == (points, points, 1)
     check_row(stage.wires, x0, pitch, points, y, 20)
     assert done.integer("x") == x0 + pitch * points + (pitch // 300) * (rate * rate // (2 * ACCEL) + 1)
@@ -119,14 +119,14 @@ def test_stop_ends_the_triggers_and_keeps_the_position(stage):
     stage.wires.clear()
     assert stage.command("ROW", 20_000, 400, 50, 0, 4000).kind == "ok"
     stage.run_ms(5_500)
-    seen = len([e for e in edges(stage.wires) if e.value])
-    assert 0 < seen < 50
+    rising_edges = len([e for e in edges(stage.wires) if e.value])
+    assert 0 < rising_edges < 50
     stage.rx(bytes([Immediate.STOP]))
     stage.rest()
     assert [r.kind for r in stage.replies()] == ["alarm"]
     status = stage.status()
     rising = [e for e in edges(stage.wires) if e.value]
-    assert seen <= len(rising) <= seen + 1
+    assert rising_edges <= len(rising) <= rising_edges + 1
     assert status.integer("points") == status.integer("pulses") == len(rising)
     assert motions(stage.wires)[-1].x_um == status.integer("x") * UM
     stage.run_ms(5_000)
@@ -188,10 +188,10 @@ def test_same_words_and_same_wires(both, seed: int):
             arguments = (argument,)
         for driver in drivers:
             getattr(driver, name)(*arguments)
-        where = f"seed {seed}, action {i}: {name} {argument}"
-        assert firmware.received == python.received, where
-        assert firmware.wires == python.wires, where
-        assert firmware.t_ns == python.t_ns, where
+        place = f"seed {seed}, action {i}: {name} {argument}"
+        assert firmware.received == python.received, place
+        assert firmware.wires == python.wires, place
+        assert firmware.t_ns == python.t_ns, place
         for driver in drivers:
             driver.received = b""
             driver.wires.clear()

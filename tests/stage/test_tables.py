@@ -28,8 +28,8 @@ PAGE = (REPO / "docs" / "spec" / "stage-line.md").read_text(encoding="utf-8")
 def constants(name: str) -> dict[str, int]:
     """`constexpr` integers of a header."""
     text = (SKETCH / name).read_text(encoding="ascii")
-    found = re.findall(r"\b([A-Z_][A-Z0-9_]+) = (-?\d+)", text)
-    return {k: int(v) for k, v in found}
+    definitions = re.findall(r"\b([A-Z_][A-Z0-9_]+) = (-?\d+)", text)
+    return {k: int(v) for k, v in definitions}
 
 
 def pins(text: str) -> dict[str, int]:
@@ -147,8 +147,8 @@ def test_the_arduino_ide_makes_the_same_image(built: tuple[Path, str], tmp_path:
     command += ["/usr/share/arduino/hardware", "-hardware", "/usr/share/arduino-builder", "-build-path", str(tmp_path)]
     # Debian's core 1.8.7 does not compile with Debian's avr-gcc 5.4 without this.
     command += ["-prefs", "compiler.cpp.extra_flags=-DDECIMAL_DIG=__DECIMAL_DIG__", str(SKETCH / "arduino_stage.ino")]
-    made = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert made.returncode == 0, made.stderr
+    compilation = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert compilation.returncode == 0, compilation.stderr
     ours = (built[0] / "arduino_stage.hex").read_bytes()
     assert (tmp_path / "arduino_stage.ino.hex").read_bytes() == ours
 

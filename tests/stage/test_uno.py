@@ -65,9 +65,9 @@ def test_random_rows(host, batch: int):
         host.uno.rest()
         (done,) = host.replies()
         x = done.integer("x")
-        held = done.integer("held")
+        hold_count = done.integer("held")
         assert (done.kind, done.integer("points"), done.integer("pulses")) == ("done", points, points)
-        assert held <= holds
+        assert hold_count <= holds
         rising = host.uno.edges[::2]
         falling = host.uno.edges[1::2]
         assert [e.value for e in host.uno.edges] == [1, 0] * points
@@ -76,7 +76,7 @@ def test_random_rows(host, batch: int):
         # A step waits at most for another interrupt to end, and lateness never adds up.
         spacing = abs(pitch) * HZ / rate
         late = [e.cycle - i * spacing for i, e in enumerate(rising)]
-        assert held or max(late) - min(late) <= 16 * US
+        assert hold_count or max(late) - min(late) <= 16 * US
         widths = [f.cycle - r.cycle for r, f in zip(rising, falling, strict=True)]
         assert all(-2 * US <= w - width_us * US <= 60 * US for w in widths)
         assert host.uno.motors == (host.zero[0] + x, host.zero[1] + y, host.zero[1] + y)
@@ -109,8 +109,8 @@ def test_backlash_comes_from_below_and_runs_up(host):
         assert ys[-700:] == list(range(y - 699, y + 1))
         xs = [host.at(e)[0] for e in host.uno.edges if e.pin == X_PUL and e.value]
         first = xs.index(9000) if pitch > 0 else len(xs) - 1 - xs[::-1].index(9000)
-        before = xs[first - 700 : first]
-        assert len({b - a for a, b in itertools.pairwise(before)}) == 1  # so do those of x in the row's direction
+        x_before = xs[first - 700 : first]
+        assert len({b - a for a, b in itertools.pairwise(x_before)}) == 1  # so do those of x in the row's direction
 
 
 def test_a_short_hold_is_told_and_costs_no_step(host):
@@ -141,11 +141,11 @@ def test_no_command_is_lost_silently(host, chatty: bool):
     replies = host.replies()
     answered = {r.sequence for r in replies if r.kind in ("ok", "error") and r.sequence is not None}
     unread = [r for r in replies if r.kind == "error" and r.sequence is None]
-    wanted = set(range(host.sequence - 99, host.sequence + 1))
-    assert answered <= wanted
-    assert answered == wanted or any(r.number == 3 for r in unread)
+    expected_sequence = set(range(host.sequence - 99, host.sequence + 1))
+    assert answered <= expected_sequence
+    assert answered == expected_sequence or any(r.number == 3 for r in unread)
     # This was a test of the loss
-    assert (answered == wanted) != chatty
+    assert (answered == expected_sequence) != chatty
     # The conversation goes on: greet, then any number may follow.
     host.uno.feed(b"\n")
     host.replies()

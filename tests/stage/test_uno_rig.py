@@ -51,10 +51,10 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
     assert sorted(scan.committed_rows()) == [0, 1]
     for board in ("RH", "RV"):
         for row in (0, 1):
-            seen = np.fromfile(scan.row_path(board, row), "<i2").astype(float)
+            samples = np.fromfile(scan.row_path(board, row), "<i2").astype(float)
             expected = np.fromfile(ideal.row_path(board, row), "<i2").astype(float)
             assert expected.std() > 100
-            assert np.abs(seen - expected).max() <= 2  # of the converter's steps: positions are exact to 1 um
+            assert np.abs(samples - expected).max() <= 2  # of the converter's steps: positions are exact to 1 um
 
 
 def test_a_time_scale_its_heartbeat_cannot_follow_is_refused(tmp_path: Path):

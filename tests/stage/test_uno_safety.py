@@ -114,8 +114,8 @@ def test_a_glitch_is_no_switch(host, request: pytest.FixtureRequest, mask: int):
     host.uno.edges.clear()
     points = 120
     glitches = 0
-    wanted = 1000 if request.config.getoption("--long") else 250
-    while glitches < wanted:
+    glitch_count = 1000 if request.config.getoption("--long") else 250
+    while glitches < glitch_count:
         host.obeyed("ROW", 4000, 400, points, 500, TOP_RATE)
         for _ in range(250):
             host.uno.run(rng.randint(0, 8 * MS))

@@ -30,13 +30,13 @@ IDE_COMPILERS = (".arduino15/packages/arduino/tools/avr-gcc/*/bin", "arduino-*/h
 def other_compilers() -> list[Path]:
     """Folders with an avr-gcc of the Arduino IDE, and those that POLYSIGHT_AVR_GCC lists, separated by colons."""
     named = [Path(p) for p in os.environ.get("POLYSIGHT_AVR_GCC", "").split(":") if p]
-    return named + [found for pattern in IDE_COMPILERS for found in sorted(Path.home().glob(pattern))]
+    return named + [compiler for pattern in IDE_COMPILERS for compiler in sorted(Path.home().glob(pattern))]
 
 
 def documented_cycles() -> int:
-    found = re.search(r"// Measured worst case: (\d+) cycles", (SKETCH / "hal_uno.cpp").read_text(encoding="ascii"))
-    assert found is not None
-    return int(found[1])
+    match = re.search(r"// Measured worst case: (\d+) cycles", (SKETCH / "hal_uno.cpp").read_text(encoding="ascii"))
+    assert match is not None
+    return int(match[1])
 
 
 def busiest_step(host: Host) -> int:
@@ -118,8 +118,8 @@ def test_hold_and_stop_begin_within_20_ms(host, byte: Immediate, rate: int):
     begins = times[-ramp - 1]
     assert sent <= begins <= sent + 20 * MS
     # Seen from outside: 20 ms after the byte the steps come slower, and they stop after the time of the ramp.
-    after = [t for t in times if t >= sent + 20 * MS]
-    paces = [(b - a) / 20 for a, b in zip(after, after[20:], strict=False)]
+    late_edges = [t for t in times if t >= sent + 20 * MS]
+    paces = [(b - a) / 20 for a, b in zip(late_edges, late_edges[20:], strict=False)]
     assert not paces or min(paces) > 1.01 * HZ / rate
     assert times[-1] <= sent + 20 * MS + 1.1 * HZ * rate / accel
     assert [r.number for r in host.replies()] == ([15] if byte == Immediate.STOP else [])

@@ -255,10 +255,10 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
         with pytest.raises(PowerCut):
             drop(ScanFolder.load(scan), digests, scan / "products")
     remaining = ScanFolder.load(scan)
-    gone = {str(b.file) for row in remaining.committed_rows().values() for b in row.boards.values()} - {
+    missing_files = {str(b.file) for row in remaining.committed_rows().values() for b in row.boards.values()} - {
         str(path.relative_to(scan)) for path in payloads(scan)
     }
-    assert gone <= set(dropped_files(remaining))
+    assert missing_files <= set(dropped_files(remaining))
     assert errors(scan) == []
     assert damaged_rows(remaining) == {}
     drop(ScanFolder.load(scan), digests, scan / "products")

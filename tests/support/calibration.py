@@ -42,6 +42,6 @@ def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
 
 def remaining(found: Leakage, truth: Leakage) -> tuple[float, float]:
     """Larger cross-polar amplitude and deviation of the co-polar ratio from 1, after correction by `found`."""
-    left = np.linalg.solve(found.matrix(), truth.matrix())
-    crosstalk = max(abs(left[0, 1] / left[0, 0]), abs(left[1, 0] / left[1, 1]))
-    return float(crosstalk), float(abs(left[0, 0] / left[1, 1] - 1))
+    residual = np.linalg.solve(found.matrix(), truth.matrix())
+    crosstalk = max(abs(residual[0, 1] / residual[0, 0]), abs(residual[1, 0] / residual[1, 1]))
+    return float(crosstalk), float(abs(residual[0, 0] / residual[1, 1] - 1))

@@ -72,8 +72,8 @@ def write_material(
     rng = np.random.default_rng(seed)
     gain_h, gain_v = (rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform()) for _ in range(2))
     values = []
-    for what in (material, Material(METAL, None)):
-        h, v = draw_pixels(what, angle_deg, pixels, errors, rng)
+    for medium in (material, Material(METAL, None)):
+        h, v = draw_pixels(medium, angle_deg, pixels, errors, rng)
         h = (h * gain_h).astype(np.complex64)
         v = (v * gain_v).astype(np.complex64)
         values.append([h / v, h, v])
@@ -136,8 +136,8 @@ def write_labels(
         for image, pixels in zip(images, (h, v), strict=True):
             image[y0:y1, x0:x1] += pixels.reshape(y1 - y0, x1 - x0)
     for key, image, gain in zip(("sar_h", "sar_v"), images, gains, strict=True):
-        whole = (gain * image * distance).astype(np.complex64)
-        np.save(path / f"{key}.npy", whole[::-1] if upside_down else whole)
+        full_image = (gain * image * distance).astype(np.complex64)
+        np.save(path / f"{key}.npy", full_image[::-1] if upside_down else full_image)
     content = {
         "description": f"simulated: {scan}, incidence {angle_deg:.0f} deg",
         "labels": {name: list(box) for name, box in boxes.items()},

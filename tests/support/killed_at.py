@@ -19,7 +19,7 @@ from typing import Any
 def kill_at(hits: Path, operation: str, suffix: str, nth: int) -> None:
     """Arm this process."""
     real = getattr(os, operation)
-    left = [nth]
+    hits_left = [nth]
 
     def call(what: Any, *more: Any, **named: Any) -> Any:
         if isinstance(what, int):
@@ -29,8 +29,8 @@ def kill_at(hits: Path, operation: str, suffix: str, nth: int) -> None:
         if name.endswith(suffix):
             with hits.open("a", encoding="utf-8") as f:
                 f.write(f"{operation}:{suffix}\n")
-            left[0] -= 1
-            if not left[0]:
+            hits_left[0] -= 1
+            if not hits_left[0]:
                 if operation == "pwrite":
                     data, offset = more
                     real(what, bytes(data)[: len(data) // 2], offset)

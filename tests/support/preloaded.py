@@ -90,27 +90,38 @@ class Popen(subprocess.Popen):
 
     def _execute_child(self, *values: Any, **named: Any) -> None:
         start = super()._execute_child  # type: ignore[misc]
-        of = inspect.signature(start).bind(*values, **named).arguments
-        if isinstance(of["args"], str | bytes | os.PathLike):
+        bound_arguments = inspect.signature(start).bind(*values, **named).arguments
+        if isinstance(bound_arguments["args"], str | bytes | os.PathLike):
             words = []
         else:
-            words = [os.fsdecode(word) for word in of["args"]]
-        environment = dict(os.environ if of["env"] is None else of["env"])
-        folder = os.fsdecode(of["cwd"] or Path.cwd())
-        is_plain = not of["shell"] and of["executable"] is None and of["process_group"] == -1
+            words = [os.fsdecode(word) for word in bound_arguments["args"]]
+        environment = dict(os.environ if bound_arguments["env"] is None else bound_arguments["env"])
+        folder = os.fsdecode(bound_arguments["cwd"] or Path.cwd())
+        is_plain = (
+            not bound_arguments["shell"]
+            and bound_arguments["executable"] is None
+            and bound_arguments["process_group"] == -1
+        )
         same_python = read_at_start(environment) == read_at_start(os.environ)
-        forked = words and name_of(words) and is_plain and same_python and is_ours(of["preexec_fn"])
+        forked = words and name_of(words) and is_plain and same_python and is_ours(bound_arguments["preexec_fn"])
         if not forked or not Path(folder).is_dir():
             start(*values, **named)
             return
-        descriptors = [0, 1, 2, *of["pass_fds"]]
-        given = [of["p2cread"], of["c2pwrite"], of["errwrite"], *of["pass_fds"]]
-        files = [number if file == -1 else file for number, file in zip(descriptors, given, strict=True)]
-        request = Request(words, environment, folder, descriptors, of["start_new_session"], of["preexec_fn"])
+        descriptors = [0, 1, 2, *bound_arguments["pass_fds"]]
+        open_descriptors = [
+            bound_arguments["p2cread"],
+            bound_arguments["c2pwrite"],
+            bound_arguments["errwrite"],
+            *bound_arguments["pass_fds"],
+        ]
+        files = [number if file == -1 else file for number, file in zip(descriptors, open_descriptors, strict=True)]
+        request = Request(
+            words, environment, folder, descriptors, bound_arguments["start_new_session"], bound_arguments["preexec_fn"]
+        )
         self.pid = Popen.server.start(request, files)
         self._child_created = True
         ends = ("p2cread", "p2cwrite", "c2pread", "c2pwrite", "errread", "errwrite")
-        self._close_pipe_fds(*(of[end] for end in ends))  # type: ignore[attr-defined]
+        self._close_pipe_fds(*(bound_arguments[end] for end in ends))  # type: ignore[attr-defined]
 
 
 class Server:

@@ -61,14 +61,14 @@ def wait_for(condition: Callable[[], bool], what: str, limit_s: float = LIMIT_S)
 
 def processes_naming(text: str) -> dict[int, str]:
     """Command lines of living processes in which `text` occurs."""
-    found = {}
+    processes = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():
             with suppress(OSError):
                 line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
                 if text in line:
-                    found[int(entry.name)] = line
-    return found
+                    processes[int(entry.name)] = line
+    return processes
 
 
 def output_of(*arguments: object) -> str:
@@ -168,14 +168,14 @@ class Bench:
         """Run a host command in this process, which saves a second for starting a program."""
         out = io.StringIO()
         err = io.StringIO()
-        before = signal.getsignal(signal.SIGTERM)
+        handler_before = signal.getsignal(signal.SIGTERM)
         try:
             with chdir(self.folder), redirect_stdout(out), redirect_stderr(err):
                 status = main([str(word) for word in arguments])
         except SystemExit as e:  # of argparse
             status = e.code if isinstance(e.code, int) else 1
         finally:
-            signal.signal(signal.SIGTERM, before)
+            signal.signal(signal.SIGTERM, handler_before)
         return Ended(status, out.getvalue(), err.getvalue())
 
     def wait_for(self, condition: Callable[[], bool], what: str) -> None:

@@ -80,17 +80,17 @@ def judged_products(folder: Path, level: str | None, careless: bool = False) -> 
 
 def computed(images: Images, content: dict[str, Any] | None, quality: dict[str, Any], **more: Any) -> ProcessedScan:
     """A result that was just computed, with these contents of materials.json (None: images only) and quality.json."""
-    given: dict[str, Any] = {"facts": ScanFacts(scan_id="s", simulated=True), "plates": (), **more}
+    results: dict[str, Any] = {"facts": ScanFacts(scan_id="s", simulated=True), "plates": (), **more}
     materials = None if content is None else ScanMaterials.decode(content)
     return ProcessedScan.from_results(
-        Path(), images=images, materials=materials, quality=ScanQuality.decode(quality), **given
+        Path(), images=images, materials=materials, quality=ScanQuality.decode(quality), **results
     )
 
 
 def changed(scan: ProcessedScan, **content: Any) -> ProcessedScan:
     """The same result with other contents."""
-    given = {name: value for name, value in vars(scan).items() if name in Computed.__annotations__}
-    return ProcessedScan.from_results(scan.folder, **{**given, **content})
+    results = {name: value for name, value in vars(scan).items() if name in Computed.__annotations__}
+    return ProcessedScan.from_results(scan.folder, **{**results, **content})
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

@@ -82,8 +82,8 @@ class Rig(Bench):
     def close(self) -> None:
         """End all processes of this rig; fail if one is left."""
         super().close()
-        left = self.processes()
-        assert not left, left
+        remaining = self.processes()
+        assert not remaining, remaining
 
 
 @contextmanager
@@ -91,9 +91,9 @@ def running(
     folder: Path, time_scale: float = 40.0, env: dict[str, str] | None = None, scene: str = SCENE
 ) -> Iterator[Rig]:
     """Run a simulated rig in `folder`; all its processes are ended afterwards."""
-    made = Rig(folder, time_scale, env, scene)
+    new_rig = Rig(folder, time_scale, env, scene)
     try:
-        made.begin()
-        yield made
+        new_rig.begin()
+        yield new_rig
     finally:
-        made.close()
+        new_rig.close()

@@ -89,13 +89,13 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "once"
     shared.mkdir(exist_ok=True)
     folder = shared / name
-    whole = shared / f"{name}.whole"
+    complete_copy = shared / f"{name}.whole"
     with (shared / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not whole.exists():
+        if not complete_copy.exists():
             folder.mkdir()
             make(folder)
-            whole.touch()
+            complete_copy.touch()
     return folder
 
 
@@ -105,7 +105,7 @@ _NAME = "costs"
 
 def _now_s() -> tuple[float, float]:
     """Processor time and the clock."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    used = [resource.getrusage(process_kind) for process_kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(u.ru_utime + u.ru_stime for u in used), time.monotonic()
 
 
@@ -123,7 +123,7 @@ class Costs:
         report = yield
         before_s = self._last_s
         self._last_s = _now_s()
-        spent_s = [now - before for now, before in zip(self._last_s, before_s, strict=True)]
+        spent_s = [now - time_before for now, time_before in zip(self._last_s, before_s, strict=True)]
         report.user_properties = [*(p for p in report.user_properties if p[0] != _NAME), (_NAME, spent_s)]
         return report
 
@@ -137,7 +137,7 @@ class Costs:
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         """The table: processor and clock seconds."""
-        rooms_cpu_s, rooms_wall_s = (_by_room(of) for of in (self._cpu_s, self._wall_s))
+        rooms_cpu_s, rooms_wall_s = (_by_room(room_times) for room_times in (self._cpu_s, self._wall_s))
         write = terminalreporter.write_line
         terminalreporter.section("costs")
         write(f"{self._cpu_s.total() / 60:.1f} CPU minutes, {self._wall_s.total() / 60:.1f} worker minutes")

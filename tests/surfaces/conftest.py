@@ -40,12 +40,12 @@ def scan_of(
     offsets = scan_offsets(columns, rows)
     cubes = scan_shapes(shapes, offsets, ShapeNuisances(noise=noise), frequencies_hz=FREQUENCIES_HZ)
     boards = published_boards()
-    found = []
+    both_samples = []
     for name, rxs in boards.receivers().items():
         places = np.array([rx.position for rx in rxs])
         valid = np.ones(offsets.shape[:2], bool)
-        found.append(Samples(cubes[name], valid, offsets, FREQUENCIES_HZ, boards.tx.position, places))
-    return found[0], found[1]
+        both_samples.append(Samples(cubes[name], valid, offsets, FREQUENCIES_HZ, boards.tx.position, places))
+    return both_samples[0], both_samples[1]
 
 
 @pytest.fixture(scope="session")

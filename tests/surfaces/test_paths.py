@@ -72,18 +72,18 @@ def test_a_sphere_of_rays_is_found_with_point_normal_and_radius():
     points = locate(echoes.path_m, echoes.slope, echoes.at_m, scan.tx_m, scan.middle_m)
     normals, _ = find_normals(points, echoes.at_m, scan.tx_m, scan.middle_m)
     bends = find_curvature(points, normals, echoes.at_m, scan.tx_m, scan.middle_m, echoes.bend)
-    away = points - FRONT_M - 0.12 * BEHIND
-    assert np.abs(np.linalg.norm(away, axis=1) - 0.12).max() < 1e-4
-    assert np.abs(np.cross(normals, away / 0.12)).max() < np.radians(0.1)
+    errors_m = points - FRONT_M - 0.12 * BEHIND
+    assert np.abs(np.linalg.norm(errors_m, axis=1) - 0.12).max() < 1e-4
+    assert np.abs(np.cross(normals, errors_m / 0.12)).max() < np.radians(0.1)
     assert np.allclose(np.linalg.eigvalsh(bends), 1 / 0.12, rtol=0.1)
     assert np.abs(echoes.amplitude) == pytest.approx(0.5, rel=1e-2)
 
 
 def test_a_weak_echo_is_found_beside_a_strong_one():
     strong = with_mirror(empty_scan(), 0.65, 1.0)
-    both = with_echo(strong, FRONT_M, 0.1, 0.16)
-    echoes = find_echoes(both, (1.4, 2.1))
-    points = locate(echoes.path_m, echoes.slope, echoes.at_m, both.tx_m, both.middle_m)
+    both_echoes = with_echo(strong, FRONT_M, 0.1, 0.16)
+    echoes = find_echoes(both_echoes, (1.4, 2.1))
+    points = locate(echoes.path_m, echoes.slope, echoes.at_m, both_echoes.tx_m, both_echoes.middle_m)
     from_weak = np.abs(np.linalg.norm(points - (FRONT_M + 0.1 * BEHIND), axis=1) - 0.1)
     assert (from_weak < 1e-3).sum() >= len(np.unique(echoes.at_m, axis=0))
 
@@ -112,9 +112,9 @@ def test_a_mirror_spreads_as_its_path():
     point = (scan.middle_m + share * (image - scan.middle_m))[None]
     normals, _ = find_normals(point, at_m, scan.tx_m, scan.middle_m)
     _, _, out_m, back_m = unit_legs(point, at_m, scan.tx_m, scan.middle_m)
-    found = spreading(point, normals, np.zeros((1, 2, 2)), at_m, scan.tx_m, scan.middle_m)
+    factors = spreading(point, normals, np.zeros((1, 2, 2)), at_m, scan.tx_m, scan.middle_m)
     assert np.allclose(normals, [[0, 0, -1]], atol=1e-9)
-    assert found[0] == pytest.approx(1 / float(out_m[0] + back_m[0]), rel=1e-6)
+    assert factors[0] == pytest.approx(1 / float(out_m[0] + back_m[0]), rel=1e-6)
 
 
 def test_a_known_path_is_measured_without_the_gain_of_a_search():

@@ -39,8 +39,8 @@ def scene_of(radius_m: float, stack: Stack) -> ShapeScene:
 @pytest.fixture(scope="module")
 def glass_ball(see, gains, optics):
     scene = scene_of(0.11, Stack(below=5.2 - 0.4j))
-    seen = see(scene.shapes)
-    return scene, seen, analyse_surface(seen, optics, gains, uncertainty=EXACT, scan_id="ball", simulated=True)
+    surface = see(scene.shapes)
+    return scene, surface, analyse_surface(surface, optics, gains, uncertainty=EXACT, scan_id="ball", simulated=True)
 
 
 def test_points_and_normals_of_a_sphere_are_found(glass_ball):
@@ -89,18 +89,18 @@ def test_below_40_mm_the_shape_alone_is_given_and_why(see, gains, optics):
 
 
 def test_without_a_reference_the_shape_alone_is_given(glass_ball, optics):
-    _, seen, with_reference = glass_ball
-    surface = analyse_surface(seen, optics, None, uncertainty=EXACT)
+    _, glass_surface, with_reference = glass_ball
+    surface = analyse_surface(glass_surface, optics, None, uncertainty=EXACT)
     assert np.array_equal(surface.points_m, with_reference.points_m)
     assert all(s.permittivity is None and s.reason for s in surface.segments)
 
 
 def test_the_error_grows_with_what_is_not_known(glass_ball, gains, optics):
-    _, seen, exact = glass_ball
+    _, surface, exact = glass_ball
     traces = [np.trace(exact.segments[0].covariance)]
     unsure = [Uncertainty(0.02, 1e-4, 1e-6), Uncertainty(0.02, 0.02, 1e-6), Uncertainty(0.02, 0.02, 1e-3)]
     for uncertainty in unsure:
-        judged = analyse_surface(seen, optics, gains, uncertainty=uncertainty).segments[0]
+        judged = analyse_surface(surface, optics, gains, uncertainty=uncertainty).segments[0]
         traces.append(np.trace(judged.covariance))
     assert traces == sorted(traces)
     assert traces[-1] > 2 * traces[0]
@@ -163,7 +163,7 @@ def test_metal_of_curvature_turns_p_by_the_known_phase():
 
 def test_the_published_grid_shows_normals_of_15_and_22_degrees():
     """As the grid's reach and the distance say: 0.349 m and 0.199 m at half a metre, 55 degrees of incidence."""
-    seen = visible_normals(load_instrument(find_packaged(Path("instrument.toml"))))
-    assert seen.x_deg == pytest.approx(15, abs=1)
-    assert seen.y_deg == pytest.approx(22, abs=1)
-    assert min(seen.alias_deg) > 50
+    normals_deg = visible_normals(load_instrument(find_packaged(Path("instrument.toml"))))
+    assert normals_deg.x_deg == pytest.approx(15, abs=1)
+    assert normals_deg.y_deg == pytest.approx(22, abs=1)
+    assert min(normals_deg.alias_deg) > 50

@@ -58,10 +58,10 @@ def test_offsets_are_at_the_cramer_rao_bound(burst, snr_db, echo):
     frames, df, phase, signal = burst(120, snr_db, echo)
     aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
     assert aligned.good.all()
-    own = np.sqrt(CHIRPS / (CHIRPS - 1))  # the mean was taken out of the errors
+    mean_factor = np.sqrt(CHIRPS / (CHIRPS - 1))  # the mean was taken out of the errors
     for error, bound in zip(_errors(aligned, df, phase), _bound(signal, snr_db), strict=True):
-        assert error.std() * own < 1.1 * bound
-        assert error.std() * own > 0.9 * bound
+        assert error.std() * mean_factor < 1.1 * bound
+        assert error.std() * mean_factor > 0.9 * bound
 
 
 def _divided(words):
@@ -106,11 +106,11 @@ def test_a_common_frequency_and_phase_of_all_chirps_has_no_other_effect(burst, c
     received = (frames[..., 0, :] + 1j * frames[..., 1, :]).transpose(3, 0, 1, 2) / 1000
     shifted = counts(received * np.exp(1j * (2 * np.pi * 0.07 * n + 1.0)))
     valid = np.ones(df.shape, bool)
-    one, other = align_row(frames, valid, LINEAR), align_row(shifted, valid, LINEAR)
-    relative = [a.frequency - a.frequency.mean(axis=1, keepdims=True) for a in (one, other)]
+    result, shifted_result = align_row(frames, valid, LINEAR), align_row(shifted, valid, LINEAR)
+    relative = [a.frequency - a.frequency.mean(axis=1, keepdims=True) for a in (result, shifted_result)]
     np.testing.assert_allclose(*relative, atol=1e-5)
     # Within a hundredth of the direct path.
-    np.testing.assert_allclose(np.abs(average_of(other)), np.abs(average_of(one)), atol=10)
+    np.testing.assert_allclose(np.abs(average_of(shifted_result)), np.abs(average_of(result)), atol=10)
 
 
 def test_the_residual_is_the_true_error(burst):
@@ -126,10 +126,10 @@ def test_a_chirp_of_noise_is_left_out(burst, noise, bad):
     rng = np.random.default_rng(5)
     frames[:, bad] = np.rint(1000 * noise(frames[:, bad].shape, 3, rng).real)
     aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
-    others = np.delete(np.arange(CHIRPS), bad)
+    other_chirps = np.delete(np.arange(CHIRPS), bad)
     assert not aligned.good[:, bad].any()
-    assert aligned.good[:, others].all()
-    f = aligned.frequency[:, others] - df[:, others]
+    assert aligned.good[:, other_chirps].all()
+    f = aligned.frequency[:, other_chirps] - df[:, other_chirps]
     assert (f - f.mean(axis=1, keepdims=True)).std() * 2.15e6 < 60  # Hz; a hundredth of an IF bin
 
 

@@ -32,15 +32,15 @@ def echoes(rig):
 
 @pytest.mark.parametrize("backlash_mm", [0.3, -0.3])
 def test_backlash_is_recovered_with_everything_else_disturbed(echoes, backlash_mm):
-    found = estimate_backlash(*echoes(backlash_mm))
-    assert found is not None
-    assert found.shift_mm == pytest.approx(backlash_mm, abs=0.05)
-    assert found.std_mm < 0.05
+    estimate = estimate_backlash(*echoes(backlash_mm))
+    assert estimate is not None
+    assert estimate.shift_mm == pytest.approx(backlash_mm, abs=0.05)
+    assert estimate.std_mm < 0.05
 
 
 def test_an_empty_plane_gives_no_backlash(echoes):
-    found = estimate_backlash(*echoes(0.3, points=[]))
-    assert found is None or found.std_mm > 0.1
+    estimate = estimate_backlash(*echoes(0.3, points=[]))
+    assert estimate is None or estimate.std_mm > 0.1
 
 
 def test_too_few_rows_give_no_backlash(echoes):

@@ -80,9 +80,9 @@ def test_offsets_have_no_effect_beyond_noise(row, setup):
 def test_the_high_pass_filter_is_compensated(row, small, setup):
     frames, valid, ideal = row(filtered=True, snr_db=30)
     undone = synchronise_row(frames, valid, BoardSetup.from_rig(small, small.receivers[1]))
-    left = synchronise_row(frames, valid, setup)
+    remainder = synchronise_row(frames, valid, setup)
     assert _relative_error(undone, ideal, slice(3, None)) < 0.04
-    assert _relative_error(undone, ideal, slice(3, None)) < 0.4 * _relative_error(left, ideal, slice(3, None))
+    assert _relative_error(undone, ideal, slice(3, None)) < 0.4 * _relative_error(remainder, ideal, slice(3, None))
 
 
 def test_errors_shrink_from_received_to_averaged(row, setup):
@@ -107,8 +107,8 @@ def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
     df, phase = 0.35 + rng.uniform(-0.08, 0.08, shape), rng.uniform(-np.pi, np.pi, shape)
     frames = signal[0][:, None, None] * np.exp(2j * np.pi * df[..., None] * n + 1j * phase[..., None])
     frames = 800 * (frames + noise(frames.shape, -snr_db, rng))
-    whole = replace(setup, examined=positions)
-    done = synchronise_row(frames.reshape(4, -1, 256).astype(np.complex64), np.ones(df.size, bool), whole)
+    full_setup = replace(setup, examined=positions)
+    done = synchronise_row(frames.reshape(4, -1, 256).astype(np.complex64), np.ones(df.size, bool), full_setup)
 
     echo = (done.samples / 800 - 1).astype(complex)
     mean = echo.mean(axis=1, keepdims=True)
@@ -124,14 +124,16 @@ def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, 
     turn = np.exp(2j * np.pi * rng.uniform(size=(1, 300, PULSES, 1)))
     frames = 800 * (signal.swapaxes(0, 1)[:, :, None] * turn)
     frames = (frames + 800 * noise(frames.shape, -12.0, rng)).reshape(4, -1, 256).astype(np.complex64)
-    some, every = (synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=n)) for n in (64, 300))
+    some, all_positions = (
+        synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=n)) for n in (64, 300)
+    )
     assert {name: values.shape[1] for name, values in some.errors.items() if name != "referenced"} == {
         "received": 64 * PULSES,
         "aligned": 64 * PULSES,
         "averaged": 64,
     }
-    assert every.errors["averaged"].shape[1] == 300
-    for stage, spread in every.stages.items():
+    assert all_positions.errors["averaged"].shape[1] == 300
+    for stage, spread in all_positions.stages.items():
         np.testing.assert_allclose(some.stages[stage], spread, rtol=0.35)
 
 
@@ -145,15 +147,15 @@ def test_clipped_and_missing_chirps_are_left_out(row, setup):
     assert done.chirps.tolist() == [6, 6, 6, 5, 6, 4, 6, 0, 6]
     assert done.valid.tolist() == [True] * 7 + [False, True]
     assert not done.samples[:, 7].any()
-    kept = done.valid
-    assert np.abs(done.samples[:, kept] / 800 - ideal[:, kept]).mean() < 0.2
+    is_valid = done.valid
+    assert np.abs(done.samples[:, is_valid] / 800 - ideal[:, is_valid]).mean() < 0.2
 
 
 def test_bursts_of_one_chirp(row, setup):
     """Only the direct path synchronises them; residuals that need two chirps are missing."""
     frames, valid, ideal = row(snr_db=20)
-    one = replace(setup, pulses=1)
-    done = synchronise_row(frames[:, ::PULSES], valid[::PULSES], one)
+    single_chirp = replace(setup, pulses=1)
+    done = synchronise_row(frames[:, ::PULSES], valid[::PULSES], single_chirp)
     assert done.valid.all()
     assert (done.chirps == 1).all()
     assert "referenced" not in done.stages

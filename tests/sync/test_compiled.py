@@ -78,12 +78,12 @@ def equaliser_of(rig):
 
 @pytest.mark.parametrize("other", ["silent", "clipped"])
 def test_one_usable_chirp_is_the_average_wherever_it_is_in_the_burst(loops, other):
-    one = bursts(positions=3, chirps=1)
+    burst = bursts(positions=3, chirps=1)
     for by in (loops.align, align_in_numpy):
-        expected = align(by, one, np.ones((3, 1), bool), (0, 192))
+        expected = align(by, burst, np.ones((3, 1), bool), (0, 192))
         for k in range(6):
-            words = np.full((3, 6, *one.shape[2:]), 32767 if other == "clipped" else 0, np.int16)
-            words[:, k] = one[:, 0]
+            words = np.full((3, 6, *burst.shape[2:]), 32767 if other == "clipped" else 0, np.int16)
+            words[:, k] = burst[:, 0]
             got = align(by, words, np.ones((3, 6), bool), (0, 192))
             np.testing.assert_array_equal(got.good, np.arange(6) == np.full((3, 1), k))
             np.testing.assert_allclose(got.centre, expected.centre, rtol=0, atol=1e-6)
@@ -101,10 +101,10 @@ def test_a_row_in_pieces_is_the_same_row(loops):
             yield memory[: 7 - i]
             memory[:] = 0  # a piece is used only until the next
 
-    for one, other in zip(
+    for piece, full_row in zip(
         align_pieces(pieces(), valid, (0, 192), by=loops.align), align(loops.align, words, valid, (0, 192)), strict=True
     ):
-        np.testing.assert_array_equal(one, other)
+        np.testing.assert_array_equal(piece, full_row)
 
 
 @pytest.mark.parametrize("positions", [0, 4, 6])
@@ -201,12 +201,12 @@ def test_the_direct_path(loops, rig, paths, noise, counts):
     got = offsets.reference(aligned, path, rig.chirp, loops)
     np.testing.assert_array_equal(got.found, expected.found)
     assert 30 < got.found.sum() < 37
-    found = got.found
+    is_found = got.found
     largest = np.abs(expected.samples).max()
     np.testing.assert_allclose(got.samples, expected.samples, rtol=0, atol=1e-5 * largest)
     np.testing.assert_allclose(got.noise, expected.noise, rtol=1e-5)
-    np.testing.assert_allclose(got.frequency[found], expected.frequency[found], rtol=0, atol=1e-7)
-    np.testing.assert_allclose(got.amplitude[found], expected.amplitude[found], rtol=1e-5)
+    np.testing.assert_allclose(got.frequency[is_found], expected.frequency[is_found], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(got.amplitude[is_found], expected.amplitude[is_found], rtol=1e-5)
     assert got.drift == pytest.approx(expected.drift, rel=1e-3, abs=1e-10)
 
 
@@ -227,8 +227,8 @@ def test_three_receivers_are_aligned_in_numpy():
 
 
 def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
-    found = sync_loops.Library(library_file)
-    monkeypatch.setattr(sync_loops, "library", lambda: found)
+    library = sync_loops.Library(library_file)
+    monkeypatch.setattr(sync_loops, "library", lambda: library)
     monkeypatch.setattr("polysight.sync.offsets.align_in_numpy", None)
     assert align_row(bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
 

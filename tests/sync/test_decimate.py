@@ -19,9 +19,9 @@ def decimated(cycles):
 )
 def test_tones_near_the_middle_pass_unchanged(bins, inner, edge):
     for sign in (1, -1):
-        off = np.abs(decimated(sign * bins * BIN) - np.exp(2j * np.pi * sign * bins * BIN * MIDDLES))
-        assert off[3:-3].max() < inner
-        assert off.max() < edge
+        deviation = np.abs(decimated(sign * bins * BIN) - np.exp(2j * np.pi * sign * bins * BIN * MIDDLES))
+        assert deviation[3:-3].max() < inner
+        assert deviation.max() < edge
 
 
 @pytest.mark.parametrize("bins", [43, 46, 48, 50, 53, 91, 96])

@@ -83,9 +83,9 @@ def test_what_is_not_found_changes_the_average_by_less_than_its_noise(align, rec
     quiet = received()
     got = align(words_of(counts, cross(quiet, chosen, level, rng)))
     clean = align(words_of(counts, quiet))
-    off = np.abs(got.halves.sum(axis=1)) - np.abs(clean.halves.sum(axis=1))
+    deviation = np.abs(got.halves.sum(axis=1)) - np.abs(clean.halves.sum(axis=1))
     noise = COUNTS * 10 ** (-8 / 20) / np.sqrt(2 * CHIRPS * 4)
-    assert np.sqrt((off**2).mean()) < noise
+    assert np.sqrt((deviation**2).mean()) < noise
 
 
 @pytest.mark.parametrize("snr_db", [-3.0, 8.0, 25.0, 60.0])
@@ -98,8 +98,8 @@ def test_no_chirp_of_an_undisturbed_burst_is_left_out(align, received, counts, s
 def test_motion_in_a_burst_is_no_disturbance(align, received, counts, travel_mm):
     """The echo of a plate aside turns by its change of path, up to 1.6 times the travel."""
     moved = np.linspace(-0.5, 0.5, CHIRPS)[:, None, None] * 1.6 * travel_mm / 3.85
-    direct, both = received(60.0, seed=3, echo=0.0), received(60.0, seed=3)
-    frames = direct + (both - direct) * np.exp(2j * np.pi * moved)
+    direct, disturbed = received(60.0, seed=3, echo=0.0), received(60.0, seed=3)
+    frames = direct + (disturbed - direct) * np.exp(2j * np.pi * moved)
     assert align(words_of(counts, frames)).good.all()
 
 
@@ -137,13 +137,13 @@ def test_both_forms_leave_out_the_same(received, counts):
     rng = np.random.default_rng(1)
     for level in (0.5, 1.0, 2.0, 20.0):
         words = words_of(counts, cross(received(12.0), rng.random((POSITIONS, CHIRPS)) < 0.3, level, rng))
-        one, other = (
+        compiled, in_numpy = (
             align_pieces([words], np.ones(words.shape[:2], bool), LINEAR, by=by)
             for by in (library.align, align_in_numpy)
         )
-        np.testing.assert_array_equal(one.good, other.good)
-        largest = np.abs(other.halves).max()
-        np.testing.assert_allclose(one.halves, other.halves, rtol=0, atol=3e-6 * largest)
+        np.testing.assert_array_equal(compiled.good, in_numpy.good)
+        largest = np.abs(in_numpy.halves).max()
+        np.testing.assert_allclose(compiled.halves, in_numpy.halves, rtol=0, atol=3e-6 * largest)
 
 
 def test_chirps_left_out_are_counted(rig, received, counts):

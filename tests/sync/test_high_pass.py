@@ -18,8 +18,8 @@ def test_each_section_is_3_db_down_and_45_degrees_ahead_at_its_corner():
 
 def test_sections_multiply_and_no_corners_is_the_identity():
     f = np.linspace(1e3, 2e6, 50)
-    both = HighPass((175e3, 350e3)).response(f)
-    np.testing.assert_allclose(both, HighPass((175e3,)).response(f) * HighPass((350e3,)).response(f))
+    response = HighPass((175e3, 350e3)).response(f)
+    np.testing.assert_allclose(response, HighPass((175e3,)).response(f) * HighPass((350e3,)).response(f))
     np.testing.assert_array_equal(HighPass().response(f), 1)
 
 
@@ -48,9 +48,9 @@ def test_three_taps_are_the_inverse_over_the_signals_band(rig, mode, if_hz, wors
     if mode == "complex2x" and if_hz > rate / 2:
         if_hz -= rate
     taps = Equaliser.from_model(model, chirp, 4).taps(np.array([if_hz / rate]))[0]
-    away = np.linspace(-40e3, 40e3, 81)
-    response = np.exp(2j * np.pi * np.outer(away / rate, 4 * np.array([-1, 0, 1]))) @ taps
-    np.testing.assert_allclose(response * model.response(if_hz + away), 1, atol=worst)
+    frequencies_hz = np.linspace(-40e3, 40e3, 81)
+    response = np.exp(2j * np.pi * np.outer(frequencies_hz / rate, 4 * np.array([-1, 0, 1]))) @ taps
+    np.testing.assert_allclose(response * model.response(if_hz + frequencies_hz), 1, atol=worst)
 
 
 def test_two_tones_are_restored_up_to_the_ends_of_the_record(rig):
@@ -79,8 +79,8 @@ def test_a_fit_recovers_the_corners_of_a_sweep(corners, with_phase):
     h = 37 * HighPass(corners).response(f)
     amplitude = np.abs(h) * (1 + 0.01 * rng.standard_normal(60))
     phase = np.angle(h) + 1.0 + 0.01 * rng.standard_normal(60)
-    found = fit_high_pass(f, amplitude, phase if with_phase else None)
-    np.testing.assert_allclose(found.corners_hz, corners, rtol=0.02 if with_phase else 0.06)
+    fit = fit_high_pass(f, amplitude, phase if with_phase else None)
+    np.testing.assert_allclose(fit.corners_hz, corners, rtol=0.02 if with_phase else 0.06)
 
 
 def test_an_insufficient_sweep_is_refused():

@@ -75,27 +75,27 @@ class SimChip:
 def _events(page: bytes) -> Iterator[tuple[int, bytes]]:
     """Time and payload of the events of a page of the ring buffer (Linux, Documentation/trace/ring-buffer-design)."""
     t_ns, committed = struct.unpack_from("<QQ", page)
-    at = 16
+    position = 16
     end = 16 + (committed & 0xFFFFFFFF)
-    while at < end:
-        head, word = struct.unpack_from("<II", page, at)
+    while position < end:
+        head, word = struct.unpack_from("<II", page, position)
         kind = head & 31
         delta = head >> 5
-        at += 4
+        position += 4
         # Padding
         if kind == 29:
             return
         # Absolute time
         if kind == 31:
             t_ns = delta | word << 27
-            at += 4
+            position += 4
             continue
         t_ns += delta | (word << 27 if kind == 30 else 0)
         # More than 2^27 ns since the last event
         if kind == 30:
-            at += 4
+            position += 4
             continue
         length = 4 * kind if kind else word - 4
-        at += 0 if kind else 4
-        yield t_ns, page[at : at + length]
-        at += length
+        position += 0 if kind else 4
+        yield t_ns, page[position : position + length]
+        position += length

@@ -48,8 +48,8 @@ def test_a_layer_reflects_by_airy(layer, below, thickness_m, cosine):
 @given(permittivities, permittivities, st.floats(0.0, 0.004), st.floats(0.0, 0.004), cosines)
 def test_a_layer_cut_in_two_is_one_layer(layer, below, first_m, second_m, cosine):
     cut = Stack(((layer, first_m), (layer, second_m)), below)
-    whole = Stack(((layer, first_m + second_m),), below)
-    whole_r = np.array(reflect(whole, FREQUENCY_HZ, cosine))
+    full_layer = Stack(((layer, first_m + second_m),), below)
+    whole_r = np.array(reflect(full_layer, FREQUENCY_HZ, cosine))
     assert np.array(reflect(cut, FREQUENCY_HZ, cosine)) == pytest.approx(whole_r, abs=1e-9)
 
 

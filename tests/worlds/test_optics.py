@@ -124,9 +124,9 @@ def test_antennas_may_change_places_near_the_specular_direction():
     for _ in range(5):
         tx, rx = mirror_pair(55, 0.87, p_share=rng.uniform(0.2, 0.8))
         moved = Antenna(rx.position + rng.normal(0, 0.003, 3), rx.boresight, rx.polarisation, 2.0)
-        there = scatter(tx, moved, facets, stack, [FREQUENCY_HZ])[0, 0]
+        exchanged = scatter(tx, moved, facets, stack, [FREQUENCY_HZ])[0, 0]
         back = scatter(moved, tx, facets, stack, [FREQUENCY_HZ])[0, 0]
-        assert abs(there - back) < 0.03 * abs(there)
+        assert abs(exchanged - back) < 0.03 * abs(exchanged)
 
 
 def test_the_direct_path_is_the_same_both_ways():

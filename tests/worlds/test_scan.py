@@ -70,10 +70,10 @@ def test_the_rig_file_is_the_published_rig():
     loaded = load_rig(ROOT / "instrument.toml")
     built = published_rig()
     for name in ("tx", "h", "v"):
-        one = getattr(loaded, name)
-        other = getattr(built, name)
-        assert one.position == pytest.approx(other.position, abs=1e-5)
-        assert one.polarisation == pytest.approx(other.polarisation, abs=1e-5)
+        loaded_value = getattr(loaded, name)
+        built_value = getattr(built, name)
+        assert loaded_value.position == pytest.approx(built_value.position, abs=1e-5)
+        assert loaded_value.polarisation == pytest.approx(built_value.polarisation, abs=1e-5)
     assert loaded.incidence_deg("h") == pytest.approx(55, abs=0.1)
     # TX2 as the rig's description has it.
     assert loaded.tx.position == pytest.approx([-0.7055, 0.0974, 0.0130], abs=1e-4)
@@ -96,6 +96,6 @@ def test_a_body_of_facets_is_the_plate_that_it_copies(rig):
     plate = Plate("plate", (0.01, 0.09), (0.040, 0.030), LAYER)
     facets = facets_of(make_surface(plate, rig.step_m, np.random.default_rng(0)), plate, rig)
     small = replace(rig, columns=9, rows=7)
-    whole = record(small, small.h, World((plate,)))
+    full_plate = record(small, small.h, World((plate,)))
     by_facets = record(small, small.h, World((), (Body("plate", facets, LAYER),)))
-    assert np.abs(whole - by_facets).max() < 1e-4 * np.abs(whole).max()
+    assert np.abs(full_plate - by_facets).max() < 1e-4 * np.abs(full_plate).max()

@@ -45,8 +45,8 @@ def random_pair(seed: int) -> tuple[Pair, Pair]:
 def test_a_large_metal_sphere_has_its_radar_cross_section():
     radius_m = 0.1
     distance_m = 60.0
-    there = (0.0, 0.0, -distance_m)
-    echo = scatter_sphere(dipoles(there, there, S_AXIS, S_AXIS), radius_m, None, FREQUENCY_HZ)[0]
+    receiver_m = (0.0, 0.0, -distance_m)
+    echo = scatter_sphere(dipoles(receiver_m, receiver_m, S_AXIS, S_AXIS), radius_m, None, FREQUENCY_HZ)[0]
     # sigma = 4 pi |E_s|^2 R^4 for a unit wave at 1 m; geometrical optics: pi a^2.
     section = 4 * np.pi * abs(echo) ** 2 * distance_m**4
     assert section == pytest.approx(np.pi * radius_m**2, rel=0.02)
@@ -80,11 +80,11 @@ def test_a_sphere_with_loss_takes_more_than_it_scatters():
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_transmitter_and_receiver_may_be_exchanged(permittivity, seed):
     forth, back = random_pair(seed)
-    there = scatter_sphere(forth, 0.05, permittivity, FREQUENCY_HZ)
-    assert scatter_sphere(back, 0.05, permittivity, FREQUENCY_HZ) == pytest.approx(there, rel=1e-9)
+    exchanged = scatter_sphere(forth, 0.05, permittivity, FREQUENCY_HZ)
+    assert scatter_sphere(back, 0.05, permittivity, FREQUENCY_HZ) == pytest.approx(exchanged, rel=1e-9)
     path_m = np.array([1.3])
-    there = scatter_cylinder(forth, 0.05, permittivity, FREQUENCY_HZ, path_m)
-    assert scatter_cylinder(back, 0.05, permittivity, FREQUENCY_HZ, path_m) == pytest.approx(there, rel=1e-9)
+    exchanged = scatter_cylinder(forth, 0.05, permittivity, FREQUENCY_HZ, path_m)
+    assert scatter_cylinder(back, 0.05, permittivity, FREQUENCY_HZ, path_m) == pytest.approx(exchanged, rel=1e-9)
 
 
 @pytest.mark.parametrize("permittivity", [None, 4 - 0.4j])
@@ -107,9 +107,9 @@ def test_the_stationary_axial_wave_gives_the_whole_integral(permittivity, sent, 
     integrand = sum_orders(many, (m_m, n_n, m_n), k, h, np.zeros(len(t))) * np.exp(
         1j * h * (pair.rx_m[0] - pair.tx_m[0])
     )
-    whole = np.conj(0.5j * integrand.sum() * (h[1] - h[0]))
+    full_integral = np.conj(0.5j * integrand.sum() * (h[1] - h[0]))
     quick = scatter_cylinder(pair, radius_m, permittivity, frequency_hz, specular)[0]
-    assert quick == pytest.approx(whole, rel=0.01)
+    assert quick == pytest.approx(full_integral, rel=0.01)
 
 
 @pytest.mark.parametrize("medium", [METAL, Stack(below=4 - 0.4j), Stack(below=9 - 1j)], ids=["metal", "4", "9"])
@@ -142,7 +142,7 @@ def test_what_physical_optics_misses_is_found_from_the_series():
     x, y = published_rig().centre_m
     centre_m = (float(x), float(y), 0.499 + 0.1)
     offsets = np.array([[0.0, 0.0, 0.0], [0.1, 0.05, 0.0], [-0.2, 0.1, 0.0]])
-    left = []
+    residuals = []
     missed = []
     for shape in (sphere("ball", METAL, centre_m, 0.1), cylinder("pipe", METAL, centre_m, 0.1, 2.0, axis=(1, 2, 0.1))):
         ratios = []
@@ -154,6 +154,6 @@ def test_what_physical_optics_misses_is_found_from_the_series():
         # Only H over V counts: what both have in common is antennas and spreading.
         without, with_bends = np.array(ratios[0]) / np.array(ratios[1])
         missed.append(np.abs(without - 1).max())
-        left.append(np.abs(with_bends - 1).max())
+        residuals.append(np.abs(with_bends - 1).max())
     assert min(missed) > 0.015
-    assert max(left) < 0.007
+    assert max(residuals) < 0.007

@@ -111,10 +111,10 @@ def test_curvatures_are_those_of_the_solids():
 def test_a_whole_scan_is_that_of_its_single_positions(shape):
     x = 0.002 * np.arange(-30, 30)
     offsets = np.stack([*np.meshgrid(x, x), np.zeros((60, 60))], axis=-1)
-    whole = record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets)
+    full_scan = record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets)
     some = record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets[::20, ::20])
-    for channel in whole:
-        difference = np.abs(whole[channel][..., ::20, ::20] - some[channel]).max()
+    for channel in full_scan:
+        difference = np.abs(full_scan[channel][..., ::20, ::20] - some[channel]).max()
         assert difference < 5e-3 * np.abs(some[channel]).max()
 
 

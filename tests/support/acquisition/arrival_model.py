@@ -50,12 +50,12 @@ def receive(
     ready = 0.0
     for k, stop in enumerate([*range(PAYLOAD, end, PAYLOAD), end]):
         frame = (stop - 1) // frame_bytes
-        made = sent[frame] + FRAME_NS * (stop - frame * frame_bytes) / frame_bytes
+        sent_ns = sent[frame] + FRAME_NS * (stop - frame * frame_bytes) / frame_bytes
         if stop == end and end % PAYLOAD:
             # The card waits 2 s before it sends a packet that is not full
-            made += 2_000 * MS
-        made = max([made, *(b for a, b in stalls if a <= made < b)])
-        ready = max(made, ready + 25 * US)
+            sent_ns += 2_000 * MS
+        sent_ns = max([sent_ns, *(b for a, b in stalls if a <= sent_ns < b)])
+        ready = max(sent_ns, ready + 25 * US)
         if k not in lost:
             arrivals.append((ready + 50 * US + rng.exponential(20 * US), stop))
     arrivals.sort()

@@ -103,11 +103,11 @@ class FakeCard:
             return
         data = payload_of(self.board.name, row, self.row_bytes)
         data = data[: len(data) - self.short.get((row, take), 0)]
-        to = (self.board.host_address, self.board.data_port)
+        destination = (self.board.host_address, self.board.data_port)
         for k, start in enumerate(range(0, len(data), FULL)):
             body = data[start : start + FULL]
             if k not in self.drop.get((row, take), ()):
-                self.out.sendto(encode_packet(self.sequence, self.count, body), to)
+                self.out.sendto(encode_packet(self.sequence, self.count, body), destination)
             self.sequence += 1
             self.count += len(body)
         self.report_status()

@@ -204,8 +204,8 @@ class FakePi:
         for point in range(row.points):
             first = begin + point * 60_000_000
             for k in range(n):
-                while (left := first + k * period + 100_000 - time.monotonic_ns()) > 0:
-                    time.sleep(left * 1e-9 if left > 2_000_000 else 0)
+                while (left_ns := first + k * period + 100_000 - time.monotonic_ns()) > 0:
+                    time.sleep(left_ns * 1e-9 if left_ns > 2_000_000 else 0)
                 for card in self.cards:
                     card.send_frame(row.index, take, point * n + k, self.rig.frame_bytes)
             self._emit(

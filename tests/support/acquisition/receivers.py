@@ -60,7 +60,7 @@ def fork_receivers(patch: pytest.MonkeyPatch) -> None:
 
 def receivers() -> list[int]:
     """Process ids of the receivers of this test's scan, in the order of the recorded boards."""
-    return sorted(one.pid for one in _started if one.pid is not None and one.poll() is None)
+    return sorted(process.pid for process in _started if process.pid is not None and process.poll() is None)
 
 
 def receiver_of(board: str) -> int:

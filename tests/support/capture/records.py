@@ -57,15 +57,15 @@ class Card:
     def record(self, resets: tuple[int, ...] = ()) -> Record:
         """Return the next record; the counters restart before each of the packets `resets`."""
         self._seed += 1
-        whole = Record.make(self._size, 0, 1, self._seed)
+        full_record = Record.make(self._size, 0, 1, self._seed)
         packets = []
-        for k in range(len(whole.packets)):
+        for k in range(len(full_record.packets)):
             if k in resets:
                 self.reset()
-            payload = whole.data[k * FULL : (k + 1) * FULL]
+            payload = full_record.data[k * FULL : (k + 1) * FULL]
             packets.append(encode_packet(self._sequence, self._count, payload))
             self._sequence, self._count = self._sequence + 1, self._count + len(payload)
-        return Record(whole.data, packets)
+        return Record(full_record.data, packets)
 
 
 def log_of(size: int, packets: list[bytes], batch: int = 7, t_ns: int = 1) -> PacketLog:
@@ -101,5 +101,5 @@ def mask_of(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
 
 
 def is_original_or_masked(record: Record, placed: Placed, out: np.ndarray) -> bool:
-    kept = ~mask_of(out.size, placed.missing)
-    return bool((out[kept] == np.frombuffer(record.data, dtype=np.uint8)[kept]).all())
+    is_kept = ~mask_of(out.size, placed.missing)
+    return bool((out[is_kept] == np.frombuffer(record.data, dtype=np.uint8)[is_kept]).all())

@@ -139,8 +139,8 @@ def answering(rig: Instrument, hello: m.HelloReply, version: str = m.WIRE_VERSIO
     def serve() -> None:
         while not stop.is_set():
             if replies.poll(20):
-                asked = m.unpack_command(replies.recv())
-                reply = hello if isinstance(asked, m.Hello) else rest
+                command = m.unpack_command(replies.recv())
+                reply = hello if isinstance(command, m.Hello) else rest
                 replies.send(msgpack.packb({**msgspec.to_builtins(reply), "version": version}))
 
     thread = threading.Thread(target=serve)

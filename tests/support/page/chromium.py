@@ -153,9 +153,9 @@ class Browser:
 
     def click(self, selector: str) -> None:
         """Press a button that is shown."""
-        found = f"document.querySelector({json.dumps(selector)})"
-        self.wait(f"{found}?.checkVisibility() && !{found}.disabled", f"that {selector} can be pressed")
-        self.value(f"{found}.click()")
+        element = f"document.querySelector({json.dumps(selector)})"
+        self.wait(f"{element}?.checkVisibility() && !{element}.disabled", f"that {selector} can be pressed")
+        self.value(f"{element}.click()")
 
     def check_whole(self, address: str) -> None:
         """Check that nothing overflows sideways, there are no errors, and nothing was loaded from another address."""

@@ -51,16 +51,16 @@ class Watched(Watch):
 @pytest.fixture
 def watching() -> Iterator[Callable[..., Watched]]:
     """Makes watches, as `Watch`, that run until the test ends."""
-    made: list[Watched] = []
+    watched: list[Watched] = []
 
     def watch(*arguments: Any, **options: Any) -> Watched:
-        made.append(Watched(*arguments, **options))
-        made[-1].start()
-        return made[-1]
+        watched.append(Watched(*arguments, **options))
+        watched[-1].start()
+        return watched[-1]
 
     yield watch
-    for one in made:
-        one.close()
+    for watched_scan in watched:
+        watched_scan.close()
 
 
 @pytest.fixture(scope="session")

@@ -51,9 +51,9 @@ class GrowingScan:
             return ""
         fact = self._facts.pop(0)
         fact |= {key: utc_now() for key in fact if key.endswith("_utc")}
-        known = fact.get("events", {}).get("bytes", 0)
-        if known:
-            (self.path / EVENTS).write_bytes(self._events[:known])
+        event_bytes = fact.get("events", {}).get("bytes", 0)
+        if event_bytes:
+            (self.path / EVENTS).write_bytes(self._events[:event_bytes])
         self.write(fact)
         return str(fact["fact"])
 
@@ -113,11 +113,11 @@ def served(watch: Watch, token: str = "", host: str = "127.0.0.1", port: int = 0
     """A server of one live view for the block."""
     access = Access(token, loopback=host == "127.0.0.1", control=bool(token))
     scans = Scans(watch.folder.parent, watch.folder.name)
-    made = Served(Site(scans, Watches(bool(token), {watch.folder.name: watch})), access, host, port)
+    server = Served(Site(scans, Watches(bool(token), {watch.folder.name: watch})), access, host, port)
     try:
-        yield made
+        yield server
     finally:
-        made.close()
+        server.close()
 
 
 @contextmanager
@@ -127,20 +127,20 @@ def served_folder(
     """A server of all scans under a folder for the block; with a rig file it starts programs."""
     access = access or Access(token, control=bool(token))
     programs = Programs() if config is not None else None
-    made = Served(Site(Scans(root), Watches(access.control), programs, config), access)
+    server = Served(Site(Scans(root), Watches(access.control), programs, config), access)
     try:
-        yield made
+        yield server
     finally:
-        made.close()
-        made.site.close()
+        server.close()
+        server.site.close()
 
 
 @contextmanager
 def served_place(root: Path, place: Place, access: Access) -> Iterator[Served]:
     """The same at a place with a certificate."""
-    made = Served(Site(Scans(root), Watches(access.control)), access, place=place)
+    server = Served(Site(Scans(root), Watches(access.control)), access, place=place)
     try:
-        yield made
+        yield server
     finally:
-        made.close()
-        made.site.close()
+        server.close()
+        server.site.close()

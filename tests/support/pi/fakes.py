@@ -305,13 +305,13 @@ class FakeStage:
         self.moving = self.held = False
         if self._closed.is_set():
             return
-        where = {"points": self.points, "pulses": self.points, "x": self.x, "y": self.y}
+        position = {"points": self.points, "pulses": self.points, "x": self.x, "y": self.y}
         if number:
             self.alarm = number
             end = Reply("alarm", number=number)
         else:
-            lost = {"lostx": self.lost[0], "losty": self.lost[1]} if c.verb == "HOME" else {}
-            end = Reply("done", c.sequence, fields={k: str(v) for k, v in (where | lost).items()})
+            lost_steps = {"lostx": self.lost[0], "losty": self.lost[1]} if c.verb == "HOME" else {}
+            end = Reply("done", c.sequence, fields={k: str(v) for k, v in (position | lost_steps).items()})
         self._end = (c.sequence, end)
         if self.lose_end:
             self.lose_end -= 1

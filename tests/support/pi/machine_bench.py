@@ -56,8 +56,8 @@ class Bench:
         """Time goes on, in the executor's turns: until something is due, or the time is over."""
         end = self.t + seconds
         while self.t < end:
-            left = self.machine.seconds_left()
-            self.t = min(end, self.t + (seconds if left is None else max(left, 1e-6)))
+            seconds_left = self.machine.seconds_left()
+            self.t = min(end, self.t + (seconds if seconds_left is None else max(seconds_left, 1e-6)))
             self.machine.check_deadlines()
             self.run_posted()
 

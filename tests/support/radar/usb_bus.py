@@ -160,8 +160,8 @@ class Bus(IBackend):
     def bulk_write(self, dev_handle, ep, intf, data, timeout) -> int:
         chip = self._check(dev_handle)
         channel = (ep + 1) // 2
-        wanted = MPSSE if channel <= 2 else BIT_BANG
-        if chip.modes.get(channel, (0, 0))[0] != wanted:
+        expected_mode = MPSSE if channel <= 2 else BIT_BANG
+        if chip.modes.get(channel, (0, 0))[0] != expected_mode:
             chip.errors.append(f"written to channel {channel} in mode {chip.modes.get(channel)}")
         chip.chip.take("ABCD"[channel - 1], bytes(data))
         return len(data)

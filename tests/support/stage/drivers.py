@@ -90,12 +90,12 @@ class Driver:
 
     def status(self) -> Reply:
         """Ask for the status; everything else that was received is kept."""
-        kept = self.received
+        messages_before = self.received
         self.received = b""
         self.rx(bytes([Immediate.STATUS]))
         self.until(lambda: b"status " in self.received)
         status = next(line for line in self.received.splitlines(keepends=True) if line.startswith(b"status "))
-        self.received = kept + self.received.replace(status, b"", 1)
+        self.received = messages_before + self.received.replace(status, b"", 1)
         return Reply.decode(status)
 
     def resync(self) -> None:
@@ -392,9 +392,9 @@ class Host(Driver):
         self.set(Parameter.HEARTBEAT, 60_000)
         self.obeyed("ENABLE", 1)
         self.motion("HOME")
-        x, left, right = self.uno.motors
-        assert left == right
-        self.zero = (x, left)
+        x, left_motor, right = self.uno.motors
+        assert left_motor == right
+        self.zero = (x, left_motor)
         return self
 
     def at(self, edge: PinEdge) -> tuple[int, int]:

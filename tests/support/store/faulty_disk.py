@@ -109,10 +109,12 @@ class FaultyDisk:
     def _draw_content(self, durable: bytes, now: bytes) -> bytes:
         """Draw what is left of a file: old, new, written in order up to some byte, or each sector old or new."""
         written = self._random.randint(0, len(now))
-        before = durable + bytes(max(0, len(now) - len(durable)))
+        content_before = durable + bytes(max(0, len(now) - len(durable)))
         sectors = (slice(k, k + SECTOR_BYTES) for k in range(0, len(now), SECTOR_BYTES))
-        mixed = b"".join((now if self._random.random() < 0.5 else before[: len(now)])[sector] for sector in sectors)
-        return self._random.choice([durable, now, before, now[:written] + durable[written:], mixed])
+        mixed = b"".join(
+            (now if self._random.random() < 0.5 else content_before[: len(now)])[sector] for sector in sectors
+        )
+        return self._random.choice([durable, now, content_before, now[:written] + durable[written:], mixed])
 
     # --- the operations ---
 
@@ -184,7 +186,7 @@ class FaultyDisk:
         a = Path(a)
         b = Path(b)
         self._hit("rename", b)
-        before = b.read_bytes() if b.exists() else None
+        content_before = b.read_bytes() if b.exists() else None
         REAL.rename(a, b, **named)
         self._durable.pop(b, None)
         if a in self._durable:
@@ -193,18 +195,18 @@ class FaultyDisk:
         def back() -> None:
             if b.exists():
                 REAL.rename(b, a)
-            if before is not None:
-                b.write_bytes(before)
+            if content_before is not None:
+                b.write_bytes(content_before)
 
         self._undo.append((b.parent, back))
 
     def _unlink(self, path: Any, **named: Any) -> None:
         path = Path(path)
-        seen = str(path).startswith(self._folder) and path.exists()
+        is_tracked = str(path).startswith(self._folder) and path.exists()
         self._hit("unlink", path)
-        content = self._durable.pop(path, path.read_bytes()) if seen else b""
+        content = self._durable.pop(path, path.read_bytes()) if is_tracked else b""
         REAL.unlink(path, **named)
-        if seen:
+        if is_tracked:
             self._undo.append((path.parent, lambda: path.write_bytes(content)))
 
 

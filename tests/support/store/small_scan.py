@@ -94,10 +94,10 @@ class SmallPi:
 
     def begin_run(self, run: m.BeginRun) -> None:
         try:
-            resumed, lost = self._journal.open(run.scan_id, run.plan, run.last_seq)
+            resumed, lost_events = self._journal.open(run.scan_id, run.plan, run.last_seq)
         except PolysightError as e:
             raise host_run.ScanError(f"the Pi refused BeginRun: {e.what}", e.why, e.remedy) from None
-        self._commit(m.RunStarted, {"plan": run.plan, "resumed": resumed, "lost": lost})
+        self._commit(m.RunStarted, {"plan": run.plan, "resumed": resumed, "lost": lost_events})
 
     def status(self) -> m.StatusReply:
         return m.StatusReply(
@@ -127,12 +127,12 @@ class SmallPi:
 
     def events(self) -> list[m.AnyEvent]:
         """Return new events of the journal."""
-        found = [m.unpack_event(raw) for raw in self._journal.read(self._scan_id, self._seen + 1, 10000)[0]]
-        for event in found:
+        unpacked = [m.unpack_event(raw) for raw in self._journal.read(self._scan_id, self._seen + 1, 10000)[0]]
+        for event in unpacked:
             assert event.seq == self._seen + 1, "the sequence has a gap"
             self._seen = event.seq
             self._take(event)
-        return found
+        return unpacked
 
     def drain(self) -> None:
         """No events are pending."""

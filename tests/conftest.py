@@ -93,9 +93,9 @@ def _composed_figures(request: pytest.FixtureRequest) -> Iterator[None]:
     if request.path.parent.name not in UNRENDERED:
         yield
         return
-    from tests.support.products import unrendered
+    from tests.support.products import skip_rendering
 
-    with unrendered():
+    with skip_rendering():
         yield
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import tomli_w
-from tests.support.acquisition.fake_cards import payload_of
+from tests.support.acquisition.fake_cards import make_payload
 from tests.support.acquisition.fake_rig import FakeRig, small_instrument
 from tests.support.acquisition.receivers import fork_receivers
 from tests.support.page.fixtures import finished, samples
@@ -37,7 +37,7 @@ def config(rig, tmp_path):
 
 @pytest.fixture
 def payload():
-    return payload_of
+    return make_payload
 
 
 @pytest.fixture

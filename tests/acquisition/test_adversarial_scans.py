@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.acquisition.fake_cards import FakeCard, payload_of
+from tests.support.acquisition.fake_cards import FakeCard, make_payload
 from tests.support.acquisition.fake_rig import FakeRig, small_instrument
 from tests.support.store.plain_scan import errors
 
@@ -42,7 +42,7 @@ class AdversarialCard(FakeCard):
         else:
             troubles = ()
         sent = self.adversary.record(
-            self.row_bytes // self._frame, troubles, payload_of(self.board.name, row, self.row_bytes)
+            self.row_bytes // self._frame, troubles, make_payload(self.board.name, row, self.row_bytes)
         )
         self.sent.append((row, take, troubles))
         self._send(sent.arrivals)
@@ -85,7 +85,7 @@ def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
     for row, committed in scan.committed_rows().items():
         for name, board in committed.boards.items():
             data = scan.read_row(name, row)
-            want = np.frombuffer(payload_of(name, row, rig.instrument.row_bytes), dtype=np.uint8)
+            want = np.frombuffer(make_payload(name, row, rig.instrument.row_bytes), dtype=np.uint8)
             mask = np.zeros(want.size, dtype=bool) if data.mask is None else data.mask
             assert (data.payload[~mask] == want[~mask]).all(), (row, name)
             assert not mask.any() or row in incomplete

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from tests.support.acquisition.arrival_model import MS, PAYLOAD, pulse_times
-from tests.support.capture.records import mask_of
+from tests.support.capture.records import make_mask
 
 from polysight.acquisition.pulse_times import PlacedFrames, frames_to_move, move_frames, place_frames
 from polysight.capture.packet_log import PacketLog
@@ -76,7 +76,7 @@ def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
         placed=placed,
         frames=frames,
         out=out,
-        masked=mask_of(out.size, missing),
+        masked=make_mask(out.size, missing),
         whole=is_whole,
         untimed=untimed,
         placed_out=placed_out,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.acquisition.arrival_model import FRAME_NS, MS, PAYLOAD, US, Load, pulse_times, receive
-from tests.support.capture.records import mask_of
+from tests.support.capture.records import make_mask
 
 from polysight.acquisition.pulse_times import PlacedFrames, describe, place_frames, rewrite_row
 from polysight.capture.receiver import RowCapture
@@ -121,7 +121,7 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
     capture = rewrite_row(path, RowCapture(**{**none, **row}), frames, frame)
     got = np.fromfile(path, dtype=np.uint8)
     np.testing.assert_array_equal(got, want)
-    np.testing.assert_array_equal(mask_of(got.size, capture.missing), want == 0)
+    np.testing.assert_array_equal(make_mask(got.size, capture.missing), want == 0)
     facts, arrivals = read_index(path.with_suffix(".idx"))
     assert [tuple(x) for x in facts["missing"]] == capture.missing
     assert facts["pulses_missed"] == sorted(missed)

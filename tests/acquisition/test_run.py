@@ -12,7 +12,7 @@ import time
 import msgspec
 import numpy as np
 import pytest
-from tests.support.acquisition.fake_cards import FULL, FakeCard, payload_of
+from tests.support.acquisition.fake_cards import FULL, FakeCard, make_payload
 from tests.support.acquisition.fake_rig import FakeRig
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
@@ -263,7 +263,7 @@ class LateCard(FakeCard):
     def send_row(self, row: int, take: int) -> None:
         if not self.recording:
             return
-        data = payload_of(self.board.name, row, self.row_bytes)[: self.cut.get((row, take), self.row_bytes)]
+        data = make_payload(self.board.name, row, self.row_bytes)[: self.cut.get((row, take), self.row_bytes)]
         whole_packets = len(data) // FULL * FULL
         for a in range(0, whole_packets, FULL):
             self._rest = data[a : a + FULL]

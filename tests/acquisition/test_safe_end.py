@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
-from tests.support.acquisition.receivers import receiver_of
+from tests.support.acquisition.receivers import find_receiver
 from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
@@ -148,7 +148,7 @@ def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, tmp_
     def progress(p) -> None:
         answer.append(p.phase)
         if p.phase == "state" and (p.state, p.row) == ("running", 1):
-            os.kill(receiver_of(board), signal.SIGKILL)
+            os.kill(find_receiver(board), signal.SIGKILL)
         if p.phase == "end":
             said_at_end.append((release.is_set(), p.message))
             release.set()
@@ -290,10 +290,10 @@ def test_processing_that_fails_does_not_hide_that_every_row_is_there(config, tmp
 def test_a_complete_scan_succeeds_if_the_pi_run_cannot_be_ended(rig, tmp_path, monkeypatch):
     """As with a full disk on the Pi: every row is committed, so nothing is missing."""
 
-    def refused(*_):
+    def refuse_end(*_):
         raise DeviceError("the Pi did not write it down", "its disk is full", "remove old journals")
 
-    monkeypatch.setattr(PiClient, "end_run", refused)
+    monkeypatch.setattr(PiClient, "end_run", refuse_end)
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.folder.complete) == ("success", True)
     assert any("the Pi did not write it down" in w for w in result.warnings)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.support.products import unrendered
+from tests.support.products import skip_rendering
 from tests.support.rigs import published_rig
 from tests.support.scenes import scene_of
 
@@ -21,7 +21,7 @@ COPPER = {"name": "copper", "centre_mm": [-45.0, 0.0], "size_mm": [45.0, 45.0], 
 PET = {"name": "PET", "centre_mm": [45.0, 0.0], "size_mm": [45.0, 45.0], "permittivity": [3.78, 0.7]}
 
 
-def simulated(folder: Path, *plates: dict[str, Any], **more: Any) -> Path:
+def simulate_plates(folder: Path, *plates: dict[str, Any], **more: Any) -> Path:
     """A scan of plates on the grid of examples/own-scene.toml, of nothing on a coarse one; `more` as of `simulate`."""
     columns, rows, step_mm = (31, 27, (10.0, 6.0)) if plates else (15, 17, (14.0, 8.0))
     image = {"columns": 90, "rows": 60, "pixel_mm": 2.0}
@@ -31,14 +31,14 @@ def simulated(folder: Path, *plates: dict[str, Any], **more: Any) -> Path:
 
 def command(*words: object) -> None:
     """Run a command of the host, which must succeed; its report is not rendered."""
-    with redirect_stdout(StringIO()), unrendered():
+    with redirect_stdout(StringIO()), skip_rendering():
         assert main([str(word) for word in words]) == 0
 
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scan folder of copper and PET, without products."""
-    return simulated(tmp_path_factory.mktemp("api") / "scan", COPPER, PET)
+    return simulate_plates(tmp_path_factory.mktemp("api") / "scan", COPPER, PET)
 
 
 @pytest.fixture(scope="session")

@@ -67,7 +67,7 @@ def test_a_plate_that_is_not_measured_is_a_reason(patches):
 
 
 @pytest.fixture
-def saved(products, tmp_path):
+def products_copy(products, tmp_path):
     return shutil.copytree(products, tmp_path / "products")
 
 
@@ -79,20 +79,20 @@ def with_plate(products, plate: CheckPlate) -> None:
 
 
 @pytest.mark.parametrize(("permittivity", "status"), [((3.78, 0.7), 0), ((9.0, 0.01), 1)])
-def test_the_command_says_and_draws_it(saved, tmp_path, capsys, permittivity, status):
+def test_the_command_says_and_draws_it(products_copy, tmp_path, capsys, permittivity, status):
     x_mm, y_mm = PET["centre_mm"]
-    with_plate(saved, CheckPlate(name="PET", permittivity=permittivity, place_mm=(x_mm, y_mm)))
+    with_plate(products_copy, CheckPlate(name="PET", permittivity=permittivity, place_mm=(x_mm, y_mm)))
     chart = tmp_path / "chart.png"
-    assert main(["check", str(saved), "--chart", str(chart), "--json"]) == status
+    assert main(["check", str(products_copy), "--chart", str(chart), "--json"]) == status
     (check,) = json.loads(capsys.readouterr().out)
     assert (check["level"] == "action") == bool(status)
     assert chart.read_bytes().startswith(b"\x89PNG")
-    table = polysight.check(saved)
+    table = polysight.check(products_copy)
     assert table["level"].item() == check["level"]
     assert table["sigmas"].item() == check["sigmas"]
 
 
-def test_a_rig_file_without_a_plate_is_an_error(saved, capsys):
-    with_plate(saved, CheckPlate())
-    assert main(["check", str(saved)]) == 2
+def test_a_rig_file_without_a_plate_is_an_error(products_copy, capsys):
+    with_plate(products_copy, CheckPlate())
+    assert main(["check", str(products_copy)]) == 2
     assert "names no check plate" in capsys.readouterr().err

@@ -14,7 +14,7 @@ from polysight import compare, fresnel, multilayer, open_scan, permittivity_from
 from polysight.products.processed import read_image
 from polysight_shared.error_codes import ErrorCode
 
-from .conftest import COPPER, PET, simulated
+from .conftest import COPPER, PET, simulate_plates
 
 BOXES = {"copper": (-60.0, -15.0, -30.0, 15.0), "PET": (30.0, -15.0, 60.0, 15.0)}
 
@@ -145,7 +145,7 @@ def test_a_scene_can_be_written_in_python(tmp_path):
 
 
 def test_a_scan_shows_itself_without_processing(products, tmp_path):
-    assert "recorded rows" in open_scan(simulated(tmp_path / "scan"))._repr_html_()
+    assert "recorded rows" in open_scan(simulate_plates(tmp_path / "scan"))._repr_html_()
     page = open_scan(products)._repr_html_()
     for text in ("SIMULATED", "<td>metal reference</td>", "verdict"):
         assert text in page

@@ -22,7 +22,7 @@ from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
 
-from .conftest import COPPER, PET, REPO, command, simulated
+from .conftest import COPPER, PET, REPO, command, simulate_plates
 
 DATASETS = ("image", "patches", "permittivity", "materials")
 
@@ -196,7 +196,7 @@ def test_products_of_other_rows_are_not_used(folder, products, tmp_path):
 @pytest.mark.parametrize("by_columns", [False, True])
 def test_the_published_layout_opens(tmp_path, monkeypatch, by_columns):
     monkeypatch.chdir(tmp_path)
-    data = simulated(tmp_path / "data", COPPER, PET, layout="authors", by_columns=by_columns)
+    data = simulate_plates(tmp_path / "data", COPPER, PET, layout="authors", by_columns=by_columns)
     opened = open_scan(data)
     assert "SIMULATED" in repr(opened)
     assert opened.rows.missing == ()
@@ -226,11 +226,11 @@ def test_rows_are_read_once_and_only_when_asked_for(folder, tmp_path, monkeypatc
     read: list[tuple[str, int]] = []
     true_read = ScanFolder.read_row
 
-    def counted(self, board, row):
+    def count_read(self, board, row):
         read.append((board, row))
         return true_read(self, board, row)
 
-    monkeypatch.setattr(ScanFolder, "read_row", counted)
+    monkeypatch.setattr(ScanFolder, "read_row", count_read)
     scan = open_scan(folder)
     assert scan.rows.planned == 27
     assert scan.rig.name
@@ -322,7 +322,7 @@ def test_a_scan_without_a_whole_row_says_so(folder, tmp_path):
 
 
 def test_a_scan_without_metal_says_what_can_be_had(tmp_path):
-    scan = open_scan(simulated(tmp_path / "scan"))
+    scan = open_scan(simulate_plates(tmp_path / "scan"))
     assert scan.verdict.level == "none"
     assert scan.materials().sizes["patch"] == 0
     assert scan.image(metal_referenced=False).attrs["metal_reference"].startswith("none")

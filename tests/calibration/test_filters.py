@@ -21,29 +21,29 @@ def scans(tmp_path_factory, make_rig, scan_of):
     folders = []
     for k, offset_hz in enumerate(OFFSETS_HZ):
 
-        def programmed(table, offset_hz=offset_hz):
+        def set_offsets(table, offset_hz=offset_hz):
             for board in table["boards"]:
                 if board["role"] != "transmit":
                     board["start_offset_hz"] = offset_hz
 
         tables = {"grid": {"columns": 8, "rows": 3}, "burst": {"pulses": 8}, "image": {"columns": 20, "rows": 20}}
-        believed = make_rig(programmed, **tables)
+        believed = make_rig(set_offsets, **tables)
         corners = {"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}
-        true = make_rig(programmed, chirp=corners, **tables)
+        true = make_rig(set_offsets, chirp=corners, **tables)
         folders.append(scan_of(folder / f"{k}", true, believed, seed=2, disturbances={"if_offset_hz": 0.0}))
     return folders
 
 
 @pytest.fixture(scope="module")
-def found(scans, tmp_path_factory):
+def filter_run(scans, tmp_path_factory):
     """The calibration file of the sweep."""
     out = tmp_path_factory.mktemp("found")
     assert main(["calibrate", "hpf", *map(str, scans), "--out", str(out)]) == 0
     return next(out.iterdir())
 
 
-def test_unknown_corners_are_recovered(scans, found):
-    file = read_calibration(found, FilterFile, "hpf")
+def test_unknown_corners_are_recovered(scans, filter_run):
+    file = read_calibration(filter_run, FilterFile, "hpf")
     for board in file.boards.values():
         corners = np.array(board.corners_khz)
         errors = np.array(board.standard_error_khz)
@@ -54,13 +54,17 @@ def test_unknown_corners_are_recovered(scans, found):
     assert (file.simulated, len(file.sources)) == (True, len(scans))
 
 
-def test_processing_uses_the_filter_that_the_rig_file_names(found, tmp_path, make_rig, scan_of):
-    rig = make_rig(grid={"columns": 4, "rows": 2}, image={"columns": 20, "rows": 20}, calibration={"hpf": str(found)})
+def test_processing_uses_the_filter_that_the_rig_file_names(filter_run, tmp_path, make_rig, scan_of):
+    rig = make_rig(
+        grid={"columns": 4, "rows": 2}, image={"columns": 20, "rows": 20}, calibration={"hpf": str(filter_run)}
+    )
     pipeline = Pipeline(ScanFolder.load(scan_of(tmp_path / "scan", rig)))
     for name, setup in pipeline.synchroniser.setups.items():
-        measured = HighPass(tuple(1e3 * c for c in read_calibration(found, FilterFile, "hpf").boards[name].corners_khz))
+        measured = HighPass(
+            tuple(1e3 * c for c in read_calibration(filter_run, FilterFile, "hpf").boards[name].corners_khz)
+        )
         assert setup.equaliser.model == measured != high_pass(rig.chirp)
-    assert load_calibration({"hpf": found}).high_pass("LS") is None
+    assert load_calibration({"hpf": filter_run}).high_pass("LS") is None
 
 
 def test_a_single_start_frequency_is_refused(scans, tmp_path):

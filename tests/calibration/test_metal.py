@@ -123,13 +123,13 @@ def calibrate(plate, out, *options):
 
 
 @pytest.fixture(scope="module")
-def whole(plate, tmp_path_factory):
+def full_metal(plate, tmp_path_factory):
     """The plate's metal reference without sub-bands."""
     return calibrate(plate, tmp_path_factory.mktemp("whole"))
 
 
 @pytest.fixture(scope="module")
-def banded(plate, tmp_path_factory):
+def banded_metal(plate, tmp_path_factory):
     """The plate's metal reference with sub-bands."""
     return calibrate(plate, tmp_path_factory.mktemp("banded"), "--bands", str(BANDS))
 
@@ -174,9 +174,9 @@ def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows
     assert not (out / "image.npz").exists()
 
 
-def test_processing_refuses_the_calibration_of_another_rig(whole, taken_with):
-    assert metal_plane(Pipeline(taken_with(whole))) is not None
-    moved = Pipeline(taken_with(whole, MATTERS["V moved"][0]))
+def test_processing_refuses_the_calibration_of_another_rig(full_metal, taken_with):
+    assert metal_plane(Pipeline(taken_with(full_metal))) is not None
+    moved = Pipeline(taken_with(full_metal, MATTERS["V moved"][0]))
     with refused(ErrorCode.MISMATCH, "RV"):
         metal_plane(moved)
     # Metal in the scene has the scene's rig
@@ -187,29 +187,29 @@ def metal_plane(pipeline, bands=1, in_scene=False):
     return pipeline.calibration.metal_plane(pipeline.rig, None, in_scene, bands)
 
 
-def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band(plate, banded, taken_with):
-    reference = load_calibration({"metal": banded}).reference()
+def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band(plate, banded_metal, taken_with):
+    reference = load_calibration({"metal": banded_metal}).reference()
     expected = load_reference(plate, bands=BANDS)
     assert len(reference.bands) == len(expected.bands) == BANDS
     for read, actual in zip((reference, *reference.bands), (expected, *expected.bands), strict=True):
         for name in ("h", "v", "valid"):
             np.testing.assert_array_equal(getattr(read, name), getattr(actual, name))
         assert (read.spread, read.how) == (actual.spread, actual.how)
-    pipeline = Pipeline(taken_with(banded))
+    pipeline = Pipeline(taken_with(banded_metal))
     assert len(metal_plane(pipeline, BANDS).bands) == BANDS
     assert metal_plane(pipeline) is not None
     with refused(ErrorCode.MISMATCH, "2 sub-bands, not 3", "--bands 3", "--bands 2"):
         metal_plane(pipeline, 3)
 
 
-def test_missing_sub_bands_are_refused_before_rows_are_read(whole, taken_with, tmp_path):
-    scan = taken_with(whole)
+def test_missing_sub_bands_are_refused_before_rows_are_read(full_metal, taken_with, tmp_path):
+    scan = taken_with(full_metal)
     assert main(["process", str(scan.path), "--bands", "2", "--out", str(tmp_path / "out"), "--model", "none"]) == 3
     assert not (tmp_path / "out" / "image.npz").exists()
 
 
-def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded, taken_with):
-    pipeline = Pipeline(taken_with(banded), Settings(bands=BANDS))
+def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded_metal, taken_with):
+    pipeline = Pipeline(taken_with(banded_metal), Settings(bands=BANDS))
     for row in pipeline.source.rows():
         pipeline.add_row(row)
     reference = metal_plane(pipeline, BANDS)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import tomli_w
-from tests.support.processes import output_of
+from tests.support.processes import read_output
 from tests.support.refusals import refused
 
 from polysight.calibration.files import Calibration, PlacesFile, load_calibration, open_raw, read_calibration
@@ -31,7 +31,7 @@ def laid(points):
 def case(tmp_path_factory, make_rig, scan_of):
     """A scan of a displaced rig whose manifest contains the rig file as it is."""
 
-    def displaced(table):
+    def shift_boards(table):
         for board in table["boards"]:
             if board["name"] in SHIFTS:
                 board["mount"].append({"shift_mm": SHIFTS[board["name"]]})
@@ -42,7 +42,7 @@ def case(tmp_path_factory, make_rig, scan_of):
         "image": {"columns": 64, "rows": 64, "pixel_mm": 2.5},
     }
     believed = make_rig(**tables)
-    true = make_rig(displaced, **tables)
+    true = make_rig(shift_boards, **tables)
     points = [{"position_mm": [float(x), float(y)], "amplitude": [0.5, 0.0]} for x, y in laid(POINTS)]
     folder = scan_of(tmp_path_factory.mktemp("places") / "scan", true, believed, points=points, seed=5)
     target = folder.parent / "target.toml"
@@ -51,20 +51,20 @@ def case(tmp_path_factory, make_rig, scan_of):
 
 
 @pytest.fixture(scope="module")
-def found(case, tmp_path_factory):
+def places_run(case, tmp_path_factory):
     """Output of the command, and the file it writes."""
     folder, target, _, _ = case
     out = tmp_path_factory.mktemp("out") / "c"
     bytes_before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    output = output_of("calibrate", "direct-path", folder, "--target", target, "--out", out)
+    output = read_output("calibrate", "direct-path", folder, "--target", target, "--out", out)
     # The scan is not touched
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == bytes_before
     return output, next(out.iterdir())
 
 
 @pytest.fixture(scope="module")
-def file(found):
-    return read_calibration(found[1], PlacesFile, "direct_path")
+def file(places_run):
+    return read_calibration(places_run[1], PlacesFile, "direct_path")
 
 
 def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):
@@ -103,8 +103,8 @@ def test_it_is_refused_after_a_change_of_mounts_in_the_rig_file(case, file):
         Calibration(places=file).rig(case[3])
 
 
-def test_the_command_shows_the_changes_and_the_line_for_the_rig_file(found, file):
-    output, path = found
+def test_the_command_shows_the_changes_and_the_line_for_the_rig_file(places_run, file):
+    output, path = places_run
     assert f"{file.object_distance_was_mm:.2f} -> {file.object_distance_mm:.2f}" in output
     assert f'direct_path = "{path}"' in output
     assert file.sources[0].simulated

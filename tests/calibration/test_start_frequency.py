@@ -73,12 +73,12 @@ def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_ri
 
     first = advice(make_rig(offset(300e3), **TABLES), "first")
 
-    def advised(table):
+    def set_advice(table):
         for board in table["boards"]:
             if board["name"] in first:
                 board["start_offset_hz"] = first[board["name"]]["start_offset_hz"]
 
-    second = advice(make_rig(advised, **TABLES), "second")
+    second = advice(make_rig(set_advice, **TABLES), "second")
     for name, board in second.items():
         assert abs(first[name]["start_offset_hz"] - 300e3) > 100e3
         error = np.hypot(board["direct_if_standard_error_hz"], first[name]["direct_if_standard_error_hz"])

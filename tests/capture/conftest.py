@@ -47,7 +47,7 @@ def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
             cards = Cards()
             stack.callback(cards.close)
             for board in (*(rig.by_name(n) for n in names), *more):
-                cards.add(board.name, cards.network_of(board), faults.get(board.name, Faults()), streams)
+                cards.add(board.name, cards.card_network(board), faults.get(board.name, Faults()), streams)
             cards.start()
             return cards
 

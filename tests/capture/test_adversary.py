@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
-from tests.support.capture.records import FULL, mask_of
+from tests.support.capture.records import FULL, make_mask
 
 from polysight.capture.dca1000 import Counters
 from polysight.capture.packet_log import PacketLog
@@ -52,7 +52,7 @@ def log_packets(sent: Sent, expected: int, batch: int) -> PacketLog:
 
 def wrong_bytes(sent: Sent, placed: Placed, out: np.ndarray) -> int:
     """Bytes that are not masked and are not those of the row."""
-    mask = mask_of(out.size, placed.missing)
+    mask = make_mask(out.size, placed.missing)
     assert not placed.located or not out[mask].any()
     return int((out[~mask] != np.frombuffer(sent.data, dtype=np.uint8)[~mask]).sum())
 
@@ -117,7 +117,7 @@ class Rows(RuleBasedStateMachine):
         if max(heads, default=0) + FULL >= self.size and self.size > FULL:
             assert placed.located, placed.reason
             lost_ranges = [(a, min(a + FULL, self.size)) for a in range(0, self.size, FULL) if a not in heads]
-            assert (mask_of(self.size, placed.missing) == mask_of(self.size, lost_ranges)).all()
+            assert (make_mask(self.size, placed.missing) == make_mask(self.size, lost_ranges)).all()
 
     @rule(
         troubles=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3, unique=True).map(tuple),

@@ -163,7 +163,7 @@ def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):
     text = program_card(running_cards, "LS", tmp_path, board.card_address, "RV", "--at", address)
     for part in ("cannot be read back", NEW_MAC, "switch the card off and on", "FPGA 2.8", f"at {board.card_address}"):
         assert part in text
-    assert running_cards.endpoints["LS"].card.network == running_cards.network_of(board)._replace(
+    assert running_cards.endpoints["LS"].card.network == running_cards.card_network(board)._replace(
         mac=bytes.fromhex(NEW_MAC.replace(":", ""))
     )
 

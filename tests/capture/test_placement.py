@@ -17,8 +17,8 @@ from tests.support.capture.records import (
     encode_packet,
     encode_packets,
     is_original_or_masked,
-    log_of,
-    mask_of,
+    make_log,
+    make_mask,
     next_start,
     place,
 )
@@ -55,12 +55,12 @@ def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, c
     placed, out = place(len(record.data), [p for _, p in order], Counters(count, sequence), frame, batch)
     assert is_original_or_masked(record, placed, out)
     got = {k for k, _ in sent}
-    lost_bytes = mask_of(out.size, [record.bytes_of(k) for k in range(len(record.packets)) if k not in got])
+    lost_bytes = make_mask(out.size, [record.byte_range(k) for k in range(len(record.packets)) if k not in got])
     assert placed.received == (~lost_bytes).sum()
     assert placed.counts.placed == len(got)
     assert placed.counts.duplicates == len(sent) - len(got)
     assert placed.counts.outside == placed.counts.disagreeing == placed.counts.malformed == 0
-    mask = mask_of(out.size, placed.missing)
+    mask = make_mask(out.size, placed.missing)
     assert (mask | ~lost_bytes).all()
     if len(record.packets) - 1 in got:
         assert placed.located
@@ -156,7 +156,7 @@ def test_every_disorder_at_once(
         assert losses.head_bytes + losses.gap_bytes + losses.tail_bytes == size - placed.received
         assert losses.tail_bytes == size - oracle.extent
         if placed.located:
-            assert (mask_of(size, placed.missing) == ~oracle.there).all()
+            assert (make_mask(size, placed.missing) == ~oracle.there).all()
             assert not out[~oracle.there].any()
 
 
@@ -272,7 +272,7 @@ def test_truncated_packet(cut, which, count, known):
     placed, out = place(len(record.data), packets, Counters(count, 77) if known else None, 4096)
     assert is_original_or_masked(record, placed, out)
     if which < 20 and placed.located:
-        _, b = record.bytes_of(which)
+        _, b = record.byte_range(which)
         assert placed.missing == ([(b - min(cut, FULL), b)] if cut else [])
 
 
@@ -299,7 +299,7 @@ def test_corrupted_header_damages_nothing(flip, which, count):
     packets[which] = bytes(bad)
     placed, out = place(len(record.data), packets, Counters(count, 500), 4096)
     assert placed.counts.disagreeing == 1
-    assert placed.missing == [record.bytes_of(which)]
+    assert placed.missing == [record.byte_range(which)]
     assert is_original_or_masked(record, placed, out)
 
 
@@ -427,7 +427,7 @@ def test_placing_leaves_the_logged_payload_as_it_came(trouble, tmp_path):
     size = len(record.data) + end
     elsewhere = encode_packet(99, 5 * size, bytes([9] * 99))
     packets = [*record.packets, *([late_packet] if "conflict" in trouble else []), elsewhere]
-    log = log_of(size, packets)
+    log = make_log(size, packets)
     past = Past.after_reset()
     payload_before = log.payload[: log.payload_bytes].copy()
     placed, out = place_record(log, FRAME, past)
@@ -442,7 +442,7 @@ def test_packets_before_the_first_pulse_are_left_over_or_spurious_frames():
     """An earlier record's are left over; with counters of the row they are frames that no pulse started."""
     record = Record.make(SHORT_END, 70_000, 9)
     for early, located in ((Record.make(2 * FULL, 70_000 - 2 * FULL, 7), True), (record, False)):
-        log = log_of(SHORT_END, early.packets[:2], t_ns=1)
+        log = make_log(SHORT_END, early.packets[:2], t_ns=1)
         block = [np.frombuffer(p, dtype=np.uint8) for p in record.packets[0 if located else 2 :]]
         for k, packet in enumerate(block):
             log.add(packet[None, :], np.array([len(packet)]), 100 + k)

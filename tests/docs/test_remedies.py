@@ -34,7 +34,7 @@ PLAIN = re.compile(r"(?<![`\w/-])(polysight(?:-pi)? [a-z][a-z-]+(?: (?![a-z]+\b)
 ACTIONS = ("calibrate", "card", "radar")
 
 
-def texts_of(path: Path) -> Iterator[tuple[int, str]]:
+def list_texts(path: Path) -> Iterator[tuple[int, str]]:
     """Strings of a file that are no docstrings, with their lines; a value that is put in is PLACEHOLDER."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
@@ -67,7 +67,7 @@ def test_commands_are_found_in_messages():
     assert commands_in("polysight label 8 --metal NAME, or measure") == ["polysight label 8 --metal NAME"]
     assert commands_in("polysight label 8 --box A=1,2,3,4; then go") == ["polysight label 8 --box A=1,2,3,4"]
     assert commands_in("the polysight of today") == []
-    commands = [command for path in SOURCES for _, text in texts_of(path) for command in commands_in(text)]
+    commands = [command for path in SOURCES for _, text in list_texts(path) for command in commands_in(text)]
     assert len(commands) > 100
     assert sum(map(is_whole, commands)) > 50
 
@@ -75,7 +75,7 @@ def test_commands_are_found_in_messages():
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_command_that_a_message_names_is_one(path):
     faults = []
-    for line, text in texts_of(path):
+    for line, text in list_texts(path):
         for command in commands_in(text):
             pasted = command.removesuffix("...").replace("COMMAND", "scan")
             problems = command_faults(pasted) if is_whole(command) else mention_faults(pasted)

@@ -35,7 +35,7 @@ def rows(page: str, heading: str) -> list[list[str]]:
     return [[c.strip() for c in line.strip("|").split("|")] for line in section.splitlines() if line.startswith("| ")]
 
 
-def shown(page: str, *labels: str) -> bytes:
+def shown_bytes(page: str, *labels: str) -> bytes:
     """The bytes behind a label (a line's first words) in a text block of a page."""
     label = " +".join(map(re.escape, labels))
     match = re.search(rf"^{label} +((?:[0-9a-f]{{2,12}} ?)+)(?: |$)", text(page), re.MULTILINE)
@@ -77,12 +77,12 @@ def test_there_are_examples_of_every_kind():
     assert {kind for kind, _, _ in wire_examples()} == {"event", "command", "reply", "journal"}
 
 
-def declared(union: object) -> list[type]:
+def declared_types(union: object) -> list[type]:
     return list(getattr(union, "__args__", ()))
 
 
 @pytest.mark.parametrize(
-    "message", [m for u in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply) for m in declared(u)]
+    "message", [m for u in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply) for m in declared_types(u)]
 )
 def test_the_page_names_every_message_and_field(message):
     page = "\n".join(line for line in text("wire.md").splitlines() if f"`{message.__name__}`" in line)
@@ -98,7 +98,7 @@ def test_the_page_names_every_message_and_field(message):
 def test_types_follow_from_names_as_the_page_says():
     """Floats end in _mm, _mm_s or _us; everything else that is a number is an integer."""
     for union in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply):
-        for message in declared(union):
+        for message in declared_types(union):
             for field in msgspec.structs.fields(message):
                 # Whatever its bounds
                 is_float = getattr(field.type, "__origin__", field.type) is float
@@ -108,7 +108,7 @@ def test_types_follow_from_names_as_the_page_says():
 def test_what_may_be_left_out():
     answer = text("wire.md").split("These may be left out:")[1].split("\n*")[0]
     for union in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply):
-        for message in declared(union):
+        for message in declared_types(union):
             for field in msgspec.structs.fields(message):
                 if field.default is not msgspec.NODEFAULT and field.name != "version":
                     assert f"`{field.name}`" in answer, (message.__name__, field.name)
@@ -145,10 +145,10 @@ def test_card_requests():
         ("version", "request"): (dca1000.Code.VERSION, b""),
     }
     for labels, (code, data) in requests.items():
-        assert shown("dca1000.md", *labels) == dca1000.encode_request(code, data)
+        assert shown_bytes("dca1000.md", *labels) == dca1000.encode_request(code, data)
     settings = EepromSettings.of_board(load_instrument(ROOT / "instrument.toml").by_name("RH"), "12:34:56:78:90:13")
     request = dca1000.encode_request(dca1000.Code.CONFIGURE_EEPROM, settings.encode())
-    assert shown("dca1000.md", "EEPROM of RH", "request") == request
+    assert shown_bytes("dca1000.md", "EEPROM of RH", "request") == request
 
 
 def test_card_replies():
@@ -157,7 +157,7 @@ def test_card_replies():
     assert [r.code for r in replies] == [5, 3, 0x0E]
     assert [r.status for r in replies[:2]] == [0, 0]
     assert str(dca1000.decode_version(replies[2].status)) == "2.8"
-    ended = dca1000.decode_reply(shown("dca1000.md", "record completed", "status"))
+    ended = dca1000.decode_reply(shown_bytes("dca1000.md", "record completed", "status"))
     assert (ended.code, ended.status) == (dca1000.Code.STATUS, dca1000.Status.RECORD_COMPLETED)
 
 
@@ -168,7 +168,7 @@ def test_card_status_bits():
 
 def test_data_packet_headers():
     for label, number in (("first", 1), ("second", 2), ("46th", 46)):
-        header = shown("dca1000.md", label)
+        header = shown_bytes("dca1000.md", label)
         sequence, count = dca1000.decode_packet_header(header + b"x")
         assert (sequence, count) == (number, (number - 1) * dca1000.MAX_PAYLOAD_BYTES)
 
@@ -190,7 +190,7 @@ def test_sub_blocks_are_those_of_the_published_rig():
         number = f"0x{message.ID:04X}"
         answer = table[number]
         if answer == "see below":
-            raw = shown("mmwavelink.md", number)
+            raw = shown_bytes("mmwavelink.md", number)
         else:
             raw = bytes.fromhex(answer.strip("`"))
         assert raw == message.block().data, number
@@ -209,7 +209,7 @@ def test_the_page_names_every_sub_block_that_is_sent():
 
 def test_whole_messages():
     for label, number, message_kind in (("frame start", 3, 1), ("stop 4", 4, 4)):
-        answer = decode(shown("mmwavelink.md", f"{label}, sequence {number}"))
+        answer = decode(shown_bytes("mmwavelink.md", f"{label}, sequence {number}"))
         assert (answer.direction, answer.kind, answer.sequence) == (Direction.HOST_TO_RF, Kind.COMMAND, number)
         assert answer.blocks == (SubBlock(0x0140, struct.pack("<HH", message_kind, 0)),)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import tomli_w
-from tests.support.doctor.case import QUICK, RIG, context_of
+from tests.support.doctor.case import QUICK, RIG, make_context
 from tests.support.rigs import programmed_rig
 
 from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
@@ -67,12 +67,12 @@ def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
         residual_db=0.05,
     )
     file = FilterFile(**header("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board, "RV": board})
-    context = context_of(programmed_rig(calibration={"hpf": str(write_calibration(file, tmp_path))}))
+    context = make_context(programmed_rig(calibration={"hpf": str(write_calibration(file, tmp_path))}))
     hello = HelloReply(pi_release="", firmware="", backend=WIRES, state="homed", scan_id="", last_seq=0)
     assert check_calibration(dataclasses.replace(context, hello=hello)).level == "ok"
     real = msgspec.structs.replace(hello, backend=GPIOD)
     assert join_reasons(dataclasses.replace(context, hello=real), "calibration") == "error"
-    assert join_reasons(context_of(programmed_rig(calibration={"hpf": "/nowhere.toml"})), "calibration") == "error"
+    assert join_reasons(make_context(programmed_rig(calibration={"hpf": "/nowhere.toml"})), "calibration") == "error"
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
     ],
 )
 def test_a_lost_clock_is_an_error_and_an_unsynchronised_one_a_warning(system, verdict):
-    assert check_host_clock(context_of(system=system)).level == verdict
+    assert check_host_clock(make_context(system=system)).level == verdict
 
 
 @pytest.mark.parametrize(("mode", "verdict"), [(0o600, "ok"), (0o640, "warning"), (None, "error")])
@@ -93,7 +93,7 @@ def test_the_secret_key_must_be_there_and_for_its_user_alone(tmp_path, mode, ver
         (tmp_path / name).touch(mode)
         (tmp_path / name).chmod(mode)
     addresses = {"command_address": "tcp://192.0.2.1:5601", "event_address": "tcp://192.0.2.1:5602"}
-    assert check_keys(context_of(programmed_rig(pi=addresses | {"key_dir": str(tmp_path)}))).level == verdict
+    assert check_keys(make_context(programmed_rig(pi=addresses | {"key_dir": str(tmp_path)}))).level == verdict
 
 
 def test_the_kernel_reports_if_its_clock_is_synchronised():
@@ -101,12 +101,12 @@ def test_the_kernel_reports_if_its_clock_is_synchronised():
 
 
 def test_a_full_disk_and_a_slow_one(tmp_path):
-    assert check_disk(context_of(programmed_rig(limits={"free_disk_bytes": 1 << 60}), tmp_path)).level == "error"
+    assert check_disk(make_context(programmed_rig(limits={"free_disk_bytes": 1 << 60}), tmp_path)).level == "error"
     small = programmed_rig(limits={"free_disk_bytes": 0}, grid={"rows": 2})
-    rate = check_disk(context_of(small, tmp_path)).facts["scan_bytes_s"]
+    rate = check_disk(make_context(small, tmp_path)).facts["scan_bytes_s"]
     for factor, verdict in ((0.5, "error"), (1.5, "warning"), (3.0, "ok")):
         system = System(write_speed=lambda _folder, speed=factor * rate: speed)
-        assert check_disk(context_of(small, tmp_path / "not" / "yet", system)).level == verdict
+        assert check_disk(make_context(small, tmp_path / "not" / "yet", system)).level == verdict
 
 
 def test_the_disk_probe_leaves_nothing_behind(tmp_path, monkeypatch):
@@ -116,7 +116,7 @@ def test_the_disk_probe_leaves_nothing_behind(tmp_path, monkeypatch):
 
 
 def test_the_published_scan_takes_two_hours(tmp_path):
-    finding = check_time(context_of(RIG, tmp_path))
+    finding = check_time(make_context(RIG, tmp_path))
     # 35 s a row, and its ends
     assert finding.facts["seconds"] == pytest.approx(200 * 38, rel=0.05)
     assert finding.facts["bytes"] == 2 * 70_000 * 65_536
@@ -147,7 +147,7 @@ def kernel_root(tmp_path, mtu=1500, speed=1000, lost=0):
     ],
 )
 def test_an_unsuitable_network_interface_is_a_warning_and_unknown_values_are_ok(tmp_path, interface, verdict):
-    finding = check_network(context_of(RIG, system=kernel_root(tmp_path, **interface)), RIG.by_name("RH"))
+    finding = check_network(make_context(RIG, system=kernel_root(tmp_path, **interface)), RIG.by_name("RH"))
     assert finding.level == verdict
     assert "eth7" in finding.what
 
@@ -197,7 +197,7 @@ def test_receivers_must_keep_up_with_the_configured_rate_of_the_cards(tmp_path, 
     def measure(_rig, rates):
         return [LoadResult(r, r, 100, n) for r, n in zip(rates, lost, strict=True)], "nice -5"
 
-    finding = check_receivers(context_of(programmed_rig(), tmp_path, System(measure_receivers=measure)))
+    finding = check_receivers(make_context(programmed_rig(), tmp_path, System(measure_receivers=measure)))
     assert finding.level == verdict
     assert ("50.0 %" in finding.what) == bool(lost[2])
 

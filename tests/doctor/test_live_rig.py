@@ -74,7 +74,7 @@ def test_the_pis_clock_is_off(live):
 
 
 def test_a_pi_that_hangs(live):
-    with live.stopped("polysight-pi"):
+    with live.stop_process("polysight-pi"):
         findings = live.doctor(pulse=True)
     assert_failed(findings, "pi")
     assert list_skipped(findings, "pi") == [
@@ -85,7 +85,7 @@ def test_a_pi_that_hangs(live):
 
 
 def test_a_card_that_is_mute(live):
-    with live.stopped("--boards RV"):
+    with live.stop_process("--boards RV"):
         findings = live.doctor(pulse=True)
     assert_failed(findings, "card RV")
     assert list_skipped(findings, "card RV") == ["buffer RV", "radar RV", "level RV", "direct path RV", "trigger skew"]
@@ -173,7 +173,7 @@ def test_a_trigger_wire_that_is_cut(live):
 
 def test_a_stage_that_is_silent(live):
     try:
-        with live.stopped("--trigger-line" if sketch_compiler() else "polysight_simulators.stage"):
+        with live.stop_process("--trigger-line" if sketch_compiler() else "polysight_simulators.stage"):
             with live.pi() as pi:
                 wait_for(lambda: pi.status().state == "fault", "the fault")
             findings = live.doctor(move=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.support.doctor.case import FRAMES, RIG, context_of, frames_of, signal_of
+from tests.support.doctor.case import FRAMES, RIG, direct_signal, make_context, simulate_frames
 from tests.support.rigs import programmed_rig
 
 from polysight.capture.receiver import RowCapture
@@ -12,7 +12,7 @@ from polysight.radar.commands import direct_if_hz
 
 
 def judge_signal(board="RH", rig=RIG, **disturbances):
-    return judge_direct_path(rig, rig.by_name(board), signal_of(board, rig, **disturbances))
+    return judge_direct_path(rig, rig.by_name(board), direct_signal(board, rig, **disturbances))
 
 
 def with_frames(words, **row):
@@ -24,7 +24,7 @@ def with_frames(words, **row):
         "slipped": False,
     }
     counts |= {"located": True, "expected": words.nbytes, "bytes": words.nbytes, "packets": 9, **row}
-    return context_of(captured={"RH": CapturedFrames(words, np.ones(len(words), bool), RowCapture(**counts))})
+    return make_context(captured={"RH": CapturedFrames(words, np.ones(len(words), bool), RowCapture(**counts))})
 
 
 def test_a_direct_path_at_the_expected_if_is_ok():
@@ -71,7 +71,7 @@ def test_another_start_frequency_than_in_the_rig_file_is_recovered():
 @pytest.mark.parametrize(("skew_ns", "verdict"), [(0.0, "ok"), (-13.0, "warning"), (21.5, "error")])
 def test_trigger_skew_between_the_boards_is_recovered(skew_ns, verdict):
     skew = {"sync_skew_ns": {"receive_h": 1.0 - skew_ns / 2, "receive_v": 1.0 + skew_ns / 2}}
-    finding = judge_skew(RIG, {name: signal_of(name, **skew) for name in ("RH", "RV")})
+    finding = judge_skew(RIG, {name: direct_signal(name, **skew) for name in ("RH", "RV")})
     assert finding.facts["skew_ns"] == pytest.approx(skew_ns, abs=5 * finding.facts["standard_error_ns"])
     assert finding.level == verdict
     assert finding.facts["later_ns"]["RH"] == pytest.approx(1.0 - skew_ns / 2, abs=2.5)
@@ -79,15 +79,15 @@ def test_trigger_skew_between_the_boards_is_recovered(skew_ns, verdict):
 
 @pytest.mark.parametrize("ppm", [-2.0, 0.0, 1.5])
 def test_a_crystal_and_a_late_trigger_are_distinguished(ppm):
-    signal = signal_of("RH", crystal_ppm={"receive_h": ppm}, sync_skew_ns={"receive_h": 3.0})
+    signal = direct_signal("RH", crystal_ppm={"receive_h": ppm}, sync_skew_ns={"receive_h": 3.0})
     assert signal.crystal_ppm(RIG) == pytest.approx(ppm, abs=0.15)
     mean, unsure = signal.start_delay_s(RIG)
     assert mean * 1e9 == pytest.approx(3.0, abs=5 * unsure * 1e9 + 0.3)
 
 
 def test_clipped_chirps_are_an_error_and_a_few_a_warning():
-    assert check_level(with_frames(frames_of("RH", adc_full_scale=1.2)), RIG.by_name("RH")).level == "error"
-    words = np.repeat(frames_of("RH"), 8, axis=0)
+    assert check_level(with_frames(simulate_frames("RH", adc_full_scale=1.2)), RIG.by_name("RH")).level == "error"
+    words = np.repeat(simulate_frames("RH"), 8, axis=0)
     assert check_level(with_frames(words), RIG.by_name("RH")).level == "ok"
     words[3, 5, 0, 1] = 32767  # one chirp of 256
     finding = check_level(with_frames(words), RIG.by_name("RH"))
@@ -95,7 +95,7 @@ def test_clipped_chirps_are_an_error_and_a_few_a_warning():
 
 
 def test_an_rx_without_a_signal_is_an_error():
-    words = frames_of("RH")
+    words = simulate_frames("RH")
     words[..., 2] = 0
     finding = check_level(with_frames(words), RIG.by_name("RH"))
     assert (finding.level, finding.facts["rms"][2]) == ("error", 0)
@@ -115,8 +115,8 @@ def test_an_rx_without_a_signal_is_an_error():
     ids=["complete", "silent", "another card's packets", "missed pulses", "lost packets", "full card", "two cards"],
 )
 def test_frames_that_are_missing_are_an_error_and_lost_packets_a_warning(row, verdict):
-    assert check_radar(with_frames(frames_of("RH"), **row), RIG.by_name("RH")).level == verdict
+    assert check_radar(with_frames(simulate_frames("RH"), **row), RIG.by_name("RH")).level == verdict
 
 
 def test_the_transmitter_has_no_direct_path():
-    assert check_direct_path(context_of(), RIG.by_name("LS")).level == "note"
+    assert check_direct_path(make_context(), RIG.by_name("LS")).level == "note"

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.support.paths import REPO
-from tests.support.products import unrendered
+from tests.support.products import skip_rendering
 from tests.support.scenes import small_scene
 from tests.support.store.facts import facts_of
 
@@ -104,8 +104,8 @@ class Killed:
         # Kinds of places that programs came to, each with who
         self.met: Counter[str] = Counter()
         self.armed = 0
-        self.restart_pi(counted(PI_PLACES))
-        assert self.scan(rig.folder / "undisturbed", counted(HOST_PLACES)).wait().status == 0
+        self.restart_pi(list_kinds(PI_PLACES))
+        assert self.scan(rig.folder / "undisturbed", list_kinds(HOST_PLACES)).wait().status == 0
         self.note("host", self.hits)
         self.note("Pi", self.pi_hits)
         self.restart_pi()
@@ -157,7 +157,7 @@ class Killed:
             self.restart_pi(places)
         host = self.scan(folder, places if kill.host else ())
         if kill.place is None:
-            has_ended = lambda: host.process.poll() is not None or len(committed(folder)) >= kill.rows  # noqa: E731
+            has_ended = lambda: host.process.poll() is not None or len(list_committed(folder)) >= kill.rows  # noqa: E731
             self.rig.wait_for(has_ended, f"{kill.rows} rows")
             time.sleep(kill.wait_s)
             if kill.host:
@@ -180,7 +180,7 @@ class Killed:
         again = []
         for place in [*kill.resumes, None]:
             safe_before = safe(folder, self.rows)
-            ended = self.scan(folder, [place] if place else counted(RESUME_PLACES)).wait()
+            ended = self.scan(folder, [place] if place else list_kinds(RESUME_PLACES)).wait()
             assert ended.status == 0 or (place and ended.status == -signal.SIGKILL), f"{kill}\n{ended.err}"
             if place:
                 self.check_died(ended.status, place, self.hits)
@@ -196,7 +196,7 @@ class Killed:
         return again
 
 
-def counted(places: Sequence[Place]) -> list[Place]:
+def list_kinds(places: Sequence[Place]) -> list[Place]:
     """Every kind of these places, to be counted: no time of meeting it kills."""
     return [(operation, suffix, 0) for operation, suffix in dict.fromkeys(place[:2] for place in places)]
 
@@ -241,7 +241,7 @@ def image(folder: Path) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def killed(running_rig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Killed]:
+def killed_rig(running_rig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Killed]:
     with running_rig(tmp_path_factory.mktemp("killed"), time_scale=50.0, scene=SCENE) as rig:
         yield Killed(rig)
 
@@ -252,37 +252,37 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("number", range(count))
 
 
-def test_killed(killed: Killed, number: int, record_property):
+def test_killed(killed_rig: Killed, number: int, record_property):
     kill = Kill.draw(number)
-    again = killed.check(kill)
+    again = killed_rig.check(kill)
     record_property("kill", f"{kill}; rows retaken by each resume: {again}")
     print(f"{kill}: rows retaken by each resume {again}")  # noqa: T201 - shown with -s
 
 
-def test_every_kind_of_place_is_come_to(killed: Killed):
+def test_every_kind_of_place_is_reached(killed_rig: Killed):
     """Else its kills are none: a file has another name by now, or is written in another way."""
 
     def never(program: str, places: Sequence[Place]) -> list[Place]:
-        return [place for place in counted(places) if not killed.met[f"{program} {place[0]}:{place[1]}"]]
+        return [place for place in list_kinds(places) if not killed_rig.met[f"{program} {place[0]}:{place[1]}"]]
 
     for number, place in ((100, ("pwrite", "manifest.jsonl", 4)), (101, ("pwrite", "events.msgpack", 3))):
         # Run alone, or not by the kills above: of a torn manifest, of torn events
         if never("resume", RESUME_PLACES):
-            killed.check(Kill(number, host=True, pi=False, place=place))
+            killed_rig.check(Kill(number, host=True, pi=False, place=place))
     for program, places in (("host", HOST_PLACES), ("Pi", PI_PLACES), ("resume", RESUME_PLACES)):
-        assert never(program, places) == [], f"{program}: {killed.met}"
+        assert never(program, places) == [], f"{program}: {killed_rig.met}"
 
 
-def test_products_of_a_killed_scan(killed: Killed):
+def test_products_of_a_killed_scan(killed_rig: Killed):
     """What was processed while the scan ran, and ran again, is what the undisturbed scan is processed into."""
-    folder = killed.rig.folder / "live"
-    scan = killed.scan(folder, [("rename", ".bin", 5)], *METAL)
+    folder = killed_rig.rig.folder / "live"
+    scan = killed_rig.scan(folder, [("rename", ".bin", 5)], *METAL)
     assert scan.wait().status == -signal.SIGKILL
-    resumed = killed.scan(folder, (), *METAL).wait()
+    resumed = killed_rig.scan(folder, (), *METAL).wait()
     assert resumed.status == NO_RESULT, resumed.err  # one plate alone: every row is there, and nothing is named
-    out = killed.rig.folder / "products"
-    with unrendered():
-        processed = killed.rig.here("process", killed.rig.folder / "undisturbed", "--out", out, *METAL)
+    out = killed_rig.rig.folder / "products"
+    with skip_rendering():
+        processed = killed_rig.rig.here("process", killed_rig.rig.folder / "undisturbed", "--out", out, *METAL)
     assert processed.status == NO_RESULT, processed.err
     with np.load(folder / "products" / "image.npz") as live, np.load(out / "image.npz") as undisturbed:
         assert live.files == undisturbed.files
@@ -293,32 +293,32 @@ def test_products_of_a_killed_scan(killed: Killed):
     assert documents[0] == documents[1]
 
 
-def test_pi_is_lost_with_its_journal(killed: Killed):
+def test_pi_is_lost_with_its_journal(killed_rig: Killed):
     """Without a Pi the error says so; a Pi with an empty card goes on behind what the host has, and the host tells."""
-    folder = killed.rig.folder / "lost"
-    scan = killed.scan(folder)
-    killed.rig.wait_for(lambda: scan.process.poll() is not None or len(committed(folder)) >= 2, "two rows")
-    killed.rig.pi.kill()
+    folder = killed_rig.rig.folder / "lost"
+    scan = killed_rig.scan(folder)
+    killed_rig.rig.wait_for(lambda: scan.process.poll() is not None or len(list_committed(folder)) >= 2, "two rows")
+    killed_rig.rig.pi.kill()
     ended = scan.wait()
     assert ended.status == 5
     assert ended.message.startswith("polysight scan: the Pi at tcp://")
     assert "polysight-pi" in ended.message
-    safe_before = safe(folder, killed.rows)
-    refused = killed.scan(folder).wait()
+    safe_before = safe(folder, killed_rig.rows)
+    refused = killed_rig.scan(folder).wait()
     assert refused.status == 5
     assert "the Pi at tcp://" in refused.message
     known_events = len(read_events(folder / "events.msgpack").events)
     scan_id = ScanFolder.load(folder).scan_id
-    (killed.rig.folder / "rig" / "journal" / f"{scan_id}.journal").unlink()
-    killed.restart_pi()
-    resumed = killed.scan(folder).wait()
+    (killed_rig.rig.folder / "rig" / "journal" / f"{scan_id}.journal").unlink()
+    killed_rig.restart_pi()
+    resumed = killed_rig.scan(folder).wait()
     assert resumed.status == 0, resumed.err
     assert f"journal of this scan ends {known_events} events before" in " ".join(resumed.err.split())
     assert safe_before.items() <= rows(folder).items()
-    assert (validate(folder), rows(folder)) == ([], killed.rows)
+    assert (validate(folder), rows(folder)) == ([], killed_rig.rows)
     assert len(retaken(folder)) <= 1
 
 
-def committed(folder: Path) -> list[int]:
+def list_committed(folder: Path) -> list[int]:
     """Rows that are committed, of a scan that may not be begun."""
     return list(ScanFolder.load(folder).committed_rows()) if begun(folder) else []

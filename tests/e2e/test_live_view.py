@@ -69,7 +69,7 @@ def priority(pid: int) -> int:
     return os.getpriority(os.PRIO_PROCESS, pid)
 
 
-def shown(state: dict[str, Any]) -> int:
+def rows_shown(state: dict[str, Any]) -> int:
     return (state.get("pictures") or {"rows": 0})["rows"]
 
 
@@ -86,7 +86,7 @@ def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):
     view.wait_headline("No scan here yet")
     scan = rig.scan("--no-process")
 
-    state = view.wait(lambda s: shown(s) >= 1, "the first row's image")
+    state = view.wait(lambda s: rows_shown(s) >= 1, "the first row's image")
     assert state["scan"]["simulated"] is True
     assert state["scan"]["marks"].startswith("c")
     assert [state[key] for key in ("control", "running", "paused")] == [True, True, False]
@@ -97,7 +97,7 @@ def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):
     assert 1 <= rows < ROWS
     assert rig.committed() == rows
     view.ask("continue")
-    view.wait(lambda s: shown(s) > rows, "rows after the pause")
+    view.wait(lambda s: rows_shown(s) > rows, "rows after the pause")
 
     scan.kill()
     headline = view.wait_headline("The scan program was killed")
@@ -111,5 +111,5 @@ def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):
     assert ended["scan"]["committed"] < ROWS
     assert again.wait().status != 0
     assert [f for f in validate(rig.folder / "scan") if f.level == "error"] == []
-    state = view.wait(lambda s: shown(s) == s["scan"]["committed"], "every row's image")
+    state = view.wait(lambda s: rows_shown(s) == s["scan"]["committed"], "every row's image")
     assert state["boards"][0]["frames_received"] == state["boards"][0]["frames_expected"]

@@ -76,7 +76,7 @@ class Lab:
         self.browser.wait(f"parseInt(document.getElementById('count')?.innerText) >= {rows}", f"{rows} rows")
         assert len(ScanFolder.load(folder).committed_rows()) >= rows
 
-    def ended(self, folder: Path) -> None:
+    def wait_end(self, folder: Path) -> None:
         """Until the program that the page started has ended; the folder is whole."""
         self.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
         assert [f for f in validate(folder) if f.level == "error"] == []
@@ -108,7 +108,7 @@ def test_a_scan_is_planned_started_and_shown(lab):
     lab.browser.wait("document.getElementById('count')?.innerText == '5 of 5 rows'", "all rows")
     lab.click("to-result")
     lab.browser.wait("location.pathname == '/scan'", "the result")
-    lab.ended(folder)
+    lab.wait_end(folder)
     assert ScanFolder.load(folder).plan.rows == 5
     lab.open("/")
     lab.browser.wait("document.querySelectorAll('#list li').length == 1", "the list")
@@ -131,7 +131,7 @@ def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
     # While nothing moves: however slow this machine is, rows are left
     lab.click("stop")
     lab.wait_headline("Stopped on request")
-    lab.ended(folder)
+    lab.wait_end(folder)
     stopped = len(ScanFolder.load(folder).committed_rows())
     assert rows < stopped < ROWS
     lab.click("resume")
@@ -140,7 +140,7 @@ def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
     lab.browser.value("document.querySelector('#confirm button[value=yes]').click()")
     lab.wait_headline("Aborted on request")
     assert "the page" in lab.browser.text("detail")
-    lab.ended(folder)
+    lab.wait_end(folder)
 
 
 def test_a_scan_outlives_its_server_and_the_next_one_finds_it(lab):
@@ -160,7 +160,7 @@ def test_a_scan_outlives_its_server_and_the_next_one_finds_it(lab):
     lab.wait_headline("Paused")
     lab.click("stop")
     lab.wait_headline("Stopped on request")
-    lab.ended(folder)
+    lab.wait_end(folder)
 
 
 def test_a_scan_has_the_priority_of_a_terminals_not_of_the_reading_process(lab):
@@ -182,7 +182,7 @@ def test_a_scan_has_the_priority_of_a_terminals_not_of_the_reading_process(lab):
     lab.open("/watch?scan=fourth")
     lab.click("stop")
     lab.wait_headline("Stopped on request")
-    lab.ended(folder)
+    lab.wait_end(folder)
 
 
 def test_the_doctor_is_shown_as_it_looks(lab):
@@ -208,4 +208,4 @@ def test_a_scan_that_cannot_begin_says_why(lab):
     lab.open("/watch?scan=sixth", PHONE)
     lab.click("again")
     lab.browser.wait("document.getElementById('count')?.innerText == '3 of 3 rows'", "all rows")
-    lab.ended(folder)
+    lab.wait_end(folder)

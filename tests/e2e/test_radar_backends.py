@@ -23,7 +23,7 @@ CHIRPS = 4
 PORTS = {"LS": 5000, "RH": 5001, "RV": 5002}
 
 
-def scanned(bench, radar: dict[str, Any], burst: dict[str, Any]) -> ScanResult:
+def scan_three_rows(bench, radar: dict[str, Any], burst: dict[str, Any]) -> ScanResult:
     """Scan three rows of eight positions; every row is whole and each radar was armed once for it."""
     table = rig_table()
     table["grid"] |= {"columns": COLUMNS, "rows": ROWS}
@@ -53,14 +53,14 @@ def scanned(bench, radar: dict[str, Any], burst: dict[str, Any]) -> ScanResult:
 
 def test_control_servers_arm_each_row_once(bench):
     servers = {board: f"127.0.0.1:{port}" for board, port in PORTS.items()}
-    scanned(bench, {"control": "line_server", "servers": servers}, {"pulses": CHIRPS})
+    scan_three_rows(bench, {"control": "line_server", "servers": servers}, {"pulses": CHIRPS})
 
 
 def test_native_radars_make_a_frame_of_many_chirps_at_each_pulse(bench):
     """`[burst] pulses = 1, chirps = 4`; the manifest has what the radars were told and what they answered."""
     burst = {"pulses": 1, "chirps": CHIRPS, "chirp_us": 228.51, "period_us": 1500.0}
     native = {board: {"usb_serial": board} for board in PORTS}
-    result = scanned(bench, {"control": "native", "native": native}, burst)
+    result = scan_three_rows(bench, {"control": "native", "native": native}, burst)
     assert {row.pulses for row in result.folder.committed_rows().values()} == {COLUMNS}
     data = result.folder.read_row("RH", 0)
     assert data.frames_expected == COLUMNS * CHIRPS

@@ -26,7 +26,7 @@ CAPTURE = REAL_CAPTURES / "test_one_frame.pcap"
 SCENE = small_scene(12, 4, pixels=30, pixel_mm=5.0, metal=False, seed=1)
 
 
-def refused(ended, *words: str, status: int | None = None) -> None:
+def check_refusal(ended, *words: str, status: int | None = None) -> None:
     """Exit status not 0; one message with what, why and what to do, in which the words occur."""
     assert ended.status > 0, ended
     if status is not None:
@@ -62,21 +62,21 @@ def damaged_rig(folder: Path, old: str, new: str) -> Path:
 def test_rig_file(bench, program, old, new, words):
     path = damaged_rig(bench.folder, old, new)
     command = ["scan", "--out", "s"] if program == "polysight" else ["run"]
-    refused(bench.run(program, *command, "--config", path), path.name, *words, status=2)
+    check_refusal(bench.run(program, *command, "--config", path), path.name, *words, status=2)
     assert not (bench.folder / "s").exists()
 
 
 def test_files_that_are_not_there(bench):
-    refused(bench.here("scan", "--out", "s"), "instrument.toml: no such file", status=2)
-    refused(bench.run("polysight-pi", "run", "--config", "no.toml"), "no.toml: no such file", status=2)
-    refused(
+    check_refusal(bench.here("scan", "--out", "s"), "instrument.toml: no such file", status=2)
+    check_refusal(bench.run("polysight-pi", "run", "--config", "no.toml"), "no.toml: no such file", status=2)
+    check_refusal(
         bench.polysight("simulate", "no.toml", "--config", RIG_FILE, "--out", "d"), "no.toml: no such file", status=2
     )
     reproduce = ("reproduce", "--config", "no.toml", "--out", "r", "table1")
-    refused(bench.here(*reproduce), "no.toml: no such file", status=2)
-    refused(bench.here("preview", RIG_FILE, "--port", "0"), "instrument.toml is a file", status=2)
-    refused(bench.here("inspect", "no.bin"), "no.bin", status=3)
-    refused(bench.here("inspect", "no.pcap"), "no.pcap", status=3)
+    check_refusal(bench.here(*reproduce), "no.toml: no such file", status=2)
+    check_refusal(bench.here("preview", RIG_FILE, "--port", "0"), "instrument.toml is a file", status=2)
+    check_refusal(bench.here("inspect", "no.bin"), "no.bin", status=3)
+    check_refusal(bench.here("inspect", "no.pcap"), "no.pcap", status=3)
 
 
 @pytest.mark.parametrize(
@@ -99,20 +99,20 @@ def test_scene_file(bench, old, new, words):
     (last / ".polysight-demo").touch()
     (last / "report.html").touch()
     rig = ("--config", RIG_FILE)
-    refused(bench.here("demo", "--scene", "scenes/scene.toml", *rig, "--out", "d"), *words, status=2)
+    check_refusal(bench.here("demo", "--scene", "scenes/scene.toml", *rig, "--out", "d"), *words, status=2)
     assert (last / "report.html").exists()
-    refused(bench.polysight("simulate", "scenes/scene.toml", *rig, "--out", "s"), *words, status=2)
+    check_refusal(bench.polysight("simulate", "scenes/scene.toml", *rig, "--out", "s"), *words, status=2)
     if old:
-        refused(bench.here("train", "--simulate", "scenes", *rig, "--out", "l.npz"), *words, status=2)
+        check_refusal(bench.here("train", "--simulate", "scenes", *rig, "--out", "l.npz"), *words, status=2)
     assert {p.name for p in bench.folder.iterdir() if p.is_dir()} == {"scenes", "d"}
 
 
 def test_simulated_rig(bench):
     """What its processes would refuse, the rig refuses before it starts them."""
     rig = ("python", "-m", "polysight_simulators.rig", "--config", RIG_FILE, "--pattern", "--dir", "rig")
-    refused(bench.run(*rig, "--faults", "no.toml"), "no.toml: no such file", status=2)
-    refused(bench.run(*rig, "--fault", "RH.los=0.1"), "faults of RH", "los", status=2)
-    refused(bench.run(*rig, "--time-scale", "0"), "--time-scale", status=2)
+    check_refusal(bench.run(*rig, "--faults", "no.toml"), "no.toml: no such file", status=2)
+    check_refusal(bench.run(*rig, "--fault", "RH.los=0.1"), "faults of RH", "los", status=2)
+    check_refusal(bench.run(*rig, "--time-scale", "0"), "--time-scale", status=2)
     assert not (bench.folder / "rig").exists()
 
 
@@ -120,15 +120,15 @@ def test_rig_file_of_a_training(bench):
     (bench.folder / "scenes").mkdir()
     (bench.folder / "scenes" / "a.toml").write_text(SCENE)
     train = ("train", "--simulate", "scenes")
-    refused(bench.here(*train, "--config", "no.toml", "--out", "l.npz"), "no.toml: no such file", status=2)
-    refused(bench.here(*train, "--config", RIG_FILE, "--out", "no/l.npz"), "no such folder no", status=2)
+    check_refusal(bench.here(*train, "--config", "no.toml", "--out", "l.npz"), "no.toml: no such file", status=2)
+    check_refusal(bench.here(*train, "--config", RIG_FILE, "--out", "no/l.npz"), "no such folder no", status=2)
 
 
 # --- recorded data ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
+def recorded_scan(tmp_path_factory):
     """A simulated scan of nothing: no metal, no plates."""
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "scene.toml").write_text(SCENE)
@@ -138,9 +138,9 @@ def recorded(tmp_path_factory):
 
 
 @pytest.fixture
-def scan(recorded, bench):
+def scan(recorded_scan, bench):
     """A copy of it, to be damaged."""
-    return Path(shutil.copytree(recorded, bench.folder / "scan"))
+    return Path(shutil.copytree(recorded_scan, bench.folder / "scan"))
 
 
 @pytest.mark.parametrize("command", ["process", "validate", "resume"])
@@ -151,26 +151,26 @@ def test_folder_that_is_no_scan(bench, command):
     (bench.folder / "other" / "notes.txt").write_text("not a scan")
     folders = ("missing", "empty", "other", "other/notes.txt")
     for name in folders if command == "validate" else ("missing", "other"):
-        refused(bench.here(command, name, *out), name, status=3)
+        check_refusal(bench.here(command, name, *out), name, status=3)
     assert not (bench.folder / "out").exists()
 
 
 def test_scan_without_a_row(bench, scan):
     path = scan / "manifest.jsonl"
     path.write_bytes(path.read_bytes().splitlines(keepends=True)[0])
-    refused(bench.here("process", scan, "--out", "out"), f"polysight resume {scan}", status=3)
+    check_refusal(bench.here("process", scan, "--out", "out"), f"polysight resume {scan}", status=3)
 
 
 def test_library(bench, scan):
     process = ("process", scan, "--out", "out", "--library")
     (bench.folder / "junk.npz").write_text("no library")
     for name in ("no.npz", "junk.npz", "scan"):
-        refused(bench.here(*process, name), name, "polysight train", status=3)
+        check_refusal(bench.here(*process, name), name, "polysight train", status=3)
     assert not (bench.folder / "out").exists(), "found out before anything is processed"
-    refused(bench.here("train", "--config", RIG_FILE, "--out", "l.npz"), "--simulate")
+    check_refusal(bench.here("train", "--config", RIG_FILE, "--out", "l.npz"), "--simulate")
 
 
-def test_nothing_to_refer_to(bench, scan):
+def test_a_scan_without_metal_gives_images_and_no_result(bench, scan):
     """No metal, no plates: no result, and the images and the report are written all the same."""
     ended = bench.here("process", scan, "--out", "out")
     assert ended.status == 7, ended
@@ -184,10 +184,10 @@ def test_out_is_taken(bench, scan):
     own_folder.mkdir()
     (own_folder / "thesis.tex").write_text("precious")
     for command in (["image", scan], ["demo", "--config", RIG_FILE], ["scan", "--config", RIG_FILE]):
-        refused(bench.here(*command, "--out", own_folder), str(own_folder), "--out", status=2)
+        check_refusal(bench.here(*command, "--out", own_folder), str(own_folder), "--out", status=2)
     for command in (["image", scan], ["demo", "--config", RIG_FILE]):
-        refused(bench.here(*command, "--out", own_folder / "thesis.tex"), "thesis.tex", "--out", status=2)
-    refused(bench.here("scan", "--config", RIG_FILE, "--out", scan), f"polysight resume {scan}", status=2)
+        check_refusal(bench.here(*command, "--out", own_folder / "thesis.tex"), "thesis.tex", "--out", status=2)
+    check_refusal(bench.here("scan", "--config", RIG_FILE, "--out", scan), f"polysight resume {scan}", status=2)
     assert (own_folder / "thesis.tex").read_text() == "precious"
     assert list(own_folder.iterdir()) == [own_folder / "thesis.tex"]
     assert bench.here("image", scan, "--out", "out").status == 0
@@ -224,16 +224,16 @@ def test_pi_ports_in_use(bench, lonely, lonely_instrument, wires):
     run = ("polysight-pi", "run", "--config", lonely, "--wires", wires)
     for address in (lonely_instrument.pi.command_address, lonely_instrument.pi.event_address):
         with listening(address):
-            refused(bench.run(*run), address, "in use", "ss -ltnp", status=5)
+            check_refusal(bench.run(*run), address, "in use", "ss -ltnp", status=5)
 
 
 def test_no_stage(bench, lonely, lonely_instrument, wires, silent_pty):
     run = ("polysight-pi", "run", "--config", lonely, "--wires", wires)
-    refused(bench.run(*run), lonely_instrument.stage.port, "No such file", "stage.port", status=5)
-    refused(bench.run(*run, "--stage-port", silent_pty), silent_pty, "does not answer", "make flash", status=5)
+    check_refusal(bench.run(*run), lonely_instrument.stage.port, "No such file", "stage.port", status=5)
+    check_refusal(bench.run(*run, "--stage-port", silent_pty), silent_pty, "does not answer", "make flash", status=5)
     (bench.folder / "file").touch()
-    refused(bench.run(*run, "--stage-port", bench.folder / "file"), "file", status=5)
-    refused(bench.run("polysight-pi", "run", "--config", lonely, "--wires", "no.sock"), "no.sock", status=5)
+    check_refusal(bench.run(*run, "--stage-port", bench.folder / "file"), "file", status=5)
+    check_refusal(bench.run("polysight-pi", "run", "--config", lonely, "--wires", "no.sock"), "no.sock", status=5)
 
 
 @pytest.fixture
@@ -250,7 +250,7 @@ def silent_pty():
 
 def test_no_pi(bench, lonely, lonely_instrument):
     ended = bench.here("scan", "--config", lonely, "--out", "s")
-    refused(ended, lonely_instrument.pi.command_address, "polysight-pi run", status=5)
+    check_refusal(ended, lonely_instrument.pi.command_address, "polysight-pi run", status=5)
     assert not (bench.folder / "s").exists()
 
 
@@ -286,12 +286,12 @@ def test_cards_that_do_not_serve(rig):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreign_socket:
         foreign_socket.bind((board.host_address, board.data_port))
         ended = rig.scan().wait(30)
-        refused(ended, f"{board.host_address}:{board.data_port}", "ss -ulnp", status=5)
+        check_refusal(ended, f"{board.host_address}:{board.data_port}", "ss -ulnp", status=5)
     table = to_builtins(rig.instrument)
     card = next(b for b in table["boards"] if b["name"] == "RV")
     card["card_address"] = card["card_address"].rpartition(".")[0] + ".99"
     rig.config.write_text(tomli_w.dumps(table))
     ended = rig.scan().wait(30)
-    refused(ended, "RV", card["card_address"], "did not answer", status=5)
+    check_refusal(ended, "RV", card["card_address"], "did not answer", status=5)
     assert "doctor" not in ended.message
     assert not (rig.folder / "scan").exists()

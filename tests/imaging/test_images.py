@@ -167,7 +167,7 @@ def test_random_offsets_of_every_chirp_do_not_change_the_image(make_rig, points_
     amplitudes = np.array([0.4, 0.4j, -0.3])
     ideal = _build(rig, lambda b: points_rows(rig, b, points, amplitudes, direct=0.0)).finish()
 
-    def disturbed(board):
+    def disturb(board):
         setup = BoardSetup.from_rig(rig, board, compensate_filter=False)
         steering = setup.path.steering  # as received, RX differ by their direct path
         n = np.arange(256)
@@ -184,7 +184,7 @@ def test_random_offsets_of_every_chirp_do_not_change_the_image(make_rig, points_
                 ),
             )
 
-    images = _build(rig, disturbed).finish()
+    images = _build(rig, disturb).finish()
     for got, want in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
         assert abs(np.vdot(got, want)) / np.linalg.norm(got) / np.linalg.norm(want) > 0.98
 

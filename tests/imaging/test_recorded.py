@@ -19,7 +19,7 @@ BRIGHT_M = np.array([-15.6, 21.6, 0.0])
 
 
 @pytest.fixture(scope="module")
-def recorded():
+def recording():
     path = os.environ.get("POLYSIGHT_GOTCHA")
     if not path:
         pytest.skip("no recording of another radar: POLYSIGHT_GOTCHA=data_3dsar_pass1_az001_HH.mat (AFRL, public)")
@@ -29,8 +29,8 @@ def recorded():
     return np.conj(data.fp.T), data.freq.astype(float), antenna, 2.0 * data.r0
 
 
-def _cut(recorded, axis, step_m, samples=None, reference_m=None):
-    s, f, antenna, reference = recorded
+def _cut(recording, axis, step_m, samples=None, reference_m=None):
+    s, f, antenna, reference = recording
     voxels = np.tile(BRIGHT_M, (61, 1))
     voxels[:, axis] += (np.arange(61) - 30) * step_m
     image = backproject(
@@ -51,25 +51,25 @@ def _half_power_width(cut, step_m):
     return (high - low - 1) * step_m
 
 
-def test_recorded_pulses_of_an_aircraft_focus_to_their_bandwidth_and_aperture(recorded):
+def test_recorded_pulses_of_an_aircraft_focus_to_their_bandwidth_and_aperture(recording):
     """Half-power widths 0.886 c / (2 B cos(elevation)) in range (x here) and 0.886 lambda / (2 angle cos) across."""
-    _, f, antenna, _ = recorded
+    _, f, antenna, _ = recording
     elevation = np.arcsin(antenna[58, 2] / np.linalg.norm(antenna[58]))
     angle = np.ptp(np.arctan2(antenna[:, 1], antenna[:, 0]))
     in_range = 0.886 * SPEED_OF_LIGHT_M_S / (2 * np.ptp(f) * np.cos(elevation))
     across = 0.886 * SPEED_OF_LIGHT_M_S / f.mean() / (2 * angle * np.cos(elevation))
-    along_x = _cut(recorded, 0, 0.02)
-    along_y = _cut(recorded, 1, 0.06)
+    along_x = _cut(recording, 0, 0.02)
+    along_y = _cut(recording, 1, 0.06)
     assert abs(int(np.argmax(along_x)) - 30) * 0.02 < 0.1
     assert abs(int(np.argmax(along_y)) - 30) * 0.06 < 0.3
     assert _half_power_width(along_x, 0.02) == pytest.approx(in_range, rel=0.2)
     assert _half_power_width(along_y, 0.06) == pytest.approx(across, rel=0.2)
 
 
-def test_without_pulse_to_pulse_phase_or_with_a_wrong_range_there_is_no_focus(recorded):
+def test_without_pulse_to_pulse_phase_or_with_a_wrong_range_there_is_no_focus(recording):
     rng = np.random.default_rng(0)
-    s, _, _, reference = recorded
-    focused = _cut(recorded, 1, 0.06).max()
+    s, _, _, reference = recording
+    focused = _cut(recording, 1, 0.06).max()
     unfocused = s * np.exp(2j * np.pi * rng.uniform(size=(len(s), 1)))
-    assert _cut(recorded, 1, 0.06, samples=unfocused).max() < focused / 4
-    assert _cut(recorded, 1, 0.06, reference_m=reference + rng.normal(0, 0.02, reference.size)).max() < focused / 3
+    assert _cut(recording, 1, 0.06, samples=unfocused).max() < focused / 4
+    assert _cut(recording, 1, 0.06, reference_m=reference + rng.normal(0, 0.02, reference.size)).max() < focused / 3

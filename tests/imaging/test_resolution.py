@@ -48,13 +48,13 @@ def test_the_published_scan_reaches_what_the_simulation_of_its_geometry_says(mak
 def test_a_taper_trades_width_for_sidelobes(make_rig):
     rig = make_rig(41, 41, 4.0, 4.0, pixels=(31, 31))
 
-    def of(name):
+    def response_with(name):
         board = _full(msgspec.structs.replace(rig, image=msgspec.structs.replace(rig.image, apodisation=name)))
         return point_response(board.aperture, board.weights)
 
-    none = of("none")
-    kaiser = of("kaiser")
-    taylor = of("taylor")
+    none = response_with("none")
+    kaiser = response_with("kaiser")
+    taylor = response_with("taylor")
     for tapered in (kaiser, taylor):
         assert min(np.subtract(tapered.width_mm, none.width_mm)) > 0
         assert max(tapered.sidelobe_db) < max(none.sidelobe_db) - 8

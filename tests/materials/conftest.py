@@ -122,7 +122,7 @@ def nine():
 
 
 @pytest.fixture(scope="session")
-def analysed():
+def analyse_placement():
     """`analysed(seed, angle_deg)`: the materials of a placement of the nine, found once."""
 
     @functools.cache
@@ -133,9 +133,9 @@ def analysed():
 
 
 @pytest.fixture(scope="session")
-def library(analysed) -> Library:
+def library(analyse_placement) -> Library:
     """Six placements that no test scene repeats."""
     return make_library(
-        [TrainingScan(f"train-{s}", analysed(s), True, s, {"made by": "test"}) for s in range(1000, 1006)],
+        [TrainingScan(f"train-{s}", analyse_placement(s), True, s, {"made by": "test"}) for s in range(1000, 1006)],
         note="synthetic images",
     )

@@ -27,13 +27,13 @@ MATERIALS = {
 BOXES = {"Copper plate": (10, 12, 40, 50), "acrylic_3mm": (60, 20, 85, 40), "ceramic": (100, 90, 130, 140)}
 
 
-def labelled(folder, seed=1, name="scan_7", **more):
+def write_scan(folder, seed=1, name="scan_7", **more):
     return write_labels(folder, name, BOXES, MATERIALS, 60.0, Errors(0.005, 0.01), seed, **more)
 
 
 @pytest.mark.parametrize("upside_down", [False, True])
 def test_boxes_give_the_materials_ratios_relative_to_metal(tmp_path, upside_down):
-    scan = read_labelled_scan(labelled(tmp_path, upside_down=upside_down))
+    scan = read_labelled_scan(write_scan(tmp_path, upside_down=upside_down))
     orientation = image_orientation([scan])
     assert ("last row" in orientation) == upside_down
     entries = {e.name: e for e in entries_of_boxes(scan.orient(orientation), 60.0)}
@@ -48,7 +48,7 @@ def test_boxes_give_the_materials_ratios_relative_to_metal(tmp_path, upside_down
 
 @pytest.mark.parametrize("how", list(ORIENTATIONS))
 def test_the_right_reading_is_found_among_all(tmp_path, how):
-    scan = read_labelled_scan(labelled(tmp_path))
+    scan = read_labelled_scan(write_scan(tmp_path))
     back = {
         "x to the right, y along the rows": lambda a: a,
         "y from the last row": lambda a: a[::-1],
@@ -61,7 +61,7 @@ def test_the_right_reading_is_found_among_all(tmp_path, how):
 
 
 def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):
-    folder = labelled(tmp_path)
+    folder = write_scan(tmp_path)
     text = json.loads((folder / "scan_7.json").read_text())
     del text["labels"]["Copper plate"]
     (folder / "scan_7.json").write_text(json.dumps(text))
@@ -79,8 +79,8 @@ def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):
 
 
 def test_folders_and_angles(tmp_path):
-    labelled(tmp_path)
-    labelled(tmp_path, name="another")
+    write_scan(tmp_path)
+    write_scan(tmp_path, name="another")
     (tmp_path / "empty").mkdir()
     assert [f.name for f in label_folders(tmp_path)] == ["another", "scan_7"]
     assert label_folders(tmp_path / "none") == []

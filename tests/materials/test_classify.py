@@ -29,23 +29,25 @@ def powders():
 
 
 @pytest.fixture(scope="module")
-def seen(synthetic, analysed):
+def two_angles(synthetic, analyse_placement):
     """Nine plates under both angles: a library of four placements, and the patches file of one to name, by angle."""
     entries = [
         entry
         for angle in ANGLES
         for seed in range(1000, 1004)
-        for entry in make_entries(TrainingScan(f"{angle:g}-{seed}", analysed(seed, angle), True, seed))
+        for entry in make_entries(TrainingScan(f"{angle:g}-{seed}", analyse_placement(seed, angle), True, seed))
     ]
     scene = synthetic(1)
-    packed = {angle: pack_patches(analysed(1, angle), scene.x_m, scene.y_m, simulated=True) for angle in ANGLES}
+    packed = {
+        angle: pack_patches(analyse_placement(1, angle), scene.x_m, scene.y_m, simulated=True) for angle in ANGLES
+    }
     return Library(tuple(entries)), packed
 
 
 @pytest.fixture
-def folders(seen, tmp_path):
+def folders(two_angles, tmp_path):
     """What `polysight process` leaves of the two scans, as far as naming needs it."""
-    library, packed = seen
+    library, packed = two_angles
     library.save(tmp_path / "library.npz")
     for angle, content in packed.items():
         (tmp_path / f"{angle:g}").mkdir()
@@ -106,10 +108,10 @@ def test_an_angle_the_library_does_not_hold_is_refused(powders):
 
 
 @pytest.mark.parametrize("model", ["knn", "discriminant"])
-def test_patches_under_two_angles_are_named_together(seen, scans, model):
+def test_patches_under_two_angles_are_named_together(two_angles, scans, model):
     matched = match_patches(scans)
     assert len(matched) == 9
-    named = Classifier(seen[0], model=model, angles_deg=ANGLES).scan([m.features for m in matched])
+    named = Classifier(two_angles[0], model=model, angles_deg=ANGLES).scan([m.features for m in matched])
     assert sum(n.verdict.name == m.truth for n, m in zip(named, matched, strict=True)) >= 8
     for n in named:
         assert 0 < n.verdict.confidence <= 1
@@ -128,8 +130,8 @@ def test_patches_match_by_place_alone(scans):
     assert len(match_patches([scans[0], without])) == 8
 
 
-def test_a_pixel_that_cannot_be_used_is_unknown_and_an_empty_patch_too(seen, scans):
-    classifier = Classifier(seen[0], model="discriminant", angles_deg=[55.0])
+def test_a_pixel_that_cannot_be_used_is_unknown_and_an_empty_patch_too(two_angles, scans):
+    classifier = Classifier(two_angles[0], model="discriminant", angles_deg=[55.0])
     x = scans[0].patches[0].features.copy()
     x[0, 2] = np.nan
     broken, empty, all_nan = classifier.scan([x, np.zeros((0, 4)), np.full((2, 4), np.nan)])

@@ -29,7 +29,7 @@ OAK = (10.0, -10.0, 40.0, 10.0)
 NAN = float("nan")
 
 
-def checked(boxes, **more):
+def check_boxes(boxes, **more):
     return check_labels(Labels(boxes, "mm", **more), X_M, Y_M)
 
 
@@ -62,13 +62,13 @@ CONFLICT = ErrorCode.VALUES_CONFLICT
 )
 def test_boxes_and_names_that_cannot_be_used_for_training_are_refused(boxes, more, code, values):
     with refused(code, *values) as e:
-        checked(boxes, **more)
+        check_boxes(boxes, **more)
     assert e.value.why
     assert e.value.remedy
 
 
 def test_boxes_may_touch_and_reach_the_edge_of_the_image():
-    boxes = checked({"copper": (-50.0, -50.0, 0.0, 50.0), "oak": (0.0, -50.0, 50.0, 50.0)})
+    boxes = check_boxes({"copper": (-50.0, -50.0, 0.0, 50.0), "oak": (0.0, -50.0, 50.0, 50.0)})
     assert (boxes.metal, list(boxes.boxes)) == ("copper", ["copper", "oak"])
     segmentation, names = boxes.patches(X_M, Y_M)
     assert [p.pixels for p in segmentation.patches] == [1250, 1250]
@@ -83,8 +83,10 @@ def test_a_box_where_nothing_was_scanned_is_refused():
 
 
 def test_one_box_needs_no_metal_and_a_second_piece_has_a_name_of_its_own():
-    assert checked({"oak": OAK}).metal is None
-    boxes = checked({"copper": COPPER, "oak": (10, -10, 20, 10), "oak#2": (30, -10, 40, 10)}, specimens={"oak": "1"})
+    assert check_boxes({"oak": OAK}).metal is None
+    boxes = check_boxes(
+        {"copper": COPPER, "oak": (10, -10, 20, 10), "oak#2": (30, -10, 40, 10)}, specimens={"oak": "1"}
+    )
     assert [boxes.specimen(name) for name in boxes.boxes] == [None, "1", "2"]
 
 
@@ -110,7 +112,7 @@ def test_marks_that_show_nothing_are_no_part_of_a_name(mark):
 
 def test_label_files_are_read_back_and_pixels_become_millimetres(tmp_path):
     path = tmp_path / "labels.json"
-    labels = checked({"copper": COPPER, "\u6a61\u6728": OAK}, specimens={"\u6a61\u6728": "board 7"})
+    labels = check_boxes({"copper": COPPER, "\u6a61\u6728": OAK}, specimens={"\u6a61\u6728": "board 7"})
     path.write_bytes(pack_labels(labels))
     assert read_labels(path) == labels
     assert "\u6a61\u6728" in path.read_text(encoding="utf-8")

@@ -34,7 +34,7 @@ def shared_covariance(own=OWN, common=COMMON, bands=4):
     return own**2 * np.eye(2 * bands) + place @ place.T
 
 
-def measured(stack, offset=0j, theta_std=0.0, covariance=None):
+def measure_bands(stack, offset=0j, theta_std=0.0, covariance=None):
     q, h = predict(stack, BANDS, THETA)
     covariance = shared_covariance() if covariance is None else covariance
     sigma = np.sqrt(np.diag(covariance)[::2])
@@ -60,7 +60,7 @@ def measured(stack, offset=0j, theta_std=0.0, covariance=None):
     ids=["sheet in air", "sheet on metal", "film behind a wall"],
 )
 def test_permittivity_and_thickness_come_back(true, asked):
-    fit = fit_layer(measured(true, covariance=shared_covariance(1e-5, 1e-5)), asked, THETA, RANGE)
+    fit = fit_layer(measure_bands(true, covariance=shared_covariance(1e-5, 1e-5)), asked, THETA, RANGE)
     assert fit.permittivity == pytest.approx(SHEET.permittivity, rel=1e-4)
     assert fit.thickness_m == pytest.approx(1.7e-3, rel=1e-4)
     assert not fit.ambiguous
@@ -75,7 +75,7 @@ def test_infinite_permittivity_is_metal_behind_a_layer():
 def test_an_error_that_all_bands_share_is_no_misfit_and_moves_little():
     """Two deviations of the common error: the data still fit, within the error bars."""
     for stack, layers in (([SHEET], [Layer("sheet")]), ([SHEET, PLATE], [Layer("sheet"), PLATE])):
-        fit = fit_layer(measured(stack, offset=2 * COMMON * np.exp(0.7j)), layers, THETA, NEAR)
+        fit = fit_layer(measure_bands(stack, offset=2 * COMMON * np.exp(0.7j)), layers, THETA, NEAR)
         assert fit.chi2 < 8
         assert not any("does not explain" in words for words in fit.warnings())
         assert abs(fit.permittivity.real - 3.4) < 3 * fit.std_real
@@ -86,7 +86,8 @@ def test_differences_between_bands_are_known_better_than_each():
     """With the same error of each band, the thickness is known better where most of it is common to all."""
     alone = np.eye(8) * (OWN**2 + COMMON**2)
     shared, independent = (
-        fit_layer(measured([SHEET], covariance=c), [Layer("sheet")], THETA, NEAR) for c in (shared_covariance(), alone)
+        fit_layer(measure_bands([SHEET], covariance=c), [Layer("sheet")], THETA, NEAR)
+        for c in (shared_covariance(), alone)
     )
     assert shared.std_thickness_m < 0.7 * independent.std_thickness_m
 
@@ -129,7 +130,9 @@ def test_a_thickness_that_is_not_determined_is_told_ambiguous():
 
 
 def test_an_uncertain_angle_widens_the_error_bars():
-    sure, unsure = (fit_layer(measured([SHEET], theta_std=std), [Layer("sheet")], THETA, NEAR) for std in (0, 0.01))
+    sure, unsure = (
+        fit_layer(measure_bands([SHEET], theta_std=std), [Layer("sheet")], THETA, NEAR) for std in (0, 0.01)
+    )
     assert unsure.std_real > 1.1 * sure.std_real
 
 

@@ -20,7 +20,7 @@ CHIRP = published_rig().chirp
 BANDS = Spectrum.from_chirp(CHIRP, 4)
 
 
-def measured(stack, sigma=1e-4, sigma_h=None, spectrum=BANDS, rng=None):
+def measure_bands(stack, sigma=1e-4, sigma_h=None, spectrum=BANDS, rng=None):
     q, h = predict(stack, spectrum, THETA)
     k = q.size
     if rng is not None:
@@ -35,7 +35,7 @@ def test_a_half_space_is_eq2_and_eq3():
     eps = 3.78 - 0.7j
     q, _ = predict([Layer("pet", eps)], BANDS, THETA)
     np.testing.assert_allclose(1 / q, ratio_from_permittivity(eps, THETA), rtol=1e-12)
-    fit = fit_layer(measured([Layer("pet", eps)]), [Layer("pet")], THETA)
+    fit = fit_layer(measure_bands([Layer("pet", eps)]), [Layer("pet")], THETA)
     assert fit.permittivity == pytest.approx(permittivity_from_ratio(1 / q[0], THETA), rel=1e-6)
 
 
@@ -43,7 +43,7 @@ def test_a_half_space_is_eq2_and_eq3():
 @given(st.floats(2.0, 12.0), st.floats(0.05, 5.0), st.floats(0.3e-3, 4e-3))
 def test_a_sheet_of_known_thickness_is_recovered(real, loss, thickness):
     eps = complex(real, -loss)
-    fit = fit_layer(measured([Layer("sheet", eps, thickness)]), [Layer("sheet", None, thickness)], THETA)
+    fit = fit_layer(measure_bands([Layer("sheet", eps, thickness)]), [Layer("sheet", None, thickness)], THETA)
     candidates = [fit.permittivity, *(r.permittivity for r in fit.rivals)]
     assert min(abs(c - eps) for c in candidates) < 1e-3 * abs(eps)
 
@@ -52,7 +52,7 @@ def test_a_sheet_of_known_thickness_is_recovered(real, loss, thickness):
 @given(st.floats(3.0, 15.0), st.floats(3.0, 25.0), st.floats(1e-3, 3.5e-3))
 def test_a_liquid_behind_a_wall_is_recovered(real, loss, wall):
     glass = Layer("glass", 5.5 - 0.05j, wall)
-    fit = fit_layer(measured([glass, Layer("liquid", complex(real, -loss))]), [glass, Layer("liquid")], THETA)
+    fit = fit_layer(measure_bands([glass, Layer("liquid", complex(real, -loss))]), [glass, Layer("liquid")], THETA)
     candidates = [fit.permittivity, *(r.permittivity for r in fit.rivals)]
     assert min(abs(c - complex(real, -loss)) for c in candidates) < 1e-2 * abs(complex(real, -loss))
 
@@ -62,7 +62,8 @@ def test_water_behind_glass_where_eq3_is_off_by_a_factor():
     stack = [GLASS, Layer("water", WATER)]
     rng = np.random.default_rng(2)
     fits = [
-        fit_layer(measured(stack, 0.01, 0.03, rng=rng), [GLASS, Layer("water")], THETA).permittivity for _ in range(20)
+        fit_layer(measure_bands(stack, 0.01, 0.03, rng=rng), [GLASS, Layer("water")], THETA).permittivity
+        for _ in range(20)
     ]
     assert np.sqrt(np.mean([(f.real / 9.37 - 1) ** 2 for f in fits])) < 0.1
     assert np.sqrt(np.mean([(f.imag / -18.0 - 1) ** 2 for f in fits])) < 0.1
@@ -75,7 +76,7 @@ def test_error_bars_are_those_of_repeated_measurements():
     stack = [Layer("pvc", 4.15 - 0.81j, 1.5e-3)]
     unknown = [Layer("pvc", None, 1.5e-3)]
     rng = np.random.default_rng(1)
-    fits = [fit_layer(measured(stack, 0.01, rng=rng), unknown, THETA) for _ in range(60)]
+    fits = [fit_layer(measure_bands(stack, 0.01, rng=rng), unknown, THETA) for _ in range(60)]
     near = [f for f in fits if abs(f.permittivity - stack[0].permittivity) < 1.0]
     assert len(near) > 50
     for value, claimed in (
@@ -90,23 +91,23 @@ def test_ambiguity_is_said():
     eps = 7.0 - 0.1j
     sheet = [Layer("sheet", None, 2e-3)]
     band = Spectrum(np.array([[76.3e9]]), np.array([[1.0]]))
-    narrow = fit_layer(measured([Layer("sheet", eps, 2e-3)], 0.005, spectrum=band), sheet, THETA)
+    narrow = fit_layer(measure_bands([Layer("sheet", eps, 2e-3)], 0.005, spectrum=band), sheet, THETA)
     assert narrow.ambiguous
     assert any(abs(s.permittivity.real - eps.real) < 3 * s.std_real for s in (narrow, *narrow.rivals))
     assert any("is not excluded" in w for w in narrow.warnings())
-    wide = fit_layer(measured([Layer("sheet", eps, 2e-3)], 0.005), sheet, THETA)
+    wide = fit_layer(measure_bands([Layer("sheet", eps, 2e-3)], 0.005), sheet, THETA)
     assert not wide.ambiguous
     assert abs(wide.permittivity - eps) < 1e-3
 
 
 def test_what_the_wave_does_not_reach_has_a_large_error_bar():
     wall = Layer("lossy wall", 6.0 - 6.0j, 5e-3)
-    fit = fit_layer(measured([wall, Layer("liquid", WATER)], 0.01), [wall, Layer("liquid")], THETA)
+    fit = fit_layer(measure_bands([wall, Layer("liquid", WATER)], 0.01), [wall, Layer("liquid")], THETA)
     assert any("large" in w or "as well" in w for w in fit.warnings())
 
 
 def test_a_stack_that_is_not_the_one_measured_is_noticed():
-    bands = measured([GLASS, Layer("water", WATER)], 0.003)
+    bands = measure_bands([GLASS, Layer("water", WATER)], 0.003)
     fit = fit_layer(bands, [Layer("sheet", None, 0.2e-3)], THETA)
     assert any("does not explain" in w for w in fit.warnings())
 
@@ -121,19 +122,19 @@ def test_a_stack_that_is_not_the_one_measured_is_noticed():
 )
 def test_stacks_that_cannot_be_fitted_are_refused(stack, code):
     with refused(code):
-        fit_layer(measured([GLASS]), stack, THETA)
+        fit_layer(measure_bands([GLASS]), stack, THETA)
 
 
 def test_fewer_data_than_unknowns_are_refused():
-    bands = measured([Layer("sheet", 3.0, 1e-3)], spectrum=Spectrum.from_chirp(CHIRP, 1))
+    bands = measure_bands([Layer("sheet", 3.0, 1e-3)], spectrum=Spectrum.from_chirp(CHIRP, 1))
     with refused(ErrorCode.NOT_ENOUGH_DATA):
         fit_layer(bands, [Layer("sheet", None, 1e-3)], THETA, (0.5e-3, 2e-3))
 
 
 def test_a_solution_at_the_end_of_what_is_looked_for_says_so():
-    beyond = fit_layer(measured([Layer("dense", 60 - 2j)]), [Layer("dense")], THETA)
+    beyond = fit_layer(measure_bands([Layer("dense", 60 - 2j)]), [Layer("dense")], THETA)
     assert any("at the limit" in words for words in beyond.warnings())
-    lossless = fit_layer(measured([Layer("clear", 4 - 0j)]), [Layer("clear")], THETA)
+    lossless = fit_layer(measure_bands([Layer("clear", 4 - 0j)]), [Layer("clear")], THETA)
     assert not any("at the limit" in words for words in lossless.warnings())  # no loss is an answer
 
 

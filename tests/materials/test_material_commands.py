@@ -48,7 +48,15 @@ def test_water_behind_glass_as_typed(tmp_path, capsys):
 def sugar() -> list[Entry]:
     ones = np.ones(5, np.float32)
     return [
-        Entry(name, scan, ones, ones, np.full(5, np.tan(1.2 - percent / 400), np.complex64), 55.0, True)
+        Entry(
+            name=name,
+            scan=scan,
+            h=ones,
+            v=ones,
+            p=np.full(5, np.tan(1.2 - percent / 400), np.complex64),
+            incidence_deg=55.0,
+            simulated=True,
+        )
         for name, percent in (("water", 0.0), ("sugar (1.3%)", 1.3), ("sugar (3.8%)", 3.8), ("sugar (7.4%)", 7.4))
         for scan in ("a", "b")
     ]

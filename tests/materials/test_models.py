@@ -29,7 +29,7 @@ def samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=0, an
     return Samples(np.concatenate(x), np.array(names), np.array(group), np.array(patch))
 
 
-def permuted(data, seed=0):
+def permute_names(data, seed=0):
     """The same pixels with the names shuffled among the patches."""
     first = np.unique(data.patches, return_index=True)[1]
     dealt = np.random.default_rng(seed).permutation(data.names[first])
@@ -52,7 +52,7 @@ def test_no_model_finds_what_is_not_there(model):
 def test_with_shuffled_names_the_discriminant_is_as_good_as_chance():
     """The same of the KNN, and its gain by a split by pixel, is in test_materials."""
     data = samples(groups=8, pixels=12, offset=0.02, noise=0.002)
-    scores = [score(permuted(data, seed), DISCRIMINANT) for seed in range(4)]
+    scores = [score(permute_names(data, seed), DISCRIMINANT) for seed in range(4)]
     assert np.mean([s.pixels for s in scores]) == pytest.approx(1 / 6, abs=0.1)
     assert np.mean([s.patches for s in scores]) == pytest.approx(1 / 6, abs=0.12)
 

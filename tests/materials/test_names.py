@@ -17,7 +17,7 @@ KINDS = (*(Kind(name, eps) for name, eps in LIBRARY.items()), *literature(tuple(
 AT_ANGLES = tuple(Kinds(KINDS, angle, sheets=True) for angle in ANGLES)
 
 
-def name_of(*ratios: complex, std: float = 0.004, share: float = 0.5):
+def name_ratios(*ratios: complex, std: float = 0.004, share: float = 0.5):
     kinds = AT_ANGLES[: len(ratios)]
     covariance = std**2 * np.eye(2)
     evidence = [RatioEvidence(kind.theta_rad, t, covariance, share) for kind, t in zip(kinds, ratios, strict=True)]
@@ -28,7 +28,7 @@ def name_of(*ratios: complex, std: float = 0.004, share: float = 0.5):
 @settings(max_examples=40, deadline=None)
 @given(st.floats(1.05, 12.0), st.floats(0.0, 8.0), st.floats(0.002, 0.05), st.integers(1, 2))
 def test_probabilities_sum_to_one_and_the_name_has_the_largest(real, loss, std, scans):
-    verdict = name_of(*inverse_ratio(complex(real, -loss), np.array(ANGLES[:scans])), std=std).verdict
+    verdict = name_ratios(*inverse_ratio(complex(real, -loss), np.array(ANGLES[:scans])), std=std).verdict
     assert sum(verdict.probabilities.values()) == pytest.approx(1, abs=1e-9)
     assert verdict.confidence == verdict.probabilities[verdict.name] == max(verdict.probabilities.values())
 
@@ -36,7 +36,7 @@ def test_probabilities_sum_to_one_and_the_name_has_the_largest(real, loss, std, 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(1.05, 12.0), st.floats(0.0, 8.0))
 def test_a_name_of_the_literature_is_never_one_of_the_library(real, loss):
-    verdict = name_of(complex(inverse_ratio(complex(real, -loss), ANGLES[0]))).verdict
+    verdict = name_ratios(complex(inverse_ratio(complex(real, -loss), ANGLES[0]))).verdict
     if verdict.source == "library":
         assert verdict.name in LIBRARY
     else:
@@ -47,15 +47,15 @@ def test_a_name_of_the_literature_is_never_one_of_the_library(real, loss):
 
 
 def test_what_only_the_literature_explains_is_said_as_like_it():
-    verdict = name_of(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2).verdict
+    verdict = name_ratios(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2).verdict
     assert verdict.source == "literature"
     assert "sapphire" in verdict.literature
 
 
 def test_a_second_angle_makes_a_true_name_surer():
     t = inverse_ratio(LIBRARY["acrylic"], np.array(ANGLES))
-    alone = name_of(t[0], std=0.03).verdict.probabilities["acrylic"]
-    verdict = name_of(*t, std=0.03).verdict
+    alone = name_ratios(t[0], std=0.03).verdict.probabilities["acrylic"]
+    verdict = name_ratios(*t, std=0.03).verdict
     assert verdict.name == "acrylic"
     assert verdict.confidence > alone
 
@@ -63,7 +63,7 @@ def test_a_second_angle_makes_a_true_name_surer():
 def test_what_is_no_half_space_but_a_thin_plate_is_a_possible_layer():
     t = draw_sheets(ANGLES[0])
     far = t[np.argsort(np.abs(t))[int(0.97 * t.size)]]
-    names = [name_of(complex(far)).verdict.name, name_of(-0.25 + 0.2j).verdict.name]
+    names = [name_ratios(complex(far)).verdict.name, name_ratios(-0.25 + 0.2j).verdict.name]
     assert LAYER in names
     assert not set(names) & set(LIBRARY)
 

@@ -57,20 +57,20 @@ def test_noise_has_no_place():
     assert align(images(h, v))[1] == (0.0, 0.0)
 
 
-def scattered(slope_of):
+def make_scatter(slope_of):
     """Nine plates with the slopes (x, y) that a function of their place gives, known to 0.1 per metre."""
     std = np.full(2, 0.1 + 0.1j)
     return [Scatter(0.01, 0.01, 8.0, np.array(slope_of(*place)), std, place) for place in PLACES_M]
 
 
 def test_slopes_that_all_plates_have_alike_are_theirs():
-    change = common_change(scattered(lambda _x, _y: (0.7 + 0.5j, 0.4j)), ORIGIN_M)
+    change = common_change(make_scatter(lambda _x, _y: (0.7 + 0.5j, 0.4j)), ORIGIN_M)
     assert np.abs(change.value).max() < 0.01
 
 
 def test_a_drift_over_the_rows_is_followed_within_its_error():
     """ln(V / H) = 0.06 cos(20 y): both parts, slopes along y."""
-    change = common_change(scattered(lambda _x, y: (0j, -(1 + 1j) * 0.06 * 20 * np.sin(20 * y))), ORIGIN_M)
+    change = common_change(make_scatter(lambda _x, y: (0j, -(1 + 1j) * 0.06 * 20 * np.sin(20 * y))), ORIGIN_M)
     true = (1 + 1j) * 0.06 * (np.cos(20 * np.array(PLACES_M)[:, 1]) - 1)
     deviation = change.value - true
     assert (np.abs(deviation.real) <= 2 * change.std.real + 1e-6).all()
@@ -79,12 +79,12 @@ def test_a_drift_over_the_rows_is_followed_within_its_error():
 
 
 def test_slopes_along_a_row_are_no_drift():
-    change = common_change(scattered(lambda x, _y: (20 * x, 0j)), ORIGIN_M)
+    change = common_change(make_scatter(lambda x, _y: (20 * x, 0j)), ORIGIN_M)
     assert np.abs(change.value).max() < 0.005
 
 
 def test_plates_at_the_border_say_nothing_of_a_drift():
-    steep = scattered(lambda _x, y: (0j, 8.0 if y > 0.05 else 0j))
+    steep = make_scatter(lambda _x, y: (0j, 8.0 if y > 0.05 else 0j))
     change = common_change(steep, ORIGIN_M, [place[1] > 0.05 for place in PLACES_M])
     assert np.abs(change.value[:6]).max() < 0.01
 

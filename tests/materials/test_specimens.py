@@ -110,13 +110,13 @@ def entries(samples):
         q = samples.x[of_patch, 2] + 1j * samples.x[of_patch, 3]
         out.append(
             Entry(
-                str(samples.names[of_patch][0]),
-                f"scan {samples.groups[of_patch][0]}",
-                h.astype(np.float32),
-                v.astype(np.float32),
-                (1 / q).astype(np.complex64),
-                60.0,
-                True,
+                name=str(samples.names[of_patch][0]),
+                scan=f"scan {samples.groups[of_patch][0]}",
+                h=h.astype(np.float32),
+                v=v.astype(np.float32),
+                p=(1 / q).astype(np.complex64),
+                incidence_deg=60.0,
+                simulated=True,
                 specimen=str(samples.specimens[of_patch][0]),
             )
         )

@@ -33,11 +33,11 @@ def scene(synthetic):
 
 
 @pytest.fixture(scope="module")
-def found(scene):
+def analysis(scene):
     return scene.analyse()
 
 
-def half_of(mask):
+def cut_left_half(mask):
     """The left half of a region."""
     columns = np.flatnonzero(mask.any(axis=0))
     left_half = np.zeros_like(mask)
@@ -45,51 +45,51 @@ def half_of(mask):
     return mask & left_half
 
 
-def test_metal_that_a_sub_band_does_not_show_is_no_part_of_its_reference(scene, found):
+def test_metal_that_a_sub_band_does_not_show_is_no_part_of_its_reference(scene, analysis):
     everywhere = np.ones(scene.h.shape, bool)
-    without = everywhere & ~half_of(found.metal.mask)
+    without = everywhere & ~cut_left_half(analysis.metal.mask)
     full_rows, cut = (
-        band_rows(found, [BAND], [channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)
+        band_rows(analysis, [BAND], [channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)
     )
-    for patch in found.patches:
+    for patch in analysis.patches:
         (row_before,), (row_after,) = full_rows[patch.patch.label], cut[patch.patch.label]
         assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
         assert row_after.ratio.value == pytest.approx(row_before.ratio.value, rel=0.03)
 
 
-def test_a_patch_that_is_shown_in_part_is_not_darkened_by_the_rest(scene, found):
-    dielectric = next(r for r in found.patches if r.patch.label != found.metal.label)
+def test_a_patch_that_is_shown_in_part_is_not_darkened_by_the_rest(scene, analysis):
+    dielectric = next(r for r in analysis.patches if r.patch.label != analysis.metal.label)
     everywhere = np.ones(scene.h.shape, bool)
-    without = everywhere & ~half_of(dielectric.patch.interior)
-    rows = [band_rows(found, [BAND], [channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)]
+    without = everywhere & ~cut_left_half(dielectric.patch.interior)
+    rows = [band_rows(analysis, [BAND], [channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)]
     (row_before,), (row_after,) = (r[dielectric.patch.label] for r in rows)
     assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
 
 
-def test_a_sub_band_without_metal_is_null_and_the_others_stay(scene, found):
+def test_a_sub_band_without_metal_is_null_and_the_others_stay(scene, analysis):
     everywhere = np.ones(scene.h.shape, bool)
-    images = [channels(scene, everywhere), channels(scene, everywhere & ~found.metal.mask)]
-    rows = band_rows(found, [BAND, BAND], images, (0, 0), 1.5)
-    for patch in found.patches:
+    images = [channels(scene, everywhere), channels(scene, everywhere & ~analysis.metal.mask)]
+    rows = band_rows(analysis, [BAND, BAND], images, (0, 0), 1.5)
+    for patch in analysis.patches:
         row_with_metal, row_without = rows[patch.patch.label]
         assert row_with_metal.ratio is not None
         assert (row_without.ratio, row_without.inverse_ratio_std, row_without.amplitude_h) == (None, None, None)
 
 
-def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, found):
+def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, analysis):
     """The metal's box, and all others, are cut to the image."""
-    valid = ~half_of(found.metal.mask)
+    valid = ~cut_left_half(analysis.metal.mask)
     cut = replace(scene, h=np.where(valid, scene.h, 0), v=np.where(valid, scene.v, 0))
-    label = found.metal.label
+    label = analysis.metal.label
     full_result, part = (
-        s.analyse(metal=label, segmentation=found.segmentation, pair=s.pair.within(is_valid))
+        s.analyse(metal=label, segmentation=analysis.segmentation, pair=s.pair.within(is_valid))
         for s, is_valid in ((scene, np.ones_like(valid)), (cut, valid))
     )
     for row_before, row_after in zip(full_result.rows(), part.rows(), strict=True):
         assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
 
 
-def row_of(ratio, parts):
+def make_row(ratio, parts):
     """A segment of materials.json whose every part of the sweep says the same: a thick plate's."""
     part_row = {
         "first_hz": 0.0,
@@ -101,8 +101,8 @@ def row_of(ratio, parts):
     return msgspec.convert(to_plain({"label": 1, **part_row, "bands": [part_row] * parts}), PatchFigures)
 
 
-def bands_of(ratio, parts) -> Bands:
-    bands = bands_of_row(row_of(ratio, parts), CHIRP, parts)
+def make_bands(ratio, parts) -> Bands:
+    bands = bands_of_row(make_row(ratio, parts), CHIRP, parts)
     assert bands is not None
     return bands
 
@@ -111,7 +111,7 @@ def test_errors_that_sub_bands_share_do_not_shrink_with_their_number():
     """Metal, edges and size are off by the same in every band. A thick plate looks the same in all of them, so that
     its permittivity has one error bar, however many they are."""
     ratio = ratio_from_permittivity(THICK, THETA)
-    fits = [fit_layer(bands_of(ratio, parts), [Layer("plate")], THETA) for parts in (1, 2, 4, 8)]
+    fits = [fit_layer(make_bands(ratio, parts), [Layer("plate")], THETA) for parts in (1, 2, 4, 8)]
     for fit in fits[1:]:
         assert fit.permittivity == pytest.approx(fits[0].permittivity, rel=1e-3)
         assert fit.std_real == pytest.approx(fits[0].std_real, rel=0.05)
@@ -125,7 +125,7 @@ def test_error_bars_of_four_sub_bands_are_those_of_repeated_placements():
     fits = []
     for _ in range(60):
         error = INVERSE_STD * complex(*rng.standard_normal(2))
-        bands = replace(bands_of(1 / (inverse + error), 4), amplitude_h=None, sigma_h=None)
+        bands = replace(make_bands(1 / (inverse + error), 4), amplitude_h=None, sigma_h=None)
         fits.append(fit_layer(bands, [Layer("plate")], THETA))
     scatter = np.std([f.permittivity.real for f in fits])
     assert scatter == pytest.approx(np.median([f.std_real for f in fits]), rel=0.3)

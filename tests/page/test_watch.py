@@ -16,7 +16,7 @@ from tests.support.page.chromium import DESK, PHONE
 from tests.support.page.live_view import GrowingScan, served
 from tests.support.processes import wait_for
 from tests.support.products import REASON, judged_products
-from tests.support.store.facts import typed
+from tests.support.store.facts import parse_fact
 
 from polysight.acquisition.control import ALIVE, CONTROL, Life, started_ticks
 from polysight.page.watch import EventTail, ManifestTail, ProductsTail, Watch, draw
@@ -70,12 +70,12 @@ def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
     watch = watching(growing.path, lapse_s=1e6)
     assert answer(watch)["scan"] is None
     growing.live()
-    growing.grow_to("scan_started")
+    growing.grow_until("scan_started")
     watch.wait_for(lambda s: s["scan"] is not None)
     assert answer(watch)["scan"]["marks"] == "..."
     revision = 0
     for row in range(3):
-        growing.grow_to("row_committed")
+        growing.grow_until("row_committed")
         watch.wait_for(shows(row + 1))
         state = answer(watch)
         assert state["scan"]["marks"] == "c" * (row + 1) + "." * (2 - row)
@@ -83,13 +83,13 @@ def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
         assert state["profile"]["row"] == row
         revision = state["pictures"]["revision"]
     assert answer(watch)["status"]["level"] == "good"
-    growing.grow_to("scan_ended")
+    growing.grow_until("scan_ended")
     watch.wait_for(lambda s: s["status"]["level"] == "done")
 
 
 def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
     watch = watching(growing.path, lapse_s=2.0)
-    growing.grow_to("row_committed")
+    growing.grow_until("row_committed")
 
     def lives() -> bool:
         growing.live()
@@ -106,7 +106,7 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
 
 
 def test_a_killed_program_is_said_at_once_however_long_its_timeout_is(growing, watching):
-    growing.grow_to("row_committed")
+    growing.grow_until("row_committed")
     program = subprocess.Popen(["sleep", "600"])
     life = Life(program.pid, started_ticks(program.pid) or 0, socket.gethostname())
     growing.live()
@@ -121,7 +121,7 @@ def test_a_killed_program_is_said_at_once_however_long_its_timeout_is(growing, w
 
 
 def test_an_unfinished_folder_without_a_program_is_said_to_be_at_once(growing, watching):
-    growing.grow_to("row_committed")
+    growing.grow_until("row_committed")
     assert answer(watching(growing.path))["status"]["key"] in ("frozen", "killed")
 
 
@@ -137,7 +137,7 @@ def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):
 
 
 def test_another_scan_in_the_same_place_begins_afresh(growing, finished, watching):
-    growing.grow_to("row_committed")
+    growing.grow_until("row_committed")
     watch = watching(growing.path, lapse_s=1e6)
     watch.wait_for(shows(1))
     shutil.rmtree(growing.path)
@@ -225,7 +225,7 @@ def test_another_and_longer_file_is_found_after_a_single_look(finished, tmp_path
     assert len(tail.look()) == len(other_items)
     (tmp_path / "new").write_bytes(b"".join(map(manifest.encode_line, other_items)))
     (tmp_path / "new").rename(path)
-    assert tail.look() == [typed(fact) for fact in other_items]
+    assert tail.look() == [parse_fact(fact) for fact in other_items]
     assert tail.file.replaced
 
 
@@ -256,12 +256,12 @@ def test_images_before_materials_and_earlier_products_are_no_result(tmp_path):
 
 
 def test_it_is_shown_when_the_scan_has_ended(growing: GrowingScan, watching):
-    growing.grow_to("row_committed")
+    growing.grow_until("row_committed")
     judged_products(growing.path / "products", "care")
     watch = watching(growing.path)
     watch.wait_for(lambda s: s["scan"] is not None)
     assert json.loads(watch.state.data)["verdict"] is None  # of an earlier run of the scan
-    growing.grow_to("scan_ended")
+    growing.grow_until("scan_ended")
     watch.wait_for(lambda s: s["verdict"] is not None)
     answer = json.loads(watch.state.data)["verdict"]
     assert answer["level"] == "care"

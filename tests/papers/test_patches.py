@@ -56,7 +56,7 @@ def test_the_noise_reaches_the_published_accuracy_of_h_on_draws_it_was_not_set_o
     assert h_accuracy(groups()[name], calibrated_errors(name, 1), (5, 6, 7)) == pytest.approx(answer, abs=0.06)
 
 
-def test_the_phase_error_is_the_published_residual_and_nothing_but_h_was_looked_at(monkeypatch):
+def test_the_phase_error_is_the_published_residual_and_only_h_is_used(monkeypatch):
     calls = []
 
     def spy(samples, model, channels="H+V+P", by_pixel=False, folds=8):

@@ -123,7 +123,7 @@ def pi(instrument: Instrument, stage: FakeStage, hub: Path) -> Iterator[Running]
 @pytest.fixture
 def host(pi: Running) -> HostSide:
     """The host of `pi`: a run is begun and the stage is homed."""
-    pi.host.accepted(pi.host.begin())
+    pi.host.must_accept(pi.host.begin())
     pi.host.home()
     return pi.host
 

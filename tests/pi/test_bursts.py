@@ -428,23 +428,23 @@ def test_a_return_wire_that_is_off_ends_the_row(pi, hub, instrument, monkeypatch
     """On the simulated wires; a rig without the wire says so."""
     monkeypatch.setattr(pi_lines, "SIMULATED_LOOK_BACK_S", 0.2)
     with closing(WireClient(hub)) as cutter:
-        pi.host.accepted(pi.host.begin())
+        pi.host.must_accept(pi.host.begin())
         pi.host.home()
         assert pi.host.row(0).pulses_seen
         cutter._socket.sendall(f"X {instrument.pi.pulses_in} 1\n".encode())
         assert cutter._next_line(HANG_S) == "K"
         done = pi.host.row(1)
         assert (done.fault, done.pulses, done.pulses_seen) == (PiFault.PULSES_UNSEEN, 0, True)
-        assert all(c.pulses_seen for c in pi.host.of(m.Capture))
+        assert all(c.pulses_seen for c in pi.host.list_events(m.Capture))
 
 
 def test_a_row_afterwards_is_complete_and_during_a_run_no_pulse_is_sent(pi, instrument):
     pulse = m.Pulse(pulses=5, period_us=1500.0, width_us=1.0)
     assert not pi.host.ask(m.Hello()).in_run
     assert pi.host.ask(pulse).pulses == 5
-    pi.host.accepted(pi.host.begin())
+    pi.host.must_accept(pi.host.begin())
     assert pi.host.ask(m.Hello()).in_run
-    assert pi.host.refused(pulse) == PiFault.NOT_READY
+    assert pi.host.must_refuse(pulse) == PiFault.NOT_READY
     pi.host.home()
     done = pi.host.row(0)
     assert (done.status, done.pulses) == ("done", instrument.grid.columns * instrument.burst.pulses)

@@ -71,7 +71,7 @@ def in_row(start, stage, hub, wires):
         program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub, faults=faults))
         stage.skip = set(range(rig.grid.columns))  # no edges of its own
         stage.pace_s = 0.05
-        host.accepted(host.begin())
+        host.must_accept(host.begin())
         host.home()
         host.start_row()
         host.wait(m.RowStarted)
@@ -91,13 +91,13 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires):
     rig = replace(rig, stage=replace(rig.stage, speed_mm_s=2.0))
     program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub))
     assert host.ask(m.Hello()).backend == "gpiod"
-    host.accepted(host.begin())
+    host.must_accept(host.begin())
     host.home()
     # A machine that was too busy for a row reports so, and the row is retaken
     for take in range(1, 6):
         rises_before = len(wires.rises(SYNC))
         done = host.row(0, take)
-        captures = [e for e in host.of(m.Capture) if e.take == take]
+        captures = [e for e in host.list_events(m.Capture) if e.take == take]
         wires.until(lambda: len(wires.rises(SYNC)) - rises_before == done.pulses)  # noqa: B023
         assert sum(c.pulses for c in captures) == done.pulses
         if done.status == "done":
@@ -134,7 +134,7 @@ def test_edges_during_a_burst_end_the_row_alone(long_bursts, in_row, wires, edge
     done = host.wait(m.RowFinished)
     assert (done.status, done.fault, done.bursts) == ("fault", fault, 1), done.reason
     assert lost in done.reason
-    assert host.of(m.Fault)[-1].number == fault
+    assert host.list_events(m.Fault)[-1].number == fault
     host.until_state("ready")
 
 
@@ -145,7 +145,7 @@ def test_a_chip_that_vanishes_is_fault_107(rig, in_row, wires):
     done = host.wait(m.RowFinished)
     assert (done.status, done.fault) == ("fault", PiFault.TRIGGER_LINE_LOST)
     assert "No such device" in host.until_state("fault").reason
-    assert host.refused(m.Home()) == PiFault.TRIGGER_LINE_LOST
+    assert host.must_refuse(m.Home()) == PiFault.TRIGGER_LINE_LOST
     ended, _, err = program.end()
     assert ended == 0, err
     wires.until(lambda: wires.level(SYNC) == 0)
@@ -222,7 +222,7 @@ def spi_rig(instrument, tmp_path):
 
 
 @pytest.fixture
-def homed(spi_rig, start):
+def start_homed(spi_rig, start):
     """Starts the program with these settings of the controller, begins a run and homes; gives both ends."""
 
     def homed(hub=None, wire_time=True, **settings):
@@ -230,7 +230,7 @@ def homed(spi_rig, start):
             spi_rig.pi.gpio_chip, hub, wire_time=wire_time, spi=spi_rig.pi.spi_device, **settings
         )
         program, host = start(spi_rig, **environment)
-        host.accepted(host.begin())
+        host.must_accept(host.begin())
         host.home()
         return program, host
 
@@ -238,9 +238,9 @@ def homed(spi_rig, start):
 
 
 @pytest.mark.slow
-def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, homed, hub, wires):
+def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, start_homed, hub, wires):
     """Bits on MOSI with the widths and spacing of the real clock, here 0.4 % fast: the program believes 250 MHz."""
-    program, host = homed(hub, core_hz="250e6,251e6")
+    program, host = start_homed(hub, core_hz="250e6,251e6")
     rate = 1 / 1.004
     assert host.ask(m.Hello()).backend == "spi"
     done = host.row(0)
@@ -255,7 +255,7 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, homed, hub,
     falls = edges[1::2]
     assert [e.value for e in edges] == [1, 0] * (n * spi_rig.grid.columns)
     assert all(abs(b.t_ns - a.t_ns - 1000 * rate) <= 1 for a, b in zip(rises, falls, strict=True))
-    for i, c in enumerate(host.of(m.Capture)):
+    for i, c in enumerate(host.list_events(m.Capture)):
         burst = rises[i * n : (i + 1) * n]
         assert all(abs(b.t_ns - a.t_ns - period_ns * rate) <= 1 for a, b in pairwise(burst))
         assert abs(burst[0].t_ns - c.first_pulse_ns) <= c.jitter_ns + 1
@@ -264,9 +264,9 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, homed, hub,
 
 
 @pytest.mark.slow
-def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(homed, hub):
+def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(start_homed, hub):
     """A run whose bursts exceed spidev's `bufsiz` is refused at once; the next one runs."""
-    _, host = homed(hub, bufsiz="640")
+    _, host = start_homed(hub, bufsiz="640")
     refused = host.ask(msgspec.structs.replace(host.begin(), pulses=2, period_us=20_000.0, speed_mm_s=5.0))
     assert isinstance(refused, m.Refused)
     assert (refused.number, "bufsiz=" in refused.remedy) == (PiFault.BAD_REQUEST, True)
@@ -274,10 +274,10 @@ def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(homed, 
 
 
 @pytest.mark.slow
-def test_a_killed_program_leaves_the_line_low(spi_rig, homed, hub, wires, stage):
+def test_a_killed_program_leaves_the_line_low(spi_rig, start_homed, hub, wires, stage):
     """The kernel ends the transfer; its last bits are low."""
     stage.skip = set(range(spi_rig.grid.columns))
-    program, host = homed(hub, wire_time=False)
+    program, host = start_homed(hub, wire_time=False)
     host.start_row()
     host.wait(m.RowStarted)
     wires.drive(WireEdge(1000, TRIGGER, 1), WireEdge(21_000, TRIGGER, 0))
@@ -329,7 +329,7 @@ def test_every_point_of_a_row_is_a_burst(gpio_rig, hub, wires, start, write_conf
     )
     with closing(StageProcess(tmp_path, "uno", 3.0, hub, write_config(rig))):
         program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub, wire_time=True))
-        host.accepted(host.begin())
+        host.must_accept(host.begin())
         host.home()
         done = host.row(0)
         wires.until(lambda: len(wires.rises(SYNC)) == done.pulses)
@@ -337,7 +337,7 @@ def test_every_point_of_a_row_is_a_burst(gpio_rig, hub, wires, start, write_conf
     assert (done.points, done.edges, done.bursts, done.pulses) == (points, points, points, points * pulses)
     assert len(wires.rises(TRIGGER)) == points
     assert [e.seq for e in host.journalled] == list(range(1, len(host.journalled) + 1))
-    captures = host.of(m.Capture)
+    captures = host.list_events(m.Capture)
     assert [(c.point, c.column, c.pulses) for c in captures] == [(i, i, pulses) for i in range(points)]
     edges = [e for e in wires.edges if e.line == SYNC]
     assert [e.value for e in edges] == [1, 0] * (points * pulses)

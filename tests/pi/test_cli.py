@@ -28,7 +28,7 @@ def command(capsys):
 
 def test_sigterm_ends_the_row_and_the_program(instrument, start, hub, stage):
     program, host = start(instrument, "--wires", hub)
-    host.accepted(host.begin())
+    host.must_accept(host.begin())
     host.home()
     assert host.row(0).status == "done"
     stage.pace_s = 0.05
@@ -37,7 +37,7 @@ def test_sigterm_ends_the_row_and_the_program(instrument, start, hub, stage):
     assert program.end() == (0, "", "")
     last = host.wait(m.RowFinished)
     assert (last.row_index, last.status) == (1, "aborted")
-    assert not host.of(m.RunStopped)
+    assert not host.list_events(m.RunStopped)
 
 
 def test_simulated_wires_need_neither_gpiod_nor_numpy(config, hub, stage, tmp_path):

@@ -123,14 +123,14 @@ class Recorder:
 def make_bench(recorder: Recorder) -> Bench:
     bench = Bench()
     bench.stage.config = recorder.config
-    bench.homed()
+    bench.begin_and_home()
     bench.start(ROW, recorder.speed_mm_s)
     return bench
 
 
 def give(bench: Bench, what: Any, t_ns: int) -> None:
     if what == "edge":
-        bench.edge_at(t_ns)
+        bench.give_edge(t_ns)
     elif isinstance(what, str):
         bench.machine.command(what)
     elif what.kind == "done":
@@ -151,7 +151,7 @@ def replay(recorder: Recorder, edges_ns: list[int]) -> m.RowFinished:
     if bench.machine.state in ("running", "held", "stopping"):
         bench.stage_says(Reply("alarm", number=StageError.STOPPED))
     bench.later(2.0)
-    return bench.of(m.RowFinished)[-1]
+    return bench.list_events(m.RowFinished)[-1]
 
 
 def draw_fault(rng: random.Random, recorder: Recorder, interval_ns: int) -> tuple[str, list[int]]:

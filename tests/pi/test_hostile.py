@@ -135,8 +135,8 @@ def test_nan_of_single_precision_is_refused_too():
 def test_a_folder_in_the_journals_place_is_refused(pi, instrument):
     (Path(instrument.pi.journal_dir) / "folder.journal").mkdir()
     for command in (m.Replay(scan_id="folder", from_seq=1), pi.host.begin("folder")):
-        assert pi.host.refused(command)
-    assert pi.host.accepted(pi.host.begin()).state == "idle"
+        assert pi.host.must_refuse(command)
+    assert pi.host.must_accept(pi.host.begin()).state == "idle"
 
 
 def test_a_message_of_64_mb_is_not_taken_into_memory(pi, stranger):
@@ -156,7 +156,7 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
     host: HostSide = pi.host
     rng = random.Random(amount)
     wires = WiresLog(hub, *instrument.pi.sync_out)
-    host.accepted(host.begin(owner="mine", heartbeat_ms=10_000))
+    host.must_accept(host.begin(owner="mine", heartbeat_ms=10_000))
     host.home("mine")
     valid = [
         m.Hello(), m.Status(), ALIVE, m.Home(), RUN, PULSE, REPLAY, m.Hold(), m.Resume(), m.Abort(), END,
@@ -177,10 +177,10 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
                 taken += 1
                 again = m.RunRow(scan_id="scan", row_index=0, take=taken + 1, owner="mine")
                 wait_for(lambda row=again: not isinstance(host.ask(row), m.Refused), "the next row")
-            host.accepted(m.Alive(scan_id="scan", owner="mine"))
+            host.must_accept(m.Alive(scan_id="scan", owner="mine"))
     assert resident_bytes() - bytes_before < BOUND_BYTES
     assert pi.service.executor.crash is None
-    host.accepted(m.Abort(owner="mine"))
+    host.must_accept(m.Abort(owner="mine"))
     host.until_state("ready")
     wires.close()
     n = instrument.burst.pulses
@@ -212,7 +212,7 @@ def test_an_impossible_position_is_ignored(pi, stage, sign):
 
 def test_impossible_lost_steps_and_points_spoil_no_journal(pi, stage):
     stage.lost = (HUGE, -HUGE)
-    pi.host.accepted(pi.host.begin())
+    pi.host.must_accept(pi.host.begin())
     pi.host.home()
     status = pi.host.ask(m.Status())
     assert (status.lost_x_mm, status.lost_y_mm) == (1e6, -1e6)
@@ -269,7 +269,7 @@ def frame(body: bytes, flags: int = 0) -> bytes:
     return bytes([flags | LONG]) + len(body).to_bytes(8, "big") + body
 
 
-def connected(address: str, kind: bytes) -> socket.socket:
+def connect_peer(address: str, kind: bytes) -> socket.socket:
     """A connection after its handshake, as a socket of this kind."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     peer = socket.create_connection((host, int(port)), timeout=HANG_S)
@@ -287,13 +287,13 @@ def is_cut(peer: socket.socket) -> bool:
     return False
 
 
-def paced(frames: bytes) -> bytes:
+def wait_a_turn(frames: bytes) -> bytes:
     time.sleep(1 / TURNS_A_SECOND)
     return frames
 
 
 ATTACKS = {
-    "a message of many frames": (0, b"DEALER", lambda: paced(frame(b"", MORE) + frame(bytes(60_000), MORE) * 10)),
+    "a message of many frames": (0, b"DEALER", lambda: wait_a_turn(frame(b"", MORE) + frame(bytes(60_000), MORE) * 10)),
     "subscriptions": (1, b"SUB", lambda: b"".join(frame(b"\x01" + os.urandom(1000)) for _ in range(50))),
 }
 
@@ -304,7 +304,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     """And the next one is served, by the same process with the same run."""
     endpoint, kind, more_bytes = ATTACKS[attack]
     program, host = start(instrument, "--wires", hub)
-    host.accepted(host.begin())
+    host.must_accept(host.begin())
     host.home()
     pid = program.popen.pid
     highest = [0]
@@ -328,7 +328,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     sent = 0
     # ZeroMQ itself ends some of these connections: the client comes back until the program had to act.
     while highest[0] < MAX_BYTES and not has_cut() and sent < ENOUGH_BYTES:
-        with connected((program.ready[1], program.events[1])[endpoint], kind) as peer, suppress(ConnectionError):
+        with connect_peer((program.ready[1], program.events[1])[endpoint], kind) as peer, suppress(ConnectionError):
             # A connection that was cut may stall before it is closed
             peer.settimeout(0.1)
             remaining = b""

@@ -39,7 +39,7 @@ def written(path, records):
     return path.read_bytes()
 
 
-def reopened(path):
+def read_again(path):
     j = JournalFile(path)
     events = j.read(1, 10**6)
     j.close()
@@ -64,7 +64,7 @@ def test_cut_at_every_byte_leaves_the_whole_records_before_it(tmp_path_factory, 
     for cut in range(len(raw) + 1):
         path.write_bytes(raw[:cut])
         complete_records = max(0, sum(e <= cut for e in ends) - 1)
-        assert reopened(path) == records[:complete_records]
+        assert read_again(path) == records[:complete_records]
         assert path.stat().st_size == ends[complete_records]
 
 
@@ -76,7 +76,7 @@ def test_a_damaged_byte_loses_only_what_lies_behind_it(tmp_path_factory, records
     position = data.draw(st.integers(len(MAGIC), len(raw) - 1))
     raw[position] ^= 1 << data.draw(st.integers(0, 7))
     path.write_bytes(raw)
-    events = reopened(path)
+    events = read_again(path)
     assert events == records[: len(events)]
     assert len(MAGIC) + sum(12 + len(r) for r in records[: len(events)]) <= position
 
@@ -116,7 +116,7 @@ def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
     j.write([b"again"])
     assert j.last_seq == 2
     j.close()
-    assert reopened(tmp_path / "a.journal") == [b"kept", b"again"]
+    assert read_again(tmp_path / "a.journal") == [b"kept", b"again"]
 
 
 def test_a_file_of_another_program_is_refused_and_kept(tmp_path):
@@ -169,7 +169,7 @@ def test_a_new_journal_torn_by_a_power_cut_is_empty(tmp_path, left):
     j.write([b"x"])
     assert j.last_seq == 1
     j.close()
-    assert reopened(path) == [b"x"]
+    assert read_again(path) == [b"x"]
 
 
 def test_damage_in_the_middle_is_reported_and_the_original_kept(tmp_path):
@@ -239,7 +239,7 @@ def full(*_):
 
 def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     host = host_in_row
-    good = host.of(m.Capture)[0].seq
+    good = host.list_events(m.Capture)[0].seq
     monkeypatch.setattr(journal_module.os, "pwrite", full)
     fault = host.wait(m.Fault)
     done = host.wait(m.RowFinished)
@@ -263,20 +263,20 @@ def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch)
 
     def refused_when_full(command):
         monkeypatch.setattr(journal_module.os, "pwrite", full)
-        assert host.refused(command) == PiFault.JOURNAL_FULL
+        assert host.must_refuse(command) == PiFault.JOURNAL_FULL
         monkeypatch.undo()
         assert host.ask(m.Status()).fault == PiFault.JOURNAL_FULL
 
-    host.accepted(host.begin())
-    host.accepted(stop)
+    host.must_accept(host.begin())
+    host.must_accept(stop)
     refused_when_full(host.begin(last_seq=2))
     assert not host.ask(m.Hello()).in_run
-    host.accepted(m.Home())
+    host.must_accept(m.Home())
     host.until_state("homed")
-    host.accepted(host.begin())
+    host.must_accept(host.begin())
     refused_when_full(stop)
     assert host.ask(m.Hello()).in_run
-    host.accepted(stop)
+    host.must_accept(stop)
     assert [type(e) for e in host.replay()] == [m.RunStarted, m.RunStopped] * 2
 
 
@@ -284,8 +284,8 @@ def test_the_pis_client_prints_each_event_once_also_behind_a_lost_journal(pi, in
     host = pi.host
     stop = m.EndRun(scan_id="scan", exit_status="success")
     for seq in (0, 5000):
-        host.accepted(host.begin(last_seq=seq))
-        host.accepted(stop)
+        host.must_accept(host.begin(last_seq=seq))
+        host.must_accept(stop)
     pi_settings = msgspec.structs.replace(instrument.pi, command_address=pi.service.server.command_address)
     printed = replay_events(msgspec.structs.replace(instrument, pi=pi_settings), "scan", 1)
     assert [e["seq"] for e in printed] == [1, 2, 5001, 5002]

@@ -50,7 +50,7 @@ class Door:
 
 
 @pytest.fixture
-def served(tmp_path):
+def served_pi(tmp_path):
     """A Pi's sockets on all addresses, with keys in `keys`; they serve until the test's end."""
     make_keys(tmp_path / "keys")
     make_keys(tmp_path / "other")
@@ -71,7 +71,7 @@ def context():
 
 
 @pytest.fixture
-def client_of(context):
+def make_client(context):
     """Makes clients with these keys (own secret, Pi's public); gives the socket, and a function: True if refused."""
     sockets = []
 
@@ -97,11 +97,11 @@ KEYS = {
 
 
 @pytest.mark.parametrize("which", KEYS)
-def test_only_allowed_keys_connect(tmp_path, served, client_of, which):
+def test_only_allowed_keys_connect(tmp_path, served_pi, make_client, which):
     host_keys, pis = (tmp_path / name for name in KEYS[which])
-    client, refused = client_of(zmq.REQ, served.command_address, host_keys, pis)
+    client, refused = make_client(zmq.REQ, served_pi.command_address, host_keys, pis)
     client.send(m.pack(m.Hello()))
-    listener, _ = client_of(zmq.SUB, served.event_address, host_keys, pis)
+    listener, _ = make_client(zmq.SUB, served_pi.event_address, host_keys, pis)
     listener.subscribe(b"")
     if which == "allowed":
         assert client.poll(HANG_S * 1e3)
@@ -115,14 +115,14 @@ def test_only_allowed_keys_connect(tmp_path, served, client_of, which):
     assert not client.poll(0)
 
 
-def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served, client_of):
+def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served_pi, make_client):
     """Its next command is refused though it is connected, and it cannot connect again."""
     keys = tmp_path / "keys"
     public, secret = allow(keys, "laptop")
     assert secret.stat().st_mode & 0o077 == 0
     assert set(read_allowed(keys).values()) == {"host", "laptop"}
     clients = {
-        name: client_of(zmq.REQ, served.command_address, keys / f"{name}.key_secret", keys / "pi.key")
+        name: make_client(zmq.REQ, served_pi.command_address, keys / f"{name}.key_secret", keys / "pi.key")
         for name in ("host", "laptop")
     }
 
@@ -137,7 +137,7 @@ def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served, c
     assert isinstance(reply, m.Refused)
     assert reply.number == PiFault.NOT_OWNER
     assert isinstance(ask("host"), m.HelloReply)
-    again, refused = client_of(zmq.REQ, served.command_address, secret, keys / "pi.key")
+    again, refused = make_client(zmq.REQ, served_pi.command_address, secret, keys / "pi.key")
     again.send(m.pack(m.Hello()))
     wait_for(refused, "the refusal")
     with expect_refused(ErrorCode.KEY_UNKNOWN, "laptop"):
@@ -147,11 +147,11 @@ def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served, c
     assert public.is_file()
 
 
-def test_a_host_with_a_refused_key_gets_that_error_and_not_a_timeout(tmp_path, served, context):
+def test_a_host_with_a_refused_key_gets_that_error_and_not_a_timeout(tmp_path, served_pi, context):
     (tmp_path / "mine").mkdir()
     shutil.copy(tmp_path / "keys" / "pi.key", tmp_path / "mine")
     shutil.copy(tmp_path / "other" / "host.key_secret", tmp_path / "mine")
-    port, events = (a.rpartition(":")[2] for a in (served.command_address, served.event_address))
+    port, events = (a.rpartition(":")[2] for a in (served_pi.command_address, served_pi.event_address))
     rig = published_rig()
     replace = msgspec.structs.replace
     pi = replace(
@@ -169,14 +169,14 @@ def test_without_a_list_the_host_key_is_allowed(tmp_path):
     assert list(read_allowed(tmp_path).values()) == ["host"]
 
 
-def test_the_files_to_copy_are_enough_for_the_host(tmp_path, served, context):
+def test_the_files_to_copy_are_enough_for_the_host(tmp_path, served_pi, context):
     """And the Pi's secret is not among them."""
     copied_names = {p.name for p in (tmp_path / "keys").iterdir()}
     assert "pi.key_secret" in copied_names - set(HOST_KEYS)
     (tmp_path / "host").mkdir()
     for name in HOST_KEYS:
         shutil.copy(tmp_path / "keys" / name, tmp_path / "host")
-    port = served.command_address.rpartition(":")[2]
+    port = served_pi.command_address.rpartition(":")[2]
     # The kernel takes any of this machine's own addresses; 0.0.0.0 is none of the loopback ones.
     client = requester(context, f"tcp://0.0.0.0:{port}", tmp_path / "host")
     client.send(m.pack(m.Hello()))

@@ -39,7 +39,7 @@ def test_a_fresh_machine_has_no_fault_and_nothing_to_wait_for():
 
 @pytest.mark.parametrize("motion", ["homing", "row before its first point"])
 def test_a_reset_whose_banner_was_lost_is_noticed_in_time(motion):
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     if motion == "homing":
         bench.machine.command("Home")
         bench.run_posted()
@@ -54,7 +54,7 @@ def test_a_reset_whose_banner_was_lost_is_noticed_in_time(motion):
 
 @pytest.mark.parametrize("place", [(500, 0), (0, -1)])
 def test_a_homing_that_does_not_end_at_zero_is_a_fault(place):
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     bench.machine.command("Home")
     bench.run_posted()
     bench.stage_says(Reply("ok", bench.stage.number))
@@ -65,14 +65,14 @@ def test_a_homing_that_does_not_end_at_zero_is_a_fault(place):
 
 
 def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     bench.start()
     bench.edge()
     bench.edge()
     bench.row_done()
     assert bench.machine.state == "done"
     bench.later(2.0)
-    finished = bench.of(m.RowFinished)[-1]
+    finished = bench.list_events(m.RowFinished)[-1]
     assert (finished.status, finished.fault) == ("fault", PiFault.POINTS_MISMATCH)
     assert bench.machine.state == "ready"
 
@@ -80,12 +80,12 @@ def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
 @pytest.mark.parametrize(("dx", "dy"), [(0, 1), (1, 0), (0, 20_000), (-4000, 0)])
 def test_a_row_that_ends_elsewhere_is_no_row(dx, dy):
     """The Pi does not take the stage's word for it: the place is compared with the command."""
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     bench.start()
     for _ in range(3):
         bench.edge()
     bench.row_done(dx, dy)
-    finished = bench.of(m.RowFinished)[-1]
+    finished = bench.list_events(m.RowFinished)[-1]
     assert (finished.status, finished.fault) == ("fault", PiFault.POSITION)
     assert bench.machine.state == "idle", "its position is not known"
 
@@ -94,7 +94,7 @@ def test_a_row_that_ends_elsewhere_is_no_row(dx, dy):
 @given(beats=st.integers(0, 30), heartbeat_ms=st.integers(10, 100))
 def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms):
     """From its last sign of life to outputs dead and the stage told to stop, in virtual time."""
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     bench.machine.command("BeginRun", heartbeat_ms)
     bench.start()
     bench.machine.command("Hold") if held else None
@@ -108,13 +108,13 @@ def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms
     assert bench.t - last <= SAFE_WITHIN_S
     assert bench.stage.sent[-1] == Immediate.STOP
     bench.stage_says(Reply("alarm", number=StageError.STOPPED))
-    finished = bench.of(m.RowFinished)[-1]
+    finished = bench.list_events(m.RowFinished)[-1]
     assert (finished.status, finished.fault) == ("fault", PiFault.HOST_LOST)
     assert (bench.machine.state, bench.machine.fault) == ("ready", PiFault.HOST_LOST)
 
 
 def test_a_host_that_falls_silent_ends_its_homing():
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     bench.machine.command("BeginRun", 100)
     bench.machine.command("Home")
     bench.run_posted()
@@ -132,7 +132,7 @@ def test_a_host_that_falls_silent_ends_its_homing():
 
 def test_a_held_row_goes_on_once_it_rests():
     """Then its place is known, and with it the times of the edges around it."""
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     bench.start()
     bench.machine.command("Hold")
     bench.machine.command("Resume")
@@ -145,7 +145,7 @@ def test_a_held_row_goes_on_once_it_rests():
 
 
 def test_a_host_without_a_heartbeat_is_not_watched():
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     bench.start()
     bench.later(20.0)
     assert bench.armed
@@ -182,7 +182,7 @@ def test_a_stage_that_falls_silent_is_noticed_in_time(phase, answer_s, heartbeat
 def test_a_lost_trigger_line_stops_everything_at_once(lasting):
     """The loop notices within its look-up time; the machine acts in the same turn."""
     assert LOOK_UP_S <= SAFE_WITHIN_S / 2
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     bench.start()
     bench.edge()
     job = None if lasting else bench.machine.row.job  # type: ignore[union-attr]
@@ -191,7 +191,7 @@ def test_a_lost_trigger_line_stops_everything_at_once(lasting):
     assert not bench.armed
     assert bench.stage.sent == [Immediate.STOP]
     bench.stage_says(Reply("alarm", number=StageError.STOPPED))
-    assert bench.of(m.RowFinished)[-1].fault == number
+    assert bench.list_events(m.RowFinished)[-1].fault == number
     assert bench.machine.state == ("fault" if lasting else "ready")
     if lasting:
         with pytest.raises(RefusedError):
@@ -201,7 +201,7 @@ def test_a_lost_trigger_line_stops_everything_at_once(lasting):
 def test_a_wire_that_comes_off_is_noticed_while_the_row_runs():
     """Points pass and no edge comes: a fault after two more statuses, a quarter of the heartbeat apart."""
     assert 3 * 0.5 / STATUS_PER_HEARTBEAT <= SAFE_WITHIN_S
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     bench.start()
     bench.status(0)
     bench.edge()
@@ -226,14 +226,14 @@ def test_a_wire_with_edges_is_never_reported_off(steps):
 
 
 def test_the_first_fault_wins():
-    bench = Bench().homed()
+    bench = Bench().begin_and_home()
     bench.start()
     bench.machine.on_loop_fault(LoopFault(bench.machine.row.job, PiFault.EDGE_LOST, "2 edges lost"))  # type: ignore[union-attr]
     bench.machine.happen("stage lost", PiFault.STAGE_LOST, "silent")
     bench.run_posted()
     assert (bench.machine.fault, bench.machine.reason) == (PiFault.EDGE_LOST, "2 edges lost")
-    assert [e.number for e in bench.of(m.Fault)] == [PiFault.EDGE_LOST, PiFault.STAGE_LOST], "both are told"
-    finished = bench.of(m.RowFinished)[-1]
+    assert [e.number for e in bench.list_events(m.Fault)] == [PiFault.EDGE_LOST, PiFault.STAGE_LOST], "both are told"
+    finished = bench.list_events(m.RowFinished)[-1]
     assert (finished.fault, finished.reason) == (PiFault.EDGE_LOST, "2 edges lost")
     bench.machine.command("Home")
     assert bench.machine.fault == 0
@@ -248,7 +248,7 @@ ACTIONS: dict[str, Callable[[Bench], object]] = {
     "resume": lambda b: b.machine.command("Resume"),
     "abort": lambda b: b.machine.command("Abort", "requested"),
     "edge": lambda b: b.edge(),
-    "status": lambda b: b.status(len(b.of(m.Capture))),
+    "status": lambda b: b.status(len(b.list_events(m.Capture))),
     "ok": lambda b: b.stage_says(Reply("ok", b.stage.number)),
     "done": lambda b: b.row_done(),
     "stopped": lambda b: b.stage_says(Reply("alarm", number=StageError.STOPPED)),
@@ -267,7 +267,7 @@ ACTIONS: dict[str, Callable[[Bench], object]] = {
 @given(st.sampled_from(["cold", "homed", "in a row"]), st.lists(st.sampled_from(sorted(ACTIONS)), max_size=40))
 def test_any_order_of_events(start, actions):
     """Only moves of the table, the first fault is kept, rows end once, and only a row is armed."""
-    bench = Bench() if start == "cold" else Bench().homed()
+    bench = Bench() if start == "cold" else Bench().begin_and_home()
     machine = bench.machine
     if start == "in a row":
         bench.start()
@@ -281,7 +281,9 @@ def test_any_order_of_events(start, actions):
                 assert (machine.fault, machine.reason) == fault_before, "the first fault wins"
             assert bench.armed <= (machine.row is not None), "edges are answered only during a row"
             assert (machine.row is not None) == (machine.state in ROW_STATES)
-            assert (machine.row is not None) == (len(bench.of(m.RowStarted)) == len(bench.of(m.RowFinished)) + 1)
+            assert (machine.row is not None) == (
+                len(bench.list_events(m.RowStarted)) == len(bench.list_events(m.RowFinished)) + 1
+            )
     if machine.row is not None:
         # A held row waits for somebody
         machine.happen("Resume")
@@ -339,7 +341,7 @@ RIG = published_rig()
 replace = msgspec.structs.replace
 
 
-def rule_of(make: Callable[[], object]) -> str:
+def find_broken_rule(make: Callable[[], object]) -> str:
     """The rule of the rig file that is broken; "" when none is."""
     try:
         make()
@@ -369,7 +371,7 @@ def test_the_pi_takes_a_raster_when_the_rig_file_is_taken(columns, rows, speed, 
         scan_id="s", plan=plan_raster(grid), pulses=1, period_us=burst.period_us, width_us=burst.width_us,
         speed_mm_s=stage.speed_mm_s,
     )  # fmt: skip
-    broken = rule_of(lambda: replace(RIG, stage=stage, grid=grid, burst=burst))
+    broken = find_broken_rule(lambda: replace(RIG, stage=stage, grid=grid, burst=burst))
     if not broken:
         return check_run(run, stage)
     with pytest.raises(RefusedError) as refused:
@@ -400,4 +402,4 @@ def test_the_pi_sends_the_pulses_that_the_rig_file_may_hold(period, width):
     edges = (MIN_PERIOD_US, *WIDTH_US)
     # The Pi counts in whole nanoseconds
     if min(abs(x - e) for e in edges for x in (period, width)) > 1e-3:
-        assert sent() == (not rule_of(lambda: Burst(pulses=1, period_us=period, width_us=width)))
+        assert sent() == (not find_broken_rule(lambda: Burst(pulses=1, period_us=period, width_us=width)))

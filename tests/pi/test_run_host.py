@@ -93,7 +93,7 @@ class Bench:
     def run_row(self) -> Any:
         return self.ask(m.RunRow(scan_id="s", row_index=0, take=1))
 
-    def of(self, kind: type) -> list[Any]:
+    def list_events(self, kind: type) -> list[Any]:
         return [e for e in self.events if isinstance(e, kind)]
 
     @property
@@ -114,10 +114,10 @@ def test_a_host_that_waits_for_its_row_to_begin_is_not_silent(bench):
     bench.stage.row_takes_s = LIMIT_S + 0.15
     assert isinstance(bench.run_row(), m.Accepted)
     bench.turn()
-    assert (bench.state, bench.of(m.Fault)) == ("running", [])
+    assert (bench.state, bench.list_events(m.Fault)) == ("running", [])
     bench.t += LIMIT_S + 0.001
     bench.turn()
-    assert bench.of(m.Fault)[0].number == PiFault.HOST_LOST, "from then on it is watched"
+    assert bench.list_events(m.Fault)[0].number == PiFault.HOST_LOST, "from then on it is watched"
 
 
 @given(every_s=st.floats(0.01, 0.2), which=st.sampled_from(["events", "another's"]))
@@ -127,7 +127,7 @@ def test_another_clients_questions_do_not_keep_a_dead_hosts_row(tmp_path_factory
     bench.ready()
     bench.run_row()
     last = bench.t
-    while not bench.of(m.Fault):
+    while not bench.list_events(m.Fault):
         assert bench.t - last <= LIMIT_S + 2 * every_s
         bench.t += every_s
         if which == "events":
@@ -135,7 +135,7 @@ def test_another_clients_questions_do_not_keep_a_dead_hosts_row(tmp_path_factory
         else:
             bench.ask(m.RunRow(scan_id="another", row_index=0, take=1))
             assert isinstance(bench.executor.host_alive("another", ""), m.Refused)
-    assert bench.of(m.Fault)[0].number == PiFault.HOST_LOST
+    assert bench.list_events(m.Fault)[0].number == PiFault.HOST_LOST
     bench.journal.close()
 
 
@@ -177,7 +177,7 @@ def test_replies_are_short_while_a_row_runs_and_whole_before_and_after(bench):
 def owner_in_row(pi, stage):
     """The host that owns the run, during row 0."""
     host = pi.host
-    host.accepted(host.begin(owner="mine", heartbeat_ms=10_000))
+    host.must_accept(host.begin(owner="mine", heartbeat_ms=10_000))
     host.home("mine")
     stage.pace_s = 0.05
     host.start_row(owner="mine")
@@ -208,11 +208,11 @@ def test_only_the_owner_commands_a_run(owner_in_row):
             m.EndRun(scan_id="scan", exit_status="abort", owner=owner),
             m.RunRow(scan_id="scan", row_index=1, take=1, owner=owner), m.Home(owner=owner),
         ):  # fmt: skip
-            assert host.refused(command) == PiFault.NOT_OWNER, command
-        assert host.refused(host.begin(owner=owner)) == PiFault.NOT_READY, "its host is alive"
+            assert host.must_refuse(command) == PiFault.NOT_OWNER, command
+        assert host.must_refuse(host.begin(owner=owner)) == PiFault.NOT_READY, "its host is alive"
     assert host.wait(m.RowFinished).status == "done"
-    assert host.refused(m.Home(owner="other")) == PiFault.NOT_OWNER, "between two rows as well"
-    host.accepted(m.EndRun(scan_id="scan", exit_status="success", owner="mine"))
+    assert host.must_refuse(m.Home(owner="other")) == PiFault.NOT_OWNER, "between two rows as well"
+    host.must_accept(m.EndRun(scan_id="scan", exit_status="success", owner="mine"))
 
 
 def test_an_old_row_does_not_move_the_stage_again(host, stage):
@@ -221,13 +221,15 @@ def test_an_old_row_does_not_move_the_stage_again(host, stage):
         assert host.row(row, take).status == "done"
     for row, take in ((1, 1), (1, 2), (1, 3), (2, 1)):
         old = m.RunRow(scan_id="scan", row_index=row, take=take)
-        assert host.refused(old) == PiFault.BAD_REQUEST
+        assert host.must_refuse(old) == PiFault.BAD_REQUEST
     # Repeated: it was the last one
-    host.accepted(m.RunRow(scan_id="scan", row_index=1, take=4))
+    host.must_accept(m.RunRow(scan_id="scan", row_index=1, take=4))
     assert stage.rows_run == 4
     assert sum(isinstance(e, m.RowStarted) for e in host.replay()) == 4
-    host.accepted(host.begin())
-    assert host.refused(m.RunRow(scan_id="scan", row_index=1, take=4)) == PiFault.BAD_REQUEST, "the scan is the same"
+    host.must_accept(host.begin())
+    assert host.must_refuse(m.RunRow(scan_id="scan", row_index=1, take=4)) == PiFault.BAD_REQUEST, (
+        "the scan is the same"
+    )
     assert host.row(1, 5).status == "done"
 
 
@@ -236,17 +238,17 @@ def test_takes_increase_across_a_restart_of_the_pi(instrument, stage, hub):
     rig = at_stage_port(instrument, stage.port)
     for first_take in (1, 2):
         with closing(Running(rig, hub)) as running:
-            running.host.accepted(running.host.begin())
+            running.host.must_accept(running.host.begin())
             running.host.home()
             if first_take > 1:
                 old = m.RunRow(scan_id="scan", row_index=0, take=first_take - 1)
-                assert running.host.refused(old) == PiFault.BAD_REQUEST
+                assert running.host.must_refuse(old) == PiFault.BAD_REQUEST
             assert running.host.row(0, first_take).status == "done"
 
 
 def test_a_host_of_an_older_release_homes_in_its_own_run(pi):
     """It sends no owner in `Home`."""
-    pi.host.accepted(pi.host.begin(owner="mine", heartbeat_ms=10_000, owns_home=False))
+    pi.host.must_accept(pi.host.begin(owner="mine", heartbeat_ms=10_000, owns_home=False))
     pi.host.home()
 
 
@@ -265,10 +267,10 @@ def test_a_person_at_the_pi_takes_over(pi, owner_in_row, instrument):
 
 def test_a_run_without_a_heartbeat_can_be_replaced(pi):
     host = pi.host
-    host.accepted(host.begin(owner="mine"))
-    host.accepted(host.begin(owner="another"))
-    assert host.refused(m.Abort(owner="mine")) == PiFault.NOT_OWNER
-    host.accepted(m.Abort(owner="another"))
+    host.must_accept(host.begin(owner="mine"))
+    host.must_accept(host.begin(owner="another"))
+    assert host.must_refuse(m.Abort(owner="mine")) == PiFault.NOT_OWNER
+    host.must_accept(m.Abort(owner="another"))
 
 
 def test_a_hanging_executor_does_not_look_alive(pi, hang, monkeypatch):
@@ -296,7 +298,7 @@ def test_a_command_that_fails_in_the_program_is_a_refusal(pi, monkeypatch, capfd
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setattr(pi.service.executor, "_replay", fail)
-    assert pi.host.refused(m.Replay(scan_id="scan", from_seq=1)) == PiFault.PROGRAM
+    assert pi.host.must_refuse(m.Replay(scan_id="scan", from_seq=1)) == PiFault.PROGRAM
     assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
     assert "ZeroDivisionError" in capfd.readouterr().err, "the log has the trace"
 

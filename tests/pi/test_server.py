@@ -32,7 +32,7 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     events = host.journalled
     assert [e.seq for e in events] == list(range(1, len(events) + 1))
     assert [type(e) for e in events] == [m.RunStarted, m.RowStarted] + n * [m.Capture] + [m.RowFinished]
-    captures = host.of(m.Capture)
+    captures = host.list_events(m.Capture)
     assert [c.point for c in captures] == list(range(n))
     # Odd rows run towards -x
     assert [c.column for c in captures] == list(reversed(range(n)))
@@ -63,7 +63,7 @@ def test_stage_gets_the_row_in_steps_and_a_heartbeat(host, stage):
     sets = {c.args[0]: c.args[1] for c in stage.seen if c.verb == "SET"}
     assert sets == {0: 40000, 1: 1000, 2: 20, 3: 160000, 4: 100000, 5: 8000, 6: 0, 7: 0}
     assert stage.bytes_seen.count(Immediate.STATUS) >= 2
-    assert any(e.state == "row" for e in host.of(m.StageStatus))
+    assert any(e.state == "row" for e in host.list_events(m.StageStatus))
 
 
 def test_homing_reports_lost_steps(host, stage):
@@ -77,18 +77,18 @@ def test_homing_reports_lost_steps(host, stage):
 
 
 def test_repeated_requests_act_once(host, stage):
-    host.accepted(host.begin())
+    host.must_accept(host.begin())
     stage.pace_s = 0.02
-    assert host.accepted(RUN_0).state == "running"
-    assert host.accepted(RUN_0).state == "running"
+    assert host.must_accept(RUN_0).state == "running"
+    assert host.must_accept(RUN_0).state == "running"
     host.wait(m.RowFinished)
-    assert host.accepted(RUN_0).state == "ready"
+    assert host.must_accept(RUN_0).state == "ready"
     assert stage.rows_run == 1
     assert host.row(0, take=2).status == "done"
     assert stage.rows_run == 2
     end = m.EndRun(scan_id="scan", exit_status="success")
-    host.accepted(end)
-    host.accepted(end)
+    host.must_accept(end)
+    host.must_accept(end)
     assert sum(isinstance(e, m.RunStopped) for e in host.replay()) == 1
 
 
@@ -96,43 +96,43 @@ def test_refusals_have_their_number(pi):
     host = pi.host
     plan = host.begin().plan
     replace = msgspec.structs.replace
-    assert host.refused(RUN_0) == PiFault.NOT_READY  # no run
-    assert host.refused(host.begin(period_us=299.0)) == PiFault.PERIOD_TOO_SHORT
-    assert host.refused(host.begin(width_us=4.5)) == PiFault.PULSE_TOO_LONG
+    assert host.must_refuse(RUN_0) == PiFault.NOT_READY  # no run
+    assert host.must_refuse(host.begin(period_us=299.0)) == PiFault.PERIOD_TOO_SHORT
+    assert host.must_refuse(host.begin(width_us=4.5)) == PiFault.PULSE_TOO_LONG
     for wrong in (
         {"speed_mm_s": 1000.0}, {"speed_mm_s": 5e-324}, {"speed_mm_s": 0.1},
         {"pulses": 100}, {"plan": replace(plan, columns=402)},
         {"plan": replace(plan, step_x_mm=2.0011)},
     ):  # fmt: skip
-        assert host.refused(host.begin(**wrong)) == PiFault.BAD_REQUEST
-    host.accepted(host.begin())
-    assert host.refused(host.begin(plan=replace(plan, rows=3))) == PiFault.BAD_REQUEST
-    assert host.refused(RUN_0) == PiFault.NOT_READY  # not homed
+        assert host.must_refuse(host.begin(**wrong)) == PiFault.BAD_REQUEST
+    host.must_accept(host.begin())
+    assert host.must_refuse(host.begin(plan=replace(plan, rows=3))) == PiFault.BAD_REQUEST
+    assert host.must_refuse(RUN_0) == PiFault.NOT_READY  # not homed
     host.home()
-    assert host.refused(m.RunRow(scan_id="scan", row_index=4, take=1)) == PiFault.BAD_REQUEST
-    assert host.refused(m.RunRow(scan_id="other", row_index=0, take=1)) == PiFault.NOT_READY
-    assert host.refused(m.Hold()) == PiFault.NOT_READY
-    assert host.refused(b"\x93nonsense") == PiFault.BAD_REQUEST
+    assert host.must_refuse(m.RunRow(scan_id="scan", row_index=4, take=1)) == PiFault.BAD_REQUEST
+    assert host.must_refuse(m.RunRow(scan_id="other", row_index=0, take=1)) == PiFault.NOT_READY
+    assert host.must_refuse(m.Hold()) == PiFault.NOT_READY
+    assert host.must_refuse(b"\x93nonsense") == PiFault.BAD_REQUEST
     refused = host.ask(m.Hello(version="2.0"))
     assert (refused.number, "2.0" in refused.what) == (PiFault.VERSION, True)
 
 
 def test_hold_and_resume_lose_nothing(host_in_row, stage):
     host = host_in_row
-    assert host.accepted(m.Hold()).state == "held"
-    assert host.accepted(m.Hold()).state == "held"
+    assert host.must_accept(m.Hold()).state == "held"
+    assert host.must_accept(m.Hold()).state == "held"
     assert host.ask(m.Status()).row_index == 0
-    assert host.accepted(m.Resume()).state == "running"
+    assert host.must_accept(m.Resume()).state == "running"
     assert host.wait(m.RowFinished).status == "done"
     assert stage.bytes_seen.count(Immediate.HOLD) == 1
 
 
 def test_abort_ends_the_row_and_the_next_one_runs_without_homing(host_in_row, stage):
     host = host_in_row
-    host.accepted(m.Abort(reason="enough"))
+    host.must_accept(m.Abort(reason="enough"))
     done = host.wait(m.RowFinished)
     assert (done.status, done.fault, done.reason) == ("aborted", PiFault.ABORTED, "enough")
-    assert done.bursts == len(host.of(m.Capture)) < 8
+    assert done.bursts == len(host.list_events(m.Capture)) < 8
     host.until_state("ready")
     stage.pace_s = 0.0
     assert host.row(0, take=2).status == "done"
@@ -141,7 +141,7 @@ def test_abort_ends_the_row_and_the_next_one_runs_without_homing(host_in_row, st
 
 def test_a_new_host_aborts_the_row_of_the_dead_one(host_in_row, stage):
     host = host_in_row
-    assert host.accepted(host.begin()).state == "ready"
+    assert host.must_accept(host.begin()).state == "ready"
     started = host.wait(m.RunStarted, lambda e: e.resumed)
     event_before = host.journalled[-2]
     assert isinstance(event_before, m.RowFinished)
@@ -156,7 +156,7 @@ def test_counts_that_differ_fault_the_row_alone(host, stage, wrong):
     done = host.row(0)
     number = PiFault.EDGE_TIME if wrong == "skip" else PiFault.POINTS_MISMATCH
     assert (done.status, done.fault) == ("fault", number)
-    assert host.of(m.Fault)[0].number == number
+    assert host.list_events(m.Fault)[0].number == number
     stage.skip = set()
     stage.extra = False
     assert host.until_state("ready").fault == number
@@ -169,9 +169,9 @@ def test_stage_alarm_in_a_row_is_a_fault_until_homed(host, stage):
     done = host.row(0)
     assert (done.status, done.fault) == ("fault", PiFault.STAGE_ALARM)
     # Edges still under way at the alarm are not answered
-    assert done.bursts == len(host.of(m.Capture)) <= 3
+    assert done.bursts == len(host.list_events(m.Capture)) <= 3
     assert not host.until_state("fault").homed
-    assert host.refused(m.RunRow(scan_id="scan", row_index=0, take=2)) == PiFault.NOT_READY
+    assert host.must_refuse(m.RunRow(scan_id="scan", row_index=0, take=2)) == PiFault.NOT_READY
     host.home()
     assert host.row(0, take=2).status == "done"
 
@@ -182,14 +182,14 @@ def test_losing_the_stage_is_a_fault(host_in_row, stage):
     done = host.wait(m.RowFinished)
     assert (done.status, done.fault) == ("fault", PiFault.STAGE_LOST)
     assert host.until_state("fault").fault == PiFault.STAGE_LOST
-    host.accepted(m.Home())  # it is still unplugged
+    host.must_accept(m.Home())  # it is still unplugged
     assert host.until_state("fault").fault == PiFault.STAGE_LOST
 
 
 def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
     """The heartbeat keeps the row for longer than silence would; without it the row ends with fault 108."""
     host = pi.host
-    host.accepted(host.begin(heartbeat_ms=100))
+    host.must_accept(host.begin(heartbeat_ms=100))
     host.home()
     stage.pace_s = 0.2
     pi_settings = msgspec.structs.replace(instrument.pi, command_address=pi.service.server.command_address)
@@ -202,24 +202,24 @@ def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
     assert Immediate.STOP in stage.bytes_seen
     assert host.until_state("ready").fault == PiFault.HOST_LOST
     stage.pace_s = 0.0
-    host.accepted(host.begin())
+    host.must_accept(host.begin())
     assert host.row(0, take=2).status == "done"
 
 
 def test_a_heartbeat_counts_for_its_run_alone(pi):
     host = pi.host
     alive = m.Alive(scan_id="scan")
-    assert host.refused(alive) == PiFault.NOT_READY
-    host.accepted(host.begin())
-    assert host.accepted(alive).state == "idle"
-    assert host.refused(m.Alive(scan_id="another")) == PiFault.NOT_READY
-    host.accepted(m.EndRun(scan_id="scan", exit_status="success"))
-    assert host.refused(alive) == PiFault.NOT_READY
+    assert host.must_refuse(alive) == PiFault.NOT_READY
+    host.must_accept(host.begin())
+    assert host.must_accept(alive).state == "idle"
+    assert host.must_refuse(m.Alive(scan_id="another")) == PiFault.NOT_READY
+    host.must_accept(m.EndRun(scan_id="scan", exit_status="success"))
+    assert host.must_refuse(alive) == PiFault.NOT_READY
 
 
 def test_lost_and_damaged_lines_do_not_matter(pi, stage):
     host = pi.host
-    host.accepted(host.begin())
+    host.must_accept(host.begin())
     stage.damage = 2
     host.home()
     stage.lose = stage.lose_end = 1

@@ -68,9 +68,9 @@ def disk(monkeypatch) -> Iterator[FrozenDisk]:
 
 
 @pytest.fixture
-def owned(pi, stage):
+def owned_run(pi, stage):
     """A begun run with an owner; the stage is homed, points are 50 ms apart."""
-    pi.host.accepted(pi.host.begin(owner=OWNER))
+    pi.host.must_accept(pi.host.begin(owner=OWNER))
     pi.host.home(OWNER)
     stage.pace_s = 0.05
     return pi.host
@@ -80,21 +80,21 @@ def stop_is_sent(stage) -> bool:
     return Immediate.STOP in stage.bytes_seen
 
 
-def test_abort_stops_and_is_answered_while_the_disk_hangs(owned, stage, disk):
-    owned.start_row(owner=OWNER)
-    owned.wait(m.Capture)
-    events_before = len(owned.journalled)
+def test_abort_stops_and_is_answered_while_the_disk_hangs(owned_run, stage, disk):
+    owned_run.start_row(owner=OWNER)
+    owned_run.wait(m.Capture)
+    events_before = len(owned_run.journalled)
     disk.freeze()
     assert disk.blocked.wait(HANG_S)
     stage.bytes_seen.clear()
-    owned.accepted(m.Abort(owner=OWNER))
+    owned_run.must_accept(m.Abort(owner=OWNER))
     wait_for(lambda: stop_is_sent(stage), "STOP")
-    owned.until_state("ready")
-    assert not owned.of(m.RowFinished), "what is not journalled is not published"
+    owned_run.until_state("ready")
+    assert not owned_run.list_events(m.RowFinished), "what is not journalled is not published"
     disk.thaw()
-    assert owned.wait(m.RowFinished).status == "aborted"
-    assert [e.seq for e in owned.replay()] == list(range(1, owned.journalled[-1].seq + 1))
-    assert len(owned.journalled) > events_before
+    assert owned_run.wait(m.RowFinished).status == "aborted"
+    assert [e.seq for e in owned_run.replay()] == list(range(1, owned_run.journalled[-1].seq + 1))
+    assert len(owned_run.journalled) > events_before
 
 
 @pytest.mark.parametrize("beats", [True, False])
@@ -102,7 +102,7 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     """A host that is lost: as always. One that lives: the row ends because of the disk, and the watchdog starves."""
     monkeypatch.setattr("polysight_pi.service.LATE_S", LATE_S)
     host = pi.host
-    host.accepted(host.begin(heartbeat_ms=0 if beats else 100, owner=OWNER))
+    host.must_accept(host.begin(heartbeat_ms=0 if beats else 100, owner=OWNER))
     host.home(OWNER)
     stage.pace_s = 0.05
     stage.endless = True
@@ -162,7 +162,7 @@ def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
     """The thread that asks for the status does not speak for it."""
     monkeypatch.setattr(stages, "CALLER_LATE_S", LATE_S)
     host = pi.host
-    host.accepted(host.begin())
+    host.must_accept(host.begin())
     host.home()
     stage.pace_s = 0.05
     stage.endless = True
@@ -184,7 +184,7 @@ def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, which):
     server = pi.service.server
     host = pi.host
     go_on = threading.Event()
-    host.accepted(host.begin())
+    host.must_accept(host.begin())
     host.home()
     stage.pace_s = 0.05
     stage.endless = True
@@ -221,14 +221,14 @@ def test_leaving_subscribers_keep_no_command_waiting(start, instrument, hub, req
     """libzmq cleans up behind them inside the publisher's next send, for long."""
     is_campaign = request.config.getoption("--long")
     program, host = start(instrument, "--wires", hub)
-    host.accepted(host.begin(owner=OWNER))
+    host.must_accept(host.begin(owner=OWNER))
     arguments = [program.events[1], "1000" if is_campaign else "100", "1"]
     longest_s = 0.0
     with subprocess.Popen([sys.executable, "-c", LEAVE, *arguments]) as leaving:
         left_s = math.inf
         while time.monotonic() < left_s + 2.0:
             begin_s = time.monotonic()
-            host.accepted(m.Alive(scan_id="scan", owner=OWNER))
+            host.must_accept(m.Alive(scan_id="scan", owner=OWNER))
             longest_s = max(longest_s, time.monotonic() - begin_s)
             time.sleep(0.005)
             if leaving.poll() is not None:
@@ -249,12 +249,12 @@ def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, request, record_te
     heartbeat_ms = 90
     stage.pace_s = 0.02
     stage.endless = True
-    host.accepted(host.begin(owner=OWNER, heartbeat_ms=heartbeat_ms))
+    host.must_accept(host.begin(owner=OWNER, heartbeat_ms=heartbeat_ms))
     host.home(OWNER)
     for take in range(1, moments + 1):
         stage.bytes_seen.clear()
         aborts = rng.random() < 0.5
-        host.accepted(host.begin(owner=OWNER, heartbeat_ms=0 if aborts else heartbeat_ms))
+        host.must_accept(host.begin(owner=OWNER, heartbeat_ms=0 if aborts else heartbeat_ms))
         freeze_before = rng.random() < 0.3
         if freeze_before:
             disk.freeze()

@@ -87,13 +87,15 @@ class InstalledPi:
         """`sudo systemctl ...`."""
         return self.box.run(f"sudo systemctl {words}")
 
-    def shown(self, name: str) -> str:
+    def read_property(self, name: str) -> str:
         """A property of the service."""
         return self.box.run(f"sudo systemctl show --value --property={name} polysight-pi").strip()
 
     def until_ready(self) -> None:
         """Wait until the service has notified systemd that it is ready."""
-        self.box.wait(lambda: self.shown("ActiveState") == "active", f"the service runs\n{self.log()}", READY_LIMIT_S)
+        self.box.wait(
+            lambda: self.read_property("ActiveState") == "active", f"the service runs\n{self.log()}", READY_LIMIT_S
+        )
 
     def log(self) -> str:
         """The service's log."""

@@ -40,7 +40,7 @@ def bench(pi: InstalledPi) -> Iterator[InstalledPi]:
 
 
 @pytest.fixture
-def homed(host: HostSide) -> HostSide:
+def homed_host(host: HostSide) -> HostSide:
     """The host, after homing."""
     home(host)
     return host
@@ -49,15 +49,15 @@ def homed(host: HostSide) -> HostSide:
 def home(host: HostSide) -> None:
     """Home the stage. The Pi calls it lost when a busy computer keeps the two apart for a second: then once more."""
     for _ in range(TRIES):
-        host.accepted(m.Home())
+        host.must_accept(m.Home())
         if host.until_state("homed", "ready", "fault").state != "fault":
             return
     raise AssertionError(host.ask(m.Status()))
 
 
-def pid_of(pi: InstalledPi) -> str:
+def service_pid(pi: InstalledPi) -> str:
     """The service's process."""
-    return pi.shown("MainPID")
+    return pi.read_property("MainPID")
 
 
 def seconds(begun: float) -> str:
@@ -76,16 +76,16 @@ def test_what_is_installed_belongs_to_whom_the_page_says(pi: InstalledPi):
         "/dev/gpiochip0": "root:gpio 660",
         "/dev/polysight-stage": "root:dialout 660",
     }
-    assert (pi.shown("UnitFileState"), pi.shown("User")) == ("enabled", "polysight")
+    assert (pi.read_property("UnitFileState"), pi.read_property("User")) == ("enabled", "polysight")
 
 
 def test_the_service_has_the_rights_that_its_unit_promises(pi: InstalledPi):
     """Real-time threads and locked memory; a right that is not given has a line in the log."""
     assert "no real-time scheduling" not in pi.log()
     assert "memory is not locked" not in pi.log()
-    threads = pi.box.run(f"ps -L -o cls=,rtprio= -p {pid_of(pi)}").split("\n")
+    threads = pi.box.run(f"ps -L -o cls=,rtprio= -p {service_pid(pi)}").split("\n")
     assert {"FF 40", "FF 50"} <= {" ".join(t.split()) for t in threads}, "the trigger thread before the others"
-    locked = pi.box.run(f"grep VmLck /proc/{pid_of(pi)}/status").split()[1]
+    locked = pi.box.run(f"grep VmLck /proc/{service_pid(pi)}/status").split()[1]
     assert int(locked) > 0
 
 
@@ -121,7 +121,7 @@ def test_home_brings_the_motors_to_zero(pi: InstalledPi):
     assert pi.uno.stands_at_mm == (0.0, 0.0)
 
 
-def test_a_bench_burst_is_made_of_one_rise_and_one_fall_a_pulse(pi: InstalledPi, homed: HostSide):
+def test_a_bench_burst_is_made_of_one_rise_and_one_fall_a_pulse(pi: InstalledPi, homed_host: HostSide):
     """The kernel's driver writes as many pulses to the chip's registers, seen from outside the Pi, as are reported.
 
     Clearing a line that is low is no edge: the program does so to be quick. An emulated processor may be so late that a
@@ -132,7 +132,7 @@ def test_a_bench_burst_is_made_of_one_rise_and_one_fall_a_pulse(pi: InstalledPi,
     pulse = m.Pulse(pulses=i.pulses, period_us=i.period_us, width_us=i.width_us)
     for _ in range(TRIES):
         replies: list[m.Pulsed] = []
-        writes = pi.box.writes_during(lambda: replies.append(homed.ask(pulse)))  # noqa: B023
+        writes = pi.box.writes_during(lambda: replies.append(homed_host.ask(pulse)))  # noqa: B023
         assert isinstance(replies[0], m.Pulsed), replies
         assert [w.lines for w in writes] == [1 << SYNC_OUT] * len(writes), "no other line is touched"
         levels_before = [False, *(w.high for w in writes)]
@@ -196,14 +196,14 @@ def test_a_line_whose_program_is_killed_becomes_an_input(bench: InstalledPi):
     bench.box.wait(lambda: bench.box.function(SYNC_OUT) == INPUT, "the line is an input again")
 
 
-def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed: HostSide):
+def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed_host: HostSide):
     """kill -9 in the middle of a row: the stage stops by itself, and no published event is lost."""
-    homed.accepted(homed.begin("killed"))
-    homed.accepted(m.RunRow(scan_id="killed", row_index=0, take=1))
-    homed.wait(m.RowStarted)
+    homed_host.must_accept(homed_host.begin("killed"))
+    homed_host.must_accept(m.RunRow(scan_id="killed", row_index=0, take=1))
+    homed_host.wait(m.RowStarted)
     in_row_mm_s = pi.rig.stage.speed_mm_s
     pi.box.wait(lambda: pi.uno.speed_mm_s == pytest.approx(in_row_mm_s, rel=0.01), "the row is under way")
-    killed = pid_of(pi)
+    killed = service_pid(pi)
     begun = time.monotonic()
     pi.systemctl("kill --signal=KILL polysight-pi")
     last_seen_mm = pi.uno.x_mm
@@ -214,30 +214,30 @@ def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed:
     pi.until_ready()
     print_figure(f"kill -9 in a row: the stage went on for {beyond_mm:.0f} mm (heartbeat"
          f" {pi.rig.stage.heartbeat_ms / 1e3:g} s here); the service was ready after {seconds(begun)}")  # fmt: skip
-    assert pid_of(pi) != killed
+    assert service_pid(pi) != killed
     back = pi.host()
     assert back.ask(m.Hello()).state == "idle"
-    assert back.replay("killed")[: len(homed.journalled)] == homed.journalled
+    assert back.replay("killed")[: len(homed_host.journalled)] == homed_host.journalled
     back.close()
 
 
 def test_a_service_that_hangs_is_started_anew(pi: InstalledPi):
     """The executor feeds systemd's watchdog."""
-    hung = pid_of(pi)
+    hung = service_pid(pi)
     begun = time.monotonic()
     pi.systemctl("kill --signal=STOP polysight-pi")
-    pi.box.wait(lambda: pid_of(pi) not in (hung, "0"), "another process")
+    pi.box.wait(lambda: service_pid(pi) not in (hung, "0"), "another process")
     pi.until_ready()
     print_figure(f"SIGSTOP: ready again after {seconds(begun)}")
     assert "watchdog" in pi.box.run("sudo journalctl --unit polysight-pi --no-pager").lower()
 
 
-def test_a_stage_whose_cable_was_pulled_is_homed_again_from_the_host(pi: InstalledPi, homed: HostSide):
+def test_a_stage_whose_cable_was_pulled_is_homed_again_from_the_host(pi: InstalledPi, homed_host: HostSide):
     pi.box.unplug()
-    pi.box.wait(lambda: not homed.ask(m.Status()).homed, "the stage is lost")
+    pi.box.wait(lambda: not homed_host.ask(m.Status()).homed, "the stage is lost")
     pi.box.plug()
     pi.box.wait(lambda: pi.box.try_run("test -e /dev/polysight-stage").returncode == 0, "the port is back")
-    home(homed)
+    home(homed_host)
     assert pi.uno.stands_at_mm == (0.0, 0.0)
 
 
@@ -257,36 +257,36 @@ def test_update_and_roll_back(pi: InstalledPi):
     files = "/etc/polysight/instrument.toml /etc/polysight/keys/* /var/lib/polysight/journal/*.journal"
     checksum_command = f"sudo sh -c 'sha256sum {files}'"
     sums_before = pi.box.run(checksum_command)
-    first = pid_of(pi)
+    first = service_pid(pi)
     begun = time.monotonic()
     pi.install()
     print_figure(f"update: {seconds(begun)}")
     pi.until_ready()
     assert pi.release() == "releases/2"
-    second = pid_of(pi)
+    second = service_pid(pi)
     begun = time.monotonic()
     pi.box.run("sudo ~/.cache/polysight-install/install.sh --roll-back")
     print_figure(f"roll back: {seconds(begun)}")
     pi.until_ready()
     assert pi.release() == "releases/1"
-    assert len({first, second, pid_of(pi)}) == 3
+    assert len({first, second, service_pid(pi)}) == 3
     assert "releases/1/" in pi.box.run(
-        f"sudo readlink /proc/{pid_of(pi)}/exe /opt/polysight/venv; pgrep -af polysight-pi"
+        f"sudo readlink /proc/{service_pid(pi)}/exe /opt/polysight/venv; pgrep -af polysight-pi"
     )
     assert pi.box.try_run("sudo ~/.cache/polysight-install/install.sh --roll-back").returncode == 5
     sums_after = pi.box.run(checksum_command)
     assert set(sums_before.splitlines()) <= set(sums_after.splitlines())
 
 
-def test_a_power_cut_in_a_row_loses_no_event_that_was_told(pi: InstalledPi, homed: HostSide):
+def test_a_power_cut_in_a_row_loses_no_event_that_was_told(pi: InstalledPi, homed_host: HostSide):
     """And the Pi comes back by itself, with its keys, ready to be homed."""
-    homed.accepted(homed.begin("cut"))
-    homed.accepted(m.RunRow(scan_id="cut", row_index=0, take=1))
-    homed.wait(m.RowStarted)
+    homed_host.must_accept(homed_host.begin("cut"))
+    homed_host.must_accept(m.RunRow(scan_id="cut", row_index=0, take=1))
+    homed_host.wait(m.RowStarted)
     pi.box.cut_power()
     pi.until_ready()
     print_figure(f"power cut: logged in again after {pi.box.boot_s:.0f} s")
     back = pi.host()
-    assert back.replay("cut")[: len(homed.journalled)] == homed.journalled
+    assert back.replay("cut")[: len(homed_host.journalled)] == homed_host.journalled
     assert back.ask(m.Hello()).state == "idle"
     back.close()

@@ -2,7 +2,7 @@
 
 import msgspec
 import pytest
-from tests.support.doctor.case import context_of
+from tests.support.doctor.case import make_context
 
 from polysight.doctor.rig_checks import check_library
 from polysight.planning import forecast
@@ -15,7 +15,7 @@ def test_a_library_with_another_angle_is_a_warning(rig, distance_mm, known):
     moved = msgspec.structs.replace(rig, geometry=geometry)
     angle = incidence_deg(moved, moved.receivers[0])
     warnings = [w for w in forecast(moved).warnings if w.where == "library"]
-    finding = check_library(context_of(moved))
+    finding = check_library(make_context(moved))
     assert (not warnings, finding.level) == (known, "ok" if known else "warning")
     assert finding.facts["incidence_deg"] == pytest.approx(angle)
     for text in [finding.what, *(w.what for w in warnings)]:

@@ -30,7 +30,7 @@ complex_gain = st.tuples(st.floats(0.2, 5.0), st.floats(-3.1, 3.1)).map(lambda g
 leak = st.tuples(st.floats(0.0, 0.12), st.floats(-3.1, 3.1)).map(lambda g: g[0] * np.exp(1j * g[1]))
 
 
-def images_of(h, v):
+def make_images(h, v):
     return Images(h, v, np.arange(h.shape[1]) * 2e-3, np.arange(h.shape[0]) * 2e-3, np.ones(h.shape, bool))
 
 
@@ -53,7 +53,7 @@ def channels(eps, gain_h=1.0, gain_v=1.0, a=0.0, b=0.0, common=None, noise=0.0):
 @given(complex_gain, complex_gain)
 def test_metal_is_one_and_gain_is_recovered(gain_h, gain_v):
     h, v = channels(4 - 0.4j, gain_h, gain_v)
-    out = calibrate(images_of(h, v), METAL)
+    out = calibrate(make_images(h, v), METAL)
     np.testing.assert_allclose(out.p[METAL], 1, rtol=1e-9)
     np.testing.assert_allclose(np.abs(out.h[METAL]), 1, rtol=1e-9)
     assert out.metal_h / out.metal_v == pytest.approx(gain_h / gain_v, rel=1e-9)
@@ -63,7 +63,7 @@ def test_metal_is_one_and_gain_is_recovered(gain_h, gain_v):
 
 def test_metal_is_one_within_noise():
     h, v = channels(4 - 0.4j, 2.0j, 0.7, noise=0.02)
-    p = calibrate(images_of(h, v), METAL).p[METAL]
+    p = calibrate(make_images(h, v), METAL).p[METAL]
     assert abs(p.mean() - 1) < 0.005
     assert np.abs(p - 1).max() < 0.02 / 0.7 * 6
 
@@ -71,10 +71,10 @@ def test_metal_is_one_within_noise():
 @given(complex_gain, st.floats(-200, 200), st.floats(-200, 200))
 def test_common_gain_and_distance_phase_do_not_change_p(gain, tilt_x, tilt_y):
     h, v = channels(3.78 - 0.7j, 1.3j, 0.8)
-    reference = calibrate(images_of(h, v), METAL).p
+    reference = calibrate(make_images(h, v), METAL).p
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 100
     common = gain * np.exp(1j * (tilt_x * x + tilt_y * y))
-    moved = calibrate(images_of(h * common, v * common), METAL).p
+    moved = calibrate(make_images(h * common, v * common), METAL).p
     inside = METAL | PLATE
     np.testing.assert_allclose(moved[inside], reference[inside], rtol=1e-9)
 
@@ -82,7 +82,7 @@ def test_common_gain_and_distance_phase_do_not_change_p(gain, tilt_x, tilt_y):
 @given(leak, leak, complex_gain, complex_gain)
 def test_set_leakage_is_removed(a, b, gain_h, gain_v):
     h, v = channels(4.69 - 0.7j, gain_h, gain_v, a, b)
-    out = calibrate(images_of(h, v), METAL)
+    out = calibrate(make_images(h, v), METAL)
     s, p = correct_leakage(out.h, out.v, a, b)
     r_s, r_p = fresnel(4.69 - 0.7j, THETA)
     np.testing.assert_allclose(s[PLATE] / p[PLATE], r_s / r_p, rtol=1e-9)
@@ -103,7 +103,7 @@ def test_reference_over_the_whole_plane_removes_uneven_illumination():
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 40
     light_h = (1 + 0.3 * x) * np.exp(2j * y)
     light_v = (1.2 - 0.2 * y) * np.exp(1j * x)
-    out = divide_by_metal(images_of(h * light_h, v * light_v), -light_h, -light_v)
+    out = divide_by_metal(make_images(h * light_h, v * light_v), -light_h, -light_v)
     r_s, r_p = fresnel(4 - 0.4j, THETA)
     np.testing.assert_allclose(out.p[PLATE], r_s / r_p, rtol=1e-9)
     np.testing.assert_allclose(out.p[METAL], 1, rtol=1e-9)
@@ -113,14 +113,14 @@ def test_dark_or_empty_metal_regions_are_refused():
     h, v = channels(4.0)
     for mask in (np.zeros(SHAPE, bool), ~(METAL | PLATE)):
         with refused(ErrorCode.NO_DATA):
-            calibrate(images_of(h, v), mask)
+            calibrate(make_images(h, v), mask)
     with refused(ErrorCode.MISMATCH, (2, 2)):
-        calibrate(images_of(h, v), np.ones((2, 2), bool))
+        calibrate(make_images(h, v), np.ones((2, 2), bool))
 
 
 def test_single_precision_stays_single():
     h, v = (a.astype(np.complex64) for a in channels(4.0, noise=0.01))
-    out = calibrate(images_of(h, v), METAL)
+    out = calibrate(make_images(h, v), METAL)
     assert out.h.dtype == out.v.dtype == out.p.dtype == np.complex64
     assert correct_leakage(out.h, out.v, 0.05, 0.05)[0].dtype == np.complex64
     assert smooth(out.h, 1.0).dtype == np.complex64

@@ -27,7 +27,7 @@ leak = st.tuples(st.floats(0.0, 0.15), st.floats(-3.1, 3.1)).map(lambda g: g[0] 
 seeds = st.integers(0, 2**32 - 1)
 
 
-def measured(truth, wave, rng, noise=0.0, pixels=400):
+def measure_standard(truth, wave, rng, noise=0.0, pixels=400):
     """Pixels of a standard: its wave through the rig, with a phase of the distance per pixel, and noise."""
     phase = np.exp(2j * np.pi * rng.random(pixels)) * rng.uniform(0.7, 1.3, pixels)
     h, v = (truth.matrix() @ np.array(wave))[:, None] * phase
@@ -36,7 +36,7 @@ def measured(truth, wave, rng, noise=0.0, pixels=400):
 
 
 def standard(truth, wave, rng, noise=0.0):
-    return Standard(common_direction(*measured(truth, wave, rng, noise)), wave)
+    return Standard(common_direction(*measure_standard(truth, wave, rng, noise)), wave)
 
 
 @given(leak, leak, gain, seeds, st.floats(0.0, 0.3))

@@ -15,7 +15,7 @@ X = np.arange(60) * 2e-3
 Y = np.arange(50) * 2e-3
 
 
-def images_of(h, v):
+def make_images(h, v):
     shape = (Y.size, X.size)
     return Images(np.broadcast_to(h, shape), np.broadcast_to(v, shape), X, Y, np.ones(shape, bool))
 
@@ -37,9 +37,9 @@ def test_gains_over_the_plane_are_divided_out(seed, phase, tilt):
     """For any distance and tilt of the plates: a common phase of both channels has no influence."""
     light = gains(np.random.default_rng(seed), 0.1)
     common = np.exp(1j * (phase + tilt * X))[None, :]
-    reference = plane_reference(images_of(-light[0] * common, -light[1] * common))
+    reference = plane_reference(make_images(-light[0] * common, -light[1] * common))
     r = fresnel(4 - 0.4j, THETA)
-    got = reference.apply(images_of(light[0] * r[0], light[1] * r[1]))
+    got = reference.apply(make_images(light[0] * r[0], light[1] * r[1]))
     is_valid = reference.valid
     assert is_valid.mean() > 0.9
     np.testing.assert_allclose(got.p[is_valid], r[0] / r[1], rtol=0.08)
@@ -51,7 +51,7 @@ def test_gains_over_the_plane_are_divided_out(seed, phase, tilt):
 def test_speckle_of_the_plate_is_smoothed_and_measured():
     rng = np.random.default_rng(3)
     ones = np.ones((Y.size, X.size), complex)
-    reference = plane_reference(images_of(noisy(ones, rng, 0.05), noisy(ones, rng, 0.05)))
+    reference = plane_reference(make_images(noisy(ones, rng, 0.05), noisy(ones, rng, 0.05)))
     p = (reference.h / reference.v)[reference.valid]
     assert np.std(p) < 0.01
     # Each part of V / H: two channels, half of each
@@ -61,28 +61,28 @@ def test_speckle_of_the_plate_is_smoothed_and_measured():
 def test_weak_parts_and_the_rim_are_masked():
     rng = np.random.default_rng(4)
     h = np.where(X[None, :] < 0.07, 1.0, 0.01) * np.ones((Y.size, 1), complex)
-    reference = plane_reference(images_of(noisy(h, rng, 0.01), noisy(h, rng, 0.01)), smooth_mm=4.0)
+    reference = plane_reference(make_images(noisy(h, rng, 0.01), noisy(h, rng, 0.01)), smooth_mm=4.0)
     assert reference.valid[:, X < 0.06].all()
     assert not reference.valid[:, X > 0.068].any()
     assert np.isnan(reference.h[:, -1]).all()
-    got = reference.apply(images_of(h, h))
+    got = reference.apply(make_images(h, h))
     assert np.isnan(got.p[:, -1]).all()
     np.testing.assert_allclose(got.p[reference.valid], 1, atol=0.02)
     assert reference.facts().share_of_plane == pytest.approx(reference.valid.mean(), abs=1e-3)
 
 
 def test_its_facts_tell_how_the_gains_vary_over_the_plane():
-    reference = plane_reference(images_of(*gains(np.random.default_rng(5), 0.02)))
+    reference = plane_reference(make_images(*gains(np.random.default_rng(5), 0.02)))
     assert reference.facts().ratio_variation_db > 0.01
 
 
 def test_images_without_a_metal_plate_are_refused():
     dark = np.zeros((Y.size, X.size), complex)
     with refused(ErrorCode.NO_DATA):
-        plane_reference(images_of(dark, dark))
+        plane_reference(make_images(dark, dark))
     spots = dark.copy()
     spots[::10, ::10] = 1.0
     with refused(ErrorCode.NO_DATA):
-        plane_reference(images_of(spots, spots), smooth_mm=2.0)
+        plane_reference(make_images(spots, spots), smooth_mm=2.0)
     with refused(ErrorCode.MISMATCH):
-        plane_reference(images_of(dark + 1, dark + 1)).check_axes(X + 1e-3, Y)
+        plane_reference(make_images(dark + 1, dark + 1)).check_axes(X + 1e-3, Y)

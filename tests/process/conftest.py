@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from tests.support.paths import EXAMPLES
-from tests.support.pipelines import pipeline_of
+from tests.support.pipelines import make_pipeline
 from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import COPPER, PET, scene_of
 
@@ -23,7 +23,7 @@ class Imaged:
     """A simulated scan, processed up to its images."""
 
     def __init__(self, folder: Path) -> None:
-        self.pipeline = pipeline_of(ScanFolder.load(folder))
+        self.pipeline = make_pipeline(ScanFolder.load(folder))
         self.images: Images = self.pipeline.form_images()
         self.rig: Instrument = self.pipeline.source.instrument
         self.plates: tuple[TruthPlate, ...] = read_truth(folder / "truth.json")
@@ -33,7 +33,7 @@ Make = Callable[..., Imaged]
 
 
 @pytest.fixture(scope="session")
-def imaged(tmp_path_factory: pytest.TempPathFactory) -> Make:
+def image_scene(tmp_path_factory: pytest.TempPathFactory) -> Make:
     """`imaged("nine-materials", seed=2, leakage_h=[0, 0])`: the example scene with changed disturbances, imaged.
 
     Four pulses per position instead of sixteen: a scan takes a third of the time.

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
-from tests.support.pipelines import pipeline_of
+from tests.support.pipelines import make_pipeline
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
@@ -34,7 +34,7 @@ SCENE = {
 
 def images(folder):
     """Both images of a recording, and its pipeline."""
-    pipeline = pipeline_of(open_source(folder, SMALL))
+    pipeline = make_pipeline(open_source(folder, SMALL))
     return pipeline.form_images(), pipeline
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tomli_w
-from tests.support.pipelines import pipeline_of
-from tests.support.processes import output_of
+from tests.support.pipelines import make_pipeline
+from tests.support.processes import read_output
 from tests.support.rigs import rig_with
 from tests.support.scenes import COPPER, PET, scene_of
 
@@ -29,7 +29,7 @@ def scan(scan_of, tmp_path_factory):
 
 def test_sub_bands_have_the_pixels_of_the_whole_band(scan, tmp_path):
     box = (-55.0, -5.0, -25.0, 25.0)
-    pipeline = pipeline_of(open_source(scan, RIG), bands=BANDS, model="none", metal_box_mm=box)
+    pipeline = make_pipeline(open_source(scan, RIG), bands=BANDS, model="none", metal_box_mm=box)
     whole_band = pipeline.form_images()
     parts = pipeline.sub_bands.finish(pipeline.source.mirrored)
     assert whole_band.h.shape == (IMAGE["rows"], IMAGE["columns"])
@@ -51,7 +51,7 @@ def test_sub_bands_have_the_pixels_of_the_whole_band(scan, tmp_path):
 
 def test_the_image_command_writes_the_same_rig(scan, tmp_path):
     (tmp_path / "rig.toml").write_bytes(tomli_w.dumps(to_builtins(RIG)).encode())
-    output_of("image", scan, "--config", tmp_path / "rig.toml", "--out", tmp_path / "out")
+    read_output("image", scan, "--config", tmp_path / "rig.toml", "--out", tmp_path / "out")
     assert grid_written(tmp_path / "out") == (COLUMNS, ROWS)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.processes import output_of
+from tests.support.processes import read_output
 from tests.support.scenes import EVERYWHERE, scene_of
 from tests.support.store.facts import facts_of
 
@@ -32,7 +32,7 @@ def products(scan_of, tmp_path_factory):
     facts = facts_of(scan)
     facts[0]["instrument"]["calibration"] = {"metal": str(path)}
     (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
-    output_of("process", scan, "--out", folder / "out", "--model", "none")
+    read_output("process", scan, "--out", folder / "out", "--model", "none")
     return folder / "out", is_known, gains, path
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.pipelines import pipeline_of
-from tests.support.processes import output_of
+from tests.support.pipelines import make_pipeline
+from tests.support.processes import read_output
 from tests.support.scenes import EVERYWHERE, scene_of
 
 from polysight.imaging import Images
@@ -40,7 +40,7 @@ def without_rows(scan: Path, to: Path, *rows: int) -> Path:
 def test_a_complete_scan_has_all_planned_rows_and_frames(two_plates, tmp_path):
     scan = shutil.copytree(two_plates, tmp_path / "scan")
     out = tmp_path / "out"
-    output = output_of("process", scan, "--out", out, "--metal", METAL)
+    output = read_output("process", scan, "--out", out, "--metal", METAL)
     assert read_json(out / "quality.json")["coverage"] == {
         "rows_planned": ROWS, "rows_recorded": ROWS, "rows_absent": [], "positions_planned": COLUMNS * ROWS,
         "positions_absent": 0, "frames_planned": FRAMES, "frames_received": FRAMES, "manifest": [],
@@ -56,7 +56,7 @@ def test_terminal_and_report_count_all_plates_of_the_scene(two_plates, tmp_path)
     plate = next(plate for plate in truth["plates"] if not plate.get("metal"))
     truth["plates"] += [plate | {"centre_mm": [80.0, y], "name": "oak"} for y in (-60.0, 60.0)]
     (scan / "truth.json").write_text(json.dumps(truth))
-    output = output_of("process", scan, "--out", out, "--metal", METAL)
+    output = read_output("process", scan, "--out", out, "--metal", METAL)
     counted = re.search(r"(\d of 3) plates named right", output)
     assert counted, output
     assert f"{counted[1]}</b><span>plates named right" in (out / "report.html").read_text(encoding="utf-8")
@@ -66,7 +66,7 @@ def test_terminal_and_report_count_all_plates_of_the_scene(two_plates, tmp_path)
 def test_missing_rows_are_counted_as_absent(two_plates, tmp_path, command):
     scan = without_rows(two_plates, tmp_path / "scan", 1, 15)
     out = tmp_path / "out"
-    output = output_of(command, scan, "--out", out, *(["--metal", METAL] if command == "process" else []))
+    output = read_output(command, scan, "--out", out, *(["--metal", METAL] if command == "process" else []))
     coverage = read_json(out / "quality.json")["coverage"]
     assert (coverage["rows_planned"], coverage["rows_recorded"], coverage["rows_absent"]) == (ROWS, ROWS - 2, [1, 15])
     assert (coverage["positions_planned"], coverage["positions_absent"]) == (COLUMNS * ROWS, 2 * COLUMNS)
@@ -111,7 +111,7 @@ class Lossy:
 def test_lost_positions_of_odd_rows_are_counted_by_column(scan_of, tmp_path):
     scene = scene_of(EVERYWHERE, columns=7, rows=4, pulses=PULSES)
     source = Lossy(ScanFolder.load(scan_of(tmp_path / "scan", scene)))
-    quality = pipeline_of(source).quality.result()
+    quality = make_pipeline(source).quality.result()
     for board in quality.boards.values():
         assert board.masked_columns == {0: [(0, 2), (4, 5)], 1: [(2, 3), (5, 7)], 3: [(0, 1)]}
         assert board.positions_masked == 7

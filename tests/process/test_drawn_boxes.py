@@ -14,8 +14,8 @@ from polysight.settings import DEFAULT
 
 
 @pytest.fixture
-def drawn_result(imaged):
-    scan = imaged("nine-materials")
+def drawn_result(image_scene):
+    scan = image_scene("nine-materials")
     return scan.pipeline.find_materials(
         scan.images, known=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
     )
@@ -28,8 +28,8 @@ def again(scan, path, plates=()):
     return scan.pipeline.find_materials(scan.images, scene, classifier), scene.names
 
 
-def test_labels_of_products_give_the_same_materials_again(imaged, drawn_result, tmp_path):
-    scan = imaged("nine-materials")
+def test_labels_of_products_give_the_same_materials_again(image_scene, drawn_result, tmp_path):
+    scan = image_scene("nine-materials")
     (tmp_path / "labels.json").write_bytes(pack_labels(make_labels(drawn_result)))
     boxes = read_labels(tmp_path / "labels.json")
     assert len(boxes.boxes) == len(drawn_result.patches) == 9
@@ -40,9 +40,9 @@ def test_labels_of_products_give_the_same_materials_again(imaged, drawn_result, 
         assert p.patch.label == second.metal.label or p.verdict.name == p.truth.name
 
 
-def test_drawn_boxes_are_the_patches_and_copper_is_the_reference(imaged, tmp_path):
+def test_drawn_boxes_are_the_patches_and_copper_is_the_reference(image_scene, tmp_path):
     """Two boxes give two patches; the one named copper is the metal reference, with a ratio of 1."""
-    scan = imaged("nine-materials")
+    scan = image_scene("nine-materials")
     copper = next(p for p in scan.plates if p.metal)
     other_plate = next(p for p in scan.plates if not p.metal)
     x = scan.images.x_m * 1e3

@@ -25,8 +25,8 @@ def correlation(a, b):
     return abs(np.vdot(a, b)) / np.sqrt(np.vdot(a, a).real * np.vdot(b, b).real)
 
 
-def test_points_focus_within_half_a_pixel_in_both_channels(imaged):
-    scan = imaged("point-targets")
+def test_points_focus_within_half_a_pixel_in_both_channels(image_scene):
+    scan = image_scene("point-targets")
     truth = {"middle": (0.0, 0.0), "right": (50.0, 10.0), "upper left": (-40.0, 60.0), "lower": (20.0, -55.0)}
     x = axis_mm(scan.images.x_m)
     y = axis_mm(scan.images.y_m)
@@ -38,10 +38,10 @@ def test_points_focus_within_half_a_pixel_in_both_channels(imaged):
             assert abs(y[row] - py) <= 1.0 + 1e-9
 
 
-def test_synchronisation_undoes_every_disturbance(imaged):
+def test_synchronisation_undoes_every_disturbance(image_scene):
     """All disturbances on, against all off: the images agree."""
-    disturbed = imaged("nine-materials")
-    ideal = imaged("nine-materials", ideal=True)
+    disturbed = image_scene("nine-materials")
+    ideal = image_scene("nine-materials", ideal=True)
     valid_in_both = disturbed.images.valid & ideal.images.valid
     for channel in ("h", "v"):
         on, ideal_values = (getattr(s.images, channel)[valid_in_both] for s in (disturbed, ideal))
@@ -49,9 +49,9 @@ def test_synchronisation_undoes_every_disturbance(imaged):
 
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
-def test_each_stage_of_synchronisation_shrinks_the_offsets(imaged, board):
+def test_each_stage_of_synchronisation_shrinks_the_offsets(image_scene, board):
     """From received chirps to the averaged burst; residuals are measured in each stage."""
-    stages = imaged("nine-materials").pipeline.quality.result().boards[board].synchronisation
+    stages = image_scene("nine-materials").pipeline.quality.result().boards[board].synchronisation
     assert stages["received"].frequency_std_hz > 10e3
     assert stages["received"].phase_std_rad > 1.0
     for key, paper in (("frequency_std_hz", 138), ("phase_std_rad", 0.022)):
@@ -60,10 +60,10 @@ def test_each_stage_of_synchronisation_shrinks_the_offsets(imaged, board):
         assert aligned < paper  # the paper's figure after all stages
 
 
-def test_metal_gives_one_at_every_pixel_within_noise(imaged):
+def test_metal_gives_one_at_every_pixel_within_noise(image_scene):
     """A metal plate over the whole plane, referenced to its middle: P = 1 everywhere, up to the noise of a pixel."""
-    scan = imaged("metal-plate")
-    again = imaged("metal-plate", seed=1003)
+    scan = image_scene("metal-plate")
+    again = image_scene("metal-plate", seed=1003)
     plate_pixels = plate_mask(scan, "copper", rim_mm=150.0)
     assert plate_pixels.sum() > 1000
     middle = box_mask((-20, -20, 20, 20), scan.images.x_m, scan.images.y_m)
@@ -77,21 +77,21 @@ OTHER = {"hv_gain_db": -3.0, "leakage_h": [0.08, 0.03], "leakage_v": [0.08, 0.03
 """A rig that differs from the default in gain (1.5 dB of H over V) and leakage (0.05)."""
 
 
-def test_the_set_gain_is_recovered_and_does_not_reach_the_images(imaged):
+def test_the_set_gain_is_recovered_and_does_not_reach_the_images(image_scene):
     def gains_db(scan):
         h, v = (np.abs(scan.images.rx_gains[b.name]).mean() for b in scan.rig.receivers)
         c = calibrate(scan.images, plate_mask(scan, "copper"))
         return 20 * np.log10(h / v), 20 * np.log10(abs(c.metal_h) / abs(c.metal_v))
 
-    received, image = gains_db(imaged("nine-materials"))
-    received_other, image_other = gains_db(imaged("nine-materials", **OTHER))
+    received, image = gains_db(image_scene("nine-materials"))
+    received_other, image_other = gains_db(image_scene("nine-materials", **OTHER))
     assert received - received_other == pytest.approx(1.5 + 3.0, abs=0.1)
     assert image == pytest.approx(image_other, abs=0.1)
 
 
 @pytest.mark.parametrize("disturbances", [{}, OTHER])
-def test_the_set_leakage_is_recovered_from_a_known_material(imaged, disturbances):
-    scan = imaged("nine-materials", **disturbances)
+def test_the_set_leakage_is_recovered_from_a_known_material(image_scene, disturbances):
+    scan = image_scene("nine-materials", **disturbances)
     leakage = complex(*disturbances.get("leakage_h", [0.05, 0.0]))
     c = calibrate(scan.images, plate_mask(scan, "copper"))
     theta = scan.pipeline.find_materials(scan.images, known=KnownScene(plates=scan.plates)).theta_rad[0, 0]
@@ -104,8 +104,8 @@ def test_the_set_leakage_is_recovered_from_a_known_material(imaged, disturbances
     assert abs(np.sum(h[plate_pixels]) / np.sum(v[plate_pixels]) / true - 1) < 0.05
 
 
-def test_the_demo_scene_is_named_right_and_its_permittivities_found(imaged):
-    scan = imaged("nine-materials")
+def test_the_demo_scene_is_named_right_and_its_permittivities_found(image_scene):
+    scan = image_scene("nine-materials")
     names = named_materials(scan)
     assert len(names.patches) == 9
     named = [p for p in names.patches if p.verdict is not None]
@@ -120,9 +120,9 @@ def test_the_demo_scene_is_named_right_and_its_permittivities_found(imaged):
             assert p.permittivity.value.real == pytest.approx(p.truth.permittivity.real, rel=0.1), p.truth.name
 
 
-def test_a_scan_of_an_ideal_rig_is_not_corrected_and_all_plates_are_named_right(imaged):
+def test_a_scan_of_an_ideal_rig_is_not_corrected_and_all_plates_are_named_right(image_scene):
     """The scene switches filters and leakage off; the recorded rig contains that, so neither is corrected."""
-    scan = imaged("nine-materials", ideal=True)
+    scan = image_scene("nine-materials", ideal=True)
     rig = scan.rig
     assert (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz) == (0.0, 0.0)
     assert rig.polarimetry.leakage_h == rig.polarimetry.leakage_v == (0.0, 0.0)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.pipelines import pipeline_of
-from tests.support.processes import output_of
+from tests.support.pipelines import make_pipeline
+from tests.support.processes import read_output
 from tests.support.refusals import refused
 
 from polysight.cli.main import main
@@ -51,7 +51,7 @@ def test_the_image_is_written_before_anything_is_derived_from_it(
 
 
 def test_images_published_beside_a_scan_are_those_of_all_rows_at_once(scan: Path, tmp_path: Path) -> None:
-    pipeline = pipeline_of(ScanFolder.load(scan), live=True)
+    pipeline = make_pipeline(ScanFolder.load(scan), live=True)
     publish_images(pipeline, tmp_path)
     first = read_products(tmp_path)
     whole_band = pipeline.form_images()
@@ -111,7 +111,7 @@ def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path
     scan_folder = tmp_path / "scan"
     shutil.copytree(scan, scan_folder)
     shutil.rmtree(scan_folder / "raw")  # the samples are enough
-    output_of("image", scan_folder, "--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
+    read_output("image", scan_folder, "--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
     products = read_products(tmp_path / "out")
     assert products.h.shape == (30, 60)
     np.testing.assert_allclose(np.diff(products.x_m), 2.5e-3)
@@ -140,7 +140,7 @@ def test_right_names_are_counted_and_the_mark_of_an_earlier_run_is_removed(two_p
     scan = shutil.copytree(two_plates, tmp_path / "scan")
     out = tmp_path / "out"
     rename_pet(scan, "no such material")
-    output = output_of("process", scan, "--out", out, "--metal", METAL)
+    output = read_output("process", scan, "--out", out, "--metal", METAL)
     segments = read_json(out / "materials.json")["segments"]
     for value in (f"{len(segments)} patches", "0 of 1 plates", out / "report.html", f"{out}/"):
         assert str(value) in output
@@ -149,5 +149,5 @@ def test_right_names_are_counted_and_the_mark_of_an_earlier_run_is_removed(two_p
     (out / FINISHED).write_text("{}")
     (pet,) = (s for s in segments if s["truth"] and s["truth"]["name"] == "no such material")
     rename_pet(scan, pet["name"])
-    assert "1 of 1 plates" in output_of("process", scan, "--out", out, "--metal", METAL)
+    assert "1 of 1 plates" in read_output("process", scan, "--out", out, "--metal", METAL)
     assert not (out / FINISHED).exists()

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from tests.support.pipelines import pipeline_of
+from tests.support.pipelines import make_pipeline
 from tests.support.refusals import refused
 
 from polysight.imaging import PLANE_REACH_M, Images
@@ -28,7 +28,7 @@ PIXELS = ("h", "v", "h_raw", "v_raw", "valid")
 
 
 def process_scan(folder: Path, samples: Use = "keep", **settings: Any) -> Pipeline:
-    return pipeline_of(ScanFolder.load(folder), samples=samples, **settings)
+    return make_pipeline(ScanFolder.load(folder), samples=samples, **settings)
 
 
 def same(one: Images, other: Images) -> bool:

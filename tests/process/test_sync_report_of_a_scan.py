@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.support.processes import output_of
+from tests.support.processes import read_output
 from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import EVERYWHERE, scene_of
 from tests.support.store.facts import facts_of
@@ -55,8 +55,8 @@ def _believe_programmed(scan):
 
 
 def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path):
-    output = output_of("sync-report", scan, "--out", tmp_path / "report")
-    output_of("image", scan, "--out", tmp_path / "image")
+    output = read_output("sync-report", scan, "--out", tmp_path / "report")
+    read_output("image", scan, "--out", tmp_path / "image")
     report = read_json(tmp_path / "report" / "sync.json")
     quality = read_json(tmp_path / "image" / "quality.json")
     assert report["simulated"] is True
@@ -85,7 +85,7 @@ def test_the_if_of_the_direct_path_follows_from_its_length_and_the_start_frequen
     rig = published_rig()
     disturbances = {"ideal": True, "if_offset_hz": offset_hz, "sync_uncertainty_ns": SYNC_NS}
     scene = scene_of(EVERYWHERE, columns=12, rows=2, pulses=1, disturbances=disturbances)
-    output_of("image", scan_of(tmp_path / "scan", scene), "--out", tmp_path / "out")
+    read_output("image", scan_of(tmp_path / "scan", scene), "--out", tmp_path / "out")
     boards = read_json(tmp_path / "out" / "quality.json")["boards"]
     tx = np.array(tx_position_m(rig))
     reach_hz = rig.chirp.slope_hz_per_s * SYNC_NS * 1e-9  # by which the boards' starts differ at most

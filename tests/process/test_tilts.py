@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from benchmarks.coverage import Cubes
-from tests.support.pipelines import pipeline_of
+from tests.support.pipelines import make_pipeline
 
 from polysight.imaging import correct_tilt
 from polysight.imaging.images import Illumination
@@ -34,7 +34,7 @@ def _images(rig, tilts):
     ]
     grid = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}
     scene = {"name": "tilts", "object_distance_mm": 499.0, "grid": grid, "plates": plates}
-    return pipeline_of(Cubes(rig, decode_scene(scene, "tilts"))).form_images()
+    return make_pipeline(Cubes(rig, decode_scene(scene, "tilts"))).form_images()
 
 
 def _insides(images):

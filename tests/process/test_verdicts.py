@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from benchmarks.coverage import Cubes
-from tests.support.pipelines import pipeline_of
+from tests.support.pipelines import make_pipeline
 
 from polysight.materials import match_truth, truth_plates
 from polysight.store import open_source
@@ -34,7 +34,7 @@ def world(names=tuple(PLATES), disturbances=None, **scene):
 
 
 def form_images(source):
-    pipeline = pipeline_of(source)
+    pipeline = make_pipeline(source)
     return pipeline, pipeline.form_images()
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 import pytest
 import scipy.io
-from tests.support.products import changed, computed, judged_products
+from tests.support.products import changed, judged_products, make_result
 
 from polysight.products import patch_dataset, read_products
 from polysight.products.exports import pack_csv, pack_mat
@@ -28,7 +28,7 @@ class RoughPatch(PatchFigures, frozen=True, kw_only=True):
 @pytest.fixture
 def scan(tmp_path):
     saved = read_products(judged_products(tmp_path, "good"))
-    scan = computed(saved.images, {"segments": []}, {})
+    scan = make_result(saved.images, {"segments": []}, {})
     patches = [
         RoughPatch(**{name: getattr(patch, name) for name in patch.__struct_fields__}, roughness_mm=0.25)
         for patch in saved.segments

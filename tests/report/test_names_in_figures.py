@@ -8,7 +8,7 @@ from html import unescape
 import numpy as np
 import pytest
 from matplotlib.font_manager import findfont, get_font
-from tests.support.products import computed
+from tests.support.products import make_result
 
 from polysight.imaging import Images
 from polysight.materials import TruthPlate
@@ -35,7 +35,7 @@ def row(label: int, name: str, truth: str) -> dict:
 def context(names: list[str]) -> ProcessedScan:
     image = np.full((12, 12), 0.5 + 0.1j, np.complex64)
     axis = np.linspace(-0.05, 0.05, 12)
-    return computed(
+    return make_result(
         Images(image, image / 2, axis, axis, np.ones((12, 12), bool), image * 2),
         {"segments": [row(k, name, name) for k, name in enumerate(names, 1)]},
         {},

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 from tests.support.page.chromium import PHONE
-from tests.support.products import changed, computed, unrendered
+from tests.support.products import changed, make_result, skip_rendering
 from tests.support.rigs import rig_table
 
 from polysight.imaging import Images
@@ -111,7 +111,7 @@ def scan():
     x = np.linspace(-0.06, 0.06, 61)
     interior = np.zeros((61, 61), bool)
     interior[25:35, 40:50] = True
-    return computed(
+    return make_result(
         Images(h, v, x, x + 0.1, np.ones((61, 61), bool), p),
         {
             "segments": MATERIALS, "pixel_accuracy": 0.5, "library": "a library.", "model": "knn",
@@ -181,7 +181,7 @@ def test_simulated_is_said_everywhere(page):
 
 
 def test_measured_data_is_not_called_simulated(scan, tmp_path):
-    with unrendered():
+    with skip_rendering():
         html = write_report(tmp_path, changed(scan, facts=ScanFacts(simulated=False))).read_text(encoding="utf-8")
     assert "simulated" not in Page(html).words.lower()
 
@@ -213,7 +213,7 @@ def test_names_cannot_break_the_page(page):
 
 
 def test_bare_images_make_a_report_too(scan, tmp_path):
-    bare = computed(scan.images, None, {})
+    bare = make_result(scan.images, None, {})
     words = Page(write_report(tmp_path, bare).read_text(encoding="utf-8")).words
     assert "Images" in words
     assert "Materials" not in words
@@ -223,7 +223,7 @@ def test_bare_images_make_a_report_too(scan, tmp_path):
 def test_dark_and_invalid_images_do_not_fail(scan, tmp_path):
     zero = np.zeros_like(scan.h)
     dark = Images(zero, zero, scan.x_m, scan.y_m, np.zeros(zero.shape, bool), zero * np.complex64(np.nan))
-    assert write_report(tmp_path, computed(dark, {}, {})).exists()
+    assert write_report(tmp_path, make_result(dark, {}, {})).exists()
 
 
 def test_one_material_has_one_colour(scan):
@@ -350,7 +350,7 @@ def test_numbers_that_are_none_are_shown_as_not_known(scan, value):
         quality=ScanQuality.decode(figures["quality"]),
         expected_accuracy=value,
     )  # fmt: skip
-    with unrendered():
+    with skip_rendering():
         html = render(strange, {})
     words = re.findall(r"[\w.]+", Page(html).words.lower())
     assert not {"nan", "inf", "infinity"} & set(words), [w for w in words if w in ("nan", "inf")]

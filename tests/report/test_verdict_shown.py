@@ -20,10 +20,10 @@ from tests.support.products import (
     PERMITTIVITY,
     REASON,
     changed,
-    computed,
     judged_products,
+    make_result,
     segments,
-    unrendered,
+    skip_rendering,
 )
 
 from polysight import open_scan
@@ -47,7 +47,7 @@ def write_products(folder, rows=None) -> ProcessedScan:
     interior[5:9, 12:16] = True
     content = json.loads((folder / "materials.json").read_text(encoding="utf-8"))
     content |= {"segments": rows or segments("good"), "library": "Of its materials 1 could not be judged: copper."}
-    return computed(
+    return make_result(
         saved.images,
         {**content, "pixel_accuracy": 0.5, "model": "knn"},
         json.loads((folder / "quality.json").read_text(encoding="utf-8")),
@@ -78,7 +78,7 @@ def drawn_text(make) -> str:
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
     folder = judged_products(tmp_path, level)
-    with unrendered():
+    with skip_rendering():
         page = unescape(write_report(folder, write_products(folder)).read_text(encoding="utf-8"))
     head = page[page.index("<main>") : page.index('<ul class="keys">')]
     assert f'<span class="badge">{LEVELS[level]}</span>' in head
@@ -92,7 +92,7 @@ def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
 @pytest.mark.parametrize("careless", [False, True])
 def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, careless):
     folder = judged_products(tmp_path, "none", careless)
-    with unrendered():
+    with skip_rendering():
         text = drawn_text(lambda: write_report(folder, write_products(folder)))
     text += drawn_text(lambda: open_scan(folder).plot())
     page = unescape((folder / "report.html").read_text(encoding="utf-8"))
@@ -116,7 +116,7 @@ def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path)
 
 def test_products_of_earlier_releases_have_no_verdict_and_no_budget(tmp_path):
     folder = judged_products(tmp_path, None)
-    with unrendered():
+    with skip_rendering():
         page = unescape(write_report(folder, write_products(folder, segments(None))).read_text(encoding="utf-8"))
     assert 'class="verdict' not in page
     assert "Error budget" not in page

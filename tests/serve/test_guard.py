@@ -42,7 +42,7 @@ def scans(finished: Path, tmp_path: Path) -> Path:
     return tmp_path / "scans"
 
 
-def test_names_of_others_are_not_answered_to(scans):
+def test_other_host_names_are_refused(scans):
     with served_folder(scans, TOKEN) as view:
         for host in ("localhost", "localhost:8080", "127.0.0.1", f"127.0.0.1:{view.port}", "[::1]:80"):
             assert ask(view, "/api/scans", Host=host)[0] == 200, host

@@ -24,7 +24,7 @@ from polysight_shared.error_codes import ErrorCode
 @pytest.fixture
 def desk(growing):
     """A running scan of which nothing has come yet: its folder and what hears of commands."""
-    growing.grow_to("scan_started")
+    growing.grow_until("scan_started")
     with open_control(growing.path) as stop:
         yield growing.path, stop
 
@@ -97,7 +97,7 @@ def test_a_page_that_never_reads_holds_nobody_up(growing, watching):
             connection.sendall(b"GET /api/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             deaf.append(connection)
         for rows in range(3):
-            growing.grow_to("row_committed")
+            growing.grow_until("row_committed")
             watch.wait_for(lambda s, n=rows + 1: (s.get("pictures") or {}).get("rows") == n)
             assert json.loads(ask(view, "/api/state")[1])["pictures"]["rows"] == rows + 1
         for connection in deaf:

@@ -53,7 +53,7 @@ def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watc
         assert browser.text("headline") == "No scan here yet"
         growing.live()
         for row in range(3):
-            growing.grow_to("row_committed")
+            growing.grow_until("row_committed")
             browser.wait(f"document.getElementById('count').innerText == '{row + 1} of 3 rows'", "the row's count")
             browser.wait(f"document.getElementById('images-note').innerText.startsWith('{row + 1} rows')", "its image")
             browser.wait(f"{PICTURES}.every(i => i.complete && i.naturalWidth == 12)", "the pictures")
@@ -61,7 +61,7 @@ def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watc
 
 
 def test_buttons_reach_the_scan(browser, growing, watching):
-    growing.grow_to("row_committed")
+    growing.grow_until("row_committed")
     with open_control(growing.path) as stop, served(watching(growing.path, control=True), TOKEN) as view:
         open_page(browser, view, token=TOKEN)
         browser.click("#pause")

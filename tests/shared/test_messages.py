@@ -16,7 +16,7 @@ from polysight_shared.errors import ProtocolError
 from polysight_shared.raster import RasterPlan
 
 
-def values_of(declared: Any) -> st.SearchStrategy:
+def draw_values(declared: Any) -> st.SearchStrategy:
     """Values of a declared type (msgspec.inspect) within its limits."""
     match declared:
         case inspect.IntType():
@@ -32,18 +32,18 @@ def values_of(declared: Any) -> st.SearchStrategy:
         case inspect.LiteralType():
             return st.sampled_from(declared.values)
         case inspect.ListType():
-            return st.lists(values_of(declared.item_type), max_size=3)
+            return st.lists(draw_values(declared.item_type), max_size=3)
         case inspect.DictType():
-            return st.dictionaries(values_of(declared.key_type), values_of(declared.value_type), max_size=5)
+            return st.dictionaries(draw_values(declared.key_type), draw_values(declared.value_type), max_size=5)
         case inspect.UnionType():
-            return st.one_of(*map(values_of, declared.types))
+            return st.one_of(*map(draw_values, declared.types))
         case inspect.StructType():
-            fields = {f.name: values_of(f.type) for f in declared.fields if f.name != "version"}
+            fields = {f.name: draw_values(f.type) for f in declared.fields if f.name != "version"}
             return st.builds(declared.cls, **fields)
     raise TypeError(declared)
 
 
-events, commands, replies = (values_of(inspect.type_info(kind)) for kind in (m.AnyEvent, m.AnyCommand, m.AnyReply))
+events, commands, replies = (draw_values(inspect.type_info(kind)) for kind in (m.AnyEvent, m.AnyCommand, m.AnyReply))
 
 
 @given(events)

@@ -55,7 +55,7 @@ def test_a_level_plate_is_the_same_as_a_shape_and_as_a_plate(medium, error):
 
 
 @pytest.mark.usefixtures("installed")
-def test_a_recorded_scan_of_a_sphere_is_processed_to_the_samples_it_was_made_of(tmp_path):
+def test_a_recorded_scan_of_a_sphere_is_processed_to_its_samples(tmp_path):
     ball = scene(shapes=[BALL]).with_disturbances(direct_snr_db="off")
     folder = simulate(RIG, ball, tmp_path / "scan")
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))

@@ -229,7 +229,7 @@ class BootLoader:
         os.close(self._far)
 
 
-def image_of(path: Path) -> bytes:
+def read_hex(path: Path) -> bytes:
     """The bytes of an Intel hex file without gaps."""
     records = [bytes.fromhex(line[1:]) for line in path.read_text(encoding="ascii").split()]
     return b"".join(r[4:-1] for r in records if r[3] == 0)
@@ -249,7 +249,7 @@ def test_flash(built: tuple[Path, str]):
     finally:
         board.close()
     assert done.returncode == 0, done.stderr
-    image = image_of(built[0] / "arduino_stage.hex")
+    image = read_hex(built[0] / "arduino_stage.hex")
     assert board.flash.startswith(image)
     assert "verified" in done.stderr
 

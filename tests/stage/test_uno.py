@@ -55,7 +55,7 @@ def test_random_rows(host, batch: int):
         ):
             host.set(parameter, value)
         host.uno.edges.clear()
-        host.obeyed("ROW", x0, pitch, points, y, rate)
+        host.must_obey("ROW", x0, pitch, points, y, rate)
         holds = rng.choice([0, 0, 0, 0, 0, 0, 1, 2])
         for _ in range(holds):
             host.uno.run_ms(rng.uniform(0, 500))
@@ -116,7 +116,7 @@ def test_backlash_comes_from_below_and_runs_up(host):
 def test_a_short_hold_is_told_and_costs_no_step(host):
     """HOLD and RESUME at once: the row is reported as held even if the main program did not see the hold."""
     host.uno.edges.clear()
-    host.obeyed("ROW", 3000, 100, 60, 0, 4000)
+    host.must_obey("ROW", 3000, 100, 60, 0, 4000)
     while not host.uno.edges:
         host.uno.run_ms(20)
     for _ in range(5):
@@ -150,7 +150,7 @@ def test_no_command_is_lost_silently(host, chatty: bool):
     host.uno.feed(b"\n")
     host.replies()
     assert host.command("HELLO").kind == "ok"
-    host.obeyed("CLEAR")
+    host.must_obey("CLEAR")
 
 
 def test_a_second_command_on_its_way_is_answered(host):
@@ -165,21 +165,21 @@ def test_a_second_command_on_its_way_is_answered(host):
 def test_a_switch_at_any_moment_is_an_alarm(host, request: pytest.FixtureRequest, mask: int, number: int):
     """A switch that closes at any time during a motion is an alarm, never `done`."""
     rng = random.Random(mask)
-    host.obeyed("MOVE", 200, 200, 4000)
+    host.must_obey("MOVE", 200, 200, 4000)
     host.uno.rest()
     host.replies()
     for _ in range(100 if request.config.getoption("--long") else 3):
-        host.obeyed("MOVE", 900, 900, 2000)
+        host.must_obey("MOVE", 900, 900, 2000)
         host.uno.run(rng.randint(20 * MS, 200 * MS))
         host.uno.press(mask)
         host.uno.run_ms(60)
         assert [(r.kind, r.number) for r in host.replies()] == [("alarm", number)]
         host.uno.press(0)
         host.uno.run_ms(8)
-        host.obeyed("CLEAR")
+        host.must_obey("CLEAR")
         # The emergency stop has switched the motors off as well.
         assert host.command("MOVE", 0, 0, 4000).number == (19 if number == 14 else 8)
-        host.obeyed("ENABLE", 1)
+        host.must_obey("ENABLE", 1)
         host.motion("HOME")
 
 
@@ -187,7 +187,7 @@ def test_damaged_lines_do_not_disturb_a_row(host):
     """Every single flipped bit of a line, one after another, while a row is under way."""
     line = Command(host.sequence + 2, "MOVE", (0, 0, 4000)).encode()
     host.uno.edges.clear()
-    host.obeyed("ROW", 4000, 200, 60, 500, 4000)
+    host.must_obey("ROW", 4000, 200, 60, 500, 4000)
     for bit in range(8 * len(line)):
         damaged = bytearray(line)
         damaged[bit // 8] ^= 1 << bit % 8

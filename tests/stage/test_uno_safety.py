@@ -34,7 +34,7 @@ def test_chatter_is_no_heartbeat(host, kind: str):
     rng = random.Random(kind)
     host.set(Parameter.HEARTBEAT, 500)
     host.uno.watch(X_PUL)
-    host.obeyed("MOVE", 100_000, 0, 4000)
+    host.must_obey("MOVE", 100_000, 0, 4000)
     for _ in range(5):
         host.uno.run_ms(100)
         host.uno.feed(bytes([Immediate.STATUS]))
@@ -57,7 +57,7 @@ def test_chatter_is_no_heartbeat(host, kind: str):
     host.uno.edges.clear()
     host.uno.run_ms(500)
     assert host.uno.edges == []
-    host.obeyed("CLEAR")
+    host.must_obey("CLEAR")
     # Home first
     assert host.command("MOVE", 0, 0, 4000).number == 8
 
@@ -69,7 +69,7 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
     if verb == "HOME":
         host.motion("MOVE", 20_000, 20_000, TOP_RATE)
     host.uno.watch(X_PUL, TRIGGER, DRIVERS_OFF)
-    host.obeyed(verb, *arguments)
+    host.must_obey(verb, *arguments)
     host.uno.run_ms(800)
     host.uno.edges.clear()
     host.uno.hang()
@@ -85,9 +85,9 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
     assert replies[0].kind == "banner"
     assert replies[-1].integer("homed") == 0
     assert host.command("MOVE", 0, 0, 4000).number == 18
-    host.obeyed("HELLO")
+    host.must_obey("HELLO")
     assert host.command("MOVE", 0, 0, 4000).number == 19
-    host.obeyed("ENABLE", 1)
+    host.must_obey("ENABLE", 1)
     assert host.command("MOVE", 0, 0, 4000).number == 8
     host.set(Parameter.HEARTBEAT, 60_000)
     host.motion("HOME")
@@ -96,7 +96,7 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
 def test_a_program_that_works_is_never_reset(host):
     """Four seconds of rows and of everything that takes the main program's time, with 250 ms of watchdog."""
     for turn in range(4):
-        host.obeyed("ROW", 6000, 40, 150, 400 * (turn % 2), TOP_RATE)
+        host.must_obey("ROW", 6000, 40, 150, 400 * (turn % 2), TOP_RATE)
         for _ in range(40):
             host.uno.feed(b"N1 SET 0 1 2 3 4 5 6 7 8 9 1 2 3 4 5 6 7 8 9 1 2 3 4 5 6 7 8 9*0000\n" * 4)
             host.uno.feed(bytes([Immediate.STATUS]))
@@ -116,7 +116,7 @@ def test_a_glitch_is_no_switch(host, request: pytest.FixtureRequest, mask: int):
     glitches = 0
     glitch_count = 1000 if request.config.getoption("--long") else 250
     while glitches < glitch_count:
-        host.obeyed("ROW", 4000, 400, points, 500, TOP_RATE)
+        host.must_obey("ROW", 4000, 400, points, 500, TOP_RATE)
         for _ in range(250):
             host.uno.run(rng.randint(0, 8 * MS))
             host.uno.press(mask)
@@ -136,7 +136,7 @@ def test_a_real_switch_stops_at_once(host, rate: int, mask: int, number: int):
     """One that stays closed for 15 ms, as every switch does: within five steps or six."""
     host.set(Parameter.ACCEL, 400_000)
     host.uno.watch(X_PUL)
-    host.obeyed("MOVE", 40_000, 0, rate)
+    host.must_obey("MOVE", 40_000, 0, rate)
     host.uno.run_ms(400)
     host.uno.edges.clear()
     pressed = host.uno.cycle
@@ -153,7 +153,7 @@ def test_a_real_switch_stops_at_once(host, rate: int, mask: int, number: int):
 def test_no_stray_byte_ends_a_hold(host):
     """Every byte but STOP during a hold: the stage does not move, and RESUME continues the row."""
     host.uno.watch(X_PUL)
-    host.obeyed("ROW", 4000, 200, 60, 500, 4000)
+    host.must_obey("ROW", 4000, 200, 60, 500, 4000)
     host.uno.run_ms(1200)
     host.uno.feed(bytes([Immediate.HOLD]))
     host.uno.rest()
@@ -176,7 +176,7 @@ def test_homing_overruns_the_switch_by_little(host, accel: int):
     host.set(Parameter.ACCEL, accel)
     host.uno.watch(X_PUL)
     host.uno.edges.clear()
-    host.obeyed("HOME")
+    host.must_obey("HOME")
     host.uno.rest()
     host.replies()
     lowest = min(e.x for e in host.uno.edges)

@@ -52,7 +52,7 @@ def busiest_step(host: Host) -> int:
             ("ROW", (12_000, 20, 300, 20_000, TOP_RATE)),
             ("ROW", (18_000, -40, 100, 0, TOP_RATE)),
         ):
-            host.obeyed(verb, *args)
+            host.must_obey(verb, *args)
             for byte in (Immediate.STATUS, Immediate.HOLD, Immediate.RESUME) * 12:
                 host.uno.feed(bytes([byte]) * 4)
                 host.uno.run_ms(30)
@@ -88,7 +88,7 @@ def test_top_rate_is_kept(host):
     host.set(Parameter.ACCEL, 400_000)
     host.uno.watch(X_PUL)
     host.uno.edges.clear()
-    host.obeyed("MOVE", 20_000, 0, TOP_RATE)
+    host.must_obey("MOVE", 20_000, 0, TOP_RATE)
     for _ in range(120):
         host.uno.feed(bytes([Immediate.STATUS]))
         host.uno.run_ms(8)
@@ -107,7 +107,7 @@ def test_hold_and_stop_begin_within_20_ms(host, byte: Immediate, rate: int):
     accel = 40_000
     host.uno.watch(X_PUL)
     host.uno.edges.clear()
-    host.obeyed("MOVE", 40_000, 0, rate)
+    host.must_obey("MOVE", 40_000, 0, rate)
     host.uno.run_ms(900.7)
     host.uno.feed(bytes([byte]))
     sent = host.uno.cycle
@@ -131,11 +131,11 @@ def test_half_a_second_of_silence_is_the_default(host):
     host.uno.reset()
     host.uno.run_ms(5)
     assert [r.kind for r in host.replies()] == ["banner"]
-    host.obeyed("HELLO")
-    host.obeyed("ENABLE", 1)
+    host.must_obey("HELLO")
+    host.must_obey("ENABLE", 1)
     host.uno.watch(X_PUL)
     silent_from = host.uno.cycle
-    host.obeyed("HOME")
+    host.must_obey("HOME")
     host.uno.rest()
     assert [(r.kind, r.number) for r in host.replies()] == [("alarm", 11)]
     steps = [e.cycle for e in host.uno.edges if e.value]

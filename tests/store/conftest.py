@@ -52,5 +52,5 @@ class Undisturbed(SmallScan):
 
 
 @pytest.fixture(scope="session")
-def undisturbed(samples: Samples, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+def undisturbed_scan(samples: Samples, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
     return Undisturbed(samples, tmp_path_factory.mktemp("undisturbed"))

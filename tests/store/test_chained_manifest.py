@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, PET, scene_of
-from tests.support.store.facts import facts_of, typed
+from tests.support.store.facts import facts_of, parse_fact
 from tests.support.store.plain_scan import errors, write_scan
 
 from polysight.store import manifest
@@ -69,7 +69,7 @@ def test_a_damaged_line_is_one_fault_and_the_chain_goes_on_behind_it(tmp_path, d
     with ManifestWriter(tmp_path / MANIFEST, create=False) as writer:
         writer.append({"fact": "scan_resumed"})
     content = manifest.read(tmp_path / MANIFEST)
-    assert content.facts[-1] == typed({"fact": "scan_resumed"})
+    assert content.facts[-1] == parse_fact({"fact": "scan_resumed"})
     assert [f.facts["line"] for f in content.faults] == [4]
 
 

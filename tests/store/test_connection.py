@@ -96,9 +96,9 @@ def move_rig(rig: Instrument) -> Instrument:
     return decode(table, Instrument, "moved")
 
 
-def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
+def test_new_connection_settings_hold_from_then_on(undisturbed_scan, tmp_path):
     """For every reader, and for a later resume that says nothing; what the scan was begun with is still there."""
-    small = undisturbed.copy(tmp_path / "moved")
+    small = undisturbed_scan.copy(tmp_path / "moved")
     scan = ScanFolder.load(small.path)
     begun = scan.instrument
     now = move_rig(scan.instrument)
@@ -115,12 +115,12 @@ def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
     for fact in (first, second):
         add_fact(story, fact)
     assert story.instrument == now
-    assert small.rows() == undisturbed.digests
-    assert small.image() == undisturbed.final_image
+    assert small.rows() == undisturbed_scan.digests
+    assert small.image() == undisturbed_scan.final_image
 
 
-def test_another_rig_is_refused_before_anything_is_written(undisturbed, tmp_path, capsys):
-    small = undisturbed.copy(tmp_path / "other")
+def test_another_rig_is_refused_before_anything_is_written(undisturbed_scan, tmp_path, capsys):
+    small = undisturbed_scan.copy(tmp_path / "other")
     state_before = (small.path / "manifest.jsonl").read_bytes()
     table = to_builtins(move_rig(ScanFolder.load(small.path).instrument))
     table["grid"] |= {"columns": 5}

@@ -39,15 +39,15 @@ def faults(scan: SmallScan, severity: str = "error") -> list[str]:
     return [to_text(f) for f in validate(scan.path) if f.level == severity]
 
 
-def resume(scan: SmallScan, undisturbed, image: bool = False, damaged_lines: int = 0) -> set[int]:
+def resume(scan: SmallScan, undisturbed_scan, image: bool = False, damaged_lines: int = 0) -> set[int]:
     """Resume; everything is as if nothing had been. Returns the rows that were taken again."""
     assert scan.run().exit_status == "success"
     notes = faults(scan, "note")
     assert faults(scan) == []
     assert len(notes) == damaged_lines, notes
-    assert scan.rows() == undisturbed.digests
+    assert scan.rows() == undisturbed_scan.digests
     if image:
-        assert scan.image() == undisturbed.final_image
+        assert scan.image() == undisturbed_scan.final_image
     facts = facts_of(scan.path)
     since = max(i for i, f in enumerate(facts) if f["fact"] == "scan_resumed")
     again = [f["row"] for f in facts[since:] if f["fact"] == "row_committed"]
@@ -63,25 +63,25 @@ def is_row(event: object) -> bool:
 
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [-2, -1], ids=["row_committed", "scan_ended"])
-def test_manifest(undisturbed, tmp_path, sample, record, tail):
-    whole_lines = lines(undisturbed.path / "manifest.jsonl")
+def test_manifest(undisturbed_scan, tmp_path, sample, record, tail):
+    whole_lines = lines(undisturbed_scan.path / "manifest.jsonl")
     state_before = b"".join(whole_lines[: len(whole_lines) + record])
     last = whole_lines[record]
     for cut in sample(range(len(last)), 8):
-        scan = undisturbed.copy(tmp_path / "s")
+        scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "manifest.jsonl").write_bytes(state_before + last[:cut] + tail)
         assert faults(scan) == []
         torn = [n for n in faults(scan, "note") if "torn" in n]
         assert len(torn) == bool(last[:cut] + tail)
-        assert resume(scan, undisturbed, image=not cut) == ({2} if record == -2 else set())
+        assert resume(scan, undisturbed_scan, image=not cut) == ({2} if record == -2 else set())
 
 
 @pytest.mark.parametrize("record", [1, -2, -1], ids=["row 0", "row 2, the last", "scan_ended"])
-def test_bit_of_the_manifest(undisturbed, tmp_path, sample, record):
-    whole_lines = lines(undisturbed.path / "manifest.jsonl")
+def test_bit_of_the_manifest(undisturbed_scan, tmp_path, sample, record):
+    whole_lines = lines(undisturbed_scan.path / "manifest.jsonl")
     offset = len(b"".join(whole_lines[:record]))
     for bit in sample(range(8 * len(whole_lines[record])), 8):
-        scan = undisturbed.copy(tmp_path / "s")
+        scan = undisturbed_scan.copy(tmp_path / "s")
         turn(scan.path / "manifest.jsonl", 8 * offset + bit)
         # The line end: this line and the next are one
         end = bit // 8 == len(whole_lines[record]) - 1
@@ -89,7 +89,7 @@ def test_bit_of_the_manifest(undisturbed, tmp_path, sample, record):
         assert len(named) == 1
         # The last line is cut off, others stay where they are
         is_kept = record == -1 or (record == -2 and end)
-        again = resume(scan, undisturbed, damaged_lines=0 if is_kept else 1)
+        again = resume(scan, undisturbed_scan, damaged_lines=0 if is_kept else 1)
         assert again == {1: {0, 1} if end else {0}, -2: {2}, -1: set()}[record]
 
 
@@ -107,36 +107,36 @@ def ends_of_events(raw: bytes) -> list[int]:
 
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
-def test_event_log(undisturbed, tmp_path, sample, record, tail):
+def test_event_log(undisturbed_scan, tmp_path, sample, record, tail):
     """What the host has lost, the Pi's journal has; no row is taken again."""
-    raw = (undisturbed.path / "events.msgpack").read_bytes()
+    raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
     start = ends_of_events(raw)[-1 - record]
     stop = ends_of_events(raw)[-record]
     for cut in sample(range(start, stop), 8):
-        scan = undisturbed.copy(tmp_path / "s")
+        scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "events.msgpack").write_bytes(raw[:cut] + tail)
         if record == 1:
             assert faults(scan) == []
         else:
             assert "resume fetches" in faults(scan)[0]
         assert len([n for n in faults(scan, "note") if "torn" in n]) == (cut > start or bool(tail))
-        assert resume(scan, undisturbed) == set()
+        assert resume(scan, undisturbed_scan) == set()
         assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
 
 
-def test_bit_of_the_event_log(undisturbed, tmp_path, sample):
+def test_bit_of_the_event_log(undisturbed_scan, tmp_path, sample):
     """What validate cannot tell by the form, it tells by the digest; what is not readable comes from the journal."""
-    raw = (undisturbed.path / "events.msgpack").read_bytes()
-    committed = facts_of(undisturbed.path, "row_committed")[-1]["events"]["bytes"]
+    raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
+    committed = facts_of(undisturbed_scan.path, "row_committed")[-1]["events"]["bytes"]
     for bit in sample(range(8 * committed), 16):
-        scan = undisturbed.copy(tmp_path / "s")
+        scan = undisturbed_scan.copy(tmp_path / "s")
         turn(scan.path / "events.msgpack", bit)
         turned = (scan.path / "events.msgpack").read_bytes()
         readable = not read_events(scan.path / "events.msgpack").damage
         assert any("events.msgpack" in f for f in faults(scan)), bit
         if readable:
             continue
-        assert resume(scan, undisturbed) == set()
+        assert resume(scan, undisturbed_scan) == set()
         assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
         damaged_log = (scan.path / "events.msgpack.damaged").read_bytes()
         assert raw[: -len(damaged_log)] + damaged_log == turned
@@ -144,33 +144,33 @@ def test_bit_of_the_event_log(undisturbed, tmp_path, sample):
 
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
-def test_journal_of_the_pi(undisturbed, tmp_path, sample, record, tail):
+def test_journal_of_the_pi(undisturbed_scan, tmp_path, sample, record, tail):
     """The journal is shorter than the host's event log: the sequence goes on behind what the host has."""
-    path = read_journal(undisturbed)
+    path = read_journal(undisturbed_scan)
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
     raw = path.read_bytes()
     start = starts[-record]
     stop = [*starts, len(raw)][len(starts) - record + 1]
     for cut in sample(range(start, stop), 8):
-        scan = undisturbed.copy(tmp_path / "s")
+        scan = undisturbed_scan.copy(tmp_path / "s")
         read_journal(scan).write_bytes(raw[:cut] + tail)
-        goes_on_behind(scan, undisturbed, lost=record)
+        goes_on_behind(scan, undisturbed_scan, lost=record)
 
 
-def test_bit_of_the_journal(undisturbed, tmp_path, sample):
-    path = read_journal(undisturbed)
+def test_bit_of_the_journal(undisturbed_scan, tmp_path, sample):
+    path = read_journal(undisturbed_scan)
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
     for bit in sample(range(8 * starts[0], 8 * path.stat().st_size), 16):
-        scan = undisturbed.copy(tmp_path / "s")
+        scan = undisturbed_scan.copy(tmp_path / "s")
         turn(read_journal(scan), bit)
-        goes_on_behind(scan, undisturbed, lost=sum(s > bit // 8 for s in starts[1:]) + 1)
+        goes_on_behind(scan, undisturbed_scan, lost=sum(s > bit // 8 for s in starts[1:]) + 1)
 
 
 @pytest.mark.parametrize("left", [b"", b"PSJR", PAGE, None], ids=["empty", "torn magic", "zeros", "removed"])
-def test_journal_that_is_lost_as_a_whole(undisturbed, tmp_path, left):
-    scan = undisturbed.copy(tmp_path / "s")
+def test_journal_that_is_lost_as_a_whole(undisturbed_scan, tmp_path, left):
+    scan = undisturbed_scan.copy(tmp_path / "s")
     if left is None:
         read_journal(scan).unlink()
     else:
@@ -179,13 +179,13 @@ def test_journal_that_is_lost_as_a_whole(undisturbed, tmp_path, left):
     # Row 2 is to be taken yet
     manifest_path.write_bytes(b"".join(lines(manifest_path)[:-2]))
     events = len(read_events(scan.path / "events.msgpack").events)
-    goes_on_behind(scan, undisturbed, lost=events, rows={2})
+    goes_on_behind(scan, undisturbed_scan, lost=events, rows={2})
 
 
-def goes_on_behind(scan: SmallScan, undisturbed, lost: int, rows: set[int] = frozenset()) -> None:
+def goes_on_behind(scan: SmallScan, undisturbed_scan, lost: int, rows: set[int] = frozenset()) -> None:
     """Resume: the host is told how much the journal lost, and keeps all it had."""
     state_before = (scan.path / "events.msgpack").read_bytes()
-    assert resume(scan, undisturbed) == rows
+    assert resume(scan, undisturbed_scan) == rows
     assert any(f"ends {lost} events before" in text for text in scan.messages)
     state_after = (scan.path / "events.msgpack").read_bytes()
     assert state_after.startswith(state_before)
@@ -196,48 +196,48 @@ def goes_on_behind(scan: SmallScan, undisturbed, lost: int, rows: set[int] = fro
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx"])
-def test_committed_row_cut_short(undisturbed, tmp_path, sample, suffix):
+def test_committed_row_cut_short(undisturbed_scan, tmp_path, sample, suffix):
     """Never imaged in silence: validate names the file, reading it is refused, resume takes that row again."""
     name = f"raw/RV/0001{suffix}"
-    raw = (undisturbed.path / name).read_bytes()
+    raw = (undisturbed_scan.path / name).read_bytes()
     for cut in sample([*range(0, len(raw) - PACKET, 97), *range(max(0, len(raw) - PACKET), len(raw))], 6):
-        scan = undisturbed.copy(tmp_path / "s")
+        scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / name).write_bytes(raw[:cut])
         assert [name in f for f in faults(scan)] == [True]
         if suffix == ".bin":
             with refused(ErrorCode.FILE_DAMAGED):
                 _ = ScanFolder.load(scan.path).read_row("RV", 1).payload
         # Row 1 is taken last now
-        assert resume(scan, undisturbed, image=not cut) == {1}
+        assert resume(scan, undisturbed_scan, image=not cut) == {1}
         withdrawn = facts_of(scan.path, "row_withdrawn")
         assert [(f["row"], f["take"]) for f in withdrawn] == [(1, 1)]
         assert name in withdrawn[0]["reasons"][0]
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx"])
-def test_bit_of_a_committed_row(undisturbed, tmp_path, sample, suffix):
+def test_bit_of_a_committed_row(undisturbed_scan, tmp_path, sample, suffix):
     name = f"raw/RH/0002{suffix}"
-    for bit in sample(range(8 * (undisturbed.path / name).stat().st_size), 4):
-        scan = undisturbed.copy(tmp_path / "s")
+    for bit in sample(range(8 * (undisturbed_scan.path / name).stat().st_size), 4):
+        scan = undisturbed_scan.copy(tmp_path / "s")
         turn(scan.path / name, bit)
         assert [name in f for f in faults(scan)] == [True]
-        assert resume(scan, undisturbed) == {2}
+        assert resume(scan, undisturbed_scan) == {2}
 
 
 @pytest.mark.parametrize("suffix", [".part", ".bin", ".idx"])
-def test_row_that_is_not_committed_may_be_anything(undisturbed, tmp_path, sample, suffix):
-    whole_lines = lines(undisturbed.path / "manifest.jsonl")
-    raw = (undisturbed.path / f"raw/RV/0002{suffix.replace('part', 'bin')}").read_bytes()
+def test_row_that_is_not_committed_may_be_anything(undisturbed_scan, tmp_path, sample, suffix):
+    whole_lines = lines(undisturbed_scan.path / "manifest.jsonl")
+    raw = (undisturbed_scan.path / f"raw/RV/0002{suffix.replace('part', 'bin')}").read_bytes()
     for cut in sample(range(len(raw)), 4):
-        scan = undisturbed.copy(tmp_path / "s")
+        scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "manifest.jsonl").write_bytes(b"".join(whole_lines[:-2]))
         (scan.path / f"raw/RV/0002{suffix}").write_bytes(raw[:cut])
         assert faults(scan) == []
-        assert resume(scan, undisturbed) == {2}
+        assert resume(scan, undisturbed_scan) == {2}
 
 
-def test_withdrawn_row_counts_again_once_it_is_taken(undisturbed, tmp_path):
-    scan = undisturbed.copy(tmp_path / "s")
+def test_withdrawn_row_counts_again_once_it_is_taken(undisturbed_scan, tmp_path):
+    scan = undisturbed_scan.copy(tmp_path / "s")
     folder = ScanFolder.load(scan.path)
     fact = facts_of(folder, "row_committed")[1]
     with folder.writer() as writer:

@@ -45,13 +45,13 @@ def broken_off(scan: SmallScan, disk: FaultyDisk) -> bool:
     return False
 
 
-def goes_on(scan: SmallScan, undisturbed, where: str) -> None:
+def goes_on(scan: SmallScan, undisturbed_scan, where: str) -> None:
     """The scan is finished as if nothing had been, with at most one row taken again."""
     state_before = scan.rows() if scan.begun else {}
     assert scan.run().exit_status == "success", where
     assert validate(scan.path) == [], where
-    assert scan.rows() == undisturbed.digests, where
-    assert {name: undisturbed.digests[name] for name in state_before} == state_before, where
+    assert scan.rows() == undisturbed_scan.digests, where
+    assert {name: undisturbed_scan.digests[name] for name in state_before} == state_before, where
     assert len(retaken(scan.path)) <= 1, where
 
 
@@ -65,7 +65,7 @@ def operations(samples: Samples, folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("fault", ["killed", "killed within", "power cut"])
-def test_scan_is_killed_at_every_operation(samples, undisturbed, tmp_path, fault, sample):
+def test_scan_is_killed_at_every_operation(samples, undisturbed_scan, tmp_path, fault, sample):
     done = operations(samples, tmp_path / "count")
     assert len(done) > 100
     draws = POWER_CUTS if fault == "power cut" else 1
@@ -74,11 +74,11 @@ def test_scan_is_killed_at_every_operation(samples, undisturbed, tmp_path, fault
         scan = SmallScan(samples, folder)
         folder.mkdir()
         assert broken_off(scan, FaultyDisk(folder, fault, step, seed))
-        goes_on(scan, undisturbed, f"{fault} at {step} ({done[step - 1]}), seed {seed}")
+        goes_on(scan, undisturbed_scan, f"{fault} at {step} ({done[step - 1]}), seed {seed}")
         shutil.rmtree(folder)
 
 
-def test_nothing_unsynced_is_relied_on(samples, undisturbed, tmp_path):
+def test_nothing_unsynced_is_relied_on(samples, undisturbed_scan, tmp_path):
     """Power is cut at and after every sync of a folder and operation on the manifest; all unsynced is lost."""
     folder = tmp_path / "count"
     done = operations(samples, folder)
@@ -94,12 +94,12 @@ def test_nothing_unsynced_is_relied_on(samples, undisturbed, tmp_path):
         scan = SmallScan(samples, folder)
         folder.mkdir()
         assert broken_off(scan, FaultyDisk(folder, "worst power cut", position))
-        goes_on(scan, undisturbed, f"power cut at {position} ({done[position - 1]})")
+        goes_on(scan, undisturbed_scan, f"power cut at {position} ({done[position - 1]})")
         shutil.rmtree(folder)
 
 
 @pytest.mark.parametrize("fault", ["killed within", "power cut"])
-def test_resume_is_killed_at_every_operation_too(samples, undisturbed, tmp_path, fault, sample):
+def test_resume_is_killed_at_every_operation_too(samples, undisturbed_scan, tmp_path, fault, sample):
     done = operations(samples, tmp_path / "count")
     first = next(i for i, description in enumerate(done, 1) if description == "write 0001.idx")  # within row 1
     killed = 0
@@ -109,6 +109,6 @@ def test_resume_is_killed_at_every_operation_too(samples, undisturbed, tmp_path,
         scan = SmallScan(samples, folder)
         assert broken_off(scan, FaultyDisk(folder, "killed within", first))
         killed += broken_off(scan, FaultyDisk(folder, fault, position, seed=position))
-        goes_on(scan, undisturbed, f"{fault} at {position} of the resume")
+        goes_on(scan, undisturbed_scan, f"{fault} at {position} of the resume")
         shutil.rmtree(folder)
     assert killed > 4

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.capture.records import Record, log_of, mask_of
+from tests.support.capture.records import Record, make_log, make_mask
 from tests.support.refusals import refused
 from tests.support.rigs import rig_with
 from tests.support.store.faulty_disk import FaultyDisk, Killed
@@ -36,7 +36,7 @@ def scan_with(folder: Path, lost: int, wrong: bool = False) -> tuple[ScanFolder,
     with scan.writer() as writer:
         for board in rig.recorded:
             path = scan.row_path(board.name, 0)
-            log = log_of(size, packets)
+            log = make_log(size, packets)
             evidence = Evidence(size, frame, past=Past())
             placed, out = place_record(log, frame)
             packets_crc = write_packets(path.with_suffix(PACKETS), log, evidence, placed)
@@ -64,7 +64,7 @@ def holds(scan: ScanFolder, data: bytes, missing: list[tuple[int, int]]) -> None
     for board in scan.instrument.recorded:
         row = scan.read_row(board.name, 0)
         assert row.mask is not None
-        assert (row.mask == mask_of(want.size, missing)).all()
+        assert (row.mask == make_mask(want.size, missing)).all()
         assert (row.payload[~row.mask] == want[~row.mask]).all()
 
 

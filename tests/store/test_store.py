@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.acquisition.fake_rig import small_instrument
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of, typed
+from tests.support.store.facts import facts_of, parse_fact
 from tests.support.store.plain_scan import write_scan
 
 from polysight.store import manifest
@@ -39,7 +39,7 @@ facts = st.dictionaries(st.text(max_size=6).filter(lambda k: k not in ("fact", "
 def test_manifest_round_trip(some):
     raw = b"".join(map(encode_line, some))
     content = parse(raw)
-    assert content.facts == [typed(fact) for fact in some]
+    assert content.facts == [parse_fact(fact) for fact in some]
     assert (content.length, content.torn, content.faults) == (len(raw), False, [])
 
 
@@ -56,7 +56,7 @@ def test_flipped_bit_is_never_a_fact(some, data):
     if content.torn or content.faults:
         assert len(content.facts) < len(some)
     else:
-        assert content.facts == [typed(fact) for fact in some]
+        assert content.facts == [parse_fact(fact) for fact in some]
 
 
 def test_after_every_truncation_the_lines_before_it_stand_and_the_chain_goes_on(tmp_path):
@@ -72,7 +72,7 @@ def test_after_every_truncation_the_lines_before_it_stand_and_the_chain_goes_on(
         whole_lines = max(k for k, e in enumerate(ends) if e <= n)
         content = parse(raw[:n])
         assert (content.facts, content.torn, content.faults) == (
-            [typed(fact) for fact in some[:whole_lines]],
+            [parse_fact(fact) for fact in some[:whole_lines]],
             n not in ends,
             [],
         )
@@ -80,7 +80,7 @@ def test_after_every_truncation_the_lines_before_it_stand_and_the_chain_goes_on(
         with ManifestWriter(path, create=False) as writer:
             writer.append({"fact": "scan_resumed"})
         state_after = manifest.read(path)
-        assert state_after.facts == [*map(typed, some[:whole_lines]), ScanResumed()]
+        assert state_after.facts == [*map(parse_fact, some[:whole_lines]), ScanResumed()]
         assert (state_after.torn, state_after.faults) == (False, [])
 
 
@@ -151,9 +151,9 @@ def test_validate_names_each_damage(whole_scan, kind):
     assert any(place in f.where and description in f.what for f in errors), to_json(errors)
 
 
-def test_events_behind_the_last_commit_may_be_damaged_by_a_power_cut(undisturbed, tmp_path):
+def test_events_behind_the_last_commit_may_be_damaged_by_a_power_cut(undisturbed_scan, tmp_path):
     """They were not synced, and the Pi's journal has them; what was committed may not be damaged."""
-    scan = undisturbed.copy(tmp_path / "scan")
+    scan = undisturbed_scan.copy(tmp_path / "scan")
     log = scan.path / "events.msgpack"
     committed = ScanFolder.load(scan.path).facts(RowCommitted)[-1].events.bytes
     assert log.stat().st_size > committed

@@ -36,9 +36,9 @@ def test_a_disk_without_locks_is_not_a_scan_in_use(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx"])
 @pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE])
-def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed, monkeypatch, suffix, number):
-    scan = ScanFolder.load(undisturbed.path)
-    bad = (undisturbed.path / next(iter(scan.committed_rows()[0].boards.values())).file).with_suffix(suffix)
+def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed_scan, monkeypatch, suffix, number):
+    scan = ScanFolder.load(undisturbed_scan.path)
+    bad = (undisturbed_scan.path / next(iter(scan.committed_rows()[0].boards.values())).file).with_suffix(suffix)
 
     def fails(path: Path) -> None:
         if path == bad:
@@ -50,13 +50,15 @@ def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed, monkeypatch, 
     monkeypatch.setattr(Path, "read_bytes", lambda path: fails(path) or read(path))
     with refused(ErrorCode.FILE_UNREADABLE, os.strerror(number)) as e:
         validation.damaged_rows(scan)
-    assert f"polysight resume {undisturbed.path}" in e.value.remedy
-    assert [f.where for f in validation.validate(undisturbed.path)] == [str(bad.relative_to(undisturbed.path))]
+    assert f"polysight resume {undisturbed_scan.path}" in e.value.remedy
+    assert [f.where for f in validation.validate(undisturbed_scan.path)] == [
+        str(bad.relative_to(undisturbed_scan.path))
+    ]
 
 
-def test_row_whose_file_is_gone_is_taken_again(undisturbed, monkeypatch):
-    scan = ScanFolder.load(undisturbed.path)
-    missing_file = undisturbed.path / next(iter(scan.committed_rows()[1].boards.values())).file
+def test_row_whose_file_is_gone_is_taken_again(undisturbed_scan, monkeypatch):
+    scan = ScanFolder.load(undisturbed_scan.path)
+    missing_file = undisturbed_scan.path / next(iter(scan.committed_rows()[1].boards.values())).file
     opened = Path.open
 
     def absent(path: Path, *how, **more):
@@ -89,7 +91,7 @@ def failure(scan: SmallScan, disk: FaultyDisk) -> PolysightError | None:
 
 @pytest.mark.parametrize("fault", ["full", "short"])
 @pytest.mark.parametrize("whose", ["scan", "journal"])
-def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed, tmp_path, sample, fault, whose):
+def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed_scan, tmp_path, sample, fault, whose):
     writes = 0
     for position in sample(needs_space(samples, tmp_path / "count", whose), 10):
         folder = tmp_path / str(position)
@@ -108,8 +110,8 @@ def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed, tmp_path,
         # There is space again
         assert scan.run().exit_status == "success"
         assert validate(scan.path) == []
-        assert scan.rows() == undisturbed.digests
-        assert state_before.items() <= undisturbed.digests.items()
+        assert scan.rows() == undisturbed_scan.digests
+        assert state_before.items() <= undisturbed_scan.digests.items()
         shutil.rmtree(folder)
     assert writes > 5
 

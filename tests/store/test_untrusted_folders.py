@@ -43,8 +43,8 @@ OUTSIDE = ["../victim.bin", "/etc/passwd", "raw/../../victim.bin", "raw/a\0b.bin
 
 
 @pytest.fixture
-def scan(undisturbed, tmp_path) -> ScanFolder:
-    return ScanFolder.load(undisturbed.copy(tmp_path / "copy").path)
+def scan(undisturbed_scan, tmp_path) -> ScanFolder:
+    return ScanFolder.load(undisturbed_scan.copy(tmp_path / "copy").path)
 
 
 def committed_as(scan: ScanFolder, file: str) -> None:

@@ -10,7 +10,7 @@ from polysight.settings import Settings
 from polysight.store import Source
 
 
-def pipeline_of(source: Source, live: bool = False, samples: Use = "none", **settings: Any) -> Pipeline:
+def make_pipeline(source: Source, live: bool = False, samples: Use = "none", **settings: Any) -> Pipeline:
     """A pipeline to which all rows of a source were added; `settings` as of :class:`polysight.settings.Settings`."""
     pipeline = Pipeline(source, Settings(**settings), live=live, samples=samples)
     for row in source.rows():

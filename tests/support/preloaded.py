@@ -62,7 +62,7 @@ class Request(NamedTuple):
     prepare: Callable[[], object] | None
 
 
-def name_of(words: list[str]) -> str:
+def program_name(words: list[str]) -> str:
     """The module or script of a command of ours, or an empty string."""
     program = Path(words[0])
     if program.parent != BIN:
@@ -103,7 +103,7 @@ class Popen(subprocess.Popen):
             and bound_arguments["process_group"] == -1
         )
         same_python = read_at_start(environment) == read_at_start(os.environ)
-        forked = words and name_of(words) and is_plain and same_python and is_ours(bound_arguments["preexec_fn"])
+        forked = words and program_name(words) and is_plain and same_python and is_ours(bound_arguments["preexec_fn"])
         if not forked or not Path(folder).is_dir():
             start(*values, **named)
             return
@@ -214,7 +214,7 @@ def serve(connection: socket.socket) -> list[str]:
         spare = [moved_up(file) for file in files]
         for end in (connection, near):
             end.close()
-        if name_of(request.words) in STARTING_OTHERS:
+        if program_name(request.words) in STARTING_OTHERS:
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             server = os.fork()
             if not server:

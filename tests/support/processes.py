@@ -71,7 +71,7 @@ def processes_naming(text: str) -> dict[int, str]:
     return processes
 
 
-def output_of(*arguments: object) -> str:
+def read_output(*arguments: object) -> str:
     """Run a host command in this process, which must succeed; return its stdout."""
     out = io.StringIO()
     with redirect_stdout(out):
@@ -123,11 +123,11 @@ class Program:
     def wait_ready(self) -> str:
         """The rest of its `ready` line."""
 
-        def there() -> bool:
+        def is_ready() -> bool:
             assert self.process.poll() is None, self.err
             return self.out.startswith("ready ") and "\n" in self.out
 
-        wait_for(there, f"{self.process.args} ready")
+        wait_for(is_ready, f"{self.process.args} ready")
         return self.out.partition("\n")[0].removeprefix("ready ")
 
     def kill(self) -> None:

@@ -78,7 +78,7 @@ def judged_products(folder: Path, level: str | None, careless: bool = False) -> 
     return folder
 
 
-def computed(images: Images, content: dict[str, Any] | None, quality: dict[str, Any], **more: Any) -> ProcessedScan:
+def make_result(images: Images, content: dict[str, Any] | None, quality: dict[str, Any], **more: Any) -> ProcessedScan:
     """A result that was just computed, with these contents of materials.json (None: images only) and quality.json."""
     results: dict[str, Any] = {"facts": ScanFacts(scan_id="s", simulated=True), "plates": (), **more}
     materials = None if content is None else ScanMaterials.decode(content)
@@ -107,7 +107,7 @@ PIXEL = (
 
 
 @contextmanager
-def unrendered() -> Iterator[None]:
+def skip_rendering() -> Iterator[None]:
     """Save every figure as one pixel: rendering takes seconds per report, and tests/report covers it."""
 
     def save(_: Figure, file: BinaryIO, **_options: Any) -> None:

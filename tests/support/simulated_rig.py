@@ -61,7 +61,7 @@ class Rig(Bench):
         # Bytes of the journal
         begun = 0
 
-        def there() -> bool:
+        def is_received() -> bool:
             nonlocal begun
             assert scan.process.poll() is None, f"the scan ended too early: {scan.err}"
             journal = sum(path.stat().st_size for path in self.folder.glob("rig/journal/*.journal"))
@@ -71,7 +71,7 @@ class Rig(Bench):
                 begun = journal
             return 0 < begun < journal
 
-        wait_for(there, f"row {rows} being received")
+        wait_for(is_received, f"row {rows} being received")
 
     def committed(self) -> int:
         """How many rows of the scan are committed."""

@@ -58,7 +58,7 @@ FIRST = (
 """Files and folders that take longest: begun first, so that no worker ends long after the others."""
 
 
-def group_of(node_id: str) -> str:
+def worker_group(node_id: str) -> str:
     """Folder or file whose tests share a worker."""
     file = node_id.partition("::")[0]
     room = file.rpartition("/")[0]
@@ -68,14 +68,14 @@ def group_of(node_id: str) -> str:
 def longest_first(items: list[pytest.Item]) -> None:
     """Sort tests in place: those of the longest files first, the others as they were."""
     place = {file: n for n, file in enumerate(FIRST)}
-    items.sort(key=lambda item: place.get(group_of(item.nodeid), len(place)))
+    items.sort(key=lambda item: place.get(worker_group(item.nodeid), len(place)))
 
 
 class ByFile(LoadScopeScheduling):
     """Hands out whole files, in the order of collection."""
 
     def _split_scope(self, nodeid: str) -> str:
-        return group_of(nodeid)
+        return worker_group(nodeid)
 
     def schedule(self) -> None:
         """As the base class, without its sorting by number of tests."""

@@ -34,7 +34,7 @@ def nominal_optics() -> Optics:
     )
 
 
-def scan_of(
+def scan_on_grid(
     shapes: Sequence[Shape], columns: int = COLUMNS, rows: int = ROWS, noise: float = 1.0
 ) -> tuple[Samples, Samples]:
     offsets = scan_offsets(columns, rows)
@@ -57,10 +57,10 @@ def optics() -> Optics:
 def see(optics) -> See:
     """The points that a scan of shapes shows."""
 
-    def of(shapes: Sequence[Shape], columns: int = COLUMNS, rows: int = ROWS, noise: float = 1.0) -> Seen:
-        return see_points(*scan_of(shapes, columns, rows, noise), optics, GATE_M)
+    def see_shapes(shapes: Sequence[Shape], columns: int = COLUMNS, rows: int = ROWS, noise: float = 1.0) -> Seen:
+        return see_points(*scan_on_grid(shapes, columns, rows, noise), optics, GATE_M)
 
-    return of
+    return see_shapes
 
 
 @pytest.fixture(scope="session")

@@ -27,7 +27,7 @@ def burst(paths, noise, rig, counts):
     return make
 
 
-def average_of(aligned):
+def average_halves(aligned):
     """Averages complex [position, rx, block]."""
     return aligned.halves.sum(axis=1)
 
@@ -64,7 +64,7 @@ def test_offsets_are_at_the_cramer_rao_bound(burst, snr_db, echo):
         assert error.std() * mean_factor > 0.9 * bound
 
 
-def _divided(words):
+def _divide_by_first(words):
     """Frequency of each chirp relative to the first by the paper's method: division, long FFT, highest peak."""
     frames = (words[..., 0, :] + 1j * words[..., 1, :])[:, :, slice(*LINEAR)]
     ratio = frames / np.where(frames[:, :1] == 0, 1, frames[:, :1])
@@ -80,7 +80,7 @@ def test_at_low_snr_there_are_no_gross_errors_and_half_the_error_of_division(bur
     bin_ = 1 / 192
     assert np.abs(f).max() < bin_ / 2
     assert np.abs(f).max() < 8 * _bound(signal, snr_db)[0]
-    divided = _divided(frames) - df
+    divided = _divide_by_first(frames) - df
     divided -= np.median(divided, axis=1, keepdims=True)
     small = np.abs(divided) < bin_ / 2  # without its gross errors
     assert f.std() < 0.5 * divided[small].std()
@@ -88,7 +88,7 @@ def test_at_low_snr_there_are_no_gross_errors_and_half_the_error_of_division(bur
 
 def test_average_is_the_signal_with_its_noise_reduced(burst):
     frames, df, _, signal = burst(20, 10)
-    mean = average_of(align_row(frames, np.ones(df.shape, bool), LINEAR)) / 1000
+    mean = average_halves(align_row(frames, np.ones(df.shape, bool), LINEAR)) / 1000
     n = np.arange(48)
     middles = signal[..., :192].reshape(20, 4, 48, 4) @ (np.array([-1, 9, 9, -1]) / 16)
     for p in range(20):  # the average differs by the frequency and phase of its reference chirp
@@ -110,7 +110,7 @@ def test_a_common_frequency_and_phase_of_all_chirps_has_no_other_effect(burst, c
     relative = [a.frequency - a.frequency.mean(axis=1, keepdims=True) for a in (result, shifted_result)]
     np.testing.assert_allclose(*relative, atol=1e-5)
     # Within a hundredth of the direct path.
-    np.testing.assert_allclose(np.abs(average_of(shifted_result)), np.abs(average_of(result)), atol=10)
+    np.testing.assert_allclose(np.abs(average_halves(shifted_result)), np.abs(average_halves(result)), atol=10)
 
 
 def test_the_residual_is_the_true_error(burst):
@@ -152,7 +152,7 @@ def test_one_spoiled_chirp_of_16_changes_nothing(burst, how, bad):
     expected = align_row(frames, without, LINEAR)
     np.testing.assert_array_equal(got.good, without)
     # Magnitudes do not depend on the reference chirp.
-    np.testing.assert_allclose(np.abs(average_of(got)), np.abs(average_of(expected)), atol=30)
+    np.testing.assert_allclose(np.abs(average_halves(got)), np.abs(average_halves(expected)), atol=30)
 
 
 def test_missing_chirps_and_missing_positions(burst):

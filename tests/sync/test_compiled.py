@@ -72,7 +72,7 @@ def same(one: AlignedRow, other: AlignedRow):
     np.testing.assert_allclose(one.error, other.error, rtol=0, atol=2e-5)
 
 
-def equaliser_of(rig):
+def make_equaliser(rig):
     return Equaliser.from_model(high_pass(rig.chirp), rig.chirp, 4)
 
 
@@ -118,7 +118,7 @@ def test_pieces_that_are_not_the_row_are_refused(loops, positions):
 @pytest.mark.parametrize("filtered", [True, False])
 def test_any_linear_part(loops, rig, linear, filtered):
     words, valid = bursts(), np.ones((5, 6), bool)
-    equaliser = equaliser_of(rig) if filtered else None
+    equaliser = make_equaliser(rig) if filtered else None
     same(align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser))
 
 
@@ -126,7 +126,7 @@ def test_any_linear_part(loops, rig, linear, filtered):
 def test_any_number_of_samples(loops, rig, samples, linear):
     """Also if samples do not fill whole vectors or blocks."""
     words, valid = bursts(samples=samples), np.ones((5, 6), bool)
-    equaliser = equaliser_of(rig)
+    equaliser = make_equaliser(rig)
     same(align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser))
 
 
@@ -134,7 +134,7 @@ def test_any_number_of_samples(loops, rig, samples, linear):
 def test_any_number_of_chirps(loops, rig, chirps):
     """Sixteen are transformed at once; a single one has no reference."""
     words, valid = bursts(positions=3, chirps=chirps), np.ones((3, chirps), bool)
-    equaliser = equaliser_of(rig)
+    equaliser = make_equaliser(rig)
     same(
         align(loops.align, words, valid, (0, 192), equaliser),
         align(align_in_numpy, words, valid, (0, 192), equaliser),
@@ -151,8 +151,8 @@ def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
     words[4, 0] = rng.integers(-1000, 1000, words[4, 0].shape)  # matches no other chirp, so another reference is tried
     words[5, :5] = rng.integers(-1000, 1000, words[5, :5].shape)
     words[6] = 0
-    done = align(loops.align, words, valid, (0, 192), equaliser_of(rig))
-    same(done, align(align_in_numpy, words, valid, (0, 192), equaliser_of(rig)))
+    done = align(loops.align, words, valid, (0, 192), make_equaliser(rig))
+    same(done, align(align_in_numpy, words, valid, (0, 192), make_equaliser(rig)))
     assert not done.good[1].any()
     assert not done.good[6].any()
     assert not done.good[3, [2, 5]].any()
@@ -195,7 +195,7 @@ def test_the_direct_path(loops, rig, paths, noise, counts):
     frames = (ideal + noise(ideal.shape, -20, rng))[:, None] * np.exp(2j * np.pi * rng.uniform(size=(37, 4, 1, 1)))
     words, valid = counts(frames.transpose(2, 0, 1, 3)), np.ones((37, 4), bool)
     valid[11] = False
-    aligned = align(align_in_numpy, words, valid, rig.chirp.linear_samples, equaliser_of(rig))
+    aligned = align(align_in_numpy, words, valid, rig.chirp.linear_samples, make_equaliser(rig))
     path = offsets.prepare(rig, board)
     expected = offsets.reference(aligned, path, rig.chirp, sync_loops.NumpyLoops)
     got = offsets.reference(aligned, path, rig.chirp, loops)

@@ -10,7 +10,7 @@ N = np.arange(192) - 95.5
 MIDDLES = N.reshape(-1, 4).mean(axis=1)
 
 
-def decimated(cycles):
+def decimate_tone(cycles):
     return flatten(fold(np.exp(2j * np.pi * cycles * N).astype(np.complex64)))
 
 
@@ -19,14 +19,14 @@ def decimated(cycles):
 )
 def test_tones_near_the_middle_pass_unchanged(bins, inner, edge):
     for sign in (1, -1):
-        deviation = np.abs(decimated(sign * bins * BIN) - np.exp(2j * np.pi * sign * bins * BIN * MIDDLES))
+        deviation = np.abs(decimate_tone(sign * bins * BIN) - np.exp(2j * np.pi * sign * bins * BIN * MIDDLES))
         assert deviation[3:-3].max() < inner
         assert deviation.max() < edge
 
 
 @pytest.mark.parametrize("bins", [43, 46, 48, 50, 53, 91, 96])
 def test_tones_that_would_fall_onto_the_scene_are_stopped(bins):
-    assert np.abs(decimated(bins * BIN)[3:-3]).max() < 10 ** (-40 / 20)
+    assert np.abs(decimate_tone(bins * BIN)[3:-3]).max() < 10 ** (-40 / 20)
 
 
 def test_the_noise_is_known():

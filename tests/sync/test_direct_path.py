@@ -12,7 +12,7 @@ CENTRE = 95.5
 
 
 @pytest.fixture(scope="session")
-def prepared(rig):
+def direct_paths(rig):
     return {b.name: prepare(rig, b) for b in rig.receivers}
 
 
@@ -22,7 +22,7 @@ def board(request, rig):
 
 
 @pytest.fixture
-def run(rig, paths, noise, prepared, align_single):
+def run(rig, paths, noise, direct_paths, align_single):
     """`run(board, ...)`: reference positions with random offsets; result, frequency error (Hz), phase error (rad)."""
 
     def go(board, echo=1.0, snr_db=None, positions=150, seed=0, direct=1.0, gain=0.0, drift_hz=0.0, **more):
@@ -37,7 +37,7 @@ def run(rig, paths, noise, prepared, align_single):
         signal *= np.exp(1j * (2 * np.pi * cycles + phase[:, None]))[:, None]
         if snr_db is not None:
             signal += noise(signal.shape, -snr_db, rng)
-        done = reference(align_single(signal, np.ones(positions, bool)), prepared[board.name], rig.chirp)
+        done = reference(align_single(signal, np.ones(positions, bool)), direct_paths[board.name], rig.chirp)
         delay = length[0] / SPEED_OF_LIGHT_M_S
         f_error = (done.frequency - df - rig.chirp.hz_per_sample * delay + 0.5) % 1 - 0.5
         middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * CENTRE
@@ -121,14 +121,14 @@ def test_two_tones_2_5_bins_apart_at_16_db_cost_little_over_one_tones_bound(rig,
     assert error.std() < 1.2 * np.sqrt(10**-1.6 / 2 / (4 * 192))
 
 
-def test_the_second_peak_is_used_where_the_amplitude_is_an_outlier(rig, paths, prepared, align_single, board):
+def test_the_second_peak_is_used_where_the_amplitude_is_an_outlier(rig, paths, direct_paths, align_single, board):
     """A far stronger object at some positions hides the direct path there; its amplitude is known from the row."""
     signal, _ = paths(board, 40, 0.5, np.random.default_rng(6), spread_m=0.02)
     pure, length = paths(board, 40, 0.0, np.random.default_rng(6))
     strong = np.arange(40) % 8 == 3
     signal = np.where(strong[:, None, None], pure + 8 * (signal - pure), signal)
     signal *= np.exp(2j * np.pi * 0.25 * np.arange(256))
-    done = reference(align_single(signal, np.ones(40, bool)), prepared[board.name], rig.chirp)
+    done = reference(align_single(signal, np.ones(40, bool)), direct_paths[board.name], rig.chirp)
     true = 0.25 + rig.chirp.hz_per_sample * length[0] / SPEED_OF_LIGHT_M_S
     assert done.found.all()
     assert np.abs(done.frequency - true).max() * 192 < 0.1  # IF bins; the object is 3.5 away
@@ -149,7 +149,7 @@ def test_a_slope_difference_of_the_crystals_is_removed(run, board):
     assert phase.std() < 0.01
 
 
-def test_a_referenced_echo_has_the_positive_phase_of_its_excess_path(rig, paths, prepared, align_single, board):
+def test_a_referenced_echo_has_the_positive_phase_of_its_excess_path(rig, paths, direct_paths, align_single, board):
     rng = np.random.default_rng(3)
     only_direct, length = paths(board, 1, 0.0, rng)
     v = np.add(specular_midpoint_m(rig, board), (0.02, -0.03, 0))
@@ -159,13 +159,13 @@ def test_a_referenced_echo_has_the_positive_phase_of_its_excess_path(rig, paths,
     echo = 0.8 * np.exp(2j * np.pi * f * (excess + length)[:, None] / SPEED_OF_LIGHT_M_S)
     turn = np.exp(1j * (2 * np.pi * 0.3 * np.arange(256) + 2.0))
     received = ((only_direct[0] + echo) * turn)[None].astype(np.complex64)
-    done = reference(align_single(received, np.ones(1, bool)), prepared[board.name], rig.chirp)
-    f = prepared[board.name].sweep_hz
+    done = reference(align_single(received, np.ones(1, bool)), direct_paths[board.name], rig.chirp)
+    f = direct_paths[board.name].sweep_hz
     expected = 1 + 0.8 * np.exp(2j * np.pi * f * excess[:, None] / SPEED_OF_LIGHT_M_S)
     np.testing.assert_allclose(done.samples[:, 0] / 1000, expected, atol=3e-3)
 
 
-def test_noise_alone_and_lost_positions_are_not_found(rig, paths, noise, prepared, align_single, board):
+def test_noise_alone_and_lost_positions_are_not_found(rig, paths, noise, direct_paths, align_single, board):
     rng = np.random.default_rng(2)
     signal, _ = paths(board, 40, 1.0, rng)
     signal *= np.exp(2j * np.pi * 0.2 * np.arange(256))
@@ -173,26 +173,26 @@ def test_noise_alone_and_lost_positions_are_not_found(rig, paths, noise, prepare
     signal[9] *= 0.05
     usable = np.ones(40, bool)
     usable[20] = False
-    done = reference(align_single(signal, usable), prepared[board.name], rig.chirp)
+    done = reference(align_single(signal, usable), direct_paths[board.name], rig.chirp)
     assert np.flatnonzero(~done.found).tolist() == [5, 9, 20]
     assert not done.samples[:, [5, 9, 20]].any()
 
 
 @pytest.mark.parametrize(("relative", "found"), [(0.35, True), (0.25, False)])
 def test_a_direct_path_below_three_tenths_of_the_rows_is_lost(
-    rig, paths, prepared, align_single, board, relative, found
+    rig, paths, direct_paths, align_single, board, relative, found
 ):
     signal, _ = paths(board, 40, 0.0, np.random.default_rng(2))
     signal[9] *= relative
     signal *= np.exp(2j * np.pi * 0.2 * np.arange(256))
-    done = reference(align_single(signal, np.ones(40, bool)), prepared[board.name], rig.chirp)
+    done = reference(align_single(signal, np.ones(40, bool)), direct_paths[board.name], rig.chirp)
     assert done.found[9] == found
     assert done.found.sum() == 39 + found
 
 
-def test_a_row_of_noise_has_no_direct_path(rig, noise, prepared, align_single, board):
+def test_a_row_of_noise_has_no_direct_path(rig, noise, direct_paths, align_single, board):
     received = noise((400, 4, 256), 0, np.random.default_rng(7)).astype(np.complex64)
-    assert not reference(align_single(received, np.ones(400, bool)), prepared[board.name], rig.chirp).found.any()
+    assert not reference(align_single(received, np.ones(400, bool)), direct_paths[board.name], rig.chirp).found.any()
 
 
 @pytest.mark.parametrize(("snr_db", "least", "most"), [(-17, 0.0, 0.05), (-13.5, 0.1, 0.9), (-10.5, 0.95, 1.0)])
@@ -202,12 +202,12 @@ def test_a_direct_path_is_found_from_15_db_over_the_noise_of_its_estimate(run, b
     assert least <= done.found.mean() <= most
 
 
-def test_an_if_outside_the_band_is_masked(rig, paths, prepared, align_single, board):
+def test_an_if_outside_the_band_is_masked(rig, paths, direct_paths, align_single, board):
     signal, _ = paths(board, 4, 1.0, np.random.default_rng(2))
     base = rig.chirp.hz_per_sample * 1.39 / SPEED_OF_LIGHT_M_S
     signal *= np.exp(2j * np.pi * (np.array([0.2, 0.5, 0.95, 0.7])[:, None] - base) * np.arange(256))[:, None]
-    done = reference(align_single(signal, np.ones(4, bool)), prepared[board.name], rig.chirp)
+    done = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], rig.chirp)
     assert done.found.tolist() == [True, True, False, True]
     two = msgspec.structs.replace(rig.chirp, if_mode="complex2x")
-    done = reference(align_single(signal, np.ones(4, bool)), prepared[board.name], two)
+    done = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], two)
     assert done.found.tolist() == [True, False, True, True]

@@ -30,7 +30,7 @@ def align(request):
 
 
 @pytest.fixture
-def received(paths, noise, rig):
+def receive_bursts(paths, noise, rig):
     """Bursts as received, complex [position, chirp, rx, sample], direct path 1."""
 
     def make(snr_db=8.0, seed=0, echo=1.0):
@@ -60,16 +60,16 @@ def choose(count, rng):
     return rng.permuted(np.arange(CHIRPS) < count + np.zeros((POSITIONS, 1)), axis=1)
 
 
-def words_of(counts, frames):
+def make_words(counts, frames):
     return counts(frames.transpose(2, 0, 1, 3))
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 6])
 @pytest.mark.parametrize("level", [2.0, 8.0])
-def test_bursts_with_disturbed_chirps_give_the_average_of_the_others(align, received, counts, count, level):
+def test_bursts_with_disturbed_chirps_give_the_average_of_the_others(align, receive_bursts, counts, count, level):
     rng = np.random.default_rng(count)
     chosen = choose(count, rng)
-    words = words_of(counts, cross(received(), chosen, level, rng))
+    words = make_words(counts, cross(receive_bursts(), chosen, level, rng))
     got, expected = align(words), align(words, ~chosen)
     np.testing.assert_array_equal(got.good, ~chosen)
     np.testing.assert_array_equal(got.halves, expected.halves)
@@ -77,12 +77,12 @@ def test_bursts_with_disturbed_chirps_give_the_average_of_the_others(align, rece
 
 
 @pytest.mark.parametrize("level", [0.2, 0.5, 1.0])
-def test_what_is_not_found_changes_the_average_by_less_than_its_noise(align, received, counts, level):
+def test_what_is_not_found_changes_the_average_by_less_than_its_noise(align, receive_bursts, counts, level):
     rng = np.random.default_rng(9)
     chosen = choose(3, rng)
-    quiet = received()
-    got = align(words_of(counts, cross(quiet, chosen, level, rng)))
-    clean = align(words_of(counts, quiet))
+    quiet = receive_bursts()
+    got = align(make_words(counts, cross(quiet, chosen, level, rng)))
+    clean = align(make_words(counts, quiet))
     deviation = np.abs(got.halves.sum(axis=1)) - np.abs(clean.halves.sum(axis=1))
     noise = COUNTS * 10 ** (-8 / 20) / np.sqrt(2 * CHIRPS * 4)
     assert np.sqrt((deviation**2).mean()) < noise
@@ -90,17 +90,17 @@ def test_what_is_not_found_changes_the_average_by_less_than_its_noise(align, rec
 
 @pytest.mark.parametrize("snr_db", [-3.0, 8.0, 25.0, 60.0])
 @pytest.mark.parametrize("echo", [0.0, 1.0, 3.0])
-def test_no_chirp_of_an_undisturbed_burst_is_left_out(align, received, counts, snr_db, echo):
-    assert align(words_of(counts, received(snr_db, echo=echo))).good.all()
+def test_no_chirp_of_an_undisturbed_burst_is_left_out(align, receive_bursts, counts, snr_db, echo):
+    assert align(make_words(counts, receive_bursts(snr_db, echo=echo))).good.all()
 
 
 @pytest.mark.parametrize("travel_mm", [0.5, 1.0])
-def test_motion_in_a_burst_is_no_disturbance(align, received, counts, travel_mm):
+def test_motion_in_a_burst_is_no_disturbance(align, receive_bursts, counts, travel_mm):
     """The echo of a plate aside turns by its change of path, up to 1.6 times the travel."""
     moved = np.linspace(-0.5, 0.5, CHIRPS)[:, None, None] * 1.6 * travel_mm / 3.85
-    direct, disturbed = received(60.0, seed=3, echo=0.0), received(60.0, seed=3)
+    direct, disturbed = receive_bursts(60.0, seed=3, echo=0.0), receive_bursts(60.0, seed=3)
     frames = direct + (disturbed - direct) * np.exp(2j * np.pi * moved)
-    assert align(words_of(counts, frames)).good.all()
+    assert align(make_words(counts, frames)).good.all()
 
 
 def clip(words, limit):
@@ -108,8 +108,8 @@ def clip(words, limit):
 
 
 @pytest.mark.parametrize("limit", [0.4, 0.6, 0.75])
-def test_a_burst_whose_chirps_are_all_clipped_is_not_used(align, received, counts, limit):
-    words = words_of(counts, 8 * received(20.0, echo=0.3))
+def test_a_burst_whose_chirps_are_all_clipped_is_not_used(align, receive_bursts, counts, limit):
+    words = make_words(counts, 8 * receive_bursts(20.0, echo=0.3))
     low = clip(words, int(limit * np.abs(words).max()))
     got = align(low)
     assert got.clipped.all()
@@ -119,9 +119,9 @@ def test_a_burst_whose_chirps_are_all_clipped_is_not_used(align, received, count
     assert not align(full).good.any()
 
 
-def test_clipped_chirps_among_others_are_left_out(align, received, counts):
+def test_clipped_chirps_among_others_are_left_out(align, receive_bursts, counts):
     chosen = choose(5, np.random.default_rng(2))
-    words = words_of(counts, 2.5 * received(20.0))
+    words = make_words(counts, 2.5 * receive_bursts(20.0))
     loud = clip(4 * words, 7000)
     words = np.where(chosen[..., None, None, None], loud, words)
     got, expected = align(words), align(words, ~chosen)
@@ -130,13 +130,13 @@ def test_clipped_chirps_among_others_are_left_out(align, received, counts):
     np.testing.assert_array_equal(got.halves, expected.halves)
 
 
-def test_both_forms_leave_out_the_same(received, counts):
+def test_both_forms_leave_out_the_same(receive_bursts, counts):
     library = sync_loops.library()
     if library is None:
         pytest.skip("no compiled loops: python -m polysight.sync.build")
     rng = np.random.default_rng(1)
     for level in (0.5, 1.0, 2.0, 20.0):
-        words = words_of(counts, cross(received(12.0), rng.random((POSITIONS, CHIRPS)) < 0.3, level, rng))
+        words = make_words(counts, cross(receive_bursts(12.0), rng.random((POSITIONS, CHIRPS)) < 0.3, level, rng))
         compiled, in_numpy = (
             align_pieces([words], np.ones(words.shape[:2], bool), LINEAR, by=by)
             for by in (library.align, align_in_numpy)
@@ -146,12 +146,12 @@ def test_both_forms_leave_out_the_same(received, counts):
         np.testing.assert_allclose(compiled.halves, in_numpy.halves, rtol=0, atol=3e-6 * largest)
 
 
-def test_chirps_left_out_are_counted(rig, received, counts):
+def test_chirps_left_out_are_counted(rig, receive_bursts, counts):
     setup = BoardSetup.from_rig(rig, rig.receivers[0], compensate_filter=False)
     rng = np.random.default_rng(4)
     chosen = choose(2, rng)
     chosen[:4] = False
-    words = words_of(counts, cross(received(15.0), chosen, 8.0, rng))
+    words = make_words(counts, cross(receive_bursts(15.0), chosen, 8.0, rng))
     words[0] = clip(4 * words[0], int(2.5 * COUNTS))
     words[1, :3] = 32767
     valid = np.ones(chosen.size, bool)
@@ -164,9 +164,9 @@ def test_chirps_left_out_are_counted(rig, received, counts):
     np.testing.assert_array_equal(row.chirps[1:4], [13, 16, 16])
 
 
-def test_three_chirps_are_too_few_to_call_one_disturbed(align, received, counts):
-    frames = received()[:, :3]
+def test_three_chirps_are_too_few_to_call_one_disturbed(align, receive_bursts, counts):
+    frames = receive_bursts()[:, :3]
     rng = np.random.default_rng(5)
-    words = words_of(counts, cross(frames, np.arange(3) == np.full((POSITIONS, 1), 1), 2.0, rng))
+    words = make_words(counts, cross(frames, np.arange(3) == np.full((POSITIONS, 1), 1), 2.0, rng))
     assert align(words).good.all()
     assert align_row(words, np.ones((POSITIONS, 3), bool), LINEAR).good.all()

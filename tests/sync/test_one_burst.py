@@ -29,7 +29,7 @@ def rig_with_burst(burst: Burst, speed_mm_s: float):
     )
 
 
-def synchronised(burst: Burst, speed_mm_s: float):
+def synchronise_burst(burst: Burst, speed_mm_s: float):
     """A simulated row of the direct path alone, synchronised."""
     rig = rig_with_burst(burst, speed_mm_s)
     radar = SimulatedRig(rig, SCENE)
@@ -43,7 +43,7 @@ def synchronised(burst: Burst, speed_mm_s: float):
 
 @pytest.mark.parametrize(("burst", "speed_mm_s"), [(MANY, 20.0), (ONE, 20.0), (ONE, 100.0)])
 def test_every_position_is_synchronised(burst, speed_mm_s):
-    synced = synchronised(burst, speed_mm_s)
+    synced = synchronise_burst(burst, speed_mm_s)
     assert synced.valid.all()
     assert synced.valid.size == COLUMNS
 

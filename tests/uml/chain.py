@@ -89,13 +89,13 @@ def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     )
     pi = start(*python, "polysight_pi", "run", "--config", str(config), "--stage-port", str(PORT))
     host = HostSide(rig.pi.command_address, rig.pi.event_address, rig)
-    host.accepted(host.begin())
-    host.accepted(m.Home())
+    host.must_accept(host.begin())
+    host.must_accept(m.Home())
     host.wait(m.StageStatus, lambda e: e.state == "idle" and (e.x_mm, e.y_mm) == (0.0, 0.0), LIMIT_S)
     host.until_state("ready")
     # What came before the row does not count
     list(chip.changes())
-    host.accepted(m.RunRow(scan_id="scan", row_index=0, take=1))
+    host.must_accept(m.RunRow(scan_id="scan", row_index=0, take=1))
     finished = host.wait(m.RowFinished, limit_s=LIMIT_S)
     captures = [e for e in host.events if isinstance(e, m.Capture)]
     pi.send_signal(signal.SIGTERM)

@@ -46,7 +46,7 @@ class Pulse(NamedTuple):
     fall_ns: int
 
 
-def bursts_of(result: dict[str, Any]) -> list[tuple[Capture, list[Pulse]]]:
+def read_bursts(result: dict[str, Any]) -> list[tuple[Capture, list[Pulse]]]:
     """The Pi's capture events with their pulses, after checking that they agree with the kernel's record."""
     changes = result["changes"]
     assert {line for _, line, _ in changes} == {SYNC_OUT}
@@ -101,7 +101,7 @@ def test_a_published_row_in_virtual_time(run_row):
     """350 positions, 5600 pulses, nothing lost, and every period within 2 us of nominal."""
     result = run_row(350, "time-travel=inf-cpu")
     assert complete(result, 350), result["finished"]
-    bursts = bursts_of(result)
+    bursts = read_bursts(result)
     print_figures("virtual time", bursts)
     assert sum(len(burst) for _, burst in bursts) == 5600
     assert max(map(abs, period_errors_ns(bursts))) <= 2_000
@@ -123,7 +123,7 @@ def test_a_row_in_real_time(run_row):
     speed_mm_s = 20.0
     for _ in range(TAKES):
         result = run_row(20, real_time=True, speed_mm_s=speed_mm_s)
-        bursts = bursts_of(result)
+        bursts = read_bursts(result)
         if complete(result, 20):
             print_figures(f"real time at {speed_mm_s:g} mm/s", bursts)
             return

@@ -32,34 +32,37 @@ def pair() -> World:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(pair) -> ImagePair:
+def undisturbed_pair(pair) -> ImagePair:
     return simulate(pair)
 
 
-def test_a_plate_stands_where_it_was_put(undisturbed):
-    x0, y0, x1, y1 = undisturbed.world.plates[0].box_m
-    lit = np.abs(undisturbed.h) > 0.5 * np.abs(undisturbed.h).max()
+def test_a_plate_stands_where_it_was_put(undisturbed_pair):
+    x0, y0, x1, y1 = undisturbed_pair.world.plates[0].box_m
+    lit = np.abs(undisturbed_pair.h) > 0.5 * np.abs(undisturbed_pair.h).max()
     columns = np.flatnonzero(lit.any(axis=0))
     rows = np.flatnonzero(lit.any(axis=1))
-    assert undisturbed.x_m[columns[[0, -1]]] == pytest.approx([x0, x1], abs=0.005)
-    assert undisturbed.y_m[rows[[0, -1]]] == pytest.approx([y0, y1], abs=0.005)
+    assert undisturbed_pair.x_m[columns[[0, -1]]] == pytest.approx([x0, x1], abs=0.005)
+    assert undisturbed_pair.y_m[rows[[0, -1]]] == pytest.approx([y0, y1], abs=0.005)
 
 
-def test_a_dielectric_beside_metal_has_the_ratio_of_fresnel(undisturbed):
+def test_a_dielectric_beside_metal_has_the_ratio_of_fresnel(undisturbed_pair):
     plate = Plate("plate", CENTRE_M, (0.06, 0.06), DIELECTRIC)
     images = simulate(World((plate,)))
-    measured = ratio(images, plate) / ratio(undisturbed, undisturbed.world.plates[0])
+    measured = ratio(images, plate) / ratio(undisturbed_pair, undisturbed_pair.world.plates[0])
     assert measured == pytest.approx(images.ratio_of(plate), rel=0.01)
 
 
 @pytest.mark.parametrize("name", [*NUISANCES, "all"])
-def test_each_nuisance_changes_the_images_and_is_told(name, pair, undisturbed):
+def test_each_nuisance_changes_the_images_and_is_told(name, pair, undisturbed_pair):
     nuisances = draw_nuisances(np.random.default_rng(1), name)
     assert nuisances.active()
     images = simulate(pair, nuisances)
-    assert images.h.shape == undisturbed.h.shape
+    assert images.h.shape == undisturbed_pair.h.shape
     assert np.isfinite(images.h).all()
-    changes = [np.abs(a - b).max() / np.abs(b).max() for a, b in ((images.h, undisturbed.h), (images.v, undisturbed.v))]
+    changes = [
+        np.abs(a - b).max() / np.abs(b).max()
+        for a, b in ((images.h, undisturbed_pair.h), (images.v, undisturbed_pair.v))
+    ]
     assert max(changes) > 1e-3
 
 

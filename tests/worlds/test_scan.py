@@ -22,7 +22,7 @@ def rig() -> Rig:
     return replace(published_rig(), columns=60, rows=40, frequencies_hz=np.array([76.3e9, 79.7e9]))
 
 
-def facets_of(surface: Surface, plate: Plate, rig: Rig) -> Facets:
+def make_facets(surface: Surface, plate: Plate, rig: Rig) -> Facets:
     rows, columns = surface.cover.shape
     x = surface.x0_m + np.arange(columns) * rig.step_m
     y = surface.y0_m + np.arange(rows) * rig.step_m
@@ -61,7 +61,7 @@ def test_convolutions_equal_the_sum_over_facets(rig, shape, error, channel):
     row = rng.integers(0, rig.rows, 12)
     column = rng.integers(0, rig.columns, 12)
     offsets = np.stack([x[column], y[row], np.zeros(12)], axis=1)
-    expected = scatter(rig.tx, rx, facets_of(surface, plate, rig), plate.stack, rig.frequencies_hz, offsets)
+    expected = scatter(rig.tx, rx, make_facets(surface, plate, rig), plate.stack, rig.frequencies_hz, offsets)
     rms = np.sqrt(np.mean(np.abs(expected) ** 2))
     assert np.sqrt(np.mean(np.abs(data[:, row, column].T - expected) ** 2)) < error * rms
 
@@ -94,7 +94,7 @@ def test_cells_cover_the_plates_area():
 
 def test_a_body_of_facets_is_the_plate_that_it_copies(rig):
     plate = Plate("plate", (0.01, 0.09), (0.040, 0.030), LAYER)
-    facets = facets_of(make_surface(plate, rig.step_m, np.random.default_rng(0)), plate, rig)
+    facets = make_facets(make_surface(plate, rig.step_m, np.random.default_rng(0)), plate, rig)
     small = replace(rig, columns=9, rows=7)
     full_plate = record(small, small.h, World((plate,)))
     by_facets = record(small, small.h, World((), (Body("plate", facets, LAYER),)))

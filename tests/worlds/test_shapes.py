@@ -29,17 +29,17 @@ DIELECTRIC = Stack(below=4 - 0.4j)
 OFFSETS_M = np.array([[0.0, 0, 0], [0.05, 0.02, 0], [-0.1, 0.06, 0], [0.12, -0.05, 0]])
 
 
-def behind(depth_m: float) -> tuple[float, float, float]:
+def point_behind(depth_m: float) -> tuple[float, float, float]:
     x, y, z = CENTRE_M
     return x, y, z + depth_m
 
 
 SHAPES = [
-    sphere("sphere", METAL, behind(0.1), 0.1),
-    cylinder("cylinder", DIELECTRIC, behind(0.1), 0.1, 0.6, axis=(0.3, 1.0, 0.1)),
-    cylinder("cone", METAL, behind(0.09), 0.09, 0.6, slope=-0.15),
-    plate("saddle", METAL, behind(0.0), (0.3, 0.3), bends=(7.0, -6.0, 1.0)),
-    plate("tilted", DIELECTRIC, behind(0.0), (0.9, 0.9), tilt_deg=(4.0, -2.0), is_soft=True),
+    sphere("sphere", METAL, point_behind(0.1), 0.1),
+    cylinder("cylinder", DIELECTRIC, point_behind(0.1), 0.1, 0.6, axis=(0.3, 1.0, 0.1)),
+    cylinder("cone", METAL, point_behind(0.09), 0.09, 0.6, slope=-0.15),
+    plate("saddle", METAL, point_behind(0.0), (0.3, 0.3), bends=(7.0, -6.0, 1.0)),
+    plate("tilted", DIELECTRIC, point_behind(0.0), (0.9, 0.9), tilt_deg=(4.0, -2.0), is_soft=True),
 ]
 
 
@@ -121,7 +121,7 @@ def test_a_whole_scan_is_that_of_its_single_positions(shape):
 def test_a_large_flat_plate_is_the_same_in_facets_and_in_zones():
     # The mean over Fresnel zones of the edges: plates of growing size swing around the one without edges.
     widths_m = np.linspace(0.5, 0.56, 9)
-    sharp = [plate("sharp", DIELECTRIC, behind(0.0), (w, w), tilt_deg=(4.0, -2.0)) for w in widths_m]
+    sharp = [plate("sharp", DIELECTRIC, point_behind(0.0), (w, w), tilt_deg=(4.0, -2.0)) for w in widths_m]
     few = OFFSETS_M[:2]
     first = [record_shapes([piece], ONE_RX, FREQUENCIES_HZ[:1], few)["h"] for piece in sharp]
     second = record_shapes([SHAPES[4]], ONE_RX, FREQUENCIES_HZ[:1], few)["h"]

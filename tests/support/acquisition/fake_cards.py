@@ -14,7 +14,7 @@ from tests.support.capture.records import FULL, encode_packet
 
 
 @functools.cache
-def payload_of(board: str, row: int, size: int) -> bytes:
+def make_payload(board: str, row: int, size: int) -> bytes:
     seed = sum(board.encode()) * 1000 + row
     return np.random.default_rng(seed).integers(0, 256, size, dtype=np.uint8).tobytes()
 
@@ -80,7 +80,7 @@ class FakeCard:
         if slot == extra:
             self._rest += bytes(frame_bytes)
         if slot not in self.missed.get((row, take), ()) and not (last and extra is not None):
-            data = payload_of(self.board.name, row, self.row_bytes)
+            data = make_payload(self.board.name, row, self.row_bytes)
             self._rest += data[slot * frame_bytes : (slot + 1) * frame_bytes]
         while len(self._rest) >= FULL:
             self._send_packet(FULL)
@@ -101,7 +101,7 @@ class FakeCard:
     def send_row(self, row: int, take: int) -> None:
         if not self.recording or self.silent_data:
             return
-        data = payload_of(self.board.name, row, self.row_bytes)
+        data = make_payload(self.board.name, row, self.row_bytes)
         data = data[: len(data) - self.short.get((row, take), 0)]
         destination = (self.board.host_address, self.board.data_port)
         for k, start in enumerate(range(0, len(data), FULL)):

@@ -75,7 +75,7 @@ class FakePi:
                     self.lose_replies -= 1
                 else:
                     self.rep.send_multipart([*envelope, m.pack(reply)])
-                self._after()
+                self._finish_command()
             if self.wanted_end and self.hanging is not None:
                 self.wanted_end = False
                 self.finish_hanging()
@@ -154,7 +154,7 @@ class FakePi:
             )  # fmt: skip
         return m.Accepted(state=self.state)
 
-    def _after(self) -> None:
+    def _finish_command(self) -> None:
         c = self._todo
         if c is None or self.run is None:
             return

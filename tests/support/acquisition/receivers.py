@@ -63,6 +63,6 @@ def receivers() -> list[int]:
     return sorted(process.pid for process in _started if process.pid is not None and process.poll() is None)
 
 
-def receiver_of(board: str) -> int:
+def find_receiver(board: str) -> int:
     """Process id of the receiver of RH or RV."""
     return receivers()[["RH", "RV"].index(board)]

@@ -41,7 +41,7 @@ class Cards:
             self._players[name] = Player(endpoint, plays, 5e6, time.monotonic)
 
     @staticmethod
-    def network_of(board: Board) -> Network:
+    def card_network(board: Board) -> Network:
         """Network settings in the EEPROM of a board's card."""
         return Network(board.host_address, board.card_address, MAC, board.command_port, board.data_port)
 

@@ -37,7 +37,7 @@ class Record:
         data = np.random.default_rng(seed).integers(1, 256, size, dtype=np.uint8).tobytes()
         return Record(data, encode_packets(data, sequence, count))
 
-    def bytes_of(self, k: int) -> tuple[int, int]:
+    def byte_range(self, k: int) -> tuple[int, int]:
         return k * FULL, min((k + 1) * FULL, len(self.data))
 
 
@@ -68,7 +68,7 @@ class Card:
         return Record(full_record.data, packets)
 
 
-def log_of(size: int, packets: list[bytes], batch: int = 7, t_ns: int = 1) -> PacketLog:
+def make_log(size: int, packets: list[bytes], batch: int = 7, t_ns: int = 1) -> PacketLog:
     """The packets of a row as a receiver logs them, a batch every nanosecond."""
     log = PacketLog(size)
     for i in range(0, len(packets), batch):
@@ -85,7 +85,7 @@ def place(
 ) -> tuple[Placed, np.ndarray]:
     """Place a row that starts at these counters, or after the known earlier records."""
     past = Past(start) if isinstance(start, Counters) else start
-    return place_record(log_of(size, packets, batch), frame, past)
+    return place_record(make_log(size, packets, batch), frame, past)
 
 
 def next_start(placed: Placed) -> Counters | None:
@@ -93,7 +93,7 @@ def next_start(placed: Placed) -> Counters | None:
     return placed.past.start
 
 
-def mask_of(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
+def make_mask(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
     mask = np.zeros(size, dtype=bool)
     for a, b in gaps:
         mask[a:b] = True
@@ -101,5 +101,5 @@ def mask_of(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
 
 
 def is_original_or_masked(record: Record, placed: Placed, out: np.ndarray) -> bool:
-    is_kept = ~mask_of(out.size, placed.missing)
+    is_kept = ~make_mask(out.size, placed.missing)
     return bool((out[is_kept] == np.frombuffer(record.data, dtype=np.uint8)[is_kept]).all())

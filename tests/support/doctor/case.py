@@ -26,7 +26,7 @@ SMALL = {
 }
 
 
-def frames_of(board, rig=RIG, **disturbances):
+def simulate_frames(board, rig=RIG, **disturbances):
     """Frames of a board at rest, int16 [frame, sample, 2, rx]; simulated."""
     scene = decode_scene({**SMALL, "disturbances": {"if_offset_hz": 0.0, **disturbances}}, "test")
     radar = SimulatedRig(rig, scene)
@@ -36,10 +36,10 @@ def frames_of(board, rig=RIG, **disturbances):
 setup_of = functools.cache(lambda board: BoardSetup.from_rig(RIG, RIG.by_name(board)))  # no start frequency changes it
 
 
-def signal_of(board, rig=RIG, **disturbances):
-    words = frames_of(board, rig, **disturbances)
+def direct_signal(board, rig=RIG, **disturbances):
+    words = simulate_frames(board, rig, **disturbances)
     return find_direct(rig, rig.by_name(board), words, np.ones(FRAMES, bool), setup_of(board))
 
 
-def context_of(rig=RIG, out=Path(), system=QUICK, **more):
+def make_context(rig=RIG, out=Path(), system=QUICK, **more):
     return CheckContext(DoctorOptions(Path("rig.toml"), out), system, loaded_rig=rig, **more)

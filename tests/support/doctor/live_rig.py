@@ -88,7 +88,7 @@ class LiveRig:
             context.destroy(linger=0)
 
     @contextmanager
-    def stopped(self, word: str) -> Iterator[None]:
+    def stop_process(self, word: str) -> Iterator[None]:
         """Stop (SIGSTOP) the rig's process with this word in its command line, as if it hung."""
         pid = self._pid(word)
         os.kill(pid, signal.SIGSTOP)

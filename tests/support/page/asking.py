@@ -47,12 +47,12 @@ def raw(view: Any, data: bytes, limit_s: float = LIMIT_S) -> bytes:
     with socket.create_connection(("127.0.0.1", view.port), limit_s) as s:
         s.sendall(data)
         out = b""
-        while part := _received(s):
+        while part := _receive(s):
             out += part
         return out
 
 
-def _received(s: socket.socket) -> bytes:
+def _receive(s: socket.socket) -> bytes:
     try:
         return s.recv(65536)
     except ConnectionResetError:

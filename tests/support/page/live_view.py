@@ -62,7 +62,7 @@ class GrowingScan:
         with (self.path / MANIFEST).open("ab") as f:
             f.write(manifest.encode_line(fact))
 
-    def grow_to(self, fact: str) -> None:
+    def grow_until(self, fact: str) -> None:
         """Write facts up to the next one of this name."""
         while self.grow() != fact:
             assert self._facts, f"no {fact} left"

@@ -45,12 +45,12 @@ class HostSide:
         wait_for(lambda: self.commands.poll(POLL_MS) != 0, f"a reply to {command}", self.limit_s)
         return m.unpack_reply(self.commands.recv())
 
-    def accepted(self, command: Any) -> m.Accepted:
+    def must_accept(self, command: Any) -> m.Accepted:
         reply = self.ask(command)
         assert isinstance(reply, m.Accepted), reply
         return reply
 
-    def refused(self, command: Any) -> int:
+    def must_refuse(self, command: Any) -> int:
         """Fault number of the refusal."""
         reply = self.ask(command)
         assert isinstance(reply, m.Refused), reply
@@ -72,7 +72,7 @@ class HostSide:
         return m.BeginRun(**{**fields, **changes})
 
     def home(self, owner: str = "") -> None:
-        self.accepted(m.Home(owner=owner))
+        self.must_accept(m.Home(owner=owner))
         self.until_state("ready")
 
     def until_state(self, *states: str) -> m.StatusReply:
@@ -99,19 +99,19 @@ class HostSide:
         raise AssertionError(f"no {kind.__name__} within {limit_s} s; seen {self.events[-5:]}")
 
     def start_row(self, row_index: int = 0, take: int = 1, owner: str = "") -> m.Accepted:
-        return self.accepted(m.RunRow(scan_id="scan", row_index=row_index, take=take, owner=owner))
+        return self.must_accept(m.RunRow(scan_id="scan", row_index=row_index, take=take, owner=owner))
 
     def row(self, row_index: int, take: int = 1) -> m.RowFinished:
         self.start_row(row_index, take)
         return self.wait(m.RowFinished, lambda e: (e.row_index, e.take) == (row_index, take))
 
-    def of(self, *kinds: type) -> list[Any]:
+    def list_events(self, *kinds: type) -> list[Any]:
         """Events of these kinds so far."""
         return [e for e in self.events if isinstance(e, kinds)]
 
     @property
     def journalled(self) -> list[Any]:
-        return self.of(*m.JOURNALLED)
+        return self.list_events(*m.JOURNALLED)
 
     def replay(self, scan_id: str = "scan", from_seq: int = 1, limit: int = 10000) -> list[Any]:
         return self.ask(m.Replay(scan_id=scan_id, from_seq=from_seq, limit=limit)).events

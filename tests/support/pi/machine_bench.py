@@ -61,7 +61,7 @@ class Bench:
             self.machine.check_deadlines()
             self.run_posted()
 
-    def homed(self) -> Bench:
+    def begin_and_home(self) -> Bench:
         self.machine.command("BeginRun", 0)
         self.machine.command("Home")
         self.run_posted()
@@ -90,9 +90,9 @@ class Bench:
         self.stage_says(Reply("done", self.stage.number, fields=fields, **times_ns))
 
     def edge(self) -> None:
-        self.edge_at(self.edge_ns + INTERVAL_NS)
+        self.give_edge(self.edge_ns + INTERVAL_NS)
 
-    def edge_at(self, t_ns: int) -> None:
+    def give_edge(self, t_ns: int) -> None:
         self.seqno += 1
         self.edge_ns = t_ns
         self.lines.t = max(self.lines.t, t_ns)
@@ -104,5 +104,5 @@ class Bench:
     def armed(self) -> bool:
         return self.loop._job is not None
 
-    def of(self, kind: type) -> list[Any]:
+    def list_events(self, kind: type) -> list[Any]:
         return [e for e in self.journal.events if isinstance(e, kind)]

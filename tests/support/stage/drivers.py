@@ -374,11 +374,11 @@ class Host(Driver):
         assert last.kind == "status"
         return last
 
-    def obeyed(self, verb: str, *args: int) -> None:
+    def must_obey(self, verb: str, *args: int) -> None:
         assert self.command(verb, *args).kind == "ok"
 
     def set(self, parameter: Parameter, value: int) -> None:
-        self.obeyed("SET", int(parameter), value)
+        self.must_obey("SET", int(parameter), value)
 
     def motion(self, verb: str, *args: int) -> Reply:
         self.uno.edges.clear()
@@ -388,9 +388,9 @@ class Host(Driver):
 
     def ready(self) -> Host:
         assert [r.kind for r in self.replies()] == ["banner"]
-        self.obeyed("HELLO")
+        self.must_obey("HELLO")
         self.set(Parameter.HEARTBEAT, 60_000)
-        self.obeyed("ENABLE", 1)
+        self.must_obey("ENABLE", 1)
         self.motion("HOME")
         x, left_motor, right = self.uno.motors
         assert left_motor == right

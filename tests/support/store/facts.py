@@ -17,6 +17,6 @@ def facts_of(scan: Any, kind: str = "") -> list[dict[str, Any]]:
     return [{key: value for key, value in fact.items() if key not in ("count", "previous")} for fact in facts]
 
 
-def typed(fact: dict[str, Any]) -> Any:
+def parse_fact(fact: dict[str, Any]) -> Any:
     """Return a fact as the program reads its line."""
     return parse(encode_line(fact)).facts[0]

@@ -89,7 +89,7 @@ class FaultyDisk:
         if str(path).startswith(self._folder):
             self._durable.setdefault(path, path.read_bytes() if path.exists() else b"")
 
-    def _synced(self, path: Path) -> None:
+    def _sync(self, path: Path) -> None:
         if path.is_dir():
             self._undo = [(folder, back) for folder, back in self._undo if folder != path]
         elif path in self._durable:
@@ -162,19 +162,19 @@ class FaultyDisk:
         return fd
 
     def _pwrite(self, fd: int, data: Any, offset: int) -> int:
-        path = _path_of(fd)
+        path = _descriptor_path(fd)
         self._touch(path)
         self._hit("pwrite", path, lambda: REAL.pwrite(fd, bytes(data)[: len(data) // 2], offset))
         return REAL.pwrite(fd, data, offset)
 
     def _on_file(self, name: str, fd: int, *more: Any) -> Any:
-        self._touch(_path_of(fd))
-        self._hit(name, _path_of(fd))
+        self._touch(_descriptor_path(fd))
+        self._hit(name, _descriptor_path(fd))
         return getattr(REAL, name)(fd, *more)
 
     def _fsync(self, fd: int) -> None:
-        self._hit("fsync", _path_of(fd))
-        self._synced(_path_of(fd))  # not the real one: this machine's disk need not wait
+        self._hit("fsync", _descriptor_path(fd))
+        self._sync(_descriptor_path(fd))  # not the real one: this machine's disk need not wait
 
     def _mkdir(self, path: Any, *more: Any, **named: Any) -> None:
         self._hit("mkdir", Path(path))
@@ -230,6 +230,6 @@ class _SeenFile(io.FileIO):
         return super().truncate(size)
 
 
-def _path_of(fd: int) -> Path:
+def _descriptor_path(fd: int) -> Path:
     """The path that a descriptor is open at."""
     return Path(f"/proc/self/fd/{fd}").readlink()

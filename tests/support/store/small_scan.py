@@ -33,7 +33,7 @@ from polysight_shared.raster import plan_raster
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.scene import SimulatedRig, load_scene, row_offsets_mm
 from tests.support.capture.records import encode_packets
-from tests.support.pipelines import pipeline_of
+from tests.support.pipelines import make_pipeline
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 
@@ -226,7 +226,7 @@ class SmallScan:
         self.acknowledged: set[int] = set()
 
     @contextmanager
-    def _connected(self) -> Iterator[None]:
+    def _connect_pi(self) -> Iterator[None]:
         """Replace the sockets by a Pi that was just started, or one that continues."""
         instrument = self._samples.instrument
         with ExitStack() as stack:
@@ -241,7 +241,7 @@ class SmallScan:
 
     def run(self) -> ScanResult:
         """Start or resume the scan."""
-        with self._connected():
+        with self._connect_pi():
             if self.begun:
                 return resume_scan(self.path, progress=self._on_progress)
             return run_scan(self._samples.instrument, self.path, progress=self._on_progress)
@@ -265,7 +265,7 @@ class SmallScan:
 
     def image(self) -> bytes:
         """The final image's bytes, both channels and their mask."""
-        images = pipeline_of(ScanFolder.load(self.path)).form_images()
+        images = make_pipeline(ScanFolder.load(self.path)).form_images()
         return b"".join(part.tobytes() for part in (images.h, images.v, images.valid))
 
 

@@ -147,7 +147,7 @@ def scan_with(samples, folder: Path, stop: StopRequest, at_row_1) -> SmallScan:
         if progress.phase == "committed" and progress.row == 0:
             at_row_1()
 
-    with scan._connected():
+    with scan._connect_pi():
         host_run.run_scan(samples.instrument, scan.path, stop=stop, progress=answer)
     return scan
 

@@ -56,7 +56,8 @@ def places_run(case, tmp_path_factory):
     folder, target, _, _ = case
     out = tmp_path_factory.mktemp("out") / "c"
     bytes_before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    output = read_output("calibrate", "direct-path", folder, "--target", target, "--out", out)
+    options = ("--target", target, "--out", out)
+    output = read_output("calibrate", "direct-path", folder, *options)
     # The scan is not touched
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == bytes_before
     return output, next(out.iterdir())

@@ -160,7 +160,8 @@ def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):
     board = rig.by_name("RV")
     running_cards = cards(more=(old,))
     address = f"{old.card_address}:{old.command_port}"
-    text = program_card(running_cards, "LS", tmp_path, board.card_address, "RV", "--at", address)
+    options = ("--at", address)
+    text = program_card(running_cards, "LS", tmp_path, board.card_address, "RV", *options)
     for part in ("cannot be read back", NEW_MAC, "switch the card off and on", "FPGA 2.8", f"at {board.card_address}"):
         assert part in text
     assert running_cards.endpoints["LS"].card.network == running_cards.card_network(board)._replace(
@@ -170,10 +171,12 @@ def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):
 
 def test_a_card_that_stays_where_it_was_must_have_been_off(cards, card, rig, tmp_path):
     running_cards = cards("RH", RH=Faults(boot_s=4.0))
-    done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "1")
+    options = ("--mac", NEW_MAC, "--yes", "--wait", "1")
+    done = card("program", "RH", *options)
     assert done.status == 5
     assert "written, but the card was not switched off" in done.err
-    done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "0")
+    options = ("--mac", NEW_MAC, "--yes", "--wait", "0")
+    done = card("program", "RH", *options)
     assert (done.status, "`polysight card` tells" in done.out) == (0, True)
     assert "it answers at" in program_card(running_cards, "RH", tmp_path, rig.by_name("RH").card_address, "RH")
     assert running_cards.endpoints["RH"].card.network.mac.hex(":") == NEW_MAC

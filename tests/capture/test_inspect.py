@@ -226,7 +226,8 @@ def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):
     done = polysight("rig.bin", "--config", RIG_FILE, "--plot", "rig.png")
     assert (done.status, "note" in done.out) == (0, False), done
     assert (tmp_path / "rig.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    document = json.loads(polysight("other.bin", "--samples", "128", "--lanes", "2", "--q-first", "--json").out)
+    options = ("--samples", "128", "--lanes", "2", "--q-first", "--json")
+    document = json.loads(polysight("other.bin", *options).out)
     assert (document["lanes"], document["samples"], document["q_first"], document["remarks"]) == (2, 128, True, [])
     assert polysight("rig.bin", "--plot", "absent/x.png").status == 5
 
@@ -238,7 +239,8 @@ def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
     done = polysight("both")
     assert done.status == 3
     assert "192.168.33.180 and 192.168.33.181" in done.err
-    done = polysight("both", "--card", "192.168.33.181", "--config", RIG_FILE, "--plot", "both.png")
+    options = ("--card", "192.168.33.181", "--config", RIG_FILE, "--plot", "both.png")
+    done = polysight("both", *options)
     assert done.status == 0, done.err
     assert "32 chirps x 4 RX x 256 samples" in done.out
     assert (tmp_path / "both.png").exists()

@@ -14,10 +14,8 @@ from polysight.store.manifest import decode_line
 def test_stopped_while_scanning(bench, scene_file, number):
     """Ctrl-C reaches the process group, SIGTERM the demo alone; both end everything."""
     out = bench.folder / "demo"
-    demo = bench.start(
-        "polysight", "demo", "--config", RIG_FILE, "--scene", scene_file, "--out", out,
-        "--time-scale", "5",
-    )  # fmt: skip
+    options = ("--config", RIG_FILE, "--scene", scene_file, "--out", out, "--time-scale", "5")
+    demo = bench.start("polysight", "demo", *options)
 
     def scanning() -> bool:
         assert demo.process.poll() is None, demo.err
@@ -47,7 +45,8 @@ def test_without_a_compiler(rig_without_compiler):
 
 def test_from_boards_with_an_empty_flash_to_the_report(bench, scene_file):
     """The first day: the host loads the boards' firmware, configures and arms them, scans, and reports."""
-    demo = bench.start("polysight", "demo", "--config", RIG_FILE, "--scene", scene_file, "--out", bench.folder / "demo")
+    options = ("--config", RIG_FILE, "--scene", scene_file, "--out", bench.folder / "demo")
+    demo = bench.start("polysight", "demo", *options)
     ended = demo.wait()
     assert "Traceback" not in ended.err
     scan = bench.folder / "demo" / "scan"

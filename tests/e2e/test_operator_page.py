@@ -35,9 +35,8 @@ class Lab:
 
     def serve(self) -> None:
         """Start the server, with a token of its own."""
-        self.server: Program = self.rig.start(
-            "polysight", "serve", self.scans, "--config", self.rig.config, "--port", "0"
-        )
+        options = ("--config", self.rig.config, "--port", "0")
+        self.server: Program = self.rig.start("polysight", "serve", self.scans, *options)
         self.rig.wait_for(lambda: "token=" in self.server.err, "the server's address")
         shown_address = re.search(r"(http://127\.0\.0\.1:\d+)/#token=(\S+)", self.server.err)
         assert shown_address is not None, self.server.err

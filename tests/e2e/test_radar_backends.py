@@ -33,10 +33,8 @@ def scan_three_rows(bench, radar: dict[str, Any], burst: dict[str, Any]) -> Scan
     for board in table["boards"]:
         board["start_offset_hz"] = 0.0 if board["role"] == "transmit" else 790e3
     (bench.folder / "rig.toml").write_text(tomli_w.dumps(table))
-    rig = bench.start(
-        "python", "-m", "polysight_simulators.rig", "--config", "rig.toml", "--dir", bench.folder / "rig", "--pattern",
-        "--time-scale", "40", "--with-pi",
-    )  # fmt: skip
+    options = ("--config", "rig.toml", "--dir", bench.folder / "rig", "--pattern", "--time-scale", "40", "--with-pi")
+    rig = bench.start("python", "-m", "polysight_simulators.rig", *options)
     result = run_scan(load_instrument(bench.folder / rig.wait_ready()), bench.folder / "scan")
     rig.end()
     assert result.exit_status == "success"

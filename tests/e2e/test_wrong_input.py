@@ -272,7 +272,8 @@ def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
 def test_interrupted_while_simulating(bench):
     """Ctrl-C reaches both programs, and one of them says so."""
     (bench.folder / "scene.toml").write_text(small_scene(350, 200, step_mm=(1.0, 1.0)))
-    simulate = bench.start("polysight", "simulate", "scene.toml", "--config", RIG_FILE, "--out", "s")
+    options = ("--config", RIG_FILE, "--out", "s")
+    simulate = bench.start("polysight", "simulate", "scene.toml", *options)
     bench.wait_for(lambda: (bench.folder / "s" / "manifest.jsonl").exists(), "the first row")
     simulate.interrupt()
     ended = simulate.wait()

@@ -35,11 +35,13 @@ def save_library(folder: Path) -> int:
     return 0
 
 
+BOXES = ("--box", "sheet=-40,-10,-30,10", "--box", "oak=0,0,10,10", "--metal", "sheet")
+EXPORTS = ("--csv", "--mat", "--netcdf")
 COMMANDS = {
-    "label": run("label", "%/one", "--box", "sheet=-40,-10,-30,10", "--box", "oak=0,0,10,10", "--metal", "sheet"),
+    "label": run("label", "%/one", *BOXES),
     "label again": run("label", "%/two", "--box", "sheet=-40,-10,-30,10"),
     "note": run("note", "%/one", "--text", "oak, second board", "--tag", "oak"),
-    "export": run("export", "%/one", "--csv", "--mat", "--netcdf", "--out", "%/one/export"),
+    "export": run("export", "%/one", *EXPORTS, "--out", "%/one/export"),
     "compare": run("compare", "%/one", "%/two", "--png", "%/one/difference.png"),
     "train": save_library,
 }

@@ -35,7 +35,8 @@ def answer(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
 
 
 def test_scans_are_listed_and_found_by_their_notes_and_tags(root, capsys):
-    answer(capsys, "note", root / "one", "--text", "Eiche, zweites Brett", "--tag", "oak", "--tag", "new")
+    options = ("--text", "Eiche, zweites Brett", "--tag", "oak", "--tag", "new")
+    answer(capsys, "note", root / "one", *options)
     assert read_notes(root / "one") == Notes("Eiche, zweites Brett", ("oak", "new"))
     assert "oak" in answer(capsys, "note", root / "one", "--untag", "new")
     assert read_notes(root / "one").tags == ("oak",)

@@ -28,7 +28,8 @@ BOXES = {"Copper plate": (10, 12, 40, 50), "acrylic_3mm": (60, 20, 85, 40), "cer
 
 
 def write_scan(folder, seed=1, name="scan_7", **more):
-    return write_labels(folder, name, BOXES, MATERIALS, 60.0, Errors(0.005, 0.01), seed, **more)
+    errors = Errors(0.005, 0.01)
+    return write_labels(folder, name, BOXES, MATERIALS, angle_deg=60.0, errors=errors, seed=seed, **more)
 
 
 @pytest.mark.parametrize("upside_down", [False, True])

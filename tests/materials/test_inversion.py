@@ -57,7 +57,7 @@ small = st.floats(-0.1, 0.1)
 parts = st.floats(-0.6, 0.6)
 
 
-@given(small, small, small, small, small, small, parts, parts)
+@given(ar=small, ai=small, br=small, bi=small, rr=small, ri=small, tr=parts, ti=parts)
 def test_ratio_there_and_back(ar, ai, br, bi, rr, ri, tr, ti):
     a = complex(ar, ai)
     b = complex(br, bi)

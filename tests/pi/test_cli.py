@@ -69,7 +69,8 @@ def test_an_open_address_needs_keys(command, config, tmp_path, hub, stage):
 
 
 def test_check_names_every_hop(command, config, hub, stage):
-    status, out, _ = command("check", "--config", config, "--wires", hub, "--stage-port", stage.port, "--json")
+    options = ("--config", config, "--wires", hub, "--stage-port", stage.port, "--json")
+    status, out, _ = command("check", *options)
     findings = {f["name"]: f for f in json.loads(out)}
     assert status == 0, findings
     assert {"plan", "simulated wires", "stage", "journal", "command address"} <= set(findings)
@@ -79,7 +80,8 @@ def test_check_names_every_hop(command, config, hub, stage):
 
 def test_commands_without_the_service(command, instrument, write_config, hub, stage):
     config = write_config(at_stage_port(on_free_subnet(instrument), stage.port))
-    status, out, _ = command("pulse", "--config", config, "--wires", hub, "--count", 3, "--json")
+    options = ("--config", config, "--wires", hub, "--count", 3, "--json")
+    status, out, _ = command("pulse", *options)
     assert (status, [r["pulses"] for r in json.loads(out)]) == (0, [4, 4, 4])
     # Before the first homing, which `jog` needs
     for axis in "xy":

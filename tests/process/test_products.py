@@ -111,7 +111,8 @@ def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path
     scan_folder = tmp_path / "scan"
     shutil.copytree(scan, scan_folder)
     shutil.rmtree(scan_folder / "raw")  # the samples are enough
-    read_output("image", scan_folder, "--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
+    options = ("--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
+    read_output("image", scan_folder, *options)
     products = read_products(tmp_path / "out")
     assert products.h.shape == (30, 60)
     np.testing.assert_allclose(np.diff(products.x_m), 2.5e-3)

@@ -34,7 +34,8 @@ def test_scans_and_their_scenes_give_the_same_library(scan_of, rig_file, tmp_pat
     (tmp_path / "scenes" / "second.toml").write_bytes(tomli_w.dumps(scene("second")).encode())
     scan = scan_of(tmp_path / "first", scene("first"))
     out = tmp_path / "library.npz"
-    output = read_output("train", scan, "--simulate", tmp_path / "scenes", "--config", rig_file, "--out", out)
+    options = ("--simulate", tmp_path / "scenes", "--config", rig_file, "--out", out)
+    output = read_output("train", scan, *options)
     assert "6 patches of 3 materials from 2 scans" in output
     library = Library.load(out)
     assert (library.names, library.scans) == (NAMES, ("first", "second"))

@@ -102,7 +102,7 @@ def test_new_connection_settings_hold_from_then_on(undisturbed_scan, tmp_path):
     scan = ScanFolder.load(small.path)
     begun = scan.instrument
     now = move_rig(scan.instrument)
-    with small._connected():
+    with small._connect_pi():
         assert resume_scan(small.path, rig_now=now).folder.instrument == now
         assert resume_scan(small.path).folder.instrument == now
     scan = ScanFolder.load(small.path)

@@ -33,10 +33,17 @@ class Rig(Bench):
         """Start the simulators and the Pi."""
         folder = self.folder
         (folder / "scene.toml").write_text(self._scene)
-        self.simulators = self.start(
-            "python", "-m", "polysight_simulators.rig", "--config", RIG_FILE, "--scene", folder / "scene.toml",
-            "--dir", folder / "rig", "--time-scale", str(self._time_scale), env=self._env,
-        )  # fmt: skip
+        options = (
+            "--config",
+            RIG_FILE,
+            "--scene",
+            folder / "scene.toml",
+            "--dir",
+            folder / "rig",
+            "--time-scale",
+            str(self._time_scale),
+        )
+        self.simulators = self.start("python", "-m", "polysight_simulators.rig", *options, env=self._env)
         base = Path(self.simulators.wait_ready())
         table = to_builtins(load_instrument(base))
         table["limits"] |= {"command_timeout_s": 1.5, "end_of_record_s": 1.0}

@@ -84,9 +84,8 @@ def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     """Home, run the row, end the Pi's program; return its events."""
     rig = load_instrument(config)
     python = [sys.executable, "-m"]
-    uno = start(
-        *python, "polysight_simulators.uno", "--config", str(config), "--wires", str(WIRES), "--link", str(PORT)
-    )
+    options = ("--config", str(config), "--wires", str(WIRES), "--link", str(PORT))
+    uno = start(*python, "polysight_simulators.uno", *options)
     pi = start(*python, "polysight_pi", "run", "--config", str(config), "--stage-port", str(PORT))
     host = HostSide(rig.pi.command_address, rig.pi.event_address, rig)
     host.must_accept(host.begin())

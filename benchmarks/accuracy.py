@@ -15,7 +15,7 @@ import numpy as np
 import scipy.signal
 from numpy.typing import NDArray
 
-from benchmarks.data import as_synced, point_row, published
+from benchmarks.data import as_synced, point_row, published_scene
 from benchmarks.measure import Line, add_arguments, one_core, show, write
 from benchmarks.published import Synchroniser
 from polysight.capture.dca1000 import raw_words
@@ -124,12 +124,12 @@ def at_bins(rig: Instrument, board: Board, bins: float) -> Instrument:
     """The rig with its object plane where the mirror point's echo is so many bins of the linear samples away."""
     samples = rig.chirp.linear_samples[1] - rig.chirp.linear_samples[0]
 
-    def moved(z_mm: float) -> Instrument:
+    def move_plane(z_mm: float) -> Instrument:
         geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=z_mm)
         return msgspec.structs.replace(rig, geometry=geometry)
 
-    def bins_at(z_mm: float) -> float:
-        moved_rig = moved(z_mm)
+    def path_bins(z_mm: float) -> float:
+        moved_rig = move_plane(z_mm)
         tx = np.array(tx_position_m(moved_rig))
         rx = np.array(rx_positions_m(moved_rig, board)[0])
         point = np.array(specular_midpoint_m(moved_rig, board))
@@ -137,7 +137,7 @@ def at_bins(rig: Instrument, board: Board, bins: float) -> Instrument:
         return float(excess * rig.chirp.hz_per_sample * samples / SPEED_OF_LIGHT_M_S)
 
     planes = np.linspace(100.0, 1500.0, 1401)
-    return moved(float(np.interp(bins, [bins_at(z) for z in planes], planes)))
+    return move_plane(float(np.interp(bins, [path_bins(z) for z in planes], planes)))
 
 
 def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials: int = 3000) -> tuple[float, float]:
@@ -148,10 +148,12 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
     """
     rng = np.random.default_rng([SEED, 2, round(10 * snr_db), round(100 * bins)])
     rig = at_bins(rig, board, bins)
-    chirp, (a, b) = rig.chirp, rig.chirp.linear_samples
+    chirp = rig.chirp
+    a, b = chirp.linear_samples
     direct, echo = _paths(rig, board)
     n = np.arange(chirp.samples) - (a + b - 1) / 2
-    frequency, phase, between = rng.uniform(0.2, 0.6, trials), *rng.uniform(-np.pi, np.pi, (2, trials))
+    frequency = rng.uniform(0.2, 0.6, trials)
+    phase, between = rng.uniform(-np.pi, np.pi, (2, trials))
     turn = np.exp(1j * (2 * np.pi * frequency[:, None] * n + phase[:, None]))
     signal = (direct + np.exp(1j * between)[:, None, None] * echo) * turn[:, None]
     received = (signal + _noise(rng, signal.shape, snr_db)).astype(np.complex64)
@@ -218,7 +220,7 @@ def image_error(rig: Instrument, board: Board) -> float:
     chosen[0] = np.abs(image).argmax()
     weights = builder.boards[board.name].weights
     taper = np.concatenate([weights[r.index, :: r.direction][used[r.index]] for r in plan])
-    true = _matched(
+    true = _match_filter(
         rig=rig,
         board=board,
         samples=np.concatenate(samples, axis=1).astype(complex) / builder.rx_calibration(board.name)[:, None, None],
@@ -230,7 +232,7 @@ def image_error(rig: Instrument, board: Board) -> float:
     return float(np.abs(image.ravel()[chosen] - true).max() / np.abs(image).max())
 
 
-def _matched(
+def _match_filter(
     rig: Instrument,
     board: Board,
     samples: NDArray[np.complex128],
@@ -240,7 +242,8 @@ def _matched(
     builder: ImageBuilder,
 ) -> NDArray[np.complex128]:
     """Sum over RX, positions and all linear samples, normalised as the imager does, complex128 [voxel]."""
-    chirp, (a, b) = rig.chirp, rig.chirp.linear_samples
+    chirp = rig.chirp
+    a, b = chirp.linear_samples
     all_antennas = tuple(Antennas.from_rig(rig, receiver) for receiver in rig.receivers)
     gate = reduction(chirp, scene_gate_m(all_antennas, plan_raster(rig.grid), builder.grid))
     antennas = Antennas.from_rig(rig, board)
@@ -268,7 +271,7 @@ TWO_TONE_SNR_DB = 16.0
 
 
 def run(args: argparse.Namespace) -> int:
-    rig, _ = published(args.quick)
+    rig, _ = published_scene(args.quick)
     few = 20 if args.quick else 1
     with one_core():
         aligned = [alignment(rig, snr, positions=240 // few) for snr in ALIGN_SNR_DB]

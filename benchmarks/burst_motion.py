@@ -46,17 +46,17 @@ def images(
     radar = SimulatedRig(rig, scene)
     board = rig.receivers[0]
     setup = BoardSetup.from_rig(rig, board, compensate_filter=False)
-    kept = {name: ImageBuilder(rig).boards[board.name] for name in TREATMENTS}
+    boards = {name: ImageBuilder(rig).boards[board.name] for name in TREATMENTS}
     travel_m = mean_burst_travel_mm(rig.burst, rig.stage) / 1e3
     for row in plan_raster(rig.grid):
         x, y = row_offsets_mm(radar, row)
         words = radar.chirps(board.name, x, y, row.index * len(x)).reshape(len(x), rig.chirp.samples, 2, -1)
         synced = synchronise_row(words, np.ones(len(x), bool), setup)
         at_triggers = row_offsets_m(rig, row) - [row.direction * travel_m, 0.0]
-        kept["undone"].add_row(row.index, synced)
-        kept["mean"].add_row(row.index, replace(synced, turn=None))
-        kept["ignored"].add_row(row.index, replace(synced, turn=None), at_triggers)
-    return {name: samples.image()[0] for name, samples in kept.items()}
+        boards["undone"].add_row(row.index, synced)
+        boards["mean"].add_row(row.index, replace(synced, turn=None))
+        boards["ignored"].add_row(row.index, replace(synced, turn=None), at_triggers)
+    return {name: samples.image()[0] for name, samples in boards.items()}
 
 
 def errors(speed_mm_s: float, amplitude: float, grid: dict[str, float] = GRID) -> dict[str, float]:

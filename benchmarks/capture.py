@@ -44,7 +44,8 @@ class Cards:
         self.blocks = [make_block(rig, k) for k in range(len(self.boards))]
         self.senders: list[Child] = []
         for k, b in enumerate(self.boards):
-            child = Child("benchmarks.capture_helpers", "send", config, k, b.card_address, b.host_address, b.data_port)
+            addresses = (b.card_address, b.host_address, b.data_port)
+            child = Child("benchmarks.capture_helpers", "send", config, k, *addresses)
             stack.callback(child.close)
             self.senders.append(child)
         for sender in self.senders:
@@ -62,13 +63,13 @@ class Cards:
     def queues(self) -> list[int]:
         """Bytes of kernel memory that wait at each board's port."""
         ports = [b.data_port for b in self.boards]
-        found = [0] * len(ports)
+        byte_counts = [0] * len(ports)
         for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]:
             words = line.split()
             port = int(words[1].split(":")[1], 16)
             if port in ports:
-                found[ports.index(port)] = int(words[4].split(":")[1], 16)
-        return found
+                byte_counts[ports.index(port)] = int(words[4].split(":")[1], 16)
+        return byte_counts
 
 
 def replace_addresses(board: Board, card: str, host: str) -> Board:
@@ -150,7 +151,7 @@ class Receivers:
         rows = -(-in_all // ROW_BLOCKS)
         blocks = round(in_all / rows)
         packets = blocks * PACKETS
-        before = ask(beside)
+        state_before = ask(beside)
         cpu = [cpu_s(r.pid) for r in self._receivers]
         trial = Trial(
             wanted=rate,
@@ -185,24 +186,24 @@ class Receivers:
                 trial.packets += packets
                 trial.lost += packets - capture.packets
                 trial.kernel_drops += capture.kernel_drops
-                trial.exact &= capture.missing_bytes > 0 or capture.crc32 == self._expected(k, blocks)
+                trial.exact &= capture.missing_bytes > 0 or capture.crc32 == self._expected_checksum(k, blocks)
             for r in self._receivers:
                 path = cards.folder / r.board.name / f"{self._row:04d}.part"
                 path.unlink() if self._row else path.rename(cards.folder / f"{r.board.name}.bin")
             self._row += 1
         wall = time.perf_counter() - began
-        after = ask(beside)
+        state_after = ask(beside)
         trial.rate = trial.packets / trial.seconds
         # All CPU, the ends of rows included, over the time of sending: it belongs to these packets.
         trial.cpu = [(cpu_s(r.pid) - c) / trial.seconds for r, c in zip(self._receivers, cpu, strict=True)]
-        trial.rows_beside = (after["rows"] - before["rows"]) / wall
+        trial.rows_beside = (state_after["rows"] - state_before["rows"]) / wall
         trial.load = os.getloadavg()[0]
         return trial
 
     def _watch(self, trial: Trial, seconds: float) -> None:
         limit = time.perf_counter() + seconds
-        while (left := limit - time.perf_counter()) > 0:
-            time.sleep(min(0.05, left))
+        while (seconds_left := limit - time.perf_counter()) > 0:
+            time.sleep(min(0.05, seconds_left))
             trial.queue = max(trial.queue, max(self._cards.queues()) / (2 * self._cards.buffer_bytes))
 
     def _drain(self) -> None:
@@ -211,12 +212,12 @@ class Receivers:
         while any(self._cards.queues()) and time.perf_counter() < limit:
             time.sleep(0.01)
 
-    def _expected(self, board: int, blocks: int) -> int:
+    def _expected_checksum(self, board: int, blocks: int) -> int:
         """CRC-32 of so many blocks."""
-        known = self._crc.setdefault(board, [0])
-        while len(known) <= blocks:
-            known.append(zlib.crc32(self._cards.blocks[board], known[-1]))
-        return known[blocks]
+        checksums = self._crc.setdefault(board, [0])
+        while len(checksums) <= blocks:
+            checksums.append(zlib.crc32(self._cards.blocks[board], checksums[-1]))
+        return checksums[blocks]
 
 
 class PlainLoops:
@@ -234,7 +235,7 @@ class PlainLoops:
 
     def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
         packets = max(1, round(rate / len(self._loops) * seconds / PACKETS)) * PACKETS
-        before = ask(beside)
+        state_before = ask(beside)
         began = time.perf_counter()
         for loop in self._loops:
             loop.say(packets)
@@ -254,7 +255,7 @@ class PlainLoops:
             cpu=[a["cpu_s"] / took for a in answers],
             queue=0.0,
             turn_s=0.0,
-            rows_beside=(ask(beside)["rows"] - before["rows"]) / wall,
+            rows_beside=(ask(beside)["rows"] - state_before["rows"]) / wall,
             load=os.getloadavg()[0],
         )
 
@@ -284,20 +285,24 @@ def run(args: argparse.Namespace) -> int:
             show(HEAD)
             # Also makes the row that is processed beside.
             show(sink.try_rate(20_000, 2.0, None).line())
-            beside = None if args.alone else processing_beside(cards, stack)
-            held = sink.try_rate(args.rate, args.seconds, beside)
-            show(held.line())
+            beside = None
+            if not args.alone:
+                beside = processing_beside(cards, stack)
+            fastest_trial = sink.try_rate(args.rate, args.seconds, beside)
+            show(fastest_trial.line())
         if not args.no_compare:
             with ExitStack() as theirs:
                 show("plain recv_into loops that only count:")
                 plain = PlainLoops(cards, theirs).try_rate(args.rate, min(args.seconds, 3.0), beside)
                 show(plain.line())
-            ours_cpu, plain_cpu = (sum(trial.cpu) / trial.rate * 1e6 for trial in (held, plain))
+            ours_cpu, plain_cpu = (sum(trial.cpu) / trial.rate * 1e6 for trial in (fastest_trial, plain))
             show(
                 f"at {args.rate:.0f} packets/s: {ours_cpu:.1f} us of CPU a packet, plain loop {plain_cpu:.1f} us and"
                 f" {plain.lost} of {plain.packets} lost: ratio {plain_cpu / ours_cpu:.2f}"
             )
-    return 0 if held.good else 1
+    if fastest_trial.good:
+        return 0
+    return 1
 
 
 def processing_beside(cards: Cards, stack: ExitStack) -> Child:

@@ -107,10 +107,10 @@ class Sender:
             began = max(began, time.perf_counter() - sent / rate - BEHIND_S)
             due = min(total, int((time.perf_counter() - began) * rate) + 1)
             while sent < due:
-                at = self._next % PACKETS
-                if at == 0:
+                position = self._next % PACKETS
+                if position == 0:
                     number(self._packets, self._next)
-                n = self._call(at, min(due - sent, PACKETS - at))
+                n = self._call(position, min(due - sent, PACKETS - position))
                 sent = sent + n
                 self._next = self._next + n
             ahead = began + (sent / rate) - time.perf_counter()

@@ -126,7 +126,9 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
     """Draw a scene of six plates, or another of `KINDS`, with every nuisance at random."""
     rng = np.random.default_rng([20261122, seed, KINDS.index(kind)])
     leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
-    materials = KNOWN if kind == "named" else MATERIALS
+    materials = MATERIALS
+    if kind == "named":
+        materials = KNOWN
     names = rng.choice(list(materials), len(PLACES), replace=False).tolist()
     if kind == "no metal" or (kind in WHOLE and rng.random() < 0.25):
         metal = None
@@ -144,7 +146,9 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
         plates.append({**place, **relief, **material})
     if kind == "no metal":
         plates = plates[: int(rng.integers(1, len(PLACES) + 1))]
-    measured = 0.003 if rng.random() < 0.5 else None
+    measured = None
+    if rng.random() < 0.5:
+        measured = 0.003
     if kind == "sheet":
         sheet = int(rng.choice([i for i in range(len(plates)) if i != metal]))
         plates[sheet] |= {"thickness_mm": rng.uniform(0.5, 5)}
@@ -175,41 +179,43 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
     plates = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
     alone = msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0, plane_tilt_deg=(0.0, 0.0))
-    pipeline = _imaged(Cubes(rig, alone))
+    pipeline = _image_scan(Cubes(rig, alone))
     images = pipeline.form_images()
     reference = plane_reference(images.level(images.valid))
     return replace(reference, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 
-def _imaged(source: Any, model: str | None = "none", inputs: Inputs = NO_INPUTS) -> Pipeline:
+def _image_scan(source: Any, model: str | None = "none", inputs: Inputs = NO_INPUTS) -> Pipeline:
     pipeline = Pipeline(source, Settings(model=model), inputs)
     for row in source.rows():
         pipeline.add_row(row)
     return pipeline
 
 
-def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Instrument, Findings, PlaneEstimate]:
+def judge_scan(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Instrument, Findings, PlaneEstimate]:
     """One scene, drawn, simulated and judged."""
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     scene = draw_scene(seed, kind)
-    model = None if kind == "named" else "none"
+    model = "none"
+    if kind == "named":
+        model = None
     inputs = NO_INPUTS
     if kind in WHOLE and not any(p.metal for p in scene.plates):
         inputs = Inputs(reference=metal_scan(rig, scene))
     if raw or kind in ("no direct path", "noise"):
         with tempfile.TemporaryDirectory(prefix="polysight-coverage-") as folder:
             simulate(rig, scene, Path(folder) / "scan")
-            pipeline = _imaged(open_source(Path(folder) / "scan", None), model, inputs)
+            pipeline = _image_scan(open_source(Path(folder) / "scan", None), model, inputs)
             findings = pipeline.examine(pipeline.form_images())
     else:
-        pipeline = _imaged(Cubes(rig, scene), model, inputs)
+        pipeline = _image_scan(Cubes(rig, scene), model, inputs)
         findings = pipeline.examine(pipeline.form_images())
     return scene, apply_scene(rig, scene), findings, pipeline.plane
 
 
 def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigures]:
     """Judged patches of one scene: the sample from which coverage is counted."""
-    scene, rig, findings, _ = judged(seed, kind, raw)
+    scene, rig, findings, _ = judge_scan(seed, kind, raw)
     plates = truth_plates(truth(rig, scene, scene.seed))
     result = findings.analysis
     true = match_truth([r.patch for r in result.patches], plates)
@@ -268,7 +274,7 @@ def _one(job: tuple[int, str, bool]) -> list[PatchFigures]:
 
 def _names(seed: int) -> list[tuple[float, bool]]:
     """Probability beside each name of one scene, and whether the name is right."""
-    scene, rig, findings, _ = judged(seed, "named")
+    scene, rig, findings, _ = judge_scan(seed, "named")
     plates = truth_plates(truth(rig, scene, scene.seed))
     result = findings.analysis
     true = match_truth([r.patch for r in result.patches], plates)
@@ -291,12 +297,14 @@ def _reliability(pairs: list[tuple[float, bool]]) -> list[dict[str, float]]:
     return out
 
 
-def _without(job: tuple[int, str]) -> tuple[str, int, str, int, str]:
+def _judge_without_result(job: tuple[int, str]) -> tuple[str, int, str, int, str]:
     seed, kind = job
-    _, _, findings, _ = judged(seed, kind)
+    _, _, findings, _ = judge_scan(seed, kind)
     rows = findings.analysis.rows()
     said = sum(r.name is not None or r.permittivity is not None for r in rows)
-    reason = findings.verdict.reasons[0].what if findings.verdict.reasons else ""
+    reason = ""
+    if findings.verdict.reasons:
+        reason = findings.verdict.reasons[0].what
     return kind, seed, findings.verdict.level, said, reason
 
 
@@ -324,7 +332,7 @@ def run(args: argparse.Namespace) -> int:
             for r in result
         ]
         kinds = [(args.first + i, KINDS[1 + i % 4]) for i in range(args.without)]
-        without = list(pool.map(_without, kinds))
+        without = list(pool.map(_judge_without_result, kinds))
         named = [pair for result in pool.map(_names, range(args.first, args.first + args.named)) for pair in result]
     rows = [r for result in results[: args.scenes] for r in result]
     raw = [r for result in results[args.scenes :] for r in result]

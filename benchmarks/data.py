@@ -37,7 +37,7 @@ DISTINCT = 4
 QUICK = {"columns": 40, "rows": 20}
 
 
-def published(quick: bool = False, **grid: Any) -> tuple[Instrument, Scene]:
+def published_scene(quick: bool = False, **grid: Any) -> tuple[Instrument, Scene]:
     """The published rig and grid in front of nine plates; changed, or too small for its figures to mean anything."""
     image = {"columns": 30, "rows": 30} if quick else {}
     scene = msgspec.structs.replace(load_scene(SCENE), grid={**(QUICK if quick else {}), **grid}, image=image)
@@ -106,22 +106,24 @@ class RepeatedRows:
     def read_row(self, board_name: str, row: int) -> RowData:
         files = self.files[board_name]
         frames = self.plan.columns * self.instrument.burst.pulses
-        return RowData(partial(_repeated, files[row % len(files)], frames * self.instrument.frame_bytes), [], frames)
+        return RowData(
+            partial(_read_repeatedly, files[row % len(files)], frames * self.instrument.frame_bytes), [], frames
+        )
 
 
-def _repeated(path: Path, wanted: int, size: int) -> Iterator[NDArray[np.uint8]]:
+def _read_repeatedly(path: Path, wanted_bytes: int, size: int) -> Iterator[NDArray[np.uint8]]:
     """Read pieces of a file, from its start again where it ends, `wanted` bytes in all."""
-    memory = allocate_pages(min(size, wanted) or wanted)
+    memory = np.empty(min(size, wanted_bytes) or wanted_bytes, np.uint8)
     with path.open("rb") as file:
-        while wanted:
-            piece = memory[:wanted]
+        while wanted_bytes:
+            piece = memory[:wanted_bytes]
             filled = 0
             while filled < piece.size:
                 filled += file.readinto(piece[filled:].data)
                 if filled < piece.size:
                     file.seek(0)
             yield piece
-            wanted -= piece.size
+            wanted_bytes -= piece.size
 
 
 def point_row(
@@ -169,7 +171,10 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
 
 def as_synced(rig: Instrument, samples: NDArray[np.complex64], valid: NDArray[np.bool_] | None = None) -> SyncedRow:
     """The part of a synchronised row that the imagers read: samples [rx, position, sample] and valid [position]."""
-    valid = np.ones(samples.shape[1], bool) if valid is None else valid
+    if valid is None:
+        valid = np.ones(samples.shape[1], bool)
+    else:
+        valid = valid
     return cast(
         SyncedRow, SimpleNamespace(samples=samples, sweep_hz=sample_frequencies_hz(rig.chirp), valid=valid, turn=None)
     )

@@ -113,27 +113,30 @@ def judge_scene(kind: str, seed: int, nuisance: str = "none") -> list[Piece]:
     rig = published_rig()
     world = draw_scene(rng, kind, 9 * seed)
     pair = simulate(world, draw_nuisances(rng, nuisance), rig)
-    found, plates = analyse_world(pair, classifier=table_2_classifier(float(np.radians(pair.incidence_deg))))
+    analysis, plates = analyse_world(pair, classifier=table_2_classifier(float(np.radians(pair.incidence_deg))))
     out = []
-    for patch in found.patches:
+    for patch in analysis.patches:
         stack = plates[patch.patch.label].stack
         if stack.is_metal:
             continue
         name = patch.verdict
         e = patch.permittivity
-        true = stack.layers[0][0] if stack.layers else stack.below
+        if stack.layers:
+            true = stack.layers[0][0]
+        else:
+            true = stack.below
         misled = False
         if patch.refused is None and e.value is not None and e.covariance is not None:
-            off = np.array([(e.value - true).real, (e.value - true).imag])
+            deviation = np.array([(e.value - true).real, (e.value - true).imag])
             width = 1.96 * float(np.sqrt(np.trace(e.covariance) / 2)) / abs(e.value)
-            misled = float(off @ np.linalg.solve(e.covariance, off)) > CHI2_99 and width < NARROW
+            misled = float(deviation @ np.linalg.solve(e.covariance, deviation)) > CHI2_99 and width < NARROW
         thin = patch.refused is not None and patch.refused.what == "possible layer"
         if name is None:
             said = ("not judged", None, 0.0)
         else:
             said = (name.name, name.source, name.confidence)
-        alike = name is not None and any(_alike(other, true) for other in name.literature)
-        out.append(Piece(plates[patch.patch.label].name, *said, alike, thin, misled))
+        agrees = name is not None and any(_is_alike(literature_name, true) for literature_name in name.literature)
+        out.append(Piece(plates[patch.patch.label].name, *said, agrees, thin, misled))
     return out
 
 
@@ -143,7 +146,7 @@ def _piece(rng: np.random.Generator, permittivity: complex) -> complex:
     )
 
 
-def _alike(name: str, true: complex) -> bool:
+def _is_alike(name: str, true: complex) -> bool:
     material = find_material(name)
     return material is not None and abs(material.permittivity - true) < ALIKE * abs(true)
 
@@ -152,7 +155,7 @@ def _judge(job: tuple[str, int, str]) -> list[Piece]:
     return judge_scene(*job)
 
 
-def line_of(title: str, pieces: Sequence[Piece]) -> str:
+def format_line(title: str, pieces: Sequence[Piece]) -> str:
     """Return one line of the table."""
     library = [p.confidence for p in pieces if p.source == "library"]
     literature = [p.alike for p in pieces if p.source == "literature" and p.confidence >= 0.5]
@@ -181,7 +184,7 @@ def run(args: argparse.Namespace) -> int:
         for nuisance in args.nuisances.split(","):
             for kind in KINDS:
                 pieces = [p for scene in pool.map(_judge, [(kind, seed, nuisance) for seed in seeds]) for p in scene]
-                print(line_of(f"{kind}, {nuisance}", pieces), flush=True)
+                print(format_line(f"{kind}, {nuisance}", pieces), flush=True)
                 for p in pieces:
                     if (p.source == "library" and p.confidence >= 0.8) or p.misled:
                         print(f"  {p.material}: {p.name} {p.confidence:.2f}{', value misled' if p.misled else ''}")

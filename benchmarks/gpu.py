@@ -21,7 +21,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.data import published, temporary, write_point_cube
+from benchmarks.data import published_scene, temporary, write_point_cube
 from benchmarks.image import Image, worst
 from benchmarks.measure import add_arguments as add_common
 from benchmarks.measure import one_core, write
@@ -62,7 +62,10 @@ class Library:
 
     def to_numpy(self, array: Any) -> NDArray[np.complexfloating]:
         """Copy an array to host memory."""
-        array = array.cpu() if hasattr(array, "cpu") else array
+        if hasattr(array, "cpu"):
+            array = array.cpu()
+        else:
+            array = array
         return np.asarray(array.get() if hasattr(array, "get") else array)
 
 
@@ -166,7 +169,7 @@ def run(args: argparse.Namespace) -> int:
     if not usable:
         print("\nno GPU with PyTorch or CuPy and array-api-compat here: imaging on a GPU is not measured")
         return 0
-    rig, _ = published(args.quick)
+    rig, _ = published_scene(args.quick)
     board = rig.receivers[0]
     rounds = 1 if args.quick else ROUNDS
     figures: dict[str, Any] = {}
@@ -233,7 +236,8 @@ class Figures:
     @classmethod
     def of_library(cls, chain: Chain, samples: NDArray[np.complex64], library: Library, rounds: int) -> Figures:
         """Measure a library on its GPU."""
-        xp, device = library.xp, library.device
+        xp = library.xp
+        device = library.device
 
         def put() -> Any:
             return xp.asarray(samples, device=device)
@@ -322,8 +326,11 @@ def measure_authors(checkout: Path, rig: Instrument, board: Board, folder: Path,
             answer[str(bins)] = {"error": program.stderr[-400:]}
             continue
         seconds = json.loads(program.stdout.splitlines()[-1])
-        other = np.load(theirs)
-        likeness = max(_likeness(turned, image) for turned in (other, other[::-1], other[:, ::-1], other[::-1, ::-1]))
+        authors_images = np.load(theirs)
+        likeness = max(
+            _likeness(turned, image)
+            for turned in (authors_images, authors_images[::-1], authors_images[:, ::-1], authors_images[::-1, ::-1])
+        )
         answer[str(bins)] = {"seconds": seconds, "likeness": likeness}
         print(
             f"authors' code, range spectra of {bins} points: first {seconds[0]:.2f} s, then"
@@ -336,5 +343,6 @@ def _likeness(one: Image, other: Image) -> float:
     """Normalised correlation of two images' magnitudes, 1 if equal but for a factor."""
     if one.shape != other.shape:
         return 0.0
-    a, b = np.abs(one), np.abs(other)
+    a = np.abs(one)
+    b = np.abs(other)
     return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum()))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.data import as_synced, published, temporary, write_point_cube
+from benchmarks.data import as_synced, published_scene, temporary, write_point_cube
 from benchmarks.measure import Line, Seconds, add_arguments, one_core, show, write
 from benchmarks.published import SETTINGS, form_image
 from polysight.imaging import ImageBuilder
@@ -59,7 +59,7 @@ class Bench:
                     file.readinto(met[r].data)
                 yield row, met[:, :: 1 - 2 * (row % 2)]
 
-    def reduced(self, window: str) -> tuple[Aperture, NDArray[np.complex64]]:
+    def reduce_cube(self, window: str) -> tuple[Aperture, NDArray[np.complex64]]:
         """The cube through the range gate alone, complex64 [rx, frequency, row, column], and its aperture."""
         plan = plan_raster(self.rig.grid)
         grid = image_grid(self.rig)
@@ -86,7 +86,7 @@ def in_turn(jobs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Second
     took = {name: Seconds() for name in jobs}
     for _ in range(rounds):
         for name, job in jobs.items():
-            with took[name].timed():
+            with took[name].time_block():
                 job()
     return took
 
@@ -112,12 +112,12 @@ def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, 
         "published, tuned": lambda: bench.theirs(tuned=True),
     }
     took = in_turn(jobs, min(rounds, ROUNDS))
-    aperture, samples = bench.reduced("boxcar")
+    aperture, samples = bench.reduce_cube("boxcar")
     exact = choose_imager(aperture)[0].image(samples)
     settings: dict[int, dict[str, float]] = {}
     for points in SETTINGS:
         once = Seconds()
-        with once.timed():
+        with once.time_block():
             image = bench.theirs(points)
         settings[points] = {"cpu_s": once.cpu[0], "rms_error": rms(image, exact)}
     theirs = took["published"].median
@@ -149,7 +149,7 @@ def against_time_domain(bench: Bench, rounds: int) -> tuple[list[Line], dict[str
         return [], {}
     from benchmarks import time_domain
 
-    aperture, samples = bench.reduced("hann")
+    aperture, samples = bench.reduce_cube("hann")
     ours_s: list[float] = []
     theirs_s: list[float] = []
     image: Image = np.empty(0, np.complex64)
@@ -176,7 +176,7 @@ def against_time_domain(bench: Bench, rounds: int) -> tuple[list[Line], dict[str
 
 def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
     """Row by row, with the footprint that both image along."""
-    aperture, samples = bench.reduced("hann")
+    aperture, samples = bench.reduce_cube("hann")
     weights = np.ones(samples.shape[2:], np.float32)
     mirror = np.ones(samples.shape[:2], np.complex64)
     starts = row_starts_m(aperture.offsets_m)
@@ -189,14 +189,14 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
         imager.constant_of_sum()
         kept["rows"] = imager.image_of_sum(np.ones(len(samples)))
 
-    def at_once() -> None:
+    def image_batch() -> None:
         imager, _ = choose_imager(aperture)
         imager.constant(mirror, weights)
         kept["batch"] = imager.image(samples * weights)
 
     jobs = {
         "rows": by_row,
-        "batch": at_once,
+        "batch": image_batch,
         "rows from disk": lambda: kept.update(live=bench.ours(live=True)),
         "batch from disk": lambda: kept.update(whole=bench.ours()),
     }
@@ -204,13 +204,13 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
         job()
     took = in_turn(jobs, rounds)
     lines = []
-    for where, rows, batch, limits in (
+    for placement, rows, batch, limits in (
         ("the cube on disk", "rows from disk", "batch from disk", (5.0, 3.0)),
         ("reduced samples", "rows", "batch", (None, None)),  # without the steps both share: for information
     ):
         ours = took[rows].median
         theirs = took[batch].median
-        name = f"all row updates in batch images, both from {where}"
+        name = f"all row updates in batch images, both from {placement}"
         note = f"{1e3 * ours / len(starts):.2f} ms a row"
         lines.append(Line(name, f"{ours:.3f} s", f"{theirs:.3f} s", ours / theirs, *limits, False, note))
     difference = max(worst(kept["rows"], kept["batch"]), worst(kept["live"], kept["whole"]))
@@ -229,7 +229,7 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
 
 
 def run(args: argparse.Namespace) -> int:
-    rig, _ = published(args.quick)
+    rig, _ = published_scene(args.quick)
     lines: list[Line] = []
     more: dict[str, Any] = {}
     with temporary(args.folder) as folder, one_core():
@@ -237,8 +237,8 @@ def run(args: argparse.Namespace) -> int:
         write_point_cube(path, rig, rig.receivers[0])
         bench = Bench(rig, rig.receivers[0], path)
         for part in (against_published, against_time_domain, against_batch):
-            found, figures = part(bench, 1 if args.quick else REPEATS)
-            lines += found
+            line, figures = part(bench, 1 if args.quick else REPEATS)
+            lines += line
             more[part.__name__] = figures
     show(f"imaging of one board, {rig.grid.rows} x {rig.grid.columns} positions, one core", lines, args.quick)
     write(args.json, "image", lines, **more)

@@ -129,7 +129,7 @@ def draw_scene(seed: int) -> Scene:
     )
 
 
-def _imaged(rig: Instrument, scene: Scene) -> Pipeline:
+def _image_scan(rig: Instrument, scene: Scene) -> Pipeline:
     source = Cubes(rig, scene)
     pipeline = Pipeline(source, Settings(model="none", bands=BANDS))
     for row in source.rows():
@@ -141,14 +141,16 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     """A metal plate over the plane, scanned by the same rig, on the rig file's plane, in the same sub-bands."""
     plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
     plates = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
-    pipeline = _imaged(rig, msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0))
+    pipeline = _image_scan(rig, msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0))
     parts = tuple(make_plane_reference(pipeline, part) for part in pipeline.sub_bands.finish(pipeline.source.mirrored))
     return replace(make_plane_reference(pipeline, pipeline.form_images()), bands=parts)
 
 
-def rows_of(seed: int, rig: Instrument, scene: Scene, metal: PlaneReference) -> tuple[dict[str, PatchFigures], float]:
+def process_scene(
+    seed: int, rig: Instrument, scene: Scene, metal: PlaneReference
+) -> tuple[dict[str, PatchFigures], float]:
     """One scene, simulated and processed: a row of materials.json for each plate found; the angle's deviation, rad."""
-    pipeline = _imaged(rig, scene)
+    pipeline = _image_scan(rig, scene)
     pipeline.inputs = Inputs(reference=metal)
     findings = pipeline.examine(pipeline.form_images())
     result = findings.analysis
@@ -157,21 +159,26 @@ def rows_of(seed: int, rig: Instrument, scene: Scene, metal: PlaneReference) -> 
     return rows, result.prior.theta_std_rad
 
 
-def asked(plate: Plate, within: float | None = None) -> list[Layer]:
+def given_stack(plate: Plate, within: float | None = None) -> list[Layer]:
     """The stack as a user would give it, the thickness of a sheet free or within a share of the truth."""
     if plate.name.startswith(KINDS[2]):
         wall = plate.layers[0]
         return [Layer("glass", wall.epsilon, (wall.thickness_mm or 0.0) / 1e3), Layer("liquid")]
-    behind = [Layer("metal", METAL)] if plate.name.startswith(KINDS[1]) else []
+    behind = []
+    if plate.name.startswith(KINDS[1]):
+        behind = [Layer("metal", METAL)]
     size = (plate.layers[0].thickness_mm or 0.0) / 1e3
     limits = RANGE_M if within is None else ((1 - within) * size, (1 + within) * size)
     return [Layer("sheet", thickness_range_m=limits), *behind]
 
 
-def judged(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -> Case:
+def judge_fit(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -> Case:
     """The fit of one plate beside its truth."""
     kind = next(k for k in KINDS if plate.name.startswith(k))
-    layer = plate.layers[1] if kind == KINDS[2] else plate.layers[0]
+    if kind == KINDS[2]:
+        layer = plate.layers[1]
+    else:
+        layer = plate.layers[0]
     true = layer.permittivity
     size_mm = layer.thickness_mm or 0.0
     if fit is None or fit.covariance is None:
@@ -204,16 +211,16 @@ def cases(seeds: Sequence[int]) -> list[Case]:
     metal = metal_scan(rig, draw_scene(seeds[0]))
     for seed in seeds:
         scene = draw_scene(seed)
-        rows, theta_std_rad = rows_of(seed, rig, scene, metal)
+        rows, theta_std_rad = process_scene(seed, rig, scene, metal)
         for plate in scene.plates:
             row = rows.get(plate.name)
             for trusted, within in SETTINGS:
-                stack = asked(plate, within)
+                stack = given_stack(plate, within)
                 if row is None:
                     fit = None
                 else:
                     fit = fit_row(row, rig.chirp, stack, BANDS, trusted, theta_std_rad)
-                out.append(judged(seed, plate, fit, (trusted, within)))
+                out.append(judge_fit(seed, plate, fit, (trusted, within)))
     return out
 
 

@@ -53,7 +53,7 @@ class Seconds:
     wall: list[float] = field(default_factory=list)
 
     @contextmanager
-    def timed(self) -> Iterator[None]:
+    def time_block(self) -> Iterator[None]:
         """Time a block, and append it."""
         wall = time.perf_counter()
         cpu = time.process_time()
@@ -75,7 +75,7 @@ def alternate(jobs: dict[str, Callable[[], Any]], repeats: int) -> dict[str, Sec
     seconds = {name: Seconds() for name in jobs}
     for turn in range(repeats + 1):
         for name, job in jobs.items():
-            with (seconds[name] if turn else Seconds()).timed():
+            with (seconds[name] if turn else Seconds()).time_block():
                 job()
     return seconds
 
@@ -142,10 +142,14 @@ class Child:
             self._process.stdin.flush()
 
     def hear(self) -> Any:
-        line = self._process.stdout.readline() if self._process.stdout is not None else ""
+        line = ""
+        if self._process.stdout is not None:
+            line = self._process.stdout.readline()
         if not line:
             raise RuntimeError(f"helper ended with status {self._process.wait()}")
-        return line.strip() if line == "ready\n" else json.loads(line)
+        if line == "ready\n":
+            return line.strip()
+        return json.loads(line)
 
     def close(self) -> None:
         self._process.communicate()
@@ -200,7 +204,9 @@ class Line:
             return ""
         if self._reaches(self.aim):
             return "aim"
-        return "holds" if self._reaches(self.at_least) else "DOES NOT HOLD"
+        if self._reaches(self.at_least):
+            return "holds"
+        return "DOES NOT HOLD"
 
     def _reaches(self, limit: float) -> bool:
         if self.higher_is_better:

@@ -84,10 +84,13 @@ def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> di
     hub = folder / "wires"
     config.write_text(tomli_w.dumps(to_builtins(rig)), encoding="utf-8")
     _start(stack, "polysight_simulators.wires", "--socket", hub)
-    _start(stack, "polysight_simulators.stage", "--config", config, "--wires", hub, "--link", rig.stage.port)
+    options = ("--config", config, "--wires", hub, "--link", rig.stage.port)
+    _start(stack, "polysight_simulators.stage", *options)
     environment = gpio.environment(Path(rig.pi.gpio_chip), hub)
     process, command_address = _start(stack, "polysight_pi", "run", "--config", config, **environment)
-    event_address = process.stdout.readline().split()[1] if process.stdout else ""
+    event_address = ""
+    if process.stdout:
+        event_address = process.stdout.readline().split()[1]
     wires = WireClient(hub, listen=rig.pi.sync_out)
     stack.callback(wires.close)
     addresses = msgspec.structs.replace(rig.pi, command_address=command_address, event_address=event_address)
@@ -162,7 +165,10 @@ class _Rows:
                         cpu = _cpu_s(self._pid)
                         began = time.monotonic()
                     captures.append(event)
-                finished = event if isinstance(event, RowFinished) else finished
+                if isinstance(event, RowFinished):
+                    finished = event
+                else:
+                    finished = finished
         if captures:
             self.cpu_s += _cpu_s(self._pid) - cpu
             self.wall_s += time.monotonic() - began

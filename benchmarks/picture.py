@@ -64,14 +64,16 @@ class Form:
     with_boxes: bool
 
 
-def forms_of(source: Path, boxes: dict[str, list[int]], scratch: Path) -> list[Form]:
+def write_forms(source: Path, boxes: dict[str, list[int]], scratch: Path) -> list[Form]:
     """Write the picture in its four forms."""
     with np.load(source) as arrays:
         h = arrays["h"]
         v = arrays["v"]
     out = []
     for with_boxes in (True, False):
-        kind = "with boxes" if with_boxes else "without boxes"
+        kind = "without boxes"
+        if with_boxes:
+            kind = "with boxes"
         folder = scratch / kind.replace(" ", "-")
         folder.mkdir()
         np.save(folder / "sar_h.npy", h)
@@ -135,7 +137,9 @@ def judge_plate(box: str, patch: PatchFigures | None) -> PlateFigures:
         estimate = f"{e.real:5.2f} +- {e.spread.real_std:4.2f}  {e.loss:5.2f} +- {e.spread.loss_std:4.2f}"
     sure = patch.confidence or 0.0
     right = patch.name == name
-    mark = "in" if inside else "OUT"
+    mark = "OUT"
+    if inside:
+        mark = "in"
     return PlateFigures(
         text=f"  {box:16} {real:5.2f} {loss:5.2f}   {estimate:32} {mark:3}  {patch.name} {sure:.2f}",
         inside=inside,
@@ -165,7 +169,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a table for each form; skipped, and said, without the picture."""
-    sources = sorted(Path(args.images).glob("*.npz")) if args.images else []
+    sources = []
+    if args.images:
+        sources = sorted(Path(args.images).glob("*.npz"))
     if not sources:
         print(f"picture: skipped (1): no picture; give --images DIR or set {FOLDER}")
         return 0
@@ -176,15 +182,19 @@ def run(args: argparse.Namespace) -> int:
             library = write_table_2_library(Path(scratch) / "table-2.npz")
         else:
             library = args.library
-        for form in forms_of(sources[0], boxes, Path(scratch)):
+        for form in write_forms(sources[0], boxes, Path(scratch)):
             scan, patch_of = process(form, boxes, library)
             by_number = {patch.label: patch for patch in scan.segments}
             plates = [judge_plate(box, by_number.get(patch_of[box])) for box in TABLE_2]
             widths = [plate.half_width for plate in plates if plate.half_width is not None]
             metal = by_number.get(patch_of[METAL_BOX])
             extra = len(by_number) - len({n for n in patch_of.values() if n})
-            level = scan.verdict.text if scan.verdict else ""
-            reference = "copper" if metal is not None and metal.metal_reference else "NOT copper"
+            level = ""
+            if scan.verdict:
+                level = scan.verdict.text
+            reference = "NOT copper"
+            if metal is not None and metal.metal_reference:
+                reference = "copper"
             figures[form.name] = {
                 "patches": len(by_number),
                 "not_plates": extra,

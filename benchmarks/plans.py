@@ -76,7 +76,7 @@ def tell(text: str) -> None:
     sys.stderr.flush()
 
 
-def thinned(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
+def image_every_nth(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
     """The images from every n-th row, by matched filter or by reconstruction; the builder is left as it was."""
     valid = {name: board.valid.copy() for name, board in builder.boards.items()}
     weights = {name: board.weights for name, board in builder.boards.items()}
@@ -109,7 +109,7 @@ def image_error(images: Images, ideal: Images) -> float:
     return float(np.mean(errors))
 
 
-def named(rig: Instrument, images: Images, plates: tuple[TruthPlate, ...]) -> MaterialsResult:
+def name_patches(rig: Instrument, images: Images, plates: tuple[TruthPlate, ...]) -> MaterialsResult:
     """Patches, permittivities and names."""
     angles = incidence_choice(rig, images.x_m, images.y_m, "one")
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
@@ -126,7 +126,7 @@ def measure(
 ) -> None:
     """Print figures of one scan; `every` n-th row was scanned."""
     scanned = Changes(step_y_mm=every * rig.grid.step_y_mm).apply(rig)  # its minutes are those of the rows scanned
-    result = named(rig, images, plates)
+    result = name_patches(rig, images, plates)
     pairs = [(r, r.truth) for r in result.patches if r.truth is not None]
     right = sum(r.verdict is not None and r.verdict.name == t.name for r, t in pairs)
     errors = [
@@ -137,7 +137,10 @@ def measure(
     b = rig.burst
     g = scanned.grid
     plan = f"{rig.stage.speed_mm_s:g} mm/s, {b.pulses} x {b.period_us / 1e3:g} ms, {g.step_x_mm:g} x {g.step_y_mm:g} mm"
-    median_error = 100 * float(np.median(errors)) if errors else float("nan")
+    if errors:
+        median_error = 100 * float(np.median(errors))
+    else:
+        median_error = float("nan")
     print(
         f"| {name} | {plan} | {scan_time(scanned).minutes:.1f} | {100 * image_error(images, ideal):.1f} % |"
         f" {right} of {len(plates)} | {100 * (pixel_accuracy(result) or 0.0):.1f} % | {median_error:.1f} % |",
@@ -148,7 +151,7 @@ def measure(
 Made = tuple[str, Instrument, Images, int]
 
 
-def published(rig: Instrument, scene: Scene) -> Iterator[Made]:
+def published_plan(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """The rig file's plan."""
     yield "published", rig, as_scanned(rig, scene)[0].finish(), 1
 
@@ -160,9 +163,9 @@ def fast(rig: Instrument, scene: Scene) -> Iterator[Made]:
     yield "fast", rig, builder.finish(), 1
     yield "fast, motion not compensated", rig, uncompensated.finish(), 1
     for step in (2, 3, 4):
-        yield f"fast, 1 row in {step}", rig, thinned(builder, step, rebuilt=False), step
+        yield f"fast, 1 row in {step}", rig, image_every_nth(builder, step, rebuilt=False), step
         if step > 2:
-            yield f"fast, 1 row in {step}, reconstructed", rig, thinned(builder, step, rebuilt=True), step
+            yield f"fast, 1 row in {step}, reconstructed", rig, image_every_nth(builder, step, rebuilt=True), step
 
 
 def short(rig: Instrument, scene: Scene) -> Iterator[Made]:
@@ -177,13 +180,13 @@ def wide(rig: Instrument, scene: Scene) -> Iterator[Made]:
     yield "half the rows, published burst", rig, as_scanned(rig, scene)[0].finish(), 1
 
 
-def proposed(rig: Instrument, scene: Scene) -> Iterator[Made]:
+def first_proposal(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """The first proposal of `polysight plan --minutes 30` for the published rig."""
     rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm, pulses=55, period_us=730.0).apply(rig)
     yield "first proposal for 30 minutes", rig, as_scanned(rig, scene)[0].finish(), 1
 
 
-SCANS = (fast, published, wide, short, proposed)
+SCANS = (fast, published_plan, wide, short, first_proposal)
 
 
 def main() -> int:

@@ -47,7 +47,8 @@ class Synchroniser:
     def __init__(self, rig: Instrument, board: Board, tuned: bool = False) -> None:
         chirp = rig.chirp
         self._tuned = tuned
-        self._samples, (self._a, self._b) = chirp.samples, chirp.linear_samples
+        self._samples = chirp.samples
+        self._a, self._b = chirp.linear_samples
         middle = chirp.first_sample_hz + chirp.hz_per_sample * chirp.samples / 2
         tx = np.array(tx_position_m(rig))
         rx = np.array(rx_positions_m(rig, board))
@@ -124,7 +125,9 @@ class Synchroniser:
         complex [rx, sample], and the direct path's phase (rad) at the first linear sample.
         """
         linear = mean[:, self._a : self._b]
-        beam = self._beam @ linear if self._tuned else None
+        beam = None
+        if self._tuned:
+            beam = self._beam @ linear
         if beam is None:
             spectrum = self._beam @ self._wide(linear)
         else:
@@ -185,7 +188,8 @@ def form_image(
     -------
     complex [ny, nx].
     """
-    chirp, (a, b) = rig.chirp, rig.chirp.linear_samples
+    chirp = rig.chirp
+    a, b = chirp.linear_samples
     n_rx, rows, columns, _ = cube.shape
     ny, nx = grid.shape
     y = _lattice(grid.y_m, rows)
@@ -193,7 +197,10 @@ def form_image(
     excess = Antennas.from_rig(rig, board).excess_m(x[None, :], y[:, None], grid.z_m)
     start_hz = chirp.first_sample_hz + chirp.hz_per_sample * a
     full = rows + y.size - 1, columns + x.size - 1
-    shape = tuple(int(scipy.fft.next_fast_len(n) or n) for n in full) if tuned else full
+    if tuned:
+        shape = tuple(int(scipy.fft.next_fast_len(n) or n) for n in full)
+    else:
+        shape = full
     window = slice(rows - 1, rows - 1 + ny), slice(columns - 1, columns - 1 + nx)
     image = np.zeros((ny, nx), np.complex64)
     total = np.zeros(shape, np.complex64)
@@ -201,7 +208,9 @@ def form_image(
         spectrum = np.asarray(scipy.fft.fft(cube[rx, :, :, a:b], points))
         bins = np.round(excess[rx] / SPEED_OF_LIGHT_M_S * chirp.hz_per_sample * points).astype(int)
         turns = (-2 * np.pi * start_hz / SPEED_OF_LIGHT_M_S * excess[rx]).astype(np.float32)
-        wave = np.exp(1j * turns) if tuned else None
+        wave = None
+        if tuned:
+            wave = np.exp(1j * turns)
         for n in range(int(bins.min()), int(bins.max()) + 1):
             if wave is not None:
                 kernel = np.where(bins == n, wave, 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import statistics
 
-from benchmarks.data import published, recorded_rows, temporary
+from benchmarks.data import published_scene, recorded_rows, temporary
 from benchmarks.measure import add_arguments as add_common
 from benchmarks.measure import one_core, write
 from benchmarks.whole import Chain
@@ -26,8 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    rig, scene = published()
-    found = []
+    rig, scene = published_scene()
+    lines = []
     with temporary(args.folder) as folder, one_core():
         files = {}
         for name, rows in recorded_rows(rig, scene, 2).items():
@@ -47,12 +47,12 @@ def run(args: argparse.Namespace) -> int:
             memory = chain.end()
             positions = columns * count * len(files)
             last = statistics.median(figures["last_row_cpu_s"])
-            found.append({"size": size, **grid, "memory_bytes": memory, **figures})
+            lines.append({"size": size, **grid, "memory_bytes": memory, **figures})
             print(
                 f"{size:7.2f} {columns:8d} {count:5d} {step_x:6.0f} x {step_y:.0f} {positions:10d}"
                 f" {figures['cpu_s']:7.1f} {figures['cpu_s'] / positions * 1e6:14.0f} {last:16.2f} s"
                 f" {memory / 1e9:14.2f} GB",
                 flush=True,
             )
-    write(args.json, "scaling", [], sizes=found)
+    write(args.json, "scaling", [], sizes=lines)
     return 0

@@ -179,10 +179,10 @@ def see_shapes(shapes: Sequence[Shape], nuisances: ShapeNuisances, scan: ScanKin
 @cache
 def see_reference(nuisances: ShapeNuisances, scan: ScanKind) -> Seen:
     """Find the points of the metal sphere that the same rig scanned before."""
-    seen = see_shapes([reference_sphere()], nuisances, scan, number=1)
-    metal = seen[seen.segment == 0]
-    kept = np.linspace(0, len(metal) - 1, min(KEPT_POINTS, len(metal))).round().astype(int)
-    return metal[kept]
+    points = see_shapes([reference_sphere()], nuisances, scan, number=1)
+    metal = points[points.segment == 0]
+    kept_indices = np.linspace(0, len(metal) - 1, min(KEPT_POINTS, len(metal))).round().astype(int)
+    return metal[kept_indices]
 
 
 def analyse_shapes(
@@ -194,9 +194,9 @@ def analyse_shapes(
     def reference(optics: Optics) -> Gains:
         return learn_gains(find_voltages(metal, optics), optics.wave_number)
 
-    seen = see_shapes((*scene.shapes, *scene.background), nuisances, scan, number=2)
+    points = see_shapes((*scene.shapes, *scene.background), nuisances, scan, number=2)
     started = time.process_time()
-    surface = analyse_surface(seen, scan.optics, reference, uncertainty=known, simulated=True)
+    surface = analyse_surface(points, scan.optics, reference, uncertainty=known, simulated=True)
     return surface, time.process_time() - started
 
 
@@ -205,8 +205,10 @@ def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> Obje
     scene = draw_shapes(seed, kind, with_table=disturbance in ("table", "all"))
     nuisances = ShapeNuisances(seed=seed, noise=scan.noise, gain_db=1.5, **DISTURBANCES[disturbance])
     surface, seconds = analyse_shapes(scene, nuisances, KNOWN[disturbance], scan)
-    truth = scene.permittivity if scene.is_uniform else None
-    distances, normals = scene.surface_at(surface.points_m)
+    truth = None
+    if scene.is_uniform:
+        truth = scene.permittivity
+    distances, normals = scene.nearest_surface(surface.points_m)
     on_object = np.abs(distances) < STRAY_M
     background = np.zeros(len(distances), bool)
     for shape in scene.background:
@@ -277,17 +279,17 @@ def _judge(job: tuple[str, int, str, ScanKind]) -> ObjectFigures:
     return judge_object(*job)
 
 
-def line_of(title: str, figures: Sequence[ObjectFigures], limits: tuple[float | None, ...] | None = None) -> str:
+def format_line(title: str, figures: Sequence[ObjectFigures], limits: tuple[float | None, ...] | None = None) -> str:
     """Return one line of the table."""
     columns = [[f.normal_deg for f in figures], [f.point_mm for f in figures]]
     columns.append([None if f.error is None else 100 * f.error for f in figures])
     cells = [f"{title:<26}{len(figures):>5}"]
     for values, limit in zip(columns, limits or (None, None, None), strict=True):
-        known = [v for v in values if v is not None]
-        value = f"{np.percentile(known, 68, method='inverted_cdf'):.2f}" if known else "-"
+        values_given = [v for v in values if v is not None]
+        value = f"{np.percentile(values_given, 68, method='inverted_cdf'):.2f}" if values_given else "-"
         cells.append(f"{value:>8} {'' if limit is None else f'<= {limit:g}':<7}")
-    given = [f for f in figures if f.error is not None]
-    cells.append(f"{100 * len(given) / len(figures):>7.0f}")
+    figures_with_error = [f for f in figures if f.error is not None]
+    cells.append(f"{100 * len(figures_with_error) / len(figures):>7.0f}")
     distances = [f.distance2 for f in figures if f.distance2 is not None]
     inside = [f.points_inside for f in figures if f.points_inside is not None]
     widths = [100 * f.half_width for f in figures if f.half_width is not None]
@@ -334,8 +336,8 @@ def run(args: argparse.Namespace) -> int:
     for name in disturbances:
         for kind in kinds:
             chosen = [f for f in figures if (f.kind, f.disturbance) == (kind, name)]
-            print(line_of(f"{kind}, {name}", chosen, MUST_HOLD.get(kind)))
-        print(line_of(f"together, {name}", [f for f in figures if f.disturbance == name]))
+            print(format_line(f"{kind}, {name}", chosen, MUST_HOLD.get(kind)))
+        print(format_line(f"together, {name}", [f for f in figures if f.disturbance == name]))
     print(f"seconds of CPU, analysis of the points: {np.median([f.seconds for f in figures]):.0f} an object")
     if args.json is not None:
         args.json.write_text(json.dumps([asdict(f) for f in figures], indent=1), encoding="utf-8")

@@ -31,19 +31,19 @@ def patterns(rows: int, columns: int) -> Iterator[tuple[str, np.ndarray, float]]
     rng = np.random.default_rng(1)
 
     def of_rows(chosen: np.ndarray) -> np.ndarray:
-        kept = np.zeros((rows, columns), bool)
-        kept[chosen] = True
-        return kept
+        is_scanned = np.zeros((rows, columns), bool)
+        is_scanned[chosen] = True
+        return is_scanned
 
     yield "all positions", np.ones((rows, columns), bool), 1.0
     yield "every second row", of_rows(np.arange(0, rows, 2)), 0.5
     yield "every third row", of_rows(np.arange(0, rows, 3)), 1 / 3
     yield "random half of the rows", of_rows(rng.permutation(rows)[: rows // 2]), 0.5
-    kept = np.zeros((rows, columns), bool)
-    kept[:, ::2] = True
-    yield "every second column, at twice the speed", kept, 0.5
-    yield "random half of the positions", rng.uniform(size=kept.shape) < 0.5, 1.0
-    yield "random quarter of the positions", rng.uniform(size=kept.shape) < 0.25, 1.0
+    every_second = np.zeros((rows, columns), bool)
+    every_second[:, ::2] = True
+    yield "every second column, at twice the speed", every_second, 0.5
+    yield "random half of the positions", rng.uniform(size=(rows, columns)) < 0.5, 1.0
+    yield "random quarter of the positions", rng.uniform(size=(rows, columns)) < 0.25, 1.0
 
 
 def scan_minutes(rig: Instrument) -> float:
@@ -56,7 +56,7 @@ def scan_minutes(rig: Instrument) -> float:
     return grid.rows * row / 60
 
 
-def predicted(board: BoardSamples, image: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def predict_image(board: BoardSamples, image: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Matched filter over all positions of the samples that a reconstructed image predicts."""
     imager, _ = choose_imager(board.aperture)
     samples = imager.samples(image)
@@ -71,19 +71,19 @@ def measure(folder: Path, iterations: int) -> list[tuple[str, float, float, floa
         pipeline.add_row(row)
     boards = list(pipeline.images.boards.values())
     valid = [b.valid.copy() for b in boards]
-    whole = [b.image()[0] for b in boards]
+    full_images = [b.image()[0] for b in boards]
     weights = [b.weights for b in boards]
     minutes = scan_minutes(pipeline.source.instrument)
     out = []
     rows, columns = valid[0].shape
-    for name, kept, share in patterns(rows, columns):
+    for name, is_scanned, share in patterns(rows, columns):
         errors = []
-        for board, good, full, weight in zip(boards, valid, whole, weights, strict=True):
+        for board, good, full, weight in zip(boards, valid, full_images, weights, strict=True):
             board.valid[:] = good
-            board.keep(kept)
+            board.keep(is_scanned)
             matched = board.image()[0]
-            found = predicted(board, reconstruct(board, iterations).image, weight)
-            errors.append([np.linalg.norm(image - full) / np.linalg.norm(full) for image in (matched, found)])
+            predicted_image = predict_image(board, reconstruct(board, iterations).image, weight)
+            errors.append([np.linalg.norm(image - full) / np.linalg.norm(full) for image in (matched, predicted_image)])
         plain, rebuilt = np.mean(errors, axis=0)
         out.append((name, share * minutes, float(plain), float(rebuilt)))
     return out

@@ -38,8 +38,8 @@ def run(out: Path, positions: int, board_name: str, snr_db: float = SNR_DB) -> s
     row = 350
     setup = replace(BoardSetup.from_rig(radar.rig, board), examined=row)
     report = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))
-    for at in range(0, positions, row):
-        still = np.zeros(min(row, positions - at) * radar.rig.burst.pulses)
+    for row_start in range(0, positions, row):
+        still = np.zeros(min(row, positions - row_start) * radar.rig.burst.pulses)
         words = radar.chirps(board_name, still, still).reshape(len(still), chirp.samples, 2, -1)
         report.add(synchronise_row(words, np.ones(len(still), bool), setup))
     return write_sync_report(out, {board_name: report}, f"{positions * radar.rig.burst.pulses:,} chirps at rest", True)

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from benchmarks.data import RepeatedRows, published, recorded_rows, temporary
+from benchmarks.data import RepeatedRows, published_scene, recorded_rows, temporary
 from benchmarks.measure import Line, Seconds, add_arguments, one_core, show, write
 from benchmarks.published import Synchroniser
 from polysight.imaging import ImageBuilder
@@ -30,11 +30,11 @@ def direct_path_timed(into: Seconds) -> Iterator[None]:
     """Times every call of the chain's direct-path stage."""
     original = chain.reference
 
-    def timed(*args: Any, **kwargs: Any) -> Any:
-        with into.timed():
+    def run_timed(*args: Any, **kwargs: Any) -> Any:
+        with into.time_block():
             return original(*args, **kwargs)
 
-    chain.reference = timed
+    chain.reference = run_timed
     try:
         yield
     finally:
@@ -59,11 +59,11 @@ class Ours:
 
     def row(self) -> tuple[float, float]:
         """One row from its files: CPU seconds of reading, decoding and aligning, and of the direct path."""
-        whole = Seconds()
+        row_seconds = Seconds()
         inner = Seconds()
-        with whole.timed(), direct_path_timed(inner):
+        with row_seconds.time_block(), direct_path_timed(inner):
             self._pipeline.add_row(0)
-        return whole.cpu[0] - sum(inner.cpu), sum(inner.cpu)
+        return row_seconds.cpu[0] - sum(inner.cpu), sum(inner.cpu)
 
 
 class Theirs:
@@ -82,12 +82,12 @@ class Theirs:
         second = Seconds()
         for method, path in self._boards:
             aligned = []
-            with first.timed():
+            with first.time_block():
                 recording = np.memmap(path, dtype=np.uint8, mode="r")
                 for i in self._chosen:
                     burst = method.decode(recording[i * size : (i + 1) * size], pulses)
                     aligned.append(method.align(burst))
-            with second.timed():
+            with second.time_block():
                 for mean in aligned:
                     method.reference(mean)
         scale = self._rig.grid.columns / len(self._chosen)
@@ -111,7 +111,7 @@ def measure(rig: Instrument, files: dict[str, Path], repeats: int) -> dict[str, 
 
 
 def run(args: argparse.Namespace) -> int:
-    rig, scene = published(args.quick)
+    rig, scene = published_scene(args.quick)
     with temporary(args.folder) as folder, one_core():
         files = {}
         for name, rows in recorded_rows(rig, scene, 1).items():

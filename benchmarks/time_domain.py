@@ -41,7 +41,7 @@ def _sum(
     cycles_per_m: np.float32,
     image: NDArray[np.float32],  # [2, y, x]
 ) -> None:
-    one = np.float32(1)
+    unit = np.float32(1)
     half = np.float32(0.5)
     pi = np.float32(math.pi)
     dz_t = (z - tx[2]) ** 2
@@ -49,8 +49,8 @@ def _sum(
         count = min(BLOCK, offset_x.size - begin)
         for r in range(rx.shape[0]):
             dz_r = (z - rx[r, 2]) ** 2
-            here = real[r, begin * bins :]
-            there = imag[r, begin * bins :]
+            real_part = real[r, begin * bins :]
+            imaginary_part = imag[r, begin * bins :]
             u = offset_x[begin : begin + count]
             v = offset_y[begin : begin + count]
             for i in range(y.size):
@@ -66,17 +66,17 @@ def _sum(
                         w = place - np.float32(low)
                         # Unsigned: no negative indices to look for
                         k = np.uint64(np.uint32(low + np.int32(p) * bins))
-                        re = here[k] + w * (here[k + np.uint64(1)] - here[k])
-                        im = there[k] + w * (there[k + np.uint64(1)] - there[k])
+                        re = real_part[k] + w * (real_part[k + np.uint64(1)] - real_part[k])
+                        im = imaginary_part[k] + w * (imaginary_part[k + np.uint64(1)] - imaginary_part[k])
                         turns = -d * cycles_per_m
                         # Half the angle: -pi/2..pi/2
                         a = (turns - np.floor(turns + half)) * pi
                         q = a * a
                         s = np.float32(-1 / 5040) + q * np.float32(1 / 362880)
-                        s = a * (one + q * (np.float32(-1 / 6) + q * (np.float32(1 / 120) + q * s)))
+                        s = a * (unit + q * (np.float32(-1 / 6) + q * (np.float32(1 / 120) + q * s)))
                         c = np.float32(-1 / 720) + q * np.float32(1 / 40320)
-                        c = one + q * (-half + q * (np.float32(1 / 24) + q * c))
-                        cos = one - np.float32(2) * s * s
+                        c = unit + q * (-half + q * (np.float32(1 / 24) + q * c))
+                        cos = unit - np.float32(2) * s * s
                         sin = np.float32(2) * s * c
                         sum_re += re * cos - im * sin
                         sum_im += re * sin + im * cos
@@ -125,21 +125,21 @@ def form_image(
     real, imag = (single(part.reshape(len(samples), -1)) for part in (spectrum.real, spectrum.imag))
     image = np.zeros((2, *grid.shape), np.float32)
     _sum(
-        real,
-        imag,
-        single(offsets_m[:, 0]),
-        single(offsets_m[:, 1]),
-        single(antennas.tx_m),
-        single(antennas.rx_m),
-        single(antennas.direct_m),
-        single(grid.x_m),
-        single(grid.y_m),
-        np.float32(grid.z_m),
-        np.int32(bins),
-        np.float32(size / period_m),
-        np.float32(first_bin * period_m / size),
-        np.float32(middle_hz / SPEED_OF_LIGHT_M_S),
-        image,
+        real=real,
+        imag=imag,
+        offset_x=single(offsets_m[:, 0]),
+        offset_y=single(offsets_m[:, 1]),
+        tx=single(antennas.tx_m),
+        rx=single(antennas.rx_m),
+        direct=single(antennas.direct_m),
+        x=single(grid.x_m),
+        y=single(grid.y_m),
+        z=np.float32(grid.z_m),
+        bins=np.int32(bins),
+        bins_per_m=np.float32(size / period_m),
+        first_m=np.float32(first_bin * period_m / size),
+        cycles_per_m=np.float32(middle_hz / SPEED_OF_LIGHT_M_S),
+        image=image,
     )
     return (image[0] + 1j * image[1]).astype(np.complex64)
 
@@ -161,7 +161,7 @@ def timed_image(aperture: Aperture, samples: NDArray[np.complex64], every: int) 
     # Two positions, to compile.
     form_image(flat[:, :2], aperture.frequencies_hz, offsets[:2], aperture.antennas, aperture.grid)
     took = Seconds()
-    with took.timed():
+    with took.time_block():
         image = form_image(flat, aperture.frequencies_hz, offsets, aperture.antennas, aperture.grid)
     rows, columns = aperture.shape[2:]
     return image, took.cpu[0] * rows * columns / len(offsets)

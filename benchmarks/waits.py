@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from benchmarks.data import ROOT, SCENE, published, recorded_rows, temporary, write_scan
+from benchmarks.data import ROOT, SCENE, published_scene, recorded_rows, temporary, write_scan
 from benchmarks.measure import Line, Seconds, add_arguments, show, write
 from benchmarks.whole import rows_that_fit
 from polysight.catalogue import Scans
@@ -58,7 +58,7 @@ def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
             rows = list(source.rows())
             if not all(pipeline.samples.is_kept(row) for row in rows):
                 raise RuntimeError("samples were not kept")
-            with took.timed():
+            with took.time_block():
                 for row in rows:
                     pipeline.add_row(row)
                 pipeline.form_images()
@@ -68,7 +68,7 @@ def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
     return same, other_seconds
 
 
-def listed(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Seconds]:
+def time_list(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Seconds]:
     """A list of so many scans, each with the manifest of `scan` and the products `made`: the first look, and later."""
     for n in range(count):
         shutil.copytree(made, root / f"scan-{n}" / "products", ignore=shutil.ignore_patterns("report.html", "figures"))
@@ -78,7 +78,7 @@ def listed(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Sec
     for _ in range(REPEATS):
         scans = Scans(root)
         for took in (first, again):
-            with took.timed():
+            with took.time_block():
                 if len(scans.list()) != count:
                     raise RuntimeError("scans are missing in the list")
     return first, again
@@ -97,7 +97,7 @@ def command(words: list[str]) -> tuple[float, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    rig, scene = published(args.quick)
+    rig, scene = published_scene(args.quick)
     repeats = 1 if args.quick else REPEATS
     with temporary(args.folder) as folder:
         count = rows_that_fit(rig, 20 if args.quick else rig.grid.rows, folder)
@@ -105,12 +105,12 @@ def run(args: argparse.Namespace) -> int:
         behind = [rows_then_products(folder / "scan", folder / f"out{n}") for n in range(repeats)]
         same, other_seconds = from_samples(folder / "scan", repeats)
         products = small_products(folder)
-        first, again = listed(folder / "scan", products, folder / "many", 20 if args.quick else 200)
+        first, again = time_list(folder / "scan", products, folder / "many", 20 if args.quick else 200)
         typed = {name: [command(name.format(made=products).split()) for _ in range(repeats)] for name in COMMANDS}
     boards = len(rig.receivers)
     lines = []
     for stage, limit in (("image", 0.1), ("report", 4.0)):
-        waited = [found[stage] for found in behind]
+        waited = [seconds_by_stage[stage] for seconds_by_stage in behind]
         note = ", ".join(f"{seconds:.2f}" for seconds in waited)
         lines.append(_least(f"last committed row to {stage}, wall s", statistics.median(waited), limit, limit, note))
     for name, took in (("its own plane", same), ("another plane", other_seconds)):

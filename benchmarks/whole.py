@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import sync
-from benchmarks.data import RepeatedRows, published, recorded_rows, temporary, write_scan
+from benchmarks.data import RepeatedRows, published_scene, recorded_rows, temporary, write_scan
 from benchmarks.measure import AnonymousMemory, Child, Line, Seconds, one_core, show, write
 from benchmarks.measure import add_arguments as add_common
 from benchmarks.published import form_image
@@ -44,22 +44,22 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
     if "scan" in source:
         scan = ScanFolder.load(Path(source["scan"]))
     else:
-        rig, _ = published(**source["grid"])
+        rig, _ = published_scene(**source["grid"])
         scan = RepeatedRows(rig, {name: [Path(f) for f in files] for name, files in source["files"].items()})
     total = Seconds()
     once = Seconds()
     last = Seconds()
-    with total.timed():
-        with once.timed():
+    with total.time_block():
+        with once.time_block():
             pipeline = Pipeline(scan, live=live)
             rows = list(scan.rows())
         for row in rows:
             pipeline.add_row(row)
-        with once.timed():
+        with once.time_block():
             pipeline.form_images()
     stages = dict(pipeline.quality.seconds)
     for _ in range(LAST_ROWS):
-        with last.timed():
+        with last.time_block():
             pipeline.add_row(rows[-1])
             pipeline.form_images(from_sums=live)
     return {
@@ -124,13 +124,13 @@ class Published:
         """CPU seconds of the whole scan."""
         positions = sum(self._row.row()) * self._rig.grid.rows
         image = Seconds()
-        with image.timed():
+        with image.time_block():
             form_image(self._cube, self._rig, self._rig.receivers[0], self._grid, tuned=self._tuned)
         return positions + image.cpu[0] * len(self._rig.receivers)
 
 
 def run(args: argparse.Namespace) -> int:
-    rig, scene = published(args.quick)
+    rig, scene = published_scene(args.quick)
     with temporary(args.folder) as folder, one_core():
         count = rows_that_fit(rig, 4 if args.quick else args.rows, folder)
         rows = recorded_rows(rig, scene)

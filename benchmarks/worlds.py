@@ -114,7 +114,9 @@ class PatchFigures:
     @property
     def inside(self) -> bool | None:
         """True if the 95 % region holds the true permittivity; None without one."""
-        return None if self.distance2 is None else self.distance2 < CHI2_95
+        if self.distance2 is None:
+            return None
+        return self.distance2 < CHI2_95
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,7 @@ class SceneFigures:
     missed: int = 0
     stray: int = 0
 
-    def named_at(self, nuisance: str) -> int | None:
+    def place_named(self, nuisance: str) -> int | None:
         """Place of the first reason that names a nuisance as a cause, from 0; None without one."""
         cause = CAUSES.get(nuisance)
         if cause is None:
@@ -209,23 +211,23 @@ def analyse_world(
     images = Images(h, v, pair.x_m, pair.y_m, usable, illumination=light)
     plates = {f"{plate.name} {i}": (plate, box) for i, (plate, box) in enumerate(pixel_boxes(pair))}
     metal_name = next((name for name, (plate, _) in plates.items() if plate.name == declared), None)
-    known = KnownScene()
+    known_scene = KnownScene()
     if not searched:
         boxes: dict[str, tuple[float, float, float, float]] = {}
         for name, (_, (left, bottom, right, top)) in plates.items():
             boxes[name] = (left, bottom, right, top)
         segmentation, names = patches_from_labels(boxes, pair.x_m, pair.y_m, margin_mm=MARGIN_MM)
         metal = next((label for label, name in names.items() if name == metal_name), None)
-        known = KnownScene(segmentation, metal, names)
+        known_scene = KnownScene(segmentation, metal, names)
     elif metal_name is not None:
-        known = KnownScene(metal=box_in_mm(plates[metal_name][1], pair))
+        known_scene = KnownScene(metal=box_in_mm(plates[metal_name][1], pair))
     prior = RigPrior(THETA_STD_RAD, channels_known=True)
     if measured:
         prior = replace(prior, leakage_std=0.003, leakage_measured=True, moved=MOVED)
-    found = analyse(images, Optics(np.radians(pair.incidence_deg), prior), known, classifier)
+    analysis = analyse(images, Optics(np.radians(pair.incidence_deg), prior), known_scene, classifier)
     if not searched:
-        return found, {label: plates[name][0] for label, name in known.names.items()}
-    return found, plates_of(found.segmentation, list(plates.values()))
+        return analysis, {label: plates[name][0] for label, name in known_scene.names.items()}
+    return analysis, match_plates(analysis.segmentation, list(plates.values()))
 
 
 def box_in_mm(box: tuple[int, int, int, int], pair: ImagePair) -> tuple[float, float, float, float]:
@@ -236,7 +238,7 @@ def box_in_mm(box: tuple[int, int, int, int], pair: ImagePair) -> tuple[float, f
     return float(x_mm[left]), float(y_mm[bottom]), float(x_mm[right - 1]), float(y_mm[top - 1])
 
 
-def plates_of(
+def match_plates(
     segmentation: Segmentation, plates: Sequence[tuple[Plate, tuple[int, int, int, int]]]
 ) -> dict[int, Plate]:
     """Return patch number to the plate that most of the patch lies on; patches without one are missing."""
@@ -260,9 +262,11 @@ def judge_world(nuisance: str, seed: int, searched: bool = False) -> SceneFigure
     """Draw, scan and judge one world."""
     pair = draw_pair(nuisance, seed)
     classifier = table_2_classifier(float(np.radians(pair.incidence_deg)))
-    found, plates = analyse_world(pair, measured=nuisance not in UNMEASURED, classifier=classifier, searched=searched)
-    verdict = join_reasons(scene_reasons(found, None, classifier))
-    judged = [(patch, plates[patch.patch.label]) for patch in found.patches if patch.patch.label in plates]
+    analysis, plates = analyse_world(
+        pair, measured=nuisance not in UNMEASURED, classifier=classifier, searched=searched
+    )
+    verdict = join_reasons(scene_reasons(analysis, None, classifier))
+    judged = [(patch, plates[patch.patch.label]) for patch in analysis.patches if patch.patch.label in plates]
     return SceneFigures(
         nuisance,
         seed,
@@ -270,25 +274,34 @@ def judge_world(nuisance: str, seed: int, searched: bool = False) -> SceneFigure
         tuple(f"{r.what}: {r.why}" for r in verdict.reasons),
         tuple(declared_figures(nuisance, patch, plate) for patch, plate in judged if not plate.stack.is_metal),
         missed=len(pixel_boxes(pair)) - len({plate.centre_m for _, plate in judged}),
-        stray=len(found.patches) - len(judged),
+        stray=len(analysis.patches) - len(judged),
     )
 
 
 def declared_figures(nuisance: str, patch: PatchResult, plate: Plate) -> PatchFigures:
     """Compare one patch with its plate."""
     e = patch.permittivity
-    refused = "" if patch.refused is None else patch.refused.what
+    if patch.refused is None:
+        refused = ""
+    else:
+        refused = patch.refused.what
     distance2 = None
     half_width = None
     error = None
     if e.value is not None and e.covariance is not None and not refused:
-        away = e.value - plate.stack.below
-        parts = np.array([away.real, away.imag])
+        deviation = e.value - plate.stack.below
+        parts = np.array([deviation.real, deviation.imag])
         distance2 = float(parts @ np.linalg.solve(e.covariance, parts))
         half_width = 1.96 * float(np.sqrt(np.trace(e.covariance) / 2)) / abs(e.value)
-        error = abs(away) / abs(plate.stack.below)
-    name = UNKNOWN if patch.verdict is None else patch.verdict.name
-    confidence = 0.0 if patch.verdict is None else patch.verdict.confidence
+        error = abs(deviation) / abs(plate.stack.below)
+    if patch.verdict is None:
+        name = UNKNOWN
+    else:
+        name = patch.verdict.name
+    if patch.verdict is None:
+        confidence = 0.0
+    else:
+        confidence = patch.verdict.confidence
     return PatchFigures(
         nuisance=nuisance,
         material=plate.name,
@@ -339,11 +352,14 @@ def judge_metal(kind: str, seed: int, searched: bool) -> MetalFigures:
     if kind == "dielectric declared":
         declared = next(plate.name for plate in world.plates if not plate.stack.layers and not plate.stack.is_metal)
     classifier = table_2_classifier(float(np.radians(pair.incidence_deg)))
-    found, _ = analyse_world(pair, declared, classifier=classifier, searched=searched)
-    verdict = join_reasons(scene_reasons(found, None, classifier))
-    shown = found if verdict.usable else found.without_result()
-    names = [patch.verdict.name for patch in shown.patches if patch.verdict is not None]
-    withdrawn = found.metal.evidence is not None and found.metal.evidence.against
+    analysis, _ = analyse_world(pair, declared, classifier=classifier, searched=searched)
+    verdict = join_reasons(scene_reasons(analysis, None, classifier))
+    if verdict.usable:
+        shown_analysis = analysis
+    else:
+        shown_analysis = analysis.without_result()
+    names = [patch.verdict.name for patch in shown_analysis.patches if patch.verdict is not None]
+    withdrawn = analysis.metal.evidence is not None and analysis.metal.evidence.against
     return MetalFigures(kind, seed, verdict.level, withdrawn, tuple(name for name in names if name != UNKNOWN))
 
 
@@ -354,19 +370,21 @@ def _judge_metal(job: tuple[str, int, bool]) -> MetalFigures:
 def print_metal(scenes: Sequence[MetalFigures]) -> None:
     """Print how often a declared metal is withdrawn, and what scenes without metal are given."""
     for kind in METAL_KINDS:
-        own = [scene for scene in scenes if scene.kind == kind]
-        if own:
-            counts = Counter(scene.level for scene in own)
+        scenes_of_kind = [scene for scene in scenes if scene.kind == kind]
+        if scenes_of_kind:
+            counts = Counter(scene.level for scene in scenes_of_kind)
             levels = ", ".join(f"{level} {counts[level]}" for level in ("good", "care", "none"))
-            print(f"{kind}: {len(own)} scenes, withdrawn {sum(scene.withdrawn for scene in own)}, verdicts {levels},"
-                  f" scenes with names {sum(bool(scene.names) for scene in own)}")  # fmt: skip
+            withdrawn = sum(scene.withdrawn for scene in scenes_of_kind)
+            with_names = sum(bool(scene.names) for scene in scenes_of_kind)
+            print(f"{kind}: {len(scenes_of_kind)} scenes, withdrawn {withdrawn}, verdicts {levels},", end="")
+            print(f" scenes with names {with_names}")
 
 
 def _judge(job: tuple[str, int, bool]) -> SceneFigures:
     return judge_world(*job)
 
 
-def line_of(title: str, scenes: Sequence[SceneFigures]) -> str:
+def format_line(title: str, scenes: Sequence[SceneFigures]) -> str:
     """Return one line of the table of patches."""
     patches = [p for scene in scenes for p in scene.patches]
     distances = np.array([p.distance2 for p in patches if p.distance2 is not None])
@@ -391,11 +409,11 @@ def verdict_line(title: str, scenes: Sequence[SceneFigures], undisturbed: Sequen
     cells = [f"{title:<14}{len(scenes):>7}{100 * len(good) / len(scenes):>8.0f}"]
     cells.append(f"{100 * np.mean(under_good):>10.1f}" if under_good else f"{'-':>10}")
     cells.append(f"{sum(scene.level == 'none' for scene in scenes):>6}")
-    places = [scene.named_at(title) for scene in scenes]
+    places = [scene.place_named(title) for scene in scenes]
     early = np.mean([place is not None and place < FIRST_REASONS for place in places])
     ever = np.mean([place is not None for place in places])
     if undisturbed:
-        false = np.mean([scene.named_at(title) is not None for scene in undisturbed])
+        false = np.mean([scene.place_named(title) is not None for scene in undisturbed])
     else:
         false = np.nan
     cells.append(f"{100 * early:>9.0f}{100 * ever:>6.0f}{100 * false:>13.0f}" if title in CAUSES else f"{'-':>9}")
@@ -411,8 +429,8 @@ def print_tables(scenes: Sequence[SceneFigures]) -> None:
     print(f"{'nuisance':<14}{'patches':>8}{'in 95 %':>9}{'rms z':>8}{'half %':>9}{'err %':>8}{'right %':>9}"
           "  names said %, right % (number) at 0.5, 0.8, 0.95")  # fmt: skip
     for name in names:
-        print(line_of(name, by_name[name]))
-    print(line_of("together", scenes))
+        print(format_line(name, by_name[name]))
+    print(format_line("together", scenes))
     print(f"\n{'nuisance':<14}{'scenes':>7}{'good %':>8}{'in good %':>10}{'none':>6}{'first 2 %':>10}{'ever':>6}"
           f"{'undisturbed':>13}  the cause among the reasons")  # fmt: skip
     for name in names:

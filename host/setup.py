@@ -22,8 +22,8 @@ TARGET = os.environ.get("POLYSIGHT_WHEEL", "")
 
 def copy_data(folder):
     """Copy the rig file, the scenes and the pages that errors name into the package that is built."""
-    found = [*(TOP / "examples").rglob("*.toml"), *(TOP / "docs").rglob("*.md"), *(TOP / "docs").rglob("*.svg")]
-    files = [Path("instrument.toml"), *(path.relative_to(TOP) for path in found)]
+    data_files = [*(TOP / "examples").rglob("*.toml"), *(TOP / "docs").rglob("*.md"), *(TOP / "docs").rglob("*.svg")]
+    files = [Path("instrument.toml"), *(path.relative_to(TOP) for path in data_files)]
     for file in files:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(TOP / file, folder / file)

@@ -74,7 +74,9 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
     async def stage(self) -> None:
         """Reset the state of the previous scan."""
         await self._end()
-        self._place, self._stop, self._collected = None, StopRequest(), 0
+        self._place = None
+        self._stop = StopRequest()
+        self._collected = 0
         self._begun.clear()
         self._times.clear()
 
@@ -126,7 +128,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         while not self._begun.is_set() and not self._scanning.done():
             await asyncio.sleep(_LOOK_S / 4)
         if self._scanning.done():
-            self._checked(await self._scanning)
+            self._check_result(await self._scanning)
 
     @WatchableAsyncStatus.wrap
     async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:
@@ -139,7 +141,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
             committed, planned = self._progress
             yield WatcherUpdate(committed, 0, planned, self.name, "rows", time_elapsed=time.monotonic() - began)
             await asyncio.wait([scanning], timeout=_LOOK_S)
-        self._checked(await scanning)
+        self._check_result(await scanning)
 
     async def stop(self, success: bool = True) -> None:
         """Stop the scan after the current row; at once if the run has failed."""
@@ -161,9 +163,9 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
             missing = sum(board.missing_bytes for board in row.boards.values())
             values = {"row": row.row, "take": row.take, "pulses": row.pulses, "missing_bytes": missing}
             data = {f"{self.name}-{key}": value for key, value in values.items()}
-            at = self._times.get(row.row, time.time())
+            time_s = self._times.get(row.row, time.time())
             self._collected += 1
-            yield {"data": data, "timestamps": dict.fromkeys(data, at), "time": at}
+            yield {"data": data, "timestamps": dict.fromkeys(data, time_s), "time": time_s}
 
     def _scan(self, folder: Path, loop: asyncio.AbstractEventLoop) -> ScanResult:
         """Run the scan; called in its own thread."""
@@ -188,7 +190,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         if phase == "committed" and committed == 1:
             self._set_scan_id(ScanFolder.load(folder).scan_id)
 
-    def _checked(self, result: ScanResult) -> None:
+    def _check_result(self, result: ScanResult) -> None:
         if result.exit_status != "success":
             raise ScanError(
                 f"{self._place}: {result.reason}",

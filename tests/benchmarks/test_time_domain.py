@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks.data import published
+from benchmarks.data import published_scene
 from numpy.typing import NDArray
 
 from polysight.imaging import backproject, image_grid
@@ -17,7 +17,7 @@ EVERY = 2
 
 @pytest.fixture(scope="module")
 def aperture() -> Aperture:
-    rig, _ = published(quick=True)
+    rig, _ = published_scene(quick=True)
     rng = np.random.default_rng(1)
     offsets = np.pad(rng.uniform(-0.2, 0.2, (ROWS, COLUMNS, 2)), ((0, 0), (0, 0), (0, 1)))
     return Aperture(Antennas.from_rig(rig, rig.receivers[1]), offsets, np.linspace(76.3e9, 79.7e9, 14), image_grid(rig))

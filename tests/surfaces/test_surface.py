@@ -45,7 +45,7 @@ def glass_ball(see, gains, optics):
 
 def test_points_and_normals_of_a_sphere_are_found(glass_ball):
     scene, _, surface = glass_ball
-    distance, normals = scene.surface_at(surface.points_m)
+    distance, normals = scene.nearest_surface(surface.points_m)
     angle = np.degrees(np.arccos(np.clip((normals * surface.normals).sum(axis=1), -1, 1)))
     assert np.median(np.abs(distance)) < 0.5e-3
     assert np.median(angle) < 0.5
@@ -66,7 +66,7 @@ def test_a_cylinder_of_50_mm_is_measured(see, gains, optics):
     rod = cylinder("rod", Stack(below=medium), (CENTRE_M[0], CENTRE_M[1], 0.55), 0.05, 0.4, axis=(0.5, 1.0, 0.05))
     scene = ShapeScene("cylinder", (rod,), medium, 0.05)
     surface = analyse_surface(see(scene.shapes), optics, gains, uncertainty=EXACT)
-    _, normals = scene.surface_at(surface.points_m)
+    _, normals = scene.nearest_surface(surface.points_m)
     angle = np.degrees(np.arccos(np.clip((normals * surface.normals).sum(axis=1), -1, 1)))
     assert np.median(angle) < 1.0
     assert abs(surface.segments[0].permittivity - medium) < 0.05 * abs(medium)

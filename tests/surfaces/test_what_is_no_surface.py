@@ -19,7 +19,7 @@ def test_the_sharp_edges_of_a_tilted_plate_are_no_surface(see, gains, optics):
     board = plate("board", Stack(below=MEDIUM), CENTRE_M, (0.1, 0.1), tilt_deg=(2.0, -2.0))
     surface = analyse_surface(see([board]), optics, gains, uncertainty=EXACT)
     _, a, b = board.project(surface.points_m)
-    turns = np.linalg.norm(surface.normals - board.at(a, b).normal.T, axis=1)
+    turns = np.linalg.norm(surface.normals - board.evaluate(a, b).normal.T, axis=1)
     assert np.median(np.degrees(turns)) < 1.5
     for segment in surface.segments:
         if segment.permittivity is not None:

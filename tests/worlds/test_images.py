@@ -49,7 +49,7 @@ def test_a_dielectric_beside_metal_has_the_ratio_of_fresnel(undisturbed_pair):
     plate = Plate("plate", CENTRE_M, (0.06, 0.06), DIELECTRIC)
     images = simulate(World((plate,)))
     measured = ratio(images, plate) / ratio(undisturbed_pair, undisturbed_pair.world.plates[0])
-    assert measured == pytest.approx(images.ratio_of(plate), rel=0.01)
+    assert measured == pytest.approx(images.plate_ratio(plate), rel=0.01)
 
 
 @pytest.mark.parametrize("name", [*NUISANCES, "all"])

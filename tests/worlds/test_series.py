@@ -10,7 +10,7 @@ from polysight_worlds.media import LIGHT_M_PER_S
 from polysight_worlds.series import (
     EndlessCylinder,
     Pair,
-    orders_of,
+    needed_orders,
     scatter_cylinder,
     scatter_sphere,
     sphere_coefficients,
@@ -97,13 +97,13 @@ def test_the_stationary_axial_wave_gives_the_whole_integral(permittivity, sent, 
     pair = dipoles((-0.25, 0.3, -0.5), (0.3, -0.2, -0.5), sent + 0.3 * S_AXIS, received + 0.2 * P_AXIS)
     body = EndlessCylinder(radius_m, permittivity, False)
     round_x = cylinder("cylinder", METAL, (0.0, 0.0, 0.0), radius_m, 2.0, axis=(1.0, 0.0, 0.0))
-    path = follow_path(round_x.at(*find_specular(round_x, pair.tx_m, pair.rx_m)), pair.tx_m, pair.rx_m)
+    path = follow_path(round_x.evaluate(*find_specular(round_x, pair.tx_m, pair.rx_m)), pair.tx_m, pair.rx_m)
     specular = np.sqrt(path.length_m**2 - (pair.rx_m[0] - pair.tx_m[0]) ** 2)
     # The contour passes below the branch point k and above -k.
     t = np.linspace(-2.2 * k, 2.2 * k, 4001)
     h = t * (1 - 0.02j)
     many = Pair(*(np.repeat(part, len(t), axis=1) for part in vars(pair).values()))
-    m_m, n_n, m_n = (table.T for table in body.coefficients(k, h, orders_of(k * radius_m)))
+    m_m, n_n, m_n = (table.T for table in body.coefficients(k, h, needed_orders(k * radius_m)))
     integrand = sum_orders(many, (m_m, n_n, m_n), k, h, np.zeros(len(t))) * np.exp(
         1j * h * (pair.rx_m[0] - pair.tx_m[0])
     )

@@ -39,9 +39,9 @@ def test_a_drawn_object_is_seen_and_its_truth_is_where_its_rays_are(kind):
     middle_m = np.zeros((3, 1))
     shape = scene.shapes[0]
     tx_m, rx_m = (antenna.position[:, None] + middle_m for antenna in (BOARDS.tx, BOARDS.h[0]))
-    patch = shape.at(*find_specular(shape, tx_m, rx_m))
+    patch = shape.evaluate(*find_specular(shape, tx_m, rx_m))
     if kind != "bottle":
-        distances, normals = scene.surface_at(patch.point.T)
+        distances, normals = scene.nearest_surface(patch.point.T)
         assert distances == pytest.approx(0, abs=1e-8)
         assert pytest.approx(patch.normal, abs=1e-6) == normals.T
     assert scene.permittivity is not None

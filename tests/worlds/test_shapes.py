@@ -47,7 +47,7 @@ def geometrical_optics(shape: Shape, tx: Antenna, rx: Antenna, offset_m: np.ndar
     """Ray at the specular point: Fresnel's coefficients, spreading by the path's second derivatives."""
     places = (antenna.position[:, None] + offset_m[:, None] for antenna in (tx, rx))
     tx_m, rx_m = places
-    patch = shape.at(*find_specular(shape, tx_m, rx_m))
+    patch = shape.evaluate(*find_specular(shape, tx_m, rx_m))
     path = follow_path(patch, tx_m, rx_m)
     out = patch.point - tx_m
     back = rx_m - patch.point
@@ -85,16 +85,16 @@ def test_a_shape_reflects_by_geometrical_optics_but_for_a_few_per_cent(shape):
 def test_a_surface_knows_its_points_normals_and_derivatives(shape):
     a = np.array([0.02, -0.03])
     b = np.array([0.01, 0.04])
-    patch = shape.at(a, b)
+    patch = shape.evaluate(a, b)
     step = 1e-5
-    along_a = (shape.at(a + step, b).point - shape.at(a - step, b).point) / (2 * step)
-    mixed = (shape.at(a, b + step).d_a - shape.at(a, b - step).d_a) / (2 * step)
+    along_a = (shape.evaluate(a + step, b).point - shape.evaluate(a - step, b).point) / (2 * step)
+    mixed = (shape.evaluate(a, b + step).d_a - shape.evaluate(a, b - step).d_a) / (2 * step)
     assert patch.d_a == pytest.approx(along_a, abs=1e-8)
     assert patch.d_ab == pytest.approx(mixed, abs=1e-8)
     # A millimetre in front of the surface.
     distances, near_a, near_b = shape.project((patch.point + 1e-3 * patch.normal).T)
     assert distances == pytest.approx(1e-3, abs=1e-9)
-    assert shape.at(near_a, near_b).point == pytest.approx(patch.point, abs=1e-9)
+    assert shape.evaluate(near_a, near_b).point == pytest.approx(patch.point, abs=1e-9)
     assert np.all(patch.normal[2] < 0)
 
 
@@ -102,9 +102,9 @@ def test_curvatures_are_those_of_the_solids():
     ball = SHAPES[0]
     pipe = SHAPES[1]
     saddle = SHAPES[3]
-    assert np.linalg.eigvalsh(ball.at(0.1, 0.2).curvature()) == pytest.approx([10, 10])
-    assert np.linalg.eigvalsh(pipe.at(0.1, 0.2).curvature()) == pytest.approx([0, 10], abs=1e-9)
-    assert saddle.at(0.0, 0.0).curvature() == pytest.approx(np.array([[7, 1], [1, -6]]))
+    assert np.linalg.eigvalsh(ball.evaluate(0.1, 0.2).curvature()) == pytest.approx([10, 10])
+    assert np.linalg.eigvalsh(pipe.evaluate(0.1, 0.2).curvature()) == pytest.approx([0, 10], abs=1e-9)
+    assert saddle.evaluate(0.0, 0.0).curvature() == pytest.approx(np.array([[7, 1], [1, -6]]))
 
 
 @pytest.mark.parametrize("shape", SHAPES[:3], ids=lambda shape: shape.name)
@@ -135,5 +135,5 @@ def test_the_phase_is_that_of_the_path_beyond_the_direct_one():
     slope_m = np.ptp(np.unwrap(np.angle(echo))) / (2 * np.pi * np.ptp(FREQUENCIES_HZ)) * LIGHT_M_PER_S
     tx_m = BOARDS.tx.position[:, None]
     rx_m = rx.position[:, None]
-    path = follow_path(SHAPES[0].at(*find_specular(SHAPES[0], tx_m, rx_m)), tx_m, rx_m)
+    path = follow_path(SHAPES[0].evaluate(*find_specular(SHAPES[0], tx_m, rx_m)), tx_m, rx_m)
     assert slope_m == pytest.approx(path.length_m[0] - direct_m, abs=2e-4)

@@ -47,7 +47,7 @@ class BendTerms:
 
     spline: CubicSpline
 
-    def at(self, cos_incidence: NDArray, frequency_hz: float) -> NDArray:
+    def evaluate(self, cos_incidence: NDArray, frequency_hz: float) -> NDArray:
         """Return complex [..., 4 rows, 4 coefficients] at these cosines."""
         angles = np.clip(np.degrees(np.arccos(cos_incidence)), ANGLES_DEG[0], ANGLES_DEG[-1])
         values = self.spline(angles)
@@ -90,7 +90,7 @@ def _compare(stack: Stack, axis: tuple[float, float, float], radius_m: float) ->
         axes = (s_axis, np.cross(s_axis, -tx_way)), (s_axis, np.cross(rx_way, s_axis))
         tx_m, rx_m = (DISTANCE_M * way[:, None] for way in (tx_way, rx_way))
         specular = find_specular(shape, tx_m, rx_m)
-        patch = shape.at(*specular)
+        patch = shape.evaluate(*specular)
         path = follow_path(patch, tx_m, rx_m)
         for sent, received in PAIRS:
             tx = Antenna(tx_m[:, 0], -tx_way, axes[0][sent], 0.0, is_dipole=True)
@@ -100,7 +100,7 @@ def _compare(stack: Stack, axis: tuple[float, float, float], radius_m: float) ->
             spreads.append(spread_of_ray(patch, path, tx_m, rx_m)[0])
             place = -np.asarray(shape.place_m)
             columns.append((tx.position + place, rx.position + place, tx.polarisation, rx.polarisation))
-    pair = Pair(*(np.array(part).T for part in zip(*columns, strict=True))).turned(shape.axes)
+    pair = Pair(*(np.array(part).T for part in zip(*columns, strict=True))).rotate(shape.axes)
     path_m = np.sqrt((2 * DISTANCE_M) ** 2 - (pair.rx_m[0] - pair.tx_m[0]) ** 2)
     medium = None if stack.is_metal else stack.below
     series = scatter_cylinder(pair, radius_m, medium, FREQUENCY_HZ, path_m)

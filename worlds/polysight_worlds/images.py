@@ -41,7 +41,7 @@ class ImagePair:
         """Mean of the angles of incidence of H and V, a tenth of a degree apart."""
         return (self.rig.incidence_deg("h") + self.rig.incidence_deg("v")) / 2
 
-    def ratio_of(self, plate: Plate) -> complex:
+    def plate_ratio(self, plate: Plate) -> complex:
         """H / V of a plate over that of metal, without any disturbance, at the middle of the band."""
         cos_h, cos_v = (np.cos(np.radians(self.rig.incidence_deg(channel))) for channel in ("h", "v"))
         r_s, _ = reflect(plate.stack, self.rig.frequencies_hz.mean(), cos_h)
@@ -67,7 +67,7 @@ class ImagePair:
         for plate in self.world.plates:
             written = asdict(plate)
             stack = written.pop("stack")
-            ratio = self.ratio_of(plate)
+            ratio = self.plate_ratio(plate)
             written["box_m"] = plate.box_m
             written["is_metal"] = plate.stack.is_metal
             written["layers"] = [[eps.real, eps.imag, 1000 * thick] for eps, thick in stack["layers"]]
@@ -135,7 +135,7 @@ def disturb_rig(rig: Rig, nuisances: Nuisances) -> Rig:
         axis = draw_direction(rng)
         shift_m = draw_direction(rng) * nuisances.misplaced_mm / 1000
         phase = rng.uniform(0, 2 * np.pi)
-        return antenna.turned(turn(axis, turn_deg), shift_m).with_leakage(leakage * np.exp(1j * phase))
+        return antenna.rotate(turn(axis, turn_deg), shift_m).with_leakage(leakage * np.exp(1j * phase))
 
     return replace(
         rig,

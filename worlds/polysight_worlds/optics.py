@@ -36,14 +36,14 @@ class Antenna:
     is_dipole: bool = False
 
     @staticmethod
-    def aimed(
+    def aim(
         position: NDArray, boresight: NDArray, direction: NDArray, polarisation: NDArray, exponent: float = 2.0
     ) -> Antenna:
         """The antenna whose field in `direction` has the given polarisation (a vector across `direction`)."""
         at_boresight = _carry(direction, boresight, polarisation)
         return Antenna(position, boresight, at_boresight, exponent)
 
-    def turned(self, rotation: NDArray, shift_m: NDArray) -> Antenna:
+    def rotate(self, rotation: NDArray, shift_m: NDArray) -> Antenna:
         """The antenna after a turn about its own place and a shift."""
         return replace(
             self,

@@ -82,10 +82,10 @@ def place(steps: list[dict], antenna_mm: NDArray) -> tuple[NDArray, NDArray]:
 
 def load_rig(file: Path) -> Rig:
     """The rig of an `instrument.toml`: mounts, antennas, object distance, grid. A board's four RX become their mean."""
-    return rig_of(tomllib.loads(file.read_text(encoding="utf-8")))
+    return read_rig(tomllib.loads(file.read_text(encoding="utf-8")))
 
 
-def rig_of(content: dict, leakage: tuple[complex, complex] = (0j, 0j)) -> Rig:
+def read_rig(content: dict, leakage: tuple[complex, complex] = (0j, 0j)) -> Rig:
     """The rig of an instrument file's content; `leakage` of p into H and of s into V, towards their mirror points."""
     boards = {board["role"]: board for board in content["boards"]}
     antennas = content["antennas"]
@@ -121,7 +121,7 @@ def build_rig(
         # Along +x, so that metal gives H and V the same sign.
         p_axis = np.cross(direction, s_axis)
         p_axis *= np.sign(p_axis[0])
-        return Antenna.aimed(*board, direction, s_share * s_axis + p_share * p_axis)
+        return Antenna.aim(*board, direction, s_share * s_axis + p_share * p_axis)
 
     half = np.sqrt(0.5)
     return Rig(aim(tx, h, half, half), aim(h, h, 1, leakage[0]), aim(v, v, leakage[1], 1), plane_m, columns, rows)
@@ -158,16 +158,16 @@ def spread_receivers(rig: Rig, step_h_m: NDArray, step_v_m: NDArray, count: int 
 
 def load_boards(file: Path) -> Boards:
     """Return the boards of an `instrument.toml`."""
-    return boards_of(tomllib.loads(file.read_text(encoding="utf-8")))
+    return read_boards(tomllib.loads(file.read_text(encoding="utf-8")))
 
 
-def boards_of(content: dict, leakage: tuple[complex, complex] = (0j, 0j)) -> Boards:
+def read_boards(content: dict, leakage: tuple[complex, complex] = (0j, 0j)) -> Boards:
     """Return the boards of an instrument file's content; `leakage` as of `rig_of`."""
     steps = {}
     for board in content["boards"]:
         places = [place(board["mount"], antenna_mm)[0] for antenna_mm in content["antennas"]["rx_mm"]]
         steps[board["role"]] = (places[-1] - places[0]) / max(1, len(places) - 1)
-    rig = rig_of(content, leakage)
+    rig = read_rig(content, leakage)
     return spread_receivers(rig, steps["receive_h"], steps["receive_v"], len(content["antennas"]["rx_mm"]))
 
 

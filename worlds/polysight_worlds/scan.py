@@ -134,17 +134,18 @@ class PlateEchoes:
         z = rig.plane_m - plate.height_mm / 1000
         return np.stack(np.broadcast_arrays(x[None, :], y[:, None], z))
 
-    def add_to(self, data: NDArray, index: int) -> None:
+    def add_echoes(self, data: NDArray, index: int) -> None:
         """Add the echoes at frequency `index` to complex `data` [rows, columns]."""
         rig = self._rig
         surface = self._surface
         frequency_hz = rig.frequencies_hz[index]
         k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
-        step, (slope_x, slope_y) = rig.step_m, surface.mean_slopes
+        step = rig.step_m
+        slope_x, slope_y = surface.mean_slopes
         edges = np.array([step, 0, slope_x * step]), np.array([0, step, slope_y * step])
         shape = integrate_phase(self._responses[0], *edges, frequency_hz)
         area_m2 = step**2 * np.sqrt(1 + slope_x**2 + slope_y**2)
-        common = (1j * k / (4 * np.pi) * area_m2 * shape).astype(np.complex64) * self._phase.at(index)
+        common = (1j * k / (4 * np.pi) * area_m2 * shape).astype(np.complex64) * self._phase.phases(index)
         terms = []
         for response in self._responses:
             r_s, r_p = self._tables[index].look_up(response.cos_incidence)
@@ -196,7 +197,7 @@ class _PhaseSteps:
         self._factor = np.exp(-2j * np.pi * spacing_hz * turns).astype(np.complex64)
         self._index = 0
 
-    def at(self, index: int) -> NDArray:
+    def phases(self, index: int) -> NDArray:
         """Phases of frequency `index`; indices are asked for in rising order."""
         while self._index < index:
             self._now = self._now * self._factor
@@ -214,7 +215,7 @@ def record(rig: Rig, rx: Antenna, world: World, seed: int = 0) -> NDArray:
         rng = np.random.default_rng([seed, 2, number])
         echoes = PlateEchoes(rig, rx, plate, make_surface(plate, rig.step_m, rng))
         for index in range(len(rig.frequencies_hz)):
-            echoes.add_to(data[index], index)
+            echoes.add_echoes(data[index], index)
     x, y = (grid.ravel() for grid in np.meshgrid(*rig.offsets_m()))
     offsets = np.stack([x, y, np.zeros_like(x)], axis=1)
     for body in world.bodies:

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from polysight_worlds.media import METAL, Stack
 from polysight_worlds.optics import Antenna
-from polysight_worlds.rig import boards_of, find_mirror_point, rig_of
-from polysight_worlds.shape_echoes import echo_of
+from polysight_worlds.rig import find_mirror_point, read_boards, read_rig
+from polysight_worlds.shape_echoes import simulate_echo
 from polysight_worlds.shapes import Shape, bottle, cylinder, plate, sphere
 
 
-def echoes_of(
+def simulate_echoes(
     shapes: Sequence[dict[str, Any]],
     rig: dict[str, Any],
     role: str,
@@ -35,8 +35,8 @@ def echoes_of(
     "receive_v"; `leakage`: of p into H and of s into V, as waves; `offsets_m` [n, 2]. `centre_m`: the image's
     centre on the object plane.
     """
-    nominal = rig_of(rig)
-    boards = boards_of(rig, leakage)
+    nominal = read_rig(rig)
+    boards = read_boards(rig, leakage)
     channel = role.removeprefix("receive_")
     level = _mirror_level(nominal.tx, getattr(nominal, channel), nominal.plane_m)
     offsets = np.column_stack([offsets_m, np.zeros(len(offsets_m))])
@@ -45,7 +45,7 @@ def echoes_of(
     for rx in boards.receivers()[channel]:
         wave = np.zeros((len(frequencies_hz), len(offsets)), np.complex64)
         for piece in pieces:
-            wave += echo_of(piece, boards.tx, rx, np.asarray(frequencies_hz, float), offsets, path_m)
+            wave += simulate_echo(piece, boards.tx, rx, np.asarray(frequencies_hz, float), offsets, path_m)
         samples.append(wave.conj() / np.float32(level))
     return np.stack(samples)
 
@@ -65,7 +65,7 @@ def make_shapes(table: dict[str, Any], centre_m: Sequence[float]) -> tuple[Shape
     front_m = x + table["centre_mm"][0] / 1000, y + table["centre_mm"][1] / 1000, z + table["height_mm"] / 1000
     name = table["name"]
     kind = table["kind"]
-    stack = _stack_of(table)
+    stack = _read_stack(table)
     if kind == "plate":
         width_mm, height_mm = table["size_mm"]
         piece = plate(
@@ -90,7 +90,7 @@ def make_shapes(table: dict[str, Any], centre_m: Sequence[float]) -> tuple[Shape
     return (cylinder(name, stack, middle_m, radius_m, length_m, axis=axis, slope=slope),)
 
 
-def _stack_of(table: dict[str, Any]) -> Stack:
+def _read_stack(table: dict[str, Any]) -> Stack:
     if table.get("metal"):
         return METAL
     real, loss = table["permittivity"]

@@ -47,7 +47,7 @@ class Pair:
     received: NDArray
 
     @staticmethod
-    def aimed(tx: Antenna, rx: Antenna, offsets_m: NDArray, origin_m: NDArray, points_m: NDArray) -> Pair:
+    def aim(tx: Antenna, rx: Antenna, offsets_m: NDArray, origin_m: NDArray, points_m: NDArray) -> Pair:
         """Return antennas that send to `points_m` [3, n], relative to a body at `origin_m` [3]."""
         places = []
         fields = []
@@ -58,7 +58,7 @@ class Pair:
             places.append(place - np.asarray(origin_m)[:, None])
         return Pair(places[0], places[1], fields[0], fields[1])
 
-    def turned(self, axes: NDArray) -> Pair:
+    def rotate(self, axes: NDArray) -> Pair:
         """Return the pair in local axes (columns of `axes`)."""
         return Pair(*(np.einsum("ji,jn->in", axes, part) for part in vars(self).values()))
 
@@ -67,7 +67,7 @@ def _dot(a: NDArray, b: NDArray) -> NDArray:
     return np.einsum("in,in->n", a, b)
 
 
-def orders_of(x: float) -> NDArray:
+def needed_orders(x: float) -> NDArray:
     """Orders 0, 1, .. that a body of size parameter x needs."""
     return np.arange(int(np.ceil(x + 4.05 * x ** (1 / 3) + MORE_TERMS)) + 1)
 
@@ -80,7 +80,7 @@ def sphere_coefficients(
     `permittivity` is eps' - j eps''.
     """
     x = k * radius_m
-    orders = orders_of(x)
+    orders = needed_orders(x)
     count = len(orders) - 1
     psi = x * special.spherical_jn(orders, x)
     xi = psi + 1j * x * special.spherical_yn(orders, x)
@@ -283,7 +283,7 @@ def _tabulate(
     path_m = (low + high) / 2 + (high - low) / 2 * places
     h, _ = _axial_wave_number(k, along_m, path_m, place)
     to_series = np.linalg.inv(chebyshev.chebvander(places, DEGREE))
-    first, second, third = (to_series @ table.T for table in body.coefficients(k, h, orders_of(k * body.radius_m)))
+    first, second, third = (to_series @ table.T for table in body.coefficients(k, h, needed_orders(k * body.radius_m)))
     return first, second, third
 
 
@@ -323,7 +323,7 @@ def scatter_cylinder(
     for place, weight in zip(PLACES, (side, 1 - 2 * side, side), strict=True):
         h, unit = _axial_wave_number(k, along_m, path_m, place)
         if len(h) <= FEW or np.ptp(along_m) > 0:
-            m_m, n_n, m_n = (table.T for table in body.coefficients(k, h, orders_of(k * radius_m)))
+            m_m, n_n, m_n = (table.T for table in body.coefficients(k, h, needed_orders(k * radius_m)))
         else:
             m_m, n_n, m_n = (basis @ table for table in _tabulate(body, k, float(along_m[0]), place, (low, high)))
         slow = sum_orders(pair, (m_m, n_n, m_n), k, h, path_m)

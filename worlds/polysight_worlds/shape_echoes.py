@@ -21,7 +21,7 @@ from polysight_worlds.optics import CHUNK, Antenna, integrate_phase, rectangle, 
 from polysight_worlds.rig import Boards
 from polysight_worlds.series import Pair, scatter_cylinder, scatter_sphere
 from polysight_worlds.shapes import Revolved, Shape, Sphere, find_specular, follow_path
-from polysight_worlds.zones import CosineTable, antennas_at, spread_of_ray, sum_window, window, window_units
+from polysight_worlds.zones import CosineTable, place_antennas, spread_of_ray, sum_window, window, window_units
 
 # What edges diffract turns by a wave in 13 mm of the stage's way, relative to the specular path. The series has none.
 LATTICE_M = 0.005
@@ -56,13 +56,13 @@ def record_shapes(
             wave = np.zeros((len(frequencies_hz), len(flat)), np.complex64)
             direct_m = np.linalg.norm(rx.position - boards.tx.position)
             for shape in shapes:
-                wave += echo_of(shape, boards.tx, rx, frequencies_hz, flat, float(direct_m))
+                wave += simulate_echo(shape, boards.tx, rx, frequencies_hz, flat, float(direct_m))
             cube[index] = wave.conj()
         cubes[channel] = cube.reshape(*cube.shape[:2], *offsets.shape[:-1])
     return cubes
 
 
-def echo_of(
+def simulate_echo(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, direct_m: float
 ) -> NDArray:
     """Wave of one shape at one RX, complex64 [frequencies, offsets], with exp(-jk (path - direct_m))."""
@@ -77,15 +77,15 @@ def echo_of(
         nodes_hz = frequencies_hz
         expand = np.eye(len(frequencies_hz))
     if lattice is None:
-        places = find_specular(shape, *antennas_at(tx, rx, offsets))
+        places = find_specular(shape, *place_antennas(tx, rx, offsets))
         slow = solution(shape, tx, rx, nodes_hz, offsets, places)
     else:
         coarse = lattice.reshape(-1, 3)
-        coarse_places = find_specular(shape, *antennas_at(tx, rx, coarse))
+        coarse_places = find_specular(shape, *place_antennas(tx, rx, coarse))
         coarse_slow = solution(shape, tx, rx, nodes_hz, coarse, coarse_places)
         places = tuple(_interpolate(p.reshape(lattice.shape[:2]), coordinates) for p in coarse_places)
         slow = np.stack([_interpolate(s.reshape(lattice.shape[:2]), coordinates) for s in coarse_slow])
-    path = follow_path(shape.at(*places), *antennas_at(tx, rx, offsets))
+    path = follow_path(shape.evaluate(*places), *place_antennas(tx, rx, offsets))
     if solution is solve_cylinder:
         slow = slow * _end_factors(shape, path.hessian, places[0], nodes_hz)
     return _add_carrier(slow, path.length_m - direct_m, frequencies_hz, expand)
@@ -120,9 +120,9 @@ def solve_sphere(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
     """Mie's series, without the specular path's phase: [frequencies, offsets]."""
-    patch = shape.at(*places)
-    path_m = follow_path(patch, *antennas_at(tx, rx, offsets)).length_m
-    pair = Pair.aimed(tx, rx, offsets, np.asarray(shape.place_m), patch.point)
+    patch = shape.evaluate(*places)
+    path_m = follow_path(patch, *place_antennas(tx, rx, offsets)).length_m
+    pair = Pair.aim(tx, rx, offsets, np.asarray(shape.place_m), patch.point)
     waves = []
     for frequency_hz in frequencies_hz:
         wave = scatter_sphere(pair, shape.scale_m()[0], _medium(shape), frequency_hz, with_inside=shows_inside(shape))
@@ -134,9 +134,9 @@ def solve_cylinder(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
     """Series of the endless cylinder, without the specular path's phase: [frequencies, offsets]."""
-    patch = shape.at(*places)
-    path_m = follow_path(patch, *antennas_at(tx, rx, offsets)).length_m
-    pair = Pair.aimed(tx, rx, offsets, np.asarray(shape.place_m), patch.point).turned(shape.axes)
+    patch = shape.evaluate(*places)
+    path_m = follow_path(patch, *place_antennas(tx, rx, offsets)).length_m
+    pair = Pair.aim(tx, rx, offsets, np.asarray(shape.place_m), patch.point).rotate(shape.axes)
     across_m = np.sqrt(path_m**2 - (pair.rx_m[0] - pair.tx_m[0]) ** 2)
     waves = []
     for frequency_hz in frequencies_hz:
@@ -216,8 +216,8 @@ def _add_bends(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
     """What physical optics misses at the specular points, [frequencies, offsets], see `bends`."""
-    tx_m, rx_m = antennas_at(tx, rx, offsets)
-    patch = shape.at(*places)
+    tx_m, rx_m = place_antennas(tx, rx, offsets)
+    patch = shape.evaluate(*places)
     spread = spread_of_ray(patch, follow_path(patch, tx_m, rx_m), tx_m, rx_m) * shape.cover(*places)
     out = patch.point - tx_m
     back = rx_m - patch.point
@@ -239,7 +239,7 @@ def _add_bends(
     pairs = np.stack([parts_in[i] * parts_out[j] for i, j in ((0, 0), (1, 1), (0, 1), (1, 0))], axis=1)
     terms = find_bend_terms(shape.stack)
     return np.stack([
-        spread * np.einsum("nr,nrc,nc->n", weights, terms.at(cosine, frequency_hz), pairs)
+        spread * np.einsum("nr,nrc,nc->n", weights, terms.evaluate(cosine, frequency_hz), pairs)
         for frequency_hz in frequencies_hz
     ])  # fmt: skip
 
@@ -253,12 +253,12 @@ def _sum_facets(
     area_m2 = float(np.linalg.norm(np.cross(facets.edge_u[:, 0], facets.edge_v[:, 0])))
     normal = -shape.axes[:, 2]
     middle = np.asarray(shape.place_m)[:, None]
-    antennas = antennas_at(tx, rx, offsets)
+    antennas = place_antennas(tx, rx, offsets)
     middle_path_m = np.linalg.norm(middle - antennas[0], axis=0) + np.linalg.norm(middle - antennas[1], axis=0)
     # Paths over a plate differ by less than its diagonal: so many radians to either side over half of the band.
     radians = np.pi / 2 * float(np.hypot(*shape.size_m)) * np.ptp(frequencies_hz) / LIGHT_M_PER_S
     nodes_hz, expand = _frequency_nodes(frequencies_hz, 5 + int(np.ceil(radians)))
-    tables = [CosineTable.of(shape.stack, f) for f in nodes_hz]
+    tables = [CosineTable.get_cached(shape.stack, f) for f in nodes_hz]
     slow = np.empty((len(nodes_hz), len(offsets)), complex)
     at_once = max(1, CHUNK // len(facets.centres[0]))
     for first in range(0, len(offsets), at_once):

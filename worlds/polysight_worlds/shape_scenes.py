@@ -43,7 +43,7 @@ class ShapeScene:
     is_uniform: bool = True
     background: tuple[Shape, ...] = ()
 
-    def surface_at(self, points_m: NDArray) -> tuple[NDArray, NDArray]:
+    def nearest_surface(self, points_m: NDArray) -> tuple[NDArray, NDArray]:
         """Signed distances [n] of points [n, 3] from the object's nearest surface, and its normals there [n, 3]."""
         distances = np.full(len(points_m), np.inf)
         normals = np.zeros((len(points_m), 3))
@@ -51,7 +51,7 @@ class ShapeScene:
             projected, a, b = shape.project(points_m)
             nearer = np.abs(projected) < np.abs(distances)
             distances = np.where(nearer, projected, distances)
-            normals = np.where(nearer[:, None], shape.at(a, b).normal.T, normals)
+            normals = np.where(nearer[:, None], shape.evaluate(a, b).normal.T, normals)
         return distances, normals
 
 
@@ -80,7 +80,7 @@ def disturb_boards(boards: Boards, nuisances: ShapeNuisances) -> Boards:
         shift_m = draw_direction(rng) * nuisances.misplaced_mm / 1000
         rotation = turn(antennas[0].boresight, nuisances.axes_deg * rng.choice([-1, 1]))
         leaked = leakage * np.exp(2j * np.pi * rng.random())
-        return tuple(antenna.turned(rotation, shift_m).with_leakage(leaked) for antenna in antennas)
+        return tuple(antenna.rotate(rotation, shift_m).with_leakage(leaked) for antenna in antennas)
 
     tx = disturb((boards.tx,), 0.0)[0]
     return Boards(tx, disturb(boards.h, nuisances.leakage), disturb(boards.v, nuisances.leakage))
@@ -140,7 +140,7 @@ class _Draw:
     stack: Stack
     axis: tuple[float, float, float]
 
-    def behind(self, depth_m: float) -> tuple[float, float, float]:
+    def point_behind(self, depth_m: float) -> tuple[float, float, float]:
         x, y, z = self.front_m
         return x, y, z + depth_m
 
@@ -148,7 +148,7 @@ class _Draw:
 def _draw_sphere(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[Shape, ...], float]]:
     def draw(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
         radius_m = drawn.rng.uniform(low_m, high_m)
-        return (sphere("sphere", drawn.stack, drawn.behind(radius_m), radius_m),), radius_m
+        return (sphere("sphere", drawn.stack, drawn.point_behind(radius_m), radius_m),), radius_m
 
     return draw
 
@@ -156,7 +156,9 @@ def _draw_sphere(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[S
 def _draw_cylinder(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[Shape, ...], float]]:
     def draw(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
         radius_m = drawn.rng.uniform(low_m, high_m)
-        return (cylinder("cylinder", drawn.stack, drawn.behind(radius_m), radius_m, 0.4, axis=drawn.axis),), radius_m
+        return (
+            cylinder("cylinder", drawn.stack, drawn.point_behind(radius_m), radius_m, 0.4, axis=drawn.axis),
+        ), radius_m
 
     return draw
 
@@ -171,14 +173,14 @@ def _draw_plate(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
 def _draw_cone(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
     radius_m = drawn.rng.uniform(0.1, 0.16)
     slope = float(np.tan(np.radians(drawn.rng.uniform(3, 12))))
-    piece = cylinder("cone", drawn.stack, drawn.behind(radius_m), radius_m, 0.3, axis=drawn.axis, slope=slope)
+    piece = cylinder("cone", drawn.stack, drawn.point_behind(radius_m), radius_m, 0.3, axis=drawn.axis, slope=slope)
     return (piece,), radius_m
 
 
 def _draw_barrel(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
     radius_m = drawn.rng.uniform(0.1, 0.16)
     bulge = float(drawn.rng.uniform(1, 6))
-    piece = cylinder("barrel", drawn.stack, drawn.behind(radius_m), radius_m, 0.2, axis=drawn.axis, bulge=bulge)
+    piece = cylinder("barrel", drawn.stack, drawn.point_behind(radius_m), radius_m, 0.2, axis=drawn.axis, bulge=bulge)
     return (piece,), radius_m
 
 
@@ -200,7 +202,7 @@ def _draw_bottle(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
     radius_m = drawn.rng.uniform(0.03, 0.05)
     wall_m = drawn.rng.uniform(0.5e-3, 3e-3)
     wall = Stack(((drawn.stack.below, wall_m),), 1.0)
-    return bottle("bottle", wall, drawn.behind(radius_m), radius_m, 0.16, axis=drawn.axis), radius_m
+    return bottle("bottle", wall, drawn.point_behind(radius_m), radius_m, 0.16, axis=drawn.axis), radius_m
 
 
 KINDS: dict[str, Callable[[_Draw], tuple[tuple[Shape, ...], float]]] = {

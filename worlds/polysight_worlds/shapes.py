@@ -86,7 +86,7 @@ class Shape:
     is_flat_plate = False
     is_bent = True
 
-    def turned(self, axis: NDArray, angle_deg: float) -> Shape:
+    def rotate(self, axis: NDArray, angle_deg: float) -> Shape:
         """Return the shape turned about its origin."""
         return replace(self, axes=turn(np.asarray(axis, float), angle_deg) @ self.axes)
 
@@ -98,7 +98,7 @@ class Shape:
         """Metres per unit of a and of b."""
         return 1.0, 1.0
 
-    def at(self, a: NDArray, b: NDArray) -> Patch:
+    def evaluate(self, a: NDArray, b: NDArray) -> Patch:
         """Return the surface in the rig frame."""
         parts = self.local(np.asarray(a, float), np.asarray(b, float))
         turned = [np.einsum("ij,j...->i...", self.axes, part) for part in vars(parts).values()]
@@ -124,12 +124,12 @@ class Shape:
         """Nearest place of the surface to points [n, 3]: signed distances (positive in front), a, b; each [n]."""
         points = np.asarray(points_m, float).T
         a, b = self.grid()
-        distance2 = ((points[:, :, None] - self.at(a, b).point[:, None]) ** 2).sum(axis=0)
+        distance2 = ((points[:, :, None] - self.evaluate(a, b).point[:, None]) ** 2).sum(axis=0)
         nearest = distance2.argmin(axis=1)
         a = a[nearest]
         b = b[nearest]
         for _ in range(ITERATIONS):
-            patch = self.at(a, b)
+            patch = self.evaluate(a, b)
             difference = patch.point - points
             gradient = np.stack([_dots(difference, patch.d_a), _dots(difference, patch.d_b)])
             hessian = np.array([
@@ -139,7 +139,7 @@ class Shape:
             step = solve_2x2(hessian, gradient)
             a = a - step[0]
             b = b - step[1]
-        patch = self.at(a, b)
+        patch = self.evaluate(a, b)
         return _dots(points - patch.point, patch.normal), a, b
 
 
@@ -372,7 +372,7 @@ def find_specular(shape: Shape, tx_m: NDArray, rx_m: NDArray) -> tuple[NDArray, 
     """Parameters (a, b), each [n], at which the path from TX to RX [3, n] is stationary."""
     scale = np.array(shape.scale_m())
     grid = shape.grid()
-    coarse = shape.at(*grid)
+    coarse = shape.evaluate(*grid)
     patch = Patch(*(part[:, None] for part in vars(coarse).values()))
     path = follow_path(patch, tx_m[:, :, None], rx_m[:, :, None])
     # The smallest slope of the path per metre on the surface.
@@ -382,7 +382,7 @@ def find_specular(shape: Shape, tx_m: NDArray, rx_m: NDArray) -> tuple[NDArray, 
     a = grid[0][start]
     b = grid[1][start]
     for _ in range(ITERATIONS):
-        path = follow_path(shape.at(a, b), tx_m, rx_m)
+        path = follow_path(shape.evaluate(a, b), tx_m, rx_m)
         step = solve_2x2(path.hessian, path.gradient)
         length = np.hypot(step[0] * scale[0], step[1] * scale[1])
         step = step * np.minimum(1, LONGEST_STEP_M / np.maximum(length, 1e-12))

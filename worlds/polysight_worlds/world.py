@@ -61,7 +61,8 @@ class Plate:
     @property
     def box_m(self) -> tuple[float, float, float, float]:
         """x0, y0, x1, y1 in the rig frame."""
-        (x, y), (width, height) = self.centre_m, self.size_m
+        x, y = self.centre_m
+        width, height = self.size_m
         return x - width / 2, y - height / 2, x + width / 2, y + height / 2
 
 

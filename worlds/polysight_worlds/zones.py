@@ -27,7 +27,7 @@ LEAST_BEND_PER_M = 0.8
 GRAZING = 0.3
 
 
-def antennas_at(tx: Antenna, rx: Antenna, offsets: NDArray) -> tuple[NDArray, NDArray]:
+def place_antennas(tx: Antenna, rx: Antenna, offsets: NDArray) -> tuple[NDArray, NDArray]:
     """Places of TX and RX [3, offsets] at stage offsets [offsets, 3]."""
     return tx.position[:, None] + offsets.T, rx.position[:, None] + offsets.T
 
@@ -81,18 +81,18 @@ def sum_window(
     sums = np.empty((len(frequencies_hz), len(offsets)), complex)
     at_once = max(1, CHUNK // len(weights))
     middle_k = 2 * np.pi * float(np.mean(frequencies_hz)) / LIGHT_M_PER_S
-    tables = [CosineTable.of(shape.stack, f) for f in frequencies_hz]
+    tables = [CosineTable.get_cached(shape.stack, f) for f in frequencies_hz]
     for first in range(0, len(offsets), at_once):
         chunk = slice(first, first + at_once)
         a0 = places[0][chunk]
         b0 = places[1][chunk]
         u = offsets[chunk]
-        middle = shape.at(a0, b0)
-        path = follow_path(middle, *antennas_at(tx, rx, u))
+        middle = shape.evaluate(a0, b0)
+        path = follow_path(middle, *place_antennas(tx, rx, u))
         zones, zone_area = _fresnel_zones(middle.tangents(), path.hessian, middle_k)
         a = a0[:, None] + zones[0, 0, :, None] * xi + zones[1, 0, :, None] * eta
         b = b0[:, None] + zones[0, 1, :, None] * xi + zones[1, 1, :, None] * eta
-        patch = shape.at(a, b)
+        patch = shape.evaluate(a, b)
         moved = patch.point - u.T[:, :, None]
         response = respond(tx, rx, moved, patch.normal)
         area = patch.area * zone_area[:, None] * weights * shape.cover(a, b) * _fade_shadow(patch.normal, response)
@@ -120,7 +120,7 @@ class CosineTable:
 
     @staticmethod
     @lru_cache(maxsize=256)
-    def of(stack: Stack, frequency_hz: float) -> CosineTable:
+    def get_cached(stack: Stack, frequency_hz: float) -> CosineTable:
         """Return the table of a medium, made once."""
         return CosineTable(stack, frequency_hz)
 

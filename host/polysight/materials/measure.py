@@ -175,13 +175,13 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
         )
     allowed = max(HALVES_APART, uneven) * (1 + 2 * float(np.median(np.abs(v[pixels])) / np.median(level)))
     several = "several kinds together"
-    apart = "move the plates apart, or draw boxes"
+    separate_plates = "move the plates apart, or draw boxes"
     if halves_apart(h, v, pixels) > allowed:
-        return Finding("error", several, "its halves have different ratios", apart)
+        return Finding("error", several, "its halves have different ratios", separate_plates)
     middle = 1 / median_ratio(h[pixels], v[pixels])
     odd = np.abs(v[pixels] / h[pixels] - middle) > max(ODD_RATIO, RIPPLE * abs(middle))
     if float(odd.mean()) > ODD_SHARE:
-        return Finding("error", several, f"{100 * odd.mean():.0f} % of its pixels have another ratio", apart)
+        return Finding("error", several, f"{100 * odd.mean():.0f} % of its pixels have another ratio", separate_plates)
     return None
 
 

@@ -170,8 +170,8 @@ class RowViewer:
             except PolysightError as e:
                 self._fail(row, take, notice_of_error(e))
             except Exception as e:  # noqa: BLE001  the page shows it; the scan is not concerned
-                what = f"Row {row} cannot be shown: {type(e).__name__}: {e}"
-                self._fail(row, take, Finding("warning", what, "A defect of the live view", "Report it"))
+                row_problem = f"Row {row} cannot be shown: {type(e).__name__}: {e}"
+                self._fail(row, take, Finding("warning", row_problem, "A defect of the live view", "Report it"))
 
     def _add(self, pipeline: Pipeline, row: int, take: int, draws: bool) -> None:
         """Process a row; publish if it `draws`, or the last pictures are old."""

@@ -269,13 +269,13 @@ def judge_segment(
     if abs(ratio - 1) < METAL_RATIO:
         return replace(segment, reason="its ratio is that of metal", name="metal"), None
     if segment.radius_mm is not None and segment.radius_mm < 1e3 * MIN_RADIUS_M:
-        why = f"radius {segment.radius_mm:.0f} mm: below {1e3 * MIN_RADIUS_M:.0f} mm only the shape is reliable"
-        return replace(segment, reason=why), None
+        cause = f"radius {segment.radius_mm:.0f} mm: below {1e3 * MIN_RADIUS_M:.0f} mm only the shape is reliable"
+        return replace(segment, reason=cause), None
     fit = fit_permittivity(voltages, gains, wave_number)
     level, rise = judge_medium(fit, voltages, gains, wave_number)
     if abs(level) > MAX_LEVEL_MISS or rise > MAX_BAND_RISE:
-        why = "no single medium reflects so: a thin wall, a coating, an edge, or a second echo at the same place"
-        return replace(segment, reason=why), None
+        cause = "no single medium reflects so: a thin wall, a coating, an edge, or a second echo at the same place"
+        return replace(segment, reason=cause), None
     return segment, fit
 
 

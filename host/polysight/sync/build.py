@@ -80,7 +80,7 @@ def build(folder: Path = HERE, target: str = "") -> Path:
         compiler = [*compiler, "-target", TARGETS[target]]
     machine = target or platform.machine().lower()
     widths = _WIDTHS if machine.endswith(("x86_64", "amd64")) else {128: ""}
-    with tempfile.TemporaryDirectory(prefix="polysight-build-") as made:
+    with tempfile.TemporaryDirectory(prefix="polysight-build-") as build_folder:
         jobs = [
             ([source, f"-DWIDTH={bits}", *flags.split()], f"{source}-{bits}.o")
             for bits, flags in widths.items()
@@ -88,10 +88,12 @@ def build(folder: Path = HERE, target: str = "") -> Path:
         ]
         jobs.append((["width.c"], "width.o"))
         with ThreadPoolExecutor(os.cpu_count()) as workers:
-            commands = [[*compiler, *_FLAGS.split(), "-c", *words, "-o", f"{made}/{name}"] for words, name in jobs]
+            commands = [
+                [*compiler, *_FLAGS.split(), "-c", *words, "-o", f"{build_folder}/{name}"] for words, name in jobs
+            ]
             list(workers.map(_run, commands))
-        library = f"{made}/{LIBRARY}"
-        objects = [f"{made}/{name}" for _, name in jobs]
+        library = f"{build_folder}/{LIBRARY}"
+        objects = [f"{build_folder}/{name}" for _, name in jobs]
         _run([*compiler, "-O3", "-fno-sanitize=undefined", "-s", "-shared", "-o", library, *objects, "-lm"])
         new = folder / f".{LIBRARY}-{os.getpid()}"
         new.write_bytes(Path(library).read_bytes() + source_digest().encode())

@@ -310,7 +310,9 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
     n = len(materials)
     many = n > 12
     fig = new_figure(11.5, 11.0 if many else 4.5)
-    size = 7.5 if many else 8.0
+    size = 8.0
+    if many:
+        size = 7.5
     axes = (fig.subplots(2, 2) if many else fig.subplots(1, len(panels), squeeze=False)).ravel()
     if many:
         axes[3].set_axis_off()
@@ -328,7 +330,9 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
         ax.set_xticks(range(n), [str(m.number) for m in materials], fontsize=size)
         ax.set_yticks(range(n), [f"{m.name}  {m.number}" if first else str(m.number) for m in materials], fontsize=size)
         for i, j in zip(*np.nonzero(shares > 0.005), strict=True):
-            colour = INK if shares[i, j] > 0.6 else "w"
+            colour = "w"
+            if shares[i, j] > 0.6:
+                colour = INK
             text = f"{100 * shares[i, j]:.0f}"
             ax.text(j, i, text, ha="center", va="center", fontsize=size - 1.5, color=colour)
     if image is not None:

@@ -294,7 +294,9 @@ def find_row(name: str, thickness_mm: float | None = None) -> int | None:
         ((max(_share_of_common_words(t, row) for t in tries), row.number) for row in table2()), key=lambda b: -b[0]
     )
     (first, number), (second, _) = best[:2]
-    return number if first >= _ENOUGH and first > second else None
+    if first >= _ENOUGH and first > second:
+        return number
+    return None
 
 
 def read_names(path: Path) -> dict[str, int]:

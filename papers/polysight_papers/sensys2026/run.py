@@ -164,7 +164,9 @@ def make_items(
             on_item(item)
     page = write_page(out=out, items=items, pictures=pictures, failed=failed, quick=quick, origin=origin, makers=makers)
     sys.stdout.write(f"{page}: {len(items)} items ({origin.word}) beside the published values\n")
-    return 1 if failed else 0
+    if failed:
+        return 1
+    return 0
 
 
 def stamped_png(figure: Figure, origin: Origin = SIMULATED) -> bytes:

@@ -180,7 +180,7 @@ class Adversary:
             pulse_ns = edges_ns[0] - 1_000_000
         sent = Sent(self._number, data, pulse_ns, troubles=troubles)
         packets, last_bytes = self._packets(sent, data)
-        before = self.take_late(0.5)
+        packets_before = self.take_late(0.5)
         in_between = self.take_late(0.7)
         if "twin" in troubles or "twin_alone" in troubles:
             sent.whole = False
@@ -203,12 +203,12 @@ class Adversary:
                 arriving.insert(place, (number, late))
         if twin:
             arriving = sorted(arriving + twin, key=lambda ka: ka[0])
-        early_ns = [self._now_ns + k * 1000 for k in range(len(before))]
+        early_ns = [self._now_ns + k * 1000 for k in range(len(packets_before))]
         made_ns = None
         if edges_ns is not None:
             made_ns = [self._made_ns(byte, edges_ns) for byte in last_bytes]
         times_ns = self._times([k for k, _ in arriving], pulse_ns, made_ns)
-        sent.arrivals = [Arrival(t, a.packet, a.record) for t, a in zip(early_ns, before, strict=True)]
+        sent.arrivals = [Arrival(t, a.packet, a.record) for t, a in zip(early_ns, packets_before, strict=True)]
         sent.arrivals += [Arrival(t, a.packet, a.record) for t, (_, a) in zip(times_ns, arriving, strict=True)]
         self._now_ns = max([pulse_ns, *times_ns]) + 10_000_000
         return sent

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from benchmarks.data import RIG, SCENE
-from benchmarks.sparse_scans import predicted
+from benchmarks.sparse_scans import predict_image
 from polysight.capture.dca1000 import row_words
 from polysight.imaging import ImageBuilder, Images
 from polysight.imaging.sparse import reconstruct
@@ -87,7 +87,7 @@ def image_every_nth(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
         kept_rows[::every] = True
         board.keep(kept_rows)
         if rebuilt:
-            raw.append(predicted(board, reconstruct(board, ITERATIONS).image, weights[name]))
+            raw.append(predict_image(board, reconstruct(board, ITERATIONS).image, weights[name]))
     images = builder.finish()
     for name, board in builder.boards.items():
         board.valid[:] = valid[name]

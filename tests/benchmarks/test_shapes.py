@@ -7,7 +7,7 @@ import argparse
 import numpy as np
 import pytest
 from benchmarks import shapes
-from benchmarks.shapes import ObjectFigures, ScanKind, angles_deg, judge_object, line_of, squared_distances
+from benchmarks.shapes import ObjectFigures, ScanKind, angles_deg, format_line, judge_object, squared_distances
 
 SMALL_SCAN = ScanKind(columns=64, rows=44)
 
@@ -47,4 +47,4 @@ def test_every_option_has_a_default_and_every_kind_a_line():
             points=0,
             stray=0,
         )
-        assert line_of(kind, [figures], shapes.MUST_HOLD.get(kind)).startswith(kind)
+        assert format_line(kind, [figures], shapes.MUST_HOLD.get(kind)).startswith(kind)

@@ -271,10 +271,8 @@ def analyse(
     kinds = _kinds(classifier, float(np.mean(theta)))
     labels = [p.label for p in judged]
     if plane is None:
-        channel = _channel_ratio(images, reference) if prior.channels_known else None
         measured_by_label = dict(zip(labels, measured, strict=True))
-        evidence = metal_evidence(measured_by_label, prior, channel, Kinds(literature(), float(np.mean(theta))))
-        reference = replace(reference, evidence=evidence)
+        reference = _weigh_metal(images, reference, measured_by_label, prior=prior, theta_rad=float(np.mean(theta)))
     inversion = invert(measured, prior, kinds)
     # Of the pixels only leakage is removed that is known: an undetermined estimate leans on what the patches may be.
     calibrated = remove_leakage(raw, inversion.leakage if inversion.leakage_determined else prior.leakage)
@@ -529,6 +527,15 @@ def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
     """Return the mean incidence angle over a patch, radians."""
     inside = theta[patch.interior] if theta.ndim and patch.interior.any() else theta
     return float(np.mean(inside))
+
+
+def _weigh_metal(
+    images: Images, metal: MetalReference, patches: Mapping[int, PatchMeasurement], *, prior: RigPrior, theta_rad: float
+) -> MetalReference:
+    """Return the metal reference with the evidence for metal and against; `patches` are the other patches."""
+    channel_ratio = _channel_ratio(images, metal) if prior.channels_known else None
+    evidence = metal_evidence(patches, prior, channel_ratio, Kinds(literature(), theta_rad))
+    return replace(metal, evidence=evidence)
 
 
 def _channel_ratio(images: Images, metal: MetalReference) -> complex | None:

@@ -233,9 +233,7 @@ def authors_fig18(judge: Judgements) -> Item:
             "scores": [None if s is None else asdict(s) for s in (*scores, *h_only)],
             "judged_with_scans_left_out": material_count,
         }
-        split = OPTIMISTIC
-        if several is not None:
-            split = LEFT_OUT
+        split = LEFT_OUT if several is not None else OPTIMISTIC
         if several is None:
             h = h_only[0]
             best = scores[2]
@@ -327,9 +325,7 @@ def _channel_figure(bars: list[tuple[str, list[float]]]) -> Any:
     width = 0.84 / len(bars)
     for k, (label, heights) in enumerate(bars):
         positions = np.arange(len(CHANNELS)) + width * (k - (len(bars) - 1) / 2)
-        hatch = ""
-        if OPTIMISTIC in label:
-            hatch = "//"
+        hatch = "//" if OPTIMISTIC in label else ""
         drawn = ax.bar(positions, heights, 0.92 * width, label=label, color=PALETTE[k], hatch=hatch)
         ax.bar_label(drawn, fmt="%.0f", fontsize=7)
     dress(ax, "Accuracy by channel, weighted KNN of the paper", "", "pixels named right (%)")

@@ -32,7 +32,7 @@ from polysight_shared.sockets import is_loopback, publisher, replier
 # A scan of 70,000 positions journals about 20 MB.
 JOURNAL_BYTES = 100 << 20
 TRANSFERS = 5
-# Of the nominal duration: the system call adds some 100 us to 22 ms.
+# Longest duration relative to the nominal one: the system call adds some 100 us to 22 ms.
 MAX_PART = 1.05
 # Pairs of system calls to time.
 PAIRS = 500

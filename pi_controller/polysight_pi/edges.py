@@ -19,11 +19,11 @@ from polysight_shared.raster import Row, Stage
 
 # Lowest speed of the sketch, steps/s (board.h, MIN_RATE).
 MIN_FEED = 31
-# Of its timer.
+# Clock of the sketch's timer.
 TICK_HZ = 2_000_000
-# Of the interval at constant speed. The resonator of an UNO is within 0.5 % of its frequency.
+# Relative tolerance of the interval at constant speed. The resonator of an UNO is within 0.5 % of its frequency.
 TOLERANCE = 0.01
-# Of the same interval: an edge may be stamped that much after a status that counts its point was written: a
+# Share of the same interval by which an edge may be stamped after a status that counts its point was written: a
 # simulated trigger wire is later than a simulated serial line.
 STATUS_TOLERANCE = 0.2
 

@@ -42,7 +42,7 @@ LATE_S = 3.0
 HUNG_S = 10.0
 COMMANDS_WAITING = 64
 REPLAYS_WAITING = 4
-# Of the stage: further lines are dropped, so that an endless flood cannot fill the memory.
+# Lines of the stage that wait; further ones are dropped, so that an endless flood cannot fill the memory.
 LINES_WAITING = 64
 # Events per reply: half a second on a Pi.
 REPLAYED_AT_REST = 1000
@@ -432,7 +432,7 @@ class Executor:
 
         def finish(error: PolysightError | OSError | None) -> None:
             self._waits_for_journal = False
-            # Else it was not opened
+            # Any other error means that the journal was not opened.
             if isinstance(error, JournalFullError) and self.journal.is_broken:
                 if isinstance(request.command, m.BeginRun):
                     self._forget_run()

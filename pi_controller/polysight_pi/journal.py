@@ -45,7 +45,7 @@ SPARE_BYTES = 4 << 20
 SEARCHED_BYTES = 1 << 20
 # Suffix of the copy of a damaged journal.
 DAMAGED = ".damaged"
-# Of the thread's queue: jobs, and events that wait for a place in it. A row stops long before (LATE_S).
+# Places in the thread's queue, for jobs and events. A row stops long before it is full (LATE_S).
 JOBS_WAITING = 256
 EVENTS_WAITING = 1000
 _HEAD = struct.Struct("<III")

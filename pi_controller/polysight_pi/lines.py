@@ -32,7 +32,7 @@ EVENT_BUFFER = 1024
 # A sleep may end this much late, so the rest of a wait polls the clock.
 SPIN_NS = 100_000
 WARM_NS = 30_000
-# Of a busy machine.
+# Timeout for the pulses of simulated wires: a busy machine delivers them late.
 SIMULATED_LOOK_BACK_S = 2.0
 # Timeout for pulses that were sent and are not seen; the kernel reports them within microseconds.
 LOOK_BACK_S = 0.05

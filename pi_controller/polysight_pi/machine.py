@@ -471,7 +471,7 @@ class Machine:
         self.stage.link.send_byte(Immediate.HOLD)
 
     def _resume(self) -> None:
-        # Not before the stage rests: its place then tells the times of the edges around it.
+        # The row resumes only when the stage rests: its place then tells the times of the edges around it.
         self._resumes_at_rest = True
         if self._rests_in_hold:
             self._send_resume()

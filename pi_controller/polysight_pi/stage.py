@@ -159,7 +159,7 @@ class StageLink:
         self._news = news
         self._caller_late_s = caller_late_s
         self._bound_now_ns = bound_now_ns
-        # Of requests without an answer yet. More than two are never open: a stage that is silent for so long is lost.
+        # Times of requests without an answer. More than two are never open: a stage that is silent for so long is lost.
         self._asked_ns: deque[int] = deque(maxlen=2)
         self._commanded_s = time.monotonic()
         self._watch = StatusWatch(heartbeat_s, time.monotonic())

@@ -16,8 +16,8 @@ from pathlib import Path
 _PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4
-# Of the trigger thread and of the others. All share the interpreter's lock, so a thread that holds it must not be
-# preempted by other programs.
+# Real-time priorities of the trigger thread and of the others. All share the interpreter's lock, so a thread that
+# holds it must not be preempted by other programs.
 PRIORITY = 50
 OTHERS_PRIORITY = 40
 # The default of 5 ms is three pulse periods.

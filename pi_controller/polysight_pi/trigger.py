@@ -28,16 +28,16 @@ from polysight_shared.units import us_to_ns
 FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
 # Timeout of waiting for an edge, after which the loop checks if it has to stop.
 LOOK_UP_S = 0.1
-# Consecutive stage statuses without an edge ...
+# The trigger wire is off if so many consecutive stage statuses came without an edge, while the stage passed at least
+# so many points.
 SILENT_STATUSES = 2
-# ... while at least this many points were passed: the trigger wire is off.
 SILENT_POINTS = 2
 # Low bits before the first pulse, and at least as many after the last: MOSI keeps the last bit's level.
 LEAD_BITS = 8
 # Shorter transfers have gaps: spi-bcm2835 writes them byte by byte, longer ones by DMA.
 MIN_BYTES = 96
 DEFAULT_BUFSIZ = 4096
-# Of the nominal duration; a shorter transfer was clocked too fast, its frames too close.
+# Shortest duration relative to the nominal one: a shorter transfer was clocked too fast, its frames are too close.
 MIN_PART = 0.98
 
 
@@ -245,13 +245,13 @@ def _send_bits(
         return nothing_sent
     before_ns, after_ns = lines.transfer(burst)
     took_ns = after_ns - before_ns
-    # The controller began at an unknown moment within it
+    # The controller began at an unknown moment within the system call.
     spare_ns = max(0, took_ns - round(burst.duration_ns))
     first_ns = before_ns + spare_ns // 2 + lead_ns
     last_ns = first_ns + round((burst.bits[-1] - burst.bits[0]) * burst.bit_ns)
     width_ns = round(max(burst.bit_ns, took_ns / (8 * len(burst.data))))
     jitter_ns = before_ns - begin_ns + (spare_ns + 1) // 2
-    # Pulses are up to half a bit away from their exact times
+    # Pulses are up to half a bit away from their exact times.
     if spec.period_ns * burst.clock_hz % 10**9:
         jitter_ns += round(burst.bit_ns / 2)
     fault = 0
@@ -356,7 +356,7 @@ class TriggerLoop:
         self._lines = lines
         self._post = post
         self._prepare = prepare
-        # Held while an edge is answered: arm and disarm wait for the burst to end
+        # The lock is held while an edge is answered: arm and disarm wait for the burst to end.
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._job: Job | None = None

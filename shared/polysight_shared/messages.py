@@ -22,7 +22,7 @@ MAX_PULSES_AT_REST = 256
 MAX_PULSES_AT_REST_S = 2.0
 # The Pi closes the connection after a longer command.
 MAX_COMMAND_BYTES = 65_536
-# Of the host; after a missing heartbeat the rig stays locked for four periods.
+# Longest heartbeat period of the host; after a missing heartbeat the rig stays locked for four periods.
 MAX_HEARTBEAT_MS = 10_000
 # Every field has a finite and bounded type; a message outside the limits is refused.
 Natural = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]

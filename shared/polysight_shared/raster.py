@@ -26,7 +26,7 @@ MIN_WIDTH_NS, MAX_WIDTH_NS = map(us_to_ns, WIDTH_US)
 _Points = Annotated[int, msgspec.Meta(ge=1, lt=100_000)]
 _Motion = Annotated[float, msgspec.Meta(ge=0.001, le=1e6)]
 _Steps = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
-# Also refuses NaN and infinities
+# The limits also refuse NaN and infinities.
 _Offset = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 INVERTIBLE = ("x_dir", "left_dir", "right_dir", "enable", "pul", "switches", "emergency_stop")
 """Pins of the stage whose level `stage.inverted` inverts against arduino_stage/board.h."""

@@ -17,7 +17,7 @@ PROTOCOL_VERSION = 2
 MAX_LINE_BYTES = 96
 MAX_SEQUENCE = 65535
 END_OF_TIME_NS = 2**63 - 1
-# Of the Pi; programs that wait for the Pi need a longer one.
+# The Pi waits so long for the end of homing; programs that wait for the Pi need a longer timeout.
 HOMING_TIMEOUT_S = 300.0
 _VALUE = re.compile(r"-?[0-9]{1,10}")
 _COMMAND = re.compile(r"N([0-9]{1,5}) ([A-Z]+)((?: -?[0-9]{1,10})*)")

@@ -49,7 +49,7 @@ def compile_once(product: str, sources: Iterable[Path], command: Sequence[str], 
     for path in sorted(sources):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     name = f"{Path(product).stem}-{digest.hexdigest()[:16]}{Path(product).suffix}"
-    # Also in a read-only folder
+    # A file that is there is used, from a read-only folder too.
     if (FOLDER / name).is_file():
         return FOLDER / name
     result = _folder() / name

@@ -81,7 +81,7 @@ def make_client(context):
         socket.curve_serverkey = load_certificate(pis)[0]
         sockets.append((HandshakeMonitor(socket), socket))
         socket.connect(address.replace("0.0.0.0", "127.0.0.1"))
-        return socket, sockets[-1][0].refused
+        return socket, sockets[-1][0].is_refused
 
     yield make
     for refusals, socket in sockets:

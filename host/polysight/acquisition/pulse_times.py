@@ -58,7 +58,7 @@ _BLURRED = 0.1
 _DISPLACED = 3
 # A card drops whole samples of its four antennas (inferred).
 _SAMPLE_BYTES = 16
-# Of the pulse period, between two trains.
+# A train that follows the previous one sooner than this share of the pulse period catches up a delay.
 _CATCHING_UP = 0.8
 # Bursts whose delays must agree, within the share of a pulse period or the time.
 _AGREEING = 3

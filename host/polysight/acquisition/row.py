@@ -73,7 +73,7 @@ class FaultKind(StrEnum):
     HELD = "held"
     # Frames are missing at known pulses.
     PULSES_MISSED = "pulses_missed"
-    # As many frames as pulses, but not at the pulses' times.
+    # There are as many frames as pulses, but not at the pulses' times.
     SLIPPED = "slipped"
     # Frames are missing at unknown pulses.
     FRAMES_MISSING = "frames_missing"
@@ -290,7 +290,7 @@ def commit_row(
         if moved is not None:
             capture = rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
             take.captures[name] = capture
-            # Of a whole row, the frames that came at no pulse's time are masked now.
+            # The frames of a whole row that came at no pulse's time are masked now.
             untimed -= len(moved.doubtful)
             if faults:
                 untimed = 0

@@ -452,7 +452,7 @@ def takes_so_far(scan: ScanFolder) -> dict[int, int]:
     begun = [(f.row, f.take) for f in (*scan.facts(RowCommitted), *scan.facts(RowRejected))]
     events = read_events(scan.path / EVENTS).events
     begun += [(e.row.index, e.take) for e in events if isinstance(e, RowStarted)]
-    # Of one row's takes, the highest is the last.
+    # The highest take of a row is its last.
     return dict(sorted(begun))
 
 

@@ -47,7 +47,7 @@ from polysight_shared.errors import DataError
 Real = NDArray[np.float64]
 
 FULL_SCALE = 32767
-# Of the sample rate.
+# Share of the sample rate that the receiver's filter passes.
 PASSBAND = 0.9
 # Rows of a scan used by `fit_start`, and by `fit_filter`.
 ROWS = 4

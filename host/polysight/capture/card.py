@@ -142,7 +142,7 @@ class CardClient:
         """Start a record; before a retry it is stopped, because it may run already. Raises DeviceError."""
         for attempt in range(ATTEMPTS):
             self.take_status()
-            # Of the previous record.
+            # Errors that the previous record left do not belong to this one.
             self._status = Status(0)
             reply = self._try(Code.RECORD_START, b"", self._timeout_s / ATTEMPTS)
             # Before the reply: of the previous record.

@@ -16,7 +16,7 @@ from polysight_shared.errors import DataError, ProtocolError
 REQUEST_MAGIC = 0xA55A
 FOOTER = 0xEEAA
 MAX_REQUEST_DATA = 504
-# Of replies and data, whatever port the card listens on.
+# The card sends replies and data from this port, whatever port it listens on.
 CARD_SOURCE_PORT = 1024
 PACKET_HEADER_BYTES = 10
 MAX_PAYLOAD_BYTES = 1456

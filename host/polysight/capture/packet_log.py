@@ -13,7 +13,7 @@ from polysight.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, PACKET
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 
-# Of payload beyond the row, for left-over packets.
+# Room for left-over packets, whose payload lies beyond the row.
 _SPARE_BYTES = 1 << 20
 # Rows of payload that are kept; two network paths double it.
 _MAX_ROWS = 4

@@ -88,7 +88,7 @@ class Receiver:
         self._row: _Row | None = None
         # Knowledge from earlier records.
         self._past = Past()
-        # Of the previous row, to be reused.
+        # Memory of the previous row, which the next one reuses.
         self._memory: NDArray[np.uint8] | None = None
 
     def serve(self) -> None:

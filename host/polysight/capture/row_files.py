@@ -148,7 +148,7 @@ RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), 
 """
 # Pairs: time (CLOCK_MONOTONIC of the host, ns), packets received by then.
 BATCH = np.dtype("<i8")
-# Of batches and runs.
+# Limit of the batches and runs of a row file: a damaged length cannot fill the memory.
 _MAX_RUN_BYTES = 256 << 20
 
 

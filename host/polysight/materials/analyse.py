@@ -274,7 +274,7 @@ def analyse(
         measured_by_label = dict(zip(labels, measured, strict=True))
         reference = _weigh_metal(images, reference, measured_by_label, prior=prior, theta_rad=float(np.mean(theta)))
     inversion = invert(measured, prior, kinds)
-    # Of the pixels only leakage is removed that is known: an undetermined estimate leans on what the patches may be.
+    # Only known leakage is removed from the pixels: an undetermined estimate leans on what the patches may be.
     calibrated = remove_leakage(raw, inversion.leakage if inversion.leakage_determined else prior.leakage)
     sh, sv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
@@ -554,7 +554,7 @@ def _patches(images: Images, known: KnownScene) -> Segmentation:
         cut = tuple(replace(p, interior=p.interior & images.valid) for p in known.segmentation.patches)
         return replace(known.segmentation, patches=cut)
     if not images.usable.any():
-        # As of a scan without a direct path in any position: nothing to search, and the verdict says why.
+        # A scan without a direct path in any position has no signal: there is nothing to search, the verdict says why.
         return Segmentation(np.zeros(images.h.shape, np.int32), ())
     even = images if known.plane is None else known.plane.apply(images)
     segmentation = segment(even.h, even.v, images.x_m, images.y_m, images.valid)

@@ -342,7 +342,7 @@ class Classifier:
         self._model.fit(samples)
         self.distributions = self._model.distributions
         self.names = library.names
-        # Of the library's patches as half spaces; without metals.
+        # Permittivities of the library's patches as half spaces; metals have none.
         self.permittivities: dict[str, complex] = self.distributions.permittivities
         kinds = (*self._library_kinds(), *literature(library.names))
         # What a patch may be, at each angle.

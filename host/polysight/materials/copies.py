@@ -23,6 +23,7 @@ LEAST_OVERLAP = 0.6
 SAME_DB = 3.0
 """Largest deviation of a copy's level from the others', relative to its plate."""
 SKIRT_PX = 4
+"""Pixels around the plates in which a copy cannot be told from the plate's own edge."""
 
 
 @dataclass(frozen=True)

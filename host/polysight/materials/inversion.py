@@ -95,7 +95,7 @@ COLUMNS_OF_SOURCE = {
 PARTICLES = 600
 MOVES = 6
 DRAWS = 8
-# Of a ratio: below it a covariance has no inverse in double precision.
+# Smallest standard deviation of a ratio: below it a covariance has no inverse in double precision.
 LEAST_RATIO_STD = 1e-6
 
 
@@ -273,10 +273,10 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | Non
     """
     model = _Scene(seen, prior, kinds)
     rng = np.random.default_rng(0)
-    of_prior = rng.standard_normal((PARTICLES, WIDTH))
+    prior_particles = rng.standard_normal((PARTICLES, WIDTH))
     no_evidence = np.zeros(model.patch_count + 1)
     all_evidence = np.ones(model.patch_count + 1)
-    posterior = _anneal(model, of_prior, no_evidence, all_evidence, rng)
+    posterior = _anneal(model, prior_particles, no_evidence, all_evidence, rng)
     patches = []
     for i in range(model.patch_count):
         # A patch is measured without the belief that it must be some material itself.
@@ -416,21 +416,21 @@ class _Scene:
         brightness_difference = self.brightness_off(z)
         usual = (1 - ODD_BRIGHTNESS) / size * np.exp(-0.5 * (brightness_difference / size) ** 2)
         odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (brightness_difference / ODD_BRIGHTNESS_STD) ** 2)
-        of_brightness = np.where(self.bright, np.log(usual + odd + 1e-300), 0.0).sum(axis=-1, keepdims=True)
+        brightness_log = np.where(self.bright, np.log(usual + odd + 1e-300), 0.0).sum(axis=-1, keepdims=True)
         if self.kinds is None:
-            no_evidence = np.zeros((*of_brightness.shape[:-1], self.patch_count))
-            return np.concatenate([of_brightness, no_evidence], axis=-1)
+            no_evidence = np.zeros((*brightness_log.shape[:-1], self.patch_count))
+            return np.concatenate([brightness_log, no_evidence], axis=-1)
         if not self.maps:
-            return of_brightness
+            return brightness_log
         t = self.ratios_of_kinds(z, self.kinds)
         library_share = self.library_share(z)
         log_ours = np.log(library_share)
         log_others = np.log1p(-library_share)
-        of_patches = []
+        patch_logs = []
         for i, density in enumerate(self.maps):
             of_library, of_others = density.log_densities(t[..., i])
-            of_patches.append(np.logaddexp(log_ours + of_library, log_others + of_others))
-        return np.concatenate([of_brightness, np.stack(of_patches, axis=-1)], axis=-1)
+            patch_logs.append(np.logaddexp(log_ours + of_library, log_others + of_others))
+        return np.concatenate([brightness_log, np.stack(patch_logs, axis=-1)], axis=-1)
 
 
 def _complex(z: Real, columns: tuple[int, int]) -> Complex:
@@ -514,16 +514,16 @@ def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> Patch
     """Estimate one patch from particles of the common errors: ratio, permittivity, shares of the sources, kinds."""
     t = model.ratios(z)[:, i]
     middle = complex(t.mean())
-    of_ratio = np.cov(pair(t).T) + model.own[i]
+    ratio_covariance = np.cov(pair(t).T) + model.own[i]
     evidence = None
     if model.kinds is not None:
         evidence = _evidence(model, model.kinds, z, i)
     from_metal = abs(middle - 1)
     if middle:
         from_metal = min(from_metal, abs(1 / middle - 1))
-    # Also if it is not a number.
-    if not from_metal >= max(METAL_WITHOUT_PERMITTIVITY, LEAST_DISTANCE * np.sqrt(np.trace(of_ratio) / 2)):
-        return PatchEstimate(middle, of_ratio, None, None, {}, evidence)
+    # Written with `not`, so that a ratio that is not a number gets no permittivity either.
+    if not from_metal >= max(METAL_WITHOUT_PERMITTIVITY, LEAST_DISTANCE * np.sqrt(np.trace(ratio_covariance) / 2)):
+        return PatchEstimate(middle, ratio_covariance, None, None, {}, evidence)
 
     angles = model.angle(z)[:, i]
     value = complex(permittivity_from_ratio(middle, float(angles.mean())))
@@ -532,14 +532,14 @@ def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> Patch
     drawn = np.asarray(permittivity_from_ratio(drawn_t, angles), np.complex128)
     # Near metal the moments of the far tail do not exist: three standard deviations of the ratio are kept.
     difference = pair(drawn_t - middle)
-    inside = np.einsum("...i,ij,...j->...", difference, np.linalg.inv(of_ratio), difference) < CHI2_997
+    inside = np.einsum("...i,ij,...j->...", difference, np.linalg.inv(ratio_covariance), difference) < CHI2_997
     parts = pair(drawn[inside] - value)
     covariance = np.asarray(parts.T @ parts / len(parts), np.float64)
     # A tail (the mount may have moved) widens a covariance more than the region that holds 95 %.
     distance2 = np.einsum("...i,ij,...j->...", parts, np.linalg.inv(covariance), parts)
     covariance *= float(np.quantile(distance2, 0.95)) / CHI2_95
     shares = _shares_of_sources(model, z, i, value)
-    return PatchEstimate(middle, of_ratio, value, covariance, shares, evidence)
+    return PatchEstimate(middle, ratio_covariance, value, covariance, shares, evidence)
 
 
 def _shares_of_sources(model: _Scene, z: Real, i: int, value: complex) -> dict[str, float]:

@@ -335,9 +335,9 @@ def patches_from_labels(
 LONGEST_NAME = 80
 RESERVED = ("unknown", "none of these", "possible layer")
 """Words that the classifier uses."""
-# Files hold three decimals
+# Label files hold three decimals, so boxes that touch may overlap by their rounding.
 _TOLERANCE_MM = 0.01
-# Invisible characters
+# Characters that nobody sees: two names that differ by one of them look the same.
 _HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]")
 
 

@@ -595,7 +595,7 @@ def estimate_permittivity(
     n = int(good.sum())
     inverse = 1 / ratio if ratio != 0 else complex(np.inf, 0.0)
     inverse_std = inverse_spread(h, v)
-    # Also when it is not a number
+    # Written with `not`, so that a distance that is not a number gets no permittivity either.
     if not distance >= METAL_WITHOUT_PERMITTIVITY:
         return Permittivity.not_estimated(ratio, inverse_std, float(distance), n)
     theta = np.broadcast_to(np.asarray(theta_rad, np.float64), h.shape)[good]

@@ -350,12 +350,12 @@ def pixel_features(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real
         return feature_matrix(np.ravel(h), np.ravel(v), np.ravel(p))
 
 
-def make_labels(found: MaterialsResult, description: str = "") -> Labels:
+def make_labels(result: MaterialsResult, description: str = "") -> Labels:
     """Return boxes around the interiors of a result's patches, in pixels, with unique names as drawn or classified."""
     out: dict[str, Box] = {}
-    for r in found.patches:
+    for r in result.patches:
         named = r.verdict.name if r.verdict is not None and r.verdict.source == "library" else None
-        name = found.boxes.get(r.patch.label) or ("metal" if r.patch.label == found.metal.label else named or "patch")
+        name = result.boxes.get(r.patch.label) or ("metal" if r.patch.label == result.metal.label else named or "patch")
         inside = r.patch.interior if r.patch.interior.any() else r.patch.mask
         rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
         key = name if name not in out else f"{name} ({r.patch.label})"
@@ -363,24 +363,24 @@ def make_labels(found: MaterialsResult, description: str = "") -> Labels:
     return Labels(out, description=description)
 
 
-def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike, simulated: bool) -> bytes:
+def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike, simulated: bool) -> bytes:
     """Return the content of `patches.npz`."""
     x = axis_mm(x_m)
     y = axis_mm(y_m)
     rows = []
     places = [np.zeros((0, 2))]
     features = [np.zeros((0, 4))]
-    for r in found.patches:
+    for r in result.patches:
         pixels = r.patch.interior
         iy, ix = np.nonzero(pixels)
         places.append(np.stack([x[ix], y[iy]], axis=1))
-        features.append(pixel_features(found.h[pixels], found.v[pixels], found.p[pixels]))
+        features.append(pixel_features(result.h[pixels], result.v[pixels], result.p[pixels]))
         truth = r.truth.name if r.truth else None
         rows.append({"label": r.patch.label, "centre_mm": r.patch.centre_mm, "truth": truth, "pixels": int(ix.size)})
-    angle = float(np.degrees(np.mean(found.theta_rad)))
+    angle = float(np.degrees(np.mean(result.theta_rad)))
     meta = {"format": PATCHES_FORMAT, "angle_deg": angle, "simulated": simulated, "patches": rows}
-    meta["judged"] = list(found.evidence)
-    evidence = found.evidence.values()
+    meta["judged"] = list(result.evidence)
+    evidence = result.evidence.values()
     out = io.BytesIO()
     np.savez_compressed(
         out,
@@ -462,7 +462,8 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
             if len(theirs):
                 far, nearest_index = scipy.spatial.KDTree(theirs).query(places)
             else:
-                far, nearest_index = (np.full(len(places), np.inf), 0)
+                far = np.full(len(places), np.inf)
+                nearest_index = 0
             near_enough &= far <= NEAR_MM
             columns.append(partner.features[np.minimum(nearest_index, len(theirs) - 1)] if len(theirs) else columns[0])
         complete = evidence if len(evidence) == len(scans) else None
@@ -470,7 +471,9 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
     return out
 
 
-def _partner(patch: ScanPatch, here: ScanPatches, there: ScanPatches) -> ScanPatch | None:
+def _partner(patch: ScanPatch, own_scan: ScanPatches, other_scan: ScanPatches) -> ScanPatch | None:
+    """Return the other scan's patch nearest to this one, if this one is also the nearest to it."""
+
     def nearest(to: ScanPatch, among: ScanPatches) -> ScanPatch | None:
         def distance_mm(p: ScanPatch) -> float:
             return float(np.hypot(p.centre_mm[0] - to.centre_mm[0], p.centre_mm[1] - to.centre_mm[1]))
@@ -478,7 +481,7 @@ def _partner(patch: ScanPatch, here: ScanPatches, there: ScanPatches) -> ScanPat
         best = min(among.patches, key=distance_mm, default=None)
         return best if best is not None and distance_mm(best) <= APART_MM else None
 
-    partner = nearest(patch, there)
-    if partner is not None and nearest(partner, here) is patch:
+    partner = nearest(patch, other_scan)
+    if partner is not None and nearest(partner, own_scan) is patch:
         return partner
     return None

@@ -24,7 +24,7 @@ from polysight_shared.errors import DataError
 
 Real = npt.NDArray[np.float64]
 Box = tuple[float, float, float, float]
-# dB
+# Smallest weight of the smoothing, dB: an image without speckle would get a weight of 0.
 _LEAST_WEIGHT = 0.1
 EDGE_DB = 6.0
 """A plate's edge is at half of its amplitude, the edge of a band-limited step."""

@@ -61,7 +61,7 @@ def check_plate(plate: CheckPlate, patches: Sequence[PatchFigures]) -> CheckResu
     if value is None or value.covariance is None:
         return msgspec.structs.replace(missing, why=f"patch {patch.label} there has no permittivity")
     covariance = np.array(value.covariance, np.float64)
-    # Of (eps', loss): the loss is minus the imaginary part.
+    # The covariance becomes that of (eps', loss): the loss is minus the imaginary part.
     covariance[0, 1] *= -1
     covariance[1, 0] *= -1
     total = covariance + np.diag(np.square(plate.std))

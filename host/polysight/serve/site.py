@@ -401,7 +401,7 @@ class Programs:
     """Starts programs; create it before the server lowers its priority (see `launcher`)."""
 
     def __init__(self) -> None:
-        # As a module it would load all of this server.
+        # Run as a file: run as a module it would load all of this server.
         command = [sys.executable, "-I", str(Path(launcher.__file__))]
         self._launcher = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True

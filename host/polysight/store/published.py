@@ -28,7 +28,7 @@ from polysight_shared.raster import RasterPlan, plan_raster
 Gaps = list[tuple[int, int]]
 # Payload of a full packet, if there is no log.
 PACKET_BYTES = 1456
-# Of the period between positions: largest deviation of a pause from a whole number of periods.
+# Largest deviation of a pause from a whole number of periods between positions, as a share of a period.
 _UNEVEN = 0.25
 
 

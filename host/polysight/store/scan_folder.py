@@ -64,7 +64,7 @@ SERIAL = ("port", "baud")
 """Keys of the stage that are not compared: the Pi has its own. Nor is calibration, of which a scan keeps copies."""
 FORMAT = 1
 EVENTS = "events.msgpack"
-# Of a simulated scene: its plates.
+# File with the plates of a simulated scene.
 TRUTH = "truth.json"
 SAMPLES = "samples"
 SAMPLE_ROWS = "rows.jsonl"

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+# Newton's method doubles the correct digits at each step. From half a metre away a few steps reach full precision; the
+# rest are for starts from which the first steps are cut to LONGEST_STEP_M.
 NEWTON_STEPS = 12
 LONGEST_STEP_M = 0.15
 
@@ -48,7 +50,7 @@ def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -
         step = np.linalg.solve(matrix + 1e-12 * np.eye(3), miss[..., None])[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         points = points - step * np.minimum(1, LONGEST_STEP_M / np.maximum(length, 1e-30))
-        # What lies behind the antennas comes back in front of them.
+        # A point that a step moved behind the antennas is put back in front of them.
         points[:, 2] = np.maximum(points[:, 2], 0.05)
     return points
 
@@ -69,7 +71,7 @@ def tangents(normals: Array) -> Array:
 
 
 def _terms(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array, Array, Array]:
-    """H in the stage's plane, X, E' H E and 2 cos(theta)."""
+    """Return H in the stage's plane, X, E' H E and 2 cos(theta) of the module's formulas."""
     t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
     bend = bend_of_legs(t, r, out_m, back_m)
     basis = tangents(normals)
@@ -80,10 +82,10 @@ def _terms(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array)
 
 def find_curvature(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
     """Curvature K [n, 2, 2] in the basis of `tangents`, 1 / m, of echoes whose path has the curvature `bend`."""
-    plane, cross, along, twice = _terms(points, normals, at_m, tx_m, rx_m)
+    plane, cross, along, twice_cosine = _terms(points, normals, at_m, tx_m, rx_m)
     rest = plane - bend
     inner = cross @ np.linalg.solve(rest + 1e-9 * np.eye(2), np.swapaxes(cross, 1, 2))
-    return (inner - along) / twice[:, None, None]
+    return (inner - along) / twice_cosine[:, None, None]
 
 
 def predict_echo(
@@ -91,22 +93,22 @@ def predict_echo(
 ) -> tuple[Array, Array, Array]:
     """Path [n], slope [n, 2] and curvature [n, 2, 2] of the echo of a surface seen from stage offsets [n, 3]."""
     t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
-    plane, cross, along, twice = _terms(points, normals, at_m, tx_m, rx_m)
-    second = along + twice[:, None, None] * curvature
+    plane, cross, along, twice_cosine = _terms(points, normals, at_m, tx_m, rx_m)
+    second = along + twice_cosine[:, None, None] * curvature
     bend = plane - np.swapaxes(cross, 1, 2) @ np.linalg.solve(second, cross)
     return out_m + back_m, -(t + r)[:, :2], bend
 
 
 def spreading(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
-    """cos(theta) / (r1 r2 sqrt |det P|): amplitude of the echo of a surface that reflects all, [n]; 1 / m.
+    """cos(theta) / (r1 r2 sqrt |det P|): echo amplitude of a surface that reflects everything, [n]; 1 / m.
 
     A mirror gives 1 / path.
     """
     _, _, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
-    _, _, along, twice = _terms(points, normals, at_m, tx_m, rx_m)
-    second = along + twice[:, None, None] * curvature
+    _, _, along, twice_cosine = _terms(points, normals, at_m, tx_m, rx_m)
+    second = along + twice_cosine[:, None, None] * curvature
     root = np.sqrt(np.abs(np.linalg.det(second)))
-    return twice / (2 * out_m * back_m * np.maximum(root, 1e-9))
+    return twice_cosine / (2 * out_m * back_m * np.maximum(root, 1e-9))
 
 
 def offset_that_sees(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:

@@ -92,7 +92,7 @@ def _low_pass() -> NDArray[np.float64]:
     off_middle = np.minimum(np.abs(cycles - 0.25), np.abs(cycles - 0.5))
     weight = np.where(off_middle < _SCENE, 1.0, 0.05)
     pairs = 2 * np.cos(2 * np.pi * np.outer(cycles, np.arange(TAPS // 2) + 0.5))
-    # Of the taps of sum 1: the last is what the others leave.
+    # The sum of the taps is 1, so the last tap is what the others leave.
     basis = pairs[:, :-1] - pairs[:, -1:]
     half = np.linalg.lstsq(weight[:, None] * basis, -weight * pairs[:, -1] / 2, rcond=None)[0]
     half = np.append(half, 0.5 - half.sum())

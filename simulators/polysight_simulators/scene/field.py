@@ -418,7 +418,7 @@ def compute(
         shape_echo = shape_field(
             rig=rig, scene=scene, board=board, axes_m=offsets, nodes_hz=nodes_hz, centre_m=ant.centre_m, path_m=centre
         )
-        # As of plates: an infinite mirror gives object_gain d / path.
+        # Shapes have the gain of plates: an infinite mirror gives object_gain d / path.
         values += np.complex64(scene.object_gain * ant.direct_m[0]) * shape_echo[:, :, list(rx)]
     return values, (ax.first_u, ay.first_u), steps, nodes_hz, centre
 

@@ -12,7 +12,7 @@ from polysight_simulators.stage.motion import EMERGENCY, LOOKS, MAX_RATE, MIN_RA
 MAX_TRAVEL = 999_999
 MAX_POINTS = 9_999
 MAX_BACKLASH = 20_000
-# steps/s and steps
+# Homing: rates in steps/s, the first leg in steps.
 HOME_RATE = 4000
 CREEP_RATE = 400
 FIRST_RATE = 2000

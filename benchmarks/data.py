@@ -113,7 +113,7 @@ class RepeatedRows:
 
 def _read_repeatedly(path: Path, wanted_bytes: int, size: int) -> Iterator[NDArray[np.uint8]]:
     """Read pieces of a file, from its start again where it ends, `wanted` bytes in all."""
-    memory = np.empty(min(size, wanted_bytes) or wanted_bytes, np.uint8)
+    memory = allocate_pages(min(size, wanted_bytes) or wanted_bytes)
     with path.open("rb") as file:
         while wanted_bytes:
             piece = memory[:wanted_bytes]

@@ -13,6 +13,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+from tests.support import arm64
 
 from polysight.sync import build, offsets
 from polysight.sync import loops as sync_loops
@@ -33,8 +34,12 @@ def library_file(tmp_path_factory):
     return build.build(tmp_path_factory.mktemp("kernels"))
 
 
-@pytest.fixture(scope="module", params=WIDTHS)
-def loops(library_file, request):
+@pytest.fixture(scope="module", params=[*WIDTHS, pytest.param("ARM64", marks=pytest.mark.slow)])
+def loops(library_file, tmp_path_factory, request):
+    if request.param == "ARM64":
+        if not arm64.is_installed():
+            pytest.skip(f"no loops on ARM64: apt install {arm64.PACKAGES}")
+        return arm64.EmulatedLibrary(tmp_path_factory.mktemp("arm64"))
     if request.param > sync_loops.Library(library_file).bits:
         pytest.skip(f"this processor has no vectors of {request.param} bits")
     return sync_loops.Library(library_file, request.param)

@@ -1,4 +1,4 @@
-"""The compiled loops of synchronisation on ARM64, in QEMU: the vector code of the wheel for it, without such a machine."""
+"""The compiled loops of synchronisation on ARM64, in QEMU: the vector code of that wheel, on any machine."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-# Until an interrupted command looks again whether a module is still loading.
+# An interrupted command looks again after this time whether a module is still loading.
 _RETRY_S = 0.02
 
 
@@ -57,6 +57,7 @@ def interrupts_between_imports() -> Iterator[None]:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, or try again soon while a module is loading."""
     if _is_importing(frame):
         signal.setitimer(signal.ITIMER_REAL, _RETRY_S)
     else:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from polysight.imaging import ImageBuilder, image_grid
-from polysight.imaging.plane import _at_depth, focus_sweep
+from polysight.imaging.plane import _interpolate_stack, focus_sweep
 
 PLACES_MM = [(-60, -55), (-10, -60), (58, -50), (-62, 5), (3, -4), (60, 8), (-55, 60), (8, 55), (61, 58)]
 
@@ -65,8 +65,8 @@ def test_interpolation_between_planes_is_exact_at_all_planes():
     depths = np.linspace(-4e-3, 4e-3, 9)
     stack = 1 + np.random.default_rng(1).random((9, 3, 4))
     for plane, depth in zip(stack, depths, strict=True):
-        np.testing.assert_allclose(_at_depth(stack, depths, np.full((3, 4), depth)), plane, rtol=1e-9)
+        np.testing.assert_allclose(_interpolate_stack(stack, depths, np.full((3, 4), depth)), plane, rtol=1e-9)
     smooth = (depths**2)[:, None, None] * np.ones((3, 4))
     between = np.full((3, 4), -3.7e-3)
     # Parabolas are exact
-    np.testing.assert_allclose(_at_depth(smooth, depths, between), between**2, rtol=1e-9)
+    np.testing.assert_allclose(_interpolate_stack(smooth, depths, between), between**2, rtol=1e-9)

@@ -44,6 +44,7 @@ MOUNT_STD_M = 1e-3
 PRIOR_STD_M = 5.8e-3
 """Standard deviation of the plane's distance if the scene does not determine it: uniform within 10 mm."""
 _WORTH_M = 5e-4
+"""Smallest offset for which images are formed again: a nearer plane changes the angle by less than MOUNT_STD_M does."""
 _STEP_M = 2e-4
 """Height step to find the change of range and phase with height."""
 _COHERENT = 0.7
@@ -53,6 +54,7 @@ _TILT_PRIOR_RAD = 0.02
 _MIN_STD_M = 3e-4
 """Smallest standard deviation of a plate's range, due to sidelobes of its neighbours."""
 _MAX_TILT = 0.035
+"""Largest tilt that phases may show, rise per metre: two degrees."""
 _PHASE_FITS_RAD = 0.5
 """Largest RMS phase error of plates on one plane; a fifth of the value for random phases."""
 _PHASE_STD_M = 5e-5
@@ -124,7 +126,7 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
         for board in builder.boards.values():
             image = board.image(replace(grid, z_m=float(np.mean(grid.z_m)) + depth))[0]
             stack[i] += np.abs(image) ** 2
-    cells = _cells(builder, depths)
+    cells = _cell_areas(builder, depths)
     x = grid.x_m - grid.x_m.mean()
     y = grid.y_m - grid.y_m.mean()
 
@@ -132,8 +134,8 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
         """Return the sharpness on a plane: depth in mm at the centre, rise along x and y in mm per 100 mm."""
         depth, along_x, along_y = plane * [1e-3, 1e-2, 1e-2]
         z = np.clip(depth + along_x * x[None, :] + along_y * y[:, None], depths[0], depths[-1])
-        weight = 1 / _at_depth(cells, depths, z)
-        intensity = _at_depth(stack, depths, z)
+        weight = 1 / _interpolate_stack(cells, depths, z)
+        intensity = _interpolate_stack(stack, depths, z)
         return float((weight * intensity**2).sum() / max(float((weight * intensity).sum()) ** 2, 1e-300))
 
     flat = np.array([sharpness(np.array([1e3 * depth, 0.0, 0.0])) for depth in depths])
@@ -152,7 +154,7 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
     return Focus(1e3 * depths, flat / flat.max(), float(depth), (float(tilt[0]), float(tilt[1])), float(gain))
 
 
-def _cells(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the relative area of a resolution cell at every pixel of every plane, [plane, ny, nx].
 
     Interpolated from nine points per plane, for it varies slowly.
@@ -177,7 +179,9 @@ def _cells(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.flo
     return between(tuple(np.meshgrid(z, grid.y_m, grid.x_m, indexing="ij")))
 
 
-def _at_depth(stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
+def _interpolate_stack(
+    stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the intensity on a surface through the stack, by cubic convolution between planes (Keys 1981)."""
     place = (z - depths[0]) / (depths[1] - depths[0])
     base = np.clip(np.floor(place).astype(np.intp), 0, len(depths) - 2)
@@ -188,7 +192,7 @@ def _at_depth(stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArra
         ((-1.5 * t + 2.0) * t + 0.5) * t,
         (0.5 * t - 0.5) * t * t,
     )
-    # One extrapolated plane beyond each end (Keys 1981).
+    # The convolution needs one extrapolated plane beyond each end (Keys 1981).
     ends = [3 * stack[:1] - 3 * stack[1:2] + stack[2:3], 3 * stack[-1:] - 3 * stack[-2:-1] + stack[-3:-2]]
     stack = np.concatenate([ends[0], stack, ends[1]])
     rows, columns = np.indices(z.shape)
@@ -296,7 +300,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     grid = builder.grid
     x = grid.x_m - grid.x_m.mean()
     y = grid.y_m - grid.y_m.mean()
-    ranges = [_ranges(board, masks) for board in builder.boards.values()]
+    ranges = [_heights_by_range(board, masks) for board in builder.boards.values()]
     precision = np.stack([1 / std**2 for _, std in ranges])
     total = precision.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -313,10 +317,10 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     if fine.sum() >= 2:
         finer, fine_covariance = _fit(places[fine], phase[0][fine], np.full(int(fine.sum()), _PHASE_STD_M))
         residual = phase[0][fine] - _plane_heights(finer, places[fine])
-        agree = float(np.sqrt(np.mean((residual * phase[1]) ** 2))) < _PHASE_FITS_RAD
+        on_one_plane = float(np.sqrt(np.mean((residual * phase[1]) ** 2))) < _PHASE_FITS_RAD
         # Thin sheets change the phase themselves: accept the plane only if the ranges agree.
-        agrees = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, 3e-3, 3e-3]
-        if agree and fine.sum() >= 4 and bool(agrees.all()) and float(np.hypot(*finer[1:])) < _MAX_TILT:
+        like_ranges = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, 3e-3, 3e-3]
+        if on_one_plane and fine.sum() >= 4 and bool(like_ranges.all()) and float(np.hypot(*finer[1:])) < _MAX_TILT:
             plane = finer
             covariance = fine_covariance
             heights = phase[0]
@@ -356,7 +360,9 @@ def move_to_plane(
     return plane, images
 
 
-def _ranges(board: BoardSamples, masks: Sequence[NDArray[np.bool_]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _heights_by_range(
+    board: BoardSamples, masks: Sequence[NDArray[np.bool_]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the height of each patch from the range of its echo, and its standard deviation, metres."""
     image, footprint, _ = board.image()
     slope, mirror_slope = board.range_slope()
@@ -398,7 +404,7 @@ def _heights_by_phase(
     phases = np.full(len(masks), np.nan)
     rates = []
     for i, mask in enumerate(masks):
-        # r_s is nearly real and negative
+        # The reflection r_s of a plate is nearly real and negative: minus makes it a phase near zero.
         flat = -image[mask].astype(np.complex128) * np.conj(footprint[mask])
         coherent = abs(flat.sum()) / max(float(np.abs(flat).sum()), 1e-300)
         if mask.any() and coherent > _COHERENT:

@@ -426,21 +426,21 @@ class Samples:
             pairs = zip(common, common, strict=True)
         else:
             pairs = zip(ours, theirs, strict=False)
-        left_rows = []
-        right = []
+        our_rows = []
+        their_rows = []
         groups = []
         patches = []
         angles = self.angles_deg + other.angles_deg if self.angles_deg and other.angles_deg else ()
         for a, b in pairs:
             for name in np.unique(self.names):
-                patches_here = np.unique(self.patches[(self.groups == a) & (self.names == name)])
-                patches_there = np.unique(other.patches[(other.groups == b) & (other.names == name)])
-                for p, q in zip(patches_here, patches_there, strict=False):
+                our_patches = np.unique(self.patches[(self.groups == a) & (self.names == name)])
+                their_patches = np.unique(other.patches[(other.groups == b) & (other.names == name)])
+                for p, q in zip(our_patches, their_patches, strict=False):
                     i = np.flatnonzero(self.patches == p)
                     j = np.flatnonzero(other.patches == q)
                     n = min(i.size, j.size)
-                    left_rows.append(rng.permutation(i)[:n])
-                    right.append(rng.permutation(j)[:n])
+                    our_rows.append(rng.permutation(i)[:n])
+                    their_rows.append(rng.permutation(j)[:n])
                     groups += [a if a == b else f"{a} + {b}"] * n
                     patches += [p] * n
         if not groups:
@@ -448,8 +448,8 @@ class Samples:
                 "no material was seen under both angles", "the materials' names differ", "train both angles",
                 code=ErrorCode.MISMATCH,
             )  # fmt: skip
-        i = np.concatenate(left_rows)
-        j = np.concatenate(right)
+        i = np.concatenate(our_rows)
+        j = np.concatenate(their_rows)
         specimens = None if self.specimens is None else self.specimens[i]
         x = np.hstack([self.x[i], other.x[j]])
         return Samples(x, self.names[i], np.array(groups), np.array(patches), specimens, angles)
@@ -509,13 +509,13 @@ class Model(ABC):
         return majority(*self.by_pixel(x), patches)
 
 
-def majority(found: npt.NDArray, distance: Real, patches: npt.NDArray) -> NamedScan:
+def majority(pixel_names: npt.NDArray, distance: Real, patches: npt.NDArray) -> NamedScan:
     """Name each patch as most of its pixels; confidence is their share, distance the median over all pixels."""
     ids = np.unique(patches)
     rows = []
     for i in ids:
         pixels = patches == i
-        names, count = np.unique(found[pixels], return_counts=True)
+        names, count = np.unique(pixel_names[pixels], return_counts=True)
         rows.append((names[count.argmax()], count.max() / pixels.sum(), float(np.median(distance[pixels]))))
     names, share, far = zip(*rows, strict=True)
-    return NamedScan(found, distance, ids, np.array(names), np.array(share), np.array(far))
+    return NamedScan(pixel_names, distance, ids, np.array(names), np.array(share), np.array(far))

@@ -32,10 +32,16 @@ MAX_TURN_RAD = 0.35
 NEIGHBOURHOOD_M = 0.024
 MIN_POINTS = 8
 MIN_NEIGHBOURS = 6
-# A third of a window.
+# Distance at which a window's own curvature counts as a slope: a third of a window.
 LEVER_OF_WINDOW_M = 0.011
 # A smaller radius is an edge or a wire: what it diffracts is no reflection.
 MIN_RADIUS_M = 0.012
+# Range of z in which objects are searched, and the largest slope of an echo's path over the stage offset.
+NEAREST_M = 0.2
+FARTHEST_M = 1.4
+MAX_SLOPE = 0.6
+# An echo below so many standard deviations of its noise has no usable slope.
+MIN_AMPLITUDE_STDS = 5
 
 
 @dataclass(frozen=True)
@@ -97,13 +103,16 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
 
 
 def _is_sound(echoes: Echoes, shape: Shape) -> NDArray[np.bool_]:
-    """True for echoes that a surface can give: in front of the antennas, curvature not that of an edge."""
-    sound = np.isfinite(shape.points).all(axis=1) & (shape.points[:, 2] > 0.2) & (shape.points[:, 2] < 1.4)
-    sound &= np.abs(echoes.slope).max(axis=1) < 0.6
-    return sound & (np.abs(echoes.amplitude) > 5 * echoes.amplitude_std)
+    """True for echoes that a surface can give: within range, not too steep, well above the noise."""
+    z_m = shape.points[:, 2]
+    in_range = np.isfinite(shape.points).all(axis=1) & (z_m > NEAREST_M) & (z_m < FARTHEST_M)
+    in_view = np.abs(echoes.slope).max(axis=1) < MAX_SLOPE
+    above_noise = np.abs(echoes.amplitude) > MIN_AMPLITUDE_STDS * echoes.amplitude_std
+    return in_range & in_view & above_noise
 
 
 def _is_wide(shape: Shape) -> NDArray[np.bool_]:
+    """True for points whose radii of curvature are larger than those of edges and wires."""
     bends = np.linalg.eigvalsh((shape.curvature + np.swapaxes(shape.curvature, 1, 2)) / 2)
     return np.isfinite(bends).all(axis=1) & (np.abs(bends).max(axis=1) < 1 / MIN_RADIUS_M)
 

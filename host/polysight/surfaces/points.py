@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-# Newton's method doubles the correct digits at each step. From half a metre away a few steps reach full precision; the
+# Newton's method doubles the correct digits at each step: from half a metre away a few steps reach full precision; the
 # rest are for starts from which the first steps are cut to LONGEST_STEP_M.
 NEWTON_STEPS = 12
 LONGEST_STEP_M = 0.15

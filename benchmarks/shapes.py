@@ -8,6 +8,9 @@ standard errors that the disturbance really has, so that its 95 % regions can be
 
 `--quick` scans every 4 mm with one RX a board, with the noise that the averages of the whole scan have: the same
 information for a sixteenth of the CPU.
+
+`--campaign FILE` adds each judged object to a file as soon as it is done, and skips those that the file holds: a long
+campaign may be stopped and run on, in as many slices as one likes. Its tables are those of all objects in the file.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -102,7 +105,7 @@ class ObjectFigures:
 
     `normals_inside`, `places_inside`: shares of points whose own 95 % regions hold the surface. `distance2`: squared
     distance of the true permittivity in the region of the object; `points_inside`: share of points whose own region
-    holds it. Figures are
+    holds it. `normal_68_deg`, `point_68_mm`, `point_error_68`: 68th percentiles over the object's points. Figures are
     None where nothing was seen or given.
     """
 
@@ -116,11 +119,14 @@ class ObjectFigures:
     stray: int
     normal_deg: float | None = None
     point_mm: float | None = None
+    normal_68_deg: float | None = None
+    point_68_mm: float | None = None
     normals_inside: float | None = None
     places_inside: float | None = None
     error: float | None = None
     distance2: float | None = None
     points_inside: float | None = None
+    point_error_68: float | None = None
     half_width: float | None = None
     dominated_by: str = ""
     reason: str = ""
@@ -232,6 +238,8 @@ def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> Obje
         figures,
         normal_deg=float(np.median(turns_deg)),
         point_mm=float(1000 * np.median(away_m)),
+        normal_68_deg=float(np.percentile(turns_deg, 68)),
+        point_68_mm=float(1000 * np.percentile(away_m, 68)),
         # A normal turns in two directions: 1.96 of their sum bounds the less sure one alone.
         normals_inside=float(np.mean(turns_deg < 1.96 * surface.normal_std_deg[on_object])),
         places_inside=float(np.mean(away_m < 1.96 * surface.position_std_m[on_object])),
@@ -254,11 +262,13 @@ def judge_permittivity(
     covariance = np.array(segment.covariance)
     points = surface.permittivity[members]
     inside = squared_distances(points - truth, surface.covariance[members]) < CHI2_95
+    point_errors = np.abs(points - truth)[np.isfinite(points)] / abs(truth)
     return replace(
         figures,
         error=abs(segment.permittivity - truth) / abs(truth),
         distance2=float(squared_distances(np.array([segment.permittivity - truth]), covariance[None])[0]),
         points_inside=float(np.mean(inside[np.isfinite(points)])),
+        point_error_68=float(np.percentile(point_errors, 68)),
         half_width=1.96 * float(np.sqrt(np.trace(covariance) / 2)) / abs(truth),
         dominated_by=segment.dominated_by,
     )
@@ -279,26 +289,92 @@ def _judge(job: tuple[str, int, str, ScanKind]) -> ObjectFigures:
     return judge_object(*job)
 
 
+def _percentile_68(values: Iterable[float | None]) -> str:
+    """68th percentile of the figures that are known, as a cell of the table."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return "-"
+    return f"{np.percentile(known, 68, method='inverted_cdf'):.2f}"
+
+
+def _percent(values: Iterable[float | bool | None]) -> str:
+    """Mean of shares that are known, in per cent."""
+    known = [float(value) for value in values if value is not None]
+    if not known:
+        return "-"
+    return f"{100 * np.mean(known):.0f}"
+
+
+def _in_percent(value: float | None) -> float | None:
+    return None if value is None else 100 * value
+
+
+def _is_inside(figures: ObjectFigures) -> bool | None:
+    """True if the object's 95 % region holds its permittivity; None without a region."""
+    return None if figures.distance2 is None else figures.distance2 < CHI2_95
+
+
+OBJECTS_HEAD = (
+    f"{'objects':<26}{'n':>5}{'normal deg':>16}{'point mm':>16}{'eps %':>16}{'given %':>9}{'in 95 %':>9}{'half %':>8}"
+)
+POINTS_HEAD = (
+    f"{'points':<26}{'n':>5}{'normal deg':>12}{'in 95 %':>9}{'point mm':>12}{'in 95 %':>9}{'eps %':>12}{'in 95 %':>9}"
+)
+
+
 def format_line(title: str, figures: Sequence[ObjectFigures], limits: tuple[float | None, ...] | None = None) -> str:
-    """Return one line of the table."""
-    columns = [[f.normal_deg for f in figures], [f.point_mm for f in figures]]
-    columns.append([None if f.error is None else 100 * f.error for f in figures])
+    """Return one line of the table of objects: 68th percentiles of their figures, and how many regions hold."""
+    columns: list[list[float | None]] = [
+        [f.normal_deg for f in figures],
+        [f.point_mm for f in figures],
+        [_in_percent(f.error) for f in figures],
+    ]
     cells = [f"{title:<26}{len(figures):>5}"]
     for values, limit in zip(columns, limits or (None, None, None), strict=True):
-        values_given = [v for v in values if v is not None]
-        value = f"{np.percentile(values_given, 68, method='inverted_cdf'):.2f}" if values_given else "-"
-        cells.append(f"{value:>8} {'' if limit is None else f'<= {limit:g}':<7}")
-    figures_with_error = [f for f in figures if f.error is not None]
-    cells.append(f"{100 * len(figures_with_error) / len(figures):>7.0f}")
-    distances = [f.distance2 for f in figures if f.distance2 is not None]
-    inside = [f.points_inside for f in figures if f.points_inside is not None]
+        must_hold = "" if limit is None else f"<= {limit:g}"
+        cells.append(f"{_percentile_68(values):>8} {must_hold:<7}")
+    cells.append(f"{_percent(f.error is not None for f in figures):>9}")
+    cells.append(f"{_percent(_is_inside(f) for f in figures):>9}")
     widths = [100 * f.half_width for f in figures if f.half_width is not None]
-    if distances:
-        cells.append(
-            f"{100 * np.mean(np.array(distances) < CHI2_95):>9.0f}{np.sqrt(np.median(distances) / 1.386):>8.2f}"
-        )
-        cells.append(f"{100 * np.mean(inside):>9.0f}{np.median(widths):>9.1f}")
+    cells.append(f"{np.median(widths):>8.1f}" if widths else f"{'-':>8}")
     return "".join(cells)
+
+
+def format_points_line(title: str, figures: Sequence[ObjectFigures]) -> str:
+    """Return one line of the table of points: 68th percentile over the points of an object, and what regions hold."""
+    seen = [f for f in figures if f.points]
+    cells = [f"{title:<26}{sum(f.points for f in seen):>5}"]
+    columns = (
+        ([f.normal_68_deg for f in seen], [f.normals_inside for f in seen]),
+        ([f.point_68_mm for f in seen], [f.places_inside for f in seen]),
+        ([_in_percent(f.point_error_68) for f in seen], [f.points_inside for f in seen]),
+    )
+    for values, inside in columns:
+        known = [value for value in values if value is not None]
+        usual = f"{np.median(known):.2f}" if known else "-"
+        cells.append(f"{usual:>12}{_percent(inside):>9}")
+    return "".join(cells)
+
+
+def print_tables(figures: Sequence[ObjectFigures]) -> None:
+    """Print the tables of objects and of points, by disturbance and kind."""
+    disturbances = [name for name in DISTURBANCES if any(f.disturbance == name for f in figures)]
+    kinds = [kind for kind in KINDS if any(f.kind == kind for f in figures)]
+    print(OBJECTS_HEAD)
+    for name in disturbances:
+        for kind in kinds:
+            chosen = [f for f in figures if (f.kind, f.disturbance) == (kind, name)]
+            if chosen:
+                print(format_line(f"{kind}, {name}", chosen, MUST_HOLD.get(kind)))
+        print(format_line(f"together, {name}", [f for f in figures if f.disturbance == name]))
+    print()
+    print(POINTS_HEAD)
+    for name in disturbances:
+        for kind in kinds:
+            chosen = [f for f in figures if (f.kind, f.disturbance) == (kind, name)]
+            if chosen:
+                print(format_points_line(f"{kind}, {name}", chosen))
+        print(format_points_line(f"together, {name}", [f for f in figures if f.disturbance == name]))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -311,7 +387,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", type=int, default=200, help="stage positions in y")
     parser.add_argument("--quick", action="store_true", help="every other position and one RX a board, with less noise")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--campaign", type=Path, default=None, help="file of judged objects: run on where it ends")
     parser.add_argument("--json", type=Path, default=None, help="write the figures of each object there")
+
+
+def load_campaign(path: Path | None) -> list[ObjectFigures]:
+    """Return the objects that a campaign has judged so far."""
+    if path is None or not path.exists():
+        return []
+    return [ObjectFigures(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -320,25 +404,27 @@ def run(args: argparse.Namespace) -> int:
     kinds = args.kinds.split(",")
     disturbances = args.disturbances.split(",")
     scan = ScanKind(args.columns, args.rows, args.quick)
-    jobs = [(kind, seed, name, scan) for name in disturbances for seed in seeds for kind in kinds]
-    figures = []
+    figures = load_campaign(args.campaign)
+    judged_before = {(f.kind, f.seed, f.disturbance) for f in figures}
+    jobs = []
+    for name in disturbances:
+        for seed in seeds:
+            jobs += [(kind, seed, name, scan) for kind in kinds if (kind, seed, name) not in judged_before]
     with ProcessPoolExecutor(args.jobs) as pool:
         for judged in pool.map(_judge, jobs):
             figures.append(judged)
+            if args.campaign is not None:
+                with args.campaign.open("a", encoding="utf-8") as campaign:
+                    campaign.write(json.dumps(asdict(judged)) + "\n")
             if judged.error is None:
                 said = "no permittivity"
             else:
                 said = f"permittivity within {100 * judged.error:.1f} %"
             print(f"{judged.kind} {judged.seed}, {judged.disturbance}: {judged.points} points, {said}", file=sys.stderr)
     print(__doc__)
-    print(f"{'kind':<26}{'n':>5}{'normal deg':>16}{'point mm':>16}{'eps %':>16}{'given %':>7}"
-          f"{'in 95 %':>9}{'rms z':>8}{'points':>9}{'half %':>9}")  # fmt: skip
-    for name in disturbances:
-        for kind in kinds:
-            chosen = [f for f in figures if (f.kind, f.disturbance) == (kind, name)]
-            print(format_line(f"{kind}, {name}", chosen, MUST_HOLD.get(kind)))
-        print(format_line(f"together, {name}", [f for f in figures if f.disturbance == name]))
-    print(f"seconds of CPU, analysis of the points: {np.median([f.seconds for f in figures]):.0f} an object")
+    print_tables(figures)
+    if figures:
+        print(f"seconds of CPU, analysis of the points: {np.median([f.seconds for f in figures]):.0f} an object")
     if args.json is not None:
         args.json.write_text(json.dumps([asdict(f) for f in figures], indent=1), encoding="utf-8")
     return 0

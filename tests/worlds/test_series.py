@@ -16,9 +16,9 @@ from polysight_worlds.series import (
     sphere_coefficients,
     sum_orders,
 )
-from polysight_worlds.shape_echoes import choose_solution, sum_bent
+from polysight_worlds.shape_echoes import choose_solution, solve_cylinder, sum_bent
 from polysight_worlds.shapes import Shape, find_specular, follow_path
-from polysight_worlds.zones import sum_window
+from polysight_worlds.zones import antennas_at, sum_window
 
 FREQUENCY_HZ = 78e9
 K = 2 * np.pi * FREQUENCY_HZ / LIGHT_M_PER_S
@@ -157,3 +157,19 @@ def test_what_physical_optics_misses_is_found_from_the_series():
         residuals.append(np.abs(with_bends - 1).max())
     assert min(missed) > 0.015
     assert max(residuals) < 0.007
+
+
+@pytest.mark.parametrize("axis", [(-0.967, 0.251, 0.045), (-0.815, 0.568, 0.115), (0.1, 1.0, 0.05)])
+def test_a_cylinder_looked_up_for_many_positions_is_that_computed_one_by_one(axis):
+    boards = published_boards()
+    x, y = published_rig().centre_m
+    rod = cylinder("rod", Stack(below=6.8 - 0.35j), (float(x), float(y), 0.68), 0.18, 0.4, axis=axis)
+    grid_x, grid_y = np.meshgrid(np.linspace(-0.4, 0.4, 9), np.linspace(-0.25, 0.25, 7))
+    offsets = np.stack([grid_x.ravel(), grid_y.ravel(), np.zeros(grid_x.size)], axis=1)
+    places = find_specular(rod, *antennas_at(boards.tx, boards.h[0], offsets))
+    frequencies_hz = np.array([FREQUENCY_HZ])
+    together = solve_cylinder(rod, boards.tx, boards.h[0], frequencies_hz, offsets, places)[0]
+    for index in (0, 17, 31, 62):
+        own_places = tuple(place[[index]] for place in places)
+        alone = solve_cylinder(rod, boards.tx, boards.h[0], frequencies_hz, offsets[[index]], own_places)[0]
+        assert together[index] == pytest.approx(complex(alone[0]), rel=1e-6)

@@ -29,6 +29,7 @@ from polysight.surfaces.permittivity import (
     add_common_errors,
     disturb_optics,
     disturb_scan,
+    find_interior,
     find_reflecting,
     find_voltages,
     fit_permittivity,
@@ -54,6 +55,10 @@ MAX_GAIN_SIGMA = 3.0
 # Level of H over that of the medium fitted, and its rise over the band, logarithms: beyond, no single surface reflects.
 MAX_LEVEL_MISS = 0.2
 MAX_BAND_RISE = 0.02
+NO_SINGLE_MEDIUM = "no single medium reflects so: a thin wall, a coating, an edge, or a second echo at the same place"
+# Both faces of a wall make one echo, whose path is that of neither. Of 4000 drawn walls (0.5 to 3 mm, permittivity 2 to
+# 9, loss to 1, 53 degrees) 95 % appear less than 4.7 mm before or behind their front face.
+WALL_STD_M = 0.0024
 
 Array = NDArray[np.float64]
 
@@ -113,7 +118,7 @@ def analyse_surface(
 ) -> Surface:
     """Return shape and permittivity of the points seen; without a reference, the shape alone."""
     gains = None if reference is None else reference(optics)
-    echoes = drop_edges(echoes, optics, gains)
+    echoes, interior = drop_edges(echoes, optics, gains)
     shape = find_shape(echoes.h, optics)
     numbers = np.unique(echoes.segment)
     segments = [describe_segment(int(number), shape[echoes.segment == number]) for number in numbers]
@@ -126,7 +131,7 @@ def analyse_surface(
         voltages = find_voltages(echoes, optics, shape)
         disturbed = disturb_scan(echoes, optics, reference, uncertainty)
         for index, segment in enumerate(segments):
-            members = echoes.segment == segment.number
+            members = (echoes.segment == segment.number) & interior
             own_voltages = voltages[members]
             judged, fit = judge_segment(segment, own_voltages, gains, optics.wave_number)
             segments[index] = judged
@@ -143,6 +148,10 @@ def analyse_surface(
             permittivity[members] = point_permittivity(own_voltages, gains, optics.wave_number)
             covariance[members] = point_covariance(own_voltages, gains, fit, optics.wave_number) + common
     position_std_m, normal_std_rad = find_shape_errors(echoes.h, shape, optics, uncertainty)
+    # A wall is not told from other things that no single medium explains.
+    walls = [segment.number for segment in segments if segment.reason == NO_SINGLE_MEDIUM]
+    is_wall = np.isin(echoes.segment, walls)
+    position_std_m[is_wall] = np.hypot(position_std_m[is_wall], WALL_STD_M)
     return Surface(
         scan_id=scan_id,
         simulated=simulated,
@@ -202,12 +211,31 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
     )
 
 
-def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> Seen:
-    """Return the points at which surfaces reflect, without segments of which hardly any is left."""
+def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> tuple[Seen, NDArray[np.bool_]]:
+    """Return the points at which surfaces reflect, and True for those [n] away from the edges of their surface.
+
+    Flat surfaces end before the zone that their edges disturb. Segments that lie in it altogether are edges, unless
+    all do: then the object is small.
+    """
+    if not len(seen):
+        return seen, np.zeros(0, bool)
     voltages = find_voltages(seen, optics)
     reflecting = seen[find_reflecting(voltages, np.abs(seen.h.amplitude), seen.segment, gains)]
+    at_m = seen.h.at_m[:, :2]
+    extent_m = (at_m.min(axis=0), at_m.max(axis=0))
+    interior = find_interior(reflecting.h.at_m[:, :2], reflecting.segment, extent_m)
     counts = np.bincount(reflecting.segment, minlength=1)
-    return reflecting[counts[reflecting.segment] >= LEAST_POINTS]
+    interior_counts = np.bincount(reflecting.segment[interior], minlength=counts.size)
+    if interior_counts.max() < LEAST_POINTS:
+        enough = counts[reflecting.segment] >= LEAST_POINTS
+        return reflecting[enough], interior[enough]
+    shape = find_shape(reflecting.h, optics)
+    kept = interior_counts[reflecting.segment] >= LEAST_POINTS
+    for number in np.unique(reflecting.segment[kept]):
+        members = reflecting.segment == number
+        if describe_segment(int(number), shape[members]).radius_mm is None:
+            kept &= interior | ~members
+    return reflecting[kept], interior[kept]
 
 
 def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty: Uncertainty) -> tuple[Array, Array]:
@@ -262,8 +290,9 @@ def judge_segment(
     segment: Segment, voltages: Voltages, gains: Gains, wave_number: float
 ) -> tuple[Segment, PermittivityFit | None]:
     """Fit a segment's permittivity, unless there is a reason why it has none."""
-    if segment.points < MIN_POINTS:
-        return replace(segment, reason=f"{segment.points} points only: too few to average over"), None
+    if len(voltages) < MIN_POINTS:
+        cause = f"{len(voltages)} points away from its edges: too few to average over"
+        return replace(segment, reason=cause), None
     ratios = point_ratio(voltages, gains)
     ratio = complex(np.median(ratios.real), np.median(ratios.imag))
     if abs(ratio - 1) < METAL_RATIO:
@@ -274,8 +303,7 @@ def judge_segment(
     fit = fit_permittivity(voltages, gains, wave_number)
     level, rise = judge_medium(fit, voltages, gains, wave_number)
     if abs(level) > MAX_LEVEL_MISS or rise > MAX_BAND_RISE:
-        cause = "no single medium reflects so: a thin wall, a coating, an edge, or a second echo at the same place"
-        return replace(segment, reason=cause), None
+        return replace(segment, reason=NO_SINGLE_MEDIUM), None
     return segment, fit
 
 
@@ -283,7 +311,7 @@ def with_permittivity(segment: Segment, eps: complex, sources: dict[str, Array])
     """Add a permittivity with its covariances by source, unless no passive medium has it."""
     (aa, ab), (_, bb) = sum(sources.values(), np.zeros((2, 2))).tolist()
     if eps.imag > MAX_GAIN_SIGMA * bb**0.5 or eps.real < 1.25:
-        return replace(segment, reason="no passive medium reflects so: a thin wall, a coating, or an edge")
+        return replace(segment, reason=NO_SINGLE_MEDIUM)
     dominant = max(sources, key=lambda name: float(np.trace(sources[name])))
     return replace(segment, permittivity=eps, covariance=((aa, ab), (ab, bb)), dominated_by=dominant)
 

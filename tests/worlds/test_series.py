@@ -18,7 +18,7 @@ from polysight_worlds.series import (
 )
 from polysight_worlds.shape_echoes import choose_solution, solve_cylinder, sum_bent
 from polysight_worlds.shapes import Shape, find_specular, follow_path
-from polysight_worlds.zones import antennas_at, sum_window
+from polysight_worlds.zones import place_antennas, sum_window
 
 FREQUENCY_HZ = 78e9
 K = 2 * np.pi * FREQUENCY_HZ / LIGHT_M_PER_S
@@ -166,7 +166,7 @@ def test_a_cylinder_looked_up_for_many_positions_is_that_computed_one_by_one(axi
     rod = cylinder("rod", Stack(below=6.8 - 0.35j), (float(x), float(y), 0.68), 0.18, 0.4, axis=axis)
     grid_x, grid_y = np.meshgrid(np.linspace(-0.4, 0.4, 9), np.linspace(-0.25, 0.25, 7))
     offsets = np.stack([grid_x.ravel(), grid_y.ravel(), np.zeros(grid_x.size)], axis=1)
-    places = find_specular(rod, *antennas_at(boards.tx, boards.h[0], offsets))
+    places = find_specular(rod, *place_antennas(boards.tx, boards.h[0], offsets))
     frequencies_hz = np.array([FREQUENCY_HZ])
     together = solve_cylinder(rod, boards.tx, boards.h[0], frequencies_hz, offsets, places)[0]
     for index in (0, 17, 31, 62):

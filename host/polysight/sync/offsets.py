@@ -554,9 +554,11 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     by
         Its loops, with equal results; None: compiled where that is possible.
     """
-    run = by or (loops.library() if len(path.beam) == loops.RX else None) or NumpyLoops
     a, b = whole_blocks(chirp.linear_samples)
     n = (b - a) // FOLD
+    # The compiled search has room for as many blocks as its transform.
+    is_supported = len(path.beam) == loops.RX and n <= _FFT
+    run = by or (loops.library() if is_supported else None) or NumpyLoops
     usable: NDArray[np.bool_] = np.any(aligned.good, axis=1)
     window = np.hanning(n + 2)[1:-1].astype(np.float32)
     nearest, farthest = int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)

@@ -23,6 +23,7 @@ NAMES = (
     "picture",
     "worlds",
     "shapes",
+    "touching",
     "foreign",
     "pi",
 )

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from benchmarks.touching import judge_gap
 from tests.support.refusals import refused
 
 from polysight.materials import Labels, SegmentSettings, pack_labels, read_labels
@@ -179,3 +180,25 @@ def test_bad_label_files_are_refused(tmp_path, text, code):
     path.write_text(text)
     with refused(code, path):
         read_labels(path)
+
+
+@pytest.mark.parametrize("gap_cells", [1.5, 2.0, 3.0])
+@pytest.mark.parametrize("same_material", [False, True])
+def test_plates_that_nearly_touch_are_patches_of_their_own(gap_cells, same_material):
+    figures = judge_gap(gap_cells, same_material, scenes=8, first_seed=38_000)
+    assert figures.share >= 0.95
+    assert figures.strays == 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sheet_that_only_h_shows_is_a_patch(synthetic, seed):
+    rng = np.random.default_rng(seed)
+    scene = synthetic(seed, {"sheet": 3.0 - 0.02j}, noise=0.0)
+    # H is 25 dB above the noise, V below it.
+    noise = rng.standard_normal((2, 2, *scene.h.shape)) * np.abs(scene.h).max() * 10 ** (-28 / 20)
+    h = scene.h + noise[0, 0] + 1j * noise[0, 1]
+    v = noise[1, 0] + 1j * noise[1, 1]
+    found = segment(h, v, scene.x_m, scene.y_m)
+    assert len(found.patches) == 1
+    box = scene.plates[0].box_mm
+    assert np.abs(np.subtract(found.patches[0].box_mm, box)).max() < 5.0

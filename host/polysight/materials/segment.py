@@ -38,6 +38,13 @@ BODY = 0.65
 """Parts of a region narrower than this share of its width do not belong to it."""
 STEP_DB = 1.0
 """Step of the falling threshold."""
+BACKGROUND_PERCENT = 20.0
+"""Percentile of a channel's power that is its background: plates rarely fill more of an image."""
+NOISY = 0.005
+"""Background relative to the brightest part above which a channel hardly shows plates: that of a real picture is 4.6 dB
+lower in H, 12 dB in V."""
+LEAST_POWER = 1e-12
+"""Power relative to the brightest that counts as none."""
 LEAST_APART_MM = 0.4
 MOST_APART_MM = 10.0
 """Distances between the images of H and V that are corrected: smaller ones are below its error (0.2 mm), and larger
@@ -174,15 +181,23 @@ def level_db(h: Image, v: Image, usable: Mask, smooth_px: float, plate_px: float
 
     Each channel is scaled by its brightest part of half a plate's width, `plate_px` (bright strips at edges do not
     count), so that an unknown gain between H and V has no effect. The larger of both is used instead of the sum,
-    because V is only noise where it nearly vanishes.
+    because V is only noise where it nearly vanishes. A channel with hardly anything above its background is lowered
+    until its background is that of the other: else the noise of V would hide a sheet that only H shows.
     """
-    power = np.zeros(h.shape)
+    channels = []
+    backgrounds = []
     for channel in (h, v):
         p = scipy.ndimage.gaussian_filter(np.where(usable, np.abs(channel).astype(np.float64) ** 2, 0.0), smooth_px)
         top = float(scipy.ndimage.gaussian_filter(p, plate_px)[usable].max())
         if top > 0:
-            power = np.maximum(power, p / top)
-    return 10 * np.log10(np.maximum(power, 1e-12))
+            channels.append(p / top)
+            backgrounds.append(max(float(np.percentile(p[usable], BACKGROUND_PERCENT)) / top, LEAST_POWER))
+    power = np.zeros(h.shape)
+    for scaled, background in zip(channels, backgrounds, strict=True):
+        is_noisy = background > NOISY
+        weight = min(backgrounds) / background if is_noisy else 1.0
+        power = np.maximum(power, weight * scaled)
+    return 10 * np.log10(np.maximum(power, LEAST_POWER))
 
 
 def segment(

@@ -46,6 +46,10 @@ HOLDER_REAL = (1.0, 2.5)
 SHEET_HZ = 78e9
 SHEET_KERNEL = 0.02
 """Smoothing of the distribution of thin plates, in t."""
+STACK_SHARE = 0.05
+"""Share of plates that are neither half space nor thin plate in the patches that are none of the library's materials: a
+liquid behind glass may reflect as no passive half space does. Their t is uniform on the unit disk. Without them three
+cups of sugar water moved the estimated leakage by three standard deviations, and their own t by a fifth."""
 LEAST_LOSS_SPREAD = 0.02
 """Standard deviation of eps'' between specimens of low-loss materials."""
 METAL_SPREAD = 0.01
@@ -181,6 +185,7 @@ class Kinds:
             y = (imag[window[0]] - self.t[k].imag)[:, None]
             distance2 = inverse[k, 0, 0] * x**2 + 2 * inverse[k, 0, 1] * x * y + inverse[k, 1, 1] * y**2
             density[0 if self.ours[k] else 1][window] += scale[k] * np.exp(-0.5 * distance2)
+        density[1] = (1 - STACK_SHARE) * density[1] + STACK_SHARE / np.pi
         return DensityMap(low, high, np.log(density + 1e-12))
 
     def any_half_space(self, t: Complex, covariance: Real) -> Real:

@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from polysight.sync import loops
 from polysight.sync.offsets import prepare, reference
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -211,3 +212,31 @@ def test_an_if_outside_the_band_is_masked(rig, paths, direct_paths, align_single
     two = msgspec.structs.replace(rig.chirp, if_mode="complex2x")
     done = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], two)
     assert done.found.tolist() == [True, False, True, True]
+
+
+def test_the_compiled_search_is_never_given_more_blocks_than_it_has_room_for(rig, align_single, noise, monkeypatch):
+    """It would write beyond its arrays."""
+    compiled = loops.library()
+    if compiled is None:
+        pytest.skip("nothing is compiled here")
+    blocks_searched = []
+    search = type(compiled).search
+
+    def watched(self, halves, *arguments):
+        blocks_searched.append(halves.shape[-1])
+        return search(self, halves, *arguments)
+
+    monkeypatch.setattr(type(compiled), "search", watched)
+    rng = np.random.default_rng(0)
+    for linear in ((0, 192), (0, 1024), (0, 1200)):
+        chirp = msgspec.structs.replace(
+            rig.chirp,
+            samples=linear[1],
+            linear_samples=linear,
+            sample_rate_hz=rig.chirp.sample_rate_hz * linear[1] / 192,
+        )
+        path = prepare(msgspec.structs.replace(rig, chirp=chirp), rig.receivers[0])
+        received = noise((3, 4, linear[1]), 0.0, rng) + np.exp(0.5j * np.arange(linear[1]))
+        done = reference(align_single(received, np.ones(3, bool), linear), path, chirp)
+        assert np.isfinite(done.samples).all()
+    assert blocks_searched == [48, 256]

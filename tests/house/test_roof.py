@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import tomllib
 from importlib.metadata import PackageNotFoundError, PackagePath, distribution
@@ -43,6 +44,18 @@ def test_all_projects_have_one_version(folder):
     assert project["version"] == __version__
     ours = [d for d in project["dependencies"] if d.startswith("polysight")]
     assert all(d.endswith(f"=={__version__}") for d in ours)
+
+
+@pytest.mark.parametrize("folder", PROJECTS)
+def test_every_program_and_entry_point_of_a_project_exists(folder):
+    """They are text: nothing else notices when a function gets another name."""
+    project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    targets = list(project.get("scripts", {}).values())
+    for group in project.get("entry-points", {}).values():
+        targets.extend(group.values())
+    for target in targets:
+        module, _, function = target.partition(":")
+        assert callable(getattr(importlib.import_module(module), function, None)), target
 
 
 def test_an_editable_installation_is_a_path_that_editors_follow():

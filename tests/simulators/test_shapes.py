@@ -25,17 +25,17 @@ def scene(**content: object) -> Scene:
 
 
 @pytest.fixture
-def is_installed(tmp_path, monkeypatch):
+def worlds_entry_point(tmp_path, monkeypatch):
     """The worlds' entry point as an installation writes it, whatever this environment was installed from."""
     package = tmp_path / "offers_shapes-1.dist-info"
     package.mkdir()
     (package / "METADATA").write_text("Name: offers-shapes\nVersion: 1\n", encoding="utf-8")
-    entry = f"[{GROUP}]\naaa = polysight_worlds.scene_shapes:echoes_of\n"
+    entry = f"[{GROUP}]\naaa = polysight_worlds.scene_shapes:simulate_echoes\n"
     (package / "entry_points.txt").write_text(entry, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
 
 
-@pytest.mark.usefixtures("installed")
+@pytest.mark.usefixtures("worlds_entry_point")
 @pytest.mark.parametrize(
     ("medium", "error"), [({"metal": True}, 0.05), ({"permittivity": [9.0, 1.0]}, 0.08)], ids=["metal", "dielectric"]
 )
@@ -54,7 +54,7 @@ def test_a_level_plate_is_the_same_as_a_shape_and_as_a_plate(medium, error):
     assert ratios == pytest.approx([1, 1], abs=error)
 
 
-@pytest.mark.usefixtures("installed")
+@pytest.mark.usefixtures("worlds_entry_point")
 def test_a_recorded_scan_of_a_sphere_is_processed_to_its_samples(tmp_path):
     ball = scene(shapes=[BALL]).with_disturbances(direct_snr_db="off")
     folder = simulate(RIG, ball, tmp_path / "scan")

@@ -2,7 +2,7 @@
 
 The simulator's own field holds flat plates that are nearly level. Shapes come from another package, found by its entry
 point `polysight.shape_echoes`: this project's is `worlds/`, which shares no code with the simulators. It gets plain
-tables and arrays; `polysight_worlds.scene_shapes.echoes_of` says which.
+tables and arrays; `polysight_worlds.scene_shapes.simulate_echoes` says which.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ sys.exit(status)
 def test_an_interrupt_at_any_moment_ends_in_one_line():
     """A command is interrupted after growing CPU times, until it is finished before."""
     ends = []
-    for cpu_ms in range(2, 5000, 120):
+    for cpu_ms in range(2, 5000, 60):
         command = [sys.executable, "-c", INTERRUPT_AFTER, f"{cpu_ms / 1e3}", "plan", "--config", str(RIG_FILE)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         ends.append((done.returncode, done.stderr))

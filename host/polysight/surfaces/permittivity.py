@@ -61,6 +61,8 @@ LEVEL_TOLERANCE_WITHOUT_GAINS = 0.9
 # bend normals by degrees, and H / V of a plate with sharp edges is 10 % too large.
 BORDER_DISC_M = 0.05
 MIN_FILLING = 0.75
+# Offsets closer than this are of one column of windows: rows start a little apart, as the stage moves within a burst.
+SAME_COLUMN_M = 1.5e-3
 EPS_STEP = 1e-4
 
 
@@ -541,9 +543,9 @@ def find_interior(at_m: Array, segment: NDArray[np.int_], extent_m: tuple[Array,
 
 
 def _find_stride(places_m: Array) -> float:
-    """Usual distance of neighbouring windows on one axis, metres."""
+    """Return the usual distance of neighbouring windows on one axis, metres."""
     steps = np.diff(np.unique(np.round(places_m, 3)))
-    steps = steps[steps > 0.0015]
+    steps = steps[steps > SAME_COLUMN_M]
     return float(np.median(steps)) if steps.size else STRIDE_M
 
 

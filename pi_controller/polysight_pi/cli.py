@@ -92,8 +92,8 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
     faults = [r.fault for r in records if r.fault]
     for number in sorted(set(faults)):
         e = explain(number)
-        sys.stderr.write(f"error: fault {number} in {faults.count(number)} of {len(records)} bursts: {e.what}\n")
-        sys.stderr.write(f"  why: {e.why}\n  do: {e.remedy}\n")
+        sys.stderr.write(f"error: fault {number} in {faults.count(number)} of {len(records)} bursts: {e.problem}\n")
+        sys.stderr.write(f"  why: {e.cause}\n  do: {e.remedy}\n")
     return int(bool(faults))
 
 

@@ -47,8 +47,8 @@ def _service(instrument: Instrument) -> Iterator[Ask]:
                 raise _no_answer(address)
             reply = m.unpack_reply(client.recv())
             if isinstance(reply, m.Refused):
-                summary = f"{type(command).__name__} was refused: {reply.what}"
-                raise DeviceError(summary, reply.why, reply.remedy, code=ErrorCode.REFUSED_BY_PEER)
+                summary = f"{type(command).__name__} was refused: {reply.problem}"
+                raise DeviceError(summary, reply.cause, reply.remedy, code=ErrorCode.REFUSED_BY_PEER)
             return reply
 
         yield ask

@@ -67,7 +67,10 @@ def make_refusal(number: int, summary: str, cause: str = "", remedy: str = "") -
     """Return a refusal, with texts of limited length; missing ones are those of shared/polysight_shared/faults.py."""
     table = explain(number)
     return m.Refused(
-        number=int(number), what=summary[:1000], why=(cause or table.why)[:1000], remedy=(remedy or table.remedy)[:1000]
+        number=int(number),
+        problem=summary[:1000],
+        cause=(cause or table.cause)[:1000],
+        remedy=(remedy or table.remedy)[:1000],
     )
 
 
@@ -387,7 +390,7 @@ class Executor:
 
         def write(journal: Journal) -> None:
             resumed, missing_events = journal.open(run.scan_id, run.plan, run.last_seq)
-            journal.add(m.RunStarted, plan=run.plan, resumed=resumed, lost=missing_events)
+            journal.add(m.RunStarted, plan=run.plan, resumed=resumed, lost_events=missing_events)
             journal.commit()
             takes.update(journal.takes)
 

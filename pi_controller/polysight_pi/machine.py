@@ -342,7 +342,7 @@ class Machine:
             self.happen("stopped")
         elif reply.kind == "alarm":
             e = explain(reply.number)
-            summary = f"stage alarm {reply.number}: {e.what} ({e.why}); {e.remedy}"
+            summary = f"stage alarm {reply.number}: {e.problem} ({e.cause}); {e.remedy}"
             self.happen("stage lost", PiFault.STAGE_ALARM, summary)
         elif reply.kind == "done" and homing and answers_home:
             self.stage.note_position(reply)
@@ -611,7 +611,7 @@ class Machine:
         if not self.fault:
             self.fault = int(number)
             self.reason = reason
-        self._journal.add(m.Fault, number=int(number), what=f"{e.what}: {reason}", why=e.why, remedy=e.remedy)
+        self._journal.add(m.Fault, number=int(number), problem=f"{e.problem}: {reason}", cause=e.cause, remedy=e.remedy)
 
 
 def row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:

@@ -73,8 +73,8 @@ class StageRefusedError(DeviceError):
 
     def __init__(self, verb: str, number: int) -> None:
         e = explain(number)
-        summary = f"stage refused {verb}: error {number}, {e.what}"
-        super().__init__(summary, e.why, e.remedy, code=ErrorCode.REFUSED_BY_PEER)
+        summary = f"stage refused {verb}: error {number}, {e.problem}"
+        super().__init__(summary, e.cause, e.remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = number
 
 
@@ -566,7 +566,7 @@ class BenchStage:
                 raise StageLostError(news.reason, "cable unplugged", "check the USB cable")
             if news.kind == "alarm":
                 e = explain(news.number)
-                raise DeviceError(f"stage alarm {news.number}: {e.what}", e.why, e.remedy)
+                raise DeviceError(f"stage alarm {news.number}: {e.problem}", e.cause, e.remedy)
             self._driver.note_position(news)
             if matches(news):
                 return Position(self._driver.x_mm, self._driver.y_mm)

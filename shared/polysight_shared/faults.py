@@ -12,8 +12,8 @@ from typing import NamedTuple
 class Explanation(NamedTuple):
     """Meaning of a number, likely cause, and remedy."""
 
-    what: str
-    why: str
+    problem: str
+    cause: str
     remedy: str
 
 
@@ -245,7 +245,7 @@ def c_header() -> str:
         "",
         "enum StageError : uint8_t {",
         "  ERROR_NONE = 0,",
-        *(f"  ERROR_{e.name} = {int(e)},  // {EXPLANATIONS[e].what}" for e in StageError),
+        *(f"  ERROR_{e.name} = {int(e)},  // {EXPLANATIONS[e].problem}" for e in StageError),
         "};",
         "",
     ]

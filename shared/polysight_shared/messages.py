@@ -61,6 +61,10 @@ def is_simulated(backend: str) -> bool:
     return backend not in _HARDWARE
 
 
+# Fields whose key on the wire and in files of events is another word than their name in the code.
+_KEYS_ON_THE_WIRE = {"problem": "what", "cause": "why", "lost_events": "lost"}
+
+
 class _Message(msgspec.Struct, frozen=True, tag_field="type", tag=True, kw_only=True):
     version: Name = WIRE_VERSION
 
@@ -80,12 +84,12 @@ class Event(_Message, frozen=True, kw_only=True):
     t_mono_ns: Natural
 
 
-class RunStarted(Event, frozen=True, kw_only=True):
-    """A run was started or resumed. `lost`: number of earlier events that only the host still has."""
+class RunStarted(Event, frozen=True, kw_only=True, rename=_KEYS_ON_THE_WIRE):
+    """A run was started or resumed. `lost_events`: number of earlier events that only the host still has."""
 
     plan: RasterPlan
     resumed: bool = False
-    lost: Seq = 0
+    lost_events: Seq = 0
 
 
 class RunStopped(Event, frozen=True, kw_only=True):
@@ -158,12 +162,12 @@ class Heartbeat(Event, frozen=True, kw_only=True):
     period_ms: Natural
 
 
-class Fault(Event, frozen=True, kw_only=True):
+class Fault(Event, frozen=True, kw_only=True, rename=_KEYS_ON_THE_WIRE):
     """A fault with its number in shared/polysight_shared/faults.py. The first fault of a row is kept."""
 
     number: Number
-    what: Text
-    why: Text = ""
+    problem: Text
+    cause: Text = ""
     remedy: Text = ""
 
 
@@ -301,12 +305,12 @@ class Accepted(_Message, frozen=True, kw_only=True):
     state: State
 
 
-class Refused(_Message, frozen=True, kw_only=True):
+class Refused(_Message, frozen=True, kw_only=True, rename=_KEYS_ON_THE_WIRE):
     """The command was refused, and changed nothing."""
 
     number: Number
-    what: Text
-    why: Text = ""
+    problem: Text
+    cause: Text = ""
     remedy: Text = ""
 
 

@@ -49,7 +49,7 @@ def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig,
     rig.pi.fail_rows[1, 1] = fault
     rig.pi.latched = "stage alarm 14: the emergency stop is pressed"
     phases = []
-    with refused(ErrorCode.STAGE_NOT_READY, explain(fault).what) as e:
+    with refused(ErrorCode.STAGE_NOT_READY, explain(fault).problem) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=lambda p: phases.append(p.phase))
     assert "retake" not in phases
     assert rig.pi.latched in e.value.what
@@ -69,7 +69,7 @@ def test_a_scan_that_begins_homes_out_of_faults_that_are_not_the_stages(rig, tmp
     if homes:
         assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
     else:
-        with refused(ErrorCode.STAGE_NOT_READY, explain(fault).what) as e:
+        with refused(ErrorCode.STAGE_NOT_READY, explain(fault).problem) as e:
             run_scan(rig.instrument, tmp_path / "s")
         assert "polysight-pi home" in e.value.remedy
     assert commands(rig.pi).count(m.Home) == homes, "at the start, and after the last row"

@@ -123,7 +123,7 @@ def test_words_follow_the_kind_alone():
         assert (notice.why, notice.do) == (cause, do)
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
     notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
-    assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).why.lower()
+    assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).cause.lower()
     for unknown in ([], [RowFault("of_a_newer_release", "RV")]):
         notice = notice_of_rejection(0, 1, [answer], unknown, "")
         assert (notice.why, notice.facts["detail"]) == ("", answer)

@@ -33,7 +33,7 @@ def test_fault_numbers_and_exit_statuses_are_told():
     text = (ROOT / "docs/how-to/when-it-goes-wrong.md").read_text(encoding="utf-8")
     for fault in PiFault:
         e = EXPLANATIONS[fault]
-        assert f"* **{int(fault)}**: {e.what} ({e.why}): {e.remedy}" in " ".join(text.split())
+        assert f"* **{int(fault)}**: {e.problem} ({e.cause}): {e.remedy}" in " ".join(text.split())
     kinds = {PolysightError, NoResult, *PolysightError.__subclasses__()}
     answer = set(map(int, re.findall(r"^\| (\d+) \|", text.split("## Messages")[0], re.MULTILINE)))
     assert {kind.exit_status for kind in kinds} | {0, 130} == answer

@@ -56,7 +56,7 @@ def test_trigger_health_is_the_worst_of_all_bursts(finished):
 
 def test_a_fault_told_twice_is_one(finished):
     history = answer(facts_of(finished))
-    fault = Fault(scan_id="s", seq=9, t_mono_ns=1, number=103, what="a trigger edge was lost")
+    fault = Fault(scan_id="s", seq=9, t_mono_ns=1, number=103, problem="a trigger edge was lost")
     history.add_events([fault])
     history.add_events([fault])
     assert [n.level for n in history.notices] == ["warning"]

@@ -82,7 +82,7 @@ def test_a_row_as_it_runs_and_nobody_else_s(pi):
 
 def test_faults_stay_until_a_row_ends_well(pi):
     tell, listener = pi
-    tell(m.Fault(**OF, seq=4, number=101, what="the stage does not answer"))
+    tell(m.Fault(**OF, seq=4, number=101, problem="the stage does not answer"))
     wait_for(lambda: listener.state.faults, "the fault")
     tell(row_finished("fault"), m.Heartbeat(**OF, seq=9, state="fault", period_ms=100))
     wait_for(lambda: listener.state.state == "fault", "the state")

@@ -82,7 +82,9 @@ def test_trouble_says_why_and_what_to_do(history, signs, heard, word):
 
 @pytest.mark.parametrize("number", sorted(EXPLANATIONS))
 def test_every_fault_of_the_pi_has_words(history, number):
-    notice = notice_of_fault(Fault(scan_id="s", seq=1, t_mono_ns=1, number=number, what=EXPLANATIONS[number].what))
+    notice = notice_of_fault(
+        Fault(scan_id="s", seq=1, t_mono_ns=1, number=number, problem=EXPLANATIONS[number].problem)
+    )
     assert notice.what
     assert notice.why
     assert notice.do
@@ -125,7 +127,7 @@ def test_an_abort_is_no_fault(history):
     """Neither in the row that it ends, nor at the Pi, nor when the scan has ended."""
     aborted = REJECTED | {"faults": [{"kind": "on_request"}]}
     add_fact(history, aborted)
-    fault = notice_of_fault(Fault(scan_id="s", seq=1, t_mono_ns=1, number=PiFault.ABORTED, what="aborted"))
+    fault = notice_of_fault(Fault(scan_id="s", seq=1, t_mono_ns=1, number=PiFault.ABORTED, problem="aborted"))
     history.notices.append(fault)
     stopped = replace(RUNNING, state="fault", faults=(fault,))
     assert status(history, signs_asked("abort"), stopped).key == "aborting"

@@ -114,7 +114,7 @@ def test_refusals_have_their_number(pi):
     assert host.must_refuse(m.Hold()) == PiFault.NOT_READY
     assert host.must_refuse(b"\x93nonsense") == PiFault.BAD_REQUEST
     refused = host.ask(m.Hello(version="2.0"))
-    assert (refused.number, "2.0" in refused.what) == (PiFault.VERSION, True)
+    assert (refused.number, "2.0" in refused.problem) == (PiFault.VERSION, True)
 
 
 def test_hold_and_resume_lose_nothing(host_in_row, stage):

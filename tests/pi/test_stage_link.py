@@ -72,7 +72,7 @@ def test_refusals_carry_the_table(connect):
     with pytest.raises(StageRefusedError) as e:
         link.request("MOVE", 1, 2, 3)
     assert e.value.number == StageError.NOT_HOMED
-    assert e.value.what.endswith(explain(StageError.NOT_HOMED).what)
+    assert e.value.what.endswith(explain(StageError.NOT_HOMED).problem)
     assert e.value.remedy
 
 

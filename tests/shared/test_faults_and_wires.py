@@ -20,7 +20,7 @@ def test_every_number_is_explained_and_unique():
     numbers = [*map(int, StageError), *map(int, PiFault)]
     assert sorted(numbers) == sorted(EXPLANATIONS)
     assert all(all(explain(k)) for k in numbers)
-    assert "250" in explain(250).what
+    assert "250" in explain(250).problem
 
 
 def test_the_firmware_header_is_the_table():

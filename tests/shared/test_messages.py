@@ -43,6 +43,10 @@ def draw_values(declared: Any) -> st.SearchStrategy:
     raise TypeError(declared)
 
 
+PLAN = RasterPlan(1, 1, 1.0, 1.0)
+STAMP = {"scan_id": "a", "seq": 1, "t_mono_ns": 5}
+HEAD_OF_EVENT = {"version": "1.0", **STAMP}
+
 events, commands, replies = (draw_values(inspect.type_info(kind)) for kind in (m.AnyEvent, m.AnyCommand, m.AnyReply))
 
 
@@ -59,6 +63,29 @@ def test_commands_round_trip(command: m.AnyCommand):
 @given(replies)
 def test_replies_round_trip(reply: m.AnyReply):
     assert m.unpack_reply(m.pack(reply)) == reply
+
+
+@pytest.mark.parametrize(
+    ("message", "written"),
+    [
+        (
+            m.Fault(**STAMP, number=101, problem="p", cause="c", remedy="r"),
+            {**HEAD_OF_EVENT, "type": "Fault", "number": 101, "what": "p", "why": "c", "remedy": "r"},
+        ),
+        (
+            m.RunStarted(**STAMP, plan=PLAN, resumed=True, lost_events=3),
+            {**HEAD_OF_EVENT, "type": "RunStarted", "plan": msgspec.to_builtins(PLAN), "resumed": True, "lost": 3},
+        ),
+        (
+            m.Refused(number=111, problem="p", cause="c", remedy="r"),
+            {"type": "Refused", "version": "1.0", "number": 111, "what": "p", "why": "c", "remedy": "r"},
+        ),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_field_with_another_name_in_the_code_keeps_its_key_on_the_wire(message: Any, written: dict):
+    """Byte for byte: peers and files of earlier releases have these keys, in this order."""
+    assert m.pack(message) == msgpack.packb({"type": written["type"], **written})
 
 
 @given(events, st.data())

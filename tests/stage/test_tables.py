@@ -102,7 +102,7 @@ def test_page_lists_every_error():
     page = " ".join(PAGE.partition("## Errors and alarms")[2].split())
     for error in StageError:
         e = EXPLANATIONS[error]
-        assert f"* **{int(error)}**: {e.what} ({e.why}): {e.remedy}" in page
+        assert f"* **{int(error)}**: {e.problem} ({e.cause}): {e.remedy}" in page
     assert set(re.findall(r"\* \*\*(\d+)\*\*", page)) == {str(int(e)) for e in StageError}
 
 

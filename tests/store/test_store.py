@@ -270,7 +270,7 @@ def test_every_truncation_of_the_manifest_loads_or_is_refused_clearly(whole_scan
 def test_truncated_events_go_on_after_the_last_whole_one(tmp_path_factory, cut):
     path = tmp_path_factory.mktemp("e") / "events.msgpack"
     writer = EventWriter(path)
-    some = [Fault(scan_id="s", seq=k, t_mono_ns=k, number=1, what="x" * k) for k in range(1, 5)]
+    some = [Fault(scan_id="s", seq=k, t_mono_ns=k, number=1, problem="x" * k) for k in range(1, 5)]
     for event in some:
         writer.append(event)
     writer.close()
@@ -290,7 +290,7 @@ def test_truncated_events_go_on_after_the_last_whole_one(tmp_path_factory, cut):
 def test_what_is_cut_off_the_events_is_kept_once(tmp_path):
     path = tmp_path / "events.msgpack"
     writer = EventWriter(path)
-    writer.append(Fault(scan_id="s", seq=1, t_mono_ns=1, number=1, what="x"))
+    writer.append(Fault(scan_id="s", seq=1, t_mono_ns=1, number=1, problem="x"))
     writer.sync()
     writer.close()
     for cut_off in (b"\x84\xa4", b"\xc1\xc1", b""):

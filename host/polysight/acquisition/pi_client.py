@@ -115,8 +115,8 @@ class RefusedError(ScanError):
     """The Pi refused a command; `number` is of shared/polysight_shared/faults.py."""
 
     def __init__(self, command: str, refusal: Refused) -> None:
-        problem = f"the Pi refused {command}: {refusal.what}"
-        super().__init__(problem, refusal.why, refusal.remedy, code=ErrorCode.REFUSED_BY_PEER)
+        problem = f"the Pi refused {command}: {refusal.problem}"
+        super().__init__(problem, refusal.cause, refusal.remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = refusal.number
 
 

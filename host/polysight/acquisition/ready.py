@@ -109,8 +109,8 @@ def check_between_rows(status: StatusReply, scan_id: str, first: bool) -> None:
         remedy = "see `journalctl -u polysight-pi` on the Pi"
     elif status.state == "fault" and (not first or status.fault in STAGE_FAULTS):
         explained = explain(status.fault)
-        problem = f"the stage is not ready: {explained.what}: {status.reason}"
-        cause = explained.why
+        problem = f"the stage is not ready: {explained.problem}: {status.reason}"
+        cause = explained.cause
         remedy = explained.remedy
     elif not first and needs_homing:
         if status.reason:

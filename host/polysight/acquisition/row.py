@@ -163,7 +163,7 @@ class Take:
         if f is None:
             return self.aborted or TakeFault(FaultKind.NO_END, "the Pi did not report how the row ended")
         if f.status != "done":
-            text = f"the row ended as {f.status}: {f.reason or explain(f.fault).what}"
+            text = f"the row ended as {f.status}: {f.reason or explain(f.fault).problem}"
             if self.aborted is not None and f.status == "aborted":
                 return TakeFault(self.aborted.kind, text)
             return TakeFault(FaultKind.PI_FAULT, text, number=f.fault)
@@ -372,7 +372,7 @@ def retakes_exhausted(take: Take, faults: list[TakeFault], scan: ScanFolder, tak
         remedy = silent[0].remedy
     elif take.finished is not None and take.finished.fault:
         explained = explain(take.finished.fault)
-        cause = explained.why
+        cause = explained.cause
         remedy = explained.remedy
     return ScanError(
         f"row {take.row.index} is not complete after {takes} takes: {reasons(faults)}",
@@ -570,8 +570,8 @@ class RowTaker:
         if take.finished is None:
             e = explain(status.fault)
             raise ScanError(
-                f"the Pi stopped in row {take.row.index}: {e.what}: {status.reason}",
-                e.why,
+                f"the Pi stopped in row {take.row.index}: {e.problem}: {status.reason}",
+                e.cause,
                 f"{e.remedy}, then `polysight resume {self._folder}`",
                 code=ErrorCode.STAGE_NOT_READY,
             )

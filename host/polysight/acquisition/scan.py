@@ -191,11 +191,11 @@ class RunningScan:
     def _warn_of_lost_events(self, events: list[AnyEvent]) -> None:
         """Warn if the Pi's journal is shorter than the scan's event log."""
         for event in events:
-            if isinstance(event, RunStarted) and event.lost:
+            if isinstance(event, RunStarted) and event.lost_events:
                 self._warn(
-                    f"the Pi's journal of this scan ends {event.lost} events before {self._scan.path / EVENTS}: it was"
-                    f" removed, damaged or cut by a power loss; nothing is missing here, the scan continues with event"
-                    f" {event.seq}"
+                    f"the Pi's journal of this scan ends {event.lost_events} events before"
+                    f" {self._scan.path / EVENTS}: it was removed, damaged or cut by a power loss; nothing is missing"
+                    f" here, the scan continues with event {event.seq}"
                 )
 
     def _rows(self, events: EventWriter) -> None:

@@ -322,7 +322,9 @@ def check_trigger(context: CheckContext) -> Finding:
         )
     if row.status != "done" or row.edges != _POINTS or row.pulses != expected:
         e = explain(row.fault)
-        return error(f"{observed}, {_POINTS} and {expected} expected: {row.reason or e.what}", e.why, e.remedy, **facts)
+        return error(
+            f"{observed}, {_POINTS} and {expected} expected: {row.reason or e.problem}", e.cause, e.remedy, **facts
+        )
     if row.fault or row.reason:
         return warning(f"{observed}; {row.reason}", "", "watch the stage during a row", **facts)
     return ok(observed, **facts)
@@ -376,8 +378,8 @@ def check_stage(context: CheckContext) -> Finding:
     if status.fault and status.state == "fault":
         e = explain(status.fault)
         return error(
-            f"fault {status.fault}: {e.what}; {status.reason}",
-            e.why,
+            f"fault {status.fault}: {e.problem}; {status.reason}",
+            e.cause,
             f"{e.remedy}; on the Pi, with its service stopped, run `polysight-pi check` for port and board",
             fault=status.fault,
         )
@@ -399,7 +401,9 @@ def check_stage(context: CheckContext) -> Finding:
         )
     if status.fault:
         e = explain(status.fault)
-        return warning(f"{observed}; its last row ended with fault {status.fault}: {e.what}", e.why, e.remedy, **facts)
+        return warning(
+            f"{observed}; its last row ended with fault {status.fault}: {e.problem}", e.cause, e.remedy, **facts
+        )
     return ok(observed, **facts)
 
 
@@ -502,7 +506,7 @@ def check_pulses(context: CheckContext) -> Finding:
     facts = {k: getattr(sent, k) for k in ("pulses", "pulses_seen", "width_max_ns", "jitter_ns", "fault")}
     if sent.fault:
         e = explain(sent.fault)
-        return error(f"{observed}: {e.what}", e.why, e.remedy, **facts)
+        return error(f"{observed}: {e.problem}", e.cause, e.remedy, **facts)
     return ok(f"{observed} ({context.rig.pi.pulse_source})", **facts)
 
 

@@ -106,11 +106,11 @@ def notice_of_fault(event: Fault) -> Finding:
     elif PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in passing:
         level = "warning"
     details = {}
-    if event.what != table.what:
-        details["detail"] = event.what
-    problem = f"Fault {event.number} at the Pi: {table.what}"
+    if event.problem != table.problem:
+        details["detail"] = event.problem
+    problem = f"Fault {event.number} at the Pi: {table.problem}"
     return Finding(
-        level, problem, sentence(event.why or table.why), sentence(event.remedy or table.remedy), facts=details
+        level, problem, sentence(event.cause or table.cause), sentence(event.remedy or table.remedy), facts=details
     )
 
 
@@ -119,7 +119,7 @@ def _cause(faults: Sequence[RowFault]) -> tuple[str, str]:
     for fault in faults:
         if fault.kind == K.PI_FAULT and fault.number:
             table = explain(fault.number)
-            return sentence(table.why), sentence(table.remedy)
+            return sentence(table.cause), sentence(table.remedy)
         if fault.kind in CAUSES:
             return CAUSES[FaultKind(fault.kind)]
     return "", ""

@@ -116,7 +116,7 @@ class FakePi:
                 lost_y_mm=self.lost_mm[1],
             )  # fmt: skip
         if isinstance(c, m.EndRun) and (self.hanging is not None or self.run is None):
-            return m.Refused(number=111, what="a row is running" if self.run else "no run is begun")
+            return m.Refused(number=111, problem="a row is running" if self.run else "no run is begun")
         if isinstance(c, m.BeginRun):
             self.run = c
             self._ran = set()

@@ -54,7 +54,7 @@ class HostSide:
         """Fault number of the refusal."""
         reply = self.ask(command)
         assert isinstance(reply, m.Refused), reply
-        assert reply.what
+        assert reply.problem
         assert reply.remedy
         return reply.number
 

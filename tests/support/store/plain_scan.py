@@ -25,7 +25,7 @@ def write_scan(folder: Path, gaps: Gaps | None = None) -> Path:
     frames = instrument.grid.columns * instrument.burst.pulses
     events = EventWriter(scan.path / "events.msgpack")
     events.append(RunStarted(scan_id=scan.scan_id, seq=1, t_mono_ns=1, plan=scan.plan))
-    events.append(Fault(scan_id=scan.scan_id, seq=2, t_mono_ns=2, number=101, what="test"))
+    events.append(Fault(scan_id=scan.scan_id, seq=2, t_mono_ns=2, number=101, problem="test"))
     events.sync()
     events.close()
     with scan.writer() as writer:

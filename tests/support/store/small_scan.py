@@ -97,7 +97,7 @@ class SmallPi:
             resumed, lost_events = self._journal.open(run.scan_id, run.plan, run.last_seq)
         except PolysightError as e:
             raise host_run.ScanError(f"the Pi refused BeginRun: {e.what}", e.why, e.remedy) from None
-        self._commit(m.RunStarted, {"plan": run.plan, "resumed": resumed, "lost": lost_events})
+        self._commit(m.RunStarted, {"plan": run.plan, "resumed": resumed, "lost_events": lost_events})
 
     def status(self) -> m.StatusReply:
         return m.StatusReply(

@@ -14,6 +14,8 @@ command -v avr-g++ >/dev/null || missing+=(gcc-avr avr-libc binutils-avr)
 command -v avrdude >/dev/null || missing+=(avrdude)
 command -v arduino-builder >/dev/null || missing+=(arduino-builder)
 command -v systemd-analyze >/dev/null || lean+=(systemd)
+# The accessibility checker of the operator's page.
+[ -d node_modules/axe-core ] || ! command -v npm >/dev/null || npm install --no-save --no-package-lock --silent axe-core >/dev/null 2>&1
 if [ "${1-}" = kernel ]; then
   for tool in flex bison bc; do command -v $tool >/dev/null || missing+=($tool); done
   command -v xz >/dev/null || missing+=(xz-utils)

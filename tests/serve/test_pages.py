@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from tests.support.page.asking import TOKEN
-from tests.support.page.chromium import DESK, PHONE, Browser
+from tests.support.page.chromium import DESK, PHONE, Browser, find_axe
 from tests.support.page.live_view import Served, open_control, served_folder
 from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
@@ -30,6 +32,7 @@ PAGES = {
     "/compare?a=one&b=two": "document.querySelector('#rows tr')",
     "/new": "document.querySelector('.time')",
     "/watch?scan=one": "document.querySelectorAll('.view img').length == 6",
+    "/surface?scan=one": "document.getElementById('facts')?.innerText.includes('4 points')",
 }
 
 
@@ -85,9 +88,28 @@ CODES: dict[str, dict[str, Any]] = {
 }
 
 
+PLY_HEAD = """ply
+format binary_little_endian 1.0
+comment simulated scan small, millimetres
+element vertex 4
+"""
+PLY_COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "permittivity", "loss", "permittivity_std", "incidence_deg")
+
+
+def write_points(path: Path) -> None:
+    """Write four points of a surface, the last of which has no permittivity."""
+    properties = "".join(f"property float {name}\n" for name in PLY_COLUMNS)
+    rows = []
+    for x, permittivity in ((0, 2.5), (1, 3.0), (2, 3.5), (3, math.nan)):
+        rows.append(struct.pack("<10fi", x, 2 * x, -x, 0, 0, -1, permittivity, 0.1, 0.2, 55, 1))
+    head = f"{PLY_HEAD}{properties}property int segment\nend_header\n"
+    path.write_bytes(head.encode() + b"".join(rows))
+
+
 @pytest.fixture
 def scans(processed: Path, tmp_path: Path) -> Path:
     shutil.copytree(processed, tmp_path / "scans")
+    write_points(tmp_path / "scans" / "one" / "products" / "surface.ply")
     return tmp_path / "scans"
 
 
@@ -144,6 +166,41 @@ def test_every_page_fits_and_can_be_read(page, path, size, tmp_path):
         page.browser.screenshot(tmp_path / "page.png")
         assert (tmp_path / "page.png").stat().st_size > 15_000
     page.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_axe_finds_nothing(page, path):
+    """The rules of https://github.com/dequelabs/axe-core: WCAG and good practice, with all that a page unfolds."""
+    axe = find_axe()
+    if axe is None:
+        pytest.skip("no axe-core here: npm install --no-save axe-core")
+    for size in (DESK, PHONE):
+        page.open(path, size)
+        for button in ("#label-open", "#process-open"):
+            page.browser.value(f"document.querySelector('{button}')?.click()")
+        page.browser.value(f"{axe.read_text(encoding='utf-8')}; 0")
+        found = page.browser.value(
+            "axe.run().then(result => result.violations.map(v => [v.id, ...v.nodes.map(node => node.html)]))"
+        )
+        assert found == [], size
+
+
+def test_the_points_of_surfaces_turn_and_are_coloured(page):
+    page.open("/surface?scan=one")
+    picture = "document.getElementById('points').toDataURL()"
+    page.browser.wait(
+        "document.getElementById('scale').innerText.includes('2.50 (dark) to 3.50 (bright)')", "the scale"
+    )
+    drawn = [page.browser.value(picture)]
+    page.browser.value("document.getElementById('points').focus()")
+    page.press("ArrowRight")
+    drawn.append(page.browser.value(picture))
+    page.browser.value("document.getElementById('colour').value = 'incidence_deg'")
+    page.browser.value("document.getElementById('colour').dispatchEvent(new Event('change'))")
+    page.browser.wait("document.getElementById('scale').innerText.includes('55.00')", "the other scale")
+    drawn.append(page.browser.value(picture))
+    assert len(set(drawn)) == len(drawn)
+    page.check_whole()
 
 
 @SIZES

@@ -18,6 +18,7 @@ from urllib.request import urlopen
 
 from websockets.sync.client import connect
 
+from tests.support.paths import REPO
 from tests.support.processes import HANG_S, LIMIT_S, idle_s, wait_for
 
 # width, height, whether it is a phone
@@ -28,6 +29,14 @@ PHONE = (390, 844, True)
 def find_chromium() -> str | None:
     """The browser's program; None where there is none."""
     return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+def find_axe() -> Path | None:
+    """The accessibility checker axe-core, as npm installs it in the checkout; None where it is not."""
+    path = REPO / "node_modules" / "axe-core" / "axe.min.js"
+    if not path.is_file():
+        return None
+    return path
 
 
 class NavigatedError(Exception):

@@ -38,7 +38,8 @@ export const address = (path, given = {}) => {
   return `/api/${path}${text ? `?${text}` : ""}`;
 };
 
-async function answer(path, given, options, limit = ANSWER_MS) {
+/** The server's answer; its refusal, or its silence, is thrown as `Refused`. */
+export async function reach(path, given, options, limit = ANSWER_MS) {
   let reply;
   try {
     const headers = { ...options?.headers, "X-Polysight-Token": token };
@@ -60,14 +61,14 @@ async function answer(path, given, options, limit = ANSWER_MS) {
   return reply;
 }
 
-export const get = async (path, given) => (await answer(path, given)).json();
+export const get = async (path, given) => (await reach(path, given)).json();
 export const post = async (path, given, body = {}, limit = ANSWER_MS) =>
-  (await answer(path, given, { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } }, limit)).json();
+  (await reach(path, given, { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } }, limit)).json();
 export const control = (command, scan) => post(`control/${command}`, { scan }, {}, CONTROL_MS);
 
 /** A picture, and what the ends of its colours mean. */
 export async function picture(path, given) {
-  const reply = await answer(path, given);
+  const reply = await reach(path, given);
   const unit = { deg: "°" }[reply.headers.get("X-Unit")] ?? reply.headers.get("X-Unit") ?? "";
   return { image: await createImageBitmap(await reply.blob()), low: +reply.headers.get("X-Low"), high: +reply.headers.get("X-High"), unit };
 }

@@ -31,7 +31,7 @@ function showHead() {
   by("report").hidden = !result?.files.some((f) => f.name === "report.html");
   by("report").href = address("file/report.html", scan);
   by("surface").hidden = !result?.files.some((f) => f.name === "surface.ply");
-  by("surface").href = `/surface?scan=${encodeURIComponent(scanName)}`;
+  by("surface").href = pageOf("surface", scanName);
 }
 
 function showReasons() {

@@ -1,5 +1,5 @@
 // The surfaces of a scan as points that turn with the mouse: reads surface.ply, draws on a canvas.
-import { by, complain, make, nest, query, reach, scanName } from "./common.js";
+import { begin, by, complain, make, nest, pageOf, query, reach, scanName } from "./common.js";
 
 const SIZE_PX = 3;
 const NORMAL_MM = 12;
@@ -54,12 +54,21 @@ function turned(x, y, z) {
   return [across, cr * y + sr * away, cr * away - sr * y];
 }
 
+/** The lowest and the highest of the values that are numbers. */
+function findEnds(values) {
+  let [low, high] = [Infinity, -Infinity];
+  for (const value of values) {
+    if (!Number.isFinite(value)) continue;
+    low = Math.min(low, value);
+    high = Math.max(high, value);
+  }
+  return [low, high];
+}
+
 function draw() {
   if (!cloud) return;
   const shown = cloud[by("colour").value];
-  const known = [...shown].filter(Number.isFinite);
-  const low = Math.min(...known);
-  const high = Math.max(...known);
+  const [low, high] = findEnds(shown);
   const scale = (0.45 * Math.min(canvas.width, canvas.height) * view.zoom) / reach_mm;
   const place = (x, y) => [canvas.width / 2 + scale * x, canvas.height / 2 - scale * y];
   const points = Array.from({ length: cloud.count }, (_, i) => [i, ...turned(cloud.x[i] - middle[0], cloud.y[i] - middle[1], cloud.z[i] - middle[2])]);
@@ -82,7 +91,7 @@ function draw() {
     }
     pen.stroke();
   }
-  by("scale").textContent = known.length ? `${COLOUR_NAMES[by("colour").value]}: ${low.toFixed(2)} (dark) to ${high.toFixed(2)} (bright); grey: none` : "no surface has this figure";
+  by("scale").textContent = low <= high ? `${COLOUR_NAMES[by("colour").value]}: ${low.toFixed(2)} (dark) to ${high.toFixed(2)} (bright); grey: none` : "no surface has this figure";
 }
 
 function turnBy(turn, rise) {
@@ -110,12 +119,11 @@ by("normals").addEventListener("change", draw);
 by("front").addEventListener("click", () => { Object.assign(view, { turn: 0, rise: 0, zoom: 1 }); draw(); });
 
 async function start() {
-  by("scan").href = `/scan?scan=${encodeURIComponent(scanName)}`;
+  by("scan").href = pageOf("scan", scanName);
   nest(by("colour"), ...Object.entries(COLOUR_NAMES).map(([value, text]) => make("option", text, null, { value })));
   const reply = await reach("file/surface.ply", { scan: scanName, of: query.get("of") });
   cloud = readPly(await reply.arrayBuffer());
-  const axes = [cloud.x, cloud.y, cloud.z];
-  const ends = axes.map((axis) => axis.reduce(([low, high], value) => [Math.min(low, value), Math.max(high, value)], [Infinity, -Infinity]));
+  const ends = [cloud.x, cloud.y, cloud.z].map(findEnds);
   middle = ends.map(([low, high]) => (low + high) / 2);
   reach_mm = Math.max(10, ...ends.map(([low, high]) => (high - low) / 2));
   by("name").textContent = `Surfaces of ${scanName}`;
@@ -123,4 +131,5 @@ async function start() {
   draw();
 }
 
+await begin("Surfaces");
 start().catch((error) => complain("told", error));

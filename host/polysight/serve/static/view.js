@@ -1,4 +1,5 @@
 // A picture with axes in millimetres: zoom, pan, a place to point at, boxes to draw; by mouse, finger and keyboard.
+import { make } from "./common.js";
 import { ticks } from "./plots.js";
 
 const LEFT = 46, BOTTOM = 38, TOP = 8, RIGHT = 16;
@@ -18,14 +19,9 @@ export class ImageView {
     this.drawing = false;
     this.box = null;
     this.pointers = new Map();
-    this.canvas = document.createElement("canvas");
-    this.canvas.className = "imageview";
-    this.canvas.tabIndex = 0;
-    this.canvas.setAttribute("role", "application");
-    this.canvas.setAttribute("aria-label", `${options.label}. Arrow keys move the cross, Enter looks at its place, plus and minus zoom, 0 shows all.`);
-    this.said = document.createElement("p");
-    this.said.className = "soft said";
-    this.said.setAttribute("aria-live", "polite");
+    const keys = "Arrow keys move the cross, Enter looks at its place, plus and minus zoom, 0 shows all.";
+    this.canvas = make("canvas", null, "imageview", { tabIndex: 0, role: "application", "aria-label": `${options.label}. ${keys}` });
+    this.said = make("p", null, "soft said", { "aria-live": "polite" });
     place.replaceChildren(this.canvas, this.#buttons(), this.said);
     for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel", "pointerleave"]) {
       this.canvas.addEventListener(kind, (event) => this.#pointer(kind.slice(7), event));
@@ -43,15 +39,9 @@ export class ImageView {
   }
 
   #buttons() {
-    const bar = document.createElement("div");
-    bar.className = "zoom row";
-    for (const [text, label, act] of [["+", "Zoom in", () => this.zoom(1.6)], ["−", "Zoom out", () => this.zoom(1 / 1.6)], ["All", "Show all", () => this.look(this.extent)]]) {
-      const button = document.createElement("button");
-      button.type = "button";
-      button.textContent = text;
-      button.setAttribute("aria-label", label);
-      button.addEventListener("click", act);
-      bar.append(button);
+    const bar = make("div", null, "zoom row");
+    for (const [text, title, onclick] of [["+", "Zoom in", () => this.zoom(1.6)], ["−", "Zoom out", () => this.zoom(1 / 1.6)], ["All", "Show all", () => this.look(this.extent)]]) {
+      bar.append(make("button", text, null, { type: "button", title, onclick }));
     }
     return bar;
   }

@@ -174,10 +174,10 @@ function showNotices() {
 
 function showBoards() {
   const table = make("table"), head = table.createTHead().insertRow(), body = table.createTBody();
-  head.append(make("th", ""), ...state.boards.map((b) => make("th", b.name)));
+  head.append(make("td"), ...state.boards.map((b) => make("th", b.name, null, { scope: "col" })));
   const line = (name, cell) => {
     const row = body.insertRow();
-    row.append(make("th", name), ...state.boards.map((b) => {
+    row.append(make("th", name, null, { scope: "row" }), ...state.boards.map((b) => {
       const [text, level] = cell(b);
       return make("td", text, level);
     }));

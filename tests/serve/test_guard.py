@@ -73,6 +73,24 @@ def test_other_sites_may_not_ask(scans):
         assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=f"{own_origin}:{view.port}")[0] == 200
 
 
+def test_a_declared_name_may_be_encrypted_by_a_proxy(scans):
+    access = Access(TOKEN, loopback=False, hosts=("lab.example.org",), control=True)
+    with served_folder(scans, access=access) as view:
+        for host, origin, expected in (
+            ("lab.example.org", "https://lab.example.org", 200),
+            ("lab.example.org:8443", "https://lab.example.org:8443", 200),
+            ("lab.example.org", "https://evil.example", 403),
+            ("lab.example.org", "https://lab.example.org:8443", 403),
+            ("127.0.0.1", "https://127.0.0.1", 403),
+        ):
+            status, _, headers = ask(
+                view, "/api/session", "POST", {}, Host=host, Origin=origin, **{TOKEN_HEADER: TOKEN}
+            )
+            assert status == expected, (host, origin)
+            if status == 200:
+                assert "; secure" in headers["set-cookie"].lower()
+
+
 def test_beyond_loopback_reading_needs_the_token_too(scans):
     access = Access(TOKEN, loopback=False, control=True)
     with served_folder(scans, access=access) as view:

@@ -147,7 +147,9 @@ def control_routes(front: Front) -> list[Route]:
         answer = JSONResponse({"what": "opened"})
         access = front.access
         cookie = cookie_name(request.scope)
-        answer.set_cookie(cookie, access.session, httponly=True, samesite="strict", secure=access.secure)
+        # A proxy may have ended the encryption.
+        is_secure = access.secure or request.headers.get("origin", "").startswith("https:")
+        answer.set_cookie(cookie, access.session, httponly=True, samesite="strict", secure=is_secure)
         return answer
 
     async def list_running(request: Request) -> Response:

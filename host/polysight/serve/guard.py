@@ -13,6 +13,7 @@ import hmac
 import ipaddress
 import sys
 import traceback
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
@@ -73,11 +74,7 @@ class Access:
 
     def accepts_host(self, host: str) -> bool:
         """True if a `Host` header names this server (a foreign name that resolves to it does not)."""
-        name = host
-        if host.startswith("["):
-            name = host[1:].partition("]")[0]
-        elif ":" in host:
-            name = host.rpartition(":")[0]
+        name = read_host_name(host)
         if name in ("localhost", *self.hosts):
             return True
         try:
@@ -98,6 +95,15 @@ class Access:
             return False
         cookies = cookie_parser(Headers(scope=scope).get("cookie", ""))
         return hmac.compare_digest(cookies.get(cookie_name(scope), "").encode(), self.session.encode())
+
+
+def read_host_name(host: str) -> str:
+    """The name or address in a `Host` header, without its port."""
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    if ":" in host:
+        return host.rpartition(":")[0]
+    return host
 
 
 def cookie_name(scope: Scope) -> str:
@@ -142,9 +148,13 @@ class Guard:
                 "open the address that it printed; --allow-host NAME adds one",
             )  # fmt: skip
         is_api = scope["path"].startswith("/api/")
+        schemes = [scope.get("scheme", "http")]
+        if read_host_name(headers.get("host", "")) in self._access.hosts:
+            # A declared name may be a proxy's, where the encryption ends.
+            schemes.append("https")
         if method not in ("GET", "HEAD", "POST") or (method == "POST" and not is_api):
             return refuse(405, ErrorCode.MESSAGE_INVALID, f"{method} is not supported here", "", "use the page")
-        if is_api and not _is_same_site(headers, scope.get("scheme", "http"), writes=method == "POST"):
+        if is_api and not _is_same_site(headers, schemes, writes=method == "POST"):
             return refuse(
                 403, ErrorCode.ORIGIN_FOREIGN, "The request comes from a page of another site", "only this server's own"
                 " pages may ask", "use the page that this server serves",
@@ -216,7 +226,7 @@ def _refuse_token(status: int) -> Response:
     )  # fmt: skip
 
 
-def _is_same_site(headers: Headers, scheme: str, writes: bool) -> bool:
+def _is_same_site(headers: Headers, schemes: Sequence[str], writes: bool) -> bool:
     """True if the request comes from a page of this server, or from no page."""
     if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
         return False
@@ -224,7 +234,7 @@ def _is_same_site(headers: Headers, scheme: str, writes: bool) -> bool:
     if origin is None:
         return True
     parts = urlsplit(origin)
-    if parts.netloc == headers.get("host", "") and parts.scheme == scheme:
+    if parts.netloc == headers.get("host", "") and parts.scheme in schemes:
         return True
     # A browser that sends Sec-Fetch-Site has vouched for a request that only reads.
     return not writes and "sec-fetch-site" in headers

@@ -99,7 +99,7 @@ class Pipeline:
         with self.quality.measure_time("sub-bands"):
             parts = self.sub_bands.finish(self.source.mirrored, self.plane.moved_m)
             if parts:
-                result = materials.with_bands(result, self.sub_bands.bands, parts, optics, plane)
+                result = materials.add_bands(result, self.sub_bands.bands, parts, optics, plane)
         return result
 
     def examine(self, images: imaging.Images, plates: materials.Plates = ()) -> process.Findings:
@@ -121,12 +121,12 @@ class Pipeline:
     def finish(self, out: Path, plates: materials.Plates = (), progress: Progress = no_progress) -> process.Products:
         """Write all products into `out`: images first, so that they stay if a later step fails."""
         images = self.form_images()
-        process.save_images(out, process.imaged_scan(out, self.source, self.rig, images, self.quality))
+        process.save_images(out, process.collect_imaged_scan(out, self.source, self.rig, images, self.quality))
         progress("point response")
         self.quality.note_imaging(self.images, images)
         progress("materials")
         findings = self.examine(images, plates)
         progress("figures and report")
         unnamed = process.why_unnamed(self.settings, self.rig)
-        scan = process.processed_scan(out, self.source, self.rig, findings, self.quality, unnamed)
+        scan = process.collect_processed_scan(out, self.source, self.rig, findings, self.quality, unnamed)
         return process.save_materials(out, scan, findings.analysis, unnamed)

@@ -425,7 +425,7 @@ class Machine:
             self.happen("stage lost", e.number, str(e))
 
     def _note_homed(self, reply: Reply) -> str:
-        self.stage.at_rest()
+        self.stage.slow_down_polling()
         place = (_number(reply, "x"), _number(reply, "y"))
         if place != (0, 0):
             self._report_fault(PiFault.POSITION, f"homing ended at {place}, not at (0, 0) (x, y in steps)")
@@ -527,7 +527,7 @@ class Machine:
     def _lose_stage(self, number: int, reason: str) -> None:
         """Handle a stage that is lost, in alarm, or reset: it cannot be stopped any more."""
         self.homed = False
-        self.stage.at_rest()
+        self.stage.slow_down_polling()
         if self.state != "fault":
             self._report_fault(number, reason)
         self._decide("fault", number, reason, lasting=True)
@@ -546,7 +546,7 @@ class Machine:
 
     def _note_passed(self, reply: Reply) -> str | None:
         row = self._current
-        self.stage.at_rest()
+        self.stage.slow_down_polling()
         row.points = max(0, _number(reply, "points", row.row.points))
         row.done_ns = reply.written_ns
         if _number(reply, "held"):
@@ -569,7 +569,7 @@ class Machine:
 
     def _clear_alarm(self) -> None:
         """Clear the alarm that STOP latches; the stage keeps its position."""
-        self.stage.at_rest()
+        self.stage.slow_down_polling()
         try:
             self.stage.clear()
         except StageRefusedError as e:

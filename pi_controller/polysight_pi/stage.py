@@ -466,7 +466,7 @@ class StageDriver:
         k = self.config.steps_per_mm
         return self._start("MOVE", round(x_mm * k), round(y_mm * k), round(speed_mm_s * k))
 
-    def at_rest(self) -> None:
+    def slow_down_polling(self) -> None:
         """Ask for the status less often: the stage does not move."""
         if self._open is not None:
             self._open.ask_status_every(IDLE_STATUS_S)
@@ -494,7 +494,7 @@ class StageDriver:
         try:
             answer = self.link.request(verb, *args)
         except StageRefusedError:
-            self.at_rest()
+            self.slow_down_polling()
             raise
         return -1 if answer.sequence is None else answer.sequence
 

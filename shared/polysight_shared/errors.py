@@ -42,10 +42,10 @@ class PolysightError(Exception):
             parts.append(f"why: {self.why}")
         if self.remedy:
             parts.append(f"do: {self.remedy}")
-        return with_whole_paths("\n  ".join(parts))
+        return expand_paths("\n  ".join(parts))
 
 
-def with_whole_paths(text: str) -> str:
+def expand_paths(text: str) -> str:
     """Return a text with pages of the documentation, such as docs/how-to/install.md, as paths of this installation.
 
     The host's wheel brings the pages; without it (on the Pi alone) the text stays as it is.

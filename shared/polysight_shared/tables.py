@@ -131,7 +131,7 @@ def _collect_keys(kind: Any, table: str, tables_of_key: dict[str, set[str]]) -> 
 
 def to_builtins(config: Any) -> dict[str, Any]:
     """Convert a configuration to plain dicts and lists, without None, for JSON, TOML or msgpack."""
-    return _without_none(msgspec.to_builtins(config))
+    return _remove_none(msgspec.to_builtins(config))
 
 
 def _lookup(data: Any, path: str) -> str:
@@ -149,9 +149,9 @@ def _lookup(data: Any, path: str) -> str:
     return repr(node)
 
 
-def _without_none(node: Any) -> Any:
+def _remove_none(node: Any) -> Any:
     if isinstance(node, dict):
-        return {k: _without_none(v) for k, v in node.items() if v is not None}
+        return {k: _remove_none(v) for k, v in node.items() if v is not None}
     if isinstance(node, list | tuple):
-        return [_without_none(v) for v in node]
+        return [_remove_none(v) for v in node]
     return node

@@ -22,7 +22,7 @@ _PI_HOST_PART = "10"
 _RADAR_PORT = 5700
 
 
-def on_subnet(rig: Instrument, subnet: str) -> Instrument:
+def move_to_subnet(rig: Instrument, subnet: str) -> Instrument:
     """Return the rig with its cards, host and Pi on `subnet` ("127.x.y"), with the last bytes of their addresses kept.
 
     A board's control server, or its native connection, gets its card's address.
@@ -63,14 +63,14 @@ def is_free(rig: Instrument) -> bool:
     return True
 
 
-def on_free_subnet(rig: Instrument, chance: random.Random | None = None) -> Instrument:
+def move_to_free_subnet(rig: Instrument, chance: random.Random | None = None) -> Instrument:
     """Return the rig on a random loopback subnet with free addresses.
 
     Raises DeviceError if there is none in 50 attempts, because this machine's loopback is not 127.0.0.0/8.
     """
     chance = chance or random.Random()
     for _ in range(_TRIES):
-        moved = on_subnet(rig, f"127.{chance.randint(1, 254)}.{chance.randint(0, 255)}")
+        moved = move_to_subnet(rig, f"127.{chance.randint(1, 254)}.{chance.randint(0, 255)}")
         if is_free(moved):
             return moved
     raise DeviceError(

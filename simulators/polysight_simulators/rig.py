@@ -26,7 +26,7 @@ from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DeviceError, PolysightError
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.faults import read_faults
-from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.loopback import move_to_free_subnet
 from polysight_simulators.process import announce_ready, command_line, die_with_parent, run_until_stopped
 from polysight_simulators.radars import make_image
 from polysight_simulators.scene import Scene, apply_scene, load_scene, truth
@@ -46,7 +46,7 @@ _LOG_LINES = 15
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
 
 
-def _under_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
+def _set_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
     """Set native radar control: each board at its card's address, the receivers with a start offset."""
     names = [board["name"] for board in table["boards"]]
     table["radar"] |= {"control": "native", "native": {name: {"usb_serial": name} for name in names}}
@@ -75,7 +75,7 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
         offset_hz = scene.disturbances.if_offset_hz
     table: dict[str, Any] = to_builtins(disturbed_rig)
     if native:
-        _under_native_control(table, offset_hz)
+        _set_native_control(table, offset_hz)
     elif table["radar"]["control"] != "native" and scene is not None:
         _as_programmed(table, scene.disturbances.if_offset_hz)
     if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
@@ -85,7 +85,7 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     table["pi"] |= {"journal_dir": str(folder / "journal"), "key_dir": str(folder / "keys")}
     table["stage"]["heartbeat_ms"] = max(MIN_HEARTBEAT_MS, table["stage"]["heartbeat_ms"])
     table["pi"]["host_heartbeat_ms"] = table["stage"]["heartbeat_ms"] // 4
-    return on_free_subnet(decode(table, Instrument, f"{rig.name}, simulated"))
+    return move_to_free_subnet(decode(table, Instrument, f"{rig.name}, simulated"))
 
 
 class Child:

@@ -25,8 +25,8 @@ from polysight.acquisition.control import (
     ScanCommand,
     StopRequest,
     read_life,
+    read_start_ticks,
     send_command,
-    started_ticks,
 )
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
@@ -70,7 +70,7 @@ def test_alive_says_who_scans_and_what_was_asked_and_goes_at_the_end(tmp_path):
         control.open()
         wait_for(lambda: read_life(tmp_path), "the first sign of life")
         life = read_life(tmp_path)
-        assert (life.pid, life.ticks, life.killed) == (os.getpid(), started_ticks(os.getpid()), False)
+        assert (life.pid, life.ticks, life.killed) == (os.getpid(), read_start_ticks(os.getpid()), False)
         assert (life.doing, life.asked, life.asker) == ("rows", "", "")
         wait_for(lambda: read_life(tmp_path).written_s != life.written_s, "the next one")
         send_command(tmp_path, ScanCommand.STOP, "the page at 192.168.1.7")
@@ -88,7 +88,7 @@ def test_a_killed_program_is_told_from_one_that_says_nothing(tmp_path):
     """Also if its process number belongs to another process by now."""
     (tmp_path / CONTROL).mkdir()
     lives = [
-        (Life(os.getpid(), started_ticks(os.getpid()) or 0, socket.gethostname()), False),
+        (Life(os.getpid(), read_start_ticks(os.getpid()) or 0, socket.gethostname()), False),
         (Life(os.getpid(), 1, socket.gethostname()), True),
         (Life(2**22 + 1, 1, socket.gethostname()), True),
         (Life(2**22 + 1, 1, "another machine"), False),

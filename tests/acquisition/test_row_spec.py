@@ -74,8 +74,8 @@ def test_only_the_transitions_of_the_table_are_made(state):
         transaction = RowTransaction(answer.append)
         transaction.state = state
         if then in TRANSITIONS[state]:
-            transaction.to(then)
+            transaction.change_state(then)
             assert answer == [RowState.WAITING, then]
         else:
             with refused(ErrorCode.OTHER, state, then):
-                transaction.to(then)
+                transaction.change_state(then)

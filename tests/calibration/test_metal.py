@@ -8,7 +8,7 @@ import pytest
 from tests.support.calibration import SOURCES, filter_file, metal_reference
 from tests.support.refusals import refused
 
-from polysight.calibration.files import checked_calibration, load_calibration, write_calibration, write_metal
+from polysight.calibration.files import load_calibration, load_checked_calibration, write_calibration, write_metal
 from polysight.cli.main import main
 from polysight.imaging import ImagedWith
 from polysight.jobs.calibrate import load_reference
@@ -77,12 +77,12 @@ def metal(make_rig, tmp_path):
 @pytest.mark.parametrize(("change", "values"), MATTERS.values(), ids=MATTERS)
 def test_a_metal_reference_of_another_rig_is_refused_with_the_difference(metal, make_rig, change, values):
     with refused(ErrorCode.MISMATCH, metal, *values):
-        checked_calibration(make_rig(change, calibration={"metal": str(metal)}), True)
+        load_checked_calibration(make_rig(change, calibration={"metal": str(metal)}), True)
 
 
 @pytest.mark.parametrize("change", CANCELS.values(), ids=CANCELS)
 def test_settings_that_cancel_may_change(metal, make_rig, change):
-    assert checked_calibration(make_rig(change, calibration={"metal": str(metal)}), True).metal is not None
+    assert load_checked_calibration(make_rig(change, calibration={"metal": str(metal)}), True).metal is not None
 
 
 def test_filters_measured_after_the_plate_may_differ_only_slightly(metal, make_rig):
@@ -90,9 +90,9 @@ def test_filters_measured_after_the_plate_may_differ_only_slightly(metal, make_r
         file = write_calibration(filter_file(corner_khz), metal.parent)
         return make_rig(calibration={"metal": str(metal), "hpf": str(file)})
 
-    assert checked_calibration(rig(179.0), True)
+    assert load_checked_calibration(rig(179.0), True)
     with refused(ErrorCode.MISMATCH, "RV", 200):
-        checked_calibration(rig(200.0), True)
+        load_checked_calibration(rig(200.0), True)
 
 
 def test_a_file_of_an_older_release_without_its_rig_is_refused(metal, make_rig):
@@ -100,7 +100,7 @@ def test_a_file_of_an_older_release_without_its_rig_is_refused(metal, make_rig):
     assert text_after
     metal.write_text(text_before)
     with refused(ErrorCode.KEY_MISSING, metal):
-        checked_calibration(make_rig(calibration={"metal": str(metal)}), True)
+        load_checked_calibration(make_rig(calibration={"metal": str(metal)}), True)
 
 
 SMALL = {

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.calibration.direct_signal import by_geometry, choose_start_offset, fit_start, unwrap_if
+from polysight.calibration.direct_signal import choose_start_offset, fit_start, predict_by_geometry, unwrap_if
 from polysight.calibration.files import StartFile, open_raw, read_calibration
 from polysight.cli.main import main
 from polysight.radar.commands import direct_if_hz
@@ -54,7 +54,7 @@ def test_jitter_across_the_bands_edge_does_not_tear_the_mean_apart(make_rig, if_
 def test_by_geometry_alone_the_expectation_is_in_the_middle(make_rig):
     rig = make_rig(offset(50e3))
     board = rig.receivers[1]
-    better = msgspec.structs.replace(board, start_offset_hz=by_geometry(rig, board))
+    better = msgspec.structs.replace(board, start_offset_hz=predict_by_geometry(rig, board))
     # Steps of 54 Hz
     assert direct_if_hz(rig, better) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=200)
 
@@ -89,5 +89,5 @@ def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_ri
 def test_without_a_direct_path_the_offset_from_geometry_is_given(make_rig, scan_of, tmp_path):
     rig = make_rig(offset(790e3), **TABLES)
     folder = scan_of(tmp_path / "scan", rig, disturbances={"if_offset_hz": 0.0, "direct_loss_db": 80.0})
-    with refused(ErrorCode.NO_DATA, "RH", f"start_offset_hz = {by_geometry(rig, rig.receivers[0]):.0f}"):
+    with refused(ErrorCode.NO_DATA, "RH", f"start_offset_hz = {predict_by_geometry(rig, rig.receivers[0]):.0f}"):
         fit_start(open_raw(folder), "RH")

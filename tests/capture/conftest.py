@@ -15,14 +15,14 @@ from polysight.capture.card import CardClient
 from polysight_shared.config import Board, Instrument
 from polysight_shared.tables import to_builtins
 from polysight_simulators.faults import Faults
-from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.loopback import move_to_free_subnet
 
 
 def small_rig() -> Instrument:
     """A free subnet, a grid whose rows are small, and little patience."""
     grid = {"columns": 12, "rows": 2}
     card = {"receive_buffer_bytes": 1 << 20}
-    return on_free_subnet(rig_with(grid=grid, limits={"command_timeout_s": 1.5}, card=card))
+    return move_to_free_subnet(rig_with(grid=grid, limits={"command_timeout_s": 1.5}, card=card))
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from polysight_shared.errors import DataError, with_whole_paths
+from polysight_shared.errors import DataError, expand_paths
 
 REPO = Path(__file__).resolve().parents[2]
 PAGE = re.compile(r"docs/[\w/-]+\.md")
@@ -32,7 +32,7 @@ def test_an_error_points_to_a_page_of_this_installation():
 
 @pytest.mark.parametrize("text", ["http://x/docs/how-to/install.md", "/a/docs/how-to/install.md"])
 def test_whole_paths_stay_as_they_are(text):
-    assert with_whole_paths(text) == text
+    assert expand_paths(text) == text
 
 
 def test_a_wheel_holds_the_pages(tmp_path, monkeypatch):

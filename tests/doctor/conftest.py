@@ -12,7 +12,7 @@ from tests.support.doctor.live_rig import SCENE, LiveRig, impatient_rig
 from tests.support.processes import Bench
 
 from polysight_shared.tables import to_builtins
-from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.loopback import move_to_free_subnet
 
 
 @pytest.fixture(scope="module")
@@ -41,5 +41,5 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRig]:
 def deaf_rig(tmp_path: Path) -> LiveRig:
     """A rig file on a free subnet without any device."""
     path = tmp_path / "instrument.toml"
-    path.write_text(tomli_w.dumps(to_builtins(on_free_subnet(impatient_rig()))))
+    path.write_text(tomli_w.dumps(to_builtins(move_to_free_subnet(impatient_rig()))))
     return LiveRig(tmp_path, path)

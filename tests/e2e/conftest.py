@@ -12,7 +12,7 @@ from tests.support.rigs import rig_with
 from tests.support.simulated_rig import SCENE, Rig, running
 
 from polysight_shared.config import Instrument
-from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.loopback import move_to_free_subnet
 
 
 @pytest.fixture(scope="session")
@@ -51,4 +51,4 @@ def lonely_instrument(tmp_path: Path) -> Instrument:
     """A rig file's content on a free loopback subnet, where nobody answers."""
     pi = {"journal_dir": str(tmp_path / "journal")}
     stage = {"port": str(tmp_path / "ttyNONE")}
-    return on_free_subnet(rig_with(limits={"command_timeout_s": 0.6}, pi=pi, stage=stage))
+    return move_to_free_subnet(rig_with(limits={"command_timeout_s": 0.6}, pi=pi, stage=stage))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polysight.imaging import ImageBuilder, fill_missing, image_grid
-from polysight.imaging.sparse import added_steps, reconstruct
+from polysight.imaging.sparse import find_added_steps, reconstruct
 from polysight_shared.errors import ConfigError
 
 AT = [(6, 8), (20, 30), (33, 12)]
@@ -126,9 +126,9 @@ def test_a_whole_scan_does_not_change(scan):
 
 def test_steps_too_wide_for_the_image_are_divided(scan):
     coarse = scan(np.ones((20, 60), bool), step_y_mm=10.0)
-    assert added_steps(coarse.rig)[0] > 1
+    assert find_added_steps(coarse.rig)[0] > 1
     filled, _ = fill_missing(coarse)
-    assert filled.rig.grid.rows == added_steps(coarse.rig)[0] * 19 + 1
+    assert filled.rig.grid.rows == find_added_steps(coarse.rig)[0] * 19 + 1
     is_away = np.ones((40, 40), bool)
     for j, i in AT:
         is_away[j - 4 : j + 5, i - 4 : i + 5] = False

@@ -15,10 +15,10 @@ from polysight.materials import (
     Library,
     analyse,
     estimate_permittivity,
-    expected_pixel_accuracy,
     fit_library,
     make_library,
     pixel_accuracy,
+    predict_pixel_accuracy,
     read_truth,
 )
 from polysight.materials.analyse import Optics
@@ -96,7 +96,7 @@ def test_at_least_eight_of_nine_named_right(synthetic, library):
     shares = []
     for seed in range(5):
         result = synthetic(seed).analyse(classifier=classifier)
-        shares.append((pixel_accuracy(result), expected_pixel_accuracy(result)))
+        shares.append((pixel_accuracy(result), predict_pixel_accuracy(result)))
         named = [r for r in result.patches if r.verdict is not None]
         # The metal reference is not named by itself
         assert len(named) == 8
@@ -112,8 +112,8 @@ def test_at_least_eight_of_nine_named_right(synthetic, library):
 
 def test_without_truth_or_probabilities_no_share_of_right_pixels_is_expected(synthetic, library):
     scene = synthetic(4)
-    assert expected_pixel_accuracy(scene.analyse()) is None
-    assert expected_pixel_accuracy(scene.analyse(classifier=Classifier(library, model="knn"))) is None
+    assert predict_pixel_accuracy(scene.analyse()) is None
+    assert predict_pixel_accuracy(scene.analyse(classifier=Classifier(library, model="knn"))) is None
 
 
 def test_polarimetry_beats_one_channel(library):

@@ -18,7 +18,7 @@ from tests.support.processes import wait_for
 from tests.support.products import REASON, judged_products
 from tests.support.store.facts import parse_fact
 
-from polysight.acquisition.control import ALIVE, CONTROL, Life, started_ticks
+from polysight.acquisition.control import ALIVE, CONTROL, Life, read_start_ticks
 from polysight.page.watch import EventTail, ManifestTail, ProductsTail, Watch, draw
 from polysight.pipeline import Pipeline
 from polysight.products import SCAN, write_json
@@ -108,7 +108,7 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
 def test_a_killed_program_is_said_at_once_however_long_its_timeout_is(growing, watching):
     growing.grow_until("row_committed")
     program = subprocess.Popen(["sleep", "600"])
-    life = Life(program.pid, started_ticks(program.pid) or 0, socket.gethostname())
+    life = Life(program.pid, read_start_ticks(program.pid) or 0, socket.gethostname())
     growing.live()
     (growing.path / CONTROL / ALIVE).write_bytes(msgspec.json.encode(life))
     watch = watching(growing.path, lapse_s=1e6)

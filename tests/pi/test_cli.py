@@ -12,7 +12,7 @@ from polysight_pi.cli import main
 from polysight_pi.trigger import BurstRecord
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault
-from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.loopback import move_to_free_subnet
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_check_names_every_hop(command, config, hub, stage):
 
 
 def test_commands_without_the_service(command, instrument, write_config, hub, stage):
-    config = write_config(at_stage_port(on_free_subnet(instrument), stage.port))
+    config = write_config(at_stage_port(move_to_free_subnet(instrument), stage.port))
     options = ("--config", config, "--wires", hub, "--count", 3, "--json")
     status, out, _ = command("pulse", *options)
     assert (status, [r["pulses"] for r in json.loads(out)]) == (0, [4, 4, 4])
@@ -96,7 +96,7 @@ def test_commands_without_the_service(command, instrument, write_config, hub, st
 def test_commands_beside_the_service(command, instrument, write_config, start, hub):
     """Commands that need lines, stage or ports are refused because the service runs; the error has its address."""
     # Ports that stay the same from one program to the next
-    rig = on_free_subnet(instrument)
+    rig = move_to_free_subnet(instrument)
     start(rig, "--wires", hub)
     config = write_config(rig)
     assert command("home", "--config", config)[1] == "stage at x 0.000 mm, y 0.000 mm\n"

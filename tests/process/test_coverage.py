@@ -15,7 +15,7 @@ from tests.support.scenes import EVERYWHERE, scene_of
 
 from polysight.imaging import Images
 from polysight.products import ProcessedScan
-from polysight.report.figures import masked_positions
+from polysight.report.figures import find_masked_positions
 from polysight.results import ScanFacts
 from polysight.store import RowData, ScanFolder
 from polysight.store.scan_folder import MANIFEST
@@ -125,5 +125,5 @@ def test_lost_positions_of_odd_rows_are_counted_by_column(scan_of, tmp_path):
     axis = np.zeros(1)
     images = Images(nothing, nothing, axis, axis, nothing.astype(bool), nothing)
     scan = ProcessedScan.from_results(Path(), images=images, quality=quality, facts=ScanFacts(), plan=source.plan)
-    for masked in masked_positions(scan).values():
+    for masked in find_masked_positions(scan).values():
         np.testing.assert_array_equal(masked, expected)

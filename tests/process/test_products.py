@@ -14,7 +14,7 @@ from tests.support.processes import read_output
 from tests.support.refusals import refused
 
 from polysight.cli.main import main
-from polysight.jobs.process import make_products, processed_rows, publish_images
+from polysight.jobs.process import make_products, process_rows, publish_images
 from polysight.materials import STEEP
 from polysight.pipeline import Pipeline
 from polysight.products import read_products
@@ -29,7 +29,7 @@ from polysight_shared.files import read_json
 @pytest.fixture(scope="module")
 def scan(two_plates: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = Path(shutil.copytree(two_plates, tmp_path_factory.mktemp("first") / "scan"))
-    processed_rows(ScanFolder.load(folder), folder)
+    process_rows(ScanFolder.load(folder), folder)
     return folder
 
 
@@ -65,7 +65,7 @@ def test_an_earlier_report_stays_until_the_new_one_is_complete(scan: Path, tmp_p
     out = tmp_path / "out"
     out.mkdir()
     (out / "report.html").write_text("earlier")
-    publish_images(processed_rows(ScanFolder.load(scan), scan), out)
+    publish_images(process_rows(ScanFolder.load(scan), scan), out)
     assert [p.name for p in out.iterdir()] == ["report.html"]
 
 
@@ -73,7 +73,7 @@ def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monke
     def fails(*_: object) -> None:
         raise DataError("no metal", code=ErrorCode.NO_DATA)
 
-    pipeline = processed_rows(ScanFolder.load(scan), scan)
+    pipeline = process_rows(ScanFolder.load(scan), scan)
     out = tmp_path / "out"
     publish_images(pipeline, out)
     monkeypatch.setattr(Pipeline, "examine", fails)
@@ -84,7 +84,7 @@ def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monke
 
 def test_progress_is_reported_before_each_step(scan: Path, tmp_path: Path) -> None:
     steps: list[str] = []
-    processed_rows(ScanFolder.load(scan), scan, Settings(model="none")).finish(tmp_path, (), steps.append)
+    process_rows(ScanFolder.load(scan), scan, Settings(model="none")).finish(tmp_path, (), steps.append)
     assert steps == ["point response", "materials", "figures and report"]
 
 
@@ -102,7 +102,7 @@ def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
 
     monkeypatch.setattr(Pipeline, "examine", examine_tilted)
     out = tmp_path / "out"
-    make_products(processed_rows(ScanFolder.load(scan), scan, Settings(model="none")), out, ())
+    make_products(process_rows(ScanFolder.load(scan), scan, Settings(model="none")), out, ())
     assert (out / "surface.npz").exists() == is_steep
     assert (b"Surfaces from three sides" in (out / "report.html").read_bytes()) == is_steep
 

@@ -13,9 +13,9 @@ from tests.support.rigs import rig_table
 
 from polysight.imaging import Images
 from polysight.materials import TruthPlate
-from polysight.process.quality import masked_runs
+from polysight.process.quality import find_masked_runs
 from polysight.report import write_report
-from polysight.report.figures import coverage_figure, masked_positions
+from polysight.report.figures import coverage_figure, find_masked_positions
 from polysight.report.report import format_heading, format_value, imaging_table, quality_tables, render
 from polysight.report.style import assign_colours, png
 from polysight.results import RxGain, ScanFacts, ScanMaterials, ScanQuality
@@ -249,7 +249,7 @@ def with_boards(scan, boards):
 
 def test_masked_positions_come_out_of_runs_and_of_rows_that_are_absent(scan):
     boards = {"RH": {"masked_columns": {"2": [[0, 2], [5, 6]]}, "rows_recorded": [0, 1, 2]}}
-    mask = masked_positions(with_boards(scan, boards))["RH"]
+    mask = find_masked_positions(with_boards(scan, boards))["RH"]
     assert np.argwhere(mask).tolist() == [[2, 0], [2, 1], [2, 5], *([3, c] for c in range(6))]
 
 
@@ -257,8 +257,10 @@ def test_runs_and_their_mask_are_the_same(scan):
     rng = np.random.default_rng(5)
     for share in (0.0, 0.3, 1.0):
         rows = rng.uniform(size=(4, 6)) < share
-        runs = {str(i): masked_runs(row) for i, row in enumerate(rows) if row.any()}
-        masks = masked_positions(with_boards(scan, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}}))
+        runs = {str(i): find_masked_runs(row) for i, row in enumerate(rows) if row.any()}
+        masks = find_masked_positions(
+            with_boards(scan, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}})
+        )
         assert (masks["RH"] == rows).all()
 
 
@@ -267,7 +269,7 @@ def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(scan):
     gains = {"RH": [RxGain(0.0, 0.0), RxGain(1.25, -8.1)]}
     rig = rig_table() | {"name": "a <rig>"}
     answer = changed(with_boards(scan, boards), facts=ScanFacts(simulated=True, rx_gains=gains, instrument=rig))
-    picture = png(coverage_figure(answer, masked_positions(answer)))
+    picture = png(coverage_figure(answer, find_masked_positions(answer)))
     page = Page(render(answer, {"coverage": picture}))
     assert base64.b64encode(picture).decode() in page.sources[0]
     assert "RH 3 of 24 (12.50%)" in page.words

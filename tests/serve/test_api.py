@@ -23,7 +23,7 @@ from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
 from tests.support.products import judged_products
 
-from polysight.acquisition.control import ALIVE, CONTROL, Life, started_ticks
+from polysight.acquisition.control import ALIVE, CONTROL, Life, read_start_ticks
 from polysight.products.folder import making_products
 from polysight.serve import commands as control
 from polysight.serve import site
@@ -169,7 +169,7 @@ def test_every_page_knows_whether_a_scan_runs_was_killed_or_hangs(view, scans, l
     alive = scans / "one" / CONTROL / ALIVE
     alive.parent.mkdir()
     pid = os.getpid() if lives else 1
-    alive.write_bytes(msgspec.json.encode(Life(pid, started_ticks(os.getpid()) or 0, socket.gethostname())))
+    alive.write_bytes(msgspec.json.encode(Life(pid, read_start_ticks(os.getpid()) or 0, socket.gethostname())))
     os.utime(alive, (time.time() - age_s,) * 2)
     running = get(view, "/api/running")
     assert [scan["state"] for scan in running] == ([state] if state else [])

@@ -11,7 +11,7 @@ from tests.support.processes import wait_for
 from tests.support.rigs import published_rig
 
 from polysight.acquisition import STATES
-from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.loopback import move_to_free_subnet
 
 TOKEN = "0123456789"
 PICTURES = "[...document.querySelectorAll('.view img')]"
@@ -83,7 +83,7 @@ def test_buttons_reach_the_scan(browser, growing, watching):
 
 def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, watching):
     """At an address of its own: a port of 127.0.0.1 that was free for a while may be somebody else's by then."""
-    rig = on_free_subnet(published_rig())
+    rig = move_to_free_subnet(published_rig())
     host, _, port = rig.pi.command_address.removeprefix("tcp://").rpartition(":")
     watch = watching(finished)
     with served(watch, host=host, port=int(port)) as view:

@@ -9,7 +9,7 @@ import pytest
 from tests.support.rigs import published_rig
 
 from polysight_shared.config import Instrument
-from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.loopback import move_to_free_subnet
 
 
 @pytest.fixture
@@ -20,4 +20,4 @@ def sockets() -> Iterator[ExitStack]:
 
 @pytest.fixture
 def rig() -> Instrument:
-    return on_free_subnet(published_rig())
+    return move_to_free_subnet(published_rig())

@@ -27,7 +27,7 @@ from polysight_shared.wires import WireClient, WireEdge, WireMotion
 from polysight_simulators.cards import CardEndpoint, CardSender, Network, Pace, bound_udp
 from polysight_simulators.cards.card import ReceiveQueue
 from polysight_simulators.faults import Faults
-from polysight_simulators.loopback import is_free, on_subnet
+from polysight_simulators.loopback import is_free, move_to_subnet
 from polysight_simulators.scene import pattern_frames
 
 TIME_SCALE = 20.0
@@ -202,7 +202,7 @@ def test_wrong_arguments_are_one_message(config: Path, tmp_path: Path, arguments
 
 
 def test_a_rig_on_its_own_subnet_keeps_ports_and_last_bytes(rig: Instrument) -> None:
-    moved = on_subnet(rig, "127.1.2")
+    moved = move_to_subnet(rig, "127.1.2")
     assert [b.card_address for b in moved.boards] == ["127.1.2.180", "127.1.2.181", "127.1.2.182"]
     assert {b.host_address for b in moved.boards} == {"127.1.2.30"}
     assert [b.command_port for b in moved.boards] == [b.command_port for b in rig.boards]

@@ -25,7 +25,7 @@ from tests.support.rigs import published_rig
 from polysight_simulators import process, replay
 from polysight_simulators.cards import MAC, CardEndpoint, Network, Pace, bound_udp
 from polysight_simulators.faults import Faults
-from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.loopback import move_to_free_subnet
 from polysight_simulators.replay import Player, Recording, scan_rows
 
 OK = {code: bytes.fromhex(f"5aa5{code:02x}000000aaee") for code in range(1, 15)}
@@ -90,7 +90,7 @@ class Client:
 
 def free_subnet() -> str:
     """A free loopback subnet 127.x.y.*."""
-    return on_free_subnet(published_rig()).boards[0].card_address.rpartition(".")[0]
+    return move_to_free_subnet(published_rig()).boards[0].card_address.rpartition(".")[0]
 
 
 @pytest.fixture

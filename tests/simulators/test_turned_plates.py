@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight_simulators.scene.optics import turned_reflection
+from polysight_simulators.scene.optics import turn_reflection
 from polysight_simulators.scene.scene_file import Plate
 from polysight_worlds import simulate
 from polysight_worlds.media import METAL, Stack
@@ -28,7 +28,7 @@ def test_metal_receives_what_the_image_of_the_transmitter_sends(rise_deg):
     p_of_receiver = np.array([np.cos(THETA), 0.0, np.sin(THETA)])
     sent = s_axis + p_of_transmitter
     image = 2 * normal * (normal @ sent) - sent
-    h, v = turned_reflection(plate(rise_deg, metal=True), 78e9, np.array(THETA))
+    h, v = turn_reflection(plate(rise_deg, metal=True), 78e9, np.array(THETA))
     assert [complex(h).real, complex(v).real] == pytest.approx([image @ s_axis, image @ p_of_receiver], abs=4e-3)
 
 
@@ -52,7 +52,7 @@ def test_a_tilted_dielectric_changes_as_in_vector_physical_optics(permittivity):
             material = {"metal": True}
         else:
             material = {"permittivity": (permittivity.real, -permittivity.imag)}
-        h, v = turned_reflection(plate(rise_deg, **material), 78e9, np.array(THETA))
+        h, v = turn_reflection(plate(rise_deg, **material), 78e9, np.array(THETA))
         expected.append(complex(v) / complex(h))
     change, predicted = (np.array(ratios[1:]) / ratios[0] - 1 for ratios in (calls, expected))
     # First order; boards see it from 53 to 58 degrees

@@ -21,8 +21,8 @@ from tests.support.store.plain_scan import errors
 
 from polysight.cli.main import main
 from polysight.jobs.live_scan import resume
-from polysight.jobs.process import make_products, process, processed_rows
-from polysight.jobs.scans import drop_raw, processed_digests
+from polysight.jobs.process import make_products, process, process_rows
+from polysight.jobs.scans import drop_raw, find_processed_digests
 from polysight.products import REPORT, making_products, write_json
 from polysight.results import NoResult
 from polysight.settings import DEFAULT
@@ -75,7 +75,7 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     quality = scan / "products" / "quality.json"
     write_json(quality, {**json.loads(quality.read_text()), "key_of_a_later_release": 1})
     products = contents(scan / "products")
-    digests = processed_digests(scan / "products")
+    digests = find_processed_digests(scan / "products")
     assert len(payloads(scan)) == ROWS * BOARDS
     done = polysight("drop-raw", scan, typed="drop\n")
     assert done.returncode == 0, done.stderr
@@ -107,7 +107,7 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
 
 
 def test_products_replaced_after_a_drop_in_between_keep_its_mark(scan):
-    pipeline = processed_rows(ScanFolder.load(scan), scan)
+    pipeline = process_rows(ScanFolder.load(scan), scan)
     assert drop_raw(scan, None, yes=True) == 0
     make_products(pipeline, scan / "products", ())
     assert "raw_dropped" in json.loads((scan / "products" / "quality.json").read_text())
@@ -202,7 +202,7 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
 
 
 def test_only_rows_in_the_products_are_dropped(scan):
-    digests = processed_digests(scan / "products")
+    digests = find_processed_digests(scan / "products")
     board = next(iter(digests))
     del digests[board][2]
     drop(ScanFolder.load(scan), digests, scan / "products")
@@ -218,14 +218,14 @@ def test_an_unfinished_scan_keeps_its_rows(scan):
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join(line for line in lines if b'"row":3' not in line))
     with refused(ErrorCode.NOT_ENOUGH_DATA, "1 of 4", "polysight resume"):
-        droppable(ScanFolder.load(scan), processed_digests(scan / "products"))
+        droppable(ScanFolder.load(scan), find_processed_digests(scan / "products"))
     with pytest.raises(ScanError):
-        drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
+        drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")
 
 
 def test_a_scan_in_use_keeps_its_rows(scan):
     with ScanFolder.load(scan).writer(), refused(ErrorCode.BUSY):
-        drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
+        drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")
     assert len(payloads(scan)) == ROWS * BOARDS
 
 
@@ -236,7 +236,7 @@ class PowerCut(BaseException):
 @pytest.mark.parametrize("cut_after", range(ROWS * (BOARDS + 1)))
 def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, monkeypatch, cut_after):
     """The steps are a line in the manifest and a removal for each board, row after row; it ends before each of them."""
-    digests = processed_digests(scan / "products")
+    digests = find_processed_digests(scan / "products")
     steps = iter(range(ROWS * (BOARDS + 1)))
     unlink = Path.unlink
     append = AppendFile.append
@@ -271,7 +271,7 @@ def test_what_remains_is_on_the_disk_before_raw_data_is_deleted(scan):
     """Samples are written without waiting for the disk: a power cut must not take them and the raw data."""
     disk = FaultyDisk(scan)
     with disk():
-        drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
+        drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")
     first = next(
         position
         for position, description in enumerate(disk.done)
@@ -289,7 +289,7 @@ def test_a_line_torn_anywhere_drops_nothing(scan):
     """The last line is torn by a power cut: its files were not touched yet, and the row is as if never dropped."""
     copy = scan.with_name("copy")
     shutil.copytree(scan, copy)
-    drop(ScanFolder.load(copy), processed_digests(copy / "products"), copy / "products")
+    drop(ScanFolder.load(copy), find_processed_digests(copy / "products"), copy / "products")
     raw = (copy / MANIFEST).read_bytes()
     line = raw.splitlines(keepends=True)[-1]
     # The rows before the last are gone
@@ -303,7 +303,7 @@ def test_a_line_torn_anywhere_drops_nothing(scan):
 
 
 def test_a_row_taken_again_is_there_again(scan):
-    drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
+    drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")
     folder = ScanFolder.load(scan)
     committed = facts_of(folder, "row_committed")[1]
     with folder.writer() as writer:

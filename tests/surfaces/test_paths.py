@@ -12,8 +12,8 @@ from polysight.surfaces.paths import find_echoes, find_mirror_path, measure_echo
 from polysight.surfaces.points import (
     find_curvature,
     find_normals,
+    find_offset_that_sees,
     locate,
-    offset_that_sees,
     predict_echo,
     spreading,
     unit_legs,
@@ -100,7 +100,7 @@ def test_the_path_of_a_point_gives_the_point_back():
     path, slope, bend = predict_echo(points, normals, bends, at_m, scan.tx_m, scan.middle_m)
     assert np.allclose(locate(path, slope, at_m, scan.tx_m, scan.middle_m), points, atol=1e-8)
     assert np.allclose(find_curvature(points, normals, at_m, scan.tx_m, scan.middle_m, bend), bends, atol=1e-4)
-    seen_from = offset_that_sees(points, normals, at_m + np.array([0.01, 0.02, 0]), scan.tx_m, scan.middle_m)
+    seen_from = find_offset_that_sees(points, normals, at_m + np.array([0.01, 0.02, 0]), scan.tx_m, scan.middle_m)
     assert np.allclose(seen_from, at_m, atol=1e-8)
 
 

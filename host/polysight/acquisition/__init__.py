@@ -16,8 +16,8 @@ from polysight.acquisition.control import (
     StopRequest,
     ignore_hangup,
     read_life,
+    read_start_ticks,
     send_command,
-    started_ticks,
 )
 from polysight.acquisition.pi_client import PiClient, RefusedError
 from polysight.acquisition.progress import (
@@ -54,11 +54,11 @@ __all__ = [
     "ignore_hangup",
     "make_ready",
     "read_life",
+    "read_start_ticks",
     "resume_scan",
     "run_scan",
     "send_command",
     "stage_differences",
-    "started_ticks",
     "time_left",
     "typical_row_s",
 ]

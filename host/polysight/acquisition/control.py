@@ -82,7 +82,7 @@ class StopRequest:
         return self._count >= 2
 
 
-def _in_main_thread() -> bool:
+def _is_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
 
 
@@ -99,7 +99,7 @@ def stop_on_interrupt(stop: StopRequest) -> Iterator[None]:
             stop.request("Ctrl-C")
 
     numbers = ()
-    if _in_main_thread():
+    if _is_main_thread():
         numbers = (signal.SIGINT, signal.SIGTERM)
     old_handlers = {number: signal.signal(number, handle) for number in numbers}
     try:
@@ -112,7 +112,7 @@ def stop_on_interrupt(stop: StopRequest) -> Iterator[None]:
 @contextmanager
 def ignore_hangup() -> Iterator[None]:
     """Ignore SIGHUP, as from a lost ssh connection; no effect outside the main thread."""
-    if not _in_main_thread():
+    if not _is_main_thread():
         yield
         return
     old_handler = signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -145,7 +145,7 @@ class ScanCommand(StrEnum):
 
 
 class Life(msgspec.Struct, frozen=True):
-    """Content of `alive`: the scan's process with its start time (:func:`started_ticks`) and machine, what it does.
+    """Content of `alive`: the scan's process with its start time (:func:`read_start_ticks`) and machine, what it does.
 
     `asked` is the pending command of `asker`, "" for none.
     """
@@ -166,10 +166,10 @@ class Life(msgspec.Struct, frozen=True):
     @property
     def killed(self) -> bool:
         """True if the process ran on this machine and is gone: a scan that ends by itself removes the file."""
-        return self.is_here and started_ticks(self.pid) != self.ticks
+        return self.is_here and read_start_ticks(self.pid) != self.ticks
 
 
-def started_ticks(pid: int) -> int | None:
+def read_start_ticks(pid: int) -> int | None:
     """Start time of a running process in clock ticks since boot, or None; it tells reused process numbers apart."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
@@ -208,7 +208,7 @@ class ControlFolder:
         written: Life | None = None
         next_alive_s = 0.0
         cleared = False
-        ticks = started_ticks(os.getpid()) or 0
+        ticks = read_start_ticks(os.getpid()) or 0
         while not self._closed.wait(_POLL_S):
             # A full disk must not end the scan.
             with suppress(OSError):

@@ -187,7 +187,7 @@ def _find_trains(
     came_ns = entries[:, 0]
     stop = entries[:, 1]
     is_whole = int(arrivals[-1, 1]) == pulses_ns.size * frame_bytes
-    expected = _expected_arrivals(pulses_ns, received_ns, entries, frame_bytes, payload_bytes, is_whole)
+    expected = _predict_arrivals(pulses_ns, received_ns, entries, frame_bytes, payload_bytes, is_whole)
 
     period_ns = _period_ns(pulses_ns)
     silence_ns = min(SILENCE_NS, period_ns // 2)
@@ -321,7 +321,7 @@ def _find_pauses(pulses_ns: Times, received_ns: Times) -> Times:
     return pulses_ns[:, 0] + offset_ns - pause_ns // 2
 
 
-def _expected_arrivals(
+def _predict_arrivals(
     pulses_ns: Times, received_ns: Times, entries: Times, frame_bytes: int, payload_bytes: int, is_whole: bool
 ) -> NDArray[np.float64]:
     """Return the expected arrival of each pulse's first packet: host's clock, float64 [pulse].

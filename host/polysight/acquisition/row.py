@@ -430,7 +430,7 @@ class RowTransaction:
         self.state = RowState.WAITING
         on_state(self.state)
 
-    def to(self, state: RowState) -> None:
+    def change_state(self, state: RowState) -> None:
         """Change to a state. Raises ScanError if `TRANSITIONS` does not allow it, which is a bug."""
         if state not in TRANSITIONS[self.state]:
             raise ScanError(f"a row went from {self.state} to {state}", "a fault of this program", "report it")
@@ -440,7 +440,7 @@ class RowTransaction:
     def fail(self) -> None:
         """Change to `failed`, except from a final state."""
         if TRANSITIONS[self.state]:
-            self.to(RowState.FAILED)
+            self.change_state(RowState.FAILED)
 
 
 class RowTaker:
@@ -478,7 +478,7 @@ class RowTaker:
         Raises PolysightError if the Pi, a card, a receiver or a radar does not respond.
         """
         take = Take(row, number)
-        transaction.to(RowState.ARMING)
+        transaction.change_state(RowState.ARMING)
         self._radars.arm(row.points * self._instrument.burst.pulses)
         self._rig.begin_row(row.index, number, row.points, self._folder)
         take.radars = self._radars.states()
@@ -487,21 +487,21 @@ class RowTaker:
         elif take.stopped_radars:
             take.aborted = TakeFault(FaultKind.RADAR_STOPPED, "the row was not begun")
         else:
-            transaction.to(RowState.RUNNING)
+            transaction.change_state(RowState.RUNNING)
             self._radars.row_begins()
             self._rig.discard_before(time.monotonic_ns())
             self._pi.run_row(self._scan_id, row.index, number)
             self._wait_for_row(take, transaction)
             if take.all_pulses_sent:
-                transaction.to(RowState.COLLECTING)
+                transaction.change_state(RowState.COLLECTING)
                 self._wait_for_data()
                 take.not_done = self._radars.wait_done(self._instrument.limits.end_of_record_s)
-        transaction.to(RowState.WRITING)
+        transaction.change_state(RowState.WRITING)
         self._end_records(take)
         take.radars = self._radars.states()
         if take.all_pulses_sent:
             self._time_frames(take)
-        transaction.to(RowState.CHECKING)
+        transaction.change_state(RowState.CHECKING)
         return take
 
     def _wait_for_row(self, take: Take, transaction: RowTransaction) -> None:
@@ -521,7 +521,7 @@ class RowTaker:
             if take.finished is None and fault and not take.aborted:
                 take.aborted = fault
                 deadline = time.monotonic() + _ABORT_TIMEOUT_S
-                transaction.to(RowState.ABORTING)
+                transaction.change_state(RowState.ABORTING)
                 self._pi.abort(fault.text)
             if take.finished is None and self._pi.state in ("fault", "idle"):
                 self._check_stopped(take)

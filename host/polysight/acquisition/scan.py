@@ -256,7 +256,7 @@ class RunningScan:
             try:
                 take = self._take(row, number, taker, transaction)
                 if take is None:
-                    transaction.to(RowState.STOPPED)
+                    transaction.change_state(RowState.STOPPED)
                     return
                 events.sync()
                 if self._settle(take, number == last_take, transaction, events) or self._stop.now:
@@ -347,10 +347,10 @@ class RunningScan:
             if self._stop.now:
                 faults = [ON_REQUEST]
             reject_row(self._scan, self._writer, take, faults)
-            transaction.to(RowState.REJECTED)
+            transaction.change_state(RowState.REJECTED)
             return False
         commit_row(self._scan, self._writer, take, faults, events.digest())
-        transaction.to(RowState.KEPT if faults else RowState.COMMITTED)
+        transaction.change_state(RowState.KEPT if faults else RowState.COMMITTED)
         self._committed.add(row)
         self._queue.add(row)
         if faults:

@@ -34,9 +34,9 @@ from polysight.polarimetry import Incidence
 from polysight.process import (
     Inputs,
     analyse_given_images,
-    imaged_scan,
+    collect_imaged_scan,
+    collect_processed_scan,
     is_given_images,
-    processed_scan,
     read_given_images,
     why_unnamed,
 )
@@ -253,7 +253,7 @@ class Scan:
         if self._saved is not None and self._saved.rig is not None:
             return self._saved.rig
         if self._source is None:
-            raise self._unknown_error("rig")
+            raise self._make_unknown_error("rig")
         return self._processing.pipeline.rig
 
     @property
@@ -262,7 +262,7 @@ class Scan:
         if self._source is not None:
             return Rows(self._source.plan.rows, tuple(self._source.rows()))
         if self._saved is None or self._saved.rows is None:
-            raise self._unknown_error("rows")
+            raise self._make_unknown_error("rows")
         return self._saved.rows
 
     def image(self, *, metal_referenced: bool = True) -> xarray.Dataset:
@@ -366,7 +366,7 @@ class Scan:
         """
         done = self.read_or_process()
         if done.interior is None:
-            raise self._unknown_error("pixels inside the patches")
+            raise self._make_unknown_error("pixels inside the patches")
         inside = done.interior & (done.labels > 0) & np.isfinite(done.p)
         p = done.p[inside]
         X = np.stack([np.abs(done.h[inside]), np.abs(done.v[inside]), p.real, p.imag], axis=1)
@@ -453,7 +453,7 @@ class Scan:
         from polysight.jobs.surface import make_surface
 
         if self._source is None:
-            raise self._unknown_error("surface")
+            raise self._make_unknown_error("surface")
         config = None if self._settings.config is None else Path(self._settings.config)
         surface = make_surface(self.folder, config, None if reference is None else Path(reference))
         return surface_dataset(surface)
@@ -568,7 +568,7 @@ class Scan:
             "open the scan folder, or ask for metal_referenced=True", code=ErrorCode.MISMATCH,
         )  # fmt: skip
 
-    def _unknown_error(self, what: str) -> DataError:
+    def _make_unknown_error(self, what: str) -> DataError:
         return DataError(
             f"{self.folder}: the {what} of the products is unknown", "an earlier release made them, or scan.json or"
             " quality.json is missing", "open the scan folder instead", code=ErrorCode.KEY_MISSING,
@@ -610,7 +610,7 @@ class Processing:
     def unreferenced(self) -> ProcessedScan:
         """Images in arbitrary units, as `polysight image` writes them. Raises PolysightError."""
         pipeline = self.pipeline
-        return imaged_scan(self.folder, self.source, pipeline.rig, self._images, pipeline.quality)
+        return collect_imaged_scan(self.folder, self.source, pipeline.rig, self._images, pipeline.quality)
 
     @cached_property
     def referenced(self) -> ProcessedScan:
@@ -627,7 +627,7 @@ class Processing:
         if note:
             warnings.warn(note, stacklevel=2)
         findings = pipeline.examine(self._images, plates)
-        return processed_scan(self.folder, self.source, pipeline.rig, findings, pipeline.quality, unnamed)
+        return collect_processed_scan(self.folder, self.source, pipeline.rig, findings, pipeline.quality, unnamed)
 
 
 def patch_table(done: ProcessedScan) -> str:

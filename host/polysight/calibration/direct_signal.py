@@ -147,7 +147,7 @@ def find_direct(
     good = aligned.good & done.found[:, None]
     cycles = (done.frequency[:, None] + aligned.frequency)[good]
     power = _power(words[good.ravel()], cycles, setup, drift + done.drift)
-    noise = _recorded_noise(aligned, done.noise) * (np.abs(setup.path.estimator[0]) ** 2).sum() / FOLD
+    noise = _estimate_recorded_noise(aligned, done.noise) * (np.abs(setup.path.estimator[0]) ** 2).sum() / FOLD
     cycles = cycles % 1.0 if chirp.if_mode == "complex1x" else (cycles + 0.5) % 1.0 - 0.5
     rate = chirp.sample_rate_hz
     return DirectSignal(
@@ -160,7 +160,7 @@ def find_direct(
     )
 
 
-def _recorded_noise(aligned: AlignedRow, noise: NDArray[np.float64]) -> float:
+def _estimate_recorded_noise(aligned: AlignedRow, noise: NDArray[np.float64]) -> float:
     """Return the noise power of a recorded sample: the estimate divided by the gain of the filter compensation."""
     raised = (aligned.gain**2 * aligned.good).sum(axis=1) / np.maximum(aligned.good.sum(axis=1), 1)
     recorded = noise / np.maximum(raised, 1e-12)
@@ -202,7 +202,8 @@ def fit_start(source: RawSource, board_name: str) -> BoardStart:
         raise DataError(
             f"{source.scan_id}: only {if_hz.size} of {chirps} chirps show the direct path of {board_name}",
             "it lies outside the IF band and is filtered out, or something blocks it",
-            f"by geometry alone start_offset_hz = {by_geometry(rig, board):.0f} for {board_name}; scan again with it",
+            f"by geometry alone start_offset_hz = {predict_by_geometry(rig, board):.0f} for {board_name};"
+            " scan again with it",
             code=ErrorCode.NO_DATA,
         )
     if_hz = unwrap_if(if_hz, rig)
@@ -231,7 +232,7 @@ def choose_start_offset(
     )
 
 
-def by_geometry(rig: Instrument, board: Board) -> float:
+def predict_by_geometry(rig: Instrument, board: Board) -> float:
     """Return the start offset from the rig file's geometry alone, Hz."""
     return board.start_offset_hz + sum(band_hz(rig)) / 2 - direct_if_hz(rig, board)
 

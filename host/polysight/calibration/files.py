@@ -511,7 +511,7 @@ def _manifest_entries(scan: ScanFolder, recorded: Any) -> dict[str, dict[str, st
         ) from None
 
 
-def checked_calibration(rig: Instrument, simulated: bool) -> Calibration:
+def load_checked_calibration(rig: Instrument, simulated: bool) -> Calibration:
     """Load the calibration files that a rig file names, and check that they can be used for a new scan.
 
     Raises ConfigError or DataError if a file is invalid, belongs to another rig, or comes from simulated data while the
@@ -539,9 +539,9 @@ def copy_into_scan(rig: Instrument, folder: Path, simulated: bool) -> dict[str, 
     """Copy the active calibration files into a new scan's folder; return the entry for its manifest, by kind.
 
     Nothing is copied into a folder that holds a scan already: creating the scan will raise the error. Raises like
-    :func:`checked_calibration`, before anything is copied.
+    :func:`load_checked_calibration`, before anything is copied.
     """
-    calibration = checked_calibration(rig, simulated)
+    calibration = load_checked_calibration(rig, simulated)
     existing = (folder / MANIFEST).exists() and manifest.read(folder / MANIFEST).length > 0
     paths = calibration.paths or {}
     names = [path.name for path in paths.values()]

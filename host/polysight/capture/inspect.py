@@ -358,7 +358,7 @@ def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") 
     DataError
         if the file is no packet capture, has nothing from a card, or several cards and none was selected.
     """
-    card, packets = _from_card(path, card_address)
+    card, packets = _select_from_card(path, card_address)
     data = [d for d in packets if len(d.payload) > dca1000.PACKET_HEADER_BYTES]
     if not data:
         if not card.replies:
@@ -381,7 +381,7 @@ def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") 
     return report
 
 
-def _from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram]]:
+def _select_from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram]]:
     """Return a card's replies and its other datagrams. Raises DataError for several cards."""
     card = CardReport(address="", replies=[], version="", status=Status(0), record=None, tail_bytes=0, tail_after_s=0.0)
     packets = []

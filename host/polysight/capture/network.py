@@ -116,13 +116,13 @@ def bind_udp(address: str, port: int, problem: str) -> socket.socket:
 def enlarge_receive_buffer(sock: socket.socket, wanted_bytes: int) -> int:
     """Request a receive buffer; return the granted size, bytes."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted_bytes)
-    if granted_bytes(sock) < wanted_bytes and sys.platform == "linux":
+    if read_granted_bytes(sock) < wanted_bytes and sys.platform == "linux":
         with contextlib.suppress(PermissionError):
             sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted_bytes)
-    return granted_bytes(sock)
+    return read_granted_bytes(sock)
 
 
-def granted_bytes(sock: socket.socket) -> int:
+def read_granted_bytes(sock: socket.socket) -> int:
     """Return the size of the receive buffer; Linux reports twice the request, for its overhead."""
     size = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     if sys.platform == "linux":

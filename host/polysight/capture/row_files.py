@@ -164,7 +164,7 @@ def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed
     if placed is None:
         places = np.full(stored, -1, dtype=np.int64)
     else:
-        places = _in_the_row(placed, sizes)
+        places = _find_offsets_in_row(placed, sizes)
     is_stored_here = places < 0
     rest = np.concatenate([[0], np.cumsum(np.where(is_stored_here, sizes, 0))])[:-1]
     place = np.where(is_stored_here, -1 - rest, places)
@@ -233,7 +233,7 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
     return evidence, log
 
 
-def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+def _find_offsets_in_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the offset of each packet's unchanged payload in the row's file, int64 [packet]; -1 if it is not there."""
     offsets = placed.offsets[: sizes.size].copy()
     offsets[offsets + sizes > placed.expected] = -1

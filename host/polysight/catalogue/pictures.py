@@ -209,7 +209,7 @@ def draw_products(pixels: Pixels, name: str, limits: Limits | None = None) -> Pi
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     if MAPS[name].needs_metal:
-        values = _derived_values(pixels, name)
+        values = _derive_values(pixels, name)
     else:
         values = _channel_values(pixels)[name]
     if limits is not None:
@@ -244,7 +244,7 @@ def _channel_values(images: Images | Pixels) -> dict[str, Values]:
     return values
 
 
-def _derived_values(pixels: Pixels, name: str) -> Values:
+def _derive_values(pixels: Pixels, name: str) -> Values:
     """Maps derived from P: its error, permittivity, loss."""
     if not pixels.referenced:
         raise DataError(

@@ -22,7 +22,7 @@ from pathlib import Path, PurePosixPath
 import msgspec
 from msgspec.structs import replace
 
-from polysight.acquisition import LAPSE_S, Life, read_life, started_ticks
+from polysight.acquisition import LAPSE_S, Life, read_life, read_start_ticks
 from polysight.products import IMAGE, MATERIALS, QUALITY, SCAN, ProcessedScan
 from polysight.store import MANIFEST, Manifest, manifest
 from polysight_shared.error_codes import ErrorCode
@@ -227,7 +227,7 @@ def summarise(folder: Path, name: str) -> Summary:
         notes = read_notes(folder)
     except DataError as e:
         notes = Notes(e.what)
-    summary = Summary(name, "begun", notes=notes.notes, tags=notes.tags, seconds=_modified_s(folder))
+    summary = Summary(name, "begun", notes=notes.notes, tags=notes.tags, seconds=_read_modified_s(folder))
     summary = _add_products(folder, summary)
     content = _read_manifest(folder)
     if content is None:
@@ -338,7 +338,7 @@ def find_program(folder: Path, kind: str) -> Program | None:
     words = record.words
     if words[1:3] == ["-m", "polysight"]:
         words = ["polysight", *words[3:]]
-    running = started_ticks(record.pid) == record.ticks
+    running = read_start_ticks(record.pid) == record.ticks
     status = None
     if not running:
         status = _read_status(base.with_suffix(".status"))
@@ -405,7 +405,7 @@ def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
         written_s = life.written_s
         patience_s = LAPSE_S
     else:
-        written_s = _modified_s(folder / MANIFEST)
+        written_s = _read_modified_s(folder / MANIFEST)
         patience_s = GRACE_S
     if life is not None and life.killed:
         return replace(summary, state="lost")
@@ -419,7 +419,7 @@ def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
     return replace(summary, state="running")
 
 
-def _modified_s(folder: Path) -> float:
+def _read_modified_s(folder: Path) -> float:
     try:
         return folder.stat().st_mtime
     except OSError:

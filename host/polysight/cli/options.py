@@ -151,7 +151,7 @@ def box(text: str) -> Box:
     return x0, y0, x1, y1
 
 
-def centred_box(text: str) -> Box:
+def parse_centred_box(text: str) -> Box:
     """Parse `x,y,width,height`, the form of a box in earlier releases; say how it is written now."""
     x, y, width, height = _four_numbers(text, "x,y,width,height in mm, e.g. 0,0,40,40")
     if width <= 0 or height <= 0:
@@ -216,7 +216,7 @@ def add_material_options(sub: argparse.ArgumentParser) -> None:
         metavar="X0,Y0,X1,Y1",
         help="metal reference: corners in mm from the image's centre, e.g. -80,-20,-40,20 (default: found)",
     )
-    sub.add_argument("--metal", type=centred_box, help=argparse.SUPPRESS)
+    sub.add_argument("--metal", type=parse_centred_box, help=argparse.SUPPRESS)
     sub.add_argument(
         "--labels",
         type=Path,

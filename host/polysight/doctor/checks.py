@@ -100,7 +100,7 @@ def run_checks(context: CheckContext) -> Iterator[Finding]:
                 board_name = board.name
             key = (check.name, board_name)
             title = " ".join(key).rstrip()
-            if failed := _failed_prerequisite(check, board, blocked):
+            if failed := _find_failed_prerequisite(check, board, blocked):
                 blocked[key] = failed
                 finding = not_checked(f"{failed} failed")
             else:
@@ -110,7 +110,7 @@ def run_checks(context: CheckContext) -> Iterator[Finding]:
             yield msgspec.structs.replace(finding, where=title)
 
 
-def _failed_prerequisite(check: Check, board: Board | None, blocked: dict[tuple[str, str], str]) -> str:
+def _find_failed_prerequisite(check: Check, board: Board | None, blocked: dict[tuple[str, str], str]) -> str:
     """Title of the failed check because of which this one is skipped; "" if there is none.
 
     A check of one board depends on the same board's checks, and one of the whole rig on those of every board.

@@ -392,7 +392,7 @@ def capture_frames(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str
         return captured, sent
 
 
-def with_boards(rig: Instrument, names: set[str]) -> Instrument:
+def select_boards(rig: Instrument, names: set[str]) -> Instrument:
     """Return the rig with only these boards recorded."""
     boards = tuple(msgspec.structs.replace(b, record=b.record and b.name in names) for b in rig.boards)
     return msgspec.structs.replace(rig, boards=boards)

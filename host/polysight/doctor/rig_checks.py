@@ -23,9 +23,9 @@ from polysight.calibration import (
     FULL_SCALE,
     DirectSignal,
     band_hz,
-    checked_calibration,
     find_direct,
     jitter_hz,
+    load_checked_calibration,
     unwrap_if,
 )
 from polysight.capture import PRIORITY_REMEDY, RowCapture, route_interface, silent_radar
@@ -39,8 +39,8 @@ from polysight.doctor.context import (
     not_checked,
     ok,
     read_interface,
+    select_boards,
     warning,
-    with_boards,
 )
 from polysight.materials import SIMULATED_LIBRARY, Library
 from polysight.planning import scan_time
@@ -128,7 +128,7 @@ def check_pi_clock(context: CheckContext) -> Finding:
 def check_calibration(context: CheckContext) -> Finding:
     """Check the calibration files that a scan would copy into its folder."""
     simulated = context.hello is not None and is_simulated(context.hello.backend)
-    facts = checked_calibration(context.rig, simulated).facts()
+    facts = load_checked_calibration(context.rig, simulated).facts()
     if not facts:
         return ok("no calibration file is configured: geometry, filters and metal as in the rig file and the scene")
     observed = "; ".join(f"{kind} of {file.made_utc[:10]}" for kind, file in facts.items())
@@ -483,7 +483,7 @@ def check_pulses(context: CheckContext) -> Finding:
         return not_checked("--no-pulse: no SYNC_IN pulse is sent", "omit --no-pulse; nothing moves")
     if not context.usable_cards:
         return not_checked("no capture card is usable")
-    rig = with_boards(context.rig, context.usable_cards)
+    rig = select_boards(context.rig, context.usable_cards)
     burst = context.rig.burst
     burst_s = burst.pulses * burst.period_us * 1e-6
     bursts = min(context.options.bursts, MAX_PULSES_AT_REST // burst.pulses, int(MAX_PULSES_AT_REST_S / burst_s))

@@ -33,8 +33,8 @@ from polysight.imaging.images import (
     SubBandImages,
     View,
     correct_tilt,
+    find_needed_gate_m,
     illumination_geometry,
-    needed_gate_m,
     sub_bands,
 )
 from polysight.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, Focus, PlaneEstimate, focus_sweep, move_to_plane
@@ -80,12 +80,12 @@ __all__ = [
     "field_limits",
     "fill_missing",
     "fill_sub_bands",
+    "find_needed_gate_m",
     "focus_sweep",
     "illumination_geometry",
     "image_grid",
     "imaging_facts",
     "move_to_plane",
-    "needed_gate_m",
     "point_response",
     "project",
     "reduction",

@@ -327,7 +327,7 @@ class View:
 AS_IN_RIG_FILE = View()
 
 
-def needed_gate_m(rig: Instrument, depth_m: float = 0.0) -> tuple[float, float]:
+def find_needed_gate_m(rig: Instrument, depth_m: float = 0.0) -> tuple[float, float]:
     """Return the smallest and largest excess path in a rig's image, with planes `depth_m` nearer and farther."""
     antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
     return scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig), depth_m)
@@ -371,7 +371,7 @@ class ImageBuilder:
             import_module("scipy.ndimage")
         plan = plan_raster(rig.grid)
         antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
-        self.gate_m = needed_gate_m(rig, depth_m) if gate_m is None else gate_m
+        self.gate_m = find_needed_gate_m(rig, depth_m) if gate_m is None else gate_m
         self.taper = TAPERS[rig.image.apodisation] if taper is None else taper
         weights_y = window_weights(self.taper, plan.rows)
         weights = np.outer(weights_y, window_weights(self.taper, plan.columns)).astype(np.float32)

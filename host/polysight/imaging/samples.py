@@ -525,7 +525,7 @@ class BoardSamples:
         gain = total / max(1, int(self.valid.sum())) * self._antennas.direct_m
         return np.where(gain == 0, 1, gain)
 
-    def calibrated_samples(self) -> NDArray[np.complex64]:
+    def calibrate_samples(self) -> NDArray[np.complex64]:
         """Return the samples divided by the gain of each RX, not weighted."""
         return self._cube * (1 / self.rx_calibration()).astype(np.complex64)[:, None, None, None]
 
@@ -592,7 +592,7 @@ class BoardSamples:
         samples times -j 2 pi (f_m - f) / c, with f the middle of the sweep.
         """
         imager, _ = self._imager(None)
-        factors = self._by_range()
+        factors = self._compute_range_slope_factors()
         gains = (1 / self.rx_calibration()).astype(np.complex64)
         image: Any = imager.image(self._cube * (gains[:, None, None, None] * factors[:, None, None] * self.weights))
         return (image / self.count).astype(np.complex64), self.mirror_slope(0.0)
@@ -603,14 +603,15 @@ class BoardSamples:
 
     def mirror_slope(self, height_m: float) -> Image:
         """Return the derivative of :meth:`mirror_image` by range, see :meth:`range_slope`."""
-        return self._constant_image(self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m) * self._by_range())
+        echo = self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m)
+        return self._constant_image(echo * self._compute_range_slope_factors())
 
     def _constant_image(self, echo: NDArray[np.complexfloating]) -> Image:
         imager, _ = self._imager(None)
         image: Any = imager.constant(echo.astype(np.complex64), self.weights)
         return (image / self.count).astype(np.complex64)
 
-    def _by_range(self) -> NDArray[np.complex64]:
+    def _compute_range_slope_factors(self) -> NDArray[np.complex64]:
         f = self._reduction.frequencies_hz
         return (-2j * np.pi * (f - f.mean()) / SPEED_OF_LIGHT_M_S).astype(np.complex64)
 

@@ -98,7 +98,7 @@ def reconstruct(
     """
     model = _Model(board)
     weights = np.sqrt(board.weights if used is None else board.weights * used)
-    data = board.calibrated_samples() * weights
+    data = board.calibrate_samples() * weights
 
     def forward(x: NDArray[np.complex64]) -> NDArray[np.complex64]:
         return model.samples(x) * weights
@@ -146,7 +146,7 @@ def _largest_eigenvalue(
     return 1.05 * value
 
 
-def added_steps(rig: Instrument) -> tuple[int, int]:
+def find_added_steps(rig: Instrument) -> tuple[int, int]:
     """Return into how many steps (row, column) those of a rig's grid are divided, so that its image has no ghosts.
 
     The image itself is the scene: ghosts of objects in it must lie outside. At most `MOST_ADDED`.
@@ -174,7 +174,7 @@ def fill_missing(
     ConfigError
         if positions are missing and the aperture needs the direct sum: its hundred images would take hours.
     """
-    steps = added_steps(builder.rig)
+    steps = find_added_steps(builder.rig)
     filled = ImageBuilder(_finer(builder.rig, steps), builder.taper, gate_m=builder.gate_m)
     errors = {}
     for name, board in filled.boards.items():
@@ -214,7 +214,7 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
     """Predict the samples of a board's missing positions and put them in their place; return their errors."""
     model = _Model(board)
     recorded = board.valid.copy()
-    samples = board.calibrated_samples()
+    samples = board.calibrate_samples()
     tested = _positions_to_test(recorded)
     first = reconstruct(board, iterations, used=~tested)
     error = None
@@ -224,7 +224,7 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
         error = _norm_of_image(model, wrong, weights) / _norm_of_image(model, samples, weights)
     last = reconstruct(board, max(1, iterations // 2), start=first.image)
     board.fill(model.samples(last.image))
-    samples = board.calibrated_samples()
+    samples = board.calibrate_samples()
     reconstructed = _norm_of_image(model, samples, board.taper * ~recorded)
     share = reconstructed / _norm_of_image(model, samples, board.taper)
     return ReconstructedPositions(

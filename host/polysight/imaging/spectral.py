@@ -293,13 +293,13 @@ class RowSpectra:
         cycles = np.outer(starts_m - self._origin, self.lattice.wavenumbers)
         return self.put(np.exp(-2j * np.pi * cycles).astype(np.complex64))
 
-    def of_rows(self, rows: Any, ramps: Any) -> Any:
+    def transform_rows(self, rows: Any, ramps: Any) -> Any:
         """Return the spectra of rows [..., row, column] in the kernel's band, [..., row, k]."""
         spectra = self._fft.fft(rows, n=self.period, axis=-1)
         return self.xp.take(spectra, self._take, axis=-1) * ramps
 
-    def to_rows(self, spectra: Any, ramps: Any) -> Any:
-        """Apply the adjoint of :meth:`of_rows`."""
+    def transform_rows_adjoint(self, spectra: Any, ramps: Any) -> Any:
+        """Apply the adjoint of :meth:`transform_rows`."""
         xp = self.xp
         count = self.lattice.band.size
         columns = self.aperture.offsets_m.shape[1]
@@ -308,11 +308,11 @@ class RowSpectra:
         folded = xp.sum(xp.reshape(spectrum, (*spectra.shape[:-1], self.lattice.stride_x, self.period)), axis=-2)
         return self._fft.ifft(folded, axis=-1)[..., :columns] * self.period
 
-    def of_pixels(self, image: Any) -> Any:
-        """Apply the adjoint of :meth:`to_pixels`: [..., ny, nx] to [..., ny, k]."""
+    def evaluate_pixels_adjoint(self, image: Any) -> Any:
+        """Apply the adjoint of :meth:`evaluate_pixels`: [..., ny, nx] to [..., ny, k]."""
         return self.xp.matmul(image, self.xp.conj(self._to_pixels).mT)
 
-    def to_pixels(self, spectra: Any) -> Any:
+    def evaluate_pixels(self, spectra: Any) -> Any:
         """Evaluate the spectra of rows of pixels [..., ny, k] at the pixels, [..., ny, nx]."""
         return self.xp.matmul(spectra, self._to_pixels)
 
@@ -346,12 +346,12 @@ class SpectralImager(RowSpectra):
         channels = self.xp.reshape(samples, (rx * m, rows, columns))
         total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
         for c in range(rx * m):
-            total += self._kernels[c, :, :] * self._along_y(self.of_rows(channels[c, :, :], self._ramps))
+            total += self._kernels[c, :, :] * self._along_y(self.transform_rows(channels[c, :, :], self._ramps))
         return self._inverse(total)
 
     def spectra_of_row(self, samples: Any, index: int) -> Any:
         """Return the spectra [..., k] of a row [..., column] for :meth:`image_of_spectra`."""
-        return self.of_rows(samples, self._ramps[index, :])
+        return self.transform_rows(samples, self._ramps[index, :])
 
     def image_of_spectra(self, spectra: Any, factors: Any) -> Any:
         """Return :meth:`image` of rows transformed along x [rx, frequency, row, k], with a factor per RX."""
@@ -374,14 +374,14 @@ class SpectralImager(RowSpectra):
             for c in range(channels.shape[0]):
                 total += self._kernels[c, :, :] * channels[c]
             self._echo = (echo, total)
-        white = self._along_y(self.of_rows(xp.astype(weights, xp.complex64), self._ramps))
+        white = self._along_y(self.transform_rows(xp.astype(weights, xp.complex64), self._ramps))
         return self._inverse(self._echo[1] * white)
 
     def samples(self, image: Any) -> Any:
         """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
         xp = self.xp
         sizes = self.lattice
-        lines = self.of_pixels(image)
+        lines = self.evaluate_pixels_adjoint(image)
         spread = xp.zeros((sizes.size_y, lines.shape[-1]), dtype=xp.complex64, device=self.device)
         end = self._last + sizes.pixel_stride * lines.shape[0]
         spread[self._last : end : sizes.pixel_stride, :] = lines
@@ -389,7 +389,7 @@ class SpectralImager(RowSpectra):
         out = []
         for c in range(self._kernels.shape[0]):
             product = self._fft.ifft(xp.conj(self._kernels[c, :, :]) * spectrum, axis=0)
-            out.append(self.to_rows(xp.take(product, self._rows, axis=0), self._ramps))
+            out.append(self.transform_rows_adjoint(xp.take(product, self._rows, axis=0), self._ramps))
         return xp.reshape(xp.stack(out), self.aperture.shape)
 
     def _along_y(self, lines: Any) -> Any:
@@ -402,7 +402,7 @@ class SpectralImager(RowSpectra):
 
     def _inverse(self, total: Any) -> Any:
         lines = self.xp.take(self._fft.ifft(total, axis=0), self._pixel_rows, axis=0)
-        return self.to_pixels(lines)
+        return self.evaluate_pixels(lines)
 
 
 class IncrementalImager(RowSpectra):
@@ -442,8 +442,8 @@ class IncrementalImager(RowSpectra):
             Stage offset of the first column.
         """
         ramp = self.ramps(np.array([start_m]))[0, :]
-        white = self.of_rows(self.xp.astype(weights, self.xp.complex64), ramp)
-        self.add_spectra(index, self.of_rows(samples, ramp), white)
+        white = self.transform_rows(self.xp.astype(weights, self.xp.complex64), ramp)
+        self.add_spectra(index, self.transform_rows(samples, ramp), white)
 
     def add_spectra(self, index: int, lines: Any, white: Any) -> None:
         """Add a row that is transformed along x, [rx, frequency, k], and its weights, [k]."""
@@ -458,11 +458,11 @@ class IncrementalImager(RowSpectra):
     def image_of_sum(self, factors: Any) -> Any:
         """Return the image of the rows so far, with a factor per RX [rx], complex64 [ny, nx]."""
         total = self.xp.matmul(self._sum, self.put(np.asarray(factors, np.complex64))[:, None])[:, :, 0]
-        return self.to_pixels(total.mT)
+        return self.evaluate_pixels(total.mT)
 
     def constant_of_sum(self) -> Any:
         """Return the image of the constant echo for the rows so far, complex64 [ny, nx]."""
-        return self.to_pixels(self._constant.mT)
+        return self.evaluate_pixels(self._constant.mT)
 
     def image(self, samples: Any) -> Any:
         """See :class:`polysight.imaging.samples.Imager`; removes all rows first."""
@@ -480,13 +480,13 @@ class IncrementalImager(RowSpectra):
     def samples(self, image: Any) -> Any:
         """See :class:`polysight.imaging.samples.Imager`."""
         xp, (rx, m, rows, columns) = self.xp, self.aperture.shape
-        lines = self.of_pixels(image).mT[:, :, None]
+        lines = self.evaluate_pixels_adjoint(image).mT[:, :, None]
         ramps = self.ramps(row_starts_m(self.aperture.offsets_m))
         out = []
         for index in range(rows):
             parts = xp.matmul(xp.conj(self._kernels[:, self._lags(index), :]).mT, lines)
             answer = xp.matmul(xp.conj(self._components).mT, parts)[:, :, 0]
-            out.append(self.to_rows(answer.mT, ramps[index, :]))
+            out.append(self.transform_rows_adjoint(answer.mT, ramps[index, :]))
         return xp.permute_dims(xp.reshape(xp.stack(out), (rows, rx, m, columns)), (1, 2, 0, 3))
 
     def _clear(self, echo: Any) -> None:

@@ -102,7 +102,7 @@ def _fresh_folder(out: Path) -> None:
 
 
 @contextmanager
-def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) -> Iterator[Path]:
+def run_simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) -> Iterator[Path]:
     """Run the simulated rig with its Pi process; yield the rig file with their addresses.
 
     It runs in a session of its own, so that Ctrl-C ends the scan first and the rig after it.
@@ -166,7 +166,7 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
     check_scenes([scene], config)
     _fresh_folder(out)
     sys.stderr.write(f"simulated rig: no hardware is involved. Scene {scene}\n")
-    with simulated_rig(config, scene, out / "rig", time_scale or TIME_SCALE) as rig_file:
+    with run_simulated_rig(config, scene, out / "rig", time_scale or TIME_SCALE) as rig_file:
         scan = [sys.executable, "-m", "polysight", "scan", "--config", str(rig_file), "--out", str(out / "scan")]
         scan += ["--truth", str(rig_file.parent / "truth.json")]
         status = _run_to_its_end(scan)

@@ -116,7 +116,7 @@ def _board(rig: Instrument, name: str, config: Path) -> Board:
         ) from None
 
 
-def _with_address(board: Board, at: str) -> Board:
+def _set_address(board: Board, at: str) -> Board:
     """Return the board with its card's present address, `ADDRESS` or `ADDRESS:PORT`. Raises ConfigError."""
     address, _, port = at.partition(":")
     if port.isdigit():
@@ -150,7 +150,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
             "two cards share one address",
             "give each its own card_address",
         )
-    now = _with_address(board, at)
+    now = _set_address(board, at)
     with CardClient(now, rig.limits.command_timeout_s) as card:
         message = (
             f"{name}: a card, FPGA {card.version()}, answers at {now.card_address}:{now.command_port}; its EEPROM is"

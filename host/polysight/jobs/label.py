@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.cells import cell_len
 
-from polysight.jobs.output import print_lines, simulated_scan
+from polysight.jobs.output import name_scan, print_lines
 from polysight.materials import (
     SPECIMEN,
     Box,
@@ -391,7 +391,7 @@ def _listing(
     folder: Path, products: ProcessedScan, saved_labels: tuple[Path, Labels] | None, patches: Sequence[FoundPatch]
 ) -> str:
     """Text of the boxes drawn, the patches found, and how to name them."""
-    lines = [f"{products.folder}: {simulated_scan(products.scan_id, bool(products.simulated))}"]
+    lines = [f"{products.folder}: {name_scan(products.scan_id, bool(products.simulated))}"]
     lines.append(f"image: {format_box(image_extent_mm(products.x_m, products.y_m))} from its centre")
     if saved_labels:
         boxes = saved_labels[1].in_mm(products.x_m, products.y_m)

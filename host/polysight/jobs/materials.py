@@ -17,7 +17,7 @@ import numpy.typing as npt
 from rich.cells import cell_len
 
 from polysight.imaging import sub_bands
-from polysight.jobs.output import print_json, print_lines, simulated_scan
+from polysight.jobs.output import name_scan, print_json, print_lines
 from polysight.materials import (
     AMPLITUDE_ERROR,
     PATCHES,
@@ -206,7 +206,7 @@ def _load_library(data: Path) -> Library:
     return Library.load(data)
 
 
-def _measured_or_simulated(is_simulated: bool) -> str:
+def _describe_origin(is_simulated: bool) -> str:
     return "simulated" if is_simulated else "measured"
 
 
@@ -223,7 +223,7 @@ def concentration(data: Path, values: Mapping[str, float], confidence: float, as
         )
     result = fit_concentration(library, values, confidence)
     left_out = sorted(set(library.names) - set(concentrations(library.names, values)))
-    source = _measured_or_simulated(library.simulated)
+    source = _describe_origin(library.simulated)
     if as_json:
         content = {
             "source": source,
@@ -269,7 +269,7 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
         return max((print_verdict(s, to_terminal=False) for s in scans), default=0)
     worst = 0
     for scan in scans:
-        sys.stdout.write(f"{scan.folder}: {simulated_scan(scan.scan_id, bool(scan.simulated))}\n")
+        sys.stdout.write(f"{scan.folder}: {name_scan(scan.scan_id, bool(scan.simulated))}\n")
         status = print_verdict(scan)
         if status == 0:
             sys.stdout.write("".join(map(_patch_line, scan.segments)))
@@ -409,7 +409,7 @@ def _score_models(data: Path, as_json: bool) -> int:
         library = library.at_angle(library.angles_deg[-1])
     samples = Samples.from_library(library)
     scores = [score(samples, model, by_pixel=by_pixel) for model in MODELS for by_pixel in (False, True)]
-    source = _measured_or_simulated(library.simulated)
+    source = _describe_origin(library.simulated)
     if as_json:
         rows = [{k: v for k, v in asdict(s).items() if "confusion" not in k and k != "names"} for s in scores]
         best = max(scores[::2], key=lambda s: s.pixels + s.patches)
@@ -453,7 +453,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
         )
     named = classifier.scan([m.features for m in matched], [m.evidence for m in matched])
     content = {
-        "source": _measured_or_simulated(any(s.simulated for s in scans)),
+        "source": _describe_origin(any(s.simulated for s in scans)),
         "incidence_deg": [s.angle_deg for s in scans],
         "model": classifier.model,
         "library": classifier_sentence(classifier),

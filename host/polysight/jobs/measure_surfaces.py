@@ -55,7 +55,7 @@ def take_board_samples(board: BoardSamples, is_mirrored: bool) -> Samples:
     """Return the samples of one board; a scan recorded by columns is held mirrored in x = y."""
     antennas = board.aperture.antennas
     samples = Samples(
-        cube=board.calibrated_samples(),
+        cube=board.calibrate_samples(),
         valid=board.valid,
         offsets_m=board.aperture.offsets_m,
         frequencies_hz=board.aperture.frequencies_hz,

@@ -32,7 +32,7 @@ def load_rig_file(config: Path | None) -> Instrument | None:
     return load_instrument(config)
 
 
-def simulated_scan(scan_id: str, is_simulated: bool) -> str:
+def name_scan(scan_id: str, is_simulated: bool) -> str:
     """`scan NAME`, or `simulated scan NAME`."""
     if is_simulated:
         return f"simulated scan {scan_id}"

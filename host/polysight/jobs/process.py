@@ -14,7 +14,7 @@ from polysight.calibration import Calibration, calibration_of_rig, calibration_o
 from polysight.data import find_packaged
 from polysight.imaging import PLANE_REACH_M, Focus, Images, PlaneEstimate, focus_sweep, image_grid
 from polysight.jobs.measure_surfaces import add_surfaces, has_steep_patch
-from polysight.jobs.output import count_steps, current_step, print_lines, say, simulated_scan
+from polysight.jobs.output import count_steps, current_step, name_scan, print_lines, say
 from polysight.materials import Plates, find_truth, read_labels, read_truth
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference, plane_reference
@@ -23,7 +23,7 @@ from polysight.process import (
     Products,
     analyse_given_images,
     boxes_as_patches,
-    imaged_scan,
+    collect_imaged_scan,
     is_given_images,
     load_classifier,
     make_reference,
@@ -63,7 +63,7 @@ def add_rows(pipeline: Pipeline, data: Path, threads: int | None = None) -> None
         pass
 
 
-def processed_rows(source: Source, data: Path, settings: Settings = DEFAULT) -> Pipeline:
+def process_rows(source: Source, data: Path, settings: Settings = DEFAULT) -> Pipeline:
     """Return a pipeline to which all rows of a source were added."""
     pipeline = Pipeline(source, settings, samples="keep")
     add_rows(pipeline, data)
@@ -80,7 +80,7 @@ def pixel_axes(pipeline: Pipeline) -> Axes:
 
 def form_scan_images(data: Path, settings: Settings = DEFAULT) -> tuple[Pipeline, Images]:
     """Process a recorded scan of any layout up to its images. Raises PolysightError."""
-    pipeline = processed_rows(open_source(data, settings.path("config"), dropped=True), data, settings)
+    pipeline = process_rows(open_source(data, settings.path("config"), dropped=True), data, settings)
     return pipeline, pipeline.form_images()
 
 
@@ -121,7 +121,7 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
     # These images differ by less than 1e-6 from those that `make_products` puts in their place.
     images = pipeline.form_images(from_sums=True)
     with making_products(out, pipeline.source.scan_id) as new:
-        scan = imaged_scan(out, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
+        scan = collect_imaged_scan(out, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
         save_images(new, scan)
     # A terminal that is closed is no reason to leave out the rest.
     with suppress(OSError):
@@ -334,15 +334,15 @@ def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
     if isinstance(source, ScanFolder) and raw_dropped(out):
         # Products in `out` may be all that is left of it
         require_raw(source)
-    pipeline = processed_rows(source, data, settings)
+    pipeline = process_rows(source, data, settings)
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
-        save_images(new, imaged_scan(out, source, pipeline.rig, images, pipeline.quality))
+        save_images(new, collect_imaged_scan(out, source, pipeline.rig, images, pipeline.quality))
     lines = (*pipeline.quality.coverage().lines(), f"image: {out / IMAGE}")
     print_lines(lines)
     sys.stdout.flush()
     pipeline.quality.note_imaging(pipeline.images, images)
-    write_json(out / QUALITY, imaged_scan(out, source, pipeline.rig, images, pipeline.quality).quality)
+    write_json(out / QUALITY, collect_imaged_scan(out, source, pipeline.rig, images, pipeline.quality).quality)
     if not images.valid.any():
         raise _no_pixel_error(pipeline, data)
     return 0
@@ -354,7 +354,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
 
     source = open_source(data, config, dropped=True)
     out.mkdir(parents=True, exist_ok=True)
-    pipeline = processed_rows(source, data, Settings(depth_range_mm=max(depth_mm, 1e3 * PLANE_REACH_M)))
+    pipeline = process_rows(source, data, Settings(depth_range_mm=max(depth_mm, 1e3 * PLANE_REACH_M)))
     builder = pipeline.images
     say("images, and the plane of the plates")
     images = pipeline.form_images()
@@ -377,7 +377,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     sweep = sharpest.to_dict() | {"plates": plates.to_dict()}
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
     (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *pixel_axes(pipeline), source.simulated))
-    head = simulated_scan(source.scan_id, source.simulated)
+    head = name_scan(source.scan_id, source.simulated)
     print_lines(_focus_lines(head, pipeline.rig.geometry.object_distance_mm, sharpest, plates))
     sys.stdout.write(f"figure: {out / 'focus.png'}\n")
     return 0

@@ -265,11 +265,11 @@ def replace_folder(folder: Path, as_json: bool) -> int:
     if as_json:
         print_json([asdict(r) for r in rows])
     else:
-        print_lines(_replaced_lines(folder, rows))
+        print_lines(_list_replaced_lines(folder, rows))
     return exit_status(not any(r.damaged for r in rows))
 
 
-def _replaced_lines(folder: Path, rows: list[Replaced]) -> list[str]:
+def _list_replaced_lines(folder: Path, rows: list[Replaced]) -> list[str]:
     changed = [
         f"row {r.row} of {r.board}: {r.missing_before} bytes missing before, {r.missing_after} now"
         for r in rows

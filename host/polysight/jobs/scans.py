@@ -222,7 +222,7 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
 
 
 def _drop(scan: ScanFolder, folder: Path, products: Path, yes: bool) -> int:
-    processed = processed_digests(products)
+    processed = find_processed_digests(products)
     rows = droppable(scan, processed)
     for line in rows.kept_files:
         sys.stdout.write(f"kept: {line}\n")
@@ -280,7 +280,7 @@ def _keep(products: Path, scan: ScanFolder) -> None:
     write_json(products / QUALITY, {**content, "raw_dropped": mark})
 
 
-def processed_digests(folder: Path) -> Digests:
+def find_processed_digests(folder: Path) -> Digests:
     """Return the CRCs of the processed rows, by board. Raises DataError."""
     products = read_products(folder)
     # Raises when it cannot be read

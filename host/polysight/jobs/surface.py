@@ -17,7 +17,7 @@ from polysight.jobs.measure_surfaces import (
     thin_out,
 )
 from polysight.jobs.output import load_rig_file, print_json, print_lines, say
-from polysight.jobs.process import processed_rows
+from polysight.jobs.process import process_rows
 from polysight.pipeline import Pipeline
 from polysight.settings import Settings, path_text
 from polysight.store import open_source
@@ -50,7 +50,7 @@ RADIUS_TOLERANCE = 0.15
 def seen_by(data: Path, config: Path | None) -> tuple[Pipeline, Optics, Seen]:
     """Process the rows of a scan, and find the specular points in it. Raises PolysightError."""
     source = open_source(data, config, dropped=True)
-    pipeline = processed_rows(source, data, Settings(config=path_text(config), depth_range_mm=1e3 * DEPTH_M))
+    pipeline = process_rows(source, data, Settings(config=path_text(config), depth_range_mm=1e3 * DEPTH_M))
     optics = make_rig_optics(pipeline.rig)
     say("specular points")
     points = see_rows(pipeline, optics)

@@ -19,7 +19,7 @@ import numpy as np
 from polysight.imaging import Images
 from polysight.jobs.demo import check_scenes, run_simulator
 from polysight.jobs.output import print_lines, steps
-from polysight.jobs.process import processed_rows
+from polysight.jobs.process import process_rows
 from polysight.materials import (
     KnownScene,
     Labels,
@@ -72,13 +72,13 @@ def training_scan(data: Path, config: Path) -> TrainingScan:
     check_labelled(data)
     saved_labels = find_labels(data)
     if saved_labels is None:
-        return _from_truth(scan, config)
+        return _process_simulated(scan, config)
     path, labels = saved_labels
     try:
         saved = _products_without_rows(data, scan)
         if saved is not None:
-            return _from_images(saved, labels)
-        return _from_rows(scan, config, labels)
+            return _load_images(saved, labels)
+        return _process_rows(scan, config, labels)
     except DataError as e:
         problem = e.what
         if str(path) not in problem:
@@ -125,10 +125,10 @@ def _products_without_rows(data: Path, scan: Path) -> ProcessedScan | None:
     return None
 
 
-def _from_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
+def _process_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
     """Process a labelled scan from its rows, as `polysight process --labels`."""
     source = open_source(data, config)
-    pipeline = processed_rows(source, data, Settings(model="none"))
+    pipeline = process_rows(source, data, Settings(model="none"))
     images = pipeline.form_images()
     checked = check_labels(labels, images.x_m, images.y_m, images.valid)
     if checked.metal is None and pipeline.calibration.reference() is None:
@@ -137,10 +137,10 @@ def _from_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
     findings = pipeline.examine(images)
     if not findings.verdict.usable:
         raise findings.verdict.error("no library was written")
-    return _with_labels(source.scan_id, findings.analysis, source.simulated, checked)
+    return _add_labels(source.scan_id, findings.analysis, source.simulated, checked)
 
 
-def _from_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
+def _load_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
     """Use the saved images of a labelled scan."""
     if saved.verdict is not None and not saved.verdict.usable:
         raise saved.verdict.error("no library was written")
@@ -151,7 +151,7 @@ def _from_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
         raise _no_metal(saved.folder)
     pair = Images(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
     materials = analyse(pair, _read_optics(saved), KnownScene(segmentation, metal))
-    return _with_labels(saved.scan_id, materials, saved.simulated is not False, checked)
+    return _add_labels(saved.scan_id, materials, saved.simulated is not False, checked)
 
 
 def _read_optics(saved: ProcessedScan) -> Optics:
@@ -182,7 +182,7 @@ def _read_optics(saved: ProcessedScan) -> Optics:
     )
 
 
-def _with_labels(scan: str, materials: MaterialsResult, simulated: bool, labels: Labels) -> TrainingScan:
+def _add_labels(scan: str, materials: MaterialsResult, simulated: bool, labels: Labels) -> TrainingScan:
     """Return the training scan with names and specimens of the boxes."""
     boxes = dict(enumerate(labels.boxes, 1))
     for patch in materials.patches:
@@ -193,14 +193,14 @@ def _with_labels(scan: str, materials: MaterialsResult, simulated: bool, labels:
     return TrainingScan(scan, materials, simulated, versions=versions(), names=names, specimens=specimens)
 
 
-def _from_truth(data: Path, config: Path) -> TrainingScan:
+def _process_simulated(data: Path, config: Path) -> TrainingScan:
     """Process a simulated scan with known plates."""
     source = open_source(data, config)
     plates = read_truth(data / TRUTH)
     metal = next((t for t in plates if t.metal), None)
     if metal is None:
         raise DataError(f"{data}: no metal plate in {TRUTH}", "features are relative to metal", "add one to the scene")
-    pipeline = processed_rows(source, data)
+    pipeline = process_rows(source, data)
     images = pipeline.form_images()
     segmentation, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
     materials = pipeline.find_materials(images, KnownScene(segmentation, metal.box_mm, plates=plates))
@@ -231,7 +231,7 @@ def train_from_scans(data: Sequence[Path], config: Path, note: str = "") -> Libr
     """
     for folder in data:
         check_labelled(folder)
-    return make_library(with_unique_names([training_scan(folder, config) for folder in data]), note)
+    return make_library(number_equal_names([training_scan(folder, config) for folder in data]), note)
 
 
 def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, times: int = 1) -> int:
@@ -277,13 +277,13 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
     note = ""
     if all(s.simulated for s in scans):
         note = "simulated scans of " + ", ".join(dict.fromkeys(s.scan for s in scans))
-    library = make_library(with_unique_names(scans), note)
+    library = make_library(number_equal_names(scans), note)
     library.save(out)
     print_lines([*_summary(out, library), *accuracy_lines(library)])
     return 0
 
 
-def with_unique_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
+def number_equal_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
     """Number the scans of equal names.
 
     Raises

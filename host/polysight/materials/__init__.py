@@ -17,11 +17,11 @@ from polysight.materials.analyse import (
     KnownScene,
     Optics,
     analyse,
-    expected_pixel_accuracy,
     image_centre_mm,
     name_permittivity,
     permittivity_change,
     pixel_accuracy,
+    predict_pixel_accuracy,
 )
 from polysight.materials.catalogue import (
     CATALOGUE,
@@ -76,9 +76,9 @@ from polysight.materials.library import (
     Library,
     Model,
     Samples,
-    by_angle,
     feature_matrix,
     ratio_columns,
+    split_by_angle,
 )
 from polysight.materials.measure import NOT_PASSIVE, Permittivity, estimate_permittivity, format_permittivity
 from polysight.materials.names import LAYER, UNKNOWN, NamedPatch, PatchName
@@ -97,6 +97,7 @@ from polysight.materials.sub_bands import (
     AMPLITUDE_ERROR,
     LAYER_FORMS,
     ConcentrationResult,
+    add_bands,
     concentrations,
     fit_concentration,
     fit_row,
@@ -104,7 +105,6 @@ from polysight.materials.sub_bands import (
     layer_content,
     parse_layer,
     polarisation_angle_rad,
-    with_bands,
 )
 from polysight.materials.train import (
     LabelledScan,
@@ -177,12 +177,12 @@ __all__ = [
     "TrainingScan",
     "TruthPlate",
     "accuracy_lines",
+    "add_bands",
     "analyse",
     "angle_in_text",
     "axis_mm",
     "box_mask",
     "box_name",
-    "by_angle",
     "calibration_error",
     "check_labels",
     "classifier_sentence",
@@ -190,7 +190,6 @@ __all__ = [
     "concentrations",
     "entries_of_boxes",
     "estimate_permittivity",
-    "expected_pixel_accuracy",
     "feature_matrix",
     "find_copies",
     "find_material",
@@ -225,6 +224,7 @@ __all__ = [
     "permittivity_change",
     "pixel_accuracy",
     "polarisation_angle_rad",
+    "predict_pixel_accuracy",
     "ratio_columns",
     "read_catalogue",
     "read_labelled_scan",
@@ -238,8 +238,8 @@ __all__ = [
     "score_unseen_materials",
     "slope",
     "specimen_seed",
+    "split_by_angle",
     "truth_plates",
-    "with_bands",
 ]
 
 

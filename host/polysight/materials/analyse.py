@@ -622,7 +622,7 @@ def pixel_accuracy(result: MaterialsResult) -> float | None:
     return float(np.concatenate(right).mean()) if right else None
 
 
-def expected_pixel_accuracy(result: MaterialsResult) -> float | None:
+def predict_pixel_accuracy(result: MaterialsResult) -> float | None:
     """Return the share of the pixels of :func:`pixel_accuracy` that the best classifier is expected to name right.
 
     It is the mean probability of each pixel's likeliest material, so that no choice of names is expected to do better

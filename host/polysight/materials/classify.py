@@ -32,12 +32,12 @@ from polysight.materials.library import (
     NamedScan,
     Real,
     Samples,
-    by_angle,
     channel_distances,
     count_votes,
     find_neighbours,
     majority,
     ratio_columns,
+    split_by_angle,
     usable,
 )
 from polysight.materials.names import (
@@ -371,16 +371,16 @@ class Classifier:
         finite are unknown. `evidence` is what each scan says of each patch; None where only the pixels are known.
         """
         if self.model == PAPER:
-            return [self._by_votes(x) for x in patches]
+            return [self._name_by_votes(x) for x in patches]
         named = []
         for x, of_patch in zip(patches, evidence or [None] * len(patches), strict=True):
-            ratios = by_angle(x)[2]
+            ratios = split_by_angle(x)[2]
             if of_patch is None:
                 of_patch = [evidence_of_pixels(t, pixels) for t, pixels in zip(ratios.T, self.kinds, strict=True)]
             named.append(name_patch(self.kinds, of_patch, ratios))
         return named
 
-    def _by_votes(self, x: Real) -> NamedPatch:
+    def _name_by_votes(self, x: Real) -> NamedPatch:
         """Name a patch by the votes of its pixels' nearest neighbours."""
         good = usable(x)
         if not good.any():

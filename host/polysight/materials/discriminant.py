@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.library import Model, NamedScan, Real, Samples, by_angle
+from polysight.materials.library import Model, NamedScan, Real, Samples, split_by_angle
 from polysight.materials.specimens import (
     METAL_SPECIMENS,
     METAL_WITHOUT_ERROR,
@@ -193,7 +193,7 @@ class ErrorDiscriminant(Model):
         shift, spread = estimate_common_error(mean[informative], patch_covariances, self.scan, self.patch_level)
 
         distance2, cost = costs(mean - shift, patch_covariances + spread)
-        probability = _with_none(shares_of_materials(cost), distance2 - self.patch_level)
+        probability = _append_none(shares_of_materials(cost), distance2 - self.patch_level)
         row = np.arange(ids.size)
         best = cost.argmin(axis=1)
         distances = np.sqrt(distance2 / self.patch_level)
@@ -235,7 +235,7 @@ class ErrorDiscriminant(Model):
 
     def _anchor(self, x: Real, of: npt.NDArray[np.intp]) -> None:
         """Set the expansion point of each material's features: the means of its pixels."""
-        h, v, t = by_angle(x)
+        h, v, t = split_by_angle(x)
         logs = np.log(np.maximum(h, 1e-6)), np.log(np.maximum(v, 1e-6))
         of_material = [of == k for k in range(self.names.size)]
         self._anchor_h, self._anchor_v, self._anchor_t = (
@@ -250,7 +250,7 @@ class ErrorDiscriminant(Model):
 
     def _deviations(self, x: Real) -> Real:
         """Return the deviations from every material's anchor, [n, materials, features]."""
-        h, v, t = by_angle(x)
+        h, v, t = split_by_angle(x)
         # Alone, by its own logarithm
         if self.channels == "V":
             return np.log(np.maximum(v, 1e-6))[:, None] - self._anchor_v
@@ -266,7 +266,7 @@ class ErrorDiscriminant(Model):
     @staticmethod
     def _metal_like(x: Real, patch: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
         """Return true for patches 0, 1, ... whose median V / H is nearly 1 under all angles, bool [patch]."""
-        q = by_angle(x)[2]
+        q = split_by_angle(x)[2]
         parts = [q[patch == i] for i in range(patch.max() + 1)]
         middle = np.stack([np.median(p.real, axis=0) + 1j * np.median(p.imag, axis=0) for p in parts])
         return np.asarray((np.abs(middle - 1) < METAL_WITHOUT_ERROR).all(axis=1), np.bool_)
@@ -335,7 +335,7 @@ def _positive(a: Real) -> Real:
     return (vectors * np.maximum(values, 0)) @ vectors.T
 
 
-def _with_none(probability: Real, beyond: Real) -> Real:
+def _append_none(probability: Real, beyond: Real) -> Real:
     """Return the probabilities [n, materials + 1] with, last, that of none of the materials.
 
     `beyond` [n, materials] is the chi-square of a patch minus the threshold that 2 % of a material's patches exceed.

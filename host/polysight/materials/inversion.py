@@ -35,8 +35,8 @@ from polysight.materials.kinds import (
     DensityMap,
     Kinds,
     RatioEvidence,
-    at_angle,
-    pair,
+    move_to_angle,
+    split_complex,
     turn_covariance,
 )
 from polysight.materials.specimens import METAL_WITHOUT_BRIGHTNESS, METAL_WITHOUT_PERMITTIVITY
@@ -380,7 +380,7 @@ class _Scene:
 
     def ratios_of_kinds(self, z: Real, kinds: Kinds) -> Complex:
         """Return t that each patch would have at the angle of the kinds, [..., patch]."""
-        return at_angle(self.ratios(z), self.angle(z), kinds.theta_rad)
+        return move_to_angle(self.ratios(z), self.angle(z), kinds.theta_rad)
 
     def permittivities(self, z: Real) -> Complex:
         """Return the permittivity of every patch, [..., patch]."""
@@ -514,7 +514,7 @@ def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> Patch
     """Estimate one patch from particles of the common errors: ratio, permittivity, shares of the sources, kinds."""
     t = model.ratios(z)[:, i]
     middle = complex(t.mean())
-    ratio_covariance = np.cov(pair(t).T) + model.own[i]
+    ratio_covariance = np.cov(split_complex(t).T) + model.own[i]
     evidence = None
     if model.kinds is not None:
         evidence = _evidence(model, model.kinds, z, i)
@@ -531,9 +531,9 @@ def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> Patch
     drawn_t = t + noise[..., 0] + 1j * noise[..., 1]
     drawn = np.asarray(permittivity_from_ratio(drawn_t, angles), np.complex128)
     # Near metal the moments of the far tail do not exist: three standard deviations of the ratio are kept.
-    difference = pair(drawn_t - middle)
+    difference = split_complex(drawn_t - middle)
     inside = np.einsum("...i,ij,...j->...", difference, np.linalg.inv(ratio_covariance), difference) < CHI2_997
-    parts = pair(drawn[inside] - value)
+    parts = split_complex(drawn[inside] - value)
     covariance = np.asarray(parts.T @ parts / len(parts), np.float64)
     # A tail (the mount may have moved) widens a covariance more than the region that holds 95 %.
     distance2 = np.einsum("...i,ij,...j->...", parts, np.linalg.inv(covariance), parts)
@@ -563,7 +563,7 @@ def _shares_of_sources(model: _Scene, z: Real, i: int, value: complex) -> dict[s
 def _evidence(model: _Scene, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
     """Return what the scene says of a patch's ratio at the angle of the kinds."""
     t = model.ratios_of_kinds(z, kinds)[:, i]
-    covariance = np.cov(pair(t).T) + model.own[i]
+    covariance = np.cov(split_complex(t).T) + model.own[i]
     library_share = USUAL_LIBRARY_SHARE
     if kinds.ours.any():
         library_share = float(model.library_share(z).mean())

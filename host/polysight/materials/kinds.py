@@ -96,7 +96,7 @@ def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Comp
     return np.asarray(1 / ratio_from_permittivity(permittivity, theta_rad), np.complex128)
 
 
-def at_angle(t: Complex, theta_rad: npt.ArrayLike, other_rad: float) -> Complex:
+def move_to_angle(t: Complex, theta_rad: npt.ArrayLike, other_rad: float) -> Complex:
     """Return t of the same half space at another angle.
 
     With u = (1 + t) / (1 - t) Eq. 3 is sqrt(eps - sin^2) = u sin^2 / cos.
@@ -111,13 +111,13 @@ def at_angle(t: Complex, theta_rad: npt.ArrayLike, other_rad: float) -> Complex:
     return np.where(np.isfinite(moved), moved, t)
 
 
-def at_kinds(evidence: RatioEvidence, kinds: Kinds) -> RatioEvidence:
+def move_to_angle_of_kinds(evidence: RatioEvidence, kinds: Kinds) -> RatioEvidence:
     """Return what a scan says of a patch's ratio at the angle of the kinds."""
-    t = at_angle(np.array(evidence.inverse_ratio), evidence.theta_rad, kinds.theta_rad)
+    t = move_to_angle(np.array(evidence.inverse_ratio), evidence.theta_rad, kinds.theta_rad)
     return replace(evidence, theta_rad=kinds.theta_rad, inverse_ratio=complex(t))
 
 
-def pair(value: npt.ArrayLike) -> Real:
+def split_complex(value: npt.ArrayLike) -> Real:
     """Return real and imaginary part on a last axis of two."""
     value = np.asarray(value, np.complex128)
     return np.stack([value.real, value.imag], axis=-1)
@@ -126,7 +126,7 @@ def pair(value: npt.ArrayLike) -> Real:
 def turn_covariance(factor: npt.ArrayLike, covariance: npt.ArrayLike) -> Real:
     """Return the covariance [..., 2, 2] of a complex number with `covariance`, times a complex `factor` [...]."""
     factor = np.asarray(factor, np.complex128)
-    matrix = np.stack([pair(factor), pair(1j * factor)], axis=-1)
+    matrix = np.stack([split_complex(factor), split_complex(1j * factor)], axis=-1)
     return np.asarray(matrix @ np.asarray(covariance, np.float64) @ matrix.swapaxes(-1, -2), np.float64)
 
 
@@ -169,7 +169,7 @@ class Kinds:
         """Return the densities of the library's kinds and of all others on a rectangle of t, for quick looking up."""
         real = np.linspace(low.real, high.real, cells)
         imag = np.linspace(low.imag, high.imag, cells)
-        other_density = self.other * self.any_half_space(real[None, :] + 1j * imag[:, None], covariance)
+        other_density = self.other * self.compute_half_space_density(real[None, :] + 1j * imag[:, None], covariance)
         if self.sheet_share:
             other_density += self.sheet_share * _histogram(self.sheets, real, imag, covariance)
         density = np.stack([np.zeros_like(other_density), other_density])
@@ -188,7 +188,7 @@ class Kinds:
         density[1] = (1 - STACK_SHARE) * density[1] + STACK_SHARE / np.pi
         return DensityMap(low, high, np.log(density + 1e-12))
 
-    def any_half_space(self, t: Complex, covariance: Real) -> Real:
+    def compute_half_space_density(self, t: Complex, covariance: Real) -> Real:
         """Return the density of t of any half space: ln eps' uniform, eps'' uniform on a scale that ends in a line.
 
         Errors of the measurement soften the border of the passive half spaces: the density there is that of the
@@ -197,7 +197,7 @@ class Kinds:
         s = np.sin(self.theta_rad)
         cosine = np.cos(self.theta_rad)
         with np.errstate(divide="ignore", invalid="ignore"):
-            parts = pair(permittivity_from_ratio(t, self.theta_rad))
+            parts = split_complex(permittivity_from_ratio(t, self.theta_rad))
             slope = np.abs(4 * s**2 * (s / cosine) ** 2 * (1 + t) / (1 - t) ** 3)
         eps_real = np.where(np.isfinite(parts[..., 0]), parts[..., 0], REAL_RANGE[1])
         eps_loss = np.where(np.isfinite(parts[..., 1]), -parts[..., 1], 0.0)
@@ -226,7 +226,7 @@ class DensityMap:
     def log_densities(self, t: Complex) -> Real:
         """Return the logarithms of both densities at t [...], [2, ...]; beyond the rectangle those of its border."""
         _, rows, columns = self.log_density.shape
-        parts = pair(t)
+        parts = split_complex(t)
         x = (parts[..., 0] - self.low.real) / (self.high.real - self.low.real) * (columns - 1)
         y = (parts[..., 1] - self.low.imag) / (self.high.imag - self.low.imag) * (rows - 1)
         place = np.stack([y, x])
@@ -256,7 +256,7 @@ def _effects(kind: Kind, theta_rad: float) -> Real:
         return METAL_SPREAD * np.eye(2)
     eps = kind.permittivity
     stretched = np.array([eps + _STEP * eps.real, eps - 1j * _STEP])
-    slopes = pair((inverse_ratio(stretched, theta_rad) - inverse_ratio(eps, theta_rad)) / _STEP)
+    slopes = split_complex((inverse_ratio(stretched, theta_rad) - inverse_ratio(eps, theta_rad)) / _STEP)
     loss_std = np.hypot(kind.spread[1] * abs(eps.imag), LEAST_LOSS_SPREAD)
     return np.asarray((slopes * np.array([[kind.spread[0]], [loss_std]])).T, np.float64)
 
@@ -278,7 +278,7 @@ def _shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
 @cache
 def draw_sheets(theta_rad: float, frequency_hz: float = SHEET_HZ) -> Complex:
     """Return t of thin plates before air or a holder, complex128 [draw]; the same plates at every angle."""
-    eps, holder, thickness_m = _drawn_sheets()
+    eps, holder, thickness_m = _draw_sheet_properties()
     r_s, r_p = multilayer([eps, holder], [thickness_m, np.inf], frequency_hz, theta_rad)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = r_p / r_s
@@ -286,7 +286,7 @@ def draw_sheets(theta_rad: float, frequency_hz: float = SHEET_HZ) -> Complex:
 
 
 @cache
-def _drawn_sheets() -> tuple[Complex, Complex, Real]:
+def _draw_sheet_properties() -> tuple[Complex, Complex, Real]:
     """Return permittivity, permittivity behind, and thickness in metres of thin plates, [draw] each."""
     unit = np.random.default_rng(0).random((_SHEETS, 5))
     real, tangent, size_mm = (
@@ -330,7 +330,7 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
     t = np.array([evidence.inverse_ratio for evidence in seen])
     effects = np.concatenate([kind.effects for kind in kinds], axis=1)
     inverse = np.linalg.inv(effects @ effects.mT + 1e-10 * np.eye(size) + errors)
-    difference = pair(t - np.stack([kind.t for kind in kinds], axis=1)).reshape(-1, size)
+    difference = split_complex(t - np.stack([kind.t for kind in kinds], axis=1)).reshape(-1, size)
     distance2 = np.einsum("ki,kij,kj->k", difference, inverse, difference)
     weight = first.share * np.sqrt(np.linalg.det(inverse / (2 * np.pi))) * np.exp(-0.5 * distance2)
     ours = float(np.mean([evidence.library_share for evidence in seen])) if first.ours.any() else 0.0
@@ -350,7 +350,7 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
 def _normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
     """Return the normal density of draws [draw, scan] about `mean` [scan], with `covariance` [2 scan, 2 scan]."""
     inverse = np.linalg.inv(covariance)
-    difference = pair(draws - mean).reshape(len(draws), -1)
+    difference = split_complex(draws - mean).reshape(len(draws), -1)
     scale = np.sqrt(np.linalg.det(inverse / (2 * np.pi)))
     return scale * np.exp(-0.5 * np.einsum("ni,ij,nj->n", difference, inverse, difference))
 
@@ -364,10 +364,10 @@ def _other_density(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> flo
     mean = seen[best].inverse_ratio
     covariance = seen[best].covariance
     if len(seen) == 1:
-        return float(kinds[best].any_half_space(np.array(mean), covariance))
+        return float(kinds[best].compute_half_space_density(np.array(mean), covariance))
     noise = np.random.default_rng(0).multivariate_normal(np.zeros(2), covariance, _HALF_SPACES, method="cholesky")
     t = mean + noise[:, 0] + 1j * noise[:, 1]
-    density = kinds[best].any_half_space(t, 1e-8 * np.eye(2))
+    density = kinds[best].compute_half_space_density(t, 1e-8 * np.eye(2))
     eps = permittivity_from_ratio(t, kinds[best].theta_rad)
     for i, evidence in enumerate(seen):
         if i != best:

@@ -402,7 +402,7 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
         clean = box_name(name)
         if twin := next((other_name for other_name in boxes if other_name.casefold() == clean.casefold()), None):
             raise name_taken(clean, twin)
-        boxes[clean] = _checked_box(clean, box, extent)
+        boxes[clean] = _check_box(clean, box, extent)
         mask = box_mask(box, x_m, y_m)
         if not (mask if valid is None else mask & valid).any():
             raise DataError(
@@ -442,7 +442,7 @@ def no_box(name: str, boxes: Mapping[str, Any]) -> DataError:
     )  # fmt: skip
 
 
-def _checked_box(name: str, box: Box, extent: Box) -> Box:
+def _check_box(name: str, box: Box, extent: Box) -> Box:
     if not all(math.isfinite(b) for b in box) or not (box[0] < box[2] and box[1] < box[3]):
         raise DataError(
             f"box of {name}, {', '.join(f'{b:g}' for b in box)}: it is empty",

@@ -573,7 +573,7 @@ class _Model:
         freedom = 5.0
         unit = rng.standard_normal((_DRAWS, x.size)) / np.sqrt(rng.chisquare(freedom, (_DRAWS, 1)) / freedom)
         unit = 1.15 * unit[np.sum(unit**2, axis=1) < (_REACH / 1.15) ** 2]
-        draws = self._from_straight(x, unit @ np.linalg.cholesky(spread).T)
+        draws = self._convert_from_straight(x, unit @ np.linalg.cholesky(spread).T)
         inside = np.all((draws >= self.lower) & (draws <= self.upper), axis=-1)
         linear = covariance[:n, :n]
         if not np.any(inside):
@@ -598,7 +598,7 @@ class _Model:
             out[2, 2] = index
         return out
 
-    def _from_straight(self, x: Real, draws: Real) -> Real:
+    def _convert_from_straight(self, x: Real, draws: Real) -> Real:
         """Return unknowns [..., n] at samples (eps', eps'', thickness times index, angle) about x."""
         out = x + draws
         if self.sized:

@@ -246,7 +246,7 @@ def usable(x: Real) -> npt.NDArray[np.bool_]:
     return np.asarray(np.isfinite(x).all(axis=1), np.bool_)
 
 
-def by_angle(x: Real) -> tuple[Real, Real, npt.NDArray[np.complex128]]:
+def split_by_angle(x: Real) -> tuple[Real, Real, npt.NDArray[np.complex128]]:
     """Return |H|, |V| and V / H of features [n, 4 * angles], each [n, angles]."""
     h, v, real, imag = np.moveaxis(x.reshape(len(x), x.shape[1] // WIDTH, WIDTH), -1, 0)
     return h, v, real + 1j * imag
@@ -289,8 +289,8 @@ def channel_distances(a: Real, b: Real, measure: Measure | None) -> Distances:
 
     They are summed over the angles. Without a measure those of P are zero.
     """
-    a_h, a_v, a_inverse = by_angle(a)
-    b_h, b_v, b_inverse = by_angle(b)
+    a_h, a_v, a_inverse = split_by_angle(a)
+    b_h, b_v, b_inverse = split_by_angle(b)
     in_h = np.zeros((len(a), len(b)))
     in_v = np.zeros_like(in_h)
     in_p = np.zeros_like(in_h)

@@ -337,7 +337,7 @@ def common_change(
             noise = np.maximum([part(s.slope_std[axis]) for s in plates], 1e-3) + BORDER_SLOPE_STD * border
             remaining_slopes = slopes - np.median(slopes)
             if axis == 1:
-                change, deviation, drift_slopes = _averaged_drift(y_m, origin_m[1], slopes, noise)
+                change, deviation, drift_slopes = _average_drift(y_m, origin_m[1], slopes, noise)
                 value += unit * change
                 std += unit * deviation
                 remaining_slopes = slopes - drift_slopes
@@ -356,7 +356,7 @@ def _excess_scatter(left: Real, noise: Real) -> float:
     return max(0.0, scatter**2 - float(np.median(noise)) ** 2) * left.size / (left.size - 2)
 
 
-def _averaged_drift(y_m: Real, origin_m: float, slopes: Real, noise: Real) -> tuple[Real, Real, Real]:
+def _average_drift(y_m: Real, origin_m: float, slopes: Real, noise: Real) -> tuple[Real, Real, Real]:
     """Return mean and standard deviation of a drift [plate] relative to the origin, and its expected slopes [plate].
 
     They are averaged over `DRIFTS`, `COMMON_SLOPES` and `OWN_SLOPES` with the evidence of each.

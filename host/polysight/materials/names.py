@@ -20,8 +20,8 @@ from polysight.materials.kinds import (
     Kinds,
     Odds,
     RatioEvidence,
-    at_kinds,
-    pair,
+    move_to_angle_of_kinds,
+    split_complex,
     weigh_kinds,
 )
 from polysight.materials.measure import format_permittivity
@@ -156,7 +156,9 @@ def name_patch(
     good = np.isfinite(inverse_ratios).all(axis=1)
     if not good.any():
         return nothing_named(good.size)
-    kind_evidence = [at_kinds(evidence, kind) for evidence, kind in zip(kind_evidence, kinds, strict=True)]
+    kind_evidence = [
+        move_to_angle_of_kinds(evidence, kind) for evidence, kind in zip(kind_evidence, kinds, strict=True)
+    ]
     odds = weigh_kinds(kinds, kind_evidence)
     at_first = kinds[0]
     names = np.array(at_first.names)
@@ -260,14 +262,14 @@ def _name_pixels(
     first = kinds[0]
     named = called != UNKNOWN
     size = 2 * len(seen)
-    values = pair(t[good]).reshape(-1, size)
+    values = split_complex(t[good]).reshape(-1, size)
     pixel = np.cov(values.T) if len(values) > 2 else np.zeros((size, size))
     effects = np.concatenate([kind.effects[named] for kind in kinds], axis=1)
     errors = scipy.linalg.block_diag(*(evidence.covariance for evidence in seen)) + pixel + 1e-10 * np.eye(size)
     inverse = np.linalg.inv(effects @ effects.mT + errors)
     middles = np.stack([kind.t[named] for kind in kinds], axis=1)
     usable: npt.NDArray[np.complex128] = np.where(good.reshape(-1, 1), t, 0)
-    difference = pair(usable[:, None, :] - middles).reshape(t.shape[0], -1, size)
+    difference = split_complex(usable[:, None, :] - middles).reshape(t.shape[0], -1, size)
     distance2 = np.einsum("nki,kij,nkj->nk", difference, inverse, difference)
     ours = np.take(first.ours, np.flatnonzero(named))
     prior = (1 - INCLUSIONS) * of_patch[named] + INCLUSIONS * ours / max(ours.sum(), 1)
@@ -302,7 +304,7 @@ def add_explanation(
     nearest_text = ""
     near = ""
     if nearest is not None:
-        nearest_text = _with_permittivity(nearest, known.get(nearest))
+        nearest_text = _add_permittivity(nearest, known.get(nearest))
         near = f"; nearest: {nearest_text}"
     if name.name == UNKNOWN:
         explanation = f"not in the library: {estimate}{near}" if estimate else f"not in the library{near}"
@@ -344,10 +346,10 @@ def _estimate(permittivity: complex | None, covariance: npt.NDArray[np.float64] 
 def _list_values(literature: Mapping[str, float]) -> str:
     """The likeliest materials of the literature with their permittivities."""
     values = {material.name: material.permittivity for material in load_catalogue()}
-    return ", ".join(_with_permittivity(name, values.get(name)) for name in list(literature)[:MOST_NAMES])
+    return ", ".join(_add_permittivity(name, values.get(name)) for name in list(literature)[:MOST_NAMES])
 
 
-def _with_permittivity(name: str, permittivity: complex | None) -> str:
+def _add_permittivity(name: str, permittivity: complex | None) -> str:
     if permittivity is None:
         return name
     return f"{name} ({format_permittivity(permittivity)})"

@@ -235,7 +235,7 @@ class MaterialsResult:
         if r.truth is not None:
             figures = structs.replace(figures, truth=_truth_figures(r.truth, self.library))
         if r.verdict is not None:
-            figures = _with_name(figures, r.verdict)
+            figures = _add_name(figures, r.verdict)
         if r.refused is None:
             figures = structs.replace(figures, permittivity=_permittivity_figures(e))
             if label in self.tilts.rises:
@@ -244,7 +244,7 @@ class MaterialsResult:
         return figures
 
 
-def _with_name(figures: PatchFigures, name: PatchName) -> PatchFigures:
+def _add_name(figures: PatchFigures, name: PatchName) -> PatchFigures:
     """Add the name to a patch's figures."""
     return structs.replace(
         figures,

@@ -234,7 +234,7 @@ def segment(
         )  # fmt: skip
     pixel_mm = abs(float(axis_mm(x_m)[1] - axis_mm(x_m)[0]))
     level = np.maximum(level_db(h, v, usable, cfg.smooth_px, cfg.smallest_mm / pixel_mm / 2), cfg.floor_db)
-    even = _without_speckle(level, usable, cfg, pixel_mm)
+    even = _remove_speckle(level, usable, cfg, pixel_mm)
     least_db = _least_level_db(even[usable], cfg)
     masks: list[Mask] = []
     left_out = 0
@@ -302,7 +302,7 @@ def whole_plane(usable: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm:
     return Segmentation(usable.astype(np.int32), (patch,))
 
 
-def _without_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> Real:
+def _remove_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> Real:
     """Return the level after total variation, dB, with the weight for the speckle of the bright plates."""
     strongest = reduce_variation(level, cfg.speckle_db)
     inside = strongest[usable]

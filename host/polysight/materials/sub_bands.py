@@ -6,7 +6,7 @@ The error of a ratio has a part common to all sub-bands of a patch (leakage, met
 of its own in each (noise, sidelobes). Differences between sub-bands are therefore known better than each of them: their
 full covariance is stored.
 
-`with_bands` measures them; `bands_of_row` reads them back from a segment of materials.json, and `fit_row` fits the
+`add_bands` measures them; `bands_of_row` reads them back from a segment of materials.json, and `fit_row` fits the
 unknown layer of a stack to it.
 
 Concentration of a solution from its polarisation angle (section 9.4 of the paper).
@@ -64,7 +64,7 @@ Real = npt.NDArray[np.float64]
 _PERCENT = re.compile(r"(\d+(?:\.\d+)?)\s*%")
 
 
-def with_bands(
+def add_bands(
     found: MaterialsResult,
     bands: Sequence[SubBand],
     images: Sequence[Images],
@@ -128,7 +128,7 @@ def band_rows(
             full_band = (found.h[pixels], found.v[pixels])
             parts[r.patch.label].append(_measure_band(band, h[pixels], v[pixels], full_band, error))
     std_by_label = {r.patch.label: _own_std(found, r.patch.interior) for r in found.patches}
-    return {label: _with_covariance(rows, found, std_by_label[label]) for label, rows in parts.items()}
+    return {label: _add_covariance(rows, found, std_by_label[label]) for label, rows in parts.items()}
 
 
 def _own_std(found: MaterialsResult, interior: Mask) -> float:
@@ -142,7 +142,7 @@ def _own_std(found: MaterialsResult, interior: Mask) -> float:
     return float(np.hypot(abs(inverse) * np.hypot(amplitude, phase) / np.sqrt(2), LEAST_STD))
 
 
-def _with_covariance(rows: list[BandFigures], found: MaterialsResult, common: float) -> list[BandFigures]:
+def _add_covariance(rows: list[BandFigures], found: MaterialsResult, common: float) -> list[BandFigures]:
     """Add the covariance of the errors to one patch's sub-bands; `common` is the deviation common to all of them."""
     ratios = [row.ratio.value for row in rows if row.ratio is not None]
     if len(ratios) < len(rows) or not math.isfinite(common):

@@ -165,7 +165,7 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
     return LabelledScan(folder.name, description, images[0], images[1], boxes, "simulated" in description.lower())
 
 
-def explained_variance(scan: LabelledScan) -> float:
+def compute_explained_variance(scan: LabelledScan) -> float:
     """Return the share of the variance of the pixels' brightness (dB) that the boxes explain, 0 to 1."""
     level = np.log(np.maximum(np.abs(scan.h) * np.abs(scan.v), 1e-30)).astype(np.float64)
     label = np.zeros(level.shape, int)
@@ -180,7 +180,7 @@ def image_orientation(scans: Sequence[LabelledScan]) -> str:
     shares = {}
     for orientation in ORIENTATIONS:
         try:
-            shares[orientation] = float(np.mean([explained_variance(s.orient(orientation)) for s in scans]))
+            shares[orientation] = float(np.mean([compute_explained_variance(s.orient(orientation)) for s in scans]))
         except DataError:
             # A box outside the image
             shares[orientation] = -1.0

@@ -185,25 +185,25 @@ def _bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iterator[
     """
     if rig.burst.chirps > 1:
         for speed in _speeds(rig, minutes):
-            plan = _with_burst(rig, speed, rig.burst.pulses, rig.burst.period_us)
+            plan = _set_burst(rig, speed, rig.burst.pulses, rig.burst.period_us)
             if _max_pulses(plan) >= rig.burst.pulses and scan_time(plan, row_overhead_s).minutes <= minutes:
                 yield plan
                 return
         return
     for period in {rig.burst.period_us, min(rig.burst.period_us, shortest_period_us(rig))}:
         for speed in _speeds(rig, minutes):
-            plan = _with_burst(rig, speed, 2, period)
+            plan = _set_burst(rig, speed, 2, period)
             most = _max_pulses(plan)
             pulses = next((n for n in range(most, 1, -1) if not whole_packets(plan, n)), most)
             if pulses < 2:
                 break
-            plan = _with_burst(rig, speed, pulses, period)
+            plan = _set_burst(rig, speed, pulses, period)
             if scan_time(plan, row_overhead_s).minutes <= minutes:
                 yield plan
                 break
 
 
-def _with_burst(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float) -> Instrument:
+def _set_burst(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float) -> Instrument:
     """Replace speed and burst without validation, for speed; the values keep the rig file's rules."""
     stage = msgspec.structs.replace(rig.stage, speed_mm_s=speed_mm_s)
     burst = msgspec.structs.replace(rig.burst, pulses=pulses, period_us=period_us)

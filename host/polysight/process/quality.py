@@ -140,7 +140,7 @@ class BoardRows:
             crc32=recorded.crc32,
             positions=int(synced.valid.size),
             positions_masked=int(synced.valid.size - synced.valid.sum()),
-            masked_columns=masked_runs(~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]),
+            masked_columns=find_masked_runs(~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]),
             stages=[(name, *spread) for name, spread in synced.stages.items() if np.isfinite(spread).all()],
             chirps_clipped=synced.chirps_clipped,
             chirps_disturbed=synced.chirps_disturbed,
@@ -271,7 +271,7 @@ def _finite_values(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     return values[np.isfinite(values)]
 
 
-def masked_runs(masked: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def find_masked_runs(masked: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the half-open ranges [start, stop) of True values, ascending."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], masked.astype(np.int8), [0]])))
     return [(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]

@@ -36,7 +36,7 @@ from polysight.imaging import (
     View,
     fill_missing,
     fill_sub_bands,
-    needed_gate_m,
+    find_needed_gate_m,
     reduction,
 )
 from polysight.process.quality import Quality, RowFigures, RowQuality
@@ -194,7 +194,7 @@ class KeptSamples:
         self._lock = threading.Lock()
         self._head = self._read_head()
         viewed = view.apply_to(rig, source.mirrored)
-        gate = self._gate_m(rig, needed_gate_m(viewed, depth_m), needed_gate_m(rig, PLANE_REACH_M))
+        gate = self._gate_m(rig, find_needed_gate_m(viewed, depth_m), find_needed_gate_m(rig, PLANE_REACH_M))
         self.images = ImageBuilder(viewed, live=live, gate_m=gate)
         self.sub_bands = SubBandImages(viewed, self._bands, gate)
         self.filled = self.images

@@ -1,4 +1,7 @@
-"""The result of processing as one typed value, and its files: `processed_scan` makes it, `save_materials` writes it."""
+"""The result of processing as one typed value, and its files.
+
+`collect_processed_scan` makes the value, `save_materials` writes it.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,11 @@ from polysight.materials import (
     MaterialsResult,
     TruthPlate,
     classifier_sentence,
-    expected_pixel_accuracy,
     make_labels,
     pack_labels,
     pack_patches,
     pixel_accuracy,
+    predict_pixel_accuracy,
 )
 from polysight.polarimetry import with_ratio
 from polysight.process.quality import Quality, error_budget, recording_verdict
@@ -103,7 +106,7 @@ class Findings:
         return replace(self.analysis.calibrated, valid=valid, p_sigma=self.analysis.p_sigma(valid))
 
 
-def imaged_scan(
+def collect_imaged_scan(
     folder: Path, source: Scan, rig: Instrument, images: Images, quality: Quality, backlash: bool = True
 ) -> ProcessedScan:
     """Return the result of a scan of which only images were made; p is h / v in arbitrary units.
@@ -121,7 +124,7 @@ def imaged_scan(
     )
 
 
-def processed_scan(
+def collect_processed_scan(
     folder: Path, source: Scan, rig: Instrument, findings: Findings, quality: Quality, unnamed: str
 ) -> ProcessedScan:
     """Return the result of a scan with its materials; `unnamed` is the reason why nothing was named, or ""."""
@@ -143,7 +146,7 @@ def assemble_result(
     unnamed: str,
     plan: RasterPlan | None = None,
 ) -> ProcessedScan:
-    """Return the result with its materials, from findings; parameters as of :func:`processed_scan`."""
+    """Return the result with its materials, from findings; parameters as of :func:`collect_processed_scan`."""
     analysis = findings.analysis
     library = unnamed or "Nothing was named."
     model = None
@@ -231,7 +234,7 @@ def _result_lines(scan: ProcessedScan, result: MaterialsResult) -> tuple[str, ..
 
 def _pixels_right(result: MaterialsResult) -> str:
     accuracy = pixel_accuracy(result)
-    expected = expected_pixel_accuracy(result)
+    expected = predict_pixel_accuracy(result)
     if accuracy is None:
         return ""
     share = f", {100 * accuracy:.1f} % of their pixels"

@@ -29,7 +29,7 @@ from polysight.materials import (
     TruthPlate,
     axis_mm,
     box_mask,
-    expected_pixel_accuracy,
+    predict_pixel_accuracy,
     read_patches,
 )
 from polysight.results import (
@@ -292,7 +292,7 @@ class ProcessedScan:
         """Share of pixels that the best classifier is expected to name right; None for saved products."""
         if self.analysis is None:
             return None
-        return expected_pixel_accuracy(self.analysis)
+        return predict_pixel_accuracy(self.analysis)
 
     @property
     def plates_named(self) -> PlatesNamed | None:

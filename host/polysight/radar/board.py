@@ -128,7 +128,7 @@ class BringUp:
             Step("die id", "the board of the rig file", exchange, self._check_die, State.CONFIGURED),
         ]
 
-    def with_ignored(self, error: DeviceError) -> DeviceError:
+    def add_ignored_errors(self, error: DeviceError) -> DeviceError:
         """Return the error with the ignored errors of this bring-up added to its cause."""
         if not self._ignored:
             return error
@@ -343,7 +343,7 @@ class BringUp:
         requested = ALL
         if restored:
             requested = ALL & ~RESTORED
-        if failed := e.failed_calibrations(event, self._board.program.transmits, requested):
+        if failed := e.list_failed_calibrations(event, self._board.program.transmits, requested):
             raise DeviceError(
                 f"{self._board.name}: RF init failed: {', '.join(failed)} ({event})",
                 "no reference clock, an RF supply out of range, or a damaged RF part",
@@ -479,7 +479,7 @@ class RadarBoard:
                 try:
                     outcome = step.run()
                 except DeviceError as error:
-                    raise up.with_ignored(error) from None
+                    raise up.add_ignored_errors(error) from None
                 if on_step is not None:
                     on_step(step, outcome)
                 self._state = step.state_after
@@ -495,7 +495,7 @@ class RadarBoard:
             try:
                 return up.write_flash(image, progress)
             except DeviceError as error:
-                raise up.with_ignored(error) from None
+                raise up.add_ignored_errors(error) from None
 
     def _begin(self) -> BringUp:
         self._state = State.OFF

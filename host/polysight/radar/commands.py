@@ -463,7 +463,7 @@ def constraints(rig: Instrument, frames: int) -> list[Constraint]:
     """
     if unusable := list(_finite(rig)):
         return unusable
-    return [*_timing(rig, frames), *_chirp(rig), *(c for b in rig.boards for c in _of_board(rig, b))]
+    return [*_timing(rig, frames), *_chirp(rig), *(c for b in rig.boards for c in _list_constraints_of_board(rig, b))]
 
 
 def require(rig: Instrument, frames: int) -> None:
@@ -555,7 +555,7 @@ def _chirp(rig: Instrument) -> Iterator[Constraint]:
     yield Constraint("TX back-off", "back-off", back_off, "dB", "lower radar.tx_backoff_db", low=0, high=20)
 
 
-def _of_board(rig: Instrument, board: Board) -> Iterator[Constraint]:
+def _list_constraints_of_board(rig: Instrument, board: Board) -> Iterator[Constraint]:
     c = rig.chirp
     of_board = f" of {board.name}"
     start = start_code(c.start_hz + board.start_offset_hz) * START_HZ_PER_CODE

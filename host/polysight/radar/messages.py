@@ -314,7 +314,7 @@ INIT_BITS = {
 _INIT_NAMES = {bit: calibration.name for bit, calibration in INIT_BITS.items()}
 
 
-def failed_calibrations(event: Event, transmits: bool, run: int) -> list[str]:
+def list_failed_calibrations(event: Event, transmits: bool, run: int) -> list[str]:
     """Return the calibrations that failed in the RF init and that the board needs.
 
     `run` is the mask of requested calibrations besides clock and synthesizers, which run at every start.

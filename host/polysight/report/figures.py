@@ -418,7 +418,7 @@ def _fill_patches(
     colour_bar(fig, ax, colours, scale[3])
 
 
-def masked_positions(scan: ProcessedScan) -> dict[str, npt.NDArray[np.bool_]]:
+def find_masked_positions(scan: ProcessedScan) -> dict[str, npt.NDArray[np.bool_]]:
     """Return for each board bool [row, column]: masked or never recorded. Empty if plan or boards are not known."""
     if scan.plan is None:
         return {}
@@ -443,7 +443,7 @@ def _mask(board: BoardQuality, plan: RasterPlan) -> npt.NDArray[np.bool_]:
 def coverage_figure(scan: ProcessedScan, masks: dict[str, npt.NDArray[np.bool_]]) -> Figure:
     """Return a map of masked stage positions for each board, millimetres from the middle of the grid.
 
-    `masks` as of :func:`masked_positions`; the scan's plan must be known.
+    `masks` as of :func:`find_masked_positions`; the scan's plan must be known.
     """
     plan = scan.plan
     if plan is None:
@@ -498,7 +498,7 @@ def figures(scan: ProcessedScan) -> dict[str, bytes]:
         out["materials"] = map_figure(scan, draw_materials, f"{_map_title(scan)} found")
         permittivities = {"permittivity": permittivity_figure(scan), "permittivity_map": permittivity_map(scan)}
         out |= {name: picture for name, picture in permittivities.items() if picture is not None}
-    masks = masked_positions(scan)
+    masks = find_masked_positions(scan)
     if any(m.any() for m in masks.values()):
         out["coverage"] = png(coverage_figure(scan, masks))
     if scan.plates:

@@ -20,7 +20,7 @@ from markupsafe import Markup, escape
 
 from polysight.materials import UNKNOWN
 from polysight.products import REPORT, ProcessedScan
-from polysight.report.figures import FIGURES, figures, masked_positions, surface_figure
+from polysight.report.figures import FIGURES, figures, find_masked_positions, surface_figure
 from polysight.report.style import assign_colours, patch_colour, patch_label, plate_label
 from polysight.results import (
     ErrorBudget,
@@ -127,10 +127,10 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         headings=[figure.column.title for figure in _shown_figures(scan)],
         with_errors=any(patch.permittivity and patch.permittivity.spread for patch in scan.segments),
         budget=budget,
-        replaced=_replaced_names(scan),
+        replaced=_list_replaced_names(scan),
         missed=missed_plates,
         quality=quality_tables(to_plain(scan.quality)),
-        coverage=coverage_sentence(masked_positions(scan)),
+        coverage=coverage_sentence(find_masked_positions(scan)),
         config=config,
         rig_file=tomli_w.dumps(scan.facts.instrument or {}),
         provenance=_provenance(scan),
@@ -202,7 +202,7 @@ def _remedies(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
     ]
 
 
-def _replaced_names(scan: ProcessedScan) -> list[str]:
+def _list_replaced_names(scan: ProcessedScan) -> list[str]:
     """Return `patch 1: ?? is NAME` for each name that the figures' fonts cannot draw."""
     pairs = [(patch_label(patch), patch.name) for patch in scan.segments if patch.name]
     pairs += [(plate_label(plate, number), plate.name) for number, plate in enumerate(scan.plates, 1)]
@@ -399,7 +399,7 @@ def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[st
     errors = [abs(r["relative_error"]) for r in rows if r["relative_error"] is not None]
     if errors:
         add(f"{100 * float(np.median(errors)):.1f} %", f"median error of ε′, worst {100 * max(errors):.1f} %")
-    for share, description in _received_shares(scan.quality):
+    for share, description in _compute_received_shares(scan.quality):
         add(share, description)
     if seconds := scan.quality.seconds_per_stage:
         total_s = sum(seconds.values())
@@ -410,7 +410,7 @@ def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[st
     return out
 
 
-def _received_shares(quality: ScanQuality) -> list[tuple[str, str]]:
+def _compute_received_shares(quality: ScanQuality) -> list[tuple[str, str]]:
     """Return shares of rows and frames received: of the plan, or of recorded rows in products without `coverage`."""
     if coverage := quality.coverage:
         share = percent(coverage.frames_received, coverage.frames_planned, 2)
@@ -455,9 +455,9 @@ def budget_table(budget: ErrorBudget) -> Table | None:
     rows = [*_leakage_rows(budget.leakage), *_incidence_rows(budget.incidence), *_plane_rows(budget.plane)]
     metal = budget.metal
     if metal is not None and metal.score is not None:
-        evidence = f"score {_with_sign(metal.score, 1)} from {metal.others} other patches"
+        evidence = f"score {_format_with_sign(metal.score, 1)} from {metal.others} other patches"
         if metal.channel_ratio_db is not None:
-            evidence += f"; V over H {_with_sign(metal.channel_ratio_db, 1)} dB relative to the direct path"
+            evidence += f"; V over H {_format_with_sign(metal.channel_ratio_db, 1)} dB relative to the direct path"
         rows.append(_cells("Evidence that the reference is metal", evidence))
     if not rows:
         return None
@@ -473,7 +473,7 @@ def _leakage_rows(leakage: LeakageError | None) -> list[dict[str, Any]]:
     for channel, value, std in (("H", leakage.h, std_h), ("V", leakage.v, std_v)):
         if value is not None and value[0] is not None and value[1] is not None:
             sign = "+" if value[1] >= 0 else "−"
-            number = f"{_with_sign(value[0], 3)} {sign} {abs(value[1]):.3f}i"
+            number = f"{_format_with_sign(value[0], 3)} {sign} {abs(value[1]):.3f}i"
             if std is not None:
                 number += f" ± {std:.3f}"
             rows.append(_cells(f"Leakage of {channel}, relative to its own channel", number))
@@ -494,12 +494,12 @@ def _plane_rows(plane: PlaneError | None) -> list[dict[str, Any]]:
         return []
     if not plane.known:
         return [_cells("Plane of the plates", "not found; that of the rig file is used")]
-    offset = f"{_with_sign(plane.offset_mm or 0.0, 1)} mm"
+    offset = f"{_format_with_sign(plane.offset_mm or 0.0, 1)} mm"
     if plane.offset_std_mm:
         offset += f" ± {plane.offset_std_mm:.1f} mm"
     rows = [_cells("Plane of the plates, relative to the rig file", offset)]
     if plane.tilt_deg and plane.tilt_deg[0] is not None and plane.tilt_deg[1] is not None:
-        tilt = f"{_with_sign(plane.tilt_deg[0], 2)}° in x, {_with_sign(plane.tilt_deg[1], 2)}° in y"
+        tilt = f"{_format_with_sign(plane.tilt_deg[0], 2)}° in x, {_format_with_sign(plane.tilt_deg[1], 2)}° in y"
         rows.append(_cells("Tilt of the plane", tilt))
     if plane.by and plane.plates:
         rows.append(_cells("Plane found by", f"{plane.by} of {plane.plates} plates"))
@@ -508,7 +508,7 @@ def _plane_rows(plane: PlaneError | None) -> list[dict[str, Any]]:
     return rows
 
 
-def _with_sign(value: float, digits: int) -> str:
+def _format_with_sign(value: float, digits: int) -> str:
     """Format a number with its sign, a true minus, and no negative zero."""
     return f"{round(float(value), digits) + 0.0:+.{digits}f}".replace("-", "−")
 

@@ -629,11 +629,11 @@ class ScanMaterials(msgspec.Struct, frozen=True, kw_only=True):
         """Return the content of a file as a struct; `path` is for messages. Raises DataError if it is damaged."""
         segments = content.get("segments", [])
         if isinstance(segments, list):
-            segments = [_with_finding(segment) for segment in segments]
+            segments = [_decode_finding(segment) for segment in segments]
         return convert({**content, "verdict": read_verdict(content), "segments": segments}, cls, path)
 
 
-def _with_finding(segment: Any) -> Any:
+def _decode_finding(segment: Any) -> Any:
     """Return an entry with its reason for refusal as a finding; files hold what, why and do."""
     if not isinstance(segment, dict) or not isinstance(segment.get("refused"), dict):
         return segment

@@ -413,6 +413,6 @@ class CountedConnection(H11Protocol):
         self._limit.remove(self)
 
 
-def counted_connections(most: int) -> Any:
+def make_counting_protocol(most: int) -> Any:
     """Make uvicorn's protocol class for connections that share a limit."""
     return partial(CountedConnection, limit=ConnectionLimit(most))

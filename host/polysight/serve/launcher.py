@@ -23,7 +23,7 @@ POLL_S = 2.0
 
 @dataclass(frozen=True)
 class Record:
-    """Content of `base`.json: a program's process number and start time (:func:`started_ticks`), and its command."""
+    """Content of `base`.json: a program's process number and start time (:func:`read_start_ticks`), and its command."""
 
     pid: int
     ticks: int
@@ -31,7 +31,7 @@ class Record:
     started_utc: str
 
 
-def started_ticks(pid: int) -> int | None:
+def read_start_ticks(pid: int) -> int | None:
     """Start time of a running process in clock ticks since boot, or None; it tells reused process numbers apart."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
@@ -53,7 +53,7 @@ def launch(words: list[str], cwd: str, base: str) -> subprocess.Popen[bytes]:
     with Path(base + ".log").open("a", encoding="utf-8") as log:
         log.write(f"--- {now} {' '.join(words)}\n")
     program = subprocess.Popen(["/bin/sh", "-c", SHELL, base, *words], cwd=cwd, start_new_session=True)
-    record = Record(program.pid, started_ticks(program.pid) or 0, words, now)
+    record = Record(program.pid, read_start_ticks(program.pid) or 0, words, now)
     part = Path(base + ".part")
     part.write_text(json.dumps(asdict(record)) + "\n", encoding="utf-8")
     part.replace(base + ".json")

@@ -31,7 +31,7 @@ from starlette.types import ASGIApp
 from polysight.catalogue import Scans
 from polysight.page import Watch
 from polysight.serve.commands import command_routes, start_waiting
-from polysight.serve.front import Front, Reader, counted_connections, make_app
+from polysight.serve.front import Front, Reader, make_app, make_counting_protocol
 from polysight.serve.guard import HANDLERS, HEAD_BYTES, Access
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import Programs, Site, Watches
@@ -342,7 +342,7 @@ def make_server(front: Front, place: Place) -> uvicorn.Server:
     return uvicorn.Server(
         _configure(
             make_app(front),
-            http=counted_connections(MAX_CONNECTIONS),
+            http=make_counting_protocol(MAX_CONNECTIONS),
             # Reached only when every connection has a request at work: then it answers 503. Connections that were
             # closed a moment ago still count there.
             limit_concurrency=MAX_CONNECTIONS + 2 * ACCEPTED_AT_ONCE,

@@ -114,12 +114,12 @@ def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
     table["burst"] |= {"pulses": settings.num_trigger, "period_us": settings.period_frame * 1e3}
     table["geometry"]["object_distance_mm"] = settings.object_distance
     table["chirp"] |= {
-        "start_hz": _to_large_unit(chirp.f0, least=1e6, factor=1e9),
-        "slope_hz_per_s": _to_large_unit(chirp.slope, least=1e6, factor=1e12),
-        "ramp_end_us": _to_large_unit(chirp.ramp_time, least=1, factor=1e6),
-        "adc_start_us": _to_large_unit(chirp.adc_start_time, least=1e-2, factor=1e6),
+        "start_hz": _convert_to_large_unit(chirp.f0, least=1e6, factor=1e9),
+        "slope_hz_per_s": _convert_to_large_unit(chirp.slope, least=1e6, factor=1e12),
+        "ramp_end_us": _convert_to_large_unit(chirp.ramp_time, least=1, factor=1e6),
+        "adc_start_us": _convert_to_large_unit(chirp.adc_start_time, least=1e-2, factor=1e6),
         "samples": chirp.num_adc,
-        "sample_rate_hz": _to_large_unit(chirp.Fs, least=1e5, factor=1e3),
+        "sample_rate_hz": _convert_to_large_unit(chirp.Fs, least=1e5, factor=1e3),
         "linear_samples": [min(n, chirp.num_adc) for n in base.chirp.linear_samples],
     }
     rig = decode(table, Instrument, str(path))
@@ -128,7 +128,7 @@ def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
     return Rig(msgspec.structs.replace(rig, boards=boards), tuple(notices))
 
 
-def _to_large_unit(value: float, least: float, factor: float) -> float:
+def _convert_to_large_unit(value: float, least: float, factor: float) -> float:
     """Return a value in the wanted unit: their files have some in SI, some in the units of TI's tools.
 
     No chirp has a value below `least` in the wanted unit; such a value is in the other one and is multiplied.

@@ -18,8 +18,8 @@ from polysight.surfaces.paths import STRIDE_M, Echoes, Samples, find_echoes, mea
 from polysight.surfaces.points import (
     find_curvature,
     find_normals,
+    find_offset_that_sees,
     locate,
-    offset_that_sees,
     predict_echo,
 )
 
@@ -96,7 +96,7 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
     shape = find_shape(echoes, optics)
     tx_m = optics.tx.at_m
     rx_m = optics.v.at_m
-    at_m = offset_that_sees(shape.points, shape.normals, echoes.at_m, tx_m, rx_m)
+    at_m = find_offset_that_sees(shape.points, shape.normals, echoes.at_m, tx_m, rx_m)
     path, slope, bend = predict_echo(shape.points, shape.normals, shape.curvature, at_m, tx_m, rx_m)
     seen_by_v, inside = measure_echoes(v, at_m, path, slope, bend)
     return Seen(echoes[inside], seen_by_v, segment[inside])

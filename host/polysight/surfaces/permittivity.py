@@ -33,7 +33,7 @@ from polysight.surfaces.optics import (
     reflect_flat,
 )
 from polysight.surfaces.paths import STRIDE_M, WINDOW_M
-from polysight.surfaces.points import offset_that_sees, predict_echo, spreading, unit_legs
+from polysight.surfaces.points import find_offset_that_sees, predict_echo, spreading, unit_legs
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -110,7 +110,7 @@ def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Vol
     tx_m = optics.tx.at_m
     k = optics.wave_number
     solid = (shape.points, shape.normals, shape.curvature)
-    seen_from = {"h": seen.h.at_m, "v": offset_that_sees(*solid[:2], seen.v.at_m, tx_m, optics.v.at_m)}
+    seen_from = {"h": seen.h.at_m, "v": find_offset_that_sees(*solid[:2], seen.v.at_m, tx_m, optics.v.at_m)}
     b = []
     std = []
     rows = []
@@ -189,7 +189,7 @@ class Gains:
         """ln|gain of H|, [n]."""
         return self._basis(arrival) @ self.level_terms
 
-    def unknown_std(self, arrival: Array) -> Array:
+    def estimate_unknown_std(self, arrival: Array) -> Array:
         """Standard deviation of ln(H / V) by directions that the reference does not cover, [n]."""
         low, high = self.covered
         beyond = np.linalg.norm(np.maximum(0, np.maximum(low - arrival, arrival - high)), axis=1)
@@ -480,7 +480,7 @@ def add_common_errors(
 
     # An error of ln(H / V) of the reference turns and scales b_H.
     of_h = miss + v.b[:, 1] * receive(v, coefficients)[:, 0]
-    reference_change = of_h * gains.unknown_std(v.arrival)
+    reference_change = of_h * gains.estimate_unknown_std(v.arrival)
     flat = np.stack(reflect_flat(fit.eps, v.theta), axis=1)
     first_order = find_misses(v, gains, flat) - miss
     model_change = first_order * (expansion_parameter(v, wave_number) + CURVATURE_ERROR)

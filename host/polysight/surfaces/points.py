@@ -111,7 +111,7 @@ def spreading(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m
     return twice_cosine / (2 * out_m * back_m * np.maximum(root, 1e-9))
 
 
-def offset_that_sees(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
+def find_offset_that_sees(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
     """Stage offsets [n, 3] from which TX and RX see a point as a mirror with the given normal; starts at `at_m`."""
     basis = np.swapaxes(tangents(normals), 1, 2)
     at_m = at_m.copy()

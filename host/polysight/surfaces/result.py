@@ -141,7 +141,7 @@ def analyse_surface(
             used_fit = replace(fit, answer=fit.answer[:, fit.used])
             of_used = [replace(d, voltages=d.voltages[used]) for d in disturbed]
             sources = add_common_errors(used_fit, voltages[used], gains, of_used, optics.wave_number)
-            segments[index] = with_permittivity(judged, fit.eps, sources)
+            segments[index] = add_permittivity(judged, fit.eps, sources)
             if segments[index].permittivity is None:
                 continue
             common = sum((c for name, c in sources.items() if name != "scatter"), np.zeros((2, 2)))
@@ -307,7 +307,7 @@ def judge_segment(
     return segment, fit
 
 
-def with_permittivity(segment: Segment, eps: complex, sources: dict[str, Array]) -> Segment:
+def add_permittivity(segment: Segment, eps: complex, sources: dict[str, Array]) -> Segment:
     """Add a permittivity with its covariances by source, unless no passive medium has it."""
     (aa, ab), (_, bb) = sum(sources.values(), np.zeros((2, 2))).tolist()
     if eps.imag > MAX_GAIN_SIGMA * bb**0.5 or eps.real < 1.25:

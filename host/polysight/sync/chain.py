@@ -347,7 +347,7 @@ def errors(
     chirp_errors = np.stack([*aligned.error[is_found].swapaxes(0, 1), amplitude_error])[:, good]
 
     two = is_found & (aligned.good.sum(axis=1) > 1)
-    halves = _referenced_halves(aligned, done, two) * half_scale(aligned.good[two])[..., None, None]
+    halves = _reference_halves(aligned, done, two) * half_scale(aligned.good[two])[..., None, None]
     with np.errstate(divide="ignore", invalid="ignore"):  # dead RX have no direct path: their figures are not finite
         out = {
             "received": received,
@@ -360,7 +360,7 @@ def errors(
     return out
 
 
-def _referenced_halves(aligned: AlignedRow, done: Referenced, some: NDArray[np.bool_]) -> NDArray[np.complex64]:
+def _reference_halves(aligned: AlignedRow, done: Referenced, some: NDArray[np.bool_]) -> NDArray[np.complex64]:
     """Return the two halves of some positions' bursts, referenced like `samples`, [position, 2, rx, block]."""
     blocks = aligned.halves.shape[-1]
     frequency = done.frequency[some] - aligned.centre[some]

@@ -31,10 +31,10 @@ from polysight.materials import (
     Library,
     Model,
     Samples,
-    by_angle,
     calibration_error,
     feature_matrix,
     score,
+    split_by_angle,
 )
 from polysight.polarimetry import fresnel
 from polysight_papers.sensys2026.item import Published, Table, percent, published_values, table2
@@ -325,7 +325,7 @@ def _outside(seen: Samples, known: Samples) -> npt.NDArray[np.bool_]:
 
 def _patch_features(samples: Samples) -> tuple[Real, npt.NDArray]:
     """Return mean ln|H|, ln|V| and arg P under each angle, [patch, 3 * angles], and the patches' names."""
-    h, v, inverse = by_angle(samples.x)
+    h, v, inverse = split_by_angle(samples.x)
     x = np.concatenate([np.log(h), np.log(v), np.angle(inverse)], axis=1)
     order = np.unique(samples.patches)
     means = np.array([x[samples.patches == p].mean(axis=0) for p in order])

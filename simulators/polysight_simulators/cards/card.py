@@ -164,7 +164,7 @@ class CardSender:
         """Return the numbers of data packets and payload bytes sent, and of waits for the receiver."""
         return {"packets_sent": self.packets, "bytes_sent": self.payload_bytes, "waits": self.waits}
 
-    def dropped_by_receiver(self) -> int | None:
+    def count_dropped_by_receiver(self) -> int | None:
         """Return the number of datagrams dropped by the receiving socket; None if it is not on this machine."""
         queue_state = self._receiver.look()
         if queue_state is None:
@@ -525,7 +525,7 @@ class CardEndpoint:
         for key, value in self.sender.counts().items():
             report[key] = self.counts[key] + value
         report["records"] = self.card.records
-        report["dropped_by_receiver"] = self.sender.dropped_by_receiver()
+        report["dropped_by_receiver"] = self.sender.count_dropped_by_receiver()
         return report
 
     def close(self) -> None:

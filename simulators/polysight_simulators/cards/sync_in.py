@@ -148,7 +148,7 @@ class StageTrack:
     def _first_pulse(self, edge_ns: int) -> int | None:
         """Return the number of the first pulse of the point with this trigger; None outside the plan."""
         plan = self._plan
-        x, y, _ = self._reported_mm([edge_ns])
+        x, y, _ = self._read_reported_mm([edge_ns])
         column = round(x[0] / plan.step_x_mm + (plan.columns - 1) / 2)
         row = round(y[0] / plan.step_y_mm + (plan.rows - 1) / 2)
         if not (0 <= column < plan.columns and 0 <= row < plan.rows):
@@ -159,10 +159,10 @@ class StageTrack:
 
     def offsets_mm(self, t_ns: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return stage offsets from the grid's middle, x_mm [n] and y_mm [n], at wire times; 0 while unknown."""
-        x, y, backwards = self._reported_mm(t_ns)
+        x, y, backwards = self._read_reported_mm(t_ns)
         return x + self._backlash_mm * backwards, y
 
-    def _reported_mm(self, t_ns: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    def _read_reported_mm(self, t_ns: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
         """Return the reported offsets, and bool [n], True while the stage moves towards -x."""
         x = np.zeros(len(t_ns))
         y = np.zeros(len(t_ns))

@@ -197,23 +197,23 @@ def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
     """Return the function that gives a plate's reflection in a board's samples, with cross-polar leakage.
 
     H: s + leak_h p. V: p + leak_v s. TX is rotated by 45 degrees and sends both polarisations equally. s and p are what
-    a plate returns in the polarisations of H and V (:func:`turned_reflection`).
+    a plate returns in the polarisations of H and V (:func:`turn_reflection`).
     """
     leak_h = complex(*scene.disturbances.leakage_h)
     leak_v = complex(*scene.disturbances.leakage_v)
 
     def h(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
-        s, p = turned_reflection(plate, frequency_hz, theta)
+        s, p = turn_reflection(plate, frequency_hz, theta)
         return conjugate(s + leak_h * p)
 
     def v(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
-        s, p = turned_reflection(plate, frequency_hz, theta)
+        s, p = turn_reflection(plate, frequency_hz, theta)
         return conjugate(p + leak_v * s)
 
     return h if board.role == "receive_h" else v
 
 
-def turned_reflection(plate: Plate, frequency_hz: float, theta: Real) -> tuple[Complex, Complex]:
+def turn_reflection(plate: Plate, frequency_hz: float, theta: Real) -> tuple[Complex, Complex]:
     """Return what a plate sends back in the polarisations of H and V for a wave with equal s and p there.
 
     A plate that rises by w across the plane of incidence (its height grows along y) turns this plane about x, and both

@@ -134,7 +134,9 @@ def echo_drift(rig: Instrument, d: Disturbances, board: Board, pulses: NDArray[n
     return ((1 + share * passed) * np.exp(1j * np.radians(degrees) * passed)).astype(np.complex64)
 
 
-def per_chirp(receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool) -> tuple[NDArray[np.complex64], Real]:
+def compute_chirp_factors(
+    receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool
+) -> tuple[NDArray[np.complex64], Real]:
     """Return the factor of each chirp before the filter, and its IF shift (0 without filter), both [chirp, sample].
 
     For a receiver that starts `delay_s` after the transmitter, all paths are shorter by that time:
@@ -340,7 +342,7 @@ class SimulatedRig:
             turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses)
         else:
             turns = 0.0 * delay
-        factor, shift = per_chirp(receiver.receiver, delay, 2 * np.pi * turns, d.hpf)
+        factor, shift = compute_chirp_factors(receiver.receiver, delay, 2 * np.pi * turns, d.hpf)
         inside = receiver.field.covers(x_m, y_m)
         self.outside[board.name] += int(np.sum(~inside))
         nodes = np.zeros((len(x_m), *receiver.direct.shape[1:2], receiver.expand.shape[1]), dtype=np.complex64)

@@ -52,7 +52,7 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
         {
             "name": p.name,
             "position_mm": list(p.position_mm),
-            "position_m": _in_rig(p.position_mm, p.height_mm, centre),
+            "position_m": _convert_to_rig_frame(p.position_mm, p.height_mm, centre),
             "height_mm": p.height_mm,
             "amplitude": list(p.amplitude),
         }
@@ -68,7 +68,7 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
         "plates": plates,
         "points": points,
         "shapes": [
-            {**msgspec.to_builtins(shape), "front_m": _in_rig(shape.centre_mm, shape.height_mm, centre)}
+            {**msgspec.to_builtins(shape), "front_m": _convert_to_rig_frame(shape.centre_mm, shape.height_mm, centre)}
             for shape in actual.shapes
         ],
         "direct_path": scene.disturbances.direct_gain > 0,
@@ -81,7 +81,7 @@ def _plate_truth(plate: Plate, nominal: Plate, centre_m: Vector) -> dict[str, An
     return {
         "name": plate.name,
         "centre_mm": list(plate.centre_mm),
-        "centre_m": _in_rig(plate.centre_mm, plate.height_mm, centre_m),
+        "centre_m": _convert_to_rig_frame(plate.centre_mm, plate.height_mm, centre_m),
         "size_mm": list(plate.size_mm),
         "permittivity": None if plate.permittivity is None else list(plate.permittivity),
         "nominal_permittivity": None if nominal.permittivity is None else list(nominal.permittivity),
@@ -98,7 +98,7 @@ def _plate_truth(plate: Plate, nominal: Plate, centre_m: Vector) -> dict[str, An
     }
 
 
-def _in_rig(at_mm: Pair, height_mm: float, centre_m: Vector) -> list[float]:
+def _convert_to_rig_frame(at_mm: Pair, height_mm: float, centre_m: Vector) -> list[float]:
     """Return a position on the plane with a height, in the rig frame, metres."""
     return [centre_m[0] + at_mm[0] / 1e3, centre_m[1] + at_mm[1] / 1e3, centre_m[2] + height_mm / 1e3]
 
@@ -231,7 +231,7 @@ def _write_scan(
 def _plan(rig: Instrument, by_columns: bool) -> RasterPlan:
     """Return the plan of the rig's grid. Raises ConfigError if a burst does not end before the next point."""
     if by_columns:
-        grid = _by_columns(rig.grid)
+        grid = _transpose_grid(rig.grid)
     else:
         grid = rig.grid
     check_burst_fits(grid, rig.burst, rig.stage)
@@ -271,7 +271,7 @@ def _write_rows(
             progress(row.index + 1, plan.rows)
 
 
-def _by_columns(grid: Grid) -> Grid:
+def _transpose_grid(grid: Grid) -> Grid:
     """Return the grid with rows and columns swapped."""
     return Grid(columns=grid.rows, rows=grid.columns, step_x_mm=grid.step_y_mm, step_y_mm=grid.step_x_mm)
 

@@ -94,16 +94,16 @@ class StepEngine:
         self.to_trigger = leg.lead
         self.points_left = leg.points
         self.reached = self.cruise = False
-        return self._from_rest()
+        return self._start_from_rest()
 
     def resume(self) -> int:
         """End a hold; return the ticks to the next step if the stage was at rest, else 0."""
         self.hold = False
         if self.stepping:
             return 0
-        return self._from_rest()
+        return self._start_from_rest()
 
-    def _from_rest(self) -> int:
+    def _start_from_rest(self) -> int:
         if self.left == 0 or self.hold:
             return 0
         self.stepping = True

@@ -11,7 +11,7 @@ import zmq
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
 from polysight_shared.raster import Row
-from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.loopback import move_to_free_subnet
 from tests.support.acquisition.fake_cards import FakeCard
 from tests.support.rigs import rig_with
 
@@ -259,4 +259,4 @@ def small_instrument(columns: int = 3, rows: int = 4, pulses: int = 3, **limits:
     limits = {"end_of_record_s": 0.25, "command_timeout_s": 1.5, "free_disk_bytes": 0, **limits}
     card = {"receive_buffer_bytes": 1 << 20}
     grid = {"columns": columns, "rows": rows}
-    return on_free_subnet(rig_with(grid=grid, burst={"pulses": pulses}, limits=limits, card=card))
+    return move_to_free_subnet(rig_with(grid=grid, burst={"pulses": pulses}, limits=limits, card=card))

@@ -13,9 +13,9 @@ from polysight.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, PACKET
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 
-# Room for left-over packets, whose payload lies beyond the row.
+# Room for packets of an earlier record that arrive late: their payload lies outside the row.
 _SPARE_BYTES = 1 << 20
-# Rows of payload that are kept; two network paths double it.
+# The payload of so many rows is kept at most. Duplicates from two network paths already make two rows of one.
 _MAX_ROWS = 4
 
 
@@ -45,6 +45,7 @@ class PacketLog:
         # Allocate the pages before the first packet.
         memory[:expected].fill(0)
         self.payload = memory
+        # The arrays of headers grow when needed; this many packets need no growth while a row is received.
         packets = 2 * expected // MAX_PAYLOAD_BYTES + 256
         self._heads = np.zeros((packets, PACKET_HEADER_BYTES), dtype=np.uint8)
         self._sizes = np.zeros(packets, dtype=np.uint16)
@@ -63,12 +64,12 @@ class PacketLog:
         """
         sizes = lengths.astype(np.int64) - PACKET_HEADER_BYTES
         times = np.broadcast_to(np.asarray(times_ns, dtype=np.int64), sizes.shape)
-        good = (sizes > 0) & (sizes <= MAX_PAYLOAD_BYTES)
-        if not good.all():
-            self.malformed += int((~good).sum())
-            packets = packets[good]
-            sizes = sizes[good]
-            times = times[good]
+        is_well_formed = (sizes > 0) & (sizes <= MAX_PAYLOAD_BYTES)
+        if not is_well_formed.all():
+            self.malformed += int((~is_well_formed).sum())
+            packets = packets[is_well_formed]
+            sizes = sizes[is_well_formed]
+            times = times[is_well_formed]
         n = len(sizes)
         if n == 0:
             return
@@ -120,15 +121,16 @@ class PacketLog:
 
     @property
     def sequences(self) -> Counts:
-        """int64 [packet]."""
+        """int64 [packet]: the card's sequence numbers, bytes 0 to 3 of a packet's header."""
         return self._heads[: self.count, 0:4].copy().view("<u4")[:, 0].astype(np.int64)
 
     @property
     def byte_counts(self) -> Counts:
-        """int64 [packet]: the card's byte count, 48 bits."""
-        wide = np.zeros((self.count, 8), dtype=np.uint8)
-        wide[:, :6] = self._heads[: self.count, 4:10]
-        return wide.view("<i8")[:, 0]
+        """int64 [packet]: the card's byte counts, bytes 4 to 9 of a packet's header."""
+        # numpy has no integer of 48 bits, so two zero bytes are added.
+        eight_bytes = np.zeros((self.count, 8), dtype=np.uint8)
+        eight_bytes[:, :6] = self._heads[: self.count, 4:10]
+        return eight_bytes.view("<i8")[:, 0]
 
     @property
     def sizes(self) -> Counts:
@@ -167,5 +169,5 @@ class PacketLog:
 
 
 def _double(array: NDArray[Any], more: int) -> NDArray[Any]:
-    """Return the array with space for twice as many entries, and `more`."""
+    """Return a copy of the array with room for twice its entries plus `more`, filled with zeros."""
     return np.concatenate([array, np.zeros((len(array) + more, *array.shape[1:]), dtype=array.dtype)])

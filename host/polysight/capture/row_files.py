@@ -31,7 +31,7 @@ MAX_INDEX_BYTES = 256 << 20
 
 
 def _find_scan(path: Path) -> Path:
-    """The scan folder of `SCAN/raw/BOARD/ROW.*`; of a file elsewhere, its own folder."""
+    """Return the scan folder of a file `SCAN/raw/BOARD/ROW.*`; for a file elsewhere, the folder it lies in."""
     if path.parent.parent.name == "raw":
         return path.parents[2]
     return path.parent
@@ -137,10 +137,11 @@ def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
     return facts, pairs
 
 
-# Suffix, beside the row's file.
+# Suffix of the packet file, which lies beside the row's file.
 PACKETS = ".pkt"
 FORMAT = 2
-"""Format 1 had other knowledge of the records before: such rows are placed as the first of a scan."""
+"""Files of format 1 describe earlier records in another way, which is not read: their rows are placed as the first of
+a scan."""
 RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), ("size", "<u2"), ("place", "<i8")])
 """Run of consecutive packets of one size: counters of the first, number of packets, payload of each, and its place.
 
@@ -157,39 +158,26 @@ def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed
 
     Raises DeviceError if the disk fails.
     """
-    stored = log.kept
-    sizes = log.sizes[:stored]
-    sequences = log.sequences[:stored]
-    counts = log.byte_counts[:stored]
+    kept = log.kept
+    sizes = log.sizes[:kept]
+    # Payload that does not lie unchanged in the row's file is stored in this one.
     if placed is None:
-        places = np.full(stored, -1, dtype=np.int64)
+        offsets_in_row = np.full(kept, -1, dtype=np.int64)
     else:
-        places = _find_offsets_in_row(placed, sizes)
-    is_stored_here = places < 0
-    rest = np.concatenate([[0], np.cumsum(np.where(is_stored_here, sizes, 0))])[:-1]
-    place = np.where(is_stored_here, -1 - rest, places)
-    ahead = np.where(is_stored_here[:-1], -sizes[:-1], sizes[:-1])
-    joined = (
-        (np.diff(sizes) == 0) & (np.diff(sequences) == 1) & (np.diff(counts) == sizes[:-1])
-        & (np.diff(place) == ahead) & (is_stored_here[1:] == is_stored_here[:-1])
-    )  # fmt: skip
-    first = np.flatnonzero(np.append(True, ~joined))[: stored and None]
-    runs = np.zeros(first.size, dtype=RUN)
-    runs["sequence"] = sequences[first]
-    runs["byte_count"] = counts[first]
-    runs["size"] = sizes[first]
-    runs["packets"] = np.diff(np.append(first, stored))
-    runs["place"] = place[first]
+        offsets_in_row = _find_offsets_in_row(placed, sizes)
+    is_stored_here = offsets_in_row < 0
+    runs = _find_runs(log, offsets_in_row)
     starts = np.cumsum(log.sizes) - log.sizes
     stored_payload = [log.payload[starts[k] : starts[k] + sizes[k]] for k in np.flatnonzero(is_stored_here).tolist()]
-    last_of_its_time = np.flatnonzero(np.diff(log.arrivals_ns, append=log.arrivals_ns[-1:] + 1))
-    batches = np.column_stack([log.arrivals_ns[last_of_its_time], last_of_its_time + 1])
+    # Packets that were received by one call have one arrival time: a batch ends where the time changes.
+    last_of_batch = np.flatnonzero(np.diff(log.arrivals_ns, append=log.arrivals_ns[-1:] + 1))
+    batches = np.column_stack([log.arrivals_ns[last_of_batch], last_of_batch + 1])
     head = {
         "format": FORMAT,
         "batches": len(batches),
         "runs": len(runs),
         "packets": log.count,
-        "kept": stored,
+        "kept": kept,
         "own_bytes": int(sizes[is_stored_here].sum()),
         "malformed": log.malformed,
         "evidence": msgspec.to_builtins(evidence),
@@ -199,6 +187,35 @@ def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed
         [line, batches.astype(BATCH).tobytes(), runs.tobytes(), *(part.tobytes() for part in stored_payload)]
     )
     return write_durably(path, raw)
+
+
+def _find_runs(log: PacketLog, offsets_in_row: NDArray[np.int64]) -> NDArray[Any]:
+    """Return the runs (`RUN`) of the kept packets; those with an offset below zero are stored in the packet file."""
+    if log.kept == 0:
+        return np.zeros(0, dtype=RUN)
+    sizes = log.sizes[: log.kept]
+    sequences = log.sequences[: log.kept]
+    counts = log.byte_counts[: log.kept]
+    is_stored_here = offsets_in_row < 0
+    # Places in this file are negative and fall from packet to packet, see `RUN`.
+    bytes_before = np.cumsum(np.where(is_stored_here, sizes, 0)) - np.where(is_stored_here, sizes, 0)
+    places = np.where(is_stored_here, -1 - bytes_before, offsets_in_row)
+    expected_steps = np.where(is_stored_here[:-1], -sizes[:-1], sizes[:-1])
+    continues_run = (
+        (np.diff(sizes) == 0)
+        & (np.diff(sequences) == 1)
+        & (np.diff(counts) == sizes[:-1])
+        & (np.diff(places) == expected_steps)
+        & (is_stored_here[1:] == is_stored_here[:-1])
+    )
+    first = np.flatnonzero(np.append(True, ~continues_run))
+    runs = np.zeros(first.size, dtype=RUN)
+    runs["sequence"] = sequences[first]
+    runs["byte_count"] = counts[first]
+    runs["size"] = sizes[first]
+    runs["packets"] = np.diff(np.append(first, log.kept))
+    runs["place"] = places[first]
+    return runs
 
 
 def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
@@ -242,23 +259,28 @@ def _find_offsets_in_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np
     return offsets
 
 
-def _restore_log(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row: Bytes, own: Bytes) -> PacketLog:
-    """Restore the packet log. Raises ValueError if payload is missing."""
-    many = runs["packets"].astype(np.int64)
+def _restore_log(
+    expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row: Bytes, stored_payload: Bytes
+) -> PacketLog:
+    """Restore the packet log from runs, batches, the row's bytes and the payload stored in the packet file.
+
+    Raises ValueError if payload is missing.
+    """
+    packets = runs["packets"].astype(np.int64)
     sizes = runs["size"].astype(np.int64)
     # Each product fits 48 bits; their sum need not fit 64.
-    payload_bytes = sum((many * sizes).tolist())
+    payload_bytes = sum((packets * sizes).tolist())
     if expected != row.size or payload_bytes > PacketLog.max_kept_bytes(expected) or (sizes == 0).any():
         raise ValueError("it is of another row, or has more payload than a receiver keeps")
-    nth = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
-    size_of_each = np.repeat(sizes, many)
+    index_in_run = np.arange(packets.sum()) - np.repeat(np.cumsum(packets) - packets, packets)
+    size_of_each = np.repeat(sizes, packets)
     parts = []
-    for n, size, place in zip(many.tolist(), sizes.tolist(), runs["place"].tolist(), strict=True):
+    for n, size, place in zip(packets.tolist(), sizes.tolist(), runs["place"].tolist(), strict=True):
         if place >= 0:
             source = row
             start = place
         else:
-            source = own
+            source = stored_payload
             start = -1 - place
         parts.append(source[start : start + n * size])
         if parts[-1].size != n * size:
@@ -267,9 +289,9 @@ def _restore_log(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], 
         payload = np.concatenate(parts)
     else:
         payload = np.zeros(0, dtype=np.uint8)
-    sequences = np.repeat(runs["sequence"].astype(np.int64), many) + nth
-    counts = np.repeat(runs["byte_count"].astype(np.int64), many) + nth * size_of_each
-    times = np.repeat(batches[:, 0], np.diff(batches[:, 1], prepend=0))[: many.sum()]
-    if times.size < many.sum():
+    sequences = np.repeat(runs["sequence"].astype(np.int64), packets) + index_in_run
+    counts = np.repeat(runs["byte_count"].astype(np.int64), packets) + index_in_run * size_of_each
+    times = np.repeat(batches[:, 0], np.diff(batches[:, 1], prepend=0))[: packets.sum()]
+    if times.size < packets.sum():
         raise ValueError("times are missing")
     return PacketLog.restore(expected, sequences, counts, size_of_each, times, payload)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from polysight_worlds import (
     KINDS,
@@ -15,6 +16,7 @@ from polysight_worlds import (
     scan_offsets,
     scan_shapes,
 )
+from polysight_worlds.shape_scenes import disturb_boards
 from polysight_worlds.shapes import find_specular
 
 WHOLE = published_boards()
@@ -67,6 +69,31 @@ def test_each_disturbance_changes_the_samples_and_repeats(change):
     assert 0.01 < largest < 2.5
     again = scan(nuisances)
     assert all(np.array_equal(disturbed[channel], again[channel]) for channel in quiet)
+
+
+@pytest.mark.parametrize(
+    ("change", "std"),
+    [
+        ({"misplaced_mm": 1.0}, 1e-3 / np.sqrt(3)),
+        ({"axes_deg": 2.0}, np.radians(2.0)),
+        ({"leakage": 0.05}, 0.05 / np.sqrt(2)),
+    ],
+    ids=["places", "axes", "leakage"],
+)
+def test_disturbances_are_normally_distributed_with_the_size_given(change, std):
+    # Sizes that are all the same lie inside every region by construction: they could not refute a covariance.
+    deviations = []
+    for seed in range(400):
+        true_boards = disturb_boards(BOARDS, ShapeNuisances(seed=seed, **change))
+        for antenna, true_antenna in ((BOARDS.h[0], true_boards.h[0]), (BOARDS.v[0], true_boards.v[0])):
+            across = np.cross(antenna.boresight, antenna.polarisation) @ true_antenna.polarisation
+            if "misplaced_mm" in change:
+                deviations.extend(true_antenna.position - antenna.position)
+            elif "axes_deg" in change:
+                deviations.append(np.arcsin(across.real))
+            else:
+                deviations.extend([across.real, across.imag])
+    assert kstest(np.array(deviations) / std, "norm").pvalue > 1e-3
 
 
 def test_noise_differs_between_scans_of_one_rig():

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from polysight_worlds.images import draw_direction
 from polysight_worlds.media import METAL, Stack
 from polysight_worlds.optics import Antenna
 from polysight_worlds.rig import Boards, published_boards, published_rig, turn
@@ -57,11 +56,11 @@ class ShapeScene:
 
 @dataclass(frozen=True)
 class ShapeNuisances:
-    """What disturbs a scan of shapes; 0 is none. Directions and phases are drawn from `seed`.
+    """What disturbs a scan of shapes; 0 is none. All is drawn from normal distributions, by `seed`.
 
-    `noise`: of the nominal noise. `misplaced_mm`: each board stands so far from where the rig file says. `axes_deg`:
-    each board's polarisation is turned about its boresight. `leakage`: magnitude of the other polarisation in H and V.
-    `gain_db`: spread of the boards' unknown gains; with any, their phases are drawn too.
+    `noise`: of the nominal noise. Root mean squares: `misplaced_mm` how far each board stands from where the rig file
+    says, `axes_deg` how far its polarisation is turned about its boresight, `leakage` the magnitude of the other
+    polarisation in H and V. `gain_db`: spread of the boards' unknown gains; with any, their phases are drawn too.
     """
 
     seed: int = 0
@@ -77,9 +76,10 @@ def disturb_boards(boards: Boards, nuisances: ShapeNuisances) -> Boards:
     rng = np.random.default_rng([nuisances.seed, 11])
 
     def disturb(antennas: tuple[Antenna, ...], leakage: float) -> tuple[Antenna, ...]:
-        shift_m = draw_direction(rng) * nuisances.misplaced_mm / 1000
-        rotation = turn(antennas[0].boresight, nuisances.axes_deg * rng.choice([-1, 1]))
-        leaked = leakage * np.exp(2j * np.pi * rng.random())
+        shift_m = nuisances.misplaced_mm / 1000 / np.sqrt(3) * rng.standard_normal(3)
+        rotation = turn(antennas[0].boresight, nuisances.axes_deg * rng.standard_normal())
+        real, imaginary = leakage / np.sqrt(2) * rng.standard_normal(2)
+        leaked = complex(real, imaginary)
         return tuple(antenna.rotate(rotation, shift_m).with_leakage(leaked) for antenna in antennas)
 
     tx = disturb((boards.tx,), 0.0)[0]

@@ -18,6 +18,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -326,57 +327,60 @@ def errors(
     """
     if not done.found.any():
         return {}
-    valid = np.flatnonzero(done.found)
-    is_found = np.zeros_like(done.found)
-    is_found[valid[np.linspace(0, valid.size - 1, min(most, valid.size)).astype(int)]] = True
-    good = aligned.good[is_found]
-    received = np.stack(
-        [
-            done.frequency[is_found, None] + aligned.frequency[is_found],
-            np.angle(done.amplitude)[is_found, None] + aligned.phase[is_found],
-            np.abs(done.amplitude)[is_found, None] * aligned.amplitude[is_found] / aligned.gain[is_found],
-        ]
-    )[:, good]
-    turns = cis(received[1])
-    received[0] -= received[0].mean()
-    received[1] = np.angle(turns * np.conj(turns.mean()))
-    received[2] = received[2] / received[2].mean() - 1
+    found = np.flatnonzero(done.found)
+    examined = found[_spread_evenly(found.size, most)]
+    good = aligned.good[examined]
+    amplitude = done.amplitude[examined, None]
+    relative_amplitude = aligned.amplitude[examined]
 
-    mean_amplitude = (aligned.amplitude[is_found] * good).sum(axis=1) / good.sum(axis=1)
-    amplitude_error = aligned.amplitude[is_found] / mean_amplitude[:, None] - 1
-    chirp_errors = np.stack([*aligned.error[is_found].swapaxes(0, 1), amplitude_error])[:, good]
+    frequency = (done.frequency[examined, None] + aligned.frequency[examined])[good]
+    phase = (np.angle(amplitude) + aligned.phase[examined])[good]
+    size = (np.abs(amplitude) * relative_amplitude / aligned.gain[examined])[good]
+    turns = (phase - np.angle(cis(phase).mean())) / (2 * np.pi)
+    received = np.array([frequency - frequency.mean(), 2 * np.pi * (turns - np.rint(turns)), size / size.mean() - 1])
 
-    two = is_found & (aligned.good.sum(axis=1) > 1)
-    halves = _reference_halves(aligned, done, two) * half_scale(aligned.good[two])[..., None, None]
+    mean_amplitude = (relative_amplitude * good).sum(axis=1, keepdims=True) / good.sum(axis=1, keepdims=True)
+    amplitude_error = relative_amplitude / mean_amplitude - 1
+    chirp_errors = np.array([*aligned.error[examined].swapaxes(0, 1)[:, good], amplitude_error[good]])
+
+    two = examined[good.sum(axis=1) > 1]
     with np.errstate(divide="ignore", invalid="ignore"):  # dead RX have no direct path: their figures are not finite
         out = {
             "received": received,
             "aligned": chirp_errors,
-            "averaged": _direct_path_errors(done.samples[:, is_found].swapaxes(0, 1), path),
-            "referenced": _object_errors(halves, path) if two.any() else np.zeros((3, 0)),
+            "averaged": _direct_path_errors(done.samples[:, examined], path),
+            "referenced": _object_errors(_reference_halves(aligned, done, two), path) if two.size else np.zeros((3, 0)),
         }
     for values in out.values():
         values[0] *= sample_rate_hz
     return out
 
 
-def _reference_halves(aligned: AlignedRow, done: Referenced, some: NDArray[np.bool_]) -> NDArray[np.complex64]:
-    """Return the two halves of some positions' bursts, referenced like `samples`, [position, 2, rx, block]."""
+@lru_cache(maxsize=8)
+def _spread_evenly(count: int, most: int) -> NDArray[np.intp]:
+    """Return at most `most` of `count` indices, evenly spaced."""
+    return np.linspace(0, count - 1, min(most, count)).astype(np.intp)
+
+
+def _reference_halves(aligned: AlignedRow, done: Referenced, some: NDArray[np.intp]) -> NDArray[np.complex64]:
+    """Return the halves of some positions' bursts, each an average referenced like `samples`, [position, 2, rx, block]."""
     blocks = aligned.halves.shape[-1]
     frequency = done.frequency[some] - aligned.centre[some]
     turn = phasor(-frequency * FOLD, -np.angle(done.amplitude[some]), blocks, (blocks - 1) / 2)
-    return aligned.halves[some] * done.steering * turn[:, None, None]
+    scale = half_scale(aligned.good[some].sum(axis=1))[..., None, None]
+    return aligned.halves[some] * (scale * (done.steering * turn[:, None])[:, None])
 
 
 def _direct_path_errors(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
-    """Return the errors of the direct path [3, n] in averages [position, rx, block], from two halves of the RX."""
-    frequency, phase, size = [], [], []
-    for h in (0, 1):
-        amplitude, w = _estimate(mean[:, h::2], path.half_estimators[h])
-        frequency.append(w / (2 * np.pi))
-        phase.append(np.angle(amplitude * np.conj(amplitude.mean())))  # without the constant difference of the RX
-        size.append(np.abs(amplitude) / np.abs(amplitude).mean())
-    return np.stack([x[0] - x[1] for x in (frequency, phase, size)]) / 2
+    """Return the errors of the direct path [3, n] in averages [rx, position, block], from two halves of the RX."""
+    halves = [_estimate(mean[h::2].swapaxes(0, 1), path.half_estimators[h]) for h in (0, 1)]
+    amplitude = np.array([amplitude for amplitude, _ in halves])
+    w = [w for _, w in halves]
+    amplitude_size = np.abs(amplitude)
+    # Without the constant difference of the RX.
+    phase = np.angle(amplitude * amplitude.mean(axis=1, keepdims=True).conj())
+    size = amplitude_size / amplitude_size.mean(axis=1, keepdims=True)
+    return np.array([(w[0] - w[1]) / (2 * np.pi), phase[0] - phase[1], size[0] - size[1]]) / 2
 
 
 def _estimate(signal: NDArray[np.complex64], estimator: NDArray[np.complex128]) -> tuple[Complex, Real]:
@@ -397,12 +401,13 @@ def _object_errors(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[n
     edges = block_edges(n)
     tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
     # Amplitudes relative to the mean of both halves.
-    energy, common = np.stack([signal_energy(echo[:, h]) for h in (0, 1)], axis=1), product.sum(axis=1)
-    size = np.abs(energy + np.stack([common, common.conj()], axis=1))
+    energy = signal_energy(echo.reshape(-1, rx, n)).reshape(-1, 2)
+    common = product.sum(axis=1)
+    size = np.abs(energy + np.array([common, common.conj()]).T)
     contrast = (size[:, 0] - size[:, 1]) / np.maximum(size.sum(axis=1), 1e-30)
     # Keep positions whose halves are more coherent than noise would be by chance.
     echoing = np.abs(tone.amplitude) > 4 / np.sqrt(rx * n) * np.sqrt(energy.prod(axis=1))
-    return np.stack([tone.frequency / 2, np.angle(tone.amplitude) / 2, contrast])[:, echoing]
+    return np.array([tone.frequency / 2, np.angle(tone.amplitude) / 2, contrast])[:, echoing]
 
 
 def _spread(values: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -2,48 +2,49 @@
    parts interleaved. */
 #include "signal.h"
 
-/* exp(-j 2 pi (frequency FOLD (m - middle) + turns)) for m < blocks. */
-static inline void ramp(double frequency, double turns, int blocks, float *restrict c, float *restrict s)
+/* exp(-j 2 pi frequency FOLD (m - middle)) for m < blocks: conjugate before and behind the middle. */
+static inline void ramp(double frequency, int blocks, float *restrict c, float *restrict s)
 {
     VECTOR
-    for (int m = 0; m < blocks; m++) {
-        Complex z = cis(-frequency * FOLD * (m - (blocks - 1) / 2.0) - turns);
-        c[m] = (float)z.re;
+    for (int m = 0; m < (blocks + 1) / 2; m++) {
+        Complex z = cis(frequency * FOLD * ((blocks - 1) / 2.0 - m));
+        c[m] = c[blocks - 1 - m] = (float)z.re;
         s[m] = (float)z.im;
+        s[blocks - 1 - m] = (float)-z.im;
     }
 }
 
-/* Sum of a position's two halves, [rx][block], times weights, as real part x and imaginary part y. */
+/* Sum of a position's two halves, [rx][block], times weights [2][rx][block], as real part x and imaginary part y. */
 static inline void weighted(const float *restrict halves, const float *restrict weights, int count, float *restrict x,
                             float *restrict y)
 {
-    const float *restrict second = halves + 2 * count;
+    float sum[2 * RX * MOST]; /* first, so that only one array is taken apart into real and imaginary parts */
+    VECTOR
+    for (int i = 0; i < 2 * count; i++)
+        sum[i] = halves[i] + halves[2 * count + i];
     VECTOR
     for (int i = 0; i < count; i++) {
-        float a = halves[2 * i] + second[2 * i], b = halves[2 * i + 1] + second[2 * i + 1];
-        x[i] = a * weights[2 * i] - b * weights[2 * i + 1];
-        y[i] = a * weights[2 * i + 1] + b * weights[2 * i];
+        float a = sum[2 * i], b = sum[2 * i + 1];
+        x[i] = a * weights[i] - b * weights[count + i];
+        y[i] = a * weights[count + i] + b * weights[i];
     }
 }
 
 /* Upper medians of the magnitudes of sixteen spectra of `size` powers. The bits of positive floats sort like the numbers,
    so each is found bit by bit, by counting smaller ones. */
-static inline void medians(const int32_t *restrict powers, int size, int lanes, double *restrict median)
+static inline void medians(const float *powers, int size, float *median)
 {
-    int32_t upper[LANES] = {0}, tried[LANES], count[LANES];
-    for (int bit = 30; bit >= 0; bit--) {
-        for (int k = 0; k < LANES; k++)
-            tried[k] = upper[k] | 1 << bit, count[k] = 0;
-        for (int i = 0; i < size; i++)
-            for (int k = 0; k < LANES; k++)
-                count[k] += powers[LANES * i + k] < tried[k];
-        for (int k = 0; k < LANES; k++)
-            upper[k] = count[k] <= size / 2 ? tried[k] : upper[k];
-    }
-    for (int k = 0; k < lanes; k++) {
-        float power;
-        memcpy(&power, &upper[k], sizeof power);
-        median[k] = sqrt(power);
+    for (int part = 0; part < LANES; part += STEP) {
+        Whole upper = {0};
+        for (int bit = 30; bit >= 0; bit--) {
+            Whole tried = upper | 1 << bit, even = {0}, odd = {0}; /* minus the numbers of smaller ones */
+            for (int i = 0; i < size; i += 2) {
+                even += (Whole)load(powers + LANES * i + part) < tried;
+                odd += (Whole)load(powers + LANES * (i + 1) + part) < tried;
+            }
+            upper |= (even + odd >= -(size / 2)) & 1 << bit;
+        }
+        store(median + part, (Vector)upper);
     }
 }
 
@@ -69,7 +70,7 @@ static inline void choose_peaks(const Table *t, const float *re, const float *im
     *second = is_object ? top : lower;
 }
 
-/* `NumpyLoops.search`. halves: [position][2][rx][block]; weights [rx][block]: beam, steering and window;
+/* `NumpyLoops.search`. halves: [position][2][rx][block]; weights [2][rx][block]: beam, steering and window;
    preference [bin]; the object is nearest..farthest bins above the direct path. Results: bins [2][position], median
    magnitude [position]. Returns 0, or 1 if there is not enough memory. */
 int NAME(search)(const float *halves, const float *weights, const float *preference, int positions, int blocks,
@@ -90,6 +91,7 @@ int NAME(search)(const float *halves, const float *weights, const float *prefere
     for (int first = 0; first < positions; first += LANES) {
         int lanes = positions - first < LANES ? positions - first : LANES;
         int32_t at[LANES];
+        float middle[LANES];
         for (int k = 0; k < lanes; k++) {
             weighted(halves + 4 * (size_t)(first + k) * count, weights, count, x, y);
             for (int m = 0; m < blocks; m++) {
@@ -98,16 +100,20 @@ int NAME(search)(const float *halves, const float *weights, const float *prefere
             }
         }
         transform(re, im, blocks, size, &table);
-        for (int i = 0; i < LANES * size; i++) {
-            float weight = preference[table.bin[i / LANES]];
-            power[i] = re[i] * re[i] + im[i] * im[i];
-            re[i] *= weight;
-            im[i] *= weight;
+        for (int i = 0; i < size; i++) {
+            float weight = preference[table.bin[i]];
+            VECTOR
+            for (int k = LANES * i; k < LANES * (i + 1); k++) {
+                power[k] = re[k] * re[k] + im[k] * im[k];
+                re[k] *= weight;
+                im[k] *= weight;
+            }
         }
-        medians((int32_t *)power, size, lanes, median + first);
+        medians(power, size, middle);
         strongest(re, im, size, at);
         for (int k = 0; k < lanes; k++) {
             int32_t *peak = bins + first + k;
+            median[first + k] = sqrt(middle[k]);
             choose_peaks(&table, re + k, im + k, table.bin[at[k]], nearest, farthest, *comparable, peak, peak + positions);
         }
     }
@@ -119,7 +125,7 @@ int NAME(search)(const float *halves, const float *weights, const float *prefere
 static void estimate_at(const float *g_re, const float *g_im, int rows, int blocks, double frequency, float *c, float *s,
                         Complex *estimate)
 {
-    ramp(frequency, 0, blocks, c, s);
+    ramp(frequency, blocks, c, s);
     for (int k = 0; k < rows; k++) {
         const float *re = g_re + k * blocks, *im = g_im + k * blocks;
         float x = 0, y = 0;
@@ -131,7 +137,7 @@ static void estimate_at(const float *g_re, const float *g_im, int rows, int bloc
     }
 }
 
-/* `NumpyLoops.refine`: steering [rx][block], estimator [row][2][rx][block], real and imaginary part; changes frequency
+/* `NumpyLoops.refine`: steering [2][rx][block], estimator [row][2][rx][block], real and imaginary part; changes frequency
    [position]. */
 int NAME(refine)(const float *halves, const float *steering, const float *estimator, int positions, int blocks, int rows,
                  int count_steps, double *frequency, double *estimates, double *steps)
@@ -171,7 +177,7 @@ int NAME(refine)(const float *halves, const float *steering, const float *estima
     return 0;
 }
 
-/* `NumpyLoops.turn`: halves [position][2][RX][block], steering [RX][block], phase in turns, scale [position][2]; the sum
+/* `NumpyLoops.turn`: halves [position][2][RX][block], steering [2][RX][block], phase in turns, scale [position][2]; the sum
    to out [RX][position][block], the energy of the scaled halves' difference to apart [position]. */
 int NAME(turn)(const float *halves, const float *steering, int positions, int blocks, const double *frequency,
                const double *phase, const uint8_t *found, const float *scale, float *out, float *apart)
@@ -189,15 +195,18 @@ int NAME(turn)(const float *halves, const float *steering, int positions, int bl
             energy += difference * difference;
         }
         apart[p] = energy;
-        ramp(frequency[p], phase[p], blocks, c, s);
+        ramp(frequency[p], blocks, c, s);
         weighted(first, steering, count, x, y);
+        Complex start = cis(-phase[p]);
+        float u = (float)start.re, v = (float)start.im;
         for (int r = 0; r < RX; r++) {
             const float *re = x + r * blocks, *im = y + r * blocks;
             float *restrict to = out + 2 * ((size_t)r * positions + p) * blocks;
             VECTOR
             for (int m = 0; m < blocks; m++) {
-                to[2 * m] = found[p] ? re[m] * c[m] - im[m] * s[m] : 0;
-                to[2 * m + 1] = found[p] ? re[m] * s[m] + im[m] * c[m] : 0;
+                float a = re[m] * c[m] - im[m] * s[m], b = re[m] * s[m] + im[m] * c[m];
+                to[2 * m] = found[p] ? a * u - b * v : 0;
+                to[2 * m + 1] = found[p] ? a * v + b * u : 0;
             }
         }
     }

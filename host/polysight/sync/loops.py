@@ -93,6 +93,7 @@ def phasor(frequency: Real, phase: Real, samples: int, origin: float) -> NDArray
     return ramp.reshape(*frequency.shape, coarse.size * step)[..., :samples]
 
 
+@lru_cache(maxsize=8)
 def block_edges(n: int) -> NDArray[np.intp]:
     """Return the edges of eight blocks in a record of n samples.
 
@@ -120,17 +121,19 @@ def refine(blocks: Complex, times: Real, steps: int = 3) -> Tone:
         Newton steps.
     """
     w = np.zeros(blocks.shape[:-1])
-    powers = np.stack([times**0, times, times**2], axis=1).astype(complex)
-    limit = 2 * np.pi / np.ptp(times)
+    squares = times**2
+    limit = 2 * np.pi / (times[-1] - times[0])
     turned, s0, s1, s2, step = blocks, w, w, w, w
     for i in range(steps):
         if i > 0:
             turned = blocks * cis(-w[..., None] * times)
-        s0, s1, s2 = np.moveaxis(turned @ powers, -1, 0)
+        s0 = turned.sum(axis=-1)
+        s1 = turned @ times
+        s2 = turned @ squares
         slope = (s0.conj() * s1).imag
         curvature = np.abs(s1) ** 2 - (s0.conj() * s2).real
         step = np.divide(-slope, curvature, out=np.zeros_like(slope), where=curvature < 0)
-        step = np.clip(step, -limit, limit)
+        step = np.minimum(np.maximum(step, -limit), limit)
         w += step
     # The sum at the final frequency, by a Taylor series about the one before: the last step is small.
     return Tone(w / (2 * np.pi), s0 - 1j * step * s1 - step**2 / 2 * s2)
@@ -570,7 +573,8 @@ class Library:
         positions, blocks = halves.shape[0], halves.shape[-1]
         bins, median = np.empty((2, positions), np.int32), np.empty(positions)
         sizes = positions, blocks, size, *object_bins
-        self._call("search", (halves, weights, _preference(size), *sizes, np.array([comparable]), bins, median))
+        parts = _take_apart(weights)
+        self._call("search", (halves, parts, _preference(size), *sizes, np.array([comparable]), bins, median))
         return bins, median
 
     def refine(
@@ -584,8 +588,9 @@ class Library:
         """See `NumpyLoops.refine`."""
         positions, blocks, rows = halves.shape[0], halves.shape[-1], len(estimator)
         frequencies, estimate, step = frequency.copy(), np.empty((positions, rows), complex), np.empty(positions)
-        parts = np.stack([estimator.real, estimator.imag], axis=1)
-        self._call("refine", (halves, steering, parts, positions, blocks, rows, steps, frequencies, estimate, step))
+        estimator_parts = np.stack([estimator.real, estimator.imag], axis=1)
+        parts = _take_apart(steering), estimator_parts
+        self._call("refine", (halves, *parts, positions, blocks, rows, steps, frequencies, estimate, step))
         return frequencies, estimate, step
 
     def turn(
@@ -601,7 +606,8 @@ class Library:
         positions, _, rx, blocks = halves.shape
         out, half_difference = np.empty((rx, positions, blocks), np.complex64), np.empty(positions, np.float32)
         turns = phase / (2 * np.pi)
-        self._call("turn", (halves, steering, positions, blocks, frequency, turns, found, scale, out, half_difference))
+        parts = _take_apart(steering)
+        self._call("turn", (halves, parts, positions, blocks, frequency, turns, found, scale, out, half_difference))
         return out, half_difference
 
     def _call(self, name: str, arguments: Sequence[NDArray[Any] | float]) -> None:
@@ -610,6 +616,11 @@ class Library:
         c_arguments = [_c_argument(x) for x in arrays]
         if getattr(self._loaded, f"{name}_{self.bits}")(*c_arguments):
             raise MemoryError(f"no memory for {name}")
+
+
+def _take_apart(values: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Return real and imaginary part [2, ...]."""
+    return np.stack([values.real, values.imag])
 
 
 def _c_argument(value: NDArray[Any] | float) -> ctypes.c_void_p | ctypes.c_int:

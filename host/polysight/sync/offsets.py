@@ -427,6 +427,8 @@ class DirectPath(NamedTuple):
         complex128 [2, 2, rx / 2 * block]: A and A w from every other RX alone.
     beam
         complex64 [rx]: weights of the steered RX for the search, sum 1, with low gain towards the object.
+    search_weights
+        complex64 [rx, block]: beam, steering and window of the search.
     object_bins
         IF distance of the nearest and farthest echo from the direct path, in bins of the search FFT.
     sweep_hz
@@ -439,6 +441,7 @@ class DirectPath(NamedTuple):
     drift_estimator: NDArray[np.complex128]
     half_estimators: NDArray[np.complex128]
     beam: NDArray[np.complex64]
+    search_weights: NDArray[np.complex64]
     object_bins: tuple[float, float]
     sweep_hz: NDArray[np.float64]
 
@@ -521,17 +524,25 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     centre = echoes[:, :, n // 2]
     spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE * np.eye(n_rx)
     beam = np.linalg.solve(spatial, np.ones(n_rx)).conj()
+    beam = complex64(beam / beam.sum())
+    folded_steering = cis(-2 * np.pi * middles * lag_s)
     bins = chirp.hz_per_sample * FOLD * _FFT / SPEED_OF_LIGHT_M_S
     return DirectPath(
         steering=cis(-2 * np.pi * sweep * lag_s),
-        folded_steering=cis(-2 * np.pi * middles * lag_s),
+        folded_steering=folded_steering,
         estimator=_least_squares(model[:, :2], covariance),
         drift_estimator=_least_squares(model, covariance),
         half_estimators=np.stack([_least_squares(model[c, :2], covariance[np.ix_(c, c)]) for c in channels_of_half]),
-        beam=(beam / beam.sum()).astype(np.complex64),
+        beam=beam,
+        search_weights=complex64(beam[:, None] * folded_steering * _window(n)),
         object_bins=(float(excess.min() * bins), float(excess.max() * bins)),
         sweep_hz=middles,
     )
+
+
+def _window(blocks: int) -> NDArray[np.float32]:
+    """Return the window of the search, a Hann window without zeros at its ends."""
+    return np.hanning(blocks + 2)[1:-1].astype(np.float32)
 
 
 def _least_squares(model: NDArray[np.complex128], covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:
@@ -559,13 +570,12 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     # The compiled search has room for as many blocks as its transform.
     is_supported = len(path.beam) == loops.RX and n <= _FFT
     run = by or (loops.library() if is_supported else None) or NumpyLoops
-    usable: NDArray[np.bool_] = np.any(aligned.good, axis=1)
-    window = np.hanning(n + 2)[1:-1].astype(np.float32)
+    good_chirps = aligned.good.sum(axis=1)
+    usable = good_chirps > 0
     nearest, farthest = int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)
-    beam = complex64(path.beam[:, None] * path.folded_steering * window)
-    bins, median = run.search(aligned.halves, beam, _FFT, (nearest, farthest), _COMPARABLE)
+    bins, median = run.search(aligned.halves, path.search_weights, _FFT, (nearest, farthest), _COMPARABLE)
     peaks = ((bins + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD
-    floor = median**2 / np.log(2) / (window**2).sum()  # from the median bin, for tones fill few bins
+    floor = median**2 / np.log(2) / (_window(n) ** 2).sum()  # from the median bin, for tones fill few bins
     three, two = complex64(path.drift_estimator), complex64(path.estimator)
     frequency, estimate, _ = run.refine(aligned.halves, path.folded_steering, three, peaks[0], _STEPS)
     drifts = _ratio(estimate[:, 2], estimate[:, 0])[usable]
@@ -580,7 +590,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     if_frequency = if_frequency % 1.0 if chirp.if_mode == "complex1x" else (if_frequency + 0.5) % 1.0 - 0.5
     band = if_frequency < 0.9 if chirp.if_mode == "complex1x" else np.abs(if_frequency) < 0.45
     strength = np.abs(amplitude)
-    chirps = np.maximum(aligned.good.sum(axis=1), 1)
+    chirps = np.maximum(good_chirps, 1)
     # All chirps of a row have the same noise.
     floor = _find_middle((floor * chirps)[usable]) / chirps if usable.any() else floor
     noise = floor / (np.abs(path.beam) ** 2).sum()  # noise power of an averaged sample of one RX
@@ -589,10 +599,10 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     if is_found.any():
         is_found &= strength > _LOST * _find_middle(strength[is_found])
 
-    scale = half_scale(aligned.good)
+    scale = half_scale(good_chirps)
     samples, half_difference = run.turn(aligned.halves, flat, frequency, np.angle(amplitude), is_found, scale)
     # A half of k of the K good chirps was scaled by K / k, so its noise is that of a chirp divided by k.
-    two = aligned.good.sum(axis=1) > 1
+    two = good_chirps > 1
     noise_power = np.full(len(two), np.nan)
     chirp_noise = half_difference * chirps / (len(path.beam) * n) / decimator().noise
     noise_power[two] = chirp_noise[two] / scale[two].sum(axis=1)
@@ -607,11 +617,11 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     )
 
 
-def half_scale(good: NDArray[np.bool_]) -> NDArray[np.float32]:
+def half_scale(good_chirps: NDArray[np.int_]) -> NDArray[np.float32]:
     """Return the factors that make each half an average of its own chirps, float32 [position, 2]."""
-    count = good.sum(axis=1)
-    halves = np.stack([(count + 1) // 2, count // 2], axis=1)
-    return (count[:, None] / np.maximum(halves, 1)).astype(np.float32)
+    chirps = good_chirps[:, None]
+    chirps_of_half = (chirps + [1, 0]) // 2
+    return (chirps / np.maximum(chirps_of_half, 1)).astype(np.float32)
 
 
 def _try_others(

@@ -8,12 +8,12 @@
 #define MOST 24 /* arguments; numbers and pointers both take a register or eight bytes of stack on ARM64 */
 typedef int Loop(long, long, long, long, long, long, long, long, long, long, long, long, long, long, long, long, long,
                  long, long, long, long, long, long, long);
-extern Loop align_128, search_128, refine_128, turn_128;
+extern Loop align_128, find_128, remove_128;
 
 int main(int count, char **words)
 {
-    Loop *loops[] = {align_128, search_128, refine_128, turn_128};
-    const char *names[] = {"align", "search", "refine", "turn"};
+    Loop *loops[] = {align_128, find_128, remove_128};
+    const char *names[] = {"align", "find", "remove"};
     long a[MOST] = {0};
     int64_t sizes[MOST], size;
     int given = 0, status = 1;
@@ -26,7 +26,7 @@ int main(int count, char **words)
         sizes[given] = size;
         a[given++] = size < 0 ? (long)number : (long)here;
     }
-    for (int i = 0; i < 4 && count == 2; i++)
+    for (int i = 0; i < 3 && count == 2; i++)
         if (!strcmp(words[1], names[i]))
             status = loops[i](a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8], a[9], a[10], a[11], a[12], a[13],
                               a[14], a[15], a[16], a[17], a[18], a[19], a[20], a[21], a[22], a[23]);

@@ -221,9 +221,15 @@ def test_peaks_and_medians_of_any_spectrum(loops, size):
     halves = (rng.standard_normal((35, 2, 4, 16)) + 1j * rng.standard_normal((35, 2, 4, 16))).astype(np.complex64)
     halves[3] = 0
     weights = (rng.standard_normal((4, 16)) + 1j * rng.standard_normal((4, 16))).astype(np.complex64)
-    got, expected = (by.search(halves, weights, size, (3, 9), 0.35) for by in (loops, sync_loops.NumpyLoops))
-    np.testing.assert_array_equal(got[0], expected[0])
-    np.testing.assert_allclose(got[1], expected[1], rtol=1e-4, atol=1e-5)
+    estimator = (rng.standard_normal((3, 64)) + 1j * rng.standard_normal((3, 64))).astype(np.complex64)
+    got, expected = (
+        by.find(halves, weights, size, (3, 9), 0.35, np.ones((4, 16), np.complex64), estimator, 0)
+        for by in (loops, sync_loops.NumpyLoops)
+    )
+    np.testing.assert_array_equal(got.peaks, expected.peaks)
+    np.testing.assert_array_equal(got.frequency, expected.peaks[0])
+    np.testing.assert_allclose(got.median, expected.median, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(got.estimate, expected.estimate, rtol=1e-4, atol=1e-3)
 
 
 def test_three_receivers_are_aligned_in_numpy():

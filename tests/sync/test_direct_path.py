@@ -220,13 +220,13 @@ def test_the_compiled_search_is_never_given_more_blocks_than_it_has_room_for(rig
     if compiled is None:
         pytest.skip("nothing is compiled here")
     blocks_searched = []
-    search = type(compiled).search
+    find = type(compiled).find
 
-    def watched(self, halves, *arguments):
+    def watched(self, halves, **arguments):
         blocks_searched.append(halves.shape[-1])
-        return search(self, halves, *arguments)
+        return find(self, halves, **arguments)
 
-    monkeypatch.setattr(type(compiled), "search", watched)
+    monkeypatch.setattr(type(compiled), "find", watched)
     rng = np.random.default_rng(0)
     for linear in ((0, 192), (0, 1024), (0, 1200)):
         chirp = msgspec.structs.replace(

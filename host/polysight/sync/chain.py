@@ -31,7 +31,7 @@ from polysight.store import CubeRow, RowData, Source
 from polysight.sync import high_pass_filter as hpf
 from polysight.sync import loops
 from polysight.sync.decimate import FOLD, flatten, fold
-from polysight.sync.loops import Complex, Real, block_edges, block_times, cis, phasor, refine, signal_energy
+from polysight.sync.loops import Complex, Real, block_edges, block_times, cis, complex64, phasor, refine, signal_energy
 from polysight.sync.offsets import (
     AlignedRow,
     DirectPath,
@@ -363,12 +363,12 @@ def _spread_evenly(count: int, most: int) -> NDArray[np.intp]:
 
 
 def _reference_halves(aligned: AlignedRow, done: Referenced, some: NDArray[np.intp]) -> NDArray[np.complex64]:
-    """Return the halves of some positions' bursts, each an average referenced like `samples`, [position, 2, rx, block]."""
+    """Return the halves of some positions' bursts as averages, referenced like `samples`: [position, 2, rx, block]."""
     blocks = aligned.halves.shape[-1]
     frequency = done.frequency[some] - aligned.centre[some]
     turn = phasor(-frequency * FOLD, -np.angle(done.amplitude[some]), blocks, (blocks - 1) / 2)
     scale = half_scale(aligned.good[some].sum(axis=1))[..., None, None]
-    return aligned.halves[some] * (scale * (done.steering * turn[:, None])[:, None])
+    return complex64(aligned.halves[some] * (scale * (done.steering * turn[:, None])[:, None]))
 
 
 def _direct_path_errors(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:

@@ -48,9 +48,9 @@ static inline void medians(const float *powers, int size, float *median)
     }
 }
 
-/* `NumpyLoops.search` for one spectrum, strongest at the bin top; by powers, which rise with magnitudes. */
+/* `loops.choose_peaks` for one spectrum, strongest at the bin top; by powers, which rise with magnitudes. */
 static inline void choose_peaks(const Table *t, const float *re, const float *im, int top, int nearest, int farthest,
-                                double comparable, int32_t *first, int32_t *second)
+                                double comparable, int bins[2])
 {
     const int last = t->size - 1;
     int lower = top;
@@ -66,27 +66,66 @@ static inline void choose_peaks(const Table *t, const float *re, const float *im
         here = below;
     }
     int is_object = best > comparable * comparable * squared(value_at(re, im, t->place[top & last]));
-    *first = is_object ? lower : top;
-    *second = is_object ? top : lower;
+    bins[0] = is_object ? lower : top;
+    bins[1] = is_object ? top : lower;
 }
 
-/* `NumpyLoops.search`. halves: [position][2][rx][block]; weights [2][rx][block]: beam, steering and window;
-   preference [bin]; the object is nearest..farthest bins above the direct path. Results: bins [2][position], median
-   magnitude [position]. Returns 0, or 1 if there is not enough memory. */
-int NAME(search)(const float *halves, const float *weights, const float *preference, int positions, int blocks,
-                 int size, int nearest, int farthest, const double *comparable, int32_t *bins, double *median)
+/* `NumpyLoops.refine` for the weighted sum x, y of a position: estimator [row][2][rx][block], real and imaginary part;
+   changes frequency. Estimates A, A w and (third row) A q. c and s: ramp of the last; work: room for 2 rows of blocks. */
+static void refine(const float *x, const float *y, const float *estimator, int blocks, int rows, int count_steps,
+                   float *c, float *s, float *work, double *frequency, Complex *estimate, double *last_step)
+{
+    const double reach = 1.0 / (blocks * FOLD);
+    float *re = work, *im = re + rows * blocks;
+    memset(re, 0, sizeof *re * 2 * rows * blocks);
+    for (int i = 0; i < rows * RX; i++) { /* the same demodulation for all RX: sum over them first */
+        const float *e = estimator + (i / RX * 2 * RX + i % RX) * blocks, *f = e + RX * blocks;
+        const float *u = x + i % RX * blocks, *v = y + i % RX * blocks;
+        float *to_re = re + i / RX * blocks, *to_im = im + i / RX * blocks;
+        VECTOR
+        for (int m = 0; m < blocks; m++) {
+            to_re[m] += e[m] * u[m] - f[m] * v[m];
+            to_im[m] += e[m] * v[m] + f[m] * u[m];
+        }
+    }
+    for (int i = 0; i <= count_steps; i++) {
+        if (i > 0) {
+            Complex a = estimate[0], aw = estimate[1];
+            double size = squared(a), step = size > 0 ? (aw.re * a.re + aw.im * a.im) / size / TURN : 0;
+            *last_step = step < -reach ? -reach : step > reach ? reach : step;
+            *frequency += *last_step;
+        }
+        ramp(*frequency, blocks, c, s);
+        for (int k = 0; k < rows; k++) {
+            const float *u = re + k * blocks, *v = im + k * blocks;
+            float a = 0, b = 0;
+            for (int m = 0; m < blocks; m++) {
+                a += u[m] * c[m] - v[m] * s[m];
+                b += u[m] * s[m] + v[m] * c[m];
+            }
+            estimate[k] = (Complex){a, b};
+        }
+    }
+}
+
+/* `NumpyLoops.find`: halves [position][2][rx][block]; weights and steering [2][rx][block], real and imaginary part;
+   preference [bin]; the object is nearest..farthest bins above the direct path; estimator [3][2][rx][block]. Results:
+   peaks [2][position], median and frequency [position], estimates [position][3]. Returns 0, or 1 without memory. */
+int NAME(find)(const float *halves, const float *weights, const float *preference, int positions, int blocks, int size,
+               int nearest, int farthest, const double *comparable, const float *steering, const float *estimator,
+               int count_steps, double *peaks, double *median, double *frequency, double *estimates)
 {
     const int count = RX * blocks;
-    Memory memory = {NULL, 0};
+    Memory memory = {NULL, sizeof(float) * (size_t)(2 * count + 3 * LANES * size + 8 * blocks)};
     Table table;
     take_table(&memory, &table, size);
-    memory.used += sizeof(float) * (size_t)(2 * count + 3 * LANES * size);
     if (!reserve(&memory))
         return 1;
     take_table(&memory, &table, size);
     float *re = floats(&memory, LANES * (size_t)size), *im = floats(&memory, LANES * (size_t)size);
-    float *power = floats(&memory, LANES * (size_t)size);
+    float *power = floats(&memory, LANES * (size_t)size), *c = floats(&memory, 8 * (size_t)blocks);
     float *x = floats(&memory, 2 * (size_t)count), *y = x + count;
+    double last_step;
     fill_table(&table);
     for (int first = 0; first < positions; first += LANES) {
         int lanes = positions - first < LANES ? positions - first : LANES;
@@ -112,101 +151,54 @@ int NAME(search)(const float *halves, const float *weights, const float *prefere
         medians(power, size, middle);
         strongest(re, im, size, at);
         for (int k = 0; k < lanes; k++) {
-            int32_t *peak = bins + first + k;
-            median[first + k] = sqrt(middle[k]);
-            choose_peaks(&table, re + k, im + k, table.bin[at[k]], nearest, farthest, *comparable, peak, peak + positions);
+            int p = first + k, bins[2];
+            choose_peaks(&table, re + k, im + k, table.bin[at[k]], nearest, farthest, *comparable, bins);
+            for (int i = 0; i < 2; i++)
+                peaks[i * positions + p] = (double)(bins[i] < size / 2 ? bins[i] : bins[i] - size) / size / FOLD;
+            median[p] = sqrt(middle[k]);
+            frequency[p] = peaks[p];
+            weighted(halves + 4 * (size_t)p * count, steering, count, x, y);
+            refine(x, y, estimator, blocks, 3, count_steps, c, c + blocks, c + 2 * blocks, frequency + p,
+                   (Complex *)estimates + 3 * p, &last_step);
         }
     }
     free(memory.block);
     return 0;
 }
 
-/* Estimates A, A w and (third row) A q at a frequency: demodulated sums over the blocks of g [row][block]. */
-static void estimate_at(const float *g_re, const float *g_im, int rows, int blocks, double frequency, float *c, float *s,
-                        Complex *estimate)
-{
-    ramp(frequency, blocks, c, s);
-    for (int k = 0; k < rows; k++) {
-        const float *re = g_re + k * blocks, *im = g_im + k * blocks;
-        float x = 0, y = 0;
-        for (int m = 0; m < blocks; m++) {
-            x += re[m] * c[m] - im[m] * s[m];
-            y += re[m] * s[m] + im[m] * c[m];
-        }
-        estimate[k] = (Complex){x, y};
-    }
-}
-
-/* `NumpyLoops.refine`: steering [2][rx][block], estimator [row][2][rx][block], real and imaginary part; changes frequency
-   [position]. */
-int NAME(refine)(const float *halves, const float *steering, const float *estimator, int positions, int blocks, int rows,
-                 int count_steps, double *frequency, double *estimates, double *steps)
+/* `NumpyLoops.remove`: halves [position][2][rx][block], steering [2][rx][block], estimator [2][2][rx][block], scale
+   [position][2]; changes frequency [position]. Results: estimates [position][2], steps [position], the sum referenced to
+   the direct path out [rx][position][block], the energy of the scaled halves' difference apart [position]. */
+int NAME(remove)(const float *halves, const float *steering, const float *estimator, int positions, int blocks,
+                 int count_steps, const float *scale, double *frequency, double *estimates, double *steps, float *out,
+                 float *apart)
 {
     const int count = RX * blocks;
-    const double reach = 1.0 / (blocks * FOLD);
-    Memory memory = {NULL, 2 * sizeof(float) * ((size_t)count + rows * blocks + blocks)};
-    if (!reserve(&memory))
-        return 1;
-    float *x = (float *)memory.block, *y = x + count, *re = y + count, *im = re + rows * blocks;
-    float *c = im + rows * blocks, *s = c + blocks;
-    for (int p = 0; p < positions; p++) {
-        Complex *estimate = (Complex *)(estimates + 2 * (size_t)p * rows);
-        weighted(halves + 4 * (size_t)p * count, steering, count, x, y);
-        memset(re, 0, sizeof *re * 2 * rows * blocks);
-        for (int i = 0; i < rows * RX; i++) { /* the same demodulation for all RX: sum over them first */
-            const float *e = estimator + (i / RX * 2 * RX + i % RX) * blocks, *f = e + count;
-            const float *u = x + i % RX * blocks, *v = y + i % RX * blocks;
-            float *to_re = re + i / RX * blocks, *to_im = im + i / RX * blocks;
-            VECTOR
-            for (int m = 0; m < blocks; m++) {
-                to_re[m] += e[m] * u[m] - f[m] * v[m];
-                to_im[m] += e[m] * v[m] + f[m] * u[m];
-            }
-        }
-        estimate_at(re, im, rows, blocks, frequency[p], c, s, estimate);
-        for (int i = 0; i < count_steps; i++) {
-            Complex a = estimate[0], aw = estimate[1];
-            double size = squared(a);
-            double step = size > 0 ? (aw.re * a.re + aw.im * a.im) / size / TURN : 0;
-            steps[p] = step < -reach ? -reach : step > reach ? reach : step;
-            frequency[p] += steps[p];
-            estimate_at(re, im, rows, blocks, frequency[p], c, s, estimate);
-        }
-    }
-    free(memory.block);
-    return 0;
-}
-
-/* `NumpyLoops.turn`: halves [position][2][RX][block], steering [2][RX][block], phase in turns, scale [position][2]; the sum
-   to out [RX][position][block], the energy of the scaled halves' difference to apart [position]. */
-int NAME(turn)(const float *halves, const float *steering, int positions, int blocks, const double *frequency,
-               const double *phase, const uint8_t *found, const float *scale, float *out, float *apart)
-{
-    const int count = RX * blocks;
-    Memory memory = {NULL, 2 * sizeof(float) * ((size_t)count + blocks)};
+    Memory memory = {NULL, 2 * sizeof(float) * ((size_t)count + 3 * blocks)};
     if (!reserve(&memory))
         return 1;
     float *x = (float *)memory.block, *y = x + count, *c = y + count, *s = c + blocks;
     for (int p = 0; p < positions; p++) {
         const float *first = halves + 4 * (size_t)p * count, *second = first + 2 * count;
+        Complex *estimate = (Complex *)estimates + 2 * p;
+        weighted(first, steering, count, x, y);
+        refine(x, y, estimator, blocks, 2, count_steps, c, s, s + blocks, frequency + p, estimate, steps + p);
+        const double size = magnitude(*estimate);
+        const float u = size > 0 ? (float)(estimate->re / size) : 0, v = size > 0 ? (float)(-estimate->im / size) : 0;
         float energy = 0;
         for (int i = 0; i < 2 * count; i++) {
             float difference = scale[2 * p] * first[i] - scale[2 * p + 1] * second[i];
             energy += difference * difference;
         }
         apart[p] = energy;
-        ramp(frequency[p], blocks, c, s);
-        weighted(first, steering, count, x, y);
-        Complex start = cis(-phase[p]);
-        float u = (float)start.re, v = (float)start.im;
         for (int r = 0; r < RX; r++) {
             const float *re = x + r * blocks, *im = y + r * blocks;
             float *restrict to = out + 2 * ((size_t)r * positions + p) * blocks;
             VECTOR
             for (int m = 0; m < blocks; m++) {
                 float a = re[m] * c[m] - im[m] * s[m], b = re[m] * s[m] + im[m] * c[m];
-                to[2 * m] = found[p] ? a * u - b * v : 0;
-                to[2 * m + 1] = found[p] ? a * v + b * u : 0;
+                to[2 * m] = a * u - b * v;
+                to[2 * m + 1] = a * v + b * u;
             }
         }
     }

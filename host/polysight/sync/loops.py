@@ -369,12 +369,66 @@ def signal_energy(signal: NDArray[np.complex64]) -> NDArray[np.float32]:
     return np.einsum("prn,prn->p", parts, parts)
 
 
+class FirstLook(NamedTuple):
+    """`peaks` [2, position]: frequency of the direct path's peak, and of a second candidate; `median` [position]: upper
+    median of the spectrum's magnitude; `frequency` [position] and `estimate` [position, 3] from `NumpyLoops.refine`.
+    """
+
+    peaks: NDArray[np.float64]
+    median: NDArray[np.float64]
+    frequency: NDArray[np.float64]
+    estimate: NDArray[np.complex128]
+
+
+class Removed(NamedTuple):
+    """`frequency` [position], `estimate` [position, 2] and last `step` [position] from `NumpyLoops.refine`; `samples`
+    [rx, position, block] and `half_difference` [position] from `NumpyLoops.turn`.
+    """
+
+    frequency: NDArray[np.float64]
+    estimate: NDArray[np.complex128]
+    step: NDArray[np.float64]
+    samples: NDArray[np.complex64]
+    half_difference: NDArray[np.float32]
+
+
 class NumpyLoops:
-    """Loops over positions that find the direct path; the same methods as :class:`Library`.
+    """Loops over positions that find and remove the direct path; :class:`Library` has `find` and `remove`, too.
 
     Halves are complex64 [position, 2, rx, block] from burst alignment (`offsets.AlignedRow`); frequencies are in cycles
     per sample.
     """
+
+    @staticmethod
+    def find(
+        halves: NDArray[np.complex64],
+        weights: NDArray[np.complex64],
+        size: int,
+        object_bins: tuple[int, int],
+        comparable: float,
+        steering: NDArray[np.complex64],
+        estimator: NDArray[np.complex64],
+        steps: int,
+    ) -> FirstLook:
+        """Call :meth:`search`, then :meth:`refine` from the first peak, with three estimates."""
+        bins, median = NumpyLoops.search(halves, weights, size, object_bins, comparable)
+        peaks = ((bins + size // 2) % size - size // 2) / size / FOLD
+        frequency, estimate, _ = NumpyLoops.refine(halves, steering, estimator, peaks[0], steps)
+        return FirstLook(peaks, median, frequency, estimate)
+
+    @staticmethod
+    def remove(
+        halves: NDArray[np.complex64],
+        steering: NDArray[np.complex64],
+        estimator: NDArray[np.complex64],
+        frequency: NDArray[np.float64],
+        steps: int,
+        scale: NDArray[np.float32],
+    ) -> Removed:
+        """Call :meth:`refine` with two estimates, then :meth:`turn` by the frequency and phase found."""
+        frequency, estimate, step = NumpyLoops.refine(halves, steering, estimator, frequency, steps)
+        samples, half_difference = NumpyLoops.turn(halves, steering, frequency, np.angle(estimate[:, 0]), scale)
+        return Removed(frequency, estimate, step, samples, half_difference)
 
     @staticmethod
     def search(
@@ -477,7 +531,6 @@ class NumpyLoops:
         steering: NDArray[np.complex64],
         frequency: NDArray[np.float64],
         phase: NDArray[np.float64],
-        found: NDArray[np.bool_],
         scale: NDArray[np.float32],
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """Apply the steering and remove frequency and phase of the direct path from a row.
@@ -490,8 +543,6 @@ class NumpyLoops:
             complex64 [rx, block].
         frequency, phase
             [position], cycles per sample; radians at the middle of the linear samples.
-        found
-            bool [position]: other positions become zero.
         scale
             float32 [position, 2]: factors that make each half an average of its chirps.
 
@@ -500,7 +551,7 @@ class NumpyLoops:
         The averages complex64 [rx, position, block], and the energy of the scaled halves' difference [position].
         """
         n = halves.shape[-1]
-        turn = phasor(-frequency * FOLD, -phase, n, (n - 1) / 2) * found[:, None]
+        turn = phasor(-frequency * FOLD, -phase, n, (n - 1) / 2)
         turned = (halves[:, 0] + halves[:, 1]) * steering * turn[:, None]
         half_difference = complex64(halves[:, 0] * scale[:, 0, None, None] - halves[:, 1] * scale[:, 1, None, None])
         return complex64(turned.swapaxes(0, 1)), signal_energy(half_difference)
@@ -561,54 +612,52 @@ class Library:
         taps = (np.array(filters), len(filters) - 3, self._decimator.taps, self._decimator.flat)
         self._call("align", (words, valid, *sizes, *taps, *into))
 
-    def search(
+    def find(
         self,
         halves: NDArray[np.complex64],
         weights: NDArray[np.complex64],
         size: int,
         object_bins: tuple[int, int],
         comparable: float,
-    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-        """See `NumpyLoops.search`."""
+        steering: NDArray[np.complex64],
+        estimator: NDArray[np.complex64],
+        steps: int,
+    ) -> FirstLook:
+        """See `NumpyLoops.find`."""
         positions, blocks = halves.shape[0], halves.shape[-1]
-        bins, median = np.empty((2, positions), np.int32), np.empty(positions)
+        out = FirstLook(
+            peaks=np.empty((2, positions)),
+            median=np.empty(positions),
+            frequency=np.empty(positions),
+            estimate=np.empty((positions, len(estimator)), complex),
+        )
+        spectrum = _take_apart(weights), _preference(size)
         sizes = positions, blocks, size, *object_bins
-        parts = _take_apart(weights)
-        self._call("search", (halves, parts, _preference(size), *sizes, np.array([comparable]), bins, median))
-        return bins, median
+        estimates = _take_apart(steering), _take_apart(estimator, axis=1), steps
+        self._call("find", (halves, *spectrum, *sizes, np.array([comparable]), *estimates, *out))
+        return out
 
-    def refine(
+    def remove(
         self,
         halves: NDArray[np.complex64],
         steering: NDArray[np.complex64],
         estimator: NDArray[np.complex64],
         frequency: NDArray[np.float64],
         steps: int,
-    ) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64]]:
-        """See `NumpyLoops.refine`."""
-        positions, blocks, rows = halves.shape[0], halves.shape[-1], len(estimator)
-        frequencies, estimate, step = frequency.copy(), np.empty((positions, rows), complex), np.empty(positions)
-        estimator_parts = np.stack([estimator.real, estimator.imag], axis=1)
-        parts = _take_apart(steering), estimator_parts
-        self._call("refine", (halves, *parts, positions, blocks, rows, steps, frequencies, estimate, step))
-        return frequencies, estimate, step
-
-    def turn(
-        self,
-        halves: NDArray[np.complex64],
-        steering: NDArray[np.complex64],
-        frequency: NDArray[np.float64],
-        phase: NDArray[np.float64],
-        found: NDArray[np.bool_],
         scale: NDArray[np.float32],
-    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
-        """See `NumpyLoops.turn`."""
+    ) -> Removed:
+        """See `NumpyLoops.remove`."""
         positions, _, rx, blocks = halves.shape
-        out, half_difference = np.empty((rx, positions, blocks), np.complex64), np.empty(positions, np.float32)
-        turns = phase / (2 * np.pi)
-        parts = _take_apart(steering)
-        self._call("turn", (halves, parts, positions, blocks, frequency, turns, found, scale, out, half_difference))
-        return out, half_difference
+        out = Removed(
+            frequency=frequency.copy(),
+            estimate=np.empty((positions, len(estimator)), complex),
+            step=np.empty(positions),
+            samples=np.empty((rx, positions, blocks), np.complex64),
+            half_difference=np.empty(positions, np.float32),
+        )
+        parts = _take_apart(steering), _take_apart(estimator, axis=1)
+        self._call("remove", (halves, *parts, positions, blocks, steps, scale, *out))
+        return out
 
     def _call(self, name: str, arguments: Sequence[NDArray[Any] | float]) -> None:
         """Call a loop with arrays as pointers and numbers as int. Raises MemoryError."""
@@ -618,9 +667,9 @@ class Library:
             raise MemoryError(f"no memory for {name}")
 
 
-def _take_apart(values: NDArray[np.complex64]) -> NDArray[np.float32]:
-    """Return real and imaginary part [2, ...]."""
-    return np.stack([values.real, values.imag])
+def _take_apart(values: NDArray[np.complex64], axis: int = 0) -> NDArray[np.float32]:
+    """Return real and imaginary parts, along a new axis."""
+    return np.stack([values.real, values.imag], axis=axis)
 
 
 def _c_argument(value: NDArray[Any] | float) -> ctypes.c_void_p | ctypes.c_int:

@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from polysight.sync import high_pass_filter as hpf
 from polysight.sync import loops
 from polysight.sync.decimate import FOLD, decimator
-from polysight.sync.loops import Library, NumpyLoops, Real, Tone, cis, complex64
+from polysight.sync.loops import Library, NumpyLoops, Real, Removed, Tone, cis, complex64
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -573,16 +573,28 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     good_chirps = aligned.good.sum(axis=1)
     usable = good_chirps > 0
     nearest, farthest = int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)
-    bins, median = run.search(aligned.halves, path.search_weights, _FFT, (nearest, farthest), _COMPARABLE)
-    peaks = ((bins + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD
-    floor = median**2 / np.log(2) / (_window(n) ** 2).sum()  # from the median bin, for tones fill few bins
-    three, two = complex64(path.drift_estimator), complex64(path.estimator)
-    frequency, estimate, _ = run.refine(aligned.halves, path.folded_steering, three, peaks[0], _STEPS)
-    drifts = _ratio(estimate[:, 2], estimate[:, 0])[usable]
+    first = run.find(
+        halves=aligned.halves,
+        weights=path.search_weights,
+        size=_FFT,
+        object_bins=(nearest, farthest),
+        comparable=_COMPARABLE,
+        steering=path.folded_steering,
+        estimator=complex64(path.drift_estimator),
+        steps=_STEPS,
+    )
+    floor = first.median**2 / np.log(2) / (_window(n) ** 2).sum()  # from the median bin, for tones fill few bins
+    drifts = _ratio(first.estimate[:, 2], first.estimate[:, 0])[usable]
     drift = _find_middle(drifts) if usable.any() else 0.0
     flat = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
-    frequency, estimate, step = run.refine(aligned.halves, flat, two, frequency, _STEPS)
-    _try_others(aligned.halves, peaks, usable, how=(run, flat, two), found=(frequency, estimate, step))
+    scale = half_scale(good_chirps)
+
+    def remove(positions: slice | NDArray[np.intp], start: NDArray[np.float64]) -> Removed:
+        return run.remove(aligned.halves[positions], flat, complex64(path.estimator), start, _STEPS, scale[positions])
+
+    removed = remove(slice(None), first.frequency)
+    _try_others(removed, first.peaks, usable, remove)
+    frequency, estimate, step, samples, half_difference = removed
 
     # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
     amplitude = estimate[:, 0]
@@ -599,8 +611,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     if is_found.any():
         is_found &= strength > _LOST * _find_middle(strength[is_found])
 
-    scale = half_scale(good_chirps)
-    samples, half_difference = run.turn(aligned.halves, flat, frequency, np.angle(amplitude), is_found, scale)
+    samples[:, ~is_found] = 0
     # A half of k of the K good chirps was scaled by K / k, so its noise is that of a chirp divided by k.
     two = good_chirps > 1
     noise_power = np.full(len(two), np.nan)
@@ -620,23 +631,22 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
 def half_scale(good_chirps: NDArray[np.int_]) -> NDArray[np.float32]:
     """Return the factors that make each half an average of its own chirps, float32 [position, 2]."""
     chirps = good_chirps[:, None]
-    chirps_of_half = (chirps + [1, 0]) // 2
+    chirps_of_half = (chirps + np.array([1, 0])) // 2
     return (chirps / np.maximum(chirps_of_half, 1)).astype(np.float32)
 
 
 def _try_others(
-    halves: NDArray[np.complex64],
+    removed: Removed,
     peaks: NDArray[np.float64],
     usable: NDArray[np.bool_],
-    how: tuple[Loops, NDArray[np.complex64], NDArray[np.complex64]],
-    found: tuple[NDArray[np.generic], ...],
+    remove: Callable[[NDArray[np.intp], NDArray[np.float64]], Removed],
 ) -> None:
-    """Use the second peak where the amplitude is an outlier in its row; changes `found` in place.
+    """Use the second peak where the amplitude is an outlier in its row; changes `removed` in place.
 
-    `how` are the loops, the steering and the estimator; `found` are frequency, estimate and last step from `refine`.
-    An outlier is beyond `_OUTLIER` standard deviations, estimated from the median absolute deviation of the row.
+    `remove` tries again from other frequencies. An outlier is beyond `_OUTLIER` standard deviations, estimated from the
+    median absolute deviation of the row.
     """
-    level = np.log(np.maximum(np.abs(found[1][:, 0]), 1e-30))
+    level = np.log(np.maximum(np.abs(removed.estimate[:, 0]), 1e-30))
     if not usable.any():
         return
     middle = _find_middle(level[usable])
@@ -645,12 +655,14 @@ def _try_others(
     odd = np.flatnonzero(usable & (np.abs(level - middle) > _OUTLIER * spread) & (peaks[0] != peaks[1]))
     if odd.size == 0:
         return
-    run, steering, estimator = how
-    second_try = run.refine(halves[odd], steering, estimator, peaks[1, odd], _STEPS)
-    other_level = np.log(np.maximum(np.abs(second_try[1][:, 0]), 1e-30))
+    second_try = remove(odd, peaks[1, odd])
+    other_level = np.log(np.maximum(np.abs(second_try.estimate[:, 0]), 1e-30))
     better = np.abs(other_level - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
-    for result_part, part in zip(found, second_try, strict=True):
-        result_part[odd[better]] = part[better]
+    replaced = odd[better]
+    removed.frequency[replaced] = second_try.frequency[better]
+    removed.estimate[replaced] = second_try.estimate[better]
+    removed.step[replaced] = second_try.step[better]
+    removed.samples[:, replaced] = second_try.samples[:, better]
 
 
 def _find_middle(values: NDArray[np.floating]) -> float:

@@ -10,8 +10,10 @@ At a curved surface they differ from Fresnel's to first order in K / k (`reflect
   - K / (2 k cos^2(theta))) replace the plane wave's, inside and outside;
 * the saddle point sums over directions: <d theta^2> = j K / (2 k cos(theta)) in the plane of incidence, where r''
   enters, and the same across it, where the angle grows by its square and the plane of incidence turns: s and p mix.
+* curvature may be twisted between both directions: then a cylinder's wave and the sum over directions couple s and p
+  (`mix_twisted`).
 The first is Snyder and Love (IEEE Trans. MTT 23, 134, 1975) and, for metal, the second term of Luneberg and Kline; the
-second is the next order of the stationary phase (Felsen and Marcuvitz, section 4.2). Both parts are linear in K.
+second is the next order of the stationary phase (Felsen and Marcuvitz, section 4.2). All are linear in K.
 """
 
 from __future__ import annotations
@@ -161,7 +163,7 @@ def visible_normals(rig: Instrument) -> VisibleNormals:
 
 
 def polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx: Antenna) -> Complex:
-    """Coefficients [n, 2] of r_s and r_p in a receiver's voltage."""
+    """Coefficients [n, 4] of r_s, r_p, and of what the surface turns from s to p and from p to s, in a voltage."""
     t, r, *_ = unit_legs(points, at_m, tx.at_m, rx.at_m)
     s_axis = np.cross(normals, t)
     s_axis /= np.maximum(np.linalg.norm(s_axis, axis=1, keepdims=True), 1e-12)
@@ -173,18 +175,23 @@ def polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx
     def dot(a: NDArray, b: NDArray) -> NDArray:
         return np.einsum("ni,ni->n", a, b)
 
-    return np.stack([dot(sent, s_axis) * dot(received, s_axis), dot(sent, p_in) * dot(received, p_out)], axis=1)
+    sent_s = dot(sent, s_axis)
+    sent_p = dot(sent, p_in)
+    received_s = dot(received, s_axis)
+    received_p = dot(received, p_out)
+    rows = [sent_s * received_s, sent_p * received_p, sent_s * received_p, sent_p * received_s]
+    return np.stack(rows, axis=1)
 
 
-def principal_bends(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array) -> tuple[Array, Array]:
-    """Curvature in the plane of incidence and across it, each [n], 1 / m."""
+def bends_by_incidence(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array) -> Array:
+    """Curvature in the plane of incidence, across it, and twist between both, [3, n], 1 / m."""
     ray = points - at_m - tx_m
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     inside = np.einsum("nij,ni->nj", tangents(normals), ray)
     inside /= np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-12)
     across = np.stack([-inside[:, 1], inside[:, 0]], axis=1)
-    bends = [np.einsum("ni,nij,nj->n", v, curvature, v) for v in (inside, across)]
-    return bends[0], bends[1]
+    pairs = ((inside, inside), (across, across), (inside, across))
+    return np.stack([np.einsum("ni,nij,nj->n", first, curvature, second) for first, second in pairs])
 
 
 def reflect_flat(eps: NDArray | complex, theta: Array) -> tuple[Complex, Complex]:
@@ -221,6 +228,32 @@ def reflect_curved(
         beside = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other_flat - r) / sin**2)
         coefficients.append(local + inside + beside)
     return coefficients[0], coefficients[1]
+
+
+def mix_twisted(eps: NDArray | complex, theta: Array, twist: Array, wave_number: float) -> Complex:
+    """Coefficient [n] of p from s, and of s from p, at a twisted surface, to first order in curvature / wave number.
+
+    `twist`: curvature (1 / m) between the direction of incidence along the surface and normal x that direction. Both
+    coefficients are the same, by reciprocity.
+    """
+    cos = np.cos(theta)
+    sin = np.sin(theta)
+    r_s, r_p = reflect_flat(eps, theta)
+    above_s, above_p = reflect_flat(eps, theta + ANGLE_STEP)
+    below_s, below_p = reflect_flat(eps, theta - ANGLE_STEP)
+    first = ((above_s - above_p) - (below_s - below_p)) / (2 * ANGLE_STEP)
+    # The sum over directions: with the angle of incidence its plane turns.
+    directions = first / (2 * sin * cos) - (r_s - r_p) / (2 * sin**2)
+    # The wave of a cylinder: its logarithmic derivative differs from a plane wave's, inside and outside.
+    if np.any(np.isinf(eps)):
+        electric = 0.0
+        magnetic = 1 / cos**2
+    else:
+        inside2 = np.asarray(eps) - sin**2
+        electric = 1 / cos**2 - eps / inside2
+        magnetic = 1 / cos**2 - 1 / inside2
+    local = (electric * (1 + r_s) * (1 + r_p) + magnetic * (1 - r_s) * (1 - r_p)) / 4
+    return np.asarray(1j * twist / wave_number * (directions + local))
 
 
 def _reflect_local(

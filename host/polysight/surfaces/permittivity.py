@@ -27,8 +27,9 @@ from polysight.surfaces.measure import Seen, Shape, find_shape
 from polysight.surfaces.optics import (
     Antenna,
     Optics,
+    bends_by_incidence,
+    mix_twisted,
     polarisation_row,
-    principal_bends,
     reflect_curved,
     reflect_flat,
 )
@@ -75,9 +76,9 @@ class Voltages:
     b, std
         Voltages of H and V without path and spreading, complex [n, 2], and their standard deviations [n, 2].
     m
-        Rows of the coefficients of r_s and r_p, complex [n, 2 receivers, 2 coefficients].
-    theta, bend_inside, bend_across
-        Incidence, and curvatures in and across the plane of incidence, [n].
+        Rows of the coefficients of r_s, r_p, s to p and p to s, complex [n, 2 receivers, 4 coefficients].
+    theta, bend_inside, bend_across, twist
+        Incidence, curvatures in and across the plane of incidence, and twist between both, [n].
     arrival
         Direction of arrival at V, its x and y, [n, 2].
     band_rise
@@ -92,6 +93,7 @@ class Voltages:
     theta: Array
     bend_inside: Array
     bend_across: Array
+    twist: Array
     arrival: Array
     band_rise: Array
     at_m: Array
@@ -123,7 +125,7 @@ def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Vol
         std.append(echoes.amplitude_std / spread)
         rows.append(polarisation_row(shape.points, shape.normals, at_m, optics.tx, receiver))
     _, back, *_ = unit_legs(shape.points, seen_from["v"], tx_m, optics.v.at_m)
-    inside, across = principal_bends(*solid, seen.h.at_m, tx_m)
+    inside, across, twist = bends_by_incidence(*solid, seen.h.at_m, tx_m)
     return Voltages(
         b=np.stack(b, axis=1),
         std=np.stack(std, axis=1),
@@ -131,6 +133,7 @@ def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Vol
         theta=np.arccos(np.clip(shape.cos, 0, 1)),
         bend_inside=inside,
         bend_across=across,
+        twist=twist,
         arrival=back[:, :2],
         band_rise=np.stack([seen.h.band_rise, seen.v.band_rise], axis=1),
         at_m=seen.h.at_m[:, :2],
@@ -138,12 +141,14 @@ def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Vol
 
 
 def reflect_points(eps: NDArray | complex, v: Voltages, wave_number: float) -> Complex:
-    """Coefficients (r_s, r_p) of the curved surface at each point, [n, 2]."""
-    return np.stack(reflect_curved(eps, v.theta, v.bend_inside, v.bend_across, wave_number), axis=1)
+    """Coefficients (r_s, r_p, s to p, p to s) of the curved surface at each point, [n, 4]."""
+    r_s, r_p = reflect_curved(eps, v.theta, v.bend_inside, v.bend_across, wave_number)
+    mixed = mix_twisted(eps, v.theta, v.twist, wave_number)
+    return np.stack([r_s, r_p, mixed, mixed], axis=1)
 
 
 def receive(v: Voltages, coefficients: Complex) -> Complex:
-    """Voltages of H and V [n, 2] that coefficients [n, 2] give with gains of 1."""
+    """Voltages of H and V [n, 2] that coefficients [n, 4] give with gains of 1."""
     return (v.m @ coefficients[..., None])[..., 0]
 
 
@@ -293,10 +298,15 @@ class PermittivityFit:
 
 
 def point_ratio(v: Voltages, gains: Gains) -> Complex:
-    """Ratio r_s / r_p of each point."""
+    """Ratio r_s / r_p of each point, as if no twist mixed both."""
     b = v.b.copy()
     b[:, 0] /= gains.ratio(v.arrival)
-    r = np.linalg.solve(v.m, b[..., None])[..., 0]
+    return _unmix(v, b)
+
+
+def _unmix(v: Voltages, b: Complex) -> Complex:
+    """Ratio r_s / r_p that voltages [n, 2] would mean at a surface without twist."""
+    r = np.linalg.solve(v.m[..., :2], b[..., None])[..., 0]
     return r[:, 0] / np.where(r[:, 1] == 0, 1e-30, r[:, 1])
 
 
@@ -306,8 +316,8 @@ def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex
     eps = clip_permittivity(permittivity_from_ratio(ratio, v.theta))
     for _ in range(4):
         r_s, r_p = reflect_flat(eps, v.theta)
-        curved_s, curved_p = reflect_curved(eps, v.theta, v.bend_inside, v.bend_across, wave_number)
-        eps = clip_permittivity(permittivity_from_ratio(ratio * (r_s / r_p) / (curved_s / curved_p), v.theta))
+        curved = _unmix(v, receive(v, reflect_points(eps, v, wave_number)))
+        eps = clip_permittivity(permittivity_from_ratio(ratio * (r_s / r_p) / curved, v.theta))
     return eps
 
 
@@ -318,7 +328,7 @@ def clip_permittivity(eps: NDArray) -> Complex:
 
 
 def find_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Complex:
-    """b_H (M r)_V - b_V (M r)_H of each point, for coefficients r [n, 2]."""
+    """b_H (M r)_V - b_V (M r)_H of each point, for coefficients r [n, 4]."""
     expected = receive(v, coefficients)
     return v.b[:, 0] / gains.ratio(v.arrival) * expected[:, 1] - v.b[:, 1] * expected[:, 0]
 
@@ -481,7 +491,8 @@ def add_common_errors(
     # An error of ln(H / V) of the reference turns and scales b_H.
     of_h = miss + v.b[:, 1] * receive(v, coefficients)[:, 0]
     reference_change = of_h * gains.estimate_unknown_std(v.arrival)
-    flat = np.stack(reflect_flat(fit.eps, v.theta), axis=1)
+    flat_s, flat_p = reflect_flat(fit.eps, v.theta)
+    flat = np.stack([flat_s, flat_p, 0 * flat_s, 0 * flat_s], axis=1)
     first_order = find_misses(v, gains, flat) - miss
     model_change = first_order * (expansion_parameter(v, wave_number) + CURVATURE_ERROR)
     # Their phases are not known.

@@ -87,14 +87,16 @@ def test_transmitter_and_receiver_may_be_exchanged(permittivity, seed):
     assert scatter_cylinder(back, 0.05, permittivity, FREQUENCY_HZ, path_m) == pytest.approx(exchanged, rel=1e-9)
 
 
-@pytest.mark.parametrize("permittivity", [None, 4 - 0.4j])
+# What creeps around metal is no part of a smooth integrand.
+@pytest.mark.parametrize(("permittivity", "tolerance"), [(None, 0.01), (4 - 0.4j, 0.005)])
+@pytest.mark.parametrize("places", [((-0.25, 0.3, -0.5), (0.3, -0.2, -0.5)), ((-0.4, 0.05, -0.4), (0.4, -0.05, -0.4))])
 @pytest.mark.parametrize(("sent", "received"), [(S_AXIS, S_AXIS), (P_AXIS, P_AXIS), (S_AXIS, P_AXIS)])
-def test_the_stationary_axial_wave_gives_the_whole_integral(permittivity, sent, received):
+def test_the_stationary_axial_wave_gives_the_whole_integral(permittivity, tolerance, places, sent, received):
     frequency_hz = 24e9
-    radius_m = 0.03
+    radius_m = 0.06
     k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
     # A turn of both dipoles, so that all parts of the sum are there.
-    pair = dipoles((-0.25, 0.3, -0.5), (0.3, -0.2, -0.5), sent + 0.3 * S_AXIS, received + 0.2 * P_AXIS)
+    pair = dipoles(*places, sent + 0.3 * S_AXIS, received + 0.2 * P_AXIS)
     body = EndlessCylinder(radius_m, permittivity, False)
     round_x = cylinder("cylinder", METAL, (0.0, 0.0, 0.0), radius_m, 2.0, axis=(1.0, 0.0, 0.0))
     path = follow_path(round_x.evaluate(*find_specular(round_x, pair.tx_m, pair.rx_m)), pair.tx_m, pair.rx_m)
@@ -109,7 +111,7 @@ def test_the_stationary_axial_wave_gives_the_whole_integral(permittivity, sent, 
     )
     full_integral = np.conj(0.5j * integrand.sum() * (h[1] - h[0]))
     quick = scatter_cylinder(pair, radius_m, permittivity, frequency_hz, specular)[0]
-    assert quick == pytest.approx(full_integral, rel=0.01)
+    assert quick == pytest.approx(full_integral, rel=tolerance)
 
 
 @pytest.mark.parametrize("medium", [METAL, Stack(below=4 - 0.4j), Stack(below=9 - 1j)], ids=["metal", "4", "9"])

@@ -48,6 +48,8 @@ OUTLIER = 4.0
 # Blocks of stage positions whose errors count as independent: windows overlap, and ripples of edges and of other echoes
 # are as long as a Fresnel zone (40 to 70 mm).
 BLOCK_M = 2 * WINDOW_M
+# Ripples of edges and of other echoes change over such a distance: points within it have the same scatter.
+RIPPLE_M = 0.04
 # Ripple of V / H that is expected before it is seen, and the number of blocks that this expectation is worth: a small
 # segment has few blocks, which say little of their own scatter.
 EXPECTED_RIPPLE = 0.02
@@ -284,8 +286,8 @@ class PermittivityFit:
         Of (real, imaginary), from the scatter of the points alone.
     used
         bool [n]: points that count.
-    noise_share
-        Root mean square of the points' misses over what their noise gives.
+    excess2
+        Squares of the points' misses over what their noise gives, [n]; 1 on average for noise alone.
     answer
         Complex [2, n]: the change of (real, imaginary) is the real part of `answer` times a change of the misses.
     """
@@ -293,7 +295,7 @@ class PermittivityFit:
     eps: complex
     covariance: Array
     used: NDArray[np.bool_]
-    noise_share: float
+    excess2: Array
     answer: Complex
 
 
@@ -388,12 +390,11 @@ def fit_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Permittiv
         step = _linearise(eps, v, gains, ripple, wave_number)
         if np.abs(move).max() < 1e-5:
             break
-    excess2 = (np.abs(step.miss) / np.maximum(step.noise, 1e-30)) ** 2
     return PermittivityFit(
         eps=eps,
         covariance=_covariance_of_scatter(step.answer, step.miss, ripple, v.at_m),
         used=step.used,
-        noise_share=float(np.sqrt(np.average(excess2, weights=step.weights) / 2)),
+        excess2=(np.abs(step.miss) / np.maximum(step.noise, 1e-30)) ** 2 / 2,
         answer=step.answer,
     )
 
@@ -577,11 +578,17 @@ def judge_medium(fit: PermittivityFit, v: Voltages, gains: Gains, wave_number: f
 
 
 def point_covariance(v: Voltages, gains: Gains, fit: PermittivityFit, wave_number: float) -> Array:
-    """Covariance of (real, imaginary) of each point's permittivity by its own scatter, [n, 2, 2]."""
-    relative = np.linalg.norm(v.std / np.maximum(np.abs(v.b), 1e-30), axis=1) * max(1.0, fit.noise_share)
+    """Covariance of (real, imaginary) of each point's permittivity by the scatter around it, [n, 2, 2].
+
+    What edges and other echoes do to a point is no part of its noise, and differs over a segment: the misses of all
+    points around it tell, those too that do not count for the segment.
+    """
+    around = scipy.spatial.KDTree(v.at_m).query_ball_point(v.at_m, RIPPLE_M)
+    excess2 = np.array([fit.excess2[near].mean() for near in around])
+    noise2 = np.sum((v.std / np.maximum(np.abs(v.b), 1e-30)) ** 2, axis=1)
     step = 1e-3
     changed = replace(v, b=v.b * np.array([1 + step, 1.0]))
     rate = (point_permittivity(changed, gains, wave_number) - point_permittivity(v, gains, wave_number)) / step
     # The permittivity is an analytic function of the ratio: the same error in both parts.
-    variance = np.abs(rate) ** 2 * relative**2
+    variance = np.abs(rate) ** 2 * noise2 * excess2
     return variance[:, None, None] * np.eye(2)

@@ -1,0 +1,71 @@
+"""Errors of single points: their regions hold where the segment is quiet and where edges or other echoes ripple."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from polysight.surfaces.optics import reflect_flat
+from polysight.surfaces.permittivity import (
+    Gains,
+    Voltages,
+    fit_permittivity,
+    point_covariance,
+    point_permittivity,
+)
+
+WAVE_NUMBER = 1634.0
+EPS = 4.0 - 0.5j
+CHI2_95 = 5.991
+# Metal of known gain, the same in all directions.
+UNIT_GAINS = Gains(
+    ratio_terms=np.zeros(1, complex),
+    level_terms=np.zeros(1),
+    band_rise=np.zeros(2),
+    middle=np.zeros(2),
+    degree=0,
+    std=0.0,
+    covered=(np.full(2, -1.0), np.full(2, 1.0)),
+)
+
+
+def make_voltages(ripple: np.ndarray, at_m: np.ndarray, stated_noise: float) -> Voltages:
+    """Voltages of a flat surface with a relative ripple [n] in each part of V, of which `stated_noise` is known."""
+    rng = np.random.default_rng(4)
+    count = len(ripple)
+    theta = np.full(count, np.radians(50.0))
+    b = np.stack(reflect_flat(EPS, theta), axis=1)
+    b[:, 1] *= 1 + ripple * (rng.standard_normal(count) + 1j * rng.standard_normal(count))
+    std = np.zeros((count, 2))
+    std[:, 1] = stated_noise * np.abs(b[:, 1])
+    zero = np.zeros(count)
+    rows = np.zeros((count, 2, 4), complex)
+    rows[:, 0, 0] = 1
+    rows[:, 1, 1] = 1
+    return Voltages(
+        b=b,
+        std=std,
+        m=rows,
+        theta=theta,
+        bend_inside=zero,
+        bend_across=zero,
+        twist=zero,
+        arrival=np.zeros((count, 2)),
+        band_rise=np.zeros((count, 2)),
+        at_m=at_m,
+    )
+
+
+@pytest.mark.parametrize("stated_noise", [0.003, 0.01])
+def test_regions_of_points_hold_where_it_is_quiet_and_where_it_ripples(stated_noise):
+    x, y = np.meshgrid(np.arange(40) * 0.008, np.arange(40) * 0.008)
+    at_m = np.stack([x.ravel(), y.ravel()], axis=1)
+    is_rippled = at_m[:, 0] > x.mean()
+    voltages = make_voltages(np.where(is_rippled, 0.03, 0.005), at_m, stated_noise)
+    fit = fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER)
+    away = point_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER) - EPS
+    covariance = point_covariance(voltages, UNIT_GAINS, fit, WAVE_NUMBER)
+    parts = np.stack([away.real, away.imag], axis=1)
+    distance2 = np.einsum("ni,nij,nj->n", parts, np.linalg.inv(covariance), parts)
+    for half in (is_rippled, ~is_rippled):
+        assert 0.9 < np.mean(distance2[half] < CHI2_95) < 0.985

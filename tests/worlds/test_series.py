@@ -96,7 +96,8 @@ def test_the_stationary_axial_wave_gives_the_whole_integral(permittivity, tolera
     radius_m = 0.06
     k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
     # A turn of both dipoles, so that all parts of the sum are there.
-    pair = dipoles(*places, sent + 0.3 * S_AXIS, received + 0.2 * P_AXIS)
+    tx_m, rx_m = places
+    pair = dipoles(tx_m, rx_m, sent + 0.3 * S_AXIS, received + 0.2 * P_AXIS)
     body = EndlessCylinder(radius_m, permittivity, False)
     round_x = cylinder("cylinder", METAL, (0.0, 0.0, 0.0), radius_m, 2.0, axis=(1.0, 0.0, 0.0))
     path = follow_path(round_x.evaluate(*find_specular(round_x, pair.tx_m, pair.rx_m)), pair.tx_m, pair.rx_m)

@@ -86,7 +86,7 @@ def test_disturbances_are_normally_distributed_with_the_size_given(change, std):
     for seed in range(400):
         true_boards = disturb_boards(BOARDS, ShapeNuisances(seed=seed, **change))
         for antenna, true_antenna in ((BOARDS.h[0], true_boards.h[0]), (BOARDS.v[0], true_boards.v[0])):
-            across = np.cross(antenna.boresight, antenna.polarisation) @ true_antenna.polarisation
+            across = complex(np.cross(antenna.boresight, antenna.polarisation) @ true_antenna.polarisation)
             if "misplaced_mm" in change:
                 deviations.extend(true_antenna.position - antenna.position)
             elif "axes_deg" in change:

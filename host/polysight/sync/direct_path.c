@@ -70,12 +70,12 @@ static inline void choose_peaks(const Table *t, const float *re, const float *im
     bins[1] = is_object ? top : lower;
 }
 
-/* `NumpyLoops.refine` for the weighted sum x, y of a position: estimator [row][2][rx][block], real and imaginary part;
-   changes frequency. Estimates A, A w and (third row) A q. c and s: ramp of the last; work: room for 2 rows of blocks. */
-static void refine(const float *x, const float *y, const float *estimator, int blocks, int rows, int count_steps,
-                   float *c, float *s, float *work, double *frequency, Complex *estimate, double *last_step)
+/* `NumpyLoops.refine` for a position's weighted sum x, y: estimator [row][2][rx][block], real and imaginary part; changes
+   frequency, returns the last step. c, s: ramp of the last estimate [block]; work [2][row][block]. */
+static double refine(const float *x, const float *y, const float *estimator, int blocks, int rows, int count_steps,
+                     float *c, float *s, float *work, double *frequency, Complex *estimate)
 {
-    const double reach = 1.0 / (blocks * FOLD);
+    double step = 0, reach = 1.0 / (blocks * FOLD);
     float *re = work, *im = re + rows * blocks;
     memset(re, 0, sizeof *re * 2 * rows * blocks);
     for (int i = 0; i < rows * RX; i++) { /* the same demodulation for all RX: sum over them first */
@@ -91,9 +91,9 @@ static void refine(const float *x, const float *y, const float *estimator, int b
     for (int i = 0; i <= count_steps; i++) {
         if (i > 0) {
             Complex a = estimate[0], aw = estimate[1];
-            double size = squared(a), step = size > 0 ? (aw.re * a.re + aw.im * a.im) / size / TURN : 0;
-            *last_step = step < -reach ? -reach : step > reach ? reach : step;
-            *frequency += *last_step;
+            double size = squared(a), whole = size > 0 ? (aw.re * a.re + aw.im * a.im) / size / TURN : 0;
+            step = whole < -reach ? -reach : whole > reach ? reach : whole;
+            *frequency += step;
         }
         ramp(*frequency, blocks, c, s);
         for (int k = 0; k < rows; k++) {
@@ -106,6 +106,7 @@ static void refine(const float *x, const float *y, const float *estimator, int b
             estimate[k] = (Complex){a, b};
         }
     }
+    return step;
 }
 
 /* `NumpyLoops.find`: halves [position][2][rx][block]; weights and steering [2][rx][block], real and imaginary part;
@@ -124,8 +125,7 @@ int NAME(find)(const float *halves, const float *weights, const float *preferenc
     take_table(&memory, &table, size);
     float *re = floats(&memory, LANES * (size_t)size), *im = floats(&memory, LANES * (size_t)size);
     float *power = floats(&memory, LANES * (size_t)size), *c = floats(&memory, 8 * (size_t)blocks);
-    float *x = floats(&memory, 2 * (size_t)count), *y = x + count;
-    double last_step;
+    float *x = floats(&memory, 2 * (size_t)count), *y = x + count, *s = c + blocks;
     fill_table(&table);
     for (int first = 0; first < positions; first += LANES) {
         int lanes = positions - first < LANES ? positions - first : LANES;
@@ -158,8 +158,7 @@ int NAME(find)(const float *halves, const float *weights, const float *preferenc
             median[p] = sqrt(middle[k]);
             frequency[p] = peaks[p];
             weighted(halves + 4 * (size_t)p * count, steering, count, x, y);
-            refine(x, y, estimator, blocks, 3, count_steps, c, c + blocks, c + 2 * blocks, frequency + p,
-                   (Complex *)estimates + 3 * p, &last_step);
+            refine(x, y, estimator, blocks, 3, count_steps, c, s, s + blocks, frequency + p, (Complex *)estimates + 3 * p);
         }
     }
     free(memory.block);
@@ -182,7 +181,7 @@ int NAME(remove)(const float *halves, const float *steering, const float *estima
         const float *first = halves + 4 * (size_t)p * count, *second = first + 2 * count;
         Complex *estimate = (Complex *)estimates + 2 * p;
         weighted(first, steering, count, x, y);
-        refine(x, y, estimator, blocks, 2, count_steps, c, s, s + blocks, frequency + p, estimate, steps + p);
+        steps[p] = refine(x, y, estimator, blocks, 2, count_steps, c, s, s + blocks, frequency + p, estimate);
         const double size = magnitude(*estimate);
         const float u = size > 0 ? (float)(estimate->re / size) : 0, v = size > 0 ? (float)(-estimate->im / size) : 0;
         float energy = 0;

@@ -41,6 +41,8 @@ MOST_CHIRPS = 256
 _log = logging.getLogger(__name__)
 _lock = threading.Lock()
 
+# Any array as an argument in C, made in a third of the time that `ctypes.data` takes
+_POINTED = ctypes.c_char * 0
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
 
@@ -121,7 +123,6 @@ def refine(blocks: Complex, times: Real, steps: int = 3) -> Tone:
         Newton steps.
     """
     w = np.zeros(blocks.shape[:-1])
-    squares = times**2
     limit = 2 * np.pi / (times[-1] - times[0])
     turned, s0, s1, s2, step = blocks, w, w, w, w
     for i in range(steps):
@@ -129,7 +130,7 @@ def refine(blocks: Complex, times: Real, steps: int = 3) -> Tone:
             turned = blocks * cis(-w[..., None] * times)
         s0 = turned.sum(axis=-1)
         s1 = turned @ times
-        s2 = turned @ squares
+        s2 = turned @ times**2
         slope = (s0.conj() * s1).imag
         curvature = np.abs(s1) ** 2 - (s0.conj() * s2).real
         step = np.divide(-slope, curvature, out=np.zeros_like(slope), where=curvature < 0)
@@ -538,7 +539,7 @@ class NumpyLoops:
         Parameters
         ----------
         halves
-            Both halves of the averages; they are added.
+            Both halves are added.
         steering
             complex64 [rx, block].
         frequency, phase
@@ -631,10 +632,9 @@ class Library:
             frequency=np.empty(positions),
             estimate=np.empty((positions, len(estimator)), complex),
         )
-        spectrum = _take_apart(weights), _preference(size)
-        sizes = positions, blocks, size, *object_bins
+        spectra = _take_apart(weights), _preference(size), positions, blocks, size, *object_bins, np.array([comparable])
         estimates = _take_apart(steering), _take_apart(estimator, axis=1), steps
-        self._call("find", (halves, *spectrum, *sizes, np.array([comparable]), *estimates, *out))
+        self._call("find", (halves, *spectra, *estimates, *out))
         return out
 
     def remove(
@@ -672,11 +672,13 @@ def _take_apart(values: NDArray[np.complex64], axis: int = 0) -> NDArray[np.floa
     return np.stack([values.real, values.imag], axis=axis)
 
 
-def _c_argument(value: NDArray[Any] | float) -> ctypes.c_void_p | ctypes.c_int:
+def _c_argument(value: NDArray[Any] | float) -> Any:
     """Return a contiguous array as a pointer, a number as int."""
-    if isinstance(value, np.ndarray):
-        return ctypes.c_void_p(value.ctypes.data)
-    return ctypes.c_int(int(value))
+    if not isinstance(value, np.ndarray):
+        return ctypes.c_int(int(value))
+    if value.flags.writeable:
+        return _POINTED.from_buffer(value.data)
+    return ctypes.c_void_p(value.ctypes.data)
 
 
 def library() -> Library | None:

@@ -369,11 +369,7 @@ class SpectralImager(RowSpectra):
         xp = self.xp
         echo = self.xp.asarray(echo, dtype=self.xp.complex64)
         if self._echo is None or not bool(xp.all(self._echo[0] == echo)):
-            channels = xp.reshape(echo, (-1,))
-            total = xp.zeros(self._kernels.shape[1:], dtype=xp.complex64, device=self.device)
-            for c in range(channels.shape[0]):
-                total += self._kernels[c, :, :] * channels[c]
-            self._echo = (echo, total)
+            self._echo = (echo, xp.tensordot(xp.reshape(echo, (-1,)), self._kernels, axes=1))
         white = self._along_y(self.transform_rows(xp.astype(weights, xp.complex64), self._ramps))
         return self._inverse(self._echo[1] * white)
 

@@ -310,7 +310,8 @@ class RowSynchroniser:
     def _form(self, board: str) -> CubeForm:
         """Return the form of a board's cube, detected from a few of its rows."""
         if board not in self._forms:
-            rig, rows = self._source.instrument, self._source.plan.rows
+            rig = self._source.instrument
+            rows = self._source.plan.rows
             some = sorted({int(r) for r in np.linspace(0, rows - 1, _CUBE_ROWS)})
             cubes = [row.cube for r in some if isinstance(row := self._source.read_row(board, r), CubeRow)]
             self._forms[board] = detect_form(cubes, rig, rig.by_name(board))
@@ -455,7 +456,8 @@ class CubeForm:
         if self.path is not None:
             samples, valid, hz, amplitude = _reference_cube(samples, valid, self.path, self.chirp)
         else:
-            hz, amplitude = zeros, np.abs(samples.mean(axis=(0, 2))).astype(np.float64)
+            hz = zeros
+            amplitude = np.abs(samples.mean(axis=(0, 2))).astype(np.float64)
         return SyncedRow(
             samples=samples,
             sweep_hz=sample_frequencies_hz(self.chirp),
@@ -496,7 +498,8 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
         )
     chirp = rig.chirp
     (a, b), sweep = chirp.linear_samples, chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
-    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    tx = np.array(tx_position_m(rig))
+    rx = np.array(rx_positions_m(rig, board))
     direct_m = np.linalg.norm(rx - tx, axis=1)
     gate = _gate_echoes(sweep[a:b], _gate_m(rig, board, tx, rx))
     absolute = np.exp(-2j * np.pi * np.outer(direct_m, sweep) / SPEED_OF_LIGHT_M_S)
@@ -505,7 +508,8 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     form = ["conjugated"] * conjugate + ["delays counted from the transmitter"] * counted_from_tx
     cube = (cube.conj() if conjugate else cube) * turn[:, None]
 
-    constant, path = np.zeros(len(rx)), None
+    constant = np.zeros(len(rx))
+    path = None
     mean, coherent = _mean_direct_path(cube[..., a:b], gate)
     if coherent > _COHERENT:
         lag = np.exp(2j * np.pi * np.outer(direct_m - direct_m[0], sweep) / SPEED_OF_LIGHT_M_S)
@@ -595,10 +599,12 @@ def _reference_cube(
     samples, (a, b) = cube.shape[2], whole_blocks(chirp.linear_samples)
     power = (np.abs(np.fft.fft(cube[..., a:b], axis=-1)) ** 2).sum(axis=0)
     centre = np.fft.fftfreq(b - a)[np.argmax(power, axis=-1)].astype(np.float64)
-    middle, still = (a + b - 1) / 2, np.zeros(centre.size)
+    middle = (a + b - 1) / 2
+    still = np.zeros(centre.size)
     mixed = cube * phasor(-centre, still, samples, middle)
     halves = flatten(fold(mixed[..., a:b])).swapaxes(0, 1) / 2
-    first_chirp, none = valid[:, None], np.zeros((centre.size, 1))
+    first_chirp = valid[:, None]
+    none = np.zeros((centre.size, 1))
     aligned = AlignedRow(
         halves=np.ascontiguousarray(np.stack([halves, halves], axis=1), np.complex64),
         centre=centre,

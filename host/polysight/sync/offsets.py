@@ -182,7 +182,9 @@ def align_pieces(
     ValueError
         if there is no piece, or the pieces are not the positions of `valid`.
     """
-    linear, row, done = whole_blocks(linear), None, 0
+    linear = whole_blocks(linear)
+    row = None
+    done = 0
     for words in pieces:
         if row is None:
             row = _empty_row(valid.shape, words.shape, (linear[1] - linear[0]) // FOLD)
@@ -299,7 +301,8 @@ def _align_round(
     amplitude = np.where(other_chirps > 0, np.abs(tone.amplitude) / np.maximum(other_chirps, 1) / level, 1.0)
     # The difference from the mean of all chirps is smaller than that from the mean of the others.
     part = other_chirps / np.maximum(n, 1)[:, None]
-    correction, shift = part * tone.frequency, part * np.angle(tone.amplitude)
+    correction = part * tone.frequency
+    shift = part * np.angle(tone.amplitude)
     coherence = amplitude * np.sqrt(level / np.maximum(own_energy, 1e-30))
     good = _coherent(coherence, usable)
 
@@ -367,9 +370,13 @@ def _against_one(
     usable = whole & words.any(axis=(2, 3, 4))
     count = usable.sum(axis=1)
     order = np.argsort(~usable, axis=1, kind="stable")  # the usable ones, first to last
-    reference, all_positions = order[:, 0].copy(), np.arange(positions)
-    frequency, amplitude, centre = np.zeros(whole.shape), np.zeros(whole.shape, complex), np.zeros(positions)
-    coherence, best_sum = np.zeros(whole.shape), np.full(positions, -1.0)
+    reference = order[:, 0].copy()
+    all_positions = np.arange(positions)
+    frequency = np.zeros(whole.shape)
+    amplitude = np.zeros(whole.shape, complex)
+    centre = np.zeros(positions)
+    coherence = np.zeros(whole.shape)
+    best_sum = np.full(positions, -1.0)
     todo = np.flatnonzero(count)
     for attempt in range(min(_REFERENCES, chirps)):
         if todo.size == 0:
@@ -382,8 +389,12 @@ def _against_one(
         total = c.sum(axis=1)
         better = total > best_sum[todo]
         won = todo[better]
-        reference[won], coherence[won], best_sum[won] = tried[better], c[better], total[better]
-        frequency[won], amplitude[won], centre[won] = offset[better], product[better], middle[better]
+        reference[won] = tried[better]
+        coherence[won] = c[better]
+        best_sum[won] = total[better]
+        frequency[won] = offset[better]
+        amplitude[won] = product[better]
+        centre[won] = middle[better]
         matching = (c > noise).sum(axis=1)
         todo = todo[(2 * matching < count[todo] - 1) & (attempt + 1 < count[todo])]
     best = coherence.max(axis=1)
@@ -499,8 +510,10 @@ def block_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
 def prepare(rig: Instrument, board: Board) -> DirectPath:
     """Return steering, search beam and estimators of a board, from geometry alone."""
     chirp = rig.chirp
-    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
-    sweep, middles = sample_frequencies_hz(chirp), block_frequencies_hz(chirp)
+    tx = np.array(tx_position_m(rig))
+    rx = np.array(rx_positions_m(rig, board))
+    sweep = sample_frequencies_hz(chirp)
+    middles = block_frequencies_hz(chirp)
     direct = np.linalg.norm(rx - tx, axis=-1)
     lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
 
@@ -512,7 +525,8 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     excess = excess_path_m(tx, rx, points)
     echoes = np.exp(2j * np.pi * middles * excess.T[:, :, None] / SPEED_OF_LIGHT_M_S)
     echoes *= (weight / np.linalg.norm(weight))[:, None, None]
-    n_rx, n = len(rx), middles.size
+    n_rx = len(rx)
+    n = middles.size
     flat = echoes.reshape(len(points), n_rx * n)
     same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
     noise = _NOISE / FOLD * np.eye(n_rx * n)
@@ -572,7 +586,8 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     run = by or (loops.library() if is_supported else None) or NumpyLoops
     good_chirps = aligned.good.sum(axis=1)
     usable = good_chirps > 0
-    nearest, farthest = int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)
+    nearest = int(path.object_bins[0] * 0.9)
+    farthest = int(path.object_bins[1] * 1.1)
     first = run.find(
         halves=aligned.halves,
         weights=path.search_weights,

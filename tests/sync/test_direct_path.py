@@ -166,6 +166,41 @@ def test_a_referenced_echo_has_the_positive_phase_of_its_excess_path(rig, paths,
     np.testing.assert_allclose(done.samples[:, 0] / 1000, expected, atol=3e-3)
 
 
+def check_what_is_left(done, path):
+    """The rest has a direct path of the amplitude found and no phase."""
+    samples = done.samples[:, done.found].swapaxes(0, 1)
+    left = samples.reshape(len(samples), -1) @ path.estimator[0]
+    size = np.abs(done.amplitude[done.found])
+    np.testing.assert_allclose(left, size, rtol=0, atol=1e-5 * size.max())
+
+
+@pytest.mark.parametrize("echo", [0.0, 1.0, 2.0])
+def test_what_is_left_has_the_direct_path_s_amplitude_and_no_phase(run, direct_paths, board, echo):
+    done, _, _ = run(board, echo=echo, echoes=9, snr_db=10)
+    assert done.found.mean() > 0.95
+    check_what_is_left(done, direct_paths[board.name])
+
+
+@pytest.mark.parametrize("loop", [None, loops.NumpyLoops])
+def test_of_two_tones_that_look_like_direct_path_and_object_the_one_with_the_row_s_amplitude_is_taken(
+    rig, paths, noise, direct_paths, align_single, board, loop
+):
+    """A tone as far below the direct path as the object lies above it: in most positions the second try finds it."""
+    rng, path = np.random.default_rng(4), direct_paths[board.name]
+    signal, _ = paths(board, 60, 0.0, rng)
+    signal += noise(signal.shape, -20, rng)
+    below = np.mean(path.object_bins) / (256 * 4)
+    disturbed = np.arange(5, 60, 7)
+    signal[disturbed] += 0.4 * signal[disturbed] * np.exp(-2j * np.pi * below * np.arange(256))
+    signal *= np.exp(2j * np.pi * 0.3 * np.arange(256))
+    done = reference(align_single(signal, np.ones(60, bool)), path, rig.chirp, loop)
+    size = np.abs(done.amplitude)
+    is_usual = np.abs(size / np.median(size) - 1) < 0.1
+    assert is_usual[disturbed].sum() > len(disturbed) / 2
+    assert np.ptp(done.frequency[is_usual]) < below / 10
+    check_what_is_left(done, path)
+
+
 def test_noise_alone_and_lost_positions_are_not_found(rig, paths, noise, direct_paths, align_single, board):
     rng = np.random.default_rng(2)
     signal, _ = paths(board, 40, 1.0, rng)

@@ -154,6 +154,9 @@ class Executor:
     def host_alive(self, scan_id: str, owner: str) -> m.Accepted | m.Refused:
         """Answer `Alive`, a heartbeat of the run's host. From any thread; does not wait for the executor."""
         run = self._run
+        jogs = self._machine.note_jog_alive(owner)
+        if not scan_id and jogs:
+            return m.Accepted(state=self._status.state)
         if run is None or run.scan_id != scan_id:
             return make_refusal(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
         if run.owner != owner:
@@ -299,6 +302,12 @@ class Executor:
         if run and isinstance(command, m.Home):
             # A run whose host is gone keeps nobody from homing; a host of an older release sends no owner.
             owned = run.owns_home and self._machine.host_lives
+        if run and isinstance(command, m.Jog):
+            owned = self._machine.host_lives
+        jog = self._machine.jog
+        if jog is not None and isinstance(command, m.Abort) and command.owner == jog.command.owner:
+            # Whoever started a jog may stop it, also in the run of a host that is gone.
+            owned = False
         if run and owned and getattr(command, "owner", "") not in (run.owner, self.take_over_key):
             raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} is another program's")
         match command:
@@ -312,6 +321,8 @@ class Executor:
                 return self._run_row(command)
             case m.Abort():
                 return self._accept("Abort", command.reason or "requested by the host")
+            case m.Jog():
+                return self._jog(command)
             case m.Pulse():
                 return self._pulse(request, command)
             case _:
@@ -348,6 +359,21 @@ class Executor:
         if event:
             self._machine.command(event, *args)
         return m.Accepted(state=self._machine.wire_state)
+
+    def _jog(self, command: m.Jog) -> m.Accepted:
+        """Start a jog, or accept one that was sent again."""
+        machine = self._machine
+        if machine.jog is not None and machine.jog.command == command:
+            return self._accept()
+        machine.require("Jog")
+        stage = machine.stage.config
+        check_jog(command, stage)
+        place_mm = machine.find_place_mm(command.axis)
+        steps_away = abs(round(place_mm * stage.steps_per_mm) - round(command.from_mm * stage.steps_per_mm))
+        if steps_away and command == machine.last_jog:
+            return self._accept()
+        _require(not steps_away, f"{command.axis} is at {place_mm:.3f} mm, not at {command.from_mm:.3f} mm")
+        return self._accept("Jog", command)
 
     def _pulse(self, request: Request, command: m.Pulse) -> None:
         """Pass a burst to the trigger loop; the reply follows when it has been sent."""
@@ -558,6 +584,24 @@ def check_run(run: m.BeginRun, stage: Stage) -> None:
     )
     misfit = stage.misfit(plan, run.speed_mm_s)
     _require(not misfit, misfit)
+
+
+def check_jog(jog: m.Jog, stage: Stage) -> None:
+    """Check distance, speed and soft limits of a jog. Raises RefusedError with the conflicting values."""
+    travel_mm = stage.travel_x_mm if jog.axis == "x" else stage.travel_y_mm
+    end_mm = jog.from_mm + jog.distance_mm
+    # In motor steps: 0.3 mm - 3 * 0.1 mm is not exactly 0.
+    end_steps = round(end_mm * stage.steps_per_mm)
+    is_inside = 0 <= end_steps <= round(travel_mm * stage.steps_per_mm)
+    _require(round(jog.distance_mm * stage.steps_per_mm) != 0, f"{jog.distance_mm} mm is less than one motor step")
+    _require(is_inside, f"{jog.axis} would end at {end_mm:g} mm, outside 0..{travel_mm:g} mm")
+    slowest = MIN_FEED / stage.steps_per_mm
+    _require(
+        slowest <= jog.speed_mm_s <= stage.travel_speed_mm_s,
+        f"speed of {jog.speed_mm_s} mm/s is outside {slowest:g}..{stage.travel_speed_mm_s} mm/s",
+    )
+    seconds = abs(jog.distance_mm) / jog.speed_mm_s
+    _require(seconds <= m.MAX_JOG_S, f"the jog would last {seconds:.0f} s, longer than {m.MAX_JOG_S:g} s")
 
 
 def _require(ok: bool, summary: str) -> None:

@@ -29,7 +29,7 @@ STATUS_EVENT_S = 0.24
 RESTS = 3
 # Times that such a reply is asked for; a stage whose banner was lost never gives it.
 ASKED_AGAIN = 3
-MOVING = ("homing", "running", "held", "stopping")
+MOVING = ("homing", "jogging", "running", "held", "stopping")
 POSITION_LOST = (
     StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
 )  # fmt: skip
@@ -43,7 +43,7 @@ class RefusedError(PolysightError):
         self.number = int(number)
 
 
-State = Literal["idle", "homing", "homed", "ready", "running", "held", "stopping", "done", "ending", "fault"]
+State = Literal["idle", "homing", "jogging", "homed", "ready", "running", "held", "stopping", "done", "ending", "fault"]
 
 
 class Rule(NamedTuple):
@@ -62,10 +62,11 @@ RULES = (
     # Commands; refused in all other states.
     Rule("Home", "idle homed ready fault", "homing", "home"),
     Rule("Home", "homing", "same"),
+    Rule("Jog", "homed ready", "jogging", "jog"),
     Rule("BeginRun", "homed", "ready", "begin_run"),
-    Rule("BeginRun", "idle homing ready fault", "same", "begin_run"),
+    Rule("BeginRun", "idle homing jogging ready fault", "same", "begin_run"),
     Rule("EndRun", "ready", "homed", "end_run"),
-    Rule("EndRun", "idle homing homed fault", "same", "end_run"),
+    Rule("EndRun", "idle homing jogging homed fault", "same", "end_run"),
     Rule("RunRow", "ready", "running", "start_row"),
     Rule("Hold", "running", "held", "hold"),
     Rule("Hold", "held", "same"),
@@ -74,34 +75,39 @@ RULES = (
     Rule("Abort", "running held", "stopping ending", "abort"),
     Rule("Abort", "done", "ending", "abort"),
     Rule("Abort", "homing", "same", "stop"),
+    Rule("Abort", "jogging", "same", "abort_jog"),
     Rule("Abort", "idle homed ready stopping ending fault", "same"),
     Rule("Pulse", "idle homed fault", "same"),
     # Replies of the stage; ignored in all other states.
     Rule("homed", "homing", "homed ready fault", "note_homed"),
+    Rule("moved", "jogging", "homed ready fault", "note_moved"),
     Rule("passed", "running held", "done ending", "note_passed"),
     Rule("passed", "stopping", "ending", "note_stopped"),
     Rule("stopped", "running held stopping done", "ending", "note_stopped"),
     Rule("stopped", "homing", "idle", "clear_alarm"),
+    Rule("stopped", "jogging", "homed ready idle", "note_jog_stopped"),
     Rule("stopped", "idle homed ready ending fault", "same", "clear_alarm"),
-    Rule("not homed", "ready", "idle", "lose_position"),
-    Rule("stage lost", "idle homing homed ready", "fault", "lose_stage"),
+    Rule("not homed", "homed ready", "idle", "lose_position"),
+    Rule("stage lost", "idle homing jogging homed ready", "fault", "lose_stage"),
     Rule("stage lost", "running held stopping done", "ending", "lose_stage"),
     Rule("stage lost", "ending fault", "same", "lose_stage"),
     # Trigger line, host, journal, time.
     Rule("row fault", "running held", "stopping ending", "fail_row"),
     Rule("row fault", "done", "ending", "fail_row"),
-    Rule("lasting fault", "idle homing homed ready", "fault", "fail"),
+    Rule("row fault", "jogging", "same", "fail_jog"),
+    Rule("lasting fault", "idle homing jogging homed ready", "fault", "fail"),
     Rule("lasting fault", "running held", "stopping ending", "fail"),
     Rule("lasting fault", "done", "ending", "fail"),
     Rule("lasting fault", "stopping ending", "same", "fail"),
     Rule("all sent", "done", "ending"),
-    Rule("timeout", "homing", "fault", "time_out"),
+    Rule("timeout", "homing jogging", "fault", "time_out"),
     Rule("timeout", "running stopping", "ending", "time_out"),
     Rule("timeout", "done", "ending", "disarm"),
     Rule("settled", "ending", "ready idle fault", "finish_row"),
 )
 TIMEOUTS_S: dict[State, float] = {
     "homing": HOMING_TIMEOUT_S,
+    "jogging": m.MAX_JOG_S + 5.0,
     "stopping": 3.0,  # from STOP to standstill
     "done": 1.0,  # from the stage's `done` to the last burst
 }  # running: set for each row; all others: no limit
@@ -111,6 +117,21 @@ END_TIMEOUT_S = 0.5
 HOST_MISSES = 4
 # The others have the same name
 WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}
+
+
+@dataclass
+class RunningJog:
+    """A jog that the stage has started; `target`: its x and y, motor steps."""
+
+    command: m.Jog
+    sequence: int
+    target: tuple[int, int]
+    timeout_s: float  # of its heartbeat
+    alive_s: float
+    # Set once the stage was told to stop
+    status: m.RowStatus = "done"
+    fault: int = 0
+    reason: str = ""
 
 
 @dataclass
@@ -179,6 +200,11 @@ class Machine:
         self._clock = clock
         self.state: State = "idle"
         self.row: RunningRow | None = None
+        self.jog: RunningJog | None = None
+        # The newest one, also after its end
+        self.last_jog: m.Jog | None = None
+        # True while the position is that of a stage at rest; a status of before is none.
+        self._is_placed = False
         self.homed = self.in_run = False
         # The first one
         self.fault = 0
@@ -259,6 +285,14 @@ class Machine:
         self._host_timeout_s = HOST_MISSES * heartbeat_ms / 1e3 or math.inf
         self._host_alive_s = self._clock()
 
+    def note_jog_alive(self, owner: str) -> bool:
+        """Note a heartbeat of the jog's host; return False if there is no jog of this owner. From any thread."""
+        jog = self.jog
+        if jog is None or jog.command.owner != owner:
+            return False
+        jog.alive_s = max(jog.alive_s, self._clock())
+        return True
+
     def note_host_alive(self) -> None:
         """Note a heartbeat of the run's host. From any thread."""
         self._host_alive_s = max(self._host_alive_s, self._clock())
@@ -272,6 +306,8 @@ class Machine:
     def _host_lost_s(self) -> float:
         if self.state in ("running", "held") or (self.state == "homing" and self._homing_is_watched):
             return self._host_alive_s + self._host_timeout_s
+        if self.jog is not None and self.jog.status == "done":
+            return self.jog.alive_s + self.jog.timeout_s
         return math.inf
 
     def seconds_left(self) -> float:
@@ -283,12 +319,16 @@ class Machine:
         if self._clock() >= self._deadline_s:
             self.happen("timeout")
         if self._clock() >= self._host_lost_s:
-            reason = f"no heartbeat of the host for {self._host_timeout_s * 1e3:.0f} ms"
+            timeout_s = self._host_timeout_s if self.jog is None else self.jog.timeout_s
+            reason = f"no heartbeat of the host for {timeout_s * 1e3:.0f} ms"
             self.stop_motion(PiFault.HOST_LOST, reason)
 
     def stop_motion(self, number: int, reason: str) -> None:
-        """Stop a row or homing, if there is one, with this fault."""
-        if self.state in ("running", "held"):
+        """Stop a row, jog or homing, if there is one, with this fault."""
+        if self.jog is not None and self.jog.status != "done":
+            # It was told to stop
+            return
+        if self.state in ("running", "held", "jogging"):
             self.happen("row fault", number, reason)
         elif self.state == "homing":
             self.happen("lasting fault", number, reason)
@@ -347,17 +387,21 @@ class Machine:
         elif reply.kind == "done" and homing and answers_home:
             self.stage.note_position(reply)
             self.happen("homed", reply)
+        elif reply.kind == "done" and self.jog is not None and reply.sequence == self.jog.sequence:
+            self.stage.note_position(reply)
+            self.happen("moved", reply)
         elif reply.kind == "done" and not homing and self.row and reply.sequence == self.row.sequence:
             self.stage.note_position(reply)
             self.happen("passed", reply)
 
     def _on_status(self, reply: Reply) -> None:
         self.stage.note_position(reply)
+        self._is_placed |= self.state in ("homed", "ready") and reply.fields.get("state") == "idle"
         self._publish_status(reply)
         row = self.row
         if row is not None and row.is_underway and self.state in MOVING:
             self._note_row_status(row, reply)
-        waits_for_end = self.state in MOVING and (row is not None or self._homing_underway)
+        waits_for_end = self.state in MOVING and (row is not None or self.jog is not None or self._homing_underway)
         if waits_for_end and reply.fields.get("state") in ("idle", "alarm"):
             self._rests += 1
         else:
@@ -408,6 +452,7 @@ class Machine:
             remedy = "find out why, then start polysight-pi again"
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self.reason, remedy=remedy)
         self.homed = self._homing_underway = False
+        self._is_placed = False
         self._homing_is_watched = self.host_lives
         self._journal.retry()
         self._forget_fault()
@@ -434,9 +479,108 @@ class Machine:
         lost_x, lost_y = (max(-limit, min(_number(reply, key), limit)) for key in ("lostx", "losty"))
         self.lost_mm = (lost_x / self.stage.config.steps_per_mm, lost_y / self.stage.config.steps_per_mm)
         self.homed = True
+        self._is_placed = True
+        return self._at_rest_state
+
+    @property
+    def _at_rest_state(self) -> str:
+        if not self.homed:
+            return "idle"
         if self.in_run:
             return "ready"
         return "homed"
+
+    # --- actions: jog -----------------------------------------------------------------------------------------------
+
+    def find_place_mm(self, axis: m.Axis) -> float:
+        """Return the place of an axis of a stage at rest. Raises RefusedError while it is not known."""
+        if not self._is_placed:
+            remedy = "ask again in a second"
+            raise RefusedError(PiFault.NOT_READY, "the stage has not said where it rests", "it just stopped", remedy)
+        return self.stage.x_mm if axis == "x" else self.stage.y_mm
+
+    def _jog(self, command: m.Jog) -> None:
+        x_mm = self.stage.x_mm
+        y_mm = self.stage.y_mm
+        if command.axis == "x":
+            x_mm = command.from_mm + command.distance_mm
+        else:
+            y_mm = command.from_mm + command.distance_mm
+        try:
+            sequence = self.stage.move(x_mm, y_mm, command.speed_mm_s)
+        except (StageRefusedError, StageLostError) as e:
+            if isinstance(e, StageLostError):
+                self.happen("stage lost", e.number, str(e))
+            elif e.number in POSITION_LOST:
+                self.happen("not homed")
+            raise
+        k = self.stage.config.steps_per_mm
+        target = (round(x_mm * k), round(y_mm * k))
+        timeout_s = HOST_MISSES * command.heartbeat_ms / 1e3
+        self.jog = RunningJog(command, sequence, target, timeout_s, self._clock())
+        self.last_jog = command
+        self._is_placed = False
+        self._rests = 0
+        self._forget_fault()
+
+    def _note_moved(self, reply: Reply) -> str:
+        self.stage.slow_down_polling()
+        end = (_number(reply, "x", -1), _number(reply, "y", -1))
+        if self.jog is not None and end != self.jog.target:
+            self.homed = False
+            reason = f"the jog ended at {end}, not at {self.jog.target} (x, y in steps)"
+            self._report_fault(PiFault.POSITION, reason)
+            self._finish_jog("fault", PiFault.POSITION, reason)
+            return "fault"
+        self._is_placed = True
+        self._finish_jog()
+        return self._at_rest_state
+
+    def _note_jog_stopped(self) -> str:
+        if self.jog is not None and self.jog.status == "done":
+            self.jog.status = "aborted"
+            self.jog.reason = "the stage was stopped"
+        self._clear_alarm()
+        self._finish_jog()
+        return self._at_rest_state
+
+    def _stop_jog(self, status: m.RowStatus, number: int, reason: str) -> None:
+        """Send STOP; the jog ends with the stage's alarm, or as lost if that does not come."""
+        jog = self.jog
+        if jog is None or jog.status != "done":
+            return
+        jog.status = status
+        jog.fault = int(number)
+        jog.reason = reason
+        self._deadline_s = min(self._deadline_s, self._clock() + TIMEOUTS_S["stopping"])
+        try:
+            self.stage.link.send_byte(Immediate.STOP)
+        except StageLostError as e:
+            self._post(partial(self.happen, "stage lost", e.number, str(e)))
+
+    def _abort_jog(self, reason: str) -> None:
+        self._stop_jog("aborted", PiFault.ABORTED, reason)
+
+    def _fail_jog(self, number: int, reason: str) -> None:
+        self._report_fault(number, reason)
+        self._stop_jog("fault", number, reason)
+
+    def _finish_jog(self, status: m.RowStatus | None = None, number: int = 0, reason: str = "") -> None:
+        """Journal the end of the jog, if there is one; what was decided when it was stopped stays."""
+        jog = self.jog
+        if jog is None:
+            return
+        if status is not None and jog.status == "done":
+            jog.status = status
+            jog.fault = int(number)
+            jog.reason = reason
+        command = jog.command
+        self._journal.add(
+            m.Jogged, axis=command.axis, from_mm=command.from_mm, distance_mm=command.distance_mm,
+            end_mm=self.stage.x_mm if command.axis == "x" else self.stage.y_mm,
+            status=jog.status, fault=jog.fault, reason=jog.reason,
+        )  # fmt: skip
+        self.jog = None
 
     def _begin_run(self, heartbeat_ms: int) -> None:
         self.in_run = True
@@ -460,6 +604,7 @@ class Machine:
         self.row = RunningRow(row, take, job, sequence, motion, EdgeTimes(motion))
         self.row_timeout_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
         self._rests = 0
+        self._is_placed = False
         self._watch = TriggerWatch()
         self._forget_fault()
         self._journal.add(m.RowStarted, row=row, take=take)
@@ -494,7 +639,7 @@ class Machine:
 
     def _stop(self, *_: object) -> str | None:
         """Stop the stage if it moves. Returns `ending` for a row that cannot be stopped."""
-        if self.state in ("homing", "running", "held"):
+        if self.state in ("homing", "jogging", "running", "held"):
             try:
                 self.stage.link.send_byte(Immediate.STOP)
             except StageLostError:
@@ -512,12 +657,15 @@ class Machine:
         """Stop the stage because the program is being ended. Returns True if a row has to end first."""
         self._terminating = True
         self.happen("Abort", "polysight-pi was ended")
+        # Nobody waits for the end of a jog: the stage stops it by itself.
+        self._finish_jog()
         if self.state == "stopping":
             self._deadline_s = self._clock() + END_TIMEOUT_S
         return self.row is not None
 
     def _fail_row(self, number: int, reason: str, lasting: bool = False) -> str | None:
         self._report_fault(number, reason)
+        self._finish_jog("fault", number, reason)
         self._decide("fault", number, reason, lasting)
         return self._stop()
 
@@ -530,6 +678,7 @@ class Machine:
         self.stage.slow_down_polling()
         if self.state != "fault":
             self._report_fault(number, reason)
+        self._finish_jog("fault", number, reason)
         self._decide("fault", number, reason, lasting=True)
 
     def _lose_position(self) -> None:
@@ -539,6 +688,7 @@ class Machine:
         if not self._terminating:
             reasons = {
                 "homing": f"not homed after {HOMING_TIMEOUT_S} s",
+                "jogging": "the jog has not ended, or the stage did not stop",
                 "running": f"the row has not ended after {self.row_timeout_s:.0f} s",
                 "stopping": "the stage did not stop",
             }

@@ -24,6 +24,9 @@ MAX_PULSES_AT_REST_S = 2.0
 MAX_COMMAND_BYTES = 65_536
 # Longest heartbeat period of the host; after a missing heartbeat the rig stays locked for four periods.
 MAX_HEARTBEAT_MS = 10_000
+# Limits of `Jog`: a person who watches the stage presses again.
+MAX_JOG_MM = 100.0
+MAX_JOG_S = 60.0
 # Every field has a finite and bounded type; a message outside the limits is refused.
 Natural = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Seq = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
@@ -34,14 +37,15 @@ MAX_TEXT = 4000
 Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
 Name = Annotated[str, msgspec.Meta(max_length=120)]
 ScanId = Annotated[str, msgspec.Meta(min_length=1, max_length=120, pattern=r"\A[A-Za-z0-9_-][A-Za-z0-9._-]*\Z")]
-ScanIdOrNone = Annotated[str, msgspec.Meta(max_length=120, pattern=r"\A[A-Za-z0-9._-]*\Z")]
+ScanIdOrNone = Annotated[str, msgspec.Meta(max_length=120, pattern=r"\A([A-Za-z0-9_-][A-Za-z0-9._-]*)?\Z")]
 Owner = Annotated[str, msgspec.Meta(max_length=64, pattern=r"\A[A-Za-z0-9-]*\Z")]
 Micros = Annotated[float, msgspec.Meta(ge=0, le=1e7)]
 Speed = Annotated[float, msgspec.Meta(ge=0, le=1e5)]
 Place = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+Axis = Literal["x", "y"]
 RowStatus = Literal["done", "aborted", "fault"]
 ExitStatus = Literal["success", "abort", "fail"]
-State = Literal["idle", "homing", "homed", "ready", "running", "held", "done", "fault"]
+State = Literal["idle", "homing", "jogging", "homed", "ready", "running", "held", "done", "fault"]
 # Backends of the Pi's SYNC_IN output (`HelloReply.backend`).
 # Kernel.
 GPIOD = "gpiod"
@@ -162,6 +166,18 @@ class Heartbeat(Event, frozen=True, kw_only=True):
     period_ms: Natural
 
 
+class Jogged(Event, frozen=True, kw_only=True):
+    """A jog ended. `from_mm` and `distance_mm` as in `Jog`; `end_mm`: where the axis rests, if `status` is `done`."""
+
+    axis: Axis
+    from_mm: Place
+    distance_mm: Place
+    end_mm: Place
+    status: RowStatus
+    fault: Number = 0
+    reason: Text = ""
+
+
 class Fault(Event, frozen=True, kw_only=True, rename=_KEYS_ON_THE_WIRE):
     """A fault with its number in shared/polysight_shared/faults.py. The first fault of a row is kept."""
 
@@ -171,8 +187,8 @@ class Fault(Event, frozen=True, kw_only=True, rename=_KEYS_ON_THE_WIRE):
     remedy: Text = ""
 
 
-AnyEvent = RunStarted | RunStopped | RowStarted | RowFinished | Capture | StageStatus | Heartbeat | Fault
-JOURNALLED = (RunStarted, RunStopped, RowStarted, RowFinished, Capture, Fault)
+AnyEvent = RunStarted | RunStopped | RowStarted | RowFinished | Capture | StageStatus | Heartbeat | Fault | Jogged
+JOURNALLED = (RunStarted, RunStopped, RowStarted, RowFinished, Capture, Fault, Jogged)
 
 # --- commands: host -> Pi, REQ/REP ------------------------------------------------------------------------------------
 
@@ -217,9 +233,12 @@ class EndRun(Command, frozen=True, kw_only=True):
 
 
 class Alive(Command, frozen=True, kw_only=True):
-    """Heartbeat of the host. A row ends with fault 108 if four heartbeats in a row are missing."""
+    """Heartbeat of the host. A row or a jog ends with fault 108 if four heartbeats in a row are missing.
 
-    scan_id: ScanId
+    `scan_id` "": of a jog outside of a run.
+    """
+
+    scan_id: ScanIdOrNone
     owner: Owner = ""
 
 
@@ -229,6 +248,22 @@ class Home(Command, frozen=True, kw_only=True):
     `owner`: that of the run, while one is begun whose host is alive.
     """
 
+    owner: Owner = ""
+
+
+class Jog(Command, frozen=True, kw_only=True):
+    """Move one axis of the homed stage by a distance. Accepted at once; `Jogged` has the result.
+
+    `from_mm`: where the sender saw the axis; the stage does not move if it is elsewhere, so that a repeated command
+    moves it once. `heartbeat_ms`: period of the sender's `Alive`, without which the stage stops. `owner`: that of the
+    run, while one is begun whose host is alive.
+    """
+
+    axis: Axis
+    from_mm: Place
+    distance_mm: Annotated[float, msgspec.Meta(ge=-MAX_JOG_MM, le=MAX_JOG_MM)]
+    speed_mm_s: Speed
+    heartbeat_ms: Annotated[int, msgspec.Meta(ge=1, le=MAX_HEARTBEAT_MS)]
     owner: Owner = ""
 
 
@@ -280,7 +315,7 @@ class Replay(Command, frozen=True, kw_only=True):
     limit: Annotated[int, msgspec.Meta(ge=1, le=10000)] = 1000
 
 
-AnyCommand = Hello | BeginRun | EndRun | Alive | Home | RunRow | Hold | Resume | Abort | Status | Replay | Pulse
+AnyCommand = Hello | BeginRun | EndRun | Alive | Home | Jog | RunRow | Hold | Resume | Abort | Status | Replay | Pulse
 
 # --- replies: Pi -> host ----------------------------------------------------------------------------------------------
 

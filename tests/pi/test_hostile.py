@@ -49,6 +49,7 @@ REPLAY = m.Replay(scan_id="scan", from_seq=1)
 ALIVE = m.Alive(scan_id="scan")
 RUN = m.RunRow(scan_id="scan", row_index=0, take=1)
 END = m.EndRun(scan_id="scan", exit_status="abort")
+JOG = m.Jog(axis="x", from_mm=0.0, distance_mm=1.0, speed_mm_s=20.0, heartbeat_ms=100)
 
 
 def draw(rng: random.Random, valid: list[Any]) -> bytes:
@@ -108,11 +109,13 @@ def stranger(pi):
     [
         ((BEGIN, PULSE), "period_us", (NAN, INF, -INF, 1e300, 1e70)),
         ((BEGIN, PULSE), "width_us", (NAN, INF, -INF, 1e300, 1e70)),
-        ((BEGIN,), "speed_mm_s", (NAN, INF, -INF, 1e300, 1e70)),
+        ((BEGIN, JOG), "speed_mm_s", (NAN, INF, -INF, 1e300, 1e70)),
         ((BEGIN,), "heartbeat_ms", (2**40,)),  # it would keep every other host out for 35 years
-        (
-            (BEGIN, REPLAY, ALIVE, RUN, END), "scan_id", ("a\0b", "x" * 300, "a\n", "..", "../../etc/passwd", "/", ""),
-        ),
+        ((JOG,), "distance_mm", (NAN, INF, -INF, 100.1, -100.1)),
+        ((JOG,), "from_mm", (NAN, INF, -INF, 1e70)),
+        ((JOG,), "heartbeat_ms", (0, -1, 2**40)),
+        ((BEGIN, REPLAY, ALIVE, RUN, END), "scan_id", ("a\0b", "x" * 300, "a\n", "..", "../../etc/passwd", "/")),
+        ((BEGIN, REPLAY, RUN, END), "scan_id", ("",)),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
@@ -159,7 +162,7 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
     host.must_accept(host.begin(owner="mine", heartbeat_ms=10_000))
     host.home("mine")
     valid = [
-        m.Hello(), m.Status(), ALIVE, m.Home(), RUN, PULSE, REPLAY, m.Hold(), m.Resume(), m.Abort(), END,
+        m.Hello(), m.Status(), ALIVE, m.Home(), JOG, RUN, PULSE, REPLAY, m.Hold(), m.Resume(), m.Abort(), END,
         host.begin("other"), host.begin(),
     ]  # fmt: skip
     sent = taken = bytes_before = 0

@@ -21,9 +21,8 @@ from polysight_pi.machine import RULES, TIMEOUTS_S, WIRE_STATE, RefusedError, St
 from polysight_pi.stage import STATUS_PER_HEARTBEAT, StatusWatch
 from polysight_pi.trigger import LOOK_UP_S, LoopFault, TriggerWatch
 from polysight_shared import messages as m
-from polysight_shared.config import Burst
 from polysight_shared.faults import PiFault, StageError
-from polysight_shared.raster import MIN_PERIOD_US, WIDTH_US, plan_raster
+from polysight_shared.raster import MIN_PERIOD_US, WIDTH_US, Burst, plan_raster
 from polysight_shared.stage_line import Immediate, Reply
 
 SAFE_WITHIN_S = 0.5
@@ -239,11 +238,55 @@ def test_the_first_fault_wins():
     assert bench.machine.fault == 0
 
 
+JOG = m.Jog(axis="x", from_mm=0.0, distance_mm=10.0, speed_mm_s=20.0, heartbeat_ms=100)
+
+
+def test_a_jog_without_its_host_stops_in_time_and_keeps_the_position():
+    bench = Bench().begin_and_home()
+    bench.machine.command("Jog", JOG)
+    bench.later(0.3)
+    assert bench.machine.note_jog_alive("")
+    bench.later(0.39)
+    assert not bench.stage.sent
+    bench.later(0.02)
+    assert bench.stage.sent == [Immediate.STOP]
+    bench.stage_says(Reply("alarm", number=StageError.STOPPED))
+    ended = bench.list_events(m.Jogged)[-1]
+    assert (ended.status, ended.fault, bench.machine.state) == ("fault", PiFault.HOST_LOST, "ready")
+
+
+def test_a_stage_that_does_not_stop_its_jog_is_lost():
+    bench = Bench().begin_and_home()
+    bench.machine.command("Jog", JOG)
+    bench.machine.command("Abort", "requested")
+    bench.later(3.1)
+    assert (bench.machine.state, bench.machine.homed) == ("fault", False)
+    assert bench.list_events(m.Jogged)[-1].status == "aborted"
+
+
+def test_the_end_of_the_program_stops_a_jog_and_says_so():
+    bench = Bench().begin_and_home()
+    bench.machine.command("Jog", JOG)
+    assert not bench.machine.terminate(), "no row is waited for"
+    assert bench.stage.sent == [Immediate.STOP]
+    ended = bench.list_events(m.Jogged)[-1]
+    assert (ended.status, ended.fault) == ("aborted", PiFault.ABORTED)
+
+
+@pytest.mark.parametrize(("x", "y"), [(2001, 0), (2000, 1), (0, 0)])
+def test_a_jog_that_ends_elsewhere_loses_the_position(x, y):
+    bench = Bench().begin_and_home()
+    bench.machine.command("Jog", JOG)
+    bench.stage_says(Reply("done", bench.stage.number, fields={"x": str(x), "y": str(y)}))
+    assert (bench.machine.state, bench.machine.fault, bench.machine.homed) == ("fault", PiFault.POSITION, False)
+
+
 ACTIONS: dict[str, Callable[[Bench], object]] = {
     "home": lambda b: b.machine.command("Home"),
     "begin": lambda b: b.machine.command("BeginRun", 100),
     "end run": lambda b: b.machine.command("EndRun"),
     "row": lambda b: b.start(),
+    "jog": lambda b: b.machine.command("Jog", JOG),
     "hold": lambda b: b.machine.command("Hold"),
     "resume": lambda b: b.machine.command("Resume"),
     "abort": lambda b: b.machine.command("Abort", "requested"),
@@ -277,13 +320,14 @@ def test_any_order_of_events(start, actions):
             ACTIONS[action](bench)
             bench.run_posted()
             # These clear it
-            if fault_before[0] and action not in ("home", "row"):
+            if fault_before[0] and action not in ("home", "row", "jog"):
                 assert (machine.fault, machine.reason) == fault_before, "the first fault wins"
             assert bench.armed <= (machine.row is not None), "edges are answered only during a row"
             assert (machine.row is not None) == (machine.state in ROW_STATES)
             assert (machine.row is not None) == (
                 len(bench.list_events(m.RowStarted)) == len(bench.list_events(m.RowFinished)) + 1
             )
+        assert (machine.jog is not None) == (machine.state == "jogging")
     if machine.row is not None:
         # A held row waits for somebody
         machine.happen("Resume")

@@ -246,6 +246,50 @@ def test_takes_increase_across_a_restart_of_the_pi(instrument, stage, hub):
             assert running.host.row(0, first_take).status == "done"
 
 
+def make_jog(from_mm: float, distance_mm: float, axis: m.Axis = "x", **changes) -> m.Jog:
+    fields = {"speed_mm_s": 20.0, "heartbeat_ms": 10_000, **changes}
+    return m.Jog(axis=axis, from_mm=from_mm, distance_mm=distance_mm, **fields)
+
+
+def test_a_jog_moves_once_and_within_its_limits(host, stage):
+    host.must_accept(make_jog(0, 10))
+    assert host.wait(m.Jogged).end_mm == 10.0
+    host.until_state("ready")
+    host.must_accept(make_jog(0, 10))
+    assert [c.args[0] for c in stage.seen if c.verb == "MOVE"] == [2000], "sent again, moved once"
+    for wrong in (
+        make_jog(0, 20), make_jog(10, -10.1), make_jog(10, 100, "y"), make_jog(10, 0), make_jog(10, 5, speed_mm_s=1e5),
+        make_jog(10, 5, speed_mm_s=5e-324), make_jog(10, 100, speed_mm_s=1),
+    ):  # fmt: skip
+        assert host.must_refuse(wrong) == PiFault.BAD_REQUEST, wrong
+    assert sum(c.verb == "MOVE" for c in stage.seen) == 1
+    assert any(isinstance(e, m.Jogged) for e in host.replay())
+    assert host.row(0).status == "done"
+
+
+def test_a_jog_is_refused_in_a_row_and_to_strangers_while_the_host_lives(owner_in_row):
+    host = owner_in_row
+    assert host.must_refuse(make_jog(0, 10, owner="mine")) == PiFault.NOT_READY
+    assert host.must_refuse(make_jog(0, 10, owner="other")) == PiFault.NOT_OWNER
+    host.wait(m.RowFinished)
+    assert host.must_refuse(make_jog(0, 10, owner="other")) == PiFault.NOT_OWNER
+
+
+def test_a_jog_outside_of_a_run_is_watched_and_aborted(pi, stage):
+    host = pi.host
+    assert host.must_refuse(make_jog(0, 10)) == PiFault.NOT_READY, "not homed"
+    host.must_accept(m.Home())
+    host.until_state("homed")
+    stage.pace_s = 60.0
+    host.must_accept(make_jog(0, 10, owner="page"))
+    host.must_accept(m.Alive(scan_id="", owner="page"))
+    assert host.must_refuse(m.Alive(scan_id="", owner="other")) == PiFault.NOT_READY
+    assert host.must_refuse(make_jog(0, 20)) == PiFault.NOT_READY
+    host.must_accept(m.Abort(owner="page"))
+    assert host.wait(m.Jogged).status == "aborted"
+    host.until_state("homed")
+
+
 def test_a_host_of_an_older_release_homes_in_its_own_run(pi):
     """It sends no owner in `Home`."""
     pi.host.must_accept(pi.host.begin(owner="mine", heartbeat_ms=10_000, owns_home=False))

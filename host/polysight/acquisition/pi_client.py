@@ -64,7 +64,7 @@ _SILENT_BEATS = 10
 # Time to wait for a reply to `Alive` before it is sent again.
 _ALIVE_TIMEOUT_S = 1.0
 # States that change without a command.
-MOVING: tuple[State, ...] = ("homing", "running", "held", "done")
+MOVING: tuple[State, ...] = ("homing", "jogging", "running", "held", "done")
 _REST_TIMEOUT_S = 10.0
 _POLL_S = 0.05
 # Events that one reply brings from the Pi's journal.

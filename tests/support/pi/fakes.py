@@ -48,6 +48,10 @@ class FakeDriver:
         self.number += 1
         return self.number
 
+    def move(self, *_: Any) -> int:
+        self.number += 1
+        return self.number
+
     def row(self, *_: Any) -> int:
         self.number += 1
         return self.number

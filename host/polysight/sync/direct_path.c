@@ -48,7 +48,7 @@ static inline void medians(const float *powers, int size, float *median)
     }
 }
 
-/* `loops.choose_peaks` for one spectrum, strongest at the bin top; by powers, which rise with magnitudes. */
+/* `NumpyLoops.search` for one spectrum, strongest at the bin top; by powers, which rise with magnitudes. */
 static inline void choose_peaks(const Table *t, const float *re, const float *im, int top, int nearest, int farthest,
                                 double comparable, int bins[2])
 {

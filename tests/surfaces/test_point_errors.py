@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from polysight.surfaces.optics import reflect_flat
 from polysight.surfaces.permittivity import (
+    DisturbedScan,
     Gains,
     Voltages,
     fit_permittivity,
+    judge_medium,
     point_covariance,
     point_permittivity,
 )
@@ -69,3 +73,26 @@ def test_regions_of_points_hold_where_it_is_quiet_and_where_it_ripples(stated_no
     distance2 = np.einsum("ni,nij,nj->n", parts, np.linalg.inv(covariance), parts)
     for half in (is_rippled, ~is_rippled):
         assert 0.9 < np.mean(distance2[half] < CHI2_95) < 0.985
+
+
+def test_scatter_that_noise_does_not_explain_may_be_common_to_a_block():
+    """Few blocks of a small plate do not show how far edges move their mean: noise does not move it at all."""
+    x, y = np.meshgrid(np.arange(8) * 0.008, np.arange(20) * 0.008)
+    at_m = np.stack([x.ravel(), y.ravel()], axis=1)
+    ripple = np.full(len(at_m), 0.05)
+    noise, edges = (
+        fit_permittivity(make_voltages(ripple, at_m, stated), UNIT_GAINS, WAVE_NUMBER) for stated in (0.05, 0.005)
+    )
+    assert np.trace(edges.covariance) > 1.1 * np.trace(noise.covariance)
+
+
+def test_a_level_that_a_badly_known_rig_explains_does_not_refuse_a_segment():
+    voltages = make_voltages(np.full(400, 0.005), np.random.default_rng(1).uniform(0, 0.3, (400, 2)), 0.005)
+    fit = fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER)
+    # H is 30 % too strong, as of a board that may stand so: the level of no half space of this permittivity.
+    loud = replace(voltages, b=voltages.b * np.array([1.3, 1.3]))
+    well_known, _ = judge_medium(fit, loud, UNIT_GAINS, [], WAVE_NUMBER)
+    moved = DisturbedScan("places", replace(loud, b=loud.b * np.array([1.2, 1.2])), UNIT_GAINS)
+    badly_known, _ = judge_medium(fit, loud, UNIT_GAINS, [moved], WAVE_NUMBER)
+    assert well_known > 0.2
+    assert badly_known == 0

@@ -66,6 +66,8 @@ BORDER_DISC_M = 0.05
 MIN_FILLING = 0.75
 # Offsets closer than this are of one column of windows: rows start a little apart, as the stage moves within a burst.
 SAME_COLUMN_M = 1.5e-3
+# Median of the square of a complex normal variable, over twice that of each part: 2 ln 2.
+MEDIAN_OF_SQUARE = 1.386
 EPS_STEP = 1e-4
 
 
@@ -392,11 +394,20 @@ def fit_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Permittiv
             break
     return PermittivityFit(
         eps=eps,
-        covariance=_covariance_of_scatter(step.answer, step.miss, ripple, v.at_m),
+        covariance=_covariance_of_scatter(step.answer, step.miss, expect_ripple(step, ripple), v.at_m),
         used=step.used,
         excess2=(np.abs(step.miss) / np.maximum(step.noise, 1e-30)) ** 2 / 2,
         answer=step.answer,
     )
+
+
+def expect_ripple(step: _Step, least: Array) -> Array:
+    """Ripple of the misses [n] that is expected to be common to a block: what noise does not explain, or `least`.
+
+    It is slow, so the few blocks of a small segment do not show how far it moves their mean.
+    """
+    excess2 = float(np.median(np.abs(step.miss) ** 2 / step.noise**2)) / MEDIAN_OF_SQUARE - 1
+    return np.hypot(least, step.noise * np.sqrt(max(0.0, excess2)))
 
 
 def _covariance_of_scatter(answer: Complex, miss: Complex, ripple: Array, at_m: Array) -> Array:
@@ -483,11 +494,13 @@ def add_common_errors(
     """
     coefficients = reflect_points(fit.eps, v, wave_number)
     miss = find_misses(v, gains, coefficients)
-    changes: list[tuple[str, Complex]] = []
-    for disturbed_values in disturbed:
-        disturbed_coefficients = reflect_points(fit.eps, disturbed_values.voltages, wave_number)
-        disturbed_miss = find_misses(disturbed_values.voltages, disturbed_values.gains, disturbed_coefficients)
-        changes.append((disturbed_values.source, disturbed_miss - miss))
+    sources = {"scatter": fit.covariance}
+
+    def add(source: str, d: Array) -> None:
+        sources[source] = sources.get(source, 0.0) + np.outer(d, d)
+
+    for scan in disturbed:
+        add(scan.source, find_common_error(fit, miss, scan, wave_number))
 
     # An error of ln(H / V) of the reference turns and scales b_H.
     of_h = miss + v.b[:, 1] * receive(v, coefficients)[:, 0]
@@ -498,14 +511,16 @@ def add_common_errors(
     model_change = first_order * (expansion_parameter(v, wave_number) + CURVATURE_ERROR)
     # Their phases are not known.
     for phase in (1, 1j):
-        changes.append(("reference", phase * reference_change))
-        changes.append(("model", phase * model_change))
-
-    sources = {"scatter": fit.covariance}
-    for source, change in changes:
-        d = (fit.answer @ change).real
-        sources[source] = sources.get(source, 0.0) + np.outer(d, d)
+        add("reference", (fit.answer @ (phase * reference_change)).real)
+        add("model", (fit.answer @ (phase * model_change)).real)
     return sources
+
+
+def find_common_error(fit: PermittivityFit, miss: Complex, scan: DisturbedScan, wave_number: float) -> Array:
+    """Change of (real, imaginary) of a segment's permittivity, if its scan is understood as `scan`."""
+    coefficients = reflect_points(fit.eps, scan.voltages, wave_number)
+    change = find_misses(scan.voltages, scan.gains, coefficients) - miss
+    return (fit.answer @ change).real
 
 
 def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.int_], gains: Gains | None) -> NDArray:
@@ -561,20 +576,40 @@ def _find_stride(places_m: Array) -> float:
     return float(np.median(steps)) if steps.size else STRIDE_M
 
 
-def judge_medium(fit: PermittivityFit, v: Voltages, gains: Gains, wave_number: float) -> tuple[float, float]:
+def judge_medium(
+    fit: PermittivityFit, v: Voltages, gains: Gains, disturbed: Sequence[DisturbedScan], wave_number: float
+) -> tuple[float, float]:
     """Return what one medium does not explain: ln of the level of H over the expected, and the rise over the band.
 
     A wall or a coating reflects twice: its level is that of no half space, or it changes over the band. The rise is
-    that of H or of V, whichever is larger, less two standard deviations of its own.
+    that of H or of V, whichever is larger. Both are given less two standard deviations of their own. `fit`, `v` and
+    `disturbed` hold the same points.
     """
-    used = v[fit.used]
-    expected = receive(used, reflect_points(fit.eps, used, wave_number))
-    level = np.log(np.abs(used.b[:, 0])) - gains.level(used.arrival) - np.log(np.abs(expected[:, 0]))
-    rise = used.band_rise - gains.band_rise
-    usual = np.median(rise, axis=0)
-    scatter = 1.48 * np.median(np.abs(rise - usual), axis=0)
-    blocks = int(number_blocks(used.at_m, (0.0, 0.0)).max()) + 1
-    return float(np.median(level)), float(np.max(np.abs(usual) - 2 * scatter / np.sqrt(blocks)))
+    blocks = int(number_blocks(v.at_m[fit.used], (0.0, 0.0)).max()) + 1
+
+    def find_levels(eps: complex, voltages: Voltages, gains: Gains) -> Array:
+        expected = receive(voltages, reflect_points(eps, voltages, wave_number))
+        levels = np.log(np.abs(voltages.b[:, 0])) - gains.level(voltages.arrival) - np.log(np.abs(expected[:, 0]))
+        return levels[fit.used]
+
+    levels = find_levels(fit.eps, v, gains)
+    level = float(np.median(levels))
+    variance = _spread(levels) ** 2 / blocks
+    # A rig that is known badly gives a wrong permittivity, and with it a wrong level.
+    miss = find_misses(v, gains, reflect_points(fit.eps, v, wave_number))
+    for scan in disturbed:
+        real, imaginary = find_common_error(fit, miss, scan, wave_number)
+        moved = find_levels(fit.eps + complex(real, imaginary), scan.voltages, scan.gains)
+        variance += (float(np.median(moved)) - level) ** 2
+
+    rises = v.band_rise[fit.used] - gains.band_rise
+    rise = np.abs(np.median(rises, axis=0)) - 2 * np.array([_spread(column) for column in rises.T]) / np.sqrt(blocks)
+    return max(0.0, abs(level) - 2 * float(np.sqrt(variance))), float(np.max(rise))
+
+
+def _spread(values: Array) -> float:
+    """Standard deviation of values by the median of their distances from the median."""
+    return 1.48 * float(np.median(np.abs(values - np.median(values))))
 
 
 def point_covariance(v: Voltages, gains: Gains, fit: PermittivityFit, wave_number: float) -> Array:

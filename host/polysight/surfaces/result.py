@@ -21,6 +21,7 @@ from polysight.surfaces.measure import Seen, Shape, find_shape
 from polysight.surfaces.optics import Optics
 from polysight.surfaces.paths import Echoes
 from polysight.surfaces.permittivity import (
+    DisturbedScan,
     Gains,
     PermittivityFit,
     Reference,
@@ -133,15 +134,12 @@ def analyse_surface(
         for index, segment in enumerate(segments):
             members = (echoes.segment == segment.number) & interior
             own_voltages = voltages[members]
-            judged, fit = judge_segment(segment, own_voltages, gains, optics.wave_number)
-            segments[index] = judged
+            of_members = [replace(d, voltages=d.voltages[members]) for d in disturbed]
+            segments[index], fit = judge_segment(segment, own_voltages, gains, of_members, optics.wave_number)
             if fit is None:
                 continue
-            used = np.flatnonzero(members)[fit.used]
-            used_fit = replace(fit, answer=fit.answer[:, fit.used])
-            of_used = [replace(d, voltages=d.voltages[used]) for d in disturbed]
-            sources = add_common_errors(used_fit, voltages[used], gains, of_used, optics.wave_number)
-            segments[index] = add_permittivity(judged, fit.eps, sources)
+            sources = add_common_errors(fit, own_voltages, gains, of_members, optics.wave_number)
+            segments[index] = add_permittivity(segments[index], fit.eps, sources)
             if segments[index].permittivity is None:
                 continue
             common = sum((c for name, c in sources.items() if name != "scatter"), np.zeros((2, 2)))
@@ -287,9 +285,9 @@ def _triple(vector: Array) -> tuple[float, float, float]:
 
 
 def judge_segment(
-    segment: Segment, voltages: Voltages, gains: Gains, wave_number: float
+    segment: Segment, voltages: Voltages, gains: Gains, disturbed: Sequence[DisturbedScan], wave_number: float
 ) -> tuple[Segment, PermittivityFit | None]:
-    """Fit a segment's permittivity, unless there is a reason why it has none."""
+    """Fit a segment's permittivity, unless there is a reason why it has none; `disturbed` holds the same points."""
     if len(voltages) < MIN_POINTS:
         cause = f"{len(voltages)} points away from its edges: too few to average over"
         return replace(segment, reason=cause), None
@@ -301,8 +299,8 @@ def judge_segment(
         cause = f"radius {segment.radius_mm:.0f} mm: below {1e3 * MIN_RADIUS_M:.0f} mm only the shape is reliable"
         return replace(segment, reason=cause), None
     fit = fit_permittivity(voltages, gains, wave_number)
-    level, rise = judge_medium(fit, voltages, gains, wave_number)
-    if abs(level) > MAX_LEVEL_MISS or rise > MAX_BAND_RISE:
+    level, rise = judge_medium(fit, voltages, gains, disturbed, wave_number)
+    if level > MAX_LEVEL_MISS or rise > MAX_BAND_RISE:
         return replace(segment, reason=NO_SINGLE_MEDIUM), None
     return segment, fit
 

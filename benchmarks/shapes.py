@@ -218,7 +218,10 @@ def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> Obje
     on_object = np.abs(distances) < STRAY_M
     background = np.zeros(len(distances), bool)
     for shape in scene.background:
-        background |= np.abs(shape.project(surface.points_m)[0]) < STRAY_M
+        away_from_shape = np.abs(shape.project(surface.points_m)[0])
+        background |= away_from_shape < STRAY_M
+        # A table that touches the object's back holds no points of the object: its front alone is seen.
+        on_object &= away_from_shape > np.abs(distances)
     figures = ObjectFigures(
         kind=kind,
         seed=seed,

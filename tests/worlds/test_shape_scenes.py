@@ -71,6 +71,19 @@ def test_each_disturbance_changes_the_samples_and_repeats(change):
     assert all(np.array_equal(disturbed[channel], again[channel]) for channel in quiet)
 
 
+def test_the_back_of_a_body_is_no_surface_that_is_seen():
+    """A table that touches it has another normal."""
+    scene = draw_shapes(5, "barrel")
+    middle_m = np.array(scene.shapes[0].place_m)
+    front = -scene.shapes[0].axes[:, 2]
+    radius_m = scene.radius_m
+    points_m = np.stack([middle_m + radius_m * front, middle_m - radius_m * front])
+    distances, normals = scene.nearest_surface(points_m)
+    assert abs(distances[0]) < 1e-6
+    assert normals[0] @ front > 0.99
+    assert abs(distances[1]) > radius_m
+
+
 @pytest.mark.parametrize(
     ("change", "std"),
     [

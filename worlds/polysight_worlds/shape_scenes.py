@@ -43,14 +43,22 @@ class ShapeScene:
     background: tuple[Shape, ...] = ()
 
     def nearest_surface(self, points_m: NDArray) -> tuple[NDArray, NDArray]:
-        """Signed distances [n] of points [n, 3] from the object's nearest surface, and its normals there [n, 3]."""
+        """Signed distances [n] of points [n, 3] from the object's nearest surface that faces the antennas, and its
+        normals there [n, 3]; infinite and zero where no piece of it lies before or behind a point.
+        """
         distances = np.full(len(points_m), np.inf)
         normals = np.zeros((len(points_m), 3))
         for shape in self.shapes:
             projected, a, b = shape.project(points_m)
-            nearer = np.abs(projected) < np.abs(distances)
+            facing = shape.evaluate(a, b).normal.T
+            # The back of a body is no surface that antennas see.
+            is_seen = facing[:, 2] < 0
+            if len(self.shapes) > 1:
+                # Beyond its edges a piece goes on, through other pieces.
+                is_seen &= shape.cover(a, b) > 0
+            nearer = is_seen & (np.abs(projected) < np.abs(distances))
             distances = np.where(nearer, projected, distances)
-            normals = np.where(nearer[:, None], shape.evaluate(a, b).normal.T, normals)
+            normals = np.where(nearer[:, None], facing, normals)
         return distances, normals
 
 

@@ -1,7 +1,7 @@
-"""The state machine of stage, run and row: RULES lists the events of each state, their actions and the next states.
+"""The state machine of stage, run, row and jog; rules.py lists the events of each state and their actions.
 
-The actions are methods of `Machine`, which control stage, trigger loop and the running row. The first fault is kept
-until the next `Home` or row. docs/spec/wire.md, "State machine", has the same tables.
+The actions are methods of `Machine`, which control stage, trigger loop and the motion under way. The first fault is
+kept until the next `Home`, row or jog.
 """
 
 from __future__ import annotations
@@ -9,27 +9,27 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 from polysight_pi.edges import EdgeTimes, RowMotion
 from polysight_pi.journal import JournalThread
+from polysight_pi.motions import RunningJog, RunningRow, row_duration_s
+from polysight_pi.rules import END_TIMEOUT_S, MOVING, RULES, TIMEOUTS_S, WIRE_STATE, State
 from polysight_pi.stage import MAX_MM, StageDriver, StageLostError, StageRefusedError
-from polysight_pi.trigger import BurstSent, BurstSpec, Counts, Job, LoopFault, TriggerLoop, TriggerWatch
+from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop, TriggerWatch
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import PolysightError, ProtocolError
 from polysight_shared.faults import PiFault, StageError, explain
-from polysight_shared.raster import Row, Stage
-from polysight_shared.stage_line import END_OF_TIME_NS, HOMING_TIMEOUT_S, Immediate, Reply
+from polysight_shared.raster import Row
+from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 
 STATUS_EVENT_S = 0.24
 # Consecutive statuses at rest after which the reply to the end of a motion counts as lost.
 RESTS = 3
 # Times that such a reply is asked for; a stage whose banner was lost never gives it.
 ASKED_AGAIN = 3
-MOVING = ("homing", "jogging", "running", "held", "stopping")
 POSITION_LOST = (
     StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
 )  # fmt: skip
@@ -43,140 +43,8 @@ class RefusedError(PolysightError):
         self.number = int(number)
 
 
-State = Literal["idle", "homing", "jogging", "homed", "ready", "running", "held", "stopping", "done", "ending", "fault"]
-
-
-class Rule(NamedTuple):
-    """Action (name of a method) and next state of an event in the listed states.
-
-    `leads_to` has the possible next states, the default first; the action may return one of the others.
-    """
-
-    event: str
-    states: str
-    leads_to: str
-    action: str = "nothing"
-
-
-RULES = (
-    # Commands; refused in all other states.
-    Rule("Home", "idle homed ready fault", "homing", "home"),
-    Rule("Home", "homing", "same"),
-    Rule("Jog", "homed ready", "jogging", "jog"),
-    Rule("BeginRun", "homed", "ready", "begin_run"),
-    Rule("BeginRun", "idle homing jogging ready fault", "same", "begin_run"),
-    Rule("EndRun", "ready", "homed", "end_run"),
-    Rule("EndRun", "idle homing jogging homed fault", "same", "end_run"),
-    Rule("RunRow", "ready", "running", "start_row"),
-    Rule("Hold", "running", "held", "hold"),
-    Rule("Hold", "held", "same"),
-    Rule("Resume", "held", "running", "resume"),
-    Rule("Resume", "running", "same"),
-    Rule("Abort", "running held", "stopping ending", "abort"),
-    Rule("Abort", "done", "ending", "abort"),
-    Rule("Abort", "homing", "same", "stop"),
-    Rule("Abort", "jogging", "same", "abort_jog"),
-    Rule("Abort", "idle homed ready stopping ending fault", "same"),
-    Rule("Pulse", "idle homed fault", "same"),
-    # Replies of the stage; ignored in all other states.
-    Rule("homed", "homing", "homed ready fault", "note_homed"),
-    Rule("moved", "jogging", "homed ready fault", "note_moved"),
-    Rule("passed", "running held", "done ending", "note_passed"),
-    Rule("passed", "stopping", "ending", "note_stopped"),
-    Rule("stopped", "running held stopping done", "ending", "note_stopped"),
-    Rule("stopped", "homing", "idle", "clear_alarm"),
-    Rule("stopped", "jogging", "homed ready idle", "note_jog_stopped"),
-    Rule("stopped", "idle homed ready ending fault", "same", "clear_alarm"),
-    Rule("not homed", "homed ready", "idle", "lose_position"),
-    Rule("stage lost", "idle homing jogging homed ready", "fault", "lose_stage"),
-    Rule("stage lost", "running held stopping done", "ending", "lose_stage"),
-    Rule("stage lost", "ending fault", "same", "lose_stage"),
-    # Trigger line, host, journal, time.
-    Rule("row fault", "running held", "stopping ending", "fail_row"),
-    Rule("row fault", "done", "ending", "fail_row"),
-    Rule("row fault", "jogging", "same", "fail_jog"),
-    Rule("lasting fault", "idle homing jogging homed ready", "fault", "fail"),
-    Rule("lasting fault", "running held", "stopping ending", "fail"),
-    Rule("lasting fault", "done", "ending", "fail"),
-    Rule("lasting fault", "stopping ending", "same", "fail"),
-    Rule("all sent", "done", "ending"),
-    Rule("timeout", "homing jogging", "fault", "time_out"),
-    Rule("timeout", "running stopping", "ending", "time_out"),
-    Rule("timeout", "done", "ending", "disarm"),
-    Rule("settled", "ending", "ready idle fault", "finish_row"),
-)
-TIMEOUTS_S: dict[State, float] = {
-    "homing": HOMING_TIMEOUT_S,
-    "jogging": m.MAX_JOG_S + 5.0,
-    "stopping": 3.0,  # from STOP to standstill
-    "done": 1.0,  # from the stage's `done` to the last burst
-}  # running: set for each row; all others: no limit
-# From STOP to standstill when the program is being ended.
-END_TIMEOUT_S = 0.5
 # Missing heartbeats after which the host is lost.
 HOST_MISSES = 4
-# The others have the same name
-WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}
-
-
-@dataclass
-class RunningJog:
-    """A jog that the stage has started; `target`: its x and y, motor steps."""
-
-    command: m.Jog
-    sequence: int
-    target: tuple[int, int]
-    timeout_s: float  # of its heartbeat
-    alive_s: float
-    # Set once the stage was told to stop
-    status: m.RowStatus = "done"
-    fault: int = 0
-    reason: str = ""
-
-
-@dataclass
-class RunningRow:
-    """A row that the stage has started. `status` is set once the row's result is decided."""
-
-    row: Row
-    take: int
-    job: Job
-    sequence: int  # of the stage's ROW and its `done`
-    motion: RowMotion
-    edges: EdgeTimes
-    # True once the stage's `ok` was read: earlier statuses belong to the motion before
-    is_underway: bool = False
-    status: m.RowStatus | None = None
-    fault: int = 0
-    reason: str = ""
-    # The next state is fault
-    lasting: bool = False
-    # Passed, counted by the stage
-    points: int = 0
-    # Reported to the host
-    bursts: int = 0
-    was_held: bool = False  # within the row; the stage says so
-    # Latest time at which its `done` was written
-    done_ns: int = END_OF_TIME_NS
-
-    def judge(self, counts: Counts) -> None:
-        """Set the result of a row that was not stopped: `done` if all counts agree, else `fault`."""
-        points = self.row.points
-        pulses = points * self.job.spec.pulses
-        if self.points == points and counts == Counts(points, points, pulses):
-            wrong = self.edges.judge(self.was_held, self.done_ns)
-            self.status = "done"
-            if wrong:
-                self.status = "fault"
-                self.fault = int(PiFault.EDGE_TIME)
-                self.reason = wrong
-            return
-        self.status = "fault"
-        self.fault = int(PiFault.POINTS_MISMATCH)
-        self.reason = (
-            f"{points} points requested, {self.points} passed by the stage, {counts.edges} edges received, "
-            f"{counts.bursts} bursts and {counts.pulses} of {pulses} pulses sent"
-        )
 
 
 class Machine:
@@ -762,12 +630,6 @@ class Machine:
             self.fault = int(number)
             self.reason = reason
         self._journal.add(m.Fault, number=int(number), problem=f"{e.problem}: {reason}", cause=e.cause, remedy=e.remedy)
-
-
-def row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:
-    """Estimate the duration of a row, including the longest travel to its first point."""
-    travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
-    return travel_s + abs(row.step_mm) * row.points / speed_mm_s + 4 * speed_mm_s / stage.accel_mm_s2
 
 
 def _number(reply: Reply, key: str, absent: int = 0) -> int:

@@ -77,9 +77,9 @@ def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, asked):
 
 
 def test_pi_and_host_have_the_same_homing_timeout():
-    from polysight_pi import machine, stage
+    from polysight_pi import rules, stage
 
-    assert machine.TIMEOUTS_S["homing"] == stage.MOTION_TIMEOUT_S == HOMING_TIMEOUT_S < ready._HOMING_TIMEOUT_S
+    assert rules.TIMEOUTS_S["homing"] == stage.MOTION_TIMEOUT_S == HOMING_TIMEOUT_S < ready._HOMING_TIMEOUT_S
 
 
 @pytest.mark.parametrize("rows", [1, 3, 4])

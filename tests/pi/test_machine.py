@@ -17,7 +17,8 @@ from tests.support.rigs import published_rig
 
 from polysight.planning.forecast import row_motion_s
 from polysight_pi.executor import check_run, read_burst
-from polysight_pi.machine import RULES, TIMEOUTS_S, WIRE_STATE, RefusedError, State
+from polysight_pi.machine import RefusedError
+from polysight_pi.rules import RULES, TIMEOUTS_S, WIRE_STATE, State
 from polysight_pi.stage import STATUS_PER_HEARTBEAT, StatusWatch
 from polysight_pi.trigger import LOOK_UP_S, LoopFault, TriggerWatch
 from polysight_shared import messages as m

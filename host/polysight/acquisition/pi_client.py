@@ -31,6 +31,7 @@ from polysight_shared.messages import (
     AnyCommand,
     AnyEvent,
     AnyReply,
+    Axis,
     BeginRun,
     EndRun,
     ExitStatus,
@@ -38,6 +39,7 @@ from polysight_shared.messages import (
     Hello,
     HelloReply,
     Home,
+    Jog,
     Pulse,
     Pulsed,
     Refused,
@@ -66,6 +68,8 @@ _ALIVE_TIMEOUT_S = 1.0
 # States that change without a command.
 MOVING: tuple[State, ...] = ("homing", "jogging", "running", "held", "done")
 _REST_TIMEOUT_S = 10.0
+# Period of the heartbeat during a jog where the rig file has none for rows.
+_JOG_HEARTBEAT_MS = 100
 _POLL_S = 0.05
 # Events that one reply brings from the Pi's journal.
 _REPLAY_LIMIT = 1000
@@ -204,6 +208,46 @@ class PiClient:
         command = Home(owner=self._owner)
         if self._once(command, self._timeout_s) is None and self.status().state != "homing":
             self._ask(command, Accepted)
+
+    def jog(self, axis: Axis, distance_mm: float, speed_mm_s: float) -> StatusReply:
+        """Move one axis of the homed stage and wait for its end; return the status there.
+
+        The stage stops if this program ends or is interrupted. Raises RefusedError, DeviceError, or ScanError if the
+        stage does not get there.
+        """
+        from_mm = _find_place_mm(self.status(), axis)
+        heartbeat_ms = self._instrument.pi.host_heartbeat_ms or _JOG_HEARTBEAT_MS
+        command = Jog(
+            axis=axis,
+            from_mm=from_mm,
+            distance_mm=distance_mm,
+            speed_mm_s=speed_mm_s,
+            heartbeat_ms=heartbeat_ms,
+            owner=self._owner,
+        )
+        heartbeat = HostHeartbeat(self._context, self._instrument, "", heartbeat_ms / 1e3, self._owner)
+        try:
+            self._ask(command, Accepted)
+            status = self.status()
+            while status.state == "jogging":
+                time.sleep(_POLL_S)
+                status = self.status()
+        except KeyboardInterrupt:
+            self.abort("stopped by its operator")
+            raise
+        finally:
+            heartbeat.stop()
+
+        missing_mm = from_mm + distance_mm - _find_place_mm(status, axis)
+        half_a_step_mm = 0.5 / self._instrument.stage.steps_per_mm
+        if status.fault or abs(missing_mm) > 1.01 * half_a_step_mm:
+            raise ScanError(
+                f"the stage stopped about {abs(missing_mm):.1f} mm before the end of the jog",
+                status.reason or "it was aborted",
+                "look at the stage; home it if its state is `fault`",
+                code=ErrorCode.STAGE_NOT_READY,
+            )
+        return status
 
     def run_row(self, scan_id: str, row_index: int, take: int) -> None:
         """Begin a row. If the reply is lost, check if the row runs before a retry.
@@ -366,6 +410,12 @@ class PiClient:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _find_place_mm(status: StatusReply, axis: Axis) -> float:
+    if axis == "x":
+        return status.x_mm
+    return status.y_mm
 
 
 def _belongs_to_take(event: AnyEvent, row_index: int, take: int) -> bool:

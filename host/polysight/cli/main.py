@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 FAMILIES = {
     "rig": (
         *("demo", "simulate", "reproduce"),
-        *("plan", "doctor", "card", "inspect", "radar", "scan", "resume", "validate", "drop-raw"),
+        *("plan", "doctor", "card", "inspect", "radar", "jog", "scan", "resume", "validate", "drop-raw"),
     ),
     "serve": ("serve", "preview", "scans", "note", "ask", "probe", "compare", "check"),
     "process": ("process", "surface", "image", "focus", "sync-report", "calibrate", "leakage"),

@@ -1,6 +1,7 @@
 """The commands around a rig and its scans, simulated or real.
 
-Simulated: demo, simulate, reproduce. Real: plan, doctor, card, inspect, radar, scan, resume, validate, drop-raw.
+Simulated: demo, simulate, reproduce. Real: plan, doctor, card, inspect, radar, jog, scan, resume,
+validate, drop-raw.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ _distance = number(float, "a distance from 20 to 10000 mm", lambda value: 20 <= 
 _seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
 _minutes = number(float, "a time of 0.01 to 100000 minutes", lambda value: 0.01 <= value <= 100_000)
 _decibels = number(float, "a ratio of -100 to 100 dB", lambda value: abs(value) <= 100)
+_jog_mm = number(float, "a distance of -100 to 100 mm", lambda value: 0 < abs(value) <= 100)
 _scene_side = number(float, "a length above 0, at most 10000 mm", lambda value: 0 < value <= 10_000)
 
 
@@ -44,6 +46,7 @@ def add_commands(add: Add) -> None:
     _add_card(add)
     _add_inspect(add)
     _add_radar(add)
+    _add_jog(add)
     _add_scans(add)
 
 
@@ -344,6 +347,29 @@ def _add_radar(add: Add) -> None:
     )
     sub.add_argument("trace", type=Path, metavar="TRACE", help="file written by --trace")
     _add_own_config(sub)
+    add_json_option(sub)
+
+
+# --- jog ---
+
+
+def _jog(args: argparse.Namespace) -> int:
+    from polysight.jobs.devices import jog_stage
+
+    return jog_stage(args.config, args.axis, args.distance_mm, args.speed_mm_s, args.json)
+
+
+def _add_jog(add: Add) -> None:
+    sub = add(
+        "jog",
+        _jog,
+        "move one axis of the homed stage; it stops at Ctrl-C and if this program ends",
+        "polysight jog x 10\n  polysight jog y -2.5 --speed-mm-s 5",
+    )
+    sub.add_argument("axis", choices=("x", "y"), help="axis of the stage")
+    sub.add_argument("distance_mm", type=_jog_mm, metavar="MM", help="distance, at most 100 mm each way")
+    sub.add_argument("--speed-mm-s", type=positive, metavar="V", help="speed (default: the rig file's in a row)")
+    add_config_option(sub)
     add_json_option(sub)
 
 

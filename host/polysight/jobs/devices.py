@@ -1,7 +1,7 @@
-"""`polysight card` and `polysight radar`: capture cards and radar boards, one at a time.
+"""`polysight card`, `polysight radar`, `polysight jog`: capture cards, radar boards and the stage, one at a time.
 
 `card` checks the network path to the cards, writes a card's addresses, or resets it; `radar` checks a board from USB to
-one frame, loads its firmware, or replays a trace. Not run on hardware yet.
+one frame, loads its firmware, or replays a trace; `jog` moves the stage. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
+import zmq
 
+from polysight.acquisition import PiClient
 from polysight.capture import CardClient, CardSurvey, EepromSettings, program_eeprom, survey_cards
 from polysight.jobs.output import confirm, exit_status, print_json
 from polysight.radar import (
@@ -35,6 +37,7 @@ from polysight.radar import (
 from polysight_shared.config import Board, Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.findings import Finding
+from polysight_shared.messages import Axis
 
 # Limit of one question to a card that is perhaps just starting, all attempts together
 _ASK_S = 1.5
@@ -355,3 +358,25 @@ def _load_native_rig(config: Path, name: str) -> Instrument:
         raise ConfigError(f"radar.native has no board {name!r}", "a typing error", f"one of {sorted(rig.radar.native)}")
     require(rig, rig.grid.columns * rig.burst.pulses)
     return rig
+
+
+def jog_stage(config: Path, axis: Axis, distance_mm: float, speed_mm_s: float | None, as_json: bool) -> int:
+    """Move one axis of the homed stage; say where it rests, and its limits. Raises DeviceError, ScanError."""
+    rig = load_instrument(config)
+    stage = rig.stage
+    if speed_mm_s is None:
+        speed_mm_s = stage.speed_mm_s
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        with PiClient(context, rig) as pi:
+            status = pi.jog(axis, distance_mm, speed_mm_s)
+    finally:
+        context.destroy(linger=0)
+    if as_json:
+        place = {"x_mm": status.x_mm, "y_mm": status.y_mm}
+        limits = {"travel_x_mm": stage.travel_x_mm, "travel_y_mm": stage.travel_y_mm}
+        print_json({"state": status.state, **place, **limits})
+    else:
+        sys.stdout.write(f"x {status.x_mm:.3f} mm (limits: 0 and {stage.travel_x_mm:g} mm)\n")
+        sys.stdout.write(f"y {status.y_mm:.3f} mm (limits: 0 and {stage.travel_y_mm:g} mm)\n")
+    return 0

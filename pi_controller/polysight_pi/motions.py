@@ -1,0 +1,78 @@
+"""What the stage does for a command: a jog, or a row with its counts and result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from polysight_pi.edges import EdgeTimes, RowMotion
+from polysight_pi.trigger import Counts, Job
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
+from polysight_shared.raster import Row, Stage
+from polysight_shared.stage_line import END_OF_TIME_NS
+
+
+@dataclass
+class RunningJog:
+    """A jog that the stage has started; `target`: its x and y, motor steps."""
+
+    command: m.Jog
+    sequence: int
+    target: tuple[int, int]
+    timeout_s: float  # of its heartbeat
+    alive_s: float
+    # Set once the stage was told to stop
+    status: m.RowStatus = "done"
+    fault: int = 0
+    reason: str = ""
+
+
+@dataclass
+class RunningRow:
+    """A row that the stage has started. `status` is set once the row's result is decided."""
+
+    row: Row
+    take: int
+    job: Job
+    sequence: int  # of the stage's ROW and its `done`
+    motion: RowMotion
+    edges: EdgeTimes
+    # True once the stage's `ok` was read: earlier statuses belong to the motion before
+    is_underway: bool = False
+    status: m.RowStatus | None = None
+    fault: int = 0
+    reason: str = ""
+    # The next state is fault
+    lasting: bool = False
+    # Passed, counted by the stage
+    points: int = 0
+    # Reported to the host
+    bursts: int = 0
+    was_held: bool = False  # within the row; the stage says so
+    # Latest time at which its `done` was written
+    done_ns: int = END_OF_TIME_NS
+
+    def judge(self, counts: Counts) -> None:
+        """Set the result of a row that was not stopped: `done` if all counts agree, else `fault`."""
+        points = self.row.points
+        pulses = points * self.job.spec.pulses
+        if self.points == points and counts == Counts(points, points, pulses):
+            wrong = self.edges.judge(self.was_held, self.done_ns)
+            self.status = "done"
+            if wrong:
+                self.status = "fault"
+                self.fault = int(PiFault.EDGE_TIME)
+                self.reason = wrong
+            return
+        self.status = "fault"
+        self.fault = int(PiFault.POINTS_MISMATCH)
+        self.reason = (
+            f"{points} points requested, {self.points} passed by the stage, {counts.edges} edges received, "
+            f"{counts.bursts} bursts and {counts.pulses} of {pulses} pulses sent"
+        )
+
+
+def row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:
+    """Estimate the duration of a row, including the longest travel to its first point."""
+    travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
+    return travel_s + abs(row.step_mm) * row.points / speed_mm_s + 4 * speed_mm_s / stage.accel_mm_s2

@@ -1,0 +1,86 @@
+"""The rules of the state machine: the events of each state, their actions and the next states, and time limits.
+
+machine.py applies them. docs/spec/wire.md, "State machine", has the same tables.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+from polysight_shared import messages as m
+from polysight_shared.stage_line import HOMING_TIMEOUT_S
+
+State = Literal["idle", "homing", "jogging", "homed", "ready", "running", "held", "stopping", "done", "ending", "fault"]
+
+
+class Rule(NamedTuple):
+    """Action (name of a method) and next state of an event in the listed states.
+
+    `leads_to` has the possible next states, the default first; the action may return one of the others.
+    """
+
+    event: str
+    states: str
+    leads_to: str
+    action: str = "nothing"
+
+
+RULES = (
+    # Commands; refused in all other states.
+    Rule("Home", "idle homed ready fault", "homing", "home"),
+    Rule("Home", "homing", "same"),
+    Rule("Jog", "homed ready", "jogging", "jog"),
+    Rule("BeginRun", "homed", "ready", "begin_run"),
+    Rule("BeginRun", "idle homing jogging ready fault", "same", "begin_run"),
+    Rule("EndRun", "ready", "homed", "end_run"),
+    Rule("EndRun", "idle homing jogging homed fault", "same", "end_run"),
+    Rule("RunRow", "ready", "running", "start_row"),
+    Rule("Hold", "running", "held", "hold"),
+    Rule("Hold", "held", "same"),
+    Rule("Resume", "held", "running", "resume"),
+    Rule("Resume", "running", "same"),
+    Rule("Abort", "running held", "stopping ending", "abort"),
+    Rule("Abort", "done", "ending", "abort"),
+    Rule("Abort", "homing", "same", "stop"),
+    Rule("Abort", "jogging", "same", "abort_jog"),
+    Rule("Abort", "idle homed ready stopping ending fault", "same"),
+    Rule("Pulse", "idle homed fault", "same"),
+    # Replies of the stage; ignored in all other states.
+    Rule("homed", "homing", "homed ready fault", "note_homed"),
+    Rule("moved", "jogging", "homed ready fault", "note_moved"),
+    Rule("passed", "running held", "done ending", "note_passed"),
+    Rule("passed", "stopping", "ending", "note_stopped"),
+    Rule("stopped", "running held stopping done", "ending", "note_stopped"),
+    Rule("stopped", "homing", "idle", "clear_alarm"),
+    Rule("stopped", "jogging", "homed ready idle", "note_jog_stopped"),
+    Rule("stopped", "idle homed ready ending fault", "same", "clear_alarm"),
+    Rule("not homed", "homed ready", "idle", "lose_position"),
+    Rule("stage lost", "idle homing jogging homed ready", "fault", "lose_stage"),
+    Rule("stage lost", "running held stopping done", "ending", "lose_stage"),
+    Rule("stage lost", "ending fault", "same", "lose_stage"),
+    # Trigger line, host, journal, time.
+    Rule("row fault", "running held", "stopping ending", "fail_row"),
+    Rule("row fault", "done", "ending", "fail_row"),
+    Rule("row fault", "jogging", "same", "fail_jog"),
+    Rule("lasting fault", "idle homing jogging homed ready", "fault", "fail"),
+    Rule("lasting fault", "running held", "stopping ending", "fail"),
+    Rule("lasting fault", "done", "ending", "fail"),
+    Rule("lasting fault", "stopping ending", "same", "fail"),
+    Rule("all sent", "done", "ending"),
+    Rule("timeout", "homing jogging", "fault", "time_out"),
+    Rule("timeout", "running stopping", "ending", "time_out"),
+    Rule("timeout", "done", "ending", "disarm"),
+    Rule("settled", "ending", "ready idle fault", "finish_row"),
+)
+TIMEOUTS_S: dict[State, float] = {
+    "homing": HOMING_TIMEOUT_S,
+    "jogging": m.MAX_JOG_S + 5.0,
+    "stopping": 3.0,  # from STOP to standstill
+    "done": 1.0,  # from the stage's `done` to the last burst
+}  # running: set for each row; all others: no limit
+# From STOP to standstill when the program is being ended.
+END_TIMEOUT_S = 0.5
+# The others have the same name
+WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}
+# The stage moves
+MOVING = ("homing", "jogging", "running", "held", "stopping")

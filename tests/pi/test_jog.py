@@ -1,0 +1,82 @@
+"""A jog from the host: the stage moves to its place while the host lives, and no further than it was told."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import msgspec
+import pytest
+import zmq
+from tests.support.processes import wait_for
+from tests.support.refusals import refused
+
+from polysight.acquisition import PiClient, RefusedError
+from polysight_shared import messages as m
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.faults import PiFault
+
+
+@pytest.fixture
+def client(pi, instrument):
+    """The host's own client, of a Pi whose stage is homed."""
+    pi.host.must_accept(m.Home())
+    pi.host.until_state("homed")
+    server = pi.service.server
+    addresses = msgspec.structs.replace(
+        instrument.pi, command_address=server.command_address, event_address=server.event_address
+    )
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    with PiClient(context, msgspec.structs.replace(instrument, pi=addresses)) as client:
+        yield client
+    context.destroy(linger=0)
+
+
+def test_jogs_add_up_and_lead_back(client):
+    assert client.jog("x", 10.0, 20.0).x_mm == 10.0
+    assert client.jog("y", 2.5, 20.0).y_mm == 2.5
+    status = client.jog("x", -10.0, 20.0)
+    assert (status.x_mm, status.y_mm, status.state) == (0.0, 2.5, "homed")
+
+
+def test_a_jog_past_the_end_is_refused_and_nothing_moves(client, stage):
+    with pytest.raises(RefusedError) as refusal:
+        client.jog("x", -0.1, 20.0)
+    assert refusal.value.number == PiFault.BAD_REQUEST
+    assert not [c for c in stage.seen if c.verb == "MOVE"]
+
+
+def test_the_heartbeat_of_the_client_keeps_a_long_jog_moving(client, pi, stage):
+    """It lasts many times longer than a silent host is waited for; ended by another person's abort."""
+    stage.pace_s = 60.0
+
+    def abort_later() -> None:
+        pi.host.until_state("jogging")
+        jog = pi.service.executor._machine.jog
+        begun_s = jog.alive_s
+        wait_for(lambda: jog.alive_s > begun_s + 3 * jog.timeout_s, "heartbeats of the jog")
+        pi.host.must_accept(m.Abort())
+
+    person = threading.Thread(target=abort_later)
+    person.start()
+    with refused(ErrorCode.STAGE_NOT_READY, "aborted"):
+        client.jog("x", 10.0, 20.0)
+    person.join()
+    assert pi.host.wait(m.Jogged).status == "aborted"
+
+
+def test_an_interrupted_jog_is_stopped(client, pi, stage):
+    stage.pace_s = 60.0
+
+    def interrupt_later() -> None:
+        pi.host.until_state("jogging")
+        os.kill(os.getpid(), signal.SIGINT)
+
+    operator = threading.Thread(target=interrupt_later)
+    operator.start()
+    with pytest.raises(KeyboardInterrupt):
+        client.jog("x", 10.0, 20.0)
+    operator.join()
+    ended = pi.host.wait(m.Jogged)
+    assert (ended.status, ended.reason) == ("aborted", "stopped by its operator")

@@ -162,7 +162,7 @@ SHEETS = (
             Wire("7 (Y3, return)", "Pi GPIO 23, pin 16", "pulse", "33"),
             Wire("GND of each cable", "board's GND", "ground"),
         ),
-        ("Three cables of one length. Remove R62 on each board.", "With = 'spi' the return goes to MISO (pin 21)."),
+        ("Three cables of one length. Remove R62 on each board.", "With 'spi' the return goes to MISO (pin 21)."),
     ),
 )  # fmt: skip
 

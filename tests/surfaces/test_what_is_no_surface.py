@@ -7,6 +7,7 @@ import pytest
 
 from polysight.surfaces import Uncertainty, analyse_surface
 from polysight.surfaces.permittivity import find_interior
+from polysight.surfaces.result import estimate_wall_std
 from polysight_worlds.media import Stack
 from polysight_worlds.shapes import cylinder, plate
 
@@ -61,3 +62,23 @@ def test_points_near_the_border_of_a_segment_are_told_but_not_where_the_scan_end
     from_border_m = np.minimum(at_m[:, 0] - x.min(), x.max() - at_m[:, 0])
     assert not interior[from_border_m < 0.014].any()
     assert interior[from_border_m > 0.026].all()
+
+
+@pytest.mark.parametrize(("least", "most"), [(0.1, 0.25), (0.25, 0.4), (0.4, 0.7)])
+def test_points_of_a_wall_say_how_far_they_may_lie_off_the_more_its_faces_cancel(least, most):
+    """Drawn walls: the path by the matched filter over the band, by the sum of both faces' echoes at 53 degrees."""
+    rng = np.random.default_rng(1)
+    wave_numbers = 2 * np.pi * np.linspace(76.282e9, 79.749e9, 24) / 299792458
+    cos = np.cos(np.radians(53))
+    paths_m = np.linspace(-0.06, 0.06, 1201)
+    matched = np.exp(1j * np.outer(paths_m, wave_numbers))
+    inside = []
+    while len(inside) < 300:
+        inner = np.sqrt(rng.uniform(2, 9) - 1j * rng.uniform(0, 1) - 1 + cos**2)
+        r = (cos - inner) / (cos + inner)
+        through = np.exp(-2j * wave_numbers * rng.uniform(0.5e-3, 3e-3) * inner)
+        level = np.abs(matched @ (r * (1 - through) / (1 - r**2 * through))) / len(wave_numbers)
+        if least < level.max() < most:
+            away_m = paths_m[level.argmax()] / (2 * cos)
+            inside.append(abs(away_m) < 1.96 * estimate_wall_std(level.max()))
+    assert 0.9 < np.mean(inside) < 0.99

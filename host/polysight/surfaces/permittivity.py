@@ -523,6 +523,12 @@ def find_common_error(fit: PermittivityFit, miss: Complex, scan: DisturbedScan, 
     return (fit.answer @ change).real
 
 
+def find_reflection(v: Voltages, gains: Gains) -> Array:
+    """Level of H over that of flat metal, [n]."""
+    metal = np.tile([-1.0, -1.0, 0.0, 0.0], (len(v), 1))
+    return np.abs(v.b[:, 0]) / np.exp(gains.level(v.arrival)) / np.maximum(np.abs(receive(v, metal)[:, 0]), 1e-30)
+
+
 def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.int_], gains: Gains | None) -> NDArray:
     """True for points [n] at which a surface reflects, False for those that only its edge diffracts to.
 

@@ -24,6 +24,8 @@ from polysight.materials.inversion import (
     PatchMeasurement,
     RigPrior,
     invert,
+    join_signs,
+    mirror_phases,
 )
 from polysight.materials.kinds import Kinds, RatioEvidence, inverse_ratio, literature, turn_covariance, weigh_kinds
 from polysight.materials.labels import TruthPlate, match_truth
@@ -105,11 +107,14 @@ class Optics:
     smooth_px
         Width (standard deviation, pixels) of the filter against speckle before permittivity and classification,
         inside each patch.
+    other_sign
+        Probability a priori that all phases of the images have the other sign: 0 of own scans.
     """
 
     theta_rad: npt.ArrayLike
     prior: RigPrior = MEASURED_RIG
     smooth_px: float = 2.0
+    other_sign: float = 0.0
 
     @classmethod
     def from_rig(
@@ -229,6 +234,8 @@ ANGLE_BY_APART = 1.0
 by 2 mrad and move the images 2 mm apart (rms; geometry of the published rig)."""
 FILLED = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material."""
+POSSIBLE_SIGN = 0.05
+"""Probability of the other sign of the phases from which on a metal that nobody declared has to be one with it, too."""
 ACTIVE = 2.0
 """Limit in standard deviations of gain, or of a real part below 1, for a permittivity to be impossible."""
 
@@ -270,10 +277,19 @@ def analyse(
     measured = [scene.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
     kinds = _kinds(classifier, float(np.mean(theta)))
     labels = [p.label for p in judged]
-    if plane is None:
-        measured_by_label = dict(zip(labels, measured, strict=True))
-        reference = _weigh_metal(images, reference, measured_by_label, prior=prior, theta_rad=float(np.mean(theta)))
     inversion = invert(measured, prior, kinds)
+    other_sign = 0.0
+    mirrored, mirrored_prior = mirror_phases(measured, prior)
+    if optics.other_sign > 0:
+        inversion, other_sign = join_signs(inversion, invert(mirrored, mirrored_prior, kinds), optics.other_sign)
+    if plane is None:
+        signs = [measured]
+        if other_sign > POSSIBLE_SIGN and not reference.given:
+            signs.append(mirrored)
+        reference = _weigh_metal(
+            images, reference, [dict(zip(labels, patches, strict=True)) for patches in signs],
+            prior=prior, theta_rad=float(np.mean(theta)),
+        )  # fmt: skip
     # Only known leakage is removed from the pixels: an undetermined estimate leans on what the patches may be.
     calibrated = remove_leakage(raw, inversion.leakage if inversion.leakage_determined else prior.leakage)
     sh, sv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (calibrated.h, calibrated.v))
@@ -296,7 +312,7 @@ def analyse(
         brightness_off={label: ln for label, ln in brightness_off.items() if np.isfinite(ln)},
         evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
         apart_mm=apart_mm, drift=scene.change, halo=scene.halo.level, behind=scene.usual_background(measured),
-        ripple=scene.usual, relief_rad=scene.relief_rad,
+        ripple=scene.usual, relief_rad=scene.relief_rad, other_sign=other_sign,
     )  # fmt: skip
 
 
@@ -530,12 +546,22 @@ def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
 
 
 def _weigh_metal(
-    images: Images, metal: MetalReference, patches: Mapping[int, PatchMeasurement], *, prior: RigPrior, theta_rad: float
+    images: Images,
+    metal: MetalReference,
+    signs: Sequence[Mapping[int, PatchMeasurement]],
+    *,
+    prior: RigPrior,
+    theta_rad: float,
 ) -> MetalReference:
-    """Return the metal reference with the evidence for metal and against; `patches` are the other patches."""
+    """Return the metal reference with the evidence for metal and against.
+
+    `signs` are the other patches with each sign of the phases that is possible: the one that speaks least for metal
+    counts.
+    """
     channel_ratio = _channel_ratio(images, metal) if prior.channels_known else None
-    evidence = metal_evidence(patches, prior, channel_ratio, Kinds(literature(), theta_rad))
-    return replace(metal, evidence=evidence)
+    kinds = Kinds(literature(), theta_rad)
+    evidence = [metal_evidence(patches, prior, channel_ratio, kinds) for patches in signs]
+    return replace(metal, evidence=min(evidence, key=lambda of_sign: of_sign.score))
 
 
 def _channel_ratio(images: Images, metal: MetalReference) -> complex | None:

@@ -2,15 +2,16 @@
 
 Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measured as
 
-    V / H = (1 + rho) exp(G w) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
+    V / H = (1 + rho) exp(j c + G w) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
 
-with a, b the leakage of p into H and of s into V, rho the error of the metal reference, w the rise of the plate
-relative to the metal's and G its effect on ln(V / H), kappa the patch's brightness relative to an ideal one (thickness,
-roughness, illumination). A plate that rises by w across the plane of incidence turns this plane about x, and both waves
-meet its s axis at d = w sin(theta): to first order H receives (1 - d) r_s - d r_p and V (1 + d) r_p + d r_s, as the
-image of the transmitter in a tilted mirror confirms. So a plate has a and b of its own, smaller and larger by d, and G
-is 4 sin(theta) across, up to the patterns of boards that see the plate from other points. r_s and r_p follow from t
-and the incidence angle by Eq. 2 and 3. Unknown are a, b, rho, G, the turn, the angle's error, the usual size of
+with a, b the leakage of p into H and of s into V, rho the error of the metal reference, c the phase by its paint (0 of
+bare metal), w the rise of the plate relative to the metal's and G its effect on ln(V / H), kappa the patch's brightness
+relative to an ideal one (thickness, roughness, illumination). A plate that rises by w across the plane of incidence
+turns this plane about x, and both waves meet its s axis at d = w sin(theta): to first order H receives
+(1 - d) r_s - d r_p and V (1 + d) r_p + d r_s, as the image of the transmitter in a tilted mirror confirms. So a plate
+has a and b of its own, smaller and larger by d, and G is 4 sin(theta) across, up to the patterns of boards that see the
+plate from other points. r_s and r_p follow from t
+and the incidence angle by Eq. 2 and 3. Unknown are a, b, rho, c, G, the turn, the angle's error, the usual size of
 ln kappa, and t of every patch.
 
 The evidence is that of |V / H| and its phase; brightness is a nuisance of each plate, whose usual size the scene tells.
@@ -24,7 +25,7 @@ the nearest material, and its name is the kind that fits this measurement.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -66,12 +67,26 @@ UNEVEN_LIGHT = (1.0, 1.0)
 EVEN_LIGHT = (0.3, 0.5)
 """Change of ln(V / H) per radian of rise, along x and across, by the patterns of boards that see the plate from other
 points: without and with the correction of the plate's illumination. The independent generator has 0.6 along x."""
+PAINTED = 0.05
+"""Probability that the metal reference is painted or otherwise coated."""
+MOST_PAINT_RAD = 0.65
+PAINT_RAD_PER_MM = 2.65
+"""Largest phase of 1 / P by a coating of metal, and its phase per thickness: 4 pi / lambda sin^2 / cos (1 - 1 / eps) of
+a thin layer at 55 degrees with eps = 3.3 (2.3 to 2.9 for 2.5 to 4). p is delayed more than s, never less. Paint has
+0.05 to 0.25 mm."""
 CHI2_95 = 5.991
 CHI2_997 = 11.8
 """Squared distances in standard deviations that hold 95 and 99.7 % of a normal distribution of two dimensions."""
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
+PHASE_SIGN = "phase sign"
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
+SIGN_EVIDENCE = 0.5
+"""Weight of the patches' evidence on the sign of the phases. Patches that are no half spaces may speak for the wrong
+one: by 5 (natural logarithm) where liquids stood behind walls; the plates of the published picture speak by 4 in all.
+"""
+UNLIKELY_SIGN = 0.005
+"""Probability of the other sign of the phases below which it is left out of the errors."""
 # Columns of a particle.
 LEAKAGE_H = (0, 1)
 LEAKAGE_V = (2, 3)
@@ -84,9 +99,10 @@ SHARE_OF_LIBRARY = 10
 TURN_BY_RISE = 11
 LIGHT_ACROSS = (12, 13)
 LIGHT_ALONG = 14
-WIDTH = 15
+PAINT = 15
+WIDTH = 16
 COLUMNS_OF_SOURCE = {
-    "metal reference": REFERENCE,
+    "metal reference": (*REFERENCE, PAINT),
     "leakage": (*LEAKAGE_H, *LEAKAGE_V, HAS_MOVED),
     "incidence": (ANGLE,),
     "tilt": (TURN_BY_RISE, *LIGHT_ACROSS, LIGHT_ALONG),
@@ -161,6 +177,8 @@ class RigPrior:
         Leakage by the rise across the plane of incidence, per radian, and its standard deviation.
     lighting_std
         Standard deviation of G along x and across: per radian of a plate's rise.
+    painted
+        Probability that the metal reference is painted.
     """
 
     theta_std_rad: float
@@ -175,6 +193,7 @@ class RigPrior:
     turn: float = TURN
     turn_std: float = TURN_STD
     lighting_std: tuple[float, float] = UNEVEN_LIGHT
+    painted: float = PAINTED
 
 
 @dataclass(frozen=True)
@@ -234,6 +253,12 @@ class Inversion:
         Usual size of the same in this scene.
     nuisance_covariance
         float64 [6, 6] of a, b, rho (real and imaginary parts), in standard deviations of their prior.
+    painted
+        Probability that the metal reference is painted.
+    paint_rad
+        Phase of its 1 / P by the paint, if it is: the mean.
+    log_evidence
+        Logarithm of the probability density of the measurements under the prior.
     """
 
     patches: tuple[PatchEstimate, ...]
@@ -245,11 +270,76 @@ class Inversion:
     brightness_off: Real
     brightness_std: float
     nuisance_covariance: Real = field(repr=False)
+    painted: float
+    paint_rad: float
+    log_evidence: float
+
+    @property
+    def paint_mm(self) -> float:
+        """Thickness of the paint on the metal reference, if it is painted."""
+        return self.paint_rad / PAINT_RAD_PER_MM
 
     @property
     def leakage_determined(self) -> bool:
         """True if the scene reduced the uncertainty of both leakages to less than half of the prior's."""
         return max(self.leakage_std) < 0.5 * self.prior_std
+
+
+def mirror_phases(seen: Sequence[PatchMeasurement], prior: RigPrior) -> tuple[list[PatchMeasurement], RigPrior]:
+    """Return the patches and the prior as they are if all phases have the other sign.
+
+    Tilts are read from phases, too.
+    """
+    patches = [
+        replace(patch, inverse_ratio=patch.inverse_ratio.conjugate(), rise=(-patch.rise[0], -patch.rise[1]))
+        for patch in seen
+    ]
+    along, across = prior.metal_rise
+    return patches, replace(prior, metal_rise=(-along, -across))
+
+
+def join_signs(as_given: Inversion, mirrored: Inversion, prior_probability: float) -> tuple[Inversion, float]:
+    """Return the solution with the errors by an unknown sign of all phases, and the probability of the other sign.
+
+    `prior_probability` is that of the other sign before any patch was looked at. Values stay those of the sign as
+    given; their covariances are those of both signs together, about these values.
+    """
+    log_odds = SIGN_EVIDENCE * (mirrored.log_evidence - as_given.log_evidence) + scipy.special.logit(prior_probability)
+    probability = float(scipy.special.expit(log_odds))
+    if probability < UNLIKELY_SIGN:
+        return as_given, probability
+    both = zip(as_given.patches, mirrored.patches, strict=True)
+    patches = tuple(_join_estimates(patch, other, probability) for patch, other in both)
+    return replace(as_given, patches=patches), probability
+
+
+def _join_estimates(patch: PatchEstimate, other: PatchEstimate, probability: float) -> PatchEstimate:
+    """Return an estimate whose covariances hold another one, which is the right one with this probability."""
+
+    def join(middle: complex, covariance: Real, other_middle: complex, other_covariance: Real) -> Real:
+        apart = split_complex(other_middle - middle)
+        return (1 - probability) * covariance + probability * (other_covariance + np.outer(apart, apart))
+
+    ratio_covariance = join(
+        patch.inverse_ratio, patch.inverse_ratio_covariance, other.inverse_ratio, other.inverse_ratio_covariance
+    )
+    evidence = patch.evidence
+    if evidence is not None and other.evidence is not None:
+        joined = join(
+            evidence.inverse_ratio, evidence.covariance, other.evidence.inverse_ratio, other.evidence.covariance
+        )
+        evidence = replace(evidence, covariance=joined)
+    joined_estimate = replace(patch, inverse_ratio_covariance=ratio_covariance, evidence=evidence)
+    if patch.permittivity is None or patch.covariance is None:
+        return joined_estimate
+    if other.permittivity is None or other.covariance is None:
+        return joined_estimate
+    covariance = join(patch.permittivity, patch.covariance, other.permittivity, other.covariance)
+    kept = float(np.trace(patch.covariance) / np.trace(covariance))
+    shares = {source: min(kept, 1.0) * share for source, share in patch.shares.items()}
+    if shares:
+        shares[PHASE_SIGN] = max(0.0, 1.0 - kept)
+    return replace(joined_estimate, covariance=covariance, shares=shares)
 
 
 def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: npt.ArrayLike = 0j) -> Complex:
@@ -276,15 +366,15 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | Non
     prior_particles = rng.standard_normal((PARTICLES, WIDTH))
     no_evidence = np.zeros(model.patch_count + 1)
     all_evidence = np.ones(model.patch_count + 1)
-    posterior = _anneal(model, prior_particles, no_evidence, all_evidence, rng)
+    posterior, log_evidence = _anneal(model, prior_particles, no_evidence, all_evidence, rng)
     patches = []
     for i in range(model.patch_count):
         # A patch is measured without the belief that it must be some material itself.
         without_patch = all_evidence.copy()
         without_patch[i + 1] = 0.0
-        particles = _anneal(model, posterior, all_evidence, without_patch, rng)
+        particles, _ = _anneal(model, posterior, all_evidence, without_patch, rng)
         patches.append(_estimate(model, particles, i, rng))
-    return _solution(model, posterior, tuple(patches))
+    return _solution(model, posterior, log_evidence, tuple(patches))
 
 
 class _Scene:
@@ -372,11 +462,20 @@ class _Scene:
         """Return t of every patch, [..., patch]."""
         return self._correct_ratios(self.measured, z)
 
+    def paint(self, z: Real) -> Real:
+        """Return the phase of 1 / P by the metal's paint, [..., 1], radians: 0 of bare metal, else uniform."""
+        painted = self.prior.painted
+        if painted <= 0:
+            return np.zeros((*z.shape[:-1], 1))
+        beyond_bare = scipy.special.ndtr(z[..., PAINT, None]) - (1 - painted)
+        return MOST_PAINT_RAD * np.maximum(beyond_bare, 0.0) / painted
+
     def _correct_ratios(self, measured: Complex, z: Real) -> Complex:
         """Return t of measured V / H [patch], [..., patch]."""
         a, b = self.leakage_of_patches(z)
         rho = self.prior.reference_std * _complex(z, REFERENCE)
-        return true_ratio(measured * np.exp(-self.lighting(z)), a, b, rho)
+        common_change = self.lighting(z) + 1j * self.paint(z)
+        return true_ratio(measured * np.exp(-common_change), a, b, rho)
 
     def ratios_of_kinds(self, z: Real, kinds: Kinds) -> Complex:
         """Return t that each patch would have at the angle of the kinds, [..., patch]."""
@@ -438,16 +537,21 @@ def _complex(z: Real, columns: tuple[int, int]) -> Complex:
     return z[..., columns[0], None] + 1j * z[..., columns[1], None]
 
 
-def _anneal(model: _Scene, z: Real, before: Real, after: Real, rng: np.random.Generator) -> Real:
-    """Move particles of one posterior to another; `before`, `after` [1 + patch] weigh the log likelihoods."""
+def _anneal(model: _Scene, z: Real, before: Real, after: Real, rng: np.random.Generator) -> tuple[Real, float]:
+    """Move particles of one posterior to another; `before`, `after` [1 + patch] weigh the log likelihoods.
+
+    Return them with the logarithm of the ratio of both evidences.
+    """
     parts = model.log_likelihoods(z)
     change = after - before
     done = 0.0
+    log_evidence = 0.0
     while done < 1:
         gain = parts @ change
         step = _choose_step(gain, 1 - done)
         done = 1.0 if step >= 1 - done else done + step
         weight = before + done * change
+        log_evidence += step * float(gain.max()) + float(np.log(np.mean(np.exp(step * (gain - gain.max())))))
         chosen = _resample(np.exp(step * (gain - gain.max())), rng)
         z = z[chosen]
         parts = parts[chosen]
@@ -460,7 +564,7 @@ def _anneal(model: _Scene, z: Real, before: Real, after: Real, rng: np.random.Ge
             accepted = (np.log(rng.random(len(z))) < log_odds)[:, None]
             z = np.where(accepted, proposed, z)
             parts = np.where(accepted, parts_proposed, parts)
-    return z
+    return z, log_evidence
 
 
 def _choose_step(gain: Real, most: float) -> float:
@@ -489,13 +593,17 @@ def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:
     return np.minimum(np.searchsorted(np.cumsum(weight) / weight.sum(), places), weight.size - 1)
 
 
-def _solution(model: _Scene, z: Real, patches: tuple[PatchEstimate, ...]) -> Inversion:
+def _solution(model: _Scene, z: Real, log_evidence: float, patches: tuple[PatchEstimate, ...]) -> Inversion:
     """Collect the solution from particles of the posterior."""
     prior = model.prior
+    paint = model.paint(z)
+    painted = paint > 0
     a, b = (leakage[:, 0] for leakage in model.leakage(z))
     unit = max(prior.leakage_std, 1e-12)
     leakage_in_units = np.stack([a.real, a.imag, b.real, b.imag], axis=1) / unit
-    covariance = np.cov(np.concatenate([leakage_in_units, z[:, REFERENCE]], axis=1).T)
+    reference = prior.reference_std * _complex(z, REFERENCE) + 1j * paint
+    reference_in_units = split_complex(reference[:, 0]) / max(prior.reference_std, 1e-12)
+    covariance = np.cov(np.concatenate([leakage_in_units, reference_in_units], axis=1).T)
     leakage_variance = unit**2 * np.diag(covariance)[:4]
     return Inversion(
         patches=patches,
@@ -507,6 +615,9 @@ def _solution(model: _Scene, z: Real, patches: tuple[PatchEstimate, ...]) -> Inv
         brightness_off=np.where(model.bright, np.median(model.brightness_off(z), axis=0), np.nan),
         brightness_std=float(np.exp(np.log(model.brightness_std(z)).mean())),
         nuisance_covariance=covariance,
+        painted=float(painted.mean()),
+        paint_rad=float(paint[painted].mean()) if painted.any() else 0.0,
+        log_evidence=log_evidence,
     )
 
 
@@ -557,7 +668,7 @@ def _shares_of_sources(model: _Scene, z: Real, i: int, value: complex) -> dict[s
     total = sum(variance.values())
     if not (np.isfinite(total) and total > 0):
         return {}
-    return {source: variance[source] / total for source in SOURCES}
+    return {source: part / total for source, part in variance.items()}
 
 
 def _evidence(model: _Scene, kinds: Kinds, z: Real, i: int) -> RatioEvidence:

@@ -64,6 +64,7 @@ SHRINKS = {
     "leakage": "measure leakage with metal strips: `polysight leakage`",
     "tilt": "lay the plates flat",
     "incidence": "measure where the antennas are: `polysight calibrate direct-path`",
+    "phase sign": "save `conjugate` (true or false) with the images",
 }
 """Source of error to the measurement that reduces it."""
 
@@ -152,6 +153,8 @@ class MaterialsResult:
         Usual scatter of ln|V / H| and of its phase inside the plates, where a flat plate has none.
     relief_rad
         Usual standard deviation of the phase of H about a plane inside the plates.
+    other_sign
+        Probability that all phases have the other sign; 0 of own scans.
     """
 
     calibrated: Images
@@ -177,6 +180,7 @@ class MaterialsResult:
     behind: float = 0.0
     ripple: tuple[float, float] = (0.0, 0.0)
     relief_rad: float = 0.0
+    other_sign: float = 0.0
 
     def rows(self) -> list[PatchFigures]:
         """Return the figures of each patch, for materials.json."""

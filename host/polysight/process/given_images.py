@@ -22,7 +22,6 @@ import scipy
 
 from polysight.imaging import UNKNOWN_PLANE, Antennas, Illumination, Images, illumination_geometry
 from polysight.materials import (
-    NOT_PASSIVE,
     Labels,
     MaterialsResult,
     Optics,
@@ -49,13 +48,16 @@ from polysight_shared.findings import Finding
 NPZ = ".npz"
 CHANNELS = ("h", "v")
 AXES = ("x_m", "y_m")
-OPTIONAL = ("valid", "incidence_deg", "simulated")
+OPTIONAL = ("valid", "incidence_deg", "simulated", "conjugate")
+OWN_ERROR = "p_sigma"
 SAR_FILES = ("sar_h.npy", "sar_v.npy")
 MIN_PIXELS = 8
 """Least rows and columns of an image: the smallest patch is 14 mm wide."""
 EVEN = 0.01
 """Largest deviation of a pixel's distance from the mean one, relative to it."""
-_EXPECTED = "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid [ny, nx], incidence_deg, simulated"
+_EXPECTED = (
+    "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid [ny, nx], incidence_deg, simulated, conjugate"
+)
 # Distances of the object plane between which `place_rig` looks for an incidence angle.
 _NEAREST_MM = 60.0
 _FARTHEST_MM = 1e5
@@ -81,6 +83,8 @@ class GivenPair:
         True if the file says so.
     assumed
         What the file does not say and was assumed, one sentence each.
+    sign_known
+        True if the file says which sign its phases have; `images` have ours.
     """
 
     path: Path
@@ -91,6 +95,7 @@ class GivenPair:
     incidence_deg: float | None
     simulated: bool
     assumed: tuple[str, ...]
+    sign_known: bool = False
 
     @property
     def scan_id(self) -> str:
@@ -133,13 +138,16 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     x_m = _axis(path, arrays, "x_m", h.shape[1], rig, assumed)
     y_m = _axis(path, arrays, "y_m", h.shape[0], rig, assumed)
     _check_square(path, x_m, y_m)
-    unused = sorted(set(arrays) - {*CHANNELS, *AXES, *OPTIONAL, "p", "p_sigma"})
+    unused = sorted(set(arrays) - {*CHANNELS, *AXES, *OPTIONAL, "p", OWN_ERROR})
     if unused:
         assumed.append(f"not used: {', '.join(unused)}")
     valid = _valid(path, arrays)
     angle = _number(path, arrays, "incidence_deg")
     images = _ascending(h, v, valid, x_m, y_m)
     simulated = bool(_number(path, arrays, "simulated") or False)
+    is_conjugate = _number(path, arrays, "conjugate")
+    if is_conjugate:
+        images = conjugate(images)
     return GivenPair(
         path=path,
         images=images,
@@ -149,7 +157,14 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
         incidence_deg=angle,
         simulated=simulated,
         assumed=tuple(assumed),
+        # Only our own images hold the error of P.
+        sign_known=is_conjugate is not None or OWN_ERROR in arrays,
     )
+
+
+def conjugate(images: Images) -> Images:
+    """Return the images with the other sign of all phases."""
+    return replace(images, h=images.h.conj(), v=images.v.conj())
 
 
 def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
@@ -407,32 +422,49 @@ def given_reasons(pair: GivenPair, angle: Angle) -> list[Finding]:
     return out
 
 
-CONJUGATED = reason(
-    "care", "the phases of the images have the other sign: they were conjugated",
-    "with their own sign the patches fit materials less well: some would amplify",
-    "save the images with the phase of r_s / r_p for eps' - j eps''", 1.2,
-)  # fmt: skip
-BETTER_SIGN = 1.0
-"""Difference of the metal reference's log evidence by which the other sign of the phases is taken."""
+TOLD_TILT_DEG = 0.5
+"""Tilt of a plate across the plane of incidence from which on the verdict tells how its polarisations were turned."""
 
 
-def fits_better(result: MaterialsResult, other: MaterialsResult) -> bool:
-    """Return true if the patches of one result are clearly more plausible materials beside the metal reference.
+def turn_reasons(result: MaterialsResult) -> list[Finding]:
+    """Return what limits the verdict if plates are tilted: images do not say to which side the antennas are turned."""
+    tilted = [
+        r.patch.label
+        for r in result.patches
+        if r.refused is None and abs(np.degrees(result.tilts.across_rad(r.patch.label))) > TOLD_TILT_DEG
+    ]
+    if not tilted:
+        return []
+    return [reason(
+        "care",
+        f"tilted patches ({', '.join(map(str, tilted))}) were corrected for antennas turned as in the rig file",
+        "a tilted plate turns the polarisations: with antennas turned to the other side the correction is reversed",
+        "lay the plates flat, or process the recorded scan with its own rig file", 1.3,
+    )]  # fmt: skip
 
-    Fewer patches that would amplify decide, then the evidence of the metal reference.
+
+OTHER_SIGN = 0.2
+"""Probability a priori that images of another program have the other sign of phase, if their file does not say it."""
+TOLD_SIGN = 0.02
+"""Probability of the other sign from which on the verdict tells it."""
+
+
+def sign_reasons(other_sign: float, conjugated: bool) -> list[Finding]:
+    """Return what limits the verdict if the sign of the phases is not known.
+
+    `other_sign` is the probability of the sign that was not taken.
     """
-    if result.metal.evidence is None or other.metal.evidence is None:
-        return False
-    amplifying = _count_amplifying(result)
-    amplifying_other = _count_amplifying(other)
-    if amplifying != amplifying_other:
-        return amplifying < amplifying_other
-    return result.metal.evidence.score > other.metal.evidence.score + BETTER_SIGN
-
-
-def _count_amplifying(result: MaterialsResult) -> int:
-    """Return the number of patches that would reflect more than metal or amplify: no material does."""
-    return sum(p.refused is not None and p.refused.what in NOT_PASSIVE for p in result.patches)
+    if other_sign < TOLD_SIGN and not conjugated:
+        return []
+    taken = "as they are"
+    if conjugated:
+        taken = "the other way round"
+    return [reason(
+        "care",
+        f"the sign of the phases is not known: taken {taken}, right with a probability of {1 - other_sign:.2f}",
+        "with the wrong sign losses are wrong; the error bars hold both signs",
+        "save `conjugate` (true or false) with the images: docs/spec/given-images.md", 2.2,
+    )]  # fmt: skip
 
 
 def make_reference(pair: GivenPair) -> PlaneReference:
@@ -467,16 +499,16 @@ def analyse_given_images(
         rig, IncidenceChoice("one", everywhere, everywhere), theta_std_rad=UNKNOWN_PLANE.incidence_std_rad(rig)
     )
     scene = replace(scene, plates=plates)
+    if not pair.sign_known:
+        optics = replace(optics, other_sign=OTHER_SIGN)
     result = analyse(images, optics, scene, classifier)
-    # Another program may have the opposite sign of phase: take the one with which the patches are materials.
-    conjugated = replace(images, h=images.h.conj(), v=images.v.conj())
-    result_conjugated = analyse(conjugated, optics, scene, classifier)
-    sign: list[Finding] = []
-    if fits_better(result_conjugated, result):
-        result = result_conjugated
-        images = conjugated
-        sign = [CONJUGATED]
-    verdict = join_reasons([*given_reasons(pair, angle), *sign, *scene_reasons(result, None, classifier)])
+    conjugated = result.other_sign > 0.5
+    if conjugated:
+        images = conjugate(images)
+        result = analyse(images, replace(optics, other_sign=1 - OTHER_SIGN), scene, classifier)
+    sign = sign_reasons(result.other_sign, conjugated)
+    limits = [*given_reasons(pair, angle), *sign, *turn_reasons(result)]
+    verdict = join_reasons([*limits, *scene_reasons(result, None, classifier)])
     if not verdict.usable:
         result = result.without_result()
     findings = Findings(images, result, verdict, UNKNOWN_PLANE, classifier, plates)

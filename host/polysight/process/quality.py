@@ -462,7 +462,9 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     if result.patches and metal.evidence is not None:
         evidence = metal.evidence
         patch = "the given box" if metal.label is None else f"patch {metal.label}"
-        enough = evidence.enough and (metal.given or metal.label not in refused)
+        painted = result.inversion.painted
+        # A dielectric that nobody declared to be metal may look like painted metal.
+        enough = evidence.enough and (metal.given or (metal.label not in refused and painted < 0.5))
         reasons += metal_reasons(
             patch,
             likely=enough,
@@ -471,6 +473,8 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
             contradicted=evidence.against,
             only_patch=evidence.others == 0,
             culprit=evidence.culprit,
+            painted=painted,
+            paint_mm=result.inversion.paint_mm,
         )
     light = result.calibrated.illumination
     if result.prior.channels_known and (light is None or light.known):

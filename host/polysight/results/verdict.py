@@ -359,6 +359,10 @@ def signal_reasons(refused: Mapping[int, str], patches: int, left_out: int = 0) 
     ]
 
 
+PAINT_TOLD = 0.2
+"""Probability of a painted metal reference from which on the verdict tells it."""
+
+
 def metal_reasons(
     patch: str,
     likely: bool,
@@ -367,12 +371,14 @@ def metal_reasons(
     contradicted: bool,
     only_patch: bool,
     culprit: int | None = None,
+    painted: float = 0.0,
+    paint_mm: float = 0.0,
 ) -> list[Finding]:
     """Judge the metal reference `patch` ("patch 3").
 
     By the other patches it is `likely` or `certain` to be metal; `contradicted`: by its own V / H against the direct
     path; `only_patch`: there are no others; `culprit`: the other patch that fits it least, if they speak against it.
-    `given`: the user chose it.
+    `given`: the user chose it. `painted` is the probability that it is metal with a coating, `paint_mm` thick.
     """
     do = "lay a metal plate into the scene and name it (--metal-box X0,Y0,X1,Y1), or use `polysight calibrate metal`"
     if given and contradicted:
@@ -380,6 +386,13 @@ def metal_reasons(
             "care" if likely or only_patch else "none",
             f"the given metal reference ({patch}) does not look like metal",
             "relative to the direct path it reflects far less of V than of H, as no metal does", do, 8.0,
+        )]  # fmt: skip
+    if given and painted > PAINT_TOLD:
+        return [reason(
+            "care", f"the given metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
+            "all patches have the same additional phase of V / H beside it, as a coating on metal makes it;"
+            " permittivities are corrected for it, with its error",
+            f"take the paint or film off {patch}, or use bare metal", 2.7,
         )]  # fmt: skip
     if given and culprit is not None and not likely:
         return [reason(
@@ -406,9 +419,9 @@ def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> 
         return []
     source = "estimated from the scene" if determined else "never measured; its prior is used"
     if is_known(relative_error):
-        share = f"uncertain by {100 * relative_error:.0f} %"
+        share = f"{100 * relative_error:.0f} %"
     else:
-        share = "uncertain by an unknown share"
+        share = "an unknown share"
     return [reason(
         "care",
         f"leakage was {source}: permittivities are uncertain by {share}, names less reliable",

@@ -11,9 +11,9 @@ from polysight.materials.inversion import (
     RigPrior,
     invert,
     ratio_error,
-    slope,
     true_ratio,
 )
+from polysight.materials.kinds import permittivity_slope
 from polysight.polarimetry import fresnel, permittivity_from_ratio
 
 THETA = np.radians(55.0)
@@ -73,7 +73,7 @@ def test_slope_is_the_derivative(tr, ti):
     t = complex(tr, ti)
     step = 1e-6
     by = (permittivity_from_ratio(t + step, THETA) - permittivity_from_ratio(t - step, THETA)) / (2 * step)
-    assert slope(t, THETA) == pytest.approx(by, rel=1e-5, abs=1e-6)
+    assert permittivity_slope(t, THETA) == pytest.approx(by, rel=1e-5, abs=1e-6)
 
 
 def test_without_errors_the_truth_comes_back():

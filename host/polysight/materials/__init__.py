@@ -42,7 +42,7 @@ from polysight.materials.classify import (
 )
 from polysight.materials.copies import Copies, find_copies
 from polysight.materials.discriminant import REJECTED, ErrorDiscriminant
-from polysight.materials.inversion import slope
+from polysight.materials.kinds import permittivity_slope
 from polysight.materials.labels import (
     METALS,
     SPECIMEN,
@@ -222,6 +222,7 @@ __all__ = [
     "parse_layer",
     "patches_from_plates",
     "permittivity_change",
+    "permittivity_slope",
     "pixel_accuracy",
     "polarisation_angle_rad",
     "predict_pixel_accuracy",
@@ -236,7 +237,6 @@ __all__ = [
     "same_material",
     "score",
     "score_unseen_materials",
-    "slope",
     "specimen_seed",
     "split_by_angle",
     "truth_plates",

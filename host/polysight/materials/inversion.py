@@ -37,6 +37,7 @@ from polysight.materials.kinds import (
     Kinds,
     RatioEvidence,
     move_to_angle,
+    permittivity_slope,
     split_complex,
     turn_covariance,
 )
@@ -350,12 +351,6 @@ def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: 
     return np.asarray((without_reference - b) / (1 - a * without_reference), np.complex128)
 
 
-def slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
-    """Return d eps / d t of Eq. 3 with t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
-    t = np.asarray(t, np.complex128)
-    return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * (1 + t) / (1 - t) ** 3
-
-
 def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None = None) -> Inversion:
     """Solve for all patches of a scene together.
 
@@ -657,7 +652,7 @@ def _shares_of_sources(model: _Scene, z: Real, i: int, value: complex) -> dict[s
     """Return the share of each source in the variance of a permittivity, to first order; they add up to 1."""
     mean = np.tile(z.mean(axis=0), (len(z), 1))
     of_all = model.permittivities(z)[:, i] - value
-    slope_at_mean = slope(model.ratios(mean[:1])[0, i], model.theta[i])
+    slope_at_mean = permittivity_slope(model.ratios(mean[:1])[0, i], model.theta[i])
     variance = {"noise": float(abs(slope_at_mean) ** 2 * np.trace(model.own[i]))}
     at_mean = model.permittivities(mean[:1])[0, i]
     for source, columns in COLUMNS_OF_SOURCE.items():

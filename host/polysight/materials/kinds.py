@@ -54,6 +54,9 @@ LEAST_LOSS_SPREAD = 0.02
 """Standard deviation of eps'' between specimens of low-loss materials."""
 METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat."""
+LEAST_STD_OF_T = 1e-6
+MOST_STD_BEYOND = 30.0
+"""Least standard deviation of t that a distance is measured in, and largest distance, of no probability in practice."""
 _STEP = 1e-4
 _SHEETS = 6000
 _HALF_SPACES = 4000
@@ -94,6 +97,12 @@ class RatioEvidence:
 def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
     """Return t = 1 / P of half spaces (Eq. 2)."""
     return np.asarray(1 / ratio_from_permittivity(permittivity, theta_rad), np.complex128)
+
+
+def permittivity_slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
+    """Return d eps / d t of Eq. 3 with t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
+    t = np.asarray(t, np.complex128)
+    return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * (1 + t) / (1 - t) ** 3
 
 
 def move_to_angle(t: Complex, theta_rad: npt.ArrayLike, other_rad: float) -> Complex:
@@ -191,25 +200,24 @@ class Kinds:
     def compute_half_space_density(self, t: Complex, covariance: Real) -> Real:
         """Return the density of t of any half space: ln eps' uniform, eps'' uniform on a scale that ends in a line.
 
-        Errors of the measurement soften the border of the passive half spaces: the density there is that of the
-        nearest passive one, times the probability of an error as large.
+        Errors of the measurement soften the border of the passive half spaces: the density beyond is that of the
+        passive one at the border, times the probability of an error as large.
         """
-        s = np.sin(self.theta_rad)
-        cosine = np.cos(self.theta_rad)
+        std = float(np.sqrt(np.trace(covariance) / 2))
         with np.errstate(divide="ignore", invalid="ignore"):
             parts = split_complex(permittivity_from_ratio(t, self.theta_rad))
-            slope = np.abs(4 * s**2 * (s / cosine) ** 2 * (1 + t) / (1 - t) ** 3)
         eps_real = np.where(np.isfinite(parts[..., 0]), parts[..., 0], REAL_RANGE[1])
         eps_loss = np.where(np.isfinite(parts[..., 1]), -parts[..., 1], 0.0)
-        slope = np.maximum(np.where(np.isfinite(slope), slope, 1e6), 1e-6)
-        error = slope * np.sqrt(np.trace(covariance) / 2)
         real = np.clip(eps_real, *REAL_RANGE)
         loss = np.clip(eps_loss, *LOSS_RANGE)
-        beyond = np.hypot(eps_real - real, eps_loss - loss) / np.maximum(error, 1e-9)
+        at_border = inverse_ratio(real - 1j * loss, self.theta_rad)
+        # At the border and not at t: near t = 1, which is metal, the slope has no bound.
+        slope = np.abs(permittivity_slope(at_border, self.theta_rad))
         width = np.log(REAL_RANGE[1] / REAL_RANGE[0]) * np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS)
-        floor = np.hypot(SOFT_LOSS, error)
+        floor = np.hypot(SOFT_LOSS, slope * std)
         density = slope**2 / (width * real * np.hypot(loss, floor))
-        return np.asarray(density * np.exp(-0.5 * np.minimum(beyond, 30.0) ** 2), np.float64)
+        beyond = np.abs(t - at_border) / max(std, LEAST_STD_OF_T)
+        return np.asarray(density * np.exp(-0.5 * np.minimum(beyond, MOST_STD_BEYOND) ** 2), np.float64)
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from polysight.imaging import Image, Mask
 from polysight.materials.inversion import (
     PatchEstimate,
     PatchMeasurement,
-    slope,
 )
+from polysight.materials.kinds import permittivity_slope
 from polysight.materials.segment import Patch, Segmentation
 from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import inverse_spread, permittivity_from_ratio
@@ -603,7 +603,7 @@ def estimate_permittivity(
     pixels = permittivity_from_ratio(v[good].astype(np.complex128) / h[good], theta)
     pixels = pixels[np.isfinite(pixels)]
     re, im = (np.percentile(part, [30, 70]) for part in (pixels.real, pixels.imag))
-    std = float(abs(slope(inverse, float(theta.mean()))) * inverse_std)
+    std = float(abs(permittivity_slope(inverse, float(theta.mean()))) * inverse_std)
     return Permittivity(
         value=value,
         real_range=(float(re[0]), float(re[1])),

@@ -55,6 +55,12 @@ MIN_PIXELS = 8
 """Least rows and columns of an image: the smallest patch is 14 mm wide."""
 EVEN = 0.01
 """Largest deviation of a pixel's distance from the mean one, relative to it."""
+OTHER_SIGN = 0.3
+PUBLISHED_OTHER_SIGN = 0.95
+"""Probability a priori that images of another program have the other sign of phase, if their file does not say it, and
+that images of the published form have it. The published imaging code multiplies the samples by exp(-j k R) and adds
+them up; a wave that is delayed by R has exp(-j k R) where losses are -j eps'': its samples are conjugates, and so are
+these images."""
 _EXPECTED = (
     "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid [ny, nx], incidence_deg, simulated, conjugate"
 )
@@ -83,8 +89,8 @@ class GivenPair:
         True if the file says so.
     assumed
         What the file does not say and was assumed, one sentence each.
-    sign_known
-        True if the file says which sign its phases have; `images` have ours.
+    other_sign
+        Probability a priori that the phases of `images` have the other sign; 0 if the file says which one.
     """
 
     path: Path
@@ -95,7 +101,7 @@ class GivenPair:
     incidence_deg: float | None
     simulated: bool
     assumed: tuple[str, ...]
-    sign_known: bool = False
+    other_sign: float = OTHER_SIGN
 
     @property
     def scan_id(self) -> str:
@@ -146,6 +152,8 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     images = _ascending(h, v, valid, x_m, y_m)
     simulated = bool(_number(path, arrays, "simulated") or False)
     is_conjugate = _number(path, arrays, "conjugate")
+    # Only our own images hold the error of P.
+    is_sign_known = is_conjugate is not None or OWN_ERROR in arrays
     if is_conjugate:
         images = conjugate(images)
     return GivenPair(
@@ -157,8 +165,7 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
         incidence_deg=angle,
         simulated=simulated,
         assumed=tuple(assumed),
-        # Only our own images hold the error of P.
-        sign_known=is_conjugate is not None or OWN_ERROR in arrays,
+        other_sign=0.0 if is_sign_known else OTHER_SIGN,
     )
 
 
@@ -334,6 +341,7 @@ def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
         incidence_deg=None,
         simulated=scan.simulated,
         assumed=tuple(assumed),
+        other_sign=PUBLISHED_OTHER_SIGN,
     )
 
 
@@ -443,8 +451,6 @@ def turn_reasons(result: MaterialsResult) -> list[Finding]:
     )]  # fmt: skip
 
 
-OTHER_SIGN = 0.2
-"""Probability a priori that images of another program have the other sign of phase, if their file does not say it."""
 TOLD_SIGN = 0.02
 """Probability of the other sign from which on the verdict tells it."""
 
@@ -499,13 +505,12 @@ def analyse_given_images(
         rig, IncidenceChoice("one", everywhere, everywhere), theta_std_rad=UNKNOWN_PLANE.incidence_std_rad(rig)
     )
     scene = replace(scene, plates=plates)
-    if not pair.sign_known:
-        optics = replace(optics, other_sign=OTHER_SIGN)
+    optics = replace(optics, other_sign=pair.other_sign)
     result = analyse(images, optics, scene, classifier)
     conjugated = result.other_sign > 0.5
     if conjugated:
         images = conjugate(images)
-        result = analyse(images, replace(optics, other_sign=1 - OTHER_SIGN), scene, classifier)
+        result = analyse(images, replace(optics, other_sign=1 - pair.other_sign), scene, classifier)
     sign = sign_reasons(result.other_sign, conjugated)
     limits = [*given_reasons(pair, angle), *sign, *turn_reasons(result)]
     verdict = join_reasons([*limits, *scene_reasons(result, None, classifier)])

@@ -26,7 +26,7 @@ import numpy.typing as npt
 import scipy
 from msgspec import UNSET
 
-from polysight.materials import axis_mm, image_centre_mm, incidence_std_rad, slope
+from polysight.materials import axis_mm, image_centre_mm, incidence_std_rad, permittivity_slope
 from polysight.polarimetry import incidence_choice, permittivity_from_ratio, specular_incidence_rad
 from polysight.products.processed import ProcessedScan, read_products
 from polysight.results import Figure, PatchFigures, Verdict, declared_figures, to_plain
@@ -253,8 +253,8 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         value = permittivity_from_ratio(p, theta_rad)
         value = np.where(np.isfinite(value), value, complex(np.nan, np.nan))
-        # d eps / d P = -slope(1 / P) / P^2.
-        by_ratio = np.abs(slope(1 / p, theta_rad) / p**2)
+        # d eps / d P = -permittivity_slope(1 / P) / P^2.
+        by_ratio = np.abs(permittivity_slope(1 / p, theta_rad) / p**2)
         by_angle = (permittivity_from_ratio(p, theta_rad + _ANGLE_STEP_RAD) - value) / _ANGLE_STEP_RAD
         if scan.images.p_sigma is None:
             p_std = np.nan

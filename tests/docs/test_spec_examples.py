@@ -88,11 +88,11 @@ def test_the_page_names_every_message_and_field(message):
     page = "\n".join(line for line in text("wire.md").splitlines() if f"`{message.__name__}`" in line)
     assert page, message
     if issubclass(message, messages.Event):
-        common = {f.name for f in msgspec.structs.fields(messages.Event)}
+        common = {f.encode_name for f in msgspec.structs.fields(messages.Event)}
     else:
         common = set()
     for field in msgspec.structs.fields(message):
-        assert field.name in common | {"version"} or f"`{field.name}`" in page, (message.__name__, field.name)
+        assert field.encode_name in common | {"version"} or f"`{field.encode_name}`" in page, (message.__name__, field.encode_name)
 
 
 def test_types_follow_from_names_as_the_page_says():
@@ -111,7 +111,7 @@ def test_what_may_be_left_out():
         for message in declared_types(union):
             for field in msgspec.structs.fields(message):
                 if field.default is not msgspec.NODEFAULT and field.name != "version":
-                    assert f"`{field.name}`" in answer, (message.__name__, field.name)
+                    assert f"`{field.encode_name}`" in answer, (message.__name__, field.encode_name)
 
 
 # --- stage line -------------------------------------------------------------------------------------------------------

@@ -278,18 +278,16 @@ def analyse(
     kinds = _kinds(classifier, float(np.mean(theta)))
     labels = [p.label for p in judged]
     inversion = invert(measured, prior, kinds)
+    signs = [(measured, prior, inversion)]
     other_sign = 0.0
-    mirrored, mirrored_prior = mirror_phases(measured, prior)
     if optics.other_sign > 0:
-        inversion, other_sign = join_signs(inversion, invert(mirrored, mirrored_prior, kinds), optics.other_sign)
-    if plane is None:
-        signs = [measured]
+        mirrored = (*mirror_phases(measured, prior), kinds)
+        mirrored_inversion = invert(*mirrored)
+        inversion, other_sign = join_signs(inversion, mirrored_inversion, optics.other_sign)
         if other_sign > POSSIBLE_SIGN and not reference.given:
-            signs.append(mirrored)
-        reference = _weigh_metal(
-            images, reference, [dict(zip(labels, patches, strict=True)) for patches in signs],
-            prior=prior, theta_rad=float(np.mean(theta)),
-        )  # fmt: skip
+            signs.append((*mirrored[:2], mirrored_inversion))
+    if plane is None:
+        reference = _weigh_metal(images, reference, labels, signs, kinds)
     # Only known leakage is removed from the pixels: an undetermined estimate leans on what the patches may be.
     calibrated = remove_leakage(raw, inversion.leakage if inversion.leakage_determined else prior.leakage)
     sh, sv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (calibrated.h, calibrated.v))
@@ -548,19 +546,20 @@ def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
 def _weigh_metal(
     images: Images,
     metal: MetalReference,
-    signs: Sequence[Mapping[int, PatchMeasurement]],
-    *,
-    prior: RigPrior,
-    theta_rad: float,
+    labels: Sequence[int],
+    signs: Sequence[tuple[list[PatchMeasurement], RigPrior, Inversion]],
+    kinds: Kinds,
 ) -> MetalReference:
     """Return the metal reference with the evidence for metal and against.
 
-    `signs` are the other patches with each sign of the phases that is possible: the one that speaks least for metal
-    counts.
+    `signs` are the other patches, the prior, and their inversion with each sign of the phases that is possible: the
+    one that speaks least for metal counts.
     """
-    channel_ratio = _channel_ratio(images, metal) if prior.channels_known else None
-    kinds = Kinds(literature(), theta_rad)
-    evidence = [metal_evidence(patches, prior, channel_ratio, kinds) for patches in signs]
+    evidence = []
+    for measured, prior, inversion in signs:
+        channel_ratio = _channel_ratio(images, metal) if prior.channels_known else None
+        patches = dict(zip(labels, measured, strict=True))
+        evidence.append(metal_evidence(patches, prior, channel_ratio, kinds, inversion))
     return replace(metal, evidence=min(evidence, key=lambda of_sign: of_sign.score))
 
 

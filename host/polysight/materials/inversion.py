@@ -32,10 +32,13 @@ import numpy.typing as npt
 import scipy
 
 from polysight.materials.kinds import (
+    METAL_SHARE,
+    METAL_SPREAD,
     USUAL_LIBRARY_SHARE,
     DensityMap,
     Kinds,
     RatioEvidence,
+    inverse_ratio,
     move_to_angle,
     permittivity_slope,
     split_complex,
@@ -75,6 +78,11 @@ PAINT_RAD_PER_MM = 2.65
 """Largest phase of 1 / P by a coating of metal, and its phase per thickness: 4 pi / lambda sin^2 / cos (1 - 1 / eps) of
 a thin layer at 55 degrees with eps = 3.3 (2.3 to 2.9 for 2.5 to 4). p is delayed more than s, never less. Paint has
 0.05 to 0.25 mm."""
+REFERENCE_REAL = (1.5, 30.0)
+REFERENCE_LOSS_TANGENT = (1e-3, 2.0)
+"""Permittivities of a reference that is no metal, uniform on logarithmic scales: all half spaces, water among them."""
+CHANNEL_RATIO_STD_DB = 2.5
+"""Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
 CHI2_95 = 5.991
 CHI2_997 = 11.8
 """Squared distances in standard deviations that hold 95 and 99.7 % of a normal distribution of two dimensions."""
@@ -260,6 +268,8 @@ class Inversion:
         Phase of its 1 / P by the paint, if it is: the mean.
     log_evidence
         Logarithm of the probability density of the measurements under the prior.
+    fit
+        float64 [patch]: log density of each patch as a material beside this reference; empty without kinds.
     """
 
     patches: tuple[PatchEstimate, ...]
@@ -274,6 +284,7 @@ class Inversion:
     painted: float
     paint_rad: float
     log_evidence: float
+    fit: Real = field(repr=False)
 
     @property
     def paint_mm(self) -> float:
@@ -358,10 +369,8 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | Non
     """
     model = _Scene(seen, prior, kinds)
     rng = np.random.default_rng(0)
-    prior_particles = rng.standard_normal((PARTICLES, WIDTH))
-    no_evidence = np.zeros(model.patch_count + 1)
+    posterior, log_evidence = _sample(model, rng)
     all_evidence = np.ones(model.patch_count + 1)
-    posterior, log_evidence = _anneal(model, prior_particles, no_evidence, all_evidence, rng)
     patches = []
     for i in range(model.patch_count):
         # A patch is measured without the belief that it must be some material itself.
@@ -372,12 +381,31 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | Non
     return _solution(model, posterior, log_evidence, tuple(patches))
 
 
+def log_evidence_of_dielectric(
+    seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None = None
+) -> float:
+    """Return the log evidence of the same measurements if the reference is a dielectric, as `Inversion.log_evidence`.
+
+    `channel_ratio_db` is V / H of the reference relative to the direct path; None if it is not known.
+    """
+    return _sample(_DielectricReference(seen, prior, kinds, channel_ratio_db), np.random.default_rng(0))[1]
+
+
+def _sample(model: _Scene, rng: np.random.Generator) -> tuple[Real, float]:
+    """Return particles of the posterior of the common errors, and the log evidence."""
+    prior_particles = rng.standard_normal((PARTICLES, model.width))
+    no_evidence = np.zeros(model.patch_count + 1)
+    return _anneal(model, prior_particles, no_evidence, no_evidence + 1, rng)
+
+
 class _Scene:
     """Likelihood of the common errors.
 
-    A particle z [WIDTH] holds the common errors as deviations from the prior's mean in its standard deviations; its
-    columns are named at the top of the module. Methods take z [..., WIDTH].
+    A particle z [width] holds the common errors as deviations from the prior's mean in its standard deviations; its
+    columns are named at the top of the module. Methods take z [..., width].
     """
+
+    width = WIDTH
 
     def __init__(self, seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None) -> None:
         self.prior = prior
@@ -392,13 +420,15 @@ class _Scene:
         self.bright = np.isfinite(level) & (level > 0) & unlike_metal
         self.log_level = np.log(np.where(self.bright, level, 1.0))
         self.own = self._own_covariances(seen)
+        # Of one part of the measured ratio
+        self.own_variance = np.array([np.trace(s.covariance) / 2 for s in seen], np.float64)
         self.maps = () if kinds is None else self._maps(kinds)
 
     def _own_covariances(self, seen: Sequence[PatchMeasurement]) -> Real:
         """Return the covariance of each patch's t by its own errors, [patch, 2, 2]: those of V / H, to first order."""
         if not seen:
             return np.zeros((0, 2, 2))
-        nominal = np.zeros((1, WIDTH))
+        nominal = np.zeros((1, self.width))
         step = 1e-4 * np.maximum(np.abs(self.measured), 1e-3)
         at_measured = self._correct_ratios(self.measured, nominal)[0]
         beside = self._correct_ratios(self.measured + step, nominal)[0]
@@ -406,7 +436,7 @@ class _Scene:
 
     def _maps(self, kinds: Kinds) -> tuple[DensityMap, ...]:
         """Return the density of each patch's ratio over its possible values."""
-        drawn = self.ratios(np.random.default_rng(1).standard_normal((PARTICLES, WIDTH)))
+        drawn = self.ratios(np.random.default_rng(1).standard_normal((PARTICLES, self.width)))
         maps = []
         for i in range(self.patch_count):
             t = drawn[np.isfinite(drawn[:, i]) & (np.abs(drawn[:, i]) < 3.0), i]
@@ -457,6 +487,14 @@ class _Scene:
         """Return t of every patch, [..., patch]."""
         return self._correct_ratios(self.measured, z)
 
+    def reference_ratio(self, z: Real) -> Complex:
+        """Return t of the reference, [..., 1]: paint delays p of metal more than s."""
+        return np.exp(-1j * self.paint(z))
+
+    def log_reference_brightness(self, z: Real) -> Real:
+        """Return ln |r_s| of the reference, [..., 1]: 0 of metal."""
+        return np.zeros((*z.shape[:-1], 1))
+
     def paint(self, z: Real) -> Real:
         """Return the phase of 1 / P by the metal's paint, [..., 1], radians: 0 of bare metal, else uniform."""
         painted = self.prior.painted
@@ -469,8 +507,7 @@ class _Scene:
         """Return t of measured V / H [patch], [..., patch]."""
         a, b = self.leakage_of_patches(z)
         rho = self.prior.reference_std * _complex(z, REFERENCE)
-        common_change = self.lighting(z) + 1j * self.paint(z)
-        return true_ratio(measured * np.exp(-common_change), a, b, rho)
+        return true_ratio(measured * np.exp(-self.lighting(z)) * self.reference_ratio(z), a, b, rho)
 
     def ratios_of_kinds(self, z: Real, kinds: Kinds) -> Complex:
         """Return t that each patch would have at the angle of the kinds, [..., patch]."""
@@ -490,6 +527,7 @@ class _Scene:
             q = (1 + t) / (1 - t) * np.sin(angle) ** 2 / cosine
             model = np.log(np.abs((cosine - q) / (cosine + q) * (1 + a * t) / (1 + a)))
         difference = self.log_level - model - METAL_BRIGHTNESS_STD * z[..., METAL_BRIGHTNESS, None]
+        difference = difference + self.log_reference_brightness(z)
         return np.where(np.isfinite(difference), np.clip(difference, -10, 10), 10.0)
 
     def brightness_std(self, z: Real) -> Real:
@@ -527,6 +565,57 @@ class _Scene:
         return np.concatenate([brightness_log, np.stack(patch_logs, axis=-1)], axis=-1)
 
 
+class _DielectricReference(_Scene):
+    """The same scene if the reference is a dielectric of unknown permittivity instead of metal."""
+
+    width = WIDTH + 2
+
+    def __init__(
+        self, seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None
+    ) -> None:
+        self.channel_ratio_db = channel_ratio_db
+        super().__init__(seen, prior, kinds)
+
+    def reference_permittivity(self, z: Real) -> Complex:
+        """Return the permittivity of the reference, [..., 1]: any half space."""
+        real, tangent = (
+            low * (high / low) ** scipy.special.ndtr(z[..., WIDTH + i, None])
+            for i, (low, high) in enumerate((REFERENCE_REAL, REFERENCE_LOSS_TANGENT))
+        )
+        return real * (1 - 1j * tangent)
+
+    def reference_ratio(self, z: Real) -> Complex:
+        """Return t of the reference, [..., 1]."""
+        return inverse_ratio(self.reference_permittivity(z), self._middle_angle())
+
+    def log_reference_brightness(self, z: Real) -> Real:
+        """Return ln |r_s| of the reference, [..., 1], by Eq. 2."""
+        cosine = np.cos(self._middle_angle())
+        root = np.sqrt(self.reference_permittivity(z) - (1 - cosine**2))
+        return np.log(np.abs((cosine - root) / (cosine + root)))
+
+    def log_likelihoods(self, z: Real) -> Real:
+        """Return log likelihoods [..., 1 + patch] of the measured ratios, which are t over that of the reference."""
+        parts = super().log_likelihoods(z)
+        reference = self.reference_ratio(z)
+        size = np.abs(reference)
+        measured = self.ratios(z) / reference
+        # The density of a measured ratio is |t0|^2 that of t. Two plates may be of the same material, as metal is
+        # beside metal.
+        variance = METAL_SPREAD**2 + self.own_variance
+        alike = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
+        of_some_kind = parts[..., 1:] + 2 * np.log(size)
+        patch_logs = np.logaddexp(np.log1p(-METAL_SHARE) + of_some_kind, np.log(METAL_SHARE) + alike)
+        brightness_log = parts[..., :1]
+        if self.channel_ratio_db is not None:
+            too_dark_db = 20 * np.log10(size) - self.channel_ratio_db
+            brightness_log = brightness_log - 0.5 * (too_dark_db / CHANNEL_RATIO_STD_DB) ** 2
+        return np.concatenate([brightness_log, patch_logs], axis=-1)
+
+    def _middle_angle(self) -> float:
+        return float(self.theta.mean()) if self.theta.size else 0.0
+
+
 def _complex(z: Real, columns: tuple[int, int]) -> Complex:
     """Return two columns of particles as real and imaginary part, [..., 1]."""
     return z[..., columns[0], None] + 1j * z[..., columns[1], None]
@@ -551,7 +640,7 @@ def _anneal(model: _Scene, z: Real, before: Real, after: Real, rng: np.random.Ge
         z = z[chosen]
         parts = parts[chosen]
         # Random walk of the usual size in so many dimensions, shaped as the particles lie.
-        spread = np.linalg.cholesky(np.cov(z.T) + 1e-9 * np.eye(WIDTH)) * 2.0 / np.sqrt(WIDTH)
+        spread = np.linalg.cholesky(np.cov(z.T) + 1e-9 * np.eye(model.width)) * 2.0 / np.sqrt(model.width)
         for _ in range(MOVES):
             proposed = z + rng.standard_normal(z.shape) @ spread.T
             parts_proposed = model.log_likelihoods(proposed)
@@ -613,6 +702,7 @@ def _solution(model: _Scene, z: Real, log_evidence: float, patches: tuple[PatchE
         painted=float(painted.mean()),
         paint_rad=float(paint[painted].mean()) if painted.any() else 0.0,
         log_evidence=log_evidence,
+        fit=model.log_likelihoods(z)[:, 1:].mean(axis=0),
     )
 
 

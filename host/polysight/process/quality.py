@@ -462,9 +462,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     if result.patches and metal.evidence is not None:
         evidence = metal.evidence
         patch = "the given box" if metal.label is None else f"patch {metal.label}"
-        painted = result.inversion.painted
-        # A dielectric that nobody declared to be metal may look like painted metal.
-        enough = evidence.enough and (metal.given or (metal.label not in refused and painted < 0.5))
+        enough = evidence.enough and (metal.given or metal.label not in refused)
         reasons += metal_reasons(
             patch,
             likely=enough,
@@ -473,7 +471,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
             contradicted=evidence.against,
             only_patch=evidence.others == 0,
             culprit=evidence.culprit,
-            painted=painted,
+            painted=result.inversion.painted,
             paint_mm=result.inversion.paint_mm,
         )
     light = result.calibrated.illumination

@@ -396,9 +396,11 @@ def metal_reasons(
         )]  # fmt: skip
     if given and culprit is not None and not likely:
         return [reason(
-            "care", f"patch {culprit} and others are unusual materials beside the given metal reference ({patch})",
-            "a thin or layered plate, a dish of liquid, or H and V of different places look so; or it is not metal",
-            f"look at patch {culprit}: fit it as a layer, or leave it out; check that {patch} is bare metal", 2.6,
+            "care",
+            f"the given metal reference ({patch}) may be no metal: patch {culprit} and others look odd beside it",
+            "the others fit a dielectric reference better; so may thin plates, dishes of liquid, or H and V of different"
+            " places",
+            f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 2.6,
         )]  # fmt: skip
     if given or certain:
         return []

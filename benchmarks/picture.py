@@ -82,7 +82,8 @@ def write_forms(source: Path, boxes: dict[str, list[int]], scratch: Path) -> lis
         (folder / f"{folder.name}.json").write_text(json.dumps(content))
         top_first = np.arange(h.shape[0])[::-1] * 2e-3
         archive = scratch / f"{folder.name}.npz"
-        np.savez(archive, h=h, v=v, x_m=top_first[::-1], y_m=top_first)
+        # The published imaging code makes conjugate images (`restore_phase_sign`); the folders' reader knows that.
+        np.savez(archive, h=h, v=v, x_m=top_first[::-1], y_m=top_first, conjugate=True)
         out += [Form(f".npz {kind}", archive, with_boxes), Form(f"labels/ {kind}", folder, with_boxes)]
     return out
 

@@ -92,7 +92,10 @@ def test_the_page_names_every_message_and_field(message):
     else:
         common = set()
     for field in msgspec.structs.fields(message):
-        assert field.encode_name in common | {"version"} or f"`{field.encode_name}`" in page, (message.__name__, field.encode_name)
+        assert field.encode_name in common | {"version"} or f"`{field.encode_name}`" in page, (
+            message.__name__,
+            field.encode_name,
+        )
 
 
 def test_types_follow_from_names_as_the_page_says():

@@ -1,5 +1,7 @@
 """Laws of the joint inversion: forward and back, error bars that hold, shares that add up, and what shrinks them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,13 +12,16 @@ from polysight.materials.inversion import (
     PatchMeasurement,
     RigPrior,
     invert,
+    join_signs,
+    mirror_phases,
     ratio_error,
     true_ratio,
 )
-from polysight.materials.kinds import permittivity_slope
+from polysight.materials.kinds import Kinds, literature, permittivity_slope
 from polysight.polarimetry import fresnel, permittivity_from_ratio
 
 THETA = np.radians(55.0)
+KINDS = Kinds(literature(), float(THETA))
 EPS = np.array([2.6 - 0.01j, 3.5 - 0.8j, 4.0 - 0.4j, 4.7 - 0.7j, 5.1 - 1.1j, 4.75 - 2.4j, 6.3 - 0.2j, 7.5 - 0.3j])
 
 
@@ -51,6 +56,18 @@ def distances(found, eps=EPS):
         pair = np.array([errors.real, errors.imag])
         out.append(float(pair @ np.linalg.solve(p.covariance, pair)))
     return out
+
+
+def paint(patches, paint_mm, eps=3.3 - 0.1j):
+    """The same patches relative to painted metal: a film on a perfect conductor, by its impedances (Pozar, 2.3)."""
+    k = 2 * np.pi * 78.5e9 / 299792458.0
+    normal = np.cos(THETA)
+    inside = np.sqrt(eps - np.sin(THETA) ** 2)
+    film = 1j * np.tan(k * inside * paint_mm * 1e-3)
+    z_s = film / inside * normal
+    z_p = film * inside / eps / normal
+    ratio = (z_p - 1) / (z_p + 1) * (z_s + 1) / (z_s - 1)
+    return [replace(patch, inverse_ratio=patch.inverse_ratio / complex(ratio)) for patch in patches]
 
 
 small = st.floats(-0.1, 0.1)
@@ -187,3 +204,54 @@ def test_brightness_is_that_of_eq_2():
     patches = world(np.random.default_rng(7), (0j, 0j), 1e-9, 0.0)
     np.testing.assert_allclose([s.brightness for s in patches], np.abs(r_s))
     np.testing.assert_allclose([s.inverse_ratio for s in patches], r_p / r_s, atol=1e-7)
+
+
+@pytest.mark.parametrize("paint_mm", [0.1, 0.15, 0.2])
+def test_paint_on_the_metal_is_found_out_and_does_not_carry_the_permittivities_off(paint_mm):
+    rng = np.random.default_rng(11)
+    prior = RigPrior(1e-3, leakage_std=0.01, leakage_measured=True)
+    patches = paint(world(rng, (0.003j, 0.004)), paint_mm)
+    found = invert(patches, prior, KINDS)
+    assert found.painted > 0.8
+    assert found.paint_mm == pytest.approx(paint_mm, abs=0.04)
+    assert sum(d < 5.99 for d in distances(found)) >= 7
+
+
+def test_bare_metal_is_not_called_painted():
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        leak = (drawn_leakage(rng) / 3, drawn_leakage(rng) / 3)
+        found = invert(world(rng, leak), RigPrior(1e-3, leakage_std=0.025), KINDS)
+        assert found.painted < 0.2
+
+
+def test_images_with_the_other_sign_of_phase_are_told_from_those_with_ours():
+    rng = np.random.default_rng(3)
+    prior = RigPrior(1e-3, leakage_std=0.01)
+    ours = world(rng, (0.01, -0.01j))
+    theirs, their_prior = mirror_phases(ours, prior)
+    right = invert(ours, prior, KINDS)
+    wrong = invert(theirs, their_prior, KINDS)
+    for prior_probability in (0.1, 0.5, 0.9):
+        _, other = join_signs(right, wrong, prior_probability)
+        _, other_way_round = join_signs(wrong, right, 1 - prior_probability)
+        assert other < 0.5
+        assert other_way_round == pytest.approx(1 - other, abs=1e-9)
+
+
+@pytest.mark.parametrize("evidence", [-1.0, 0.0, 1.0])
+def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evidence):
+    rng = np.random.default_rng(4)
+    prior = RigPrior(1e-3, leakage_std=0.01)
+    ours = world(rng, (0j, 0j))
+    right = invert(ours, prior, KINDS)
+    wrong = replace(invert(*mirror_phases(ours, prior), KINDS), log_evidence=right.log_evidence + evidence)
+    joined, other = join_signs(right, wrong, 0.3)
+    for before, mirrored, after in zip(right.patches, wrong.patches, joined.patches, strict=True):
+        assert after.permittivity == before.permittivity
+        apart = abs(mirrored.permittivity - before.permittivity) ** 2
+        expected = (1 - other) * np.trace(before.covariance) + other * (np.trace(mirrored.covariance) + apart)
+        assert np.trace(after.covariance) == pytest.approx(expected)
+        assert sum(after.shares.values()) == pytest.approx(1.0)
+    # Without any doubt nothing changes
+    assert join_signs(right, wrong, 1e-6)[0] == right

@@ -54,6 +54,21 @@ def test_no_dielectric_is_taken_for_metal(plates, scenes):
         assert not metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough
 
 
+@pytest.mark.parametrize("plates", [7])
+def test_a_dielectric_that_is_declared_as_metal_is_doubted_and_metal_is_not(plates, scenes):
+    """Without a direct path: the other patches alone tell it."""
+    doubted = []
+    for seed in range(scenes // 2):
+        for metal in (True, False):
+            patches, is_metal, _ = scene(np.random.default_rng([plates, seed]), plates, metal)
+            evidence = metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), None, KINDS)
+            if is_metal:
+                assert evidence.culprit is None
+            else:
+                doubted.append(evidence.culprit is not None)
+    assert np.mean(doubted) >= 0.7
+
+
 @pytest.mark.parametrize(("plates", "least"), [(2, 0.6), (4, 0.8), (8, 0.8)])
 def test_metal_among_dielectrics_is_mostly_recognised(plates, least, scenes):
     is_recognised = []

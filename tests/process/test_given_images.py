@@ -41,7 +41,8 @@ def labels_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pair(labels_folder):
-    return {name: np.load(labels_folder / f"sar_{name}.npy") for name in "hv"}
+    """The same images with our sign of phase."""
+    return {name: np.load(labels_folder / f"sar_{name}.npy").conj() for name in "hv"}
 
 
 @pytest.fixture
@@ -49,7 +50,7 @@ def save_images(tmp_path, pair):
     """`saved(h=..., x_m=None)`: the pair as a file, with changed arrays; None leaves one out."""
 
     def save(name="plates", **changed):
-        arrays = {**pair, "incidence_deg": ANGLE, **changed}
+        arrays = {**pair, "incidence_deg": ANGLE, "conjugate": False, **changed}
         np.savez(tmp_path / f"{name}.npz", **{k: v for k, v in arrays.items() if v is not None})
         return tmp_path / f"{name}.npz"
 

@@ -61,7 +61,8 @@ def draw_pixels(
             std * np.sqrt(0.5) * (rng.standard_normal() + rng.standard_normal(n))
             for std in (errors.amplitude, errors.phase_rad)
         ]
-        out.append((signal * (1 + parts[0]) * np.exp(1j * parts[1])).astype(np.complex64))
+        # The published images are conjugate to a reflection with losses of -j eps''.
+        out.append(np.conj(signal * (1 + parts[0]) * np.exp(1j * parts[1])).astype(np.complex64))
     return out[0], out[1]
 
 

@@ -496,9 +496,12 @@ class _Scene:
         return np.zeros((*z.shape[:-1], 1))
 
     def paint(self, z: Real) -> Real:
-        """Return the phase of 1 / P by the metal's paint, [..., 1], radians: 0 of bare metal, else uniform."""
+        """Return the phase of 1 / P by the metal's paint, [..., 1], radians: 0 of bare metal, else uniform.
+
+        Without kinds of materials nothing could tell paint: there is none.
+        """
         painted = self.prior.painted
-        if painted <= 0:
+        if painted <= 0 or self.kinds is None:
             return np.zeros((*z.shape[:-1], 1))
         beyond_bare = scipy.special.ndtr(z[..., PAINT, None]) - (1 - painted)
         return MOST_PAINT_RAD * np.maximum(beyond_bare, 0.0) / painted

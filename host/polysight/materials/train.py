@@ -125,8 +125,19 @@ class LabelledScan:
         return max(metals, key=lambda n: self.mask(n).sum(), default=None)
 
 
+def restore_phase_sign(published: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.complexfloating]:
+    """Return published images or pixels with our sign of phase, where losses are -j eps'': the conjugate.
+
+    The published imaging code multiplies the samples by exp(-j k R) and adds them up. A wave that is delayed by R has
+    exp(-j k R) in our sign, so that samples which add up in phase are its conjugate, and the images are, too. No
+    document says so; the published picture agrees (a plate of it would amplify otherwise, by three standard
+    deviations).
+    """
+    return np.conj(published)
+
+
 def read_labelled_scan(folder: Path) -> LabelledScan:
-    """Read `labels/<scan>`.
+    """Read `labels/<scan>`; its images get our sign of phase.
 
     Raises DataError if a file is missing or invalid.
     """
@@ -156,7 +167,7 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
                 f"{path}: {image.dtype} {image.shape}", "expected a complex image [150, 150]",
                 "give a folder labels/<scan> of the published data", code=ErrorCode.TYPE_WRONG,
             )  # fmt: skip
-        images.append(image.astype(np.complex64))
+        images.append(restore_phase_sign(image).astype(np.complex64))
     if images[0].shape != images[1].shape:
         raise DataError(
             f"{folder}: images of {images[0].shape} and {images[1].shape}", "they are not of one scan",
@@ -329,7 +340,7 @@ def read_material(path: Path) -> Entry:
         scan=scan,
         h=(abs(h) / level_h).astype(np.float32),
         v=(abs(v) / level_v).astype(np.float32),
-        p=(p / level_p).astype(np.complex64),
+        p=restore_phase_sign(p / level_p).astype(np.complex64),
         incidence_deg=angle,
         simulated=bool(raw.get("simulated", False)),
         thickness_mm=thickness,

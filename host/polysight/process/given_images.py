@@ -56,11 +56,9 @@ MIN_PIXELS = 8
 EVEN = 0.01
 """Largest deviation of a pixel's distance from the mean one, relative to it."""
 OTHER_SIGN = 0.3
-PUBLISHED_OTHER_SIGN = 0.95
+PUBLISHED_OTHER_SIGN = 0.05
 """Probability a priori that images of another program have the other sign of phase, if their file does not say it, and
-that images of the published form have it. The published imaging code multiplies the samples by exp(-j k R) and adds
-them up; a wave that is delayed by R has exp(-j k R) where losses are -j eps'': its samples are conjugates, and so are
-these images."""
+that images of the published form have, after `restore_phase_sign`."""
 _EXPECTED = (
     "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid [ny, nx], incidence_deg, simulated, conjugate"
 )

@@ -398,9 +398,9 @@ def metal_reasons(
         return [reason(
             "care",
             f"the given metal reference ({patch}) may be no metal: patch {culprit} and others look odd beside it",
-            "the others fit a dielectric reference better; so may thin plates, dishes of liquid, or H and V of different"
+            "the others fit a dielectric reference better; so may thin plates, liquids, or H and V of different"
             " places",
-            f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 2.6,
+            f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 4.4,
         )]  # fmt: skip
     if given or certain:
         return []

@@ -1,0 +1,27 @@
+"""Laws of the densities of what a plate may be."""
+
+import numpy as np
+import pytest
+
+from polysight.materials.kinds import Kinds, literature
+
+THETA = np.radians(55.0)
+KINDS = Kinds(literature(), float(THETA))
+
+
+@pytest.mark.parametrize("std", [0.005, 0.02, 0.06])
+def test_half_spaces_have_a_density_that_adds_up_to_one(std):
+    """Also beside metal, t = 1, where permittivity has no bound; errors add what lies beyond the passive ones."""
+    axis = np.linspace(-0.6, 1.6, 1101)
+    t = axis[None, :] + 1j * axis[:, None]
+    density = KINDS.compute_half_space_density(t, std**2 * np.eye(2))
+    total = float(density.sum()) * (axis[1] - axis[0]) ** 2
+    assert 0.5 < total < 1.6
+
+
+def test_no_half_space_lies_at_metal():
+    """A density without bound there once drew every metal-like patch, and the leakage with it."""
+    near = 1 + 0.1 * np.exp(2j * np.pi * np.arange(12) / 12)
+    density = KINDS.compute_half_space_density(np.append(near, 1.0), 0.03**2 * np.eye(2))
+    everywhere = KINDS.compute_half_space_density(np.array([0.2 - 0.03j]), 0.03**2 * np.eye(2))
+    assert density.max() < 0.2 * float(everywhere[0])

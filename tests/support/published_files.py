@@ -18,7 +18,7 @@ def write_materials(folder: Path, entries: Iterable[Entry]) -> None:
     for number, entry in enumerate(entries):
         content = {
             "name": entry.name, "collection_name": entry.scan, "incident_angle": entry.incidence_deg,
-            "ref_name": "metal", "values": [entry.p, entry.h.astype(np.complex64), entry.v.astype(np.complex64)],
+            "ref_name": "metal", "values": [entry.p.conj(), entry.h.astype(np.complex64), entry.v.astype(np.complex64)],
             "ref_values": [ones, ones, ones], "simulated": entry.simulated,
         }  # fmt: skip
         (folder / f"{number}_{entry.incidence_deg:.0f}.pkl").write_bytes(pickle.dumps(content))

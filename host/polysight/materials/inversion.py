@@ -71,8 +71,10 @@ UNEVEN_LIGHT = (1.0, 1.0)
 EVEN_LIGHT = (0.3, 0.5)
 """Change of ln(V / H) per radian of rise, along x and across, by the patterns of boards that see the plate from other
 points: without and with the correction of the plate's illumination. The independent generator has 0.6 along x."""
-PAINTED = 0.05
-"""Probability that the metal reference is painted or otherwise coated."""
+PAINTED = 0.02
+POSSIBLY_PAINTED = 0.2
+"""Probability that the metal reference is painted or otherwise coated, and that from which on its paint is an error of
+pixels and sub-bands, too: less of it lies outside of 95 %."""
 MOST_PAINT_RAD = 0.65
 PAINT_RAD_PER_MM = 2.65
 """Largest phase of 1 / P by a coating of metal, and its phase per thickness: 4 pi / lambda sin^2 / cos (1 - 1 / eps) of
@@ -688,7 +690,9 @@ def _solution(model: _Scene, z: Real, log_evidence: float, patches: tuple[PatchE
     a, b = (leakage[:, 0] for leakage in model.leakage(z))
     unit = max(prior.leakage_std, 1e-12)
     leakage_in_units = np.stack([a.real, a.imag, b.real, b.imag], axis=1) / unit
-    reference = prior.reference_std * _complex(z, REFERENCE) + 1j * paint
+    reference = prior.reference_std * _complex(z, REFERENCE)
+    if painted.mean() > POSSIBLY_PAINTED:
+        reference = reference + 1j * paint
     reference_in_units = split_complex(reference[:, 0]) / max(prior.reference_std, 1e-12)
     covariance = np.cov(np.concatenate([leakage_in_units, reference_in_units], axis=1).T)
     leakage_variance = unit**2 * np.diag(covariance)[:4]

@@ -44,8 +44,8 @@ WEAK_V_DB = -7.0
 """V / H relative to the direct path below which a patch that nobody declared is no metal, and below which even a
 declared one is none: half spaces of eps' up to 10 have -8 dB or less, bare water -4 dB, metal 0 dB, but for the
 patterns of the antennas (-4 dB with those of an independent generator)."""
-LEAST_SCORE = 3.0
-SCORE_PER_PATCH = 0.3
+LEAST_SCORE = 2.5
+SCORE_PER_PATCH = 0.35
 SURE_MARGIN = 1.5
 """Score from which on a patch that nobody declared counts as metal: the first and the second for each other patch, for
 each of which may be an odd one. Beyond it by the third it is certain. From 150 drawn scenes of each number of plates

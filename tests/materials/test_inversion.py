@@ -12,12 +12,11 @@ from polysight.materials.inversion import (
     PatchMeasurement,
     RigPrior,
     invert,
-    join_signs,
-    mirror_phases,
     ratio_error,
     true_ratio,
 )
 from polysight.materials.kinds import Kinds, literature, permittivity_slope
+from polysight.materials.phase_sign import join_signs, mirror_phases
 from polysight.polarimetry import fresnel, permittivity_from_ratio
 
 THETA = np.radians(55.0)

@@ -20,8 +20,6 @@ from polysight.materials.analyse import (
     image_centre_mm,
     name_permittivity,
     permittivity_change,
-    pixel_accuracy,
-    predict_pixel_accuracy,
 )
 from polysight.materials.catalogue import (
     CATALOGUE,
@@ -90,6 +88,8 @@ from polysight.materials.result import (
     make_labels,
     match_patches,
     pack_patches,
+    pixel_accuracy,
+    predict_pixel_accuracy,
     read_patches,
 )
 from polysight.materials.segment import Box, SegmentSettings, axis_mm, box_mask, insides

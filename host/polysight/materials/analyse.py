@@ -24,8 +24,6 @@ from polysight.materials.inversion import (
     PatchMeasurement,
     RigPrior,
     invert,
-    join_signs,
-    mirror_phases,
 )
 from polysight.materials.kinds import Kinds, RatioEvidence, inverse_ratio, literature, turn_covariance, weigh_kinds
 from polysight.materials.labels import TruthPlate, match_truth
@@ -60,7 +58,8 @@ from polysight.materials.metal import (
     metal_in_box,
     no_metal,
 )
-from polysight.materials.names import UNKNOWN, NamedPatch, PatchName, add_explanation, name_patch
+from polysight.materials.names import NamedPatch, PatchName, add_explanation, name_patch
+from polysight.materials.phase_sign import join_signs, mirror_phases
 from polysight.materials.result import MaterialsResult, PatchResult, Tilts, pixel_features
 from polysight.materials.segment import (
     Box,
@@ -78,7 +77,6 @@ from polysight.polarimetry import (
     PlaneReference,
     calibrate,
     divide_by_metal,
-    inverse_spread,
     permittivity_from_ratio,
     ratio,
     remove_leakage,
@@ -277,16 +275,10 @@ def analyse(
     measured = [scene.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
     kinds = _kinds(classifier, float(np.mean(theta)))
     labels = [p.label for p in judged]
-    inversion = invert(measured, prior, kinds)
-    signs = [(measured, prior, inversion)]
-    other_sign = 0.0
-    if optics.other_sign > 0:
-        mirrored = (*mirror_phases(measured, prior), kinds)
-        mirrored_inversion = invert(*mirrored)
-        inversion, other_sign = join_signs(inversion, mirrored_inversion, optics.other_sign)
-        if other_sign > POSSIBLE_SIGN and not reference.given:
-            signs.append((*mirrored[:2], mirrored_inversion))
+    solution = _solve(measured, prior, kinds, optics.other_sign)
+    inversion = solution.inversion
     if plane is None:
+        signs = solution.signs[:1] if reference.given else solution.signs
         reference = _weigh_metal(images, reference, labels, signs, kinds)
     # Only known leakage is removed from the pixels: an undetermined estimate leans on what the patches may be.
     calibrated = remove_leakage(raw, inversion.leakage if inversion.leakage_determined else prior.leakage)
@@ -310,8 +302,41 @@ def analyse(
         brightness_off={label: ln for label, ln in brightness_off.items() if np.isfinite(ln)},
         evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
         apart_mm=apart_mm, drift=scene.change, halo=scene.halo.level, behind=scene.usual_background(measured),
-        ripple=scene.usual, relief_rad=scene.relief_rad, other_sign=other_sign,
+        ripple=scene.usual, relief_rad=scene.relief_rad, other_sign=solution.other_sign,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Solution of a scene whose phases may have the other sign.
+
+    Attributes
+    ----------
+    inversion
+        The joint inversion; its errors hold both signs.
+    other_sign
+        Probability of the other sign.
+    signs
+        Patches, prior and inversion for the sign as given, and for the other one if it is possible.
+    """
+
+    inversion: Inversion
+    other_sign: float
+    signs: tuple[tuple[list[PatchMeasurement], RigPrior, Inversion], ...]
+
+
+def _solve(measured: list[PatchMeasurement], prior: RigPrior, kinds: Kinds, other_sign: float) -> _Solution:
+    """Solve for all patches together; `other_sign` is the probability a priori that phases have the other sign."""
+    inversion = invert(measured, prior, kinds)
+    as_given = (measured, prior, inversion)
+    if other_sign <= 0:
+        return _Solution(inversion, 0.0, (as_given,))
+    mirrored, mirrored_prior = mirror_phases(measured, prior)
+    mirrored_inversion = invert(mirrored, mirrored_prior, kinds)
+    joined, probability = join_signs(inversion, mirrored_inversion, other_sign)
+    if probability <= POSSIBLE_SIGN:
+        return _Solution(joined, probability, (as_given,))
+    return _Solution(joined, probability, (as_given, (mirrored, mirrored_prior, mirrored_inversion)))
 
 
 @dataclass(frozen=True)
@@ -615,15 +640,6 @@ def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | 
         return divide_by_metal(images, 1.0 + 0j, 1.0 + 0j)
 
 
-def reference_spread(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
-    """Return the relative spread of the metal's pixels."""
-    if reference is None:
-        spread = inverse_spread(h[metal.mask], v[metal.mask])
-    else:
-        spread = reference.spread
-    return spread if np.isfinite(spread) else 0.0
-
-
 def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
     """Apply a Gaussian filter inside each patch separately; NaN elsewhere."""
     out = np.full(image.shape, complex(np.nan, np.nan), image.dtype)
@@ -636,34 +652,6 @@ def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
             smoothed = smooth(np.where(inside, image[near], complex(np.nan, np.nan)).astype(image.dtype), sigma_px)
             out[near] = np.where(inside, smoothed, out[near])
     return out
-
-
-def pixel_accuracy(result: MaterialsResult) -> float | None:
-    """Return the share of interior pixels named right over all patches of known truth; None without such patches.
-
-    Patches rightly called unknown, because the library does not hold their material, do not count.
-    """
-    right = [n.names == truth for n, truth in _pixels_with_truth(result)]
-    return float(np.concatenate(right).mean()) if right else None
-
-
-def predict_pixel_accuracy(result: MaterialsResult) -> float | None:
-    """Return the share of the pixels of :func:`pixel_accuracy` that the best classifier is expected to name right.
-
-    It is the mean probability of each pixel's likeliest material, so that no choice of names is expected to do better
-    on these data. None without known truth, or if the classifier gives no probabilities.
-    """
-    shares = [n.confidence for n, _ in _pixels_with_truth(result)]
-    known_shares = [s for s in shares if s is not None]
-    if known_shares and len(known_shares) == len(shares):
-        return float(np.concatenate(known_shares).mean())
-    return None
-
-
-def _pixels_with_truth(result: MaterialsResult) -> list[tuple[NamedPatch, str]]:
-    """Return the named patches of known truth, each with the true name; without those rightly called unknown."""
-    judged = [(r.named, r.verdict.name, r.truth.name) for r in result.patches if r.named and r.verdict and r.truth]
-    return [(n, truth) for n, name, truth in judged if n.names.size and (name != UNKNOWN or truth in result.library)]
 
 
 def image_centre_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[float, float]:

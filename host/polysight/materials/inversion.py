@@ -25,20 +25,17 @@ the nearest material, and its name is the kind that fits this measurement.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
 from polysight.materials.kinds import (
-    METAL_SHARE,
-    METAL_SPREAD,
     USUAL_LIBRARY_SHARE,
     DensityMap,
     Kinds,
     RatioEvidence,
-    inverse_ratio,
     move_to_angle,
     permittivity_slope,
     split_complex,
@@ -80,24 +77,12 @@ PAINT_RAD_PER_MM = 2.65
 """Largest phase of 1 / P by a coating of metal, and its phase per thickness: 4 pi / lambda sin^2 / cos (1 - 1 / eps) of
 a thin layer at 55 degrees with eps = 3.3 (2.3 to 2.9 for 2.5 to 4). p is delayed more than s, never less. Paint has
 0.05 to 0.25 mm."""
-REFERENCE_REAL = (1.5, 30.0)
-REFERENCE_LOSS_TANGENT = (1e-3, 2.0)
-"""Permittivities of a reference that is no metal, uniform on logarithmic scales: all half spaces, water among them."""
-CHANNEL_RATIO_STD_DB = 2.5
-"""Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
 CHI2_95 = 5.991
 CHI2_997 = 11.8
 """Squared distances in standard deviations that hold 95 and 99.7 % of a normal distribution of two dimensions."""
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
-PHASE_SIGN = "phase sign"
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
-SIGN_EVIDENCE = 0.5
-"""Weight of the patches' evidence on the sign of the phases. Patches that are no half spaces may speak for the wrong
-one: by 5 (natural logarithm) where liquids stood behind walls; the plates of the published picture speak by 4 in all.
-"""
-UNLIKELY_SIGN = 0.005
-"""Probability of the other sign of the phases below which it is left out of the errors."""
 # Columns of a particle.
 LEAKAGE_H = (0, 1)
 LEAKAGE_V = (2, 3)
@@ -299,63 +284,6 @@ class Inversion:
         return max(self.leakage_std) < 0.5 * self.prior_std
 
 
-def mirror_phases(seen: Sequence[PatchMeasurement], prior: RigPrior) -> tuple[list[PatchMeasurement], RigPrior]:
-    """Return the patches and the prior as they are if all phases have the other sign.
-
-    Tilts are read from phases, too.
-    """
-    patches = [
-        replace(patch, inverse_ratio=patch.inverse_ratio.conjugate(), rise=(-patch.rise[0], -patch.rise[1]))
-        for patch in seen
-    ]
-    along, across = prior.metal_rise
-    return patches, replace(prior, metal_rise=(-along, -across))
-
-
-def join_signs(as_given: Inversion, mirrored: Inversion, prior_probability: float) -> tuple[Inversion, float]:
-    """Return the solution with the errors by an unknown sign of all phases, and the probability of the other sign.
-
-    `prior_probability` is that of the other sign before any patch was looked at. Values stay those of the sign as
-    given; their covariances are those of both signs together, about these values.
-    """
-    log_odds = SIGN_EVIDENCE * (mirrored.log_evidence - as_given.log_evidence) + scipy.special.logit(prior_probability)
-    probability = float(scipy.special.expit(log_odds))
-    if probability < UNLIKELY_SIGN:
-        return as_given, probability
-    both = zip(as_given.patches, mirrored.patches, strict=True)
-    patches = tuple(_join_estimates(patch, other, probability) for patch, other in both)
-    return replace(as_given, patches=patches), probability
-
-
-def _join_estimates(patch: PatchEstimate, other: PatchEstimate, probability: float) -> PatchEstimate:
-    """Return an estimate whose covariances hold another one, which is the right one with this probability."""
-
-    def join(middle: complex, covariance: Real, other_middle: complex, other_covariance: Real) -> Real:
-        apart = split_complex(other_middle - middle)
-        return (1 - probability) * covariance + probability * (other_covariance + np.outer(apart, apart))
-
-    ratio_covariance = join(
-        patch.inverse_ratio, patch.inverse_ratio_covariance, other.inverse_ratio, other.inverse_ratio_covariance
-    )
-    evidence = patch.evidence
-    if evidence is not None and other.evidence is not None:
-        joined = join(
-            evidence.inverse_ratio, evidence.covariance, other.evidence.inverse_ratio, other.evidence.covariance
-        )
-        evidence = replace(evidence, covariance=joined)
-    joined_estimate = replace(patch, inverse_ratio_covariance=ratio_covariance, evidence=evidence)
-    if patch.permittivity is None or patch.covariance is None:
-        return joined_estimate
-    if other.permittivity is None or other.covariance is None:
-        return joined_estimate
-    covariance = join(patch.permittivity, patch.covariance, other.permittivity, other.covariance)
-    kept = float(np.trace(patch.covariance) / np.trace(covariance))
-    shares = {source: min(kept, 1.0) * share for source, share in patch.shares.items()}
-    if shares:
-        shares[PHASE_SIGN] = max(0.0, 1.0 - kept)
-    return replace(joined_estimate, covariance=covariance, shares=shares)
-
-
 def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: npt.ArrayLike = 0j) -> Complex:
     """Return t of a measured V / H: the first formula of the module's docstring, solved for t, at the metal's place."""
     a = np.asarray(a, np.complex128)
@@ -369,9 +297,9 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | Non
 
     `seen` are the patches without the metal reference. With `kinds` the patches get probabilities of them.
     """
-    model = _Scene(seen, prior, kinds)
+    model = SceneLikelihood(seen, prior, kinds)
     rng = np.random.default_rng(0)
-    posterior, log_evidence = _sample(model, rng)
+    posterior, log_evidence = sample_posterior(model, rng)
     all_evidence = np.ones(model.patch_count + 1)
     patches = []
     for i in range(model.patch_count):
@@ -383,24 +311,14 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | Non
     return _solution(model, posterior, log_evidence, tuple(patches))
 
 
-def log_evidence_of_dielectric(
-    seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None = None
-) -> float:
-    """Return the log evidence of the same measurements if the reference is a dielectric, as `Inversion.log_evidence`.
-
-    `channel_ratio_db` is V / H of the reference relative to the direct path; None if it is not known.
-    """
-    return _sample(_DielectricReference(seen, prior, kinds, channel_ratio_db), np.random.default_rng(0))[1]
-
-
-def _sample(model: _Scene, rng: np.random.Generator) -> tuple[Real, float]:
+def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[Real, float]:
     """Return particles of the posterior of the common errors, and the log evidence."""
     prior_particles = rng.standard_normal((PARTICLES, model.width))
     no_evidence = np.zeros(model.patch_count + 1)
     return _anneal(model, prior_particles, no_evidence, no_evidence + 1, rng)
 
 
-class _Scene:
+class SceneLikelihood:
     """Likelihood of the common errors.
 
     A particle z [width] holds the common errors as deviations from the prior's mean in its standard deviations; its
@@ -570,63 +488,12 @@ class _Scene:
         return np.concatenate([brightness_log, np.stack(patch_logs, axis=-1)], axis=-1)
 
 
-class _DielectricReference(_Scene):
-    """The same scene if the reference is a dielectric of unknown permittivity instead of metal."""
-
-    width = WIDTH + 2
-
-    def __init__(
-        self, seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None
-    ) -> None:
-        self.channel_ratio_db = channel_ratio_db
-        super().__init__(seen, prior, kinds)
-
-    def reference_permittivity(self, z: Real) -> Complex:
-        """Return the permittivity of the reference, [..., 1]: any half space."""
-        real, tangent = (
-            low * (high / low) ** scipy.special.ndtr(z[..., WIDTH + i, None])
-            for i, (low, high) in enumerate((REFERENCE_REAL, REFERENCE_LOSS_TANGENT))
-        )
-        return real * (1 - 1j * tangent)
-
-    def reference_ratio(self, z: Real) -> Complex:
-        """Return t of the reference, [..., 1]."""
-        return inverse_ratio(self.reference_permittivity(z), self._middle_angle())
-
-    def log_reference_brightness(self, z: Real) -> Real:
-        """Return ln |r_s| of the reference, [..., 1], by Eq. 2."""
-        cosine = np.cos(self._middle_angle())
-        root = np.sqrt(self.reference_permittivity(z) - (1 - cosine**2))
-        return np.log(np.abs((cosine - root) / (cosine + root)))
-
-    def log_likelihoods(self, z: Real) -> Real:
-        """Return log likelihoods [..., 1 + patch] of the measured ratios, which are t over that of the reference."""
-        parts = super().log_likelihoods(z)
-        reference = self.reference_ratio(z)
-        size = np.abs(reference)
-        measured = self.ratios(z) / reference
-        # The density of a measured ratio is |t0|^2 that of t. Two plates may be of the same material, as metal is
-        # beside metal.
-        variance = METAL_SPREAD**2 + self.own_variance
-        alike = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
-        of_some_kind = parts[..., 1:] + 2 * np.log(size)
-        patch_logs = np.logaddexp(np.log1p(-METAL_SHARE) + of_some_kind, np.log(METAL_SHARE) + alike)
-        brightness_log = parts[..., :1]
-        if self.channel_ratio_db is not None:
-            too_dark_db = 20 * np.log10(size) - self.channel_ratio_db
-            brightness_log = brightness_log - 0.5 * (too_dark_db / CHANNEL_RATIO_STD_DB) ** 2
-        return np.concatenate([brightness_log, patch_logs], axis=-1)
-
-    def _middle_angle(self) -> float:
-        return float(self.theta.mean()) if self.theta.size else 0.0
-
-
 def _complex(z: Real, columns: tuple[int, int]) -> Complex:
     """Return two columns of particles as real and imaginary part, [..., 1]."""
     return z[..., columns[0], None] + 1j * z[..., columns[1], None]
 
 
-def _anneal(model: _Scene, z: Real, before: Real, after: Real, rng: np.random.Generator) -> tuple[Real, float]:
+def _anneal(model: SceneLikelihood, z: Real, before: Real, after: Real, rng: np.random.Generator) -> tuple[Real, float]:
     """Move particles of one posterior to another; `before`, `after` [1 + patch] weigh the log likelihoods.
 
     Return them with the logarithm of the ratio of both evidences.
@@ -682,7 +549,7 @@ def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:
     return np.minimum(np.searchsorted(np.cumsum(weight) / weight.sum(), places), weight.size - 1)
 
 
-def _solution(model: _Scene, z: Real, log_evidence: float, patches: tuple[PatchEstimate, ...]) -> Inversion:
+def _solution(model: SceneLikelihood, z: Real, log_evidence: float, patches: tuple[PatchEstimate, ...]) -> Inversion:
     """Collect the solution from particles of the posterior."""
     prior = model.prior
     paint = model.paint(z)
@@ -713,7 +580,7 @@ def _solution(model: _Scene, z: Real, log_evidence: float, patches: tuple[PatchE
     )
 
 
-def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> PatchEstimate:
+def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator) -> PatchEstimate:
     """Estimate one patch from particles of the common errors: ratio, permittivity, shares of the sources, kinds."""
     t = model.ratios(z)[:, i]
     middle = complex(t.mean())
@@ -745,7 +612,7 @@ def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> Patch
     return PatchEstimate(middle, ratio_covariance, value, covariance, shares, evidence)
 
 
-def _shares_of_sources(model: _Scene, z: Real, i: int, value: complex) -> dict[str, float]:
+def _shares_of_sources(model: SceneLikelihood, z: Real, i: int, value: complex) -> dict[str, float]:
     """Return the share of each source in the variance of a permittivity, to first order; they add up to 1."""
     mean = np.tile(z.mean(axis=0), (len(z), 1))
     of_all = model.permittivities(z)[:, i] - value
@@ -763,7 +630,7 @@ def _shares_of_sources(model: _Scene, z: Real, i: int, value: complex) -> dict[s
     return {source: part / total for source, part in variance.items()}
 
 
-def _evidence(model: _Scene, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
+def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
     """Return what the scene says of a patch's ratio at the angle of the kinds."""
     t = model.ratios_of_kinds(z, kinds)[:, i]
     covariance = np.cov(split_complex(t).T) + model.own[i]

@@ -24,33 +24,39 @@ import scipy
 
 from polysight.imaging import Image, Images, Mask
 from polysight.materials.inversion import (
-    CHANNEL_RATIO_STD_DB,
+    WIDTH,
     Inversion,
     PatchMeasurement,
     RigPrior,
+    SceneLikelihood,
     invert,
-    log_evidence_of_dielectric,
+    sample_posterior,
 )
-from polysight.materials.kinds import Kinds
+from polysight.materials.kinds import METAL_SHARE, METAL_SPREAD, Kinds, inverse_ratio
 from polysight.materials.segment import Box, Patch, Segmentation, box_mask
 from polysight.materials.specimens import METAL_UNLIKE
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
 Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
 
-DOUBTFUL_V_DB = -3.0
+DOUBTFUL_V_DB = -2.5
 WEAK_V_DB = -7.0
 """V / H relative to the direct path below which a patch that nobody declared is no metal, and below which even a
 declared one is none: half spaces of eps' up to 10 have -8 dB or less, bare water -4 dB, metal 0 dB, but for the
 patterns of the antennas (-4 dB with those of an independent generator)."""
-LEAST_SCORE = 2.5
-SCORE_PER_PATCH = 0.35
+LEAST_SCORE = 1.7
 SURE_MARGIN = 1.5
-"""Score from which on a patch that nobody declared counts as metal: the first and the second for each other patch, for
-each of which may be an odd one. Beyond it by the third it is certain. From 150 drawn scenes of each number of plates
-(tests/materials/test_metal_evidence.py): the brightest dielectric, wet ones among them, has at most 5 with the direct
-path; metal has 7 or more beside eight plates, and 5 (median) beside two."""
+"""Score from which on a patch that nobody declared counts as metal beside one other patch, and more by which it is
+certain. It grows with the root of their number, for each may be an odd one. Of 150 drawn scenes without metal with two,
+four and nine plates none reaches it with the direct path (open water comes closest), metal has 7 or more beside eight
+plates, 5 (median) beside two (tests/materials/test_metal_evidence.py)."""
+REFERENCE_REAL = (1.5, 30.0)
+REFERENCE_LOSS_TANGENT = (1e-3, 2.0)
+"""Permittivities of a reference that is no metal, uniform on logarithmic scales: all half spaces, water among them."""
+CHANNEL_RATIO_STD_DB = 2.5
+"""Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
 CONFLICT_SCORE = -0.5
 """Score below which a declared metal is told to be doubtful, with the patch that fits it least. Metal has 1.6 or more
 in 49 scenes of a generator that knows nothing of this estimator, dielectrics declared as metal -5 or less in five."""
@@ -95,7 +101,7 @@ class MetalEvidence:
         """Least score of bare metal to count as metal that nobody declared."""
         if self.others == 0:
             return np.inf
-        return LEAST_SCORE + SCORE_PER_PATCH * self.others
+        return LEAST_SCORE * float(np.sqrt(self.others))
 
     @property
     def sure(self) -> bool:
@@ -112,6 +118,67 @@ class MetalEvidence:
         """True if the patch is shown to be bare metal."""
         doubtful = self.channel_ratio_db is not None and self.channel_ratio_db < DOUBTFUL_V_DB
         return self.bare >= self.needed and not doubtful
+
+
+def log_evidence_of_dielectric(
+    seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None = None
+) -> float:
+    """Return the log evidence of the same measurements if the reference is a dielectric, as `Inversion.log_evidence`.
+
+    `channel_ratio_db` is V / H of the reference relative to the direct path; None if it is not known.
+    """
+    return sample_posterior(_DielectricReference(seen, prior, kinds, channel_ratio_db), np.random.default_rng(0))[1]
+
+
+class _DielectricReference(SceneLikelihood):
+    """The same scene if the reference is a dielectric of unknown permittivity instead of metal."""
+
+    width = WIDTH + 2
+
+    def __init__(
+        self, seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None
+    ) -> None:
+        self.channel_ratio_db = channel_ratio_db
+        super().__init__(seen, prior, kinds)
+
+    def reference_permittivity(self, z: Real) -> Complex:
+        """Return the permittivity of the reference, [..., 1]: any half space."""
+        real, tangent = (
+            low * (high / low) ** scipy.special.ndtr(z[..., WIDTH + i, None])
+            for i, (low, high) in enumerate((REFERENCE_REAL, REFERENCE_LOSS_TANGENT))
+        )
+        return real * (1 - 1j * tangent)
+
+    def reference_ratio(self, z: Real) -> Complex:
+        """Return t of the reference, [..., 1]."""
+        return inverse_ratio(self.reference_permittivity(z), self._middle_angle())
+
+    def log_reference_brightness(self, z: Real) -> Real:
+        """Return ln |r_s| of the reference, [..., 1], by Eq. 2."""
+        cosine = np.cos(self._middle_angle())
+        root = np.sqrt(self.reference_permittivity(z) - (1 - cosine**2))
+        return np.log(np.abs((cosine - root) / (cosine + root)))
+
+    def log_likelihoods(self, z: Real) -> Real:
+        """Return log likelihoods [..., 1 + patch] of the measured ratios, which are t over that of the reference."""
+        parts = super().log_likelihoods(z)
+        reference = self.reference_ratio(z)
+        size = np.abs(reference)
+        measured = self.ratios(z) / reference
+        # The density of a measured ratio is |t0|^2 that of t. Two plates may be of the same material, as metal is
+        # beside metal.
+        variance = METAL_SPREAD**2 + self.own_variance
+        alike = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
+        of_some_kind = parts[..., 1:] + 2 * np.log(size)
+        patch_logs = np.logaddexp(np.log1p(-METAL_SHARE) + of_some_kind, np.log(METAL_SHARE) + alike)
+        brightness_log = parts[..., :1]
+        if self.channel_ratio_db is not None:
+            too_dark_db = 20 * np.log10(size) - self.channel_ratio_db
+            brightness_log = brightness_log - 0.5 * (too_dark_db / CHANNEL_RATIO_STD_DB) ** 2
+        return np.concatenate([brightness_log, patch_logs], axis=-1)
+
+    def _middle_angle(self) -> float:
+        return float(self.theta.mean()) if self.theta.size else 0.0
 
 
 def metal_evidence(

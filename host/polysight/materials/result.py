@@ -27,7 +27,7 @@ from polysight.materials.labels import Labels, TruthPlate
 from polysight.materials.library import Real, feature_matrix
 from polysight.materials.measure import CommonChange, Permittivity, background, ratio_sigma
 from polysight.materials.metal import MetalReference
-from polysight.materials.names import NamedPatch, PatchName
+from polysight.materials.names import UNKNOWN, NamedPatch, PatchName
 from polysight.materials.segment import Box, Patch, Segmentation, axis_mm
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, PermittivityFigures, TruthFigures
 from polysight.store import open_npz
@@ -489,3 +489,31 @@ def _partner(patch: ScanPatch, own_scan: ScanPatches, other_scan: ScanPatches) -
     if partner is not None and nearest(partner, own_scan) is patch:
         return partner
     return None
+
+
+def pixel_accuracy(result: MaterialsResult) -> float | None:
+    """Return the share of interior pixels named right over all patches of known truth; None without such patches.
+
+    Patches rightly called unknown, because the library does not hold their material, do not count.
+    """
+    right = [n.names == truth for n, truth in _pixels_with_truth(result)]
+    return float(np.concatenate(right).mean()) if right else None
+
+
+def predict_pixel_accuracy(result: MaterialsResult) -> float | None:
+    """Return the share of the pixels of :func:`pixel_accuracy` that the best classifier is expected to name right.
+
+    It is the mean probability of each pixel's likeliest material, so that no choice of names is expected to do better
+    on these data. None without known truth, or if the classifier gives no probabilities.
+    """
+    shares = [n.confidence for n, _ in _pixels_with_truth(result)]
+    known_shares = [s for s in shares if s is not None]
+    if known_shares and len(known_shares) == len(shares):
+        return float(np.concatenate(known_shares).mean())
+    return None
+
+
+def _pixels_with_truth(result: MaterialsResult) -> list[tuple[NamedPatch, str]]:
+    """Return the named patches of known truth, each with the true name; without those rightly called unknown."""
+    judged = [(r.named, r.verdict.name, r.truth.name) for r in result.patches if r.named and r.verdict and r.truth]
+    return [(n, truth) for n, name, truth in judged if n.names.size and (name != UNKNOWN or truth in result.library)]

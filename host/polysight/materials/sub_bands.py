@@ -30,11 +30,12 @@ import scipy
 from msgspec import structs
 
 from polysight.imaging import Image, Images, Mask, SubBand
-from polysight.materials.analyse import Optics, level, reference_spread, smooth_inside, to_metal
+from polysight.materials.analyse import Optics, level, smooth_inside, to_metal
 from polysight.materials.inversion import ratio_slopes
 from polysight.materials.layers import METAL, THICKNESS_RANGE_M, Bands, Layer, LayerFit, Spectrum, fit_layer
 from polysight.materials.library import Library
 from polysight.materials.measure import LEAST_STD, NOT_PASSIVE, measure_scatter, median_ratio, relative_errors
+from polysight.materials.metal import MetalReference
 from polysight.materials.result import MaterialsResult
 from polysight.polarimetry import PlaneReference, inverse_spread, remove_leakage
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, ScanMaterials
@@ -177,7 +178,7 @@ def _relative_to_metal(
     h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (pair.h, pair.v))
     relative = remove_leakage(to_metal(replace(pair, h=h, v=v), metal, reference), leakage)
     h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
-    return h, v, reference_spread(h, v, metal, reference)
+    return h, v, _reference_spread(h, v, metal, reference)
 
 
 def _measure_band(band: SubBand, h: Image, v: Image, whole: tuple[Image, Image], error: float) -> BandFigures:
@@ -540,3 +541,12 @@ def fit_concentration(
         estimates = zip(names, line.percent(x[test]), low, high, strict=True)
         rows += [LeftOut(name, value, float(percent), float(lo), float(hi)) for name, percent, lo, hi in estimates]
     return ConcentrationResult(Line.through(x, y), tuple(rows))
+
+
+def _reference_spread(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
+    """Return the relative spread of the metal's pixels."""
+    if reference is None:
+        spread = inverse_spread(h[metal.mask], v[metal.mask])
+    else:
+        spread = reference.spread
+    return spread if np.isfinite(spread) else 0.0

@@ -129,18 +129,14 @@ def restore_phase_sign(published: npt.NDArray[np.complexfloating]) -> npt.NDArra
     """Return published images or pixels with our sign of phase, where losses are -j eps'': the conjugate.
 
     The published imaging code multiplies the samples by exp(-j k R) and adds them up. A wave that is delayed by R has
-    exp(-j k R) in our sign, so that samples which add up in phase are its conjugate, and the images are, too. No
-    document says so; the published picture agrees (a plate of it would amplify otherwise, by three standard
-    deviations).
+    exp(-j k R) in our sign: samples that add up are its conjugate, and the images are, too. No document says so; a
+    plate of the published picture would amplify otherwise, by three standard deviations.
     """
     return np.conj(published)
 
 
 def read_labelled_scan(folder: Path) -> LabelledScan:
-    """Read `labels/<scan>`; its images get our sign of phase.
-
-    Raises DataError if a file is missing or invalid.
-    """
+    """Read `labels/<scan>`; its images get our sign of phase. Raises DataError if a file is missing or invalid."""
     file = folder / f"{folder.name}.json"
     if not file.exists():
         json_files = sorted(folder.glob("*.json"))

@@ -520,7 +520,12 @@ def analyse_given_images(
         verdict=verdict,
         pixel_accuracy=pixel_accuracy(result),
         incidence=IncidenceAngles(used="one number for the image", one_deg=round(angle.deg, 4)),
-        given_images=GivenImages(file=str(pair.path), incidence_from=angle.source, assumed=list(pair.assumed)),
+        given_images=GivenImages(
+            file=str(pair.path),
+            incidence_from=angle.source,
+            assumed=list(pair.assumed),
+            other_sign=round(result.other_sign, 4),
+        ),
     )
     facts = ScanFacts(
         scan_id=pair.scan_id,

@@ -532,7 +532,13 @@ def error_budget(result: MaterialsResult, plane: PlaneEstimate | None) -> ErrorB
         ratio_db = evidence.channel_ratio_db
         if ratio_db is not None:
             ratio_db = round(ratio_db, 2)
-        metal = MetalScore(score=round(evidence.score, 2), others=evidence.others, channel_ratio_db=ratio_db)
+        metal = MetalScore(
+            score=round(evidence.score, 2),
+            others=evidence.others,
+            channel_ratio_db=ratio_db,
+            painted=round(inversion.painted, 3),
+            paint_mm=round(inversion.paint_mm, 3),
+        )
     leakage_h, leakage_v = inversion.leakage
     std_h, std_v = inversion.leakage_std
     angle_deg = float(np.degrees(np.mean(result.theta_rad) + inversion.theta_error_rad))

@@ -564,11 +564,16 @@ class PlaneError(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MetalScore(msgspec.Struct, frozen=True, kw_only=True):
-    """Evidence that the reference is metal: score from the other patches, V over H beside the direct path."""
+    """Evidence that the reference is metal: score from the other patches, V over H beside the direct path.
+
+    `painted` is the probability that the metal is painted, `paint_mm` the thickness of the paint then.
+    """
 
     score: float | None = None
     others: int = 0
     channel_ratio_db: float | None = None
+    painted: float | None = None
+    paint_mm: float | None = None
 
 
 class ErrorBudget(msgspec.Struct, frozen=True, kw_only=True):

@@ -165,12 +165,14 @@ class Recording(msgspec.Struct, frozen=True, kw_only=True):
 class GivenImages(msgspec.Struct, frozen=True, kw_only=True):
     """Images of another program that were processed instead of rows.
 
-    `incidence_from` is "option", "file" or "rig file"; `assumed` says what the file left open.
+    `incidence_from` is "option", "file" or "rig file"; `assumed` says what the file left open. `other_sign` is the
+    probability that the phases have the other sign than was taken.
     """
 
     file: str
     incidence_from: str
     assumed: list[str] = []
+    other_sign: float = 0.0
 
 
 class RawDropped(msgspec.Struct, frozen=True):

@@ -60,9 +60,12 @@ def segments(level: str | None) -> list[dict[str, Any]]:
     return [metal, pet, noise]
 
 
-def judged_products(folder: Path, level: str | None, careless: bool = False) -> Path:
-    """Write the files; with `careless`, names and permittivities are kept although the verdict allows none."""
-    rng = np.random.default_rng(2)
+def judged_products(folder: Path, level: str | None, careless: bool = False, seed: int = 2) -> Path:
+    """Write the files; the images are noise of this seed.
+
+    With `careless`, names and permittivities are kept although the verdict allows none.
+    """
+    rng = np.random.default_rng(seed)
     h, v = (rng.standard_normal((2, 20, 30)) + 1j * rng.standard_normal((2, 20, 30))).astype(np.complex64)
     axes = (np.linspace(-0.06, 0.06, 30), np.linspace(-0.04, 0.04, 20))
     sigma = None if level is None else rng.uniform(0.1, 0.2, h.shape)

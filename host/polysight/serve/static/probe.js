@@ -9,11 +9,19 @@ function complex({ real, imag }) {
   return `${number(real)} ${imag < 0 ? "−" : "+"} j ${number(Math.abs(imag))}`;
 }
 
-/** Ask for a place and show it; returns what was told. */
-export async function showProbe(scan, x, y, library) {
+/** Forget the place: it was of products that are gone. */
+export function clearProbe() {
+  by("probe-facts").replaceChildren();
+  by("profile-why").replaceChildren();
+  by("profile").hidden = true;
+}
+
+/** Ask for a place and show it while it `isCurrent`; returns what was told. */
+export async function showProbe(scan, x, y, library, isCurrent) {
   let told;
   try {
     told = await get("probe", { ...scan, x: x.toFixed(2), y: y.toFixed(2), library });
+    if (!isCurrent()) return null;
     complain("probe-hint");
   } catch (error) { complain("probe-hint", error); return null; }
   by("probe-hint").textContent = told.lit ? "" : "The scan does not illuminate this place.";

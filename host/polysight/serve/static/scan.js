@@ -2,10 +2,10 @@
 import { ImageView, caption, outline } from "./view.js";
 import { badge, begin, by, bytes, called, address, complain, day, ending, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, signed, STATES, VERDICTS } from "./common.js";
 import { Labels } from "./label.js";
-import { showProbe } from "./probe.js";
+import { clearProbe, showProbe } from "./probe.js";
 
 const scan = { scan: scanName };
-let server = {}, summary = {}, result = null, view = null, labels = null, shown = "h_amplitude", running = "";
+let server = {}, summary = {}, result = null, view = null, labels = null, shown = "h_amplitude", running = "", loads = 0;
 let metal = null, drawsMetal = false; // the box of "Process again"
 
 // --- the head ---
@@ -50,14 +50,22 @@ function buildMaps() {
 }
 
 async function showMap(name) {
+  const { generation } = result;
   shown = name;
-  for (const button of by("maps").children) button.setAttribute("aria-pressed", String(button.value === name));
+  markMap();
   try {
-    const made = await picture(`map/${name}`, { ...scan, generation: result.generation });
-    if (shown !== name) return; // another was asked for meanwhile
-    view.show({ image: made.image });
-    by("scale").replaceChildren(...scale(result.pictures.find((p) => p.name === name), made));
+    const made = await picture(`map/${name}`, { ...scan, generation });
+    if (shown === name && result?.generation === generation) drawMap(made); // another was asked for meanwhile
   } catch (error) { if (error.code !== "mismatch") complain("told", error); } // the next look loads the new products
+}
+
+function markMap() {
+  for (const button of by("maps").children) button.setAttribute("aria-pressed", String(button.value === shown));
+}
+
+function drawMap(made) {
+  view.show({ image: made?.image });
+  by("scale").replaceChildren(...(made ? scale(result.pictures.find((p) => p.name === shown), made) : []));
 }
 
 export function scale(map, made) {
@@ -119,7 +127,8 @@ function showPatches() {
 
 async function pick(x, y) {
   if (labels?.open) return;
-  const found = await showProbe({ ...scan, generation: result.generation }, x, y, by("library").value);
+  const { generation } = result;
+  const found = await showProbe({ ...scan, generation }, x, y, by("library").value, () => result?.generation === generation);
   for (const row of by("rows").children) row.classList.toggle("here", row.id === `patch-${found?.patch?.label}`);
 }
 
@@ -150,7 +159,7 @@ async function follow() {
   const was = running;
   running = program?.running ? program.kind : "";
   showHead();
-  if ((was && !running) || (result && summary.generation !== result.generation)) await load();
+  if ((was && !running) || (hasProducts() && summary.generation !== result?.generation)) await load();
   if (running) by("told").textContent = "";
 }
 
@@ -181,8 +190,24 @@ async function saveNotes() {
 
 // --- begin ---
 
+const hasProducts = () => summary.processed || summary.images_only;
+
+/** Read result and image before anything is shown: the page goes from one generation of products to the next at once. */
 async function load() {
-  try { result = summary.processed || summary.images_only ? await get("result", scan) : null; } catch (error) { complain("told", error); result = null; }
+  const turn = ++loads;
+  let next = null, made = null, map = shown;
+  try {
+    if (hasProducts()) next = await get("result", scan);
+    if (next && !next.pictures.some((p) => p.name === map)) map = "h_amplitude";
+    if (next) made = await picture(`map/${map}`, { ...scan, generation: next.generation });
+  } catch (error) {
+    if (error.code === "mismatch") return; // they were replaced meanwhile: the next look loads the new ones
+    complain("told", error);
+  }
+  if (turn !== loads) return;
+  if (next?.generation !== result?.generation) clearProbe();
+  result = next;
+  shown = map;
   showHead();
   showReasons();
   showFiles();
@@ -205,7 +230,7 @@ async function load() {
   labels.load(result);
   buildMaps();
   showPatches();
-  await showMap(result.pictures.some((p) => p.name === shown) ? shown : "h_amplitude");
+  drawMap(made);
 }
 
 by("resume").addEventListener("click", async () => {

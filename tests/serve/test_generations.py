@@ -1,0 +1,62 @@
+"""The page of a scan goes from one generation of products to the next at once: no moment shows parts of two."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from tests.support.page.asking import TOKEN
+from tests.support.page.chromium import DESK, Browser
+from tests.support.page.live_view import served_folder
+from tests.support.products import judged_products
+
+from polysight.products import making_products
+
+pytestmark = pytest.mark.xdist_group("browser")
+RUNS = 2
+LONG_RUNS = 20
+# Verdict and seed of the images of the two generations.
+GENERATIONS = (("good", 2), ("none", 5))
+# What the page shows of the products: badges, reasons, patches, scale of the image, and the place that is probed.
+PARTS = "['badges', 'reasons', 'rows', 'scale', 'probe-facts'].map(id => document.getElementById(id).innerText)"
+# Seen 20 times a second and at each change of the document.
+RECORD = f"""(() => {{
+  window.seen = new Set();
+  const look = () => window.seen.add(JSON.stringify({PARTS}));
+  setInterval(look, 50);
+  new MutationObserver(look).observe(document.body, {{ childList: true, subtree: true, characterData: true }});
+}})()"""
+
+
+def test_a_page_never_shows_a_mixture_of_two_generations(browser: Browser, tmp_path, request):
+    runs = LONG_RUNS if request.config.getoption("--long") else RUNS
+    products = tmp_path / "one" / "products"
+    judged_products(products, GENERATIONS[0][0], seed=GENERATIONS[0][1])
+    (tmp_path / "one" / "program").mkdir()
+    with served_folder(tmp_path, TOKEN) as view:
+        browser.visit(f"{view.address}/scan?scan=one#token={TOKEN}", DESK)
+        browser.wait("document.querySelector('#scale img')", "the first image")
+        parts = browser.value(PARTS)
+        whole = [parts]
+        browser.value("document.querySelector('canvas.imageview').focus()")
+        for key, code in (("ArrowRight", 39), ("Enter", 13)):
+            browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, code=key, windowsVirtualKeyCode=code)
+        browser.wait("document.getElementById('probe-facts').innerText", "the place")
+        whole.append(browser.value(PARTS))
+        browser.value(RECORD)
+
+        for run in range(1, runs + 1):
+            level, seed = GENERATIONS[run % 2]
+            with making_products(products, "s") as new:
+                judged_products(new, level, seed=seed)
+            shown = json.dumps(parts[3])
+            browser.wait(f"document.getElementById('scale').innerText !== {shown}", f"generation {run}")
+            parts = browser.value(PARTS)
+            if parts not in whole:
+                whole.append(parts)
+        seen = [json.loads(text) for text in browser.value("[...window.seen]")]
+        # The two generations, the first with and without a place that is probed.
+        assert len(whole) == 3
+        differing = zip(whole[0][:4], whole[2][:4], strict=True)
+        assert all(one != other for one, other in differing), whole
+        assert [parts for parts in seen if parts not in whole] == []

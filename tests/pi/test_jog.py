@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
@@ -13,24 +14,41 @@ from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
 from polysight.acquisition import PiClient, RefusedError
+from polysight.cli.main import main
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.faults import PiFault
 
 
 @pytest.fixture
-def client(pi, instrument):
-    """The host's own client, of a Pi whose stage is homed."""
+def rig(pi, instrument):
+    """The rig as its host sees it, with the stage homed."""
     pi.host.must_accept(m.Home())
     pi.host.until_state("homed")
     server = pi.service.server
     addresses = msgspec.structs.replace(
         instrument.pi, command_address=server.command_address, event_address=server.event_address
     )
+    return msgspec.structs.replace(instrument, pi=addresses)
+
+
+@pytest.fixture
+def client(rig):
+    """The host's own client."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    with PiClient(context, msgspec.structs.replace(instrument, pi=addresses)) as client:
+    with PiClient(context, rig) as client:
         yield client
     context.destroy(linger=0)
+
+
+def test_the_command_says_where_the_stage_rests_and_its_limits(rig, write_config, capsys):
+    config = str(write_config(rig))
+    assert main(["jog", "x", "10", "--config", config]) == 0
+    assert main(["jog", "x", "-2.5", "--speed-mm-s", "5", "--json", "--config", config]) == 0
+    place, report = capsys.readouterr().out.split("\n{", 1)
+    assert f"x 10.000 mm (limits: 0 and {rig.stage.travel_x_mm:g} mm)" in place
+    answer = json.loads("{" + report)
+    assert (answer["x_mm"], answer["y_mm"], answer["travel_y_mm"]) == (7.5, 0.0, rig.stage.travel_y_mm)
 
 
 def test_jogs_add_up_and_lead_back(client):

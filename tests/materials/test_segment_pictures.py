@@ -156,6 +156,19 @@ def test_copies_of_the_plates_by_a_second_path_are_recognised(seed):
     assert copies.level_db == pytest.approx(-16.0, abs=2.0)
 
 
+def test_weak_plates_one_pitch_away_are_no_copies_if_both_channels_show_them():
+    """Cups and sheets of a grid lie where a shift by one pitch would copy others, 16 dB weaker in H."""
+    plates = raster([0.0, 0.0, 0.0, 0.0], [COPPER, 0.3, 0.25, 0.35], 8)
+    h, v = draw(5, plates, amplitude=0.05, phase_deg=3.0)
+    weak = 0.16 * np.roll(h, (30, 45), axis=(0, 1))
+    # Their own ratios have nothing to do with those of the plates beside them.
+    level = np.where(np.arange(SIDE)[None, :] < SIDE // 2, 2.5, 0.7)
+    own_v = level * weak
+    assert find_copies(segment(h + weak, v, AXIS, AXIS).patches, h + weak, v, PIXEL_MM) is not None
+    segmentation = segment(h + weak, v + own_v, AXIS, AXIS)
+    assert find_copies(segmentation.patches, h + weak, v + own_v, PIXEL_MM) is None
+
+
 @pytest.mark.skipif(PUBLISHED is None, reason="POLYSIGHT_PUBLISHED_IMAGES is not set: the folder of the real picture")
 def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_else():
     folder = Path(PUBLISHED or "")

@@ -22,6 +22,8 @@ LEAST_OVERLAP = 0.6
 """Share of a copy that a shifted plate covers, and of the shifted plates that copies cover."""
 SAME_DB = 3.0
 """Largest deviation of a copy's level from the others', relative to its plate."""
+VISIBLE = 0.06
+"""Amplitude relative to the brightest plate at which the other channel shows a patch: -24 dB."""
 SKIRT_PX = 4
 """Pixels around the plates in which a copy cannot be told from the plate's own edge."""
 
@@ -40,10 +42,27 @@ def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -
 
     `h`, `v` complex [ny, nx] are the images that the patches were found in.
     """
-    copies_of_channels = [
-        copies for channel in (h, v) if (copies := _copies_in(patches, np.abs(channel), pixel_mm)) is not None
-    ]
+    amplitudes = [np.abs(h), np.abs(v)]
+    copies_of_channels = []
+    for amplitude, other in (amplitudes, amplitudes[::-1]):
+        copies = _copies_in(patches, amplitude, pixel_mm)
+        if copies is not None and not _are_plates(copies, patches, other, pixel_mm):
+            copies_of_channels.append(copies)
     return max(copies_of_channels, key=lambda copies: len(copies.labels), default=None)
+
+
+def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pixel_mm: float) -> bool:
+    """Return true if the other channel shows the copies of one channel, and not as copies: weak plates of a grid.
+
+    `other` float [ny, nx] is the amplitude of the other channel, which a second path copies to another place, or by
+    the same shift and level.
+    """
+    brightest = max(float(np.median(other[p.mask])) for p in patches)
+    seen = [p for p in patches if p.label in copies.labels and float(np.median(other[p.mask])) > VISIBLE * brightest]
+    if len(seen) < len(copies.labels):
+        return False
+    again = _copies_in(patches, other, pixel_mm)
+    return again is None or not set(copies.labels) & set(again.labels)
 
 
 def _copies_in(patches: Sequence[Patch], amplitude: np.ndarray, pixel_mm: float) -> Copies | None:

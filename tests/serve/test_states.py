@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 from tests.support.page.asking import TOKEN
-from tests.support.page.chromium import DESK, PHONE, Browser
+from tests.support.page.chromium import DESK, PHONE, Browser, find_axe
 from tests.support.page.live_view import Served, begin_history
 from tests.support.paths import RIG_FILE
 from tests.support.store.facts import facts_of
@@ -99,10 +99,34 @@ def test_every_state_says_what_the_table_says(browser: Browser, still, size):
     assert browser.errors == []
 
 
-def test_a_page_that_is_alone_says_so_and_how_to_abort(browser: Browser, still, monkeypatch):
+@pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_in_any_state(browser: Browser, still, size, scheme, request):
+    axe = find_axe()
+    if axe is None:
+        pytest.skip("no axe-core here: npm install --no-save axe-core")
+    watch, view = still
+    request.addfinalizer(lambda: browser.set_scheme("light"))
+    browser.set_scheme(scheme)
+    browser.visit(f"{view.address}/watch#token={TOKEN}", size)
+    violations = {}
+    for key, state in STATES.items():
+        if key in OF_THE_PAGE:
+            continue
+        watch.show(key)
+        headline = state.headline.format(**WORDS)
+        browser.wait(f"document.getElementById('headline')?.innerText == {headline!r}", key)
+        found = browser.find_violations(axe)
+        if found:
+            violations[key] = found
+    assert violations == {}
+
+
+@pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+def test_a_page_that_is_alone_says_so_and_how_to_abort(browser: Browser, still, monkeypatch, size):
     _, view = still
     monkeypatch.setattr(serve_site, "ALIVE_INTERVAL_S", 1e9)
-    browser.visit(f"{view.address}/watch#token={TOKEN}")
+    browser.visit(f"{view.address}/watch#token={TOKEN}", size)
     for key in ("server_frozen", "offline"):
         state = STATES[key]
         if key == "offline":
@@ -110,6 +134,8 @@ def test_a_page_that_is_alone_says_so_and_how_to_abort(browser: Browser, still, 
         # One look: it may find back at once.
         browser.wait(
             f"document.getElementById('headline')?.innerText == {state.headline!r}"
+            f" && document.getElementById('status').dataset.level == {state.level!r}"
+            " && document.documentElement.scrollWidth <= innerWidth"
             " && document.body.innerText.includes('polysight ask')"
             f" && !{list(state.never)!r}.some(phrase => document.body.innerText.includes(phrase))",
             key,

@@ -172,6 +172,18 @@ class Browser:
         assert self.errors == []
         assert all(url.startswith((address, "about:", "blob:")) for url in self.requests), self.requests
 
+    def set_scheme(self, scheme: str) -> None:
+        """Prefer `light` or `dark` colours."""
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self.call("Emulation.setEmulatedMedia", features=features)
+
+    def find_violations(self, axe: Path) -> list[list[str]]:
+        """Rules of axe-core that the page breaks, each with the elements that break it."""
+        self.value(f"{axe.read_text(encoding='utf-8')}; 0")
+        return self.value(
+            "axe.run().then(result => result.violations.map(v => [v.id, ...v.nodes.map(node => node.html)]))"
+        )
+
     def value(self, expression: str) -> Any:
         """Return the value of a JavaScript expression in the page."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)

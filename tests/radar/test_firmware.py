@@ -228,9 +228,11 @@ def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, 
 @pytest.mark.parametrize("flash", [b"", DATA], ids=["from RAM", "from flash"])
 def test_another_patch_of_the_rf_core_is_a_warning(clock, monkeypatch, flash):
     board = Simulated(lambda: clock.time, flash=flash)
-    effect = board.cores._effect
+    effect = board.cores._apply_setting_or_query
     old = bytes((2, 1, 20, 1, 1, 0))
-    monkeypatch.setattr(board.cores, "_effect", lambda n, d: effect(n, d)[:10] + old if n == 0x0220 else effect(n, d))
+    monkeypatch.setattr(
+        board.cores, "_apply_setting_or_query", lambda n, d: effect(n, d)[:10] + old if n == 0x0220 else effect(n, d)
+    )
     radar = make_board(board, clock, IMAGE)
     radar.configure()
     (result,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
@@ -300,7 +302,7 @@ def test_a_flash_that_loses_data_is_an_error(new, clock, monkeypatch):
 @pytest.mark.parametrize(("reported", "warned"), [((2, 9, 20, 1, 1, 0x30), True), ((0,) * 6, False)])
 def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, reported, warned):
     """Another patch than the file's is a warning; the old one, or none, is an error."""
-    effect = new.cores._effect
+    effect = new.cores._apply_setting_or_query
 
     def answer(number, data):
         result = effect(number, data)
@@ -308,7 +310,7 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
             return result[:10] + bytes(reported)
         return result
 
-    monkeypatch.setattr(new.cores, "_effect", answer)
+    monkeypatch.setattr(new.cores, "_apply_setting_or_query", answer)
     radar = make_board(new, clock, IMAGE)
     if warned:
         radar.configure()

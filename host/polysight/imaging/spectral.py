@@ -270,7 +270,7 @@ class RowSpectra:
         self.lattice: Lattice = get_cached(lattice_key(aperture, slack_m), lambda: lattice(aperture, slack_m))
         self._fft = fft_module(xp)
         self.period = self.lattice.size_x // self.lattice.stride_x
-        self._take = self.put(self.lattice.band % self.period)
+        self._band_bins = self.put(self.lattice.band % self.period)
         self._origin = float(row_starts_m(aperture.offsets_m).min())
         lags_m = aperture.grid.x_m - self._origin - self.lattice.first_lag_m[0]
         wave = np.exp(2j * np.pi * np.outer(self.lattice.wavenumbers, lags_m)) / self.lattice.size_x
@@ -296,7 +296,7 @@ class RowSpectra:
     def transform_rows(self, rows: Any, ramps: Any) -> Any:
         """Return the spectra of rows [..., row, column] in the kernel's band, [..., row, k]."""
         spectra = self._fft.fft(rows, n=self.period, axis=-1)
-        return self.xp.take(spectra, self._take, axis=-1) * ramps
+        return self.xp.take(spectra, self._band_bins, axis=-1) * ramps
 
     def transform_rows_adjoint(self, spectra: Any, ramps: Any) -> Any:
         """Apply the adjoint of :meth:`transform_rows`."""
@@ -332,7 +332,7 @@ class SpectralImager(RowSpectra):
         self._last = sizes.row_stride * (rows - 1)
         count = sizes.size_y // sizes.row_stride
         # Zeros below rows
-        self._tall = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)
+        self._padded_lines = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)
         self._repeat = self.put(np.arange(sizes.size_y) % count)
         self._rows = self.put(np.arange(rows) * sizes.row_stride)
         self._pixel_rows = self.put(self._last + np.arange(lines) * sizes.pixel_stride)
@@ -370,8 +370,8 @@ class SpectralImager(RowSpectra):
         echo = self.xp.asarray(echo, dtype=self.xp.complex64)
         if self._echo is None or not bool(xp.all(self._echo[0] == echo)):
             self._echo = (echo, xp.tensordot(xp.reshape(echo, (-1,)), self._kernels, axes=1))
-        white = self._along_y(self.transform_rows(xp.astype(weights, xp.complex64), self._ramps))
-        return self._inverse(self._echo[1] * white)
+        weight_spectra = self._along_y(self.transform_rows(xp.astype(weights, xp.complex64), self._ramps))
+        return self._inverse(self._echo[1] * weight_spectra)
 
     def samples(self, image: Any) -> Any:
         """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
@@ -390,8 +390,8 @@ class SpectralImager(RowSpectra):
 
     def _along_y(self, lines: Any) -> Any:
         """Return the 2-D spectrum on the lattice [ky, k] of the rows' spectra [row, k]."""
-        self._tall[: lines.shape[0], :] = lines
-        spectrum = self._fft.fft(self._tall, axis=0)
+        self._padded_lines[: lines.shape[0], :] = lines
+        spectrum = self._fft.fft(self._padded_lines, axis=0)
         if self.lattice.row_stride == 1:
             return spectrum
         return self.xp.take(spectrum, self._repeat, axis=0)
@@ -438,10 +438,10 @@ class IncrementalImager(RowSpectra):
             Stage offset of the first column.
         """
         ramp = self.ramps(np.array([start_m]))[0, :]
-        white = self.transform_rows(self.xp.astype(weights, self.xp.complex64), ramp)
-        self.add_spectra(index, self.transform_rows(samples, ramp), white)
+        weight_spectra = self.transform_rows(self.xp.astype(weights, self.xp.complex64), ramp)
+        self.add_spectra(index, self.transform_rows(samples, ramp), weight_spectra)
 
-    def add_spectra(self, index: int, lines: Any, white: Any) -> None:
+    def add_spectra(self, index: int, lines: Any, weight_spectra: Any) -> None:
         """Add a row that is transformed along x, [rx, frequency, k], and its weights, [k]."""
         xp, (rx, m) = self.xp, self.aperture.shape[:2]
         by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
@@ -449,7 +449,7 @@ class IncrementalImager(RowSpectra):
             by_rx[:, r * m : (r + 1) * m, r] = lines[r, :, :].mT
         lags = self._lags(index)
         self._sum += xp.matmul(self._kernels[:, lags, :], xp.matmul(self._components, by_rx))
-        self._constant += self._echo_kernel[:, lags] * white[:, None]
+        self._constant += self._echo_kernel[:, lags] * weight_spectra[:, None]
 
     def image_of_sum(self, factors: Any) -> Any:
         """Return the image of the rows so far, with a factor per RX [rx], complex64 [ny, nx]."""

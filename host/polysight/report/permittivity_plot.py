@@ -145,12 +145,12 @@ def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour
             if share == min(_STYLES):
                 ax.add_patch(Ellipse(centre, w, h, angle=angle, facecolor=colour, alpha=0.18, linewidth=0, zorder=2))
     elif e.real_p30_p70 and e.imag_p30_p70:
-        r0, r1 = e.real_p30_p70
-        i0, i1 = e.imag_p30_p70
+        real_p30, real_p70 = e.real_p30_p70
+        imag_p30, imag_p70 = e.imag_p30_p70
         ax.errorbar(
             *centre, color=colour, linewidth=1.2, zorder=3,
-            xerr=[[max(e.real - r0, 0)], [max(r1 - e.real, 0)]],
-            yerr=[[max(e.loss + i1, 0)], [max(-i0 - e.loss, 0)]],
+            xerr=[[max(e.real - real_p30, 0)], [max(real_p70 - e.real, 0)]],
+            yerr=[[max(e.loss + imag_p70, 0)], [max(-imag_p30 - e.loss, 0)]],
         )  # fmt: skip
     ax.plot(*centre, "o", color=colour, markersize=6, markeredgecolor=INK, markeredgewidth=0.6, zorder=3)
     if truth:

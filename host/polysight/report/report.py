@@ -91,7 +91,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
     )
     environment.filters["code"] = _code
     colours = assign_colours(scan)
-    rows = [_row(patch, colours) for patch in scan.segments]
+    rows = [_format_patch_row(patch, colours) for patch in scan.segments]
     names_found = {row["truth"] for row in rows}
     centre = [f"{(float(a[0]) + float(a[-1])) * 500:.1f}" for a in (scan.x_m, scan.y_m)]
     metal_how = ""
@@ -219,7 +219,7 @@ def _lead(scan: ProcessedScan) -> str:
     )
 
 
-def _row(patch: PatchFigures, colours: dict[str, str]) -> dict[str, Any]:
+def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str, Any]:
     """Format one line of the materials table."""
     truth = patch.truth
     e = patch.permittivity
@@ -278,10 +278,10 @@ def _format_estimate(e: PermittivityFigures) -> dict[str, str]:
         row["real_error"] = f"± {e.spread.real_std:.2f}"
         row["loss_error"] = f"± {e.spread.loss_std:.2f}"
     if e.real_p30_p70 and e.imag_p30_p70:
-        r0, r1 = e.real_p30_p70
-        i0, i1 = e.imag_p30_p70
-        row["real_range"] = f"({r0:.2f} … {r1:.2f})"
-        row["loss_range"] = f"({-i1:.2f} … {-i0:.2f})"
+        real_p30, real_p70 = e.real_p30_p70
+        imag_p30, imag_p70 = e.imag_p30_p70
+        row["real_range"] = f"({real_p30:.2f} … {real_p70:.2f})"
+        row["loss_range"] = f"({-imag_p70:.2f} … {-imag_p30:.2f})"
     row["dominated_by"] = e.dominated_by or ""
     row["do"] = e.do or ""
     share = e.shares.get(e.dominated_by or "")

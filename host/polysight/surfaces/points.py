@@ -18,6 +18,12 @@ Array = NDArray[np.float64]
 # rest are for starts from which the first steps are cut to LONGEST_STEP_M.
 NEWTON_STEPS = 12
 LONGEST_STEP_M = 0.15
+# Newton's method starts this far in front of the antennas, and never comes closer than NEAREST_M: behind them a
+# mirror image of each point has nearly the same path and slope.
+START_RANGE_M = 0.5
+NEAREST_M = 0.05
+# Keeps a singular matrix solvable. Entries are about 1, so that the added share lies far below the steps' precision.
+SOLVABLE = 1e-12
 
 
 def unit_legs(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array, Array, Array]:
@@ -40,18 +46,20 @@ def bend_of_legs(t: Array, r: Array, out_m: Array, back_m: Array) -> Array:
 def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
     """Specular points [n, 3] of echoes with a path [n] and its slope [n, 2], by Newton's method."""
     points = at_m + (tx_m + rx_m) / 2
-    points = points + np.stack([np.zeros_like(path_m), np.zeros_like(path_m), np.full_like(path_m, 0.5)], axis=-1)
+    points = points + np.stack(
+        [np.zeros_like(path_m), np.zeros_like(path_m), np.full_like(path_m, START_RANGE_M)], axis=-1
+    )
     for _ in range(NEWTON_STEPS):
         t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
         bisector = t + r
         miss = np.concatenate([(out_m + back_m - path_m)[:, None], bisector[:, :2] + slope], axis=1)
         bend = bend_of_legs(t, r, out_m, back_m)
         matrix = np.concatenate([bisector[:, None], bend[:, :2]], axis=1)
-        step = np.linalg.solve(matrix + 1e-12 * np.eye(3), miss[..., None])[..., 0]
+        step = np.linalg.solve(matrix + SOLVABLE * np.eye(3), miss[..., None])[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         points = points - step * np.minimum(1, LONGEST_STEP_M / np.maximum(length, 1e-30))
         # A point that a step moved behind the antennas is put back in front of them.
-        points[:, 2] = np.maximum(points[:, 2], 0.05)
+        points[:, 2] = np.maximum(points[:, 2], NEAREST_M)
     return points
 
 

@@ -107,6 +107,31 @@ CALIBRATED = 0x1004
 TRIGGER_READY = 0x100B
 FRAME_END = 0x100F
 RF_FAULT = 0x1002
+# Sub-block numbers (ICD 5): events are above, commands below.
+DOWNLOAD = 0x4080
+SET_EVENT_CHECKSUM = 0x404C
+POWER_UP_RF = 0x4000
+READ_MAIN_VERSION = 0x40E0
+READ_RF_VERSION = 0x0220
+READ_DIE = 0x0223
+READ_TEMPERATURES = 0x02EA
+SET_LDO_BYPASS = 0x02CC
+INIT_RF = 0x00C0
+START_OR_STOP_FRAMES = 0x0140
+READ_PROFILE = 0x0120
+READ_CHIRP = 0x0121
+READ_FRAME = 0x0122
+# Error numbers of the ICD's tables 5.1, 7.1 and 7.2.
+UNKNOWN_COMMAND = 3
+WRONG_LENGTH = 4
+INVALID_INPUT = 5
+WRONG_STATE = 6
+PROFILE_OUT_OF_RANGE = 35
+CHIRP_END_OUT_OF_RANGE = 60
+CHIRP_END_BEFORE_START = 61
+CHIRP_PROFILE_OUT_OF_RANGE = 62
+CHIRP_PROFILE_UNDEFINED = 63
+FRAME_WHILE_ARMED = 83
 PROFILE = 0x0100
 CHIRP = 0x0101
 FRAME = 0x0102
@@ -118,14 +143,16 @@ CHUNK_BYTES = 224
 CHUNKS = 3
 # Data bytes of each sub-block
 SIZES = {
-    0x0080: 8, 0x0082: 8, 0x0083: 4, 0x0085: 4, 0x0086: 12, 0x0089: 12, RESTORE: 228, 0x008D: 16, SAVE: 4, 0x00C0: 0,
-    PROFILE: 44, CHIRP: 20, FRAME: 24, STREAM_SET: 20, STREAM: 4, 0x0120: 4, 0x0121: 4, 0x0122: 0, 0x0140: 4,
-    0x0220: 0, 0x0223: 0, 0x02CC: 4, 0x02EA: 0, 0x4000: 0, 0x4041: 12, 0x4042: 8, 0x4043: 4,
-    0x4044: 4, 0x4045: 4, 0x4046: 4, 0x404C: 12, 0x40C0: 8, 0x40E0: 0,
+    0x0080: 8, 0x0082: 8, 0x0083: 4, 0x0085: 4, 0x0086: 12, 0x0089: 12, RESTORE: 228, 0x008D: 16, SAVE: 4, INIT_RF: 0,
+    PROFILE: 44, CHIRP: 20, FRAME: 24, STREAM_SET: 20, STREAM: 4, READ_PROFILE: 4, READ_CHIRP: 4, READ_FRAME: 0,
+    START_OR_STOP_FRAMES: 4,
+    READ_RF_VERSION: 0, READ_DIE: 0, SET_LDO_BYPASS: 4, READ_TEMPERATURES: 0, POWER_UP_RF: 0,
+    0x4041: 12, 0x4042: 8, 0x4043: 4,
+    0x4044: 4, 0x4045: 4, 0x4046: 4, SET_EVENT_CHECKSUM: 12, 0x40C0: 8, READ_MAIN_VERSION: 0,
 }  # fmt: skip
-_BEFORE_FRAMES = (0x0080, 0x0082, 0x0086, 0x00C0, PROFILE, CHIRP, 0x4041, 0x4042, 0x4043, 0x4044, 0x4045)
+_BEFORE_FRAMES = (0x0080, 0x0082, 0x0086, INIT_RF, PROFILE, CHIRP, 0x4041, 0x4042, 0x4043, 0x4044, 0x4045)
 # Commands before the RF power-up
-_WITHOUT_RF = (0x4080, 0x404C, 0x4000, 0x40E0)
+_WITHOUT_RF = (DOWNLOAD, SET_EVENT_CHECKSUM, POWER_UP_RF, READ_MAIN_VERSION)
 
 
 @dataclass
@@ -186,54 +213,54 @@ class Cores:
 
     def execute(self, number: int, data: bytes, remaining: int) -> tuple[int, bytes, float]:
         """Execute a command; return error number (0: none; ICD table 5.1, 7.1, 7.2), answer, and extra delay in s."""
-        if number == 0x4080:
+        if number == DOWNLOAD:
             return self._download(data, remaining)
         if number not in SIZES or (self.first_generation and number == 0x008D):
-            return 3, b"", 0.0
+            return UNKNOWN_COMMAND, b"", 0.0
         if len(data) != SIZES[number]:
-            return 4, b"", 0.0
+            return WRONG_LENGTH, b"", 0.0
         if not self.main_up or (number not in _WITHOUT_RF and not self.rf_up):
-            return 6, b"", 0.0
-        error, answer = self._do(number, data)
+            return WRONG_STATE, b"", 0.0
+        error, answer = self._dispatch(number, data)
         if not error:
             self.executed.append(number)
             self.settings[number] = data
         return error, answer, 0.0
 
-    def _do(self, number: int, data: bytes) -> tuple[int, bytes]:
-        if number == 0x0140:
+    def _dispatch(self, number: int, data: bytes) -> tuple[int, bytes]:
+        if number == START_OR_STOP_FRAMES:
             return self._start_or_stop(struct.unpack_from("<H", data)[0]), b""
         if number == FRAME and self.armed:
-            return 83, b""
-        if number in (0x0120, 0x0121, 0x0122):
+            return FRAME_WHILE_ARMED, b""
+        if number in (READ_PROFILE, READ_CHIRP, READ_FRAME):
             return self._read_back(number, data)
         if number in (PROFILE, CHIRP):
-            return self._keep(number, data), b""
+            return self._store_profile_or_chirps(number, data), b""
         if number in (SAVE, RESTORE):
-            return self._calibration(number, data)
-        return 0, self._effect(number, data)
+            return self._save_or_restore_calibration(number, data)
+        return 0, self._apply_setting_or_query(number, data)
 
-    def _effect(self, number: int, data: bytes) -> bytes:
-        if number == 0x404C:
+    def _apply_setting_or_query(self, number: int, data: bytes) -> bytes:
+        if number == SET_EVENT_CHECKSUM:
             self.crc32_events = data[0] == 1
-        elif number == 0x4000 and (
-            self._read_patch() or not self.first_generation
-        ):  # otherwise it never reports, as observed
-            self.rf_up = True
-            self.event(UP_RF, struct.pack("<4I", self.rf_tests, 2000, 0, 0), RF_UP_S)
-        elif number == 0x00C0:
+        elif number == POWER_UP_RF:
+            # A first-generation board without a patch never reports the power-up, as observed.
+            if self._read_patch() or not self.first_generation:
+                self.rf_up = True
+                self.event(UP_RF, struct.pack("<4I", self.rf_tests, 2000, 0, 0), RF_UP_S)
+        elif number == INIT_RF:
             self.calibrated = True
             self._report_calibration(self.passes)
-        elif number == 0x02CC and data[0] & 1 and self.supply_v > 1.1:
+        elif number == SET_LDO_BYPASS and data[0] & 1 and self.supply_v > 1.1:
             self.destroyed = True
-        elif number in (0x0220, 0x40E0):
-            rom = self.main_rom if number == 0x40E0 else self.rf_rom
-            return bytes((1, 2, 0, *rom, 20, 3, 17)) + self._patch(main=number == 0x40E0)
-        elif number == 0x0223:
+        elif number in (READ_RF_VERSION, READ_MAIN_VERSION):
+            rom = self.main_rom if number == READ_MAIN_VERSION else self.rf_rom
+            return bytes((1, 2, 0, *rom, 20, 3, 17)) + self._patch(main=number == READ_MAIN_VERSION)
+        elif number == READ_DIE:
             if not self.die:
                 return bytes(32)
             return struct.pack("<8I", 0x5EED0000 + self.die, 0xD1E, 2243, self.die, 0, 0, 0, 0)
-        elif number == 0x02EA:
+        elif number == READ_TEMPERATURES:
             return struct.pack("<I10h", int(self.now() * 1e3) & 0xFFFFFFFF, 41, 41, 42, 42, 45, 46, 45, 40, 43, 0)
         return b""
 
@@ -251,18 +278,22 @@ class Cores:
     def _report_calibration(self, passed: int) -> None:
         self.event(CALIBRATED, struct.pack("<IIhHII", passed, passed, 41, 0, 500, 0), RF_INIT_S)
 
-    def _keep(self, number: int, data: bytes) -> int:
+    def _store_profile_or_chirps(self, number: int, data: bytes) -> int:
         """Store a profile (0..3), or chirps (0..511) of one (ICD tables 5.24, 5.26); return an error number."""
         first, last, profile = struct.unpack_from("<3H", data)
         if number == PROFILE:
             if first > 3:
-                return 35
+                return PROFILE_OUT_OF_RANGE
             self.profiles[first] = data
             return 0
-        if last > 511 or first > last:
-            return 60 if last > 511 else 61
+        if last > 511:
+            return CHIRP_END_OUT_OF_RANGE
+        if first > last:
+            return CHIRP_END_BEFORE_START
         if profile not in self.profiles:
-            return 62 if profile > 3 else 63
+            if profile > 3:
+                return CHIRP_PROFILE_OUT_OF_RANGE
+            return CHIRP_PROFILE_UNDEFINED
         for chirp in range(first, last + 1):
             self.chirps[chirp] = data
         return 0
@@ -270,22 +301,22 @@ class Cores:
     def _read_back(self, number: int, data: bytes) -> tuple[int, bytes]:
         """Read back a setting in the form in which it was sent (ICD 5.6.1..5.6.6)."""
         stored = {
-            0x0120: lambda: self.profiles.get(struct.unpack_from("<H", data)[0]),
-            0x0121: lambda: self.chirps.get(struct.unpack_from("<H", data)[0]),
-            0x0122: lambda: self.settings.get(FRAME),
+            READ_PROFILE: lambda: self.profiles.get(struct.unpack_from("<H", data)[0]),
+            READ_CHIRP: lambda: self.chirps.get(struct.unpack_from("<H", data)[0]),
+            READ_FRAME: lambda: self.settings.get(FRAME),
         }[number]()
         if stored is None:
-            return 5, b""
+            return INVALID_INPUT, b""
         return 0, stored
 
-    def _calibration(self, number: int, data: bytes) -> tuple[int, bytes]:
+    def _save_or_restore_calibration(self, number: int, data: bytes) -> tuple[int, bytes]:
         """Save or restore 672 bytes of calibration in three parts (ICD 5.2.11, 5.3.2)."""
         _, part = struct.unpack_from("<2H", data)
         if part >= CHUNKS:
-            return 5, b""
+            return INVALID_INPUT, b""
         if number == SAVE:
             if not self.calibrated:
-                return 6, b""
+                return WRONG_STATE, b""
             calibration_data = (
                 struct.pack("<2I8xh", self.passes, self.passes, 41)
                 + bytes((self.die * 31 + n) & 0xFF for n in range(654))
@@ -337,7 +368,7 @@ class Cores:
     def _download(self, data: bytes, remaining: int) -> tuple[int, bytes, float]:
         """Store a part of a file (ICD 5.18.1). The first part erases the flash; its content is checked only at boot."""
         if not self.main_up:
-            return 6, b"", 0.0
+            return WRONG_STATE, b"", 0.0
         first = self._file is None
         if self._file is None:
             kind, length = struct.unpack_from("<II", data)
@@ -363,7 +394,7 @@ class Cores:
             self._file = None
             if kind == 0:
                 self._boot_from_ram()
-        self.executed.append(0x4080)
+        self.executed.append(DOWNLOAD)
         return 0, b"", self.erase_s if first and kind else 0.0
 
     def _boot_from_ram(self) -> None:

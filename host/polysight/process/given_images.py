@@ -449,24 +449,29 @@ def turn_reasons(result: MaterialsResult) -> list[Finding]:
     )]  # fmt: skip
 
 
+TOLD_PAINT = 0.2
 TOLD_SIGN = 0.02
-"""Probability of the other sign from which on the verdict tells it."""
+"""Probability of paint and of the other sign from which on the verdict tells them."""
 
 
-def sign_reasons(other_sign: float, conjugated: bool) -> list[Finding]:
+def sign_reasons(other_sign: float, conjugated: bool, painted: float = 0.0) -> list[Finding]:
     """Return what limits the verdict if the sign of the phases is not known.
 
-    `other_sign` is the probability of the sign that was not taken.
+    `other_sign` is the probability of the sign that was not taken; `painted` that the metal reference is painted if
+    the phases are as given: either turns all ratios.
     """
     if other_sign < TOLD_SIGN and not conjugated:
         return []
     taken = "as they are"
     if conjugated:
         taken = "the other way round"
+    cause = "with the wrong sign losses are wrong; the error bars hold both signs"
+    if conjugated and painted > TOLD_PAINT:
+        cause += "; or the sign is as given, and the metal reference is painted"
     return [reason(
         "care",
         f"the sign of the phases is not known: taken {taken}, right with a probability of {1 - other_sign:.2f}",
-        "with the wrong sign losses are wrong; the error bars hold both signs",
+        cause,
         "save `conjugate` (true or false) with the images: docs/spec/given-images.md", 2.2,
     )]  # fmt: skip
 
@@ -506,10 +511,11 @@ def analyse_given_images(
     optics = replace(optics, other_sign=pair.other_sign)
     result = analyse(images, optics, scene, classifier)
     conjugated = result.other_sign > 0.5
+    painted = result.inversion.painted
     if conjugated:
         images = conjugate(images)
         result = analyse(images, replace(optics, other_sign=1 - pair.other_sign), scene, classifier)
-    sign = sign_reasons(result.other_sign, conjugated)
+    sign = sign_reasons(result.other_sign, conjugated, painted)
     limits = [*given_reasons(pair, angle), *sign, *turn_reasons(result)]
     verdict = join_reasons([*limits, *scene_reasons(result, None, classifier)])
     if not verdict.usable:

@@ -22,17 +22,22 @@ from polysight_shared.errors import DeviceError, os_error
 from polysight_shared.sockets import Socket, requester, subscriber
 
 CONNECT_TIMEOUT_S = 2.0
+# Sends a command and returns the service's reply.
 Ask = Callable[..., Any]
 
 
 def _no_answer(address: str) -> DeviceError:
-    cause = "polysight-pi run is not running here"
-    return DeviceError(f"no answer from {address}", cause, "start it", code=ErrorCode.NO_ANSWER)
+    cause = "the service `polysight-pi run` is not running on this Pi, or it hangs"
+    remedy = "start it: `sudo systemctl restart polysight-pi`"
+    return DeviceError(f"no answer from {address}", cause, remedy, code=ErrorCode.NO_ANSWER)
 
 
 @contextmanager
 def _service(instrument: Instrument) -> Iterator[Ask]:
-    """Connect; the value sends a command and returns its reply. It raises DeviceError for silence and refusals."""
+    """Connect and give a function that sends a command and returns its reply.
+
+    The function raises DeviceError if the service refuses or does not reply in time.
+    """
     context: zmq.Context[Socket] = zmq.Context()
     address = instrument.pi.command_address
     try:
@@ -91,11 +96,19 @@ def home_by_service(instrument: Instrument) -> m.StatusReply | None:
         while time.monotonic() < deadline:
             status = ask(m.Status())
             if status.state == "fault":
-                raise DeviceError(f"homing failed: {status.reason}", "see the fault", "remove its cause, home again")
+                raise DeviceError(
+                    f"homing failed: {status.reason}",
+                    "the text before says which fault stopped it",
+                    "remove the cause, then home again",
+                )
             if status.state != "homing":
                 return status
             time.sleep(0.1)
-        raise DeviceError("homing has not ended", "the motors stall", "look at the stage")
+        raise DeviceError(
+            f"homing did not end within {MOTION_TIMEOUT_S:.0f} s",
+            "the motors stall, or a limit switch does not close",
+            "look at the stage, then home again",
+        )
 
 
 def take_over(instrument: Instrument, action: str) -> str:
@@ -107,7 +120,7 @@ def take_over(instrument: Instrument, action: str) -> str:
         owner = (Path(instrument.pi.journal_dir) / TAKE_OVER_KEY).read_text(encoding="ascii").strip()
     except OSError as e:
         raise os_error(e, "polysight-pi run is not running here, or you are not its user", AS_THE_SERVICE) from None
-    reason = "a person at the Pi took over"
+    reason = "a person at the Pi took over the run"
     with _service(instrument) as ask:
         if action == "end":
             scan_id = ask(m.Status()).scan_id
@@ -138,7 +151,12 @@ def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterat
             reply = ask(m.Replay(scan_id=scan_id, from_seq=from_seq))
             if reply.last_seq == 0:
                 summary = f"the Pi has no journal of scan {scan_id!r}"
-                raise DeviceError(summary, "another name", "see its journal folder", code=ErrorCode.FILE_MISSING)
+                raise DeviceError(
+                    summary,
+                    "the scan has another name, or another Pi ran it",
+                    f"list the journals in {instrument.pi.journal_dir}",
+                    code=ErrorCode.FILE_MISSING,
+                )
             if not reply.events:
                 return
             yield from map(msgspec.to_builtins, reply.events)

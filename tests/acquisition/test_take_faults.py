@@ -109,7 +109,7 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
     assert set(re.findall(r"`([a-z_]+)`(?=[^|\n]*\|[^|\n]*\|$)", table, re.MULTILINE)) >= set(FaultKind)
     for kind in FaultKind:
         fault = TakeFault(kind, "text", "RV", 103 if kind is FaultKind.PI_FAULT else 0)
-        notice = notice_of_rejection(0, 1, [str(fault)], [fault.fact()], "")
+        notice = notice_of_rejection(0, 1, [str(fault)], [fault.to_row_fault()], "")
         assert notice.why
         assert notice.do
     assert set(CAUSES) == set(FaultKind) - {FaultKind.PI_FAULT}
@@ -119,10 +119,10 @@ def test_words_follow_the_kind_alone():
     """The cause shown depends on the kind of the fault, not on the text of the reason."""
     answer = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
     for kind, (cause, do) in CAUSES.items():
-        notice = notice_of_rejection(0, 1, [answer], [TakeFault(kind, answer, "RV").fact()], "")
+        notice = notice_of_rejection(0, 1, [answer], [TakeFault(kind, answer, "RV").to_row_fault()], "")
         assert (notice.why, notice.do) == (cause, do)
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
-    notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
+    notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.to_row_fault()], "")
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).cause.lower()
     for unknown in ([], [RowFault("of_a_newer_release", "RV")]):
         notice = notice_of_rejection(0, 1, [answer], unknown, "")

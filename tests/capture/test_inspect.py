@@ -21,7 +21,7 @@ from tests.support.scenes import small_scene
 from polysight.capture import recognise_format
 from polysight.capture.dca1000 import Status
 from polysight.capture.inspect import Layout, inspect_bin, inspect_pcap, is_pcap, read_pcap
-from polysight.jobs.recordings import inspect_file, main_text
+from polysight.jobs.recordings import format_report, inspect_file
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -154,7 +154,7 @@ def test_lost_packets_of_a_pcap_are_masked_and_reported(tmp_path):
     assert r.card.record.missing == [(5 * 1456, 6 * 1456)]
     assert r.card.record.counts.duplicates == 1
     assert r.chirps == 32
-    assert "1456 bytes are missing" in main_text(r)
+    assert "1456 bytes are missing" in format_report(r)
 
 
 @pytest.mark.parametrize("size", [0, 3, 10, 30, 60])
@@ -191,7 +191,7 @@ def test_real_commands():
     names = [name for name, _ in r.card.replies]
     assert len(names) == 10
     assert {"RESET_FPGA", "RECORD_START", "RECORD_STOP", "CONFIGURE_PACKET", "ALIVE", "VERSION"} <= set(names)
-    assert "2.8" in main_text(r)
+    assert "2.8" in format_report(r)
 
 
 def npy() -> bytes:

@@ -105,7 +105,7 @@ class TakeFault:
             return f"{self.board}: {self.text}"
         return self.text
 
-    def fact(self) -> RowFault:
+    def to_row_fault(self) -> RowFault:
         """Return the fault as the manifest stores it."""
         return RowFault(str(self.kind), self.board, self.number)
 
@@ -113,7 +113,7 @@ class TakeFault:
 ON_REQUEST = TakeFault(FaultKind.ON_REQUEST, "stop requested at the host")
 
 
-def reasons(faults: list[TakeFault]) -> str:
+def join_faults(faults: list[TakeFault]) -> str:
     """Join the faults to one sentence."""
     return "; ".join(map(str, faults))
 
@@ -190,8 +190,9 @@ class Take:
 
     def _find_board_fault(self, name: str, capture: RowCapture, pulses_per_point: int) -> TakeFault | None:
         """Return the fault of one board's data; None if it is complete."""
-        placed = self.find_displaced(name)
+        displaced = self.find_displaced(name)
         radar = self.radars.get(name, BoardState(RadarState.UNKNOWN))
+        # `note` is not empty if the row was held.
         if self.note:
             held_text = "; the row was held, and a card ends its record after 2 s without data"
         else:
@@ -202,27 +203,30 @@ class Take:
             else:
                 detail = ""
             return TakeFault(FaultKind.NO_DATA, f"no data{detail}", name)
-        if placed is not None:
-            if placed.slots.size < placed.pulses:
-                missed = FaultKind.PULSES_MISSED
+        if displaced is not None:
+            if held_text:
+                kind = FaultKind.HELD
+            elif displaced.slots.size < displaced.pulses:
+                kind = FaultKind.PULSES_MISSED
             else:
-                missed = FaultKind.SLIPPED
-            kind = FaultKind.HELD if held_text else missed
-            return TakeFault(kind, describe(placed, pulses_per_point) + held_text, name)
+                kind = FaultKind.SLIPPED
+            return TakeFault(kind, describe(displaced, pulses_per_point) + held_text, name)
         if not capture.located:
+            # The kind with the clearest remedy goes first; the text lists all that is known.
             frames = self.frames.get(name)
             if frames is not None:
                 unplaced = f"; missed pulses cannot be located: {frames.reason}"
             else:
                 unplaced = ""
-            waits = "; the radar still waits for pulses" if radar.state is RadarState.ARMED else ""
-            if waits:
+            waits_text = ""
+            if radar.state is RadarState.ARMED:
+                waits_text = "; the radar still waits for pulses"
                 kind = FaultKind.RADAR_WAITS
             elif held_text:
                 kind = FaultKind.HELD
             else:
                 kind = _classify_unlocated(capture)
-            return TakeFault(kind, capture.reason + unplaced + waits + held_text, name)
+            return TakeFault(kind, capture.reason + unplaced + waits_text + held_text, name)
         if capture.conflicting and capture.missing:
             text = f"{capture.conflicting} packets have other bytes than packets with equal counters"
             return TakeFault(FaultKind.CONFLICTING, f"{text}; {capture.missing_bytes} bytes are masked", name)
@@ -280,6 +284,7 @@ def commit_row(
     for name, capture in take.captures.items():
         final = scan.row_path(name, take.row.index)
         frames = take.frames.get(name)
+        # Frames that lie at another pulse than their number says; None if the record can stay as it came.
         moved = frames_to_move(capture, frames)
         untimed = 0
         if capture.located:
@@ -290,7 +295,8 @@ def commit_row(
         if moved is not None:
             capture = rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
             take.captures[name] = capture
-            # The frames of a whole row that came at no pulse's time are masked now.
+            # Rewriting masks the frames that came at no pulse's time, which are not untimed then. Of a row that is
+            # kept incomplete, only frames remain that were seen at their pulses.
             untimed -= len(moved.doubtful)
             if faults:
                 untimed = 0
@@ -328,7 +334,7 @@ def commit_row(
             events=events,
             committed_utc=utc_now(),
             kept_incomplete=[str(f) for f in faults],
-            faults=[f.fact() for f in faults],
+            faults=[f.to_row_fault() for f in faults],
             note=take.note,
         )
     )
@@ -345,7 +351,7 @@ def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
             row=take.row.index,
             take=take.number,
             reasons=[str(f) for f in faults],
-            faults=[f.fact() for f in faults],
+            faults=[f.to_row_fault() for f in faults],
             boards={name: Reception(**_reception(capture)) for name, capture in take.captures.items()},
             rejected_utc=utc_now(),
         )
@@ -353,12 +359,12 @@ def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
 
 
 def _reception(capture: RowCapture) -> dict[str, Any]:
-    """Return the fields of `Reception` that every capture has."""
+    """Return the counts of `capture` under the names of the manifest; both types use the same names, but for bytes."""
     counts = {kind: getattr(capture, kind) for kind in Reception.__struct_fields__ if hasattr(capture, kind)}
     return {**counts, "received_bytes": capture.bytes}
 
 
-def retakes_exhausted(take: Take, faults: list[TakeFault], scan: ScanFolder, takes: int) -> ScanError:
+def explain_incomplete_row(take: Take, faults: list[TakeFault], scan: ScanFolder, takes: int) -> ScanError:
     """Return the error for a row whose retakes are used up, with the likeliest cause."""
     cause = "packets are lost on the network or in this machine, or a board misses SYNC_IN pulses"
     remedy = "see the counts of row_rejected in the manifest; check cable, receive buffer and load"
@@ -375,7 +381,7 @@ def retakes_exhausted(take: Take, faults: list[TakeFault], scan: ScanFolder, tak
         cause = explained.cause
         remedy = explained.remedy
     return ScanError(
-        f"row {take.row.index} is not complete after {takes} takes: {reasons(faults)}",
+        f"row {take.row.index} is not complete after {takes} takes: {join_faults(faults)}",
         cause,
         advice(remedy, f"then `polysight resume {scan.path}`; with --keep-incomplete it keeps such rows, masked"),
         code=ErrorCode.ROW_INCOMPLETE,
@@ -384,7 +390,9 @@ def retakes_exhausted(take: Take, faults: list[TakeFault], scan: ScanFolder, tak
 
 # Interval at which stop requests and timeouts are checked.
 _POLL_MS = 50
+# An aborted row ends as soon as the stage has braked; a Pi that is silent longer than this does not respond.
 _ABORT_TIMEOUT_S = 10.0
+# A row that is not on the disk after this time is reported, and again each time it passes.
 _DISK_NOTICE_S = 2.0
 
 
@@ -512,18 +520,20 @@ class RowTaker:
         is_held = False
         while take.finished is None:
             self._poll(take)
-            if self._stop.now:
-                fault = ON_REQUEST
-            elif take.aborted:
+            if take.finished is not None:
+                return
+            if take.aborted:
                 fault = None
+            elif self._stop.now:
+                fault = ON_REQUEST
             else:
                 fault = self._fatal_fault(take, silence)
-            if take.finished is None and fault and not take.aborted:
+            if fault is not None:
                 take.aborted = fault
                 deadline = time.monotonic() + _ABORT_TIMEOUT_S
                 transaction.change_state(RowState.ABORTING)
                 self._pi.abort(fault.text)
-            if take.finished is None and self._pi.state in ("fault", "idle"):
+            if self._pi.state in ("fault", "idle"):
                 self._check_stopped(take)
             if self._pi.state == "held" and not take.aborted:
                 # A held row has no timeout.
@@ -547,7 +557,7 @@ class RowTaker:
         if stopped := take.stopped_radars:
             texts = (f"{name}: the radar has stopped: {s.detail}" for name, s in stopped.items())
             return TakeFault(FaultKind.RADAR_STOPPED, "; ".join(texts))
-        if boards := silence.boards(take.events):
+        if boards := silence.find_silent_boards(take.events):
             return TakeFault(FaultKind.NO_DATA, f"no data from {', '.join(boards)}")
         return None
 
@@ -577,14 +587,14 @@ class RowTaker:
             )
 
     def _poll(self, take: Take) -> None:
+        """Wait for messages and read all of them: cards and receivers are read by asking for their state."""
         self._poller.poll(_POLL_MS)
-        # Reads the cards' messages.
         self._rig.statuses()
-        # Reads the receivers' messages.
         _ = self._rig.complete
         self._collect(take)
 
     def _collect(self, take: Take) -> None:
+        """Keep the Pi's events of this take; those of other rows and takes are ignored."""
         for event in self._pi.events():
             if isinstance(event, Capture) and (event.row_index, event.take) == (take.row.index, take.number):
                 take.events.append(ReceivedCapture(event, time.monotonic_ns()))
@@ -629,13 +639,13 @@ class _SilenceCheck:
         self._rig = rig
         self._limit_ns = int(instrument.limits.end_of_record_s * NS_PER_S)
         burst_bytes = instrument.burst.pulses * instrument.frame_bytes
-        # That fill at least two packets.
+        # A card sends a packet when it is full: fewer bursts than fill two packets prove nothing.
         self._bursts = -(-2 * instrument.card.packet_bytes // burst_bytes)
         self._checked_ns = 0
         self._all_heard = False
 
-    def boards(self, events: list[ReceivedCapture]) -> list[str]:
-        """Return the silent boards."""
+    def find_silent_boards(self, events: list[ReceivedCapture]) -> list[str]:
+        """Return the boards without a byte `end_of_record_s` after enough bursts. Asks the receivers no more often."""
         now = time.monotonic_ns()
         if self._all_heard or len(events) < self._bursts or now - self._checked_ns < self._limit_ns:
             return []
@@ -648,7 +658,10 @@ class _SilenceCheck:
 
 
 def row_limit_s(instrument: Instrument, row: Row) -> float:
-    """Return the timeout of a row: one minute plus four times the travel to it and along it."""
+    """Return the timeout of a row: one minute plus four times the travel to it and along it.
+
+    It is generous on purpose: only a stage that stands still or a Pi that hangs is to reach it.
+    """
     stage = instrument.stage
     travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
     return 60.0 + 4 * (travel_s + abs(row.step_mm) * row.points / stage.speed_mm_s)

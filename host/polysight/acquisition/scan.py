@@ -42,9 +42,9 @@ from polysight.acquisition.row import (
     RowTransaction,
     Take,
     commit_row,
-    reasons,
+    explain_incomplete_row,
+    join_faults,
     reject_row,
-    retakes_exhausted,
 )
 from polysight.radar import RadarControl, radar_control
 from polysight.store import (
@@ -266,13 +266,13 @@ class RunningScan:
                 raise
             faults = take.faults(self._instrument.burst.pulses)
             if number == last_take:
-                raise retakes_exhausted(take, faults, self._scan, number - first_take + 1)
+                raise explain_incomplete_row(take, faults, self._scan, number - first_take + 1)
             check_between_rows(self._pi.status(), self._scan.scan_id, first=False)
             if take.silent_boards:
                 # A card that lost power has lost its configuration.
                 self._rig.configure(take.silent_boards)
             self.result.retakes += 1
-            self._notify("retake", f"row {row.index} is taken again: {reasons(faults)}")
+            self._notify("retake", f"row {row.index} is taken again: {join_faults(faults)}")
 
     def _take(self, row: Row, number: int, taker: RowTaker, transaction: RowTransaction) -> Take | None:
         """Wait until the row may begin, and record it; return None if asked to stop before it began."""
@@ -355,7 +355,7 @@ class RunningScan:
         self._queue.add(row)
         if faults:
             self.result.incomplete_rows.append(row)
-            self._notify("warning", f"row {row} is kept incomplete: {reasons(faults)}")
+            self._notify("warning", f"row {row} is kept incomplete: {join_faults(faults)}")
         return True
 
     def _end(self, begun: bool) -> None:

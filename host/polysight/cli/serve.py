@@ -34,14 +34,18 @@ def _serve(args: argparse.Namespace) -> int:
     if config is None and RIG.exists():
         config = RIG
     if config is not None and not config.is_file():
-        raise ConfigError(f"{config}: no such file", "--config names it", "give a rig file, or leave it out")
+        raise ConfigError(
+            f"{config}: no such file", "--config names a rig file", "correct the path, or leave --config out"
+        )
     return serve(args.scans, _place(args), config, not args.read_only)
 
 
 def _preview(args: argparse.Namespace) -> int:
     _check_extra()
     if args.folder.exists() and not args.folder.is_dir():
-        raise ConfigError(f"{args.folder} is a file", "a scan is a folder, there or not yet", "give a scan folder")
+        raise ConfigError(
+            f"{args.folder} is a file", "a scan is a folder, which may not exist yet", "give a scan folder"
+        )
     sys.stderr.write("polysight preview: starting\n")
     from polysight.serve import preview
 
@@ -49,10 +53,11 @@ def _preview(args: argparse.Namespace) -> int:
 
 
 def _check_extra() -> None:
+    """Raise ConfigError if the packages of the web server are not installed."""
     if any(importlib.util.find_spec(name) is None for name in ("starlette", "uvicorn")):
         raise ConfigError(
             "starlette and uvicorn are not installed",
-            "the page is an extra of the host half",
+            "the operator's page needs them; an installation without the page leaves them out",
             "pip install starlette uvicorn",
         )
 

@@ -32,38 +32,42 @@ from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError, os_error
 
-# Missing ranges that are printed
-_SHOWN = 8
+# Missing ranges that are printed: they fill about one line of a terminal.
+_MAX_RANGES = 8
 # Lowest level in the plot of a range profile.
 BOTTOM_DB = -20.0
 
 
-def main_text(report: Report) -> str:
-    """The report as text."""
-    r = report
-    head = f"{r.path}: {r.bytes} bytes"
-    if r.simulated:
+def format_report(report: Report) -> str:
+    """Return the report as lines of a keyword and its values."""
+    head = f"{report.path}: {report.bytes} bytes"
+    if report.simulated:
         head += " of a simulated scan"
     lines = [head]
-    if r.card is not None:
-        lines += _card_lines(r.card)
-    if r.chirps:
-        shape = r.layout
-        first = "Q" if shape.q_first else "I"
+    if report.card is not None:
+        lines += _card_lines(report.card)
+    if report.chirps:
+        layout = report.layout
+        first_of_pair = "Q" if layout.q_first else "I"
+        rms = ", ".join(f"{counts:.0f}" for counts in report.rx_rms)
         lines += [
-            f"shape      {r.chirps} chirps x {shape.rx} RX x {shape.samples} samples, {shape.lanes}-lane,"
-            f" {first} first",
-            f"peak       {r.peak_db:.1f} dB over the median at bin {r.peak_bin} of {shape.samples}",
-            f"level      rms {', '.join(f'{v:.0f}' for v in r.rx_rms)} counts on RX 0.., DC {max(r.rx_dc):.1f}",
-            f"clipping   {r.clipped} values at full scale",
-            f"profile    {_sparkline(r.profile_db)}",
+            f"shape      {report.chirps} chirps x {layout.rx} RX x {layout.samples} samples, {layout.lanes}-lane,"
+            f" {first_of_pair} first",
+            f"peak       {report.peak_db:.1f} dB over the median at bin {report.peak_bin} of {layout.samples}",
+            f"level      rms {rms} counts on RX 0.., DC {max(report.rx_dc):.1f}",
+            f"clipping   {report.clipped} values at full scale",
+            f"profile    {_sparkline(report.profile_db)}",
         ]
-    return "\n".join(lines + [f"note       {remark}" for remark in r.remarks]) + "\n"
+    lines += [f"note       {remark}" for remark in report.remarks]
+    return "\n".join(lines) + "\n"
 
 
 def _card_lines(card: CardReport) -> list[str]:
-    lines = [f"card       {card.address}, {len(card.replies)} replies: {', '.join(n for n, _ in card.replies)}"]
-    refused = [n for n, s in card.replies if s and n not in (Code.STATUS.name, Code.VERSION.name)]
+    commands = ", ".join(command for command, _ in card.replies)
+    lines = [f"card       {card.address}, {len(card.replies)} replies: {commands}"]
+    # Replies to these two carry a value; to any other command, a status other than 0 is a refusal.
+    commands_with_value = (Code.STATUS.name, Code.VERSION.name)
+    refused = [command for command, status in card.replies if status and command not in commands_with_value]
     if refused:
         lines.append(f"refused    {', '.join(refused)}")
     if card.version:
@@ -71,10 +75,10 @@ def _card_lines(card: CardReport) -> list[str]:
     if card.status:
         lines.append(f"status     {' '.join(s.name or '?' for s in card.status)}")
     if card.record is not None:
-        c = card.record.counts
+        counts = card.record.counts
         lines.append(
-            f"record     {card.record.received} of {card.record.expected} bytes in {c.placed} packets, {c.duplicates}"
-            f" duplicates, {c.late} late, {c.disagreeing} disagreeing"
+            f"record     {card.record.received} of {card.record.expected} bytes in {counts.placed} packets,"
+            f" {counts.duplicates} duplicates, {counts.late} late, {counts.disagreeing} disagreeing"
         )
     if card.tail_bytes:
         lines.append(f"tail       {card.tail_bytes} bytes, {card.tail_after_s:.3f} s after the packet before")
@@ -82,11 +86,15 @@ def _card_lines(card: CardReport) -> list[str]:
 
 
 def _sparkline(profile_db: NDArray[np.float64], width: int = 64) -> str:
+    """Draw the profile as a line of bars, each as high as the maximum of its bins; negative levels are blank."""
     bars = " ▁▂▃▄▅▆▇█"
+    highest = len(bars) - 1
     groups = np.array_split(profile_db, min(width, profile_db.size))
-    tops = np.array([g.max() for g in groups])
-    span = max(float(tops.max()), 1e-9)
-    return "".join(bars[int(np.clip(round(t / span * 8), 0, 8))] for t in tops)
+    tops_db = np.array([group.max() for group in groups])
+    # An empty profile has a maximum of 0.
+    span_db = max(float(tops_db.max()), 1e-9)
+    heights = np.clip(np.round(tops_db / span_db * highest), 0, highest).astype(int)
+    return "".join(bars[height] for height in heights)
 
 
 def validate_folder(folder: Path, as_json: bool) -> int:
@@ -149,7 +157,7 @@ def inspect_file(
         content |= content.pop("layout")
         print_json(to_plain(content))
     else:
-        sys.stdout.write(main_text(report))
+        sys.stdout.write(format_report(report))
     if plot is not None:
         plot_profile(report, plot)
         sys.stderr.write(f"range profile: {plot}\n")
@@ -219,6 +227,7 @@ def inspect_placement(file: Path, as_json: bool) -> int:
                 "`polysight validate SCAN` says whether it is whole",
             )
     again = place_again(row)
+    # A row whose frames were moved to their pulses cannot be compared range by range.
     same = again.moved or again.missing == again.placed.missing
     if as_json:
         print_json({**again.placed.facts(), "committed_missing": again.missing, "same": same})
@@ -228,28 +237,28 @@ def inspect_placement(file: Path, as_json: bool) -> int:
 
 
 def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
-    p = again.placed
-    e = again.evidence
-    counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(p.counts).items() if n)
+    placed = again.placed
+    evidence = again.evidence
+    counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(placed.counts).items() if n)
     start = "known from the record before, or from a reset"
-    if e.past.start is None:
+    if evidence.past.start is None:
         start = "not known from the records before"
-    missing = ", ".join(f"{a}..{b}" for a, b in p.missing[:_SHOWN])
-    if len(p.missing) > _SHOWN:
+    missing = ", ".join(f"{first}..{end}" for first, end in placed.missing[:_MAX_RANGES])
+    if len(placed.missing) > _MAX_RANGES:
         missing += ", ..."
-    if p.located:
+    if placed.located:
         located = "yes"
     else:
-        located = f"no: {p.reason}"
+        located = f"no: {placed.reason}"
     lines = [
-        f"{file}: {p.received} of {p.expected} bytes in place",
+        f"{file}: {placed.received} of {placed.expected} bytes in place",
         f"packets    {counts or 'none'}",
         f"start      {start}",
         f"located    {located}",
         f"missing    {missing or 'nothing'}",
     ]
-    if e.dropped_by_card:
-        lines.append(f"card       dropped data before numbering it ({e.dropped_by_card})")
+    if evidence.dropped_by_card:
+        lines.append(f"card       dropped data before numbering it ({evidence.dropped_by_card})")
     if again.moved:
         lines.append("committed  with its frames at their pulses")
     elif same:

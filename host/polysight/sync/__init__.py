@@ -4,7 +4,8 @@
 chirps of each burst and average them (`align_row`), find the direct path and remove its frequency and phase
 (`reference`). The result is a `SyncedRow`, with the residual errors after each stage. `RowSynchroniser` does this for
 every row of a source, and converts cubes that another program has synchronised. The loops run compiled (C) if possible,
-otherwise in NumPy with equal results. `estimate_backlash` measures the backlash of the stage from the echoes.
+otherwise in NumPy with equal results; `cis` is exp(i x). `estimate_backlash` measures the backlash of the stage from
+the echoes.
 """
 
 from polysight.sync.backlash import estimate_backlash, object_filter

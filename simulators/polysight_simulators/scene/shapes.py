@@ -44,21 +44,25 @@ def shape_field(
     centre_m: NDArray[np.floating],
     path_m: float,
 ) -> NDArray[np.complex64]:
-    """Return echoes of a scene's shapes on a grid of stage offsets (x, y), complex64 [y, x, rx, node].
+    """Return echoes of a scene's shapes on a grid of stage offsets, complex64 [y, x, rx, node].
 
-    Relative to a free path of 1 m, without the phase of `path_m`. Places of
-    shapes are relative to `centre_m`.
+    `axes_m` are the offsets in x and in y, `nodes_hz` the frequencies. From `centre_m`, the image's centre on the
+    object plane, the scene file measures the places of shapes. The phase of `path_m` is removed: the rest varies slowly
+    with frequency. Amplitudes are relative to a free path of 1 m.
     """
     x, y = np.meshgrid(*axes_m)
-    d = scene.disturbances
+    disturbances = scene.disturbances
     samples = find_echoes(scene)(
         shapes=[to_builtins(shape) for shape in scene.shapes],
         rig=to_builtins(rig),
         role=board.role,
-        leakage=(complex(*d.leakage_h), complex(*d.leakage_v)),
+        leakage=(complex(*disturbances.leakage_h), complex(*disturbances.leakage_v)),
         offsets_m=np.stack([x.ravel(), y.ravel()], axis=1),
         frequencies_hz=nodes_hz,
         centre_m=tuple(centre_m.tolist()),
         path_m=path_m,
     )
-    return np.moveaxis(samples.reshape(*samples.shape[:2], *x.shape), (0, 1), (2, 3)).astype(np.complex64)
+    # From [rx, node, offset] to [y, x, rx, node].
+    receivers, nodes, _ = samples.shape
+    on_grid = samples.reshape(receivers, nodes, *x.shape)
+    return np.moveaxis(on_grid, (0, 1), (2, 3)).astype(np.complex64)

@@ -11,7 +11,7 @@ import pytest
 from scipy import ndimage
 
 from polysight.imaging import Images
-from polysight.materials import Library, MaterialsResult, TrainingScan, TruthPlate, make_library
+from polysight.materials import Classifier, Library, MaterialsResult, TrainingScan, TruthPlate, make_library
 from polysight.materials.analyse import KnownScene, Optics, analyse
 from polysight.materials.inversion import RigPrior
 
@@ -128,6 +128,17 @@ def analyse_placement():
     @functools.cache
     def find(seed: int, angle_deg: float = 55.0) -> MaterialsResult:
         return make(seed, theta=np.radians(angle_deg)).analyse()
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def name_placement(library):
+    """`name_placement(seed)`: the materials of a placement of the nine, named by the library, found once."""
+
+    @functools.cache
+    def find(seed: int) -> MaterialsResult:
+        return make(seed).analyse(classifier=Classifier(library))
 
     return find
 

@@ -104,7 +104,7 @@ def test_without_errors_the_truth_comes_back():
 @pytest.mark.parametrize("measured", [True, False], ids=["leakage measured", "leakage not measured"])
 def test_regions_hold_the_truth_as_often_as_they_say(measured, request):
     d = []
-    for seed in range(60 if request.config.getoption("--long") else 25):
+    for seed in range(60 if request.config.getoption("--long") else 12):
         rng = np.random.default_rng(seed)
         leak = (drawn_leakage(rng), drawn_leakage(rng))
         angle = 2e-3 * rng.standard_normal()
@@ -117,7 +117,7 @@ def test_regions_hold_the_truth_as_often_as_they_say(measured, request):
         prior = RigPrior(2e-3, measured_leakage, 0.003 if measured else 0.041, measured, reference_std=0.005)
         d += distances(invert(patches, prior))
     d = np.array(d)
-    # The patches of a scene share leakage, angle and reference: 25 scenes are not 200 independent draws.
+    # The patches of a scene share leakage, angle and reference: 12 scenes are not 96 independent draws.
     assert 0.58 < np.mean(d < 2.279) < 0.80
     assert np.mean(d < 5.991) > 0.90
     assert np.sqrt(np.mean(d) / 2) < 1.2

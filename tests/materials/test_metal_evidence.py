@@ -44,7 +44,7 @@ def scene(rng, plates, metal, patterns_db=1.0):
 @pytest.fixture
 def scenes(request):
     """How many random scenes of each kind; `--long` takes as many as the stated shares are known from."""
-    return 25 if request.config.getoption("--long") else 10
+    return 25 if request.config.getoption("--long") else 5
 
 
 @pytest.mark.parametrize("plates", [1, 2, 3, 4, 6, 9])
@@ -58,7 +58,7 @@ def test_no_dielectric_is_taken_for_metal(plates, scenes):
 def test_a_dielectric_that_is_declared_as_metal_is_doubted_and_metal_is_not(plates, scenes):
     """Without a direct path: the other patches alone tell it."""
     doubted = []
-    for seed in range(scenes // 2):
+    for seed in range(max(5, scenes // 2)):
         for metal in (True, False):
             patches, is_metal, _ = scene(np.random.default_rng([plates, seed]), plates, metal)
             evidence = metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), None, KINDS)

@@ -23,10 +23,10 @@ def named_again(found, scene, classifier, path):
     return {m.label: n.verdict for m, n in zip(matched, again, strict=True)}
 
 
-def test_a_scan_is_named_again_as_it_was_named(synthetic, library, tmp_path):
+def test_a_scan_is_named_again_as_it_was_named(synthetic, library, name_placement, tmp_path):
     scene = synthetic(3)
     classifier = Classifier(library)
-    analysis = scene.analyse(classifier=classifier)
+    analysis = name_placement(3)
     again = named_again(analysis, scene, classifier, tmp_path / "patches.npz")
     for r in analysis.patches:
         if r.named is not None:
@@ -35,11 +35,13 @@ def test_a_scan_is_named_again_as_it_was_named(synthetic, library, tmp_path):
 
 
 @pytest.mark.parametrize("gain", [0.8, 0.9, 1.1, 1.25])
-def test_brightness_that_all_plates_share_does_not_change_their_names(gain, synthetic, library, tmp_path):
+def test_brightness_that_all_plates_share_does_not_change_their_names(
+    gain, synthetic, library, name_placement, tmp_path
+):
     """A low or tilted metal plate makes all others brighter or darker in both channels: V / H stays."""
     scene = synthetic(3)
     classifier = Classifier(library)
-    plain = scene.analyse(classifier=classifier)
+    plain = name_placement(3)
     metal = plain.segmentation.labels == plain.metal.label
     factor = np.where(metal, 1.0, gain)
     pair = Images(scene.h * factor, scene.v * factor, scene.x_m, scene.y_m, np.ones(scene.h.shape, bool))
@@ -51,9 +53,9 @@ def test_brightness_that_all_plates_share_does_not_change_their_names(gain, synt
     assert sum(v.name == names.get(n) for n, v in again.items()) >= 0.7 * len(names)
 
 
-def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, tmp_path):
+def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, name_placement, tmp_path):
     scene = synthetic(3)
-    analysis = scene.analyse(classifier=Classifier(library))
+    analysis = name_placement(3)
     path = tmp_path / "patches.npz"
     path.write_bytes(pack_patches(analysis, scene.x_m, scene.y_m, simulated=True))
     with np.load(path) as z:
@@ -72,10 +74,10 @@ def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, tm
     assert not [n for n, t in zip(names, true, strict=True) if n in library.names and n != t]
 
 
-def test_a_budget_of_other_patches_is_refused(synthetic, tmp_path):
+def test_a_budget_of_other_patches_is_refused(synthetic, analyse_placement, tmp_path):
     scene = synthetic(3)
     path = tmp_path / "patches.npz"
-    path.write_bytes(pack_patches(scene.analyse(), scene.x_m, scene.y_m, simulated=True))
+    path.write_bytes(pack_patches(analyse_placement(3), scene.x_m, scene.y_m, simulated=True))
     with np.load(path) as z:
         arrays = {k: z[k] for k in z}
     out = io.BytesIO()

@@ -27,10 +27,11 @@ def test_the_error_grows_towards_metal():
     assert estimate_permittivity(h, v, THETA).real_std == pytest.approx(slope * 0.004, rel=0.05)
 
 
-def test_a_shifted_plate_stays_within_its_error_bar(synthetic):
-    """Nine plates in eight random placements with noise: no estimate leaves three of its standard errors."""
+def test_a_shifted_plate_stays_within_its_error_bar(synthetic, request):
+    """Nine plates in random placements with noise: no estimate leaves three of its standard errors."""
+    placements = 8 if request.config.getoption("--long") else 3
     z = []
-    for seed in range(8):
+    for seed in range(placements):
         scene = synthetic(seed, uneven=0.0)
         for patch in scene.analyse().patches:
             e = patch.permittivity
@@ -39,6 +40,6 @@ def test_a_shifted_plate_stays_within_its_error_bar(synthetic):
                 continue
             difference = e.value - truth.permittivity
             z += [difference.real / e.real_std, difference.imag / e.loss_std]
-    assert len(z) > 80
+    assert len(z) > 10 * placements
     assert max(np.abs(z)) < 3
     assert np.sqrt(np.mean(np.square(z))) < 1.2

@@ -113,8 +113,8 @@ def test_outline_encloses_the_patch(synthetic):
         np.testing.assert_allclose(patch.outline_mm.max(axis=0), patch.box_mm[2:], atol=2.1)
 
 
-def test_metal_is_found_by_itself_whatever_the_gains(synthetic):
-    for seed in range(4):
+def test_metal_is_found_by_itself_whatever_the_gains(synthetic, request):
+    for seed in range(4 if request.config.getoption("--long") else 2):
         scene = synthetic(seed, gain_v=0.05j)
         segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
         metal = find_metal(scene.h, scene.v, segmentation)
@@ -132,8 +132,8 @@ WITHOUT_METAL = {
 
 
 @pytest.mark.parametrize("names", WITHOUT_METAL.values(), ids=WITHOUT_METAL.keys())
-def test_scene_without_metal_is_called_uncertain(synthetic, nine, names):
-    for seed in range(3):
+def test_scene_without_metal_is_called_uncertain(synthetic, nine, names, request):
+    for seed in range(3 if request.config.getoption("--long") else 1):
         scene = synthetic(seed, {n: nine[n] for n in names})
         assert not scene.analyse().metal.certain
 

@@ -8,16 +8,22 @@ from polysight.materials import Library, accuracy_lines
 from polysight.materials.train import fit_samples
 from polysight.materials.training_advice import FREEDOM_NEEDED
 
+MANY_SCANS = 12
 CLOSE = {"acrylic": 4.0 - 0.4j, "resin": 4.03 - 0.405j, "rubber": 5.06 - 1.11j}
 
 
-def advice(samples) -> str:
-    return "\n".join(accuracy_lines(Library((), {"angles": {"60": fit_samples(samples)}})))
+@pytest.fixture(scope="module")
+def fit_of_many_specimens():
+    return fit_samples(drawn((0.03, 0.2), MANY_SCANS, seed=2))
+
+
+def advise(fit) -> str:
+    return "\n".join(accuracy_lines(Library((), {"angles": {"60": fit}})))
 
 
 def test_pieces_that_nobody_named_make_an_underconfident_library_that_asks_for_specimens():
     """They differ by 12 %, which counts as an error of placement for all materials alike."""
-    text = advice(drawn((0.12, 0.6), 6, seed=1, labelled=False))
+    text = advise(fit_samples(drawn((0.12, 0.6), 6, seed=1, labelled=False)))
     assert "underconfident" in text
     assert "no second specimen" in text
     assert f"{FREEDOM_NEEDED} more are needed" in text
@@ -31,27 +37,27 @@ def test_pieces_that_nobody_named_make_an_underconfident_library_that_asks_for_s
         ({}, "a scan may be disturbed, or a label wrong"),
     ],
 )
-def test_names_said_too_surely_are_told_with_the_likeliest_cause(change, cause):
-    fit = fit_samples(drawn((0.03, 0.2), 12, seed=5)) | {"named": 200, "said": 0.97, "right": 0.8} | change
-    text = "\n".join(accuracy_lines(Library((), {"angles": {"60": fit}})))
+def test_names_said_too_surely_are_told_with_the_likeliest_cause(fit_of_many_specimens, change, cause):
+    text = advise(fit_of_many_specimens | {"named": 200, "said": 0.97, "right": 0.8} | change)
     assert "overconfident: names are said with 97 % and 80 % are right" in text
     assert cause in text
 
 
-def test_a_library_of_many_specimens_needs_none_and_is_neither_over_nor_underconfident():
-    text = advice(drawn((0.03, 0.2), 12, seed=2))
+def test_a_library_of_many_specimens_needs_none_and_is_neither_over_nor_underconfident(fit_of_many_specimens):
+    text = advise(fit_of_many_specimens)
     assert "confident" not in text
     assert "needed" not in text
 
 
 def test_materials_that_no_number_of_specimens_separates_are_told():
-    text = advice(drawn((0.03, 0.2), 8, seed=3, kinds=CLOSE))
+    text = advise(fit_samples(drawn((0.03, 0.2), 8, seed=3, kinds=CLOSE)))
     assert "acrylic and resin lie" in text
     assert "rubber" not in text.split("lie")[0].splitlines()[-1]
 
 
-@pytest.mark.parametrize("scans", [3, 12])
-def test_the_freedom_of_specimens_is_counted_over_the_materials(scans):
-    fit = fit_samples(drawn((0.03, 0.2), scans, seed=4))
-    assert fit["specimen_freedom"] == len(KINDS) * (scans - 1)
-    assert np.isfinite([fit["said"], fit["right"]]).all()
+def test_the_freedom_of_specimens_is_counted_over_the_materials(fit_of_many_specimens):
+    few_scans = 3
+    fit_of_few = fit_samples(drawn((0.03, 0.2), few_scans, seed=4))
+    for scans, fit in ((few_scans, fit_of_few), (MANY_SCANS, fit_of_many_specimens)):
+        assert fit["specimen_freedom"] == len(KINDS) * (scans - 1)
+        assert np.isfinite([fit["said"], fit["right"]]).all()

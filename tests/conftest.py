@@ -99,25 +99,6 @@ def _composed_figures(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-NAMING = (*UNRENDERED, "api", "e2e", "report")
-"""Rooms whose tests name the patches of many scans."""
-
-
-@pytest.fixture(scope="session")
-def _kept_classifiers() -> Iterator[None]:
-    """All scans that are named by one library share its classifier: for most it is the simulated library."""
-    from tests.support.products import keep_classifiers
-
-    with keep_classifiers():
-        yield
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _classifiers_of_rooms(request: pytest.FixtureRequest) -> None:
-    if request.path.parent.name in NAMING:
-        request.getfixturevalue("_kept_classifiers")
-
-
 @pytest.fixture(scope="session")
 def rig() -> Instrument:
     """The published rig. Folders whose tests need another one have a fixture of the same name."""

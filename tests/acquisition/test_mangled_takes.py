@@ -1,7 +1,7 @@
 """Takes of rows with every trouble of radar, wires, card and network: what is kept is right or masked.
 
 Each take goes the way of a scan's: placed by counters, its frames compared with the pulses, committed if it is whole,
-else kept as with `--keep-incomplete`. 500 takes; `--long` takes 10,000 (MANGLED_FIRST: the first seed of a piece).
+else kept as with `--keep-incomplete`. 250 takes; `--long` takes 10,000 (MANGLED_FIRST: the first seed of a piece).
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def wrong_bytes(kept: Kept, sent: Sent) -> int:
 def test_no_wrong_byte_is_kept(request: pytest.FixtureRequest):
     """A whole row may hold one in frames that the manifest says were not seen at their pulses; a kept row none."""
     first = int(os.environ.get("MANGLED_FIRST", "0"))
-    for seed in range(first, first + (5_000 if request.config.getoption("--long") else 250)):
+    for seed in range(first, first + (5_000 if request.config.getoption("--long") else 125)):
         for troubles, take, sent, frame in takes(seed):
             wrong = wrong_bytes(take, sent)
             assert wrong <= (take.untimed * frame if take.whole else 0), (

@@ -30,7 +30,7 @@ FILES = (
     "scan", "scan/raw", "scan/products", "scan/manifest.jsonl", "scan/products/image.npz", "text.txt", "random.bin",
     "empty", "array.npz", "damaged.toml", "instrument.toml", "/dev/null", "no folder/no file",
 )  # fmt: skip
-CASES = 120
+CASES = 60
 CASES_LONG = 500  # for each command
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import struct
 import zlib
 from collections.abc import Iterator
@@ -15,8 +14,6 @@ import pytest
 from matplotlib.figure import Figure
 
 from polysight.imaging import Images
-from polysight.materials import Classifier, Library
-from polysight.process import inputs
 from polysight.products import ProcessedScan, write_image, write_json
 from polysight.products.processed import Computed
 from polysight.results import ScanFacts, ScanMaterials, ScanQuality
@@ -110,22 +107,6 @@ PIXEL = (
     + _chunk(b"IEND", b"")
 )
 """A PNG of one pixel."""
-
-
-@contextmanager
-def keep_classifiers() -> Iterator[None]:
-    """Fit each library once: the fit takes a fifth of a second, as long as a small scan's images."""
-    kept: dict[tuple[object, ...], Classifier] = {}
-
-    def fit_once(library: Library, **options: Any) -> Classifier:
-        key = (pickle.dumps(library), *(repr(option) for option in sorted(options.items())))
-        if key not in kept:
-            kept[key] = Classifier(library, **options)
-        return kept[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(inputs, "Classifier", fit_once)
-        yield
 
 
 @contextmanager

@@ -33,6 +33,28 @@ def test_a_place_tells_its_own_pixel(processed):
     assert any(near.name.startswith("PET") and near.sigmas < 2 for near in answer.nearest)
 
 
+def test_the_image_ends_half_a_pixel_beyond_its_outermost_pixels(processed):
+    pixels = Pixels(processed / "one" / "products")
+    rows, columns = pixels.p.shape
+    pixel_mm = pixels.x_mm[1] - pixels.x_mm[0]
+    left, right, low, high = pixels.extent_mm
+    assert right - left == pytest.approx(columns * pixel_mm)
+    assert high - low == pytest.approx(rows * (pixels.y_mm[1] - pixels.y_mm[0]))
+    assert left == pytest.approx(pixels.x_mm[0] - pixel_mm / 2)
+    inside_mm = 0.01
+    assert pixels.nearest(left + inside_mm, low + inside_mm) == (0, 0)
+    assert pixels.nearest(right - inside_mm, high - inside_mm) == (rows - 1, columns - 1)
+    middle_x, middle_y = (left + right) / 2, (low + high) / 2
+    for place in (
+        (left - inside_mm, middle_y),
+        (right + inside_mm, middle_y),
+        (middle_x, low - inside_mm),
+        (middle_x, high + inside_mm),
+    ):
+        with refused(ErrorCode.VALUE_INVALID, "outside the image"):
+            pixels.nearest(*place)
+
+
 def test_the_error_of_a_pixel_is_that_of_draws(processed):
     """Of P as it is drawn with its standard deviation, in each part."""
     pixels = Pixels(processed / "one" / "products")

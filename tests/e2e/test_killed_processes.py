@@ -296,11 +296,11 @@ def test_products_of_a_killed_scan(killed_rig: Killed):
 def test_pi_is_lost_with_its_journal(killed_rig: Killed):
     """Without a Pi the error says so; a Pi with an empty card goes on behind what the host has, and the host tells."""
     folder = killed_rig.rig.folder / "lost"
-    scan = killed_rig.scan(folder)
-    killed_rig.rig.wait_for(lambda: scan.process.poll() is not None or len(list_committed(folder)) >= 2, "two rows")
-    killed_rig.rig.pi.kill()
-    ended = scan.wait()
+    # It dies by itself: on a busy machine the scan may end before a test that looks at its rows kills it.
+    killed_rig.restart_pi([("fsync", ".journal", 6)])
+    ended = killed_rig.scan(folder).wait()
     assert ended.status == 5
+    assert 0 < len(list_committed(folder)) < ROWS
     assert ended.message.startswith("polysight scan: the Pi at tcp://")
     assert "polysight-pi" in ended.message
     safe_before = safe(folder, killed_rig.rows)

@@ -327,7 +327,8 @@ def test_a_record_bounds_what_the_controller_did(late_ns):
     assert abs(record.first_ns - first) <= record.jitter_ns
     assert record.last_ns - record.first_ns == 15 * 1_500_000
     assert 1000 <= record.width_max_ns <= 1010
-    assert record.jitter_ns <= late_ns
+    # Half of what the call took beyond the burst: it may have been spent before the burst or behind it.
+    assert record.jitter_ns <= late_ns / 2 + burst.bit_ns
 
 
 def test_no_position_is_lost_to_a_width_fault():

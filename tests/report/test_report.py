@@ -232,6 +232,12 @@ def test_one_material_has_one_colour(scan):
     assert len(set(table.values())) == len(table)
 
 
+def test_a_heading_keeps_every_word_but_std():
+    assert format_heading("RH if_hz") == "RH IF (Hz)"
+    assert format_heading("zeta_std_width_mm") == "zeta width (mm)"
+    assert format_heading("std_turn") == "turn"
+
+
 def test_numbers_read_well():
     assert format_value(268800) == "268\u202f800"
     assert format_value(16) == "16"

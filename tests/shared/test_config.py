@@ -8,7 +8,7 @@ import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 
-from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.config import Instrument, Section, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import no_such
 from polysight_shared.geometry import direct_path_m, incidence_deg, rx_positions_m, specular_midpoint_m, tx_position_m
@@ -19,6 +19,14 @@ def test_the_published_rig_survives_toml(rig: Instrument, tmp_path: Path):
     path = tmp_path / "copy.toml"
     path.write_text(tomli_w.dumps(to_builtins(rig)))
     assert load_instrument(path) == rig
+
+
+def test_no_section_of_the_rig_can_be_changed(rig: Instrument):
+    sections = [getattr(rig, name) for name in rig.__struct_fields__]
+    for section in (rig, *(s for s in sections if isinstance(s, Section))):
+        for name in section.__struct_fields__:
+            with pytest.raises(AttributeError):
+                setattr(section, name, getattr(section, name))
 
 
 def test_published_chirp(rig: Instrument):

@@ -1,0 +1,33 @@
+"""Boards that send nothing although bursts were sent are told once bursts enough to fill two packets are long past."""
+
+import time
+from types import SimpleNamespace
+
+import pytest
+from tests.support.rigs import rig_with
+
+from polysight.acquisition.row import _SilenceCheck
+
+NS_PER_S = 1_000_000_000
+
+
+def find_silent(rig, received: dict[str, int], bursts: int, age_s: float) -> list[str]:
+    """Boards told as silent, of a row whose bursts came at one moment, that long ago."""
+    progress = {name: SimpleNamespace(received=count) for name, count in received.items()}
+    check = _SilenceCheck(rig, SimpleNamespace(reports=lambda: progress))
+    event = SimpleNamespace(received_ns=time.monotonic_ns() - int(age_s * NS_PER_S))
+    return check.find_silent_boards([event] * bursts)
+
+
+@pytest.mark.parametrize("pulses", [1, 2, 16])
+def test_a_board_is_silent_when_it_sent_nothing_of_two_packets(pulses):
+    rig = rig_with(burst={"pulses": pulses})
+    two_packets_bytes = 2 * rig.card.packet_bytes
+    burst_bytes = pulses * rig.frame_bytes
+    enough = next(count for count in range(1, 100) if count * burst_bytes >= two_packets_bytes)
+    long_ago_s = rig.limits.end_of_record_s + 10
+    assert find_silent(rig, {"RH": 0, "RV": 1}, enough, long_ago_s) == ["RH"]
+    assert find_silent(rig, {"RH": 0, "RV": 0}, enough + 5, long_ago_s) == ["RH", "RV"]
+    assert find_silent(rig, {"RH": 1, "RV": 1}, enough, long_ago_s) == []
+    assert find_silent(rig, {"RH": 0, "RV": 0}, enough - 1, long_ago_s) == []
+    assert find_silent(rig, {"RH": 0, "RV": 0}, enough, age_s=0.0) == []

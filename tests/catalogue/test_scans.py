@@ -13,6 +13,7 @@ from tests.support.products import judged_products
 from tests.support.store.facts import facts_of
 
 from polysight.catalogue import NOTES, Notes, Scans, read_notes, scans, write_notes
+from polysight.catalogue.scans import is_scan
 from polysight.store import MANIFEST, ScanFolder, manifest
 from polysight_shared import files
 from polysight_shared.errors import ConfigError, DataError
@@ -31,6 +32,14 @@ def root(processed: Path, tmp_path: Path) -> Path:
     judged_products(tmp_path / "out" / "one", "none")
     (tmp_path / "empty").mkdir()
     return tmp_path
+
+
+def test_a_folder_that_cannot_be_looked_into_holds_no_scan(tmp_path, monkeypatch):
+    def refuse(path: Path) -> bool:
+        raise PermissionError(path)
+
+    monkeypatch.setattr(Path, "exists", refuse)
+    assert not is_scan(tmp_path)
 
 
 def test_every_scan_is_listed_with_its_state(root):

@@ -45,8 +45,13 @@ def test_text_and_json_have_the_same_plan(capsys):
 
 @pytest.mark.parametrize(
     ("options", "status"),
-    [([*SMALL, "--speed-mm-s", "100"], 1), (["--minutes", "0.5"], 1), (["--width-mm", "5000"], 2)],
-    ids=["refused plan", "no plan", "broken rule"],
+    [
+        ([*SMALL, "--speed-mm-s", "100"], 1),
+        (["--minutes", "0.5"], 1),
+        (["--width-mm", "5000"], 2),
+        (["--step-x-mm", "5e-324"], 2),
+    ],
+    ids=["refused plan", "no plan", "broken rule", "endless steps"],
 )
 def test_a_plan_that_is_impossible_fails(options, status):
     assert main(["plan", *RIG, *options]) == status

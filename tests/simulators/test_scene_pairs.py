@@ -70,8 +70,12 @@ def change_scene(scene: dict[str, Any], path: Path_, value: Any) -> dict[str, An
     node: Any = scene
     with contextlib.suppress(LookupError, TypeError, AttributeError):
         for part in path[:-1]:
+            if isinstance(node, dict) and not isinstance(part, str):
+                return scene
             node = node.setdefault(part, {}) if isinstance(node, dict) else node[part]
-        node[path[-1]] = value
+        # A position in a list means nothing in a table.
+        if isinstance(node, dict) == isinstance(path[-1], str):
+            node[path[-1]] = value
     return scene
 
 

@@ -627,5 +627,7 @@ def _is_name(part: str) -> bool:
 
 
 def is_scan(path: Path) -> bool:
-    """True if a folder holds a scan, products, or programs that a page started."""
-    return any((path / name).exists() for name in (MANIFEST, IMAGE, PROGRAM))
+    """True if a folder holds a scan, products, or programs that a page started; one that cannot be looked into is none."""
+    with suppress(OSError):
+        return any((path / name).exists() for name in (MANIFEST, IMAGE, PROGRAM))
+    return False

@@ -93,7 +93,15 @@ class Changes:
             step = f"step_{axis}_mm"
             extent = size or (grid[count] - 1) * grid[step]
             grid[step] = getattr(self, step) or grid[step]
-            grid[count] = getattr(self, count) or 1 + round(extent / grid[step])
+            steps = extent / grid[step]
+            if not math.isfinite(steps):
+                raise ConfigError(
+                    f"{extent:g} mm in steps of {grid[step]:g} mm",
+                    "their number is beyond any scan",
+                    "plan a wider step",
+                    code=ErrorCode.VALUE_INVALID,
+                )
+            grid[count] = getattr(self, count) or 1 + round(steps)
         if min(grid["columns"], grid["rows"]) < 2:
             raise ConfigError(
                 f"{grid['columns']} x {grid['rows']} positions",

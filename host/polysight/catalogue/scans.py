@@ -627,7 +627,7 @@ def _is_name(part: str) -> bool:
 
 
 def is_scan(path: Path) -> bool:
-    """True if a folder holds a scan, products, or programs that a page started; one that cannot be looked into is none."""
+    """True if a folder holds a scan, products, or programs that a page started; False if it cannot be looked into."""
     with suppress(OSError):
         return any((path / name).exists() for name in (MANIFEST, IMAGE, PROGRAM))
     return False

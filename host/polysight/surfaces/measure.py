@@ -14,7 +14,7 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.surfaces.optics import Optics
-from polysight.surfaces.paths import STRIDE_M, Echoes, Samples, find_echoes, measure_echoes
+from polysight.surfaces.paths import STRIDE_M, WINDOW_M, Echoes, Samples, find_echoes, measure_echoes
 from polysight.surfaces.points import (
     find_curvature,
     find_normals,
@@ -22,6 +22,7 @@ from polysight.surfaces.points import (
     locate,
     predict_echo,
 )
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Array = NDArray[np.float64]
 # Points and normals of neighbouring windows that belong to one surface differ by no more.
@@ -40,6 +41,13 @@ MIN_RADIUS_M = 0.012
 NEAREST_M = 0.2
 FARTHEST_M = 1.4
 MAX_SLOPE = 0.6
+# Two echoes of a window closer than this many resolution cells, in slope and path together, disturb each other's path
+# and amplitude: a pipe 150 mm beside a bottle is one cell away from it, and both scatter by 5 dB.
+MIN_CELLS_APART = 1.5
+# An echo below this share of the other does not count: edges of a plate are half as strong as its mirror point at most.
+DISTURBING_SHARE = 0.5
+# Offsets of the stage closer than this are of one window.
+SAME_WINDOW_M = 1e-4
 # An echo below so many standard deviations of its noise has no usable slope.
 MIN_AMPLITUDE_STDS = 5
 
@@ -86,6 +94,8 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
     """Find the specular points of a scan in H, and measure the same points in V."""
     echoes = find_echoes(h, gate_m)
     echoes = echoes[_is_sound(echoes, find_shape(echoes, optics))]
+    bandwidth_hz = float(np.ptp(h.frequencies_hz))
+    echoes = echoes[~find_crowded(echoes, optics.wave_number, bandwidth_hz)]
     segment = group_echoes(echoes, optics)
     echoes = echoes[segment >= 0]
     segment = segment[segment >= 0]
@@ -109,6 +119,21 @@ def _is_sound(echoes: Echoes, shape: Shape) -> NDArray[np.bool_]:
     in_view = np.abs(echoes.slope).max(axis=1) < MAX_SLOPE
     above_noise = np.abs(echoes.amplitude) > MIN_AMPLITUDE_STDS * echoes.amplitude_std
     return in_range & in_view & above_noise
+
+
+def find_crowded(echoes: Echoes, wave_number: float, bandwidth_hz: float) -> NDArray[np.bool_]:
+    """True for echoes [n] that another echo of the same window disturbs: the window hardly resolves both."""
+    slope_cell = 2 * np.pi / wave_number / WINDOW_M
+    path_cell_m = SPEED_OF_LIGHT_M_S / bandwidth_hz
+    places = np.column_stack([echoes.slope / slope_cell, echoes.path_m / path_cell_m])
+    level = np.abs(echoes.amplitude)
+    pairs = scipy.spatial.KDTree(echoes.at_m).query_pairs(SAME_WINDOW_M, output_type="ndarray")
+    crowded = np.zeros(len(echoes), bool)
+    for first, second in (pairs.T, pairs.T[::-1]):
+        is_near = np.linalg.norm(places[first] - places[second], axis=1) < MIN_CELLS_APART
+        is_strong = level[second] > DISTURBING_SHARE * level[first]
+        crowded[first[is_near & is_strong]] = True
+    return crowded
 
 
 def _is_wide(shape: Shape) -> NDArray[np.bool_]:

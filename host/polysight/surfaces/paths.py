@@ -25,7 +25,7 @@ STRIDE_M = 0.008
 MAX_SLOPE = 0.47
 # Bins of the coarse search per resolution cell.
 SLOPE_BINS = 19
-MAX_ECHOES = 3
+MAX_ECHOES = 5
 # Share of a window's power that a plane wave explains; noise alone gives 0.01.
 MIN_SHARE = 0.05
 # What is left after the stronger echoes: a sphere before a table that is 16 dB brighter has 0.025.

@@ -272,7 +272,9 @@ TWO_TONE_SNR_DB = 16.0
 
 def run(args: argparse.Namespace) -> int:
     rig, _ = published_scene(args.quick)
-    few = 20 if args.quick else 1
+    few = 1
+    if args.quick:
+        few = 20
     with one_core():
         aligned = [alignment(rig, snr, positions=240 // few) for snr in ALIGN_SNR_DB]
         tones = {snr: one_tone(snr, trials=30_000 // few) for snr in TONE_SNR_DB}

@@ -149,6 +149,9 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
     measured = None
     if rng.random() < 0.5:
         measured = 0.003
+    specimen_spread = [0.03, 0.3]
+    if kind == "named":
+        specimen_spread = [0.0, 0.0]
     if kind == "sheet":
         sheet = int(rng.choice([i for i in range(len(plates)) if i != metal]))
         plates[sheet] |= {"thickness_mm": rng.uniform(0.5, 5)}
@@ -159,7 +162,7 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
             "grid": GRID,
             "object_distance_mm": 499.0,
             "image": {"columns": 116, "rows": 90},
-            "specimen_spread": [0.0, 0.0] if kind == "named" else [0.03, 0.3],
+            "specimen_spread": specimen_spread,
             "plane_shift_mm": rng.uniform(-10, 10),
             "plane_tilt_deg": (rng.uniform(-1, 1, 2) * (not tilted)).tolist(),
             "plates": [] if kind in ("empty", "noise") else plates,
@@ -340,11 +343,9 @@ def run(args: argparse.Namespace) -> int:
     out["raw"] = _table(raw, "all, from raw data")
     for name in CLASSES:
         out[name] = _table([r for r in rows if r.kind == name], f"  {name}")
-    for measured in (True, False):
-        title = f"  leakage {'measured' if measured else 'not measured'}"
+    for measured, title in ((True, "  leakage measured"), (False, "  leakage not measured")):
         out[title.strip()] = _table([r for r in rows if r.leakage_measured == measured], title)
-    for inside in (True, False):
-        title = f"  metal {'in the scene' if inside else 'scanned on its own'}"
+    for inside, title in ((True, "  metal in the scene"), (False, "  metal scanned on its own")):
         out[title.strip()] = _table([r for r in rows if r.metal_in_scene == inside], title)
     out["beside a sheet"] = _table([r for r in thin if not r.sheet], "  beside a thin sheet, undeclared")
     out["sheet"] = _table([r for r in thin if r.sheet], "  the sheet itself, as a half space")

@@ -39,8 +39,11 @@ QUICK = {"columns": 40, "rows": 20}
 
 def published_scene(quick: bool = False, **grid: Any) -> tuple[Instrument, Scene]:
     """The published rig and grid in front of nine plates; changed, or too small for its figures to mean anything."""
-    image = {"columns": 30, "rows": 30} if quick else {}
-    scene = msgspec.structs.replace(load_scene(SCENE), grid={**(QUICK if quick else {}), **grid}, image=image)
+    image = {}
+    if quick:
+        image = {"columns": 30, "rows": 30}
+        grid = {**QUICK, **grid}
+    scene = msgspec.structs.replace(load_scene(SCENE), grid=grid, image=image)
     return apply_scene(load_instrument(RIG), scene), scene
 
 
@@ -139,7 +142,9 @@ def point_row(
     Phase +2 pi f d / c with d the excess path, as after perfect synchronisation.
     """
     offsets = row_offsets_m(rig, row)
-    shift = np.pad(offsets if chosen is None else offsets[chosen], ((0, 0), (0, 1)))
+    if chosen is not None:
+        offsets = offsets[chosen]
+    shift = np.pad(offsets, ((0, 0), (0, 1)))
     offset_m = points_m[None] - shift[:, None]
     path = antennas.excess_m(offset_m[..., 0], offset_m[..., 1], offset_m[..., 2])
     return np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * path[..., None] * frequencies_hz).sum(axis=2)

@@ -100,10 +100,12 @@ def draw_scene(rng: np.random.Generator, kind: str, first: int) -> World:
     world = draw_world(rng, centre, materials=stacks, half_spaces=True)
     if kind != "dishes":
         return world
-    plates = [
-        plate if plate.stack.is_metal else dish(plate.name, plate.centre_m, 0.046, plate.stack.below, wall_m=3e-3)
-        for plate in world.plates
-    ]
+    plates = []
+    for plate in world.plates:
+        if plate.stack.is_metal:
+            plates.append(plate)
+        else:
+            plates.append(dish(plate.name, plate.centre_m, 0.046, plate.stack.below, wall_m=3e-3))
     return replace(world, plates=tuple(plates))
 
 
@@ -187,5 +189,8 @@ def run(args: argparse.Namespace) -> int:
                 print(format_line(f"{kind}, {nuisance}", pieces), flush=True)
                 for p in pieces:
                     if (p.source == "library" and p.confidence >= 0.8) or p.misled:
-                        print(f"  {p.material}: {p.name} {p.confidence:.2f}{', value misled' if p.misled else ''}")
+                        remark = ""
+                        if p.misled:
+                            remark = ", value misled"
+                        print(f"  {p.material}: {p.name} {p.confidence:.2f}{remark}")
     return 0

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from benchmarks.data import published_scene, temporary, write_point_cube
 from benchmarks.image import Image, worst
 from benchmarks.measure import add_arguments as add_common
-from benchmarks.measure import one_core, write
+from benchmarks.measure import count_repeats, one_core, write
 from polysight.imaging import spectral
 from polysight.imaging.direct import DirectImager
 from polysight.imaging.geometry import Antennas, Aperture, image_grid, scan_offsets_m
@@ -62,11 +62,12 @@ class Library:
 
     def to_numpy(self, array: Any) -> NDArray[np.complexfloating]:
         """Copy an array to host memory."""
+        # PyTorch has `cpu`, CuPy has `get`.
         if hasattr(array, "cpu"):
             array = array.cpu()
-        else:
-            array = array
-        return np.asarray(array.get() if hasattr(array, "get") else array)
+        elif hasattr(array, "get"):
+            array = array.get()
+        return np.asarray(array)
 
 
 def libraries() -> list[Library]:
@@ -171,7 +172,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     rig, _ = published_scene(args.quick)
     board = rig.receivers[0]
-    rounds = 1 if args.quick else ROUNDS
+    rounds = count_repeats(args.quick, ROUNDS)
     figures: dict[str, Any] = {}
     with temporary(args.folder) as folder:
         path = folder / "RH_synced.npy"
@@ -266,11 +267,11 @@ class Figures:
             ),
             "cube on disk to image": wall_seconds(from_cube, FEW),
         }
-        kept: list[Image] = []
+        exact_images: list[Image] = []
         # A GPU idles in the chunks that suit a CPU's cache
         with patch("polysight.imaging.direct._CHUNK", LARGE_CHUNK):
-            seconds["exact sum"] = wall_seconds(lambda: kept.append(exact()), 1)
-        return cls(library.name, seconds, from_samples(), from_cube(), kept[0])
+            seconds["exact sum"] = wall_seconds(lambda: exact_images.append(exact()), 1)
+        return cls(library.name, seconds, from_samples(), from_cube(), exact_images[0])
 
     def differences(self, cpu: Figures) -> dict[str, float]:
         """Return the largest differences of images, of the peak."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.data import as_synced, published_scene, temporary, write_point_cube
-from benchmarks.measure import Line, Seconds, add_arguments, one_core, show, write
+from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, one_core, show, write
 from benchmarks.published import SETTINGS, form_image
 from polysight.imaging import ImageBuilder
 from polysight.imaging import spectral as kernels
@@ -45,7 +45,9 @@ class Bench:
         samples = ImageBuilder(self.rig, live=live).boards[self.board.name]
         for row, met in self._rows():
             samples.add_row(row, as_synced(self.rig, met))
-        return (samples.current() if live else samples.image())[0]
+        if live:
+            return samples.current()[0]
+        return samples.image()[0]
 
     def _rows(self) -> Iterator[tuple[int, NDArray[np.complex64]]]:
         """Rows [rx, position, sample] as met, read into one buffer: fresh pages for each would cost more."""
@@ -71,7 +73,7 @@ class Bench:
         return Aperture(antennas, scan_offsets_m(self.rig), gate.frequencies_hz, grid), samples
 
     def ours_cold(self) -> Image:
-        """The same without any kernel kept from before."""
+        """The same without any kernel images from before."""
         kernels.forget()
         return self.ours()
 
@@ -180,25 +182,25 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
     weights = np.ones(samples.shape[2:], np.float32)
     mirror = np.ones(samples.shape[:2], np.complex64)
     starts = row_starts_m(aperture.offsets_m)
-    kept: dict[str, Image] = {}
+    images: dict[str, Image] = {}
 
     def by_row() -> None:
         imager = IncrementalImager(aperture, mirror)
         for row, start in enumerate(starts):
             imager.add_row(row, samples[:, :, row] * weights[row], weights[row], float(start))
         imager.constant_of_sum()
-        kept["rows"] = imager.image_of_sum(np.ones(len(samples)))
+        images["rows"] = imager.image_of_sum(np.ones(len(samples)))
 
     def image_batch() -> None:
         imager, _ = choose_imager(aperture)
         imager.constant(mirror, weights)
-        kept["batch"] = imager.image(samples * weights)
+        images["batch"] = imager.image(samples * weights)
 
     jobs = {
         "rows": by_row,
         "batch": image_batch,
-        "rows from disk": lambda: kept.update(live=bench.ours(live=True)),
-        "batch from disk": lambda: kept.update(whole=bench.ours()),
+        "rows from disk": lambda: images.update(live=bench.ours(live=True)),
+        "batch from disk": lambda: images.update(whole=bench.ours()),
     }
     for job in jobs.values():
         job()
@@ -213,7 +215,7 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
         name = f"all row updates in batch images, both from {placement}"
         note = f"{1e3 * ours / len(starts):.2f} ms a row"
         lines.append(Line(name, f"{ours:.3f} s", f"{theirs:.3f} s", ours / theirs, *limits, False, note))
-    difference = max(worst(kept["rows"], kept["batch"]), worst(kept["live"], kept["whole"]))
+    difference = max(worst(images["rows"], images["batch"]), worst(images["live"], images["whole"]))
     lines.append(
         Line(
             quantity="row by row against batch, of the peak",
@@ -231,15 +233,15 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
 def run(args: argparse.Namespace) -> int:
     rig, _ = published_scene(args.quick)
     lines: list[Line] = []
-    more: dict[str, Any] = {}
+    figures_of_parts: dict[str, Any] = {}
     with temporary(args.folder) as folder, one_core():
         path = folder / "cube.npy"
         write_point_cube(path, rig, rig.receivers[0])
         bench = Bench(rig, rig.receivers[0], path)
         for part in (against_published, against_time_domain, against_batch):
-            line, figures = part(bench, 1 if args.quick else REPEATS)
+            line, figures = part(bench, count_repeats(args.quick, REPEATS))
             lines += line
-            more[part.__name__] = figures
+            figures_of_parts[part.__name__] = figures
     show(f"imaging of one board, {rig.grid.rows} x {rig.grid.columns} positions, one core", lines, args.quick)
-    write(args.json, "image", lines, **more)
+    write(args.json, "image", lines, **figures_of_parts)
     return 0

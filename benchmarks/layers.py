@@ -22,6 +22,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.coverage import CHI2_68, CHI2_95, GRID, PLACES, Cubes
 from polysight.data import find_packaged
@@ -63,7 +64,7 @@ class Case:
     setting: Setting
     permittivity: tuple[float, float]
     thickness_mm: float
-    found: tuple[float, float] | None = None
+    fitted: tuple[float, float] | None = None
     found_mm: float | None = None
     error: float = float("nan")
     thickness_error: float = 0.0
@@ -168,7 +169,9 @@ def given_stack(plate: Plate, within: float | None = None) -> list[Layer]:
     if plate.name.startswith(KINDS[1]):
         behind = [Layer("metal", METAL)]
     size = (plate.layers[0].thickness_mm or 0.0) / 1e3
-    limits = RANGE_M if within is None else ((1 - within) * size, (1 + within) * size)
+    limits = RANGE_M
+    if within is not None:
+        limits = ((1 - within) * size, (1 + within) * size)
     return [Layer("sheet", thickness_range_m=limits), *behind]
 
 
@@ -191,7 +194,7 @@ def judge_fit(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -
         setting=setting,
         permittivity=true,
         thickness_mm=size_mm,
-        found=(fit.permittivity.real, -fit.permittivity.imag),
+        fitted=(fit.permittivity.real, -fit.permittivity.imag),
         found_mm=found_mm,
         error=float(np.hypot(*difference) / np.hypot(*true)),
         thickness_error=abs(found_mm / size_mm - 1) if size_mm else 0.0,
@@ -224,9 +227,15 @@ def cases(seeds: Sequence[int]) -> list[Case]:
     return out
 
 
+def _mean_or_nan(flags: NDArray[np.bool_]) -> float:
+    if flags.size == 0:
+        return float("nan")
+    return float(np.mean(flags))
+
+
 def table(rows: list[Case], title: str) -> dict[str, float]:
     """Print and return the shares of one kind of stack."""
-    fits = [r for r in rows if r.found is not None]
+    fits = [r for r in rows if r.fitted is not None]
     everywhere = np.array([r.distance2 for r in fits if not r.rivals])
     sure = [r for r in fits if not r.flagged]
     if not fits:
@@ -239,10 +248,10 @@ def table(rows: list[Case], title: str) -> dict[str, float]:
         "ambiguous": float(np.mean([r.flagged for r in fits])),
         "rivals": float(np.mean([r.rivals > 0 for r in fits])),
         "wrong, not flagged": float(sum(not r.right for r in sure)),
-        "in_68, no rivals": float(np.mean(everywhere < CHI2_68)) if everywhere.size else float("nan"),
-        "in_95, no rivals": float(np.mean(everywhere < CHI2_95)) if everywhere.size else float("nan"),
-        "in_68": float(np.mean(d < CHI2_68)) if sure else float("nan"),
-        "in_95": float(np.mean(d < CHI2_95)) if sure else float("nan"),
+        "in_68, no rivals": _mean_or_nan(everywhere < CHI2_68),
+        "in_95, no rivals": _mean_or_nan(everywhere < CHI2_95),
+        "in_68": _mean_or_nan(d < CHI2_68),
+        "in_95": _mean_or_nan(d < CHI2_95),
         "median_std": float(np.median([r.relative_std for r in fits])),
         "median_error": float(np.median([max(r.error, r.thickness_error) for r in fits])),
         "unexplained": float(np.mean([r.unexplained for r in fits])),

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
@@ -70,14 +70,11 @@ class Seconds:
         return statistics.median(self.wall)
 
 
-def alternate(jobs: dict[str, Callable[[], Any]], repeats: int) -> dict[str, Seconds]:
-    """Run the jobs in turn, `repeats` rounds after one that warms caches and is not counted."""
-    seconds = {name: Seconds() for name in jobs}
-    for turn in range(repeats + 1):
-        for name, job in jobs.items():
-            with (seconds[name] if turn else Seconds()).time_block():
-                job()
-    return seconds
+def count_repeats(quick: bool, usual: int) -> int:
+    """Number of repeats of a measurement: a quick trial only shows that it runs."""
+    if quick:
+        return 1
+    return usual
 
 
 class AnonymousMemory:

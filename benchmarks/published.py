@@ -221,7 +221,9 @@ def form_image(
         if not tuned:
             image += np.asarray(scipy.fft.ifft2(total))[window]
             total[:] = 0
-    return np.asarray(scipy.fft.ifft2(total))[window] if tuned else image
+    if tuned:
+        return np.asarray(scipy.fft.ifft2(total))[window]
+    return image
 
 
 def _lattice(axis_m: NDArray[np.float64], positions: int) -> NDArray[np.float64]:

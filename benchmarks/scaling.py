@@ -38,8 +38,11 @@ def run(args: argparse.Namespace) -> int:
         print(
             "   grid  columns  rows  steps, mm  positions   CPU s  us a position  last row to image  anonymous memory"
         )
+        largest = args.largest
+        if args.quick:
+            largest = 0.25
         for size, (columns, count, step_x, step_y) in SIZES.items():
-            if size > (0.25 if args.quick else args.largest):
+            if size > largest:
                 break
             grid = {"columns": columns, "rows": count, "step_x_mm": step_x, "step_y_mm": step_y}
             chain = Chain(folder, "batch", {"files": files, "grid": grid})

@@ -73,7 +73,7 @@ DISTURBANCES: dict[str, dict[str, float]] = {
     "all": {"misplaced_mm": 1.0, "axes_deg": 2.0, "leakage": 0.05},
 }
 # Standard errors that the host is told: those of the disturbance (each axis of a place, each part of a leakage), and
-# what a rig that stands as its file says is known to.
+# what a rig that stands as its file says is numbers to.
 EXACT = Uncertainty(leakage=0.001, axis_rad=0.001, place_m=0.00001)
 PLACES = {"place_m": 0.001 / np.sqrt(3)}
 AXES = {"axis_rad": float(np.radians(2.0))}
@@ -106,7 +106,7 @@ class ObjectFigures:
     `normals_inside`, `places_inside`: shares of points whose own 95 % regions hold the surface. `distance2`: squared
     distance of the true permittivity in the region of the object; `points_inside`: share of points whose own region
     holds it. `normal_68_deg`, `point_68_mm`, `point_error_68`: 68th percentiles over the object's points. Figures are
-    None where nothing was seen or given.
+    None where nothing was seen_objects or given.
     """
 
     kind: str
@@ -144,7 +144,10 @@ class ScanKind:
     @property
     def offsets_m(self) -> NDArray:
         """Stage offsets [row, column, 3]."""
-        return scan_offsets(self.columns, self.rows, every=QUICK_STEP if self.is_quick else 1)
+        every = 1
+        if self.is_quick:
+            every = QUICK_STEP
+        return scan_offsets(self.columns, self.rows, every=every)
 
     @property
     def boards(self) -> Boards:
@@ -167,7 +170,9 @@ class ScanKind:
     @property
     def noise(self) -> float:
         """Noise of a sample over the nominal one: a quick scan has fewer positions and RX to average over."""
-        return 0.25 if self.is_quick else 1.0
+        if self.is_quick:
+            return 0.25
+        return 1.0
 
 
 def see_shapes(shapes: Sequence[Shape], nuisances: ShapeNuisances, scan: ScanKind, number: int) -> Seen:
@@ -192,7 +197,7 @@ def see_reference(nuisances: ShapeNuisances, scan: ScanKind) -> Seen:
 
 
 def analyse_shapes(
-    scene: ShapeScene, nuisances: ShapeNuisances, known: Uncertainty, scan: ScanKind
+    scene: ShapeScene, nuisances: ShapeNuisances, numbers: Uncertainty, scan: ScanKind
 ) -> tuple[Surface, float]:
     """Scan a scene and its reference; return what the host finds, and the seconds of CPU that its analysis took."""
     metal = see_reference(nuisances, scan)
@@ -202,7 +207,7 @@ def analyse_shapes(
 
     points = see_shapes((*scene.shapes, *scene.background), nuisances, scan, number=2)
     started = time.process_time()
-    surface = analyse_surface(points, scan.optics, reference, uncertainty=known, simulated=True)
+    surface = analyse_surface(points, scan.optics, reference, uncertainty=numbers, simulated=True)
     return surface, time.process_time() - started
 
 
@@ -220,14 +225,19 @@ def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> Obje
     for shape in scene.background:
         away_from_shape = np.abs(shape.project(surface.points_m)[0])
         background |= away_from_shape < STRAY_M
-        # A table that touches the object's back holds no points of the object: its front alone is seen.
+        # A table that touches the object's back holds no points of the object: its front alone is seen_objects.
         on_object &= away_from_shape > np.abs(distances)
+    true_real = float("nan")
+    true_loss = float("nan")
+    if scene.permittivity is not None:
+        true_real = scene.permittivity.real
+        true_loss = -scene.permittivity.imag
     figures = ObjectFigures(
         kind=kind,
         seed=seed,
         disturbance=disturbance,
-        true_real=float("nan") if scene.permittivity is None else scene.permittivity.real,
-        true_loss=float("nan") if scene.permittivity is None else -scene.permittivity.imag,
+        true_real=true_real,
+        true_loss=true_loss,
         radius_mm=1000 * scene.radius_m,
         points=int(on_object.sum()),
         stray=int((~on_object & ~background).sum()),
@@ -293,28 +303,32 @@ def _judge(job: tuple[str, int, str, ScanKind]) -> ObjectFigures:
 
 
 def _percentile_68(values: Iterable[float | None]) -> str:
-    """68th percentile of the figures that are known, as a cell of the table."""
-    known = [value for value in values if value is not None]
-    if not known:
+    """68th percentile of the figures that are numbers, as a cell of the table."""
+    numbers = [value for value in values if value is not None]
+    if not numbers:
         return "-"
-    return f"{np.percentile(known, 68, method='inverted_cdf'):.2f}"
+    return f"{np.percentile(numbers, 68, method='inverted_cdf'):.2f}"
 
 
 def _percent(values: Iterable[float | bool | None]) -> str:
-    """Mean of shares that are known, in per cent."""
-    known = [float(value) for value in values if value is not None]
-    if not known:
+    """Mean of shares that are numbers, in per cent."""
+    numbers = [float(value) for value in values if value is not None]
+    if not numbers:
         return "-"
-    return f"{100 * np.mean(known):.0f}"
+    return f"{100 * np.mean(numbers):.0f}"
 
 
 def _in_percent(value: float | None) -> float | None:
-    return None if value is None else 100 * value
+    if value is None:
+        return None
+    return 100 * value
 
 
 def _is_inside(figures: ObjectFigures) -> bool | None:
     """True if the object's 95 % region holds its permittivity; None without a region."""
-    return None if figures.distance2 is None else figures.distance2 < CHI2_95
+    if figures.distance2 is None:
+        return None
+    return figures.distance2 < CHI2_95
 
 
 OBJECTS_HEAD = (
@@ -334,7 +348,9 @@ def format_line(title: str, figures: Sequence[ObjectFigures], limits: tuple[floa
     ]
     cells = [f"{title:<26}{len(figures):>5}"]
     for values, limit in zip(columns, limits or (None, None, None), strict=True):
-        must_hold = "" if limit is None else f"<= {limit:g}"
+        must_hold = ""
+        if limit is not None:
+            must_hold = f"<= {limit:g}"
         cells.append(f"{_percentile_68(values):>8} {must_hold:<7}")
     cells.append(f"{_percent(f.error is not None for f in figures):>9}")
     cells.append(f"{_percent(_is_inside(f) for f in figures):>9}")
@@ -345,16 +361,16 @@ def format_line(title: str, figures: Sequence[ObjectFigures], limits: tuple[floa
 
 def format_points_line(title: str, figures: Sequence[ObjectFigures]) -> str:
     """Return one line of the table of points: 68th percentile over the points of an object, and what regions hold."""
-    seen = [f for f in figures if f.points]
-    cells = [f"{title:<26}{sum(f.points for f in seen):>5}"]
+    seen_objects = [f for f in figures if f.points]
+    cells = [f"{title:<26}{sum(f.points for f in seen_objects):>5}"]
     columns = (
-        ([f.normal_68_deg for f in seen], [f.normals_inside for f in seen]),
-        ([f.point_68_mm for f in seen], [f.places_inside for f in seen]),
-        ([_in_percent(f.point_error_68) for f in seen], [f.points_inside for f in seen]),
+        ([f.normal_68_deg for f in seen_objects], [f.normals_inside for f in seen_objects]),
+        ([f.point_68_mm for f in seen_objects], [f.places_inside for f in seen_objects]),
+        ([_in_percent(f.point_error_68) for f in seen_objects], [f.points_inside for f in seen_objects]),
     )
     for values, inside in columns:
-        known = [value for value in values if value is not None]
-        usual = f"{np.median(known):.2f}" if known else "-"
+        numbers = [value for value in values if value is not None]
+        usual = f"{np.median(numbers):.2f}" if numbers else "-"
         cells.append(f"{usual:>12}{_percent(inside):>9}")
     return "".join(cells)
 

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from benchmarks.data import RepeatedRows, published_scene, recorded_rows, temporary
-from benchmarks.measure import Line, Seconds, add_arguments, one_core, show, write
+from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, one_core, show, write
 from benchmarks.published import Synchroniser
 from polysight.imaging import ImageBuilder
 from polysight.pipeline import Pipeline
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
         for name, rows in recorded_rows(rig, scene, 1).items():
             files[name] = folder / f"{name}.bin"
             rows[0].tofile(files[name])
-        times = measure(rig, files, 1 if args.quick else REPEATS)
+        times = measure(rig, files, count_repeats(args.quick, REPEATS))
     medians = {method: np.median(t, axis=0) for method, t in times.items()}
     lines = []
     for k, stage in enumerate(STAGES):

@@ -117,9 +117,12 @@ def _transfer(shape: tuple[int, ...], cells_mm: NDArray[np.float64], tapered: bo
     """Return the aperture's transfer function [ny, nx] with these half-power widths along x and y."""
     factors = []
     for count, cell_mm in zip(shape[::-1], cells_mm, strict=True):
-        band = (WIDTH_HAMMING if tapered else WIDTH_EVEN) / cell_mm
-        share = np.fft.fftfreq(count, PIXEL_MM) / band
-        taper = 0.54 + 0.46 * np.cos(2 * np.pi * share) if tapered else np.ones(count)
+        if tapered:
+            share = np.fft.fftfreq(count, PIXEL_MM) * cell_mm / WIDTH_HAMMING
+            taper = 0.54 + 0.46 * np.cos(2 * np.pi * share)
+        else:
+            share = np.fft.fftfreq(count, PIXEL_MM) * cell_mm / WIDTH_EVEN
+            taper = np.ones(count)
         factors.append(np.where(np.abs(share) <= 0.5, taper, 0.0))
     return factors[1][:, None] * factors[0][None, :]
 
@@ -157,9 +160,9 @@ def judge_gap(gap_cells: float, same_material: bool, scenes: int, first_seed: in
     plates = separate = strays = 0
     for seed in range(first_seed, first_seed + scenes):
         scene = draw_scene(seed, gap_cells, same_material)
-        found, extra = count_separate(scene)
+        separate_plates, extra = count_separate(scene)
         plates += len(scene.plates)
-        separate += found
+        separate += separate_plates
         strays += extra
     return GapFigures(gap_cells, same_material, plates, separate, strays)
 

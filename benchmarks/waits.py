@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from benchmarks.data import ROOT, SCENE, published_scene, recorded_rows, temporary, write_scan
-from benchmarks.measure import Line, Seconds, add_arguments, show, write
+from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, show, write
 from benchmarks.whole import rows_that_fit
 from polysight.catalogue import Scans
 from polysight.jobs.process import make_products, publish_images
@@ -98,14 +98,19 @@ def command(words: list[str]) -> tuple[float, float]:
 
 def run(args: argparse.Namespace) -> int:
     rig, scene = published_scene(args.quick)
-    repeats = 1 if args.quick else REPEATS
+    repeats = count_repeats(args.quick, REPEATS)
+    most_rows = rig.grid.rows
+    scans_in_list = 200
+    if args.quick:
+        most_rows = 20
+        scans_in_list = 20
     with temporary(args.folder) as folder:
-        count = rows_that_fit(rig, 20 if args.quick else rig.grid.rows, folder)
+        count = rows_that_fit(rig, most_rows, folder)
         write_scan(folder / "scan", rig, recorded_rows(rig, scene, min(4, count)), count)
         behind = [rows_then_products(folder / "scan", folder / f"out{n}") for n in range(repeats)]
         same, other_seconds = from_samples(folder / "scan", repeats)
         products = small_products(folder)
-        first, again = time_list(folder / "scan", products, folder / "many", 20 if args.quick else 200)
+        first, again = time_list(folder / "scan", products, folder / "many", scans_in_list)
         typed = {name: [command(name.format(made=products).split()) for _ in range(repeats)] for name in COMMANDS}
     boards = len(rig.receivers)
     lines = []

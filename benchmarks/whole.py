@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks import sync
 from benchmarks.data import RepeatedRows, published_scene, recorded_rows, temporary, write_scan
-from benchmarks.measure import AnonymousMemory, Child, Line, Seconds, one_core, show, write
+from benchmarks.measure import AnonymousMemory, Child, Line, Seconds, count_repeats, one_core, show, write
 from benchmarks.measure import add_arguments as add_common
 from benchmarks.published import form_image
 from polysight.imaging import image_grid
@@ -131,8 +131,11 @@ class Published:
 
 def run(args: argparse.Namespace) -> int:
     rig, scene = published_scene(args.quick)
+    most_rows = args.rows
+    if args.quick:
+        most_rows = 4
     with temporary(args.folder) as folder, one_core():
-        count = rows_that_fit(rig, 4 if args.quick else args.rows, folder)
+        count = rows_that_fit(rig, most_rows, folder)
         rows = recorded_rows(rig, scene)
         scan = folder / "scan"
         write_scan(scan, rig, rows, count)
@@ -143,7 +146,7 @@ def run(args: argparse.Namespace) -> int:
         ours = []
         theirs = []
         theirs_tuned = []
-        for _ in range(1 if args.quick else args.repeats):
+        for _ in range(count_repeats(args.quick, args.repeats)):
             ours.append(batch.run())
             theirs.append(plain.run())
             theirs_tuned.append(tuned.run())

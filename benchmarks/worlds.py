@@ -396,8 +396,11 @@ def format_line(title: str, scenes: Sequence[SceneFigures]) -> str:
     cells.append(f"{100 * right:>9.1f}")
     for low, high in ((0.5, 0.8), (0.8, 0.95), (0.95, 1.01)):
         named = [p for p in patches if p.name != UNKNOWN and low <= p.confidence < high]
-        said = np.mean([p.confidence for p in named]) if named else np.nan
-        correct = np.mean([p.name == p.material for p in named]) if named else np.nan
+        said = np.nan
+        correct = np.nan
+        if named:
+            said = np.mean([p.confidence for p in named])
+            correct = np.mean([p.name == p.material for p in named])
         cells.append(f"{100 * said:>6.0f}{100 * correct:>4.0f} ({len(named)})")
     return "".join(cells)
 

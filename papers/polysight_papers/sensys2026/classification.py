@@ -38,7 +38,7 @@ from polysight_papers.sensys2026.item import (
     percent,
     published_values,
 )
-from polysight_papers.sensys2026.patches import Errors, calibrated_errors, draw, groups, spread_table
+from polysight_papers.sensys2026.patches import Errors, calibrated_errors, count_draws, draw, groups, spread_table
 
 SECOND_ANGLE_DEG = 55.0
 RESULT = 20
@@ -51,16 +51,12 @@ Panel = tuple[Score, npt.NDArray[np.float64], str]
 TRIALS = 4000
 
 
-def _draws(quick: bool) -> int:
-    return 1 if quick else 3
-
-
 @cache
 def task_samples(task: str, seed: int, quick: bool) -> Samples:
     """Return the pixels of a task of Fig. 18, under one angle, or under both for the task of two angles."""
     name, _, two = task.partition(", ")
     group = groups()[name]
-    errors = calibrated_errors(name, _draws(quick))
+    errors = calibrated_errors(name, count_draws(quick))
     samples = draw(group.materials, group.angle_deg, errors, seed).samples()
     if not two:
         return samples
@@ -76,7 +72,7 @@ def score_simulated(task: str, model: str, channels: str, by_pixel: bool, quick:
 def noise_text(tasks: Iterable[str], quick: bool) -> str:
     """Return a sentence with the calibrated amplitude errors."""
     names = sorted({t.partition(", ")[0] for t in tasks})
-    printed = ", ".join(f"{100 * calibrated_errors(n, _draws(quick)).amplitude:.2f} % ({n})" for n in names)
+    printed = ", ".join(f"{100 * calibrated_errors(n, count_draws(quick)).amplitude:.2f} % ({n})" for n in names)
     phase_std_rad = published_values()["phase_std_rad"]
     return (
         f"Amplitude errors set on H alone: {printed}; phase error {phase_std_rad:g} rad. A scan is one"
@@ -93,12 +89,14 @@ def _angles(task: str) -> tuple[float, ...]:
 
 def chance(quick: bool) -> Table:
     """Return the discriminant's accuracy over further draws of the same noise, beside the Bayes limit."""
+    seeds = OTHER_DRAWS
+    if quick:
+        seeds = OTHER_DRAWS[:2]
     rows = []
     for task in TASKS:
         name = task.partition(", ")[0]
-        seeds = OTHER_DRAWS[: 2 if quick else None]
         scores = [score(task_samples(task, seed, quick), DISCRIMINANT) for seed in seeds]
-        errors = calibrated_errors(name, _draws(quick))
+        errors = calibrated_errors(name, count_draws(quick))
         limits = [
             pixel_bound(groups()[name].materials, _angles(task), errors, reference, pixels)
             for reference, pixels in ((True, 1), (False, 1), (False, 12))
@@ -111,8 +109,8 @@ def chance(quick: bool) -> Table:
     kinds = ("pixel alone", "pixel, scan known", "by patch, scan known")
     head = ("Task", *(f"{k}{w}" for k in kinds for w in (", found", ", bound")))
     caption = (
-        f"The {DISCRIMINANT} with scans left out, mean and spread over {len(OTHER_DRAWS[: 2 if quick else None])} other"
-        " draws; the bound is the best any classifier can do that knows every material's mean and the errors' sizes"
+        f"The {DISCRIMINANT} with scans left out, mean and spread over {len(seeds)} other draws;"
+        " the bound is the best any classifier can do that knows every material's mean and the errors' sizes"
         " (and, where the scan is known, the reference's error)"
     )
     return Table(caption, head, tuple(rows))
@@ -120,8 +118,11 @@ def chance(quick: bool) -> Table:
 
 def unknowns(quick: bool) -> Table:
     """Return the shares called unknown: patches of known materials, and of materials left out of training."""
+    tasks = TASKS
+    if quick:
+        tasks = TASKS[:1]
     rows = []
-    for task in TASKS[:1] if quick else TASKS:
+    for task in tasks:
         drawn = task_samples(task, RESULT, quick)
         missed = score_unseen_materials(drawn, DISCRIMINANT)
         never = [n for n, share in missed.items() if share < 0.5]
@@ -163,12 +164,14 @@ class TaskScores:
     def row(self) -> tuple[str, ...]:
         """Return a line of the table, published shares beside simulated ones."""
         name, _, two = self.task.partition(", ")
-        printed = published_values()["classification"][name]
+        published_h = None
+        if not two:
+            published_h = published_values()["classification"][name]["h_percent"] / 100
         return (
             f"{len(self.knn.names)} {self.task}",
-            percent(None if two else printed["h_percent"] / 100),
+            percent(published_h),
             percent(self.h_pixel.pixels),
-            percent(_published_percent(self.task) / 100),
+            percent(published_percent(self.task) / 100),
             percent(self.knn_pixel.pixels),
             percent(self.knn.pixels),
             percent(self.discriminant_pixel.pixels),
@@ -180,10 +183,10 @@ class TaskScores:
     def to_json(self, quick: bool) -> dict[str, Any]:
         """Return the content of the JSON file."""
         return {
-            "published_percent": _published_percent(self.task),
+            "published_percent": published_percent(self.task),
             "simulated": [asdict(s) for s in (self.knn_pixel, self.knn, self.discriminant_pixel, self.discriminant)],
             "h_only_pixel_split": self.h_pixel.pixels,
-            "errors": asdict(calibrated_errors(self.task.partition(", ")[0], _draws(quick))),
+            "errors": asdict(calibrated_errors(self.task.partition(", ")[0], count_draws(quick))),
         }
 
     def picture(self) -> Picture:
@@ -204,9 +207,13 @@ class TaskScores:
         )
 
 
-def _published_percent(task: str) -> float:
-    name, _, two = task.partition(", ")
-    return published_values()["classification"][name]["two_angles_percent" if two else "all_percent"]
+def published_percent(task: str) -> float:
+    """Return the paper's accuracy with H, V and P; `task` is the name of a group, with ", two angles" for both."""
+    name, _, two_angles = task.partition(", ")
+    published = published_values()["classification"][name]
+    if two_angles:
+        return published["two_angles_percent"]
+    return published["all_percent"]
 
 
 def fig18(run: Run) -> Item:
@@ -308,27 +315,37 @@ def fig20(run: Run) -> Item:
 def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) -> Figure:
     """One panel for each score and matrix, with its title."""
     n = len(materials)
-    many = n > 12
-    fig = new_figure(11.5, 11.0 if many else 4.5)
-    size = 8.0
-    if many:
+    if n > 12:
+        # Large matrices stand two by two, and leave room for a list of confusions.
+        fig = new_figure(11.5, 11.0)
+        axes = fig.subplots(2, 2).ravel()
+        leftmost = (axes[0], axes[2])
         size = 7.5
-    axes = (fig.subplots(2, 2) if many else fig.subplots(1, len(panels), squeeze=False)).ravel()
-    if many:
+        letters_a_line = 60
         axes[3].set_axis_off()
         axes[3].text(0.02, 0.98, _list_confusions(panels[1:]), va="top", fontsize=9, color=INK, linespacing=1.5)
+    else:
+        fig = new_figure(11.5, 4.5)
+        axes = fig.subplots(1, len(panels), squeeze=False).ravel()
+        leftmost = (axes[0],)
+        size = 8.0
+        letters_a_line = 36
     image = None
     for ax, (scored, table, title) in zip(axes[: len(panels)], panels, strict=True):
         order = [scored.names.index(m.name) for m in materials]
         shares = table[np.ix_(order, order)]
         image = ax.imshow(100 * shares, cmap="cividis", vmin=0, vmax=100, interpolation="nearest")
-        first = ax in (axes[0], axes[2] if many else axes[0])
-        lines = [fill(line, 60 if many else 36) for line in title.splitlines()]
-        dress(ax, "\n".join(lines), "named", "true" if first else "")
+        y_title = ""
+        y_labels = [str(m.number) for m in materials]
+        if ax in leftmost:
+            y_title = "true"
+            y_labels = [f"{m.name}  {m.number}" for m in materials]
+        lines = [fill(line, letters_a_line) for line in title.splitlines()]
+        dress(ax, "\n".join(lines), "named", y_title)
         ax.title.set_fontsize(9.5)
         ax.grid(visible=False)
         ax.set_xticks(range(n), [str(m.number) for m in materials], fontsize=size)
-        ax.set_yticks(range(n), [f"{m.name}  {m.number}" if first else str(m.number) for m in materials], fontsize=size)
+        ax.set_yticks(range(n), y_labels, fontsize=size)
         for i, j in zip(*np.nonzero(shares > 0.005), strict=True):
             colour = "w"
             if shares[i, j] > 0.6:

@@ -138,9 +138,11 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
             libraries[IMAGES] = _entries(ours, angles, notices)
     elif images is not None:
         notices.append("images made here are left out: labels/ holds no boxes to look at them with")
-    meaning, sources = _rename_entries(
-        {k: e for k, e in libraries.items() if e}, read_names(names) if names else {}, notices
-    )
+    renames = {}
+    if names:
+        renames = read_names(names)
+    filled_libraries = {source: entries for source, entries in libraries.items() if entries}
+    meaning, sources = _rename_entries(filled_libraries, renames, notices)
     if not sources:
         raise DataError(
             f"{folder}: neither materials/*.pkl nor labels/<scan> with a known material is in it",
@@ -157,7 +159,10 @@ def _readable(read: Callable[[Path], T], paths: Sequence[Path], notices: list[st
         try:
             out.append(read(path))
         except DataError as e:
-            notices.append(f"left out: {e.what} ({e.why})" if e.why else f"left out: {e.what}")
+            notice = f"left out: {e.what}"
+            if e.why:
+                notice += f" ({e.why})"
+            notices.append(notice)
     return out
 
 
@@ -373,7 +378,10 @@ def authors_library(data: AuthorsData) -> Library:
             entries_of_source.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(_without_leakage(e, a, b))
         merged = {**merged, **entries_of_source}
     entries = tuple(e for group in merged.values() for e in group)
-    return Library(entries, {}, f"{'simulated files' if data.simulated else 'files'} of {data.folder.name}")
+    kind = "files"
+    if data.simulated:
+        kind = "simulated files"
+    return Library(entries, {}, f"{kind} of {data.folder.name}")
 
 
 def _without_leakage(entry: Entry, leak_hv: complex, leak_vh: complex) -> Entry:

@@ -31,7 +31,7 @@ from polysight.materials import (
 )
 from polysight.polarimetry import permittivity_from_ratio
 from polysight.report import INK, PALETTE
-from polysight_papers.sensys2026.classification import confusion_figure
+from polysight_papers.sensys2026.classification import confusion_figure, published_percent
 from polysight_papers.sensys2026.dataset import IMAGES, AuthorsData, read_authors
 from polysight_papers.sensys2026.dataset_sugar import authors_fig21
 from polysight_papers.sensys2026.item import (
@@ -167,10 +167,10 @@ class Judgements:
         if key not in self._scores:
             several = select_repeated(samples)
             mixed = score(_split_one_scan(samples), model, channels, by_pixel=True)
-            self._scores[key] = (
-                mixed,
-                (None if several is None else score(several, model, channels, folds=np.unique(several.groups).size)),
-            )
+            scans_left_out = None
+            if several is not None:
+                scans_left_out = score(several, model, channels, folds=np.unique(several.groups).size)
+            self._scores[key] = (mixed, scans_left_out)
         return self._scores[key]
 
 
@@ -206,8 +206,11 @@ def authors_fig18(judge: Judgements) -> Item:
     content = {}
     pictures = {}
     for source, task, samples in judge.list_tasks(TASKS):
-        name, _, two = task.partition(", ")
-        paper = printed[name]["two_angles_percent" if two else "all_percent"] / 100
+        name, _, two_angles = task.partition(", ")
+        paper = published_percent(task) / 100
+        published_h = None
+        if not two_angles:
+            published_h = printed[name]["h_percent"] / 100
         several = select_repeated(samples)
         scores = [s for m in (PAPER, DISCRIMINANT) for s in judge.score(source, task, m)]
         h_only = judge.score(source, task, PAPER, "H")
@@ -220,7 +223,7 @@ def authors_fig18(judge: Judgements) -> Item:
                 f"{names.size} {task}",
                 source,
                 str(np.unique(samples.groups).size),
-                "–" if two else percent(printed[name]["h_percent"] / 100),
+                percent(published_h),
                 *(_share(s) for s in h_only),
                 percent(paper),
                 *(_share(s) for s in scores),
@@ -325,7 +328,9 @@ def _channel_figure(bars: list[tuple[str, list[float]]]) -> Any:
     width = 0.84 / len(bars)
     for k, (label, heights) in enumerate(bars):
         positions = np.arange(len(CHANNELS)) + width * (k - (len(bars) - 1) / 2)
-        hatch = "//" if OPTIMISTIC in label else ""
+        hatch = ""
+        if OPTIMISTIC in label:
+            hatch = "//"
         drawn = ax.bar(positions, heights, 0.92 * width, label=label, color=PALETTE[k], hatch=hatch)
         ax.bar_label(drawn, fmt="%.0f", fontsize=7)
     dress(ax, "Accuracy by channel, weighted KNN of the paper", "", "pixels named right (%)")
@@ -335,8 +340,10 @@ def _channel_figure(bars: list[tuple[str, list[float]]]) -> Any:
     return fig
 
 
-def _share(s: Score | None) -> str:
-    return percent(None if s is None else s.pixels)
+def _share(score_or_none: Score | None) -> str:
+    if score_or_none is None:
+        return percent(None)
+    return percent(score_or_none.pixels)
 
 
 Complex = npt.NDArray[np.complexfloating]

@@ -320,7 +320,11 @@ def fig14(run: Run) -> Item:
         bar.set_label("degrees", fontsize=8)
         for p in patches.values():
             x0, _, x1, y1 = p.patch.box_mm
-            text = f"{p.truth.name.split(' (')[0] if p.truth else ''}\n{np.median(angle[p.patch.interior]) + 0.0:.1f}°"
+            name = ""
+            if p.truth:
+                name = p.truth.name.split(" (")[0]
+            # Adding zero removes the sign of a negative zero.
+            text = f"{name}\n{np.median(angle[p.patch.interior]) + 0.0:.1f}°"
             ax.text((x0 + x1) / 2, y1 + 4, text, ha="center", fontsize=8, color=INK)
     for name, p in patches.items():
         spreads = {c: _spread_deg(v[p.patch.interior]) for c, v in channels.items()}

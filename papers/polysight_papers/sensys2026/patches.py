@@ -169,6 +169,13 @@ def h_accuracy(group: Group, errors: Errors, seeds: tuple[int, ...]) -> float:
     return float(np.mean([score(s, PAPER, "H", by_pixel=True).pixels for s in drawn]))
 
 
+def count_draws(quick: bool) -> int:
+    """Number of draws on which errors are calibrated."""
+    if quick:
+        return 1
+    return 3
+
+
 @cache
 def calibrated_errors(group_name: str, draws: int = 3, shared: float = 0.5) -> Errors:
     """Return the errors with which |H| alone has the published accuracy; V and P are not used.
@@ -223,9 +230,12 @@ def both_angles(group: str, angles_deg: tuple[float, ...], errors: Errors, seed:
 @cache
 def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, float], quick: bool) -> Found:
     """Judge the discriminant on new specimens and scans, and Bayes' rule on the same errors."""
-    errors = replace(calibrated_errors(group, 1 if quick else 3), spread=spread)
+    test_scans = TEST_SCANS
+    if quick:
+        test_scans = 6
+    errors = replace(calibrated_errors(group, count_draws(quick)), spread=spread)
     taught = both_angles(group, angles_deg, errors, 41, LIBRARY_SCANS)
-    test = both_angles(group, angles_deg, errors, _TEST_SEED, 6 if quick else TEST_SCANS)
+    test = both_angles(group, angles_deg, errors, _TEST_SEED, test_scans)
     model = MODELS[DISCRIMINANT]("H+V+P").fit(taught)
     named, right, sure = by_patch(model, test)
     calibration = calibration_error(sure[named], right[named])
@@ -265,7 +275,9 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
     )
     rng = np.random.default_rng(0)
     right = []
-    trials = 40 if quick else 250
+    trials = 250
+    if quick:
+        trials = 40
     for k in range(len(materials)):
         eps = specimens(materials, errors.spread, rng.standard_normal((2, trials, len(materials))))[:, k]
         measured = _features(eps, angles_deg) + std * rng.standard_normal((trials, std.size))
@@ -292,7 +304,10 @@ def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, i
     """
     named = []
     outside = []
-    scans = np.unique(test.groups)[: 2 if quick else 6]
+    most_scans = 6
+    if quick:
+        most_scans = 2
+    scans = np.unique(test.groups)[:most_scans]
     for name in np.unique(test.names):
         taught_others = taught.take(taught.names != name)
         model = MODELS[DISCRIMINANT]("H+V+P").fit(taught_others)
@@ -335,9 +350,13 @@ def _patch_features(samples: Samples) -> tuple[Real, npt.NDArray]:
 def spread_table(quick: bool) -> Table:
     """Return the table of accuracy and bound for spreads and tasks."""
     tasks = (("solids", (60.0,)), ("solids", (60.0, 55.0)), ("liquids", (55.0,)), ("powders", (60.0,)))
+    spreads = SPREADS
+    if quick:
+        tasks = tasks[3:]
+        spreads = SPREADS[::3]
     rows = []
-    for group, angles in tasks[3:] if quick else tasks:
-        for spread in SPREADS[:: 3 if quick else 1]:
+    for group, angles in tasks:
+        for spread in spreads:
             f = with_spread(group, angles, spread, quick)
             row_title = f"{len(groups()[group].materials)} {group}{', two angles' if len(angles) > 1 else ''}"
             label = f"{100 * spread[0]:g} / {100 * spread[1]:g} %"

@@ -39,7 +39,7 @@ from polysight_papers.sensys2026.item import (
     published_values,
     table2,
 )
-from polysight_papers.sensys2026.patches import calibrated_errors, draw, groups
+from polysight_papers.sensys2026.patches import calibrated_errors, count_draws, draw, groups
 
 Complex = npt.NDArray[np.complex128]
 
@@ -118,7 +118,7 @@ def _d_prime(a: np.ndarray, b: np.ndarray) -> float:
 def fig16(run: Run) -> Item:
     """Level of |H| at 0 degrees and of |P| at 55 and 60, pixels of eight scans each."""
     materials = _rows(CONTRAST)
-    errors = calibrated_errors("solids", 1 if run.quick else 3)
+    errors = calibrated_errors("solids", count_draws(run.quick))
     fig = new_figure(11.5, 4.6)
     axes = fig.subplots(1, 3, sharex=True)
     levels: dict[str, dict[str, np.ndarray]] = {}
@@ -178,7 +178,7 @@ def table2_item(run: Run) -> Item:
     fig = new_figure(10.5, 4.6)
     axes = fig.subplots(1, 2)
     for colour, (name, group) in zip((PALETTE[0], PALETTE[6], PALETTE[3]), groups().items(), strict=True):
-        errors = calibrated_errors(name, 1 if run.quick else 3)
+        errors = calibrated_errors(name, count_draws(run.quick))
         measured = draw(group.materials, group.angle_deg, errors, seed=2)
         estimated: list[tuple[complex, complex, float]] = []
         for j, m in enumerate(group.materials):
@@ -249,7 +249,9 @@ def places(seed: int, count: int = 3) -> list[tuple[float, float]]:
 
 def fig17(run: Run) -> Item:
     """Return the permittivities of all pixels of PET and ceramic in scans with other placements."""
-    count = 3 if run.quick else PLACEMENTS
+    count = PLACEMENTS
+    if run.quick:
+        count = 3
     true = {name: table2()[n - 1].permittivity for name, n in MATERIALS.items()}
     pixels: dict[str, list[Complex]] = {name: [] for name in true}
     centres = []
@@ -327,7 +329,7 @@ WATER_IN_GLASS = "Water (with glass)"
 def fig21(run: Run) -> Item:
     """Water and five solutions in eight scans; each concentration is estimated by a line through the others."""
     group = groups()["liquids"]
-    errors = calibrated_errors("liquids", 1 if run.quick else 3)
+    errors = calibrated_errors("liquids", count_draws(run.quick))
     materials = tuple(m for m in table2() if m.name == WATER_IN_GLASS or m.name.startswith("Cane Sugar"))
     library = draw(materials, group.angle_deg, errors, seed=21).library()
     result = fit_concentration(library, {WATER_IN_GLASS: 0.0})

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 
-import msgspec
 import numpy as np
 import pytest
+from tests.support.products import name_check_plate
 
 import polysight
 from polysight.cli.main import main
-from polysight.products import SCAN, read_products, write_json
 from polysight.results import PatchFigures, PermittivityFigures, check_plate, check_reasons
 from polysight_shared.config import CheckPlate
 
@@ -71,17 +70,10 @@ def products_copy(products, tmp_path):
     return shutil.copytree(products, tmp_path / "products")
 
 
-def with_plate(products, plate: CheckPlate) -> None:
-    """Name a check plate in the rig of saved products."""
-    facts = read_products(products).facts
-    rig = {**facts.instrument, "check": msgspec.to_builtins(plate)}
-    write_json(products / SCAN, msgspec.structs.replace(facts, instrument=rig))
-
-
 @pytest.mark.parametrize(("permittivity", "status"), [((3.78, 0.7), 0), ((9.0, 0.01), 1)])
 def test_the_command_says_and_draws_it(products_copy, tmp_path, capsys, permittivity, status):
     x_mm, y_mm = PET["centre_mm"]
-    with_plate(products_copy, CheckPlate(name="PET", permittivity=permittivity, place_mm=(x_mm, y_mm)))
+    name_check_plate(products_copy, CheckPlate(name="PET", permittivity=permittivity, place_mm=(x_mm, y_mm)))
     chart = tmp_path / "chart.png"
     assert main(["check", str(products_copy), "--chart", str(chart), "--json"]) == status
     (check,) = json.loads(capsys.readouterr().out)
@@ -93,6 +85,6 @@ def test_the_command_says_and_draws_it(products_copy, tmp_path, capsys, permitti
 
 
 def test_a_rig_file_without_a_plate_is_an_error(products_copy, capsys):
-    with_plate(products_copy, CheckPlate())
+    name_check_plate(products_copy, CheckPlate())
     assert main(["check", str(products_copy)]) == 2
     assert "names no check plate" in capsys.readouterr().err

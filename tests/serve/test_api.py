@@ -21,13 +21,16 @@ from tests.support.page.asking import TOKEN, ask, get, post
 from tests.support.page.live_view import Served, open_control, served_folder
 from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
-from tests.support.products import judged_products
+from tests.support.products import judged_products, name_check_plate
 
 from polysight.acquisition.control import ALIVE, CONTROL, Life, read_start_ticks
+from polysight.products import SCAN, write_json
 from polysight.products.folder import making_products
+from polysight.results import ScanFacts, to_plain
 from polysight.serve import commands as control
 from polysight.serve import site
 from polysight.serve.guard import TOKEN_HEADER
+from polysight_shared.config import CheckPlate, load_instrument
 from polysight_shared.error_codes import ErrorCode
 
 
@@ -117,6 +120,21 @@ def test_a_pair_is_compared_once_for_all_its_maps(view, scans, monkeypatch):
     assert ask(view, "/api/compare/p?a=one&b=two")[0] == 200
     # Other products are compared again
     assert len(done) == 3
+
+
+def test_a_damaged_scan_does_not_hide_the_other_check_plates(view, scans):
+    plate = CheckPlate(name="PET", permittivity=(2.9, 0.2), place_mm=(0.0, 0.0))
+    for name in ("one", "two"):
+        facts = ScanFacts(scan_id="s", simulated=True, instrument=to_plain(load_instrument(RIG_FILE)))
+        write_json(scans / name / "products" / SCAN, facts)
+        name_check_plate(scans / name / "products", plate)
+    chart = get(view, "/api/check")
+    assert [(scan["name"], scan["check"]["level"]) for scan in chart["scans"]] == [("one", "good"), ("two", "good")]
+    (scans / "one" / "products" / "materials.json").write_text("{")
+    chart = get(view, "/api/check")
+    assert [scan["name"] for scan in chart["scans"]] == ["two"]
+    # It was good before, but now its products are others.
+    assert chart["unreadable"] == ["one"]
 
 
 def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):

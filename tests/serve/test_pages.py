@@ -16,13 +16,15 @@ from tests.support.page.chromium import DESK, PHONE, Browser, find_axe
 from tests.support.page.live_view import Served, open_control, served_folder
 from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
-from tests.support.products import REASON, judged_products
+from tests.support.products import REASON, judged_products, name_check_plate
 from tests.support.scenes import COPPER, PET
 
+import polysight
 from polysight.catalogue import Notes, find_program, read_notes, write_notes
 from polysight.materials import Library, read_labels
 from polysight.products import ProcessedScan
 from polysight.serve import queue as serve_queue
+from polysight_shared.config import CheckPlate
 
 pytestmark = pytest.mark.xdist_group("browser")
 SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
@@ -32,8 +34,13 @@ PAGES = {
     "/compare?a=one&b=two": "document.querySelector('#rows tr')",
     "/new": "document.querySelector('.time')",
     "/watch?scan=one": "document.querySelectorAll('.view img').length == 6",
+    "/check": "document.querySelectorAll('#real circle').length == 2",
     "/surface?scan=one": "document.getElementById('facts')?.innerText.includes('4 points')",
 }
+
+
+# What each scan's rig file says of its check plate: the truth, and what no measurement of it agrees with.
+KNOWN_PERMITTIVITY = {"one": (3.78, 0.7), "two": (9.0, 0.01)}
 
 
 class Page:
@@ -110,6 +117,10 @@ def write_points(path: Path) -> None:
 def scans(processed: Path, tmp_path: Path) -> Path:
     shutil.copytree(processed, tmp_path / "scans")
     write_points(tmp_path / "scans" / "one" / "products" / "surface.ply")
+    x_mm, y_mm = PET["centre_mm"]
+    for name, permittivity in KNOWN_PERMITTIVITY.items():
+        plate = CheckPlate(name="PET", permittivity=permittivity, place_mm=(x_mm, y_mm))
+        name_check_plate(tmp_path / "scans" / name / "products", plate)
     return tmp_path / "scans"
 
 
@@ -197,6 +208,43 @@ def test_the_points_of_surfaces_turn_and_are_coloured(page):
     drawn.append(page.browser.value(picture))
     assert len(set(drawn)) == len(drawn)
     page.check_whole()
+
+
+def test_the_control_chart_has_a_link_to_each_scan_at_its_place(page, scans):
+    page.open("/check")
+    assert "1 good" in page.browser.text("told")
+    assert "1 action" in page.browser.text("told")
+    for name in KNOWN_PERMITTIVITY:
+        measured = polysight.check(scans / name)["permittivity"].item().real
+        # The tick's place gives the scale of the axis.
+        drawn = page.browser.value(
+            "(() => { const t = [...document.querySelectorAll('#real text[text-anchor=end]')].slice(0, 2)"
+            ".map((n) => [+n.textContent, +n.getAttribute('y') - 4]);"
+            f" const c = document.querySelector('#real a[href$=\"{name}\"] circle');"
+            " const slope = (t[1][0] - t[0][0]) / (t[1][1] - t[0][1]);"
+            " return t[0][0] + slope * (c.getAttribute('cy') - t[0][1]); })()"
+        )
+        assert drawn == pytest.approx(measured, abs=1e-6), name
+    assert page.browser.value("[...document.querySelectorAll('#real a')].map((n) => n.dataset.level)") == [
+        "good",
+        "bad",
+    ]
+    page.browser.value("document.querySelector('#real a').dispatchEvent(new MouseEvent('click', { bubbles: true }))")
+    page.browser.wait("location.pathname == '/scan'", "the scan's page")
+
+
+def test_the_control_chart_says_what_is_missing_and_follows_new_products(page, scans):
+    name_check_plate(
+        scans / "one" / "products", CheckPlate(name="PET", permittivity=(3.78, 0.7), place_mm=(200.0, 0.0))
+    )
+    name_check_plate(scans / "two" / "products", CheckPlate())
+    # Without the condition of PAGES: one of the scans has no plate.
+    page.open("/check?")
+    page.browser.wait("document.getElementById('told').innerText.includes('1 missing')", "the level")
+    assert "no patch at x 200" in page.browser.text("rows")
+    shutil.rmtree(scans / "one" / "products")
+    page.open("/check?plate=none")
+    page.browser.wait("document.getElementById('told').innerText.includes('No processed scan')", "the advice")
 
 
 @SIZES

@@ -9,14 +9,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from polysight.imaging import Images
-from polysight.products import ProcessedScan, write_image, write_json
+from polysight.products import SCAN, ProcessedScan, read_products, write_image, write_json
 from polysight.products.processed import Computed
 from polysight.results import ScanFacts, ScanMaterials, ScanQuality
+from polysight_shared.config import CheckPlate
 
 NAMES = ("PET", "acrylic", "copper")
 REASON = {"what": "no metal reference", "why": "it is the only patch", "do": "lay a metal plate into the scene"}
@@ -79,6 +81,13 @@ def judged_products(folder: Path, level: str | None, careless: bool = False, see
     write_json(folder / "quality.json", quality)
     write_json(folder / "scan.json", {"scan_id": "s", "simulated": True})
     return folder
+
+
+def name_check_plate(products: Path, plate: CheckPlate) -> None:
+    """Name a check plate in the rig of saved products."""
+    facts = read_products(products).facts
+    rig = {**facts.instrument, "check": msgspec.to_builtins(plate)}
+    write_json(products / SCAN, msgspec.structs.replace(facts, instrument=rig))
 
 
 def make_result(images: Images, content: dict[str, Any] | None, quality: dict[str, Any], **more: Any) -> ProcessedScan:

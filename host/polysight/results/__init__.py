@@ -8,7 +8,13 @@
 `to_plain` converts all of it to JSON types.
 """
 
-from polysight.results.check_plate import WARNING_SIGMAS, CheckResult, check_plate, check_reasons
+from polysight.results.check_plate import (
+    ACTION_SIGMAS,
+    WARNING_SIGMAS,
+    CheckResult,
+    check_plate,
+    check_reasons,
+)
 from polysight.results.json_files import damage_error, json_text, one_line, read_object, to_plain
 from polysight.results.materials import (
     BandFigures,
@@ -73,6 +79,7 @@ from polysight.results.verdict import (
 )
 
 __all__ = [
+    "ACTION_SIGMAS",
     "WARNING_SIGMAS",
     "Backlash",
     "BandFigures",

@@ -43,6 +43,7 @@ PAGES = {
     "/new": "new.html",
     "/compare": "compare.html",
     "/surface": "surface.html",
+    "/check": "check.html",
 }
 MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 # While the reading process starts, or is started again.

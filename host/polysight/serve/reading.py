@@ -41,9 +41,10 @@ from polysight.catalogue import (
 )
 from polysight.page import Watch
 from polysight.products import REPORT, read_products
+from polysight.results import ACTION_SIGMAS, WARNING_SIGMAS, CheckResult
 from polysight.serve.guard import refuse
 from polysight.serve.queue import Waiting
-from polysight.serve.site import THUMBNAIL, Site, compare_products, draw_map
+from polysight.serve.site import THUMBNAIL, Site, check_products, compare_products, draw_map
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError, ScanError
 
@@ -72,6 +73,7 @@ def reading_routes(site: Site) -> list[Route]:
         "map/{name}": _map,
         "probe": _probe,
         "file/{name}": _file,
+        "check": _check,
         "compare": _compare,
         "compare/{name}": _compare_map,
     }
@@ -317,6 +319,50 @@ def _number(request: Request, key: str) -> float:
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     return value
+
+
+# --- check plates ---
+
+
+class CheckedScan(msgspec.Struct, frozen=True, kw_only=True):
+    """Check plate of one scan of the list; `seconds` when it began, since 1970."""
+
+    name: str
+    seconds: float
+    simulated: bool | None
+    check: CheckResult
+
+
+class ControlChart(msgspec.Struct, frozen=True, kw_only=True):
+    """Check plates of all scans, the oldest first; names of scans whose products cannot be read; limits."""
+
+    scans: list[CheckedScan]
+    unreadable: list[str]
+    warning_sigmas: float = WARNING_SIGMAS
+    action_sigmas: float = ACTION_SIGMAS
+
+
+async def _check(site: Site, request: Request) -> Response:
+    del request
+
+    def read_checks() -> ControlChart:
+        scans = []
+        unreadable = []
+        for summary in site.scans.list():
+            if not summary.processed:
+                continue
+            try:
+                check = check_products(site.scans.folder(summary.name))
+            except (PolysightError, OSError):
+                unreadable.append(summary.name)
+                continue
+            if check is not None:
+                scan = CheckedScan(name=summary.name, seconds=summary.seconds, simulated=summary.simulated, check=check)
+                scans.append(scan)
+        scans.sort(key=lambda scan: (scan.seconds, scan.name))
+        return ControlChart(scans=scans, unreadable=unreadable)
+
+    return json_answer(await site.read("", read_checks))
 
 
 # --- comparisons ---

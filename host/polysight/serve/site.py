@@ -39,6 +39,7 @@ from polysight.catalogue import (
 )
 from polysight.page import Watch
 from polysight.products import read_products
+from polysight.results import CheckResult, check_plate
 from polysight.serve import launcher
 from polysight.serve.queue import Queue
 from polysight_shared.error_codes import ErrorCode
@@ -54,6 +55,8 @@ LIBRARIES = "libraries"
 THUMBNAIL = "thumbnail"
 MAX_PICTURES = 400
 MAX_COMPARISONS = 4
+# A check plate's result takes a few hundred bytes; reading it again takes milliseconds for each scan.
+MAX_CHECKS = 20_000
 # Each live view forms images with an own pipeline.
 MAX_WATCHES = 4
 LINGER_S = 30.0
@@ -181,6 +184,11 @@ def compare_products(first: Path, second: Path) -> Comparison:
     return _compare(first, second, _stamp_products(first), _stamp_products(second))
 
 
+def check_products(folder: Path) -> CheckResult | None:
+    """Check plate of a scan's products, None without one; read again only when these have changed. Raises DataError."""
+    return _check(*_stamp_products(folder))
+
+
 def _stamp_products(folder: Path) -> tuple[Path, str]:
     """The folder of a scan's products, and what changes when these do."""
     products = read_products(folder).folder
@@ -194,6 +202,15 @@ def _draw(products: Path, stamp: str, name: str, limits: tuple[float, float] | N
     if name == THUMBNAIL:
         return thumbnail(pixels)
     return draw_products(pixels, name, limits)
+
+
+@lru_cache(maxsize=MAX_CHECKS)
+def _check(products: Path, stamp: str) -> CheckResult | None:
+    del stamp
+    scan = read_products(products)
+    if scan.rig is None:
+        return None
+    return check_plate(scan.rig.check, scan.segments)
 
 
 @lru_cache(maxsize=MAX_COMPARISONS)

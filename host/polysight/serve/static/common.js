@@ -154,7 +154,7 @@ export async function begin(title) {
   const told = await get("page");
   Object.assign(STATES, told.badges);
   if (!told.only) {
-    for (const [text, href] of [["Scans", "/"], ["New scan", "/new"], ["Compare", "/compare"]]) {
+    for (const [text, href] of [["Scans", "/"], ["New scan", "/new"], ["Compare", "/compare"], ["Check plate", "/check"]]) {
       if (href === "/new" && !told.starts) continue;
       nav.append(make("a", text, null, { href, ...(location.pathname === href ? { "aria-current": "page" } : {}) }));
     }

@@ -72,6 +72,45 @@ export function plot(place, what) {
   place.replaceChildren(svg);
 }
 
+/**
+ * A control chart. points: [{ value (null: missing), bar, known, band, level, href, name }]; band: half width around
+ * `known`, bar: half height of the error bar. A point is a link to its scan.
+ */
+export function control(place, points, label) {
+  const width = place.clientWidth || 320, height = place.clientHeight || 230;
+  const left = 46, right = width - 14, top = 22, bottom = height - 24;
+  const ends = points.flatMap((p) => [p.known - p.band, p.known + p.band, ...(p.value === null ? [] : [p.value - p.bar, p.value + p.bar])]);
+  let [low, high] = [Math.min(...ends), Math.max(...ends)];
+  if (low === high) [low, high] = [low - 0.01, high + 0.01];
+  const slot = (right - left) / points.length;
+  const px = (i) => left + (i + 0.5) * slot, py = (v) => bottom - ((v - low) / (high - low)) * (bottom - top);
+  const svg = document.createElementNS(SVG, "svg");
+  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  for (const v of ticks(low, high, 4)) {
+    add(svg, "line", { x1: left, x2: right, y1: py(v), y2: py(v), class: "axis" });
+    add(svg, "text", { x: left - 5, y: py(v) + 4, "text-anchor": "end" }, v);
+  }
+  points.forEach((p, i) => {
+    const from = px(i) - slot / 2;
+    add(svg, "rect", { x: from, y: py(p.known + p.band), width: slot, height: Math.max(py(p.known - p.band) - py(p.known + p.band), 1), class: "known" });
+    add(svg, "line", { x1: from, x2: from + slot, y1: py(p.known), y2: py(p.known), class: "value" });
+  });
+  points.forEach((p, i) => {
+    const link = add(svg, "a", { href: p.href, "data-level": p.level, "aria-label": p.name });
+    add(link, "title", {}, p.name);
+    if (p.value === null) {
+      add(link, "circle", { cx: px(i), cy: bottom, r: 5 });
+      add(link, "text", { x: px(i), y: bottom - 8, "text-anchor": "middle" }, "missing");
+      return;
+    }
+    add(link, "line", { x1: px(i), x2: px(i), y1: py(p.value - p.bar), y2: py(p.value + p.bar), class: "bar" });
+    add(link, "circle", { cx: px(i), cy: py(p.value), r: 5 });
+  });
+  add(svg, "text", { x: 2, y: 12 }, label);
+  add(svg, "text", { x: right, y: height - 3, "text-anchor": "end" }, "scans, oldest to newest");
+  place.replaceChildren(svg);
+}
+
 /** The rows as bands (row 0 at the bottom, as y grows upwards), the running row's part, and the stage. */
 export function raster(canvas, state, motion) {
   const { columns, rows, step_x_mm: dx, step_y_mm: dy } = state.scan;

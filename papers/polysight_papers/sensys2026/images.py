@@ -318,13 +318,10 @@ def fig14(run: Run) -> Item:
         ticks = [-PHASE_DEG, -PHASE_DEG / 2, 0, PHASE_DEG / 2, PHASE_DEG]
         bar = fig.colorbar(picture, ax=ax, fraction=0.046, pad=0.02, ticks=ticks, extend="both")
         bar.set_label("degrees", fontsize=8)
-        for p in patches.values():
+        for name, p in patches.items():
             x0, _, x1, y1 = p.patch.box_mm
-            name = ""
-            if p.truth:
-                name = p.truth.name.split(" (")[0]
             # Adding zero removes the sign of a negative zero.
-            text = f"{name}\n{np.median(angle[p.patch.interior]) + 0.0:.1f}°"
+            text = f"{name.split(' (')[0]}\n{np.median(angle[p.patch.interior]) + 0.0:.1f}°"
             ax.text((x0 + x1) / 2, y1 + 4, text, ha="center", fontsize=8, color=INK)
     for name, p in patches.items():
         spreads = {c: _spread_deg(v[p.patch.interior]) for c, v in channels.items()}

@@ -245,16 +245,9 @@ def authors_fig18(judge: Judgements) -> Item:
             best = scores[3]
         if h is None or best is None:
             continue
-        panels = [
-            (h, h.confusion, f"H alone: {percent(h.pixels)}\n{PAPER}"),
-            (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT}"),
-            (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT}"),
-        ]
-        fig = confusion_figure([m for m in table2() if m.name in best.names], panels)
         key = f"{task}-{source}".replace(", ", "-").replace(" ", "-").replace("/", "")
-        pictures[key] = Picture(
-            fig, f"{task[0].upper()}{task[1:]}, {source}, {split}. Rows are the truth, adding to 100 %."
-        )
+        caption = f"{task[0].upper()}{task[1:]}, {source}, {split}. Rows are the truth, adding to 100 %."
+        pictures[key] = Picture(_draw_confusion(h, best), caption)
     return Item(
         "fig18",
         "Fig. 18: classification of solids, liquids and powders",
@@ -263,6 +256,16 @@ def authors_fig18(judge: Judgements) -> Item:
         pictures,
         content,
     )
+
+
+def _draw_confusion(h_only: Score, best: Score) -> Figure:
+    """Draw the confusion of the paper's KNN by H beside the discriminant's, by pixels and by patches."""
+    panels = [
+        (h_only, h_only.confusion, f"H alone: {percent(h_only.pixels)}\n{PAPER}"),
+        (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT}"),
+        (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT}"),
+    ]
+    return confusion_figure([m for m in table2() if m.name in best.names], panels)
 
 
 def authors_fig20(judge: Judgements) -> Item:

@@ -1,8 +1,8 @@
 """`polysight-pi run`: the two ZeroMQ sockets, and the service that creates all parts and closes them in a safe order.
 
 Events go out on a PUB socket, commands come in on a ROUTER, which keeps each command's envelope, so that `Hello`,
-`Status` and `Alive` are answered while the executor is busy or hangs. Each socket has a thread that alone uses it;
-others queue messages. Specification: docs/spec/wire.md.
+`Status` and `Alive` are answered while the executor is busy or hangs. Each socket has a thread that alone uses it,
+and an I/O thread of libzmq; others queue messages. Specification: docs/spec/wire.md.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError, VersionError
 from polysight_shared.faults import PiFault
-from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, publisher, replier
+from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, make_server_context, publisher, replier
 
 LINGER_MS = 200
 POLL_MS = 250
@@ -48,7 +48,7 @@ class Server:
 
     def __init__(self, command_address: str, event_address: str, key_dir: Path, heartbeat_ms: int) -> None:
         self._heartbeat_ms = heartbeat_ms
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._context = make_server_context()
         self._allowed = AllowedKeys(key_dir)
         self._secret = not is_loopback(command_address)
         try:

@@ -21,6 +21,9 @@ EVENT_TOPIC = b"event"
 MAX_SUBSCRIPTION_BYTES = 1024
 SEND_TIMEOUT_MS = 200
 HANDSHAKE_TIMEOUT_MS = 5000  # then a connection without a handshake is closed
+# Bits of ZMQ_AFFINITY: which of a context's I/O threads reads and writes the connections of a socket.
+COMMAND_IO_THREAD = 0b01
+EVENT_IO_THREAD = 0b10
 
 
 def host_name(address: str) -> str:
@@ -113,17 +116,28 @@ def _make(
     return socket
 
 
+def make_server_context() -> zmq.Context[Socket]:
+    """Create a context for `publisher` and `replier`, with an I/O thread for each.
+
+    With one thread for both, 1,000 subscribers that came and left kept commands waiting for 40 to 440 ms.
+    """
+    return zmq.Context(io_threads=2)
+
+
 def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """Create the Pi's PUB socket, bound."""
+    """Create the Pi's PUB socket, bound. `context`: from `make_server_context`."""
     options: dict[int, int | bytes] = {zmq.SNDHWM: 100_000, zmq.MAXMSGSIZE: MAX_SUBSCRIPTION_BYTES}
-    options[zmq.HANDSHAKE_IVL] = HANDSHAKE_TIMEOUT_MS
+    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS, zmq.AFFINITY: EVENT_IO_THREAD}
     return _make(context, zmq.PUB, address, key_dir, bind=True, options=options)
 
 
 def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """Create the Pi's ROUTER socket, bound, for REQ sockets; a message over the limit closes its connection."""
+    """Create the Pi's ROUTER socket, bound, for REQ sockets; a message over the limit closes its connection.
+
+    `context`: from `make_server_context`.
+    """
     options: dict[int, int | bytes] = {zmq.MAXMSGSIZE: MAX_COMMAND_BYTES, zmq.ROUTER_MANDATORY: 1}
-    options[zmq.HANDSHAKE_IVL] = HANDSHAKE_TIMEOUT_MS
+    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS, zmq.AFFINITY: COMMAND_IO_THREAD}
     return _make(context, zmq.ROUTER, address, key_dir, bind=True, options=options)
 
 

@@ -20,7 +20,7 @@ from zmq.utils.monitor import recv_monitor_message
 from polysight.page.watch import PiListener
 from polysight_shared import messages as m
 from polysight_shared.raster import plan_raster
-from polysight_shared.sockets import EVENT_TOPIC, publisher
+from polysight_shared.sockets import EVENT_TOPIC, make_server_context, publisher
 
 RIG = published_rig()
 OF = {"scan_id": "mine", "t_mono_ns": 1}
@@ -29,7 +29,7 @@ OF = {"scan_id": "mine", "t_mono_ns": 1}
 @pytest.fixture
 def pi(tmp_path):
     """The events' end of a Pi, and who listens to it."""
-    context = zmq.Context()
+    context = make_server_context()
     events = publisher(context, "tcp://127.0.0.1:*", tmp_path)
     address = events.getsockopt_string(zmq.LAST_ENDPOINT)
     # Nobody could answer there
@@ -124,7 +124,7 @@ while True:
 
 def test_the_pi_forgets_a_view_that_hangs(tmp_path):
     """Its queue for that subscriber does not grow for ever."""
-    context = zmq.Context()
+    context = make_server_context()
     events = publisher(context, "tcp://127.0.0.1:*", tmp_path)
     monitor = events.get_monitor_socket()
     address = events.getsockopt_string(zmq.LAST_ENDPOINT)

@@ -27,7 +27,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, PolysightError, os_error
 from polysight_shared.findings import Finding
 from polysight_shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
-from polysight_shared.sockets import is_loopback, publisher, replier
+from polysight_shared.sockets import is_loopback, make_server_context, publisher, replier
 
 # A scan of 70,000 positions journals about 20 MB.
 JOURNAL_BYTES = 100 << 20
@@ -130,7 +130,7 @@ def _keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
 
 
 def _address(make: Callable[..., zmq.Socket[bytes]], address: str, key_dir: Path) -> str:
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    context = make_server_context()
     try:
         make(context, address, key_dir).close()
     finally:

@@ -73,7 +73,7 @@ class Bench:
         return Aperture(antennas, scan_offsets_m(self.rig), gate.frequencies_hz, grid), samples
 
     def ours_cold(self) -> Image:
-        """The same without any kernel images from before."""
+        """The same without any kernel kept from before."""
         kernels.forget()
         return self.ours()
 

@@ -73,7 +73,7 @@ DISTURBANCES: dict[str, dict[str, float]] = {
     "all": {"misplaced_mm": 1.0, "axes_deg": 2.0, "leakage": 0.05},
 }
 # Standard errors that the host is told: those of the disturbance (each axis of a place, each part of a leakage), and
-# what a rig that stands as its file says is numbers to.
+# what a rig that stands as its file says is known to.
 EXACT = Uncertainty(leakage=0.001, axis_rad=0.001, place_m=0.00001)
 PLACES = {"place_m": 0.001 / np.sqrt(3)}
 AXES = {"axis_rad": float(np.radians(2.0))}
@@ -106,7 +106,7 @@ class ObjectFigures:
     `normals_inside`, `places_inside`: shares of points whose own 95 % regions hold the surface. `distance2`: squared
     distance of the true permittivity in the region of the object; `points_inside`: share of points whose own region
     holds it. `normal_68_deg`, `point_68_mm`, `point_error_68`: 68th percentiles over the object's points. Figures are
-    None where nothing was seen_objects or given.
+    None where nothing was seen or given.
     """
 
     kind: str
@@ -197,7 +197,7 @@ def see_reference(nuisances: ShapeNuisances, scan: ScanKind) -> Seen:
 
 
 def analyse_shapes(
-    scene: ShapeScene, nuisances: ShapeNuisances, numbers: Uncertainty, scan: ScanKind
+    scene: ShapeScene, nuisances: ShapeNuisances, known: Uncertainty, scan: ScanKind
 ) -> tuple[Surface, float]:
     """Scan a scene and its reference; return what the host finds, and the seconds of CPU that its analysis took."""
     metal = see_reference(nuisances, scan)
@@ -207,7 +207,7 @@ def analyse_shapes(
 
     points = see_shapes((*scene.shapes, *scene.background), nuisances, scan, number=2)
     started = time.process_time()
-    surface = analyse_surface(points, scan.optics, reference, uncertainty=numbers, simulated=True)
+    surface = analyse_surface(points, scan.optics, reference, uncertainty=known, simulated=True)
     return surface, time.process_time() - started
 
 
@@ -225,7 +225,7 @@ def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> Obje
     for shape in scene.background:
         away_from_shape = np.abs(shape.project(surface.points_m)[0])
         background |= away_from_shape < STRAY_M
-        # A table that touches the object's back holds no points of the object: its front alone is seen_objects.
+        # A table that touches the object's back holds no points of the object: its front alone is seen.
         on_object &= away_from_shape > np.abs(distances)
     true_real = float("nan")
     true_loss = float("nan")
@@ -257,8 +257,8 @@ def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> Obje
         normals_inside=float(np.mean(turns_deg < 1.96 * surface.normal_std_deg[on_object])),
         places_inside=float(np.mean(away_m < 1.96 * surface.position_std_m[on_object])),
     )
-    numbers, counts = np.unique(surface.segment[on_object], return_counts=True)
-    largest = int(numbers[counts.argmax()])
+    segments, counts = np.unique(surface.segment[on_object], return_counts=True)
+    largest = int(segments[counts.argmax()])
     segment = next(s for s in surface.segments if s.number == largest)
     of_segment = on_object & (surface.segment == largest)
     return judge_permittivity(figures, segment, surface, of_segment, truth)
@@ -303,7 +303,7 @@ def _judge(job: tuple[str, int, str, ScanKind]) -> ObjectFigures:
 
 
 def _percentile_68(values: Iterable[float | None]) -> str:
-    """68th percentile of the figures that are numbers, as a cell of the table."""
+    """68th percentile of the figures that are known, as a cell of the table."""
     numbers = [value for value in values if value is not None]
     if not numbers:
         return "-"
@@ -311,7 +311,7 @@ def _percentile_68(values: Iterable[float | None]) -> str:
 
 
 def _percent(values: Iterable[float | bool | None]) -> str:
-    """Mean of shares that are numbers, in per cent."""
+    """Mean of shares that are known, in per cent."""
     numbers = [float(value) for value in values if value is not None]
     if not numbers:
         return "-"

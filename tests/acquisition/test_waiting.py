@@ -177,6 +177,16 @@ def test_held_row_that_is_whole_counts_with_a_note(rig, tmp_path):
     assert validate(tmp_path / "s") == []
 
 
+def test_a_report_that_comes_as_the_time_is_up_ends_the_row(rig, monkeypatch):
+    monkeypatch.setattr(row, "row_limit_s", lambda *_: -1.0)
+    take = SimpleNamespace(finished=None, aborted=None, row=None)
+    taker = SimpleNamespace(
+        _instrument=rig.instrument, _rig=None, _poll=lambda taken: setattr(taken, "finished", "the Pi's report")
+    )
+    row.RowTaker._wait_for_row(taker, take, transaction=None)
+    assert take.finished == "the Pi's report"
+
+
 def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
     monkeypatch.setattr(row, "row_limit_s", lambda _, held: 0.5 if held.index == 1 else 60.0)
     rig.pi.hang_at = {1}

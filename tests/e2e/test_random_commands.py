@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import random
+import re
 import shutil
 import sys
 from collections.abc import Iterator
@@ -110,9 +111,9 @@ def check_end(words: list[str]) -> None:
     assert isinstance(status, int), words
     assert output.strip() or status == 0, words
     assert "Traceback" not in output, words
-    # A note says what was written into it, and a list of scans the folder as it was given.
-    told = out.getvalue().split() if words[0] not in ("note", "scans") else []
-    numbers = {word.strip("(),;:+-").lower() for word in told}
+    # A note says what was written into it; the last line of a list of scans names the folder as it was given.
+    told = "" if words[0] == "note" else re.sub(r"scans under .*", "", out.getvalue())
+    numbers = {word.strip("(),;:+-").lower() for word in told.split()}
     assert status != 0 or not {"nan", "inf"} & numbers, (words, out.getvalue())
     assert status not in (2, 3, 5, 6) or "usage:" in output or "\n  do: " in output, (words, output)
 

@@ -225,18 +225,15 @@ def test_the_control_chart_has_a_link_to_each_scan_at_its_place(page, scans):
             " return t[0][0] + slope * (c.getAttribute('cy') - t[0][1]); })()"
         )
         assert drawn == pytest.approx(measured, abs=1e-6), name
-    assert page.browser.value("[...document.querySelectorAll('#real a')].map((n) => n.dataset.level)") == [
-        "good",
-        "bad",
-    ]
+    levels = page.browser.value("[...document.querySelectorAll('#real a')].map((n) => n.dataset.level)")
+    assert levels == ["good", "bad"]
     page.browser.value("document.querySelector('#real a').dispatchEvent(new MouseEvent('click', { bubbles: true }))")
     page.browser.wait("location.pathname == '/scan'", "the scan's page")
 
 
 def test_the_control_chart_says_what_is_missing_and_follows_new_products(page, scans):
-    name_check_plate(
-        scans / "one" / "products", CheckPlate(name="PET", permittivity=(3.78, 0.7), place_mm=(200.0, 0.0))
-    )
+    elsewhere = CheckPlate(name="PET", permittivity=(3.78, 0.7), place_mm=(200.0, 0.0))
+    name_check_plate(scans / "one" / "products", elsewhere)
     name_check_plate(scans / "two" / "products", CheckPlate())
     # Without the condition of PAGES: one of the scans has no plate.
     page.open("/check?")

@@ -23,9 +23,14 @@ function points(scans, part) {
 
 function row({ name, seconds, check }) {
   const node = make("tr");
-  node.append(nest(make("td"), make("a", name, null, { href: pageOf("scan", name) })), make("td", seconds ? day(seconds) : "–"),
-    make("td", check.measured ? both(check.measured, check.measured_std) : check.why), make("td", both(check.expected, check.expected_std)),
-    make("td", check.sigmas === null ? "–" : check.sigmas.toFixed(1), "n"), nest(make("td"), badge(LEVELS[check.level])));
+  node.append(
+    nest(make("td"), make("a", name, null, { href: pageOf("scan", name) })),
+    nest(make("td"), badge(LEVELS[check.level])),
+    make("td", check.sigmas === null ? "–" : check.sigmas.toFixed(1), "n"),
+    make("td", check.measured ? both(check.measured, check.measured_std) : check.why),
+    make("td", both(check.expected, check.expected_std)),
+    make("td", seconds ? day(seconds) : "–"),
+  );
   return node;
 }
 

@@ -28,9 +28,16 @@ test: $(VENV)/installed  ## install what is missing, then run every test
 	@./tests/install-tools.sh
 	$(BIN)/python -m pytest -n $(JOBS) $(COSTS)
 
+# Each file that takes more draws with --long.
+LONG := tests/stage tests/store tests/capture/test_adversary.py tests/acquisition/test_adversarial_scans.py \
+	tests/acquisition/test_mangled_takes.py tests/acquisition/test_pulse_times.py tests/pi/test_hostile.py \
+	tests/pi/test_edges.py tests/pi/test_stops.py tests/calibration/test_metal.py tests/materials \
+	tests/process/test_metal_scans.py tests/surfaces/test_what_is_no_surface.py tests/e2e/test_killed_processes.py \
+	tests/e2e/test_random_commands.py tests/radar/test_random_faults.py tests/serve/test_generations.py \
+	tests/serve/test_states.py tests/simulators/test_scene_pairs.py
 test-long: $(VENV)/installed  ## tests at full length: random rows, records, messages, faults and kills by the ten thousand (hours)
 	@./tests/install-tools.sh
-	$(BIN)/python -m pytest tests/stage tests/store tests/capture/test_adversary.py tests/acquisition/test_adversarial_scans.py tests/pi/test_hostile.py tests/calibration/test_metal.py tests/materials tests/surfaces/test_what_is_no_surface.py tests/e2e/test_killed_processes.py tests/radar/test_random_faults.py -n $(JOBS) --long
+	$(BIN)/python -m pytest $(LONG) -n $(JOBS) --long
 
 test-uml: $(VENV)/installed  ## the chain on a kernel's GPIO chip, in user-mode Linux built from Debian's source (10 minutes, once)
 	@./tests/install-tools.sh kernel

@@ -97,6 +97,36 @@ def test_sheets_that_only_h_shows_are_found(seed):
     assert_found(segment(*draw(seed, plates, background_db=-40.0), AXIS, AXIS), plates)
 
 
+def band_limited_noise(rng, level_db):
+    """Complex noise [2, SIDE, SIDE] of this level with resolution cells of some 4 mm."""
+    parts = [ndimage.gaussian_filter(rng.standard_normal((SIDE, SIDE)), 1.0) for _ in range(4)]
+    noise = np.array([parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]])
+    return noise / np.sqrt(np.mean(np.abs(noise) ** 2)) * 10 ** (level_db / 20)
+
+
+def uneven_light(seed):
+    """An amplitude [SIDE, SIDE] that varies by 5 dB (standard deviation) over some 100 mm."""
+    field = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((SIDE, SIDE)), 20.0)
+    return 10 ** (5.0 * field / field.std() / 20)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plates_are_found_over_an_uneven_background_whose_levels_overlap_with_theirs(seed):
+    """A table in the antennas' pattern and reflections of the direct path; one threshold does not separate them."""
+    plates = raster([0.0, -12.0, -13.0, -11.0, -10.0, -12.0, -14.0], [COPPER, 0.1, 0.2, 0.1, 0.2, 0.15, 0.1], 12)
+    channels = np.array(draw(seed, plates, strips=1.0, amplitude=0.15, background_db=-60.0))
+    background = band_limited_noise(np.random.default_rng(seed), -24.0) * uneven_light(seed + 50)
+    boxes = boxes_px(segment(*(channels + background), AXIS, AXIS))
+    found = [any(np.abs(np.subtract(plate, box)).max() <= 4 for box in boxes) for plate in plates]
+    assert sum(found) >= 6
+    assert len(boxes) <= len(plates) + 1
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_band_limited_noise_alone_holds_no_plate(seed):
+    assert not segment(*band_limited_noise(np.random.default_rng(seed), 0.0), AXIS, AXIS).patches
+
+
 @pytest.mark.parametrize(("x0", "cut"), [(0, True), (130, True), (8, False)])
 def test_a_plate_at_the_border_is_cut_and_refused(x0, cut):
     plates = {(60, 60, 84, 84): (0.0, COPPER), (x0, 20, min(x0 + 24, SIDE), 44): (-2.0, 0.25)}

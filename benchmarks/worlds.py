@@ -61,8 +61,10 @@ from polysight_worlds import (
 UNMEASURED = ("leakage", "all")
 """Nuisances of rigs whose leakage was never measured."""
 THETA_STD_RAD = 1.5e-3
-"""Error of the incidence angle that the analysis counts with: 2 mm in the places of the boards (1.2e-3 by the published
-rig's geometry), 1 mm in that of the plane (0.9e-3)."""
+"""Error of the incidence angle that the analysis counts with, and that a scene is given: 2 mm in the places of the
+boards (1.2e-3 by the published rig's geometry), 1 mm in that of the plane (0.9e-3)."""
+LEAKAGE_STD = 0.003
+"""The same of a measured leakage, of each real and imaginary part."""
 MARGIN_MM = 6.0
 LEAST_PIXELS = 8
 """Least width and height of a plate's part within the picture."""
@@ -195,14 +197,16 @@ def pixel_boxes(pair: ImagePair) -> list[tuple[Plate, tuple[int, int, int, int]]
 def analyse_world(
     pair: ImagePair,
     declared: str | None = "copper",
-    measured: bool = True,
+    leakage: tuple[complex, complex] | None = (0j, 0j),
     classifier: Classifier | None = None,
     searched: bool = False,
+    theta_error_rad: float = 0.0,
 ) -> tuple[MaterialsResult, dict[int, Plate]]:
     """Analyse the images of a world; return the result, and patch number to true plate.
 
-    `declared` is the plate that is given as the metal reference; None: it is looked for. `measured`: the rig's leakage
-    was measured. `searched`: patches are searched for instead of given as boxes.
+    `declared` is the plate that is given as the metal reference; None: it is looked for. `leakage` is that of p into H
+    and of s into V as it was measured; None: it never was. `searched`: patches are searched for instead of given as
+    boxes. `theta_error_rad` is the error of the nominal incidence angle.
     """
     h = pair.h.astype(np.complex64)
     v = pair.v.astype(np.complex64)
@@ -222,9 +226,10 @@ def analyse_world(
     elif metal_name is not None:
         known_scene = KnownScene(metal=box_in_mm(plates[metal_name][1], pair))
     prior = RigPrior(THETA_STD_RAD, channels_known=True)
-    if measured:
-        prior = replace(prior, leakage_std=0.003, leakage_measured=True, moved=MOVED)
-    analysis = analyse(images, Optics(np.radians(pair.incidence_deg), prior), known_scene, classifier)
+    if leakage is not None:
+        prior = replace(prior, leakage=leakage, leakage_std=LEAKAGE_STD, leakage_measured=True, moved=MOVED)
+    theta_rad = np.radians(pair.incidence_deg) + theta_error_rad
+    analysis = analyse(images, Optics(theta_rad, prior), known_scene, classifier)
     if not searched:
         return analysis, {label: plates[name][0] for label, name in known_scene.names.items()}
     return analysis, match_plates(analysis.segmentation, list(plates.values()))
@@ -258,12 +263,25 @@ def draw_pair(nuisance: str, seed: int) -> ImagePair:
     return simulate(world, draw_nuisances(rng, nuisance), rig)
 
 
+def draw_calibration(nuisance: str, seed: int) -> tuple[tuple[complex, complex] | None, float]:
+    """Draw what a calibration of the rig gives: its leakage, in truth 0, or None; and the error of the incidence angle.
+
+    A rig that knew its leakage exactly would be better than its error bars say.
+    """
+    rng = np.random.default_rng([seed, sum(map(ord, nuisance)), 1])
+    into_h, into_v = LEAKAGE_STD * (rng.standard_normal(2) + 1j * rng.standard_normal(2))
+    theta_error_rad = THETA_STD_RAD * float(rng.standard_normal())
+    leakage = None if nuisance in UNMEASURED else (complex(into_h), complex(into_v))
+    return leakage, theta_error_rad
+
+
 def judge_world(nuisance: str, seed: int, searched: bool = False) -> SceneFigures:
-    """Draw, scan and judge one world."""
+    """Draw, scan and judge one world, with the errors of a calibration as the analysis believes in them."""
     pair = draw_pair(nuisance, seed)
     classifier = table_2_classifier(float(np.radians(pair.incidence_deg)))
+    leakage, theta_error_rad = draw_calibration(nuisance, seed)
     analysis, plates = analyse_world(
-        pair, measured=nuisance not in UNMEASURED, classifier=classifier, searched=searched
+        pair, leakage=leakage, classifier=classifier, searched=searched, theta_error_rad=theta_error_rad
     )
     verdict = join_reasons(scene_reasons(analysis, None, classifier))
     judged = [(patch, plates[patch.patch.label]) for patch in analysis.patches if patch.patch.label in plates]

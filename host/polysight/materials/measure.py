@@ -36,18 +36,18 @@ USUAL_BLOCKS = 2.0
 """Weight of the scene's usual scatter against a plate's own, in independent places of the plate."""
 BLOCK_M = 0.012
 """Length over which the errors of V / H within a plate are correlated."""
-LEAST_STD = 1.4e-3
+LEAST_STD = 0.8e-3
 """Least error of V / H, even with uniform pixels: H and V are illuminated from points some 15 mm apart."""
 TILT_STD = 0.004
 """Error of V / H if the phase of H spreads over the patch by one radian.
 
 A tilted plate is illuminated from other points, different for H and V; one degree of tilt spreads the phase by 0.3 rad.
 """
-DRIFTS = {0.002: 0.7, 0.02: 0.1, 0.06: 0.2}
+DRIFTS = {0.002: 0.8, 0.02: 0.1, 0.06: 0.1}
 """Standard deviations of the drift of ln(V / H) over a scan, each part, with their prior probabilities: of a stable
 rig, of a usual one, and of one that drifts by 15 % and 9 degrees."""
-DRIFT_M = 0.07
-"""Length over which a drift changes, along the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
+DRIFT_LENGTHS_M = (0.07, 0.15)
+"""Lengths over which a drift changes, along the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
 COMMON_SLOPES = (0.1, 1.0)
 """Prior standard deviations of the slope of ln(V / H) that all plates have by themselves, per metre: H and V that see
 the same place, and images some millimetres apart (their edges differ)."""
@@ -331,17 +331,15 @@ def common_change(
     value = np.zeros(y_m.size, np.complex128)
     std = np.zeros(y_m.size, np.complex128)
     ripple2 = np.zeros(2)
-    for axis in (0, 1):
-        for k, (part, unit) in enumerate(((np.real, 1), (np.imag, 1j))):
-            slopes = np.array([part(s.slope[axis]) for s in plates], np.float64)
-            noise = np.maximum([part(s.slope_std[axis]) for s in plates], 1e-3) + BORDER_SLOPE_STD * border
-            remaining_slopes = slopes - np.median(slopes)
-            if axis == 1:
-                change, deviation, drift_slopes = _average_drift(y_m, origin_m[1], slopes, noise)
-                value += unit * change
-                std += unit * deviation
-                remaining_slopes = slopes - drift_slopes
-            ripple2[k] += _excess_scatter(remaining_slopes[~border], noise[~border]) / 2
+    for k, (part, unit) in enumerate(((np.real, 1), (np.imag, 1j))):
+        slopes = np.array([part(s.slope) for s in plates], np.float64).reshape(-1, 2).T
+        noise = np.array([part(s.slope_std) for s in plates], np.float64).reshape(-1, 2).T
+        noise = np.maximum(noise, 1e-3) + BORDER_SLOPE_STD * border
+        change, deviation, drift_slopes = _average_drift(y_m, origin_m[1], slopes, noise)
+        value += unit * change
+        std += unit * deviation
+        for remaining, errors in ((slopes[0] - np.median(slopes[0]), noise[0]), (slopes[1] - drift_slopes, noise[1])):
+            ripple2[k] += _excess_scatter(remaining[~border], errors[~border]) / 2
     return CommonChange(value, std, complex(*np.sqrt(ripple2)))
 
 
@@ -359,36 +357,45 @@ def _excess_scatter(left: Real, noise: Real) -> float:
 def _average_drift(y_m: Real, origin_m: float, slopes: Real, noise: Real) -> tuple[Real, Real, Real]:
     """Return mean and standard deviation of a drift [plate] relative to the origin, and its expected slopes [plate].
 
-    They are averaged over `DRIFTS`, `COMMON_SLOPES` and `OWN_SLOPES` with the evidence of each.
+    `slopes` and `noise` [2, plate] are those along x and along y. All is averaged over `DRIFTS`, `DRIFT_LENGTHS_M`,
+    `COMMON_SLOPES` and `OWN_SLOPES` with the evidence of each. Slopes that plates have by themselves are as large along
+    x, where there is no drift.
     """
+    slopes_x, slopes_y = slopes
+    noise_x, noise_y = noise
     distance_m = y_m[:, None] - y_m
-    near = np.exp(-0.5 * (distance_m / DRIFT_M) ** 2)
     from_origin = y_m - origin_m
-    near_origin = np.exp(-0.5 * (from_origin / DRIFT_M) ** 2)
-    # Covariances of a drift of variance 1, relative to the origin: of its slopes, with its slopes, of itself.
-    of_slopes = near * (1 - (distance_m / DRIFT_M) ** 2) / DRIFT_M**2
-    with_slopes = (distance_m * near + (from_origin * near_origin)[None, :]) / DRIFT_M**2
-    of_itself = 2 - 2 * near_origin
     means = []
     variances = []
     fitted = []
     evidences = []
-    for drift, common, own_slope in itertools.product(DRIFTS, COMMON_SLOPES, OWN_SLOPES):
-        explained = drift**2 * of_slopes + common**2
-        total = explained + np.diag(noise**2 + own_slope**2)
-        inverse = np.linalg.inv(total)
-        gain = drift**2 * with_slopes @ inverse
-        means.append(gain @ slopes)
-        variances.append(drift**2 * of_itself - np.sum(gain * drift**2 * with_slopes, axis=1))
-        fitted.append(explained @ inverse @ slopes)
-        evidences.append(
-            np.log(DRIFTS[drift]) - 0.5 * float(slopes @ inverse @ slopes) - 0.5 * np.linalg.slogdet(total)[1]
-        )
+    all_sizes = itertools.product(DRIFT_LENGTHS_M, DRIFTS, COMMON_SLOPES, OWN_SLOPES)
+    for length_m, drift, common, own_slope in all_sizes:
+        near = np.exp(-0.5 * (distance_m / length_m) ** 2)
+        near_origin = np.exp(-0.5 * (from_origin / length_m) ** 2)
+        # Covariances of the drift relative to the origin: of its slopes, with its slopes, of itself.
+        of_slopes = drift**2 * near * (1 - (distance_m / length_m) ** 2) / length_m**2
+        with_slopes = drift**2 * (distance_m * near + (from_origin * near_origin)[None, :]) / length_m**2
+        of_itself = drift**2 * (2 - 2 * near_origin)
+        explained = of_slopes + common**2
+        total_y = explained + np.diag(noise_y**2 + own_slope**2)
+        total_x = common**2 + np.diag(noise_x**2 + own_slope**2)
+        gain = with_slopes @ np.linalg.inv(total_y)
+        means.append(gain @ slopes_y)
+        variances.append(of_itself - np.sum(gain * with_slopes, axis=1))
+        fitted.append(explained @ np.linalg.solve(total_y, slopes_y))
+        evidence = _log_normal(slopes_y, total_y) + _log_normal(slopes_x, total_x)
+        evidences.append(np.log(DRIFTS[drift]) + evidence)
     weight = np.exp(np.array(evidences) - max(evidences))
     weight /= weight.sum()
     mean = weight @ np.array(means)
     square = weight @ (np.array(variances) + np.square(means))
     return mean, np.sqrt(np.maximum(square - mean**2, 0.0)), weight @ np.array(fitted)
+
+
+def _log_normal(values: Real, covariance: Real) -> float:
+    """Return the logarithm of the normal density of values [n] about 0, but for a constant."""
+    return float(-0.5 * values @ np.linalg.solve(covariance, values) - 0.5 * np.linalg.slogdet(covariance)[1])
 
 
 def relative_errors(own: Scatter | None, usual: tuple[float, float]) -> tuple[float, float]:

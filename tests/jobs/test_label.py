@@ -89,7 +89,7 @@ def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
     assert main(["label", str(products), "--box", "oak=-40,-10,-20,10", "--metal", "oak"]) == 0
     assert "note: dark" not in capsys.readouterr().out
     assert main(["label", str(products), "--box", "nothing=30,-10,50,10"]) == 0
-    assert "note: dark, as where nothing lies: nothing;" in capsys.readouterr().out
+    assert "note: as dark as empty background: nothing;" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

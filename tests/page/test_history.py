@@ -7,7 +7,7 @@ from tests.support.page.live_view import add_fact, begin_history
 from tests.support.store.facts import facts_of
 
 from polysight.page.history import seconds
-from polysight.page.status import remaining
+from polysight.page.status import estimate_time_left
 from polysight.store.logs import read_events
 from polysight.store.scan_folder import EVENTS, ScanFolder
 from polysight_shared.messages import Capture, Fault
@@ -67,16 +67,16 @@ def test_a_fault_told_twice_is_one(finished):
 def test_time_left_is_what_rows_took(begun):
     history, last = begun
     now = seconds(UTC.format(2, 20))
-    assert remaining(history, now) == (40, "measured")
+    assert estimate_time_left(history, now) == (40, "measured")
     add_fact(history, last | {"committed_utc": UTC.format(3, 0)})
-    assert remaining(history, seconds(UTC.format(9, 0))) == (0, "measured")
+    assert estimate_time_left(history, seconds(UTC.format(9, 0))) == (0, "measured")
 
 
 def test_a_pause_is_no_time_of_a_row(begun):
     history, last = begun
     add_fact(history, {"fact": "scan_paused", "paused_utc": UTC.format(2, 0)})
     assert history.paused
-    assert remaining(history, seconds(UTC.format(30, 0))) == (60, "measured")
+    assert estimate_time_left(history, seconds(UTC.format(30, 0))) == (60, "measured")
     add_fact(history, {"fact": "scan_continued", "continued_utc": UTC.format(40, 0)})
     assert not history.paused
     add_fact(history, last | {"committed_utc": UTC.format(41, 0)})

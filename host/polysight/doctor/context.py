@@ -49,11 +49,16 @@ from polysight_shared.messages import HelloReply, Pulsed
 if TYPE_CHECKING:
     from polysight.calibration import DirectSignal
 
-# Struct timex, adjtimex(2)
+# Flag in the status of struct timex, see adjtimex(2).
 _STA_UNSYNC = 0x40
+# The ioctl of ethtool (linux/sockios.h), and its command to read the sizes of rings (linux/ethtool.h).
 _SIOCETHTOOL = 0x8946
 _ETHTOOL_GRINGPARAM = 0x10
+# Words of struct ethtool_ringparam behind the command: the largest receive ring and the one in use.
+_RX_MAX_WORD = 1
+_RX_WORD = 5
 _DROP_COUNTERS = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
+# The probe of a disk ends after so many bytes, or so many seconds on a slow disk.
 _PROBE_BYTES = 64 << 20
 _PROBE_S = 2.0
 
@@ -109,6 +114,7 @@ def read_interface(name: str, root: Path = Path("/")) -> NetworkInterface:
 
 def _receive_ring(name: str) -> tuple[int, int] | tuple[None, None]:
     """Receive descriptors in use and their maximum (ethtool -g)."""
+    # The structure has the command and eight sizes; the request names the interface and points to it.
     words = array.array("I", [_ETHTOOL_GRINGPARAM] + 8 * [0])
     request = struct.pack("16sP16x", name.encode()[:15], words.buffer_info()[0])
     try:
@@ -116,7 +122,7 @@ def _receive_ring(name: str) -> tuple[int, int] | tuple[None, None]:
             fcntl.ioctl(sock, _SIOCETHTOOL, request)
     except OSError:
         return None, None
-    return words[5], words[1]
+    return words[_RX_WORD], words[_RX_MAX_WORD]
 
 
 def write_speed(folder: Path) -> float:
@@ -140,6 +146,7 @@ def write_speed(folder: Path) -> float:
 PACKET_TIME_US = 11.0
 # Duration of the load at each rate.
 _RATE_S = 1.5
+# A receiver that was behind gets so long to read what waits in its socket.
 _DRAIN_S = 5.0
 _SENDER = Path(__file__).with_name("send_packets.py")
 _BUSY_LOOP = "while True: sum(range(100_000))"
@@ -174,6 +181,7 @@ def measure_receivers(rig: Instrument, rates: list[float], seconds: float = _RAT
 
     Returns the result for each rate and the receivers' scheduling. Raises DeviceError if a receiver does not start.
     """
+    # Addresses of the loopback device, so that a second doctor or a scan does not use the same.
     subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
     boards = [
         msgspec.structs.replace(b, card_address=f"{subnet}.{100 + k}", host_address=f"{subnet}.30")
@@ -199,16 +207,18 @@ def measure_receivers(rig: Instrument, rates: list[float], seconds: float = _RAT
 
 def _measure_rate(rate: float, first: int, packets: int, receivers: list[ReceiverProcess], folder: Path) -> LoadResult:
     """Send `packets` packets to each receiver; like a card, the counters continue from record to record (`first`)."""
-    for r in receivers:
-        r.begin_row(0, 1, packets * MAX_PAYLOAD_BYTES, 1, folder / f"{r.board.name}.part")
+    for receiver in receivers:
+        receiver.begin_row(0, 1, packets * MAX_PAYLOAD_BYTES, 1, folder / f"{receiver.board.name}.part")
     senders = []
-    for r in receivers:
-        card = (r.board.card_address, CARD_SOURCE_PORT)
-        host = (r.board.host_address, r.board.data_port)
+    for receiver in receivers:
+        card = (receiver.board.card_address, CARD_SOURCE_PORT)
+        host = (receiver.board.host_address, receiver.board.data_port)
         words = map(str, (*card, *host, first, packets, rate, MAX_PAYLOAD_BYTES))
         command = [sys.executable, "-I", str(_SENDER), *words]
         senders.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-    took_s = [float(sender.communicate()[0] or "inf") for sender in senders]
+    # A sender prints the seconds that it took; one that failed prints nothing.
+    sending_s = [float(sender.communicate()[0] or "inf") for sender in senders]
+    # Wait until all packets are in place, or nothing more arrives: the rest is lost.
     deadline = time.monotonic() + _DRAIN_S
     while not all(r.poll().complete for r in receivers) and time.monotonic() < deadline:
         received_before = [r.report().received for r in receivers]
@@ -216,7 +226,7 @@ def _measure_rate(rate: float, first: int, packets: int, receivers: list[Receive
         if [r.report().received for r in receivers] == received_before:
             break
     lost_packets = sum(packets - r.end_row().packets for r in receivers)
-    return LoadResult(rate, packets / max(took_s), packets * len(receivers), lost_packets)
+    return LoadResult(rate, packets / max(sending_s), packets * len(receivers), lost_packets)
 
 
 def ok(what: str, **facts: Any) -> Finding:

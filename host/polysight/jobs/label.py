@@ -1,6 +1,6 @@
 """`polysight label`: boxes of a scan drawn or taken from its patches, named, and saved for training.
 
-`apply_edits` applies options to boxes, `ask_for_names` asks a person at a terminal. What results is checked as a whole
+`apply_edits` applies options to boxes, `ask_for_names` asks a person at a terminal. The result is checked as a whole
 before anything is written.
 """
 
@@ -47,7 +47,7 @@ from polysight_shared.files import write_together
 
 METAL = "metal"
 REFERENCE = "the metal reference"
-FEW = 16
+MIN_PIXELS = 16
 """Largest number of pixels of a box that a library uses; with fewer it would learn speckle."""
 # Largest margin, as a share of a patch's side.
 _LARGEST_MARGIN = 0.3
@@ -112,7 +112,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     patches = list_patches(products)
     if edits.given and list_only:
         raise ConfigError(
-            "--list with other options would not do them", "it writes nothing", "leave --list out",
+            "--list cannot be combined with options that change boxes", "--list writes nothing", "leave --list out",
             code=ErrorCode.VALUES_CONFLICT,
         )  # fmt: skip
     labels = Labels({}, "mm")
@@ -121,21 +121,21 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     if edits.given:
         labels, left_out = apply_edits(labels, patches, edits)
     elif list_only or ask is None:
-        sys.stdout.write(_listing(folder, products, saved_labels, patches))
+        sys.stdout.write(_describe_boxes(folder, products, saved_labels, patches))
         return 0
     else:
-        sys.stdout.write(_listing(folder, products, saved_labels, patches))
+        sys.stdout.write(_describe_boxes(folder, products, saved_labels, patches))
         question = "name the patches anew, in place of the boxes drawn by hand? type yes: "
         if saved_labels and ask(question).strip() != "yes":
             raise ConfigError(
-                "nothing was changed", "yes was asked for", "options edit boxes: polysight label --help",
+                "nothing was changed", "the answer was not yes", "for options: polysight label --help",
                 code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip
         labels = ask_for_names(patches, ask)
         left_out = []
     place = label_folder(products.folder)
     checked, notes = save_labels(place, products, labels)
-    print_lines(_table(checked))
+    print_lines(_format_table(checked))
     if left_out:
         sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
     sys.stdout.write("".join(f"note: {note}\n" for note in notes))
@@ -149,7 +149,7 @@ def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[L
     Raises
     ------
     DataError
-        when there is none, or one is refused; nothing was written then.
+        when there is no box, or a box is refused; nothing was written then.
     """
     if not labels.boxes:
         raise DataError(
@@ -162,20 +162,20 @@ def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[L
     checked = replace(
         checked, by_hand=True, description=f"boxes of scan {products.scan_id}, in mm from the image centre"
     )
-    # Matplotlib, which is not needed to list or to refuse
+    # Loads matplotlib, which is needed neither to list boxes nor to refuse them.
     from polysight.report import label_figure
 
     picture = label_figure(products, checked.boxes, checked.metal)
-    # The boxes last: where they are, their picture is.
+    # The boxes are written last, so that saved boxes always have a picture.
     write_together({place / LABELS_PICTURE: picture, place / LABELS: pack_labels(checked)})
     masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
     notes = []
-    if few := [name for name, mask in masks.items() if (mask & products.valid).sum() < FEW]:
-        notes.append(f"fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few")
+    if few := [name for name, mask in masks.items() if (mask & products.valid).sum() < MIN_PIXELS]:
+        notes.append(f"fewer than {MIN_PIXELS} pixels: {', '.join(few)}; a library would learn speckle from so few")
     if dark := _find_dark_boxes(products, masks):
-        notes.append(f"dark, as where nothing lies: {', '.join(dark)}; look at the picture")
+        notes.append(f"as dark as empty background: {', '.join(dark)}; look at the picture")
     if checked.metal is None:
-        notes.append("no box is metal; train then needs a rig with `polysight calibrate metal`")
+        notes.append("no box is metal; train then needs a rig calibrated with `polysight calibrate metal`")
     return checked, notes
 
 
@@ -212,7 +212,9 @@ def list_patches(products: ProcessedScan) -> list[FoundPatch]:
     out = []
     for patch in products.segments:
         x0, y0, x1, y1 = patch.box_mm
-        mx, my = (min(margin_mm, _LARGEST_MARGIN * (b - a)) for a, b in ((x0, x1), (y0, y1)))
+        margin_x_mm = min(margin_mm, _LARGEST_MARGIN * (x1 - x0))
+        margin_y_mm = min(margin_mm, _LARGEST_MARGIN * (y1 - y0))
+        inner_box = (x0 + margin_x_mm, y0 + margin_y_mm, x1 - margin_x_mm, y1 - margin_y_mm)
         text = "not named"
         if patch.box:
             text = patch.box
@@ -224,7 +226,7 @@ def list_patches(products: ProcessedScan) -> list[FoundPatch]:
             text = f"named {patch.name}"
             if patch.confidence is not None:
                 text += f" {100 * patch.confidence:.0f} %"
-        out.append(FoundPatch(patch.label, (x0 + mx, y0 + my, x1 - mx, y1 - my), text))
+        out.append(FoundPatch(patch.label, inner_box, text))
     return out
 
 
@@ -242,58 +244,68 @@ def apply_edits(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tu
     if edits.from_patches:
         if not found:
             raise DataError("no patch was found", "only images were made, or nothing is in them", "draw it: --box")
-        boxes = {str(f.number): f.box for f in found}
+        boxes = {str(patch.number): patch.box for patch in found}
         specimens = {}
         metal = None
-    # Former name of each box to its new one.
-    names = {name: name for name in boxes}
-    for name in (_find_box(n, boxes) for n in edits.removed):
-        del boxes[name], names[name]
+
+    for option in edits.removed:
+        name = _find_box(option, boxes)
+        del boxes[name]
         specimens.pop(name, None)
         if name == metal:
             metal = None
-    # A patch's number: it is called metal, unless it gets a name
+
+    # A patch that is given as the metal by its number is named metal, unless it is renamed too.
     if edits.from_patches and edits.metal in boxes:
-        renamed = {old for old, _ in (_split(text, boxes) for text in edits.renames)}
+        renamed = {old for old, _ in (_split_at_equals(text, boxes) for text in edits.renames)}
         if edits.metal not in renamed:
             edits = replace(edits, renames=(*edits.renames, f"{edits.metal}={METAL}"))
+    new_names = {name: name for name in boxes}
     for text in edits.renames:
-        old, new = _split(text, boxes)
-        names[old] = box_name(new)
-    boxes = _rename_boxes(boxes, names)
-    specimens = {names[n]: s for n, s in specimens.items()}
-    metal = names.get(metal or "")
+        old, new = _split_at_equals(text, boxes)
+        new_names[old] = box_name(new)
+    boxes = _rename_boxes(boxes, new_names)
+    specimens = {new_names[name]: specimen for name, specimen in specimens.items()}
+    metal = new_names.get(metal or "")
+
     for name, box in edits.boxes:
         clean = box_name(name)
-        # The same box again is no other one: a command that was killed can be repeated.
+        # The same box under the same name is accepted, so that a command that was killed can be repeated.
         if boxes.get(clean) != box:
-            _refuse_twin(clean, boxes)
+            _refuse_taken_name(clean, boxes)
             boxes[clean] = box
+
+    # A patch that is still called by its number was not named.
     left_out = [name for name in boxes if name.isdecimal()]
-    boxes = {n: b for n, b in boxes.items() if n not in left_out}
+    boxes = {name: box for name, box in boxes.items() if name not in left_out}
+
     for text in edits.specimens:
-        name, specimen = _split(text, boxes)
+        name, specimen = _split_at_equals(text, boxes)
         specimens[name] = clean_name(specimen, "specimen")
+
     if edits.metal is not None:
-        if edits.from_patches and edits.metal in names:
-            metal = names[edits.metal]
+        if edits.from_patches and edits.metal in new_names:
+            metal = new_names[edits.metal]
         else:
             metal = _find_box(edits.metal, boxes)
     return Labels(boxes, "mm", metal, specimens), left_out
 
 
-def _rename_boxes(boxes: Mapping[str, Box], names: Mapping[str, str]) -> dict[str, Box]:
-    out: dict[str, Box] = {}
+def _rename_boxes(boxes: Mapping[str, Box], new_names: Mapping[str, str]) -> dict[str, Box]:
+    """Return the boxes under their new names. Raises DataError if two would have the same name."""
+    renamed: dict[str, Box] = {}
     for old, box in boxes.items():
-        _refuse_twin(names[old], out)
-        out[names[old]] = box
-    return out
+        new = new_names[old]
+        _refuse_taken_name(new, renamed)
+        renamed[new] = box
+    return renamed
 
 
-def _refuse_twin(name: str, boxes: Mapping[str, Box]) -> None:
-    for twin in boxes:
-        if twin.casefold() == name.casefold():
-            raise name_taken(name, twin)
+def _refuse_taken_name(name: str, boxes: Mapping[str, Box]) -> None:
+    """Raise DataError if a box has this name, in large or small letters."""
+    for other in boxes:
+        if other.casefold() == name.casefold():
+            raise name_taken(name, other)
 
 
 def _find_box(name: str, boxes: Mapping[str, Box]) -> str:
@@ -309,8 +321,9 @@ def _find_box(name: str, boxes: Mapping[str, Box]) -> str:
     return clean
 
 
-def _split(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
+def _split_at_equals(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
     """Split `NAME=TEXT`, where NAME is a box and may contain `=`. Raises DataError."""
+    # The longest name that is a box counts.
     parts = text.split("=")
     for count in range(len(parts) - 1, 0, -1):
         name = "=".join(parts[:count])
@@ -326,7 +339,7 @@ def ask_for_names(found: Sequence[FoundPatch], ask: Ask) -> Labels:
         raise DataError("no patch was found", "only images were made, or nothing is in them", "draw it: --box")
     boxes: dict[str, Box] = {}
     metal = None
-    sys.stdout.write(f"name each patch; Enter leaves it out, m is the metal reference (called {METAL})\n")
+    sys.stdout.write(f"name each patch; Enter leaves it out, m is the metal reference (named {METAL})\n")
     try:
         for patch in found:
             question = f"patch {patch.number}, {format_box(patch.box)}, {patch.description}: "
@@ -356,12 +369,12 @@ def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missi
             name = METAL if is_metal else answer
             name = box_name(name)
             if name not in boxes:
-                _refuse_twin(name, boxes)
+                _refuse_taken_name(name, boxes)
                 return name, is_metal
             piece = ask(f"  {name} is there already. Another piece of it? Its name, such as 2 (Enter: another name): ")
             if piece.strip():
                 name = box_name(f"{material_name(name)}{SPECIMEN}{piece}")
-                _refuse_twin(name, boxes)
+                _refuse_taken_name(name, boxes)
                 return name, is_metal
         except DataError as e:
             sys.stdout.write(f"  {e.what}: {e.why}\n")
@@ -377,7 +390,7 @@ def _ask_for_metal(boxes: Mapping[str, Box], ask: Ask) -> str | None:
     return None
 
 
-def _table(labels: Labels) -> list[str]:
+def _format_table(labels: Labels) -> list[str]:
     """The boxes as lines of a table."""
     rows = [("name", "specimen", "box", "")]
     for name, box in labels.boxes.items():
@@ -387,7 +400,7 @@ def _table(labels: Labels) -> list[str]:
     return ["  ".join(c + " " * (w - cell_len(c)) for c, w in zip(r, (*widths, 0), strict=True)).rstrip() for r in rows]
 
 
-def _listing(
+def _describe_boxes(
     folder: Path, products: ProcessedScan, saved_labels: tuple[Path, Labels] | None, patches: Sequence[FoundPatch]
 ) -> str:
     """Text of the boxes drawn, the patches found, and how to name them."""
@@ -395,7 +408,7 @@ def _listing(
     lines.append(f"image: {format_box(image_extent_mm(products.x_m, products.y_m))} from its centre")
     if saved_labels:
         boxes = saved_labels[1].in_mm(products.x_m, products.y_m)
-        lines += [f"drawn by hand: {saved_labels[0]}", *(f"  {line}" for line in _table(boxes))]
+        lines += [f"drawn by hand: {saved_labels[0]}", *(f"  {line}" for line in _format_table(boxes))]
     if patches:
         lines += ["patches that were found, a box inside each:"]
         lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.description}" for f in patches]

@@ -42,12 +42,13 @@ from polysight_shared.errors import ConfigError, DataError
 
 # Fronts of objects lie up to this before or behind the object plane.
 DEPTH_M = 0.12
+# Points of a metal sphere that its radius and gains are taken from; with few the directions are not covered.
 LEAST_METAL_POINTS = 60
 # The radius of a metal sphere of 125 mm is found within 0.5 %, with antennas misplaced by 1 mm too (simulated).
 RADIUS_TOLERANCE = 0.15
 
 
-def seen_by(data: Path, config: Path | None) -> tuple[Pipeline, Optics, Seen]:
+def process_to_points(data: Path, config: Path | None) -> tuple[Pipeline, Optics, Seen]:
     """Process the rows of a scan, and find the specular points in it. Raises PolysightError."""
     source = open_source(data, config, dropped=True)
     pipeline = process_rows(source, data, Settings(config=path_text(config), depth_range_mm=1e3 * DEPTH_M))
@@ -118,15 +119,16 @@ def find_axis(rig: Instrument, axis_mm: tuple[float, float]) -> tuple[float, flo
 
 def make_surface(data: Path, config: Path | None = None, reference: Path | None = None) -> Surface:
     """Return the surfaces of a recorded scan; `reference` is a scan of a flat metal plate. Raises PolysightError."""
-    pipeline, optics, points = seen_by(data, config)
+    pipeline, optics, points = process_to_points(data, config)
     gains: Reference | None = None
     if reference is not None:
-        _, _, metal = seen_by(reference, config)
+        _, _, metal = process_to_points(reference, config)
         gains = make_reference(thin_out(metal[metal.segment == 0]))
     return analyse_points(pipeline, optics, points, gains)
 
 
-def _list_columns(echoes: Echoes) -> list[list[float]]:
+def _list_rows(echoes: Echoes) -> list[list[float]]:
+    """Return a row of numbers for each point, as `SphereFile` stores it; `bend` is symmetric: three of its four."""
     bend = echoes.bend
     columns = [*echoes.at_m.T, echoes.path_m, *echoes.slope.T, bend[:, 0, 0], bend[:, 0, 1], bend[:, 1, 1]]
     columns += [echoes.amplitude.real, echoes.amplitude.imag, echoes.amplitude_std, echoes.band_rise]
@@ -138,26 +140,28 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
     from polysight.jobs.calibrate import print_result, rig_file_keys
 
     raw = open_raw(scan, load_rig_file(config))
-    _, optics, points = seen_by(scan, config)
+    _, optics, points = process_to_points(scan, config)
     metal = points[points.segment == 0]
     if len(metal) < LEAST_METAL_POINTS:
         raise DataError(
             f"{scan}: {len(metal)} points of the sphere, {LEAST_METAL_POINTS} are needed",
-            "it hangs outside the grid, or another object is before it",
-            "hang it so that its front is at the middle of the object plane",
+            "the sphere hangs outside the grid, or another object hides it",
+            "hang the sphere so that its front is at the middle of the object plane",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
     shape = find_shape(metal.h, optics)
-    bends = np.linalg.eigvalsh((shape.curvature + np.swapaxes(shape.curvature, 1, 2)) / 2)
-    radius_m = 1 / float(np.median(bends))
+    # The principal curvatures are the eigenvalues of the symmetric part.
+    curvatures = np.linalg.eigvalsh((shape.curvature + np.swapaxes(shape.curvature, 1, 2)) / 2)
+    radius_m = 1 / float(np.median(curvatures))
+    # The centre lies one radius behind each point, along its normal.
     centre = np.median(shape.points - radius_mm / 1e3 * shape.normals, axis=0)
-    rest_m = np.linalg.norm(shape.points - centre, axis=1) - radius_mm / 1e3
-    rest_m = float(np.median(np.abs(rest_m - np.median(rest_m))))
+    off_sphere_m = np.linalg.norm(shape.points - centre, axis=1) - radius_mm / 1e3
+    scatter_m = float(np.median(np.abs(off_sphere_m - np.median(off_sphere_m))))
     if abs(1e3 * radius_m / radius_mm - 1) > RADIUS_TOLERANCE:
         raise DataError(
             f"{scan}: the surface has a radius of {1e3 * radius_m:.0f} mm, not {radius_mm:g}",
             "it is another object, or the boards stand elsewhere than the rig file says",
-            "give the sphere's radius, or calibrate the places first",
+            "give the sphere's true radius, or calibrate the places of the boards first",
             code=ErrorCode.MISMATCH,
         )
     chosen_metal = thin_out(metal)
@@ -167,14 +171,14 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
         radius_mm=radius_mm,
         radius_found_mm=1e3 * radius_m,
         centre_mm=(1e3 * float(centre[0]), 1e3 * float(centre[1]), 1e3 * float(centre[2])),
-        misfit_mm=1e3 * rest_m,
+        misfit_mm=1e3 * scatter_m,
         gain_std=gains.std,
-        points={"h": _list_columns(chosen_metal.h), "v": _list_columns(chosen_metal.v)},
+        points={"h": _list_rows(chosen_metal.h), "v": _list_rows(chosen_metal.v)},
     )
     path = write_calibration(file, out)
     low, high = (np.degrees(np.arcsin(edge)) for edge in gains.covered)
     lines = [
-        f"sphere of {1e3 * radius_m:.1f} mm (given: {radius_mm:g}), its points scatter by {1e3 * rest_m:.2f} mm",
+        f"sphere of {1e3 * radius_m:.1f} mm (given: {radius_mm:g}), its points scatter by {1e3 * scatter_m:.2f} mm",
         f"directions of arrival {low[0]:.0f}..{high[0]:.0f} degrees in x, {low[1]:.0f}..{high[1]:.0f} in y",
         f"H / V is known to {100 * gains.std:.2f} %",
     ]

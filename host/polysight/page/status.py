@@ -25,9 +25,9 @@ SINCE = "{since}"
 """The page puts the elapsed time here."""
 PAPER_PHASE_RAD = 0.022
 """Phase residual after all stages, paper section 9.1."""
-# A rejected take is shown for so many rows.
+# A fault stays in the headline until so many rows came without one.
 RECENT_ROWS = 3
-# Timeout of a row, in usual durations and at least.
+# A row is late after so many usual durations, and after at least so many seconds.
 LATE_ROWS = 3.0
 LATE_S = 60.0
 # Residual of the direct path above which images lose contrast; 0.004 is usual.
@@ -35,8 +35,8 @@ DIRECT_RAD = 0.1
 # Share of positions without a direct path that gives a warning.
 MASKED_SHARE = 0.05
 MAX_NOTICES = 30
-# Characters of an ISO time up to its seconds.
-SECONDS = 19
+# Characters of an ISO time up to its seconds: the page and the manifest write different fractions.
+ISO_SECONDS_CHARACTERS = 19
 MARKS = {"committed": "c", "kept": "k", "rejected": "r"}
 
 
@@ -281,14 +281,14 @@ def make_motion(inputs: Inputs) -> Motion:
     left_s = None
     basis = ""
     if inputs.signs.alive:
-        left_s, basis = remaining(inputs.history, inputs.signs.now_s)
+        left_s, basis = estimate_time_left(inputs.history, inputs.signs.now_s)
     stage = None
     if pi.x_mm is not None and pi.y_mm is not None:
         stage = (round(pi.x_mm, 1), round(pi.y_mm, 1))
     return Motion(now_s=now_s, left_s=left_s, left_from=basis, stage=stage, row=pi.row, point=pi.point)
 
 
-def remaining(history: ScanHistory, now_s: float) -> tuple[int | None, str]:
+def estimate_time_left(history: ScanHistory, now_s: float) -> tuple[int | None, str]:
     """Seconds to the scan's end and their origin (`measured`, `first row`, `plan`); None: not known."""
     rows_left = history.plan.rows - len(history.takes)
     if history.ended is not None or history.row_seconds is None:
@@ -394,16 +394,17 @@ def judge(inputs: Inputs) -> Status:
         return _judge_start(inputs)
     if history.ended is not None:
         return _judge_end(inputs, history, history.ended)
+    # The first that has something to say is the worst.
     status = _judge_trouble(inputs, history) or _judge_rig(inputs, history) or _judge_rows(inputs, history)
     if status is not None:
         return status
-    now = _safe_rows(history)
+    now = _describe_safe_rows(history)
     if inputs.pi.row >= 0:
         now = f"Row {inputs.pi.row} is being scanned."
     return say("rows", now=now)
 
 
-def _safe_rows(history: ScanHistory) -> str:
+def _describe_safe_rows(history: ScanHistory) -> str:
     return f"{len(history.takes)} of {history.plan.rows} rows are safe."
 
 
@@ -429,15 +430,15 @@ def _may_have_result(inputs: Inputs, history: ScanHistory) -> bool:
 def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status:
     """A scan whose last run has ended."""
     folder = str(inputs.folder)
-    safe = _safe_rows(history)
+    safe = _describe_safe_rows(history)
     words = "Every row is safe."
-    gaps = sum(mark == "kept" for mark in history.marks.values())
-    if gaps:
-        words = f"Every row is safe; {gaps} are kept with gaps, masked."
+    rows_with_gaps = sum(mark == "kept" for mark in history.marks.values())
+    if rows_with_gaps:
+        words = f"Every row is safe; {rows_with_gaps} are kept with gaps, masked."
     program = inputs.program
     if not _may_have_result(inputs, history):
         return say("materials", gaps=words)
-    if program is not None and program.running and program.started_utc[:SECONDS] > ended.ended_utc[:SECONDS]:
+    if program is not None and program.running and cut_fraction(program.started_utc) > cut_fraction(ended.ended_utc):
         if program.kind == "process":
             return say("processing")
         return say("resuming", safe=safe)
@@ -449,6 +450,11 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
     problem = f"{sentence(ended.reason)}."
     do = sentence(ended.remedy) or f"`polysight resume {folder}`"
     return say("failed", what=problem, safe=safe, why=sentence(ended.why) or "See its terminal", do=do)
+
+
+def cut_fraction(iso_time: str) -> str:
+    """Return the time without fractions of a second; such texts can be compared."""
+    return iso_time[:ISO_SECONDS_CHARACTERS]
 
 
 def _judge_result(inputs: Inputs, gaps: str) -> Status:
@@ -467,7 +473,7 @@ def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
     """A program or Pi that does not answer, and what the scan was asked."""
     signs = inputs.signs
     folder = str(inputs.folder)
-    safe = _safe_rows(history)
+    safe = _describe_safe_rows(history)
     program = inputs.program
     if not signs.alive and program is not None and program.kind == "scan" and program.running:
         return say("resuming", safe=safe)
@@ -488,7 +494,7 @@ def _judge_request(life: Life, history: ScanHistory, folder: str) -> Status | No
     if life.asked == "stop":
         return say("stopping", asker=asker)
     if history.paused:
-        return say("paused", asker=asker, safe=_safe_rows(history), folder=folder)
+        return say("paused", asker=asker, safe=_describe_safe_rows(history), folder=folder)
     if life.asked == "pause":
         return say("pausing", asker=asker)
     return None

@@ -28,7 +28,6 @@ from polysight.catalogue import Picture, Program, draw, explain_failure, find_pr
 from polysight.imaging import Antennas, image_grid, scene_gate_m
 from polysight.page.history import PiState, ScanHistory, notice_of_error, notice_of_fault
 from polysight.page.status import (
-    SECONDS,
     Inputs,
     LifeSigns,
     Motion,
@@ -36,6 +35,7 @@ from polysight.page.status import (
     RowSync,
     Shown,
     Snapshot,
+    cut_fraction,
     make_motion,
     make_snapshot,
 )
@@ -333,7 +333,7 @@ class ProductsTail:
             self._verdict = verdict
             self._processed_utc = processed_utc
         # Releases before this one did not say when.
-        if self._processed_utc and self._processed_utc[:SECONDS] < last_row_utc[:SECONDS]:
+        if self._processed_utc and cut_fraction(self._processed_utc) < cut_fraction(last_row_utc):
             return None
         return self._verdict
 

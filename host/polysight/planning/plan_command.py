@@ -55,6 +55,7 @@ _PI_KEYS = ("speed_mm_s", "accel_mm_s2")
 _STEP_MULTIPLES = (1, 2, 3, 4, 5)
 # Largest share of the time between two points that a burst may take.
 _MAX_DUTY = 0.95
+# Travel during a burst. Echoes of pulses that lie further apart have opposite phases, and averaging them cancels.
 _MAX_TRAVEL_WAVELENGTHS = 0.5
 # Largest number of frames in a row, as in host/polysight/radar/commands.py.
 _MAX_FRAMES = 65535
@@ -159,21 +160,23 @@ def propose(
     """
     noise = noise or Noise()
     best: list[tuple[float, Instrument]] = []
-    for changed in _grids(rig):
-        candidates = _bursts(changed, minutes, row_overhead_s)
-        scored = [(predict_noise(p, noise).image_db - predict_burst(p).edge_loss_db, p) for p in candidates]
+    for rig_with_steps in _vary_steps(rig):
+        plans = _vary_bursts(rig_with_steps, minutes, row_overhead_s)
+        # The level of a point over the noise, where a burst's motion weakens it most: at the image's edge.
+        scored = [(predict_noise(plan, noise).image_db - predict_burst(plan).edge_loss_db, plan) for plan in plans]
         if scored:
-            best.append(max(scored, key=lambda t: t[0]))
-    best.sort(key=lambda t: -t[0])
-    usable = (p for _, p in best if not any(_excludes(w) for w in find_warnings(p, noise, scene_mm)))
-    return [forecast(p, noise, row_overhead_s, scene_mm) for p in islice(usable, count)]
+            best.append(max(scored, key=lambda scored_plan: scored_plan[0]))
+    best.sort(key=lambda scored_plan: -scored_plan[0])
+    usable = (plan for _, plan in best if not any(_rules_out(w) for w in find_warnings(plan, noise, scene_mm)))
+    return [forecast(plan, noise, row_overhead_s, scene_mm) for plan in islice(usable, count)]
 
 
-def _excludes(warning: Finding) -> bool:
+def _rules_out(warning: Finding) -> bool:
+    """True if no plan with this warning is proposed."""
     return warning.level == "error" or warning.where == "aliasing"
 
 
-def _grids(rig: Instrument) -> Iterator[Instrument]:
+def _vary_steps(rig: Instrument) -> Iterator[Instrument]:
     """Yield the rig file with other steps."""
     for nx in _STEP_MULTIPLES:
         for ny in _STEP_MULTIPLES:
@@ -185,24 +188,25 @@ def _grids(rig: Instrument) -> Iterator[Instrument]:
                 continue
 
 
-def _bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iterator[Instrument]:
+def _vary_bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iterator[Instrument]:
     """Yield plans with as many pulses as fit, at the slowest speed that keeps the time.
 
     They use the rig's pulse period and the radars' shortest, and the highest number of pulses whose rows end in a short
     packet, which marks the end. A burst with several chirps a frame is not changed.
     """
     if rig.burst.chirps > 1:
-        for speed in _speeds(rig, minutes):
+        for speed in _list_speeds(rig, minutes):
             plan = _set_burst(rig, speed, rig.burst.pulses, rig.burst.period_us)
             if _max_pulses(plan) >= rig.burst.pulses and scan_time(plan, row_overhead_s).minutes <= minutes:
                 yield plan
                 return
         return
     for period in {rig.burst.period_us, min(rig.burst.period_us, shortest_period_us(rig))}:
-        for speed in _speeds(rig, minutes):
+        for speed in _list_speeds(rig, minutes):
             plan = _set_burst(rig, speed, 2, period)
             most = _max_pulses(plan)
-            pulses = next((n for n in range(most, 1, -1) if not whole_packets(plan, n)), most)
+            with_short_last_packet = (n for n in range(most, 1, -1) if not whole_packets(plan, n))
+            pulses = next(with_short_last_packet, most)
             if pulses < 2:
                 break
             plan = _set_burst(rig, speed, pulses, period)
@@ -219,13 +223,14 @@ def _set_burst(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float
 
 
 def _max_pulses(rig: Instrument) -> int:
+    """Largest number of pulses of a burst: by time, by travel during the burst, by the radar's frames in a row."""
     by_time = _MAX_DUTY * 1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us
     travel = predict_burst(rig).travel_wavelengths
     by_travel = 1 + _MAX_TRAVEL_WAVELENGTHS * (rig.burst.chirps_a_position - 1) / travel
     return min(int(by_time), int(by_travel), _MAX_FRAMES // rig.grid.columns)
 
 
-def _speeds(rig: Instrument, minutes: float) -> Iterator[float]:
+def _list_speeds(rig: Instrument, minutes: float) -> Iterator[float]:
     """Yield whole speeds, mm/s, ascending, from the slowest that can keep the time to the limit of stage and travel."""
     length = (rig.grid.columns - 1) * rig.grid.step_x_mm
     slowest = max(1, int(rig.grid.rows * length / (60 * minutes)))
@@ -235,7 +240,7 @@ def _speeds(rig: Instrument, minutes: float) -> Iterator[float]:
             yield float(speed)
 
 
-def _duration(seconds: float) -> str:
+def _format_duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     if seconds < 6000:
@@ -243,18 +248,18 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 3600:.2f} h"
 
 
-def _size(count: float) -> str:
+def _format_bytes(count: float) -> str:
     if count >= 1e9:
         return f"{count / 1e9:.2f} GB"
     return f"{count / 1e6:.0f} MB"
 
 
-def _pair(values: tuple[float, float], digits: int = 1) -> str:
+def _format_pair(values: tuple[float, float], digits: int = 1) -> str:
     return " x ".join("unlimited" if math.isinf(v) else f"{v:.{digits}f}" for v in values)
 
 
 def describe(f: Forecast) -> str:
-    """Return the text of one forecast."""
+    """Return the text of one forecast: two columns, the second continued on lines without a keyword."""
     g = f.rig.grid
     b = f.rig.burst
     s = f.rig.stage
@@ -265,27 +270,31 @@ def describe(f: Forecast) -> str:
     lines = [
         ("scan", f"{g.columns} x {g.rows} positions, steps {g.step_x_mm:g} x {g.step_y_mm:g} mm, {w:g} x {h:g} mm"),
         ("", f"{s.speed_mm_s:g} mm/s, {b.chirps_a_position} chirps a position, {b.chirp_us or b.period_us:g} us apart"),
-        ("time", f"{_duration(t.total_s)}, without homing and retakes: {_duration(t.measuring_s)} measuring,"),
+        (
+            "time",
+            f"{_format_duration(t.total_s)}, without homing and retakes: {_format_duration(t.measuring_s)} measuring,",
+        ),
         (
             "",
-            f"{_duration(t.ramps_s)} ramps, {_duration(t.turns_s)} turns, {_duration(t.tail_s)} waiting for last"
-            f" packets, {_duration(t.overhead_s)} between rows, {_duration(t.approach_s)} approach",
+            f"{_format_duration(t.ramps_s)} ramps, {_format_duration(t.turns_s)} turns,"
+            f" {_format_duration(t.tail_s)} waiting for last packets, {_format_duration(t.overhead_s)} between rows,"
+            f" {_format_duration(t.approach_s)} approach",
         ),
         ("pulses", f.rig.pi.pulse_source),
-        ("raw data", f"{_size(f.raw_bytes)} of {len(f.rig.recorded)} boards"),
+        ("raw data", f"{_format_bytes(f.raw_bytes)} of {len(f.rig.recorded)} boards"),
         (
             "resolution",
-            f"{_pair(r.width_mm)} mm at half power (x by y), with the rig file's window and taper;"
-            f" limit of the geometry {_pair(r.limit_mm)} mm",
+            f"{_format_pair(r.width_mm)} mm at half power (x by y), with the rig file's window and taper;"
+            f" limit of the geometry {_format_pair(r.limit_mm)} mm",
         ),
         (
             "",
-            f"the paper's r lambda / L: {_pair(r.paper_mm)} mm (docs/decisions/0002-imaging.md explains the"
+            f"the paper's r lambda / L: {_format_pair(r.paper_mm)} mm (docs/decisions/0002-imaging.md explains the"
             " difference)",
         ),
-        ("field", f"without aliases over {_pair(f.field.alias_free_mm, 0)} mm"),
-        ("", f"flat plates need {_pair(f.field.mirror_zone_mm, 0)} mm of aperture beyond them on every side"),
-        ("normals", _normals(visible_normals(f.rig))),
+        ("field", f"without aliases over {_format_pair(f.field.alias_free_mm, 0)} mm"),
+        ("", f"flat plates need {_format_pair(f.field.mirror_zone_mm, 0)} mm of aperture beyond them on every side"),
+        ("normals", _describe_normals(visible_normals(f.rig))),
         (
             "motion",
             f"{f.burst.travel_mm:.2f} mm during a burst, {f.burst.travel_wavelengths:.2f} wavelengths;"
@@ -306,7 +315,7 @@ def describe(f: Forecast) -> str:
     return "\n".join(out) + "\n"
 
 
-def _normals(seen: VisibleNormals) -> str:
+def _describe_normals(seen: VisibleNormals) -> str:
     """Text of the tilts at which curved and tilted surfaces are seen."""
     text = f"surfaces tilted by up to {seen.x_deg:.0f} degrees in x, {seen.y_deg:.0f} in y are seen"
     limits = zip(seen.alias_deg, (seen.x_deg, seen.y_deg), strict=True)
@@ -316,15 +325,17 @@ def _normals(seen: VisibleNormals) -> str:
     return text
 
 
-def _table(plans: list[Forecast]) -> str:
+def _format_table(plans: list[Forecast]) -> str:
     lines = ["    time      mm/s  chirps  period us  steps mm     grid       image dB  motion  alias-free mm   raw"]
     for i, f in enumerate(plans, 1):
         g = f.rig.grid
         b = f.rig.burst
         lines.append(
-            f"{i:2d}  {_duration(f.time.total_s):9s} {f.rig.stage.speed_mm_s:4g}  {b.pulses:6d}  {b.period_us:9g}"
+            f"{i:2d}  {_format_duration(f.time.total_s):9s} {f.rig.stage.speed_mm_s:4g}  {b.pulses:6d}"
+            f"  {b.period_us:9g}"
             f"  {f'{g.step_x_mm:g} x {g.step_y_mm:g}':11s}  {f'{g.columns} x {g.rows}':9s}  {f.noise.image_db:8.1f}"
-            f"  {f.burst.travel_wavelengths:4.2f} w  {_pair(f.field.alias_free_mm, 0):13s}  {_size(f.raw_bytes)}"
+            f"  {f.burst.travel_wavelengths:4.2f} w  {_format_pair(f.field.alias_free_mm, 0):13s}"
+            f"  {_format_bytes(f.raw_bytes)}"
         )
     return "\n".join(lines) + "\n"
 
@@ -423,21 +434,24 @@ def measure_row_overhead(folder: Path) -> float | None:
     if scan.started.pi is None:
         return None
     rig = scan.instrument
-    # Times of the first and last trigger of each take of a row.
-    ends: dict[tuple[int, int], tuple[int, int]] = {}
+    # Times of the first and last trigger of each take of a row, in the order taken.
+    triggers_ns: dict[tuple[int, int], tuple[int, int]] = {}
     for event in read_events(folder / EVENTS).events:
         if isinstance(event, Capture):
-            first, _ = ends.setdefault((event.row_index, event.take), (event.edge_ns, event.edge_ns))
-            ends[event.row_index, event.take] = (first, event.edge_ns)
-    motion = row_motion_s(rig.grid, rig.stage) - measuring_s(rig) + turn_s(rig.grid, rig.stage) + tail_s(rig)
-    gaps = [
-        (later[0] - earlier[1]) / 1e9
-        for (row, earlier), (next_row, later) in pairwise((row, t) for (row, _), t in ends.items())
-        if next_row == row + 1
-    ]
-    if not gaps:
+            take = (event.row_index, event.take)
+            first_ns, _ = triggers_ns.setdefault(take, (event.edge_ns, event.edge_ns))
+            triggers_ns[take] = (first_ns, event.edge_ns)
+    gaps_s = []
+    for (take, (_, last_ns)), (next_take, (first_ns, _)) in pairwise(triggers_ns.items()):
+        # A row that was taken again, or a resumed scan, has a gap of another kind before it.
+        if next_take[0] == take[0] + 1:
+            gaps_s.append((first_ns - last_ns) / 1e9)
+    if not gaps_s:
         return None
-    return max(0.0, float(np.median(gaps)) - motion)
+    # Between the triggers the stage brakes, turns, waits for the last packet and accelerates.
+    ramps_s = row_motion_s(rig.grid, rig.stage) - measuring_s(rig)
+    motion_s = ramps_s + turn_s(rig.grid, rig.stage) + tail_s(rig)
+    return max(0.0, float(np.median(gaps_s)) - motion_s)
 
 
 @dataclass(frozen=True)
@@ -478,7 +492,7 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
     """
     original = load_instrument(config)
     rig = changes.apply(original)
-    noise, overhead = _assumptions(options)
+    noise, overhead = _choose_assumptions(options)
     if options.minutes is None:
         f = forecast_scene(original, changes, options.scene, noise, overhead, options.scene_mm)
         if options.as_json:
@@ -498,20 +512,20 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
             differences = "It is the rig file's plan.\n"
         sys.stdout.write(
             f"Best plans within {options.minutes:g} minutes for this aperture, least noise in the image first"
-            f" (dB: point over noise; motion: wavelengths during a burst)\n\n{_table(plans)}\n"
+            f" (dB: point over noise; motion: wavelengths during a burst)\n\n{_format_table(plans)}\n"
             f"The first plan in full:\n\n{describe(plans[0])}\n{differences}"
         )
     else:
         sys.stderr.write(
             f"polysight plan: no plan within {options.minutes:g} minutes without aliases\n"
-            "  why: aperture, stage and scene need more\n"
+            "  why: this aperture takes longer on this stage, or larger steps have aliases in this scene\n"
             "  do: give more time, a smaller --width-mm or --height-mm, a smaller --scene-mm, or a higher"
             " --accel-mm-s2\n"
         )
     return int(not plans)
 
 
-def _assumptions(options: PlanOptions) -> tuple[Noise, float]:
+def _choose_assumptions(options: PlanOptions) -> tuple[Noise, float]:
     """Noise and standstill: as given, else of the scan of --like, else the simulated rig's."""
     noise = Noise(source=_SIMULATED)
     overhead_s = ROW_OVERHEAD_S

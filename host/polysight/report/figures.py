@@ -84,6 +84,17 @@ _MAX_DEG = 300.0
 _METAL_BOX = "#ff9e3d"
 _OTHER_BOX = "#ffffff"
 _FOCUS_RANGE_DB = 30.0
+# Without a metal reference the colours end at this percentile: single bright pixels do not darken the rest.
+_BRIGHT_PERCENTILE = 99.8
+# Range of the amplitude's colours below their end.
+_AMPLITUDE_RANGE_DB = 35
+# Ratio and phase begin to show this far below the brightest pixels, and are opaque 8 dB above that.
+_FADE_BEGINS_DB = -26
+_FADE_WIDTH_DB = 8
+# Room around patches and plates: beside them, below them, and above them, where their names stand.
+_SIDE_ROOM_MM = 20
+_LOWER_ROOM_MM = 12
+_UPPER_ROOM_MM = 24
 Limits = tuple[float, float]
 # Share of a map's height that a label needs.
 _LABEL_HEIGHT = 0.05
@@ -132,7 +143,7 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     return None
 
 
-def _decibels(scan: ProcessedScan) -> str:
+def _amplitude_unit(scan: ProcessedScan) -> str:
     if not scan.metal_referenced:
         return "dB"
     return "dB (metal = 0)" if scan.judged else "dB (reference = 0)"
@@ -145,11 +156,11 @@ def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | No
     """
     kind, _, channel = key.partition("_")
     data = {"h": scan.h, "v": scan.v, "p": scan.p}[channel]
-    unit = _decibels(scan)
+    unit = _amplitude_unit(scan)
     colours = "cividis"
-    fade = None
+    opacity = None
     if kind == "phase" or channel == "p":
-        fade = _fade(scan)
+        opacity = _find_opacity(scan)
     if kind == "phase":
         unit = "degrees"
         colours = "cividis" if phase_deg else "twilight"
@@ -166,13 +177,13 @@ def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | No
         if scan.metal_referenced:
             high = 0.0
         elif finite.size:
-            high = float(np.percentile(finite, 99.8))
+            high = float(np.percentile(finite, _BRIGHT_PERCENTILE))
         else:
             high = 0.0
-        low = high - 35
+        low = high - _AMPLITUDE_RANGE_DB
     image = ax.imshow(
         _mask_invalid(scan, values), extent=extent_mm(scan), origin="lower", cmap=colours, vmin=low, vmax=high,
-        alpha=fade, interpolation="nearest",
+        alpha=opacity, interpolation="nearest",
     )  # fmt: skip
     return image, unit
 
@@ -182,7 +193,7 @@ def _ratio_range_db(scan: ProcessedScan, level: npt.NDArray) -> tuple[float, flo
     levels = [patch.p_abs_db for patch in scan.segments]
     values = np.array([level for level in levels if level is not None])
     if values.size == 0:
-        bright = level[(_fade(scan) > 0.5) & np.isfinite(level)]
+        bright = level[(_find_opacity(scan) > 0.5) & np.isfinite(level)]
         values = np.array([0.0, 20.0])
         if bright.size:
             values = np.percentile(bright, [5, 95])
@@ -191,9 +202,9 @@ def _ratio_range_db(scan: ProcessedScan, level: npt.NDArray) -> tuple[float, flo
     return np.floor(min(low, 0.0) - 1), max(np.ceil(high + 1), np.floor(low) + 6)
 
 
-def _fade(scan: ProcessedScan) -> npt.NDArray[np.float64]:
+def _find_opacity(scan: ProcessedScan) -> npt.NDArray[np.float64]:
     """Return the opacity of ratio and phase: pixels without signal are noise and fade into the background."""
-    return np.clip((_strength_db(scan) + 26) / 8, 0.0, 1.0)
+    return np.clip((_strength_db(scan) - _FADE_BEGINS_DB) / _FADE_WIDTH_DB, 0.0, 1.0)
 
 
 def _strength_db(scan: ProcessedScan) -> npt.NDArray[np.float64]:
@@ -260,7 +271,7 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[Map
         if label not in refused:
             rgb[interior] = [to_rgb(colours.get(str(n), UNKNOWN_COLOUR)) for n in names]
     ax.imshow(rgb, extent=extent_mm(scan), origin="lower", interpolation="nearest")
-    _crop(ax, scan)
+    _crop_to_plates(ax, scan)
     labels = []
     for patch in scan.segments:
         _, y0, _, y1 = patch.box_mm
@@ -289,16 +300,16 @@ def _keep_inside(ax: Axes, text: Text, top_mm: float) -> None:
         text.set(y=min(top_mm, top) - 1.0, verticalalignment="top")
 
 
-def _crop(ax: Axes, scan: ProcessedScan) -> None:
+def _crop_to_plates(ax: Axes, scan: ProcessedScan) -> None:
     """Set limits around patches and plates: square, inside the image, the same for map and truth."""
     boxes = [patch.box_mm for patch in scan.segments] + [plate.box_mm for plate in scan.plates]
     left_mm, right, bottom, top = extent_mm(scan)
     if boxes:
         b = np.array(boxes)
-        x0 = b[:, 0].min() - 20
-        y0 = b[:, 1].min() - 12
-        x1 = b[:, 2].max() + 20
-        y1 = b[:, 3].max() + 24
+        x0 = b[:, 0].min() - _SIDE_ROOM_MM
+        y0 = b[:, 1].min() - _LOWER_ROOM_MM
+        x1 = b[:, 2].max() + _SIDE_ROOM_MM
+        y1 = b[:, 3].max() + _UPPER_ROOM_MM
         half = max(x1 - x0, y1 - y0) / 2
         cx = (x0 + x1) / 2
         cy = (y0 + y1) / 2
@@ -313,7 +324,7 @@ def _crop(ax: Axes, scan: ProcessedScan) -> None:
 def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[MapLabel]:
     """Draw the true plates. Return the labels."""
     colours = assign_colours(scan)
-    _crop(ax, scan)
+    _crop_to_plates(ax, scan)
     left_mm, right = ax.get_xlim()
     bottom, top = ax.get_ylim()
     labels = []
@@ -413,7 +424,7 @@ def _fill_patches(
             str(patch.label), (patch.box_mm[0], patch.box_mm[3]), textcoords="offset points", xytext=(2.5, -2),
             ha="left", va="top", fontsize=6.5, color=INK, path_effects=[withStroke(linewidth=2, foreground="white")],
         )  # fmt: skip
-    _crop(ax, scan)
+    _crop_to_plates(ax, scan)
     ax.set_aspect("equal")
     colour_bar(fig, ax, colours, scale[3])
 

@@ -90,7 +90,7 @@ def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
             assert (data.payload[~mask] == want[~mask]).all(), (row, name)
             assert not mask.any() or row in incomplete
             again = place_again(folder / board.file)
-            assert again.moved or again.placed.missing == again.missing
+            assert again.by_pulses or again.placed.missing == again.missing_before
 
 
 def test_committed_bytes_are_right_or_masked(request, tmp_path):

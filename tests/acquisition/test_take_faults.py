@@ -48,7 +48,7 @@ def pi_fault(rig) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "fault"),
     [
         (lost_on_the_way, {"kind": "lost_on_the_way", "board": "RV"}),
         (no_data, {"kind": "no_data", "board": "RV"}),
@@ -59,14 +59,14 @@ def pi_fault(rig) -> None:
     ],
     ids=lambda x: x.__name__ if callable(x) else "",
 )
-def test_a_rejected_take_has_the_kind_and_board_of_its_fault(rig, tmp_path, spoil, said):
+def test_a_rejected_take_has_the_kind_and_board_of_its_fault(rig, tmp_path, spoil, fault):
     spoil(rig)
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 1)
     (fact,) = facts_of(result.folder, "row_rejected")
-    assert fact["faults"] == [said]
+    assert fact["faults"] == [fault]
     assert len(fact["reasons"]) == 1
-    assert fact["reasons"][0].startswith("RV: ") == ("board" in said)
+    assert fact["reasons"][0].startswith("RV: ") == ("board" in fault)
 
 
 @pytest.mark.parametrize("bit", [Status.DDR_FULL, Status.LVDS_BUFFER_FULL])
@@ -117,14 +117,14 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
 
 def test_words_follow_the_kind_alone():
     """The cause shown depends on the kind of the fault, not on the text of the reason."""
-    answer = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
+    reason = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
     for kind, (cause, do) in CAUSES.items():
-        notice = notice_of_rejection(0, 1, [answer], [TakeFault(kind, answer, "RV").to_row_fault()], "")
+        notice = notice_of_rejection(0, 1, [reason], [TakeFault(kind, reason, "RV").to_row_fault()], "")
         assert (notice.why, notice.do) == (cause, do)
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
     notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.to_row_fault()], "")
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).cause.lower()
     for unknown in ([], [RowFault("of_a_newer_release", "RV")]):
-        notice = notice_of_rejection(0, 1, [answer], unknown, "")
-        assert (notice.why, notice.facts["detail"]) == ("", answer)
+        notice = notice_of_rejection(0, 1, [reason], unknown, "")
+        assert (notice.why, notice.facts["detail"]) == ("", reason)
         assert notice.do

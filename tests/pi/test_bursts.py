@@ -81,8 +81,8 @@ def test_width_is_an_upper_bound_of_every_pulse(k, set_ns, clear_ns):
     assert sent.pulses == (k + 1 if worst > 4000 else 16)
     lines = FakeLines(long=lines.long)
     lines.check_width = False
-    free = send_burst(lines, SPEC, 1_000)
-    assert (free.fault, free.pulses) == (0, 16)
+    unchecked = send_burst(lines, SPEC, 1_000)
+    assert (unchecked.fault, unchecked.pulses) == (0, 16)
 
 
 @given(st.integers(1, 15), st.integers(0, 3 * PERIOD))
@@ -235,10 +235,11 @@ def test_stop_within_a_burst_ends_it_at_a_whole_pulse():
 
 
 bursts = st.tuples(st.integers(1, 256), st.integers(MIN_PERIOD_NS, 20_000_000), st.integers(500, 2000))
-ROOMY = 1 << 22
+# Bytes of a buffer of spidev that every burst of these tests fits into.
+LARGE_BUFFER = 1 << 22
 
 
-def ones(data: bytes) -> list[int]:
+def list_set_bits(data: bytes) -> list[int]:
     """Indices of the set bits, most significant bit first."""
     return np.flatnonzero(np.unpackbits(np.frombuffer(data, np.uint8))).tolist()
 
@@ -246,9 +247,9 @@ def ones(data: bytes) -> list[int]:
 @given(bursts)
 def test_one_set_bit_a_pulse_at_its_place(burst):
     pulses, period_ns, width_ns = burst
-    made_burst = spi_burst(BurstSpec(pulses, period_ns, width_ns), ROOMY)
+    made_burst = spi_burst(BurstSpec(pulses, period_ns, width_ns), LARGE_BUFFER)
     assert made_burst.bit_ns == pytest.approx(width_ns, rel=1e-5), "the width that was asked for"
-    set_bits = ones(made_burst.data)
+    set_bits = list_set_bits(made_burst.data)
     assert tuple(set_bits) == made_burst.bits
     assert len(set_bits) == pulses
     for k, bit in enumerate(set_bits):
@@ -261,7 +262,7 @@ def test_one_set_bit_a_pulse_at_its_place(burst):
 
 @given(bursts, st.integers(MIN_BYTES, 65_536))
 def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
-    needed_bytes = len(spi_burst(BurstSpec(*burst), ROOMY).data)
+    needed_bytes = len(spi_burst(BurstSpec(*burst), LARGE_BUFFER).data)
     if needed_bytes > bufsiz:
         with refused(ErrorCode.VALUES_CONFLICT, bufsiz) as e:
             spi_burst(BurstSpec(*burst), bufsiz)
@@ -275,7 +276,7 @@ def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
 @pytest.mark.parametrize("width_ns", [MIN_WIDTH_NS, 499, 2001, MAX_WIDTH_NS])
 def test_a_width_that_the_controller_cannot_make_is_refused(width_ns):
     with refused(ErrorCode.VALUES_CONFLICT, "0.5..2 us"):
-        spi_burst(BurstSpec(1, PERIOD, width_ns), ROOMY)
+        spi_burst(BurstSpec(1, PERIOD, width_ns), LARGE_BUFFER)
 
 
 def test_the_published_burst_fits_every_pi_as_it_comes():

@@ -28,7 +28,7 @@ from polysight.results import NoResult
 from polysight.settings import DEFAULT
 from polysight.store import locked_samples
 from polysight.store.logs import AppendFile
-from polysight.store.raw import drop, droppable, require_raw
+from polysight.store.raw import drop, find_droppable, require_raw
 from polysight.store.scan_folder import MANIFEST, ScanFolder, dropped_files
 from polysight.store.validation import damaged_rows
 from polysight_shared.error_codes import ErrorCode
@@ -218,7 +218,7 @@ def test_an_unfinished_scan_keeps_its_rows(scan):
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join(line for line in lines if b'"row":3' not in line))
     with refused(ErrorCode.NOT_ENOUGH_DATA, "1 of 4", "polysight resume"):
-        droppable(ScanFolder.load(scan), find_processed_digests(scan / "products"))
+        find_droppable(ScanFolder.load(scan), find_processed_digests(scan / "products"))
     with pytest.raises(ScanError):
         drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")
 

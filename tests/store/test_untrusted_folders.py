@@ -31,7 +31,7 @@ from polysight.products.folder import making_products
 from polysight.products.processed import read_image
 from polysight.store import manifest
 from polysight.store.published_rig import read_json as read_settings_json
-from polysight.store.raw import drop, droppable
+from polysight.store.raw import drop, find_droppable
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared.config import load_instrument
@@ -62,7 +62,7 @@ def test_a_row_outside_the_scan_is_refused_by_whatever_reads_it(scan, file):
     victim = scan.path.parent / "victim.bin"
     victim.write_bytes(b"mine")
     committed_as(scan, file)
-    for use in (scan.committed_rows, lambda: list(scan.rows()), lambda: droppable(scan, {})):
+    for use in (scan.committed_rows, lambda: list(scan.rows()), lambda: find_droppable(scan, {})):
         with refused(ErrorCode.PATH_OUTSIDE):
             use()
     assert any(f.level == "error" for f in validate(scan.path))
@@ -94,7 +94,7 @@ def test_only_bytes_that_were_committed_are_dropped(scan):
     zeros = bytes(board.bytes)
     (scan.path / board.file).write_bytes(zeros)
     processed = {n: {r.row: r.boards[n].crc32 for r in scan.committed_rows().values()} for n in row.boards}
-    kept_files = droppable(scan, processed).kept_files
+    kept_files = find_droppable(scan, processed).kept_files
     assert [line for line in kept_files if board.file in line]
     drop(scan, processed, scan.path)
     assert (scan.path / board.file).read_bytes() == zeros
@@ -247,7 +247,7 @@ def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):
     os.truncate(scan.path / board.file, 1 << 42)
     with refused(ErrorCode.FILE_DAMAGED, 1 << 42):
         _ = scan.read_row(name, 0).payload
-    assert board.file in str(droppable(scan, {name: {0: board.crc32}}).kept_files)
+    assert board.file in str(find_droppable(scan, {name: {0: board.crc32}}).kept_files)
 
 
 @pytest.mark.parametrize("file", ["manifest.jsonl", "raw/{board}/0000.idx", "raw/{board}/0000.pkt"])

@@ -222,10 +222,16 @@ def test_peaks_and_medians_of_any_spectrum(loops, size):
     halves[3] = 0
     weights = (rng.standard_normal((4, 16)) + 1j * rng.standard_normal((4, 16))).astype(np.complex64)
     estimator = (rng.standard_normal((3, 64)) + 1j * rng.standard_normal((3, 64))).astype(np.complex64)
-    got, expected = (
-        by.find(halves, weights, size, (3, 9), 0.35, np.ones((4, 16), np.complex64), estimator, 0)
-        for by in (loops, sync_loops.NumpyLoops)
-    )
+    arguments = {
+        "size": size,
+        "object_bins": (3, 9),
+        "comparable": 0.35,
+        "steering": np.ones((4, 16), np.complex64),
+        "estimator": estimator,
+        "steps": 0,
+    }
+    got = loops.find(halves, weights, **arguments)
+    expected = sync_loops.NumpyLoops.find(halves, weights, **arguments)
     np.testing.assert_array_equal(got.peaks, expected.peaks)
     np.testing.assert_array_equal(got.frequency, expected.peaks[0])
     np.testing.assert_allclose(got.median, expected.median, rtol=1e-4, atol=1e-5)

@@ -26,49 +26,48 @@ def ratio(images: ImagePair, plate: Plate) -> complex:
 
 
 @pytest.fixture(scope="module")
-def pair() -> World:
-    """Metal and a dielectric, each in its turn at the middle."""
+def metal_world() -> World:
+    """A metal plate at the middle of the image."""
     return World((Plate("plate", CENTRE_M, (0.06, 0.06), METAL),))
 
 
 @pytest.fixture(scope="module")
-def undisturbed_pair(pair) -> ImagePair:
-    return simulate(pair)
+def metal_images(metal_world) -> ImagePair:
+    return simulate(metal_world)
 
 
-def test_a_plate_stands_where_it_was_put(undisturbed_pair):
-    x0, y0, x1, y1 = undisturbed_pair.world.plates[0].box_m
-    lit = np.abs(undisturbed_pair.h) > 0.5 * np.abs(undisturbed_pair.h).max()
+def test_a_plate_stands_where_it_was_put(metal_images):
+    x0, y0, x1, y1 = metal_images.world.plates[0].box_m
+    lit = np.abs(metal_images.h) > 0.5 * np.abs(metal_images.h).max()
     columns = np.flatnonzero(lit.any(axis=0))
     rows = np.flatnonzero(lit.any(axis=1))
-    assert undisturbed_pair.x_m[columns[[0, -1]]] == pytest.approx([x0, x1], abs=0.005)
-    assert undisturbed_pair.y_m[rows[[0, -1]]] == pytest.approx([y0, y1], abs=0.005)
+    assert metal_images.x_m[columns[[0, -1]]] == pytest.approx([x0, x1], abs=0.005)
+    assert metal_images.y_m[rows[[0, -1]]] == pytest.approx([y0, y1], abs=0.005)
 
 
-def test_a_dielectric_beside_metal_has_the_ratio_of_fresnel(undisturbed_pair):
+def test_a_dielectric_beside_metal_has_the_ratio_of_fresnel(metal_images):
     plate = Plate("plate", CENTRE_M, (0.06, 0.06), DIELECTRIC)
     images = simulate(World((plate,)))
-    measured = ratio(images, plate) / ratio(undisturbed_pair, undisturbed_pair.world.plates[0])
+    measured = ratio(images, plate) / ratio(metal_images, metal_images.world.plates[0])
     assert measured == pytest.approx(images.plate_ratio(plate), rel=0.01)
 
 
 @pytest.mark.parametrize("name", [*NUISANCES, "all"])
-def test_each_nuisance_changes_the_images_and_is_told(name, pair, undisturbed_pair):
+def test_each_nuisance_changes_the_images_and_is_listed_as_active(name, metal_world, metal_images):
     nuisances = draw_nuisances(np.random.default_rng(1), name)
     assert nuisances.active()
-    images = simulate(pair, nuisances)
-    assert images.h.shape == undisturbed_pair.h.shape
+    images = simulate(metal_world, nuisances)
+    assert images.h.shape == metal_images.h.shape
     assert np.isfinite(images.h).all()
     changes = [
-        np.abs(a - b).max() / np.abs(b).max()
-        for a, b in ((images.h, undisturbed_pair.h), (images.v, undisturbed_pair.v))
+        np.abs(a - b).max() / np.abs(b).max() for a, b in ((images.h, metal_images.h), (images.v, metal_images.v))
     ]
     assert max(changes) > 1e-3
 
 
-def test_a_seed_gives_one_scan(pair):
+def test_a_seed_gives_one_scan(metal_world):
     nuisances = draw_nuisances(np.random.default_rng(5), "all")
-    assert np.array_equal(simulate(pair, nuisances).h, simulate(pair, nuisances).h)
+    assert np.array_equal(simulate(metal_world, nuisances).h, simulate(metal_world, nuisances).h)
 
 
 def test_no_nuisance_is_none():

@@ -100,15 +100,15 @@ def check_inputs(settings: Settings, inputs: Inputs, calibration: Calibration, r
     Raises
     ------
     DataError
-        when the library cannot be read or fitted, a box holds no pixel, or the plate was imaged otherwise.
+        when the library cannot be read or fitted, a box holds no pixel, or the plate was imaged with other settings.
     """
     boxes = boxes_as_patches(settings, inputs, *axes_m)
     if load_classifier(settings, rig) is None and settings.model != "none":
-        sys.stderr.write(f"note: {why_unnamed(settings, rig).replace('was', 'will be', 1)}\n")
-    in_scene = boxes.metal is not None or settings.metal_box_mm is not None
-    plate = calibration.metal_plane(rig, inputs.reference, in_scene, settings.bands)
-    if plate is not None:
-        plate.check_axes(*axes_m)
+        sys.stderr.write(f"note: {why_unnamed(settings, rig, will_be=True)}\n")
+    metal_in_scene = boxes.metal is not None or settings.metal_box_mm is not None
+    metal_plate = calibration.metal_plane(rig, inputs.reference, metal_in_scene, settings.bands)
+    if metal_plate is not None:
+        metal_plate.check_axes(*axes_m)
 
 
 def publish_images(pipeline: Pipeline, out: Path) -> None:
@@ -123,7 +123,7 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
     with making_products(out, pipeline.source.scan_id) as new:
         scan = collect_imaged_scan(out, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
         save_images(new, scan)
-    # A terminal that is closed is no reason to leave out the rest.
+    # If the terminal was closed, processing goes on all the same.
     with suppress(OSError):
         sys.stderr.write(f"image: {out / IMAGE}\n")
 
@@ -131,11 +131,11 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
 def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
     """Write all products, replacing those in `out`; show the current step on stderr.
 
-    When the metal that was given is none, the images alone do, unless `out` holds a report; the error says where they
-    are. Raises PolysightError.
+    If the given metal turns out not to be metal, the images alone are written, unless `out` holds a report; the error
+    says where they are. Raises PolysightError.
     """
     with making_products(out, pipeline.source.scan_id) as new, current_step("image") as progress:
-        # `out` is locked; `drop-raw` may have run since the rows were added
+        # The rows were added before `out` was locked: `drop-raw` may have run in between.
         _check_dropped(pipeline, out)
         try:
             products = pipeline.finish(new, plates, progress)
@@ -245,7 +245,7 @@ def process_images(data: Path, out: Path, settings: Settings, inputs: Inputs) ->
     if settings.bands > 1 or settings.sparse:
         option = "--sparse" if settings.sparse else "--bands"
         raise ConfigError(
-            f"{option} with given images", "it needs the rows of a recorded scan",
+            f"{option} with given images", f"{option} needs the rows of a recorded scan",
             "leave it out", code=ErrorCode.VALUES_CONFLICT,
         )  # fmt: skip
     rig = rig_of_images(settings.path("config"))
@@ -320,7 +320,7 @@ def _check_dropped(pipeline: Pipeline, out: Path) -> None:
     absent = pipeline.quality.coverage().rows_absent
     if absent:
         raise DataError(
-            f"{out} holds products of more rows: {len(absent)} rows have no data any more",
+            f"{len(absent)} rows of the scan have no data any more, and {out} holds products made with them",
             "their raw data was dropped, and their samples are damaged or missing",
             "give another --out",
             code=ErrorCode.NOT_ENOUGH_DATA,
@@ -332,7 +332,7 @@ def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
     source = open_source(data, settings.path("config"), dropped=True)
     check_products_folder(out, source.scan_id)
     if isinstance(source, ScanFolder) and raw_dropped(out):
-        # Products in `out` may be all that is left of it
+        # Products in `out` may be all that is left of the scan.
         require_raw(source)
     pipeline = process_rows(source, data, settings)
     images = pipeline.form_images()
@@ -359,26 +359,26 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     say("images, and the plane of the plates")
     images = pipeline.form_images()
     pipeline.place_plane(images, move=False)
-    plates = pipeline.plane
+    plates_plane = pipeline.plane
     say("the plane at which the image is sharpest")
     sharpest = focus_sweep(builder, depth_m=depth_mm / 1e3)
-    if plates.known:
-        depth_m = plates.offset_m
+    if plates_plane.known:
+        depth_m = plates_plane.offset_m
     else:
         depth_m = sharpest.depth_mm / 1e3
     grid = builder.grid
     board = builder.boards[source.instrument.receivers[0].name]
     pictures = (board.image()[0], board.image(replace(grid, z_m=grid.z_m + depth_m))[0])
-    # The builder's image is that of the mirrored rig
+    # A scan recorded column by column is processed as that of a mirrored rig.
     if source.mirrored:
         sharpest = sharpest.transpose()
-        plates = plates.transpose()
+        plates_plane = plates_plane.transpose()
         pictures = (pictures[0].T, pictures[1].T)
-    sweep = sharpest.to_dict() | {"plates": plates.to_dict()}
+    sweep = sharpest.to_dict() | {"plates": plates_plane.to_dict()}
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
     (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *pixel_axes(pipeline), source.simulated))
     head = name_scan(source.scan_id, source.simulated)
-    print_lines(_focus_lines(head, pipeline.rig.geometry.object_distance_mm, sharpest, plates))
+    print_lines(_focus_lines(head, pipeline.rig.geometry.object_distance_mm, sharpest, plates_plane))
     sys.stdout.write(f"figure: {out / 'focus.png'}\n")
     return 0
 
@@ -387,18 +387,19 @@ def _focus_lines(head: str, distance_mm: float, sharpest: Focus, plates: PlaneEs
     """Text of `focus`: the plane by the plates, if there are any, and by sharpness."""
     lines = []
     if plates.known:
-        mm = 1e3 * plates.offset_m
-        std = 1e3 * plates.offset_std_m
-        tilt = np.degrees(plates.tilt_rad)
-        tilt_std = np.degrees(plates.tilt_std_rad)
+        offset_mm = 1e3 * plates.offset_m
+        offset_std_mm = 1e3 * plates.offset_std_m
+        tilt_deg = np.degrees(plates.tilt_rad)
+        tilt_std_deg = np.degrees(plates.tilt_std_rad)
         method = "the phase of their echoes" if plates.by_phase else "the range of their echoes"
         lines += [
-            f"{head}: {plates.plates} flat plates lie {mm:+.2f} +- {std:.2f} mm from the rig file's plane, by {method}:"
-            f" object_distance_mm = {distance_mm + mm:.2f}",
-            f"tilt: {tilt[0]:+.2f} +- {tilt_std[0]:.2f} degrees along x, {tilt[1]:+.2f} +- {tilt_std[1]:.2f} along y",
+            f"{head}: {plates.plates} flat plates lie {offset_mm:+.2f} +- {offset_std_mm:.2f} mm from the rig file's"
+            f" plane, by {method}: object_distance_mm = {distance_mm + offset_mm:.2f}",
+            f"tilt: {tilt_deg[0]:+.2f} +- {tilt_std_deg[0]:.2f} degrees along x,"
+            f" {tilt_deg[1]:+.2f} +- {tilt_std_deg[1]:.2f} along y",
         ]
     if plates.known and not sharpest.certain:
-        return [*lines, "sharpness does not tell (a narrow scan, or no points and edges in it); the plates do"]
+        return [*lines, "sharpness gives no plane (a narrow scan, or no points and edges in it); use the plates' plane"]
     lines += [
         f"{head}: the plane is sharpest {sharpest.depth_mm:+.2f} mm from the rig file's:"
         f" object_distance_mm = {distance_mm + sharpest.depth_mm:.2f}",

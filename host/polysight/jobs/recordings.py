@@ -228,9 +228,9 @@ def inspect_placement(file: Path, as_json: bool) -> int:
             )
     again = place_again(row)
     # A row whose frames were moved to their pulses cannot be compared range by range.
-    same = again.moved or again.missing == again.placed.missing
+    same = again.by_pulses or again.missing_before == again.placed.missing
     if as_json:
-        print_json({**again.placed.facts(), "committed_missing": again.missing, "same": same})
+        print_json({**again.placed.facts(), "committed_missing": again.missing_before, "same": same})
     else:
         sys.stdout.write("\n".join(_placement_lines(file, again, same)) + "\n")
     return exit_status(same)
@@ -259,7 +259,7 @@ def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
     ]
     if evidence.dropped_by_card:
         lines.append(f"card       dropped data before numbering it ({evidence.dropped_by_card})")
-    if again.moved:
+    if again.by_pulses:
         lines.append("committed  with its frames at their pulses")
     elif same:
         lines.append("committed  the same")

@@ -25,7 +25,16 @@ from polysight.jobs.output import confirm, print_json
 from polysight.materials import UNKNOWN
 from polysight.products import QUALITY, REPORT, products_locked, read_products, write_json
 from polysight.results import ComplexNumber, RawDropped, read_object, to_plain
-from polysight.store import Digests, ScanFolder, damaged_samples, drop, droppable, dropped_rows, locked_samples, utc_now
+from polysight.store import (
+    Digests,
+    ScanFolder,
+    damaged_samples,
+    drop,
+    dropped_rows,
+    find_droppable,
+    locked_samples,
+    utc_now,
+)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, no_such
 from polysight_shared.files import write_atomically
@@ -223,7 +232,7 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
 
 def _drop(scan: ScanFolder, folder: Path, products: Path, yes: bool) -> int:
     processed = find_processed_digests(products)
-    rows = droppable(scan, processed)
+    rows = find_droppable(scan, processed)
     for line in rows.kept_files:
         sys.stdout.write(f"kept: {line}\n")
     if not rows.files:

@@ -51,13 +51,16 @@ def boxes_as_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m
     return KnownScene(patches, metal, names)
 
 
-def why_unnamed(settings: Settings, rig: Instrument) -> str:
-    """Return the reason why nothing will be named in scans of a rig, as a sentence; "" if names are given.
+def why_unnamed(settings: Settings, rig: Instrument, will_be: bool = False) -> str:
+    """Return the reason why nothing was named in scans of a rig, as sentences; "" if names are given.
+
+    With `will_be` they speak of a scan that is processed later.
 
     Raises DataError if the library cannot be loaded.
     """
+    verb = "will be" if will_be else "was"
     if settings.model == "none":
-        return "Nothing was named: naming was left out (--model none)."
+        return f"Nothing {verb} named: naming was left out (--model none)."
     path = library_path(settings)
     angle = incidence_deg(rig, rig.receivers[0])
     known_angles = Library.load(path).angles_deg
@@ -65,7 +68,7 @@ def why_unnamed(settings: Settings, rig: Instrument) -> str:
     if not known_angles or any(abs(library_angle - angle) <= SAME_ANGLE_DEG for library_angle in known_angles):
         return ""
     return (
-        f"Nothing was named: the scan looks at {angle:.1f} degrees of incidence, and {path.name} holds"
+        f"Nothing {verb} named: the scan looks at {angle:.1f} degrees of incidence, and {path.name} holds"
         f" {' and '.join(f'{a:g}' for a in known_angles)} degrees only (|P| changes by a tenth in a degree)."
         " Train a library at this angle, and process the scan again with --library."
     )

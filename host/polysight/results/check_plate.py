@@ -16,6 +16,9 @@ from polysight_shared.findings import Finding
 # Distances in standard deviations that 95 and 99.7 % of good scans stay below (chi-square of two values).
 WARNING_SIGMAS = 2.45
 ACTION_SIGMAS = 3.41
+# Weights of the reasons, which order them: a plate that was measured wrongly says more than one that is missing.
+_MISSING_WEIGHT = 2.0
+_ACTION_WEIGHT = 3.8
 
 
 class CheckResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -24,17 +27,17 @@ class CheckResult(msgspec.Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     name
-        The plate's, of the rig file.
+        Name of the plate in the rig file.
     level
         "good", "warning" (expected in 5 % of good scans), "action" (in 0.3 %), or "missing".
     expected, expected_std
         Permittivity [eps', loss] of the rig file and its standard errors.
     measured, measured_std
-        The same of the patch; None if it is missing.
+        The same as measured on the patch; None if it is missing.
     sigmas
         Distance in standard deviations, of both errors and their correlation.
     why
-        Why it is missing.
+        Why the plate is missing.
     """
 
     name: str
@@ -54,7 +57,7 @@ def check_plate(plate: CheckPlate, patches: Sequence[PatchFigures]) -> CheckResu
     # The result of a plate that was not measured; it is filled in below.
     missing = CheckResult(name=plate.name, level="missing", expected=plate.permittivity, expected_std=plate.std)
     x_mm, y_mm = plate.place_mm
-    patch = next((patch for patch in patches if _holds(patch, x_mm, y_mm)), None)
+    patch = next((patch for patch in patches if _contains(patch, x_mm, y_mm)), None)
     if patch is None:
         return msgspec.structs.replace(missing, why=f"no patch at x {x_mm:g}, y {y_mm:g} mm from the image's centre")
     value = patch.permittivity
@@ -81,7 +84,7 @@ def check_plate(plate: CheckPlate, patches: Sequence[PatchFigures]) -> CheckResu
     )
 
 
-def _holds(patch: PatchFigures, x_mm: float, y_mm: float) -> bool:
+def _contains(patch: PatchFigures, x_mm: float, y_mm: float) -> bool:
     x0, y0, x1, y1 = patch.box_mm
     return x0 <= x_mm <= x1 and y0 <= y_mm <= y1
 
@@ -93,7 +96,7 @@ def check_reasons(result: CheckResult | None) -> list[Finding]:
     remedy = "scan it again; if it stays, check calibration, antennas and the metal reference (polysight doctor)"
     if result.measured is None:
         problem = f"the check plate {result.name} was not measured: {result.why}"
-        return [reason("care", problem, "the rig file says that it lies in every scan", remedy, 2.0)]
+        return [reason("care", problem, "the rig file says that it lies in every scan", remedy, _MISSING_WEIGHT)]
     real, loss = result.measured
     known_real, known_loss = result.expected
     problem = (
@@ -101,4 +104,4 @@ def check_reasons(result: CheckResult | None) -> list[Finding]:
         f" {known_loss:.2f}: {result.sigmas:.1f} standard deviations"
     )
     cause = "three good scans in a thousand are so far off: the rig has changed"
-    return [reason("care", problem, cause, remedy, 3.8)]
+    return [reason("care", problem, cause, remedy, _ACTION_WEIGHT)]

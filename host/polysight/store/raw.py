@@ -53,17 +53,17 @@ class Droppable:
 
 def require_raw(scan: ScanFolder) -> None:
     """Check that no raw data of the scan was dropped. Raises DataError."""
-    facts = list(dropped_files(scan).values())
-    if facts:
+    dropped = list(dropped_files(scan).values())
+    if dropped:
         raise DataError(
-            f"{scan.path}: the raw data of {len({fact.row for fact in facts})} rows was dropped",
-            f"it was dropped on {facts[-1].dropped_utc[:10]}, after it was processed into {facts[-1].products}",
+            f"{scan.path}: the raw data of {len({fact.row for fact in dropped})} rows was dropped",
+            f"it was dropped on {dropped[-1].dropped_utc[:10]}, after it was processed into {dropped[-1].products}",
             "use those products; to synchronise again, restore the raw folder from a copy, or scan again",
             code=ErrorCode.NO_DATA,
         )
 
 
-def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
+def find_droppable(scan: ScanFolder, processed: Digests) -> Droppable:
     """Find the files that may be deleted: unchanged since their commit, and processed with the same digest.
 
     Parameters
@@ -108,7 +108,7 @@ def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
 
 
 def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
-    """Lock the scan, then record and delete, row by row, the files that :func:`droppable` finds.
+    """Lock the scan, then record and delete, row by row, the files that :func:`find_droppable` finds.
 
     Raises
     ------
@@ -123,20 +123,20 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
         products_path = products_path.relative_to(scan.path.resolve())
     with scan.writer() as writer:
         scan.reload()
-        droppable_files = droppable(scan, processed)
+        droppable_files = find_droppable(scan, processed)
         recorded = dropped_files(scan)
         rows = scan.committed_rows()
         for index, files in droppable_files.files.items():
             if any(str(path.relative_to(scan.path)) not in recorded for path in files.values()):
-                writer.append(_fact(rows[index], list(files), str(products_path)))
+                writer.append(_describe_dropped_row(rows[index], list(files), str(products_path)))
             for path in files.values():
                 try:
                     path.unlink(missing_ok=True)
                 except OSError as e:
                     raise DeviceError(
                         f"{path}: cannot be removed: {e.strerror}",
-                        "you may not write there, or the disk fails",
-                        f"mend that, then `polysight drop-raw {scan.path}` deletes the rest",
+                        "this user may not write there, or the disk fails",
+                        f"correct the rights or the disk, then `polysight drop-raw {scan.path}` deletes the rest",
                         code=ErrorCode.FILE_UNWRITABLE,
                     ) from None
         for folder in {path.parent for files in droppable_files.files.values() for path in files.values()}:
@@ -159,14 +159,17 @@ def _make_durable(folder: Path) -> None:
     sync_folder(folder)
 
 
-def _fact(row: RowCommitted, boards: list[str], products: str) -> RawDropped:
-    files = {n: DroppedFile(b.file, b.bytes, b.crc32) for n, b in row.boards.items() if n in boards}
+def _describe_dropped_row(row: RowCommitted, boards: list[str], products: str) -> RawDropped:
+    """Return the line of the manifest for a row whose files of these boards are deleted."""
+    files = {
+        name: DroppedFile(board.file, board.bytes, board.crc32) for name, board in row.boards.items() if name in boards
+    }
     return RawDropped(row=row.row, take=row.take, boards=files, products=products, dropped_utc=utc_now())
 
 
 @dataclass(frozen=True)
 class Replaced:
-    """Result for one board's row."""
+    """Report on one board's row that was placed again."""
 
     row: int
     board: str
@@ -187,12 +190,12 @@ class PlacedAgain:
 
     evidence: Evidence
     placed: Placed
-    # uint8, the payload
-    out: np.ndarray
-    # The committed gaps
-    missing: list[tuple[int, int]]
-    # The committed frames were moved to their pulses: the row is left unchanged
-    moved: bool
+    # uint8, the payload as placed now
+    payload: np.ndarray
+    # Missing bytes as committed, [start, stop)
+    missing_before: list[tuple[int, int]]
+    # True if the committed row has its frames at the times of their pulses. Placement by byte count would undo that.
+    by_pulses: bool
 
 
 def place_again(path: Path) -> PlacedAgain:
@@ -204,12 +207,13 @@ def place_again(path: Path) -> PlacedAgain:
         problem = f"{path}: cannot be read: {e.strerror}"
         remedy = "give SCAN/raw/BOARD/ROW.bin"
         raise DataError(problem, cause, remedy, code=ErrorCode.FILE_UNREADABLE) from None
-    facts, _ = read_index(path.with_suffix(".idx"))
+    index, _ = read_index(path.with_suffix(".idx"))
     evidence, log = read_packets(path.with_suffix(PACKETS), row)
-    e = evidence
-    placed, out = place_record(log, e.frame_bytes, e.past, e.not_before_ns, e.dropped_by_card)
-    missing = [(int(a), int(b)) for a, b in facts.get("missing", [])]
-    return PlacedAgain(evidence, placed, out, missing, moved="frames" in facts)
+    placed, payload = place_record(
+        log, evidence.frame_bytes, evidence.past, evidence.not_before_ns, evidence.dropped_by_card
+    )
+    missing = [(int(start), int(stop)) for start, stop in index.get("missing", [])]
+    return PlacedAgain(evidence, placed, payload, missing, by_pulses="frames" in index)
 
 
 def replace_rows(scan: ScanFolder) -> list[Replaced]:
@@ -224,16 +228,17 @@ def replace_rows(scan: ScanFolder) -> list[Replaced]:
     with scan.writer() as writer:
         scan.reload()
         for row in scan.committed_rows().values():
-            boards = {name: _place(scan, row, board) for name, board in row.boards.items()}
+            boards = {name: _place_row_again(scan, row, board) for name, board in row.boards.items()}
             reports += [report for report, _ in boards.values()]
             changed = {name: again for name, (report, again) in boards.items() if report.changed and again is not None}
             if changed:
-                _commit(scan, writer, row, changed)
+                _commit_changed_boards(scan, writer, row, changed)
     scan.reload()
     return reports
 
 
-def _place(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
+def _place_row_again(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
+    """Place one board's row again; None beside the report if that cannot be done."""
     name = Path(board.file).parent.name
     path = scan.path / board.file
     unchanged = Replaced(row.row, name, board.missing_bytes, board.missing_bytes)
@@ -245,21 +250,25 @@ def _place(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[Replac
         again = place_again(path)
     except DataError as e:
         return replace(unchanged, why_unchanged=str(e), damaged=True), None
-    if again.moved:
+    if again.by_pulses:
         return replace(unchanged, why_unchanged="its frames were placed by their pulses"), None
-    missing_now = sum(b - a for a, b in again.placed.missing)
-    same = again.missing == again.placed.missing and f"{crc32(again.out.tobytes()):08x}" == board.crc32
-    return replace(unchanged, missing_after=missing_now, changed=not same), again
+    missing_now = sum(stop - start for start, stop in again.placed.missing)
+    same_gaps = again.missing_before == again.placed.missing
+    same_payload = f"{crc32(again.payload.tobytes()):08x}" == board.crc32
+    changed = not (same_gaps and same_payload)
+    return replace(unchanged, missing_after=missing_now, changed=changed), again
 
 
-def _commit(scan: ScanFolder, writer: ManifestWriter, row: RowCommitted, changed: dict[str, PlacedAgain]) -> None:
+def _commit_changed_boards(
+    scan: ScanFolder, writer: ManifestWriter, row: RowCommitted, changed: dict[str, PlacedAgain]
+) -> None:
     """Write the new files, then the line, then delete the old files."""
     boards = dict(row.boards)
     old_files: list[Path] = []
     for name, again in changed.items():
         path = scan.path / boards[name].file
         old_files += [path.with_suffix(suffix) for suffix in (".bin", ".idx", PACKETS)]
-        boards[name] = _write(scan, boards[name], again)
+        boards[name] = _write_new_files(scan, boards[name], again)
     kept_incomplete = row.kept_incomplete
     faults = row.faults
     if all(board.missing_bytes == 0 for board in boards.values()):
@@ -275,24 +284,24 @@ def _commit(scan: ScanFolder, writer: ManifestWriter, row: RowCommitted, changed
         path.unlink(missing_ok=True)
 
 
-def _write(scan: ScanFolder, board: BoardRow, again: PlacedAgain) -> BoardRow:
+def _write_new_files(scan: ScanFolder, board: BoardRow, again: PlacedAgain) -> BoardRow:
     """Write a row's new files durably; return their entry for the manifest."""
     placed = again.placed
-    frame = scan.instrument.frame_bytes
+    frame_bytes = scan.instrument.frame_bytes
     path = scan.path / board.file
-    facts, _ = read_index(path.with_suffix(".idx"))
+    index, _ = read_index(path.with_suffix(".idx"))
     _, log = read_packets(path.with_suffix(PACKETS), np.fromfile(path, dtype=np.uint8))
-    new = _free_name(path)
-    crc = write_durably(new, again.out.tobytes())
-    index_crc = write_index(new.with_suffix(".idx"), {**facts, **placed.facts()}, placed.arrivals)
-    packets_crc = write_packets(new.with_suffix(PACKETS), log, again.evidence, placed)
-    sync_folder(new.parent)
-    frames = placed.expected // frame
+    new_path = _find_free_name(path)
+    crc = write_durably(new_path, again.payload.tobytes())
+    index_crc = write_index(new_path.with_suffix(".idx"), {**index, **placed.facts()}, placed.arrivals)
+    packets_crc = write_packets(new_path.with_suffix(PACKETS), log, again.evidence, placed)
+    sync_folder(new_path.parent)
+    frames = placed.expected // frame_bytes
     return msgspec.structs.replace(
         board,
-        file=str(new.relative_to(scan.path)),
-        frames_received=int(valid_frames(placed.missing, frames, frame).sum()),
-        missing_bytes=sum(b - a for a, b in placed.missing),
+        file=str(new_path.relative_to(scan.path)),
+        frames_received=int(valid_frames(placed.missing, frames, frame_bytes).sum()),
+        missing_bytes=sum(stop - start for start, stop in placed.missing),
         crc32=f"{crc:08x}",
         index_crc32=f"{index_crc:08x}",
         packets_crc32=f"{packets_crc:08x}",
@@ -302,7 +311,7 @@ def _write(scan: ScanFolder, board: BoardRow, again: PlacedAgain) -> BoardRow:
     )
 
 
-def _free_name(path: Path) -> Path:
+def _find_free_name(path: Path) -> Path:
     """`0003-1.bin` for `0003.bin`, or the next number that is free."""
     stem = path.stem.split("-")[0]
     number = 1

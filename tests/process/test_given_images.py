@@ -47,7 +47,7 @@ def pair(labels_folder):
 
 @pytest.fixture
 def save_images(tmp_path, pair):
-    """`saved(h=..., x_m=None)`: the pair as a file, with changed arrays; None leaves one out."""
+    """`save_images(h=..., x_m=None)`: the pair as a file, with changed arrays; None leaves one out."""
 
     def save(name="plates", **changed):
         arrays = {**pair, "incidence_deg": ANGLE, "conjugate": False, **changed}
@@ -103,13 +103,13 @@ def test_the_direction_of_an_axis_does_not_matter(save_images, pair, rig):
 def test_the_angle_of_the_option_comes_before_that_of_the_file_and_the_rigs(save_images, rig):
     with_angle = save_images()
     without = save_images("bare", incidence_deg=None)
-    for path, option, deg, source in (
+    for path, option, expected_deg, source in (
         (with_angle, 60.0, 60.0, "option"),
         (with_angle, None, ANGLE, "file"),
         (without, None, 54.9, "rig file"),
     ):
         scan = analyse_file(path, rig, incidence_deg=option)
-        assert scan.quality.incidence.one_deg == pytest.approx(deg, abs=0.05)
+        assert scan.quality.incidence.one_deg == pytest.approx(expected_deg, abs=0.05)
         assert scan.quality.given_images.incidence_from == source
         assert {round(s.incidence_deg, 1) for s in scan.segments} == {round(scan.quality.incidence.one_deg, 1)}
 

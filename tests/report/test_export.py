@@ -36,17 +36,17 @@ def folder(tmp_path):
     return products
 
 
-def same_arrays(found, products):
+def assert_same_arrays(read_array, products):
     for name in ("h", "v", "p", "valid"):
-        assert (np.asarray(found(name)) == getattr(products, name)).all()
-        assert np.asarray(found(name)).dtype.kind == getattr(products, name).dtype.kind
+        assert (np.asarray(read_array(name)) == getattr(products, name)).all()
+        assert np.asarray(read_array(name)).dtype.kind == getattr(products, name).dtype.kind
 
 
 def test_matlab_round_trip(folder, tmp_path):
     products = read_products(folder)
     (tmp_path / "image.mat").write_bytes(pack_mat(products))
     content = scipy.io.loadmat(tmp_path / "image.mat", simplify_cells=True)
-    same_arrays(lambda name: content[name].astype(getattr(products, name).dtype), products)
+    assert_same_arrays(lambda name: content[name].astype(getattr(products, name).dtype), products)
     assert np.array_equal(content["x_m"], products.x_m)
     assert np.array_equal(content["y_m"], products.y_m)
     config = content["config"]

@@ -20,20 +20,20 @@ from polysight.store.validation import validate
 # Draws of what is left, for each place
 POWER_CUTS = 12
 pytestmark = [
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # who is killed closes nothing
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # a killed program closes no file
     pytest.mark.timeout(3600),  # with --long
 ]
 
 
-def retaken(path: Path) -> set[int]:
+def list_retaken_rows(path: Path) -> set[int]:
     """Rows that were taken again since the last resume, by the manifest."""
     facts = facts_of(path)
     since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
     return {f["row"] for f in facts[since:] if f["fact"] == "row_committed" and f["take"] > 1}
 
 
-def broken_off(scan: SmallScan, disk: FaultyDisk) -> bool:
-    """Run or resume until the disk's fault; what was committed then is safe. Whether the fault came at all."""
+def run_until_fault(scan: SmallScan, disk: FaultyDisk) -> bool:
+    """Run or resume until the disk's fault; rows committed by then must be safe. True if the fault came."""
     try:
         with disk():
             scan.run()
@@ -45,18 +45,18 @@ def broken_off(scan: SmallScan, disk: FaultyDisk) -> bool:
     return False
 
 
-def goes_on(scan: SmallScan, undisturbed_scan, where: str) -> None:
-    """The scan is finished as if nothing had been, with at most one row taken again."""
+def assert_that_it_resumes(scan: SmallScan, undisturbed_scan, where: str) -> None:
+    """Resume the scan: it must end like an undisturbed one, with at most one row taken again."""
     state_before = scan.rows() if scan.begun else {}
     assert scan.run().exit_status == "success", where
     assert validate(scan.path) == [], where
     assert scan.rows() == undisturbed_scan.digests, where
     assert {name: undisturbed_scan.digests[name] for name in state_before} == state_before, where
-    assert len(retaken(scan.path)) <= 1, where
+    assert len(list_retaken_rows(scan.path)) <= 1, where
 
 
-def operations(samples: Samples, folder: Path) -> list[str]:
-    """Everything an undisturbed scan does to the disk."""
+def list_disk_operations(samples: Samples, folder: Path) -> list[str]:
+    """Return the operations of an undisturbed scan on the disk, in order."""
     folder.mkdir()
     disk = FaultyDisk(folder)
     with disk():
@@ -66,22 +66,22 @@ def operations(samples: Samples, folder: Path) -> list[str]:
 
 @pytest.mark.parametrize("fault", ["killed", "killed within", "power cut"])
 def test_scan_is_killed_at_every_operation(samples, undisturbed_scan, tmp_path, fault, sample):
-    done = operations(samples, tmp_path / "count")
+    done = list_disk_operations(samples, tmp_path / "count")
     assert len(done) > 100
     draws = POWER_CUTS if fault == "power cut" else 1
     for step, seed in sample([(step, seed) for step in range(1, len(done) + 1) for seed in range(draws)], 12):
         folder = tmp_path / f"{step}-{seed}"
         scan = SmallScan(samples, folder)
         folder.mkdir()
-        assert broken_off(scan, FaultyDisk(folder, fault, step, seed))
-        goes_on(scan, undisturbed_scan, f"{fault} at {step} ({done[step - 1]}), seed {seed}")
+        assert run_until_fault(scan, FaultyDisk(folder, fault, step, seed))
+        assert_that_it_resumes(scan, undisturbed_scan, f"{fault} at {step} ({done[step - 1]}), seed {seed}")
         shutil.rmtree(folder)
 
 
 def test_nothing_unsynced_is_relied_on(samples, undisturbed_scan, tmp_path):
     """Power is cut at and after every sync of a folder and operation on the manifest; all unsynced is lost."""
     folder = tmp_path / "count"
-    done = operations(samples, folder)
+    done = list_disk_operations(samples, folder)
     folders = {f"fsync {path.name}" for path in (folder, *folder.rglob("*")) if path.is_dir()}
     steps = [
         position
@@ -93,22 +93,22 @@ def test_nothing_unsynced_is_relied_on(samples, undisturbed_scan, tmp_path):
         folder = tmp_path / str(position)
         scan = SmallScan(samples, folder)
         folder.mkdir()
-        assert broken_off(scan, FaultyDisk(folder, "worst power cut", position))
-        goes_on(scan, undisturbed_scan, f"power cut at {position} ({done[position - 1]})")
+        assert run_until_fault(scan, FaultyDisk(folder, "worst power cut", position))
+        assert_that_it_resumes(scan, undisturbed_scan, f"power cut at {position} ({done[position - 1]})")
         shutil.rmtree(folder)
 
 
 @pytest.mark.parametrize("fault", ["killed within", "power cut"])
 def test_resume_is_killed_at_every_operation_too(samples, undisturbed_scan, tmp_path, fault, sample):
-    done = operations(samples, tmp_path / "count")
+    done = list_disk_operations(samples, tmp_path / "count")
     first = next(i for i, description in enumerate(done, 1) if description == "write 0001.idx")  # within row 1
     killed = 0
     for position in sample(range(1, len(done)), 12):
         folder = tmp_path / str(position)
         folder.mkdir()
         scan = SmallScan(samples, folder)
-        assert broken_off(scan, FaultyDisk(folder, "killed within", first))
-        killed += broken_off(scan, FaultyDisk(folder, fault, position, seed=position))
-        goes_on(scan, undisturbed_scan, f"{fault} at {position} of the resume")
+        assert run_until_fault(scan, FaultyDisk(folder, "killed within", first))
+        killed += run_until_fault(scan, FaultyDisk(folder, fault, position, seed=position))
+        assert_that_it_resumes(scan, undisturbed_scan, f"{fault} at {position} of the resume")
         shutil.rmtree(folder)
     assert killed > 4

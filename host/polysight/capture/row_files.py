@@ -25,7 +25,8 @@ from polysight_shared.errors import DataError, DeviceError
 from polysight_shared.files import open_to_write, read_bounded
 
 Bytes = NDArray[np.uint8]
-PAIR = np.dtype("<i8")
+# Each arrival in an index is a pair of these.
+_INDEX_PAIR = np.dtype("<i8")
 # Sixteen million batches of packets.
 MAX_INDEX_BYTES = 256 << 20
 
@@ -38,7 +39,7 @@ def _find_scan(path: Path) -> Path:
 
 
 def write_error(path: Path, done: str, e: OSError) -> DeviceError:
-    """Return the error for a file of a scan that cannot be `done`: written, opened, renamed..."""
+    """Return the error for a file of a scan; `done` is what failed: "written", "opened", "renamed"."""
     is_full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     code = ErrorCode.DISK_FULL if is_full else ErrorCode.FILE_UNWRITABLE
     return DeviceError(
@@ -107,7 +108,7 @@ class Segment:
 def write_index(path: Path, facts: dict[str, Any], arrivals: NDArray[np.int64]) -> int:
     """Write a row's index durably and return its CRC-32. `arrivals` is int64 [n, 2]. Raises DeviceError."""
     head = json.dumps({**facts, "arrivals": len(arrivals)}, sort_keys=True, separators=(",", ":"))
-    raw = head.encode("ascii") + b"\n" + arrivals.astype(PAIR).tobytes()
+    raw = head.encode("ascii") + b"\n" + arrivals.astype(_INDEX_PAIR).tobytes()
     return write_durably(path, raw)
 
 
@@ -128,7 +129,7 @@ def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
     try:
         head, _, tail = read_bounded(path, MAX_INDEX_BYTES).partition(b"\n")
         facts = json.loads(head)
-        pairs = np.frombuffer(tail, dtype=PAIR).reshape(-1, 2).astype(np.int64)
+        pairs = np.frombuffer(tail, dtype=_INDEX_PAIR).reshape(-1, 2).astype(np.int64)
     except (OSError, ValueError, RecursionError) as e:
         problem = f"{path}: not a readable row index: {e}"
         raise DataError(problem, *_explain_damage(path), code=ErrorCode.FILE_DAMAGED) from None
@@ -271,7 +272,7 @@ def _restore_log(
     # Each product fits 48 bits; their sum need not fit 64.
     payload_bytes = sum((packets * sizes).tolist())
     if expected != row.size or payload_bytes > PacketLog.max_kept_bytes(expected) or (sizes == 0).any():
-        raise ValueError("it is of another row, or has more payload than a receiver keeps")
+        raise ValueError("it belongs to another row, or has more payload than a receiver keeps")
     index_in_run = np.arange(packets.sum()) - np.repeat(np.cumsum(packets) - packets, packets)
     size_of_each = np.repeat(sizes, packets)
     parts = []

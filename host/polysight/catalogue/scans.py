@@ -44,7 +44,7 @@ MAX_DEPTH = 4
 MAX_SCANS = 5000
 LOG_BYTES = 16384
 CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-# From a manifest's last line to the first sign of life.
+# Time that a program may take from the last line of a manifest to its first sign of life.
 GRACE_S = 20.0
 Stamp = tuple[tuple[int, int], ...]
 
@@ -112,7 +112,7 @@ def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
         fault = f"the tag {longest[:MAX_TAG]!r}... has {len(longest)} characters, {MAX_TAG} are allowed"
     if fault:
         raise ConfigError(
-            fault, "lists have to stay readable", "shorten it; longer texts go into a file of their own",
+            fault, "longer ones would make the list of scans unreadable", "shorten it; put longer texts into a file",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     written = Notes(text, tuple(tags))
@@ -189,9 +189,9 @@ class Summary(msgspec.Struct, frozen=True):
 
 
 def read_generation(products: Path) -> str:
-    """What tells the products in a folder from those that replace them; the folder is exchanged as a whole.
+    """Return a text that changes when the products in a folder are replaced; they are replaced all at once.
 
-    Who reads several files compares it before and after: equal ones mean that all files belong together.
+    To read several files that belong together, compare the text before and after.
     """
     stamps = []
     for path in (products, *(products / name for name in (IMAGE, MATERIALS, QUALITY, SCAN))):
@@ -208,7 +208,7 @@ def read_generation(products: Path) -> str:
     return ".".join(stamps)
 
 
-def _stamp(folder: Path) -> Stamp:
+def _read_stamp(folder: Path) -> Stamp:
     """Times and sizes of the files that a summary is made from."""
     products = (IMAGE, MATERIALS, QUALITY)
     stamps = []
@@ -366,6 +366,7 @@ def explain_failure(program: Program | None) -> Finding | None:
         lines = lines or ["its program ended without a message"]
         return Finding("error", lines[-1][:300])
     start = heads[-1]
+    # Errors are printed in three parts: the problem, and indented lines `why:` and `do:`.
     parts = {"why": "", "do": ""}
     for line in lines[start + 1 :]:
         name, _, text = line.strip().partition(": ")
@@ -466,7 +467,7 @@ class Scans:
             if self.only is not None:
                 entries = [self.only]
             else:
-                entries = [name for name, _ in _folders(self.root)]
+                entries = [name for name, _ in _list_folders(self.root)]
             self._read_all(deque(entry for entry in entries if entry not in self._reading))
             scans: list[Summary] = []
             for entry in entries:
@@ -489,25 +490,25 @@ class Scans:
                 worker.join(READ_S)
 
     def _read_entries(self, waiting: deque[str]) -> None:
-        # Another thread may take the last one.
+        # Two threads may read: the other one may take the last entry.
         with suppress(IndexError):
             while True:
                 entry = waiting.popleft()
                 self._reading.add(entry)
                 try:
-                    self._listed[entry] = [self._summary(name) for name in self._names_below(entry)]
+                    self._listed[entry] = [self._summary(name) for name in self._find_names_below(entry)]
                 finally:
                     self._reading.discard(entry)
 
-    def _names_below(self, entry: str) -> Iterator[str]:
+    def _find_names_below(self, entry: str) -> Iterator[str]:
         """The scan that an entry of the root is, or those below it."""
         if self.only is not None or is_scan(self.root / entry):
             return iter([entry])
-        return _scan_names(self.root / entry, f"{entry}/", 2)
+        return _find_scan_names(self.root / entry, f"{entry}/", 2)
 
     def lives(self) -> Iterator[tuple[str, Life]]:
         """Name and last sign of life of each scan that runs, or was killed; no scan is read."""
-        places = _places(self.root, "", 1)
+        places = _find_scans(self.root, "", 1)
         if self.only is not None:
             places = iter([(self.only, self.root / self.only)])
         for name, path in places:
@@ -553,7 +554,7 @@ class Scans:
         else:
             path = self.root
         try:
-            # No link on the way.
+            # The resolved path differs if a part of it is a link.
             valid = valid and path.resolve() == self.root.resolve() / name
             outer = [parent for parent in path.parents if self.root in parent.parents and is_scan(parent)]
             exists = new or name == self.only or is_scan(path)
@@ -562,24 +563,25 @@ class Scans:
             exists = False
         if not valid:
             raise DataError(
-                f"no scan is called {name[:80]!r} here", "the name leads elsewhere, or is none", "see the list",
+                f"no scan here has the name {name[:80]!r}", "the name is not valid, or leads out of this folder",
+                "choose a name from the list",
                 code=ErrorCode.PATH_OUTSIDE,
             )  # fmt: skip
         if outer:
             raise DataError(
-                f"{path}: no scan", f"it lies inside the scan {outer[0].name}", "give the scan's own name",
+                f"{path}: not a scan", f"the folder lies inside the scan {outer[0].name}", "give the name of that scan",
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
         if not exists:
             if not path.exists():
                 raise no_such(path)
             cause = "nothing was recorded there"
-            raise DataError(f"{path}: no scan", cause, "see the list", code=ErrorCode.FILE_MISSING)
+            raise DataError(f"{path}: not a scan", cause, "choose a name from the list", code=ErrorCode.FILE_MISSING)
         return path
 
     def _summary(self, name: str) -> Summary:
         folder = self.root / name
-        stamp = _stamp(folder)
+        stamp = _read_stamp(folder)
         stored = self._summaries.get(name)
         if stored is None or stored[0] != stamp:
             stored = (stamp, summarise(folder, name))
@@ -592,29 +594,29 @@ def folder_bytes(folder: Path) -> int:
     total = 0
     for place, _, files in os.walk(folder):
         for name in files:
-            # A file may go meanwhile.
+            # A file may be deleted meanwhile.
             with suppress(OSError):
                 total += (Path(place) / name).lstat().st_size
     return total
 
 
-def _scan_names(root: Path, prefix: str, depth: int) -> Iterator[str]:
+def _find_scan_names(root: Path, prefix: str, depth: int) -> Iterator[str]:
     """Names of the scans below a folder."""
-    names = (name for name, _ in _places(root, prefix, depth))
+    names = (name for name, _ in _find_scans(root, prefix, depth))
     yield from islice(names, MAX_SCANS)
 
 
-def _places(root: Path, prefix: str, depth: int) -> Iterator[tuple[str, Path]]:
+def _find_scans(root: Path, prefix: str, depth: int) -> Iterator[tuple[str, Path]]:
     """Names and paths of the scans below a folder; links, hidden folders and insides of scans are left out."""
-    for entry, path in _folders(root):
+    for entry, path in _list_folders(root):
         name = f"{prefix}{entry}"
         if is_scan(path):
             yield name, path
         elif depth < MAX_DEPTH:
-            yield from _places(path, f"{name}/", depth + 1)
+            yield from _find_scans(path, f"{name}/", depth + 1)
 
 
-def _folders(root: Path) -> list[tuple[str, Path]]:
+def _list_folders(root: Path) -> list[tuple[str, Path]]:
     """Names and paths of the folders in a folder, sorted; links and names that cannot be shown are left out."""
     with suppress(OSError), os.scandir(root) as entries:
         folders = [e for e in entries if _is_name(e.name) and e.is_dir(follow_symlinks=False)]

@@ -34,8 +34,9 @@ MOST_ADDED = 4
 """Largest number of steps into which a step between positions is divided."""
 TEST_SHARE = 10
 """One in so many recorded rows, columns or positions is left out of the first fit, to measure the prediction."""
-# Steps of the power iteration
+# The power iteration comes from below: after 12 rounds 5 % are added, so that the estimate is not too small.
 _POWER_ROUNDS = 12
+_EIGENVALUE_MARGIN = 1.05
 
 
 @dataclass(frozen=True)
@@ -107,25 +108,29 @@ def reconstruct(
         return model.adjoint(y * weights)
 
     matched = adjoint(data)
+    # Steps of 1 / lipschitz cannot overshoot.
     lipschitz = _largest_eigenvalue(lambda x: adjoint(forward(x)), matched)
     threshold = strength * float(np.abs(matched).max()) / lipschitz
     norm = float(np.linalg.norm(data)) or 1.0
     x = np.zeros_like(matched) if start is None else start
+
+    # FISTA (Beck and Teboulle, SIAM J. Imaging Sciences 2, 2009, equations 4.1 to 4.3): each step starts from a point
+    # ahead of the last image, in the direction of the last change.
     ahead = x
-    t = 1.0
+    momentum = 1.0
     residuals = []
     for _ in range(iterations):
         misfit = forward(ahead) - data
         residuals.append(float(np.linalg.norm(misfit)) / norm)
-        new = _shrunk(ahead - adjoint(misfit) / np.float32(lipschitz), threshold)
-        grown = (1 + np.sqrt(1 + 4 * t * t)) / 2
-        ahead = (new + (t - 1) / grown * (new - x)).astype(np.complex64)
+        new = _shrink_amplitudes(ahead - adjoint(misfit) / np.float32(lipschitz), threshold)
+        next_momentum = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
+        ahead = (new + (momentum - 1) / next_momentum * (new - x)).astype(np.complex64)
         x = new
-        t = grown
+        momentum = next_momentum
     return Reconstruction(x, np.array(residuals))
 
 
-def _shrunk(x: NDArray[np.complexfloating], threshold: float) -> NDArray[np.complex64]:
+def _shrink_amplitudes(x: NDArray[np.complexfloating], threshold: float) -> NDArray[np.complex64]:
     """Reduce amplitudes by a threshold and keep phases: the proximal operator of the 1-norm."""
     size = np.abs(x)
     return (x * (np.maximum(size - threshold, 0) / np.maximum(size, 1e-30))).astype(np.complex64)
@@ -134,7 +139,7 @@ def _shrunk(x: NDArray[np.complexfloating], threshold: float) -> NDArray[np.comp
 def _largest_eigenvalue(
     operator: Callable[[NDArray[np.complex64]], NDArray[np.complex64]], start: NDArray[np.complex64]
 ) -> float:
-    """Return the largest eigenvalue of a positive operator by power iteration, plus 5 %."""
+    """Return the largest eigenvalue of a positive operator by power iteration, with a margin."""
     x = start
     value = 1.0
     for _ in range(_POWER_ROUNDS):
@@ -143,7 +148,7 @@ def _largest_eigenvalue(
             return 1.0
         x = operator((x / norm).astype(np.complex64))
         value = float(np.linalg.norm(x))
-    return 1.05 * value
+    return _EIGENVALUE_MARGIN * value
 
 
 def find_added_steps(rig: Instrument) -> tuple[int, int]:
@@ -175,7 +180,7 @@ def fill_missing(
         if positions are missing and the aperture needs the direct sum: its hundred images would take hours.
     """
     steps = find_added_steps(builder.rig)
-    filled = ImageBuilder(_finer(builder.rig, steps), builder.taper, gate_m=builder.gate_m)
+    filled = ImageBuilder(_divide_steps(builder.rig, steps), builder.taper, gate_m=builder.gate_m)
     errors = {}
     for name, board in filled.boards.items():
         board.copy_samples(builder.boards[name], steps)
@@ -198,7 +203,7 @@ def fill_sub_bands(sub_bands: SubBandImages) -> SubBandImages:
     return filled
 
 
-def _finer(rig: Instrument, steps: tuple[int, int]) -> Instrument:
+def _divide_steps(rig: Instrument, steps: tuple[int, int]) -> Instrument:
     """Return the rig with each step between rows and between columns divided."""
     grid = msgspec.structs.replace(
         rig.grid,
@@ -215,18 +220,18 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
     model = _Model(board)
     recorded = board.valid.copy()
     samples = board.calibrate_samples()
-    tested = _positions_to_test(recorded)
+    tested = _choose_test_positions(recorded)
     first = reconstruct(board, iterations, used=~tested)
     error = None
     if tested.any():
-        wrong = model.samples(first.image) - samples
+        misfit = model.samples(first.image) - samples
         weights = board.taper * tested
-        error = _norm_of_image(model, wrong, weights) / _norm_of_image(model, samples, weights)
+        error = _measure_image(model, misfit, weights) / _measure_image(model, samples, weights)
     last = reconstruct(board, max(1, iterations // 2), start=first.image)
     board.fill(model.samples(last.image))
     samples = board.calibrate_samples()
-    reconstructed = _norm_of_image(model, samples, board.taper * ~recorded)
-    share = reconstructed / _norm_of_image(model, samples, board.taper)
+    reconstructed = _measure_image(model, samples, board.taper * ~recorded)
+    share = reconstructed / _measure_image(model, samples, board.taper)
     return ReconstructedPositions(
         missing_share=float(1 - recorded.mean()),
         residual=float(last.residual[-1]),
@@ -235,7 +240,7 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
     )
 
 
-def _positions_to_test(recorded: Mask) -> Mask:
+def _choose_test_positions(recorded: Mask) -> Mask:
     """Return recorded positions to leave out of a fit: whole rows or columns if such are missing, otherwise any."""
     rows = np.flatnonzero(recorded.any(axis=1))
     columns = np.flatnonzero(recorded.any(axis=0))
@@ -249,7 +254,7 @@ def _positions_to_test(recorded: Mask) -> Mask:
     return tested & recorded
 
 
-def _norm_of_image(model: _Model, samples: NDArray[np.complexfloating], weights: NDArray[Any]) -> float:
+def _measure_image(model: _Model, samples: NDArray[np.complexfloating], weights: NDArray[Any]) -> float:
     """Return the root of the sum of the squares of an image's pixels; 1e-30 if it is dark."""
     image = model.imager.image((samples * weights).astype(np.complex64))
     return float(np.linalg.norm(image)) or 1e-30

@@ -20,23 +20,37 @@ from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missi
 
 def main(argv: list[str] | None = None) -> int:
     """Run until SIGTERM or SIGINT."""
-    p = command_line("polysight_simulators.uno", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
-    p.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
-    p.add_argument("--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires: gets trigger and motion")
-    p.add_argument("--link", type=Path, required=True, metavar="PATH", help="name of the serial port to make")
-    p.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="times real time; see above")
-    p.add_argument("--boot-ms", type=int, default=200, metavar="N", help="after opening, in the board's own time")
-    args = p.parse_args(argv)
+    parser = command_line("polysight_simulators.uno", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
+    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
+    parser.add_argument(
+        "--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires: gets trigger and motion"
+    )
+    parser.add_argument("--link", type=Path, required=True, metavar="PATH", help="name of the serial port to make")
+    parser.add_argument(
+        "--time-scale",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="speed of the board, relative to real time; see above",
+    )
+    parser.add_argument(
+        "--boot-ms",
+        type=int,
+        default=200,
+        metavar="N",
+        help="time of the boot loader after the port is opened, in the board's own time",
+    )
+    args = parser.parse_args(argv)
     if not args.time_scale > 0:
-        p.error("--time-scale must be positive")
+        parser.error("--time-scale must be positive")
     die_with_parent()
     return run_program(lambda: _run(args))
 
 
 def _run(args: argparse.Namespace) -> None:
-    if lacking := missing():
-        problem = f"not installed: {' '.join(lacking)}"
-        raise PolysightError(problem, "the emulated board is compiled here", ENABLING_COMMAND)
+    if missing_packages := missing():
+        problem = f"not installed: {' '.join(missing_packages)}"
+        raise PolysightError(problem, "the emulated board is compiled on this machine", ENABLING_COMMAND)
     rig = load_instrument(args.config)
     zero = homing_zero()
     program = str(emulator())

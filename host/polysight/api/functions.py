@@ -103,7 +103,9 @@ def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: 
     """
     with _scene_file(scene) as path:
         if path is None:
-            raise ConfigError("no scene was given", "it says what lies where", "see help(polysight.simulate)")
+            raise ConfigError(
+                "no scene was given", "a scene says which objects lie where", "see help(polysight.simulate)"
+            )
         simulate_scene(path, _rig_path(rig), Path(out), seed)
     return open_scan(out)
 

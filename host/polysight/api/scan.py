@@ -166,7 +166,11 @@ def _check_arguments(
 def _analyse_images(path: Path, rig: str | os.PathLike[str] | Instrument | None, settings: Settings) -> ProcessedScan:
     """Find the materials of images that another program made. Raises PolysightError."""
     if settings.bands > 1:
-        raise ConfigError(f"bands = {settings.bands} with given images", "it needs the rows of a scan", "leave it out")
+        raise ConfigError(
+            f"bands = {settings.bands} with given images",
+            "sub-bands need the rows of a recorded scan",
+            "leave bands out",
+        )
     if not isinstance(rig, Instrument):
         rig = load_instrument(find_packaged(RIG) if rig is None else Path(rig))
     scan, _, _ = analyse_given_images(read_given_images(path, rig), settings, Inputs(), rig)
@@ -689,5 +693,8 @@ def _parse_layer(layer: str | Layer) -> Layer:
         return parse_layer(layer)
     except ValueError:
         raise ConfigError(
-            f"{layer!r} is no layer", "it has another form", f"write {LAYER_FORMS}", code=ErrorCode.VALUE_INVALID
+            f"{layer!r} does not describe a layer",
+            "the text has another form",
+            f"write {LAYER_FORMS}",
+            code=ErrorCode.VALUE_INVALID,
         ) from None

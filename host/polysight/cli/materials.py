@@ -45,8 +45,8 @@ def _permittivity(args: argparse.Namespace) -> int:
     if useless and not args.layer:
         raise ConfigError(
             f"{' and '.join(useless)} without --layer would do nothing",
-            "it says how layers are fitted; one interface needs none of it",
-            "add the layers (--layer), or leave it out",
+            "these options say how layers are fitted; a single interface does not need them",
+            "add the layers (--layer), or leave these options out",
             code=ErrorCode.VALUES_CONFLICT,
         )
     amplitude = 10.0 if args.amplitude is None else args.amplitude

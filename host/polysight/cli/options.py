@@ -121,13 +121,13 @@ def material_settings(args: argparse.Namespace) -> Settings:
     if options_used and getattr(args, "no_process", False):
         raise ConfigError(
             f"{' and '.join(options_used)} with --no-process would do nothing",
-            "it says how the scan is processed, and it will only be recorded",
-            "give it to `polysight process` later, or leave --no-process out",
+            "these options say how a scan is processed, and --no-process only records it",
+            "give these options to `polysight process` later, or leave --no-process out",
             code=ErrorCode.VALUES_CONFLICT,
         )
     if args.library is not None and args.model == "none":
         raise ConfigError(
-            "--library with --model none would do nothing", "nothing is named", "leave one of them out",
+            "--library with --model none would do nothing", "--model none names nothing", "leave one of them out",
             code=ErrorCode.VALUES_CONFLICT,
         )  # fmt: skip
     return Settings(

@@ -301,7 +301,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
     except (OSError, TimeoutError, ValueError) as e:
         raise ConfigError(
             f"no Dask scheduler at {address}: {e}",
-            "it is not running, or a firewall is between",
+            "the scheduler is not running, or a firewall blocks it",
             "start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`",
             code=ErrorCode.NO_ANSWER,
         ) from None

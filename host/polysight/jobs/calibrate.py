@@ -59,7 +59,11 @@ def take_antenna_places(scanned: Instrument, other: Instrument) -> Instrument:
     """Return a scan's rig with antennas, mounts and object plane of another rig file. Raises ConfigError."""
     mounts = {b.name: b.mount for b in other.boards}
     if set(mounts) != {b.name for b in scanned.boards}:
-        raise ConfigError(f"the rig file has the boards {sorted(mounts)}", "it is of another rig", "give the scan's")
+        raise ConfigError(
+            f"the rig file has the boards {sorted(mounts)}",
+            "it belongs to another rig",
+            "give the rig file of the scan",
+        )
     boards = tuple(msgspec.structs.replace(b, mount=mounts[b.name]) for b in scanned.boards)
     return msgspec.structs.replace(scanned, boards=boards, antennas=other.antennas, geometry=other.geometry)
 
@@ -116,7 +120,9 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
     chirps = {(s.instrument.chirp.hpf1_khz, s.instrument.chirp.hpf2_khz) for s in sources}
     if len(chirps) > 1:
         raise DataError(
-            f"the scans have different filters: {sorted(chirps)} kHz", "they are of several sweeps", "give one"
+            f"the scans have different filters: {sorted(chirps)} kHz",
+            "they belong to several sweeps",
+            "give the scans of one sweep",
         )
     names = [b.name for b in sources[0].instrument.receivers]
     boards = {name: fit_filter(sources, name) for name in steps(names, [f"filters of {name}" for name in names])}

@@ -145,7 +145,7 @@ def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
                 raise _simulator_error(rig.wait(), output)
     raise DeviceError(
         f"the simulated rig was not ready within {_START_LIMIT_S:.0f} s",
-        "an overloaded machine",
+        "the machine is overloaded",
         f"see {folder / 'logs'}",
     )
 

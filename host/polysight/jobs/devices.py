@@ -329,9 +329,7 @@ def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
 
 def _check_trace(trace: Path | None) -> None:
     if trace is not None and trace.is_file():
-        raise ConfigError(
-            f"{trace}: is there already", "a trace of before, which is never written over", "another name"
-        )
+        raise ConfigError(f"{trace} exists already", "traces are never overwritten", "give another name")
 
 
 def _open(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, slow: bool) -> WordLink:

@@ -230,6 +230,14 @@ def list_patches(products: ProcessedScan) -> list[FoundPatch]:
     return out
 
 
+def _require_patches(patches: Sequence[FoundPatch]) -> None:
+    """Raise DataError if there are none."""
+    if not patches:
+        raise DataError(
+            "no patch was found", "only images were made, or no object stands out in them", "draw a box: --box"
+        )
+
+
 def apply_edits(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tuple[Labels, list[str]]:
     """Return boxes after the edits, and the numbers of unnamed patches.
 
@@ -242,8 +250,7 @@ def apply_edits(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tu
     specimens = dict(labels.specimens)
     metal = labels.metal
     if edits.from_patches:
-        if not found:
-            raise DataError("no patch was found", "only images were made, or nothing is in them", "draw it: --box")
+        _require_patches(found)
         boxes = {str(patch.number): patch.box for patch in found}
         specimens = {}
         metal = None
@@ -335,8 +342,7 @@ def _split_at_equals(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
 
 def ask_for_names(found: Sequence[FoundPatch], ask: Ask) -> Labels:
     """Ask for the names of patches. Raises DataError without patches, ConfigError when the input ends."""
-    if not found:
-        raise DataError("no patch was found", "only images were made, or nothing is in them", "draw it: --box")
+    _require_patches(found)
     boxes: dict[str, Box] = {}
     metal = None
     sys.stdout.write(f"name each patch; Enter leaves it out, m is the metal reference (named {METAL})\n")

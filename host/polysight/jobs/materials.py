@@ -99,7 +99,7 @@ def _check_bands(patch: PatchFigures, chirp: Chirp, source: str) -> None:
             raise DataError(
                 f"patch {patch.label} covers {saved.first_hz / 1e9:.4f} to {saved.last_hz / 1e9:.4f} GHz; the chirp"
                 f" of {source} has that part from {expected.first_hz / 1e9:.4f} to {expected.last_hz / 1e9:.4f} GHz",
-                "that is another rig file than the scan's",
+                "the rig file is not that of the scan",
                 "leave --config out: the products bring their own",
             )
 
@@ -377,7 +377,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
     if len({s.folder.resolve() for s in products}) < len(products):
         raise ConfigError(
             f"{' '.join(map(str, data))}: one scan is given twice",
-            "it tells nothing more the second time",
+            "the second one adds no information",
             "give scans of the same patches under different angles",
         )
     if len(products) == len(scans):

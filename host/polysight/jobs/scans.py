@@ -256,7 +256,9 @@ def _drop(scan: ScanFolder, folder: Path, products: Path, yes: bool) -> int:
         sys.stdout.write(f"to be removed: {folder_of_board.relative_to(folder)}: {', '.join(names)}\n")
     answer = confirm(text, WORD, yes)
     if answer != WORD:
-        raise ConfigError(f"nothing dropped: answered {answer!r}", f"{WORD!r} was asked for", f"type {WORD}, or --yes")
+        raise ConfigError(
+            f"nothing dropped: answered {answer!r}", f"the answer was not {WORD!r}", f"type {WORD}, or --yes"
+        )
     _keep(products, scan)
     drop(scan, processed, products)
     sys.stdout.write(f"{folder}: dropped; its digests stay in the manifest\n")
@@ -275,7 +277,7 @@ def _check_samples(scan: ScanFolder, rows: set[int]) -> None:
         names = sorted({name for files in damaged.values() for name in files})
         raise DataError(
             f"{scan.path}: samples of rows {', '.join(map(str, damaged))} are damaged or missing: {', '.join(names)}",
-            "without them the raw data is all there is to make images from",
+            "without these samples images can be made from the raw data only",
             f"`polysight process {scan.path} --out DIR` makes them again",
             code=ErrorCode.FILE_DAMAGED,
         )

@@ -69,8 +69,9 @@ class PlanRequest(Body, frozen=True):
         rig = self.changes().apply(load_instrument(config))
         if max(rig.grid.columns, rig.grid.rows) > MAX_POSITIONS:
             raise ConfigError(
-                f"{rig.grid.columns} x {rig.grid.rows} positions", f"{MAX_POSITIONS} in a row are the most here",
-                "larger steps, or a smaller area", code=ErrorCode.VALUE_INVALID,
+                f"{rig.grid.columns} x {rig.grid.rows} positions",
+                f"at most {MAX_POSITIONS} in each direction can be planned here",
+                "choose larger steps, or a smaller area", code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip
         return rig
 
@@ -247,7 +248,7 @@ def check_request(site: Site, body: StartRequest) -> Instrument:
     folder = site.scans.folder(body.name, new=True)
     if folder.exists() and any(p.name not in (PROGRAM, NOTES) for p in folder.iterdir()):
         raise ConfigError(
-            f"{body.name} is there already", "scans are never overwritten", "give another name",
+            f"{body.name} exists already", "scans are never overwritten", "give another name",
             code=ErrorCode.NAME_TAKEN,
         )  # fmt: skip
     return rig
@@ -315,16 +316,14 @@ def _put_away(site: Site, folder: Path, name: str, typed: str) -> Path:
     """Move a scan into the hidden archive; returns its new place. Raises PolysightError."""
     if typed != name:
         raise ConfigError(
-            "the name that was typed is another one", f"the scan is called {name}", "type it as it is shown",
+            "the typed name is not that of the scan", f"the scan has the name {name}", "type the name as it is shown",
             code=ErrorCode.MISMATCH,
         )  # fmt: skip
     with site.rig:
         working = [p.kind for p in find_programs(folder) if p.running]
         summary = site.scans.summary(name)
         if working or summary.state in ("running", "paused", "frozen"):
-            raise ScanError(
-                f"{name} is at work", "its files are being written", "wait, or stop it", code=ErrorCode.BUSY
-            )
+            raise ScanError(f"{name} is in use", "its files are being written", "wait, or stop it", code=ErrorCode.BUSY)
         place = site.logs / "archive" / f"{time.time_ns()}" / folder.name
         place.parent.mkdir(parents=True)
         folder.rename(place)

@@ -57,8 +57,8 @@ class Queue:
             names = [waiting for waiting, _ in self._requests()]
             if name in names or len(names) >= MAX_WAITING:
                 raise ConfigError(
-                    f"{name} cannot wait: it does already, or {MAX_WAITING} scans do", "each is started once",
-                    "give another name", code=ErrorCode.NAME_TAKEN,
+                    f"{name} cannot be queued", f"it is queued already, or {MAX_WAITING} scans are",
+                    "wait, or give another name", code=ErrorCode.NAME_TAKEN,
                 )  # fmt: skip
             self._folder.mkdir(parents=True, exist_ok=True)
             write_atomically(self._folder / f"{time.time_ns()}.json", request)

@@ -315,7 +315,7 @@ def _number(request: Request, key: str) -> float:
         value = float("nan")
     if not abs(value) < 1e6:
         raise DataError(
-            f"{key} = {text[:40]!r} is no number below a million", "the address is wrong", "use the page",
+            f"{key} = {text[:40]!r} is not a number below a million", "the address is wrong", "use the page",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     return value

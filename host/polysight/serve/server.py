@@ -180,7 +180,7 @@ def load_token() -> str:
     is_safe = stat.S_ISREG(status.st_mode) and not status.st_mode & 0o077 and status.st_uid == os.getuid()
     if not is_safe or len(token) < TOKEN_BYTES:
         raise ConfigError(
-            f"{path} is no token of this user alone", "others may read it, or it was edited",
+            f"{path} cannot be used as a token", "other users may read it, another user owns it, or it was edited",
             "remove it: the next start makes another", code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     return token

@@ -103,7 +103,11 @@ class Site:
     def programs(self) -> Programs:
         """Started programs. Raises DeviceError if none can be started here."""
         if self._programs is None:
-            raise DeviceError("nothing can be started here", "it shows one scan", "polysight serve starts scans")
+            raise DeviceError(
+                "nothing can be started here",
+                "this server only shows one scan",
+                "start a server for scans: polysight serve",
+            )
         return self._programs
 
     @property
@@ -449,7 +453,7 @@ class Programs:
         if answer:
             raise DeviceError(
                 f"{folder}: {kind} cannot be started: {answer}", "no room, no permission, or no memory",
-                "see what it says; the same command works in a terminal",
+                "remove the cause; or give the same command in a terminal",
             )  # fmt: skip
 
     def _ask(self, request: str) -> str:
@@ -480,6 +484,6 @@ def _check_place(place: Path, kind: str) -> None:
     for path in (place, *files):
         if path.is_symlink() or (path != place and path.exists() and not is_plain(path)):
             raise DeviceError(
-                f"{path} is no file of its own", "the folder was made by another program",
+                f"{path} is a link or not a regular file", "the folder was made by another program",
                 "remove it, and find out who made it", code=ErrorCode.PATH_OUTSIDE,
             )  # fmt: skip

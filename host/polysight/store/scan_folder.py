@@ -483,7 +483,7 @@ def locked_samples(scan: ScanFolder) -> Iterator[None]:
     except OSError as e:
         raise DataError(
             f"{path}: {e.strerror}",
-            "the samples of this scan are not kept: its raw data is all there is to make images from",
+            "the samples of this scan are not kept: images can be made from its raw data only",
             f"`polysight process {scan.path} --out DIR` keeps them",
             code=ErrorCode.FILE_MISSING,
         ) from None

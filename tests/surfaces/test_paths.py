@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from polysight.surfaces import Samples
-from polysight.surfaces.paths import find_echoes, find_mirror_path, measure_echoes
+from polysight.surfaces.paths import find_echoes, measure_echoes
 from polysight.surfaces.points import (
     find_curvature,
     find_normals,
@@ -18,6 +18,7 @@ from polysight.surfaces.points import (
     spreading,
     unit_legs,
 )
+from polysight.surfaces.window import find_mirror_path
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_worlds.rig import published_boards
 from polysight_worlds.shape_scenes import scan_offsets
@@ -35,20 +36,22 @@ def empty_scan() -> Samples:
     return Samples(cube, np.ones((21, 21), bool), offsets, FREQUENCIES_HZ, boards.tx.position, rx_m)
 
 
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 def with_echo(scan: Samples, point_m: np.ndarray, radius_m: float, amplitude: complex) -> Samples:
     """Add a metal sphere's specular path, found by minimising over its surface with Newton's method."""
     centre = point_m + np.array([0.0, 0.0, radius_m])
-    paths = np.empty((len(scan.rx_m), *scan.valid.shape))
-    for index in np.ndindex(*paths.shape):
-        tx = scan.tx_m + scan.offsets_m[index[1:]]
-        rx = scan.rx_m[index[0]] + scan.offsets_m[index[1:]]
-        normal = np.array([0.0, 0.0, -1.0])
-        for _ in range(12):
-            p = centre + radius_m * normal
-            way = (tx - p) / np.linalg.norm(tx - p) + (rx - p) / np.linalg.norm(rx - p)
-            normal = way / np.linalg.norm(way)
+    tx = scan.tx_m + scan.offsets_m
+    rx = scan.rx_m[:, None, None] + scan.offsets_m
+    normal = np.array([0.0, 0.0, -1.0])
+    for _ in range(12):
         p = centre + radius_m * normal
-        paths[index] = np.linalg.norm(p - tx) + np.linalg.norm(p - rx)
+        way = _unit(tx - p) + _unit(rx - p)
+        normal = _unit(way)
+    p = centre + radius_m * normal
+    paths = np.linalg.norm(p - tx, axis=-1) + np.linalg.norm(p - rx, axis=-1)
     excess = paths - scan.direct_m[:, None, None]
     turns = scan.frequencies_hz[None, :, None, None] * excess[:, None] / C
     return replace(scan, cube=scan.cube + amplitude * np.exp(2j * np.pi * turns))

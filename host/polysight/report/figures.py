@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
@@ -56,6 +57,8 @@ from polysight.surfaces import Segment, Surface, describe_form, describe_materia
 from polysight_shared.raster import RasterPlan
 
 # Axis numbers of a view (horizontal, vertical), its title, and the names of the axes.
+# Axis of the points along which the rig looks.
+Z = 2
 VIEWS = (
     ((0, 1), "From the rig", ("x (mm)", "y (mm)")),
     ((2, 1), "From the side", ("z (mm), away from the rig", "y (mm)")),
@@ -604,14 +607,17 @@ def surface_figure(surface: Surface) -> bytes:
     panels = fig.subplots(1, 3)
     points_mm = 1e3 * surface.points_m
     colour = surface_colours(surface)
-    known_colour = np.isfinite(colour)
     low, high = colour_range(surface)
+    colours = colormaps["viridis"].with_extremes(bad=NO_PERMITTIVITY)
     coloured = None
     for ax, ((across, up), title, (label_x, label_y)) in zip(panels, VIEWS, strict=True):
-        ax.scatter(points_mm[~known_colour, across], points_mm[~known_colour, up], s=5, color=NO_PERMITTIVITY)
+        # What is nearer to the eye is drawn last: the rig looks along +z, the other two against x and y.
+        depth_axis = 3 - across - up
+        depth = points_mm[:, depth_axis]
+        order = np.argsort(-depth if depth_axis == Z else depth, kind="stable")
         coloured = ax.scatter(
-            points_mm[known_colour, across], points_mm[known_colour, up], s=6, c=colour[known_colour],
-            cmap="viridis", vmin=low, vmax=high,
+            points_mm[order, across], points_mm[order, up], s=6, c=colour[order],
+            cmap=colours, vmin=low, vmax=high, plotnonfinite=True,
         )  # fmt: skip
         stride = max(1, len(points_mm) // NORMALS_SHOWN)
         start = points_mm[::stride]
@@ -622,7 +628,7 @@ def surface_figure(surface: Surface) -> bytes:
         ax.set_xlabel(label_x, fontsize=9, color=MUTED)
         ax.set_ylabel(label_y, fontsize=9, color=MUTED)
         ax.set_aspect("equal", adjustable="datalim")
-    if known_colour.any() and coloured is not None:
+    if np.isfinite(colour).any() and coloured is not None:
         bar = fig.colorbar(coloured, ax=panels, shrink=0.85, pad=0.01)
         bar.set_label("permittivity, real part", fontsize=9, color=MUTED)
     lines = [segment_text(segment) for segment in surface.segments[:MAX_LINES]]

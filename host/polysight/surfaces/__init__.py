@@ -3,8 +3,8 @@
 `Samples` are what the pipeline holds of a board after synchronisation. `see_points` finds the specular points in H and
 measures the same points in V; `analyse_surface` gives points, normals, curvature and permittivity with covariance, with
 the gains that `learn_gains` takes from points of a metal sphere or plate. `write_surface` and `read_surface` are the
-files. In order: `paths` (fit of a window), `points` (geometry), `measure` (both receivers, segments), `optics`
-(polarisation, curved reflection), `permittivity`, `result`.
+files. In order: `window` (fit of one echo), `joint` (of several), `paths` (search), `points` (geometry), `measure`
+(both receivers, segments), `optics` (polarisation, curved reflection), `permittivity`, `result`.
 """
 
 from polysight.surfaces.measure import Seen, Shape, find_shape, see_points
@@ -20,7 +20,6 @@ from polysight.surfaces.optics import (
     reflect_flat,
     visible_normals,
 )
-from polysight.surfaces.paths import Echoes, Samples, find_mirror_path
 from polysight.surfaces.permittivity import Gains, Reference, Uncertainty, find_voltages, learn_gains
 from polysight.surfaces.result import (
     POINTS,
@@ -36,6 +35,7 @@ from polysight.surfaces.result import (
     summary_lines,
     write_surface,
 )
+from polysight.surfaces.window import Echoes, Samples, find_mirror_path
 
 __all__ = [
     "POINTS",

@@ -14,7 +14,7 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.surfaces.optics import Optics
-from polysight.surfaces.paths import STRIDE_M, WINDOW_M, Echoes, Samples, find_echoes, measure_echoes
+from polysight.surfaces.paths import STRIDE_M, find_echoes, measure_echoes
 from polysight.surfaces.points import (
     find_curvature,
     find_normals,
@@ -22,7 +22,7 @@ from polysight.surfaces.points import (
     locate,
     predict_echo,
 )
-from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight.surfaces.window import Echoes, Samples
 
 Array = NDArray[np.float64]
 # Points and normals of neighbouring windows that belong to one surface differ by no more.
@@ -41,12 +41,6 @@ MIN_RADIUS_M = 0.012
 NEAREST_M = 0.2
 FARTHEST_M = 1.4
 MAX_SLOPE = 0.6
-# Two echoes of a window closer than this many resolution cells, in slope and path together, disturb each other's path
-# and amplitude: a pipe 150 mm beside a bottle is one cell away from it, and both scatter by 5 dB.
-MIN_CELLS_APART = 1.5
-# An echo below this share of the other does not count: most edges of a plate are weaker than half of its mirror point.
-# Chosen on one scene of three objects and two plates, all simulated; plates lose a sixth of their points by it.
-DISTURBING_SHARE = 0.5
 # Offsets of the stage closer than this are of one window.
 SAME_WINDOW_M = 1e-4
 # An echo below so many standard deviations of its noise has no usable slope.
@@ -95,21 +89,16 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
     """Find the specular points of a scan in H, and measure the same points in V."""
     echoes = find_echoes(h, gate_m)
     echoes = echoes[_is_sound(echoes, find_shape(echoes, optics))]
-    bandwidth_hz = float(np.ptp(h.frequencies_hz))
-    echoes = echoes[~find_crowded(echoes, optics.wave_number, bandwidth_hz)]
     segment = group_echoes(echoes, optics)
-    echoes = echoes[segment >= 0]
-    segment = segment[segment >= 0]
     echoes = smooth_bends(echoes, segment)
-    keep = _is_wide(find_shape(echoes, optics))
-    echoes = echoes[keep]
-    segment = segment[keep]
     shape = find_shape(echoes, optics)
+    keep = (segment >= 0) & _is_wide(shape)
     tx_m = optics.tx.at_m
     rx_m = optics.v.at_m
     at_m = find_offset_that_sees(shape.points, shape.normals, echoes.at_m, tx_m, rx_m)
     path, slope, bend = predict_echo(shape.points, shape.normals, shape.curvature, at_m, tx_m, rx_m)
-    seen_by_v, inside = measure_echoes(v, at_m, path, slope, bend)
+    window = np.unique(np.round(echoes.at_m / SAME_WINDOW_M), axis=0, return_inverse=True)[1].reshape(-1)
+    seen_by_v, inside = measure_echoes(v, at_m, path, slope, bend, window=window, is_measured=keep)
     return Seen(echoes[inside], seen_by_v, segment[inside])
 
 
@@ -120,21 +109,6 @@ def _is_sound(echoes: Echoes, shape: Shape) -> NDArray[np.bool_]:
     in_view = np.abs(echoes.slope).max(axis=1) < MAX_SLOPE
     above_noise = np.abs(echoes.amplitude) > MIN_AMPLITUDE_STDS * echoes.amplitude_std
     return in_range & in_view & above_noise
-
-
-def find_crowded(echoes: Echoes, wave_number: float, bandwidth_hz: float) -> NDArray[np.bool_]:
-    """True for echoes [n] that another echo of the same window disturbs: the window hardly resolves both."""
-    slope_cell = 2 * np.pi / wave_number / WINDOW_M
-    path_cell_m = SPEED_OF_LIGHT_M_S / bandwidth_hz
-    places = np.column_stack([echoes.slope / slope_cell, echoes.path_m / path_cell_m])
-    level = np.abs(echoes.amplitude)
-    pairs = scipy.spatial.KDTree(echoes.at_m).query_pairs(SAME_WINDOW_M, output_type="ndarray")
-    crowded = np.zeros(len(echoes), bool)
-    for first, second in (pairs.T, pairs.T[::-1]):
-        is_near = np.linalg.norm(places[first] - places[second], axis=1) < MIN_CELLS_APART
-        is_strong = level[second] > DISTURBING_SHARE * level[first]
-        crowded[first[is_near & is_strong]] = True
-    return crowded
 
 
 def _is_wide(shape: Shape) -> NDArray[np.bool_]:
@@ -180,7 +154,7 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
     """
     bend = echoes.bend.copy()
     slope_std = echoes.slope_std.copy()
-    for number in np.unique(segment):
+    for number in np.unique(segment[segment >= 0]):
         members = np.flatnonzero(segment == number)
         at_m = echoes.at_m[members, :2]
         neighbours = scipy.spatial.KDTree(at_m).query_ball_point(at_m, NEIGHBOURHOOD_M)

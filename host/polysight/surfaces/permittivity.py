@@ -33,8 +33,9 @@ from polysight.surfaces.optics import (
     reflect_curved,
     reflect_flat,
 )
-from polysight.surfaces.paths import STRIDE_M, WINDOW_M
+from polysight.surfaces.paths import STRIDE_M
 from polysight.surfaces.points import find_offset_that_sees, predict_echo, spreading, unit_legs
+from polysight.surfaces.window import WINDOW_M
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -19,7 +19,6 @@ from polysight.store import open_npz
 from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS
 from polysight.surfaces.measure import Seen, Shape, find_shape
 from polysight.surfaces.optics import Optics
-from polysight.surfaces.paths import Echoes
 from polysight.surfaces.permittivity import (
     DisturbedScan,
     Gains,
@@ -41,6 +40,7 @@ from polysight.surfaces.permittivity import (
     point_ratio,
 )
 from polysight.surfaces.points import tangents
+from polysight.surfaces.window import Echoes
 from polysight_shared.files import write_atomically
 
 # Fields of a surface that are no arrays of points.

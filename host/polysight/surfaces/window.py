@@ -1,0 +1,365 @@
+"""Samples of a board, and the fit of one echo's path in windows of stage positions.
+
+In a window of some 34 mm the path of an echo is L + g.d + d'Q d / 2, with d the offset from the window's centre: the
+six values (L, g_x, g_y, Q_xx, Q_xy, Q_yy). A window's RX are added up in phase for the direction from which the echo
+comes, and `maximise` fits values and complex amplitude by the matched filter over positions and frequencies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.surfaces.points import locate, unit_legs
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+WINDOW_M = 0.034
+ITERATIONS = 7
+# Largest step of path (m), slopes, and curvatures (1 / m).
+STEP_LIMITS = np.array([0.02, 0.05, 0.05, 1.5, 1.5, 1.5])
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of a receiving board, direct path removed, as after synchronisation.
+
+    Attributes
+    ----------
+    cube
+        complex [rx, frequency, row, column]: an echo of path L is a exp(+2 pi j f (L - direct) / c), seen through
+        `model`.
+    valid
+        bool [row, column].
+    offsets_m
+        float64 [row, column, 3]: stage offsets.
+    frequencies_hz
+        float64 [frequency], evenly spaced.
+    tx_m, rx_m
+        Antennas at stage offset zero, [3] and [rx, 3].
+    model
+        complex [frequency, frequency]: effect of the range gate on an echo; None: none.
+    """
+
+    cube: NDArray[np.complexfloating]
+    valid: NDArray[np.bool_]
+    offsets_m: Array
+    frequencies_hz: Array
+    tx_m: Array
+    rx_m: Array
+    model: NDArray[np.complex128] | None = None
+
+    @property
+    def middle_m(self) -> Array:
+        """Mean place of the RX: echoes are given as if received there."""
+        return self.rx_m.mean(axis=0)
+
+    @property
+    def direct_m(self) -> Array:
+        """Direct path to each RX, [rx]."""
+        return np.linalg.norm(self.rx_m - self.tx_m, axis=1)
+
+    def window_shape(self) -> tuple[int, int]:
+        """Rows and columns of a window."""
+        y = self.offsets_m[:, 0, 1]
+        x = self.offsets_m[0, :, 0]
+        steps = [abs(axis[-1] - axis[0]) / max(1, axis.size - 1) for axis in (y, x)]
+        rows, columns = (max(5, round(WINDOW_M / step)) for step in steps)
+        return min(rows, y.size), min(columns, x.size)
+
+
+@dataclass(frozen=True)
+class Echoes:
+    """Echoes [n]: stage offset `at_m` [n, 3], path, its gradient [n, 2] and curvature [n, 2, 2] (1 / m) there.
+
+    `amplitude`: complex, exp(-j k path) with the path's phase at the centre frequency in it. `amplitude_std`: of its
+    real and of its imaginary part. `path_std_m`, `slope_std` [n, 2]: by the rest of the fit. `share`: of a window's
+    power that its echoes explain. `band_rise`: ln of the amplitude in the upper half of the band over that in the lower
+    half.
+    """
+
+    at_m: Array
+    path_m: Array
+    slope: Array
+    bend: Array
+    amplitude: NDArray[np.complex128]
+    amplitude_std: Array
+    path_std_m: Array
+    slope_std: Array
+    share: Array
+    band_rise: Array
+
+    def __len__(self) -> int:
+        return len(self.path_m)
+
+    def __getitem__(self, keep: NDArray) -> Echoes:
+        return Echoes(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    @staticmethod
+    def join(parts: list[Echoes]) -> Echoes:
+        """Return all echoes of several parts."""
+        return Echoes(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Echoes)})
+
+    def move(self, at_m: Array, wave_number: float) -> Echoes:
+        """Return the echoes at other stage offsets [n, 3] near by: path, slope and phase follow the fitted path."""
+        d = (at_m - self.at_m)[:, :2]
+        rise = np.einsum("np,np->n", self.slope, d) + np.einsum("np,npq,nq->n", d, self.bend, d) / 2
+        return replace(
+            self,
+            at_m=at_m,
+            path_m=self.path_m + rise,
+            slope=self.slope + np.einsum("npq,nq->np", self.bend, d),
+            amplitude=self.amplitude * np.exp(-1j * wave_number * rise),
+        )
+
+
+@dataclass
+class Windows:
+    """Samples of some windows: [window, rx, frequency, position], offsets from their centres [window, position, 2]."""
+
+    samples: NDArray[np.complex64]
+    valid: Array
+    offsets: Array
+    at_m: Array
+
+
+class BoardFit:
+    """The matched filter of one board: frequencies, weights and directions."""
+
+    def __init__(self, board: Samples) -> None:
+        self.board = board
+        self.omega = 2 * np.pi * board.frequencies_hz / SPEED_OF_LIGHT_M_S
+        self.middle = float(self.omega.mean())
+        self.lever = board.rx_m - board.middle_m
+        # The largest gain of the range gate for an echo, and the spread of its frequencies.
+        if board.model is None:
+            model = np.eye(self.omega.size)
+            gate = np.linspace(0.05, 0.6, 24)
+        else:
+            model = board.model
+            gate = np.linspace(*_find_gate(board), 24)
+        phases = np.exp(1j * np.outer(self.omega, gate))
+        weights = np.mean((model @ phases) * phases.conj(), axis=1).real
+        self.gain = float(weights.sum())
+        self.upper_half = np.arange(weights.size) >= weights.size // 2
+        self.band_rise = float(np.log(weights[self.upper_half].sum() / weights[~self.upper_half].sum()))
+        self.weights = weights / self.gain
+        self.middle = float(self.weights @ self.omega)
+        self.mean_square = float(self.weights @ self.omega**2)
+        self.model = model
+
+    def steer(self, offsets: Array, path_m: Array, slope: Array) -> NDArray[np.complex128]:
+        """Phase factors [window, rx, frequency] that add up the RX for echoes of given path and slope."""
+        board = self.board
+        points = locate(path_m, slope, offsets, board.tx_m, board.middle_m)
+        _, back, *_ = unit_legs(points, offsets, board.tx_m, board.middle_m)
+        excess = -back @ self.lever.T - board.direct_m
+        return np.exp(-1j * excess[:, :, None] * self.omega)
+
+
+def _find_gate(board: Samples) -> tuple[float, float]:
+    """Range of excess paths in which the model's gain is looked at: the middle half of its unambiguous range."""
+    reach = SPEED_OF_LIGHT_M_S / (board.frequencies_hz[1] - board.frequencies_hz[0])
+    centre = find_mirror_path(board, 0.5) - board.direct_m.mean()
+    return centre - reach / 10, centre + reach / 10
+
+
+def find_mirror_path(board: Samples, z_m: float) -> float:
+    """Path over a mirror at `z_m`."""
+    image = board.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
+    return float(np.linalg.norm(board.middle_m - image))
+
+
+def find_basis(offsets: Array) -> Array:
+    """Rates of the path by (L, g_x, g_y, Q_xx, Q_xy, Q_yy): [window, position, 6]."""
+    x = offsets[..., 0]
+    y = offsets[..., 1]
+    return np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=-1)
+
+
+def pack_values(path_m: Array, slope: Array, bend: Array) -> Array:
+    """Values [n, 6] of paths [n], slopes [n, 2] and curvatures [n, 2, 2]."""
+    return np.stack([path_m, *slope.T, bend[:, 0, 0], bend[:, 0, 1], bend[:, 1, 1]], axis=1)
+
+
+def unpack_values(values: Array) -> tuple[Array, Array, Array]:
+    """Paths [n], slopes [n, 2] and curvatures [n, 2, 2] of values [n, 6]."""
+    bend = np.stack([values[:, [3, 4]], values[:, [4, 5]]], axis=1)
+    return values[:, 0], values[:, 1:3], bend
+
+
+@dataclass
+class Maximum:
+    """Result of :func:`maximise`: parameters, amplitude, noise, standard deviations, share and rise over the band."""
+
+    values: Array
+    amplitude: NDArray[np.complex128]
+    rest: Array
+    std: Array
+    share: Array
+    band_rise: Array
+
+
+def derotate(fit: BoardFit, added: NDArray, paths: Array) -> Iterator[tuple[float, NDArray]]:
+    """Yield each frequency's wave number and samples [window, position] turned back by the path."""
+    first = np.exp(-1j * fit.omega[0] * paths)
+    step = np.exp(-1j * (fit.omega[1] - fit.omega[0]) * paths) if fit.omega.size > 1 else first
+    for index, omega in enumerate(fit.omega):
+        yield float(omega), added[:, index] * first
+        first = first * step
+
+
+def maximise(
+    fit: BoardFit, added: NDArray, valid: Array, offsets: Array, values: Array, *, iterations: int = ITERATIONS
+) -> Maximum:
+    """Maximise |sum of derotated samples| by Newton's method with the expected curvature.
+
+    `added`: [window, frequency, position], RX added up; `values` [window, 6].
+    """
+    basis = find_basis(offsets)
+    count = np.maximum(valid.sum(axis=1), 1)
+    weighted = valid[:, :, None] * basis
+    mean = weighted.sum(axis=1) / count[:, None]
+    square = np.einsum("wnp,wnq->wpq", weighted, basis) / count[:, None, None]
+    curvature = fit.mean_square * square - fit.middle**2 * np.einsum("wp,wq->wpq", mean, mean)
+    scale = np.sqrt(np.einsum("wpp->wp", curvature) + 1e-12)
+    scaled = curvature / scale[:, :, None] / scale[:, None, :] + 1e-9 * np.eye(6)
+    values = values.copy()
+    sums = np.zeros(basis.shape[:2], complex)
+    upper = np.zeros(basis.shape[:2], complex)
+    total = np.zeros(len(values), complex)
+    for step in range(iterations + 1):
+        paths = np.einsum("wnp,wp->wn", basis, values)
+        sums = np.zeros(paths.shape, complex)
+        upper = np.zeros(paths.shape, complex)
+        rates = np.zeros(paths.shape, complex)
+        for index, (omega, turned) in enumerate(derotate(fit, added, paths)):
+            sums += turned
+            rates -= 1j * omega * turned
+            if fit.upper_half[index]:
+                upper += turned
+        total = (sums * valid).sum(axis=1)
+        if step == iterations:
+            break
+        slope = np.einsum("wnp,wn->wp", weighted, rates) / np.where(total == 0, 1, total)[:, None]
+        move = np.linalg.solve(scaled, (slope.real / scale)[..., None])[..., 0] / scale
+        values += np.clip(move, -STEP_LIMITS, STEP_LIMITS)
+    amplitude = total / count / fit.gain
+    # The amplitude may change linearly over the window: a plane is taken out before the rest counts as noise.
+    plane = weighted[:, :, :3]
+    matrix = np.einsum("wnp,wnq->wpq", plane, basis[:, :, :3]) + 1e-12 * np.eye(3)
+    flat = np.linalg.solve(matrix, np.einsum("wnp,wn->wp", plane, sums)[..., None])[..., 0]
+    rest = (sums - np.einsum("wnp,wp->wn", basis[:, :, :3], flat)) * valid
+    power = (np.abs(rest) ** 2).sum(axis=1) / np.maximum(count - 9, 1) / fit.gain**2
+    noise = power / count / 2
+    inverse = np.linalg.inv(scaled)
+    spread = np.einsum("wpp->wp", inverse) / scale**2
+    std = np.sqrt(spread * (noise / np.maximum(np.abs(amplitude) ** 2, 1e-30))[:, None])
+    energy = np.einsum("wfn,wn->w", np.abs(added) ** 2, valid)
+    share = count * np.abs(amplitude) ** 2 * fit.gain**2 / fit.omega.size / np.maximum(energy, 1e-30)
+    upper_total = (upper * valid).sum(axis=1)
+    lower_total = np.maximum(np.abs(total - upper_total), 1e-30)
+    band_rise = np.log(np.maximum(np.abs(upper_total), 1e-30) / lower_total) - fit.band_rise
+    return Maximum(
+        values=values,
+        amplitude=amplitude,
+        rest=np.sqrt(noise),
+        std=std,
+        share=share,
+        band_rise=band_rise,
+    )
+
+
+def make_echoes(fit: BoardFit, windows: Windows, found: Maximum) -> Echoes:
+    """Echoes of the maxima found in windows."""
+    path, slope, bend = unpack_values(found.values)
+    # The matched filter's phase is that at the weighted middle of the band.
+    turned = found.amplitude * np.exp(1j * fit.middle * path)
+    return Echoes(
+        at_m=windows.at_m,
+        path_m=path,
+        slope=slope,
+        bend=bend,
+        amplitude=turned.conj(),
+        amplitude_std=found.rest,
+        path_std_m=found.std[:, 0],
+        slope_std=found.std[:, 1:3],
+        share=found.share,
+        band_rise=found.band_rise,
+    )
+
+
+def gather_windows(board: Samples, rows: NDArray, columns: NDArray, at_m: Array) -> Windows:
+    """Windows whose first positions are at (rows, columns), each [window]; `at_m` [window, 3] are their centres."""
+    height, width = board.window_shape()
+    r = rows[:, None, None] + np.arange(height)[:, None]
+    c = columns[:, None, None] + np.arange(width)
+    count = len(rows)
+    samples = np.moveaxis(board.cube[:, :, r, c], 2, 0).reshape(count, *board.cube.shape[:2], -1)
+    valid = board.valid[r, c].reshape(count, -1).astype(float)
+    offsets = board.offsets_m[r, c].reshape(count, -1, 3) - at_m[:, None]
+    return Windows(samples * valid[:, None, None].astype(np.float32), valid, offsets[..., :2], at_m)
+
+
+def add_up(fit: BoardFit, windows: Windows, values: Array) -> NDArray:
+    """Samples of all RX added up for echoes of the given values: [window, frequency, position]."""
+    path, slope, _ = unpack_values(values)
+    factors = fit.steer(windows.at_m, path, slope) / len(fit.lever)
+    return np.einsum("wrf,wrfn->wfn", factors, windows.samples)
+
+
+def make_waves(fit: BoardFit, paths: Array) -> NDArray[np.complex64]:
+    """exp(j omega path) of paths [window, position]: [window, frequency, position]."""
+    waves = np.empty((len(paths), fit.omega.size, paths.shape[1]), np.complex64)
+    wave = np.exp(1j * fit.omega[0] * paths)
+    turn = np.exp(1j * (fit.omega[1] - fit.omega[0]) * paths)
+    for index in range(fit.omega.size):
+        waves[:, index] = wave
+        wave = wave * turn
+    return waves
+
+
+def synthesise(
+    fit: BoardFit, valid: Array, waves: NDArray, amplitude: NDArray, steering: NDArray
+) -> NDArray[np.complex64]:
+    """Samples of echoes, [window, rx, frequency, position]."""
+    factors = (amplitude[:, None, None] * steering.conj()).astype(np.complex64)
+    echo = factors[..., None] * (waves * valid[:, None].astype(np.float32))[:, None]
+    if fit.board.model is not None:
+        echo = fit.model.astype(np.complex64) @ echo
+    return echo
+
+
+def no_echoes() -> Echoes:
+    """Return the echoes of nothing."""
+    return Echoes(
+        at_m=np.zeros((0, 3)),
+        path_m=np.zeros(0),
+        slope=np.zeros((0, 2)),
+        bend=np.zeros((0, 2, 2)),
+        amplitude=np.zeros(0, np.complex128),
+        amplitude_std=np.zeros(0),
+        path_std_m=np.zeros(0),
+        slope_std=np.zeros((0, 2)),
+        share=np.zeros(0),
+        band_rise=np.zeros(0),
+    )
+
+
+def select_windows(windows: Windows, keep: NDArray) -> Windows:
+    """Return some of the windows."""
+    return Windows(windows.samples[keep], windows.valid[keep], windows.offsets[keep], windows.at_m[keep])
+
+
+def replace_samples(windows: Windows, samples: NDArray) -> Windows:
+    """Return windows with other samples."""
+    return Windows(samples, windows.valid, windows.offsets, windows.at_m)
+
+
+def select_maxima(found: Maximum, keep: NDArray) -> Maximum:
+    """Return copies of some maxima."""
+    return Maximum(*(getattr(found, f.name)[keep].copy() for f in fields(Maximum)))

@@ -1,0 +1,56 @@
+"""The picture of a surface: what is nearer to the eye hides what is behind it."""
+
+from __future__ import annotations
+
+import io
+
+import matplotlib
+import numpy as np
+from matplotlib.image import imread
+
+from polysight.report import surface_figure
+from polysight.surfaces import Segment, Surface
+
+
+def make_surface() -> Surface:
+    """A patch of permittivity 6 before a table of 2, whose points come last."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(-0.1, 0.1, 60)))
+    is_near = np.hypot(x, y) < 0.05
+    x, y = np.concatenate([x, x[is_near]]), np.concatenate([y, y[is_near]])
+    z = np.full(x.size, 0.7)
+    z[is_near.size :] = 0.5
+    number = (z == 0.5).astype(int)
+    x, y, z, number = x[::-1], y[::-1], z[::-1], number[::-1]
+    count = x.size
+    medium = (2.0 + 0j, 6.0 + 0j)
+    segments = tuple(
+        Segment(index, 10, (0, 0, 0.6), (0, 0, -1), None, 50.0, eps, ((0.1, 0.0), (0.0, 0.1)))
+        for index, eps in enumerate(medium)
+    )
+    return Surface(
+        scan_id="drawn",
+        simulated=True,
+        points_m=np.stack([x, y, z], axis=1),
+        normals=np.tile([0.0, 0.0, -1.0], (count, 1)),
+        curvature=np.zeros((count, 2, 2)),
+        incidence_deg=np.full(count, 50.0),
+        permittivity=np.array(medium)[number],
+        covariance=np.zeros((count, 2, 2)),
+        position_std_m=np.zeros(count),
+        normal_std_deg=np.zeros(count),
+        segment=number,
+        segments=segments,
+    )
+
+
+def count_pixels(surface: Surface, value: float) -> int:
+    """Pixels of the view from the rig (its left third) in the colour map's colour of `value`."""
+    pixels = imread(io.BytesIO(surface_figure(surface)))
+    view = pixels[:, : pixels.shape[1] // 3, :3]
+    colour = np.array(matplotlib.colormaps["viridis"](value)[:3])
+    return int((np.abs(view - colour).max(axis=2) < 0.02).sum())
+
+
+def test_an_object_hides_the_table_behind_it():
+    # The colour bar spans 1.8 to 6.2.
+    assert count_pixels(make_surface(), (6 - 1.8) / 4.4) > 500

@@ -1,0 +1,70 @@
+"""Objects side by side: the echoes of a window that hardly resolves them are told apart, in H and in V."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.surfaces.test_paths import BEHIND, FRONT_M, empty_scan, with_echo
+
+from polysight.surfaces import Samples
+from polysight.surfaces.paths import find_echoes, measure_echoes
+from polysight.surfaces.points import locate
+from polysight.surfaces.window import Echoes
+
+RADIUS_M = 0.06
+GATE_M = (1.4, 2.2)
+
+
+def scan_two(apart_m: tuple[float, float, float], second: complex) -> tuple[Samples, list[np.ndarray]]:
+    """Scan two spheres whose fronts are so far apart; the echo of one has amplitude 0.5."""
+    fronts = [FRONT_M - np.array(apart_m) / 2, FRONT_M + np.array(apart_m) / 2]
+    scan = with_echo(with_echo(empty_scan(), fronts[0], RADIUS_M, 0.5), fronts[1], RADIUS_M, second)
+    return scan, fronts
+
+
+def find_owner(echoes: Echoes, scan: Samples, fronts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of each echo's point from the nearer sphere, and which sphere that is."""
+    points = locate(echoes.path_m, echoes.slope, echoes.at_m, scan.tx_m, scan.middle_m)
+    away_m = [np.linalg.norm(points - front - RADIUS_M * BEHIND, axis=1) - RADIUS_M for front in fronts]
+    owner = np.abs(away_m).argmin(axis=0)
+    return np.abs(away_m).min(axis=0), owner
+
+
+# One resolution cell of a window is 140 mm in x, 48 mm in y and 74 mm in range.
+@pytest.mark.parametrize("apart_m", [(0.15, 0, 0), (0, 0.06, 0), (0, 0, 0.1)])
+def test_each_of_two_objects_has_its_own_place_and_strength(apart_m):
+    scan, fronts = scan_two(apart_m, 0.4j)
+    echoes = find_echoes(scan, GATE_M)
+    away_m, owner = find_owner(echoes, scan, fronts)
+    windows = len(np.unique(echoes.at_m, axis=0))
+    assert np.bincount(owner, minlength=2).tolist() == [windows, windows]
+    assert away_m.max() < 1e-4
+    assert np.abs(echoes.amplitude) == pytest.approx(np.where(owner == 0, 0.5, 0.4), rel=0.03)
+
+
+def test_known_paths_of_a_window_are_measured_apart():
+    """V is measured along paths that H gives: a neighbour's echo must not leak into an object's ratio."""
+    scan, fronts = scan_two((0.0, 0.07, 0.0), 0.2)
+    echoes = find_echoes(scan, GATE_M)
+    _, owner = find_owner(echoes, scan, fronts)
+    window = np.unique(echoes.at_m, axis=0, return_inverse=True)[1].reshape(-1)
+    paths = (echoes.at_m, echoes.path_m, echoes.slope, echoes.bend)
+    together, inside = measure_echoes(scan, *paths, window=window)
+    alone, _ = measure_echoes(scan, *paths)
+    weak = owner == 1
+    assert inside.all()
+    assert np.abs(together.amplitude[weak]) == pytest.approx(0.2, rel=0.05)
+    assert np.abs(np.abs(alone.amplitude[weak]) / 0.2 - 1).max() > 0.1
+
+
+def test_half_a_wave_is_one_echo():
+    """The edge of a plate cuts its wave: two waves of opposite sign would fit it better, and are no objects."""
+    scan, _ = scan_two((0.0, 0.0, 0.0), 0.5)
+    column = np.arange(scan.valid.shape[1])
+    step = 1 / (1 + np.exp((column - column.mean()) / 3))
+    cut = Samples(scan.cube * step, scan.valid, scan.offsets_m, scan.frequencies_hz, scan.tx_m, scan.rx_m)
+    echoes = find_echoes(cut, GATE_M)
+    level = np.abs(echoes.amplitude)
+    assert level.max() < 1
+    strong = level > 0.25
+    assert strong.sum() == len(np.unique(echoes.at_m, axis=0))

@@ -87,7 +87,6 @@ class PatchFigures:
     distance2: float
     relative_error: float
     relative_std: float
-    smallest_std: float
     leakage_measured: bool
     metal_in_scene: bool
     level: str
@@ -240,7 +239,6 @@ def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigur
                 distance2=float(difference @ np.linalg.solve(e.covariance, difference)),
                 relative_error=float(np.hypot(*difference)) / size,
                 relative_std=float(np.sqrt(values.mean())) / size,
-                smallest_std=float(np.sqrt(values[0])) / size,
                 leakage_measured=result.prior.leakage_measured,
                 metal_in_scene=any(p.metal for p in scene.plates),
                 level=findings.verdict.level,

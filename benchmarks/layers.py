@@ -65,7 +65,6 @@ class Case:
     permittivity: tuple[float, float]
     thickness_mm: float
     fitted: tuple[float, float] | None = None
-    found_mm: float | None = None
     error: float = float("nan")
     thickness_error: float = 0.0
     distance2: float = float("nan")
@@ -195,7 +194,6 @@ def judge_fit(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -
         permittivity=true,
         thickness_mm=size_mm,
         fitted=(fit.permittivity.real, -fit.permittivity.imag),
-        found_mm=found_mm,
         error=float(np.hypot(*difference) / np.hypot(*true)),
         thickness_error=abs(found_mm / size_mm - 1) if size_mm else 0.0,
         distance2=float(difference @ np.linalg.solve(fit.covariance[:2, :2], difference)),

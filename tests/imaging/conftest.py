@@ -43,8 +43,6 @@ def synced_row(rig):
             chirps=np.full(n, 16),
             direct_hz=zero,
             direct_amplitude=zero,
-            freq_residual_hz=zero,
-            phase_residual_rad=zero,
             errors={},
         )
 

@@ -85,8 +85,6 @@ def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
         chirps=np.ones(5, int),
         direct_hz=zeros,
         direct_amplitude=zeros,
-        freq_residual_hz=zeros,
-        phase_residual_rad=zeros,
     )
     distances_m = np.linspace(-0.2, 1.0, 601)
     level = range_profile_db(row, chirp, distances_m)

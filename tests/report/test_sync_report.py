@@ -26,8 +26,6 @@ def row(snr_db=7.2, n=4000, seed=0):
         chirps=np.full(n, 16),
         direct_hz=zero,
         direct_amplitude=zero + 500,
-        freq_residual_hz=zero,
-        phase_residual_rad=zero,
         errors=errors,
         noise=noise,
     )
@@ -78,11 +76,12 @@ def test_files_and_words(tmp_path, simulated):
 
 def test_a_scan_without_a_valid_position_is_reported_as_such(tmp_path):
     empty = SyncedRow(
-        np.zeros((4, 3, 1), np.complex64),
-        np.zeros(1),
-        np.zeros(3, bool),
-        np.zeros(3, int),
-        *(np.zeros(3) for _ in range(4)),
+        samples=np.zeros((4, 3, 1), np.complex64),
+        sweep_hz=np.zeros(1),
+        valid=np.zeros(3, bool),
+        chirps=np.zeros(3, int),
+        direct_hz=np.zeros(3),
+        direct_amplitude=np.zeros(3),
     )
     text = write_sync_report(tmp_path, {"RH": make_report(empty)}, "nothing", True)
     assert "0 chirps at 0 positions" in text

@@ -528,7 +528,6 @@ def resume_scan(
     progress: OnProgress | None = None,
     keep_incomplete: bool = False,
     stop: StopRequest | None = None,
-    radars: RadarControl | None = None,
     rig_now: Instrument | None = None,
 ) -> ScanResult:
     """Resume a scan at its first missing row, after comparing committed rows with their digests.
@@ -572,7 +571,7 @@ def resume_scan(
             )
         )
         scan.reload()
-        radars = stack.enter_context(radars or radar_control(scan.instrument))
+        radars = stack.enter_context(radar_control(scan.instrument))
         stop = stop or StopRequest()
         running = RunningScan(
             scan=scan,

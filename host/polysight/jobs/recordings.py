@@ -85,11 +85,15 @@ def _card_lines(card: CardReport) -> list[str]:
     return lines
 
 
-def _sparkline(profile_db: NDArray[np.float64], width: int = 64) -> str:
+# Width of a line of bars.
+_SPARKLINE_CHARACTERS = 64
+
+
+def _sparkline(profile_db: NDArray[np.float64]) -> str:
     """Draw the profile as a line of bars, each as high as the maximum of its bins; negative levels are blank."""
     bars = " ▁▂▃▄▅▆▇█"
     highest = len(bars) - 1
-    groups = np.array_split(profile_db, min(width, profile_db.size))
+    groups = np.array_split(profile_db, min(_SPARKLINE_CHARACTERS, profile_db.size))
     tops_db = np.array([group.max() for group in groups])
     # An empty profile has a maximum of 0.
     span_db = max(float(tops_db.max()), 1e-9)

@@ -127,8 +127,6 @@ class SyncedRow:
         int [position]: chirps in each average.
     direct_hz, direct_amplitude
         float64 [position]: IF and amplitude (ADC counts) of the direct path.
-    freq_residual_hz, phase_residual_rad
-        float64 [position]: standard deviation of one chirp's error after alignment within its burst.
     noise
         float64 [position]: noise power of a sample of one channel of one chirp (ADC counts squared), NaN with fewer
         than two good chirps; None: unknown.
@@ -150,8 +148,6 @@ class SyncedRow:
     chirps: NDArray[np.int64]
     direct_hz: NDArray[np.float64]
     direct_amplitude: NDArray[np.float64]
-    freq_residual_hz: NDArray[np.float64]
-    phase_residual_rad: NDArray[np.float64]
     errors: Errors = field(default_factory=dict)
     noise: NDArray[np.float64] | None = None
     turn: NDArray[np.float64] | None = None
@@ -204,17 +200,14 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
         _FULL_SCALE,
     )
     done = reference(aligned, setup.path, setup.chirp)
-    chirps, rate = aligned.good.sum(axis=1), setup.chirp.sample_rate_hz
-    residual = np.sqrt((aligned.error**2).sum(axis=-1) / np.maximum(chirps, 1)[:, None])
+    rate = setup.chirp.sample_rate_hz
     return SyncedRow(
         samples=done.samples,
         sweep_hz=setup.path.sweep_hz,
         valid=done.found,
-        chirps=chirps,
+        chirps=aligned.good.sum(axis=1),
         direct_hz=done.frequency * rate,
         direct_amplitude=np.abs(done.amplitude),
-        freq_residual_hz=residual[:, 0] * rate,
-        phase_residual_rad=residual[:, 1],
         errors=errors(aligned, done, setup.path, rate, setup.examined),
         noise=done.noise,
         turn=_turn_along(done.samples),
@@ -452,11 +445,10 @@ class CubeForm:
         valid = np.isfinite(cube).all(axis=(0, 2)) & (cube != 0).any(axis=(0, 2))
         samples = self._turn_cube(np.where(valid[:, None], cube, 0)) + self.constant[:, None, None]
         samples *= valid[:, None]
-        zeros = np.zeros(valid.size)
         if self.path is not None:
             samples, valid, hz, amplitude = _reference_cube(samples, valid, self.path, self.chirp)
         else:
-            hz = zeros
+            hz = np.zeros(valid.size)
             amplitude = np.abs(samples.mean(axis=(0, 2))).astype(np.float64)
         return SyncedRow(
             samples=samples,
@@ -465,8 +457,6 @@ class CubeForm:
             chirps=np.where(valid, pulses, 0),
             direct_hz=hz,
             direct_amplitude=amplitude,
-            freq_residual_hz=zeros,
-            phase_residual_rad=zeros,
         )
 
     def _turn_cube(self, cube: NDArray[np.complex64]) -> NDArray[np.complex64]:

@@ -43,6 +43,13 @@ MAX_NOTES_BYTES = 1 << 17
 MAX_DEPTH = 4
 MAX_SCANS = 5000
 LOG_BYTES = 16384
+# Longest record of a started program that is read: its command line is short.
+MAX_RECORD_BYTES = 100_000
+# Characters of a program's message, and of its cause and remedy, that the list shows.
+MESSAGE_CHARACTERS = 300
+REMEDY_CHARACTERS = 500
+# Names of materials in a line of the list.
+MAX_NAMES = 12
 CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 # Time that a program may take from the last line of a manifest to its first sign of life.
 GRACE_S = 20.0
@@ -242,7 +249,7 @@ def summarise(folder: Path, name: str) -> Summary:
         state = "lost"
     reason = ""
     if content.ended is not None:
-        reason = content.ended.reason[:300]
+        reason = content.ended.reason[:MESSAGE_CHARACTERS]
     return replace(
         summary,
         state=state,
@@ -282,7 +289,7 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
             else:
                 level = products.verdict.level
             names = dict.fromkeys(patch.name for patch in products.segments if patch.name)
-            summary = replace(summary, verdict=level, materials=tuple(names)[:12])
+            summary = replace(summary, verdict=level, materials=tuple(names)[:MAX_NAMES])
         if places[0] == folder:
             summary = replace(summary, scan_id=products.scan_id, simulated=products.simulated)
     except PolysightError:
@@ -332,7 +339,7 @@ def find_program(folder: Path, kind: str) -> Program | None:
     if (folder / PROGRAM).is_symlink() or not is_plain(path):
         return None
     try:
-        record = msgspec.json.decode(path.read_bytes()[:100_000], type=_Record)
+        record = msgspec.json.decode(path.read_bytes()[:MAX_RECORD_BYTES], type=_Record)
     except (OSError, ValueError):
         return None
     words = record.words
@@ -364,16 +371,16 @@ def explain_failure(program: Program | None) -> Finding | None:
     heads = [k for k, line in enumerate(lines) if re.match(r"polysight \w+: ", line)]
     if not heads:
         lines = lines or ["its program ended without a message"]
-        return Finding("error", lines[-1][:300])
+        return Finding("error", lines[-1][:MESSAGE_CHARACTERS])
     start = heads[-1]
     # Errors are printed in three parts: the problem, and indented lines `why:` and `do:`.
     parts = {"why": "", "do": ""}
     for line in lines[start + 1 :]:
         name, _, text = line.strip().partition(": ")
         if name in parts:
-            parts[name] = text[:500]
+            parts[name] = text[:REMEDY_CHARACTERS]
     problem = lines[start].partition(": ")[2]
-    return Finding("error", problem[:300], parts["why"], parts["do"])
+    return Finding("error", problem[:MESSAGE_CHARACTERS], parts["why"], parts["do"])
 
 
 def log_tail(path: Path) -> str:

@@ -30,6 +30,7 @@ STRENGTH = 0.002
 a smaller one leaves more aliases.
 """
 ITERATIONS = 40
+"""Steps of the first fit of missing positions; the second fit starts from its image and takes half as many."""
 MOST_ADDED = 4
 """Largest number of steps into which a step between positions is divided."""
 TEST_SHARE = 10

@@ -12,7 +12,6 @@ motion within a burst, of the filter, and of the object in the host's direct pat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +66,6 @@ def synced_cube(
     noise: float | None = None,
     direct: bool = True,
     seed: int | None = None,
-    cache_dir: Path | None = None,
 ) -> NDArray[np.complex64]:
     """Return the samples of a scan after ideal synchronisation: referenced to the direct path, bursts averaged.
 
@@ -89,8 +87,6 @@ def synced_cube(
         Include the direct path.
     seed
         Seed of the power cycle (gains and noise); None: the scene's. Specimens always use the scene's seed.
-    cache_dir
-        Folder that caches fields between runs; None: no cache.
 
     Returns
     -------
@@ -108,7 +104,7 @@ def synced_cube(
         channels = list(range(len(rig.antennas.rx_mm)))
     else:
         channels = list(rx)
-    field = build_field(rig, scene, board, f, cache_dir, channels)
+    field = build_field(rig, scene, board, f, rx=channels)
     all_m = antennas(rig, board).direct_m
     direct_m = all_m[channels]
     gains = power_on(rig, scene, board, seed).gains[channels]

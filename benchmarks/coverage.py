@@ -69,12 +69,19 @@ CLASSES = {"low loss": 0.05, "medium": 0.18, "lossy": np.inf}
 """Material classes by their loss tangent's upper end."""
 GRID = {"columns": 45, "rows": 43, "step_x_mm": 10.0, "step_y_mm": 6.0}
 PLACES = [(x, y) for y in (-34.0, 34.0) for x in (-66.0, 0.0, 66.0)]
-KINDS = ("full", "no metal", "no direct path", "noise", "empty", "named", "sheet")
-"""Kinds of scenes; "sheet" is "full" with one thin sheet in air that is not declared."""
-WHOLE = ("full", "sheet")
+KINDS = ("full", "no metal", "no direct path", "noise", "empty", "named", "sheet", "wide")
+"""Kinds of scenes; "sheet" is "full" with one thin sheet in air that is not declared, "wide" is "full" with
+permittivities and apertures drawn from the ranges below."""
+WHOLE = ("full", "sheet", "wide")
+WIDE_REAL = (2.0, 12.0)
+WIDE_LOSS_TANGENT = (0.003, 0.4)
+# Columns and rows; the image stays as it is, so that the outer plates lie beyond the smallest aperture.
+WIDE_APERTURES = ((45, 43), (33, 31), (25, 25))
 SURE = (0.0, 0.5, 0.8, 0.95, 1.01)
 CHI2_68 = 2.279
 CHI2_95 = 5.991
+# Standard deviations on both sides of a normal distribution's mean that hold 95 %.
+Z_95 = 1.960
 
 
 @dataclass(frozen=True)
@@ -90,6 +97,11 @@ class PatchFigures:
     leakage_measured: bool
     metal_in_scene: bool
     level: str
+    permittivity_real: float
+    # Error over its standard error.
+    real_pull: float
+    loss_pull: float
+    columns: int
     sheet: bool = False
 
 
@@ -126,8 +138,13 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
     rng = np.random.default_rng([20261122, seed, KINDS.index(kind)])
     leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
     materials = MATERIALS
+    grid = GRID
     if kind == "named":
         materials = KNOWN
+    elif kind == "wide":
+        materials = _draw_materials(rng)
+        columns, rows = WIDE_APERTURES[int(rng.integers(len(WIDE_APERTURES)))]
+        grid = GRID | {"columns": columns, "rows": rows}
     names = rng.choice(list(materials), len(PLACES), replace=False).tolist()
     if kind == "no metal" or (kind in WHOLE and rng.random() < 0.25):
         metal = None
@@ -158,7 +175,7 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
         {
             "name": f"drawn {kind} {seed}",
             "seed": 1000 + seed,
-            "grid": GRID,
+            "grid": grid,
             "object_distance_mm": 499.0,
             "image": {"columns": 116, "rows": 90},
             "specimen_spread": specimen_spread,
@@ -174,6 +191,13 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
         },
         "drawn",
     )
+
+
+def _draw_materials(rng: np.random.Generator) -> dict[str, tuple[float, float]]:
+    """A material for each place: real part evenly, loss tangent evenly in its logarithm."""
+    real = rng.uniform(*WIDE_REAL, len(PLACES))
+    tangent = np.exp(rng.uniform(*np.log(WIDE_LOSS_TANGENT), len(PLACES)))
+    return {f"drawn {i}": (float(real[i]), float(real[i] * tangent[i])) for i in range(len(PLACES))}
 
 
 def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
@@ -242,6 +266,10 @@ def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigur
                 leakage_measured=result.prior.leakage_measured,
                 metal_in_scene=any(p.metal for p in scene.plates),
                 level=findings.verdict.level,
+                permittivity_real=plate.permittivity.real,
+                real_pull=float(difference[0] / np.sqrt(e.covariance[0, 0])),
+                loss_pull=float(difference[1] / np.sqrt(e.covariance[1, 1])),
+                columns=scene.grid["columns"],
                 sheet=plate.thickness_mm is not None,
             )
         )
@@ -267,6 +295,39 @@ def _table(rows: list[PatchFigures], title: str) -> dict[str, float]:
         flush=True,
     )
     return entry
+
+
+def _pull_table(rows: list[PatchFigures], title: str) -> dict[str, float]:
+    """Coverage of the real part and of the loss, each by its own standard error."""
+    entry = {"patches": float(len(rows))}
+    text = f"{title:36s} {len(rows):5d} patches"
+    for part in ("real", "loss"):
+        pulls = np.array([getattr(r, f"{part}_pull") for r in rows])
+        if pulls.size == 0:
+            return {}
+        entry[f"{part}_in_68"] = float(np.mean(np.abs(pulls) < 1))
+        entry[f"{part}_in_95"] = float(np.mean(np.abs(pulls) < Z_95))
+        entry[f"{part}_rms_pull"] = float(np.sqrt(np.mean(pulls**2)))
+        text += (
+            f"   {part}: 68 %: {100 * entry[f'{part}_in_68']:.1f}, 95 %: {100 * entry[f'{part}_in_95']:.1f},"
+            f" rms {entry[f'{part}_rms_pull']:.2f}"
+        )
+    print(text, flush=True)
+    return entry
+
+
+def print_pulls(rows: list[PatchFigures]) -> dict[str, Any]:
+    """Coverage of both parts over all patches, by aperture and by real part."""
+    out: dict[str, Any] = {"wide": _pull_table(rows, "real part 2..12, all apertures")}
+    for columns, grid_rows in WIDE_APERTURES:
+        title = f"  aperture {columns} x {grid_rows}"
+        out[title.strip()] = _pull_table([r for r in rows if r.columns == columns], title)
+    for low, high in itertools.pairwise((0.0, 4.0, 8.0, np.inf)):
+        title = f"  real part {low:.0f} to {high:.0f}"
+        out[title.strip()] = _pull_table([r for r in rows if low <= r.permittivity_real < high], title)
+    for measured, title in ((True, "  wide, leakage measured"), (False, "  wide, leakage not measured")):
+        out[title.strip()] = _pull_table([r for r in rows if r.leakage_measured == measured], title)
+    return out
 
 
 def _one(job: tuple[int, str, bool]) -> list[PatchFigures]:
@@ -315,6 +376,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--without", type=int, default=20, help="scenes that hold nothing to name (default: 20)")
     parser.add_argument("--sheets", type=int, default=8, help="full scenes with a thin sheet undeclared (default: 8)")
     parser.add_argument("--named", type=int, default=12, help="scenes of the library's materials (default: 12)")
+    parser.add_argument(
+        "--wide", type=int, default=8, help="scenes of real parts 2 to 12, small apertures (default: 8)"
+    )
     parser.add_argument("--first", type=int, default=0, help="number of the first scene (default: 0)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
     parser.add_argument("--json", type=Path, default=None, help="write every patch here")
@@ -332,6 +396,8 @@ def run(args: argparse.Namespace) -> int:
             for result in pool.map(figures, [*range(args.first, args.first + args.sheets)], ["sheet"] * args.sheets)
             for r in result
         ]
+        wide_jobs = [(args.first + i, "wide", False) for i in range(args.wide)]
+        wide = [r for result in pool.map(_one, wide_jobs) for r in result]
         kinds = [(args.first + i, KINDS[1 + i % 4]) for i in range(args.without)]
         without = list(pool.map(_judge_without_result, kinds))
         named = [pair for result in pool.map(_names, range(args.first, args.first + args.named)) for pair in result]
@@ -348,6 +414,7 @@ def run(args: argparse.Namespace) -> int:
     out["beside a sheet"] = _table([r for r in thin if not r.sheet], "  beside a thin sheet, undeclared")
     out["sheet"] = _table([r for r in thin if r.sheet], "  the sheet itself, as a half space")
     print(f"  sheets: {args.sheets}; without a permittivity {args.sheets - sum(r.sheet for r in thin)}")
+    out["pulls"] = print_pulls(wide)
     same = {(r.scene, r.material): r for r in rows}
     outliers = [
         abs(r.relative_error - same[r.scene, r.material].relative_error) for r in raw if (r.scene, r.material) in same
@@ -366,7 +433,7 @@ def run(args: argparse.Namespace) -> int:
         content = {
             "summary": out,
             "names": reliability,
-            "patches": [asdict(r) for r in rows + raw + thin],
+            "patches": [asdict(r) for r in rows + raw + thin + wide],
             "without": without,
         }
         args.json.write_text(json.dumps(content, indent=1) + "\n")

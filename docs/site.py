@@ -1,7 +1,7 @@
 """Static pages of the documentation: every Markdown page, the gallery's pictures, and the notebooks with their results.
 
-The links between pages stay, with `.html` for `.md` and `.ipynb`. Other files are linked in the repository
-that the pages are made from.
+The links between pages stay, with `.html` for `.md` and `.ipynb`; pictures lie beside their pages, so that the folder
+can be moved. Other files are linked in the repository that the pages are made from.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import polysight
 
 NOTEBOOKS = ROOT / "examples" / "notebooks"
 GALLERY = ROOT / "docs" / "gallery.md"
+PICTURES = (".png", ".svg")
 _TARGET = re.compile(r'((?:href|src)=")([^"#:]+)(#[^"]*)?"')
 _PICTURE = re.compile(r'"out/(gallery-\w+\.png)"')
 _STYLE = (
@@ -42,7 +43,7 @@ def build_site(out: Path, *, run: bool) -> list[Path]:
         made += [_write(path, out, _from_notebook(path, folder if run else None)) for path in notebooks]
         if run:
             polysight.simulate("examples/own-scene.toml", folder / "out" / "gallery")
-            made.append(_write(GALLERY, out, _with_pictures(_from_markdown(GALLERY), folder, out)))
+            made.append(_write(GALLERY, out, draw_pictures(_from_markdown(GALLERY), folder, out)))
     return made
 
 
@@ -57,6 +58,14 @@ def _write(path: Path, out: Path, body: str) -> Path:
         if target in pages:
             place = Path(os.path.relpath(out / target.relative_to(ROOT).with_suffix(".html"), page.parent))
             return f'{link[1]}{place.as_posix()}{link[3] or ""}"'
+        if (page.parent / link[2]).is_file():
+            # A picture that was drawn for the page
+            return link[0]
+        if target.suffix in PICTURES and target.is_file():
+            copy = out / target.relative_to(ROOT)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(target.read_bytes())
+            return f'{link[1]}{Path(os.path.relpath(copy, page.parent)).as_posix()}"'
         return f'{link[1]}{target.as_uri()}{link[3] or ""}"'
 
     title = html.escape(path.stem.replace("-", " "))
@@ -96,7 +105,7 @@ def _from_notebook(path: Path, folder: Path | None) -> str:
     return "\n".join(parts)
 
 
-def _with_pictures(body: str, folder: Path, out: Path) -> str:
+def draw_pictures(body: str, folder: Path, out: Path) -> str:
     """Run the gallery's blocks in `folder`; return its page with a picture below each."""
     blocks = re.findall(r"<pre><code class=\"language-python\">(.*?)</code></pre>", body, re.DOTALL)
     for block in blocks:
@@ -106,5 +115,5 @@ def _with_pictures(body: str, folder: Path, out: Path) -> str:
             picture = out / "docs" / name
             picture.write_bytes((folder / "out" / name).read_bytes())
             shown = f'<pre><code class="language-python">{block}</code></pre>'
-            body = body.replace(shown, f'{shown}<img alt="simulated" src="{picture.as_uri()}">')
+            body = body.replace(shown, f'{shown}<img alt="simulated" src="{picture.name}">')
     return body

@@ -49,6 +49,20 @@ def test_reflection_coefficients_broadcast_by_name():
     assert complex(r_s.isel(frequency=1, material=1).sel(angle=55)) == pytest.approx(plain)
 
 
+@pytest.mark.parametrize("which", ["permittivities", "thicknesses"])
+def test_an_array_with_labels_is_one_medium(which):
+    """Its dimension is no list of media, whether or not it stands in a list."""
+    if which == "permittivities":
+        eps = xarray.DataArray([2.1 - 0.01j, 2.9 - 0.03j, 6 - 0.3j], dims="kind")
+        thickness_m = 1e-3
+    else:
+        eps = 2.9 - 0.03j
+        thickness_m = xarray.DataArray([1.2e-3, 3e-3, 10e-3], dims="kind")
+    swept = multilayer(eps, thickness_m, 78e9, np.radians(55))[0]
+    assert swept.dims == ("kind",)
+    xarray.testing.assert_identical(swept, multilayer([eps], [thickness_m], 78e9, np.radians(55))[0])
+
+
 # --- maps -------------------------------------------------------------------------------------------------------------
 
 
@@ -63,6 +77,16 @@ def test_the_map_of_permittivity_agrees_with_the_patch_and_knows_its_error(scan)
     pixel = scan.probe(45, 0)
     assert complex(pixel["permittivity"]) == complex(eps["permittivity"].sel(x_mm=45, y_mm=0, method="nearest"))
     assert int(pixel["label"]) == 2
+
+
+def test_the_mask_holds_no_value_that_a_half_space_cannot_have(scan):
+    """Not the edges of the metal, either."""
+    eps = scan.permittivity_map()
+    shown = eps["permittivity"].values[eps["mask"].values]
+    errors = eps["permittivity_real_standard_error"].values[eps["mask"].values]
+    assert shown.size > 0
+    assert np.all(shown.real + 2 * errors >= 1)
+    assert np.all(shown.imag - 2 * errors <= 1e-6)
 
 
 def test_the_errors_of_the_map_are_those_of_its_ratio(scan):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import html
 from pathlib import Path
 
 import pytest
 from docs.reference import build, link_faults, modules_of
-from docs.site import build_site
+from docs.site import build_site, draw_pictures
 
 import polysight
 
@@ -37,6 +38,25 @@ def test_links_between_the_pages_lead_somewhere(reference):
     assert 'href="#open_scan"' in pages
     assert (reference / "docs/how-to/python.html").exists()
     assert (reference / "examples/notebooks/liquids.html").exists()
+
+
+def test_pictures_lie_beside_their_pages(reference):
+    """The folder can be moved: no picture is looked for on the machine that made it."""
+    for page in reference.rglob("*.html"):
+        assert 'src="file:' not in page.read_text(encoding="utf-8"), page
+    assert (reference / "docs/images/demo.png").is_file()
+
+
+def test_the_gallery_shows_what_its_code_draws(tmp_path, monkeypatch):
+    """Into a relative folder, as `make docs` does."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "site" / "docs").mkdir(parents=True)
+    code = 'open("out/gallery-x.png", "w").write("picture")'
+    block = f'<pre><code class="language-python">{html.escape(code)}</code></pre>'
+    page = draw_pictures(block, tmp_path, Path("site"))
+    assert '<img alt="simulated" src="gallery-x.png">' in page
+    assert (tmp_path / "site" / "docs" / "gallery-x.png").read_text(encoding="utf-8") == "picture"
 
 
 @pytest.mark.parametrize("link", ["gone.html", "other.html#gone", "#gone", "folder/other.html#here"])

@@ -47,6 +47,8 @@ CONVENTION = (
 PLANE = ("y_mm", "x_mm")
 # Largest error of a permittivity that says something, relative to its size.
 LARGEST_ERROR = 0.5
+# Standard errors by which a permittivity may lie beyond what a half space can have.
+LARGEST_DEVIATION = 2.0
 # Step for the derivative by the incidence angle.
 _ANGLE_STEP_RAD = 1e-6
 _PART = "complex_part"
@@ -230,8 +232,9 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
     -------
     xarray.Dataset
         `permittivity` complex128 [y_mm, x_mm], eps' - j eps''; `permittivity_real_standard_error` and
-        `permittivity_loss_standard_error` float64; `mask` bool: True where the pixel is lit and the errors are below
-        half of the value. The values are not a number where the scan lights nothing.
+        `permittivity_loss_standard_error` float64; `mask` bool: True where the pixel is lit, the errors are below
+        half of the value, and a half space can have it within twice its errors: no loss below 0, no real part below
+        1. The values are not a number where the scan lights nothing.
 
     Raises
     ------
@@ -263,12 +266,16 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
         angle_std_rad = incidence_std_rad(scan.materials)
         real_std = np.hypot(by_ratio * p_std, by_angle.real * angle_std_rad)
         loss_std = np.hypot(by_ratio * p_std, by_angle.imag * angle_std_rad)
-        mask = np.hypot(real_std, loss_std) < LARGEST_ERROR * np.abs(value)
+        is_known = np.hypot(real_std, loss_std) < LARGEST_ERROR * np.abs(value)
+        # Edges of metal have ratios near 1, of which Eq. 3 makes large negative permittivities.
+        has_real_part = value.real + LARGEST_DEVIATION * real_std >= 1.0
+        has_loss = -value.imag + LARGEST_DEVIATION * loss_std >= 0.0
+        mask = is_known & has_real_part & has_loss
     data = {
         "permittivity": _describe(PLANE, value, "1", "relative permittivity eps' - j eps'' as a half space"),
         "permittivity_real_standard_error": _describe(PLANE, real_std, "1", "standard error of eps'"),
         "permittivity_loss_standard_error": _describe(PLANE, loss_std, "1", "standard error of eps''"),
-        "mask": _describe(PLANE, mask, "1", "True where the permittivity is known to half of its size"),
+        "mask": _describe(PLANE, mask, "1", "True where the permittivity is possible and known to half of its size"),
     }
     return xarray.Dataset(data, _axes(scan), provenance(scan))
 

@@ -337,7 +337,8 @@ class Scan:
         xarray.Dataset
             `permittivity` complex128 [y_mm, x_mm], eps' - j eps''; `permittivity_real_standard_error` and
             `permittivity_loss_standard_error`; `mask` bool: True where the errors are below half of the value and
-            a half space can have it (real part 1, loss 0 or more) within twice its errors. Errors of neighbouring pixels are mostly the same ones: a mean over a patch is no more certain than its pixels.
+            a half space can have it (real part 1, loss 0 or more) within twice its errors. Errors
+            of neighbouring pixels are mostly the same ones: a mean over a patch is no more certain than its pixels.
 
         Raises
         ------

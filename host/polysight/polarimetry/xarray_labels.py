@@ -67,16 +67,19 @@ def _fill(value: Any, arrays: Iterator[Any]) -> Any:
 
 _REFLECTION = ("s-polarised reflection coefficient", "p-polarised reflection coefficient")
 fresnel = keep_labels(*_REFLECTION)(plain_fresnel)
-_labelled_multilayer = keep_labels(*_REFLECTION)(plain_multilayer)
 
 
-@wraps(plain_multilayer)
-def multilayer(eps: Any, thickness_m: Any, frequency_hz: Any, theta_rad: Any) -> Any:
-    # Dimensions of a DataArray are not media: it is one medium of several permittivities or thicknesses.
-    return _labelled_multilayer(_name_one_medium(eps), _name_one_medium(thickness_m), frequency_hz, theta_rad)
+def _take_arrays_as_one_medium(function: Function) -> Function:
+    """Decorate `multilayer`: a `DataArray` is one medium, its dimensions are not media."""
+
+    @wraps(function)
+    def call(eps: Any, thickness_m: Any, frequency_hz: Any, theta_rad: Any) -> Any:
+        return function(_list_one_medium(eps), _list_one_medium(thickness_m), frequency_hz, theta_rad)
+
+    return call  # type: ignore[return-value]
 
 
-def _name_one_medium(value: Any) -> Any:
+def _list_one_medium(value: Any) -> Any:
     """Return a `DataArray` as the list of it, anything else as it is."""
     xarray = sys.modules.get("xarray")
     if xarray is not None and isinstance(value, xarray.DataArray):
@@ -84,4 +87,5 @@ def _name_one_medium(value: Any) -> Any:
     return value
 
 
+multilayer = _take_arrays_as_one_medium(keep_labels(*_REFLECTION)(plain_multilayer))
 permittivity_from_ratio = keep_labels("relative permittivity")(plain_permittivity)

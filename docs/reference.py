@@ -90,6 +90,9 @@ def link_faults(out: Path) -> list[str]:
                 continue
             name, _, anchor = unquote(link).partition("#")
             target = (path.parent / name).resolve() if name else path
+            is_picture = target.suffix != ".html" and target.is_file()
+            if is_picture:
+                continue
             known = pages.get(target)
             if known is None or (anchor and anchor not in known.anchors):
                 faults.append(f"{path.relative_to(out.resolve())}: {link}")

@@ -96,6 +96,60 @@ def test_what_has_not_changed_is_not_read_again(root, monkeypatch):
     assert opened == []
 
 
+def age_files(root: Path) -> None:
+    """Give all files times that are long ago: what was written a moment ago is read again."""
+    for path in root.rglob("*"):
+        os.utime(path, (1e9, 1e9))
+
+
+def test_what_has_not_changed_is_not_read_again_after_a_restart(root, monkeypatch):
+    index = root / ".polysight" / "list.json"
+    age_files(root)
+    before = Scans(root, index=index).list()
+    write_notes(root / "done", Notes("new"))
+    read: list[str] = []
+    summarise = scans.summarise
+    monkeypatch.setattr(scans, "summarise", lambda folder, name: read.append(name) or summarise(folder, name))
+    after = Scans(root, index=index).list()
+    assert read == ["done"]
+    assert after == Scans(root).list() != before
+
+
+def test_what_was_written_a_moment_ago_is_read_again_after_a_restart(root):
+    """A file that is written twice within the clock's step of its drive keeps its time, and may keep its size."""
+    index = root / ".polysight" / "list.json"
+    age_files(root)
+    write_notes(root / "done", Notes("cat"))
+    written = (root / "done" / NOTES).stat()
+    Scans(root, index=index).list()
+    (root / "done" / NOTES).write_text((root / "done" / NOTES).read_text().replace("cat", "dog"))
+    os.utime(root / "done" / NOTES, ns=(written.st_atime_ns, written.st_mtime_ns))
+    assert Scans(root, index=index).summary("done").notes == "dog"
+
+
+@pytest.mark.parametrize("kept", [0, 1, 0.5, 0.999])
+def test_a_damaged_or_foreign_index_changes_no_list(root, kept):
+    index = root / ".polysight" / "list.json"
+    age_files(root)
+    listed = Scans(root, index=index).list()
+    content = index.read_bytes()
+    assert Scans(root, index=index).list() == listed
+    if kept == 1:
+        index.write_bytes(content.replace(b'"version":1', b'"version":0').replace(b"finished", b"stopped"))
+    else:
+        index.write_bytes(content[: int(kept * len(content))])
+    again = Scans(root, index=index).list()
+    assert again == listed
+    assert index.read_bytes() == content
+
+
+def test_an_index_writes_through_no_link(root, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    (root / ".polysight").symlink_to(elsewhere)
+    assert Scans(root, index=root / ".polysight" / "list.json").list()
+    assert not list(elsewhere.iterdir())
+
+
 def test_a_list_reads_no_rows(root, monkeypatch):
     opened: list[str] = []
     real = files.open_regular

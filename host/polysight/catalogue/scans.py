@@ -1,6 +1,7 @@
 """The scans under a folder: a list with one line for each, the folder of a scan by its name, the operator's notes.
 
-Nothing is read again that has not changed, so that hundreds of scans are listed at once.
+Nothing is read again that has not changed, so that thousands of scans are listed at once: a line of the list is kept
+with the times and sizes of the files that it was made from, also over a restart (`Index`).
 """
 
 from __future__ import annotations
@@ -443,6 +444,49 @@ def _parse_utc(utc: str) -> float:
 
 # --- the list ---
 
+StampedSummary = tuple[Stamp, Summary]
+# Raised when summaries are made in another way from the same files.
+INDEX_VERSION = 1
+# A file that is written twice within the clock's step of a drive keeps its time (FAT: 2 s): what was written so short a
+# while ago is read again after a restart.
+CLOCK_STEP_S = 2.0
+# A scan at work changes the list with every row; each index is flushed to disk.
+INDEX_INTERVAL_S = 60.0
+
+
+class Index(msgspec.Struct, frozen=True):
+    """Summaries by name that a later process need not read again while their files have the same stamps."""
+
+    version: int
+    summaries: dict[str, StampedSummary]
+
+
+def read_index(path: Path) -> dict[str, StampedSummary]:
+    """Read the summaries of an earlier process; none if there is no index, or it is damaged or of another version."""
+    if not is_plain(path):
+        return {}
+    try:
+        index = msgspec.json.decode(path.read_bytes(), type=Index)
+    except (OSError, ValueError):
+        return {}
+    if index.version != INDEX_VERSION:
+        return {}
+    return index.summaries
+
+
+def write_index(path: Path, summaries: dict[str, StampedSummary]) -> None:
+    """Replace the index as a whole, so that a kill leaves the old one; a folder that is read-only has none."""
+    if path.parent.is_symlink():
+        return
+    newest_ns = int((time.time() - CLOCK_STEP_S) * 1e9)
+    settled = {
+        name: (stamp, summary)
+        for name, (stamp, summary) in summaries.items()
+        if all(modified_ns < newest_ns for modified_ns, _ in stamp)
+    }
+    with suppress(OSError):
+        write_atomically(path, msgspec.json.encode(Index(INDEX_VERSION, settled)))
+
 
 class Scans:
     """The scans in a folder, or a single one.
@@ -453,12 +497,20 @@ class Scans:
         Folder to look under.
     only
         Name of the one scan in it that is shown; it need not be there yet. None: all.
+    index
+        File that keeps the list over a restart, see :class:`Index`. None: it is not kept.
     """
 
-    def __init__(self, root: Path, only: str | None = None) -> None:
+    def __init__(self, root: Path, only: str | None = None, index: Path | None = None) -> None:
         self.root = root
         self.only = only
-        self._summaries: dict[str, tuple[Stamp, Summary]] = {}
+        self._index = index
+        self._summaries: dict[str, StampedSummary] = {}
+        if index is not None:
+            self._summaries = read_index(index)
+        # Those that were there when the index was read or written.
+        self._indexed = dict(self._summaries)
+        self._indexed_at = float("-inf")
         # Scans below each entry of the root, and entries that are being read.
         self._listed: dict[str, list[Summary]] = {}
         self._reading: set[str] = set()
@@ -484,7 +536,17 @@ class Scans:
                 scans += listed
             names = {s.name for s in scans}
             self._summaries = {name: stored for name, stored in list(self._summaries.items()) if name in names}
+            self._keep_index()
         return sorted(scans, key=lambda s: (-s.seconds, s.name))
+
+    def _keep_index(self) -> None:
+        """Write the index if the list has changed since it was written, not too often."""
+        age_s = time.monotonic() - self._indexed_at
+        if self._index is None or age_s < INDEX_INTERVAL_S or self._summaries == self._indexed:
+            return
+        write_index(self._index, self._summaries)
+        self._indexed = dict(self._summaries)
+        self._indexed_at = time.monotonic()
 
     def _read_all(self, waiting: deque[str]) -> None:
         """Read entries of the root in a thread; when it makes no progress for `READ_S`, another thread goes on."""

@@ -34,7 +34,7 @@ from polysight.serve.commands import command_routes, start_waiting
 from polysight.serve.front import Front, Reader, make_app, make_counting_protocol
 from polysight.serve.guard import HANDLERS, HEAD_BYTES, Access
 from polysight.serve.reading import reading_routes
-from polysight.serve.site import Programs, Site, Watches
+from polysight.serve.site import HIDDEN, Programs, Site, Watches
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 
@@ -48,6 +48,7 @@ ACCEPTED_AT_ONCE = 128
 KEEP_ALIVE_S = 10**6
 CLOSE_S = 1
 RESTART_S = 1.0
+LIST_INDEX = "list.json"
 TOKEN_BYTES = 18
 
 
@@ -242,7 +243,10 @@ def run_reader(shown: Shown, path: Path) -> None:
         watch = Watch(shown.root / shown.only, shown.control)
         watch.start()
         watches = Watches(shown.control, {shown.only: watch})
-    site = Site(Scans(shown.root, shown.only), watches, programs, shown.config)
+    index = None
+    if shown.only is None:
+        index = shown.root / HIDDEN / LIST_INDEX
+    site = Site(Scans(shown.root, shown.only, index), watches, programs, shown.config)
     # The list is cached before the page asks for it.
     threading.Thread(target=site.scans.list, name="first list", daemon=True).start()
     path.unlink(missing_ok=True)

@@ -127,10 +127,11 @@ class RefusedError(ScanError):
 class PiClient:
     """Client of one Pi, for one thread; `instrument` has addresses, keys and limits.
 
+    `owner` identifies the runs and jogs that it begins; clients with the same one stop each other's.
     Raises ConfigError if an address needs keys that are missing.
     """
 
-    def __init__(self, context: zmq.Context[Any], instrument: Instrument) -> None:
+    def __init__(self, context: zmq.Context[Any], instrument: Instrument, owner: str = "") -> None:
         self._context = context
         self._instrument = instrument
         self._heartbeat: HostHeartbeat | None = None
@@ -143,8 +144,7 @@ class PiClient:
         self._events = subscriber(context, self._event_address, keys)
         self._commands = requester(context, self._address, keys)
         self._handshake = HandshakeMonitor(self._commands)
-        # Identifies the runs that this client begins.
-        self._owner = secrets.token_hex(16)
+        self._owner = owner or secrets.token_hex(16)
         self._scan_id = ""
         self._last_seq = 0
         self._last_heard_s = time.monotonic()

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import tomli_w
@@ -138,6 +138,7 @@ class ExportRequest(Body, frozen=True):
     formats: Annotated[tuple[Format, ...], msgspec.Meta(min_length=1)]
 
 
+AnyBody = TypeVar("AnyBody", bound=Body)
 Answer = Callable[[Site, Request, Any], Awaitable[object]]
 Words = list[str | Path]
 
@@ -147,7 +148,7 @@ def command_routes(site: Site) -> list[Route]:
 
     def make_route(path: str, kind: type[Body], answer: Answer) -> Route:
         async def endpoint(request: Request) -> Response:
-            return json_answer(await answer(site, request, _decode_body(await request.body(), kind)))
+            return json_answer(await answer(site, request, decode_body(await request.body(), kind)))
 
         return Route(f"/api/{path}", endpoint, methods=["POST"])
 
@@ -175,7 +176,7 @@ def command_routes(site: Site) -> list[Route]:
     ]
 
 
-def _decode_body(body: bytes, kind: type[Body]) -> Body:
+def decode_body(body: bytes, kind: type[AnyBody]) -> AnyBody:
     """Parse and check the body of a request. Raises ConfigError."""
     try:
         table = msgspec.json.decode(body or b"{}")
@@ -234,9 +235,7 @@ def start_scan(site: Site, body: StartRequest) -> None:
 
 def start_waiting(site: Site, request: bytes) -> None:
     """Start a request of the queue. Raises PolysightError."""
-    body = _decode_body(request, StartRequest)
-    if isinstance(body, StartRequest):
-        start_scan(site, body)
+    start_scan(site, decode_body(request, StartRequest))
 
 
 def check_request(site: Site, body: StartRequest) -> Instrument:
@@ -264,9 +263,8 @@ def read_request(folder: Path, name: str) -> StartRequest:
     """The request that a scan was started with, or one with its plan. Raises PolysightError if it has neither."""
     path = folder / PROGRAM / REQUEST
     if is_plain(path) and not path.parent.is_symlink():
-        request = _decode_body(path.read_bytes()[:MAX_REQUEST_BYTES], StartRequest)
-        if isinstance(request, StartRequest):
-            return msgspec.structs.replace(request, name=name)
+        request = decode_body(path.read_bytes()[:MAX_REQUEST_BYTES], StartRequest)
+        return msgspec.structs.replace(request, name=name)
     rig = ScanFolder.load(folder).instrument
     plan = PlanRequest(
         columns=rig.grid.columns,

@@ -31,7 +31,9 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from polysight.acquisition import BADGES, LAPSE_S, STATES, Life, ScanCommand, send_command
 from polysight.catalogue import Scans
+from polysight.serve.commands import decode_body
 from polysight.serve.guard import HANDLERS, Access, Guard, cookie_name, refuse, tell_no_page
+from polysight.serve.stage import JogRequest, StageControl, StagePlace
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -81,17 +83,24 @@ class RunningScan(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Front:
-    """State of the process: `starts` as programs can be started, `reader` answers everything else."""
+    """State of the process: `starts` as programs can be started, `reader` answers everything else.
+
+    `stage` is what home and jog move; None: the page moves nothing.
+    """
 
     scans: Scans
     access: Access
     starts: bool
     reader: ASGIApp
+    stage: StageControl | None = None
 
 
 def make_app(front: Front) -> Starlette:
     """Build the application: the guard, pages, control; the reading process for everything else."""
-    routes = [*page_routes(front), *control_routes(front), Route("/api/{path:path}", front.reader)]
+    routes = [*page_routes(front), *control_routes(front)]
+    if front.stage is not None:
+        routes += stage_routes(front.stage)
+    routes.append(Route("/api/{path:path}", front.reader))
     guard = Middleware(Guard, access=front.access)
     return Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS)
 
@@ -175,6 +184,26 @@ def control_routes(front: Front) -> list[Route]:
         Route("/api/session", open_session, methods=["POST"]),
         Route("/api/control/{command}", control, methods=["POST"]),
     ]
+
+
+def stage_routes(stage: StageControl) -> list[Route]:
+    """Routes of home and jog; all are POST, since even looking asks the Pi."""
+    works: dict[str, Callable[[bytes], StagePlace]] = {
+        "look": lambda _: stage.look(),
+        "home": lambda _: stage.home(),
+        "stop": lambda _: stage.stop(),
+        "jog": lambda body: stage.jog(decode_body(body, JogRequest)),
+    }
+
+    def make_route(name: str, work: Callable[[bytes], StagePlace]) -> Route:
+        async def endpoint(request: Request) -> Response:
+            body = await request.body()
+            place = await run_in_own_thread(lambda: work(body))
+            return Response(msgspec.json.encode(place), media_type="application/json")
+
+        return Route(f"/api/stage/{name}", endpoint, methods=["POST"])
+
+    return [make_route(name, work) for name, work in works.items()]
 
 
 async def run_in_own_thread(work: Callable[[], T]) -> T:

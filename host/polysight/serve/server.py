@@ -35,6 +35,7 @@ from polysight.serve.front import Front, Reader, make_app, make_counting_protoco
 from polysight.serve.guard import HANDLERS, HEAD_BYTES, Access
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import HIDDEN, Programs, Site, Watches
+from polysight.serve.stage import StageControl
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 
@@ -137,7 +138,11 @@ def _run(shown: Shown, place: Place, what: str) -> int:
     try:
         access = _access(place, listener, shown.control)
         with tempfile.TemporaryDirectory(prefix="polysight-") as folder, _reading(shown, Path(folder) / "reader"):
-            front = Front(Scans(shown.root, shown.only), access, shown.starts, Reader(Path(folder) / "reader"))
+            stage = None
+            if shown.starts and shown.config is not None:
+                stage = StageControl(shown.config)
+            reader = Reader(Path(folder) / "reader")
+            front = Front(Scans(shown.root, shown.only), access, shown.starts, reader, stage)
             sys.stderr.write(_welcome(access, place, listener, what))
             sys.stderr.flush()
             make_server(front, place).run(sockets=[listener])

@@ -17,6 +17,7 @@ from polysight.serve.front import Front
 from polysight.serve.guard import Access
 from polysight.serve.server import Place, make_reader_app, make_server
 from polysight.serve.site import Programs, Site, Watches
+from polysight.serve.stage import StageControl
 from polysight.store import EVENTS, MANIFEST, manifest, utc_now
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.store.facts import facts_of
@@ -90,7 +91,9 @@ class Served:
         self, site: Site, access: Access, host: str = "127.0.0.1", port: int = 0, place: Place | None = None
     ) -> None:
         self.site = site
-        front = Front(site.scans, access, site.starts and access.control, make_reader_app(site))
+        starts = site.starts and access.control
+        stage = StageControl(site.config) if starts else None
+        front = Front(site.scans, access, starts, make_reader_app(site), stage)
         self._server = make_server(front, place or Place())
         site.is_ending = lambda: self._server.should_exit
         self._server.config.host = host

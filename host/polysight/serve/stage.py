@@ -1,0 +1,112 @@
+"""Home and jog of the stage from the page: the Pi decides what may move, and stops a jog whose server is gone.
+
+In the process that browsers reach, each request in a thread of its own, so that nothing that is read keeps the stage
+from stopping. A scan that runs has the stage: the Pi refuses.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import zmq
+
+from polysight.acquisition import PiClient
+from polysight.serve.commands import Body
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ScanError
+from polysight_shared.messages import MAX_JOG_MM, Axis, StatusReply
+
+
+class JogRequest(Body, frozen=True):
+    """One axis by a distance."""
+
+    axis: Axis
+    distance_mm: Annotated[float, msgspec.Meta(ge=-MAX_JOG_MM, le=MAX_JOG_MM)]
+
+
+class StagePlace(msgspec.Struct, frozen=True):
+    """Where the stage is, and its limits: 0 and `travel_x_mm`, `travel_y_mm`. `state` as the Pi has it."""
+
+    state: str
+    homed: bool
+    scan_id: str
+    reason: str
+    x_mm: float
+    y_mm: float
+    travel_x_mm: float
+    travel_y_mm: float
+
+
+class StageControl:
+    """The stage of a rig file, for the page; all clients of one server share an owner, so that each can stop a jog."""
+
+    def __init__(self, config: Path) -> None:
+        self._config = config
+        self._owner = secrets.token_hex(16)
+        self._jogging = threading.Lock()
+
+    def look(self) -> StagePlace:
+        """Where it is. Raises PolysightError, as all of these."""
+        return self._ask(lambda pi, _: pi.status())
+
+    def home(self) -> StagePlace:
+        """Start homing."""
+
+        def home(pi: PiClient, rig: Instrument) -> StatusReply:
+            del rig
+            pi.home()
+            return pi.status()
+
+        return self._ask(home)
+
+    def stop(self) -> StagePlace:
+        """Stop homing or a jog."""
+
+        def stop(pi: PiClient, rig: Instrument) -> StatusReply:
+            del rig
+            pi.abort("stopped on the page")
+            return pi.status()
+
+        return self._ask(stop)
+
+    def jog(self, request: JogRequest) -> StagePlace:
+        """Move, and wait for the end. Refused while another jog of this server moves."""
+        if not self._jogging.acquire(blocking=False):
+            raise ScanError(
+                "the stage moves already", "another jog has not ended", "wait for it, or stop it", code=ErrorCode.BUSY
+            )
+        try:
+            return self._ask(lambda pi, rig: pi.jog(request.axis, request.distance_mm, rig.stage.speed_mm_s))
+        finally:
+            self._jogging.release()
+
+    def _ask(self, work: Callable[[PiClient, Instrument], StatusReply]) -> StagePlace:
+        rig = load_instrument(self._config)
+        with self._connect(rig) as pi:
+            status = work(pi, rig)
+        return StagePlace(
+            state=status.state,
+            homed=status.homed,
+            scan_id=status.scan_id,
+            reason=status.reason,
+            x_mm=status.x_mm,
+            y_mm=status.y_mm,
+            travel_x_mm=rig.stage.travel_x_mm,
+            travel_y_mm=rig.stage.travel_y_mm,
+        )
+
+    @contextmanager
+    def _connect(self, rig: Instrument) -> Iterator[PiClient]:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        try:
+            with PiClient(context, rig, self._owner) as pi:
+                yield pi
+        finally:
+            context.destroy(linger=0)

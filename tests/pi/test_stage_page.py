@@ -1,0 +1,120 @@
+"""Home and jog on the operator's page: what is pressed moves, within the limits, and can be stopped."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import msgspec
+import pytest
+from tests.support.page.asking import TOKEN, post
+from tests.support.page.chromium import DESK, PHONE, Browser, find_axe
+from tests.support.page.live_view import Served, served_folder
+
+from polysight_shared import messages as m
+
+pytestmark = pytest.mark.xdist_group("browser")
+SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+
+
+@pytest.fixture
+def view(pi, instrument, write_config, tmp_path) -> Iterator[Served]:
+    """A page beside a Pi and its stage, which is not homed."""
+    server = pi.service.server
+    addresses = msgspec.structs.replace(
+        instrument.pi, command_address=server.command_address, event_address=server.event_address
+    )
+    config = write_config(msgspec.structs.replace(instrument, pi=addresses))
+    (tmp_path / "scans").mkdir()
+    with served_folder(tmp_path / "scans", TOKEN, config=config) as view:
+        yield view
+
+
+def home(view: Served, pi) -> None:
+    assert post(view, "/api/stage/home")[0] == 200
+    pi.host.until_state("homed")
+
+
+def moves_of(stage) -> list[object]:
+    return [line for line in stage.seen if line.verb == "MOVE"]
+
+
+@pytest.mark.parametrize("command", ["look", "home", "stop", "jog"])
+def test_without_the_token_the_stage_is_neither_seen_nor_moved(view, stage, command):
+    seen_before = list(stage.seen)
+    status, _ = post(view, f"/api/stage/{command}", {"axis": "x", "distance_mm": 1.0}, token="wrong")
+    assert status == 403
+    assert not [line for line in stage.seen[len(seen_before) :] if line.verb in ("HOME", "MOVE")]
+
+
+def test_a_jog_before_homing_past_a_limit_or_too_far_is_refused_and_moves_nothing(view, pi, stage):
+    jog = {"axis": "x", "distance_mm": 1.0}
+    assert post(view, "/api/stage/jog", jog)[0] == 409
+    home(view, pi)
+    assert post(view, "/api/stage/jog", {**jog, "distance_mm": -1.0})[0] == 409
+    assert post(view, "/api/stage/jog", {**jog, "distance_mm": 100.1})[0] == 400
+    assert post(view, "/api/stage/jog", {**jog, "axis": "z"})[0] == 400
+    assert not moves_of(stage)
+
+
+def test_a_jog_is_stopped_by_another_request_and_a_second_one_waits(view, pi, stage):
+    home(view, pi)
+    stage.pace_s = 60.0
+    answers = []
+    jog = threading.Thread(
+        target=lambda: answers.append(post(view, "/api/stage/jog", {"axis": "x", "distance_mm": 10.0}))
+    )
+    jog.start()
+    pi.host.until_state("jogging")
+    assert post(view, "/api/stage/jog", {"axis": "y", "distance_mm": 1.0})[1]["code"] == "busy"
+    assert post(view, "/api/stage/stop")[0] == 200
+    jog.join()
+    ((status, answer),) = answers
+    assert status == 409
+    assert "stopped" in answer["what"]
+    assert pi.host.wait(m.Jogged).status == "aborted"
+    assert len(moves_of(stage)) == 1
+
+
+@SIZES
+def test_the_stage_is_homed_and_jogged_between_its_limits(browser: Browser, view, instrument, tmp_path, size):
+    travel_mm = instrument.stage.travel_x_mm
+    browser.visit(f"{view.address}/new#token={TOKEN}", size)
+    browser.wait("document.querySelector('.time')", "the plan")
+    browser.value("document.querySelector('#stage > summary').click()")
+    told = "document.getElementById('stage-told').textContent"
+    browser.wait(f"{told}.startsWith('Not homed')", "the state")
+    enabled = "[...document.querySelectorAll('#axes button:enabled')].map((b) => b.getAttribute('aria-label')).join()"
+    assert browser.value(enabled) == ""
+
+    browser.value("document.getElementById('stage-home').click()")
+    forward = ",".join(f"Move {axis} by {step} mm" for axis in "xy" for step in (1, 10, 100))
+    # The stage is at the corner: nothing leads back.
+    browser.wait(f"{enabled} == '{forward}'", "buttons that lead within the limits")
+    browser.value("document.querySelector('[aria-label=\"Move x by 10 mm\"]').click()")
+    place = "document.getElementById('axes').innerText"
+    browser.wait(f"{place}.includes('x 10.0 mm') && {told} == 'At rest.'", "the end of the jog")
+    assert f"limits 0 and {travel_mm:g} mm" in browser.value(place)
+    browser.wait(f"{enabled}.includes('Move x by -10 mm')", "the way back")
+    assert "Move x by -100 mm" not in browser.value(enabled)
+
+    browser.screenshot(tmp_path / "stage.png")
+    browser.check_whole(view.address)
+    axe = find_axe()
+    if axe is not None:
+        assert browser.find_violations(axe) == []
+
+
+def test_a_pi_that_does_not_answer_is_said_and_can_be_asked_again(browser: Browser, instrument, write_config, tmp_path):
+    silent = msgspec.structs.replace(
+        instrument.pi, command_address="tcp://127.0.0.1:9", event_address="tcp://127.0.0.1:9"
+    )
+    limits = msgspec.structs.replace(instrument.limits, command_timeout_s=0.5)
+    config = write_config(msgspec.structs.replace(instrument, pi=silent, limits=limits))
+    (tmp_path / "scans").mkdir()
+    with served_folder(tmp_path / "scans", TOKEN, config=config) as view:
+        browser.visit(f"{view.address}/new#token={TOKEN}", PHONE)
+        browser.wait("document.querySelector('.time')", "the plan")
+        browser.value("document.querySelector('#stage > summary').click()")
+        browser.wait("document.getElementById('stage-told').textContent.includes('did not answer')", "the error")
+        assert not browser.value("document.getElementById('stage-home').disabled")

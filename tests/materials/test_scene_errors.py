@@ -78,6 +78,12 @@ def test_a_drift_over_the_rows_is_followed_within_its_error():
     assert max(change.largest()) > 0.03
 
 
+def test_a_slope_along_y_alone_is_rather_drift_than_one_that_plates_have_both_ways():
+    along_y_alone = common_change(make_scatter(lambda _x, _y: (0j, 0.8)), ORIGIN_M)
+    both_ways = common_change(make_scatter(lambda _x, _y: (0.8, 0.8)), ORIGIN_M)
+    assert np.abs(along_y_alone.value).max() > 2 * np.abs(both_ways.value).max()
+
+
 def test_slopes_along_a_row_are_no_drift():
     change = common_change(make_scatter(lambda x, _y: (20 * x, 0j)), ORIGIN_M)
     assert np.abs(change.value).max() < 0.005
@@ -100,3 +106,13 @@ def test_an_overdriven_receiver_shows_as_a_halo_of_v_alone():
     assert halo.level > 0.005
     assert max(halo.around, key=lambda label: halo.around[label]) == metal.label
     assert find_halo(metal.interior, patches, images(h + glow, v + glow)).level == 0
+
+
+def test_only_a_plate_that_outshines_all_others_in_v_has_a_halo():
+    """Whatever is declared as metal: a dielectric does not overdrive the receiver."""
+    h, v = plates()
+    patches = segment(h, v, AXIS, AXIS).patches
+    by_level = sorted(patches, key=lambda patch: float(np.median(np.abs(v[patch.interior]))))
+    glow = 0.3 * ndimage.gaussian_filter(by_level[-1].mask.astype(float), 8.0)
+    assert find_halo(by_level[-1].interior, patches, images(h, v + glow)).level > 0
+    assert find_halo(by_level[0].interior, patches, images(h, v + glow)).level == 0

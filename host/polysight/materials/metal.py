@@ -70,6 +70,9 @@ AROUND_MM = (4.0, 14.0)
 HALO_EXCESS = 1.26
 """Median of |V| over |H| beside the metal, each relative to metal, above which it is a halo: 2 dB. Undisturbed scenes
 of an independent generator have -4 to 1.1 dB, clipped ones -0.3 to 8.7 dB (seven of eight above 2.4 dB)."""
+OVERDRIVING = 2.0
+"""Least |V| of the metal over that of any other plate: only such an echo overdrives the receiver of V. Beside a
+dielectric that is declared as metal the sidelobes of its neighbours would count as its halo."""
 USUAL_POWER = 0.56
 """Usual power of V there without a halo, relative to H's: dielectrics, whose sidelobes it is, reflect H better."""
 
@@ -354,6 +357,10 @@ def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
     relative = [np.abs(channel) / level for channel, level in zip((images.h, images.v), levels, strict=True)]
     metal_mask = next((p.mask for p in patches if (p.mask & metal).any()), metal)
     plates = np.logical_or.reduce([metal_mask, *(p.mask for p in patches)])
+    others = [patch for patch in patches if patch.interior.any() and not (patch.mask & metal).any()]
+    strongest = max((float(np.median(relative[1][patch.interior])) for patch in others), default=0.0)
+    if OVERDRIVING * strongest > 1:
+        return Halo()
     free = images.usable & (_distance_mm(plates, pixel_mm) > AROUND_MM[0])
     level = _excess(relative, free, metal_mask, HALO_MM, pixel_mm)
     if level == 0:

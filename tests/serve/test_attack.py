@@ -1,0 +1,84 @@
+"""Abort while everybody asks at once: streams, live views, readers, wrong tokens, connections without a request.
+
+The server runs as its command. How long each abort takes is said (`-s` shows it); only that it works is asserted.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from tests.serve.test_processes import Server, serving
+from tests.support.page.asking import post
+from tests.support.page.live_view import open_control
+from tests.support.paths import REPO
+
+
+class Attack(NamedTuple):
+    """Clients of each kind; `connections` are opened each second and closed without a request."""
+
+    streams: int
+    readers: int
+    wrong_tokens: int
+    connections: int
+    aborts: int
+
+
+BRIEF = Attack(streams=4, readers=10, wrong_tokens=4, connections=50, aborts=3)
+LONG = Attack(streams=48, readers=250, wrong_tokens=90, connections=1000, aborts=100)
+# Each of these scans has a live view.
+VIEWS = 4
+WARM_UP_S = 3.0
+
+
+@contextmanager
+def attacking(port: int, attack: Attack, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Clients of another process, which runs for the block."""
+    command = [sys.executable, "-m", "tests.serve.attackers", str(port), *map(str, attack), str(VIEWS)]
+    with (folder / "attackers.txt").open("wb") as told:
+        clients = subprocess.Popen(command, cwd=REPO, stdout=told)
+        try:
+            yield clients
+            assert clients.poll() is None, "the attackers have ended"
+        finally:
+            clients.terminate()
+            clients.wait()
+
+
+def abort_once(server: Server, folder: Path) -> float:
+    """Abort a scan that runs; seconds until the answer."""
+    with open_control(folder) as stop:
+        begun_s = time.monotonic()
+        status, answer = post(server, f"/api/control/abort?scan={folder.name}", token=server.token)
+        took_s = time.monotonic() - begun_s
+        assert status == 200, answer
+        assert stop.now
+    return took_s
+
+
+def test_an_abort_gets_through_whoever_else_asks(processed: Path, tmp_path: Path, request, record_property):
+    attack = LONG if request.config.getoption("--long") else BRIEF
+    for k in range(VIEWS + 1):
+        shutil.copytree(processed / "one", tmp_path / "scans" / f"s{k}", ignore=shutil.ignore_patterns("figures"))
+    (tmp_path / "state").mkdir()
+    took_s = []
+    with serving(tmp_path / "scans", tmp_path / "state") as server, attacking(server.port, attack, tmp_path):
+        time.sleep(WARM_UP_S)
+        for _ in range(attack.aborts):
+            took_s.append(abort_once(server, tmp_path / "scans" / f"s{VIEWS}"))
+            time.sleep(random.uniform(0, 0.2))
+    record_property("median_s", statistics.median(took_s))
+    record_property("longest_s", max(took_s))
+    record_property("load", os.getloadavg()[0])
+    late = sum(seconds >= 1 for seconds in took_s)
+    sys.stdout.write(f"median {statistics.median(took_s):.3f} s, longest {max(took_s):.3f} s, {late} of {len(took_s)}")
+    sys.stdout.write(f" took 1 s or more; load {os.getloadavg()[0]:.1f}\n{(tmp_path / 'attackers.txt').read_text()}")

@@ -23,7 +23,7 @@ SYNC_OUT = 22
 SPACING_NS = 100_000_000
 TAKES = 6
 FAULTS_OF_A_LATE_PROGRAM = (PiFault.EDGE_DURING_BURST, PiFault.PERIOD_TOO_SHORT, PiFault.PROGRAM_LATE)
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(7200)]
 
 
 class Capture(NamedTuple):

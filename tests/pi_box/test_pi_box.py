@@ -12,12 +12,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgspec
 import pytest
 import zmq
 from tests.pi_box.installed import PROGRAM, InstalledPi, print_figure
 from tests.support.pi.host_side import HostSide
-from tests.support.rigs import published_rig
+from tests.support.rigs import at_stage_port, published_rig, timed_by_spi
 
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault
@@ -163,11 +162,9 @@ def test_check_finds_everything_that_is_there(bench: InstalledPi):
     assert verdicts["keys"] == verdicts["stage"] == "ok"
 
 
-def test_check_of_the_shipped_rig_names_spi_and_nothing_else(bench: InstalledPi):
+def test_check_of_a_rig_with_spi_names_it_and_nothing_else(bench: InstalledPi):
     """No SPI controller here, as on a Pi where it was not switched on."""
-    shipped = published_rig()
-    stage = msgspec.structs.replace(shipped.stage, port=bench.rig.stage.port)
-    bench.configure(msgspec.structs.replace(shipped, stage=stage))
+    bench.configure(at_stage_port(timed_by_spi(published_rig()), bench.rig.stage.port))
     findings = bench.check()
     assert {n for n, f in findings.items() if f["verdict"] == "fail"} == {"SYNC_IN line 10", "pulse width"}
     assert "dtparam=spi=on" in findings["SYNC_IN line 10"]["remedy"]

@@ -7,7 +7,6 @@ of the lines recorded by the kernel. conftest.py passes PYTHONPATH, with the rep
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import json
 import signal
 import socket
@@ -28,6 +27,7 @@ from polysight_shared.wires import WireEdge, parse
 
 LINES = 28
 LIMIT_S = 600.0
+HOMINGS = 5
 WIRES = Path("/run/wires")
 PORT = Path("/run/ttySTAGE")
 SIOCSIFFLAGS = 0x8914
@@ -80,6 +80,15 @@ def start(*command: str) -> subprocess.Popen[str]:
     return process
 
 
+def home(host: HostSide) -> int:
+    """Home the stage; return the number of attempts: the Pi stops it if a busy machine keeps its threads waiting."""
+    for homings in range(1, HOMINGS + 1):
+        host.must_accept(m.Home())
+        if host.until_state("ready", "fault").state == "ready":
+            return homings
+    raise AssertionError(host.ask(m.Status()))
+
+
 def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     """Home, run the row, end the Pi's program; return its events."""
     rig = load_instrument(config)
@@ -89,9 +98,7 @@ def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     pi = start(*python, "polysight_pi", "run", "--config", str(config), "--stage-port", str(PORT))
     host = HostSide(rig.pi.command_address, rig.pi.event_address, rig)
     host.must_accept(host.begin())
-    host.must_accept(m.Home())
-    host.wait(m.StageStatus, lambda e: e.state == "idle" and (e.x_mm, e.y_mm) == (0.0, 0.0), LIMIT_S)
-    host.until_state("ready")
+    homings = home(host)
     # What came before the row does not count
     list(chip.changes())
     host.must_accept(m.RunRow(scan_id="scan", row_index=0, take=1))
@@ -103,6 +110,7 @@ def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     uno.wait(LIMIT_S)
     host.close()
     return {
+        "homings": homings,
         "finished": [finished.points, finished.fault, finished.reason],
         "captures": [
             [e.point, e.column, e.pulses, e.edge_ns, e.first_pulse_ns, e.last_pulse_ns, e.width_max_ns, e.jitter_ns]
@@ -127,7 +135,6 @@ def main() -> None:
     result["late_ns"] = wire.late_ns
     changes: list[Change] = list(chip.changes())
     result["changes"] = [[c.t_ns, c.line, c.value] for c in changes]
-    result["digest"] = hashlib.sha256(repr(changes).encode()).hexdigest()
     print("RESULT", json.dumps(result, separators=(",", ":")), flush=True)  # noqa: T201
 
 

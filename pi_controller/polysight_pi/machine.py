@@ -20,7 +20,7 @@ from polysight_pi.stage import MAX_MM, StageDriver, StageLostError, StageRefused
 from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop, TriggerWatch
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import PolysightError, ProtocolError
+from polysight_shared.errors import DeviceError, PolysightError, ProtocolError
 from polysight_shared.faults import PiFault, StageError, explain
 from polysight_shared.raster import Row
 from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
@@ -374,22 +374,28 @@ class Machine:
             x_mm = command.from_mm + command.distance_mm
         else:
             y_mm = command.from_mm + command.distance_mm
-        try:
-            sequence = self.stage.move(x_mm, y_mm, command.speed_mm_s)
-        except (StageRefusedError, StageLostError) as e:
-            if isinstance(e, StageLostError):
-                self.happen("stage lost", e.number, str(e))
-            elif e.number in POSITION_LOST:
-                self.happen("not homed")
-            raise
+        sequence = self._start_motion(partial(self.stage.move, x_mm, y_mm, command.speed_mm_s))
         k = self.stage.config.steps_per_mm
         target = (round(x_mm * k), round(y_mm * k))
         timeout_s = HOST_MISSES * command.heartbeat_ms / 1e3
         self.jog = RunningJog(command, sequence, target, timeout_s, self._clock())
         self.last_jog = command
+
+    def _start_motion(self, start: Callable[[], int]) -> int:
+        """Start a motion of a homed stage; return its sequence number. Raises StageRefusedError or StageLostError."""
+        try:
+            sequence = start()
+        except StageLostError as e:
+            self.happen("stage lost", e.number, str(e))
+            raise
+        except StageRefusedError as e:
+            if e.number in POSITION_LOST:
+                self.happen("not homed")
+            raise
         self._is_placed = False
         self._rests = 0
         self._forget_fault()
+        return sequence
 
     def _note_moved(self, reply: Reply) -> str:
         self.stage.slow_down_polling()
@@ -461,20 +467,13 @@ class Machine:
         job = self._loop.arm(row.points, spec)
         motion = RowMotion.plan(row, self.stage.config, speed_mm_s)
         try:
-            sequence = self.stage.row(motion)
-        except (StageRefusedError, StageLostError) as e:
+            sequence = self._start_motion(partial(self.stage.row, motion))
+        except DeviceError:
             self._loop.disarm()
-            if isinstance(e, StageLostError):
-                self.happen("stage lost", e.number, str(e))
-            elif e.number in POSITION_LOST:
-                self.happen("not homed")
             raise
         self.row = RunningRow(row, take, job, sequence, motion, EdgeTimes(motion))
         self.row_timeout_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
-        self._rests = 0
-        self._is_placed = False
         self._watch = TriggerWatch()
-        self._forget_fault()
         self._journal.add(m.RowStarted, row=row, take=take)
 
     def _hold(self) -> None:
@@ -610,9 +609,7 @@ class Machine:
         self.row = None
         if row.lasting:
             return "fault"
-        if self.homed:
-            return "ready"
-        return "idle"
+        return self._at_rest_state
 
     @property
     def _current(self) -> RunningRow:

@@ -279,11 +279,8 @@ class Machine:
             reason = "it rests, and does not say how its motion ended: it was reset"
             self.happen("stage lost", PiFault.STAGE_LOST, reason)
         elif self._rests and self._rests % RESTS == 0:
-            try:
-                # The stage repeats the end of its motion
-                self.stage.link.repeat()
-            except StageLostError as e:
-                self.happen("stage lost", e.number, str(e))
+            # The stage repeats the end of its motion. Looked up inside: there may be no link any more.
+            self._tell_stage(lambda: self.stage.link.repeat())
 
     def _note_row_status(self, row: RunningRow, reply: Reply) -> None:
         row.points = max(0, _number(reply, "points"))
@@ -297,10 +294,14 @@ class Machine:
             row.edges.note_stop(_number(reply, "x"), row.points)
             self._rests_in_hold = True
             if self._resumes_at_rest:
-                try:
-                    self._send_resume()
-                except StageLostError as e:
-                    self.happen("stage lost", e.number, str(e))
+                self._tell_stage(self._send_resume)
+
+    def _tell_stage(self, send: Callable[[], object]) -> None:
+        """Send something to the stage; if it is lost, that happens after the event that is being handled."""
+        try:
+            send()
+        except StageLostError as e:
+            self._post(partial(self.happen, "stage lost", e.number, str(e)))
 
     def _publish_status(self, reply: Reply) -> None:
         now_s = self._clock()
@@ -427,10 +428,7 @@ class Machine:
         jog.fault = int(number)
         jog.reason = reason
         self._deadline_s = min(self._deadline_s, self._clock() + TIMEOUTS_S["stopping"])
-        try:
-            self.stage.link.send_byte(Immediate.STOP)
-        except StageLostError as e:
-            self._post(partial(self.happen, "stage lost", e.number, str(e)))
+        self._tell_stage(lambda: self.stage.link.send_byte(Immediate.STOP))
 
     def _abort_jog(self, reason: str) -> None:
         self._stop_jog("aborted", PiFault.ABORTED, reason)
@@ -588,11 +586,9 @@ class Machine:
         """Clear the alarm that STOP latches; the stage keeps its position."""
         self.stage.slow_down_polling()
         try:
-            self.stage.clear()
+            self._tell_stage(self.stage.clear)
         except StageRefusedError as e:
             self.homed = self.homed and e.number not in POSITION_LOST
-        except StageLostError as e:
-            self._post(partial(self.happen, "stage lost", e.number, str(e)))
 
     def _finish_row(self) -> str:
         row = self._current

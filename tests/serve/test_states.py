@@ -125,8 +125,9 @@ def test_axe_finds_nothing_in_any_state(browser: Browser, still, size, scheme, r
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_a_page_that_is_alone_says_so_and_how_to_abort(browser: Browser, still, monkeypatch, size):
+def test_a_page_that_is_alone_says_so_and_how_to_abort(browser: Browser, still, monkeypatch, size, request):
     _, view = still
+    axe = find_axe()
     monkeypatch.setattr(serve_site, "ALIVE_INTERVAL_S", 1e9)
     browser.visit(f"{view.address}/watch#token={TOKEN}", size)
     for key in ("server_frozen", "offline"):
@@ -142,3 +143,5 @@ def test_a_page_that_is_alone_says_so_and_how_to_abort(browser: Browser, still, 
             f" && !{list(state.never)!r}.some(phrase => document.body.innerText.includes(phrase))",
             key,
         )
+        if axe is not None and request.config.getoption("--long"):
+            assert browser.find_violations(axe) == [], key

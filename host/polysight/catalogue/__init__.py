@@ -5,6 +5,7 @@ tags beside a scan. Of a processed scan, `read_result` gives the results for a p
 `probe` reads one place; `compare` takes two scans. They share `Pixels`: images with permittivity and errors.
 """
 
+from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes, write_notes
 from polysight.catalogue.pictures import (
     AMPLITUDE,
     PHASE,
@@ -28,9 +29,7 @@ from polysight.catalogue.results import (
     read_result,
 )
 from polysight.catalogue.scans import (
-    NOTES,
     PROGRAM,
-    Notes,
     Program,
     Scans,
     Summary,
@@ -38,11 +37,7 @@ from polysight.catalogue.scans import (
     find_program,
     find_programs,
     folder_bytes,
-    is_plain,
-    printable,
     read_generation,
-    read_notes,
-    write_notes,
 )
 
 __all__ = [

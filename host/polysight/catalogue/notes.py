@@ -1,0 +1,110 @@
+"""The operator's notes and tags of a scan, beside its rows; texts and files that others may have made to harm."""
+
+from __future__ import annotations
+
+import json
+import stat
+import threading
+import unicodedata
+from pathlib import Path
+
+import msgspec
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError, ScanError
+from polysight_shared.files import write_atomically
+
+NOTES = "operator.json"
+MAX_NOTES = 10_000
+MAX_TAG = 40
+MAX_TAGS = 20
+MAX_NOTES_BYTES = 1 << 17
+
+
+class Notes(msgspec.Struct, frozen=True):
+    """Free text and short tags of one scan, in `operator.json` beside its rows."""
+
+    notes: str = ""
+    tags: tuple[str, ...] = ()
+
+
+# Held from the comparison with the present notes until they are replaced.
+_notes_lock = threading.Lock()
+
+
+def read_notes(folder: Path) -> Notes:
+    """Read the notes of a scan; empty if there are none.
+
+    Raises
+    ------
+    DataError
+        if the file is damaged.
+    """
+    path = folder / NOTES
+    if not is_plain(path):
+        return Notes()
+    try:
+        with path.open("rb") as f:
+            raw = f.read(MAX_NOTES_BYTES + 1)
+        if len(raw) > MAX_NOTES_BYTES:
+            return Notes()
+        return msgspec.json.decode(raw, type=Notes)
+    except FileNotFoundError:
+        return Notes()
+    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as e:
+        raise DataError(
+            f"{path}: cannot be read: {e}", "it was edited or damaged", "correct it, or remove it",
+            code=ErrorCode.FILE_DAMAGED,
+        ) from None  # fmt: skip
+
+
+def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
+    """Check and write the notes of a scan; return them as written.
+
+    Raises
+    ------
+    ConfigError
+        if a text is too long, or there are too many tags.
+    ScanError
+        if the present notes differ from `base`, from which these were edited; None: not checked.
+    """
+    text = printable(notes.notes, keep="\n")
+    tags = dict.fromkeys(printable(tag).strip() for tag in notes.tags)
+    tags.pop("", None)
+    longest = max(tags, key=len, default="")
+    fault = ""
+    if len(text) > MAX_NOTES:
+        fault = f"the notes have {len(text)} characters, {MAX_NOTES} are allowed"
+    elif len(tags) > MAX_TAGS:
+        fault = f"{len(tags)} tags, {MAX_TAGS} are allowed"
+    elif len(longest) > MAX_TAG:
+        fault = f"the tag {longest[:MAX_TAG]!r}... has {len(longest)} characters, {MAX_TAG} are allowed"
+    if fault:
+        raise ConfigError(
+            fault, "longer ones would make the list of scans unreadable", "shorten it; put longer texts into a file",
+            code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+    written = Notes(text, tuple(tags))
+    with _notes_lock:
+        if base is not None and read_notes(folder) != base:
+            raise ScanError(
+                f"the notes of {folder.name} have changed", "somebody saved them after they were read here",
+                "copy your text, load the page again, and add it", code=ErrorCode.MISMATCH,
+            )  # fmt: skip
+        content = json.dumps(msgspec.to_builtins(written), indent=1, ensure_ascii=False)
+        write_atomically(folder / NOTES, f"{content}\n".encode())
+    return written
+
+
+def is_plain(path: Path) -> bool:
+    """True if a path is a regular file: no link, and no pipe, on which a reader would block."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def printable(text: str, keep: str = "") -> str:
+    """Return the text without control, direction and surrogate characters, for lists and terminals."""
+    hidden = ("Cc", "Cf", "Cs", "Zl", "Zp")
+    return "".join(c for c in unicodedata.normalize("NFC", text) if c in keep or unicodedata.category(c) not in hidden)

@@ -104,6 +104,18 @@ def band_limited_noise(rng, level_db):
     return noise / np.sqrt(np.mean(np.abs(noise) ** 2)) * 10 ** (level_db / 20)
 
 
+@pytest.mark.parametrize("noise_db", [-20.0, -14.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sheet_whose_v_is_noise_is_one_plate_of_one_kind(seed, noise_db):
+    plates = raster([0.0, -3.0], [COPPER, 0.01], 12)
+    h, v = draw(seed, plates, strips=1.0, amplitude=0.02, phase_deg=1.0, background_db=-60.0)
+    v = v + band_limited_noise(np.random.default_rng(seed), noise_db)[1]
+    usable = np.ones(h.shape, bool)
+    found, _ = patches_from_labels({str(i): box for i, box in enumerate(plates)}, AXIS, AXIS, margin_mm=6.0)
+    dark = background(h, v, found, usable)
+    assert [check_patch(patch, h, v, dark, 0.05) for patch in found.patches] == [None, None]
+
+
 def uneven_light(seed):
     """An amplitude [SIDE, SIDE] that varies by 5 dB (standard deviation) over some 100 mm."""
     field = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((SIDE, SIDE)), 20.0)

@@ -75,6 +75,13 @@ of its pixels lie two standard deviations of 0.24 away."""
 HALVES_APART = 0.07
 """Difference of V / H between opposite halves of a dielectric (thrice for metal), above which two materials touch. A
 real plate of one material (acrylic, published rig) has 0.06 after the factor for its V / H."""
+ODD_NOISE = 2.0
+"""Size of V's noise in V / H, in its root mean square, that makes no pixel odd: 2 % of noise exceeds it."""
+NOISE_OF_HALVES = 22.0
+"""Difference of the halves' medians by noise in V / H, over its root mean square and the root of the pixels: three
+standard deviations, with one independent value in nine pixels and medians that scatter by 1.25 of means."""
+IN_NOISE = 2.0
+"""|V| over its background below which V is rather noise: its phase tells nothing."""
 # Margin around patches that does not count as background
 _AROUND_PX = 6
 
@@ -168,18 +175,21 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
         return Finding("error", "as dark as the background", "it does not stand out from noise and sidelobes", remedy)
     cross = abs(np.vdot(h[pixels].astype(np.complex128), v[pixels]))
     power_h, power_v = (float(np.sum(np.abs(c[pixels].astype(np.complex128)) ** 2)) for c in (h, v))
-    dim = float(np.median(np.abs(v[pixels]))) < 0.12 * float(np.median(level))
+    level_v = float(np.median(np.abs(v[pixels])))
+    dim = level_v < 0.12 * float(np.median(level)) or level_v < IN_NOISE * dark[1]
     if not dim and cross < 0.7 * np.sqrt(power_h * power_v):
         return Finding(
             "error", "H and V do not agree", "their phase difference varies from pixel to pixel, like noise", remedy
         )
+    # Where a sheet hardly reflects V, its V / H is noise.
+    noise = dark[1] / float(np.median(level)) if np.isfinite(dark[1]) else 0.0
     allowed = max(HALVES_APART, uneven) * (1 + 2 * float(np.median(np.abs(v[pixels])) / np.median(level)))
     several = "several kinds together"
     separate_plates = "move the plates apart, or draw boxes"
-    if halves_apart(h, v, pixels) > allowed:
+    if halves_apart(h, v, pixels) > np.hypot(allowed, NOISE_OF_HALVES * noise / np.sqrt(pixels.sum())):
         return Finding("error", several, "its halves have different ratios", separate_plates)
     middle = 1 / median_ratio(h[pixels], v[pixels])
-    odd = np.abs(v[pixels] / h[pixels] - middle) > max(ODD_RATIO, RIPPLE * abs(middle))
+    odd = np.abs(v[pixels] / h[pixels] - middle) > np.hypot(max(ODD_RATIO, RIPPLE * abs(middle)), ODD_NOISE * noise)
     if float(odd.mean()) > ODD_SHARE:
         return Finding("error", several, f"{100 * odd.mean():.0f} % of its pixels have another ratio", separate_plates)
     return None

@@ -56,9 +56,9 @@ from polysight.results import BoardQuality
 from polysight.surfaces import Segment, Surface, describe_form, describe_material
 from polysight_shared.raster import RasterPlan
 
-# Axis numbers of a view (horizontal, vertical), its title, and the names of the axes.
 # Axis of the points along which the rig looks.
 Z = 2
+# Axis numbers of a view (horizontal, vertical), its title, and the names of the axes.
 VIEWS = (
     ((0, 1), "From the rig", ("x (mm)", "y (mm)")),
     ((2, 1), "From the side", ("z (mm), away from the rig", "y (mm)")),

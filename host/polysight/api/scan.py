@@ -693,9 +693,6 @@ def _parse_layer(layer: str | Layer) -> Layer:
     try:
         return parse_layer(layer)
     except ValueError:
-        raise ConfigError(
-            f"{layer!r} does not describe a layer",
-            "the text has another form",
-            f"write {LAYER_FORMS}",
-            code=ErrorCode.VALUE_INVALID,
-        ) from None
+        problem = f"{layer!r} does not describe a layer"
+        why = "the text has another form"
+        raise ConfigError(problem, why, f"write {LAYER_FORMS}", code=ErrorCode.VALUE_INVALID) from None

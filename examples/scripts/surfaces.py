@@ -64,32 +64,24 @@ optics = replace(
 )
 offsets_m = scan_offsets(every=2)
 
+valid = np.ones(offsets_m.shape[:2], bool)
 
-def scan(scene, number):
-    """Scan shapes and find their specular points."""
+# %% Both scans, of a metal sphere and of the scene, with their specular points.
+points = {}
+for number, (name, scene) in enumerate({"sphere": [reference_sphere()], "scene": shapes}.items(), start=1):
     cubes = scan_shapes(scene, offsets_m, ShapeNuisances(noise=0.25), boards=boards, number=number)
-    valid = np.ones(offsets_m.shape[:2], bool)
     samples = [
         Samples(cubes[channel], valid, offsets_m, FREQUENCIES_HZ, boards.tx.position, rxs[0].position[None])
         for channel, rxs in boards.receivers().items()
     ]
-    return see_points(samples[0], samples[1], optics, GATE_M)
+    points[name] = see_points(samples[0], samples[1], optics, GATE_M)
 
-
-# %% A metal sphere gives the gains; then the scene.
-sphere = scan([reference_sphere()], number=1)
-metal = sphere[sphere.segment == 0]
-
-
-def learn(rig):
-    """Gains that the metal sphere gives, for any rig."""
-    return learn_gains(find_voltages(metal, rig), rig.wave_number)
-
-
+# %% The sphere gives the gains, for any error of the rig that is tried.
+metal = points["sphere"][points["sphere"].segment == 0]
 surface = analyse_surface(
-    scan(shapes, number=2),
+    points["scene"],
     optics,
-    learn,
+    lambda rig: learn_gains(find_voltages(metal, rig), rig.wave_number),
     uncertainty=Uncertainty(leakage=0.003, axis_rad=0.002, place_m=0.0003),
     scan_id="surfaces",
     simulated=True,

@@ -281,7 +281,7 @@ def test_an_existing_trace_is_not_overwritten(rig_file, opened_boards, capsys, t
     trace = tmp_path / "day.jsonl"
     trace.write_text("of another day")
     assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 2
-    assert "there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     assert trace.read_text() == "of another day"
     assert opened_boards == []
 

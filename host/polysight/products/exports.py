@@ -268,8 +268,8 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
         loss_std = np.hypot(by_ratio * p_std, by_angle.imag * angle_std_rad)
         is_known = np.hypot(real_std, loss_std) < LARGEST_ERROR * np.abs(value)
         # Edges of metal have ratios near 1, of which Eq. 3 makes large negative permittivities.
-        has_real_part = value.real + LARGEST_DEVIATION * real_std >= 1.0
-        has_loss = -value.imag + LARGEST_DEVIATION * loss_std >= 0.0
+        has_real_part = np.real(value) + LARGEST_DEVIATION * real_std >= 1.0
+        has_loss = -np.imag(value) + LARGEST_DEVIATION * loss_std >= 0.0
         mask = is_known & has_real_part & has_loss
     data = {
         "permittivity": _describe(PLANE, value, "1", "relative permittivity eps' - j eps'' as a half space"),

@@ -357,8 +357,8 @@ def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
     relative = [np.abs(channel) / level for channel, level in zip((images.h, images.v), levels, strict=True)]
     metal_mask = next((p.mask for p in patches if (p.mask & metal).any()), metal)
     plates = np.logical_or.reduce([metal_mask, *(p.mask for p in patches)])
-    others = [patch for patch in patches if patch.interior.any() and not (patch.mask & metal).any()]
-    strongest = max((float(np.median(relative[1][patch.interior])) for patch in others), default=0.0)
+    other_plates = [patch for patch in patches if patch.interior.any() and not (patch.mask & metal).any()]
+    strongest = max((float(np.median(relative[1][patch.interior])) for patch in other_plates), default=0.0)
     if OVERDRIVING * strongest > 1:
         return Halo()
     free = images.usable & (_distance_mm(plates, pixel_mm) > AROUND_MM[0])

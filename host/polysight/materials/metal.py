@@ -74,7 +74,8 @@ OVERDRIVING = 2.0
 """Least |V| of the metal over that of any other plate: only such an echo overdrives the receiver of V. Beside a
 dielectric that is declared as metal the sidelobes of its neighbours would count as its halo."""
 USUAL_POWER = 0.56
-"""Usual power of V there without a halo, relative to H's: dielectrics, whose sidelobes it is, reflect H better."""
+"""Usual power of V there without a halo, relative to H's: dielectrics, whose sidelobes it is, reflect H better.
+Median of the same undisturbed scenes, -2.5 dB."""
 
 
 @dataclass(frozen=True)

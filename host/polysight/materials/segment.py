@@ -34,7 +34,7 @@ MOST_SCATTER_DB = 4.0
 """Largest scatter of a background's level: that of a real picture is 3.8 dB; with more, plates are among the pixels."""
 PLAIN_DB = 14.0
 """Level above the background that noise hardly reaches over the width of the smallest patch. Of 200 images of noise
-alone 24 have a patch, 10 without this rule; all that it adds have resolution cells above 5.9 mm (standard deviation)."""
+alone 24 have a patch, 10 without this rule; all that it adds have cells above 5.9 mm (standard deviation)."""
 SMALLEST_SHARE = 0.75
 """Least area of a patch, relative to a square of the least width: a corner of a skirt has 0.6."""
 BODY = 0.65

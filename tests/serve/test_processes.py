@@ -1,24 +1,26 @@
-"""The two processes of `polysight serve`: control answers whatever becomes of the reading one, and after a restart."""
+"""The processes of `polysight serve`: commands are answered whatever becomes of the others, and after a restart."""
 
 from __future__ import annotations
 
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from tests.support.page.asking import ask, get, post
 from tests.support.page.live_view import open_control
-from tests.support.processes import wait_for
+from tests.support.processes import LIMIT_S, wait_for
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 
+from polysight.serve.door import MOST_SILENT, is_command
 from polysight.serve.guard import TOKEN_HEADER
 from polysight.serve.server import load_token
 from polysight_shared.error_codes import ErrorCode
@@ -84,6 +86,38 @@ def test_a_scan_is_aborted_while_the_reading_process_is_frozen_killed_and_starte
         assert "the page" in stop.asker
         wait_for(lambda: server.reading_process() not in (None, first), "another one")
         wait_for(lambda: ask(server, "/api/scans")[0] == 200, "the list again")
+
+
+def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_nothing(scans, tmp_path):
+    """More silent connections than are kept; a request that came with them is answered when the pages go on."""
+    with serving(scans, tmp_path / "state") as server, open_control(scans / "one") as stop, ExitStack() as clients:
+        assert ask(server, "/api/page")[2]["connection"] == "close"
+        os.kill(server.program.pid, signal.SIGSTOP)
+        try:
+            reading = clients.enter_context(socket.create_connection(("127.0.0.1", server.port), LIMIT_S))
+            reading.sendall(b"GET /api/page HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            for _ in range(MOST_SILENT + 100):
+                clients.enter_context(socket.create_connection(("127.0.0.1", server.port), LIMIT_S))
+            assert post(server, "/api/control/abort?scan=one", token=server.token)[0] == 200
+            assert stop.now
+        finally:
+            os.kill(server.program.pid, signal.SIGCONT)
+        assert reading.recv(100).startswith(b"HTTP/1.1 200")
+
+
+@pytest.mark.parametrize(
+    ("head", "answered_here"),
+    [
+        (b"POST /api/control/abort?scan=one HTTP/1.1\r\nX-Polysight-Token: right\r\n\r\n{}", True),
+        (b"POST /api/control/abort?scan=one HTTP/1.1\r\nx-polysight-token:right\r\nHost: a\r\n\r\n", True),
+        (b"POST /api/control/abort?scan=one HTTP/1.1\r\nX-Polysight-Token: wrong\r\n\r\n", False),
+        (b"POST /api/control/abort?scan=one HTTP/1.1\r\nX-Polysight-Token: right\r\n", False),
+        (b"POST /api/control/abort?scan=one HTTP/1.1\r\nHost: a\r\n\r\nX-Polysight-Token: right", False),
+        (b"POST /api/notes?scan=one HTTP/1.1\r\nX-Polysight-Token: right\r\n\r\n", False),
+    ],
+)
+def test_only_a_whole_command_with_the_right_token_is_answered_at_the_door(head, answered_here):
+    assert is_command(head, b"right") == answered_here
 
 
 def test_the_token_survives_a_restart_and_nobody_else_can_read_it(scans, tmp_path, monkeypatch):

@@ -1,9 +1,9 @@
 """The operator's page: one web server for the catalogue, the live view and the results of scans.
 
 `serve` shows all scans under a folder; whoever holds the token starts, controls and labels them. `preview` shows one.
-Two processes (`server`): browsers reach `front`, where each request passes the access checks of `guard`, and which
-controls running scans. It forwards the rest to the reading process: `reading` answers GET requests, `commands` POST
-requests; `site` holds their shared state: the live views, and the programs that scan and process, which outlive the
+Three processes (`server`): `door` accepts connections and answers commands to scans. It hands the rest to `front`, where
+each request passes the access checks of `guard`; what is no page goes on to the reading process: `reading` answers GET
+requests, `commands` POST requests; `site` holds their shared state: the live views, and the programs that scan and process, which outlive the
 server; `queue` the scans that wait.
 Threat model: docs/decisions/0014-operators-page.md.
 """

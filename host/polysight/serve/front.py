@@ -1,8 +1,8 @@
-"""The process that browsers reach: access checks, static pages, and the control of running scans.
+"""The process of the pages: access checks, static pages, running scans, and commands to them.
 
-It reads no scan, so that nothing that is read can hold up pause, stop or abort: all other requests are forwarded to
-the reading process (`Reader`), which has a low priority. A command goes into the scan's control folder, in a thread of
-its own. The number of connections has one limit (`ConnectionLimit`).
+It reads no scan: all other requests are forwarded to the reading process (`Reader`), which has a low priority. A
+command goes into the scan's control folder, in a thread of its own; with `door`, that process answers commands by the
+same route, and nothing here can hold them up. The number of connections has one limit (`ConnectionLimit`).
 """
 
 from __future__ import annotations
@@ -97,12 +97,20 @@ class Front:
 
 def make_app(front: Front) -> Starlette:
     """Build the application: the guard, pages, control; the reading process for everything else."""
-    routes = [*page_routes(front), *control_routes(front)]
+    routes = [*page_routes(front), *control_routes(front), command_route(front)]
     if front.stage is not None:
         routes += stage_routes(front.stage)
     routes.append(Route("/api/{path:path}", front.reader))
-    guard = Middleware(Guard, access=front.access)
-    return Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS)
+    return _guarded(routes, front.access)
+
+
+def make_command_app(front: Front) -> Starlette:
+    """Build the application of the door: commands to scans."""
+    return _guarded([command_route(front)], front.access)
+
+
+def _guarded(routes: list[Route], access: Access) -> Starlette:
+    return Starlette(routes=routes, middleware=[Middleware(Guard, access=access)], exception_handlers=HANDLERS)
 
 
 def page_routes(front: Front) -> list[Route]:
@@ -150,7 +158,7 @@ def page_routes(front: Front) -> list[Route]:
 
 
 def control_routes(front: Front) -> list[Route]:
-    """Routes of the running scans, their control, and the session of who has the token."""
+    """Routes of the running scans, and of the session of who has the token."""
     running = RunningScans(front.scans)
 
     async def open_session(request: Request) -> Response:
@@ -166,6 +174,12 @@ def control_routes(front: Front) -> list[Route]:
         del request
         return Response(msgspec.json.encode(await run_in_own_thread(running.list)), media_type="application/json")
 
+    return [Route("/api/running", list_running), Route("/api/session", open_session, methods=["POST"])]
+
+
+def command_route(front: Front) -> Route:
+    """Route of pause, stop, abort and the other commands to a scan that runs."""
+
     async def control(request: Request) -> Response:
         name = request.query_params.get("scan") or front.scans.only or ""
         command = request.path_params["command"]
@@ -179,11 +193,7 @@ def control_routes(front: Front) -> list[Route]:
         await run_in_own_thread(lambda: send_command(front.scans.folder(name), ScanCommand(command), asker))
         return JSONResponse(None)
 
-    return [
-        Route("/api/running", list_running),
-        Route("/api/session", open_session, methods=["POST"]),
-        Route("/api/control/{command}", control, methods=["POST"]),
-    ]
+    return Route("/api/control/{command}", control, methods=["POST"])
 
 
 def stage_routes(stage: StageControl) -> list[Route]:

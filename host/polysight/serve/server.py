@@ -1,7 +1,8 @@
-"""`polysight serve` and `polysight preview`: the address, the token, and the two processes until Ctrl-C.
+"""`polysight serve` and `polysight preview`: the address, the token, and the processes until Ctrl-C.
 
-This process is the one that browsers reach (`front`); it starts the reading process, and starts it again should it
-end. Both are uvicorn; the reading process listens on a socket in a folder that only this user may enter.
+This process shows the pages (`front`). It starts the one that accepts connections (`door`), and the reading process,
+which it starts again should that end. All are uvicorn; the reading process listens on a socket in a folder that only
+this user may enter.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ from starlette.types import ASGIApp
 from polysight.catalogue import Scans
 from polysight.page import Watch
 from polysight.serve.commands import command_routes, start_waiting
-from polysight.serve.front import Front, Reader, make_app, make_counting_protocol
+from polysight.serve.door import PagesServer, close_after_each, open_door
+from polysight.serve.front import Front, Reader, make_app, make_command_app, make_counting_protocol
 from polysight.serve.guard import HANDLERS, HEAD_BYTES, Access
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import HIDDEN, Programs, Site, Watches
@@ -43,8 +45,10 @@ from polysight_shared.errors import ConfigError, DeviceError
 NICE = 10
 # A page holds up to six.
 MAX_CONNECTIONS = 2048
-# Connections that may be accepted before the next one that has sent something is read.
+# Connections that may be accepted before the next one that has sent something is read; and in the kernel's queue: a
+# client whose connection finds no room there tries again after 1 s, and then after 2 more.
 ACCEPTED_AT_ONCE = 128
+BACKLOG = 4096
 # Idle connections are closed when there are too many, never for their age.
 KEEP_ALIVE_S = 10**6
 CLOSE_S = 1
@@ -137,15 +141,22 @@ def _run(shown: Shown, place: Place, what: str) -> int:
     listener = _bind(place)
     try:
         access = _access(place, listener, shown.control)
-        with tempfile.TemporaryDirectory(prefix="polysight-") as folder, _reading(shown, Path(folder) / "reader"):
+        with contextlib.ExitStack() as stack:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="polysight-"))
             stage = None
             if shown.starts and shown.config is not None:
                 stage = StageControl(shown.config)
             reader = Reader(Path(folder) / "reader")
             front = Front(Scans(shown.root, shown.only), access, shown.starts, reader, stage)
+            _allow_files()
+            door = None
+            if access.control and not access.secure:
+                commands = close_after_each(make_command_app(front))
+                door = stack.enter_context(open_door(listener, access.token, _configure(commands)))
+            stack.enter_context(_reading(shown, Path(folder) / "reader"))
             sys.stderr.write(_welcome(access, place, listener, what))
             sys.stderr.flush()
-            make_server(front, place).run(sockets=[listener])
+            make_server(front, place, door).run(sockets=[listener])
     finally:
         listener.close()
     return 0
@@ -198,7 +209,7 @@ def _bind(place: Place) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((place.host, place.port))
-        listener.listen(ACCEPTED_AT_ONCE)
+        listener.listen(BACKLOG)
     except OSError as e:
         listener.close()
         raise DeviceError(
@@ -339,25 +350,33 @@ def _configure(app: ASGIApp, **more: object) -> uvicorn.Config:
     )
 
 
-def make_server(front: Front, place: Place) -> uvicorn.Server:
-    """Build the server that browsers reach."""
+def make_server(front: Front, place: Place, door: socket.socket | None = None) -> uvicorn.Server:
+    """Build the server of the pages: it accepts connections, or takes them from the `door`."""
+    app: ASGIApp = make_app(front)
+    if door is not None:
+        app = close_after_each(app)
+    protocol = make_counting_protocol(MAX_CONNECTIONS)
+    config = _configure(
+        app,
+        http=protocol,
+        # Reached only when every connection has a request at work: then it answers 503. Connections that were
+        # closed a moment ago still count there.
+        limit_concurrency=MAX_CONNECTIONS + 2 * ACCEPTED_AT_ONCE,
+        backlog=ACCEPTED_AT_ONCE,
+        timeout_keep_alive=KEEP_ALIVE_S,
+        ssl_certfile=place.certificate,
+        ssl_keyfile=place.key,
+    )
+    if door is not None:
+        return PagesServer(config, door, protocol)
+    return uvicorn.Server(config)
+
+
+def _allow_files() -> None:
+    """Allow as many open files as the system does: connections are files."""
     with contextlib.suppress(OSError, ValueError, ModuleNotFoundError):
         # A module of POSIX systems: the page's results are read on laptops, too.
         import resource
 
-        # Connections are files.
         _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, 1 << 16), most))
-    return uvicorn.Server(
-        _configure(
-            make_app(front),
-            http=make_counting_protocol(MAX_CONNECTIONS),
-            # Reached only when every connection has a request at work: then it answers 503. Connections that were
-            # closed a moment ago still count there.
-            limit_concurrency=MAX_CONNECTIONS + 2 * ACCEPTED_AT_ONCE,
-            backlog=ACCEPTED_AT_ONCE,
-            timeout_keep_alive=KEEP_ALIVE_S,
-            ssl_certfile=place.certificate,
-            ssl_keyfile=place.key,
-        )
-    )

@@ -19,7 +19,7 @@ from .conftest import PET
 PLATE = CheckPlate(name="PTFE", permittivity=(2.05, 0.01), std=(0.02, 0.01), place_mm=(30.0, 0.0))
 
 
-def patch(real: float, loss: float, covariance: list[list[float]] | None = None) -> PatchFigures:
+def patch(real: float, loss: float, covariance: list[list[float | None]] | None = None) -> PatchFigures:
     covariance = covariance or [[0.01, 0.0], [0.0, 0.01]]
     value = PermittivityFigures(real=real, imag=-loss, covariance=covariance)
     return PatchFigures(label=1, box_mm=(10.0, -20.0, 50.0, 20.0), permittivity=value)
@@ -37,12 +37,15 @@ def test_limits_are_those_of_good_scans(real, level, reasons):
 
 def test_the_error_of_both_parts_and_their_correlation_count():
     """An error along the axis of the covariance is likelier than one across it; the loss is -imag."""
-    covariance = [[0.01, -0.0095], [-0.0095, 0.01]]
+    covariance: list[list[float | None]] = [[0.01, -0.0095], [-0.0095, 0.01]]
     along = check_plate(PLATE, [patch(2.25, 0.21, covariance)])
     across = check_plate(PLATE, [patch(2.25, -0.19, covariance)])
     assert along is not None
+    assert along.sigmas is not None
+    assert along.sigmas < 2.1
     assert across is not None
-    assert along.sigmas < 2.1 < 5 < across.sigmas
+    assert across.sigmas is not None
+    assert across.sigmas > 5
 
 
 def test_good_scans_are_within_the_limits():
@@ -51,7 +54,9 @@ def test_good_scans_are_within_the_limits():
     levels = []
     for _ in range(2000):
         real, imag = rng.multivariate_normal([2.05, -0.01], covariance + np.diag([0.02**2, 0.01**2]))
-        levels.append(check_plate(PLATE, [patch(real, -imag, covariance.tolist())]).level)
+        result = check_plate(PLATE, [patch(real, -imag, covariance.tolist())])
+        assert result is not None
+        levels.append(result.level)
     assert levels.count("good") / 2000 == pytest.approx(0.95, abs=0.02)
     assert levels.count("action") / 2000 < 0.01
 

@@ -55,7 +55,9 @@ def test_it_names_as_the_model_of_libraries(library):
 @pytest.mark.parametrize("model", ["knn", "discriminant"])
 def test_a_classifier_is_an_estimator(library, model):
     X, y, scans = library.columns()
-    classifier = clone(Classifier(model)).fit(X, y, scans)
+    classifier = clone(Classifier(model))
+    assert isinstance(classifier, Classifier)
+    classifier.fit(X, y, scans)
     probability = classifier.predict_proba(X[::50])
     assert probability.shape == (len(X[::50]), len(classifier.classes_))
     assert probability.sum(axis=1) == pytest.approx(1)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shutil
+from typing import assert_type
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import xarray
 from tests.support.refusals import refused
@@ -16,6 +18,7 @@ from polysight_shared.error_codes import ErrorCode
 
 from .conftest import COPPER, PET, simulate_plates
 
+Complex = npt.NDArray[np.complex128]
 BOXES = {"copper": (-60.0, -15.0, -30.0, 15.0), "PET": (30.0, -15.0, 60.0, 15.0)}
 
 
@@ -61,6 +64,20 @@ def test_an_array_with_labels_is_one_medium(which):
     swept = multilayer(eps, thickness_m, 78e9, np.radians(55))[0]
     assert swept.dims == ("kind",)
     xarray.testing.assert_identical(swept, multilayer([eps], [thickness_m], 78e9, np.radians(55))[0])
+
+
+def test_types_say_whether_labels_are_kept():
+    """`assert_type` is judged by pyright: tests/api is among the files of `make check`."""
+    plain = np.array([2.0, 3.0])
+    labelled = xarray.DataArray(plain, dims="kind")
+    assert_type(permittivity_from_ratio(plain, 0.9), Complex)
+    assert_type(permittivity_from_ratio(labelled, 0.9), xarray.DataArray)
+    assert_type(fresnel(3.8 - 0.7j, labelled), tuple[xarray.DataArray, xarray.DataArray])
+    assert_type(multilayer([2.9, 3 - 0.1j], 1e-3, 78e9, 0.9), tuple[Complex, Complex])
+    assert_type(multilayer(2.9, labelled * 1e-3, 78e9, 0.9), tuple[xarray.DataArray, xarray.DataArray])
+    places = np.zeros((2, 3))
+    image = polysight.backproject(np.ones((2, 4), complex), np.linspace(77e9, 78e9, 4), places, places, places, plain)
+    assert_type(image, Complex)
 
 
 # --- maps -------------------------------------------------------------------------------------------------------------

@@ -16,8 +16,7 @@ from tests.support.store.facts import facts_of
 import polysight
 from polysight import open_scan, read_netcdf
 from polysight.products.processed import read_image
-from polysight.store import manifest
-from polysight.store.scan_folder import MANIFEST, ScanFolder
+from polysight.store import MANIFEST, ScanFolder, manifest
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
@@ -273,7 +272,8 @@ def test_nothing_is_written_unless_asked(folder, products, tmp_path, monkeypatch
 
 
 def same_dataset(found: xarray.Dataset, expected: xarray.Dataset) -> None:
-    xarray.testing.assert_equal(found[sorted(expected.data_vars)], expected[sorted(expected.data_vars)])
+    variables = sorted(map(str, expected.data_vars))
+    xarray.testing.assert_equal(found[variables], expected[variables])
     for name, variable in expected.variables.items():
         assert found[name].attrs == variable.attrs, name
         if variable.dtype.kind in "cfib":
@@ -323,6 +323,7 @@ def test_a_scan_without_a_whole_row_says_so(folder, tmp_path):
 
 def test_a_scan_without_metal_says_what_can_be_had(tmp_path):
     scan = open_scan(simulate_plates(tmp_path / "scan"))
+    assert scan.verdict is not None
     assert scan.verdict.level == "none"
     assert scan.materials().sizes["patch"] == 0
     assert scan.image(metal_referenced=False).attrs["metal_reference"].startswith("none")

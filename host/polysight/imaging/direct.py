@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Protocol, TypeVar, overload
 
 import numpy as np
+import numpy.typing as npt
 
 from polysight.imaging.geometry import Aperture, excess_path_m, get_device, namespace, turn
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -14,6 +15,26 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 _CHUNK = 1 << 20
 
 
+class Shaped(Protocol):
+    """An array of any array API library."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of values along each dimension."""
+        ...
+
+
+Array = TypeVar("Array", bound=Shaped)
+
+
+@overload
+def backproject(
+    samples: npt.NDArray[Any], frequencies_hz: Shaped, tx_m: Shaped, rx_m: Shaped, voxels_m: Shaped, reference_m: Shaped
+) -> npt.NDArray[np.complex128]: ...
+@overload
+def backproject(
+    samples: Array, frequencies_hz: Shaped, tx_m: Shaped, rx_m: Shaped, voxels_m: Shaped, reference_m: Shaped
+) -> Array: ...
 def backproject(samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any) -> Any:
     """Backproject samples (paper, equation 6, with the exponent's sign of the conjugate of the received phase).
 

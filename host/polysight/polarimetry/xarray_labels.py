@@ -6,15 +6,75 @@ Rooms use the plain functions of `fresnel.py`.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast, overload
 
+import numpy as np
+import numpy.typing as npt
+
+from polysight.polarimetry.fresnel import Complex
 from polysight.polarimetry.fresnel import fresnel as plain_fresnel
 from polysight.polarimetry.fresnel import multilayer as plain_multilayer
 from polysight.polarimetry.fresnel import permittivity_from_ratio as plain_permittivity
 
+if TYPE_CHECKING:
+    from xarray import DataArray
+
 Function = TypeVar("Function", bound=Callable[..., Any])
+# Arrays without labels: `ArrayLike` would hold the ones with labels, too.
+Plain = complex | np.generic | npt.NDArray[Any] | Sequence[Any]
+
+
+class _Fresnel(Protocol):
+    @overload
+    def __call__(self, eps: DataArray, theta_rad: Plain | DataArray) -> tuple[DataArray, DataArray]: ...
+    @overload
+    def __call__(self, eps: Plain, theta_rad: DataArray) -> tuple[DataArray, DataArray]: ...
+    @overload
+    def __call__(self, eps: Plain, theta_rad: Plain) -> tuple[Complex, Complex]: ...
+
+
+class _PermittivityFromRatio(Protocol):
+    @overload
+    def __call__(self, p: DataArray, theta_rad: Plain | DataArray) -> DataArray: ...
+    @overload
+    def __call__(self, p: Plain, theta_rad: DataArray) -> DataArray: ...
+    @overload
+    def __call__(self, p: Plain, theta_rad: Plain) -> Complex: ...
+
+
+class _Multilayer(Protocol):
+    """A list of media that mixes arrays with and without labels counts as one without."""
+
+    @overload
+    def __call__(
+        self,
+        eps: DataArray | list[DataArray],
+        thickness_m: Plain | DataArray,
+        frequency_hz: Plain | DataArray,
+        theta_rad: Plain | DataArray,
+    ) -> tuple[DataArray, DataArray]: ...
+    @overload
+    def __call__(
+        self,
+        eps: Plain,
+        thickness_m: DataArray | list[DataArray],
+        frequency_hz: Plain | DataArray,
+        theta_rad: Plain | DataArray,
+    ) -> tuple[DataArray, DataArray]: ...
+    @overload
+    def __call__(
+        self, eps: Plain, thickness_m: Plain, frequency_hz: DataArray, theta_rad: Plain | DataArray
+    ) -> tuple[DataArray, DataArray]: ...
+    @overload
+    def __call__(
+        self, eps: Plain, thickness_m: Plain, frequency_hz: Plain, theta_rad: DataArray
+    ) -> tuple[DataArray, DataArray]: ...
+    @overload
+    def __call__(
+        self, eps: Plain, thickness_m: Plain, frequency_hz: Plain, theta_rad: Plain
+    ) -> tuple[Complex, Complex]: ...
 
 
 def keep_labels(*results: str) -> Callable[[Function], Function]:
@@ -66,7 +126,7 @@ def _fill(value: Any, arrays: Iterator[Any]) -> Any:
 
 
 _REFLECTION = ("s-polarised reflection coefficient", "p-polarised reflection coefficient")
-fresnel = keep_labels(*_REFLECTION)(plain_fresnel)
+fresnel = cast(_Fresnel, keep_labels(*_REFLECTION)(plain_fresnel))
 
 
 def _take_arrays_as_one_medium(function: Function) -> Function:
@@ -87,5 +147,5 @@ def _list_one_medium(value: Any) -> Any:
     return value
 
 
-multilayer = _take_arrays_as_one_medium(keep_labels(*_REFLECTION)(plain_multilayer))
-permittivity_from_ratio = keep_labels("relative permittivity")(plain_permittivity)
+multilayer = cast(_Multilayer, _take_arrays_as_one_medium(keep_labels(*_REFLECTION)(plain_multilayer)))
+permittivity_from_ratio = cast(_PermittivityFromRatio, keep_labels("relative permittivity")(plain_permittivity))

@@ -86,12 +86,13 @@ def link_faults(out: Path) -> list[str]:
     faults = []
     for path, page in pages.items():
         for link in page.links:
-            if "://" in link or link.startswith("file:") or link.startswith(("mailto:", "data:")):
+            is_elsewhere = "://" in link and not link.startswith("file:")
+            if is_elsewhere or link.startswith(("mailto:", "data:")):
                 continue
             name, _, anchor = unquote(link).partition("#")
             target = (path.parent / name).resolve() if name else path
-            is_picture = target.suffix != ".html" and target.is_file()
-            if is_picture:
+            is_other_file = target.suffix != ".html" and target.is_file()
+            if is_other_file:
                 continue
             known = pages.get(target)
             if known is None or (anchor and anchor not in known.anchors):

@@ -1,7 +1,7 @@
 """Static pages of the documentation: every Markdown page, the gallery's pictures, and the notebooks with their results.
 
-The links between pages stay, with `.html` for `.md` and `.ipynb`; pictures lie beside their pages, so that the folder
-can be moved. Other files are linked in the repository that the pages are made from.
+The links between pages stay, with `.html` for `.md` and `.ipynb`; pictures and other linked files are copied, so that
+the folder can be moved.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ import polysight
 
 NOTEBOOKS = ROOT / "examples" / "notebooks"
 GALLERY = ROOT / "docs" / "gallery.md"
-PICTURES = (".png", ".svg")
 _TARGET = re.compile(r'((?:href|src)=")([^"#:]+)(#[^"]*)?"')
 _PICTURE = re.compile(r'"out/(gallery-\w+\.png)"')
 _STYLE = (
@@ -36,7 +35,7 @@ _STYLE = (
 
 def build_site(out: Path, *, run: bool) -> list[Path]:
     """Write all pages into `out`; with `run` the notebooks' results and the gallery's pictures, too."""
-    made = [_write(path, out, _from_markdown(path)) for path in all_pages()]
+    made = [_write(path, out, _from_markdown(path)) for path in site_pages()]
     with tempfile.TemporaryDirectory(prefix="polysight-docs-") as name:
         folder = Path(name)
         notebooks = sorted(NOTEBOOKS.glob("*.ipynb"))
@@ -47,11 +46,16 @@ def build_site(out: Path, *, run: bool) -> list[Path]:
     return made
 
 
+def site_pages() -> list[Path]:
+    """Markdown files that become pages."""
+    return [*all_pages(), ROOT / "CONTRIBUTING.md", ROOT / "tests/README.md"]
+
+
 def _write(path: Path, out: Path, body: str) -> Path:
     """Write a page at its place below `out`."""
     page = out / path.relative_to(ROOT).with_suffix(".html")
     page.parent.mkdir(parents=True, exist_ok=True)
-    pages = {*all_pages(), *NOTEBOOKS.glob("*.ipynb")}
+    pages = {*site_pages(), *NOTEBOOKS.glob("*.ipynb")}
 
     def turn(link: re.Match[str]) -> str:
         target = (path.parent / link[2]).resolve()
@@ -61,12 +65,13 @@ def _write(path: Path, out: Path, body: str) -> Path:
         if (page.parent / link[2]).is_file():
             # A picture that was drawn for the page
             return link[0]
-        if target.suffix in PICTURES and target.is_file():
+        if target.is_file():
             copy = out / target.relative_to(ROOT)
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(target.read_bytes())
             return f'{link[1]}{Path(os.path.relpath(copy, page.parent)).as_posix()}"'
-        return f'{link[1]}{target.as_uri()}{link[3] or ""}"'
+        # The check of the links finds it.
+        return link[0]
 
     title = html.escape(path.stem.replace("-", " "))
     head = f'<!doctype html><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'

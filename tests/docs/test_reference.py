@@ -40,11 +40,12 @@ def test_links_between_the_pages_lead_somewhere(reference):
     assert (reference / "examples/notebooks/liquids.html").exists()
 
 
-def test_pictures_lie_beside_their_pages(reference):
-    """The folder can be moved: no picture is looked for on the machine that made it."""
+def test_pictures_and_linked_files_lie_beside_their_pages(reference):
+    """The folder can be moved: nothing is looked for on the machine that made it."""
     for page in reference.rglob("*.html"):
-        assert 'src="file:' not in page.read_text(encoding="utf-8"), page
+        assert '="file:' not in page.read_text(encoding="utf-8"), page
     assert (reference / "docs/images/demo.png").is_file()
+    assert (reference / "examples/scripts/surfaces.py").is_file()
 
 
 def test_the_gallery_shows_what_its_code_draws(tmp_path, monkeypatch):
@@ -59,7 +60,7 @@ def test_the_gallery_shows_what_its_code_draws(tmp_path, monkeypatch):
     assert (tmp_path / "site" / "docs" / "gallery-x.png").read_text(encoding="utf-8") == "picture"
 
 
-@pytest.mark.parametrize("link", ["gone.html", "other.html#gone", "#gone", "folder/other.html#here"])
+@pytest.mark.parametrize("link", ["gone.html", "other.html#gone", "#gone", "folder/other.html#here", "file:///etc/hosts"])
 def test_a_link_that_leads_nowhere_is_found(tmp_path, link):
     (tmp_path / "other.html").write_text('<p id="here">')
     (tmp_path / "page.html").write_text(

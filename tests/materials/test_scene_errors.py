@@ -5,7 +5,8 @@ import pytest
 from scipy import ndimage
 
 from polysight.imaging import Images
-from polysight.materials.measure import Scatter, common_change
+from polysight.materials.common_change import common_change
+from polysight.materials.measure import Scatter
 from polysight.materials.metal import find_halo
 from polysight.materials.segment import align, segment
 
@@ -75,7 +76,7 @@ def test_a_drift_over_the_rows_is_followed_within_its_error():
     deviation = change.value - true
     assert (np.abs(deviation.real) <= 2 * change.std.real + 1e-6).all()
     assert np.abs(deviation).max() < 0.6 * np.abs(true).max()
-    assert max(change.largest()) > 0.03
+    assert max(change.largest_drift()) > 0.03
 
 
 def test_a_slope_along_y_alone_is_rather_drift_than_one_that_plates_have_both_ways():
@@ -93,6 +94,42 @@ def test_plates_at_the_border_say_nothing_of_a_drift():
     steep = make_scatter(lambda _x, y: (0j, 8.0 if y > 0.05 else 0j))
     change = common_change(steep, ORIGIN_M, [place[1] > 0.05 for place in PLACES_M])
     assert np.abs(change.value[:6]).max() < 0.01
+
+
+def test_long_fringes_are_within_the_error():
+    """Both parts of ln(V / H) follow 0.12 exp(i k . place) in any direction, fringes of 0.2 to 0.3 m."""
+    rng = np.random.default_rng(7)
+    places = np.array(PLACES_M)
+    standardised = []
+    for _ in range(8):
+        direction = rng.uniform(0, 2 * np.pi)
+        wave_vector = 2 * np.pi / rng.uniform(0.2, 0.3) * np.array([np.cos(direction), np.sin(direction)])
+        phase = rng.uniform(0, 2 * np.pi)
+        fringes = 0.12 * np.exp(1j * (places @ wave_vector + phase))
+        slopes = dict(zip(PLACES_M, 1j * fringes[:, None] * wave_vector, strict=True))
+        change = common_change(make_scatter(lambda x, y, slopes=slopes: slopes[x, y]), ORIGIN_M)
+        true = fringes - fringes[PLACES_M.index(ORIGIN_M)]
+        for place in range(len(PLACES_M)):
+            if PLACES_M[place] == ORIGIN_M:
+                continue
+            value, (amplitude_std, phase_std) = change.log_ratio(place)
+            deviation = true[place] - value
+            standardised += [deviation.real / amplitude_std, deviation.imag / phase_std]
+    assert np.mean(np.abs(standardised) < 2) >= 0.85
+
+
+def test_a_plate_that_a_copy_of_another_disturbs_is_doubted_alone():
+    disturbed = make_scatter(lambda x, y: (8 + 6j, 5j) if (x, y) == PLACES_M[0] else (0j, 0j))
+    error = common_change(disturbed, ORIGIN_M).ripple
+    assert error[0] > 0.05
+    assert error[1:].max() < 0.01
+
+
+def test_bent_plates_are_no_ripple():
+    """Their brightness changes along y, in which direction H and V see different places."""
+    rng = np.random.default_rng(3)
+    bent = make_scatter(lambda _x, _y: (0j, complex(rng.normal(0, 4))))
+    assert common_change(bent, ORIGIN_M).ripple.max() < 0.01
 
 
 def test_an_overdriven_receiver_shows_as_a_halo_of_v_alone():

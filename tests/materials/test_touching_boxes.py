@@ -4,7 +4,8 @@ import numpy as np
 
 from polysight.imaging import Images
 from polysight.materials.analyse import KnownScene, Optics, analyse, smooth_inside
-from polysight.materials.labels import TruthPlate, patches_from_labels, patches_from_plates
+from polysight.materials.labels import patches_from_labels, patches_from_plates
+from polysight.materials.segment import TruthPlate
 from polysight.polarimetry import fresnel
 
 X_M = np.arange(60) * 2e-3

@@ -46,7 +46,6 @@ from polysight.materials.labels import (
     SPECIMEN,
     Labels,
     Plates,
-    TruthPlate,
     box_name,
     check_labels,
     clean_name,
@@ -54,7 +53,6 @@ from polysight.materials.labels import (
     format_box,
     image_extent_mm,
     is_metal,
-    match_truth,
     material_name,
     name_taken,
     no_box,
@@ -92,7 +90,7 @@ from polysight.materials.result import (
     predict_pixel_accuracy,
     read_patches,
 )
-from polysight.materials.segment import Box, SegmentSettings, axis_mm, box_mask, insides
+from polysight.materials.segment import Box, SegmentSettings, TruthPlate, axis_mm, box_mask, insides, match_truth
 from polysight.materials.sub_bands import (
     AMPLITUDE_ERROR,
     LAYER_FORMS,

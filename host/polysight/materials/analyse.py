@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise, correct_tilt
 from polysight.materials.classify import PAPER, Classifier
+from polysight.materials.common_change import CommonChange, common_change
 from polysight.materials.inversion import (
     EVEN_LIGHT,
     MOVED,
@@ -26,20 +27,17 @@ from polysight.materials.inversion import (
     invert,
 )
 from polysight.materials.kinds import Kinds, RatioEvidence, inverse_ratio, literature, turn_covariance, weigh_kinds
-from polysight.materials.labels import TruthPlate, match_truth
 from polysight.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,
     BORDER_STD,
     LEAST_STD,
     POSSIBLE_LAYER,
-    CommonChange,
     Permittivity,
     Scatter,
     background,
     background_mean,
     check_patches,
-    common_change,
     measure_patch,
     measure_scatter,
     median_ratio,
@@ -66,8 +64,10 @@ from polysight.materials.segment import (
     Patch,
     Segmentation,
     SegmentSettings,
+    TruthPlate,
     align,
     axis_mm,
+    match_truth,
     segment,
     touches_border,
     whole_plane,

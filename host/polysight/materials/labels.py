@@ -3,8 +3,7 @@
 A label file holds boxes with names, the metal reference among them, and their specimens. `polysight label` writes the
 boxes of a person, in millimetres; `polysight process` writes a box inside each patch that it found, in pixels, named by
 the classifier. Both forms are read, and the published data set's files too. `Labels.patches` makes patches of the
-boxes; `check_labels` checks a file before training, `clean_name` and `box_name` one name. `match_truth` matches the
-plates of a truth file to patches by position.
+boxes; `check_labels` checks a file before training, `clean_name` and `box_name` one name.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import json
 import math
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -23,30 +22,11 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.imaging import Mask
-from polysight.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
+from polysight.materials.segment import Box, Patch, Segmentation, TruthPlate, axis_mm, box_mask, make_patch
 from polysight.store import TRUTH
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 from polysight_shared.files import read_json
-
-
-@dataclass(frozen=True)
-class TruthPlate:
-    """A rectangular plate of the true scene.
-
-    Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal, strips and stacks of layers.
-    """
-
-    name: str
-    box_mm: Box
-    permittivity: complex | None
-    thickness_mm: float | None = None
-    metal: bool = False
-
-    @property
-    def centre_mm(self) -> tuple[float, float]:
-        """Middle of the box."""
-        return (self.box_mm[0] + self.box_mm[2]) / 2, (self.box_mm[1] + self.box_mm[3]) / 2
 
 
 def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
@@ -123,23 +103,6 @@ def _plate(raw: Mapping[str, Any]) -> TruthPlate:
         raise ValueError(f"a number of plate {raw['name']} is not finite")
     box = (cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2)
     return TruthPlate(str(raw["name"]), box, eps, None if thickness is None else float(thickness), metal)
-
-
-def match_truth(patches: Iterable[Patch], plates: Iterable[TruthPlate]) -> dict[int, TruthPlate]:
-    """Return patch label to plate: the patch's centre lies in the plate; of several patches the nearest gets it."""
-    pairs = []
-    for plate in plates:
-        x0, y0, x1, y1 = plate.box_mm
-        for patch in patches:
-            x, y = patch.centre_mm
-            if x0 <= x <= x1 and y0 <= y <= y1:
-                distance = float(np.hypot(x - plate.centre_mm[0], y - plate.centre_mm[1]))
-                pairs.append((distance, patch.label, plate))
-    out: dict[int, TruthPlate] = {}
-    for _, label, plate in sorted(pairs, key=lambda p: p[0]):
-        if label not in out and all(p is not plate for p in out.values()):
-            out[label] = plate
-    return out
 
 
 METALS = ("metal", "copper", "aluminium", "aluminum", "steel", "brass", "iron")

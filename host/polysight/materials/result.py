@@ -21,14 +21,15 @@ import scipy
 from msgspec import UNSET, structs
 
 from polysight.imaging import Image, Images, Rise
+from polysight.materials.common_change import CommonChange
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
 from polysight.materials.kinds import RatioEvidence
-from polysight.materials.labels import Labels, TruthPlate
+from polysight.materials.labels import Labels
 from polysight.materials.library import Real, feature_matrix
-from polysight.materials.measure import CommonChange, Permittivity, background, ratio_sigma
+from polysight.materials.measure import Permittivity, background, ratio_sigma
 from polysight.materials.metal import MetalReference
 from polysight.materials.names import UNKNOWN, NamedPatch, PatchName
-from polysight.materials.segment import Box, Patch, Segmentation, axis_mm
+from polysight.materials.segment import Box, Patch, Segmentation, TruthPlate, axis_mm
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, PermittivityFigures, TruthFigures
 from polysight.store import open_npz
 from polysight_shared.error_codes import ErrorCode

@@ -5,11 +5,12 @@ additive noise and plates are constant with steps between them: total variation 
 Levels of plates differ by 25 dB (thin wood against metal), so a common threshold cannot give their edges. The threshold
 falls from the brightest level instead, and each region that grows with it is cut at half of its own amplitude, the
 position of the edge of a band-limited step. A region is a patch if it stands out from the background; bright ones that
-do not are counted (`Segmentation.left_out`).
+do not are counted (`Segmentation.left_out`). Where the true plates are known, `match_truth` finds each one's patch.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -503,3 +504,39 @@ def drop_corners(outline: Real, tolerance: float) -> Real:
             kept_indices.add(corner)
             parts += [(start, corner), (corner, end)]
     return outline[sorted(kept_indices)]
+
+
+@dataclass(frozen=True)
+class TruthPlate:
+    """A rectangular plate of the true scene.
+
+    Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal, strips and stacks of layers.
+    """
+
+    name: str
+    box_mm: Box
+    permittivity: complex | None
+    thickness_mm: float | None = None
+    metal: bool = False
+
+    @property
+    def centre_mm(self) -> tuple[float, float]:
+        """Middle of the box."""
+        return (self.box_mm[0] + self.box_mm[2]) / 2, (self.box_mm[1] + self.box_mm[3]) / 2
+
+
+def match_truth(patches: Iterable[Patch], plates: Iterable[TruthPlate]) -> dict[int, TruthPlate]:
+    """Return patch label to plate: the patch's centre lies in the plate; of several patches the nearest gets it."""
+    pairs = []
+    for plate in plates:
+        x0, y0, x1, y1 = plate.box_mm
+        for patch in patches:
+            x, y = patch.centre_mm
+            if x0 <= x <= x1 and y0 <= y <= y1:
+                distance = float(np.hypot(x - plate.centre_mm[0], y - plate.centre_mm[1]))
+                pairs.append((distance, patch.label, plate))
+    out: dict[int, TruthPlate] = {}
+    for _, label, plate in sorted(pairs, key=lambda p: p[0]):
+        if label not in out and all(p is not plate for p in out.values()):
+            out[label] = plate
+    return out

@@ -453,7 +453,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
         reasons += copies_reasons(copies.labels, copies.shift_mm, copies.level_db)
     reasons += apart_reasons(result.apart_mm)
     if result.drift is not None:
-        reasons += drift_reasons(*result.drift.largest())
+        reasons += drift_reasons(*result.drift.largest_drift())
     reasons += halo_reasons(result.halo)
     reasons += background_reasons(result.behind)
     reasons += fit_reasons(result.ripple, result.relief_rad)

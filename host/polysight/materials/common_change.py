@@ -1,0 +1,325 @@
+"""How the gain of V over H changes over a scan, from the slopes of ln(V / H) over the plates.
+
+The stage moves the whole rig, so that ln(V / H) of a plate is constant over it, but for four causes, which differ in
+what their slopes have in common:
+
+- a drift of the gains is a function of y, because rows are scanned one after the other;
+- a second path beside the direct path makes fringes over the stage's plane, of any direction, as large in amplitude as
+  in phase. Long ones change the gain from plate to plate; short ones lay copies of plates on each other;
+- images of H and V that are not in the same place give all plates the same slope;
+- each plate has slopes of its own: it is uneven, disturbed, or a copy of another lies on it.
+
+The first two are one field g(x, y), drift and fringes together, seen by its derivatives (Gaussian process; Rasmussen
+and Williams, Gaussian Processes for Machine Learning, 2006, 9.4). What the plates' slopes leave of it is in the error
+of every plate.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from polysight.materials.measure import Scatter
+
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+DRIFTS = {0.002: 0.8, 0.02: 0.1, 0.06: 0.1}
+"""Standard deviations of the drift of ln(V / H) over a scan, each part, with their prior probabilities: of a stable
+rig, of a usual one, and of one that drifts by 15 % and 9 degrees. The probabilities are chosen, not measured."""
+DRIFT_LENGTHS_M = (0.07, 0.15)
+"""Lengths over which a drift changes, along the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
+FRINGES = {0.0: 0.95, 0.05: 0.025, 0.15: 0.025}
+"""The same of fringes by a second path beside the direct path; the published rig shows 10 to 20 %."""
+FRINGE_LENGTHS_M = (0.03, 0.05)
+"""Their lengths: fringes of 0.2 to 0.3 m. Shorter ones average out over a plate."""
+COMMON_SLOPES = (0.1, 1.0, 3.0)
+"""Standard deviations of the slope of ln(V / H) that all plates have by themselves, per metre: H and V that see the
+same place (0.1 to 0.3 in scenes of the independent generator), images some millimetres apart, and a small aperture."""
+OWN_SLOPES = (0.05, 1.0, 3.0)
+"""The same of the slope that each plate has of its own: flat plates, uneven or disturbed ones."""
+ALIKE_BOTH_WAYS = 0.7
+"""Probability that the plates' own slopes are as large along x as along y. Bent plates have them along y alone, in
+which direction H and V see different places."""
+BORDER_SLOPE_STD = 100.0
+"""Standard deviation of the slope of a plate at the border of the image: it says nothing."""
+LEAST_SLOPE_STD = 1e-3
+"""Least standard deviation of a slope, per metre."""
+RIPPLE_M = 0.015
+"""Error of a plate's ln(V / H) over its own slopes: copies of other plates turn their phase against the plate by
+50 to 100 radians per metre. 15 mm fits the errors of plates of the independent generator best (20 and 30 are worse)."""
+USUAL_RIPPLE = 2.0
+"""Weight of the scene's usual slopes against a plate's own three."""
+
+
+@dataclass(frozen=True)
+class CommonChange:
+    """How ln(V / H) changes over the scan.
+
+    Attributes
+    ----------
+    value, std
+        complex [plate]: ln(V / H) at each plate relative to the origin by drift and fringes, and the standard
+        deviations of its real and of its imaginary part.
+    drift, drift_std
+        The same by drift alone.
+    ripple
+        float64 [plate]: error of each part of the plate's ln(V / H) by its own slopes.
+    """
+
+    value: Complex
+    std: Complex
+    drift: Complex
+    drift_std: Complex
+    ripple: Real
+
+    def largest_drift(self) -> tuple[float, float]:
+        """Return the largest root mean square of the drift at a plate, of its real and of its imaginary part."""
+        if not self.drift.size:
+            return 0.0, 0.0
+        parts = (np.hypot(part(self.drift), part(self.drift_std)) for part in (np.real, np.imag))
+        amplitude, phase = (float(part.max()) for part in parts)
+        return amplitude, phase
+
+    def log_ratio(self, plate: int) -> tuple[complex, tuple[float, float]]:
+        """Return ln(V / H) of a plate relative to the origin, and the standard deviations of both of its parts."""
+        std = complex(self.std[plate])
+        ripple = float(self.ripple[plate])
+        return complex(self.value[plate]), (float(np.hypot(std.real, ripple)), float(np.hypot(std.imag, ripple)))
+
+
+def common_change(
+    plates: Sequence[Scatter], origin_m: tuple[float, float], at_border: Sequence[bool] = ()
+) -> CommonChange:
+    """Return what the slopes of all plates of a scene tell of a change of ln(V / H) over the scan.
+
+    Plates `at_border` of the image say nothing of it.
+    """
+    border = np.array(at_border, bool) if at_border else np.zeros(len(plates), bool)
+    places_m = np.array([plate.centre_m for plate in plates], np.float64).reshape(-1, 2)
+    smooth_fields = _Fields.collect(places_m, np.array(origin_m, np.float64))
+    parts = []
+    noises = []
+    for part in (np.real, np.imag):
+        slopes = np.array([part(plate.slope) for plate in plates], np.float64).reshape(-1, 2).T
+        noise = np.array([part(plate.slope_std) for plate in plates], np.float64).reshape(-1, 2).T
+        noises.append(np.maximum(noise, LEAST_SLOPE_STD))
+        parts.append(smooth_fields.explain(slopes, noises[-1] + BORDER_SLOPE_STD * border))
+    # Fringes, and slopes that all plates have alike, are as large in amplitude as in phase.
+    log_weight = parts[0].log_evidence + parts[1].log_evidence + smooth_fields.log_prior
+    weight = np.exp(log_weight - log_weight.max())
+    real, imag = (part.average(weight / weight.sum()) for part in parts)
+    return CommonChange(
+        value=(real.mean + 1j * imag.mean)[0],
+        std=(real.std + 1j * imag.std)[0],
+        drift=(real.drift + 1j * imag.drift)[0],
+        drift_std=(real.drift_std + 1j * imag.drift_std)[0],
+        ripple=RIPPLE_M * _own_slopes((real.remaining[0], imag.remaining[0]), noises, border),
+    )
+
+
+def _own_slopes(remaining: Sequence[Real], noises: Sequence[Real], border: npt.NDArray[np.bool_]) -> Real:
+    """Return the root mean square of each plate's own slopes beyond their errors, [plate], per metre.
+
+    `remaining` and `noises` are those of the real part and of the imaginary part, [2, plate] each, along x and y. What
+    disturbs a plate does so alike both ways and in both parts. Unevenness changes the brightness of H and V along y
+    alone, in which direction they see different places; it is antisymmetric about the middle and no error of the
+    median: these slopes are left out.
+    """
+    (real_x, _), (imag_x, imag_y) = remaining
+    (noise_real_x, _), (noise_imag_x, noise_imag_y) = noises
+    slopes = np.stack([real_x, imag_x, imag_y])
+    errors = np.stack([noise_real_x, noise_imag_x, noise_imag_y])
+    usual = float(np.mean([_excess_variance(s[~border], e[~border]) for s, e in zip(slopes, errors, strict=True)]))
+    own = np.where(border, len(slopes) * usual, np.maximum(np.sum(slopes**2 - errors**2, axis=0), 0.0))
+    return np.sqrt((USUAL_RIPPLE * usual + own) / (USUAL_RIPPLE + len(slopes)))
+
+
+def _excess_variance(slopes: Real, errors: Real) -> float:
+    """Return the variance of slopes [plate] beyond their errors; robust: one plate that hardly reflects V is no ripple.
+
+    The mean is known already, so that the median deviation is about zero.
+    """
+    if slopes.size < 3:
+        return 0.0
+    scatter = 1.4826 * float(np.median(np.abs(slopes)))
+    return max(0.0, scatter**2 - float(np.median(errors)) ** 2) * slopes.size / (slopes.size - 2)
+
+
+@dataclass(frozen=True)
+class _Field:
+    """Covariances of a smooth field of unit variance on the plane, relative to its value at the origin.
+
+    Attributes
+    ----------
+    of_slopes
+        [2 plate, 2 plate]: of its slopes at the plates, those along x before those along y.
+    with_slopes
+        [plate, 2 plate]: of its values with its slopes.
+    of_itself
+        [plate]: variances of its values.
+    """
+
+    of_slopes: Real
+    with_slopes: Real
+    of_itself: Real
+
+    @classmethod
+    def along(cls, axes: tuple[int, int], length_m: float, places_m: Real, origin_m: Real) -> _Field:
+        """Return a field that changes over `length_m` along the axes that are 1, at places [plate, 2]."""
+        count = len(places_m)
+        apart = (places_m[:, None] - places_m[None]) * np.array(axes)
+        from_origin = (places_m - origin_m) * np.array(axes)
+        near = np.exp(-0.5 * np.sum(apart**2, axis=-1) / length_m**2)
+        near_origin = np.exp(-0.5 * np.sum(from_origin**2, axis=-1) / length_m**2)
+        product = apart[..., :, None] * apart[..., None, :] / length_m**2
+        of_slopes = near[..., None, None] * (np.diag(axes) - product) / length_m**2
+        with_slopes = (near[..., None] * apart + (near_origin[:, None] * from_origin)[None]) / length_m**2
+        return cls(
+            of_slopes=of_slopes.transpose(2, 0, 3, 1).reshape(2 * count, 2 * count),
+            with_slopes=with_slopes.transpose(0, 2, 1).reshape(count, 2 * count),
+            of_itself=2 - 2 * near_origin,
+        )
+
+
+@dataclass(frozen=True)
+class _Fields:
+    """Drift and fringes at the places of the plates, and the prior of what both parts of ln(V / H) share.
+
+    Attributes
+    ----------
+    drifts
+        Fields of unit variance along y, one for each of `DRIFT_LENGTHS_M`.
+    fringes
+        Length in metres to the field of unit variance over the plane.
+    shared
+        Size and length of the fringes, and the size of the slopes that all plates have alike.
+    log_prior
+        Logarithm of the prior probability of each of `shared`.
+    """
+
+    drifts: Sequence[_Field]
+    fringes: Mapping[float, _Field]
+    shared: Sequence[tuple[float, float, float]]
+    log_prior: Real
+
+    @classmethod
+    def collect(cls, places_m: Real, origin_m: Real) -> _Fields:
+        """Return the fields for plates at places [plate, 2], relative to the origin [2]."""
+        shared = []
+        prior = []
+        for (size, share), length_m, common in itertools.product(FRINGES.items(), FRINGE_LENGTHS_M, COMMON_SLOPES):
+            shared.append((size, length_m, common))
+            prior.append(share)
+        return cls(
+            drifts=[_Field.along((0, 1), length_m, places_m, origin_m) for length_m in DRIFT_LENGTHS_M],
+            fringes={length_m: _Field.along((1, 1), length_m, places_m, origin_m) for length_m in FRINGE_LENGTHS_M},
+            shared=shared,
+            log_prior=np.log(prior),
+        )
+
+    def explain(self, slopes: Real, noise: Real) -> _Explained:
+        """Return what the slopes [2, plate] of one part and their errors tell, for each of `shared`."""
+        parts = [_arrays(self._explain(slopes, noise, *shared)) for shared in self.shared]
+        return _Explained(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+    def _explain(self, slopes: Real, noise: Real, fringe: float, fringe_m: float, common: float) -> _Explained:
+        """Return the same for one of `shared`, averaged over drifts and the plates' own slopes by their evidence."""
+        count = slopes.shape[1]
+        seen = slopes.ravel()
+        fringes = self.fringes[fringe_m]
+        alike = common**2 * np.kron(np.eye(2), np.ones((count, count))) + fringe**2 * fringes.of_slopes
+        cases = []
+        for field, (drift, probability) in itertools.product(self.drifts, DRIFTS.items()):
+            explained = alike + drift**2 * field.of_slopes
+            own_slopes, share = _own_variances(count)
+            total = explained + (noise.ravel() ** 2 + own_slopes)[:, :, None] * np.eye(2 * count)
+            inverse = np.asarray(np.linalg.inv(total), np.float64)
+            answer = inverse @ seen
+            of_drift = drift**2 * field.with_slopes
+            of_all = of_drift + fringe**2 * fringes.with_slopes
+            variance_of_drift = drift**2 * field.of_itself
+            case = _Explained(
+                log_evidence=np.log(probability * share) - 0.5 * answer @ seen + 0.5 * np.linalg.slogdet(inverse)[1],
+                mean=answer @ of_all.T,
+                square=_square(answer, inverse, of_all, variance_of_drift + fringe**2 * fringes.of_itself),
+                drift=answer @ of_drift.T,
+                drift_square=_square(answer, inverse, of_drift, variance_of_drift),
+                remaining=slopes - (answer @ explained).reshape(-1, 2, count),
+            )
+            cases.append(case)
+        return _Explained.average_over(cases)
+
+
+def _own_variances(count: int) -> tuple[Real, Real]:
+    """Return variances of the plates' own slopes along x and y, [case, 2 plate], and the probability of each case."""
+    variances = []
+    shares = []
+    for along_x, along_y in itertools.product(OWN_SLOPES, OWN_SLOPES):
+        variances.append(np.repeat([along_x**2, along_y**2], count))
+        share = (1 - ALIKE_BOTH_WAYS) / len(OWN_SLOPES) ** 2
+        if along_x == along_y:
+            share += ALIKE_BOTH_WAYS / len(OWN_SLOPES)
+        shares.append(share)
+    return np.array(variances), np.array(shares)
+
+
+def _square(answer: Real, inverse: Real, with_slopes: Real, of_itself: Real) -> Real:
+    """Return the mean square of a field at each plate, [case, plate], from its covariance with the slopes."""
+    known = np.einsum("ps,cst,pt->cp", with_slopes, inverse, with_slopes, optimize=True)
+    return np.maximum(of_itself - known, 0.0) + (answer @ with_slopes.T) ** 2
+
+
+@dataclass(frozen=True)
+class _Explained:
+    """What the slopes of one part tell, for some cases.
+
+    Attributes
+    ----------
+    log_evidence
+        [case].
+    mean, square
+        [case, plate]: mean and mean square of drift and fringes at each plate.
+    drift, drift_square
+        The same of the drift alone.
+    remaining
+        [case, 2, plate]: slopes along x and y that are left.
+    """
+
+    log_evidence: Real
+    mean: Real
+    square: Real
+    drift: Real
+    drift_square: Real
+    remaining: Real
+
+    @classmethod
+    def average_over(cls, parts: Sequence[_Explained]) -> _Explained:
+        """Return one case for all cases of `parts`, weighed by their evidence."""
+        together = cls(*(np.concatenate(arrays) for arrays in zip(*map(_arrays, parts), strict=True)))
+        largest = float(together.log_evidence.max())
+        weight = np.exp(together.log_evidence - largest)
+        average = together.average(weight / weight.sum())
+        return replace(average, log_evidence=np.array([largest + np.log(weight.sum())]))
+
+    def average(self, weight: Real) -> _Explained:
+        """Return one case, the average with weights [case]."""
+        return _Explained(*(np.tensordot(weight, array, 1)[None] for array in _arrays(self)))
+
+    @property
+    def std(self) -> Real:
+        """Standard deviation of drift and fringes, [case, plate]."""
+        return np.sqrt(np.maximum(self.square - self.mean**2, 0.0))
+
+    @property
+    def drift_std(self) -> Real:
+        """Standard deviation of the drift alone, [case, plate]."""
+        return np.sqrt(np.maximum(self.drift_square - self.drift**2, 0.0))
+
+
+def _arrays(explained: _Explained) -> tuple[Real, ...]:
+    return tuple(getattr(explained, field.name) for field in fields(explained))

@@ -8,7 +8,7 @@ from tests.support.refusals import refused
 from polysight.materials import Labels, SegmentSettings, pack_labels, read_labels
 from polysight.materials.labels import patches_from_labels
 from polysight.materials.metal import find_metal, metal_by_label, metal_in_box
-from polysight.materials.segment import box_mask, segment
+from polysight.materials.segment import box_mask, match_truth, segment
 from polysight_shared.error_codes import ErrorCode
 
 

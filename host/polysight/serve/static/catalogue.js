@@ -2,7 +2,7 @@
 import { address, badge, begin, by, bytes, called, complain, day, get, make, nest, pageOf, post, STATES, VERDICTS } from "./common.js";
 
 const LOOK_MS = 4000;
-const MADE_AT_ONCE = 200; // cards: the first ones of a long list are seen before the rest is made
+const FIRST_CARDS = 40, MORE_CARDS = 400; // the first ones of a long list are seen before the rest is made
 const ORDER = { good: 0, care: 1, "": 2, none: 3, damaged: 4 };
 const cards = new Map(), chosen = new Set();
 let server = {}, told = { scans: [] }, seen = "";
@@ -65,15 +65,16 @@ function options(id, values, name = (v) => v) {
 
 function show() {
   const found = wanted();
+  const most = cards.size ? MORE_CARDS : FIRST_CARDS;
   let waiting = 0;
   for (const s of found) {
     const made = JSON.stringify(s), old = cards.get(s.name);
-    if (old?.made === made || ++waiting > MADE_AT_ONCE) continue;
+    if (old?.made === made || ++waiting > most) continue;
     const node = card(s);
     old?.node.replaceWith(node);
     cards.set(s.name, { made, node });
   }
-  if (waiting > MADE_AT_ONCE) setTimeout(show);
+  if (waiting > most) setTimeout(show);
   const nodes = found.filter((s) => cards.has(s.name)).map((s) => cards.get(s.name).node), now = [...by("list").children];
   if (nodes.length !== now.length || nodes.some((node, i) => node !== now[i])) by("list").replaceChildren(...nodes);
   const all = told.scans.length;

@@ -1,5 +1,5 @@
 // The control chart: the check plate of every processed scan beside its known permittivity and the limits.
-import { badge, begin, by, complain, day, get, make, nest, pageOf, query } from "./common.js";
+import { badge, begin, by, complain, day, fill, get, make, nest, pageOf, query } from "./common.js";
 import { control } from "./plots.js";
 
 const LOOK_MS = 10000;
@@ -46,11 +46,11 @@ function show() {
   }
   const count = (level) => scans.filter((s) => s.check.level === level).length;
   const last = scans.at(-1);
-  by("told").textContent = `Latest scan ${last.name}: ${last.check.level}. Of ${scans.length} scans: ${count("good")} good, ${count("warning")} warning, ${count("action")} action, ${count("missing")} missing.${unreadable}`;
+  by("told").textContent = `Latest scan ${last.name}: ${last.check.level}. Of ${scans.length} scan${scans.length === 1 ? "" : "s"}: ${count("good")} good, ${count("warning")} warning, ${count("action")} action, ${count("missing")} missing.${unreadable}`;
   by("limits").textContent = `Warning above ${told.warning_sigmas} standard deviations (5 % of good scans), action above ${told.action_sigmas} (0.3 %).`;
   control(by("real"), points(scans, 0), "real part");
   control(by("loss"), points(scans, 1), "loss");
-  by("rows").replaceChildren(...[...scans].reverse().map(row));
+  fill(by("rows"), [...scans].reverse().map(row));
 }
 
 async function look() {

@@ -73,6 +73,13 @@ export async function picture(path, given) {
   return { image: await createImageBitmap(await reply.blob()), low: +reply.headers.get("X-Low"), high: +reply.headers.get("X-High"), unit };
 }
 
+/** The colours of a picture with the values at their ends; nothing without a picture. */
+export function showScale(node, made, colours) {
+  if (!made) { node.replaceChildren(); return; }
+  const digits = made.unit ? 1 : 3, bar = make("img", null, null, { src: address(`bar/${colours}`), alt: "" });
+  node.replaceChildren(make("span", signed(made.low, digits)), bar, make("span", signed(made.high, digits)), make("span", made.unit, "soft"));
+}
+
 export function make(name, text, className, more = {}) {
   const node = document.createElement(name);
   if (text !== undefined && text !== null) node.textContent = text;
@@ -86,6 +93,13 @@ export function make(name, text, className, more = {}) {
 }
 
 export const nest = (node, ...children) => { node.append(...children); return node; };
+
+/** Fill a table; each cell has the name of its column, which a phone shows beside it. */
+export function fill(body, rows) {
+  const names = [...body.closest("table").querySelectorAll("thead th")].map((head) => head.textContent);
+  for (const row of rows) [...row.children].forEach((cell, i) => { cell.dataset.name = names[i]; });
+  body.replaceChildren(...rows);
+}
 
 /** Text with `commands` in it, as nodes. */
 export const rich = (text) =>

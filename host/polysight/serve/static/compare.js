@@ -1,6 +1,6 @@
 // Two scans: one under the other with an edge to move, side by side, or their difference in standard deviations.
 import { ImageView } from "./view.js";
-import { address, begin, by, called, complain, get, make, nest, permittivity, picture, query, signed } from "./common.js";
+import { begin, by, called, complain, fill, get, make, nest, permittivity, picture, query, showScale, signed } from "./common.js";
 
 const MAPS = { h_amplitude: "|H|", v_amplitude: "|V|", p_amplitude: "|P|", p_phase: "phase of P", permittivity: "permittivity, real part", loss: "permittivity, loss" };
 const DIFFERENCES = { sigmas: "difference of P, in standard deviations", p: "|difference of P|", permittivity: "difference of the permittivity, real part", loss: "difference of the loss" };
@@ -34,24 +34,18 @@ async function showMap() {
       const made = await picture(`compare/${map}`, { a, b });
       if (mine !== asked) return;
       views.a.show({ image: made.image, second: null });
-      showScale(made, ["sigmas", "p"].includes(map) ? "cividis" : "RdBu");
+      showScale(by("scale"), made, ["sigmas", "p"].includes(map) ? "cividis" : "RdBu");
     } else {
       const first = await picture(`map/${map}`, { scan: a });
       const second = await picture(`map/${map}`, { scan: b, low: first.low, high: first.high });
       if (mine !== asked) return;
       views.a.show({ image: first.image, second: how === "swipe" ? second.image : null, swipe: by("swipe").value / 100 });
       views.b.show({ image: second.image });
-      showScale(first, COLOURS[map] ?? "cividis");
+      showScale(by("scale"), first, COLOURS[map] ?? "cividis");
     }
     by("name-a").textContent = how === "pair" ? a : "";
     by("name-b").textContent = b;
   } catch (error) { complain("told", error); }
-}
-
-function showScale(made, colours) {
-  const digits = made.unit ? 1 : 3;
-  by("scale").replaceChildren(make("span", signed(made.low, digits)), make("img", null, null, { src: address(`bar/${colours}`), alt: "" }),
-    make("span", signed(made.high, digits)), make("span", made.unit, "soft"));
 }
 
 function showTable() {
@@ -65,7 +59,7 @@ function showTable() {
     row.append(make("td", d ? `${signed(d.real, 2)}${std(d.real_std)}, loss ${signed(-d.imag, 2)}${std(d.imag_std)}` : "–"), make("td", sure, "n"));
     return row;
   });
-  by("rows").replaceChildren(...rows);
+  fill(by("rows"), rows);
   by("share").textContent = told.significant_share === null ? "Errors are unknown: significance cannot be judged."
     : `${(100 * told.significant_share).toFixed(1)} % of ${told.compared} pixels differ by more than ${told.significant_sigmas} standard deviations.`;
   by("warnings").replaceChildren(...told.notes.map((n) => make("li", n)));

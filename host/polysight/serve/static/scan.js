@@ -1,6 +1,6 @@
 // One scan: its images, what was found in them, and what can be done with it.
 import { ImageView, caption, outline } from "./view.js";
-import { badge, begin, by, bytes, called, address, complain, day, ending, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, signed, STATES, VERDICTS } from "./common.js";
+import { badge, begin, by, bytes, called, address, complain, day, ending, fill, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, showScale, signed, STATES, VERDICTS } from "./common.js";
 import { Labels } from "./label.js";
 import { clearProbe, showProbe } from "./probe.js";
 
@@ -65,12 +65,7 @@ function markMap() {
 
 function drawMap(made) {
   view.show({ image: made?.image });
-  by("scale").replaceChildren(...(made ? scale(result.pictures.find((p) => p.name === shown), made) : []));
-}
-
-export function scale(map, made) {
-  const digits = made.unit ? 1 : 3, bar = make("img", null, null, { src: address(`bar/${map.colours}`), alt: "" });
-  return [make("span", signed(made.low, digits)), bar, make("span", signed(made.high, digits)), make("span", made.unit, "soft")];
+  showScale(by("scale"), made, result.pictures.find((p) => p.name === shown)?.colours);
 }
 
 /** Outlines of the patches and boxes drawn by hand, over the image. */
@@ -114,7 +109,7 @@ const patchName = (p) => (p.metal_reference ? "metal reference" : p.refused ? "n
 function showPatches() {
   by("patches").hidden = !result.patches.length;
   by("patches-note").textContent = result.metal ? `metal reference: ${result.metal}` : "";
-  by("rows").replaceChildren(...result.patches.map((p) => {
+  fill(by("rows"), result.patches.map((p) => {
     const row = make("tr", null, null, { id: `patch-${p.label}` });
     const sure = p.confidence === null || p.confidence === undefined || p.name === "unknown" ? "" : ` ${Math.round(100 * p.confidence)} %`;
     const dominated = p.permittivity?.dominated_by ?? "", why = p.refused ? `${p.refused.what}: ${p.refused.why}` : p.why ?? "";

@@ -302,7 +302,7 @@ def analyse(
         brightness_off={label: ln for label, ln in brightness_off.items() if np.isfinite(ln)},
         evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
         apart_mm=apart_mm, drift=scene.change, halo=scene.halo.level, behind=scene.usual_background(measured),
-        ripple=scene.usual, relief_rad=scene.relief_rad, other_sign=solution.other_sign,
+        ripple=scene.usual, disturbed=scene.disturbed, relief_rad=scene.relief_rad, other_sign=solution.other_sign,
     )  # fmt: skip
 
 
@@ -420,6 +420,13 @@ class Seen:
             halo=halo,
             behind=behind,
         )
+
+    @property
+    def disturbed(self) -> dict[int, float]:
+        """Patch number to the error of each part of its ln(V / H) by slopes that it has of its own."""
+        if self.change is None:
+            return {}
+        return dict(zip(self.scatter, self.change.ripple.tolist(), strict=False))
 
     @property
     def relief_rad(self) -> float:

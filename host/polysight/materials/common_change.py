@@ -69,6 +69,8 @@ class CommonChange:
         The same by drift alone.
     ripple
         float64 [plate]: error of each part of the plate's ln(V / H) by its own slopes.
+    fringes
+        Probability of fringes by a second path beside the direct path.
     """
 
     value: Complex
@@ -76,6 +78,7 @@ class CommonChange:
     drift: Complex
     drift_std: Complex
     ripple: Real
+    fringes: float
 
     def largest_drift(self) -> tuple[float, float]:
         """Return the largest root mean square of the drift at a plate, of its real and of its imaginary part."""
@@ -112,13 +115,15 @@ def common_change(
     # Fringes, and slopes that all plates have alike, are as large in amplitude as in phase.
     log_weight = parts[0].log_evidence + parts[1].log_evidence + smooth_fields.log_prior
     weight = np.exp(log_weight - log_weight.max())
-    real, imag = (part.average(weight / weight.sum()) for part in parts)
+    weight /= weight.sum()
+    real, imag = (part.average(weight) for part in parts)
     return CommonChange(
         value=(real.mean + 1j * imag.mean)[0],
         std=(real.std + 1j * imag.std)[0],
         drift=(real.drift + 1j * imag.drift)[0],
         drift_std=(real.drift_std + 1j * imag.drift_std)[0],
         ripple=RIPPLE_M * _own_slopes((real.remaining[0], imag.remaining[0]), noises, border),
+        fringes=float(sum(w for w, (size, _, _) in zip(weight, smooth_fields.shared, strict=True) if size > 0)),
     )
 
 

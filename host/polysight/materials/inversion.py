@@ -249,6 +249,8 @@ class Inversion:
         Usual size of the same in this scene.
     nuisance_covariance
         float64 [6, 6] of a, b, rho (real and imaginary parts), in standard deviations of their prior.
+    moved
+        Probability that the mount has moved since its leakage was measured.
     painted
         Probability that the metal reference is painted.
     paint_rad
@@ -268,6 +270,7 @@ class Inversion:
     brightness_off: Real
     brightness_std: float
     nuisance_covariance: Real = field(repr=False)
+    moved: float
     painted: float
     paint_rad: float
     log_evidence: float
@@ -372,13 +375,14 @@ class SceneLikelihood:
     def leakage(self, z: Real) -> tuple[Complex, Complex]:
         """Return a and b at the metal's place, [..., 1] each."""
         p = self.prior
-        scale: Real | float = p.leakage_std
-        if p.moved > 0:
-            moved = z[..., HAS_MOVED, None] > scipy.special.ndtri(1 - p.moved)
-            scale = np.where(moved, max(MOVED_STD, p.leakage_std), p.leakage_std)
+        scale = np.where(self.has_moved(z), max(MOVED_STD, p.leakage_std), p.leakage_std)
         a = p.leakage[0] + scale * _complex(z, LEAKAGE_H)
         b = p.leakage[1] + scale * _complex(z, LEAKAGE_V)
         return a, b
+
+    def has_moved(self, z: Real) -> npt.NDArray[np.bool_]:
+        """Return where the mount has moved since its leakage was measured, [..., 1]."""
+        return z[..., HAS_MOVED, None] > scipy.special.ndtri(1 - self.prior.moved)
 
     def leakage_of_patches(self, z: Real) -> tuple[Complex, Complex]:
         """Return a and b of each patch as its rise turns the polarisations, [..., patch] each."""
@@ -573,6 +577,7 @@ def _solution(model: SceneLikelihood, z: Real, log_evidence: float, patches: tup
         brightness_off=np.where(model.bright, np.median(model.brightness_off(z), axis=0), np.nan),
         brightness_std=float(np.exp(np.log(model.brightness_std(z)).mean())),
         nuisance_covariance=covariance,
+        moved=float(model.has_moved(z).mean()),
         painted=float(painted.mean()),
         paint_rad=float(paint[painted].mean()) if painted.any() else 0.0,
         log_evidence=log_evidence,

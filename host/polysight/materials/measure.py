@@ -29,7 +29,7 @@ PHASE_OF_BLOCKS = 1.2
 """Error of a plate's ln|V / H| and of its phase over the scatter of its pixels and the root of its independent places.
 
 Speckle averages out; edges, neighbours and ripple are correlated over 10 to 20 mm, `BLOCK_M`, and average as slowly.
-Scenes of the independent generator are described best by 0.9 and 1.0; a little more is taken, for the published picture.
+Scenes of the independent generator are described best by 0.9 and 1.0; for the published picture it is a little more.
 """
 USUAL_BLOCKS = 2.0
 """Weight of the scene's usual scatter against a plate's own, in independent places of the plate."""

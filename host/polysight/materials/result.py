@@ -152,6 +152,8 @@ class MaterialsResult:
         Usual error of each part of ln(V / H) by what lies behind the plates; it is in their error bars.
     ripple
         Usual scatter of ln|V / H| and of its phase inside the plates, where a flat plate has none.
+    disturbed
+        Patch number to the error of each part of its ln(V / H) by slopes that it has of its own.
     relief_rad
         Usual standard deviation of the phase of H about a plane inside the plates.
     other_sign
@@ -180,6 +182,7 @@ class MaterialsResult:
     halo: float = 0.0
     behind: float = 0.0
     ripple: tuple[float, float] = (0.0, 0.0)
+    disturbed: Mapping[int, float] = field(default_factory=dict)
     relief_rad: float = 0.0
     other_sign: float = 0.0
 

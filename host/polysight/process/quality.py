@@ -45,14 +45,17 @@ from polysight.results import (
     copies_reasons,
     direct_path_reasons,
     disturbance_reasons,
+    disturbed_reasons,
     drift_reasons,
     fit_reasons,
+    fringe_reasons,
     halo_reasons,
     incidence_reasons,
     join_reasons,
     leakage_reasons,
     level_reasons,
     metal_reasons,
+    moved_reasons,
     passivity_reasons,
     plane_reasons,
     reconstruction_reasons,
@@ -454,9 +457,11 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     reasons += apart_reasons(result.apart_mm)
     if result.drift is not None:
         reasons += drift_reasons(*result.drift.largest_drift())
+        reasons += fringe_reasons(result.drift.fringes)
     reasons += halo_reasons(result.halo)
     reasons += background_reasons(result.behind)
     reasons += fit_reasons(result.ripple, result.relief_rad)
+    reasons += disturbed_reasons({k: error for k, error in result.disturbed.items() if k not in refused})
     reasons += passivity_reasons(gaining)
     metal = result.metal
     if result.patches and metal.evidence is not None:
@@ -478,6 +483,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     if result.prior.channels_known and (light is None or light.known):
         gains = {"H": result.calibrated.metal_h, "V": result.calibrated.metal_v}
         reasons += level_reasons({channel: _median_level(gain) for channel, gain in gains.items()})
+    reasons += moved_reasons(result.inversion.moved)
     reasons += leakage_reasons(
         result.prior.leakage_measured, result.inversion.leakage_determined, _leakage_error(result)
     )

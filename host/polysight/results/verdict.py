@@ -147,6 +147,13 @@ BACKGROUND_CARE = 0.04
 """Error of P by what lies behind the plates: about 3 % of a permittivity."""
 RIPPLE_CARE = 0.03
 """Scatter of V / H inside plates above which the result needs care; undisturbed scenes have up to 0.012."""
+DISTURBED_CARE = 0.05
+"""Error of V / H by slopes that a plate has of its own, above which it is named. Undisturbed plates stay below 0.025,
+seven of nine scenes with a second path have one above (scenes of the independent generator)."""
+FRINGES_CARE = 0.5
+"""Probability of fringes above which they are told: undisturbed scenes have less than 0.01."""
+MOVED_CARE = 0.5
+"""Probability that boards have turned above which it is told: undisturbed scenes have less than 0.02."""
 RELIEF_CARE_RAD = 0.035
 """Scatter of the phase of H inside plates above which they are uneven; flat ones have up to 0.005, tilted ones 0.03."""
 PLATE_ACROSS_DEG = 0.5
@@ -499,6 +506,41 @@ def drift_reasons(amplitude: float, phase_rad: float) -> list[Finding]:
         "care", f"V / H drifts by {100 * amplitude:.0f} % and {np.degrees(phase_rad):.0f} degrees between the plates",
         "the gains of the boards change during the scan (temperature); it is corrected to about a half",
         "let the boards warm up for half an hour; put the metal into the middle of the scan", 2.7,
+    )]  # fmt: skip
+
+
+def fringe_reasons(probability: float) -> list[Finding]:
+    """Judge fringes of a second path, by their probability."""
+    if not is_known(probability) or probability <= FRINGES_CARE:
+        return []
+    return [reason(
+        "care", "V / H changes over the scan in fringes, more than the plates can tell",
+        "a second path beside the direct path (multipath), or a receiver that is overdriven, changes the gains",
+        "take reflectors away from the line between transmitter and receivers, or cover them with absorber", 4.3,
+    )]  # fmt: skip
+
+
+def disturbed_reasons(errors: Mapping[int, float]) -> list[Finding]:
+    """Judge plates that something disturbs: patch number to the error of V / H by slopes that it has of its own."""
+    worst = {label: error for label, error in errors.items() if is_known(error) and error > DISTURBED_CARE}
+    if not worst:
+        return []
+    patches = f"patch {min(worst)}" if len(worst) == 1 else f"patches {', '.join(map(str, sorted(worst)))}"
+    return [reason(
+        "care", f"V / H changes within {patches}, by an error of up to {100 * max(worst.values()):.0f} %",
+        "copies of other plates lie there: a second path beside the direct path, clipping, or positions without data",
+        "take reflectors away from the line between transmitter and receivers; scan all positions", 2.5,
+    )]  # fmt: skip
+
+
+def moved_reasons(probability: float) -> list[Finding]:
+    """Judge the probability that the mount has moved since its leakage was measured."""
+    if not is_known(probability) or probability <= MOVED_CARE:
+        return []
+    return [reason(
+        "care", f"boards have turned since their leakage was measured, with a probability of {probability:.2f}",
+        "the patches fit materials only with another leakage; theirs is estimated and counted in the error bars",
+        "fix the boards and measure the leakage again: `polysight leakage` (docs/how-to/calibration.md)", 4.0,
     )]  # fmt: skip
 
 

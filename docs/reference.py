@@ -25,6 +25,7 @@ from docs.site import build_site
 
 PACKAGES = ("polysight", "polysight_shared", "polysight_simulators", "polysight_pi")
 
+_NAVIGATION = '<nav class="pdoc"><p><a href="docs/README.html">How-tos, notebooks, gallery, formats</a></p>'
 _TO_PRIVATE = re.compile(r'<a href="[^"#]*#_[^"]*">(.*?)</a>')  # base classes that have no place of their own
 
 
@@ -57,7 +58,7 @@ def build(names: Sequence[str], out: Path) -> list[Path]:
         page.write_text(_TO_PRIVATE.sub(r"\1", html), encoding="utf-8")
         pages.append(page)
     index = out / "index.html"
-    index.write_text(pdoc.render.html_index(modules), encoding="utf-8")
+    index.write_text(pdoc.render.html_index(modules).replace('<nav class="pdoc">', _NAVIGATION, 1), encoding="utf-8")
     (out / "search.js").write_text(pdoc.render.search_index(modules), encoding="utf-8")
     return [*pages, index]
 

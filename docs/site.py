@@ -76,7 +76,8 @@ def _write(path: Path, out: Path, body: str) -> Path:
     title = html.escape(path.stem.replace("-", " "))
     head = f'<!doctype html><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
     index = Path(os.path.relpath(out / "docs/README.html", page.parent)).as_posix()
-    top = f'<p><a href="{index}">Documentation</a></p>'
+    reference = Path(os.path.relpath(out / "index.html", page.parent)).as_posix()
+    top = f'<p><a href="{index}">Documentation</a> · <a href="{reference}">Reference</a></p>'
     page.write_text(head + top + _TARGET.sub(turn, body), encoding="utf-8")
     return page
 

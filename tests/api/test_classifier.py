@@ -26,6 +26,12 @@ def library():
     )
 
 
+def test_a_notebook_shows_a_library_in_a_line(library):
+    assert repr(library).startswith("<Library: ")
+    assert "6 scans, 54.9 degrees" in repr(library)
+    assert len(repr(library)) < 500
+
+
 @pytest.mark.parametrize("measure", ["log", "paper"])
 def test_the_paper_s_classifier_passes_scikit_learn_s_checks(measure):
     results = check_estimator(PaperKNeighborsClassifier(measure=measure), on_skip=None)

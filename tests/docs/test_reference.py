@@ -19,7 +19,7 @@ def reference(tmp_path_factory) -> Path:
     rooms = ("polysight", "polysight.api", "polysight.imaging", "polysight.polarimetry")
     names = [name for room in rooms for name in modules_of(room)]
     assert names == list(rooms), "a package that names its public functions has one page"
-    build(names, out)
+    build([*names, "polysight_shared"], out)
     build_site(out, run=False)
     return out
 
@@ -38,6 +38,7 @@ def test_links_between_the_pages_lead_somewhere(reference):
     assert 'href="#open_scan"' in pages
     assert (reference / "docs/how-to/python.html").exists()
     assert (reference / "examples/notebooks/liquids.html").exists()
+    assert 'href="docs/README.html"' in (reference / "index.html").read_text(encoding="utf-8")
 
 
 def test_pictures_and_linked_files_lie_beside_their_pages(reference):
@@ -60,7 +61,9 @@ def test_the_gallery_shows_what_its_code_draws(tmp_path, monkeypatch):
     assert (tmp_path / "site" / "docs" / "gallery-x.png").read_text(encoding="utf-8") == "picture"
 
 
-@pytest.mark.parametrize("link", ["gone.html", "other.html#gone", "#gone", "folder/other.html#here", "file:///etc/hosts"])
+@pytest.mark.parametrize(
+    "link", ["gone.html", "other.html#gone", "#gone", "folder/other.html#here", "file:///etc/hosts"]
+)
 def test_a_link_that_leads_nowhere_is_found(tmp_path, link):
     (tmp_path / "other.html").write_text('<p id="here">')
     (tmp_path / "page.html").write_text(

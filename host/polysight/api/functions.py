@@ -23,7 +23,7 @@ from polysight.planning import Changes, Forecast, describe, forecast_scene
 from polysight.products import PLANE, image_dataset
 from polysight.results import CheckResult
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, expand_paths
 
 if TYPE_CHECKING:
     import xarray
@@ -47,10 +47,10 @@ class Plan:
     @property
     def warnings(self) -> list[str]:
         """What to change before scanning."""
-        return [f"{warning.where}: {warning.what}" for warning in self.forecast.warnings]
+        return [expand_paths(f"{warning.where}: {warning.what}") for warning in self.forecast.warnings]
 
     def __str__(self) -> str:
-        return describe(self.forecast)
+        return expand_paths(describe(self.forecast))
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(str(self))}</pre>"

@@ -104,6 +104,11 @@ class Library:
                 out.append([angle])
         return tuple(round(sum(a) / len(a), 1) for a in out)
 
+    def __repr__(self) -> str:
+        """Say what it holds: its arrays would fill a notebook."""
+        angles = ", ".join(f"{angle:g}" for angle in self.angles_deg)
+        return f"<Library: {', '.join(self.names)}; {len(self.scans)} scans, {angles} degrees of incidence>"
+
     def at_angle(self, angle_deg: float) -> Library:
         """Return the entries under an incidence angle, with their fit.
 

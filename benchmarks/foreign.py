@@ -18,44 +18,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.worlds import analyse_world, table_2_classifier
+from benchmarks.worlds import FOREIGN, analyse_world, draw_piece, table_2_classifier
 from polysight.materials import find_material
 from polysight_worlds import draw_nuisances, draw_world, published_rig, simulate
 from polysight_worlds.media import Stack
 from polysight_worlds.world import World, dish
 
-FOREIGN: dict[str, complex] = {
-    "polycarbonate": 2.77 - 0.018j,
-    "PEEK": 3.20 - 0.025j,
-    "polyetherimide": 3.05 - 0.013j,
-    "PETG": 2.74 - 0.035j,
-    "ASA": 2.60 - 0.025j,
-    "printer resin": 2.85 - 0.095j,
-    "epoxy": 2.95 - 0.075j,
-    "HDPE": 2.34 - 0.001j,
-    "polystyrene": 2.53 - 0.003j,
-    "PTFE": 2.06 - 0.001j,
-    "EPDM": 2.60 - 0.06j,
-    "natural rubber": 2.40 - 0.03j,
-    "cork": 1.45 - 0.05j,
-    "leather": 2.60 - 0.25j,
-    "felt": 1.35 - 0.03j,
-    "oak": 2.30 - 0.22j,
-    "pine": 1.80 - 0.12j,
-    "MDF": 2.55 - 0.18j,
-    "bamboo": 2.20 - 0.20j,
-    "granite": 5.50 - 0.15j,
-    "slate": 6.40 - 0.25j,
-    "sandstone": 4.20 - 0.12j,
-    "limestone": 7.50 - 0.08j,
-    "porcelain": 5.60 - 0.08j,
-    "machinable ceramic": 5.70 - 0.06j,
-    "alumina": 9.70 - 0.005j,
-    "float glass": 6.60 - 0.22j,
-    "mortar": 4.60 - 0.28j,
-    "gypsum": 2.85 - 0.09j,
-    "glass epoxy G10": 4.50 - 0.10j,
-}
 LIQUIDS: dict[str, complex] = {
     "olive oil": 2.30 - 0.10j,
     "isopropanol": 3.00 - 0.60j,
@@ -89,14 +57,14 @@ def draw_scene(rng: np.random.Generator, kind: str, first: int) -> World:
     stacks: dict[str, complex | Stack]
     if kind == "plates":
         names = [list(FOREIGN)[(first + k) % len(FOREIGN)] for k in range(9)]
-        stacks = {name: Stack(below=_piece(rng, FOREIGN[name])) for name in names}
+        stacks = {name: Stack(below=draw_piece(rng, FOREIGN[name])) for name in names}
     elif kind == "sheets":
         real = rng.uniform(2, 5, 9)
         tangent = rng.uniform(0.002, 0.05, 9)
         size_m = rng.uniform(1e-3, 5e-3, 9)
         stacks = {f"sheet {k}": Stack(((real[k] * (1 - 1j * tangent[k]), size_m[k]),), 1.0) for k in range(9)}
     else:
-        stacks = {name: Stack(below=_piece(rng, eps)) for name, eps in LIQUIDS.items()}
+        stacks = {name: Stack(below=draw_piece(rng, eps)) for name, eps in LIQUIDS.items()}
     world = draw_world(rng, centre, materials=stacks, half_spaces=True)
     if kind != "dishes":
         return world
@@ -140,12 +108,6 @@ def judge_scene(kind: str, seed: int, nuisance: str = "none") -> list[Piece]:
         agrees = name is not None and any(_is_alike(literature_name, true) for literature_name in name.literature)
         out.append(Piece(plates[patch.patch.label].name, *said, agrees, thin, misled))
     return out
-
-
-def _piece(rng: np.random.Generator, permittivity: complex) -> complex:
-    return permittivity.real * (1 + 0.03 * rng.standard_normal()) + 1j * permittivity.imag * np.exp(
-        0.2 * rng.standard_normal()
-    )
 
 
 def _is_alike(name: str, true: complex) -> bool:

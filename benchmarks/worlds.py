@@ -35,7 +35,7 @@ from polysight.materials import (
     analyse,
     axis_mm,
 )
-from polysight.materials.inversion import MOVED, RigPrior
+from polysight.materials.inversion import LIBRARY_SHARE, MOVED, RigPrior
 from polysight.materials.kinds import inverse_ratio
 from polysight.materials.labels import patches_from_labels
 from polysight.materials.result import PatchResult
@@ -70,6 +70,41 @@ LEAST_PIXELS = 8
 """Least width and height of a plate's part within the picture."""
 CHI2_95 = 5.991
 FIRST_REASONS = 2
+FOREIGN: dict[str, complex] = {
+    "polycarbonate": 2.77 - 0.018j,
+    "PEEK": 3.20 - 0.025j,
+    "polyetherimide": 3.05 - 0.013j,
+    "PETG": 2.74 - 0.035j,
+    "ASA": 2.60 - 0.025j,
+    "printer resin": 2.85 - 0.095j,
+    "epoxy": 2.95 - 0.075j,
+    "HDPE": 2.34 - 0.001j,
+    "polystyrene": 2.53 - 0.003j,
+    "PTFE": 2.06 - 0.001j,
+    "EPDM": 2.60 - 0.06j,
+    "natural rubber": 2.40 - 0.03j,
+    "cork": 1.45 - 0.05j,
+    "leather": 2.60 - 0.25j,
+    "felt": 1.35 - 0.03j,
+    "oak": 2.30 - 0.22j,
+    "pine": 1.80 - 0.12j,
+    "MDF": 2.55 - 0.18j,
+    "bamboo": 2.20 - 0.20j,
+    "granite": 5.50 - 0.15j,
+    "slate": 6.40 - 0.25j,
+    "sandstone": 4.20 - 0.12j,
+    "limestone": 7.50 - 0.08j,
+    "porcelain": 5.60 - 0.08j,
+    "machinable ceramic": 5.70 - 0.06j,
+    "alumina": 9.70 - 0.005j,
+    "float glass": 6.60 - 0.22j,
+    "mortar": 4.60 - 0.28j,
+    "gypsum": 2.85 - 0.09j,
+    "glass epoxy G10": 4.50 - 0.10j,
+}
+"""Common materials, values rounded from open tables near 100 GHz (Lamb, Int. J. Infrared Millim. Waves 17, 1996;
+Jepsen, Cooke and Koch, Laser Photonics Rev. 5, 2011; ITU-R P.2040; tables of woods, rocks and solvents in the open
+literature)."""
 LIQUIDS = {"water": 8.7 - 14.0j, "oil": 2.3 - 0.02j, "alcohol": 3.2 - 1.2j}
 """Liquids in glass dishes, rounded: water at 20 degrees and 78 GHz, and typical values for the others."""
 CAUSES = {
@@ -255,12 +290,39 @@ def match_plates(
     return out
 
 
-def draw_pair(nuisance: str, seed: int) -> ImagePair:
-    """Draw and scan one world: eight materials of Table 2 as half spaces, and copper."""
+def draw_pair(nuisance: str, seed: int, mixed: bool = False) -> ImagePair:
+    """Draw and scan one world: eight materials of Table 2 as half spaces, and copper.
+
+    `mixed`: a drawn share of them, between `LIBRARY_SHARE`, is of Table 2; the others are pieces that no library has.
+    """
     rng = np.random.default_rng([seed, sum(map(ord, nuisance))])
     rig = published_rig()
-    world = draw_world(rng, tuple(rig.centre_m), half_spaces=True)
+    materials = None
+    if mixed:
+        materials = draw_mixed_materials(np.random.default_rng([seed, sum(map(ord, nuisance)), 2]))
+    world = draw_world(rng, tuple(rig.centre_m), materials=materials, half_spaces=True)
     return simulate(world, draw_nuisances(rng, nuisance), rig)
+
+
+def draw_piece(rng: np.random.Generator, permittivity: complex) -> complex:
+    """Draw a piece of a material: 3 % in the real part, 20 % in the loss (standard deviations)."""
+    return permittivity.real * (1 + 0.03 * rng.standard_normal()) + 1j * permittivity.imag * np.exp(
+        0.2 * rng.standard_normal()
+    )
+
+
+def draw_mixed_materials(rng: np.random.Generator) -> dict[str, complex | Stack]:
+    """Draw nine materials: of Table 2, or of those that no library has, whose names are marked."""
+    of_library = rng.random(9) < rng.uniform(*LIBRARY_SHARE)
+    members = rng.choice(list(TABLE_2), 9, replace=False)
+    strangers = rng.choice(list(FOREIGN), 9, replace=False)
+    materials: dict[str, complex | Stack] = {}
+    for is_member, member, stranger in zip(of_library, members.tolist(), strangers.tolist(), strict=True):
+        if is_member:
+            materials[member] = TABLE_2[member]
+        else:
+            materials[f"foreign {stranger}"] = draw_piece(rng, FOREIGN[stranger])
+    return materials
 
 
 def draw_calibration(nuisance: str, seed: int) -> tuple[tuple[complex, complex] | None, float]:
@@ -275,9 +337,9 @@ def draw_calibration(nuisance: str, seed: int) -> tuple[tuple[complex, complex] 
     return leakage, theta_error_rad
 
 
-def judge_world(nuisance: str, seed: int, searched: bool = False) -> SceneFigures:
+def judge_world(nuisance: str, seed: int, searched: bool = False, mixed: bool = False) -> SceneFigures:
     """Draw, scan and judge one world, with the errors of a calibration as the analysis believes in them."""
-    pair = draw_pair(nuisance, seed)
+    pair = draw_pair(nuisance, seed, mixed)
     classifier = table_2_classifier(float(np.radians(pair.incidence_deg)))
     leakage, theta_error_rad = draw_calibration(nuisance, seed)
     analysis, plates = analyse_world(
@@ -398,7 +460,7 @@ def print_metal(scenes: Sequence[MetalFigures]) -> None:
             print(f" scenes with names {with_names}")
 
 
-def _judge(job: tuple[str, int, bool]) -> SceneFigures:
+def _judge(job: tuple[str, int, bool, bool]) -> SceneFigures:
     return judge_world(*job)
 
 
@@ -466,6 +528,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--nuisances", default=",".join(("none", *NUISANCES, "all")), help="separated by commas")
     parser.add_argument("--metal", type=int, default=0, help="judge so many scenes of each kind of metal instead")
     parser.add_argument("--searched", action="store_true", help="search for patches instead of giving boxes")
+    parser.add_argument("--mixed", action="store_true", help="a drawn share of the plates is of no library")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--json", type=Path, default=None, help="write the figures of each scene there")
 
@@ -479,7 +542,7 @@ def run(args: argparse.Namespace) -> int:
             print_metal(list(pool.map(_judge_metal, of_metal)))
         return 0
     seeds = range(args.first, args.first + args.scenes)
-    jobs = [(name, seed, args.searched) for name in args.nuisances.split(",") for seed in seeds]
+    jobs = [(name, seed, args.searched, args.mixed) for name in args.nuisances.split(",") for seed in seeds]
     with ProcessPoolExecutor(args.jobs) as pool:
         scenes = list(pool.map(_judge, jobs))
     print(__doc__)

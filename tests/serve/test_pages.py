@@ -171,7 +171,9 @@ def test_every_page_fits_and_can_be_read(page, path, size, tmp_path):
         page.open(path, size)
         page.check_whole()
         # A table's last columns, too.
-        assert page.browser.value("[...document.querySelectorAll('.wide')].every((t) => t.scrollWidth <= t.clientWidth)")
+        assert page.browser.value(
+            "[...document.querySelectorAll('.wide')].every((t) => t.scrollWidth <= t.clientWidth)"
+        )
         # WCAG AA
         assert page.browser.value(CONTRAST) == []
         assert page.browser.value(NAMELESS) == []

@@ -40,6 +40,18 @@ def commands(pi) -> list[type]:
     return [type(c) for c in pi.commands if not isinstance(c, m.Status | m.Replay | m.Alive)]
 
 
+def test_a_scan_can_be_stopped_before_the_pi_is_asked_for_a_run(rig, tmp_path):
+    """Progress opens its control folder; a warning of the rig is not always there to do so."""
+    first = []
+
+    def note(p) -> None:
+        if p.phase not in ("connect", "warning"):
+            first.append(m.BeginRun in commands(rig.pi))
+
+    run_scan(rig.instrument, tmp_path / "s", progress=note)
+    assert not first[0]
+
+
 # --- what moves by itself ---------------------------------------------------------------------------------------------
 
 

@@ -84,6 +84,8 @@ def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
         revision = state["pictures"]["revision"]
     assert answer(watch)["status"]["level"] == "good"
     growing.grow_until("scan_ended")
+    watch.wait_for(lambda s: s["status"]["key"] == "finishing")
+    shutil.rmtree(growing.path / CONTROL)
     watch.wait_for(lambda s: s["status"]["level"] == "done")
 
 

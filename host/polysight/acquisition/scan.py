@@ -124,6 +124,8 @@ class RunningScan:
 
         Raises PolysightError as :func:`polysight.acquisition.scan.run_scan`.
         """
+        # The folder is this scan's from here on: whoever controls it can, before the Pi and the cards are ready.
+        self._notify("state", "")
         for warning in self._rig.warnings + warnings:
             self._warn(warning)
         begun = False

@@ -443,6 +443,9 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
             return say("processing")
         return say("resuming", safe=safe)
     if ended.exit_status == "success" and len(history.takes) == history.plan.rows:
+        # Between the last row and materials; whether it is processed is not known yet.
+        if inputs.verdict is None and inputs.signs.life is not None and inputs.signs.alive:
+            return say("finishing")
         return _judge_result(inputs, words)
     if ended.exit_status == "abort":
         key = "aborted" if ended.asked == "abort" else "stopped"

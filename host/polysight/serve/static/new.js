@@ -46,6 +46,8 @@ async function plan() {
 
 /** The same error with fields called as the page calls them, not as the rig file does. */
 function inWords(error) {
+  const ofField = /^the request: /; // which field, and what it must be, is all that helps here
+  if (ofField.test(error.what)) Object.assign(error, { what: error.what.replace(ofField, ""), why: "", do: "" });
   for (const id of NUMBERS) {
     const label = by(id).parentNode.firstChild.textContent.trim();
     const isMeant = new RegExp(`\\b${id}\\b`).test(error.what ?? "");

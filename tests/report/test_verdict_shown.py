@@ -89,6 +89,23 @@ def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
     assert "54.60° ± 0.12°" in page
 
 
+def test_reasons_of_less_weight_are_folded(tmp_path):
+    """A phone shows five of a score of reasons before anything is opened."""
+    folder = judged_products(tmp_path, "care")
+    verdict = {"level": "care", "reasons": [{**REASON, "what": f"reason {number}"} for number in range(1, 21)]}
+    for name in ("quality.json", "materials.json"):
+        content = json.loads((folder / name).read_text(encoding="utf-8"))
+        (folder / name).write_text(json.dumps({**content, "verdict": verdict}), encoding="utf-8")
+    with skip_rendering():
+        page = write_report(folder, write_products(folder)).read_text(encoding="utf-8")
+    head = page[page.index("<main>") : page.index('<ul class="keys">')]
+    shown, _, folded = head.partition("15 more")
+    assert "reason 5<" in shown
+    assert "reason 6<" not in shown
+    assert '<ol start="6">' in folded
+    assert "reason 20<" in folded
+
+
 @pytest.mark.parametrize("careless", [False, True])
 def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, careless):
     folder = judged_products(tmp_path, "none", careless)

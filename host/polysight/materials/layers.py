@@ -315,7 +315,7 @@ class LayerFit:
                 size = f" at {1e3 * r.thickness_m:.3g} mm"
             out.append(
                 f"{format_permittivity(r.permittivity)}{size} is not excluded: chi-square {r.chi2:.1f}, the best has"
-                f" {self.chi2:.1f} for {self.freedom} degrees"
+                f" {self.chi2:.1f} for {self.freedom} degrees of freedom"
             )
         if not self.rivals and self.ambiguous:
             out.append(
@@ -323,7 +323,9 @@ class LayerFit:
                 " measure the thickness"
             )
         if self.freedom > 0 and scipy.special.chdtrc(self.freedom, self.chi2) < UNLIKELY:
-            out.append(f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees")
+            out.append(
+                f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees of freedom"
+            )
         if self.std_real > 0.2 * self.permittivity.real or self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
             out.append("the data hardly depend on this layer: its error bar is large")
         if self.at_limit:

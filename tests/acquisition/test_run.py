@@ -232,6 +232,14 @@ def test_a_receive_buffer_below_two_bursts_ends_the_scan_before_it_begins(rig, t
     assert not (tmp_path / "s").exists()
 
 
+def test_frames_below_a_packet_end_the_scan_before_it_begins(rig, tmp_path):
+    """Of several frames in a packet, the times of all but one are unknown."""
+    chirp = msgspec.structs.replace(rig.instrument.chirp, samples=64, linear_samples=(0, 64))
+    with refused(ErrorCode.VALUE_INVALID, "1024 bytes", "more samples"):
+        run_scan(msgspec.structs.replace(rig.instrument, chirp=chirp), tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
 def test_existing_scan_is_not_overwritten(rig, tmp_path):
     run_scan(rig.instrument, tmp_path / "s")
     state_before = digests(ScanFolder.load(tmp_path / "s"))

@@ -10,14 +10,15 @@ a frame less behind a spurious edge.
   the train came at the time of a pulse and is of a single frame: what was held back comes in one go.
 
 In a whole row every train must allow a shift of 0. In a row that is some frames short, the shift only grows, from 0 to
-what is missing at the end; a frame is kept where its bounds meet at a whole number of frames.
+what is missing at the end; a frame is kept where its bounds meet at a whole number of frames. Of both, only frames are
+kept that were seen at their pulses.
 """
 
 from __future__ import annotations
 
 import os
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,6 +38,8 @@ from polysight.capture import (
     write_packets,
 )
 from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
 from polysight_shared.messages import Capture
 from polysight_shared.raster import Row
 from polysight_shared.units import us_to_ns
@@ -52,8 +55,8 @@ _EARLY = 0.1
 _EARLY_NS = 200_000
 _LATE = 0.15
 _LATE_NS = 200_000
-# Trains that come at no pulse's time are of wrong frames if they are few. If they are more, the machine or the network
-# is slow: then displaced frames show only by so many trains at earlier pulses, or one after another at later ones.
+# If more trains come at no pulse's time, the machine or the network is slow, and the expected times are not sharp. Then
+# displaced frames show only by so many trains at earlier pulses. At later ones, they show by so many in a row.
 _BLURRED = 0.1
 _DISPLACED = 3
 # A card drops whole samples of its four antennas (inferred).
@@ -78,20 +81,21 @@ _NO_BOUND = 1 << 60
 class PlacedFrames:
     """Pulse numbers of the frames of a row."""
 
-    # int64 [frame]: the pulse number of each received frame; -1 if uncertain
+    # int64 [frame]: the pulse number of each received frame; -1 if it was not seen at its pulse
     slots: Times
     # Numbers of the pulses that were certainly missed
     missed: list[int]
     # Number of pulses in the row.
     pulses: int
-    # Why the times say nothing; "" if they do
-    reason: str = ""
-    # Frames are at other pulses than their number says: none is certain
+    # The times contradict the row's length or each other: no frame is certain
     contradicted: bool = False
-    # `reason` is that the times contradict each other, not that they are missing
-    disturbed: bool = False
-    # Frames of a whole row that came at no pulse's time
-    doubtful: list[int] = field(default_factory=list)
+    # Why the times say nothing, or how they contradict each other; "" otherwise
+    reason: str = ""
+
+    @property
+    def is_timed(self) -> bool:
+        """False if there are no times to compare the frames with: their pulses follow from their number alone."""
+        return self.contradicted or not self.reason
 
     @property
     def uncertain(self) -> int:
@@ -126,7 +130,7 @@ def place_frames(
     Returns
     -------
     PlacedFrames
-        with strictly increasing slots; -1 where the evidence allows more than one pulse.
+        with strictly increasing slots; -1 where the evidence allows more than one pulse, or says nothing.
     """
     pulses = pulses_ns.size
     received = 0
@@ -137,19 +141,15 @@ def place_frames(
             raise _UndeterminedError("no frame came")
         if received > pulses:
             raise _UndeterminedError("more frames came than pulses were sent")
-        if frame_bytes < payload_bytes and received < pulses:
-            raise _UndeterminedError("a packet holds several frames: those that are missing cannot be told")
+        if frame_bytes < payload_bytes:
+            raise _UndeterminedError("a packet holds several frames: only the one that fills it has a time")
         trains = _find_trains(pulses_ns, received_ns, arrivals, frame_bytes, payload_bytes, frame_ns)
     except _UndeterminedError as e:
         none = np.full(received, -1, dtype=np.int64)
-        is_disturbed = isinstance(e, _DisturbedError)
-        if is_disturbed and frame_bytes < payload_bytes:
-            # Frames below a packet are counted from the row's first: behind a spurious edge their bursts disagree.
-            return PlacedFrames(none, [], pulses, contradicted=True)
-        return PlacedFrames(none, [], pulses, str(e), disturbed=is_disturbed)
+        return PlacedFrames(none, [], pulses, contradicted=isinstance(e, _DisturbedError), reason=str(e))
     if received < pulses:
         return _place_short_row(trains, received, pulses, frame_bytes)
-    return _check_whole_row(trains, pulses, frame_bytes, payload_bytes)
+    return _check_whole_row(trains, pulses, frame_bytes)
 
 
 class _UndeterminedError(Exception):
@@ -187,7 +187,7 @@ def _find_trains(
     came_ns = entries[:, 0]
     stop = entries[:, 1]
     is_whole = int(arrivals[-1, 1]) == pulses_ns.size * frame_bytes
-    expected = _predict_arrivals(pulses_ns, received_ns, entries, frame_bytes, payload_bytes, is_whole)
+    expected = _predict_arrivals(pulses_ns, received_ns, entries, frame_bytes, is_whole)
 
     period_ns = _period_ns(pulses_ns)
     silence_ns = min(SILENCE_NS, period_ns // 2)
@@ -220,31 +220,23 @@ def _find_trains(
     )
 
 
-def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int, payload_bytes: int) -> PlacedFrames:
+def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int) -> PlacedFrames:
     """Compare a row that has as many frames as pulses with them."""
-    slots = np.arange(pulses)
     is_sharp = (~trains.punctual).sum() <= _BLURRED * trains.punctual.size
-    # Frames below a packet are counted from the row's first: behind a spurious edge, all of them seem to come late.
-    is_early = (trains.high < 0) & (trains.punctual | (frame_bytes < payload_bytes))
+    is_early = (trains.high < 0) & trains.punctual
     is_displaced = is_early | (trains.low > 0)
     is_in_place = trains.punctual & ~is_displaced
-    if is_sharp:
-        # A single train between two that are in their places was delayed: packets came out of order there.
-        is_alone = is_displaced & np.append(False, is_in_place[:-1]) & np.append(is_in_place[1:], False)
-        contradicted = (is_displaced & ~is_alone).any()
-    else:
-        contradicted = is_early.sum() >= _DISPLACED or _longest_run(is_displaced) >= _DISPLACED
-    if contradicted:
-        return PlacedFrames(np.full_like(slots, -1), [], pulses, contradicted=True)
+    # A train or two at later pulses were delayed: packets came out of order there, or the machine stalled.
+    max_early = 0 if is_sharp else _DISPLACED - 1
+    contradicted = is_early.sum() > max_early or _longest_run(is_displaced) >= _DISPLACED
     trains = trains._replace(punctual=is_in_place, astray=trains.astray | is_displaced)
-    doubtful = np.flatnonzero(_select_frames(trains, trains.astray, frame_bytes, pulses))
-    slots[~_select_seen(trains, frame_bytes, pulses)] = -1
-    if (slots < 0).all():
-        cause = "the delays in this row are as long as the pauses between its bursts"
-        return PlacedFrames(slots, [], pulses, cause, disturbed=True)
-    if not is_sharp:
-        return PlacedFrames(slots, [], pulses)
-    return PlacedFrames(slots, [], pulses, doubtful=doubtful.tolist())
+    slots = np.where(_select_seen(trains, frame_bytes, pulses), np.arange(pulses), -1)
+    reason = ""
+    if not contradicted and (slots < 0).all():
+        reason = "the delays in this row are as long as the pauses between its bursts"
+    if contradicted or reason:
+        return PlacedFrames(np.full(pulses, -1, dtype=np.int64), [], pulses, contradicted=True, reason=reason)
+    return PlacedFrames(slots, [], pulses)
 
 
 def _longest_run(flags: Flags) -> int:
@@ -322,7 +314,7 @@ def _find_pauses(pulses_ns: Times, received_ns: Times) -> Times:
 
 
 def _predict_arrivals(
-    pulses_ns: Times, received_ns: Times, entries: Times, frame_bytes: int, payload_bytes: int, is_whole: bool
+    pulses_ns: Times, received_ns: Times, entries: Times, frame_bytes: int, is_whole: bool
 ) -> NDArray[np.float64]:
     """Return the expected arrival of each pulse's first packet: host's clock, float64 [pulse].
 
@@ -330,6 +322,9 @@ def _predict_arrivals(
     data of each burst, and its drift along the row. A burst with a missed pulse or a spurious edge differs from the
     others and is left out. Of a row with missed pulses only bursts with all of their frames count, as a radar may miss
     the first pulse of many.
+
+    If no frame came in another burst than its number says, frames are counted from the row's first: the first frames of
+    many bursts may have come out of order. Otherwise they are counted from the first of their burst.
     """
     bursts, count = pulses_ns.shape
     pauses = _find_pauses(pulses_ns, received_ns)
@@ -338,13 +333,11 @@ def _predict_arrivals(
     edges = np.append(np.searchsorted(came_ns, pauses, "right"), came_ns.size)
     sent: list[int] = []
     delays: list[int] = []
+    burst_of_packet = np.searchsorted(pauses, came_ns, "left") - 1
+    is_in_its_burst = is_whole and bool((burst_of_packet == frame // count).all())
     for b in range(bursts):
         packets = slice(int(edges[b]), int(edges[b + 1]))
-        # A burst's first packet is of its first frame; frames below a packet are counted from the row's first.
-        if frame_bytes >= payload_bytes:
-            first_frame = frame[packets][:1]
-        else:
-            first_frame = b * count
+        first_frame = b * count if is_in_its_burst else frame[packets][:1]
         pulse = frame[packets] - first_frame
         of_burst = (pulse >= 0) & (pulse < count)
         if of_burst.any() and (is_whole or pulse.max() == count - 1):
@@ -379,6 +372,17 @@ def _estimate_drift(at: NDArray[np.float64], delay: NDArray[np.float64], pulses_
     return 0.0
 
 
+def check_frame_fills_packet(rig: Instrument) -> None:
+    """Raise ConfigError if a packet of the card holds several frames: of these, only one has an arrival time."""
+    if rig.frame_bytes < rig.card.payload_bytes:
+        raise ConfigError(
+            f"a frame of {rig.frame_bytes} bytes is smaller than a packet of {rig.card.payload_bytes}",
+            "a missed and a spurious edge within a packet cannot be seen",
+            "use more samples or chirps a frame",
+            code=ErrorCode.VALUE_INVALID,
+        )
+
+
 class ReceivedCapture(NamedTuple):
     """A capture event and the time at which the host read it (monotonic clock, ns)."""
 
@@ -395,7 +399,7 @@ def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instru
     events = sorted((e for e in events if e.event.pulses == rig.burst.pulses), key=lambda e: e.event.point)
     if [e.event.point for e in events] != list(range(row.points)):
         none = np.full(0, -1, dtype=np.int64)
-        return PlacedFrames(none, [], row.points * rig.burst.pulses, "capture events of the row are missing")
+        return PlacedFrames(none, [], row.points * rig.burst.pulses, reason="capture events of the row are missing")
     arrivals = read_index(path.with_suffix(".idx"))[1]
     frame_us = (rig.burst.chirps - 1) * rig.burst.chirp_us + rig.chirp.ramp_end_us
     return place_frames(
@@ -429,6 +433,8 @@ def _event_times(events: list[ReceivedCapture]) -> tuple[NDArray[np.int64], NDAr
 def describe(placed: PlacedFrames, pulses: int) -> str:
     """Describe missed pulses and lost frames in a sentence; `pulses` is the number in a burst."""
     count = placed.pulses - placed.slots.size
+    if placed.reason:
+        return f"{placed.reason}: the pulses of {placed.uncertain} frames are unknown"
     if count == 0:
         return f"frames are not at their pulses: spurious edges on SYNC_IN; {placed.uncertain} frames are lost"
     places = [f"position {s // pulses} pulse {s % pulses}" for s in placed.missed[:_SHOWN]]
@@ -501,22 +507,14 @@ def move_frames(
 def frames_to_move(capture: RowCapture | Placed, frames: PlacedFrames | None) -> PlacedFrames | None:
     """Return the frames with which a row is rewritten; None if it stays as its packets' counters say.
 
-    Of a row that is short or has holes, only frames are kept that were seen at their pulses; no frame if the times
-    contradict its length or each other. In a whole row, frames that came at no pulse's time are masked.
+    Only frames are kept that were seen at their pulses. Without times a row stays as it is, and the manifest says so.
     """
-    if frames is None:
+    if frames is None or not frames.is_timed:
         return None
-    has_holes = capture.located and bool(capture.missing)
-    if frames.contradicted or (frames.disturbed and has_holes):
+    if frames.contradicted:
         return replace(frames, slots=np.full_like(frames.slots, -1), missed=[])
-    if frames.reason:
-        return None
-    if capture.slipped or (has_holes and frames.uncertain):
+    if capture.slipped or frames.uncertain:
         return frames
-    if frames.doubtful:
-        slots = np.arange(frames.pulses)
-        slots[frames.doubtful] = -1
-        return replace(frames, slots=slots)
     return None
 
 

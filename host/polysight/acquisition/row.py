@@ -175,18 +175,11 @@ class Take:
     def find_displaced(self, name: str) -> PlacedFrames | None:
         """Return where a board's frames are if they are not at their pulses; None if they are, or it is unknown."""
         frames = self.frames.get(name)
-        if frames is None or frames.reason:
+        if frames is None or not frames.is_timed:
             return None
         if self.captures[name].slipped or frames.contradicted:
             return frames
         return None
-
-    def count_untimed(self, name: str, pulses_per_point: int) -> int:
-        """Number of a board's frames whose pulse follows from their count alone, not from their arrival times."""
-        frames = self.frames.get(name)
-        if frames is None or frames.reason:
-            return self.row.points * pulses_per_point
-        return frames.uncertain
 
     def _find_board_fault(self, name: str, capture: RowCapture, pulses_per_point: int) -> TakeFault | None:
         """Return the fault of one board's data; None if it is complete."""
@@ -284,22 +277,18 @@ def commit_row(
     for name, capture in take.captures.items():
         final = scan.row_path(name, take.row.index)
         frames = take.frames.get(name)
-        # Frames that lie at another pulse than their number says; None if the record can stay as it came.
+        # Frames that were not seen at the pulse of their number; None if the record can stay as it came.
         moved = frames_to_move(capture, frames)
+        # Without times to compare them with, the pulse of each frame follows from its number alone.
         untimed = 0
-        if capture.located:
-            untimed = take.count_untimed(name, scan.instrument.burst.pulses)
+        if capture.located and (frames is None or not frames.is_timed):
+            untimed = planned
         missed = None
         if capture.slipped and frames is not None:
             missed = frames.pulses - frames.slots.size
         if moved is not None:
             capture = rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
             take.captures[name] = capture
-            # Rewriting masks the frames that came at no pulse's time, which are not untimed then. Of a row that is
-            # kept incomplete, only frames remain that were seen at their pulses.
-            untimed -= len(moved.doubtful)
-            if faults:
-                untimed = 0
         try:
             final.with_suffix(PART).rename(final)
         except OSError as e:

@@ -26,6 +26,7 @@ from polysight.acquisition.progress import (
     time_left,
     typical_row_s,
 )
+from polysight.acquisition.pulse_times import check_frame_fills_packet
 from polysight.acquisition.ready import (
     check_between_rows,
     check_disk,
@@ -494,6 +495,7 @@ def run_scan(
     """
     plan = plan_raster(instrument.grid)
     check_burst_fits(instrument.grid, instrument.burst, instrument.stage)
+    check_frame_fills_packet(instrument)
     with ExitStack() as stack:
         pi, rig, hello = _connect(stack, instrument, progress)
         warnings = check_same_stage(instrument.stage, hello, "this scan")

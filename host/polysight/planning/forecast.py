@@ -419,11 +419,10 @@ def _card_warnings(rig: Instrument) -> Iterator[Finding]:
             " total",
         )
     if rig.frame_bytes < rig.card.payload_bytes:
-        yield _note(
+        yield _refusal(
             "card",
-            f"a frame of {rig.frame_bytes} bytes is smaller than a packet of {rig.card.payload_bytes}: arrival times"
-            " tell the pulse only of frames that fill a packet, and rows with missed pulses are masked; use more"
-            " samples or chirps a frame",
+            f"a frame of {rig.frame_bytes} bytes is smaller than a packet of {rig.card.payload_bytes}: a missed and a"
+            " spurious edge within a packet cannot be seen; use more samples or chirps a frame",
         )
     packet_us = max(rig.card.packet_delay_us, _WIRE_BYTES / _ETHERNET_BYTES_PER_US)
     frame_us = rig.frame_bytes / rig.card.payload_bytes * packet_us

@@ -116,7 +116,7 @@ class BoardRow(Reception, frozen=True, kw_only=True, omit_defaults=True):
     crc32: str
     index_crc32: str = ""
     packets_crc32: str = ""
-    # Frames whose pulse follows from their count alone, not from arrival times.
+    # Frames whose pulse follows from their count alone: all if there are no arrival times, otherwise none.
     frames_untimed: int | None = None
 
 

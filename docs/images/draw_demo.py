@@ -18,7 +18,8 @@ REACH_MM = 98.0
 
 
 def _loss(permittivity: dict[str, float]) -> str:
-    return f"loss {-permittivity['imag']:.1f} ± {permittivity['imag_std']:.1f}"
+    loss = round(-permittivity["imag"], 1) + 0.0  # + 0.0: no -0.0
+    return f"loss {loss:.1f} ± {permittivity['imag_std']:.1f}"
 
 
 def draw(products: Path, to: Path) -> None:

@@ -64,13 +64,13 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
 
     Positions are combined into at most 24 x 24 blocks at their mean positions, exact enough within the evaluated range.
     """
-    small, total = _blocks(aperture, weights)
+    blocks, block_weights = _blocks(aperture, weights)
     grid = aperture.grid
     point = np.array([grid.x_m.mean(), grid.y_m.mean(), float(np.mean(grid.z_m))])
     limit = [limit_m(aperture, point, axis) for axis in (0, 1)]
     point_grid = ImageGrid(point[:1], point[1:2], float(point[2]), grid.pixel_m)
-    answer = DirectImager(replace(small, grid=point_grid)).samples(np.ones((1, 1))) * total
-    cuts = [_cut(small, answer, point, axis, limit[axis]) for axis in (0, 1)]
+    of_point = DirectImager(replace(blocks, grid=point_grid)).samples(np.ones((1, 1))) * block_weights
+    cuts = [_cut(blocks, of_point, point, axis, limit[axis]) for axis in (0, 1)]
     wave = SPEED_OF_LIGHT_M_S / aperture.frequencies_hz.mean()
     length = np.ptp(aperture.offsets_m[..., :2], axis=(0, 1))
     distance = point[2] - aperture.offsets_m[..., 2].mean()
@@ -111,9 +111,12 @@ def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
 
 
 def _cut(
-    aperture: Aperture, answer: NDArray[np.complex128], point: NDArray[np.float64], axis: int, cell_m: float
+    aperture: Aperture, of_point: NDArray[np.complex128], point: NDArray[np.float64], axis: int, cell_m: float
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the amplitude along an axis through the point, relative to the point, and the step in metres."""
+    """Return the amplitude along an axis through the point, relative to the point, and the step in metres.
+
+    `of_point` are the samples that a point there gives, complex128 [rx, frequency, row, column].
+    """
     count = int(_CELLS * _POINTS)
     step = (cell_m if np.isfinite(cell_m) else aperture.grid.pixel_m) / _POINTS
     voxels = np.tile(point, (2 * count + 1, 1))
@@ -121,7 +124,7 @@ def _cut(
     shift = aperture.offsets_m.reshape(-1, 3)
     a = aperture.antennas
     total = np.zeros(len(voxels), complex)
-    for rx, samples in enumerate(answer):
+    for rx, samples in enumerate(of_point):
         places = (a.tx_m + shift, a.rx_m[rx] + shift, voxels, np.full(len(shift), a.direct_m[rx]))
         total += backproject(samples.reshape(len(samples), -1).T, aperture.frequencies_hz, *places)
     cut = np.abs(total)

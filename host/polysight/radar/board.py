@@ -97,9 +97,13 @@ class BringUp:
         self._link = board.link
         # Errors that healthy boards report, too.
         self._ignored: list[str] = []
+        # What the last boot status calls for: "firmware" (none in the flash), "hardware" (replace the board), or "".
         self._cure = ""
+        # The main core's patch before anything was downloaded.
         self._flash_patch = ""
+        # The boot status that reported a hardware fault, as text.
         self._damage = ""
+        # True if the board already runs the rig file's image from its flash.
         self._from_flash = False
 
     def steps(self) -> list[Step]:

@@ -208,7 +208,7 @@ def reflect_curved(
     `bend_inside`, `bend_across`: curvature (1 / m, convex positive) in the plane of incidence and across it.
     """
     bends = (bend_inside, bend_across)
-    middle = _reflect_local(eps, theta, bends, wave_number)
+    single_wave = _reflect_local(eps, theta, bends, wave_number)
     # Metal's flat coefficients do not depend on the angle, so its own first order does: V of a sphere of 50 mm by 2 %.
     # For dielectrics the next order of all other terms is missing, and the flat derivatives are closer to the series.
     is_metal = bool(np.any(np.isinf(eps)))
@@ -220,7 +220,7 @@ def reflect_curved(
     sin = np.sin(theta)
     coefficients = []
     for local, r, other_flat, up, down in zip(
-        middle, flat, flat[::-1], reflection_above, reflection_below, strict=True
+        single_wave, flat, flat[::-1], reflection_above, reflection_below, strict=True
     ):
         first = (up - down) / (2 * ANGLE_STEP)
         second = (up - 2 * r + down) / ANGLE_STEP**2

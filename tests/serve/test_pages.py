@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import struct
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from tests.support.page.asking import TOKEN
 from tests.support.page.chromium import DESK, PHONE, Browser, find_axe
 from tests.support.page.live_view import Served, open_control, served_folder
 from tests.support.paths import RIG_FILE
-from tests.support.processes import wait_for
+from tests.support.processes import LIMIT_S, wait_for
 from tests.support.products import REASON, judged_products, name_check_plate
 from tests.support.scenes import COPPER, PET
 
@@ -24,7 +25,9 @@ from polysight.catalogue import Notes, find_program, read_notes, write_notes
 from polysight.materials import Library, read_labels
 from polysight.products import ProcessedScan
 from polysight.serve import queue as serve_queue
+from polysight.serve import reading
 from polysight_shared.config import CheckPlate
+from polysight_shared.errors import DataError
 
 pytestmark = pytest.mark.xdist_group("browser")
 SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
@@ -251,6 +254,28 @@ def test_the_control_chart_says_what_is_missing_and_follows_new_products(page, s
     shutil.rmtree(scans / "one" / "products")
     page.open("/check?plate=none")
     page.browser.wait("document.getElementById('told').innerText.includes('No processed scan')", "the advice")
+
+
+def test_an_abort_goes_before_pictures_that_hang(page, scans, monkeypatch):
+    """A browser has six connections to a server, and pictures on a drive that is gone take all of them."""
+    released = threading.Event()
+
+    def hang(*_: object) -> None:
+        released.wait(LIMIT_S)
+        raise DataError("no picture", "the drive is gone", "none")
+
+    monkeypatch.setattr(reading, "draw_map", hang)
+    for k in range(8):
+        shutil.copytree(scans / "one", scans / f"more{k}")
+    try:
+        with open_control(scans / "one") as stop:
+            page.browser.visit(f"{page.view.address}/#token={TOKEN}", DESK)
+            page.browser.wait("document.querySelectorAll('#list li').length == 10", "the list")
+            page.browser.click("#running .danger")
+            page.browser.click("#confirm .danger")
+            wait_for(lambda: stop.now, "the abort")
+    finally:
+        released.set()
 
 
 @SIZES

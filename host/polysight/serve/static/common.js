@@ -3,6 +3,7 @@ const KEY = "polysight-token";
 const ANSWER_MS = 40000; // a read may take 30 s on a network drive
 const CONTROL_MS = 8000; // a scan takes a command within 5 s, or it is withdrawn
 const RUNNING_MS = 2000;
+export const INTERRUPTED = "interrupted";
 // What advice for a terminal is called on a page.
 const ON_PAGE = [
   [/\(--metal [A-Z,]+\)/g, "(Process again, metal reference)"],
@@ -38,21 +39,27 @@ export const address = (path, given = {}) => {
   return `/api/${path}${text ? `?${text}` : ""}`;
 };
 
+const reads = new Set(); // what ends the reads that are under way
+
 /** The server's answer; its refusal, or its silence, is thrown as `Refused`. */
 export async function reach(path, given, options, limit = ANSWER_MS) {
+  const cut = new AbortController();
   let reply;
+  setTimeout(() => cut.abort("late"), limit);
+  if (!options) reads.add(cut);
   try {
     const headers = { ...options?.headers, "X-Polysight-Token": token };
-    reply = await fetch(address(path, given), { ...options, headers, signal: AbortSignal.timeout(limit) });
+    reply = await fetch(address(path, given), { ...options, headers, signal: cut.signal });
   } catch (error) {
     const shell = "in a shell on the host `polysight ask SCAN abort` stops a scan; the emergency stop stops the stage";
-    const late = error.name === "TimeoutError";
+    const late = error === "late";
+    if (error === INTERRUPTED) throw new Refused({ what: "A command went first", code: INTERRUPTED }, 0);
     throw new Refused({
       what: late ? `No answer within ${limit / 1000} s` : "The server is not responding",
       why: late ? "the server or its machine is very busy, or it hangs" : "`polysight serve` was ended, or the network is gone",
       do: shell,
     }, 0);
-  }
+  } finally { reads.delete(cut); }
   if (!reply.ok) {
     const told = await reply.json().catch(() => ({ what: `The server answered ${reply.status}` }));
     if (told.code === "token-wrong") askForToken();
@@ -64,7 +71,16 @@ export async function reach(path, given, options, limit = ANSWER_MS) {
 export const get = async (path, given) => (await reach(path, given)).json();
 export const post = async (path, given, body = {}, limit = ANSWER_MS) =>
   (await reach(path, given, { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } }, limit)).json();
-export const control = (command, scan) => post(`control/${command}`, { scan }, {}, CONTROL_MS);
+
+/** Send a command to a scan. A browser has six connections: what is being read waits, or all may hang on a drive that is gone. */
+export async function control(command, scan) {
+  for (const cut of reads) cut.abort(INTERRUPTED);
+  const waiting = [...document.images].filter((image) => !image.complete).map((image) => [image, image.src]);
+  for (const [image] of waiting) image.removeAttribute("src");
+  try { return await post(`control/${command}`, { scan }, {}, CONTROL_MS); } finally {
+    for (const [image, source] of waiting) image.src = source;
+  }
+}
 
 /** A picture, and what the ends of its colours mean. */
 export async function picture(path, given) {
@@ -114,6 +130,7 @@ export function tell(id, text) {
 
 /** An error where it belongs, or nothing. */
 export function complain(id, error) {
+  if (error?.code === INTERRUPTED) return; // the next look reads it
   const node = by(id);
   node.classList.toggle("wrong", Boolean(error));
   if (!error) { node.replaceChildren(); return; }

@@ -1,6 +1,6 @@
 // One scan: its images, what was found in them, and what can be done with it.
 import { ImageView, caption, outline } from "./view.js";
-import { badge, begin, by, bytes, called, address, complain, day, ending, fill, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, showScale, signed, STATES, VERDICTS } from "./common.js";
+import { INTERRUPTED, badge, begin, by, bytes, called, address, complain, day, ending, fill, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, showScale, signed, STATES, VERDICTS } from "./common.js";
 import { Labels } from "./label.js";
 import { clearProbe, showProbe } from "./probe.js";
 
@@ -196,7 +196,7 @@ async function load() {
     if (next && !next.pictures.some((p) => p.name === map)) map = "h_amplitude";
     if (next) made = await picture(`map/${map}`, { ...scan, generation: next.generation });
   } catch (error) {
-    if (error.code === "mismatch") return; // they were replaced meanwhile: the next look loads the new ones
+    if (["mismatch", INTERRUPTED].includes(error.code)) return; // replaced, or a command went first: the next look loads them
     complain("told", error);
   }
   if (turn !== loads) return;

@@ -125,8 +125,6 @@ class RunningScan:
 
         Raises PolysightError as :func:`polysight.acquisition.scan.run_scan`.
         """
-        # The folder is this scan's from here on: whoever controls it can, before the Pi and the cards are ready.
-        self._notify("state", "")
         for warning in self._rig.warnings + warnings:
             self._warn(warning)
         begun = False
@@ -510,6 +508,9 @@ def run_scan(
             calibration=_copy_calibration(instrument, folder, simulated),
         )
         writer = stack.enter_context(scan.writer())
+        if progress is not None:
+            # The folder is this scan's from here on, and it can be stopped; the radars may take seconds.
+            progress(ScanProgress("check", "making the radars ready", plan.rows, 0))
         radars = stack.enter_context(radars or radar_control(instrument))
         stop = stop or StopRequest()
         return RunningScan(

@@ -21,7 +21,7 @@ def tilted_images(rig):
     return [_images(rig, tilts) for tilts in (TILTS_DEG, [(0.0, 0.0)] * 6)]
 
 
-def _images(rig, tilts):
+def _images(rig, tilts, size=None):
     plates = [
         {
             "name": "a",
@@ -32,7 +32,7 @@ def _images(rig, tilts):
         }
         for place, t in zip(PLACES, tilts, strict=True)
     ]
-    grid = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}
+    grid = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0} | (size or {})
     scene = {"name": "tilts", "object_distance_mm": 499.0, "grid": grid, "plates": plates}
     return make_pipeline(Cubes(rig, decode_scene(scene, "tilts"))).form_images()
 
@@ -61,6 +61,20 @@ def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted_images):
     images = tilted_images[0]
     rises = [images.illumination.rise(images.h, images.v, mask) for mask in _insides(images)]
     assert np.degrees(rises) == pytest.approx(np.array(TILTS_DEG), abs=0.12)
+
+
+@pytest.mark.parametrize("grid", [(25, 25), (33, 31)])
+def test_plates_at_the_ends_of_a_small_scan_do_not_seem_tilted(rig, grid):
+    """A scan that reaches little beyond them sees more from one side of them."""
+    columns, rows = grid
+    images = _images(rig, [(0.0, 0.0)] * 6, {"columns": columns, "rows": rows})
+    insides = _insides(images)
+    plates = [box_mask((x - 22.5, y - 22.5, x + 22.5, y + 22.5), images.x_m, images.y_m) for x, y in PLACES]
+    apparent_deg = np.degrees([images.illumination.rise(images.h, images.v, inside) for inside in insides])
+    pairs = zip(insides, plates, strict=True)
+    deg = np.degrees([images.illumination.rise(images.h, images.v, inside, plate) for inside, plate in pairs])
+    assert np.abs(apparent_deg).max() > 0.25
+    assert np.sqrt(np.mean(deg**2)) < 0.4 * np.sqrt(np.mean(apparent_deg**2))
 
 
 def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(tilted_images):

@@ -40,7 +40,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.imaging.geometry import Antennas, Window, image_grid, window_weights
+from polysight.imaging.geometry import Antennas, StageWindow, Window, image_grid, scan_offsets_m, window_weights
 from polysight.imaging.samples import BoardSamples, reduction, scene_gate_m
 from polysight.sync import HighPass, SyncedRow, high_pass
 from polysight_shared.config import Board, Chirp, Instrument
@@ -99,12 +99,15 @@ class Illumination:
         float64 [2]: growth of the phase, radians a metre, for a rise of 1.
     pixel_m
         Pitch of the pixels along x and y.
+    windows
+        The scan along x and along y; None if it is not known.
     """
 
     footprints: NDArray[np.complex64]
     moved_m: NDArray[np.float64]
     steepness_rad_m: NDArray[np.float64]
     pixel_m: tuple[float, float]
+    windows: tuple[StageWindow, StageWindow] | None = None
 
     @property
     def across(self) -> int:
@@ -114,14 +117,21 @@ class Illumination:
     def transpose(self) -> Illumination:
         """Return the illumination with x and y swapped."""
         turned = np.ascontiguousarray(self.footprints.transpose(0, 2, 1))
-        return replace(self, footprints=turned, moved_m=self.moved_m[:, ::-1, ::-1], pixel_m=self.pixel_m[::-1])
+        return replace(
+            self,
+            footprints=turned,
+            moved_m=self.moved_m[:, ::-1, ::-1],
+            pixel_m=self.pixel_m[::-1],
+            windows=None if self.windows is None else self.windows[::-1],
+        )
 
-    def rise(self, h: Image, v: Image, mask: Mask) -> Rise:
+    def rise(self, h: Image, v: Image, mask: Mask, plate: Mask | None = None) -> Rise:
         """Estimate the rise of a patch along x and y from its phase, radians; zero if undetermined.
 
         `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] is the inside of
         the patch. A channel that nearly vanishes there (V of a low permittivity) is left out: its phase is that of the
-        neighbours' sidelobes.
+        neighbours' sidelobes. `plate` [ny, nx] is the whole patch: with it the rise that a level plate seems to have is
+        taken off (:mod:`polysight.imaging.geometry`).
         """
         level_h, level_v = (float(np.nanmedian(np.abs(channel[mask]))) if mask.any() else 0.0 for channel in (h, v))
         channels = [h] if level_v < _FEEBLE * level_h else [h, v]
@@ -129,9 +139,34 @@ class Illumination:
         for along in (0, 1):
             # The phase of the conjugate falls where the plate rises.
             step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in channels) / len(channels)
-            slope = float(np.angle(step)) / self.pixel_m[along] / float(self.steepness_rad_m.mean())
-            out.append(slope if abs(step) > _COHERENT else 0.0)
+            slope = self._slope(float(np.angle(step)), h, along, mask, plate) if abs(step) > _COHERENT else 0.0
+            out.append(slope)
         return out[0], out[1]
+
+    def _slope(self, step_rad: float, h: Image, along: int, mask: Mask, plate: Mask | None) -> float:
+        """Return the rise of a plate along x (0) or y (1) from its phase step."""
+        slope_per_rad = 1 / (self.pixel_m[along] * float(self.steepness_rad_m.mean()))
+        slope = slope_per_rad * step_rad
+        inside_px = np.flatnonzero(mask.any(axis=along))
+        if self.windows is None or plate is None or inside_px.size < 2:
+            return slope
+        lit = np.abs(self.footprints).min(axis=0) >= _VISIBLE * np.abs(self.footprints).max()
+        level = np.where(lit & np.isfinite(h), np.abs(h), np.nan)
+        if along == 1:
+            level, mask, plate = level.T, mask.T, plate.T
+        lines = level[mask.any(axis=1)]
+        if not np.isfinite(lines).any():
+            return slope
+        plate_px = np.flatnonzero(plate.any(axis=0))
+        return self.windows[along].correct_slope(
+            slope,
+            inside_px,
+            slope_per_rad=slope_per_rad,
+            profile=np.nansum(lines, axis=0) / np.maximum(np.isfinite(lines).sum(axis=0), 1),
+            lit=np.asarray(np.isfinite(lines).any(axis=0)),
+            mask_ends_px=np.array([plate_px[0] - 0.5, plate_px[-1] + 0.5]),
+            moved_px=float(self.moved_m.mean(axis=0)[along, along]) / self.pixel_m[along],
+        )
 
     def bend(self, h: Image, v: Image, mask: Mask) -> tuple[float, float]:
         """Estimate a patch's curvature along x and y from its phase, 1 / m, positive where it bends away; 0 if unknown.
@@ -168,8 +203,7 @@ class Illumination:
 
         They use only the magnitude of the footprint, for its phase ripples with the rows of the grid; and only the rise
         across the plane of incidence. Along it, H and V are illuminated equally (|H| changes by 7 % per degree), and
-        the phase is less reliable: plates at the sides of the image seem to rise by up to 0.3 degrees (0.8 degrees
-        with a narrow aperture).
+        the phase is less reliable.
         """
         slope = rise[self.across]
         if abs(slope) < MIN_RISE:
@@ -262,13 +296,20 @@ class Images:
         return self
 
 
-def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -> tuple[NDArray[np.float64], float]:
-    """Return `moved_m` [2, 2] and `steepness_rad_m` of a board at its specular point on the plane at `z_m`."""
+def specular_point_m(antennas: Antennas, z_m: float) -> NDArray[np.float64]:
+    """Return where a board's TX is reflected into its RX on the plane at `z_m`, (x, y), at stage offset zero."""
     tx = antennas.tx_m
     rx = antennas.rx_m.mean(axis=0)
     z_tx = z_m - tx[2]
     z_rx = z_m - rx[2]
-    point = np.append((tx[:2] * z_rx + rx[:2] * z_tx) / (z_tx + z_rx), z_m)
+    return (tx[:2] * z_rx + rx[:2] * z_tx) / (z_tx + z_rx)
+
+
+def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -> tuple[NDArray[np.float64], float]:
+    """Return `moved_m` [2, 2] and `steepness_rad_m` of a board at its specular point on the plane at `z_m`."""
+    tx = antennas.tx_m
+    rx = antennas.rx_m.mean(axis=0)
+    point = np.append(specular_point_m(antennas, z_m), z_m)
     bend = np.zeros((2, 2))
     cosines = 0.0
     for antenna in (tx, rx):
@@ -441,7 +482,24 @@ class ImageBuilder:
         """Return the illumination of the plane at `z_m` by both channels."""
         moved, steep = zip(*(illumination_geometry(a, z_m, self._middle_hz) for a in self._antennas), strict=True)
         pitch = self.grid.pixel_m
-        return Illumination(footprints, np.stack(moved), np.array(steep), (pitch, pitch))
+        moved_m = np.stack(moved)
+        steepness_rad_m = np.array(steep)
+        # Half of the second derivative of the phase by the distance from the specular point.
+        bend_rad_m2 = steepness_rad_m.mean() * np.diagonal(np.linalg.inv(moved_m.mean(axis=0))) / 2
+        specular_m = np.mean([specular_point_m(a, z_m) for a in self._antennas], axis=0)
+        offsets_m = scan_offsets_m(self.rig)
+        along_x, along_y = (
+            StageWindow(
+                places_px=(specular_m[axis] + offsets - start_m) / pitch,
+                weights=window_weights(self.taper, len(offsets)),
+                bend_px=float(bend_rad_m2[axis] * pitch**2),
+            )
+            for axis, offsets, start_m in (
+                (0, offsets_m[0, :, 0], self.grid.x_m[0]),
+                (1, offsets_m[:, 0, 1], self.grid.y_m[0]),
+            )
+        )
+        return Illumination(footprints, moved_m, steepness_rad_m, (pitch, pitch), (along_x, along_y))
 
 
 @dataclass(frozen=True)

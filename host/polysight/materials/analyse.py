@@ -185,7 +185,7 @@ def level(images: Images, found: Segmentation, tilts: Tilts | None = None) -> tu
 
 def _tilts(images: Images, illumination: Illumination, found: Segmentation) -> Tilts:
     """Estimate the rise of each patch from its phase; patches that are steeper than what is modelled are marked."""
-    rises = {p.label: illumination.rise(images.h, images.v, p.interior) for p in found.patches}
+    rises = {p.label: illumination.rise(images.h, images.v, p.interior, p.mask) for p in found.patches}
     bends = {p.label: illumination.bend(images.h, images.v, p.interior) for p in found.patches}
     steep = frozenset(
         label

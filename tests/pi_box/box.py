@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import re
 import signal
@@ -10,8 +9,11 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from polysight_simulators.process import die_with_parent
 
 MEMORY_WRITE = "memory_region_ops_write"
 GPIO_BASE = 0x3F200000
@@ -43,11 +45,6 @@ def free_port() -> int:
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         return s.getsockname()[1]
-
-
-def die_with_parent() -> None:
-    """For `preexec_fn`: the machine goes when the tests go, however they end."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)
 
 
 class Monitor:
@@ -109,7 +106,11 @@ class Box:
         command += ["-chardev", f"serial,id=stage,path={stage}"]
         with (work / "qemu.log").open("wb") as log:
             self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, preexec_fn=die_with_parent
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                preexec_fn=partial(die_with_parent, signal.SIGKILL),
             )
         self.ssh_config = work / "ssh"
         self.ssh_config.write_text(

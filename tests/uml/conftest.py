@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from tests.support.rigs import published_rig, timed_by_the_program
 
 from polysight_shared.config import Instrument
 from polysight_shared.tables import to_builtins
+from polysight_simulators.process import die_with_parent
 from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
 HERE = Path(__file__).parent
@@ -64,7 +67,7 @@ def run_row(kernel: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
             text=True,
             timeout=LIMIT_S,
             check=False,
-            preexec_fn=_before_others if real_time else None,
+            preexec_fn=partial(_prepare_guest, real_time),
         )
         results = [line.removeprefix("RESULT ") for line in done.stdout.splitlines() if line.startswith("RESULT ")]
         assert results, f"the guest says:\n{done.stdout[-3000:]}"
@@ -73,10 +76,15 @@ def run_row(kernel: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
     return run
 
 
-def _before_others() -> None:
-    """Real-time scheduling where it is permitted: a Pi does not share its processor with a test suite."""
-    with suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+def _prepare_guest(real_time: bool) -> None:
+    """In the guest's process: end with the tests, however they end; in real time also go before other programs.
+
+    Real-time scheduling, where it is permitted: a Pi does not share its processor with a test suite.
+    """
+    die_with_parent(signal.SIGKILL)
+    if real_time:
+        with suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
 
 
 def _rig(points: int, one_shot: bool, speed_mm_s: float) -> Instrument:

@@ -207,6 +207,9 @@ class Executor:
             pass
         self._machine.check_deadlines()
         late = self._find_late()
+        if late and self.unresponsive_s > LATE_S:
+            # After a pause of the whole program, whoever wakes first finds the others late.
+            late += f", nor has the executor turned for {self.unresponsive_s:.1f} s: the computer was too busy or slept"
         if late:
             self._machine.stop_motion(PiFault.PROGRAM_LATE, late)
         self._refresh()

@@ -114,13 +114,15 @@ class Server:
         """
         next_beat = time.monotonic()
         while True:
+            # No longer than the other socket's thread: an idle one would count as late between rare heartbeats.
+            wait_s = min(POLL_MS / 1e3, max(0.0, next_beat - time.monotonic()))
             try:
-                raw = self._unsent.get(timeout=max(0.0, next_beat - time.monotonic()))
+                raw = self._unsent.get(timeout=wait_s)
                 if raw is None:
                     return
                 self._events.send_multipart([EVENT_TOPIC, raw])
             except queue.Empty:
-                if self._beat(executor):
+                if time.monotonic() >= next_beat and self._beat(executor):
                     next_beat = max(next_beat + self._heartbeat_ms / 1e3, time.monotonic())
             if not self._stop:
                 self._turned_s["event"] = time.monotonic()

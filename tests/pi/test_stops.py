@@ -13,10 +13,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from typing import Any
 
+import msgspec
 import pytest
+from tests.support.pi.host_side import Running
 from tests.support.processes import HANG_S, wait_for
+from tests.support.rigs import at_stage_port
 
 from polysight_pi import executor as executors
 from polysight_pi import journal as journals
@@ -120,6 +124,34 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     disk.thaw()
     assert host.wait(m.RowFinished).fault == number
     wait_for(lambda: bool(fed), "that the watchdog is fed again")
+
+
+def test_sockets_are_served_between_rare_heartbeats(instrument, stage, hub):
+    """A Pi that has nothing to say is not late, however seldom it says so: the watchdog would end the service."""
+    settings = msgspec.structs.replace(instrument.pi, heartbeat_ms=3_600_000)
+    rig = msgspec.structs.replace(instrument, pi=settings)
+    with closing(Running(at_stage_port(rig, stage.port), hub)) as pi:
+        # Without a stage there are no statuses to send either
+        stage.unplug()
+        pi.host.until_state("fault")
+        time.sleep(LATE_S)
+        wait_for(lambda: pi.service.server.find_late(LATE_S) == "", "that each socket is served")
+
+
+def test_a_program_that_was_paused_blames_no_part_of_it_alone(host_in_row, pi, stage, monkeypatch):
+    """As when a busy machine gives it no processor: the executor, which judges, is as late as the others."""
+    # The row outlasts the pause
+    stage.pace_s = 1.0
+    monkeypatch.setattr(executors, "LATE_S", LATE_S)
+
+    def pause() -> None:
+        time.sleep(1.5 * LATE_S)
+        monkeypatch.setattr(pi.service.executor, "_find_late", lambda: "the event socket has not been served")
+
+    pi.service.executor.post(pause)
+    finished = host_in_row.wait(m.RowFinished)
+    assert finished.fault == PiFault.PROGRAM_LATE
+    assert "served, nor has the executor turned for" in finished.reason
 
 
 def test_nothing_is_acknowledged_that_is_not_journalled(disk, pi):

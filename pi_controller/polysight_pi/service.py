@@ -33,6 +33,7 @@ from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError, VersionError
 from polysight_shared.faults import PiFault
+from polysight_shared.program import die_with_parent
 from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, make_server_context, publisher, replier
 
 LINGER_MS = 200
@@ -326,7 +327,7 @@ def run(instrument: Instrument, wires: Path | None) -> int:
     Raises ConfigError or DeviceError if it cannot start.
     """
     if wires is not None:
-        system.die_with_parent(signal.SIGTERM)
+        die_with_parent()
     else:
         for sentence in system.prepare_process():
             log(sentence)

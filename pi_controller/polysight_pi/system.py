@@ -13,7 +13,6 @@ from contextlib import suppress
 from pathlib import Path
 
 # <linux/prctl.h>, <linux/mman.h>
-_PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4
 # Real-time priorities of the trigger thread and of the others. All share the interpreter's lock, so a thread that
@@ -70,14 +69,6 @@ def notify_systemd(state: str) -> None:
     if address:
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as s:
             s.sendto(state.encode("ascii"), "\0" + address[1:] if address.startswith("@") else address)
-
-
-def die_with_parent(signal_number: int) -> None:
-    """Have the kernel send this signal when the parent ends, so that a simulated rig leaves no processes behind."""
-    parent = os.getppid()
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal_number, 0, 0, 0)
-    if os.getppid() != parent:
-        os.kill(os.getpid(), signal_number)
 
 
 class MemoryWatch(threading.Thread):

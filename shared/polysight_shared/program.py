@@ -1,4 +1,4 @@
-"""Start of a command: standard streams that are open, and signals that end it without a traceback."""
+"""Start of a command: open standard streams, signals that end it without a traceback, an end with its parent."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from types import FrameType
 
 # An interrupted command looks again after this time whether a module is still loading.
 _RETRY_S = 0.02
+# <linux/prctl.h>
+_PR_SET_PDEATHSIG = 1
 
 
 def expand_home(words: Sequence[str]) -> list[str]:
@@ -35,6 +37,20 @@ def open_standard_streams() -> None:
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))  # noqa: SIM115
+
+
+def die_with_parent(sig: signal.Signals = signal.SIGTERM) -> None:
+    """Request the signal `sig` at the end of the parent process, so that a simulated rig leaves none behind (Linux)."""
+    if not sys.platform.startswith("linux"):
+        return
+    # Needed by few programs
+    import ctypes
+
+    parent = os.getppid()
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, int(sig), 0, 0, 0)
+    # The parent ended before the request was made
+    if os.getppid() != parent:
+        os.kill(os.getpid(), sig)
 
 
 @contextmanager

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import ctypes
-import os
 import signal
 import sys
 import threading
 from collections.abc import Callable
 
 from polysight_shared.errors import PolysightError, os_error
-
-_PR_SET_PDEATHSIG = 1
+from polysight_shared.program import die_with_parent
 
 
 def command_line(module: str, description: str, example: str) -> argparse.ArgumentParser:
@@ -23,17 +20,6 @@ def command_line(module: str, description: str, example: str) -> argparse.Argume
         epilog=f"example:\n  python -m {module} {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-
-
-def die_with_parent(sig: signal.Signals = signal.SIGTERM) -> None:
-    """Request the signal `sig` at the end of the parent process (Linux only)."""
-    if not sys.platform.startswith("linux"):
-        return
-    parent = os.getppid()
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, int(sig), 0, 0, 0)
-    # The parent ended before the request was made
-    if os.getppid() != parent:
-        os.kill(os.getpid(), sig)
 
 
 def announce_ready(text: str = "") -> None:

@@ -24,10 +24,11 @@ import tomli_w
 
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DeviceError, PolysightError
+from polysight_shared.program import die_with_parent
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.faults import read_faults
 from polysight_simulators.loopback import move_to_free_subnet
-from polysight_simulators.process import announce_ready, command_line, die_with_parent, run_until_stopped
+from polysight_simulators.process import announce_ready, command_line, run_until_stopped
 from polysight_simulators.radars import make_image
 from polysight_simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight_simulators.wires import MAX_SOCKET_PATH

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from polysight_simulators.process import die_with_parent
+from polysight_shared.program import die_with_parent
 
 MEMORY_WRITE = "memory_region_ops_write"
 GPIO_BASE = 0x3F200000

@@ -20,8 +20,8 @@ from tests.support.paths import REPO
 from tests.support.rigs import published_rig, timed_by_the_program
 
 from polysight_shared.config import Instrument
+from polysight_shared.program import die_with_parent
 from polysight_shared.tables import to_builtins
-from polysight_simulators.process import die_with_parent
 from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
 HERE = Path(__file__).parent

@@ -18,12 +18,13 @@ from threading import Event
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError
+from polysight_shared.program import die_with_parent
 from polysight_shared.wires import WireClient
 from polysight_simulators.cards.card import Pace, SimulatedCard
 from polysight_simulators.cards.server import CardServer
 from polysight_simulators.cards.sync_in import StageTrack
 from polysight_simulators.faults import read_faults
-from polysight_simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight_simulators.process import announce_ready, command_line, stop_requested
 from polysight_simulators.radars import LineServer, RadarSocket
 from polysight_simulators.scene import (
     Disturbances,

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import PolysightError
-from polysight_simulators.process import command_line, die_with_parent, run_program
+from polysight_shared.program import die_with_parent
+from polysight_simulators.process import command_line, run_program
 from polysight_simulators.stage import homing_zero
 from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 

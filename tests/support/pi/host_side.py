@@ -37,7 +37,7 @@ class HostSide:
         self.instrument = instrument
         self.events: list[Any] = []
         # The subscription has arrived
-        self.wait(m.Heartbeat)
+        self.wait(object)
 
     def ask(self, command: Any) -> Any:
         """The reply to a command, or to bytes."""

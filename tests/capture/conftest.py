@@ -43,11 +43,11 @@ def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
     """Starts cards of the named boards (or of other boards given whole)."""
     with ExitStack() as stack:
 
-        def start(*names: str, streams: Path | None = None, more: tuple[Board, ...] = (), **faults: Faults) -> Cards:
+        def start(*names: str, streams: bool = False, more: tuple[Board, ...] = (), **faults: Faults) -> Cards:
             cards = Cards()
             stack.callback(cards.close)
             for board in (*(rig.by_name(n) for n in names), *more):
-                cards.add(board.name, cards.card_network(board), faults.get(board.name, Faults()), streams)
+                cards.add(board.name, cards.card_network(board), faults.get(board.name, Faults()), streams=streams)
             cards.start()
             return cards
 

@@ -23,7 +23,7 @@ PROGRAMS = [
     (*MODULE, "polysight_simulators", "simulate", "--help"),
     *(
         (*MODULE, f"polysight_simulators.{name}", "--help")
-        for name in ("cards", "radars", "replay", "rig", "stage", "uno", "wires")
+        for name in ("cards", "radars", "rig", "stage", "uno", "wires")
     ),
 ]
 # The words after `env` are the same, and `env` is no program of ours.

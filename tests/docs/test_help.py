@@ -13,8 +13,7 @@ from docs.check.pages import ROOT
 MODULES = (
     "polysight.cli.main", "polysight_pi.cli", "docs.check",
     "polysight_simulators", "polysight_simulators.rig", "polysight_simulators.cards", "polysight_simulators.stage",
-    "polysight_simulators.wires", "polysight_simulators.uno", "polysight_simulators.replay",
-    "polysight_simulators.radars",
+    "polysight_simulators.wires", "polysight_simulators.uno", "polysight_simulators.radars",
 )  # fmt: skip
 
 

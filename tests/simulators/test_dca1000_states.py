@@ -25,16 +25,14 @@ class AnyUse(RuleBasedStateMachine):
     @initialize(
         sequence=st.sampled_from([1, 77, 2**32 - 2]),
         count=st.sampled_from([0, 12345, 2**48 - 3000]),
-        lanes=st.booleans(),
     )
-    def switch_on(self, sequence: int, count: int, lanes: bool) -> None:
-        self.card = Card(HOME, sequence, count, lanes=4 if lanes else None)
+    def switch_on(self, sequence: int, count: int) -> None:
+        self.card = Card(HOME, sequence, count)
         self.sequence = sequence
         self.count = count
         self.now = 0.0
         self.recording = False
         self.suits = True
-        self.lanes = lanes
         self.payload = 1456
         self.given = self.received = b""
         self.last_data: float | None = None
@@ -120,7 +118,7 @@ class AnyUse(RuleBasedStateMachine):
         if body == "01010102031e":
             self.suits = True
         elif body == "01020102031e":
-            self.suits = not self.lanes
+            self.suits = False
 
     @rule(size=st.sampled_from([48, 1000, 1470, 1472]), ticks=st.integers(0, 5000))
     @precondition(lambda self: not self.recording)

@@ -7,9 +7,8 @@ sockets; `card` adds sockets and a radar; `sender` sends many packets per call; 
 """
 
 from polysight_simulators.cards.adversary import KINDS, RADAR, Adversary, Arrival, Sent
-from polysight_simulators.cards.card import MAC, CardEndpoint, CardSender, Clock, Pace, SimulatedCard, bound_udp
+from polysight_simulators.cards.card import MAC, CardEndpoint, CardSender, Pace, SimulatedCard, bound_udp
 from polysight_simulators.cards.dca1000 import SOURCE_PORT, Network
-from polysight_simulators.cards.fault_draws import EventKind
 from polysight_simulators.cards.sync_in import StageTrack
 
 __all__ = [
@@ -21,8 +20,6 @@ __all__ = [
     "Arrival",
     "CardEndpoint",
     "CardSender",
-    "Clock",
-    "EventKind",
     "Network",
     "Pace",
     "Sent",

@@ -333,8 +333,6 @@ class CardEndpoint:
         Wire time over wall time.
     clock_s
         Wall clock.
-    lanes
-        LVDS lanes of the radar; None fits every configuration.
 
     Raises
     ------
@@ -351,7 +349,6 @@ class CardEndpoint:
         time_scale: float,
         clock_s: Clock,
         pace: Pace,
-        lanes: int | None = 4,
     ) -> None:
         self.name = name
         self.counts: Counter[str] = Counter()
@@ -361,7 +358,6 @@ class CardEndpoint:
             faults.first_byte_count,
             no_data_floor_s=NO_DATA_FLOOR_S * time_scale,
             stop_discards=faults.stop_discards,
-            lanes=lanes,
         )
         self._faults = faults
         self._time_scale = time_scale

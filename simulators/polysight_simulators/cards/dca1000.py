@@ -33,7 +33,7 @@ _MIN_PACKET = 48
 _MAX_PACKET = 1470
 # Number of choices of each byte of command 0x03 but the last, counted from 1.
 _CHOICES = (2, 2, 2, 2, 3)
-_LANES = {1: 4, 2: 2}
+_FOUR_LANES = 1
 
 Bytes2D = NDArray[np.uint8]
 
@@ -196,8 +196,6 @@ class Card:
         Shortest timeout after record start without LVDS data; the timer of command 0x03 applies if it is longer.
     stop_discards
         On record stop, lose bytes that do not fill a packet instead of sending them as the short last packet.
-    lanes
-        LVDS lanes of the radar: a card configured for another number records nothing. None fits either.
     """
 
     def __init__(
@@ -207,11 +205,9 @@ class Card:
         byte_count: int = 0,
         no_data_floor_s: float = 0.0,
         stop_discards: bool = False,
-        lanes: int | None = 4,
     ) -> None:
         self.network = network
         self.records = 0
-        self._lanes = lanes
         self._eeprom = network
         self._no_data_floor_s = no_data_floor_s
         self._stop_discards = stop_discards
@@ -281,9 +277,9 @@ class Card:
         elif code == Code.CONFIGURE_FPGA:
             # The card also answers bodies of wrong length or content (seen).
             if well_formed and len(body) == 6 and all(1 <= b <= n for b, n in zip(body, _CHOICES, strict=False)):
-                # Raw, capture, ethernet, 16 bit
-                raw_ethernet = (body[0], *body[2:5]) == (1, 1, 2, 3)
-                self._suits_radar = raw_ethernet and self._lanes in (None, _LANES[body[1]])
+                # The radar sends on four LVDS lanes: a card set up for two records nothing.
+                # The others: raw, capture, ethernet, 16 bit.
+                self._suits_radar = tuple(body[:5]) == (1, _FOUR_LANES, 1, 2, 3)
                 self._timer_s = body[5]
         elif code == Code.CONFIGURE_PACKET:
             if well_formed and len(body) == 6:

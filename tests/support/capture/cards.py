@@ -8,37 +8,36 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterable
-from itertools import repeat
-from pathlib import Path
+
+import numpy as np
 
 from polysight_shared.config import Board
 from polysight_simulators.cards import MAC, CardEndpoint, Network, Pace
 from polysight_simulators.faults import Faults
-from polysight_simulators.replay import Player, Recording
 from tests.support.processes import HANG_S
 
 LIMIT_S = 60.0
+# Frames of a radar that streams: of one turn of the thread, some 5 MB/s in all.
+FRAMES = np.arange(8192, dtype="<u4").view(np.uint8)
+MAX_QUEUED_BYTES = 1 << 20
 
 
 class Cards:
-    """Simulated cards, all served by one thread; those with a recording stream it in every record."""
+    """Simulated cards, all served by one thread; the radars of some stream frames without end."""
 
     def __init__(self) -> None:
         self.endpoints: dict[str, CardEndpoint] = {}
-        self._players: dict[str, Player] = {}
+        self._streaming: set[str] = set()
         self._tasks: list[Callable[[], None]] = []
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._serve)
 
-    def add(self, name: str, network: Network, faults: Faults, recording: Path | None) -> None:
-        endpoint = CardEndpoint(
+    def add(self, name: str, network: Network, faults: Faults, *, streams: bool) -> None:
+        self.endpoints[name] = CardEndpoint(
             name=name, network=network, faults=faults, seed=0, time_scale=1.0, clock_s=time.monotonic, pace=Pace()
         )
-        self.endpoints[name] = endpoint
-        if recording is not None:
-            plays = (Recording(path) for path in repeat(recording))
-            # Bytes/s
-            self._players[name] = Player(endpoint, plays, 5e6, time.monotonic)
+        if streams:
+            self._streaming.add(name)
 
     @staticmethod
     def card_network(board: Board) -> Network:
@@ -60,12 +59,12 @@ class Cards:
             while self._tasks:
                 self._tasks.pop(0)()
             for name, endpoint in self.endpoints.items():
-                if name in self._players:
-                    self._players[name].turn()
-                else:
-                    endpoint.serve_commands()
-                    endpoint.tick()
-                    endpoint.flush()
+                endpoint.serve_commands()
+                has_room = endpoint.sender.queued_bytes < MAX_QUEUED_BYTES
+                if name in self._streaming and endpoint.card.recording and has_room:
+                    endpoint.emit(endpoint.card.lvds(FRAMES, endpoint.wire_s()))
+                endpoint.tick()
+                endpoint.flush()
 
     def close(self) -> None:
         self._end.set()

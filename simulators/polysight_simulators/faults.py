@@ -15,24 +15,16 @@ from polysight_shared.tables import decode, read_toml
 Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Natural = Annotated[int, msgspec.Meta(ge=0)]
 Seconds = Annotated[float, msgspec.Meta(ge=0)]
-Bit = Annotated[int, msgspec.Meta(ge=0, le=15)]
-CommandCode = Annotated[int, msgspec.Meta(ge=1, le=0xFFFF)]
 
 
 class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The `[faults]` table. Probabilities are per data packet (or frame, pulse, request); numbers count from 0 on.
+    """The `[faults]` table. Probabilities are per data packet (or frame, pulse); numbers count from 0 on.
 
-    The network: `loss`, `duplicate`, `reorder` (swapped with the next packet), `late` (`late_packets` packets
-    later), `truncate` (half of it arrives), `corrupt` (a flipped payload bit), `corrupt_header` (a flipped bit in the
-    ten header bytes), `lose_packets` (these packets are lost), `link_down` (no packets for s seconds of wire time
-    from pulse n on), `request_loss`, `reply_loss` (executed, but without a reply).
-    The card: `overflow`, `ddr_full` (half a frame is lost before packetising: no sequence gap, status bits 9 and 7),
-    `mute` (no replies), `answers` (no replies after this number), `reply_delay_ms`, `deaf_ms` (after command 0x03),
-    `refuse` (these commands fail), `command_status` (this status bit follows the reply to this command),
-    `pulse_status` (this status bit is sent at this pulse), `stop_after_packets` (no data packets after this number),
-    `end_pulses` (the record ends before this pulse), `reset_pulses` (FPGA resets before this pulse),
-    `power_cycle_pulses`, `boot_s`, `stop_discards` (record stop discards an incomplete packet), `first_sequence`,
-    `first_byte_count`, `status_loss` (of asynchronous status messages), `twin` (a second card with the same address).
+    The network: `loss`, `duplicate`, `reorder` (swapped with the next packet), `truncate` (half of it arrives),
+    `corrupt` (a flipped payload bit), `status_loss` (of asynchronous status messages), `twin` (a second card with the
+    same address).
+    The card: `overflow` (half a frame is lost before packetising: no sequence gap, status bit 9), `mute` (no replies),
+    `boot_s` (deaf for so long after a power cycle).
     The radar: `missed_pulse`, `miss_pulses` (these SYNC_IN pulses start no frame), `spurious_edges` (an edge this many
     ms behind this pulse). Its control server:
     `retrigger_fails` (these lines have no effect), `retrigger_resets` (the connection is reset at these lines). Under
@@ -42,51 +34,24 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     loss: Probability = 0.0
     duplicate: Probability = 0.0
     reorder: Probability = 0.0
-    late: Probability = 0.0
-    late_packets: Annotated[int, msgspec.Meta(ge=1)] = 100
     truncate: Probability = 0.0
     corrupt: Probability = 0.0
-    corrupt_header: Probability = 0.0
-    lose_packets: tuple[Natural, ...] = ()
-    link_down: tuple[tuple[Natural, Seconds], ...] = ()
-    request_loss: Probability = 0.0
-    reply_loss: Probability = 0.0
-    overflow: Probability = 0.0
-    ddr_full: Probability = 0.0
-    mute: bool = False
-    answers: Natural | None = None
-    reply_delay_ms: Seconds = 0.0
-    deaf_ms: Seconds = 0.0
-    refuse: tuple[CommandCode, ...] = ()
-    command_status: tuple[tuple[CommandCode, Bit], ...] = ()
-    pulse_status: tuple[tuple[Natural, Bit], ...] = ()
-    stop_after_packets: Natural | None = None
-    end_pulses: tuple[Natural, ...] = ()
-    reset_pulses: tuple[Natural, ...] = ()
-    power_cycle_pulses: tuple[Natural, ...] = ()
-    boot_s: Seconds = 0.0
-    stop_discards: bool = False
-    first_sequence: Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)] = 1
-    first_byte_count: Annotated[int, msgspec.Meta(ge=0, lt=1 << 48)] = 0
     status_loss: Probability = 0.0
     twin: bool = False
+    overflow: Probability = 0.0
+    mute: bool = False
+    boot_s: Seconds = 0.0
     missed_pulse: Probability = 0.0
-    spurious_edges: tuple[tuple[Natural, Seconds], ...] = ()
     miss_pulses: tuple[Natural, ...] = ()
+    spurious_edges: tuple[tuple[Natural, Seconds], ...] = ()
     retrigger_fails: tuple[Natural, ...] = ()
     retrigger_resets: tuple[Natural, ...] = ()
     radar_fault_pulses: tuple[Natural, ...] = ()
 
     @property
-    def corrupts(self) -> bool:
-        """True if bits are flipped."""
-        return bool(self.corrupt or self.corrupt_header)
-
-    @property
     def disturbs_network(self) -> bool:
-        """True if single packets can be disturbed (without `link_down`)."""
-        some = self.loss or self.duplicate or self.reorder or self.late or self.truncate or self.lose_packets
-        return bool(some) or self.corrupts or self.stop_after_packets is not None
+        """True if single packets can be disturbed."""
+        return any((self.loss, self.duplicate, self.reorder, self.truncate, self.corrupt))
 
 
 # Faults that need a certain radar control.

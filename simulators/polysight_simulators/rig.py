@@ -155,7 +155,6 @@ class RigOptions(NamedTuple):
     # Single ones, KEY=VALUE
     fault: Sequence[str] = ()
     cache: Path | None = None
-    real_pacing: bool = False
     uno: bool = False
     native: bool = False
 
@@ -245,8 +244,6 @@ def _card_options(scene: Path | None, options: RigOptions) -> list[str]:
         words += ["--scene", str(scene), "--offset-in-rig"]
     if options.pattern:
         words.append("--pattern")
-    if options.real_pacing:
-        words.append("--real-pacing")
     values = {"--seed": options.seed, "--faults": options.faults, "--cache": options.cache}
     for option, value in values.items():
         if value is not None:
@@ -341,7 +338,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--faults", type=Path, help="TOML file with a [faults] table for the cards")
     parser.add_argument("--fault", action="append", default=[], metavar="[BOARD.]KEY=VALUE", help="a single fault")
     parser.add_argument("--cache", type=Path, help="cache folder for the scene's object fields")
-    parser.add_argument("--real-pacing", action="store_true", help="send each packet at its own time, as a card does")
     parser.add_argument(
         "--uno",
         action="store_true",

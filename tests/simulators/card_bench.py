@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from polysight_shared.config import Instrument
-from polysight_simulators.cards import Pace, SimulatedCard, StageTrack, bound_udp
+from polysight_simulators.cards import SimulatedCard, StageTrack, bound_udp
 from polysight_simulators.faults import read_faults
 from polysight_simulators.scene import PatternSource, pattern_frames
 
@@ -43,7 +43,7 @@ class Bench:
             seed=seed,
             time_scale=1.0,
             clock_s=lambda: self.now,
-            pace=Pace(False),
+            wait_for_receiver=False,
         )
         sockets.callback(self.card.close)
         self.pulse = 0

@@ -24,7 +24,7 @@ from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.tables import to_builtins
 from polysight_shared.wires import WireClient, WireEdge, WireMotion
-from polysight_simulators.cards import CardEndpoint, CardSender, Network, Pace, bound_udp
+from polysight_simulators.cards import CardEndpoint, CardSender, Network, bound_udp
 from polysight_simulators.cards.card import ReceiveQueue
 from polysight_simulators.faults import Faults
 from polysight_simulators.loopback import is_free, move_to_subnet
@@ -254,42 +254,12 @@ def test_the_eeproms_addresses_are_taken_over_the_network_after_a_power_cycle(
         pass
 
 
-def test_single_packets_leave_no_faster_than_their_delay_and_one_by_one(rig: Instrument, sockets: ExitStack) -> None:
-    board = rig.boards[0]
-    now = [0.0]
-    sent = list[float]()
-    receiver = sockets.enter_context(bound_udp(board.host_address, board.data_port))
-    sender = CardSender(
-        (board.card_address, 1024), (board.host_address, 1), (board.host_address, board.data_port), Pace(False, True)
-    )
-    sockets.callback(sender.close)
-    receiver.setblocking(False)
-
-    def clock() -> float:
-        now[0] += 1e-6
-        try:
-            receiver.recv(2000)
-        except BlockingIOError:
-            return now[0]
-        sent.append(now[0])
-        return now[0]
-
-    sender.put_packets(np.zeros((60, 1466), np.uint8))
-    while sender.flush(clock, 25e-6) is not None:
-        pass
-    clock()
-    gaps = np.diff(sent)
-    assert len(sent) == 60
-    assert 59 * 25e-6 - 2e-6 < sent[-1] - sent[0] < 59 * 27e-6
-    assert gaps.min() > 24e-6
-
-
 def test_packets_in_calls_of_many_keep_the_delay_as_a_mean_also_after_a_pause(
     rig: Instrument, sockets: ExitStack
 ) -> None:
     board = rig.boards[0]
     now = [0.0]
-    sender = CardSender((board.card_address, 1024), (board.host_address, 1), (board.host_address, 9), Pace(False))
+    sender = CardSender((board.card_address, 1024), (board.host_address, 1), (board.host_address, 9), False)
     sockets.callback(sender.close)
     for pause in (0.0, 1.0, 0.003):
         now[0] += pause
@@ -304,6 +274,4 @@ def test_packets_in_calls_of_many_keep_the_delay_as_a_mean_also_after_a_pause(
 def test_an_address_of_another_machine_is_an_error() -> None:
     network = Network("127.0.0.30", "203.0.113.5", bytes(6), 4096, 4098)
     with refused(ErrorCode.BUSY, "203.0.113.5:4096"):
-        CardEndpoint(
-            name="RH", network=network, faults=Faults(), seed=0, time_scale=1.0, clock_s=lambda: 0.0, pace=Pace()
-        )
+        CardEndpoint(name="RH", network=network, faults=Faults(), seed=0, time_scale=1.0, clock_s=lambda: 0.0)

@@ -37,8 +37,8 @@ def stream(n: int, seed: int = 0) -> NDArray[np.uint8]:
     return np.random.default_rng(seed).integers(0, 256, n, dtype=np.uint8)
 
 
-def ready_card(sequence: int = 1, byte_count: int = 0, discards: bool = False) -> Card:
-    card = Card(HOME, sequence, byte_count, stop_discards=discards)
+def ready_card(sequence: int = 1, byte_count: int = 0) -> Card:
+    card = Card(HOME, sequence, byte_count)
     card.command(CONFIGURE, 0.0)
     card.command(PACKET, 0.0)
     return card
@@ -57,16 +57,6 @@ def test_the_tail_comes_two_seconds_after_the_last_data_and_the_status_right_beh
     assert not card.recording
     assert card.tick(99.0) == []
     assert card.lvds(stream(4096), 100.0) == []
-
-
-def test_a_card_that_discards_at_stop_loses_only_what_fills_no_packet() -> None:
-    card = ready_card(discards=True)
-    card.command(START, 0.0)
-    card.lvds(stream(2000), 0.1)
-    assert packets(card.command(STOP, 0.2)) == []
-    card.command(START, 1.0)
-    (packet,) = packets(card.lvds(stream(1456), 1.1))
-    assert parse(packet)[:2] == (2, 1456)
 
 
 @pytest.mark.parametrize(

@@ -1,28 +1,28 @@
-"""Faults of the simulated card: from a seed, independent of grouping, and as configured."""
+"""Faults of the simulated card: from a seed, independent of grouping, counted, and as configured."""
 
 from __future__ import annotations
 
+from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.simulators.card_bench import FRAME, Bench
 from tests.support.refusals import refused
 
+from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
-from polysight_simulators.cards.dca1000 import Status
 from polysight_simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults
 from polysight_simulators.cards.sync_in import Pulse
 from polysight_simulators.faults import Faults, read_faults
 
 # Bytes of a packet, 10 of them its header
 SIZE = 20
-EVERYTHING = Faults(
-    loss=0.1, duplicate=0.1, reorder=0.1, late=0.1, late_packets=7, truncate=0.1, lose_packets=(3, 50), corrupt=0.2,
-    corrupt_header=0.2,
-)  # fmt: skip
+EVERYTHING = Faults(loss=0.1, duplicate=0.1, reorder=0.1, truncate=0.1, corrupt=0.2)
 
 
 def rows(n: int) -> np.ndarray:
@@ -31,7 +31,7 @@ def rows(n: int) -> np.ndarray:
 
 
 def arrivals(faults: Faults, sizes: list[int], seed: int = 1, board: str = "RH") -> list[bytes]:
-    network = NetworkFaults(faults, seed, board)
+    network = NetworkFaults(faults, seed, board, Counter())
     data = rows(sum(sizes))
     first = 0
     out = []
@@ -60,19 +60,16 @@ def test_without_faults_everything_arrives_in_order() -> None:
 @pytest.mark.parametrize(
     ("faults", "numbers"),
     [
-        (Faults(lose_packets=(1, 3)), [0, 2, 4, 5]),
         (Faults(loss=1.0), []),
         (Faults(duplicate=1.0), [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]),
-        (Faults(stop_after_packets=4), [0, 1, 2, 3]),
-        (Faults(late=1.0, late_packets=3), [0, 1, 2, 3, 4, 5]),
     ],
 )
 def test_each_fault_alone(faults: Faults, numbers: list[int]) -> None:
     assert arrivals(faults, [6]) == [bytes([n] * SIZE) for n in numbers]
 
 
-def test_reordered_and_late_packets_all_arrive() -> None:
-    got = arrivals(Faults(reorder=0.2, late=0.1, late_packets=9), [200])
+def test_reordered_packets_all_arrive() -> None:
+    got = arrivals(Faults(reorder=0.2), [200])
     assert got != [r.tobytes() for r in rows(200)]
     assert sorted(got) == sorted(r.tobytes() for r in rows(200))
 
@@ -84,13 +81,49 @@ def test_truncated_packets_are_half() -> None:
 def test_overflow_takes_the_second_half_of_single_frames() -> None:
     frames = np.arange(100 * 8, dtype=np.int16).reshape(100, 2, 4)
     runs = OverflowFaults(Faults(overflow=0.3), 5, "RH").split(frames)
-    assert {run.status for run in runs} <= {None, Status.LVDS_BUFFER_FULL}
-    overflows = sum(run.status is not None for run in runs)
+    overflows = sum(run.lost_bytes > 0 for run in runs)
     assert 10 < overflows < 60
     assert sum(run.lost_bytes for run in runs) == overflows * 8
     joined = np.concatenate([run.data.reshape(-1) for run in runs])
     assert len(joined) == 100 * 8 - overflows * 4
     assert np.all(np.diff(joined) > 0)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_the_counts_are_the_truth(rig: Instrument) -> None:
+    faults = {"loss": 0.05, "duplicate": 0.05, "reorder": 0.05, "truncate": 0.05, "corrupt": 0.05, "overflow": 0.05}
+
+    def run(seed: int) -> tuple[list[bytes], dict[str, int | None]]:
+        with ExitStack() as stack:
+            bench = Bench(rig, stack, seed, **faults)
+            bench.record(100)
+            return bench.packets(), bench.counts
+
+    packets, counts = run(4)
+    assert run(4) == (packets, counts)
+    assert run(5)[0] != packets
+
+    def count(key: str) -> int:
+        return int(counts.get(key) or 0)
+
+    assert min(count(k) for k in ("lost", "duplicated", "reordered", "truncated", "corrupted", "overflows")) > 0
+    assert len(packets) == count("packets_made") - count("lost") + count("duplicated") == count("packets_sent")
+    places = {p[4:10] for p in packets}
+    assert len(places) == count("packets_made") - count("lost")
+    arrived = sum(len(p) - 10 for p in packets)
+    assert arrived == count("bytes_sent")
+    lost_bytes = count("lost_bytes") + count("truncated_bytes")
+    extra = sum(len(p) - 10 for i, p in enumerate(packets) if p in packets[:i])
+    assert arrived == count("bytes_made") - lost_bytes + extra
+    assert count("bytes_made") == 100 * FRAME - count("overflow_bytes")
+    assert count("overflow_bytes") == count("overflows") * FRAME // 2
+    statuses = count("statuses") - 1
+    assert statuses == count("overflows")
+
+
+def test_a_corrupt_packet_has_one_bit_of_its_payload_turned() -> None:
+    for clean, corrupt in zip(rows(60), arrivals(Faults(corrupt=1.0), [60]), strict=True):
+        turned = np.bitwise_xor(clean, np.frombuffer(corrupt, np.uint8))
+        assert np.unpackbits(turned).sum() == np.unpackbits(turned[10:]).sum() == 1
 
 
 def test_missed_pulses_are_those_named() -> None:
@@ -104,10 +137,10 @@ def test_missed_pulses_are_those_named() -> None:
 def test_faults_come_from_the_file_and_the_command_line(tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     path.write_text("[faults]\nloss = 0.01\n[faults.RH]\nmute = true\n")
-    faults = read_faults(path, ["loss=0.02", "RV.miss_pulses=[3, 4]"], ("LS", "RH", "RV"), {"late": 0.5})
-    assert faults["LS"] == Faults(loss=0.02, late=0.5)
-    assert faults["RH"] == Faults(loss=0.02, late=0.5, mute=True)
-    assert faults["RV"] == Faults(loss=0.02, late=0.5, miss_pulses=(3, 4))
+    faults = read_faults(path, ["loss=0.02", "RV.miss_pulses=[3, 4]"], ("LS", "RH", "RV"), {"reorder": 0.5})
+    assert faults["LS"] == Faults(loss=0.02, reorder=0.5)
+    assert faults["RH"] == Faults(loss=0.02, reorder=0.5, mute=True)
+    assert faults["RV"] == Faults(loss=0.02, reorder=0.5, miss_pulses=(3, 4))
 
 
 @pytest.mark.parametrize("setting", ["los=0.1", "loss=2", "XX.mute=true", "mute", "loss='a'"])

@@ -83,11 +83,6 @@ class AnyUse(RuleBasedStateMachine):
         assert outputs[0] == message(0x06, 0)
         self.take(outputs[1:], self.recording)
 
-    @rule()
-    @precondition(lambda self: self.recording)
-    def end_by_itself(self) -> None:
-        self.take(self.card.end_record(), True)
-
     @rule(n=st.integers(0, 9000))
     def data(self, n: int) -> None:
         fresh = ((np.arange(n) + self.next_byte) % 251).astype(np.uint8)

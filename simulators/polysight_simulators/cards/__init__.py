@@ -7,7 +7,7 @@ sockets; `card` adds sockets and a radar; `sender` sends many packets per call; 
 """
 
 from polysight_simulators.cards.adversary import KINDS, RADAR, Adversary, Arrival, Sent
-from polysight_simulators.cards.card import MAC, CardEndpoint, CardSender, Pace, SimulatedCard, bound_udp
+from polysight_simulators.cards.card import MAC, CardEndpoint, CardSender, SimulatedCard, bound_udp
 from polysight_simulators.cards.dca1000 import SOURCE_PORT, Network
 from polysight_simulators.cards.sync_in import StageTrack
 
@@ -21,7 +21,6 @@ __all__ = [
     "CardEndpoint",
     "CardSender",
     "Network",
-    "Pace",
     "Sent",
     "SimulatedCard",
     "StageTrack",

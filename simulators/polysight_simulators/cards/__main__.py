@@ -20,7 +20,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError
 from polysight_shared.program import die_with_parent
 from polysight_shared.wires import WireClient
-from polysight_simulators.cards.card import Pace, SimulatedCard
+from polysight_simulators.cards.card import SimulatedCard
 from polysight_simulators.cards.server import CardServer
 from polysight_simulators.cards.sync_in import StageTrack
 from polysight_simulators.faults import read_faults
@@ -58,11 +58,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--faults", type=Path, help="TOML file with a [faults] table")
     parser.add_argument("--fault", action="append", default=[], metavar="[BOARD.]KEY=VALUE", help="a single fault")
     parser.add_argument("--no-wait", action="store_true", help="send even if the receiver does not keep up")
-    parser.add_argument(
-        "--real-pacing",
-        action="store_true",
-        help="send each packet individually when it is due; occupies a core; implies --no-wait",
-    )
     parser.add_argument("--report", type=Path, help="JSON file for the counts, written at the end")
     parser.add_argument("--cache", type=Path, help="folder where the scene's object fields are kept between runs")
     return parser
@@ -117,7 +112,6 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     source = _source(args, rig, scene, names)
     power_cycle = Event()
     signal.signal(signal.SIGUSR1, lambda _signal, _frame: power_cycle.set())
-    pace = Pace(not (args.no_wait or args.real_pacing), args.real_pacing)
     cards: list[SimulatedCard] = []
     open_things.callback(lambda: _report(cards, args.report))
     for name in names:
@@ -129,7 +123,7 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
             seed=seed,
             time_scale=args.time_scale,
             clock_s=time.monotonic,
-            pace=pace,
+            wait_for_receiver=not args.no_wait,
         )
         cards.append(card)
     lines = tuple(sorted({card.line for card in cards} | {rig.pi.trigger_in}))

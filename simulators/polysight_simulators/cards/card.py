@@ -12,9 +12,8 @@ import socket
 import struct
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,24 +26,14 @@ from polysight_simulators.cards.dca1000 import (
     SOURCE_PORT,
     TAIL_S,
     Card,
-    Code,
     Message,
     Network,
     Output,
     Packetiser,
     Packets,
-    message,
     parse_request,
 )
-from polysight_simulators.cards.fault_draws import (
-    CommandFaults,
-    EventKind,
-    NetworkFaults,
-    OverflowFaults,
-    PulseEvents,
-    PulseFaults,
-    fault_generator,
-)
+from polysight_simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults, fault_generator
 from polysight_simulators.cards.sync_in import RECOVERY_US, Pulse, StageTrack, SyncInput
 from polysight_simulators.faults import Faults
 from polysight_simulators.radars import RadarBoard
@@ -63,10 +52,6 @@ _WAIT_TIMEOUT_S = 2.0
 _MAX_QUEUED_BYTES = 64 << 20
 # Largest delay that is made up for when sending many packets per call
 _CATCH_UP_S = 0.01
-# Longest time in one call: commands wait in the meantime.
-_MAX_SPIN_S = 0.02
-# Waits below this spin, because a process cannot reliably sleep that short
-_SPIN_S = 0.001
 
 
 class ReceiveQueue:
@@ -99,13 +84,6 @@ class ReceiveQueue:
             self._table = None
 
 
-class Pace(NamedTuple):
-    """Pacing of packets: not faster than the receiver reads, and in calls of 44 or (as a real card) one by one."""
-
-    wait_for_receiver: bool = True
-    single: bool = False
-
-
 class CardSender:
     """Sends what one card emits, from its own source port, in order.
 
@@ -113,8 +91,7 @@ class CardSender:
     the host's process gets no CPU for a moment; such losses say nothing about the instrument. So before every call the
     sender looks at the receiver's queue, and waits while it is filled. `wait_for_receiver=False` leaves that out.
 
-    The packet delay is kept as a mean: packets leave 44 at a time. With `single` each leaves when it is due and never
-    sooner after the last one, for which this process spins.
+    The packet delay is kept as a mean: packets leave 44 at a time.
 
     Raises
     ------
@@ -127,15 +104,14 @@ class CardSender:
         source: tuple[str, int],
         command_to: tuple[str, int],
         data_to: tuple[str, int],
-        pace: Pace = Pace(),  # noqa: B008 - immutable
+        wait_for_receiver: bool = True,
     ) -> None:
         self._command_to = command_to
         self._data_to = data_to
         self._socket = bound_udp(*source)
         self._segmented = _can_segment(self._socket)
         self._receiver = ReceiveQueue(*data_to)
-        self._pace = pace
-        self._replies: deque[tuple[float, bytes]] = deque()
+        self._wait_for_receiver = wait_for_receiver
         self._queue: deque[bytes | Rows] = deque()
         self._queued_bytes = 0
         self._not_before_s = 0.0
@@ -158,7 +134,7 @@ class CardSender:
     @property
     def idle(self) -> bool:
         """True if everything was sent."""
-        return not self._queue and not self._replies
+        return not self._queue
 
     def counts(self) -> dict[str, int]:
         """Return the numbers of data packets and payload bytes sent, and of waits for the receiver."""
@@ -171,12 +147,9 @@ class CardSender:
             return None
         return queue_state[1]
 
-    def reply(self, message: bytes, due_s: float | None = None) -> None:
-        """Send a command's reply at once, or at `due_s` of the clock given to :meth:`flush`."""
-        if due_s is None:
-            self._send_datagram(message, self._command_to)
-        else:
-            self._replies.append((due_s, message))
+    def reply(self, message: bytes) -> None:
+        """Send a command's reply at once."""
+        self._send_datagram(message, self._command_to)
 
     def put_status(self, message: bytes) -> None:
         """Send an asynchronous status after the data queued before it."""
@@ -192,18 +165,6 @@ class CardSender:
 
         `clock_s` is the wall clock; `packet_interval_s` the shortest mean time between packets, wall time.
         """
-        wait = self._flush_queue(clock_s, packet_interval_s)
-        while self._replies:
-            rest_s = self._replies[0][0] - clock_s()
-            if rest_s > 0:
-                if wait is None:
-                    return rest_s
-                return min(wait, rest_s)
-            self._send_datagram(self._replies.popleft()[1], self._command_to)
-        return wait
-
-    def _flush_queue(self, clock_s: Callable[[], float], packet_interval_s: float) -> float | None:
-        until_s = clock_s() + _MAX_SPIN_S
         while self._queue:
             item = self._queue[0]
             if isinstance(item, bytes):
@@ -212,17 +173,13 @@ class CardSender:
                 continue
             now = clock_s()
             if now < self._not_before_s:
-                if not self._pace.single or self._not_before_s - now > _SPIN_S or now > until_s:
-                    return self._not_before_s - now
-                continue
+                return self._not_before_s - now
             if not self._may_send(now):
                 return _POLL_S
-            n = 1
-            if not self._pace.single:
-                n = min(len(item), _CALL_SEGMENTS, max(1, _CALL_BYTES // item.shape[1]))
+            n = min(len(item), _CALL_SEGMENTS, max(1, _CALL_BYTES // item.shape[1]))
             self._send(item[:n])
             self._queued_bytes -= n * item.shape[1]
-            catch_up_s = 0.0 if self._pace.single or self._was_idle else _CATCH_UP_S
+            catch_up_s = 0.0 if self._was_idle else _CATCH_UP_S
             self._was_idle = False
             self._not_before_s = max(self._not_before_s, now - catch_up_s) + n * packet_interval_s
             if n == len(item):
@@ -244,7 +201,7 @@ class CardSender:
         self._queued_bytes = 0
 
     def _may_send(self, now_s: float) -> bool:
-        if not self._pace.wait_for_receiver:
+        if not self._wait_for_receiver:
             return True
         queue_state = self._receiver.look()
         if queue_state is None or queue_state[0] <= _UNREAD_BYTES:
@@ -348,29 +305,25 @@ class CardEndpoint:
         seed: int,
         time_scale: float,
         clock_s: Clock,
-        pace: Pace,
+        wait_for_receiver: bool = True,
     ) -> None:
         self.name = name
         self.counts: Counter[str] = Counter()
         self.card = Card(
             network,
-            faults.first_sequence,
-            faults.first_byte_count,
             no_data_floor_s=NO_DATA_FLOOR_S * time_scale,
-            stop_discards=faults.stop_discards,
         )
         self._faults = faults
         self._time_scale = time_scale
         self._clock_s = clock_s
-        self._pace = pace
+        self._wait_for_receiver = wait_for_receiver
         self._network_faults = NetworkFaults(faults, seed, name, self.counts)
-        self._command_faults = CommandFaults(faults, seed, name, self.counts)
         self._status_rng = fault_generator(seed, name, "status")
         if faults.twin:
             self._twin = Packetiser(sequence=700, byte_count=1 << 40)
         else:
             self._twin = None
-        self._deaf_until_s = self._link_up_s = float("-inf")
+        self._deaf_until_s = float("-inf")
         self.bindings = 0
         self._bind(network)
 
@@ -382,7 +335,7 @@ class CardEndpoint:
                 (network.card_address, SOURCE_PORT),
                 (network.host_address, network.command_port),
                 (network.host_address, network.data_port),
-                self._pace,
+                self._wait_for_receiver,
             )
         except PolysightError:
             self._commands.close()
@@ -412,21 +365,6 @@ class CardEndpoint:
             self.close()
             self._bind(self.card.network)
 
-    def reset(self) -> None:
-        """Reset the FPGA, as command 0x01 does, without a command."""
-        self.counts["resets"] += 1
-        self.card.reset_fpga()
-
-    def take_link_down(self, seconds: float) -> None:
-        """Neither receive nor send for this time (wire time)."""
-        self.counts["link_downs"] += 1
-        self._link_up_s = self._clock_s() + seconds / self._time_scale
-
-    @property
-    def link_is_down(self) -> bool:
-        """True if requests cannot reach the card now."""
-        return self._clock_s() < self._link_up_s
-
     def serve_commands(self) -> None:
         """Answer pending requests."""
         while True:
@@ -442,60 +380,42 @@ class CardEndpoint:
             self.counts["not_requests"] += 1
             return
         self.counts["requests"] += 1
-        if self._clock_s() < self._deaf_until_s or self.link_is_down:
+        if self._clock_s() < self._deaf_until_s:
             self.counts["requests_unheard"] += 1
             return
-        if not self._command_faults.heard():
+        if self._faults.mute:
+            self.counts["requests_unanswered"] += 1
             return
-        code = request[0]
-        refused = self._command_faults.refuses(code)
-        if refused:
-            reply, *further_replies = [message(code, 1)]
-        else:
-            reply, *further_replies = self.card.command(datagram, self.wire_s())
-        if code == Code.CONFIGURE_FPGA:
-            self._deaf_until_s = self._clock_s() + self._faults.deaf_ms * 1e-3
-        if bits := self._command_faults.status_after(code):
-            further_replies.append(message(Code.STATUS, bits))
-        if isinstance(reply, Message) and self._command_faults.reply_arrives():
+        reply, *further_replies = self.card.command(datagram, self.wire_s())
+        if isinstance(reply, Message):
             self.counts["replies"] += 1
-            delay_s = self._faults.reply_delay_ms * 1e-3
             for _ in range(2 if self._twin else 1):
-                self.sender.reply(reply.payload, self._clock_s() + delay_s if delay_s else None)
+                self.sender.reply(reply.payload)
         self.emit(further_replies)
 
-    def emit(self, outputs: Sequence[Output], link_is_up: bool = True) -> None:
+    def emit(self, outputs: Sequence[Output]) -> None:
         """Send the card's output through the faults of the network."""
         for output in outputs:
-            if isinstance(output, Message):
-                if not self.card.recording:
-                    for rows in self._network_faults.drain():
-                        self.sender.put_packets(rows)
-                if link_is_up and self._status_rng.random() < self._faults.status_loss:
-                    self.counts["statuses_lost"] += 1
-                elif link_is_up:
-                    self.counts["statuses"] += 1
-                    self.sender.put_status(output.payload)
-                else:
-                    self.counts["link_down_statuses"] += 1
+            if isinstance(output, Packets):
+                self._emit_packets(output)
+                continue
+            if not self.card.recording:
+                for rows in self._network_faults.drain():
+                    self.sender.put_packets(rows)
+            if self._status_rng.random() < self._faults.status_loss:
+                self.counts["statuses_lost"] += 1
             else:
-                self._emit_packets(output, link_is_up)
+                self.counts["statuses"] += 1
+                self.sender.put_status(output.payload)
 
-    def _emit_packets(self, packets: Packets, link_is_up: bool) -> None:
-        n = len(packets.rows)
-        payload_bytes = packets.payload_bytes
-        self.counts["packets_made"] += n
-        self.counts["bytes_made"] += payload_bytes
-        if link_is_up:
-            for rows in self._network_faults.carry(packets.rows):
-                self.sender.put_packets(rows)
-            if self._twin is not None:
-                reversed_payload = packets.rows[:, DATA_HEADER_BYTES:].reshape(-1)[::-1]
-                self.sender.put_packets(self._twin.feed(np.ascontiguousarray(reversed_payload)))
-        else:
-            self._network_faults.skip(packets.rows)
-            self.counts["link_down_packets"] += n
-            self.counts["link_down_bytes"] += payload_bytes
+    def _emit_packets(self, packets: Packets) -> None:
+        self.counts["packets_made"] += len(packets.rows)
+        self.counts["bytes_made"] += packets.payload_bytes
+        for rows in self._network_faults.carry(packets.rows):
+            self.sender.put_packets(rows)
+        if self._twin is not None:
+            reversed_payload = packets.rows[:, DATA_HEADER_BYTES:].reshape(-1)[::-1]
+            self.sender.put_packets(self._twin.feed(np.ascontiguousarray(reversed_payload)))
 
     @property
     def due(self) -> bool:
@@ -503,9 +423,9 @@ class CardEndpoint:
         deadline_s = self.card.deadline_s
         return deadline_s is not None and self.wire_s() >= deadline_s
 
-    def tick(self, link_is_up: bool = True) -> None:
+    def tick(self) -> None:
         """End the record if its deadline has passed."""
-        self.emit(self.card.tick(self.wire_s()), link_is_up)
+        self.emit(self.card.tick(self.wire_s()))
 
     def flush(self) -> float | None:
         """Send data that is due; return the seconds until more is due, None if all is sent."""
@@ -551,7 +471,7 @@ class SimulatedCard:
         seed: int,
         time_scale: float,
         clock_s: Clock,
-        pace: Pace = Pace(),  # noqa: B008 - immutable
+        wait_for_receiver: bool = True,
     ) -> None:
         self.board = board
         self.line = rig.pi.sync_out[0]
@@ -565,7 +485,7 @@ class SimulatedCard:
             seed=seed,
             time_scale=time_scale,
             clock_s=clock_s,
-            pace=pace,
+            wait_for_receiver=wait_for_receiver,
         )
         self._burst = rig.burst
         later_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
@@ -577,12 +497,8 @@ class SimulatedCard:
         else:
             self.radar = None
         self._sync = SyncInput(rig, self.radar)
-        self._events = PulseEvents(faults)
         self._pulse_faults = PulseFaults(faults, seed, board.name)
         self._overflow = OverflowFaults(faults, seed, board.name)
-        # Start and end of the link's outage, wire time
-        self._down_ns = (0, 0)
-        self._last_pulse_ns = 0
         self._pulses = 0
         self.last_data_wall_s = 0.0
 
@@ -599,40 +515,17 @@ class SimulatedCard:
         """Process rising edges of SYNC_IN at these wire times."""
         pulses = [Pulse(self._pulses + i, t) for i, t in enumerate(rising_ns)]
         self._pulses += len(pulses)
-        for part in self._events.parts(pulses):
-            for kind, value in self._events.before_pulse(part[0]):
-                self._happen(kind, value, part[0])
-            self._frames(self._sync.frames(self._pulse_faults.select_seen(part)), track)
-            self._last_pulse_ns = part[-1].t_ns
+        self._frames(self._sync.frames(self._pulse_faults.select_seen(pulses)), track)
         self.last_data_wall_s = self._clock_s()
-
-    def _happen(self, kind: EventKind, value: float, pulse: Pulse) -> None:
-        if kind is EventKind.LINK_DOWN:
-            self._down_ns = (pulse.t_ns, pulse.t_ns + round(value * 1e9))
-            self.endpoint.take_link_down(value)
-        elif kind is EventKind.STATUS:
-            self.endpoint.emit([message(Code.STATUS, 1 << int(value))], self._link_is_up(pulse.t_ns))
-        elif kind is EventKind.END:
-            outputs = self.card.end_record()
-            self.endpoint.counts["records_ended_early"] += bool(outputs)
-            self.endpoint.emit(outputs, self._link_is_up(pulse.t_ns))
-        elif kind is EventKind.RESET:
-            self.endpoint.reset()
-        else:
-            self.endpoint.power_cycle()
-
-    def _link_is_up(self, t_ns: int) -> bool:
-        return not self._down_ns[0] <= t_ns < self._down_ns[1]
 
     def _frames(self, started: list[Pulse], track: StageTrack) -> None:
         if not self.card.recording:
             self.endpoint.counts["frames_not_recorded"] += len(started)
             return
-        for link_is_up, group in groupby(started, key=lambda p: self._link_is_up(p.t_ns)):
-            for run in _runs(track.places(list(group))):
-                self._run(run, track, link_is_up)
+        for run in _runs(track.places(started)):
+            self._run(run, track)
 
-    def _run(self, run: list[Pulse], track: StageTrack, link_is_up: bool) -> None:
+    def _run(self, run: list[Pulse], track: StageTrack) -> None:
         counts = self.endpoint.counts
         burst = self._burst
         x_mm, y_mm = track.offsets_mm(
@@ -642,11 +535,11 @@ class SimulatedCard:
         frames = chirps.reshape(len(run), -1, *chirps.shape[2:])
         counts["frames"] += len(frames)
         for lvds in self._overflow.split(frames):
-            self.endpoint.emit(self.card.lvds(lvds.data, self.endpoint.wire_s()), link_is_up)
-            if lvds.status is not None:
+            self.endpoint.emit(self.card.lvds(lvds.data, self.endpoint.wire_s()))
+            if lvds.lost_bytes:
                 counts["overflows"] += 1
                 counts["overflow_bytes"] += lvds.lost_bytes
-                self.endpoint.emit(self.card.overflow(lvds.status), link_is_up)
+                self.endpoint.emit(self.card.overflow())
 
     def tick(self, more_expected: bool) -> None:
         """End the record when its time has come.
@@ -657,7 +550,7 @@ class SimulatedCard:
         """
         if more_expected and self._clock_s() - self.last_data_wall_s < TAIL_S:
             return
-        self.endpoint.tick(self._link_is_up(self._last_pulse_ns + round(TAIL_S * 1e9)))
+        self.endpoint.tick()
 
     def report(self) -> dict[str, int | None]:
         """Return all counts, for comparison with those of a host."""

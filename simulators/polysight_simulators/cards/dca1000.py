@@ -163,12 +163,6 @@ class Packetiser:
         self._rest = np.empty(0, np.uint8)
         return self._pack(rest.reshape(1 if len(rest) else 0, len(rest)))
 
-    def discard(self) -> int:
-        """Discard bytes that are not sent yet; return their number."""
-        lost_bytes = len(self._rest)
-        self._rest = np.empty(0, np.uint8)
-        return lost_bytes
-
     def _pack(self, payload: Bytes2D) -> Bytes2D:
         n, size = payload.shape
         k = np.arange(n, dtype=np.uint64)
@@ -194,8 +188,6 @@ class Card:
         Counters at power-up.
     no_data_floor_s
         Shortest timeout after record start without LVDS data; the timer of command 0x03 applies if it is longer.
-    stop_discards
-        On record stop, lose bytes that do not fill a packet instead of sending them as the short last packet.
     """
 
     def __init__(
@@ -204,13 +196,11 @@ class Card:
         sequence: int = 1,
         byte_count: int = 0,
         no_data_floor_s: float = 0.0,
-        stop_discards: bool = False,
     ) -> None:
         self.network = network
         self.records = 0
         self._eeprom = network
         self._no_data_floor_s = no_data_floor_s
-        self._stop_discards = stop_discards
         self._power_up(sequence, byte_count)
 
     def _power_up(self, sequence: int, byte_count: int) -> None:
@@ -266,8 +256,6 @@ class Card:
         if code == Code.RECORD_STOP:
             if not self._recording:
                 return [message(code, 0)]
-            if self._stop_discards:
-                self._packetiser.discard()
             return [message(code, 0), *self._end(Status.RECORD_COMPLETED)]
         return [message(code, self._configure(code, body, well_formed))]
 
@@ -309,17 +297,11 @@ class Card:
             return []
         return [Packets(rows)]
 
-    def overflow(self, status: Status = Status.LVDS_BUFFER_FULL) -> list[Output]:
+    def overflow(self) -> list[Output]:
         """Report LVDS data lost before packetising, which leaves no gap in the sequence numbers."""
         if not self._recording:
             return []
-        return [message(Code.STATUS, status)]
-
-    def end_record(self) -> list[Output]:
-        """End the record now, as if the LVDS data had ended 2 s ago."""
-        if not self._recording:
-            return []
-        return self._end(Status.RECORD_COMPLETED)
+        return [message(Code.STATUS, Status.LVDS_BUFFER_FULL)]
 
     def tick(self, now_s: float) -> list[Output]:
         """End the record if :attr:`deadline_s` has passed: the short last packet, then the status."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from polysight_shared.config import Board
-from polysight_simulators.cards import MAC, CardEndpoint, Network, Pace
+from polysight_simulators.cards import MAC, CardEndpoint, Network
 from polysight_simulators.faults import Faults
 from tests.support.processes import HANG_S
 
@@ -34,7 +34,7 @@ class Cards:
 
     def add(self, name: str, network: Network, faults: Faults, *, streams: bool) -> None:
         self.endpoints[name] = CardEndpoint(
-            name=name, network=network, faults=faults, seed=0, time_scale=1.0, clock_s=time.monotonic, pace=Pace()
+            name=name, network=network, faults=faults, seed=0, time_scale=1.0, clock_s=time.monotonic
         )
         if streams:
             self._streaming.add(name)

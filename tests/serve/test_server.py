@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import gc
 import hmac
 import json
 import re
 import socket
+import threading
 from typing import get_args
 
 import pytest
+import uvicorn
 from tests.support.page.asking import TOKEN, ask
 from tests.support.page.live_view import open_control, served
+from tests.support.processes import LIMIT_S, wait_for
 
 from polysight.acquisition.control import ScanCommand
 from polysight.cli.main import build_parser
 from polysight.serve.commands import Format
-from polysight.serve.front import STATIC
+from polysight.serve.front import STATIC, EndingServer
 from polysight.serve.guard import TOKEN_HEADER
 from polysight.serve.server import Place
 from polysight_shared.error_codes import ErrorCode
@@ -102,6 +106,29 @@ def test_a_page_that_never_reads_holds_nobody_up(growing, watching):
             assert json.loads(ask(view, "/api/state")[1])["pictures"]["rows"] == rows + 1
         for connection in deaf:
             connection.close()
+
+
+@pytest.mark.parametrize("request_head", [b"GET / HTTP/1.1\r\nHost: a\r\n\r\n", b"GET / HT"])
+def test_connections_end_with_their_server(request_head):
+    async def answer_much(_scope, _receive, send):
+        await send({"type": "http.response.start", "status": 200})
+        await send({"type": "http.response.body", "body": bytes(1 << 26)})
+
+    config = uvicorn.Config(answer_much, host="127.0.0.1", port=0, lifespan="off", log_config=None)
+    config.timeout_graceful_shutdown = 0
+    server = EndingServer(config)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    wait_for(lambda: server.started, "the server serves")
+    address = server.servers[0].sockets[0].getsockname()
+    with socket.create_connection(address) as deaf_client:
+        deaf_client.sendall(request_head)
+        wait_for(lambda: len(server.server_state.connections) == 1, "the server has the connection")
+        server.should_exit = True
+        thread.join(LIMIT_S)
+        # Whatever is still open is told as a ResourceWarning, which fails the test.
+        gc.collect()
+        assert not server.server_state.connections
 
 
 def test_the_page_offers_every_format_of_exports():

@@ -26,6 +26,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
+from polysight.serve.front import EndingServer
 from polysight.serve.guard import HEAD_BYTES, TOKEN_HEADER
 
 COMMAND = b"POST /api/control/"
@@ -193,7 +194,7 @@ def open_door(listener: socket.socket, token: str, config: uvicorn.Config) -> It
         process.join()
 
 
-class PagesServer(uvicorn.Server):
+class PagesServer(EndingServer):
     """The server of the pages: its connections come from the door, and it ends with it."""
 
     def __init__(self, config: uvicorn.Config, door: socket.socket, protocol: Any) -> None:

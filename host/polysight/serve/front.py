@@ -8,6 +8,7 @@ same route, and nothing here can hold them up. The number of connections has one
 from __future__ import annotations
 
 import asyncio
+import socket
 import struct
 import threading
 import time
@@ -21,6 +22,7 @@ from typing import Any, TypeVar
 import anyio
 import h11
 import msgspec
+import uvicorn
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
@@ -451,6 +453,18 @@ class CountedConnection(H11Protocol):
         """Count it out."""
         super().connection_lost(exc)
         self._limit.remove(self)
+
+
+class EndingServer(uvicorn.Server):
+    """A server whose connections end with it, whatever their clients read or send."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Close connections as uvicorn does, and abort those that are open after its time for that."""
+        await super().shutdown(sockets)
+        for open_connection in list(self.server_state.connections):
+            open_connection.transport.abort()
+        # The loop closes an aborted socket in its next round.
+        await asyncio.sleep(0)
 
 
 def make_counting_protocol(most: int) -> Any:

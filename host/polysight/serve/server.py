@@ -33,7 +33,7 @@ from polysight.catalogue import Scans
 from polysight.page import Watch
 from polysight.serve.commands import command_routes, start_waiting
 from polysight.serve.door import PagesServer, close_after_each, open_door
-from polysight.serve.front import Front, Reader, make_app, make_command_app, make_counting_protocol
+from polysight.serve.front import EndingServer, Front, Reader, make_app, make_command_app, make_counting_protocol
 from polysight.serve.guard import HANDLERS, HEAD_BYTES, Access
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import HIDDEN, Programs, Site, Watches
@@ -266,7 +266,7 @@ def run_reader(shown: Shown, path: Path) -> None:
     # The list is cached before the page asks for it.
     threading.Thread(target=site.scans.list, name="first list", daemon=True).start()
     path.unlink(missing_ok=True)
-    server = uvicorn.Server(_configure(make_reader_app(site), uds=str(path)))
+    server = EndingServer(_configure(make_reader_app(site), uds=str(path)))
     site.is_ending = lambda: server.should_exit
     parent = multiprocessing.parent_process()
 
@@ -369,7 +369,7 @@ def make_server(front: Front, place: Place, door: socket.socket | None = None) -
     )
     if door is not None:
         return PagesServer(config, door, protocol)
-    return uvicorn.Server(config)
+    return EndingServer(config)
 
 
 def _allow_files() -> None:

@@ -149,7 +149,7 @@ def test_other_words_are_left_as_they_are():
 @pytest.mark.parametrize("place", ["-60,0", "-.5,-1", "60,-1"])
 def test_a_place_in_the_left_half_is_no_option(place):
     words = build_parser().parse_args(join_negative_values(["probe", "scan", place]))
-    assert words.at == tuple(map(float, place.split(",")))
+    assert words.place_mm == tuple(map(float, place.split(",")))
 
 
 def test_materials_of_a_scan_or_of_its_products(scan, capsys):

@@ -22,9 +22,9 @@ from polysight_shared.program import (
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
-    from polysight.cli.options import CommandParser
+    from polysight.cli.options import CommandParser, Run
 
 FAMILIES = {
     "rig": (
@@ -43,7 +43,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     import argparse
     from importlib import import_module
 
-    from polysight.cli.options import CommandParser, describe
+    from polysight.cli.options import CommandParser, describe, set_run
 
     parser = argparse.ArgumentParser(
         prog="polysight",
@@ -54,12 +54,10 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"polysight {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=CommandParser)
 
-    def add(
-        name: str, run: Callable[[argparse.Namespace], int], text: str, example: str, most_used: tuple[str, ...] = ()
-    ) -> CommandParser:
+    def add(name: str, run: Run, text: str, example: str, most_used: tuple[str, ...] = ()) -> CommandParser:
         sub = commands.add_parser(name, help=text)
         describe(sub, text, example)
-        sub.set_defaults(run=run)
+        set_run(sub, run)
         sub.most_used = most_used
         return sub
 

@@ -27,14 +27,8 @@ def _materials(args: argparse.Namespace) -> int:
             code=ErrorCode.VALUES_CONFLICT,
         )
     if args.catalogue:
-        return catalogue(args.json)
-    return materials(args.data, args.json)
-
-
-def _report(args: argparse.Namespace) -> int:
-    from polysight.jobs.materials import report
-
-    return report(args.scan)
+        return catalogue(args.as_json)
+    return materials(args.data, args.as_json)
 
 
 def _permittivity(args: argparse.Namespace) -> int:
@@ -55,22 +49,10 @@ def _permittivity(args: argparse.Namespace) -> int:
         config=args.config,
         stack=args.layer,
         number=args.patch,
-        as_json=args.json,
+        as_json=args.as_json,
         bands=args.bands,
         amplitude_error=amplitude / 100,
     )
-
-
-def _concentration(args: argparse.Namespace) -> int:
-    from polysight.jobs.materials import concentration
-
-    return concentration(args.data, dict(args.value), args.confidence, args.json)
-
-
-def _classify(args: argparse.Namespace) -> int:
-    from polysight.jobs.materials import classify
-
-    return classify(args.data, args.library, args.model, args.json)
 
 
 def _layer(text: str) -> Layer:
@@ -119,9 +101,12 @@ def _add_results(add: Add) -> None:
     add_json_option(sub)
 
     sub = add(
-        "report", _report, "print where a scan's report is; make it if it is missing", "polysight report scans/one"
+        "report",
+        "materials.report",
+        "print where a scan's report is; make it if it is missing",
+        "polysight report scans/one",
     )
-    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder, or a folder of products")
+    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder, or a folder of products")
 
 
 def _add_permittivity(add: Add) -> None:
@@ -160,13 +145,14 @@ def _add_permittivity(add: Add) -> None:
 def _add_concentration(add: Add) -> None:
     sub = add(
         "concentration",
-        _concentration,
+        "materials.concentration",
         "estimate the concentration of solutions from the polarisation angle",
         "polysight concentration sugar.npz --value water=0",
     )
     sub.add_argument("data", type=Path, metavar="LIBRARY", help="library (.npz), or folder of published material files")
     sub.add_argument(
         "--value",
+        dest="values",
         type=_value,
         action="append",
         default=[],
@@ -180,7 +166,7 @@ def _add_concentration(add: Add) -> None:
 def _add_classify(add: Add) -> None:
     sub = add(
         "classify",
-        _classify,
+        "materials.classify",
         "name the patches of processed scans, or judge the classifiers on a library",
         "polysight classify out/at-60 out/at-55",
     )

@@ -7,6 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -19,6 +20,8 @@ RIG = Path("instrument.toml")
 # Options before "more options"
 _FIRST = 3
 _FARTHEST_MM = 10_000
+# Names in a parsed command line that are no options.
+_OF_THE_PARSER = ("command", "action", "run")
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -74,13 +77,29 @@ def describe(sub: argparse.ArgumentParser, text: str, example: str) -> None:
     sub.formatter_class = argparse.RawDescriptionHelpFormatter
 
 
+Run = Callable[[argparse.Namespace], int] | str
+"""What a command runs: a function, or the name of one in `polysight.jobs`, such as "scans.note". The options of the
+command then have the names of its parameters."""
+
+
+def set_run(sub: argparse.ArgumentParser, run: Run) -> None:
+    """Have a command run a function; the module of a named one is loaded when the command runs."""
+
+    def run_job(args: argparse.Namespace) -> int:
+        module, _, function = str(run).partition(".")
+        options = {option: value for option, value in vars(args).items() if option not in _OF_THE_PARSER}
+        return getattr(import_module(f"polysight.jobs.{module}"), function)(**options)
+
+    sub.set_defaults(run=run_job if isinstance(run, str) else run)
+
+
 class Add(Protocol):
     """Adds a command to `polysight`, and returns its parser."""
 
     def __call__(
         self,
         name: str,
-        run: Callable[[argparse.Namespace], int],
+        run: Run,
         text: str,
         example: str,
         most_used: tuple[str, ...] = (),
@@ -92,20 +111,20 @@ class Add(Protocol):
 def add_action(
     actions: argparse._SubParsersAction[Any],
     name: str,
-    run: Callable[[argparse.Namespace], int],
+    run: Run,
     text: str,
     example: str,
 ) -> argparse.ArgumentParser:
     """Add an action of a command, such as `polysight card reset`; returns its parser."""
     sub = actions.add_parser(name, help=text)
     describe(sub, text, example)
-    sub.set_defaults(run=run)
+    set_run(sub, run)
     return sub
 
 
 def add_json_option(sub: argparse.ArgumentParser) -> None:
     """Add `--json`."""
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    sub.add_argument("--json", dest="as_json", action="store_true", help="print JSON, for programs")
 
 
 def material_settings(args: argparse.Namespace) -> Settings:

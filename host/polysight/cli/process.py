@@ -90,7 +90,7 @@ def _surface(args: argparse.Namespace) -> int:
         args.reference,
         turned_deg=args.turned,
         axis_mm=args.axis,
-        as_json=args.json,
+        as_json=args.as_json,
     )
 
 
@@ -267,40 +267,10 @@ def _add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
     )
 
 
-def _direct_path(args: argparse.Namespace) -> int:
-    from polysight.jobs.calibrate import direct_path
-
-    return direct_path(args.scan, args.target, args.config, args.prior, args.out, args.json)
-
-
-def _hpf(args: argparse.Namespace) -> int:
-    from polysight.jobs.calibrate import hpf
-
-    return hpf(args.scans, args.config, args.out, args.json)
-
-
-def _metal(args: argparse.Namespace) -> int:
-    from polysight.jobs.calibrate import metal
-
-    return metal(args.scan, args.config, args.bands, args.out, args.json)
-
-
-def _sphere(args: argparse.Namespace) -> int:
-    from polysight.jobs.surface import sphere
-
-    return sphere(args.scan, args.radius, args.config, args.out, args.json)
-
-
-def _start_frequency(args: argparse.Namespace) -> int:
-    from polysight.jobs.calibrate import start_frequency
-
-    return start_frequency(args.scan, args.config, args.out, args.json)
-
-
 def _add_calibrate(add: Add) -> None:
     sub = add(
         "calibrate",
-        _direct_path,
+        "calibrate.direct_path",
         "calibrate the rig from recorded scans; each action writes one dated file",
         "polysight calibrate direct-path scans/points --target points.toml",
     )
@@ -310,7 +280,7 @@ def _add_calibrate(add: Add) -> None:
     sub = add_action(
         actions,
         "hpf",
-        _hpf,
+        "calibrate.hpf",
         "fit the receivers' high-pass filters to scans of one scene at several start frequencies",
         "polysight calibrate hpf scans/if-200 scans/if-500 scans/if-900 scans/if-1500",
     )
@@ -319,7 +289,7 @@ def _add_calibrate(add: Add) -> None:
     sub = add_action(
         actions,
         "metal",
-        _metal,
+        "calibrate.metal",
         "measure the gains of both channels at every pixel from a scan of a metal plate",
         "polysight calibrate metal scans/metal-plate",
     )
@@ -335,17 +305,19 @@ def _add_calibrate(add: Add) -> None:
     sub = add_action(
         actions,
         "sphere",
-        _sphere,
+        "surface.sphere",
         "measure the gains of both channels over the direction with a scan of a metal sphere, for `polysight surface`",
         "polysight calibrate sphere scans/sphere --radius 125",
     )
     sub.add_argument("scan", type=Path, metavar="SCAN", help="scan of a metal sphere of 100 to 150 mm")
-    sub.add_argument("--radius", type=_radius, required=True, metavar="MM", help="radius of the sphere")
+    sub.add_argument(
+        "--radius", dest="radius_mm", type=_radius, required=True, metavar="MM", help="radius of the sphere"
+    )
     _add_outputs(sub)
     sub = add_action(
         actions,
         "start-frequency",
-        _start_frequency,
+        "calibrate.start_frequency",
         "find the start frequency that puts each direct path in the middle of the band",
         "polysight calibrate start-frequency scans/first-light",
     )
@@ -357,7 +329,7 @@ def _add_direct_path(actions: argparse._SubParsersAction[CommandParser]) -> None
     sub = add_action(
         actions,
         "direct-path",
-        _direct_path,
+        "calibrate.direct_path",
         "fit the places of receivers and object plane to a scan of points at known places",
         "polysight calibrate direct-path scans/points --target points.toml",
     )
@@ -367,6 +339,7 @@ def _add_direct_path(actions: argparse._SubParsersAction[CommandParser]) -> None
     )
     sub.add_argument(
         "--prior",
+        dest="prior_mm",
         type=_millimetres,
         default=5.0,
         metavar="MM",
@@ -383,16 +356,10 @@ def _add_outputs(sub: argparse.ArgumentParser, more: str = "") -> None:
     add_json_option(sub)
 
 
-def _leakage(args: argparse.Namespace) -> int:
-    from polysight.jobs.calibrate import leakage
-
-    return leakage(args.plate, args.strips, args.config, args.json)
-
-
 def _add_leakage(add: Add) -> None:
     sub = add(
         "leakage",
-        _leakage,
+        "calibrate.leakage",
         "measure the cross-polar leakage of both receivers, as lines for the rig file",
         "polysight leakage scans/plate --strips 0=scans/vertical --strips 90=scans/horizontal",
     )

@@ -82,7 +82,7 @@ def _plan(args: argparse.Namespace) -> int:
         row_overhead_s=args.row_overhead_s,
         scene_mm=args.scene_mm,
         scene=scene,
-        as_json=args.json,
+        as_json=args.as_json,
     )
     return run_plan(args.config, Changes(**{name: getattr(args, name) for name in names}), options)
 
@@ -140,7 +140,7 @@ def _doctor(args: argparse.Namespace) -> int:
             code=ErrorCode.VALUES_CONFLICT,
         )  # fmt: skip
     options = DoctorOptions(args.config, args.out, args.move, args.pulse, args.bursts)
-    return run_doctor(options, args.json, bundle=args.bundle)
+    return run_doctor(options, args.as_json, bundle=args.bundle)
 
 
 def _add_doctor(add: Add) -> None:
@@ -179,23 +179,23 @@ def _card(args: argparse.Namespace) -> int:
     """`polysight card` without an action."""
     from polysight.jobs.devices import show_cards
 
-    return show_cards(args.config, args.listen, args.json)
+    return show_cards(args.config, args.listen, args.as_json)
 
 
 def _card_program(args: argparse.Namespace) -> int:
     from polysight.jobs.devices import program_card
 
-    return program_card(args.config, args.board, args.mac, args.at, args.yes, args.wait)
+    return program_card(args.config, args.name, args.mac, args.at, args.yes, args.wait)
 
 
 def _card_reset(args: argparse.Namespace) -> int:
     from polysight.jobs.devices import reset_card
 
-    return reset_card(args.config, args.board, args.radar)
+    return reset_card(args.config, args.name, args.radar)
 
 
 def _add_board(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("board", metavar="BOARD", help="name of the board in the rig file, e.g. RH")
+    sub.add_argument("name", metavar="BOARD", help="name of the board in the rig file, e.g. RH")
 
 
 def _add_own_config(sub: argparse.ArgumentParser) -> None:
@@ -249,9 +249,9 @@ def _inspect(args: argparse.Namespace) -> int:
     from polysight.jobs.recordings import inspect_file, inspect_placement
 
     if args.placement:
-        return inspect_placement(args.file, args.json)
+        return inspect_placement(args.file, args.as_json)
     options = {name: value for name in ("lanes", "samples", "q_first") if (value := getattr(args, name)) is not None}
-    return inspect_file(args.file, args.config, args.plot, args.card, args.json, options)
+    return inspect_file(args.file, args.config, args.plot, args.card, args.as_json, options)
 
 
 def _add_inspect(add: Add) -> None:
@@ -277,30 +277,6 @@ def _add_inspect(add: Add) -> None:
 # --- radar ---
 
 
-def _radar_plan(args: argparse.Namespace) -> int:
-    from polysight.jobs.devices import plan_radars
-
-    return plan_radars(args.config)
-
-
-def _radar_check(args: argparse.Namespace) -> int:
-    from polysight.jobs.devices import check_radar
-
-    return check_radar(args.config, args.board, args.trace, args.slow, args.json)
-
-
-def _radar_firmware(args: argparse.Namespace) -> int:
-    from polysight.jobs.devices import load_firmware
-
-    return load_firmware(args.config, args.board, args.image, args.flash, args.trace, args.slow)
-
-
-def _radar_replay(args: argparse.Namespace) -> int:
-    from polysight.jobs.devices import replay_radar
-
-    return replay_radar(args.config, args.trace, args.json)
-
-
 def _add_link(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--trace", type=Path, metavar="FILE", help="record all words between host and board")
     sub.add_argument("--slow", action="store_true", help="send words one by one at 1 MHz, for doubtful wiring")
@@ -308,19 +284,26 @@ def _add_link(sub: argparse.ArgumentParser) -> None:
 
 def _add_radar(add: Add) -> None:
     radar = add(
-        "radar", _radar_plan, "check one radar board, load its firmware, or replay a trace", "polysight radar check RH"
+        "radar",
+        "devices.plan_radars",
+        "check one radar board, load its firmware, or replay a trace",
+        "polysight radar check RH",
     )
     add_config_option(radar)
     actions = radar.add_subparsers(dest="action", metavar="ACTION")
 
     sub = add_action(
-        actions, "plan", _radar_plan, "show all constraints and the settings of each board", "polysight radar plan"
+        actions,
+        "plan",
+        "devices.plan_radars",
+        "show all constraints and the settings of each board",
+        "polysight radar plan",
     )
     _add_own_config(sub)
     sub = add_action(
         actions,
         "check",
-        _radar_check,
+        "devices.check_radar",
         "check one board step by step, from USB to one frame",
         "polysight radar check RH --trace first-day.jsonl",
     )
@@ -331,7 +314,7 @@ def _add_radar(add: Add) -> None:
     sub = add_action(
         actions,
         "firmware",
-        _radar_firmware,
+        "devices.load_firmware",
         "load TI's firmware into a board's RAM, or write it to its flash",
         "polysight radar firmware RH xwr22xx_metaImage.bin --flash",
     )
@@ -343,7 +326,11 @@ def _add_radar(add: Add) -> None:
     _add_link(sub)
     _add_own_config(sub)
     sub = add_action(
-        actions, "replay", _radar_replay, "run the check against a trace", "polysight radar replay first-day.jsonl"
+        actions,
+        "replay",
+        "devices.replay_radar",
+        "run the check against a trace",
+        "polysight radar replay first-day.jsonl",
     )
     sub.add_argument("trace", type=Path, metavar="TRACE", help="file written by --trace")
     _add_own_config(sub)
@@ -353,16 +340,10 @@ def _add_radar(add: Add) -> None:
 # --- jog ---
 
 
-def _jog(args: argparse.Namespace) -> int:
-    from polysight.jobs.devices import jog_stage
-
-    return jog_stage(args.config, args.axis, args.distance_mm, args.speed_mm_s, args.json)
-
-
 def _add_jog(add: Add) -> None:
     sub = add(
         "jog",
-        _jog,
+        "devices.jog_stage",
         "move one axis of the homed stage; it stops at Ctrl-C and if this program ends",
         "polysight jog x 10\n  polysight jog y -2.5 --speed-mm-s 5",
     )
@@ -393,14 +374,8 @@ def _validate(args: argparse.Namespace) -> int:
     from polysight.jobs.recordings import replace_folder, validate_folder
 
     if args.replace:
-        return replace_folder(args.folder, args.json)
-    return validate_folder(args.folder, args.json)
-
-
-def _drop_raw(args: argparse.Namespace) -> int:
-    from polysight.jobs.scans import drop_raw
-
-    return drop_raw(args.folder, args.products, args.yes)
+        return replace_folder(args.folder, args.as_json)
+    return validate_folder(args.folder, args.as_json)
 
 
 def _add_recording_options(sub: argparse.ArgumentParser) -> None:
@@ -444,7 +419,7 @@ def _add_scans(add: Add) -> None:
 
     sub = add(
         "drop-raw",
-        _drop_raw,
+        "scans.drop_raw",
         "delete the raw rows of a processed scan; its products and digests stay",
         "polysight drop-raw scans/one",
     )

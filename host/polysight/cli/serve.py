@@ -37,7 +37,7 @@ def _serve(args: argparse.Namespace) -> int:
         raise ConfigError(
             f"{config}: no such file", "--config names a rig file", "correct the path, or leave --config out"
         )
-    return serve(args.scans, _place(args), config, not args.read_only)
+    return serve(args.root, _place(args), config, not args.read_only)
 
 
 def _preview(args: argparse.Namespace) -> int:
@@ -104,7 +104,7 @@ def _add_serve(add: Add) -> None:
 
 def _add_folder(sub: argparse.ArgumentParser) -> None:
     text = "folder of scans (default: scans)"
-    sub.add_argument("scans", type=Path, nargs="?", default=Path("scans"), metavar="SCANS", help=text)
+    sub.add_argument("root", type=Path, nargs="?", default=Path("scans"), metavar="SCANS", help=text)
 
 
 def _add_place(sub: argparse.ArgumentParser) -> None:
@@ -120,65 +120,34 @@ def _add_place(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--key", type=Path, metavar="FILE", help="its private key (PEM)")
 
 
-def _scans(args: argparse.Namespace) -> int:
-    from polysight.jobs.scans import scans
-
-    return scans(args.scans, args.tag, args.find, args.json)
-
-
-def _note(args: argparse.Namespace) -> int:
-    from polysight.jobs.scans import note
-
-    return note(args.scan, args.text, args.tag, args.untag)
-
-
-def _ask(args: argparse.Namespace) -> int:
-    from polysight.jobs.scans import ask_scan
-
-    return ask_scan(args.scan, args.request)
-
-
 def _add_lists(add: Add) -> None:
-    sub = add("scans", _scans, "list the scans under a folder", "polysight scans scans")
+    sub = add("scans", "scans.scans", "list the scans under a folder", "polysight scans scans")
     _add_folder(sub)
-    sub.add_argument("--find", default="", metavar="TEXT", help="search names, notes, tags and materials")
-    sub.add_argument("--tag", action="append", default=[], metavar="TAG", help="only scans with this tag")
+    sub.add_argument("--find", dest="text", default="", metavar="TEXT", help="search names, notes, tags and materials")
+    sub.add_argument("--tag", dest="tags", action="append", default=[], metavar="TAG", help="only scans with this tag")
     add_json_option(sub)
     sub = add(
         "note",
-        _note,
+        "scans.note",
         "show or change notes and tags of a scan",
         "polysight note scans/one --text 'second board' --tag oak",
     )
-    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder")
+    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
     sub.add_argument("--text", metavar="TEXT", help="replace the notes")
-    sub.add_argument("--tag", action="append", default=[], metavar="TAG", help="add a tag")
-    sub.add_argument("--untag", action="append", default=[], metavar="TAG", help="remove a tag")
-    sub = add("ask", _ask, "pause, continue, stop or abort a running scan", "polysight ask scans/one pause")
-    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder")
+    sub.add_argument("--tag", dest="add", action="append", default=[], metavar="TAG", help="add a tag")
+    sub.add_argument("--untag", dest="remove", action="append", default=[], metavar="TAG", help="remove a tag")
+    sub = add(
+        "ask",
+        "scans.ask_scan",
+        "pause, continue, stop or abort a running scan",
+        "polysight ask scans/one pause",
+    )
+    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
     sub.add_argument(
         "request",
         choices=SCAN_COMMANDS,
         help="pause: before the next row; stop: after this row; abort: now, this row is lost; continue: after a pause",
     )
-
-
-def _probe(args: argparse.Namespace) -> int:
-    from polysight.jobs.scans import probe_scan
-
-    return probe_scan(args.data, args.at, args.library, args.json)
-
-
-def _compare(args: argparse.Namespace) -> int:
-    from polysight.jobs.scans import compare_scans
-
-    return compare_scans(args.first, args.second, args.png, args.json)
-
-
-def _check(args: argparse.Namespace) -> int:
-    from polysight.jobs.check import check
-
-    return check(args.data, args.chart, args.json)
 
 
 def _point(text: str) -> tuple[float, float]:
@@ -190,27 +159,34 @@ def _point(text: str) -> tuple[float, float]:
 
 
 def _add_results(add: Add) -> None:
-    sub = add("probe", _probe, "print all results at one place of a processed scan", "polysight probe scans/one 45,0")
-    sub.add_argument("data", type=Path, metavar="DATA", help="scan folder, or a folder of products")
-    sub.add_argument("at", type=_point, metavar="X,Y", help="place, mm from the image's centre")
+    sub = add(
+        "probe",
+        "scans.probe_scan",
+        "print all results at one place of a processed scan",
+        "polysight probe scans/one 45,0",
+    )
+    sub.add_argument("folder", type=Path, metavar="DATA", help="scan folder, or a folder of products")
+    sub.add_argument("place_mm", type=_point, metavar="X,Y", help="place, mm from the image's centre")
     sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
     add_json_option(sub)
     sub = add(
         "compare",
-        _compare,
+        "scans.compare_scans",
         "compare two processed scans: differences of P and permittivity",
         "polysight compare scans/one scans/two --png difference.png",
     )
     for name in ("first", "second"):
         sub.add_argument(name, type=Path, metavar="DATA", help="scan folder, or a folder of products")
-    sub.add_argument("--png", type=Path, metavar="FILE", help="draw the difference of P in standard deviations")
+    sub.add_argument(
+        "--png", dest="picture", type=Path, metavar="FILE", help="draw the difference of P in standard deviations"
+    )
     add_json_option(sub)
     sub = add(
         "check",
-        _check,
+        "check.check",
         "compare the check plate of scans with its known permittivity",
         "polysight check scans/today\n  polysight check scans --chart check.png",
     )
-    sub.add_argument("data", type=Path, nargs="+", metavar="DATA", help="processed scan, or a folder of scans")
+    sub.add_argument("folders", type=Path, nargs="+", metavar="DATA", help="processed scan, or a folder of scans")
     sub.add_argument("--chart", type=Path, metavar="FILE", help="draw the control chart (PNG)")
     add_json_option(sub)

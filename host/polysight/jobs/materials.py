@@ -210,19 +210,21 @@ def _describe_origin(is_simulated: bool) -> str:
     return "simulated" if is_simulated else "measured"
 
 
-def concentration(data: Path, values: Mapping[str, float], confidence: float, as_json: bool) -> int:
+def concentration(data: Path, values: Sequence[tuple[str, float]], confidence: float, as_json: bool) -> int:
     """Fit concentration against polarisation angle, with leave-one-out errors; return the exit status.
 
-    `data` is a library (.npz) or a folder of the published material files. Raises DataError.
+    `data` is a library (.npz) or a folder of the published material files, `values` are percentages of materials
+    without one in their name. Raises DataError.
     """
     library = _load_library(data)
-    unknown = sorted(set(values) - set(library.names))
+    percent_by_name = dict(values)
+    unknown = sorted(set(percent_by_name) - set(library.names))
     if unknown:
         raise ConfigError(
             f"{data}: no material {unknown[0]!r}", f"it holds {', '.join(library.names)}", "correct --value"
         )
-    result = fit_concentration(library, values, confidence)
-    left_out = sorted(set(library.names) - set(concentrations(library.names, values)))
+    result = fit_concentration(library, percent_by_name, confidence)
+    left_out = sorted(set(library.names) - set(concentrations(library.names, percent_by_name)))
     source = _describe_origin(library.simulated)
     if as_json:
         content = {

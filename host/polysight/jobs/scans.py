@@ -109,15 +109,15 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
     return 0
 
 
-def ask_scan(folder: Path, command: str) -> int:
+def ask_scan(folder: Path, request: str) -> int:
     """Send a command to a running scan; return 0 when it has received it. Raises ScanError."""
     if not folder.is_dir():
         raise no_such(folder)
-    send_command(folder, ScanCommand(command), "polysight ask")
+    send_command(folder, ScanCommand(request), "polysight ask")
     states = {"pause": "pausing", "continue": "rows", "stop": "stopping", "abort": "aborting"}
-    state = STATES[states[command]]
-    words = state.headline if command != "continue" else "The scan goes on"
-    sys.stdout.write(f"{folder}: heard {command}: {words}\n")
+    state = STATES[states[request]]
+    words = state.headline if request != "continue" else "The scan goes on"
+    sys.stdout.write(f"{folder}: heard {request}: {words}\n")
     return 0
 
 

@@ -6,17 +6,11 @@ import pytest
 import tomli_w
 from tests.support.acquisition.fake_cards import make_payload
 from tests.support.acquisition.fake_rig import FakeRig, small_instrument
-from tests.support.acquisition.receivers import fork_receivers
 from tests.support.page.fixtures import finished, samples
 
 from polysight_shared.tables import to_builtins
 
 __all__ = ["finished", "samples"]
-
-
-@pytest.fixture(autouse=True)
-def _forked_receivers(monkeypatch: pytest.MonkeyPatch) -> None:
-    fork_receivers(monkeypatch)
 
 
 @pytest.fixture

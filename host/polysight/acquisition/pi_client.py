@@ -239,8 +239,9 @@ class PiClient:
             heartbeat.stop()
 
         missing_mm = from_mm + distance_mm - _find_place_mm(status, axis)
-        half_a_step_mm = 0.5 / self._instrument.stage.steps_per_mm
-        if status.fault or abs(missing_mm) > 1.01 * half_a_step_mm:
+        # The stage goes whole steps, so it may rest half a step beside the place; 1 % is for rounding.
+        tolerance_mm = 1.01 * 0.5 / self._instrument.stage.steps_per_mm
+        if status.fault or abs(missing_mm) > tolerance_mm:
             raise ScanError(
                 f"the stage stopped about {abs(missing_mm):.1f} mm before the end of the jog",
                 status.reason or "it was aborted",

@@ -97,11 +97,15 @@ class DirectSignal:
 
     def start_delay_s(self, rig: Instrument) -> tuple[float, float]:
         """Return the mean start delay of the board relative to the transmitter, and its standard error; seconds."""
-        chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
-        middle_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * (a + b - 1) / 2
+        chirp = rig.chirp
+        first, end = whole_blocks(chirp.linear_samples)
+        middle_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * (first + end - 1) / 2
         expected = self.expected_hz + self.crystal_ppm(rig) * 1e-6 * middle_hz
         delay = (expected - unwrap_if(self.if_hz, rig)) / chirp.slope_hz_per_s
-        return float(delay.mean()), float(delay.std(ddof=1) / np.sqrt(delay.size)) if delay.size > 1 else np.inf
+        standard_error = np.inf
+        if delay.size > 1:
+            standard_error = float(delay.std(ddof=1) / np.sqrt(delay.size))
+        return float(delay.mean()), standard_error
 
 
 def band_hz(rig: Instrument) -> tuple[float, float]:
@@ -142,20 +146,24 @@ def find_direct(
     drift = reference(aligned, setup.path, chirp).drift
     time = np.arange(aligned.halves.shape[-1]) * float(FOLD)
     time -= time.mean()
-    flat = aligned._replace(halves=aligned.halves * cis(-0.5 * drift * time**2))
-    done = reference(flat, setup.path, chirp)
-    good = aligned.good & done.found[:, None]
-    cycles = (done.frequency[:, None] + aligned.frequency)[good]
-    power = _power(words[good.ravel()], cycles, setup, drift + done.drift)
-    noise = _estimate_recorded_noise(aligned, done.noise) * (np.abs(setup.path.estimator[0]) ** 2).sum() / FOLD
-    cycles = cycles % 1.0 if chirp.if_mode == "complex1x" else (cycles + 0.5) % 1.0 - 0.5
+    without_drift = aligned._replace(halves=aligned.halves * cis(-0.5 * drift * time**2))
+    referenced = reference(without_drift, setup.path, chirp)
+    has_direct_path = aligned.good & referenced.found[:, None]
+    cycles = (referenced.frequency[:, None] + aligned.frequency)[has_direct_path]
+    power = _measure_power(words[has_direct_path.ravel()], cycles, setup, drift + referenced.drift)
+    noise = _estimate_recorded_noise(aligned, referenced.noise) * (np.abs(setup.path.estimator[0]) ** 2).sum() / FOLD
+    # Cycles a sample repeat after one: bring them into the receiver's band.
+    if chirp.if_mode == "complex1x":
+        cycles = cycles % 1.0
+    else:
+        cycles = (cycles + 0.5) % 1.0 - 0.5
     rate = chirp.sample_rate_hz
     return DirectSignal(
         cycles * rate,
         power,
         np.full(power.size, noise),
         direct_if_hz(rig, board),
-        (drift + done.drift) * rate**2 / (2 * np.pi),  # its phase is `drift t^2 / 2`, t in samples
+        (drift + referenced.drift) * rate**2 / (2 * np.pi),  # its phase is `drift t^2 / 2`, t in samples
         int(valid.sum()),
     )
 
@@ -169,18 +177,18 @@ def _estimate_recorded_noise(aligned: AlignedRow, noise: NDArray[np.float64]) ->
     return 0.0
 
 
-def _power(
+def _measure_power(
     words: NDArray[np.int16], cycles: NDArray[np.float64], setup: BoardSetup, drift: float
 ) -> NDArray[np.float64]:
     """Return the power of the direct path in each chirp [chirp], by the estimator that suppresses the object."""
     if not len(words):
         return np.zeros(0)
-    a, b = whole_blocks(setup.chirp.linear_samples)
-    n = b - a
+    first, end = whole_blocks(setup.chirp.linear_samples)
+    n = end - first
     path = setup.path
     time = np.arange(n) - (n - 1) / 2
     # [chirp, sample, rx]
-    raw = words[:, a:b, 0] + 1j * words[:, a:b, 1].astype(np.float32)
+    raw = words[:, first:end, 0] + 1j * words[:, first:end, 1].astype(np.float32)
     still = raw * cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
     folded = still.reshape(len(words), n // FOLD, FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
     return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2
@@ -243,7 +251,7 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
     Raises DataError if the direct path is not found, or the sweep does not determine the corners.
     """
     setups: dict[str, BoardSetup] = {}
-    powers = [_power_of_scan(scan, scan.instrument.by_name(board_name), setups) for scan in scans]
+    powers = [_measure_power_of_scan(scan, scan.instrument.by_name(board_name), setups) for scan in scans]
     if_hz, power, noise_power = (np.concatenate(parts) for parts in zip(*powers, strict=True))
     middles, levels = average_in_bins(if_hz, power, noise_power)
     if middles.size == 0:
@@ -252,7 +260,7 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
         )
     model = fit_high_pass(middles, levels)
     corners = np.array(model.corners_hz)
-    errors, residual = _errors(middles, levels, corners)
+    errors, residual = _estimate_corner_errors(middles, levels, corners)
     chirp = scans[0].instrument.chirp
     return BoardFilter(
         corners_khz=[float(c / 1e3) for c in corners],
@@ -265,7 +273,7 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
     )
 
 
-def _power_of_scan(scan: RawSource, board: Board, setups: dict[str, BoardSetup]) -> tuple[Real, Real, Real]:
+def _measure_power_of_scan(scan: RawSource, board: Board, setups: dict[str, BoardSetup]) -> tuple[Real, Real, Real]:
     """Return IF (Hz), power and noise power (ADC counts squared) of the direct path in the chirps of some rows."""
     rig = scan.instrument
     # Scans of one sweep share the setup
@@ -294,7 +302,7 @@ def average_in_bins(if_hz: Real, power: Real, noise_power: Real) -> tuple[Real, 
     return np.array([f for f, _ in means]), np.sqrt([s for _, s in means])
 
 
-def _errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple[Real, float]:
+def _estimate_corner_errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple[Real, float]:
     """Return the standard errors of the corners (Hz), and the residual of the log levels (dB, RMS)."""
 
     def residual(logs: Real) -> Real:

@@ -168,6 +168,7 @@ def fit_places(
         flat = np.concatenate([p.ravel() for p in parts]) / sigma
         return np.concatenate([flat.real, flat.imag, unknown / scale])
 
+    # In the order of `Prior.scale`: shift of each board, distance of the plane, x, y and rotation of the target.
     start = np.zeros(scale.size)
     start[-3:-1] = _find_target(boards, centre, mm)
     size = sum(b.samples.size for b in boards)
@@ -218,12 +219,12 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
         )
     # Noise is white in the raw samples, so its covariance in the reduced samples is that of the reduction.
     power, directions = scipy.linalg.eigh(maps.matrix @ maps.matrix.conj().T)
-    strong = power > _MIN_NOISE * power[-1]
-    white = directions[:, strong].conj().T / np.sqrt(power[strong])[:, None]
-    samples = (samples / gains[:, None, None]) @ white.T
+    has_noise = power > _MIN_NOISE * power[-1]
+    whitening = directions[:, has_noise].conj().T / np.sqrt(power[has_noise])[:, None]
+    samples = (samples / gains[:, None, None]) @ whitening.T
     flat = np.concatenate(offsets)
     places = np.column_stack([flat, np.zeros(len(flat))])
-    return BoardEchoes(Antennas.from_rig(rig, board), samples, white @ maps.model, places, maps.frequencies_hz)
+    return BoardEchoes(Antennas.from_rig(rig, board), samples, whitening @ maps.model, places, maps.frequencies_hz)
 
 
 def _places_m(centre: Real, mm: Real, unknown: Real) -> Real:
@@ -235,7 +236,7 @@ def _places_m(centre: Real, mm: Real, unknown: Real) -> Real:
     return centre + np.column_stack([flat, np.full(len(mm), depth)]) / 1e3
 
 
-def _design(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
+def _model_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
     """Return the echo of each point with amplitude one, complex [rx * position * k, point]."""
     tx = board.antennas.tx_m
     rx = board.antennas.rx_m + np.asarray(shift_mm) / 1e3
@@ -245,9 +246,9 @@ def _design(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.co
     back = np.linalg.norm(difference[None] - rx[:, None, None], axis=-1)
     path = out + back - np.linalg.norm(rx - tx, axis=-1)[:, None, None]
     f = board.frequencies_hz / SPEED_OF_LIGHT_M_S
-    step = _turns(path * (f[-1] - f[0]) / (f.size - 1))
+    step = _rotate_phase(path * (f[-1] - f[0]) / (f.size - 1))
     tones = np.empty((*path.shape, f.size), np.complex128)
-    tones[..., 0] = _turns(path * f[0]) / (out * back)
+    tones[..., 0] = _rotate_phase(path * f[0]) / (out * back)
     # Evenly spaced
     for k in range(1, f.size):
         np.multiply(tones[..., k - 1], step, out=tones[..., k])
@@ -255,14 +256,14 @@ def _design(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.co
     return echoes.reshape(*path.shape, -1).transpose(0, 1, 3, 2).reshape(-1, len(places_m))
 
 
-def _turns(cycles: Real) -> NDArray[np.complex128]:
+def _rotate_phase(cycles: Real) -> NDArray[np.complex128]:
     """Return exp(2j pi cycles), accurate for many cycles."""
     return np.exp(2j * np.pi * (cycles - np.round(cycles)))
 
 
 def _residual(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
     """Return the samples minus the best-fitting sum of the points' echoes."""
-    design = _design(board, shift_mm, places_m)
+    design = _model_echoes(board, shift_mm, places_m)
     samples = board.samples.reshape(-1)
     amplitude = np.linalg.lstsq(design.conj().T @ design, design.conj().T @ samples, rcond=1e-9)[0]
     return samples - design @ amplitude
@@ -272,23 +273,23 @@ def _find_target(boards: list[BoardEchoes], centre: Real, mm: Real) -> tuple[flo
     """Return the position of the target on a coarse grid, millimetres: maximum of the power at all points."""
     best = -1.0
     best_place = (0.0, 0.0)
-    few = [_subset(b) for b in boards]
+    small_boards = [_take_some_positions(b) for b in boards]
     steps = np.arange(-_REACH_MM, _REACH_MM + _STEP_MM / 2, _STEP_MM)
     for x in steps:
         for y in steps:
             places = _places_m(centre, mm, np.array([0.0, x, y, 0.0]))
             total = 0.0
-            for board in few:
-                design = _design(board, np.zeros(3), places)
-                answer = design.conj().T @ board.samples.reshape(-1)
-                total += float((np.abs(answer) ** 2 / (np.abs(design) ** 2).sum(axis=0)).sum())
+            for board in small_boards:
+                design = _model_echoes(board, np.zeros(3), places)
+                correlation = design.conj().T @ board.samples.reshape(-1)
+                total += float((np.abs(correlation) ** 2 / (np.abs(design) ** 2).sum(axis=0)).sum())
             if total > best:
                 best = total
                 best_place = (float(x), float(y))
     return best_place
 
 
-def _subset(b: BoardEchoes) -> BoardEchoes:
+def _take_some_positions(b: BoardEchoes) -> BoardEchoes:
     """Return the samples of one RX at some positions."""
     picked = slice(None, None, -(-len(b.offsets_m) // _SEARCH_POSITIONS))
     antennas = Antennas(b.antennas.tx_m, b.antennas.rx_m[:1])

@@ -48,7 +48,7 @@ from polysight_shared.files import write_together
 METAL = "metal"
 REFERENCE = "the metal reference"
 MIN_PIXELS = 16
-"""Largest number of pixels of a box that a library uses; with fewer it would learn speckle."""
+"""Number of pixels below which a box is told as small: a library would learn speckle from fewer."""
 # Largest margin, as a share of a patch's side.
 _LARGEST_MARGIN = 0.3
 Ask = Callable[[str], str]

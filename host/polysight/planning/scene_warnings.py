@@ -112,15 +112,15 @@ def _warn_of_size(plate: Plate, cell_mm: Pair) -> Iterator[Finding]:
 
 def _warn_of_aperture(plate: Plate, rig: Instrument) -> Iterator[Finding]:
     zone_mm = field_limits(rig).mirror_zone_mm
-    steps = ((rig.grid.columns - 1) * rig.grid.step_x_mm, (rig.grid.rows - 1) * rig.grid.step_y_mm)
+    aperture_mm = ((rig.grid.columns - 1) * rig.grid.step_x_mm, (rig.grid.rows - 1) * rig.grid.step_y_mm)
     for axis in (0, 1):
-        reach_mm = steps[axis] / 2 - zone_mm[axis]
+        reach_mm = aperture_mm[axis] / 2 - zone_mm[axis]
         low, high = plate.edges(axis)
         beyond_mm = max(-low, high) - reach_mm
         if beyond_mm > 0:
             text = (
                 f"{plate.name} reaches {beyond_mm:.0f} mm beyond the {max(2 * reach_mm, 0):.0f} mm in {'xy'[axis]} that"
-                f" this aperture of {steps[axis]:.0f} mm images well: a larger aperture, or nearer to the centre"
+                f" this aperture of {aperture_mm[axis]:.0f} mm images well: a larger aperture, or nearer to the centre"
             )
             yield Finding("note", text, where="aperture")
 

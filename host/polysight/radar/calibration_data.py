@@ -31,6 +31,8 @@ ALL = 0x1FF0
 # A die id that does not identify a board
 NO_DIE = "-".join(["00000000"] * 4)
 _MAX_FILE_BYTES = 2**16
+# Offset of the temperature at the calibration in the data, int16 in degrees Celsius.
+_TEMPERATURE_BYTE = 16
 _REMEDY = "delete the file: the board then calibrates itself, and a new file is written"
 
 
@@ -93,12 +95,12 @@ class CalibrationFiles:
         try:
             content = json.loads(read_bounded(path, _MAX_FILE_BYTES))
             data = bytes.fromhex(content["data"])
-            sound = content["die_id"] == die_id and len(data) == PARTS * PART_BYTES
-            sound = sound and zlib.crc32(data) == content["crc32"]
+            is_of_die = content["die_id"] == die_id and len(data) == PARTS * PART_BYTES
+            is_sound = is_of_die and zlib.crc32(data) == content["crc32"]
         except (ValueError, KeyError, TypeError, RecursionError):
-            sound = False
+            is_sound = False
             data = b""
-        if not sound:
+        if not is_sound:
             raise ConfigError(
                 f"{path}: is not the calibration data of {die_id}",
                 "it is damaged, or another board's",
@@ -110,7 +112,7 @@ class CalibrationFiles:
     def save(self, die_id: str, data: bytes) -> None:
         """Write a die's file atomically. Raises ConfigError if it cannot be written."""
         path = self.path(die_id)
-        temperature = struct.unpack_from("<h", data, 16)[0]
+        temperature = _temperature_c(data)
         content = {"die_id": die_id, "temperature_c": temperature, "crc32": zlib.crc32(data), "data": data.hex()}
         part = path.with_suffix(".part")
         try:
@@ -124,6 +126,11 @@ class CalibrationFiles:
                 "correct calibration_dir, or remove it",
                 code=ErrorCode.FILE_UNWRITABLE,
             ) from None
+
+
+def _temperature_c(data: bytes) -> int:
+    """Temperature of the board at its calibration."""
+    return struct.unpack_from("<h", data, _TEMPERATURE_BYTE)[0]
 
 
 def read_calibration(link: Link, name: str) -> bytes:
@@ -154,9 +161,10 @@ def restore_calibration(link: Link, name: str, data: bytes, timeout_s: float, no
 
     Raises DeviceError if the board does not accept it.
     """
-    valid = struct.pack("<2I", RESTORED, RESTORED) + data[8:]
+    # The first two words select calibrations: of all that were saved only those that TI recommends.
+    selected_data = struct.pack("<2I", RESTORED, RESTORED) + data[8:]
     for part in range(PARTS):
-        link.call(RestoreCalibration(part, valid[PART_BYTES * part : PART_BYTES * (part + 1)]))
+        link.call(RestoreCalibration(part, selected_data[PART_BYTES * part : PART_BYTES * (part + 1)]))
     event = link.wait_for((e.RF_INIT_DONE,), timeout_s, note)
     passed = event.values.get("passed")
     if not isinstance(passed, int) or passed & RESTORED != RESTORED:
@@ -167,4 +175,4 @@ def restore_calibration(link: Link, name: str, data: bytes, timeout_s: float, no
             code=ErrorCode.REFUSED_BY_PEER,
         )
     link.call(InitCalibrations(ALL & ~RESTORED))
-    return f"calibration restored, made at {struct.unpack_from('<h', data, 16)[0]} C"
+    return f"calibration restored, made at {_temperature_c(data)} C"

@@ -400,6 +400,7 @@ def program(rig: Instrument, board: Board) -> Program:
 
 # 76..81 GHz, to the code (ICD 81)
 BAND_HZ = (0x5471C71B * START_HZ_PER_CODE, 0x5A000000 * START_HZ_PER_CODE)
+# Shortest time from the last chirp to the end of a frame (ICD 91), and from there to the next pulse (ICD 93).
 INTER_FRAME_US = 300.0
 AFTER_FRAME_US = 150.0
 FRAME_PERIOD_US = (MIN_PERIOD_US, 1.342e6)
@@ -461,9 +462,10 @@ def constraints(rig: Instrument, frames: int) -> list[Constraint]:
 
     Raises nothing for any rig file. A rig file that keeps all constraints can be encoded by `program`.
     """
-    if unusable := list(_finite(rig)):
+    if unusable := list(_find_unusable_numbers(rig)):
         return unusable
-    return [*_timing(rig, frames), *_chirp(rig), *(c for b in rig.boards for c in _list_constraints_of_board(rig, b))]
+    of_boards = [constraint for board in rig.boards for constraint in _list_constraints_of_board(rig, board)]
+    return [*_list_timing_constraints(rig, frames), *_list_chirp_constraints(rig), *of_boards]
 
 
 def require(rig: Instrument, frames: int) -> None:
@@ -478,7 +480,7 @@ def require(rig: Instrument, frames: int) -> None:
         )
 
 
-def _finite(rig: Instrument) -> Iterator[Constraint]:
+def _find_unusable_numbers(rig: Instrument) -> Iterator[Constraint]:
     """Yield a broken constraint for each value that is infinite or not a number."""
     tables = {"chirp": rig.chirp, "burst": rig.burst, "radar": rig.radar}
     tables |= {f"boards.{b.name}": b for b in rig.boards}
@@ -493,49 +495,50 @@ def _finite(rig: Instrument) -> Iterator[Constraint]:
                 )
 
 
-def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
+def _list_timing_constraints(rig: Instrument, frames: int) -> Iterator[Constraint]:
     burst = rig.burst
     period = frame_period_us(rig)
     chirp = chirp_us(rig)
-    longer = "raise burst.period_us"
+    period_remedy = "raise burst.period_us"
     yield Constraint("frames", "frames of a row", frames, "", "reduce the points or pulses of a row", low=1, high=65535)
     low, high = FRAME_PERIOD_US
-    yield Constraint("frame period", "frame period", period, "us", longer, low=low, high=high)
+    yield Constraint("frame period", "frame period", period, "us", period_remedy, low=low, high=high)
     # ICD 91
     yield Constraint("chirps", "chirps of a frame", burst.chirps, "", "set burst.chirps to 1..255", low=1, high=255)
     if burst.chirps > 1:
         spacing_remedy = f"set radar.idle_us to {burst.chirp_us - chirp + rig.radar.idle_us:g}, or burst.chirp_us"
+        # The radar counts time in steps of 10 ns: half a step is rounding, with a little room.
         excess = chirp - burst.chirp_us
         yield Constraint(
             "chirp spacing", "idle + ramp - chirp_us", excess, "us", spacing_remedy, low=-0.006, high=0.006
         )
     # ICD 91
     rest = period - burst.chirps * chirp
-    yield Constraint("inter-frame time", "frame period - chirps", rest, "us", longer, low=INTER_FRAME_US)
+    yield Constraint("inter-frame time", "frame period - chirps", rest, "us", period_remedy, low=INTER_FRAME_US)
     # ICD 93
     gap = burst.period_us - period
-    yield Constraint("pulse gap", "pulse period - frame period", gap, "us", longer, low=AFTER_FRAME_US)
+    yield Constraint("pulse gap", "pulse period - frame period", gap, "us", period_remedy, low=AFTER_FRAME_US)
     low, high = WIDTH_US
     yield Constraint("pulse width", "SYNC_IN pulse", burst.width_us, "us", "set burst.width_us", low=low, high=high)
 
 
-def _chirp(rig: Instrument) -> Iterator[Constraint]:
+def _list_chirp_constraints(rig: Instrument) -> Iterator[Constraint]:
     c = rig.chirp
     end = inf
     if c.sample_rate_hz:
         end = c.adc_start_us + c.samples / c.sample_rate_hz * 1e6
-    longer = "raise chirp.ramp_end_us"
-    yield Constraint("ADC window", "ADC start + samples / rate", end, "us", longer, high=c.ramp_end_us)
+    ramp_remedy = "raise chirp.ramp_end_us"
+    yield Constraint("ADC window", "ADC start + samples / rate", end, "us", ramp_remedy, high=c.ramp_end_us)
     memory = c.samples * len(rig.antennas.rx_mm) * 4
-    fewer = "lower chirp.samples"
-    yield Constraint("sample memory", "samples x RX x 4", memory, "bytes", fewer, high=SAMPLE_MEMORY_BYTES)
+    samples_remedy = "lower chirp.samples"
+    yield Constraint("sample memory", "samples x RX x 4", memory, "bytes", samples_remedy, high=SAMPLE_MEMORY_BYTES)
     # Error 1023
     yield Constraint("samples", "words a chirp", 2 * c.samples, "", "set chirp.samples", low=64, high=8192)
     limit = MAX_RATE_HZ[c.if_mode]
     yield Constraint("sample rate", "rate", c.sample_rate_hz, "Hz", "set chirp.sample_rate_hz", low=2e6, high=limit)
     remainder = abs(c.sample_rate_hz / 1e3 - round(c.sample_rate_hz / 1e3)) * 1e3
-    whole_khz = "give whole kHz in sample_rate_hz"
-    yield Constraint("sample rate step", "distance to whole kHz", remainder, "Hz", whole_khz, high=1e-3)
+    rate_remedy = "give whole kHz in sample_rate_hz"
+    yield Constraint("sample rate step", "distance to whole kHz", remainder, "Hz", rate_remedy, high=1e-3)
     slope = slope_code(c.slope_hz_per_s)
     yield Constraint("slope", "code of the slope", slope, "", "lower chirp.slope_hz_per_s", low=1, high=MAX_SLOPE_CODE)
     yield Constraint("ADC start", "ADC start", c.adc_start_us, "us", "lower chirp.adc_start_us", low=0, high=40.95)
@@ -545,8 +548,8 @@ def _chirp(rig: Instrument) -> Iterator[Constraint]:
     # Only simulated radars work without filters.
     if not simulated or (c.hpf1_khz and c.hpf2_khz):
         lowest = min(c.hpf1_khz, c.hpf2_khz)
-        corner = "set corners of the devices: chirp.hpf1_khz of at least 175 and hpf2_khz of at least 350"
-        yield Constraint("high-pass filters", "lower corner", lowest, "kHz", corner, low=HPF_FIRST_KHZ[0])
+        filter_remedy = "set corners of the devices: chirp.hpf1_khz of at least 175 and hpf2_khz of at least 350"
+        yield Constraint("high-pass filters", "lower corner", lowest, "kHz", filter_remedy, low=HPF_FIRST_KHZ[0])
     gain = rig.radar.rx_gain_db
     # ICD table 5.24; the 24..52 dB of error 52 are not reached at every temperature and RF target.
     yield Constraint("RX gain", "RX gain", gain, "dB", "set radar.rx_gain_db to 32..52, even", low=32, high=52)
@@ -560,11 +563,11 @@ def _list_constraints_of_board(rig: Instrument, board: Board) -> Iterator[Constr
     of_board = f" of {board.name}"
     start = start_code(c.start_hz + board.start_offset_hz) * START_HZ_PER_CODE
     top = start + slope_code(c.slope_hz_per_s) * SLOPE_HZ_PER_S_PER_CODE * c.ramp_end_us * 1e-6
-    offset = f"change start_offset_hz{of_board}, or the chirp"
+    offset_remedy = f"change start_offset_hz{of_board}, or the chirp"
     low, high = BAND_HZ
-    yield Constraint(f"start frequency{of_board}", "start + offset", start, "Hz", offset, low=low, high=high)
-    sweep = "start + offset + slope x ramp end"
-    yield Constraint(f"sweep{of_board}", sweep, top, "Hz", offset, low=low, high=high)
+    yield Constraint(f"start frequency{of_board}", "start + offset", start, "Hz", offset_remedy, low=low, high=high)
+    sweep_formula = "start + offset + slope x ramp end"
+    yield Constraint(f"sweep{of_board}", sweep_formula, top, "Hz", offset_remedy, low=low, high=high)
     if board.name in rig.radar.native:
         native = rig.radar.native[board.name]
         # A USB path does not identify a board.

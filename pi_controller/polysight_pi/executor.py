@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from polysight_pi.edges import MIN_FEED
-from polysight_pi.journal import Journal, JournalFullError, JournalThread
+from polysight_pi.journal import Journal, JournalFullError, JournalThread, NewEvent
 from polysight_pi.machine import Machine, RefusedError
 from polysight_pi.stage import StageDriver, StageLost, StageNews
 from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop
@@ -419,8 +419,8 @@ class Executor:
 
         def write(journal: Journal) -> None:
             resumed, missing_events = journal.open(run.scan_id, run.plan, run.last_seq)
-            journal.add(m.RunStarted, plan=run.plan, resumed=resumed, lost_events=missing_events)
-            journal.commit()
+            started = NewEvent.now(m.RunStarted, plan=run.plan, resumed=resumed, lost_events=missing_events)
+            journal.write([started])
             takes.update(journal.takes)
 
         def accept_begin() -> m.Accepted:
@@ -446,8 +446,7 @@ class Executor:
         def write(journal: Journal) -> None:
             # There may be space again
             journal.broken = False
-            journal.add(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
-            journal.commit()
+            journal.write([NewEvent.now(m.RunStopped, exit_status=command.exit_status, reason=command.reason)])
 
         def accept_end() -> m.Accepted:
             self._run = None

@@ -226,6 +226,19 @@ class JournalFile:
             os.close(self._fd)
 
 
+class NewEvent(NamedTuple):
+    """An event that has no number yet."""
+
+    kind: type[m.AnyEvent]
+    fields: dict[str, Any]
+    t_mono_ns: int
+
+    @staticmethod
+    def now(kind: type[m.AnyEvent], **fields: Any) -> NewEvent:
+        """Return an event of this moment."""
+        return NewEvent(kind, fields, time.monotonic_ns())
+
+
 class Journal:
     """Numbers events, writes them to the file of the current scan, then publishes them. One process per folder.
 
@@ -243,9 +256,6 @@ class Journal:
         self._publish = publish
         self._warn = warn
         self._file: JournalFile | None = None
-        self._batch: list[tuple[m.AnyEvent, bytes]] = []
-        # Events of the batch that are to be written
-        self._pending = 0
         self.broken = False
         self.scan_id = ""
         # Current scan and number of its newest published event; replaced as a whole
@@ -271,7 +281,7 @@ class Journal:
     @property
     def last_seq(self) -> int:
         """Sequence number of the newest event of the current scan."""
-        return self._file.last_seq + self._pending if self._file else 0
+        return self._file.last_seq if self._file else 0
 
     @property
     def takes(self) -> dict[int, int]:
@@ -302,7 +312,6 @@ class Journal:
             if the file is not a journal, or the scan was begun with another plan. Nothing is changed then.
         """
         self.broken = False
-        self.commit()
         self.check_room(scan_id, plan.positions)
         file = self._file
         if file is None or self.scan_id != scan_id:
@@ -344,40 +353,32 @@ class Journal:
             room = f"{free / 1e6:.1f} MB free, {needed_bytes / 1e6:.1f} MB needed for {positions} positions"
             raise JournalFullError(self.folder, OSError(errno.ENOSPC, room))
 
-    def add(self, kind: type[m.AnyEvent], t_mono_ns: int = 0, **fields: Any) -> None:
-        """Number an event and add it to the batch; long texts are shortened to the limit of the messages.
+    def write(self, events: Sequence[NewEvent]) -> None:
+        """Number events, write them to the file, then publish them; long texts are cut to the limit of the messages.
 
-        An event that is not journalled has the number of the last one that is. Default time: now.
+        Raises JournalFullError if they cannot be written; of them only faults and the end of a row are then published.
+        Until the scan is opened again, events have the last good number and are not stored.
         """
-        self._pending += issubclass(kind, m.JOURNALLED) and self._file is not None and not self.broken
-        fields = {k: v[: m.MAX_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
-        event = kind(scan_id=self.scan_id, seq=self.last_seq, t_mono_ns=t_mono_ns or time.monotonic_ns(), **fields)
-        self._batch.append((event, m.pack(event)))
-
-    def commit(self) -> None:
-        """Write the batch to the file, then publish it.
-
-        Raises JournalFullError if it cannot be written. Until the scan is opened again, events are then published with
-        the last good number and not stored; of this batch only statuses, faults and the end of a row are published.
-        """
-        batch = self._batch
-        self._batch = []
-        self._pending = 0
-        if self._file is not None:
-            last_seq = self._file.last_seq
-            journalled = [(e, raw) for e, raw in batch if isinstance(e, m.JOURNALLED) and e.seq > last_seq]
-            sync = any(not isinstance(e, m.Capture) for e, _ in journalled)
+        file = None if self.broken else self._file
+        seq = self.last_seq
+        numbered: list[m.AnyEvent] = []
+        for event in events:
+            seq += file is not None
+            fields: dict[str, Any] = {
+                key: value[: m.MAX_TEXT] if isinstance(value, str) else value for key, value in event.fields.items()
+            }
+            numbered.append(event.kind(scan_id=self.scan_id, seq=seq, t_mono_ns=event.t_mono_ns, **fields))
+        packed = [m.pack(event) for event in numbered]
+        if file is not None:
             try:
-                if journalled:
-                    self._file.write([raw for _, raw in journalled], sync)
+                file.write(packed, sync=any(event.kind is not m.Capture for event in events))
             except JournalFullError:
                 self.broken = True
-                urgent = [e for e, _ in batch if isinstance(e, m.RowFinished | m.Fault | m.StageStatus)]
-                self._publish([m.pack(msgspec.structs.replace(e, seq=last_seq)) for e in urgent])
+                urgent = [event for event in numbered if isinstance(event, m.RowFinished | m.Fault)]
+                self._publish([m.pack(msgspec.structs.replace(event, seq=self.last_seq)) for event in urgent])
                 raise
-        if batch:
-            self._publish([raw for _, raw in batch])
-            self.position = (self.scan_id, self.last_seq)
+        self._publish(packed)
+        self.position = (self.scan_id, self.last_seq)
 
     def publish_now(self, kind: type[m.AnyEvent], **fields: Any) -> None:
         """Publish an event that is not journalled, without waiting for those that are. From any thread."""
@@ -428,7 +429,7 @@ class JournalThread:
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
-        self._events: list[tuple[type[m.AnyEvent], int, dict[str, Any]]] = []
+        self._events: list[NewEvent] = []
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._busy_since_s: float | None = None  # when the job in work was asked for
         self._thread = threading.Thread(target=self._work, name="journal", daemon=True)
@@ -453,7 +454,7 @@ class JournalThread:
     def add(self, kind: type[m.AnyEvent], **fields: Any) -> None:
         """Add an event to the batch; events that are not journalled are published at once."""
         if issubclass(kind, m.JOURNALLED):
-            self._events.append((kind, time.monotonic_ns(), fields))
+            self._events.append(NewEvent.now(kind, **fields))
         else:
             self._journal.publish_now(kind, **fields)
 
@@ -469,13 +470,7 @@ class JournalThread:
         if len(events) >= EVENTS_WAITING:
             then(JournalFullError(self._journal.folder, OSError(errno.EIO, "the disk hangs, too many events wait")))
             return
-
-        def write(journal: Journal) -> None:
-            for kind, t_mono_ns, fields in events:
-                journal.add(kind, t_mono_ns, **fields)
-            journal.commit()
-
-        self.call(write, then)
+        self.call(lambda journal: journal.write(events), then)
 
     @property
     def has_batch(self) -> bool:

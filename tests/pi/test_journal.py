@@ -21,6 +21,7 @@ from polysight_pi.journal import (
     SPARE_BYTES,
     Journal,
     JournalFile,
+    JournalThread,
 )
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
@@ -85,10 +86,12 @@ def test_a_batch_is_neither_stored_nor_published_until_committed(tmp_path):
     published = []
     journal = Journal(tmp_path, published.extend)
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
+    thread = JournalThread(journal)  # not started: its jobs are done here
     for _ in range(2):
-        journal.add(RunStopped, exit_status="abort")
-    assert (journal.last_seq, journal.read("s", 1, 9)[0], published) == (2, [], [])
-    journal.commit()
+        thread.add(RunStopped, exit_status="abort")
+    assert (journal.last_seq, journal.read("s", 1, 9)[0], published) == (0, [], [])
+    thread.commit(lambda _: None)
+    thread.do_waiting()
     assert [unpack_event(raw).seq for raw in journal.read("s", 1, 9)[0]] == [1, 2]
     assert [unpack_event(raw).seq for raw in published] == [1, 2]
     journal.close()

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 
-from polysight_pi.journal import Journal
+from polysight_pi.journal import Journal, NewEvent
 from polysight_shared import messages as m
 from polysight_shared.raster import RasterPlan
 
@@ -47,8 +47,7 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
             with FaultyDisk(path, "power cut", position, seed)():
                 journal.open("s", PLAN, 0)
                 for event in added:
-                    journal.add(event[0], **event[1])
-                    journal.commit()
+                    journal.write([NewEvent.now(event[0], **event[1])])
                 journal.close()
             ended = True
         except Killed:
@@ -62,8 +61,7 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
         assert all(map(same, events_kept, added)), "a prefix of what was added"
         synced = max((e.seq for e in published if not isinstance(e, m.Capture)), default=0)
         assert len(events_kept) >= synced, "what was published as synced is on the disk"
-        again.add(added[-1][0], **added[-1][1])
-        again.commit()
+        again.write([NewEvent.now(added[-1][0], **added[-1][1])])
         assert again.last_seq == len(events_kept) + 1
         again.close()
     assert position > 20

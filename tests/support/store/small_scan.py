@@ -25,7 +25,7 @@ from polysight.capture.receiver import RowCapture
 from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets
 from polysight.store import manifest
 from polysight.store.scan_folder import MANIFEST, PART, ScanFolder
-from polysight_pi.journal import Journal, JournalFullError
+from polysight_pi.journal import Journal, JournalFullError, NewEvent
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
 from polysight_shared.errors import PolysightError
@@ -84,10 +84,8 @@ class SmallPi:
 
     def _commit(self, kind: type[m.AnyEvent], *events: dict[str, Any]) -> None:
         """As the executor: a failing journal puts the Pi into fault."""
-        for event in events:
-            self._journal.add(kind, **event)
         try:
-            self._journal.commit()
+            self._journal.write([NewEvent.now(kind, **event) for event in events])
         except JournalFullError as e:
             self.state = "fault"
             self.fault = str(e)

@@ -174,7 +174,7 @@ class Machine:
     def _host_lost_s(self) -> float:
         if self.state in ("running", "held") or (self.state == "homing" and self._homing_is_watched):
             return self._host_alive_s + self._host_timeout_s
-        if self.jog is not None and self.jog.status == "done":
+        if self.jog is not None and self.jog.status is None:
             return self.jog.alive_s + self.jog.timeout_s
         return math.inf
 
@@ -193,7 +193,7 @@ class Machine:
 
     def stop_motion(self, number: int, reason: str) -> None:
         """Stop a row, jog or homing, if there is one, with this fault."""
-        if self.jog is not None and self.jog.status != "done":
+        if self.jog is not None and self.jog.status is not None:
             # It was told to stop
             return
         if self.state in ("running", "held", "jogging"):
@@ -379,7 +379,9 @@ class Machine:
         k = self.stage.config.steps_per_mm
         target = (round(x_mm * k), round(y_mm * k))
         timeout_s = HOST_MISSES * command.heartbeat_ms / 1e3
-        self.jog = RunningJog(command, sequence, target, timeout_s, self._clock())
+        self.jog = RunningJog(
+            sequence=sequence, command=command, target=target, timeout_s=timeout_s, alive_s=self._clock()
+        )
         self.last_jog = command
 
     def _start_motion(self, start: Callable[[], int]) -> int:
@@ -412,21 +414,14 @@ class Machine:
         return self._at_rest_state
 
     def _note_jog_stopped(self) -> str:
-        if self.jog is not None and self.jog.status == "done":
-            self.jog.status = "aborted"
-            self.jog.reason = "the stage was stopped"
         self._clear_alarm()
-        self._finish_jog()
+        self._finish_jog("aborted", reason="the stage was stopped")
         return self._at_rest_state
 
     def _stop_jog(self, status: m.RowStatus, number: int, reason: str) -> None:
         """Send STOP; the jog ends with the stage's alarm, or as lost if that does not come."""
-        jog = self.jog
-        if jog is None or jog.status != "done":
+        if self.jog is None or not self.jog.decide(status, number, reason):
             return
-        jog.status = status
-        jog.fault = int(number)
-        jog.reason = reason
         self._deadline_s = min(self._deadline_s, self._clock() + TIMEOUTS_S["stopping"])
         self._tell_stage(lambda: self.stage.link.send_byte(Immediate.STOP))
 
@@ -437,20 +432,17 @@ class Machine:
         self._report_fault(number, reason)
         self._stop_jog("fault", number, reason)
 
-    def _finish_jog(self, status: m.RowStatus | None = None, number: int = 0, reason: str = "") -> None:
+    def _finish_jog(self, status: m.RowStatus = "done", number: int = 0, reason: str = "") -> None:
         """Journal the end of the jog, if there is one; what was decided when it was stopped stays."""
         jog = self.jog
         if jog is None:
             return
-        if status is not None and jog.status == "done":
-            jog.status = status
-            jog.fault = int(number)
-            jog.reason = reason
+        jog.decide(status, number, reason)
         command = jog.command
         self._journal.add(
             m.Jogged, axis=command.axis, from_mm=command.from_mm, distance_mm=command.distance_mm,
             end_mm=self.stage.x_mm if command.axis == "x" else self.stage.y_mm,
-            status=jog.status, fault=jog.fault, reason=jog.reason,
+            status=jog.status or status, fault=jog.fault, reason=jog.reason,
         )  # fmt: skip
         self.jog = None
 
@@ -469,7 +461,8 @@ class Machine:
         except DeviceError:
             self._loop.disarm()
             raise
-        self.row = RunningRow(row, take, job, sequence, motion, EdgeTimes(motion))
+        edges = EdgeTimes(motion)
+        self.row = RunningRow(sequence=sequence, row=row, take=take, job=job, motion=motion, edges=edges)
         self.row_timeout_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
         self._watch = TriggerWatch()
         self._journal.add(m.RowStarted, row=row, take=take)
@@ -496,10 +489,7 @@ class Machine:
         """Set the row's result, unless it is set already, and disarm the trigger loop."""
         if self.row is not None:
             self.row.lasting |= lasting
-            if self.row.status is None:
-                self.row.status = status
-                self.row.fault = int(number)
-                self.row.reason = reason
+            if self.row.decide(status, number, reason):
                 self._loop.disarm()
 
     def _stop(self, *_: object) -> str | None:
@@ -564,9 +554,7 @@ class Machine:
         self.stage.slow_down_polling()
         row.points = max(0, _number(reply, "points", row.row.points))
         row.done_ns = reply.written_ns
-        if _number(reply, "held"):
-            row.was_held = True
-            row.reason = "held during the row: some positions were passed below full speed"
+        row.was_held = bool(_number(reply, "held"))
         end = (_number(reply, "x", -1), _number(reply, "y", -1))
         if end != row.motion.end and row.status is None:
             self.homed = False

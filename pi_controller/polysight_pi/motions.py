@@ -12,36 +12,46 @@ from polysight_shared.raster import Row, Stage
 from polysight_shared.stage_line import END_OF_TIME_NS
 
 
-@dataclass
-class RunningJog:
-    """A jog that the stage has started; `target`: its x and y, motor steps."""
+@dataclass(kw_only=True)
+class _Motion:
+    """A motion that the stage has started with this line. Its result is decided once, perhaps before it ends."""
 
-    command: m.Jog
-    sequence: int
-    target: tuple[int, int]
-    timeout_s: float  # of its heartbeat
-    alive_s: float
-    # Set once the stage was told to stop
-    status: m.RowStatus = "done"
+    sequence: int  # of the line and its `done`
+    status: m.RowStatus | None = None
     fault: int = 0
     reason: str = ""
 
+    def decide(self, status: m.RowStatus, number: int = 0, reason: str = "") -> bool:
+        """Set the result; return False if it is set already."""
+        if self.status is not None:
+            return False
+        self.status = status
+        self.fault = int(number)
+        self.reason = reason
+        return True
 
-@dataclass
-class RunningRow:
-    """A row that the stage has started. `status` is set once the row's result is decided."""
+
+@dataclass(kw_only=True)
+class RunningJog(_Motion):
+    """A jog; `target`: its x and y, motor steps."""
+
+    command: m.Jog
+    target: tuple[int, int]
+    timeout_s: float  # of its heartbeat
+    alive_s: float
+
+
+@dataclass(kw_only=True)
+class RunningRow(_Motion):
+    """A row with its counts."""
 
     row: Row
     take: int
     job: Job
-    sequence: int  # of the stage's ROW and its `done`
     motion: RowMotion
     edges: EdgeTimes
     # True once the stage's `ok` was read: earlier statuses belong to the motion before
     is_underway: bool = False
-    status: m.RowStatus | None = None
-    fault: int = 0
-    reason: str = ""
     # The next state is fault
     lasting: bool = False
     # Passed, counted by the stage
@@ -58,18 +68,17 @@ class RunningRow:
         pulses = points * self.job.spec.pulses
         if self.points == points and counts == Counts(points, points, pulses):
             wrong = self.edges.judge(self.was_held, self.done_ns)
-            self.status = "done"
             if wrong:
-                self.status = "fault"
-                self.fault = int(PiFault.EDGE_TIME)
-                self.reason = wrong
+                self.decide("fault", PiFault.EDGE_TIME, wrong)
+            else:
+                held = "held during the row: some positions were passed below full speed"
+                self.decide("done", reason=held if self.was_held else "")
             return
-        self.status = "fault"
-        self.fault = int(PiFault.POINTS_MISMATCH)
-        self.reason = (
+        reason = (
             f"{points} points requested, {self.points} passed by the stage, {counts.edges} edges received, "
             f"{counts.bursts} bursts and {counts.pulses} of {pulses} pulses sent"
         )
+        self.decide("fault", PiFault.POINTS_MISMATCH, reason)
 
 
 def row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:

@@ -103,7 +103,7 @@ def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
 
     refuse_beside_service(instrument)
     with BenchStage(instrument.stage) as stage:
-        speed_mm_s = instrument.stage.travel_speed_mm_s if args.speed is None else args.speed
+        speed_mm_s = args.speed or instrument.stage.travel_speed_mm_s
         return _print_position(args, stage.jog(args.dx, args.dy, speed_mm_s))
 
 

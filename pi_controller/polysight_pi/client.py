@@ -125,11 +125,8 @@ def take_over(instrument: Instrument, action: str) -> str:
         if action == "end":
             scan_id = ask(m.Status()).scan_id
             return ask(m.EndRun(scan_id=scan_id, exit_status="abort", reason=reason, owner=owner)).state
-        if action == "abort":
-            return ask(m.Abort(reason=reason, owner=owner)).state
-        if action == "hold":
-            return ask(m.Hold(owner=owner)).state
-        return ask(m.Resume(owner=owner)).state
+        command = {"abort": m.Abort(reason=reason, owner=owner), "hold": m.Hold(owner=owner)}
+        return ask(command.get(action, m.Resume(owner=owner))).state
 
 
 def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:

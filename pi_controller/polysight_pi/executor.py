@@ -27,7 +27,16 @@ from polysight_shared import __version__
 from polysight_shared import messages as m
 from polysight_shared.errors import PolysightError, os_error
 from polysight_shared.faults import PiFault, explain
-from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, MIN_WIDTH_NS, WIDTH_TEXT, Stage
+from polysight_shared.raster import (
+    MAX_WIDTH_NS,
+    MIN_PERIOD_NS,
+    MIN_PERIOD_US,
+    MIN_WIDTH_NS,
+    WIDTH_TEXT,
+    Burst,
+    Stage,
+    check_burst_fits,
+)
 from polysight_shared.stage_line import Reply
 from polysight_shared.units import us_to_ns
 
@@ -156,25 +165,25 @@ class Executor:
         run = self._run
         jogs = self._machine.note_jog_alive(owner)
         if not scan_id and jogs:
-            return m.Accepted(state=self._status.state)
+            return self._accept()
         if run is None or run.scan_id != scan_id:
             return make_refusal(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
         if run.owner != owner:
             return make_refusal(PiFault.NOT_OWNER, f"run {scan_id} is another program's")
         self._machine.note_host_alive()
-        return m.Accepted(state=self._status.state)
+        return self._accept()
 
     @property
     def status(self) -> m.StatusReply:
         """The reply to `Status`. From any thread."""
         scan_id, last_seq = self.journal.position
-        return msgspec.structs.replace(self._status, scan_id=scan_id, last_seq=last_seq)
+        return self._make_status(scan_id=scan_id, last_seq=last_seq)
 
     @property
     def hello(self) -> m.HelloReply:
         """The reply to `Hello`. From any thread."""
         scan_id, last_seq = self.journal.position
-        return msgspec.structs.replace(self._hello, scan_id=scan_id, last_seq=last_seq, t_unix_ns=time.time_ns())
+        return self._make_hello(scan_id=scan_id, last_seq=last_seq, t_unix_ns=time.time_ns())
 
     def start(self) -> None:
         """Start this thread and the journal's. The stage has to be connected."""
@@ -530,20 +539,20 @@ class Executor:
         """
         machine = self._machine
         stage = machine.stage
-        status = m.StatusReply(
-            state=machine.wire_state, homed=machine.homed, x_mm=stage.x_mm, y_mm=stage.y_mm,
-            scan_id="", row_index=-1, take=0, points=0, pulses=0, last_seq=0,
-            fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
-        )  # fmt: skip
+        row_fields = {"row_index": -1, "take": 0, "points": 0, "pulses": 0}
         if (row := machine.row) is not None:
             counts = self._loop.counts
-            status = msgspec.structs.replace(
-                status, row_index=row.row.index, take=row.take, points=counts.bursts, pulses=counts.pulses
-            )
-        self._status = status
-        self._hello = m.HelloReply(
-            pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend, state=machine.wire_state,
-            scan_id="", last_seq=0, in_run=self._run is not None, stage=stage.config.placement_settings,
+            row_fields = {
+                "row_index": row.row.index, "take": row.take, "points": counts.bursts, "pulses": counts.pulses,
+            }  # fmt: skip
+        self._make_status = partial(
+            m.StatusReply, state=machine.wire_state, homed=machine.homed, x_mm=stage.x_mm, y_mm=stage.y_mm,
+            fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
+            **row_fields,
+        )  # fmt: skip
+        self._make_hello = partial(
+            m.HelloReply, pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend,
+            state=machine.wire_state, in_run=self._run is not None, stage=stage.config.placement_settings,
         )  # fmt: skip
 
 
@@ -561,9 +570,9 @@ def read_burst(asked: m.BeginRun | m.Pulse) -> BurstSpec:
 
 
 def check_run(run: m.BeginRun, stage: Stage) -> None:
-    """Check that this rig can execute a run. Raises RefusedError with the conflicting values."""
+    """Check that this rig can execute a run. Raises RefusedError or ConfigError with the conflicting values."""
     plan = run.plan
-    spec = read_burst(run)
+    read_burst(run)
     _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")
     _require(plan.step_x_mm > 0 and plan.step_y_mm > 0, "steps of the plan must be positive")
     fastest = max(stage.speed_mm_s, stage.travel_speed_mm_s)
@@ -577,14 +586,9 @@ def check_run(run: m.BeginRun, stage: Stage) -> None:
         abs(steps - round(steps)) < 1e-6 and round(steps) >= 1,
         f"step of {plan.step_x_mm} mm is {steps:g} motor steps: it must be a whole number",
     )
-    between_ms = 1e3 * plan.step_x_mm / run.speed_mm_s
-    burst_ms = run.pulses * spec.period_ns * 1e-6
-    _require(
-        burst_ms <= between_ms,
-        f"burst of {run.pulses} x {run.period_us} us lasts {burst_ms:.2f} ms, a point passes every "
-        f"{between_ms:.2f} ms at {run.speed_mm_s} mm/s",
-    )
-    misfit = stage.misfit(plan, run.speed_mm_s)
+    stage_in_run = msgspec.structs.replace(stage, speed_mm_s=run.speed_mm_s)
+    check_burst_fits(plan, Burst(run.pulses, run.period_us, run.width_us), stage_in_run)
+    misfit = stage_in_run.misfit(plan)
     _require(not misfit, misfit)
 
 

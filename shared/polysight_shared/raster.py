@@ -131,9 +131,9 @@ class Stage(Section, frozen=True):
         speed = speed_mm_s or self.speed_mm_s
         return speed**2 / (2 * self.accel_mm_s2) + max(step_mm, self.backlash_mm)
 
-    def misfit(self, raster: Grid | RasterPlan, speed_mm_s: float | None = None) -> str:
+    def misfit(self, raster: Grid | RasterPlan) -> str:
         """Explain why a raster with its run-up exceeds the travel around the centre; return "" if it fits."""
-        run_up_mm = self.run_up_mm(raster.step_x_mm, speed_mm_s)
+        run_up_mm = self.run_up_mm(raster.step_x_mm)
         for axis, key, points, step, margin, centre, travel in (
             ("x", "columns", raster.columns, raster.step_x_mm, run_up_mm, self.centre_x_mm, self.travel_x_mm),
             ("y", "rows", raster.rows, raster.step_y_mm, self.backlash_mm, self.centre_y_mm, self.travel_y_mm),
@@ -221,7 +221,7 @@ def burst_middle_s(burst: Burst) -> float:
     return FIRST_PULSE_DELAY_S + burst_duration_s(burst) / 2
 
 
-def check_burst_fits(grid: Grid, burst: Burst, stage: Stage) -> None:
+def check_burst_fits(grid: Grid | RasterPlan, burst: Burst, stage: Stage) -> None:
     """Raise ConfigError if a burst does not end before the next trigger point."""
     between_s = grid.step_x_mm / stage.speed_mm_s
     burst_s = burst.pulses * burst.period_us * 1e-6

@@ -205,10 +205,12 @@ def write_calibration(file: CalibrationFile, out: Path) -> Path:
     Raises DeviceError if the file cannot be written.
     """
     stamp = datetime.fromisoformat(file.made_utc).strftime("%Y%m%dT%H%M%SZ")
+    name = f"{file.kind.replace('_', '-')}-{stamp}"
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for n in range(100):
-            path = out / f"{file.kind.replace('_', '-')}-{stamp}{f'-{n}' if n else ''}.toml"
+        # Several of one second are numbered.
+        for ending in ("", *(f"-{number}" for number in range(1, 100))):
+            path = out / f"{name}{ending}.toml"
             try:
                 with path.open("xb") as f:
                     f.write(tomli_w.dumps(to_builtins(file)).encode())
@@ -367,20 +369,23 @@ class Calibration:
 
     def _check_filters(self, rig: Instrument) -> None:
         """Raise ConfigError if filters were measured with other programmed corners, or not for every receiver."""
+        if self.filters is None:
+            return
         programmed = [khz for khz in (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz) if khz]
-        for board in rig.receivers if self.filters is not None else ():
-            board_filter = self.filters.boards.get(board.name) if self.filters else None
-            if board_filter is None or [float(khz) for khz in board_filter.programmed_khz if khz] != programmed:
-                if board_filter is None:
-                    difference = "is not in it"
-                else:
-                    difference = f"was measured with {board_filter.programmed_khz} kHz programmed"
-                raise ConfigError(
-                    f"{self.path('hpf')}: {board.name} {difference}, the rig file says {programmed}",
-                    "the boards or chirp.hpf1_khz, hpf2_khz were changed after the calibration",
-                    "calibrate again with this rig file, or empty calibration.hpf",
-                    code=ErrorCode.MISMATCH,
-                )
+        for board in rig.receivers:
+            board_filter = self.filters.boards.get(board.name)
+            if board_filter is None:
+                difference = "is not in it"
+            elif [float(khz) for khz in board_filter.programmed_khz if khz] != programmed:
+                difference = f"was measured with {board_filter.programmed_khz} kHz programmed"
+            else:
+                continue
+            raise ConfigError(
+                f"{self.path('hpf')}: {board.name} {difference}, the rig file says {programmed}",
+                "the boards or chirp.hpf1_khz, hpf2_khz were changed after the calibration",
+                "calibrate again with this rig file, or empty calibration.hpf",
+                code=ErrorCode.MISMATCH,
+            )
 
     @staticmethod
     def _shift_board(board: Board, places: PlacesFile) -> Board:

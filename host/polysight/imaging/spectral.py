@@ -443,7 +443,8 @@ class IncrementalImager(RowSpectra):
 
     def add_spectra(self, index: int, lines: Any, weight_spectra: Any) -> None:
         """Add a row that is transformed along x, [rx, frequency, k], and its weights, [k]."""
-        xp, (rx, m) = self.xp, self.aperture.shape[:2]
+        xp = self.xp
+        rx, m = self.aperture.shape[:2]
         by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
         for r in range(rx):
             by_rx[:, r * m : (r + 1) * m, r] = lines[r, :, :].mT
@@ -475,19 +476,21 @@ class IncrementalImager(RowSpectra):
 
     def samples(self, image: Any) -> Any:
         """See :class:`polysight.imaging.samples.Imager`."""
-        xp, (rx, m, rows, columns) = self.xp, self.aperture.shape
+        xp = self.xp
+        rx, m, rows, columns = self.aperture.shape
         lines = self.evaluate_pixels_adjoint(image).mT[:, :, None]
         ramps = self.ramps(row_starts_m(self.aperture.offsets_m))
         out = []
         for index in range(rows):
             parts = xp.matmul(xp.conj(self._kernels[:, self._lags(index), :]).mT, lines)
-            answer = xp.matmul(xp.conj(self._components).mT, parts)[:, :, 0]
-            out.append(self.transform_rows_adjoint(answer.mT, ramps[index, :]))
+            row_spectra = xp.matmul(xp.conj(self._components).mT, parts)[:, :, 0]
+            out.append(self.transform_rows_adjoint(row_spectra.mT, ramps[index, :]))
         return xp.permute_dims(xp.reshape(xp.stack(out), (rows, rx, m, columns)), (1, 2, 0, 3))
 
     def _clear(self, echo: Any) -> None:
         """Remove all rows."""
-        xp, (rx, _, _, _) = self.xp, self.aperture.shape
+        xp = self.xp
+        rx = self.aperture.shape[0]
         size = (self.lattice.band.size, self.aperture.grid.shape[0])
         self._sum = xp.zeros((*size, rx), dtype=xp.complex64, device=self.device)
         self._constant = xp.zeros(size, dtype=xp.complex64, device=self.device)

@@ -108,8 +108,7 @@ _POSITION_COLOURS = ("#dfe5ec", "#882255")
 
 
 def _mask_invalid(scan: ProcessedScan, values: npt.NDArray) -> npt.NDArray:
-    bad = ~np.isfinite(values)
-    return np.ma.masked_array(values, bad | ~scan.valid)
+    return np.ma.masked_array(values, ~np.isfinite(values) | ~scan.valid)
 
 
 def _db(values: npt.NDArray) -> npt.NDArray[np.float64]:
@@ -283,15 +282,15 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[Map
         if patch.outline_mm or patch.refused is not None:
             ax.add_patch(draw_outline(patch, fill=False, edgecolor=INK, linewidth=0.9))
         name = patch_label(patch)
-        within = ""
+        second_line = ""
         if patch.refused is not None:
-            within = "not judged"
+            second_line = "not judged"
         elif patch.confidence is not None:
-            within = f"{100 * patch.confidence:.0f} %"
+            second_line = f"{100 * patch.confidence:.0f} %"
         text = write_label(ax, patch.centre_x_mm, y1 + 0.5, name, size, above=True)
         _keep_inside(ax, text, y1)
         # Two lines above the patch would reach the next one.
-        write_label(ax, patch.centre_x_mm, y0 + 1.0, within, size, above=True)
+        write_label(ax, patch.centre_x_mm, y0 + 1.0, second_line, size, above=True)
         labels.append(MapLabel(text, str(patch.label), name, patch_colour(patch, colours)))
     return labels
 
@@ -308,11 +307,11 @@ def _crop_to_plates(ax: Axes, scan: ProcessedScan) -> None:
     boxes = [patch.box_mm for patch in scan.segments] + [plate.box_mm for plate in scan.plates]
     left_mm, right, bottom, top = extent_mm(scan)
     if boxes:
-        b = np.array(boxes)
-        x0 = b[:, 0].min() - _SIDE_ROOM_MM
-        y0 = b[:, 1].min() - _LOWER_ROOM_MM
-        x1 = b[:, 2].max() + _SIDE_ROOM_MM
-        y1 = b[:, 3].max() + _UPPER_ROOM_MM
+        corners = np.array(boxes)
+        x0 = corners[:, 0].min() - _SIDE_ROOM_MM
+        y0 = corners[:, 1].min() - _LOWER_ROOM_MM
+        x1 = corners[:, 2].max() + _SIDE_ROOM_MM
+        y1 = corners[:, 3].max() + _UPPER_ROOM_MM
         half = max(x1 - x0, y1 - y0) / 2
         cx = (x0 + x1) / 2
         cy = (y0 + y1) / 2

@@ -78,7 +78,6 @@ class WireHub:
         self._last_motion = b""
         self._cut: set[bytes] = set()
         self._joined: dict[bytes, bytes] = {}
-        self.relayed = 0
 
     def serve(self, stop: Event, poll_s: float = 0.1) -> None:
         """Relay until `stop` is set."""
@@ -149,7 +148,6 @@ class WireHub:
                 for p in other_clients:
                     if p.motion:
                         p.pending += self._last_motion
-                        self.relayed += 1
             elif tag == b"L " and all(word.isdigit() for word in line[2:].split()):
                 sender.lines.update(line[2:].split())
                 sender.pending += b"K\n"
@@ -173,7 +171,6 @@ class WireHub:
         for client in clients:
             if gpio_line in client.lines and gpio_line not in self._cut:
                 client.pending += line + b"\n"
-                self.relayed += 1
 
     def _write(self, client: _Client) -> None:
         try:

@@ -131,11 +131,6 @@ class CardSender:
         """Bytes of data packets not sent yet."""
         return self._queued_bytes
 
-    @property
-    def idle(self) -> bool:
-        """True if everything was sent."""
-        return not self._queue
-
     def counts(self) -> dict[str, int]:
         """Return the numbers of data packets and payload bytes sent, and of waits for the receiver."""
         return {"packets_sent": self.packets, "bytes_sent": self.payload_bytes, "waits": self.waits}

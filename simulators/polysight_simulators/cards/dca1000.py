@@ -54,20 +54,11 @@ class Code(IntEnum):
 
 
 class Status(IntFlag):
-    """Bits of the asynchronous status 0x0A."""
+    """Bits of the asynchronous status 0x0A that this card sends."""
 
     NO_LVDS_DATA = 1 << 0
-    NO_HEADER = 1 << 1
-    EEPROM_FAILURE = 1 << 2
-    SD_CARD_DETECTED = 1 << 3
-    SD_CARD_REMOVED = 1 << 4
-    SD_CARD_FULL = 1 << 5
-    MODE_CONFIGURATION_FAILED = 1 << 6
-    DDR_FULL = 1 << 7
     RECORD_COMPLETED = 1 << 8
     LVDS_BUFFER_FULL = 1 << 9
-    PLAYBACK_COMPLETED = 1 << 10
-    PLAYBACK_OUT_OF_SEQUENCE = 1 << 11
 
 
 class Network(NamedTuple):

@@ -299,13 +299,11 @@ class LineServer(_Server):
         self._rearm = rearm
         self._faults = faults
         self.lines = 0
-        self.unknown_lines = 0
 
     def _execute(self, client: socket.socket, data: bytes) -> bytes:
         *lines, rest = data.split(b"\n")
         for line in lines:
             if line.strip() != LINE:
-                self.unknown_lines += 1
                 continue
             number = self.lines
             self.lines = self.lines + 1

@@ -24,7 +24,16 @@ def make_surface() -> Surface:
     count = x.size
     medium = (2.0 + 0j, 6.0 + 0j)
     segments = tuple(
-        Segment(index, 10, (0, 0, 0.6), (0, 0, -1), None, 50.0, eps, ((0.1, 0.0), (0.0, 0.1)))
+        Segment(
+            number=index,
+            points=10,
+            centre_m=(0, 0, 0.6),
+            normal=(0, 0, -1),
+            radius_mm=None,
+            incidence_deg=50.0,
+            permittivity=eps,
+            covariance=((0.1, 0.0), (0.0, 0.1)),
+        )
         for index, eps in enumerate(medium)
     )
     return Surface(

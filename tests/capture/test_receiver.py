@@ -19,6 +19,7 @@ from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
 from polysight.acquisition.capture_rig import record_ended
+from polysight.capture import network
 from polysight.capture.dca1000 import Status
 from polysight.capture.network import BatchReceiver, bind_udp
 from polysight.capture.receiver import Progress, ReceiverProcess
@@ -256,6 +257,30 @@ def test_the_short_last_packet_is_reported_at_once(board, card, tmp_path):
 )
 def test_a_record_ends_with_whichever_is_first(progress, status, now_s, ended):
     assert record_ended(progress, status, 10**9, int(now_s * 1e9), 3 * 10**9) == ended
+
+
+class SuspendedClocks:
+    """Two clocks of a process that the kernel suspends before some of its readings; see `time`."""
+
+    def __init__(self, difference_ns: int, pauses_ns: list[int]) -> None:
+        self._now_ns = 0
+        self._difference_ns = difference_ns
+        self._pauses_ns = pauses_ns
+
+    def monotonic_ns(self) -> int:
+        self._now_ns += 100 + (self._pauses_ns.pop(0) if self._pauses_ns else 0)
+        return self._now_ns
+
+    def time_ns(self) -> int:
+        return self.monotonic_ns() + self._difference_ns
+
+
+@pytest.mark.parametrize("suspended_reading", range(3))
+def test_a_pause_between_two_clocks_is_not_their_difference(monkeypatch, suspended_reading):
+    pauses_ns = [0, 0, 0]
+    pauses_ns[suspended_reading] = 800_000
+    monkeypatch.setattr(network, "time", SuspendedClocks(5_000_000_000, pauses_ns))
+    assert abs(network.measure_clock_difference() - 5_000_000_000) < 10_000
 
 
 def test_a_packet_has_the_time_of_its_arrival_and_not_that_of_the_read(board, card):

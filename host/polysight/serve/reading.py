@@ -28,7 +28,6 @@ from polysight.catalogue import (
     Comparison,
     Picture,
     Program,
-    Summary,
     colour_bar,
     draw_comparison,
     find_program,
@@ -43,6 +42,7 @@ from polysight.page import Watch
 from polysight.products import REPORT, read_products
 from polysight.results import ACTION_SIGMAS, WARNING_SIGMAS, CheckResult
 from polysight.serve.guard import refuse
+from polysight.serve.listing import ListChanges, ListedScan
 from polysight.serve.queue import Waiting
 from polysight.serve.site import THUMBNAIL, Site, check_products, compare_products, draw_map
 from polysight_shared.error_codes import ErrorCode
@@ -95,16 +95,9 @@ def json_answer(content: object) -> Response:
 # --- lists ---
 
 
-class ListedScan(Summary, frozen=True, kw_only=True):
-    """A line of the list with the scan's size, None while it is being counted."""
+class ScanList(ListChanges, frozen=True, kw_only=True):
+    """The scans under the folder, or what has changed among them; and names in it that are not shown."""
 
-    bytes: int | None
-
-
-class ScanList(msgspec.Struct, frozen=True):
-    """The scans under the folder, and names in it that are not shown."""
-
-    scans: list[ListedScan]
     free_bytes: int | None
     libraries: list[str]
     left_out: list[str]
@@ -118,15 +111,21 @@ class ScanDetails(ListedScan, frozen=True, kw_only=True):
 
 
 async def _scans(site: Site, request: Request) -> Response:
-    del request
     root = site.scans.root
+    stamp = request.query_params.get("since", "")
 
     def list_scans() -> ScanList:
         scans = [ListedScan(**asdict(s), bytes=site.size(s.name)) for s in site.scans.list()]
         free_bytes = None
         if root.is_dir():
             free_bytes = shutil.disk_usage(root).free
-        return ScanList(scans, free_bytes, list(site.libraries()), site.scans.left_out())
+        changes = site.listed.update(scans, stamp)
+        return ScanList(
+            **asdict(changes),
+            free_bytes=free_bytes,
+            libraries=list(site.libraries()),
+            left_out=site.scans.left_out(),
+        )
 
     return json_answer(await site.read("", list_scans))
 

@@ -41,6 +41,7 @@ from polysight.page import Watch
 from polysight.products import read_products
 from polysight.results import CheckResult, check_plate
 from polysight.serve import launcher
+from polysight.serve.listing import ChangingList
 from polysight.serve.queue import Queue
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError, ScanError
@@ -88,6 +89,7 @@ class Site:
         self.is_ending: Callable[[], bool] = lambda: False
         # Held from the check that the rig is free until a program has it.
         self.rig = threading.Lock()
+        self.listed = ChangingList()
         self._programs = programs
         self._config = config
         self._queue: Queue | None = None

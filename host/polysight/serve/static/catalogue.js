@@ -5,7 +5,7 @@ const LOOK_MS = 4000;
 const FIRST_CARDS = 40, MORE_CARDS = 400; // the first ones of a long list are seen before the rest is made
 const ORDER = { good: 0, care: 1, "": 2, none: 3, damaged: 4 };
 const cards = new Map(), chosen = new Set();
-let server = {}, told = { scans: [] }, seen = "";
+let server = {}, told = { scans: [] };
 
 const words = (s) => [s.name, s.scan_id, s.rig, s.state, s.notes, s.started_utc, ...s.tags, ...s.materials].join(" ").toLowerCase();
 
@@ -68,11 +68,11 @@ function show() {
   const most = cards.size ? MORE_CARDS : FIRST_CARDS;
   let waiting = 0;
   for (const s of found) {
-    const made = JSON.stringify(s), old = cards.get(s.name);
-    if (old?.made === made || ++waiting > most) continue;
+    const old = cards.get(s.name);
+    if (old?.of === s || ++waiting > most) continue;
     const node = card(s);
     old?.node.replaceWith(node);
-    cards.set(s.name, { made, node });
+    cards.set(s.name, { of: s, node });
   }
   if (waiting > most) setTimeout(show);
   const nodes = found.filter((s) => cards.has(s.name)).map((s) => cards.get(s.name).node), now = [...by("list").children];
@@ -87,10 +87,14 @@ function show() {
 
 async function look() {
   try {
-    const now = await get("scans"), text = JSON.stringify(now);
+    const now = await get("scans", { since: told.stamp }), held = new Map(now.whole ? [] : told.scans.map((s) => [s.name, s]));
     complain("told");
-    if (text !== seen) {
-      [told, seen] = [now, text];
+    for (const name of now.gone) held.delete(name);
+    for (const s of now.scans) held.set(s.name, s);
+    const differs = now.whole || now.scans.length || now.gone.length;
+    now.scans = [...held.values()];
+    told = now;
+    if (differs) {
       options("state", [...new Set(now.scans.map((s) => s.state))], (v) => STATES[v]?.[0] ?? v);
       options("tag", [...new Set(now.scans.flatMap((s) => s.tags))].sort());
     }

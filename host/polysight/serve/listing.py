@@ -1,0 +1,78 @@
+"""The list of scans as the page asks for it: whole once, then what has changed since.
+
+2,000 scans are 834 kB of JSON, which each open page asks for every 4 s. The server numbers the states of its list; a
+page names the one that it has.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Sequence
+
+import msgspec
+
+from polysight.catalogue import Summary
+
+ORIGIN_BYTES = 4
+
+
+class ListedScan(Summary, frozen=True, kw_only=True):
+    """A line of the list with the scan's size, None while it is being counted."""
+
+    bytes: int | None
+
+
+class ListChanges(msgspec.Struct, frozen=True, kw_only=True):
+    """Scans that are new or differ, and names that are gone; all scans if `whole`. `stamp` names the state reached."""
+
+    stamp: str
+    whole: bool
+    scans: list[ListedScan]
+    gone: list[str]
+
+
+class ChangingList:
+    """The newest list, with the number of the state in which each of its scans changed last."""
+
+    def __init__(self) -> None:
+        # A server that was started again counts from zero: stamps of another one are not its own.
+        self._origin = secrets.token_hex(ORIGIN_BYTES)
+        self._number = 0
+        self._scans: dict[str, ListedScan] = {}
+        self._changed_in: dict[str, int] = {}
+        self._gone_in: dict[str, int] = {}
+        self._lock = threading.Lock()
+
+    def update(self, scans: Sequence[ListedScan], stamp: str) -> ListChanges:
+        """Take over the newest list; return what differs from the state that `stamp` names, or all of it."""
+        with self._lock:
+            self._take_over({scan.name: scan for scan in scans})
+            reached = f"{self._origin}-{self._number}"
+            known = self._find_state(stamp)
+            if known is None:
+                return ListChanges(stamp=reached, whole=True, scans=list(self._scans.values()), gone=[])
+            changed = [scan for name, scan in self._scans.items() if self._changed_in[name] > known]
+            gone = [name for name, number in self._gone_in.items() if number > known]
+        return ListChanges(stamp=reached, whole=False, scans=changed, gone=gone)
+
+    def _take_over(self, scans: dict[str, ListedScan]) -> None:
+        changed = [name for name, scan in scans.items() if self._scans.get(name) != scan]
+        gone = [name for name in self._scans if name not in scans]
+        if changed or gone:
+            self._number += 1
+        for name in changed:
+            self._changed_in[name] = self._number
+            self._gone_in.pop(name, None)
+        for name in gone:
+            del self._changed_in[name]
+            self._gone_in[name] = self._number
+        self._scans = scans
+
+    def _find_state(self, stamp: str) -> int | None:
+        """Number of the state that a stamp names; None if it is not one of this list."""
+        origin, _, number = stamp.partition("-")
+        is_number = number.isascii() and number.isdecimal() and len(number) <= len(str(self._number))
+        if origin != self._origin or not is_number:
+            return None
+        return int(number)

@@ -1,0 +1,50 @@
+"""Changes of the list: whoever applies them has the list of the server, whatever it had before."""
+
+from __future__ import annotations
+
+import random
+
+from tests.support.page.asking import get
+from tests.support.page.live_view import served_folder
+from tests.support.products import judged_products
+
+from polysight.serve.listing import ChangingList, ListedScan
+
+SEED = 37
+
+
+def make_scan(name: str, size: int) -> ListedScan:
+    return ListedScan(name=name, seconds=0.0, state="finished", bytes=size)
+
+
+def test_who_applies_the_changes_has_the_list():
+    rng = random.Random(SEED)
+    changing = ChangingList()
+    # Pages that ask often, seldom, and one that has the stamp of another server.
+    pages: list[dict[str, ListedScan]] = [{}, {}, {}]
+    stamps = ["", "", "00000000-3"]
+    for _ in range(200):
+        names = rng.sample("abcdef", rng.randrange(7))
+        listed = [make_scan(name, rng.randrange(2)) for name in names]
+        page = rng.randrange(3)
+        changes = changing.update(listed, stamps[page])
+        if changes.whole:
+            pages[page] = {}
+        for name in changes.gone:
+            pages[page].pop(name, None)
+        pages[page] |= {scan.name: scan for scan in changes.scans}
+        stamps[page] = changes.stamp
+        assert pages[page] == {scan.name: scan for scan in listed}
+
+
+def test_a_list_that_is_unchanged_is_not_sent_again(tmp_path):
+    for name in ("one", "two"):
+        judged_products(tmp_path / name / "products", "care")
+    with served_folder(tmp_path) as view:
+        whole = get(view, "/api/scans")
+        while any(scan["bytes"] is None for scan in whole["scans"]):
+            whole = get(view, "/api/scans")
+        assert whole["whole"]
+        same = get(view, f"/api/scans?since={whole['stamp']}")
+        assert (same["whole"], same["scans"], same["gone"]) == (False, [], [])
+        assert get(view, "/api/scans?since=wrong")["whole"]

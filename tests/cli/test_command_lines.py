@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import functools
+import inspect
 import io
 import json
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -150,6 +154,29 @@ def test_other_words_are_left_as_they_are():
 def test_a_place_in_the_left_half_is_no_option(place):
     words = build_parser().parse_args(join_negative_values(["probe", "scan", place]))
     assert words.place_mm == tuple(map(float, place.split(",")))
+
+
+def list_named_jobs(parser: argparse.ArgumentParser, options: frozenset[str] = frozenset()):
+    """Each job that a command names, with the options of that command and of those above it."""
+    options |= {action.dest for action in parser._actions if action.dest not in ("help", "command", "action")}
+    options -= {"version"}
+    run = parser.get_default("run")
+    branches = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    needs_an_action = any(branch.required for branch in branches)
+    if isinstance(run, functools.partial) and not needs_an_action:
+        yield run.args[0], options
+    for branch in branches:
+        for sub in branch.choices.values():
+            yield from list_named_jobs(sub, options)
+
+
+def test_options_of_a_command_that_names_a_job_are_its_parameters():
+    jobs = list(list_named_jobs(build_parser()))
+    assert len(jobs) >= 20
+    for name, options in jobs:
+        module, _, function = name.partition(".")
+        job = getattr(import_module(f"polysight.jobs.{module}"), function)
+        inspect.signature(job).bind(**dict.fromkeys(options))
 
 
 def test_materials_of_a_scan_or_of_its_products(scan, capsys):

@@ -43,7 +43,7 @@ _MEMINFO_DROPS = 8
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 # A larger jump between two reads means that somebody set the clock: NTP moves it by far less.
 _CLOCK_WAS_SET_NS = 1_000_000
-# Readings of two clocks this close are of one time: a tenth of what an arrival may be early.
+# Readings of two clocks this close are of one time: a tenth of what an arrival may be early, in `pulse_times`.
 _CLOSE_READINGS_NS = 20_000
 _CLOCK_READINGS = 5
 # Bytes per packet: more than the largest, to detect longer ones.

@@ -7,6 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -84,13 +85,16 @@ command then have the names of its parameters."""
 
 def set_run(sub: argparse.ArgumentParser, run: Run) -> None:
     """Have a command run a function; the module of a named one is loaded when the command runs."""
+    if isinstance(run, str):
+        run = partial(_run_job, run)
+    sub.set_defaults(run=run)
 
-    def run_job(args: argparse.Namespace) -> int:
-        module, _, function = str(run).partition(".")
-        options = {option: value for option, value in vars(args).items() if option not in _OF_THE_PARSER}
-        return getattr(import_module(f"polysight.jobs.{module}"), function)(**options)
 
-    sub.set_defaults(run=run_job if isinstance(run, str) else run)
+def _run_job(name: str, args: argparse.Namespace) -> int:
+    """Call a function of `polysight.jobs` with the options of its command."""
+    module, _, function = name.partition(".")
+    options = {option: value for option, value in vars(args).items() if option not in _OF_THE_PARSER}
+    return getattr(import_module(f"polysight.jobs.{module}"), function)(**options)
 
 
 class Add(Protocol):

@@ -1,7 +1,7 @@
 """The list of scans as the page asks for it: whole once, then what has changed since.
 
-2,000 scans are 834 kB of JSON, which each open page asks for every 4 s. The server numbers the states of its list; a
-page names the one that it has.
+2,000 scans are some 800 kB of JSON, and each open page asks for the list every 4 s. The server numbers the states of
+its list; a page names the one that it has.
 """
 
 from __future__ import annotations

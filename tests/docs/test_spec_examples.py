@@ -11,14 +11,24 @@ from pathlib import Path
 import msgspec
 import pytest
 from docs.check.pages import ROOT, read_page
+from starlette.routing import Route
 from tests.support.radar.boards import native_rig
 
 from polysight.capture import dca1000
 from polysight.capture.card import EepromSettings
+from polysight.catalogue import Scans
 from polysight.radar import commands
 from polysight.radar import messages as radar_messages
 from polysight.radar.commands import DEVICE_CONFIGURATION, Command, program
 from polysight.radar.messages import Direction, Kind, SubBlock, decode, decode_event
+from polysight.serve.commands import command_routes
+from polysight.serve.front import Front, make_app
+from polysight.serve.guard import Access
+from polysight.serve.listing import ListedScan
+from polysight.serve.reading import ScanList, reading_routes
+from polysight.serve.server import make_reader_app
+from polysight.serve.site import Site, Watches
+from polysight.serve.stage import StageControl
 from polysight_shared import messages, stage_line
 from polysight_shared.config import load_instrument
 
@@ -233,3 +243,24 @@ def test_pages_name_files_that_exist():
             r"`((?:host|shared|simulators|pi_controller|arduino_stage|tests)/[\w/.]+\w)`", text(page.name)
         ):
             assert (ROOT / Path(path)).exists(), f"{page.name} names {path}"
+
+
+# --- requests of the operator's page ----------------------------------------------------------------------------------
+
+
+def test_every_request_to_the_server_is_described(tmp_path):
+    site = Site(Scans(tmp_path), Watches(control=True))
+    front = Front(site.scans, Access(), starts=True, reader=make_reader_app(site), stage=StageControl(tmp_path))
+    routes = [*make_app(front).routes, *reading_routes(site), *command_routes(site)]
+    for method in ("GET", "POST"):
+        served = {r.path for r in routes if isinstance(r, Route) and method in (r.methods or ())}
+        described = {path for row in rows("requests.md", method) for path in re.findall(r"`(/api/[^`]+)`", row[0])}
+        assert described == {path for path in served if path.startswith("/api/")} - {"/api/{path:path}"}
+
+
+@pytest.mark.parametrize("part", [ScanList, ListedScan])
+def test_every_key_of_the_list_of_scans_is_described(part):
+    described = {
+        key for row in rows("requests.md", "The list and its changes") for key in re.findall(r"`(\w+)`", row[0])
+    }
+    assert {field.encode_name for field in msgspec.structs.fields(part)} <= described

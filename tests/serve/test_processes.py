@@ -36,9 +36,16 @@ class Server:
 
     def reading_process(self) -> int | None:
         """Number of the reading process; None while there is none."""
+        return self._find_child(b"spawn_main")
+
+    def door(self) -> int | None:
+        """Number of the process that accepts connections: it is forked, and has the command line of the server."""
+        return self._find_child(b"serve\0")
+
+    def _find_child(self, word: bytes) -> int | None:
         children = Path(f"/proc/{self.program.pid}/task").glob("*/children")
         for pid in " ".join(path.read_text() for path in children).split():
-            if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            if word in Path(f"/proc/{pid}/cmdline").read_bytes():
                 return int(pid)
         return None
 
@@ -92,6 +99,11 @@ def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_no
     """More silent connections than are kept; a request that came with them is answered when the pages go on."""
     with serving(scans, tmp_path / "state") as server, open_control(scans / "one") as stop, ExitStack() as clients:
         assert ask(server, "/api/page")[2]["connection"] == "close"
+        door = server.door()
+        assert door is not None
+        # They come for the whole group, and the server ends its door by itself.
+        os.kill(door, signal.SIGTERM)
+        os.kill(door, signal.SIGINT)
         os.kill(server.program.pid, signal.SIGSTOP)
         try:
             reading = clients.enter_context(socket.create_connection(("127.0.0.1", server.port), LIMIT_S))

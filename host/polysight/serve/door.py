@@ -178,8 +178,9 @@ def open_door(listener: socket.socket, token: str, config: uvicorn.Config) -> It
     door_end, pages_end = socket.socketpair()
 
     def run() -> None:
-        # Ctrl-C reaches the whole group; the door ends when the pages' end is closed.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # Ctrl-C and a service manager's end reach the whole group; the door ends when the pages' end is closed.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
         pages_end.close()
         asyncio.run(_keep_door(listener, door_end, token, config))
 

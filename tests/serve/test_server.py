@@ -8,9 +8,11 @@ import json
 import re
 import socket
 import threading
+from contextlib import suppress
 from typing import get_args
 
 import pytest
+import segno
 import uvicorn
 from tests.support.page.asking import TOKEN, ask
 from tests.support.page.live_view import open_control, served
@@ -20,8 +22,9 @@ from polysight.acquisition.control import ScanCommand
 from polysight.cli.main import build_parser
 from polysight.serve.commands import Format
 from polysight.serve.front import STATIC, EndingServer
-from polysight.serve.guard import TOKEN_HEADER
+from polysight.serve.guard import TOKEN_HEADER, Access
 from polysight.serve.server import Place
+from polysight.serve.welcome import ELSEWHERE, describe_server, draw_code, find_addresses
 from polysight_shared.error_codes import ErrorCode
 
 
@@ -129,6 +132,49 @@ def test_connections_end_with_their_server(request_head):
         # Whatever is still open is told as a ResourceWarning, which fails the test.
         gc.collect()
         assert not server.server_state.connections
+
+
+def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
+    """Rows of modules, True for dark, as a terminal shows them that has black text on white, or white on black."""
+    colours = {"0": (black_text, not black_text), "38;5;16;48;5;231": (True, False)}
+    blocks = {" ": (1, 1), "\u2580": (0, 1), "\u2584": (1, 0), "\u2588": (0, 0)}
+    rows: list[list[bool]] = []
+    dark = colours["0"]
+    for line in text.splitlines():
+        upper: list[bool] = []
+        lower: list[bool] = []
+        for code, block in re.findall(r"\033\[([0-9;]+)m|(.)", line):
+            if code:
+                dark = colours[code]
+                continue
+            top, bottom = blocks[block]
+            upper.append(dark[top])
+            lower.append(dark[bottom])
+        rows += [upper, lower]
+    return rows
+
+
+@pytest.mark.parametrize("black_text", [True, False])
+def test_the_code_is_dark_on_light_whatever_the_terminal_s_colours_are(black_text):
+    address = f"http://192.168.33.7:8080/#token={TOKEN}"
+    expected = [[bool(module) for module in row] for row in segno.make(address, error="l").matrix_iter()]
+    shown = show_on_terminal(draw_code(address), black_text)
+    assert shown[: len(expected)] == expected
+    assert not any(map(any, shown[len(expected) :]))
+
+
+def test_a_server_of_all_interfaces_names_each_address_of_this_machine():
+    addresses = find_addresses()
+    text = describe_server(Access(TOKEN, loopback=False, control=True), "scans", ("0.0.0.0", 8080))
+    for name in [*addresses, socket.gethostname()]:
+        assert f"http://{name}:8080/#token={TOKEN}\n" in text
+    for address in addresses:
+        # Only an address of this machine can be bound.
+        with socket.socket() as listener:
+            listener.bind((address, 0))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
+        probe.connect(ELSEWHERE)
+        assert addresses[0] == probe.getsockname()[0]
 
 
 def test_the_page_offers_every_format_of_exports():

@@ -8,7 +8,6 @@ this user may enter.
 from __future__ import annotations
 
 import contextlib
-import io
 import ipaddress
 import logging
 import multiprocessing
@@ -38,6 +37,7 @@ from polysight.serve.guard import HANDLERS, HEAD_BYTES, Access
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import HIDDEN, Programs, Site, Watches
 from polysight.serve.stage import StageControl
+from polysight.serve.welcome import describe_server
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 
@@ -154,7 +154,7 @@ def _run(shown: Shown, place: Place, what: str) -> int:
                 commands = close_after_each(make_command_app(front))
                 door = stack.enter_context(open_door(listener, access.token, _configure(commands)))
             stack.enter_context(_reading(shown, Path(folder) / "reader"))
-            sys.stderr.write(_welcome(access, place, listener, what))
+            sys.stderr.write(describe_server(access, what, listener.getsockname()[:2]))
             sys.stderr.flush()
             make_server(front, place, door).run(sockets=[listener])
     finally:
@@ -294,42 +294,6 @@ def lower_priority() -> None:
         os.nice(NICE)
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
-
-
-def _welcome(access: Access, place: Place, listener: socket.socket, what: str) -> str:
-    host, port = listener.getsockname()[:2]
-    name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname(), "::1": "localhost"}.get(host, str(host))
-    if ":" in name:
-        name = f"[{name}]"
-    scheme = "https" if access.secure else "http"
-    if access.token:
-        token = f"#token={access.token}"
-    else:
-        token = ""
-    address = f"{scheme}://{name}:{port}/{token}"
-    lines = [f"{what}: {address}"]
-    if access.control:
-        lines.append("anyone with this address and its token can start, pause and stop scans")
-    else:
-        lines.append("read-only; --control adds buttons to pause and stop the scan")
-    if not place.loopback:
-        plain = "" if access.secure else "; nothing is encrypted: --certificate and --key do that"
-        lines.append(f"anyone who reaches this machine and has the token can read all scans{plain}")
-        lines.append(draw_code(address))
-    return "\n".join(line for line in lines if line) + "\nCtrl-C ends the page; started programs go on\n"
-
-
-def draw_code(address: str) -> str:
-    """The address as a QR code for a phone's camera, in half blocks; "" without the library, or for no terminal."""
-    try:
-        import segno
-    except ImportError:
-        return ""
-    if not sys.stderr.isatty():
-        return ""
-    text = io.StringIO()
-    segno.make(address, error="l").terminal(text, compact=True)
-    return text.getvalue().rstrip("\n")
 
 
 def _configure(app: ASGIApp, **more: object) -> uvicorn.Config:

@@ -33,21 +33,6 @@ def test_frames_never_start_closer_than_the_radar_can_and_every_other_pulse_is_c
     assert len(started) + sync.too_soon == len(times)
 
 
-def test_a_burst_of_the_rig_file_starts_a_frame_each_and_a_pulse_too_soon_does_not_shift_the_next() -> None:
-    sync = SyncInput(RIG)
-    burst = [k * 1_500_000 for k in range(16)]
-    assert len(sync.frames(pulses(burst))) == 16
-    sync = SyncInput(RIG)
-    started = sync.frames(pulses([0, DEAD_NS - 1, DEAD_NS, 1_500_000]))
-    assert [p.number for p in started] == [0, 2, 3]
-    assert sync.too_soon == 1
-
-
-def test_a_restarted_wire_clock_does_not_silence_the_radar() -> None:
-    sync = SyncInput(RIG)
-    assert len(sync.frames(pulses([10**12, 0, 1_500_000]))) == 3
-
-
 def test_the_stage_is_where_its_last_motion_line_before_the_pulse_puts_it() -> None:
     track = StageTrack(RIG)
     track.add(WireMotion(1_000_000_000, 100_000, 250_000, 20_000))
@@ -56,19 +41,6 @@ def test_the_stage_is_where_its_last_motion_line_before_the_pulse_puts_it() -> N
     x, y = track.offsets_mm([1_000_000_000, 2_000_000_000, 2_999_999_999, 4_000_000_000])
     assert x == pytest.approx([-300.0, -280.0, -260.0, -260.0], abs=1e-6)
     assert y == pytest.approx([0.0, 0.0, 0.0, 2.0])
-
-
-def test_an_unknown_stage_stands_in_the_middle_of_the_grid() -> None:
-    x, y = StageTrack(RIG).offsets_mm([5])
-    assert (x[0], y[0]) == (0.0, 0.0)
-
-
-def test_motion_lines_are_kept_long_enough_and_not_forever() -> None:
-    track = StageTrack(RIG)
-    for k in range(20_000):
-        track.add(WireMotion(k * 1000, k, 250_000, 0))
-    x, _ = track.offsets_mm([19_999_000, 17_000_000])
-    assert x == pytest.approx([19.999 - 400.0, 17.0 - 400.0])
 
 
 def test_without_burst_motion_all_pulses_of_a_burst_are_at_its_middle() -> None:
@@ -123,15 +95,3 @@ def test_a_pulse_has_the_number_of_its_place_whenever_it_comes(row: int, column:
     for again in (0, 10**11):
         numbered = track.places(at_point(track, row, column, t_ns + again))
         assert [p.number for p in numbered] == list(range(first, first + RIG.burst.pulses))
-
-
-def test_a_pulse_of_no_point_keeps_its_number() -> None:
-    track = StageTrack(RIG)
-    assert track.places([Pulse(7, 5)]) == [Pulse(7, 5)]
-    burst = at_point(track, 0, 0, 10**9)
-    late = Pulse(8, burst[-1].t_ns + 1_500_000)
-    assert track.places([*burst, late])[-1] == late
-    track.add(WireMotion(2 * 10**9, 0, 0, 20_000))
-    track.trigger(2 * 10**9)
-    outside = Pulse(9, 2 * 10**9 + 200_000)
-    assert track.places([outside]) == [outside]

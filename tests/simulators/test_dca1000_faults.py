@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.simulators.card_bench import FRAME, Bench
 from tests.support.refusals import refused
 
-from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 from polysight_simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults
@@ -53,10 +50,6 @@ def test_the_same_seed_gives_the_same_faults_and_boards_differ() -> None:
     assert arrivals(EVERYTHING, [200]) != arrivals(EVERYTHING, [200], board="RV")
 
 
-def test_without_faults_everything_arrives_in_order() -> None:
-    assert arrivals(Faults(), [100, 50]) == [r.tobytes() for r in rows(150)]
-
-
 @pytest.mark.parametrize(
     ("faults", "numbers"),
     [
@@ -89,37 +82,6 @@ def test_overflow_takes_the_second_half_of_single_frames() -> None:
     assert np.all(np.diff(joined) > 0)
 
 
-def test_the_same_seed_gives_the_same_bytes_and_the_counts_are_the_truth(rig: Instrument) -> None:
-    faults = {"loss": 0.05, "duplicate": 0.05, "reorder": 0.05, "truncate": 0.05, "corrupt": 0.05, "overflow": 0.05}
-
-    def run(seed: int) -> tuple[list[bytes], dict[str, int | None]]:
-        with ExitStack() as stack:
-            bench = Bench(rig, stack, seed, **faults)
-            bench.record(100)
-            return bench.packets(), bench.counts
-
-    packets, counts = run(4)
-    assert run(4) == (packets, counts)
-    assert run(5)[0] != packets
-
-    def count(key: str) -> int:
-        return int(counts.get(key) or 0)
-
-    assert min(count(k) for k in ("lost", "duplicated", "reordered", "truncated", "corrupted", "overflows")) > 0
-    assert len(packets) == count("packets_made") - count("lost") + count("duplicated") == count("packets_sent")
-    places = {p[4:10] for p in packets}
-    assert len(places) == count("packets_made") - count("lost")
-    arrived = sum(len(p) - 10 for p in packets)
-    assert arrived == count("bytes_sent")
-    lost_bytes = count("lost_bytes") + count("truncated_bytes")
-    extra = sum(len(p) - 10 for i, p in enumerate(packets) if p in packets[:i])
-    assert arrived == count("bytes_made") - lost_bytes + extra
-    assert count("bytes_made") == 100 * FRAME - count("overflow_bytes")
-    assert count("overflow_bytes") == count("overflows") * FRAME // 2
-    statuses = count("statuses") - 1
-    assert statuses == count("overflows")
-
-
 def test_a_corrupt_packet_has_one_bit_of_its_payload_turned() -> None:
     for clean, corrupt in zip(rows(60), arrivals(Faults(corrupt=1.0), [60]), strict=True):
         turned = np.bitwise_xor(clean, np.frombuffer(corrupt, np.uint8))
@@ -147,13 +109,6 @@ def test_faults_come_from_the_file_and_the_command_line(tmp_path: Path) -> None:
 def test_a_fault_that_does_not_exist_is_refused(setting: str) -> None:
     with pytest.raises(ConfigError):
         read_faults(None, [setting], ("RH",))
-
-
-def test_a_fault_file_holds_faults_only(tmp_path: Path) -> None:
-    path = tmp_path / "faults.toml"
-    path.write_text("loss = 0.1\n")
-    with refused(ErrorCode.FILE_FOREIGN, path):
-        read_faults(path, [], ("RH",))
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.processes import HANG_S
-from tests.support.refusals import refused
 
-from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
 from polysight_shared.wires import WireClient, WireEdge, WireMessage, WireMotion, encode
 from polysight_simulators.wires import WireHub
@@ -104,17 +102,6 @@ def test_a_client_gets_its_subscriptions_and_never_its_own_lines(serve: Serve, j
     assert cards.receive(0.05) is None
 
 
-def test_a_late_client_gets_the_stage_s_position(serve: Serve, join: Join) -> None:
-    path = serve()
-    stage = join(path)
-    early = join(path, motion=True)
-    stage.send(WireMotion(1, 10, 20, 0), WireMotion(2, 30, 40, 50))
-    assert len(take(early, 2)) == 2
-    late = join(path, motion=True)
-    assert take(late, 1) == [WireMotion(2, 30, 40, 50)]
-    assert late.receive(0.05) is None
-
-
 def test_a_client_that_does_not_read_delays_nobody_and_loses_nothing(serve: Serve, join: Join) -> None:
     path = serve()
     slow = join(path, (26,))
@@ -154,19 +141,3 @@ def test_a_client_that_sends_an_invalid_line_is_disconnected(
         assert bad.recv(1) == b""
     assert take(listener, 1) == [WireEdge(1, 26, 1)]
     assert len(reports) == 1
-
-
-def test_a_used_socket_is_refused_and_an_unused_one_is_replaced(serve: Serve, tmp_path: Path) -> None:
-    path = serve()
-    with refused(ErrorCode.BUSY, path):
-        WireHub(path, str)
-    left_over = tmp_path / "old.sock"
-    with socket.socket(socket.AF_UNIX) as dead:
-        dead.bind(str(left_over))
-    WireHub(left_over, str).close()
-    assert not left_over.exists()
-
-
-def test_a_path_too_long_for_a_unix_socket_is_refused(tmp_path: Path) -> None:
-    with refused(ErrorCode.VALUE_INVALID):
-        WireHub(tmp_path / ("x" * 120), str)

@@ -1,4 +1,4 @@
-"""Functions beside a scan: labels kept by the maths, maps of permittivity, plan, simulate, compare, label, train."""
+"""Functions beside a scan: labels kept by the maths, plan, simulate, compare, label, train."""
 
 from __future__ import annotations
 
@@ -78,42 +78,6 @@ def test_types_say_whether_labels_are_kept():
     places = np.zeros((2, 3))
     image = polysight.backproject(np.ones((2, 4), complex), np.linspace(77e9, 78e9, 4), places, places, places, plain)
     assert_type(image, Complex)
-
-
-# --- maps -------------------------------------------------------------------------------------------------------------
-
-
-def test_the_map_of_permittivity_agrees_with_the_patch_and_knows_its_error(scan):
-    eps = scan.permittivity_map()
-    inside = eps.where(scan.patches()["label"] == 2).sel(x_mm=slice(30, 60), y_mm=slice(-15, 15))
-    z = np.abs(inside["permittivity"].real - PET["permittivity"][0]) / inside["permittivity_real_standard_error"]
-    assert float(z.median()) < 2
-    assert bool(inside["mask"].mean() > 0.9)
-    metal = eps.sel(x_mm=slice(-60, -30), y_mm=slice(-15, 15))
-    assert not metal["mask"].any()
-    pixel = scan.probe(45, 0)
-    assert complex(pixel["permittivity"]) == complex(eps["permittivity"].sel(x_mm=45, y_mm=0, method="nearest"))
-    assert int(pixel["label"]) == 2
-
-
-def test_the_mask_holds_no_value_that_a_half_space_cannot_have(scan):
-    """Not the edges of the metal, either."""
-    eps = scan.permittivity_map()
-    shown = eps["permittivity"].values[eps["mask"].values]
-    errors = eps["permittivity_real_standard_error"].values[eps["mask"].values]
-    assert shown.size > 0
-    assert np.all(shown.real + 2 * errors >= 1)
-    assert np.all(shown.imag - 2 * errors <= 1e-6)
-
-
-def test_the_errors_of_the_map_are_those_of_its_ratio(scan):
-    """A ratio off by its standard deviation moves the permittivity by its standard error."""
-    image = scan.image().sel(x_mm=45, y_mm=0, method="nearest")
-    eps = scan.permittivity_map().sel(x_mm=45, y_mm=0, method="nearest")
-    moved = permittivity_from_ratio(complex(image["p"]) + float(image["p_sigma"]) * 1e-3, float(image["incidence_rad"]))
-    change = abs(complex(moved) - complex(eps["permittivity"])) * 1e3
-    for part in ("real", "loss"):
-        assert float(eps[f"permittivity_{part}_standard_error"]) >= 0.99 * change
 
 
 # --- compare ----------------------------------------------------------------------------------------------------------

@@ -339,7 +339,8 @@ class Scan:
             `permittivity_loss_standard_error`; `mask` bool: True where the errors are below half of the value and
             a half space can have it (real part 1, loss 0 or more) within twice its errors. Errors
             of neighbouring pixels are mostly the same ones: a mean over a patch is no more certain than its pixels.
-            Pixels are corrected for known leakage only, patches for what the scene tells of it, too.
+            Pixels are corrected for the leakage and the incidence angle that the scene tells, and those of a patch for
+            all that is known of it: their median has the patch's permittivity.
 
         Raises
         ------

@@ -546,6 +546,8 @@ def error_budget(result: MaterialsResult, plane: PlaneEstimate | None) -> ErrorB
             paint_mm=round(inversion.paint_mm, 3),
         )
     leakage_h, leakage_v = inversion.leakage
+    # `analyse` removes only known leakage from the pixels.
+    removed_h, removed_v = inversion.leakage if inversion.leakage_determined else result.prior.leakage
     std_h, std_v = inversion.leakage_std
     angle_deg = float(np.degrees(np.mean(result.theta_rad) + inversion.theta_error_rad))
     angle_std_deg = float(np.degrees(inversion.theta_std_rad))
@@ -554,12 +556,18 @@ def error_budget(result: MaterialsResult, plane: PlaneEstimate | None) -> ErrorB
         plane_error = msgspec.convert(plane.to_dict(), PlaneError)
     return ErrorBudget(
         leakage=LeakageError(
-            h=(round(leakage_h.real, 5), round(leakage_h.imag, 5)),
-            v=(round(leakage_v.real, 5), round(leakage_v.imag, 5)),
+            h=_round_complex(leakage_h),
+            v=_round_complex(leakage_v),
             std=(round(std_h, 5), round(std_v, 5)),
             source=source,
+            removed_h=_round_complex(removed_h),
+            removed_v=_round_complex(removed_v),
         ),
         incidence=IncidenceError(deg=round(angle_deg, 4), std_deg=round(angle_std_deg, 4)),
         plane=plane_error,
         metal=metal,
     )
+
+
+def _round_complex(value: complex) -> tuple[float, float]:
+    return round(value.real, 5), round(value.imag, 5)

@@ -26,8 +26,9 @@ import numpy.typing as npt
 import scipy
 from msgspec import UNSET
 
-from polysight.materials import axis_mm, image_centre_mm, incidence_std_rad, permittivity_slope
-from polysight.polarimetry import incidence_choice, permittivity_from_ratio, specular_incidence_rad
+from polysight.materials import axis_mm, image_centre_mm
+from polysight.polarimetry import incidence_choice, specular_incidence_rad
+from polysight.products.permittivity_map import map_permittivity
 from polysight.products.processed import ProcessedScan, read_products
 from polysight.results import Figure, PatchFigures, Verdict, declared_figures, to_plain
 from polysight.store import MAX_BYTES
@@ -45,12 +46,6 @@ CONVENTION = (
     " real - j loss"
 )
 PLANE = ("y_mm", "x_mm")
-# Largest error of a permittivity that says something, relative to its size.
-LARGEST_ERROR = 0.5
-# Standard errors by which a permittivity may lie beyond what a half space can have.
-LARGEST_DEVIATION = 2.0
-# Step for the derivative by the incidence angle.
-_ANGLE_STEP_RAD = 1e-6
 _PART = "complex_part"
 UNREFERENCED = "none: h, v and p are in arbitrary units"
 
@@ -222,11 +217,9 @@ def patch_dataset(scan: ProcessedScan) -> xarray.Dataset:
 
 
 def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
-    """Return the permittivity of each pixel as a half space, with its standard errors.
+    """Return the permittivity of each pixel as a half space, with its standard errors (:func:`map_permittivity`).
 
-    Eq. 3 is analytic in 1 / P, so the error of P adds the same variance to both parts; that of the incidence angle adds
-    its own. `p_sigma` holds noise, leakage and the metal reference. Neighbouring pixels share most of their error:
-    averaging over a patch does not reduce it.
+    Neighbouring pixels share most of their error: averaging over a patch does not reduce it.
 
     Returns
     -------
@@ -247,35 +240,14 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
         raise _no_materials(scan)
     if scan.verdict is not None and not scan.verdict.usable:
         raise scan.verdict.error("the images are kept")
-    image = image_dataset(scan)
-    if "incidence_rad" in image:
-        theta_rad = np.asarray(image["incidence_rad"])
-    else:
-        theta_rad = np.float64(np.nan)
-    p = np.where(scan.valid, scan.p, np.nan).astype(np.complex128)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        value = permittivity_from_ratio(p, theta_rad)
-        value = np.where(np.isfinite(value), value, complex(np.nan, np.nan))
-        # d eps / d P = -permittivity_slope(1 / P) / P^2.
-        by_ratio = np.abs(permittivity_slope(1 / p, theta_rad) / p**2)
-        by_angle = (permittivity_from_ratio(p, theta_rad + _ANGLE_STEP_RAD) - value) / _ANGLE_STEP_RAD
-        if scan.images.p_sigma is None:
-            p_std = np.nan
-        else:
-            p_std = scan.images.p_sigma.astype(np.float64)
-        angle_std_rad = incidence_std_rad(scan.materials)
-        real_std = np.hypot(by_ratio * p_std, by_angle.real * angle_std_rad)
-        loss_std = np.hypot(by_ratio * p_std, by_angle.imag * angle_std_rad)
-        is_known = np.hypot(real_std, loss_std) < LARGEST_ERROR * np.abs(value)
-        # Edges of metal have ratios near 1, of which Eq. 3 makes large negative permittivities.
-        has_real_part = np.real(value) + LARGEST_DEVIATION * real_std >= 1.0
-        has_loss = -np.imag(value) + LARGEST_DEVIATION * loss_std >= 0.0
-        mask = is_known & has_real_part & has_loss
+    angle_deg = _incidence_deg(scan)
+    pixels = map_permittivity(scan, np.nan if angle_deg is None else np.radians(angle_deg))
+    mask = "True where the permittivity is possible and known to half of its size"
     data = {
-        "permittivity": _describe(PLANE, value, "1", "relative permittivity eps' - j eps'' as a half space"),
-        "permittivity_real_standard_error": _describe(PLANE, real_std, "1", "standard error of eps'"),
-        "permittivity_loss_standard_error": _describe(PLANE, loss_std, "1", "standard error of eps''"),
-        "mask": _describe(PLANE, mask, "1", "True where the permittivity is possible and known to half of its size"),
+        "permittivity": _describe(PLANE, pixels.value, "1", "relative permittivity eps' - j eps'' as a half space"),
+        "permittivity_real_standard_error": _describe(PLANE, pixels.real_std, "1", "standard error of eps'"),
+        "permittivity_loss_standard_error": _describe(PLANE, pixels.loss_std, "1", "standard error of eps''"),
+        "mask": _describe(PLANE, pixels.mask, "1", mask),
     }
     return xarray.Dataset(data, _axes(scan), provenance(scan))
 

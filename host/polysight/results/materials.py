@@ -535,13 +535,16 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
 class LeakageError(msgspec.Struct, frozen=True, kw_only=True):
     """Leakage of H and V into each other, relative to their own channel, with its standard deviations.
 
-    `source` is "measured", "scene", or "prior and scene" (hardly known).
+    `source` is "measured", "scene", or "prior and scene" (hardly known). `removed_h` and `removed_v` are what the
+    pixels of image.npz are free of.
     """
 
     h: Pair | None = None
     v: Pair | None = None
     std: Pair | None = None
     source: str = ""
+    removed_h: Pair | UnsetType = UNSET
+    removed_v: Pair | UnsetType = UNSET
 
 
 class IncidenceError(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,0 +1,154 @@
+"""Permittivity of each pixel of a processed scan, with its errors.
+
+The pixels of image.npz are relative to metal and free of known leakage. What the scene tells beyond that is in the
+error budget and in the patches: leakage and incidence angle apply to all pixels, drift, tilt and the error of the metal
+reference are known where a patch is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import UnsetType
+
+from polysight.materials import incidence_std_rad, permittivity_slope
+from polysight.polarimetry import correct_leakage, fresnel, permittivity_from_ratio
+from polysight.products.processed import ProcessedScan
+from polysight.results import ErrorBudget, LeakageError, Pair
+
+# Largest error of a permittivity that says something, relative to its size.
+LARGEST_ERROR = 0.5
+# Standard errors by which a permittivity may lie beyond what a half space can have.
+LARGEST_DEVIATION = 2.0
+# Step for the derivative by the incidence angle.
+_ANGLE_STEP_RAD = 1e-6
+
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class PermittivityMap:
+    """Permittivity of each pixel, [ny, nx].
+
+    Attributes
+    ----------
+    value
+        complex128, eps' - j eps''; not a number where the scan lights nothing.
+    real_std, loss_std
+        float64, standard errors.
+    mask
+        True where the permittivity is known and possible for a half space.
+    """
+
+    value: Complex
+    real_std: Real
+    loss_std: Real
+    mask: npt.NDArray[np.bool_]
+
+
+def map_permittivity(scan: ProcessedScan, theta_rad: npt.ArrayLike) -> PermittivityMap:
+    """Return the permittivity of each pixel as a half space.
+
+    The leakage and the incidence angle of the error budget are applied to every pixel. The pixels of a patch are moved
+    together, in V / H, so that their median has the patch's permittivity, and none is more certain than the patch.
+
+    Eq. 3 is analytic in 1 / P, so the error of P adds the same variance to both parts; that of the angle adds its own.
+    `p_sigma` holds noise, metal reference, and what is left of the leakage.
+
+    Parameters
+    ----------
+    scan
+        A scan with materials.
+    theta_rad
+        Nominal angle of incidence, one number or [ny, nx].
+    """
+    budget = (scan.materials and scan.materials.error_budget) or None
+    angle_rad = _estimated_angle(np.asarray(theta_rad, np.float64), budget)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        measured = 1 / np.where(scan.valid, scan.p, np.nan).astype(np.complex128)
+        inverse = measured
+        if budget is not None and budget.leakage is not None:
+            inverse = _without_leakage(measured, budget.leakage)
+        inverse, least_real_std, least_loss_std = _as_patches(scan, inverse, angle_rad)
+        value = permittivity_from_ratio(1 / inverse, angle_rad)
+        value = np.where(np.isfinite(value), value, complex(np.nan, np.nan))
+        by_ratio = np.abs(permittivity_slope(inverse, angle_rad))
+        by_angle = (permittivity_from_ratio(1 / inverse, angle_rad + _ANGLE_STEP_RAD) - value) / _ANGLE_STEP_RAD
+        inverse_std = np.full(value.shape, np.nan)
+        if scan.images.p_sigma is not None:
+            # d (1 / P) = -dP / P^2.
+            inverse_std = scan.images.p_sigma.astype(np.float64) * np.abs(measured) ** 2
+        angle_std_rad = incidence_std_rad(scan.materials)
+        real_std = np.fmax(np.hypot(by_ratio * inverse_std, by_angle.real * angle_std_rad), least_real_std)
+        loss_std = np.fmax(np.hypot(by_ratio * inverse_std, by_angle.imag * angle_std_rad), least_loss_std)
+        return PermittivityMap(value, real_std, loss_std, _is_known_half_space(value, real_std, loss_std))
+
+
+def _estimated_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:
+    """Return the angle of incidence with the error that the scene tells, radians; the nominal one if it tells none."""
+    if budget is None or budget.incidence is None or budget.incidence.deg is None:
+        return theta_rad
+    return theta_rad + (np.radians(budget.incidence.deg) - theta_rad.mean())
+
+
+def _without_leakage(inverse: Complex, leakage: LeakageError) -> Complex:
+    """Return V / H without the estimated leakage, instead of without that which the pixels are free of.
+
+    Unchanged if the products do not say what was removed.
+    """
+    removed_h = _as_complex(leakage.removed_h)
+    removed_v = _as_complex(leakage.removed_v)
+    estimated_h = _as_complex(leakage.h)
+    estimated_v = _as_complex(leakage.v)
+    if removed_h is None or removed_v is None or estimated_h is None or estimated_v is None:
+        return inverse
+    # The channels as received, see `correct_leakage`.
+    h = (1 + removed_h * inverse) / (1 + removed_h)
+    v = (inverse + removed_v) / (1 + removed_v)
+    h, v = correct_leakage(h, v, estimated_h, estimated_v)
+    return v / h
+
+
+def _as_complex(pair: Pair | UnsetType | None) -> complex | None:
+    if not pair or pair[0] is None or pair[1] is None:
+        return None
+    return complex(pair[0], pair[1])
+
+
+def _as_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tuple[Complex, Real, Real]:
+    """Move V / H of the pixels of each patch, so that their median has the patch's permittivity.
+
+    Return it with the standard errors of the patch in each pixel, real part and loss; 0 outside of patches.
+    """
+    moved = inverse.copy()
+    real_std = np.zeros(inverse.shape)
+    loss_std = np.zeros(inverse.shape)
+    for patch in scan.segments:
+        value = patch.permittivity_value
+        if value is None:
+            continue
+        of_patch = scan.labels == patch.label
+        inside = of_patch & np.isfinite(inverse)
+        if scan.interior is not None:
+            inside &= scan.interior
+        if not inside.any():
+            continue
+        patch_angle = float(np.broadcast_to(angle_rad, inverse.shape)[inside].mean())
+        r_s, r_p = fresnel(value, patch_angle)
+        median = complex(np.median(inverse[inside].real), np.median(inverse[inside].imag))
+        moved[of_patch] += complex(r_p / r_s) - median
+        real_std[of_patch] = patch.permittivity_real_std or 0.0
+        loss_std[of_patch] = patch.permittivity_loss_std or 0.0
+    return moved, real_std, loss_std
+
+
+def _is_known_half_space(value: Complex, real_std: Real, loss_std: Real) -> npt.NDArray[np.bool_]:
+    """Return where the errors are below half of the value and a half space can have it within twice its errors."""
+    is_known = np.hypot(real_std, loss_std) < LARGEST_ERROR * np.abs(value)
+    # Edges of metal have ratios near 1, of which Eq. 3 makes large negative permittivities.
+    has_real_part = np.real(value) + LARGEST_DEVIATION * real_std >= 1.0
+    has_loss = -np.imag(value) + LARGEST_DEVIATION * loss_std >= 0.0
+    return is_known & has_real_part & has_loss

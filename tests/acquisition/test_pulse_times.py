@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.support.acquisition.arrival_model import FRAME_NS, MS, PAYLOAD, US, Load, pulse_times, receive
+from tests.support.acquisition.arrival_model import FRAME_NS, MS, PAYLOAD, Load, pulse_times, receive
 from tests.support.capture.records import make_mask
 from tests.support.rigs import published_rig
 
@@ -149,54 +149,3 @@ def test_a_whole_row_is_never_taken_for_a_slipped_one(load, seed, drift, frame):
     assert not result.contradicted
     if load == QUIET:
         assert (result.reason, result.uncertain) == ("", 0)
-
-
-FAULTS = ("missed", "spurious", "near", "lost", "stalled")
-
-
-def draw_edges(pulses: np.ndarray, faults: tuple[str, ...], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edges that a radar takes for pulses, and the pulse of each, -2 for a spurious one."""
-    edges = pulses.reshape(-1)
-    truth = np.arange(pulses.size)
-    if "missed" in faults:
-        lost_frames = rng.choice(edges.size, rng.integers(1, 4), replace=False)
-        edges = np.delete(edges, lost_frames)
-        truth = np.delete(truth, lost_frames)
-    if "near" in faults:
-        k = int(rng.integers(edges.size))
-        edges = edges.copy()
-        truth = truth.copy()
-        edges[k] += rng.choice([-1, 1]) * rng.integers(350, 700) * US
-        truth[k] = -2
-    if "spurious" in faults:
-        for _ in range(rng.integers(1, 3)):
-            extra = int(rng.integers(pulses[0, 0], pulses[-1, -1]))
-            # An edge within a frame or just behind it starts none; at a missed pulse it makes that pulse's frame.
-            if np.abs(np.append(edges, pulses) - extra).min() > 350 * US:
-                place = int(np.searchsorted(edges, extra))
-                edges = np.insert(edges, place, extra)
-                truth = np.insert(truth, place, -2)
-    return edges[: pulses.size], truth[: pulses.size]
-
-
-def test_whatever_happens_no_frame_is_at_a_wrong_pulse(request):
-    """Bursts of one pulse to sixteen, frames of one packet and more, faults of radar, wires, network and host."""
-    chance = np.random.default_rng(7)
-    for seed in range(10_000 if request.config.getoption("--long") else 300):
-        rng = np.random.default_rng(seed)
-        faults = tuple(chance.choice(FAULTS, int(chance.integers(1, 4)), replace=False).tolist())
-        bursts, count = [(12, 16), (30, 1), (7, 13), (7, 12), (40, 2)][chance.integers(5)]
-        frame = int(chance.choice([1456, 4096]))
-        pulses = pulse_times(bursts, count)
-        edges, truth = draw_edges(pulses, faults, rng)
-        if "lost" in faults:
-            lost_packets = frozenset(rng.choice(edges.size * frame // PAYLOAD, 2).tolist())
-        else:
-            lost_packets = frozenset()
-        load = Load(20, 3) if "stalled" in faults else QUIET
-        arrivals, answer = receive(edges, pulses, frame, rng, load, lost_packets)
-        result = place(pulses, answer, arrivals, frame)
-        assert result.is_timed
-        placed = np.flatnonzero(result.slots >= 0)
-        wrong = placed[result.slots[placed] != truth[placed]]
-        assert not wrong.size, (seed, bursts, count, frame, faults, wrong[:5], result.slots[wrong[:5]])

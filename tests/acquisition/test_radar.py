@@ -21,8 +21,6 @@ from polysight_shared.config import Instrument, Radar
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
 from polysight_shared.tables import decode, to_builtins
-from polysight_simulators.faults import Faults
-from polysight_simulators.radars import LineServer
 
 
 class Server:
@@ -279,19 +277,3 @@ def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_
 
 
 # --- the simulated server ---
-
-
-def test_simulated_server_arms_once_a_line_and_has_its_faults():
-    armed = []
-    server = LineServer("127.0.0.1:0", lambda: armed.append(1), Faults(retrigger_fails=(1,), retrigger_resets=(3,)))
-    address = f"127.0.0.1:{server._listener.getsockname()[1]}"
-    with LineServers({"RH": address}, 5.0) as radars:
-        for n, want in enumerate([1, 1, 2, 2], 1):
-            radars.arm(1)
-            wait_for(lambda n=n: server.serve() or server.lines == n, "radar")
-            assert len(armed) == want
-        wait_for(lambda: radars.states()["RH"].state is RadarState.FAULT, "radar")
-        radars.arm(1)
-        wait_for(lambda: server.serve() or server.lines == 5, "radar")
-        assert len(armed) == 3
-    server.close()

@@ -132,16 +132,6 @@ def test_a_line_at_every_tenth_of_the_scan():
     assert said[1:] == [f"{n} of 20 rows, {ROWS - n}:00 left" for n in range(2, ROWS + 1, 2)]
 
 
-def test_time_left_in_words():
-    def seconds_left(seconds: float | None) -> str:
-        return show_progress(make_progress(1, seconds), terminal=False).strip()
-
-    assert seconds_left(None) == "1 of 20 rows,"
-    assert seconds_left(5.4) == "1 of 20 rows, 0:05 left"
-    assert seconds_left(3599.6) == "1 of 20 rows, 1:00:00 left"
-    assert seconds_left(2 * 3600 + 3 * 60 + 4) == "1 of 20 rows, 2:03:04 left"
-
-
 def test_notices_are_shown_and_steps_are_not():
     step = {"rows": ROWS, "committed": 3, "row": 4, "take": 1}
     answer = ("warning", "retake", "home", "check", "connect", "stop", "held", "wait", "end")
@@ -149,15 +139,3 @@ def test_notices_are_shown_and_steps_are_not():
         *(ScanProgress(phase, f"so {phase}", **step) for phase in (*answer, "row", "state")), terminal=False
     )
     assert said.splitlines() == [f"{phase}: so {phase}" for phase in answer]
-
-
-def test_bars_over_rows_and_points_on_a_terminal():
-    step = ScanProgress("state", "", ROWS, 3, row=4, take=1, points=7, row_points=140, remaining_s=90.0)
-    said = show_progress(step, terminal=True)
-    assert re.search(r"rows .*3/20 +1:30 left", said)
-    assert re.search(r"row 4 .*7/140", said)
-    assert "take" not in said
-    again = ScanProgress("state", "", ROWS, 3, row=4, take=2, points=0, row_points=140)
-    assert "row 4 take 2" in show_progress(again, terminal=True)
-    assert "points" not in show_progress(make_progress(1, None), terminal=True), "no bar before a row has points"
-    assert " rows, " not in show_progress(make_progress(2, 60.0), terminal=True), "lines are for what is no terminal"

@@ -13,7 +13,6 @@ import resource
 import signal
 import subprocess
 import sys
-from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,13 +22,12 @@ from tests.support.paths import REPO
 from tests.support.pi.program import WiresLog, require_stand_in_chip, run
 from tests.support.processes import wait_for
 from tests.support.rigs import timed_by_spi
-from tests.support.stage.processes import StageProcess
 
 from polysight_pi.system import OTHERS_PRIORITY, PRIORITY
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault
 from polysight_shared.wires import WireEdge
-from polysight_simulators import gpio, uno
+from polysight_simulators import gpio
 
 require_stand_in_chip()
 
@@ -307,47 +305,6 @@ def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_
     assert "512 bytes" in small["SYNC_IN line 10"]["found"]
     assert "options spidev bufsiz=4096" in small["pulse width"]["remedy"]
     assert not wires.rises(MOSI)
-
-
-@pytest.mark.slow
-def test_every_point_of_a_row_is_a_burst(gpio_rig, hub, wires, start, write_config, tmp_path):
-    """The whole chain: the sketch's machine code on an emulated UNO, serial line, trigger wire, bindings, chip.
-
-    The published burst and spacing in wire time, so that the machine may be busy; `make test-uml` has 350 points.
-    """
-    if lacking := uno.missing():
-        pytest.skip(f"no emulated UNO without {' '.join(lacking)}: {uno.ENABLING_COMMAND}")
-    points = 100
-    pulses = 16
-    period_ns = 1_500_000
-    place = {"centre_x_mm": points + 3.0, "centre_y_mm": 2.0}
-    rig = replace(
-        gpio_rig,
-        grid=replace(gpio_rig.grid, columns=points, rows=1),
-        burst=replace(gpio_rig.burst, pulses=pulses, period_us=period_ns / 1e3),
-        stage=replace(gpio_rig.stage, port=str(tmp_path / "ttySTAGE"), heartbeat_ms=10_000, **place),
-    )
-    with closing(StageProcess(tmp_path, "uno", 3.0, hub, write_config(rig))):
-        program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub, wire_time=True))
-        host.must_accept(host.begin())
-        host.home()
-        done = host.row(0)
-        wires.until(lambda: len(wires.rises(SYNC)) == done.pulses)
-        assert (done.status, program.end()[0], wires.level(SYNC)) == ("done", 0, 0), done.reason
-    assert (done.points, done.edges, done.bursts, done.pulses) == (points, points, points, points * pulses)
-    assert len(wires.rises(TRIGGER)) == points
-    assert [e.seq for e in host.journalled] == list(range(1, len(host.journalled) + 1))
-    captures = host.list_events(m.Capture)
-    assert [(c.point, c.column, c.pulses) for c in captures] == [(i, i, pulses) for i in range(points)]
-    edges = [e for e in wires.edges if e.line == SYNC]
-    assert [e.value for e in edges] == [1, 0] * (points * pulses)
-    for c in captures:
-        burst = edges[2 * pulses * c.point : 2 * pulses * (c.point + 1)]
-        widths = [fall.t_ns - rise.t_ns for rise, fall in zip(burst[::2], burst[1::2], strict=True)]
-        assert max(widths) <= c.width_max_ns, "the bound holds for every pulse on the wire"
-        assert c.edge_ns < c.first_pulse_ns <= burst[0].t_ns
-        drift = c.last_pulse_ns - c.first_pulse_ns - (pulses - 1) * period_ns
-        assert abs(drift) <= c.jitter_ns, "deadlines are absolute: only the last pulse's own lateness shows"
 
 
 PR_CAPBSET_DROP = 24

@@ -305,12 +305,6 @@ def test_an_interrupted_flash_write_reports_the_parts_written(rig_file, words, b
     assert board.cores.flash != make_image()
 
 
-def test_the_simulated_board_refuses_an_empty_trace(tmp_path):
-    (tmp_path / "a").write_text("")
-    with pytest.raises(ValueError, match="trace"):
-        replay(tmp_path / "a", RadarBoard)
-
-
 @pytest.mark.usefixtures("opened_boards")
 def test_a_truncated_trace_replays_to_its_end(rig_file, capsys, tmp_path):
     trace = tmp_path / "day.jsonl"

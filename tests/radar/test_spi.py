@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 from tests.support.refusals import refused
 
-from polysight.radar.commands import DEVICE_CONFIGURATION, GET_TEMPERATURES, LOW_POWER_OFF, RF_POWER_UP
+from polysight.radar.board import RadarBoard
+from polysight.radar.commands import (
+    DEVICE_CONFIGURATION,
+    GET_TEMPERATURES,
+    LOW_POWER_OFF,
+    RF_POWER_UP,
+    Chirp,
+    LdoBypass,
+    program,
+)
 from polysight.radar.link import ATTEMPTS, Link
 from polysight.radar.messages import CALIBRATION_REPORT, MAIN_POWER_UP, READY_TO_READ, RF_POWER_UP_DONE, decode
 from polysight_shared.error_codes import ErrorCode
-from polysight_simulators.radars import Fault
+from polysight_simulators.radars import Fault, make_image
+from polysight_simulators.radars import RadarBoard as Simulated
 
 
 def ignore(_):
@@ -133,3 +146,36 @@ def test_an_unplugged_link_is_an_error_at_once(link, board):
 def test_an_event_that_does_not_come_is_a_timeout_with_its_number(link):
     with refused(ErrorCode.NO_ANSWER, "0x100B", "2 s"):
         link.wait_for((0x100B,), 2.0, ignore)
+
+
+# --- several commands, each disturbed --------------------------------------------------------------------------------
+
+RIG = native_rig()
+LOST = st.sampled_from([Fault.NACK, Fault.BAD_CRC, Fault.BAD_CHECKSUM, Fault.LOST_INTERRUPT, Fault.NO_ANSWER])
+HARMLESS = st.sampled_from([Fault.EVENT_BETWEEN, Fault.BAD_SYNC])
+
+
+def _faults_of_one_command() -> st.SearchStrategy[list[Fault]]:
+    lost_words = st.lists(LOST, max_size=2)
+    return st.one_of(lost_words, st.tuples(lost_words, HARMLESS).map(lambda t: [*t[0], t[1]]))
+
+
+@settings(deadline=None)
+@given(st.lists(_faults_of_one_command(), min_size=1, max_size=8))
+def test_commands_are_executed_once_in_order_although_messages_are_lost(faults_of_each: list[list[Fault]]):
+    """Twice only if the answer was lost and its retry was damaged, because a NACK requires a new sequence number."""
+    clock = VirtualClock()
+    board = Simulated(lambda: clock.time, flash=make_image())
+    radar = RadarBoard("RH", BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")))
+    radar.configure()
+    board.executed.clear()
+    link: Link = radar.link
+    result = []
+    for n, faults in enumerate(faults_of_each):
+        sent = (LOW_POWER_OFF, LdoBypass(), Chirp(0))[n % 3]
+        board.inject(*faults)
+        link.call(sent)
+        unheard = (Fault.NACK, Fault.NO_ANSWER)
+        twice = len(faults) > 1 and faults[0] not in unheard and faults[1] is Fault.NACK
+        result += [sent.ID] * (2 if twice else 1)
+    assert board.executed == result

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.support.rigs import published_rig
-from tests.support.scenes import COPPER, PET, scene_of
 from tests.support.store.facts import facts_of, parse_fact
 from tests.support.store.plain_scan import errors, write_scan
 
@@ -17,7 +15,6 @@ from polysight.store import manifest
 from polysight.store.manifest import ManifestWriter, encode_line, parse
 from polysight.store.scan_folder import MANIFEST, ScanFolder
 from polysight.store.validation import to_text, validate
-from polysight_simulators.scene import decode_scene, simulate
 
 SOME = [{"fact": "scan_started"}, *({"fact": "row_committed", "row": k} for k in range(5)), {"fact": "scan_ended"}]
 
@@ -33,11 +30,6 @@ def chain_lines(path: Path, facts=SOME) -> list[bytes]:
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory) -> list[bytes]:
     return chain_lines(tmp_path_factory.mktemp("chain"))
-
-
-def test_a_whole_chain_has_no_faults_and_facts_are_without_it(lines):
-    content = parse(b"".join(lines))
-    assert (len(content.facts), content.faults) == (len(SOME), [])
 
 
 @given(st.integers(0, len(SOME) - 2), st.integers(1, 3))
@@ -136,10 +128,3 @@ def test_a_row_withdrawn_after_the_end_is_no_fault_of_the_manifest(scan):
     with ScanFolder.load(scan).writer() as writer:
         writer.append({"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["its file changed"]})
     assert ScanFolder.load(scan).manifest_faults == ()
-
-
-def test_simulated_scans_are_chained_and_counted(tmp_path):
-    folder = simulate(published_rig(), decode_scene(scene_of(COPPER, PET, columns=2, rows=3), "t"), tmp_path / "scan")
-    assert ScanFolder.load(folder).manifest_faults == ()
-    remove_line(folder, 3)
-    assert {f.facts["line"] for f in ScanFolder.load(folder).manifest_faults} == {3}

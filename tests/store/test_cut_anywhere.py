@@ -234,16 +234,3 @@ def test_row_that_is_not_committed_may_be_anything(undisturbed_scan, tmp_path, s
         (scan.path / f"raw/RV/0002{suffix}").write_bytes(raw[:cut])
         assert faults(scan) == []
         assert resume(scan, undisturbed_scan) == {2}
-
-
-def test_withdrawn_row_counts_again_once_it_is_taken(undisturbed_scan, tmp_path):
-    scan = undisturbed_scan.copy(tmp_path / "s")
-    folder = ScanFolder.load(scan.path)
-    fact = facts_of(folder, "row_committed")[1]
-    with folder.writer() as writer:
-        writer.append({"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["test"]})
-        folder.reload()
-        assert list(folder.committed_rows()) == [0, 2]
-        writer.append(fact)
-    folder.reload()
-    assert list(folder.committed_rows()) == [0, 1, 2]

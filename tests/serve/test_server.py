@@ -89,7 +89,7 @@ def test_the_page_needs_nothing_from_elsewhere():
     for path in STATIC.iterdir():
         addresses = set(re.findall(r"https?://[^\s\"'<)]+", path.read_text(encoding="utf-8")))
         assert addresses <= {"http://www.w3.org/2000/svg"}, path
-    assert 'src="' in (STATIC / "watch.html").read_text()
+    assert 'src="' in (STATIC / "frame.html").read_text()
 
 
 def test_a_page_that_never_reads_holds_nobody_up(growing, watching):

@@ -40,16 +40,17 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
 STATIC = Path(__file__).parent / "static"
+# Name of a page's content and script, title, and style sheet.
 PAGES = {
-    "/": "catalogue.html",
-    "/scan": "scan.html",
-    "/watch": "watch.html",
-    "/new": "new.html",
-    "/compare": "compare.html",
-    "/surface": "surface.html",
-    "/check": "check.html",
+    "/": ("catalogue", "Scans · polysight", "catalogue"),
+    "/scan": ("scan", "Scan · polysight", "scan"),
+    "/watch": ("watch", "polysight", "watch"),
+    "/new": ("new", "New scan · polysight", "new"),
+    "/compare": ("compare", "Compare · polysight", "scan"),
+    "/surface": ("surface", "Surfaces · polysight", "scan"),
+    "/check": ("check", "Check plate · polysight", "scan"),
 }
-MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+MEDIA_TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 # While the reading process starts, or is started again.
 READER_PATIENCE_S = 20.0
 CONNECT_INTERVAL_S = 0.1
@@ -124,6 +125,7 @@ def page_routes(front: Front) -> list[Route]:
         if path.suffix in MEDIA_TYPES
     }
     files["favicon.ico"] = files["icon.svg"]
+    pages = {path: Response(frame_page(*parts), media_type="text/html") for path, parts in PAGES.items()}
 
     async def show_page(request: Request) -> Response:
         path = request.url.path
@@ -133,7 +135,7 @@ def page_routes(front: Front) -> list[Route]:
             return RedirectResponse("/watch")
         if path in ("/scan", "/watch") and only is None and not request.query_params.get("scan"):
             return RedirectResponse("/")
-        return files[PAGES[path]]
+        return pages[path]
 
     async def send_file(request: Request) -> Response:
         answer = files.get(request.path_params["name"])
@@ -155,8 +157,15 @@ def page_routes(front: Front) -> list[Route]:
         )
         return Response(msgspec.json.encode(facts), media_type="application/json")
 
-    pages = [Route(path, show_page) for path in PAGES]
-    return [*pages, Route("/{name}", send_file), Route("/api/page", describe_page)]
+    shown = [Route(path, show_page) for path in PAGES]
+    return [*shown, Route("/{name}", send_file), Route("/api/page", describe_page)]
+
+
+def frame_page(name: str, title: str, style: str) -> str:
+    """A page's content in the frame of all pages."""
+    frame = (STATIC / "frame.html").read_text(encoding="utf-8")
+    content = (STATIC / f"{name}.html").read_text(encoding="utf-8")
+    return frame.format(name=name, title=title, style=style, content=content)
 
 
 def control_routes(front: Front) -> list[Route]:

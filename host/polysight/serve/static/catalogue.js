@@ -123,7 +123,7 @@ by("train").addEventListener("submit", async (event) => {
 by("tools").addEventListener("submit", (event) => event.preventDefault());
 for (const id of ["find", "state", "tag", "sort"]) by(id).addEventListener("input", show);
 
-server = await begin("Scans");
+server = await begin();
 await look();
 if ((await get("program/train"))?.running) {
   by("train").hidden = false;

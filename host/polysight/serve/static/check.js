@@ -69,7 +69,7 @@ async function look() {
   } catch (error) { complain("told", error); }
 }
 
-await begin("Check plate");
+await begin();
 by("plate").addEventListener("change", show);
 addEventListener("resize", show);
 await look();

@@ -128,6 +128,22 @@ export function tell(id, text) {
   node.hidden = !text;
 }
 
+/** What was found, why, and what to do, as an item of a list. */
+export function finding({ what, why, do: remedy }, separator = ": ") {
+  const item = nest(make("li"), nest(make("b"), ...rich(what)));
+  if (why) item.append(nest(make("span", separator, "why"), ...rich(why)));
+  if (remedy) item.append(nest(make("span", "→ ", "do"), ...rich(remedy)));
+  return item;
+}
+
+/** A started program, and what it printed. */
+export function showProgram(program, isShown) {
+  by("program").hidden = !program || !isShown;
+  if (!program) return;
+  by("program-title").textContent = `polysight ${program.kind} ${ending(program)}`;
+  if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "No output yet.";
+}
+
 /** An error where it belongs, or nothing. */
 export function complain(id, error) {
   if (error?.code === INTERRUPTED) return; // the next look reads it

@@ -82,7 +82,7 @@ async function compare() {
   } catch (error) { complain("told", error); }
 }
 
-await begin("Compare");
+await begin();
 try {
   const { scans } = await get("scans");
   const good = scans.filter((s) => s.processed || s.images_only).map((s) => s.name);

@@ -1,5 +1,6 @@
 // A new scan: its plan while it is typed, the doctor's findings, and the start.
 import { badge, begin, by, bytes, complain, get, make, nest, pageOf, post, rich, span } from "./common.js";
+import "./stage.js";
 
 const NUMBERS = ["columns", "rows", "step_x_mm", "step_y_mm", "speed_mm_s", "pulses"];
 const LEVELS = { ok: ["ok", "good"], warning: ["warning", "warn"], error: ["error", "bad"], "not checked": ["not checked", "wait"] };
@@ -163,7 +164,7 @@ by("enqueue").addEventListener("click", enqueue);
 by("release").addEventListener("click", () => change("release", {}));
 by("form").addEventListener("submit", (event) => { event.preventDefault(); if (!confirmed) start(); });
 
-await begin("New scan");
+await begin();
 by("name").value = `scan-${stamp()}`;
 by("materials").open = innerWidth > 640;
 try {

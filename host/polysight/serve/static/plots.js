@@ -19,25 +19,32 @@ export function ticks(low, high, n) {
   return found;
 }
 
+/** An empty drawing as large as its place, with the values of its upright axis: x from `left` to `right`, y by `py`. */
+function frame(place, [low, high], left, below) {
+  const width = place.clientWidth || 320, height = place.clientHeight || 230;
+  const right = width - 14, top = 22, bottom = height - below;
+  const svg = document.createElementNS(SVG, "svg");
+  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  const py = (v) => bottom - ((v - low) / (high - low)) * (bottom - top);
+  for (const v of ticks(low, high, 4)) {
+    add(svg, "line", { x1: left, x2: right, y1: py(v), y2: py(v), class: "axis" });
+    add(svg, "text", { x: left - 5, y: py(v) + 4, "text-anchor": "end" }, v);
+  }
+  place.replaceChildren(svg);
+  return { svg, width, height, right, top, bottom, py };
+}
+
 /**
  * Lines on axes. what: { x: [low, high], y: [low, high], xLabel, yLabel, lines: [{ x, y, style, name }],
  * upright: [{ x, name }], level: [{ y, name }], scene: [low, high] with its name }. Points whose y is null are left out.
  */
 export function plot(place, what) {
-  const width = place.clientWidth || 320, height = place.clientHeight || 230;
-  const left = 42, right = width - 14, top = 22, bottom = height - 34;
-  const at = (v, [a, b], from, to) => from + ((v - a) / (b - a)) * (to - from);
-  const px = (v) => at(v, what.x, left, right), py = (v) => at(v, what.y, bottom, top);
-  const svg = document.createElementNS(SVG, "svg");
-  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  const left = 42, { svg, width, height, right, top, bottom, py } = frame(place, what.y, left, 34);
+  const px = (v) => left + ((v - what.x[0]) / (what.x[1] - what.x[0])) * (right - left);
   if (what.scene) {
     const [a, b] = what.scene.map((v) => Math.min(right, Math.max(left, px(v))));
     add(svg, "rect", { x: a, y: top, width: b - a, height: bottom - top, class: "scene" });
     add(svg, "text", { x: (a + b) / 2, y: top + 10, "text-anchor": "middle" }, what.sceneName);
-  }
-  for (const v of ticks(...what.y, 4)) {
-    add(svg, "line", { x1: left, x2: right, y1: py(v), y2: py(v), class: "axis" });
-    add(svg, "text", { x: left - 5, y: py(v) + 4, "text-anchor": "end" }, v);
   }
   for (const v of ticks(...what.x, Math.min(6, width / 70))) {
     add(svg, "line", { x1: px(v), x2: px(v), y1: bottom, y2: bottom + 4, class: "axis" });
@@ -45,7 +52,7 @@ export function plot(place, what) {
   }
   add(svg, "text", { x: right, y: height - 3, "text-anchor": "end" }, what.xLabel);
   add(svg, "text", { x: 2, y: 12 }, what.yLabel);
-  for (const { y, name } of what.level ?? []) {
+  for (const { y } of what.level ?? []) {
     add(svg, "line", { x1: left, x2: right, y1: py(y), y2: py(y), class: "direct" });
   }
   for (const { x, name } of what.upright ?? []) {
@@ -69,7 +76,6 @@ export function plot(place, what) {
   for (const { y, name } of what.level ?? []) {
     add(svg, "text", { x: right - 2, y: py(y) - 5, "text-anchor": "end", class: "direct-name" }, name);
   }
-  place.replaceChildren(svg);
 }
 
 /**
@@ -77,19 +83,11 @@ export function plot(place, what) {
  * `known`, bar: half height of the error bar. A point is a link to its scan.
  */
 export function control(place, points, label) {
-  const width = place.clientWidth || 320, height = place.clientHeight || 230;
-  const left = 46, right = width - 14, top = 22, bottom = height - 24;
-  const ends = points.flatMap((p) => [p.known - p.band, p.known + p.band, ...(p.value === null ? [] : [p.value - p.bar, p.value + p.bar])]);
+  const left = 46, ends = points.flatMap((p) => [p.known - p.band, p.known + p.band, ...(p.value === null ? [] : [p.value - p.bar, p.value + p.bar])]);
   let [low, high] = [Math.min(...ends), Math.max(...ends)];
   if (low === high) [low, high] = [low - 0.01, high + 0.01];
-  const slot = (right - left) / points.length;
-  const px = (i) => left + (i + 0.5) * slot, py = (v) => bottom - ((v - low) / (high - low)) * (bottom - top);
-  const svg = document.createElementNS(SVG, "svg");
-  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
-  for (const v of ticks(low, high, 4)) {
-    add(svg, "line", { x1: left, x2: right, y1: py(v), y2: py(v), class: "axis" });
-    add(svg, "text", { x: left - 5, y: py(v) + 4, "text-anchor": "end" }, v);
-  }
+  const { svg, height, right, bottom, py } = frame(place, [low, high], left, 24);
+  const slot = (right - left) / points.length, px = (i) => left + (i + 0.5) * slot;
   points.forEach((p, i) => {
     const from = px(i) - slot / 2;
     add(svg, "rect", { x: from, y: py(p.known + p.band), width: slot, height: Math.max(py(p.known - p.band) - py(p.known + p.band), 1), class: "known" });
@@ -108,7 +106,6 @@ export function control(place, points, label) {
   });
   add(svg, "text", { x: 2, y: 12 }, label);
   add(svg, "text", { x: right, y: height - 3, "text-anchor": "end" }, "scans, oldest to newest");
-  place.replaceChildren(svg);
 }
 
 /** The rows as bands (row 0 at the bottom, as y grows upwards), the running row's part, and the stage. */

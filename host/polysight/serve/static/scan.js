@@ -1,6 +1,6 @@
 // One scan: its images, what was found in them, and what can be done with it.
 import { ImageView, caption, outline } from "./view.js";
-import { INTERRUPTED, badge, begin, by, bytes, called, address, complain, day, ending, fill, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, showScale, signed, STATES, VERDICTS } from "./common.js";
+import { INTERRUPTED, badge, begin, by, bytes, called, address, complain, day, fill, finding, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, showProgram, showScale, signed, STATES, VERDICTS } from "./common.js";
 import { Labels } from "./label.js";
 import { clearProbe, showProbe } from "./probe.js";
 
@@ -35,12 +35,7 @@ function showHead() {
 }
 
 function showReasons() {
-  by("reasons").replaceChildren(...(result?.verdict?.reasons ?? []).map((r) => {
-    const item = nest(make("li"), ...rich(r.what));
-    if (r.why) item.append(nest(make("span", ": ", "why"), ...rich(r.why)));
-    if (r.do) item.append(nest(make("span", "→ ", "do"), ...rich(r.do)));
-    return item;
-  }));
+  by("reasons").replaceChildren(...(result?.verdict?.reasons ?? []).map((reason) => finding(reason)));
 }
 
 // --- the images ---
@@ -146,11 +141,7 @@ async function follow() {
   try { now = await get("scan", scan); } catch (error) { complain("told", error); return; }
   summary = now;
   const [program] = summary.programs;
-  by("program").hidden = !program || (!program.running && program.status === 0 && running === "");
-  if (program) {
-    by("program-title").textContent = `polysight ${program.kind} ${ending(program)}`;
-    if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "No output yet.";
-  }
+  showProgram(program, program?.running || program?.status !== 0 || running !== "");
   const was = running;
   running = program?.running ? program.kind : "";
   showHead();
@@ -265,7 +256,7 @@ by("copy").addEventListener("click", async () => {
   try { await navigator.clipboard.writeText(by("code").textContent); by("copied").textContent = "Copied."; } catch { by("copied").textContent = "Select it and copy."; }
 });
 
-server = await begin(scanName || "Scan");
+server = await begin(scanName);
 try {
   summary = await get("scan", scan);
   by("side").hidden = by("snippet").hidden = false;

@@ -131,5 +131,5 @@ async function start() {
   draw();
 }
 
-await begin("Surfaces");
+await begin();
 start().catch((error) => complain("told", error));

@@ -1,5 +1,5 @@
 // The live view's page: hears the newest state from the server, shows it, and asks for what a button says.
-import { address, begin, by, clock, complain, confirmAbort, control, ending, get, grouped, make, pageOf, post, rich, scanName, signed, span, tell, VERDICTS } from "./common.js";
+import { address, begin, by, clock, complain, confirmAbort, control, finding, get, grouped, make, nest, pageOf, post, scanName, showProgram, signed, span, tell, VERDICTS } from "./common.js";
 import { plot, raster } from "./plots.js";
 
 const SILENT_MS = 7000; // the server says something every two seconds
@@ -8,9 +8,9 @@ const CHANNELS = [["h", "H", "s-polarised"], ["v", "V", "p-polarised"], ["p", "P
 const FEW = 4;
 // Name, class, and what a press does; what may be pressed says the status.
 const BUTTONS = {
-  pause: ["Pause after this row", "", () => ask("pause")],
-  continue: ["Continue", "", () => ask("continue")],
-  stop: ["Stop after this row", "", () => ask("stop")],
+  pause: ["Pause after this row", "", () => command("pause")],
+  continue: ["Continue", "", () => command("continue")],
+  stop: ["Stop after this row", "", () => command("stop")],
   resume: ["Resume the scan", "main", () => start("resume")],
   again: ["Try again", "main", () => start("again")],
   process: ["Process", "main", () => start("process")],
@@ -59,18 +59,7 @@ function showResult() {
   if (!told) return;
   by("result").dataset.level = told.level;
   by("result-level").textContent = VERDICTS[told.level][0];
-  by("reasons").replaceChildren(...told.reasons.map((r) => {
-    const item = make("li"), what = make("b"), why = make("span", r.why && ": ", "why");
-    what.append(...rich(r.what));
-    if (r.why) why.append(...rich(r.why));
-    item.append(what, why);
-    if (r.do) {
-      const todo = make("span", "→ ", "do");
-      todo.append(...rich(r.do));
-      item.append(todo);
-    }
-    return item;
-  }));
+  by("reasons").replaceChildren(...told.reasons.map((reason) => finding(reason)));
 }
 
 function showButtons() {
@@ -86,25 +75,14 @@ function showButtons() {
 function buildChannels() {
   const { width_mm: wide, height_mm: high } = state.pictures;
   by("channels").replaceChildren(...CHANNELS.map(([key, name, note]) => {
-    const card = make("div", undefined, "channel");
-    const head = make("h3", `${name} `);
-    head.append(make("span", note, null, { id: `${key}_note` }));
-    card.append(head, ...["amplitude", "phase"].map((kind) => {
-      const figure = make("figure"), view = make("div", undefined, kind === "phase" || key === "p" ? "view fades" : "view"), caption = make("figcaption");
+    const head = nest(make("h3", `${name} `), make("span", note, null, { id: `${key}_note` }));
+    return nest(make("div", undefined, "channel"), head, ...["amplitude", "phase"].map((kind) => {
+      const view = make("div", undefined, kind === "phase" || key === "p" ? "view fades" : "view");
       view.style.aspectRatio = `${wide} / ${high}`;
-      const picture = make("img");
-      picture.id = `${key}_${kind}`;
-      picture.alt = `${kind} of ${name}`;
-      picture.hidden = true;
-      view.append(make("span", "after the first row"), picture);
-      const bar = make("img");
-      bar.src = address(`bar/${kind}`);
-      bar.alt = "";
-      caption.append(make("span", kind), bar, make("span", ""));
-      figure.append(view, caption);
-      return figure;
+      view.append(make("span", "after the first row"), make("img", null, null, { id: `${key}_${kind}`, alt: `${kind} of ${name}`, hidden: true }));
+      const bar = make("img", null, null, { src: address(`bar/${kind}`), alt: "" });
+      return nest(make("figure"), view, nest(make("figcaption"), make("span", kind), bar, make("span", "")));
     }));
-    return card;
   }));
 }
 
@@ -145,23 +123,10 @@ function showNotices() {
   by("faults-note").textContent = notices.length ? `${notices.length}, the newest first` : "";
   const shown = allNotices ? notices : notices.slice(0, FEW);
   const items = shown.map((n) => {
-    const item = make("li");
+    const item = finding(n, ". ");
     item.dataset.level = { warning: "warn", error: "bad" }[n.level] ?? n.level;
-    if (n.facts.utc) item.append(make("time", `${clock(Date.parse(n.facts.utc) / 1000)} `));
-    const what = make("b");
-    what.append(...rich(n.what));
-    item.append(what);
-    if (n.why) item.append(make("span", ` ${n.why}.`, "why"));
-    if (n.do) {
-      const todo = make("span", "→ ", "do");
-      todo.append(...rich(n.do));
-      item.append(todo);
-    }
-    if (n.facts.detail) {
-      const more = make("details");
-      more.append(make("summary", "in full"), make("span", n.facts.detail));
-      item.append(more);
-    }
+    if (n.facts.utc) item.prepend(make("time", `${clock(Date.parse(n.facts.utc) / 1000)} `));
+    if (n.facts.detail) item.append(nest(make("details"), make("summary", "in full"), make("span", n.facts.detail)));
     return item;
   });
   const isWell = ["good", "done"].includes(state.status.level);
@@ -286,35 +251,26 @@ setInterval(() => {
   lost(isClosed ? server.states.offline : server.states.server_frozen);
 }, 1000);
 
-async function ask(command) {
-  by("answer").textContent = "Asking…";
+/** Say that something is asked, until it is answered. */
+async function ask(words, work) {
+  by("answer").textContent = words;
   try {
-    await control(command, name);
-    by("answer").textContent = "";
+    await work();
     complain("answer");
   } catch (error) { complain("answer", error); }
 }
 
+const command = (word) => ask("Asking…", () => control(word, name));
+const start = (path) => ask("Starting…", () => post(path, { scan: name }));
+
 /** What the scan's program printed, while that says more than the status, and the way to the result. */
-async function showProgram() {
+async function look() {
   try { summary = await get("scan", { scan: name }); } catch { return; } // not there yet, or gone for a moment
   by("to-result").hidden = !(summary.processed || summary.images_only);
   by("to-result").href = pageOf("scan", name);
   const [program] = summary.programs.filter((p) => ["scan", "process"].includes(p.kind));
   const isNews = ["starting", "start_failed", "resuming", "failed", "unprocessed", "processing"].includes(state?.status.key);
-  by("program").hidden = !program || !isNews;
-  if (by("program").hidden) return;
-  by("program-title").textContent = `polysight ${program.kind} ${ending(program)}`;
-  if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "No output yet.";
-}
-
-async function start(path) {
-  by("answer").textContent = "Starting…";
-  try {
-    await post(path, { scan: name });
-    by("answer").textContent = "";
-    complain("answer");
-  } catch (error) { complain("answer", error); }
+  showProgram(program, isNews);
 }
 
 by("more").addEventListener("click", () => { allNotices = !allNotices; showNotices(); });
@@ -322,5 +278,5 @@ new ResizeObserver(() => { if (state?.scan) { showStage(); showPlots(); } }).obs
 server = await begin();
 name = scanName || server.only || "";
 connect();
-showProgram();
-setInterval(showProgram, 3000);
+look();
+setInterval(look, 3000);

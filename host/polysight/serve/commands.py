@@ -8,9 +8,9 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import msgspec
 import tomli_w
@@ -139,40 +139,55 @@ class ExportRequest(Body, frozen=True):
 
 
 AnyBody = TypeVar("AnyBody", bound=Body)
-Answer = Callable[[Site, Request, Any], Awaitable[object]]
 Words = list[str | Path]
+
+
+class Named(NamedTuple):
+    """The scan that a request names, and its folder."""
+
+    name: str
+    folder: Path
 
 
 def command_routes(site: Site) -> list[Route]:
     """Routes of everything that POST asks for."""
 
-    def make_route(path: str, kind: type[Body], answer: Answer) -> Route:
-        async def endpoint(request: Request) -> Response:
-            return json_answer(await answer(site, request, decode_body(await request.body(), kind)))
-
-        return Route(f"/api/{path}", endpoint, methods=["POST"])
-
     async def show_request(request: Request) -> Response:
         name = site.name(request)
         return json_answer(await site.read_scan(request, lambda folder: read_request(folder, name)))
+
+    def make_route(path: str, kind: type[Body], work: Callable[[Site, Any], object]) -> Route:
+        async def endpoint(request: Request) -> Response:
+            body = decode_body(await request.body(), kind)
+            return json_answer(await site.act(lambda: work(site, body)))
+
+        return Route(f"/api/{path}", endpoint, methods=["POST"])
+
+    def make_scan_route(path: str, kind: type[Body], work: Callable[[Site, Named, Any], object]) -> Route:
+        async def endpoint(request: Request) -> Response:
+            body = decode_body(await request.body(), kind)
+            name = site.name(request)
+            return json_answer(await site.read_scan(request, lambda folder: work(site, Named(name, folder), body)))
+
+        return Route(f"/api/{path}", endpoint, methods=["POST"])
 
     return [
         Route("/api/request", show_request),
         make_route("plan", PlanRequest, _plan),
         make_route("doctor", Body, _doctor),
-        make_route("start", StartRequest, _start),
-        make_route("again", Body, _again),
+        make_route("start", StartRequest, start_scan),
         make_route("queue", StartRequest, _enqueue),
-        make_route("unqueue", ScanName, _unqueue),
-        make_route("release", Body, _release),
-        make_route("archive", ScanName, _archive),
-        make_route("delete", ScanName, _delete),
-        make_route("resume", ResumeRequest, _resume),
-        make_route("process", ProcessRequest, _process),
-        make_route("labels", LabelRequest, _labels),
-        make_route("notes", NotesRequest, _notes),
+        make_route("unqueue", ScanName, lambda site, body: site.queue.remove(body.name)),
+        make_route("release", Body, lambda site, _: site.queue.release()),
         make_route("train", TrainRequest, _train),
-        make_route("export", ExportRequest, _export),
+        make_scan_route("again", Body, _again),
+        make_scan_route("archive", ScanName, _archive),
+        make_scan_route("delete", ScanName, _delete),
+        make_scan_route("resume", ResumeRequest, _resume),
+        make_scan_route("process", ProcessRequest, _process),
+        make_scan_route("labels", LabelRequest, _labels),
+        make_scan_route("notes", NotesRequest, _notes),
+        make_scan_route("export", ExportRequest, _export),
     ]
 
 
@@ -188,30 +203,18 @@ def decode_body(body: bytes, kind: type[AnyBody]) -> AnyBody:
     return decode(table, kind, "the request", "send what the page sends")
 
 
-async def _plan(site: Site, request: Request, body: PlanRequest) -> dict[str, Any]:
-    del request
-    config = site.config
-    plan = await site.read("plan", lambda: forecast_values(forecast(body.apply(config))))
-    rig = load_instrument(config)
-    return plan | {"rig": rig.name, "config": str(config), "begun_with": to_builtins(rig)["grid"]}
+def _plan(site: Site, body: PlanRequest) -> dict[str, Any]:
+    plan = forecast_values(forecast(body.apply(site.config)))
+    rig = load_instrument(site.config)
+    return plan | {"rig": rig.name, "config": str(site.config), "begun_with": to_builtins(rig)["grid"]}
 
 
-async def _doctor(site: Site, request: Request, body: Body) -> None:
-    del request, body
-    words: Words = ["doctor", "--config", site.config, "--out", site.scans.root]
-
-    def start() -> None:
-        with site.rig:
-            _check_free(site)
-            site.logs.mkdir(exist_ok=True)
-            site.programs.start(site.logs, "doctor", words)
-
-    await site.act(start)
-
-
-async def _start(site: Site, request: Request, body: StartRequest) -> None:
-    del request
-    await site.act(lambda: start_scan(site, body))
+def _doctor(site: Site, body: Body) -> None:
+    del body
+    with site.rig:
+        _check_free(site)
+        site.logs.mkdir(exist_ok=True)
+        site.programs.start(site.logs, "doctor", ["doctor", "--config", site.config, "--out", site.scans.root])
 
 
 def start_scan(site: Site, body: StartRequest) -> None:
@@ -253,10 +256,10 @@ def check_request(site: Site, body: StartRequest) -> Instrument:
     return rig
 
 
-async def _again(site: Site, request: Request, body: Body) -> None:
+def _again(site: Site, scan: Named, body: Body) -> None:
     """Start a scan once more that could not start; its request is checked as at first, wherever its file is from."""
     del body
-    await site.read_scan(request, lambda folder: start_scan(site, read_request(folder, site.name(request))))
+    start_scan(site, read_request(scan.folder, scan.name))
 
 
 def read_request(folder: Path, name: str) -> StartRequest:
@@ -277,41 +280,24 @@ def read_request(folder: Path, name: str) -> StartRequest:
     return StartRequest(name=name, plan=plan)
 
 
-async def _enqueue(site: Site, request: Request, body: StartRequest) -> None:
-    del request
-
-    def add() -> None:
-        check_request(site, body)
-        site.queue.add(body.name, msgspec.json.encode(body))
-
-    await site.act(add)
+def _enqueue(site: Site, body: StartRequest) -> None:
+    check_request(site, body)
+    site.queue.add(body.name, msgspec.json.encode(body))
 
 
-async def _unqueue(site: Site, request: Request, body: ScanName) -> None:
-    del request
-    await site.act(lambda: site.queue.remove(body.name))
+def _archive(site: Site, scan: Named, body: ScanName) -> None:
+    _put_away(site, scan, body.name)
 
 
-async def _release(site: Site, request: Request, body: Body) -> None:
-    del request, body
-    site.queue.release()
+def _delete(site: Site, scan: Named, body: ScanName) -> None:
+    # Out of the list at once; the files take their time.
+    place = _put_away(site, scan, body.name)
+    threading.Thread(target=shutil.rmtree, args=(place, True), name="delete").start()
 
 
-async def _archive(site: Site, request: Request, body: ScanName) -> None:
-    await site.read_scan(request, lambda folder: _put_away(site, folder, site.name(request), body.name))
-
-
-async def _delete(site: Site, request: Request, body: ScanName) -> None:
-    def delete(folder: Path) -> None:
-        # Out of the list at once; the files take their time.
-        place = _put_away(site, folder, site.name(request), body.name)
-        threading.Thread(target=shutil.rmtree, args=(place, True), name="delete").start()
-
-    await site.read_scan(request, delete)
-
-
-def _put_away(site: Site, folder: Path, name: str, typed: str) -> Path:
+def _put_away(site: Site, scan: Named, typed: str) -> Path:
     """Move a scan into the hidden archive; returns its new place. Raises PolysightError."""
+    name, folder = scan
     if typed != name:
         raise ConfigError(
             "the typed name is not that of the scan", f"the scan has the name {name}", "type the name as it is shown",
@@ -365,33 +351,28 @@ def _write_files(folder: Path, rig: Instrument, request: StartRequest) -> Path:
     return place / RIG
 
 
-async def _resume(site: Site, request: Request, body: ResumeRequest) -> None:
-    def start(folder: Path) -> None:
-        words: Words = ["resume", folder.absolute(), *_processing_words(site, body.library, None)]
-        if body.keep_incomplete:
-            words.append("--keep-incomplete")
-        with site.rig:
-            _check_free(site)
-            site.programs.start(folder, "scan", words)
-
-    await site.read_scan(request, start)
+def _resume(site: Site, scan: Named, body: ResumeRequest) -> None:
+    words: Words = ["resume", scan.folder.absolute(), *_processing_words(site, body.library, None)]
+    if body.keep_incomplete:
+        words.append("--keep-incomplete")
+    with site.rig:
+        _check_free(site)
+        site.programs.start(scan.folder, "scan", words)
 
 
-async def _process(site: Site, request: Request, body: ProcessRequest) -> None:
-    def start(folder: Path) -> None:
-        words: Words = ["process", folder.absolute(), "--out", folder.absolute() / "products"]
-        words += _processing_words(site, body.library, body.metal)
-        if body.labels:
-            labels = find_labels(folder)
-            if labels is None:
-                raise ConfigError(
-                    "no boxes are drawn on this scan", "they were not saved", "draw and save them first",
-                    code=ErrorCode.FILE_MISSING,
-                )  # fmt: skip
-            words += ["--labels", labels[0].absolute()]
-        site.programs.start(folder, "process", words)
-
-    await site.read_scan(request, start)
+def _process(site: Site, scan: Named, body: ProcessRequest) -> None:
+    folder = scan.folder.absolute()
+    words: Words = ["process", folder, "--out", folder / "products"]
+    words += _processing_words(site, body.library, body.metal)
+    if body.labels:
+        labels = find_labels(folder)
+        if labels is None:
+            raise ConfigError(
+                "no boxes are drawn on this scan", "they were not saved", "draw and save them first",
+                code=ErrorCode.FILE_MISSING,
+            )  # fmt: skip
+        words += ["--labels", labels[0]]
+    site.programs.start(folder, "process", words)
 
 
 class SavedLabels(msgspec.Struct, frozen=True):
@@ -401,51 +382,41 @@ class SavedLabels(msgspec.Struct, frozen=True):
     notes: list[str] = []
 
 
-async def _labels(site: Site, request: Request, body: LabelRequest) -> SavedLabels:
+def _labels(site: Site, scan: Named, body: LabelRequest) -> SavedLabels:
+    del site
     labels = Labels(body.boxes, "mm", body.metal or None, body.specimens, by_hand=True)
-
-    def save(folder: Path) -> SavedLabels:
-        if not labels.boxes:
-            remove_labels(folder)
-            return SavedLabels("")
-        products = read_products(folder)
-        place = label_folder(products.folder)
-        _, notes = save_labels(place, products, labels)
-        return SavedLabels(str(place / "labels.json"), notes)
-
-    return await site.read_scan(request, save)
+    if not labels.boxes:
+        remove_labels(scan.folder)
+        return SavedLabels("")
+    products = read_products(scan.folder)
+    place = label_folder(products.folder)
+    _, notes = save_labels(place, products, labels)
+    return SavedLabels(str(place / "labels.json"), notes)
 
 
-async def _notes(site: Site, request: Request, body: NotesRequest) -> Notes:
-    notes = Notes(body.notes, body.tags)
-    return await site.read_scan(request, lambda folder: write_notes(folder, notes, body.base))
+def _notes(site: Site, scan: Named, body: NotesRequest) -> Notes:
+    del site
+    return write_notes(scan.folder, Notes(body.notes, body.tags), body.base)
 
 
-async def _train(site: Site, request: Request, body: TrainRequest) -> None:
-    del request
-
-    def start() -> None:
-        folders = [site.scans.folder(name).absolute() for name in body.scans]
-        out = site.scans.root.absolute() / LIBRARIES
-        out.mkdir(exist_ok=True)
-        site.logs.mkdir(exist_ok=True)
-        site.programs.start(site.logs, "train", ["train", *folders, "--out", out / f"{body.name}.npz"])
-
-    await site.act(start)
+def _train(site: Site, body: TrainRequest) -> None:
+    folders = [site.scans.folder(name).absolute() for name in body.scans]
+    out = site.scans.root.absolute() / LIBRARIES
+    out.mkdir(exist_ok=True)
+    site.logs.mkdir(exist_ok=True)
+    site.programs.start(site.logs, "train", ["train", *folders, "--out", out / f"{body.name}.npz"])
 
 
-async def _export(site: Site, request: Request, body: ExportRequest) -> None:
-    def start(folder: Path) -> None:
-        out = folder.absolute() / "export"
-        if not out.resolve().is_relative_to(folder.resolve()):
-            raise DataError(
-                f"{out}: leads out of the scan", "it is a link", "remove the link, or use `polysight export --out`",
-                code=ErrorCode.PATH_OUTSIDE,
-            )  # fmt: skip
-        options = [f"--{name}" for name in body.formats]
-        site.programs.start(folder, "export", ["export", folder.absolute(), *options, "--out", out])
-
-    await site.read_scan(request, start)
+def _export(site: Site, scan: Named, body: ExportRequest) -> None:
+    folder = scan.folder.absolute()
+    out = folder / "export"
+    if not out.resolve().is_relative_to(folder.resolve()):
+        raise DataError(
+            f"{out}: leads out of the scan", "it is a link", "remove the link, or use `polysight export --out`",
+            code=ErrorCode.PATH_OUTSIDE,
+        )  # fmt: skip
+    options = [f"--{name}" for name in body.formats]
+    site.programs.start(folder, "export", ["export", folder, *options, "--out", out])
 
 
 def _processing_words(site: Site, library: str, metal: Box | None) -> Words:

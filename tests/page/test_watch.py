@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from tests.support.page.chromium import DESK, PHONE
-from tests.support.page.live_view import GrowingScan, served
+from tests.support.page.live_view import GrowingScan
 from tests.support.processes import wait_for
 from tests.support.products import REASON, judged_products
 from tests.support.store.facts import parse_fact
@@ -268,17 +267,3 @@ def test_it_is_shown_when_the_scan_has_ended(growing: GrowingScan, watching):
     answer = json.loads(watch.state.data)["verdict"]
     assert answer["level"] == "care"
     assert [{key: r[key] for key in REASON} for r in answer["reasons"]] == [REASON]
-
-
-def test_the_page_shows_it(browser, finished, watching, tmp_path):
-    scan = shutil.copytree(finished, tmp_path / "scan")
-    judged_products(scan / "products", "none")
-    watch = watching(scan)
-    watch.wait_for(lambda s: bool(s.get("verdict")))
-    with served(watch) as view:
-        for size in (DESK, PHONE):
-            browser.visit(view.address + "/", size)
-            browser.wait("document.getElementById('result-level')?.textContent.length > 0", "the verdict")
-            assert browser.text("result-level") == "no result"
-            assert REASON["do"] in browser.text("reasons")
-            browser.check_whole(view.address)

@@ -165,43 +165,44 @@ NAMELESS = """[...document.querySelectorAll('button, a[href], input, select, tex
 """What can be used and has no name for who cannot see it."""
 
 
+def test_axe_is_here():
+    """Without it the rules of accessibility are not checked; everything else is."""
+    if find_axe() is None:
+        pytest.skip("no axe-core here: npm install --no-save axe-core")
+
+
 @SIZES
 @pytest.mark.parametrize("path", PAGES)
-def test_every_page_fits_and_can_be_read(page, path, size, tmp_path):
-    for dark in (False, True):
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        page.browser.call("Emulation.setEmulatedMedia", features=[scheme])
-        page.open(path, size)
-        page.check_whole()
-        # A table's last columns, too.
-        assert page.browser.value(
-            "[...document.querySelectorAll('.wide')].every((t) => t.scrollWidth <= t.clientWidth)"
-        )
-        # WCAG AA
-        assert page.browser.value(CONTRAST) == []
-        assert page.browser.value(NAMELESS) == []
-        assert page.browser.value("document.querySelectorAll('h1').length") == 1
-        page.browser.screenshot(tmp_path / "page.png")
-        assert (tmp_path / "page.png").stat().st_size > 15_000
-    page.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
-
-
-@pytest.mark.parametrize("path", [*PAGES, "report"])
-def test_axe_finds_nothing(page, scans, path):
-    """The rules of https://github.com/dequelabs/axe-core: WCAG and good practice, with all that a page unfolds."""
+def test_every_page_fits_can_be_read_and_has_the_abort_of_the_running_scan(page, scans, path, size, request):
+    """In both schemes, with all that a page unfolds; axe: https://github.com/dequelabs/axe-core."""
     axe = find_axe()
-    if axe is None:
-        pytest.skip("no axe-core here: npm install --no-save axe-core")
-    for size in (DESK, PHONE):
-        if path == "report":
-            page.browser.visit((scans / "one" / "products" / "report.html").as_uri(), size)
-            page.browser.wait("document.querySelector('details')", path)
-        else:
+    request.addfinalizer(lambda: page.browser.set_scheme("light"))
+    with open_control(scans / "two"):
+        for scheme in ("dark", "light"):
+            page.browser.set_scheme(scheme)
             page.open(path, size)
-        for button in ("#label-open", "#process-open"):
-            page.browser.value(f"document.querySelector('{button}')?.click()")
-        page.browser.value("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-        assert page.browser.find_violations(axe) == [], size
+            page.browser.wait("document.querySelector('#running button.danger')?.checkVisibility()", "the abort")
+            page.check_whole()
+            # A table's last columns, too.
+            assert page.browser.value(
+                "[...document.querySelectorAll('.wide')].every((t) => t.scrollWidth <= t.clientWidth)"
+            )
+            assert page.browser.value("document.querySelectorAll('h1').length") == 1
+            for button in ("#label-open", "#process-open"):
+                page.browser.value(f"document.querySelector('{button}')?.click()")
+            page.browser.value("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+            # WCAG AA
+            assert page.browser.value(CONTRAST) == []
+            assert page.browser.value(NAMELESS) == []
+            assert axe is None or page.browser.find_violations(axe) == []
+
+
+@SIZES
+def test_axe_finds_nothing_in_a_report(page, scans, size):
+    axe = find_axe()
+    page.browser.visit((scans / "one" / "products" / "report.html").as_uri(), size)
+    page.browser.wait("document.querySelector('details')", "the report")
+    assert axe is None or page.browser.find_violations(axe) == []
 
 
 def test_the_points_of_surfaces_turn_and_are_coloured(page):
@@ -278,13 +279,12 @@ def test_an_abort_goes_before_pictures_that_hang(page, scans, monkeypatch):
         released.set()
 
 
-@SIZES
-def test_long_names_and_tags_fit(page, scans, size):
+def test_long_names_and_tags_fit(page, scans):
     long = "n" * 200
     shutil.copytree(scans / "one", scans / long)
     write_notes(scans / long, Notes("", ("t" * 40,)))
     for path in ("/", "/compare?a=one&b=two", f"/scan?scan={long}"):
-        page.browser.visit(f"{page.view.address}{path}#token={TOKEN}", size)
+        page.browser.visit(f"{page.view.address}{path}#token={TOKEN}", PHONE)
         if path == "/":
             ready = "document.querySelectorAll('#list li').length == 3"
         else:
@@ -299,12 +299,6 @@ def test_a_scan_that_is_not_there_shows_the_error_alone(page):
     page.browser.wait("document.getElementById('told').innerText.includes('nowhere')", "the error")
     sections = "[...document.querySelectorAll('main section, #side')].filter(s => s.checkVisibility()).map(s => s.id)"
     assert page.browser.value(sections) == ["head"]
-
-
-def test_a_processed_scan_is_watched_with_the_way_to_its_result(page):
-    page.open("/watch?scan=one")
-    page.browser.wait("document.getElementById('p_note')?.innerText.includes('Result')", "the note")
-    assert "yet" not in page.browser.text("p_note")
 
 
 def test_the_list_is_searched_and_two_are_compared(page):
@@ -382,20 +376,6 @@ def test_notes_are_kept_beside_the_scan(page, scans):
     page.open("/")
     page.browser.fill("#find", "brett")
     page.browser.wait("document.querySelectorAll('#list li').length == 1", "the search finds it")
-
-
-@SIZES
-def test_every_page_has_the_abort_of_the_running_scan(page, scans, size):
-    abort = "document.querySelector('#running button.danger')"
-    for path in PAGES:
-        with open_control(scans / "two") as stop:
-            page.open(path, size)
-            page.browser.wait(f"{abort}?.checkVisibility()", path)
-            page.check_whole()
-            page.browser.value(f"{abort}.click()")
-            page.browser.click("#confirm button[value=yes]")
-            wait_for(lambda s=stop: s.now, "the abort")
-            page.browser.wait(f"!{abort}", "that it was heard")
 
 
 def test_a_plan_is_repeated_and_waits_in_the_queue(page, scans, monkeypatch):

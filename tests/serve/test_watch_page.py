@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import socket
-import subprocess
 import time
 
-import msgspec
 import pytest
 from tests.support.page.chromium import DESK, PHONE, Browser
 from tests.support.page.live_view import GrowingScan, open_control, served
@@ -14,7 +11,6 @@ from tests.support.processes import wait_for
 from tests.support.rigs import published_rig
 
 from polysight.acquisition import STATES
-from polysight.acquisition.control import ALIVE, CONTROL, Life, read_start_ticks
 from polysight_simulators.loopback import move_to_free_subnet
 
 TOKEN = "0123456789"
@@ -99,19 +95,3 @@ def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, wa
     with served(watch, host=host, port=int(port)):
         browser.wait("!document.body.classList.contains('lost')", "the way back")
         browser.wait("document.getElementById('headline').innerText == 'The scan is finished'", "the state")
-
-
-def test_a_killed_scan_turns_red_on_an_open_page(browser, growing: GrowingScan, watching):
-    """Without waiting for a timeout: the process is gone."""
-    growing.grow_until("row_committed")
-    program = subprocess.Popen(["sleep", "600"])
-    life = Life(program.pid, read_start_ticks(program.pid) or 0, socket.gethostname())
-    growing.live()
-    (growing.path / CONTROL / ALIVE).write_bytes(msgspec.json.encode(life))
-    with served(watching(growing.path, lapse_s=1e6)) as view:
-        open_page(browser, view)
-        browser.wait("document.getElementById('status').dataset.level == 'good'", "that it runs")
-        program.kill()
-        program.wait()
-        browser.wait("document.getElementById('status').dataset.level == 'bad'", "that it is red")
-        assert browser.text("headline") == STATES["killed"].headline

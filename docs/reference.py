@@ -8,6 +8,7 @@ A package that names its public functions (`__all__`) has one page with these; a
 from __future__ import annotations
 
 import argparse
+import inspect
 import pkgutil
 import re
 import sys
@@ -17,15 +18,27 @@ from html.parser import HTMLParser
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from unittest import mock
 from urllib.parse import unquote
 
+import numpy.typing as npt
 import pdoc.doc
 import pdoc.render
 from docs.site import build_site
 
-PACKAGES = ("polysight", "polysight_shared", "polysight_simulators", "polysight_pi")
+# The rooms hold what public functions return: verdicts, scores, forecasts, processed scans.
+ROOMS = ("materials", "planning", "products", "results", "imaging", "polarimetry")
+PACKAGES = (
+    "polysight",
+    *(f"polysight.{room}" for room in ROOMS),
+    "polysight_shared",
+    "polysight_simulators",
+    "polysight_pi",
+)
 
 _NAVIGATION = '<nav class="pdoc"><p><a href="docs/README.html">How-tos, notebooks, gallery, formats</a></p>'
+_ARRAY = re.compile(r"numpy\.ndarray\[tuple\[(?:typing\.)?Any, \.\.\.\], numpy\.dtype\[(?:numpy\.)?([\w.]+)\]\]")
+_as_evaluated = inspect.formatannotation
 _TO_PRIVATE = re.compile(r'<a href="[^"#]*#_[^"]*">(.*?)</a>')  # base classes that have no place of their own
 
 
@@ -34,7 +47,7 @@ def modules_of(name: str) -> Iterator[str]:
     module = import_module(name)
     yield name
     for public in getattr(module, "__all__", ()):
-        getattr(module, public)  # a lazy name is imported now, for pdoc to see it
+        setattr(module, public, getattr(module, public))  # a lazy name is imported now, for pdoc to see it
     if not hasattr(module, "__all__") and hasattr(module, "__path__"):
         yield from (page for child in _children(module) for page in modules_of(child))
 
@@ -45,6 +58,16 @@ def _children(package: ModuleType) -> Iterator[str]:
             yield found.name
 
 
+def format_type(annotation: object) -> str:
+    """Return a type as it is written in the sources: the union behind `ArrayLike` has 400 letters."""
+    text = _as_evaluated(annotation)
+    array_like = _as_evaluated(npt.ArrayLike).removeprefix("typing.").removeprefix("Union[").removesuffix("]")
+    text = text.replace(array_like, "ArrayLike").replace("Union[ArrayLike]", "ArrayLike")
+    text = text.replace("Union[ArrayLike, NoneType]", "ArrayLike | None")
+    text = _ARRAY.sub(r"NDArray[\1]", text)
+    return text.replace("xarray.core.dataset.Dataset", "xarray.Dataset").replace("typing.", "")
+
+
 def build(names: Sequence[str], out: Path) -> list[Path]:
     """Write the pages of these modules, an index and a search index into `out`; returns the pages."""
     pdoc.render.configure(docformat="numpy", show_source=False, footer_text="polysight, from its docstrings")
@@ -52,15 +75,29 @@ def build(names: Sequence[str], out: Path) -> list[Path]:
     modules = {name: pdoc.doc.Module.from_name(name) for name in names}
     pages = []
     for name, module in modules.items():
+        _hide_metadata_routing(module)
         page = out / f"{name.replace('.', '/')}.html"
         page.parent.mkdir(parents=True, exist_ok=True)
-        html = pdoc.render.html_module(module, modules)
+        # Of a variable, and of a parameter
+        with (
+            mock.patch.object(pdoc.doc, "formatannotation", format_type),
+            mock.patch.object(inspect, "formatannotation", format_type),
+        ):
+            html = pdoc.render.html_module(module, modules)
         page.write_text(_TO_PRIVATE.sub(r"\1", html), encoding="utf-8")
         pages.append(page)
     index = out / "index.html"
     index.write_text(pdoc.render.html_index(modules).replace('<nav class="pdoc">', _NAVIGATION, 1), encoding="utf-8")
     (out / "search.js").write_text(pdoc.render.search_index(modules), encoding="utf-8")
     return [*pages, index]
+
+
+def _hide_metadata_routing(module: pdoc.doc.Module) -> None:
+    """Leave out the methods that scikit-learn adds to every estimator, with pages of its own about their making."""
+    for member in module.members.values():
+        if isinstance(member, pdoc.doc.Class):
+            for name in [name for name in member.members if name.startswith("set_") and name.endswith("_request")]:
+                del member.members[name]
 
 
 class _Page(HTMLParser):

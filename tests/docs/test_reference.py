@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import html
+import re
 from pathlib import Path
 
 import pytest
-from docs.reference import build, link_faults, modules_of
+from docs.reference import ROOMS, build, link_faults, modules_of
 from docs.site import build_site, draw_pictures
 
 import polysight
@@ -16,7 +17,7 @@ import polysight
 def reference(tmp_path_factory) -> Path:
     """Pages of the public interface and of the rooms behind it."""
     out = tmp_path_factory.mktemp("reference")
-    rooms = ("polysight", "polysight.api", "polysight.imaging", "polysight.polarimetry")
+    rooms = ("polysight", "polysight.api", *(f"polysight.{room}" for room in ROOMS))
     names = [name for room in rooms for name in modules_of(room)]
     assert names == list(rooms), "a package that names its public functions has one page"
     build([*names, "polysight_shared"], out)
@@ -30,6 +31,18 @@ def test_every_public_name_is_on_the_page_with_its_text(reference):
         assert f'id="{name}"' in page
     for text in ("metal_box_mm", "Reference library of the materials", "complex64 [y_mm, x_mm]"):
         assert text in page
+
+
+def test_types_of_public_functions_are_read_and_followed(reference):
+    """What a function gives has a page of its own; arrays are called as in the sources."""
+    page = (reference / "polysight.html").read_text(encoding="utf-8")
+    for name in ("results.html#Verdict", "materials.html#Score", "planning.html#Forecast", "products.html#Rows"):
+        assert f'href="polysight/{name}"' in page
+    text = re.sub(r"<[^>]+>", "", page)
+    assert "X: ArrayLike" in text
+    assert "NDArray[float64]" in text
+    for hidden in ("numpy._typing", "numpy.ndarray[", "set_fit_request"):
+        assert hidden not in text
 
 
 def test_links_between_the_pages_lead_somewhere(reference):

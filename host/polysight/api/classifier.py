@@ -79,7 +79,14 @@ class Classifier(ClassifierMixin, BaseEstimator):
     model
         "knn": the paper's nearest neighbours, a :class:`PaperKNeighborsClassifier`. "discriminant": the discriminant of
         error sources, which knows what the pixels of a patch and of a scan share; columns of every angle are needed.
+
+    Attributes
+    ----------
+    classes_
+        Materials, sorted; there after `fit`.
     """
+
+    classes_: Names
 
     def __init__(self, model: Literal["knn", "discriminant"] = "discriminant") -> None:
         self.model = model

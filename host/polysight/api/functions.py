@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import xarray
 
 PathText = str | os.PathLike[str]
-Scene = PathText | Mapping[str, Any]
+Scene = PathText | Mapping[str, object]
 
 
 @dataclass(frozen=True)

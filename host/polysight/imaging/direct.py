@@ -35,7 +35,14 @@ def backproject(
 def backproject(
     samples: Array, frequencies_hz: Shaped, tx_m: Shaped, rx_m: Shaped, voxels_m: Shaped, reference_m: Shaped
 ) -> Array: ...
-def backproject(samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any) -> Any:
+def backproject(
+    samples: Array | npt.NDArray[Any],
+    frequencies_hz: Shaped,
+    tx_m: Shaped,
+    rx_m: Shaped,
+    voxels_m: Shaped,
+    reference_m: Shaped,
+) -> Array | npt.NDArray[np.complex128]:
     """Backproject samples (paper, equation 6, with the exponent's sign of the conjugate of the received phase).
 
     `image(v) = sum_p sum_f samples[p, f] exp(-j 2 pi f (|v - tx_p| + |v - rx_p| - reference_p) / c)`

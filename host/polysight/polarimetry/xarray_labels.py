@@ -126,7 +126,7 @@ def _fill(value: Any, arrays: Iterator[Any]) -> Any:
 
 
 _REFLECTION = ("s-polarised reflection coefficient", "p-polarised reflection coefficient")
-fresnel = cast(_Fresnel, keep_labels(*_REFLECTION)(plain_fresnel))
+fresnel: _Fresnel = cast(_Fresnel, keep_labels(*_REFLECTION)(plain_fresnel))
 
 
 def _take_arrays_as_one_medium(function: Function) -> Function:
@@ -147,5 +147,7 @@ def _list_one_medium(value: Any) -> Any:
     return value
 
 
-multilayer = cast(_Multilayer, _take_arrays_as_one_medium(keep_labels(*_REFLECTION)(plain_multilayer)))
-permittivity_from_ratio = cast(_PermittivityFromRatio, keep_labels("relative permittivity")(plain_permittivity))
+multilayer: _Multilayer = cast(_Multilayer, _take_arrays_as_one_medium(keep_labels(*_REFLECTION)(plain_multilayer)))
+permittivity_from_ratio: _PermittivityFromRatio = cast(
+    _PermittivityFromRatio, keep_labels("relative permittivity")(plain_permittivity)
+)

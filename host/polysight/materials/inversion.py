@@ -24,8 +24,10 @@ the nearest material, and its name is the kind that fits this measurement.
 
 from __future__ import annotations
 
+import copy
+import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +43,7 @@ from polysight.materials.kinds import (
     split_complex,
     turn_covariance,
 )
+from polysight.materials.monte_carlo import anneal, resample
 from polysight.materials.specimens import METAL_WITHOUT_BRIGHTNESS, METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import permittivity_from_ratio
 
@@ -103,9 +106,8 @@ COLUMNS_OF_SOURCE = {
     "incidence": (ANGLE,),
     "tilt": (TURN_BY_RISE, *LIGHT_ACROSS, LIGHT_ALONG),
 }
-# Particles, moves at each temperature, and draws of a patch's own errors for each particle.
+# Particles, and draws of a patch's own errors for each particle.
 PARTICLES = 600
-MOVES = 6
 DRAWS = 8
 # Smallest standard deviation of a ratio: below it a covariance has no inverse in double precision.
 LEAST_RATIO_STD = 1e-6
@@ -309,16 +311,28 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | Non
         # A patch is measured without the belief that it must be some material itself.
         without_patch = all_evidence.copy()
         without_patch[i + 1] = 0.0
-        particles, _ = _anneal(model, posterior, all_evidence, without_patch, rng)
+        particles, _ = anneal(model, posterior, all_evidence, without_patch, rng)
         patches.append(_estimate(model, particles, i, rng))
     return _solution(model, posterior, log_evidence, tuple(patches))
 
 
 def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[Real, float]:
-    """Return particles of the posterior of the common errors, and the log evidence."""
-    prior_particles = rng.standard_normal((PARTICLES, model.width))
+    """Return particles of the posterior of the common errors, and the log evidence.
+
+    Whether the mount has moved and whether the metal is painted are sampled apart and weighed by their evidence: what
+    fits of each is so small a part of its prior that among few particles of all none may lie there.
+    """
     no_evidence = np.zeros(model.patch_count + 1)
-    return _anneal(model, prior_particles, no_evidence, no_evidence + 1, rng)
+    samples = []
+    log_weights = []
+    for hypothesis, probability in model.hypotheses():
+        prior_particles = rng.standard_normal((PARTICLES, model.width))
+        z, log_evidence = anneal(hypothesis, prior_particles, no_evidence, no_evidence + 1, rng)
+        samples.append(hypothesis.within(model.prior, z))
+        log_weights.append(np.log(probability) + log_evidence)
+    weight = np.exp(np.array(log_weights) - max(log_weights))
+    chosen = resample(np.repeat(weight, PARTICLES), rng)[:: len(samples)]
+    return np.concatenate(samples)[chosen], max(log_weights) + float(np.log(weight.sum()))
 
 
 class SceneLikelihood:
@@ -372,6 +386,26 @@ class SceneLikelihood:
             maps.append(kinds.density_map(low, high, self.own[i]))
         return tuple(maps)
 
+    def hypotheses(self) -> list[tuple[SceneLikelihood, float]]:
+        """Return the same scene with each certainty on what the prior leaves open, and the probability of each."""
+        out = []
+        for moved, painted in itertools.product(_certainties(self.prior.moved), _certainties(self._painted())):
+            hypothesis = copy.copy(self)
+            hypothesis.prior = replace(self.prior, moved=moved[0], painted=painted[0])
+            out.append((hypothesis, moved[1] * painted[1]))
+        return out
+
+    def within(self, prior: RigPrior, z: Real) -> Real:
+        """Return particles of this hypothesis as particles of a prior that leaves it open."""
+        out = z.copy()
+        out[:, HAS_MOVED] = _place(z[:, HAS_MOVED], self.prior.moved, prior.moved)
+        out[:, PAINT] = _place(z[:, PAINT], self.prior.painted, prior.painted)
+        return out
+
+    def _painted(self) -> float:
+        """Return the probability of paint: without kinds of materials nothing could tell it, there is none."""
+        return self.prior.painted if self.kinds is not None else 0.0
+
     def leakage(self, z: Real) -> tuple[Complex, Complex]:
         """Return a and b at the metal's place, [..., 1] each."""
         p = self.prior
@@ -420,12 +454,9 @@ class SceneLikelihood:
         return np.zeros((*z.shape[:-1], 1))
 
     def paint(self, z: Real) -> Real:
-        """Return the phase of 1 / P by the metal's paint, [..., 1], radians: 0 of bare metal, else uniform.
-
-        Without kinds of materials nothing could tell paint: there is none.
-        """
-        painted = self.prior.painted
-        if painted <= 0 or self.kinds is None:
+        """Return the phase of 1 / P by the metal's paint, [..., 1], radians: 0 of bare metal, else uniform."""
+        painted = self._painted()
+        if painted <= 0:
             return np.zeros((*z.shape[:-1], 1))
         beyond_bare = scipy.special.ndtr(z[..., PAINT, None]) - (1 - painted)
         return MOST_PAINT_RAD * np.maximum(beyond_bare, 0.0) / painted
@@ -492,65 +523,25 @@ class SceneLikelihood:
         return np.concatenate([brightness_log, np.stack(patch_logs, axis=-1)], axis=-1)
 
 
+def _certainties(probability: float) -> list[tuple[float, float]]:
+    """Return whether something is so, 0 or 1, with the probability of each that is possible."""
+    return [(0.0, 1 - probability)] * (probability < 1) + [(1.0, probability)] * (probability > 0)
+
+
+def _place(z: Real, certainty: float, probability: float) -> Real:
+    """Return a column of particles that know whether something is so as one of those that do not.
+
+    It is so in the uppermost part of the standard normal distribution that has its probability.
+    """
+    if certainty == probability:
+        return z
+    low, high = (1 - probability, 1.0) if certainty else (0.0, 1 - probability)
+    return scipy.special.ndtri(low + (high - low) * scipy.special.ndtr(z))
+
+
 def _complex(z: Real, columns: tuple[int, int]) -> Complex:
     """Return two columns of particles as real and imaginary part, [..., 1]."""
     return z[..., columns[0], None] + 1j * z[..., columns[1], None]
-
-
-def _anneal(model: SceneLikelihood, z: Real, before: Real, after: Real, rng: np.random.Generator) -> tuple[Real, float]:
-    """Move particles of one posterior to another; `before`, `after` [1 + patch] weigh the log likelihoods.
-
-    Return them with the logarithm of the ratio of both evidences.
-    """
-    parts = model.log_likelihoods(z)
-    change = after - before
-    done = 0.0
-    log_evidence = 0.0
-    while done < 1:
-        gain = parts @ change
-        step = _choose_step(gain, 1 - done)
-        done = 1.0 if step >= 1 - done else done + step
-        weight = before + done * change
-        log_evidence += step * float(gain.max()) + float(np.log(np.mean(np.exp(step * (gain - gain.max())))))
-        chosen = _resample(np.exp(step * (gain - gain.max())), rng)
-        z = z[chosen]
-        parts = parts[chosen]
-        # Random walk of the usual size in so many dimensions, shaped as the particles lie.
-        spread = np.linalg.cholesky(np.cov(z.T) + 1e-9 * np.eye(model.width)) * 2.0 / np.sqrt(model.width)
-        for _ in range(MOVES):
-            proposed = z + rng.standard_normal(z.shape) @ spread.T
-            parts_proposed = model.log_likelihoods(proposed)
-            log_odds = (parts_proposed - parts) @ weight - 0.5 * np.sum(proposed**2 - z**2, axis=1)
-            accepted = (np.log(rng.random(len(z))) < log_odds)[:, None]
-            z = np.where(accepted, proposed, z)
-            parts = np.where(accepted, parts_proposed, parts)
-    return z, log_evidence
-
-
-def _choose_step(gain: Real, most: float) -> float:
-    """Return the largest step of the temperature that leaves half of the particles' weight effective."""
-
-    def effective_share(step: float) -> float:
-        weight = np.exp(step * (gain - gain.max()))
-        return float(weight.sum() ** 2 / np.sum(weight**2)) / gain.size
-
-    if effective_share(most) >= 0.5:
-        return most
-    low = 0.0
-    high = most
-    for _ in range(30):
-        middle = (low + high) / 2
-        if effective_share(middle) >= 0.5:
-            low = middle
-        else:
-            high = middle
-    return max(low, 1e-6)
-
-
-def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:
-    """Return indices of particles in proportion to their weights (systematic resampling)."""
-    places = (rng.random() + np.arange(weight.size)) / weight.size
-    return np.minimum(np.searchsorted(np.cumsum(weight) / weight.sum(), places), weight.size - 1)
 
 
 def _solution(model: SceneLikelihood, z: Real, log_evidence: float, patches: tuple[PatchEstimate, ...]) -> Inversion:

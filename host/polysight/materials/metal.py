@@ -148,6 +148,9 @@ class _DielectricReference(SceneLikelihood):
         self.channel_ratio_db = channel_ratio_db
         super().__init__(seen, prior, kinds)
 
+    def _painted(self) -> float:
+        return 0.0
+
     def reference_permittivity(self, z: Real) -> Complex:
         """Return the permittivity of the reference, [..., 1]: any half space."""
         real, tangent = (

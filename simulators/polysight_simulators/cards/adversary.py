@@ -31,6 +31,8 @@ KINDS = (
     "reorder",
     # A switch sends packets by turns over queues of different length.
     "flows",
+    # Packets are held until later ones have come, perhaps those of the next pulses.
+    "held",
     "truncate",
     "turn_header_bit",
     # The card restarts: in mid-stream, in the record's first packets, or before the record.
@@ -180,37 +182,32 @@ class Adversary:
             pulse_ns = edges_ns[0] - 1_000_000
         sent = Sent(self._number, data, pulse_ns, troubles=troubles)
         packets, last_bytes = self._packets(sent, data)
+        made_ns = [pulse_ns + (k + 1) * _GAP_NS for k in range(len(packets))]
+        if edges_ns is not None:
+            made_ns = [self._made_ns(byte, edges_ns) for byte in last_bytes]
+        # A card that was reset may send nothing
+        made_ns = made_ns or [pulse_ns]
         packets_before = self.take_late(0.5)
         in_between = self.take_late(0.7)
+        arriving = self._network(packets, made_ns, sent)
         if "twin" in troubles or "twin_alone" in troubles:
             sent.whole = False
             twin_data = np.random.default_rng(chance.getrandbits(32)).integers(1, 256, len(data), np.uint8)
-            in_between += [Arrival(0, bytes(p), -1) for p in [*self._twin.feed(twin_data), *self._twin.flush()]]
-        on_time = []
-        if "twin_alone" not in troubles:
-            on_time = self._network(packets, sent)
-        arriving = [(k, Arrival(0, p, self._number)) for k, p in on_time]
-        twin = [(k, a) for k, a in enumerate(in_between) if a.record == -1]
+            twin = [bytes(p) for p in [*self._twin.feed(twin_data), *self._twin.flush()]]
+            arriving += [Arrival(made_ns[min(k, len(made_ns) - 1)], p, -1) for k, p in enumerate(twin)]
+            arriving.sort(key=lambda a: a.t_ns)
         for late in in_between:
-            if late.record != -1:
-                latest_place = len(arriving)
-                if chance.random() < 0.5:
-                    latest_place = min(latest_place, 3)
-                place = chance.randint(0, latest_place)
-                number = 0
-                if place:
-                    number, _ = arriving[place - 1]
-                arriving.insert(place, (number, late))
-        if twin:
-            arriving = sorted(arriving + twin, key=lambda ka: ka[0])
-        early_ns = [self._now_ns + k * 1000 for k in range(len(packets_before))]
-        made_ns = None
-        if edges_ns is not None:
-            made_ns = [self._made_ns(byte, edges_ns) for byte in last_bytes]
-        times_ns = self._times([k for k, _ in arriving], pulse_ns, made_ns)
-        sent.arrivals = [Arrival(t, a.packet, a.record) for t, a in zip(early_ns, packets_before, strict=True)]
-        sent.arrivals += [Arrival(t, a.packet, a.record) for t, (_, a) in zip(times_ns, arriving, strict=True)]
-        self._now_ns = max([pulse_ns, *times_ns]) + 10_000_000
+            latest_place = len(arriving)
+            if chance.random() < 0.5:
+                latest_place = min(latest_place, 3)
+            place = chance.randint(0, latest_place)
+            t_ns = made_ns[0]
+            if place:
+                t_ns = arriving[place - 1].t_ns
+            arriving.insert(place, Arrival(t_ns, late.packet, late.record))
+        before = [Arrival(self._now_ns + k * 1000, a.packet, a.record) for k, a in enumerate(packets_before)]
+        sent.arrivals = before + arriving
+        self._now_ns = max([pulse_ns, *(a.t_ns for a in arriving)]) + 10_000_000
         return sent
 
     def _packets(self, sent: Sent, data: bytes) -> tuple[list[bytes], list[int]]:
@@ -299,13 +296,16 @@ class Adversary:
         """Time at which a byte of the data leaves the radar."""
         return edges_ns[byte // self._frame] + _FRAME_NS * (byte % self._frame) // self._frame + 100_000
 
-    def _network(self, packets: list[bytes], sent: Sent) -> list[tuple[int, bytes]]:
-        """Return the packets that arrive in time, in order, each with its number; keep the delayed ones."""
+    def _network(self, packets: list[bytes], made_ns: list[int], sent: Sent) -> list[Arrival]:
+        """Return the packets that arrive in time, in the order of arrival; keep the delayed ones.
+
+        Packets overtake others by the time that these wait, at most 0.6 ms; only what is "held" waits for pulses.
+        """
         t = sent.troubles
         chance = self._chance
         n = len(packets)
         lost_packets: set[int] = set()
-        if "lose_all" in t:
+        if "lose_all" in t or "twin_alone" in t:
             lost_packets = set(range(n))
         if "lose" in t:
             lost_packets |= {k for k in range(n) if chance.random() < chance.choice([0.02, 0.2])}
@@ -319,18 +319,20 @@ class Adversary:
         if "backlog" in t:
             late |= set(range(max(0, n - chance.randint(1, 4)), n))
         self._late += [Arrival(0, packets[k], sent.number) for k in sorted(late - lost_packets)]
-        coming = [(float(k), k, self._damage(packets[k], t)) for k in range(n) if k not in lost_packets | late]
+        coming = [(made_ns[k], k, self._damage(packets[k], t)) for k in range(n) if k not in lost_packets | late]
         if "duplicate" in t and coming:
             coming += [chance.choice(coming) for _ in range(chance.randint(1, 4))]
         if "two_paths" in t:
-            coming += [(arrival + chance.choice([0.5, 30.0]), k, p) for arrival, k, p in coming]
+            coming += [(t_ns + chance.choice([10_000, 600_000]), k, p) for t_ns, k, p in coming]
             if chance.random() < 0.5 and n:
                 self._late.append(Arrival(0, packets[-1], sent.number))
         if "reorder" in t:
-            coming = [(arrival + chance.uniform(-3, 3) * (chance.random() < 0.2), k, p) for arrival, k, p in coming]
+            coming = [(t_ns + chance.randint(0, 120_000) * (chance.random() < 0.2), k, p) for t_ns, k, p in coming]
         if "flows" in t:
-            coming = [(arrival + 5 * (k % 3), k, p) for arrival, k, p in coming]
-        return [(k, p) for _, k, p in sorted(coming, key=lambda c: c[0])]
+            coming = [(t_ns + 100_000 * (k % 3), k, p) for t_ns, k, p in coming]
+        if "held" in t:
+            coming = [(made_ns[min(k + 5 * (k % 3), n - 1)] + k % 3, k, p) for _, k, p in coming]
+        return [Arrival(t_ns, p, sent.number) for t_ns, _, p in sorted(coming, key=lambda c: c[0])]
 
     def _damage(self, packet: bytes, troubles: tuple[str, ...]) -> bytes:
         if "truncate" in troubles and self._chance.random() < 0.05:
@@ -341,16 +343,3 @@ class Adversary:
             turned[bit // 8] ^= 1 << bit % 8
             return bytes(turned)
         return packet
-
-    @staticmethod
-    def _times(numbers: list[int], pulse_ns: int, made_ns: list[int] | None) -> list[int]:
-        """Return when the packets arrive: 20 us apart, or each when its last frame is there."""
-        times: list[int] = []
-        for n, number in enumerate(numbers):
-            t = pulse_ns + (n + 1) * _GAP_NS
-            if made_ns:
-                t = made_ns[min(number, len(made_ns) - 1)]
-                if times:
-                    t = max(t, times[-1] + 1000)
-            times.append(t)
-        return times

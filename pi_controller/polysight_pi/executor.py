@@ -241,7 +241,7 @@ class Executor:
         self._commit(behind_journal)
 
     def _commit(self, behind_journal: list[tuple[Request, m.AnyReply]]) -> None:
-        """Have the events so far written, then these replies sent."""
+        """Have the events so far written, then these replies sent; they wait for a later turn while too much waits."""
 
         def answer(error: PolysightError | OSError | None) -> None:
             if error is not None:
@@ -251,8 +251,9 @@ class Executor:
                     reply = refuse(error)
                 request.answer(reply)
 
-        if behind_journal or self.journal.has_batch:
-            self.journal.commit(answer)
+        has_work = bool(behind_journal) or self.journal.has_batch
+        if has_work and not self.journal.commit(answer):
+            self._replies += behind_journal
 
     def _count_as_heartbeat(self, command: m.AnyCommand) -> None:
         """Count a command of the run's host as its heartbeat: it sends no `Alive` while it waits for the reply."""

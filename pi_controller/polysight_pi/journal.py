@@ -458,19 +458,20 @@ class JournalThread:
         else:
             self._journal.publish_now(kind, **fields)
 
-    def commit(self, then: Callable[[PolysightError | OSError | None], object]) -> None:
+    def commit(self, then: Callable[[PolysightError | OSError | None], object]) -> bool:
         """Have the batch written and published; then call `then` with None, or with the error.
 
-        While the queue is full the batch waits for a later call; a batch that is too long is given up.
+        Return False while the queue is full: the batch waits for a later call. One that is too long is given up.
         """
         if self._jobs.qsize() >= JOBS_WAITING and len(self._events) < EVENTS_WAITING:
-            return
+            return False
         events = self._events
         self._events = []
         if len(events) >= EVENTS_WAITING:
             then(JournalFullError(self._journal.folder, OSError(errno.EIO, "the disk hangs, too many events wait")))
-            return
-        self.call(lambda journal: journal.write(events), then)
+        else:
+            self.call(lambda journal: journal.write(events), then)
+        return True
 
     @property
     def has_batch(self) -> bool:

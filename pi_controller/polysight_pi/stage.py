@@ -50,6 +50,8 @@ STATUS_PER_HEARTBEAT = 4
 # Timeout of a status request, in heartbeats. With the time until the next request and the read timeout, a silent stage
 # is noticed before its own heartbeat stops it.
 SILENT_HEARTBEATS = 0.5
+# Timeout at rest: nothing has to be stopped, and a busy machine may answer late.
+SILENT_AT_REST_S = 3.0
 IDLE_STATUS_S = 1.0
 # From STOP to standstill.
 STOP_TIMEOUT_S = 3.0
@@ -99,6 +101,17 @@ class StatusWatch:
         self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)
         self.interval_s = 0.0  # between status requests; 0: none
 
+    def ask_every(self, interval_s: float, now_s: float) -> None:
+        """Request the status at this interval from now on, 0: never; an open request's timeout begins again."""
+        self.interval_s = interval_s
+        if self._unanswered_since_s is not None:
+            self._unanswered_since_s = now_s
+
+    @property
+    def is_at_rest(self) -> bool:
+        """True if the interval is that of a stage at rest."""
+        return self.interval_s >= IDLE_STATUS_S
+
     def is_due(self, now_s: float) -> bool:
         """Return True, once per interval, if the status is to be requested now."""
         if not self.interval_s or now_s - self._asked_s < self.interval_s:
@@ -121,7 +134,10 @@ class StatusWatch:
         self._looked_s = now_s
         if self._unanswered_since_s is not None and late_s > 0:
             self._unanswered_since_s += late_s
-        if self._unanswered_since_s is None or now_s - self._unanswered_since_s <= self._silence_s:
+        timeout_s = self._silence_s
+        if self.is_at_rest:
+            timeout_s = max(timeout_s, SILENT_AT_REST_S)
+        if self._unanswered_since_s is None or now_s - self._unanswered_since_s <= timeout_s:
             return 0.0
         return now_s - self._unanswered_since_s
 
@@ -135,7 +151,7 @@ class StageLink:
         Called by the reader thread with every unsolicited reply, every `ok` (it separates replies before a command from
         those after it), and one :class:`StageLost` when the link is lost. Must return at once.
     heartbeat_s
-        The stage's heartbeat; the stage is lost if a status request is not answered within half of it.
+        The stage's heartbeat; a moving stage is lost if a status request is not answered within half of it.
     banner_timeout_s
         Timeout for the banner of a stage that was reset by opening the port; a stage without one is greeted anyway.
     caller_late_s
@@ -265,7 +281,7 @@ class StageLink:
 
     def ask_status_every(self, interval_s: float) -> None:
         """Request the status at this interval: the heartbeat of a moving stage. 0 stops the requests."""
-        self._watch.interval_s = interval_s
+        self._watch.ask_every(interval_s, time.monotonic())
 
     def close(self) -> None:
         """Close the port and end the reader."""
@@ -321,7 +337,7 @@ class StageLink:
 
     def _ask_status(self, now: float) -> None:
         hung_s = min(self._caller_late_s(), now - self._commanded_s)
-        if hung_s < CALLER_LATE_S or self._watch.interval_s >= IDLE_STATUS_S:
+        if hung_s < CALLER_LATE_S or self._watch.is_at_rest:
             self._asked_ns.append(self._bound_now_ns()[0])
             self._write(bytes([Immediate.STATUS]))
         else:

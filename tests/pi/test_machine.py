@@ -19,7 +19,7 @@ from polysight.planning.forecast import row_motion_s
 from polysight_pi.executor import check_run, read_burst
 from polysight_pi.machine import RefusedError
 from polysight_pi.rules import RULES, TIMEOUTS_S, WIRE_STATE, State
-from polysight_pi.stage import STATUS_PER_HEARTBEAT, StatusWatch
+from polysight_pi.stage import IDLE_STATUS_S, SILENT_AT_REST_S, STATUS_PER_HEARTBEAT, StatusWatch
 from polysight_pi.trigger import LOOK_UP_S, LoopFault, TriggerWatch
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault, StageError
@@ -176,6 +176,22 @@ def test_a_stage_that_falls_silent_is_noticed_in_time(phase, answer_s, heartbeat
         assert t < 10
     assert dead_s < t + 1e-9, "a stage that answers is not lost"
     assert t - dead_s <= SAFE_WITHIN_S
+
+
+def test_a_stage_at_rest_may_answer_late():
+    """A scan goes on if a busy machine delays the answer between two rows; a moving stage would be lost."""
+    watch = StatusWatch(1.0, 0.0)
+    watch.ask_every(IDLE_STATUS_S, 0.0)
+    t = 0.0
+    while t < IDLE_STATUS_S + SILENT_AT_REST_S - 0.1:
+        t += watch.look_s
+        assert not watch.silent_s(t)
+        watch.is_due(t)
+    watch.ask_every(1.0 / STATUS_PER_HEARTBEAT, t)
+    row_begins_s = t
+    while not watch.silent_s(t):
+        t += watch.look_s
+    assert 0.5 < t - row_begins_s < 0.6
 
 
 @pytest.mark.parametrize("lasting", [True, False])

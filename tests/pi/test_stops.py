@@ -177,6 +177,21 @@ def test_nothing_is_acknowledged_that_is_not_journalled(disk, pi):
             host.wait(m.RowFinished)
 
 
+@pytest.mark.usefixtures("host")
+def test_a_full_queue_loses_no_reply(pi, stage):
+    """What waits for the journal is answered once there is room."""
+    go_on = threading.Event()
+    pi.service._journal.call(lambda _: go_on.wait(HANG_S), lambda _: None)
+    for _ in range(journals.JOBS_WAITING + 1):
+        pi.service._journal.call(lambda _: None, lambda _: None)
+    answers: list[Any] = []
+    assert pi.service.executor.submit(m.RunRow(scan_id="scan", row_index=0, take=1), answers.append)
+    wait_for(lambda: stage.rows_run == 1, "the row")
+    go_on.set()
+    wait_for(lambda: bool(answers), "an answer")
+    assert isinstance(answers[0], m.Accepted), answers
+
+
 def test_a_full_queue_keeps_its_bound(tmp_path):
     """Events of a hanging disk are given up, with an error, before they fill the memory."""
     journal = journals.JournalThread(journals.Journal(tmp_path))

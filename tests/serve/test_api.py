@@ -67,6 +67,8 @@ def view(scans: Path) -> Iterator[Served]:
         ("/api/process?scan=one", {"labels": True}, ErrorCode.FILE_MISSING, ()),
         ("/api/export?scan=one", {"formats": ["pdf"]}, ErrorCode.VALUE_INVALID, ("pdf",)),
         ("/api/process?scan=one", {"library": "mine"}, ErrorCode.FILE_MISSING, ("mine",)),
+        ("/api/concentration", {"library": "mine"}, ErrorCode.FILE_MISSING, ("mine",)),
+        ("/api/layers?scan=one", {"patch": 1, "layers": ["glass"]}, ErrorCode.VALUE_INVALID, ("glass", "NAME,?,MM")),
     ],
 )
 def test_a_wrong_request_is_refused_in_plain_words(view, path, body, code, values):

@@ -271,6 +271,7 @@ def test_nothing_in_a_report_can_act(scans):
 
 
 POSTS = ("control/abort?scan=one", "notes?scan=one", "labels?scan=one", "start", "train", "process?scan=one",
+         "layers?scan=one", "concentration",
          "export?scan=one", "session", "doctor", "plan", "queue", "unqueue", "release", "again?scan=one",
          "archive?scan=one", "delete?scan=one")  # fmt: skip
 NO_NAMES = ("..", "%2e%2e%2f", "/etc", "one%00", "a" * 9000, "%ff%fe")

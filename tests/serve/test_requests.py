@@ -15,6 +15,7 @@ from tests.support.refusals import refused
 
 from polysight.cli.main import build_parser
 from polysight.cli.options import join_negative_values
+from polysight.materials import Layer
 from polysight.serve.commands import (
     MAX_POSITIONS,
     ExportRequest,
@@ -117,6 +118,10 @@ def to_plain(value: Any, root: Path) -> Any:
          {"folder": "%/one", "keep_incomplete": True, "library": "%/libraries/mine.npz"}),
         ("resume?scan=one", {}, {"folder": "%/one", "keep_incomplete": False, "library": None}),
         ("process?scan=one", {"metal": [0, 0, 5, 8]}, {"out": "%/one/products", "metal": (0, 0, 5, 8), "labels": None}),
+        ("process?scan=one", {"bands": 4}, {"bands": 4}),
+        ("layers?scan=one", {"patch": 2, "layers": ["glass, 5.5, 0.05, 3", "liquid, ?"]},
+         {"products": "%/one", "patch": 2, "layer": [Layer("glass", 5.5 - 0.05j, 3e-3), Layer("liquid")]}),
+        ("concentration", {"library": "mine"}, {"data": "%/libraries/mine.npz"}),
         ("train", {"name": "own", "scans": ["one"]}, {"data": ["%/one"], "out": "%/libraries/own.npz"}),
         ("export?scan=one", {"formats": ["csv", "netcdf"]},
          {"products": "%/one", "csv": True, "netcdf": True, "mat": False, "out": "%/one/export"}),
@@ -127,7 +132,7 @@ def test_a_request_is_a_command_line_that_the_parser_takes(start_program, root, 
     status, answer = post(view, f"/api/{path}", body)
     assert status == 200, answer
     (words,) = commands
-    assert words[0] == path.partition("?")[0].replace("start", "scan")
+    assert words[0] == path.partition("?")[0].replace("start", "scan").replace("layers", "permittivity")
     options = vars(build_parser(words[0]).parse_args(join_negative_values(words)))
 
     arguments_shown = {name: to_plain(options[name], root) for name in values}

@@ -206,7 +206,7 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
 
 # --- programs ---
 
-KINDS = ("scan", "process", "export", "doctor", "train")
+KINDS = ("scan", "process", "permittivity", "export", "doctor", "train", "concentration")
 """Programs that a page starts; each has its record, log and exit status in `<folder>/program/`."""
 NO_RESULT = 7
 """Exit status of a program that ended well, but without a result."""

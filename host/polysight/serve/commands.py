@@ -20,7 +20,7 @@ from starlette.routing import Route
 
 from polysight.catalogue import NOTES, PROGRAM, Notes, Summary, find_program, find_programs, is_plain, write_notes
 from polysight.jobs.label import remove_labels, save_labels
-from polysight.materials import Labels
+from polysight.materials import LAYER_FORMS, Labels, parse_layer
 from polysight.planning import Changes, forecast, forecast_values
 from polysight.products import find_labels, label_folder, read_products
 from polysight.serve.reading import json_answer
@@ -38,6 +38,8 @@ Format = Literal["csv", "mat", "netcdf"]
 """Formats of exports, which are written into `<scan>/export`."""
 # Positions of a row, and rows.
 MAX_POSITIONS = 2000
+# Sub-bands that images are made in.
+MAX_BANDS = 16
 Text = Annotated[str, msgspec.Meta(max_length=200)]
 LongText = Annotated[str, msgspec.Meta(max_length=1000)]
 Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
@@ -107,6 +109,20 @@ class ProcessRequest(Body, frozen=True):
     library: Text = ""
     labels: bool = False
     metal: Box | None = None
+    bands: Annotated[int, msgspec.Meta(ge=1, le=MAX_BANDS)] | None = None
+
+
+class LayersRequest(Body, frozen=True):
+    """Layers to fit to a patch, in the order the wave meets them, as `parse_layer` takes them."""
+
+    patch: Annotated[int, msgspec.Meta(ge=1)]
+    layers: Annotated[tuple[Text, ...], msgspec.Meta(min_length=1, max_length=20)]
+
+
+class LibraryRequest(Body, frozen=True):
+    """A library of solutions."""
+
+    library: Text
 
 
 class LabelRequest(Body, frozen=True):
@@ -180,11 +196,13 @@ def command_routes(site: Site) -> list[Route]:
         make_route("unqueue", ScanName, lambda site, body: site.queue.remove(body.name)),
         make_route("release", Body, lambda site, _: site.queue.release()),
         make_route("train", TrainRequest, _train),
+        make_route("concentration", LibraryRequest, _concentration),
         make_scan_route("again", Body, _again),
         make_scan_route("archive", ScanName, _archive),
         make_scan_route("delete", ScanName, _delete),
         make_scan_route("resume", ResumeRequest, _resume),
         make_scan_route("process", ProcessRequest, _process),
+        make_scan_route("layers", LayersRequest, _layers),
         make_scan_route("labels", LabelRequest, _labels),
         make_scan_route("notes", NotesRequest, _notes),
         make_scan_route("export", ExportRequest, _export),
@@ -372,7 +390,23 @@ def _process(site: Site, scan: Named, body: ProcessRequest) -> None:
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
         words += ["--labels", labels[0]]
+    if body.bands is not None:
+        words += ["--bands", str(body.bands)]
     site.programs.start(folder, "process", words)
+
+
+def _layers(site: Site, scan: Named, body: LayersRequest) -> None:
+    for text in body.layers:
+        try:
+            parse_layer(text)
+        except ValueError:
+            raise ConfigError(
+                f"{text!r} is no layer", "a value is missing, or is no number", f"write {LAYER_FORMS}",
+                code=ErrorCode.VALUE_INVALID,
+            ) from None  # fmt: skip
+    stack = [f"--layer={text}" for text in body.layers]
+    words: Words = ["permittivity", scan.folder.absolute(), "--patch", str(body.patch), *stack]
+    site.programs.start(scan.folder, "permittivity", words)
 
 
 class SavedLabels(msgspec.Struct, frozen=True):
@@ -407,6 +441,10 @@ def _train(site: Site, body: TrainRequest) -> None:
     site.programs.start(site.logs, "train", ["train", *folders, "--out", out / f"{body.name}.npz"])
 
 
+def _concentration(site: Site, body: LibraryRequest) -> None:
+    site.programs.start(site.logs, "concentration", ["concentration", _find_library(site, body.library)])
+
+
 def _export(site: Site, scan: Named, body: ExportRequest) -> None:
     folder = scan.folder.absolute()
     out = folder / "export"
@@ -423,14 +461,19 @@ def _processing_words(site: Site, library: str, metal: Box | None) -> Words:
     """Options of the library and the metal reference. Raises ConfigError."""
     words: Words = []
     if library:
-        libraries = site.libraries()
-        if library not in libraries:
-            raise ConfigError(
-                f"no library is called {library[:60]!r}", "it was not trained here", "train it first",
-                code=ErrorCode.FILE_MISSING,
-            )  # fmt: skip
-        words += ["--library", libraries[library].absolute()]
+        words += ["--library", _find_library(site, library)]
     if metal is not None:
         x0, y0, x1, y1 = metal
         words.append(f"--metal-box={x0:g},{y0:g},{x1:g},{y1:g}")
     return words
+
+
+def _find_library(site: Site, name: str) -> Path:
+    """File of a library. Raises ConfigError."""
+    libraries = site.libraries()
+    if name not in libraries:
+        raise ConfigError(
+            f"no library is called {name[:60]!r}", "it was not trained here", "train it first",
+            code=ErrorCode.FILE_MISSING,
+        )  # fmt: skip
+    return libraries[name].absolute()

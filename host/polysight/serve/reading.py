@@ -164,7 +164,7 @@ async def _thumbnail(site: Site, request: Request) -> Response:
 
 async def _program(site: Site, request: Request) -> Response:
     kind = request.path_params["kind"]
-    if kind not in ("doctor", "train"):
+    if kind not in ("doctor", "train", "concentration"):
         return json_answer(None)
     return json_answer(find_program(site.logs, kind))
 

@@ -1,5 +1,5 @@
 // The list of scans: what there is, how it stands; search, order, and what several scans are chosen for.
-import { address, badge, begin, by, bytes, called, complain, day, get, make, nest, pageOf, post, STATES, VERDICTS } from "./common.js";
+import { address, badge, begin, by, bytes, called, complain, day, get, make, nest, pageOf, post, rich, STATES, VERDICTS } from "./common.js";
 
 const LOOK_MS = 4000;
 const FIRST_CARDS = 40, MORE_CARDS = 400; // the first ones of a long list are seen before the rest is made
@@ -102,24 +102,34 @@ async function look() {
   } catch (error) { complain("told", error); }
 }
 
-async function showTraining() {
-  const program = await get("program/train");
+/** Follow `train` or `concentration` to its end. */
+async function showTraining(kind = "train") {
+  const program = await get(`program/${kind}`);
   by("train-log").hidden = !program;
   if (!program) return;
-  by("train-log").textContent = program.log;
-  by("train-told").textContent = program.running ? `Training: ${program.log.split("\n").pop() || "starting"}` : program.status === 0 ? "The library is saved." : "Training failed:";
-  if (program.running) setTimeout(showTraining, 1000);
+  by("train-log").replaceChildren(...rich(program.log));
+  const [, scan, all] = /^.*\[(\d+)\/(\d+)\]/s.exec(program.log) ?? [];
+  const progress = all ? `Reading scan ${scan} of ${all}.` : "Starting.";
+  const done = kind === "train" ? "The library is saved: choose it under Process again, or for a new scan." : "Done.";
+  by("train-told").textContent = program.running ? progress : program.status === 0 ? done : "It has failed:";
+  by("concentration").hidden = program.running || program.status !== 0;
+  if (program.running) setTimeout(showTraining, 1000, kind);
+}
+
+async function train(kind, body) {
+  try {
+    await post(kind, {}, body);
+    complain("train-told");
+    await showTraining(kind);
+  } catch (error) { complain("train-told", error); }
 }
 
 by("train-open").addEventListener("click", () => { by("train").hidden = false; by("train-name").focus(); });
-by("train").addEventListener("submit", async (event) => {
+by("train").addEventListener("submit", (event) => {
   event.preventDefault();
-  try {
-    await post("train", {}, { name: by("train-name").value, scans: [...chosen] });
-    complain("train-told");
-    await showTraining();
-  } catch (error) { complain("train-told", error); }
+  train("train", { name: by("train-name").value, scans: [...chosen] });
 });
+by("concentration").addEventListener("click", () => train("concentration", { library: by("train-name").value }));
 by("tools").addEventListener("submit", (event) => event.preventDefault());
 for (const id of ["find", "state", "tag", "sort"]) by(id).addEventListener("input", show);
 

@@ -6,8 +6,18 @@ const RUNNING_MS = 2000;
 export const INTERRUPTED = "interrupted";
 // What advice for a terminal is called on a page.
 const ON_PAGE = [
-  [/\(--metal [A-Z,]+\)/g, "(Process again, metal reference)"],
+  [/\(--metal(-box)? [A-Z0-9,]+\)/g, "(Process again, metal reference)"],
   [/\(polysight label; process --labels[^)]*\)/g, "(Label, then Process again with the boxes)"],
+  [/`polysight process --bands (\d+)`/g, "Process again with $1 sub-bands"],
+  [/`?polysight permittivity --layer( NAME,\?,\?)?`?/g, "Fit layers"],
+  [/polysight label (SCAN )?--specimen NAME=WHICH/g, "Label, piece"],
+  [/polysight label SCAN --list shows them/g, "see Label"],
+  [/;? to move a box: --remove .*/g, "; or correct the box that has this name"],
+  [/--box .*=x0,y0,x1,y1 with/g, "give"],
+  [/add --metal NAME: /g, "mark the metal, one of "],
+  [/with --bands (\d+)/g, "with $1 sub-bands"],
+  [/: --value water=0/g, " in it, such as water (0%)"],
+  [/\(--value NAME=PERCENT gives it\)/g, ""],
 ];
 
 export const by = (id) => document.getElementById(id);

@@ -57,7 +57,7 @@ export class Labels {
     const piece = make("input", null, null, { value: b.specimen, placeholder: "piece", maxLength: 80, "aria-label": `Which piece lies in box ${i + 1}`, oninput: change((f) => { b.specimen = f.value; }) });
     const metal = make("input", null, null, { type: "radio", name: "metal", checked: b.metal, onchange: change(() => { this.boxes.forEach((o) => { o.metal = o === b; }); }) });
     const remove = make("button", "Remove", "danger", { type: "button", onclick: () => { this.boxes.splice(i, 1); this.touched = true; this.show(); } });
-    const corners = make("div", "mm: ", "corners");
+    const corners = make("div", `${i + 1}, mm: `, "corners");
     ["left", "lower", "right", "upper"].forEach((side, k) => corners.append(make("input", null, null, {
       type: "number", step: "0.5", value: b.box[k], "aria-label": `${side} edge of box ${i + 1}, mm`, oninput: change((f) => { if (f.value !== "") b.box[k] = +f.value; }),
     })));
@@ -66,10 +66,11 @@ export class Labels {
 
   overlay(pen, at) {
     if (!this.open) return;
-    for (const b of this.boxes) {
+    for (const [i, b] of this.boxes.entries()) {
       const [x0, y1] = at(b.box[0], b.box[1]), [x1, y0] = at(b.box[2], b.box[3]);
       outline(pen, () => pen.strokeRect(x0, y0, x1 - x0, y1 - y0), b.metal ? "#f2b632" : "#7cc7f7");
-      caption(pen, b.name || "?", (x0 + x1) / 2, (y0 + y1) / 2);
+      const isWide = x1 - x0 > 7.5 * b.name.length;
+      caption(pen, b.name && isWide ? b.name : String(i + 1), (x0 + x1) / 2, (y0 + y1) / 2); // names of neighbours would overlap
     }
   }
 
@@ -90,7 +91,7 @@ export class Labels {
       const told = await post("labels", this.scan, { boxes, metal: this.boxes.find((b) => b.metal)?.name.trim() ?? null, specimens });
       this.touched = false;
       const left = Boolean(told.file);
-      const done = left ? "Saved. Process again to use them." : "No box is left: the saved ones are deleted.";
+      const done = left ? "Saved. Process again to use them here; to learn from them, choose the scans in the list and make a library." : "No box is left: the saved ones are deleted.";
       by("label-told").textContent = [done, ...told.notes.map((n) => `Note: ${n}.`)].join(" ");
       by("use-labels").disabled = !left;
       by("use-labels").checked = left;

@@ -28,6 +28,7 @@ function showHead() {
   by("repeat").href = `/new?${new URLSearchParams({ from: scanName })}`;
   by("away").hidden = !(server.starts && !live);
   by("process-open").hidden = !(server.starts && recorded && !live);
+  by("layers-open").hidden = !(server.starts && result?.patches.length && !live);
   by("report").hidden = !result?.files.some((f) => f.name === "report.html");
   by("report").href = address("file/report.html", scan);
   by("surface").hidden = !result?.files.some((f) => f.name === "surface.ply");
@@ -103,6 +104,10 @@ const patchName = (p) => (p.metal_reference ? "metal reference" : p.refused ? "n
 
 function showPatches() {
   by("patches").hidden = !result.patches.length;
+  const layered = by("layers-patch").value;
+  const options = result.patches.filter((p) => !p.metal_reference).map((p) => make("option", `${p.label} ${patchName(p)}`, null, { value: p.label }));
+  by("layers-patch").replaceChildren(...options);
+  if (options.some((option) => option.value === layered)) by("layers-patch").value = layered;
   by("patches-note").textContent = result.metal ? `metal reference: ${result.metal}` : "";
   fill(by("rows"), result.patches.map((p) => {
     const row = make("tr", null, null, { id: `patch-${p.label}` });
@@ -141,22 +146,25 @@ async function follow() {
   try { now = await get("scan", scan); } catch (error) { complain("told", error); return; }
   summary = now;
   const [program] = summary.programs;
-  showProgram(program, program?.running || program?.status !== 0 || running !== "");
+  const fits = program?.kind === "permittivity" && program.status === 0; // its result stands beside the form
+  showProgram(program, !fits && (program?.running || program?.status !== 0 || running !== ""));
   const was = running;
   running = program?.running ? program.kind : "";
+  if (fits && was) by("layers-told").textContent = `In the stack: ${program.log.split("in the stack").at(-1).trim()}`;
   showHead();
   if ((was && !running) || (hasProducts() && summary.generation !== result?.generation)) await load();
   if (running) by("told").textContent = "";
 }
 
-async function run(path, body) {
-  complain("told");
+async function run(path, body, told = "told") {
+  complain(told);
   try {
-    by("told").textContent = "Starting…";
+    by(told).textContent = "Starting…";
     await post(path, scan, body);
+    complain(told);
     running = path;
     await follow();
-  } catch (error) { by("told").textContent = ""; complain("told", error); }
+  } catch (error) { complain(told, error); }
 }
 
 // --- notes ---
@@ -224,14 +232,21 @@ by("resume").addEventListener("click", async () => {
   if (running) location.href = pageOf("watch", scanName);
 });
 by("label-open").addEventListener("click", () => labels.toggle());
-by("process-open").addEventListener("click", () => {
-  by("process").hidden = !by("process").hidden;
-  by("process-open").setAttribute("aria-expanded", String(!by("process").hidden));
-});
+for (const id of ["process", "layers"]) {
+  by(`${id}-open`).addEventListener("click", () => {
+    by(id).hidden = !by(id).hidden;
+    by(`${id}-open`).setAttribute("aria-expanded", String(!by(id).hidden));
+  });
+}
 by("process").addEventListener("submit", (event) => {
   event.preventDefault();
-  by("process").hidden = true;
-  run("process", { library: by("library").value, labels: by("use-labels").checked, metal });
+  by("process-open").click();
+  run("process", { library: by("library").value, labels: by("use-labels").checked, metal, bands: +by("bands").value || null });
+});
+by("layers").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const layers = by("layers-text").value.split("\n").map((line) => line.trim()).filter(Boolean);
+  run("layers", { patch: +by("layers-patch").value, layers }, "layers-told");
 });
 by("draw-metal").addEventListener("click", () => {
   if (metal || drawsMetal) { setMetal(null); return; }

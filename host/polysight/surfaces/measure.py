@@ -22,7 +22,7 @@ from polysight.surfaces.points import (
     locate,
     predict_echo,
 )
-from polysight.surfaces.window import Echoes, Samples
+from polysight.surfaces.window import WINDOW_M, Echoes, Samples
 
 Array = NDArray[np.float64]
 # Points and normals of neighbouring windows that belong to one surface differ by no more.
@@ -150,7 +150,8 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
     """Replace the curvature of each echo's path by a fit to its neighbours in the same surface.
 
     The fit takes the slopes of all windows near by, g + Q d at the distance d, for the unknown g and Q. What it leaves
-    of the slopes is an error of each that its own window does not show: ripple of edges and of other echoes.
+    of the slopes is an error of each that its own window does not show: ripple of edges and of other echoes. Its
+    variance is averaged over the neighbours, for one fit leaves few independent residuals.
     """
     bend = echoes.bend.copy()
     slope_std = echoes.slope_std.copy()
@@ -158,29 +159,68 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
         members = np.flatnonzero(segment == number)
         at_m = echoes.at_m[members, :2]
         neighbours = scipy.spatial.KDTree(at_m).query_ball_point(at_m, NEIGHBOURHOOD_M)
-        for index, near in zip(members, neighbours, strict=True):
-            if len(near) < MIN_NEIGHBOURS:
-                continue
-            bend[index], residuals = fit_bend(echoes, int(index), members[near])
-            slope_std[index] = np.maximum(slope_std[index], residuals)
+        ripple = np.zeros((len(members), 2))
+        is_fitted = np.array([len(near) >= MIN_NEIGHBOURS for near in neighbours])
+        for place in np.flatnonzero(is_fitted):
+            bend[members[place]], ripple[place] = fit_bend(echoes, int(members[place]), members[neighbours[place]])
+        for place in np.flatnonzero(is_fitted):
+            near = [other for other in neighbours[place] if is_fitted[other]]
+            slope_std[members[place]] = np.hypot(
+                slope_std[members[place]], np.sqrt(np.maximum(0, ripple[near].mean(axis=0)))
+            )
     return replace(echoes, bend=bend, slope_std=slope_std)
 
 
 def fit_bend(echoes: Echoes, index: int, others: NDArray[np.int_]) -> tuple[Array, Array]:
-    """Symmetric curvature [2, 2] from the slopes of neighbours, and what it leaves of these, root mean square [2]."""
+    """Symmetric curvature [2, 2] from the slopes of neighbours, and the variance [2] of their ripple.
+
+    Ripple is what is neither a smooth change nor noise of the windows. Where there is none, its variance scatters about
+    zero.
+    """
     d = (echoes.at_m[others] - echoes.at_m[index])[:, :2]
     zero = np.zeros(len(d))
     ones = np.ones(len(d))
     # Unknown: g_x, g_y, Q_xx, Q_xy, Q_yy.
     along_x = np.stack([ones, zero, d[:, 0], d[:, 1], zero], axis=1)
     along_y = np.stack([zero, ones, zero, d[:, 0], d[:, 1]], axis=1)
-    slopes = np.concatenate(list(echoes.slope[others].T))
+    matrix = np.stack([along_x, along_y])
+    slopes = echoes.slope[others].T
     # The windows' own curvatures count as slopes at this distance.
-    weight_m = LEVER_OF_WINDOW_M * np.sqrt(len(d))
+    weight_m2 = LEVER_OF_WINDOW_M**2 * len(d)
     bend = echoes.bend[others].mean(axis=0)
-    matrix = np.concatenate([along_x, along_y, weight_m * np.eye(5)[2:]])
-    right = np.concatenate([slopes, weight_m * np.array([bend[0, 0], bend[0, 1], bend[1, 1]])])
-    fitted = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    residuals = (slopes - matrix[: len(slopes)] @ fitted).reshape(2, -1)
-    freedom = max(1.0, len(d) - 2.5)
-    return np.array([[fitted[2], fitted[3]], [fitted[3], fitted[4]]]), np.sqrt(np.sum(residuals**2, axis=1) / freedom)
+    own = np.array([0.0, 0.0, bend[0, 0], bend[0, 1], bend[1, 1]])
+    weights = np.diag([0.0, 0.0, weight_m2, weight_m2, weight_m2])
+    inverse = np.linalg.inv(along_x.T @ along_x + along_y.T @ along_y + weights)
+    fitted = inverse @ (along_x.T @ slopes[0] + along_y.T @ slopes[1] + weights @ own)
+    left = np.mean((slopes - matrix @ fitted) ** 2, axis=1)
+    noise, ripple = correlate_windows(d)
+    noise_left = find_share_left(noise, matrix, inverse) * np.mean(echoes.slope_std[others] ** 2, axis=0)
+    variance = (left - noise_left) / find_share_left(ripple, matrix, inverse)
+    return np.array([[fitted[2], fitted[3]], [fitted[3], fitted[4]]]), variance
+
+
+def correlate_windows(d: Array) -> tuple[Array, Array]:
+    """Correlations [2, n, n] of the errors of both slopes of windows at the offsets `d` [n, 2], by noise and by ripple.
+
+    Windows share data as far as they overlap. Noise counts by its distance from the middle in the direction of the
+    slope, hence 1 - 3 s + 2 s^3 at the share s of a window there, and 1 - s across it. Ripple is as long as a window or
+    longer: normals of simulated plates had correlations of 0.77, 0.49 and 0.13 at 8, 16 and 24 mm, about 1 - s.
+    """
+    apart = np.minimum(1, np.abs(d[:, None] - d[None]) / WINDOW_M)
+    across = np.moveaxis(1 - apart, -1, 0)
+    along = np.moveaxis(1 - 3 * apart + 2 * apart**3, -1, 0)
+    ripple = across[0] * across[1]
+    return along * across[::-1], np.stack([ripple, ripple])
+
+
+def find_share_left(correlation: Array, matrix: Array, inverse: NDArray) -> Array:
+    """Share [2] of the variance of errors of both slopes that a fit leaves as residuals.
+
+    trace((1 - S) C (1 - S)') / n, with S = `matrix` `inverse` `matrix`' the smoother and C the correlation [2, n, n].
+    `matrix` [2, n, 5]: both slopes in terms of the unknown; `inverse` [5, 5]: of the normal matrix.
+    """
+    transposed = np.swapaxes(matrix, 1, 2)
+    common = transposed @ correlation @ matrix
+    taken = 2 * np.trace(inverse @ common, axis1=1, axis2=2)
+    fitted = np.trace(inverse @ common.sum(axis=0) @ inverse @ transposed @ matrix, axis1=1, axis2=2)
+    return 1 + (fitted - taken) / matrix.shape[1]

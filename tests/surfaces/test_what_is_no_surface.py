@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from polysight.surfaces import Uncertainty, analyse_surface
-from polysight.surfaces.permittivity import find_interior
+from polysight.surfaces import Uncertainty, analyse_surface, find_voltages
+from polysight.surfaces.permittivity import find_interior, find_reflecting
 from polysight.surfaces.result import estimate_wall_std
 from polysight_worlds.media import Stack
 from polysight_worlds.shapes import cylinder, plate
@@ -38,6 +40,19 @@ def test_edges_alone_give_no_permittivity(see, gains, optics):
     surface = analyse_surface(see([board]), optics, gains, uncertainty=EXACT)
     assert [s.permittivity for s in surface.segments] == [None] * len(surface.segments)
     assert all(s.reason for s in surface.segments)
+
+
+def test_an_edge_has_no_level_of_its_own(metal, gains, optics):
+    """What an edge diffracts falls off as 1 / angle from the border of the zone that its surface reflects to."""
+    voltages = find_voltages(metal, optics)
+    amplitude = np.abs(metal.h.amplitude)
+    number = np.zeros(len(metal), int)
+    learnt = gains(optics)
+    assert find_reflecting(voltages, amplitude, number, learnt).mean() > 0.9
+    angle = metal.h.slope[:, 0] - metal.h.slope[:, 0].min() + 0.02
+    fall = 0.02 / angle
+    edge = replace(voltages, b=voltages.b * fall[:, None])
+    assert not find_reflecting(edge, amplitude * fall, number, learnt).any()
 
 
 def test_a_thin_wall_gives_no_permittivity(see, gains, optics, request):

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from polysight.surfaces.optics import Optics
 from polysight.surfaces.paths import STRIDE_M, find_echoes, measure_echoes
 from polysight.surfaces.points import (
+    find_bend,
     find_curvature,
+    find_motion,
     find_normals,
     find_offset_that_sees,
     locate,
@@ -31,6 +33,9 @@ MAX_PATH_MISS_M = 0.002
 MAX_TURN_RAD = 0.35
 # Windows of one surface whose path curvature is averaged.
 NEIGHBOURHOOD_M = 0.024
+# Points so close on a surface have the same curvature; they are counted in cells.
+SAME_CURVATURE_M = 0.012
+CELL_M = 0.004
 MIN_POINTS = 8
 MIN_NEIGHBOURS = 6
 # Distance at which a window's own curvature counts as a slope: a third of a window.
@@ -91,6 +96,7 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
     echoes = echoes[_is_sound(echoes, find_shape(echoes, optics))]
     segment = group_echoes(echoes, optics)
     echoes = smooth_bends(echoes, segment)
+    echoes = share_curvatures(echoes, segment, optics)
     shape = find_shape(echoes, optics)
     keep = (segment >= 0) & _is_wide(shape)
     tx_m = optics.tx.at_m
@@ -224,3 +230,27 @@ def find_share_left(correlation: Array, matrix: Array, inverse: NDArray) -> Arra
     taken = 2 * np.trace(inverse @ common, axis1=1, axis2=2)
     fitted = np.trace(inverse @ common.sum(axis=0) @ inverse @ transposed @ matrix, axis1=1, axis2=2)
     return 1 + (fitted - taken) / matrix.shape[1]
+
+
+def share_curvatures(echoes: Echoes, segment: NDArray[np.int_], optics: Optics) -> Echoes:
+    """Replace the curvature of each echo's path by that of the mean motion of the points close by on the surface.
+
+    A small body shows nearly the same place to all windows, which moves by millimetres: each window alone tells little
+    of its curvature, all together much. On a plane only the next windows see the same place. Echoes count by power.
+    """
+    shape = find_shape(echoes, optics)
+    geometry = (shape.points, shape.normals, echoes.at_m, optics.tx.at_m, optics.h.at_m)
+    motion = find_motion(*geometry, echoes.bend)
+    weight = np.abs(echoes.amplitude) ** 2
+    for number in np.unique(segment[segment >= 0]):
+        members = np.flatnonzero(segment == number)
+        places = np.round(shape.points[members] / CELL_M).astype(int)
+        cells, cell = np.unique(places, axis=0, return_inverse=True)
+        cell = cell.reshape(-1)
+        weights = np.bincount(cell, weight[members])
+        sums = np.zeros((len(cells), 2, 2))
+        np.add.at(sums, cell, weight[members, None, None] * motion[members])
+        near = scipy.spatial.KDTree(cells * CELL_M).query_ball_point(cells * CELL_M, SAME_CURVATURE_M)
+        means = np.array([sums[group].sum(axis=0) / weights[group].sum() for group in near])
+        motion[members] = means[cell]
+    return replace(echoes, bend=find_bend(*geometry, motion))

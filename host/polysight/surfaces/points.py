@@ -5,7 +5,8 @@ With u the stage offset, T and R the antennas, p the specular point, t and r the
 normal is n = -(t + r) / |t + r| and cos(theta) = |t + r| / 2: the angle of incidence depends on the place alone. With
 H = sum (I - k k') / distance over both legs, E the tangents and X = -E' H_xy, the second derivative of the path by the
 place on the surface is P = E' H E + 2 cos(theta) K, and eliminating the place gives Q = H_xy - X' P^-1 X, hence
-K = (X (H_xy - Q)^-1 X' - E' H E) / (2 cos(theta)). Curvature is positive for convex bodies. All arrays are [n, ...].
+K = (X (H_xy - Q)^-1 X' - E' H E) / (2 cos(theta)). Curvature is positive for convex bodies. P^-1 is how far the point
+moves with the stage: nothing on an edge, and Q is linear in it. All arrays are [n, ...].
 """
 
 from __future__ import annotations
@@ -94,6 +95,19 @@ def find_curvature(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m
     rest = plane - bend
     inner = cross @ np.linalg.solve(rest + 1e-9 * np.eye(2), np.swapaxes(cross, 1, 2))
     return (inner - along) / twice_cosine[:, None, None]
+
+
+def find_motion(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
+    """P^-1 [n, 2, 2], metres, of echoes whose path has the curvature `bend`."""
+    plane, cross, _, _ = _terms(points, normals, at_m, tx_m, rx_m)
+    inverse = np.linalg.inv(cross)
+    return np.swapaxes(inverse, 1, 2) @ (plane - bend) @ inverse
+
+
+def find_bend(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, motion: Array) -> Array:
+    """Curvature [n, 2, 2] of the paths of echoes with a P^-1 of `motion`."""
+    plane, cross, _, _ = _terms(points, normals, at_m, tx_m, rx_m)
+    return plane - np.swapaxes(cross, 1, 2) @ motion @ cross
 
 
 def predict_echo(

@@ -126,6 +126,11 @@ class CardSender:
         """True if the queue is full."""
         return self._queued_bytes > _MAX_QUEUED_BYTES
 
+    @property
+    def queued_bytes(self) -> int:
+        """Bytes of data packets not sent yet; the tests' cards stay far below a full queue."""
+        return self._queued_bytes
+
     def counts(self) -> dict[str, int]:
         """Return the numbers of data packets and payload bytes sent, and of waits for the receiver."""
         return {"packets_sent": self.packets, "bytes_sent": self.payload_bytes, "waits": self.waits}

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from polysight.sync import loops
+from polysight.sync.decimate import FOLD
 from polysight.sync.offsets import prepare, reference
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -83,6 +84,39 @@ def test_the_bias_is_small_for_every_object_distance(rig, align_single, board, z
     assert done.found.all()
     assert np.abs(done.frequency - true).max() * rig.chirp.sample_rate_hz < 10
     assert np.angle(done.amplitude / done.amplitude.mean()).std() < 6e-4
+
+
+def test_clutter_behind_the_object_hardly_moves_it_and_costs_little_noise(board, direct_paths):
+    """Clutter of any direction: its power in the estimate, against that of a plain mean; noise against one tone's."""
+    path = direct_paths[board.name]
+    rx, blocks = path.folded_steering.shape
+    time = (np.arange(blocks) - (blocks - 1) / 2) * FOLD
+    paths_m = np.linspace(0.6, 1.4, 400)
+    clutter = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(paths_m, path.sweep_hz))
+    plain = np.stack([np.ones(blocks), -1j * time / (time**2).mean()]) / (rx * blocks)
+    for weights, mean in zip(path.estimator, plain, strict=True):
+        by_rx = weights.reshape(rx, blocks)
+        passed = (np.abs(clutter @ by_rx.T) ** 2).sum(axis=1).mean()
+        assert passed < 0.35 * rx * (np.abs(clutter @ mean) ** 2).mean()
+    bounds = np.sqrt([1 / (rx * blocks), 1 / (rx * (time**2).sum())])
+    assert (np.linalg.norm(path.estimator, axis=1) < [1.03, 1.09] * bounds).all()
+
+
+def test_clutter_half_as_strong_0_9_m_behind_it_leaves_its_phase(rig, align_single, board, direct_paths):
+    rng, n = np.random.default_rng(8), 300
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    direct = np.linalg.norm(rx - tx, axis=1)
+    clutter = direct + 0.9 + rng.uniform(-0.04, 0.04, (n, 1))
+    f = (rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(256)) / SPEED_OF_LIGHT_M_S
+    received = np.exp(2j * np.pi * f * direct[:, None]) + 0.5 * np.exp(
+        2j * np.pi * (f * clutter[..., None] + rng.uniform(size=(n, 4, 1)))
+    )
+    received *= np.exp(2j * np.pi * 0.3 * np.arange(256))
+    done = reference(align_single(received, np.ones(n, bool)), direct_paths[board.name], rig.chirp)
+    true = 0.3 + rig.chirp.hz_per_sample * direct[0] / SPEED_OF_LIGHT_M_S
+    assert done.found.all()
+    assert np.angle(done.amplitude / done.amplitude.mean()).std() < 2.5e-3
+    assert (done.frequency - true).std() * rig.chirp.sample_rate_hz < 50
 
 
 def test_unequal_receivers_do_not_bias_it_much(run, board):

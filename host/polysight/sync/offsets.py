@@ -22,8 +22,9 @@ a direct path `A exp(j w t)` near `w = 0`, with the model `x = A g + A w (jt g)`
     [A, A w] = (G^H R^-1 G)^-1 G^H R^-1 x,   G = [g, j t g]
 
 (generalised least squares; Kay 1993, section 6.4). This is a fixed 2 x (4 RX x samples) matrix: a beamformer in space
-and frequency with nulls at the object. Gauss-Newton steps `w += Re(A w / A)` converge. Its input is the average after
-burst alignment: mixed to zero frequency, with four consecutive samples averaged.
+and frequency with nulls at the object. R also holds weak clutter behind the object (walls, a table) from any direction;
+otherwise the sidelobes there would be those of a rectangular window. Gauss-Newton steps `w += Re(A w / A)` converge.
+Its input is the average after burst alignment: mixed to zero frequency, with four consecutive samples averaged.
 
 The crystals of the boards differ by some ppm, and with them the chirp slopes, so the IF drifts by some kilohertz within
 a chirp, equally for all paths and positions. A third column `jt^2/2 g` estimates this drift; its median over the row is
@@ -73,6 +74,10 @@ _SPREAD_M = 0.1
 _GAIN_SPREAD = 0.3
 # Noise power of a sample relative to an echo as strong as the direct path.
 _NOISE = 1e-2
+# Clutter behind the object: largest excess path, and power of all of it relative to the direct path. At this power the
+# estimate holds a sixth of the clutter's power that it holds without, and 0.5 % more noise.
+_CLUTTER_M = 1.5
+_CLUTTER_POWER = 4e-3
 # Gauss-Newton steps to its frequency. In noise the last one stays large, so that no direct path is found.
 _STEPS = 3
 # A second peak this strong, one object distance below the first, is the direct path.
@@ -530,7 +535,11 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     flat = echoes.reshape(len(points), n_rx * n)
     same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
     noise = _NOISE / FOLD * np.eye(n_rx * n)
-    covariance = ((flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + noise).astype(np.complex128)
+    mirror_m = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).min()
+    clutter = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(np.linspace(mirror_m, _CLUTTER_M, 8 * n), middles))
+    clutter_of_rx = _CLUTTER_POWER / len(clutter) * (clutter.T @ clutter.conj())
+    covariance = (flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + noise
+    covariance = (covariance + np.kron(np.eye(n_rx), clutter_of_rx)).astype(np.complex128)
     time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
     model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
     channels_of_half = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]

@@ -67,8 +67,9 @@ _FULL_SCALE = 32767
 # Positions read at a time: 2 MB, which stay in the processor's cache.
 _POSITIONS = 32
 
-# Cubes: rows from which their form is detected.
+# Cubes: rows from which their form is detected, and about how many of their positions.
 _CUBE_ROWS = 7
+_FORM_POSITIONS = 300
 # Echoes come from within this distance of the mirror point.
 _SPREAD_M = 0.15
 # Noise power of a sample relative to the object, for the estimate of the direct path.
@@ -442,9 +443,12 @@ class CubeForm:
 
         The receiver's filter is not compensated.
         """
-        valid = np.isfinite(cube).all(axis=(0, 2)) & (cube != 0).any(axis=(0, 2))
-        samples = self._turn_cube(np.where(valid[:, None], cube, 0)) + self.constant[:, None, None]
-        samples *= valid[:, None]
+        valid = _positions_with_data(cube)
+        if not valid.all():
+            cube = np.where(valid[:, None], cube, np.complex64(0))
+        samples = (cube.conj() if self.conjugate else cube) * self.turn[:, None]
+        samples += self.constant[:, None, None]
+        samples[:, ~valid] = 0
         if self.path is not None:
             samples, valid, hz, amplitude = _reference_cube(samples, valid, self.path, self.chirp)
         else:
@@ -459,8 +463,14 @@ class CubeForm:
             direct_amplitude=amplitude,
         )
 
-    def _turn_cube(self, cube: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        return ((cube.conj() if self.conjugate else cube) * self.turn[:, None]).astype(np.complex64)
+
+def _positions_with_data(cube: NDArray[np.complex64]) -> NDArray[np.bool_]:
+    """Return the positions of a row [rx, position, sample] that are finite and not all zero, [position]."""
+    numbers = np.ascontiguousarray(cube, np.complex64).view(np.float32)
+    # The largest and the smallest of numbers with a NaN are NaN.
+    highest = numbers.max(axis=2).max(axis=0)
+    lowest = numbers.min(axis=2).min(axis=0)
+    return np.isfinite(highest) & np.isfinite(lowest) & ((highest != 0) | (lowest != 0))
 
 
 def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Board) -> CubeForm:
@@ -478,7 +488,8 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     DataError
         if the rows have no data.
     """
-    cube = np.concatenate([r[:, np.isfinite(r).all(axis=(0, 2)) & (r != 0).any(axis=(0, 2))] for r in rows], axis=1)
+    cube = np.concatenate([r[:, _positions_with_data(r)] for r in rows], axis=1)
+    cube = cube[:, :: max(1, cube.shape[1] // _FORM_POSITIONS)]
     if cube.shape[1] == 0:
         raise DataError(
             f"the cube of board {board.name} has no data",

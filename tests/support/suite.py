@@ -4,8 +4,8 @@ A file's tests run in one worker, so that its fixtures are made once. pytest-xdi
 most of it, but it writes its groups into the names of tests, and since pytest 9.2 nothing reads them there: every test
 is a group of its own, without a word (https://github.com/pytest-dev/pytest-xdist/issues/1386).
 
-Costs (`--costs`) are processor times of a test's own process and of the programs that it started and awaited. On a busy
-machine they change less than the clock.
+Costs (`--costs`) are processor times of a test's own process and of all programs that it started, also of those that
+still run or that nobody awaited, such as a browser's. On a busy machine they change less than the clock.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import resource
 import time
 from collections import Counter
 from collections.abc import Callable, Generator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -99,59 +100,105 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     return folder
 
 
-_SHOWN = 10
+_SHOWN = 60
 _NAME = "costs"
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
-def _now_s() -> tuple[float, float]:
-    """Processor time and the clock."""
-    used = [resource.getrusage(process_kind) for process_kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(u.ru_utime + u.ru_stime for u in used), time.monotonic()
+class ProcessTimes:
+    """Processor time of this process and of all programs that it started, directly or not.
+
+    A program that was seen once is followed after its parent has ended, too: most processes of a browser are such
+    orphans. What one uses between the last call and its end is lost unless its parent awaits it.
+    """
+
+    def __init__(self) -> None:
+        # Process number and time of start: numbers are given again.
+        self._followed: set[tuple[int, str]] = set()
+
+    def read_s(self) -> float:
+        """Seconds until now. They decrease when a program ends that nobody awaits."""
+        table = {}
+        for folder in filter(str.isdigit, os.listdir("/proc")):  # noqa: PTH208
+            with suppress(OSError):
+                line = Path(f"/proc/{folder}/stat").read_text(errors="replace")
+                table[int(folder)] = line.rpartition(") ")[2].split()
+        # Field numbers of proc_pid_stat(5), less the three before: 4 ppid, 14 to 17 times, 22 time of start.
+        own = {pid for pid, fields in table.items() if (pid, fields[19]) in self._followed}
+        children: dict[int, list[int]] = {}
+        for pid, fields in table.items():
+            children.setdefault(int(fields[1]), []).append(pid)
+        waiting = [os.getpid(), *own]
+        while waiting:
+            new = set(children.get(waiting.pop(), ())) - own
+            own |= new
+            waiting.extend(new)
+        self._followed = {(pid, table[pid][19]) for pid in own}
+        ticks = sum(int(field) for pid in own for field in table[pid][11:15])
+        used = [resource.getrusage(process_kind) for process_kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return ticks / _TICKS_PER_S + sum(u.ru_utime + u.ru_stime for u in used)
 
 
 class Costs:
-    """Workers measure the phases of each test; the main process adds them up."""
+    """Workers measure each test with its fixtures; the main process adds them up."""
 
     def __init__(self) -> None:
-        self._last_s = _now_s()
+        self._times = ProcessTimes()
+        self._last_s = self._now_s()
         self._cpu_s: Counter[str] = Counter()
         self._wall_s: Counter[str] = Counter()
 
+    def _now_s(self) -> tuple[float, float]:
+        """Processor time and the clock."""
+        return self._times.read_s(), time.monotonic()
+
     @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-        """Add what passed since the last report to this one."""
+    def pytest_runtest_makereport(
+        self, call: pytest.CallInfo[None]
+    ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+        """Add what a test used to the report of its last phase."""
         report = yield
+        if call.when != "teardown":
+            return report
         before_s = self._last_s
-        self._last_s = _now_s()
-        spent_s = [now - time_before for now, time_before in zip(self._last_s, before_s, strict=True)]
-        report.user_properties = [*(p for p in report.user_properties if p[0] != _NAME), (_NAME, spent_s)]
+        self._last_s = self._now_s()
+        spent_s = [max(0.0, now - time_before) for now, time_before in zip(self._last_s, before_s, strict=True)]
+        report.user_properties.append((_NAME, spent_s))
         return report
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Add a phase to its test."""
+        """Note what a test used."""
         for name, spent_s in report.user_properties:
             if name == _NAME:
                 cpu_s, wall_s = spent_s  # type: ignore[misc]
-                self._cpu_s[report.nodeid] += cpu_s
-                self._wall_s[report.nodeid] += wall_s
+                self._cpu_s[report.nodeid] = cpu_s
+                self._wall_s[report.nodeid] = wall_s
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         """The table: processor and clock seconds."""
-        rooms_cpu_s, rooms_wall_s = (_by_room(room_times) for room_times in (self._cpu_s, self._wall_s))
         write = terminalreporter.write_line
         terminalreporter.section("costs")
         write(f"{self._cpu_s.total() / 60:.1f} CPU minutes, {self._wall_s.total() / 60:.1f} worker minutes")
         for title, cpu_s, wall_s in (
-            ("rooms", rooms_cpu_s, rooms_wall_s),
-            ("most processor time", self._cpu_s, self._wall_s),
+            ("rooms", _by_part(self._cpu_s, _room), _by_part(self._wall_s, _room)),
+            ("files", _by_part(self._cpu_s, _file), _by_part(self._wall_s, _file)),
+            ("tests", self._cpu_s, self._wall_s),
         ):
             write(f"{'CPU s':>8} {'wall s':>8}  {title}")
-            for name, spent_s in cpu_s.most_common(None if cpu_s is rooms_cpu_s else _SHOWN):
+            for name, spent_s in cpu_s.most_common(_SHOWN):
                 write(f"{spent_s:8.1f} {wall_s[name]:8.1f}  {name}")
 
 
-def _by_room(tests: Counter[str]) -> Counter[str]:
-    rooms: Counter[str] = Counter()
+def _file(test: str) -> str:
+    return test.partition("::")[0]
+
+
+def _room(test: str) -> str:
+    return "/".join(_file(test).split("/")[:2])
+
+
+def _by_part(tests: Counter[str], part: Callable[[str], str]) -> Counter[str]:
+    parts: Counter[str] = Counter()
     for name, spent_s in tests.items():
-        rooms["/".join(name.partition("::")[0].split("/")[:2])] += spent_s
-    return rooms
+        parts[part(name)] += spent_s
+    return parts

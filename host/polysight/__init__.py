@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from polysight_shared import __version__
 
 if TYPE_CHECKING:
-    from polysight.api import Scan, open_scan, read_netcdf
+    from polysight.api import Scan, open_scan, read_netcdf, write_netcdf
     from polysight.api.classifier import Classifier, train
     from polysight.api.functions import Plan, check, compare, plan, simulate
     from polysight.imaging import backproject
@@ -38,6 +38,7 @@ _HOME = {
     "read_netcdf": "polysight.api",
     "simulate": "polysight.api.functions",
     "train": "polysight.api.classifier",
+    "write_netcdf": "polysight.api",
 }
 
 __all__ = [
@@ -58,6 +59,7 @@ __all__ = [
     "read_netcdf",
     "simulate",
     "train",
+    "write_netcdf",
 ]
 
 

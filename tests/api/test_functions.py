@@ -145,7 +145,7 @@ def test_a_scene_can_be_written_in_python(tmp_path):
     simulated_scan = polysight.simulate(scene, tmp_path / "scan", seed=5)
     assert simulated_scan.simulated is True
     assert simulated_scan.rows.planned == 9
-    with refused(ErrorCode.OTHER):
+    with pytest.warns(UserWarning, match="grid"), refused(ErrorCode.OTHER):
         polysight.simulate({"name": "wrong", "plates": [{"nme": "x"}]}, tmp_path / "other")
 
 

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 
+import polysight
 from polysight import fresnel, open_scan, permittivity_from_ratio
 from polysight.imaging import Images
 from polysight.polarimetry import correct_leakage, specular_incidence_rad
@@ -131,6 +133,22 @@ def moved_images(images: Images) -> Images:
     assert images.p is not None
     assert images.p_sigma is not None
     return replace(images, p=images.p + images.p_sigma.astype(np.float64) * 1e-3)
+
+
+def test_where_the_scan_lights_nothing_neither_value_nor_error_is_known(scan):
+    leaking = leaking_scan(scan.rig)
+    dark = np.zeros(TRUE.shape, bool)
+    dark[0, 1] = True
+    vars(leaking)["images"] = replace(leaking.images, valid=~dark)
+    eps = permittivity_dataset(leaking)
+    for name in ("permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error"):
+        np.testing.assert_array_equal(np.isnan(eps[name].values), dark)
+
+
+def test_a_map_is_written_and_read_back(scan, tmp_path):
+    eps = scan.permittivity_map()
+    polysight.write_netcdf(tmp_path / "map.nc", eps)
+    xarray.testing.assert_identical(polysight.read_netcdf(tmp_path / "map.nc"), eps)
 
 
 def test_a_place_has_the_figures_of_map_and_patch(scan):

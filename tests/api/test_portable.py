@@ -8,21 +8,44 @@ import sys
 import textwrap
 
 HIDDEN = """
-import os, subprocess, sys, types  # subprocess takes a msvcrt for Windows' own
+import builtins, ctypes, io, os, subprocess, sys, types  # subprocess takes a msvcrt for Windows' own
 for name in ("fcntl", "resource", "termios", "tty", "pty", "grp", "pwd", "syslog"):
     sys.modules[name] = None
-for name in ("O_DIRECTORY", "O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "sysconf"):
+for name in ("O_DIRECTORY", "O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "sysconf", "sched_getaffinity", "getloadavg"):
     delattr(os, name)
 locked = []
 msvcrt = types.ModuleType("msvcrt")
 msvcrt.LK_NBLCK = 2
 msvcrt.locking = lambda file, mode, count: locked.append((mode, count))
 sys.modules["msvcrt"] = msvcrt
+asked = set()
+open_file = io.open
+def open_without_proc(file, *more, **named):
+    if str(file).startswith("/proc"):
+        asked.add("/proc")
+        raise FileNotFoundError(2, "there is no /proc", str(file))
+    return open_file(file, *more, **named)
+io.open = builtins.open = open_without_proc
+class Library(ctypes.CDLL):
+    def __init__(self, name, *more, **named):
+        if name is not None and "kernels" in str(name):
+            asked.add("kernels")
+            raise OSError("nothing was compiled")
+        super().__init__(name, *more, **named)
+    def __getattr__(self, name):
+        if name == "renameat2":
+            asked.add(name)
+            raise AttributeError(name)
+        return super().__getattr__(name)
+ctypes.CDLL = Library
 """
 
 
 def run_hidden(program: str, *arguments: object) -> str:
-    """Run a program where these modules and functions are not there; Windows' locks are a stand-in."""
+    """Run a program where these modules and functions, /proc and compiled loops are not there.
+
+    Windows' locks are a stand-in.
+    """
     code = HIDDEN + textwrap.dedent(program)
     done = subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, check=False
@@ -44,6 +67,7 @@ def test_a_scan_is_processed_read_and_exported_without_posix(folder, tmp_path):
     assert main(["process", scan, "--out", out]) == 0
     assert main(["process", scan, "--out", out]) == 0
     assert (2, 1) in locked
+    assert {"renameat2", "kernels"} <= asked
     import polysight
     print(polysight.open_scan(out).materials().sizes["patch"])
     assert main(["export", out, "--csv", "--mat", "--out", out + "-export"]) == 0

@@ -11,6 +11,6 @@ a `Classifier` with scikit-learn's conventions. The functions that need no scan 
 """
 
 from polysight.api.scan import Scan, open_scan
-from polysight.products import Rows, read_netcdf
+from polysight.products import Rows, read_netcdf, write_netcdf
 
-__all__ = ["Rows", "Scan", "open_scan", "read_netcdf"]
+__all__ = ["Rows", "Scan", "open_scan", "read_netcdf", "write_netcdf"]

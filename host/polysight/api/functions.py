@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import tempfile
+import tomllib
+import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -88,7 +90,8 @@ def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: 
     scene
         Scene file, such as "examples/own-scene.toml" (also from an installed package), or its content as a dict:
         `{"name": "two plates", "plates": [{"name": "PET", "centre_mm": [30, 0], "size_mm": [45, 45], ...}]}`;
-        docs/spec/scene-file.md lists all keys.
+        docs/spec/scene-file.md lists all keys. Without a `grid` all positions of the rig file are simulated, which
+        takes long; `examples/own-scene.toml` has one that takes seconds.
     out
         Folder of the scan, which must not exist or be empty.
     rig
@@ -106,8 +109,17 @@ def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: 
             raise ConfigError(
                 "no scene was given", "a scene says which objects lie where", "see help(polysight.simulate)"
             )
+        _warn_of_whole_grid(path)
         simulate_scene(path, _rig_path(rig), Path(out), seed)
     return open_scan(out)
+
+
+def _warn_of_whole_grid(scene: Path) -> None:
+    """Warn if a scene has no grid of its own. A file that cannot be read is left to the simulator."""
+    with suppress(OSError, ValueError):
+        if "grid" not in tomllib.loads(scene.read_text(encoding="utf-8")):
+            text = "the scene has no `grid`: all positions of the rig file are simulated, which takes long"
+            warnings.warn(f"{text}; examples/own-scene.toml has a grid that takes seconds", stacklevel=3)
 
 
 def compare(first: Scan | PathText, second: Scan | PathText) -> xarray.Dataset:

@@ -480,7 +480,7 @@ class Scan:
         return plot_scan(self.read_or_process(metal_referenced))
 
     def to_netcdf(self, path: str | os.PathLike[str], *, metal_referenced: bool = True) -> None:
-        """Write all results as one NetCDF file: complex variables as `h_real` and `h_imag`, see :func:`read_netcdf`.
+        """Write images and patches as one NetCDF file, see :func:`write_netcdf`, which writes maps, too.
 
         Raises
         ------
@@ -489,7 +489,7 @@ class Scan:
         DataError
             as :meth:`image`.
         """
-        write_netcdf(Path(path), full_dataset(self.read_or_process(metal_referenced)))
+        write_netcdf(path, full_dataset(self.read_or_process(metal_referenced)))
 
     def __repr__(self) -> str:
         simulated = "SIMULATED, " if self.simulated else ""

@@ -162,6 +162,7 @@ def _stack(
         raise PolysightError(
             f"multilayer: {len(media)} permittivities with {len(layers)} thicknesses",
             "each medium needs a thickness; only that of the last one may be left out (half space)",
+            "to sweep the thickness of one medium, put the array into a list: thickness_m=[thicknesses]",
             code=ErrorCode.MISMATCH,
         )
     if len(layers) == len(media):

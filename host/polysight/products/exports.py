@@ -392,9 +392,18 @@ def _require_h5netcdf() -> None:
         ) from None
 
 
-def write_netcdf(path: Path, dataset: xarray.Dataset) -> None:
-    """Write a NetCDF 4 file as of :func:`pack_netcdf`; its folder is made. Raises ConfigError and OSError."""
-    write_atomically(path, pack_netcdf(dataset))
+def write_netcdf(path: str | os.PathLike[str], dataset: xarray.Dataset) -> None:
+    """Write any dataset of a scan, such as a map, as a NetCDF 4 file that :func:`read_netcdf` reads back.
+
+    NetCDF has neither complex numbers nor truth values among attributes, so that `Dataset.to_netcdf` refuses: a complex
+    variable `h` becomes `h_real` and `h_imag`, True and False become 1 and 0. The file's folder is made.
+
+    Raises
+    ------
+    ConfigError
+        if h5netcdf is not installed.
+    """
+    write_atomically(Path(path), pack_netcdf(dataset))
 
 
 def pack_netcdf(dataset: xarray.Dataset) -> bytes:
@@ -418,7 +427,7 @@ def pack_netcdf(dataset: xarray.Dataset) -> bytes:
 
 
 def read_netcdf(path: str | os.PathLike[str]) -> xarray.Dataset:
-    """Load a file of `Scan.to_netcdf` or `polysight export --netcdf` into memory, with complex variables.
+    """Load a file of `Scan.to_netcdf`, `write_netcdf` or `polysight export --netcdf`, with complex variables.
 
     Raises
     ------

@@ -121,11 +121,11 @@ def _as_complex(pair: Pair | UnsetType | None) -> complex | None:
 def _as_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tuple[Complex, Real, Real]:
     """Move V / H of the pixels of each patch, so that their median has the patch's permittivity.
 
-    Return it with the standard errors of the patch in each pixel, real part and loss; 0 outside of patches.
+    Return it with the standard errors of the patch in each pixel, real part and loss; not a number outside of patches.
     """
     moved = inverse.copy()
-    real_std = np.zeros(inverse.shape)
-    loss_std = np.zeros(inverse.shape)
+    real_std = np.full(inverse.shape, np.nan)
+    loss_std = np.full(inverse.shape, np.nan)
     for patch in scan.segments:
         value = patch.permittivity_value
         if value is None:
@@ -140,8 +140,8 @@ def _as_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tuple
         r_s, r_p = fresnel(value, patch_angle)
         median = complex(np.median(inverse[inside].real), np.median(inverse[inside].imag))
         moved[of_patch] += complex(r_p / r_s) - median
-        real_std[of_patch] = patch.permittivity_real_std or 0.0
-        loss_std[of_patch] = patch.permittivity_loss_std or 0.0
+        real_std[of_patch] = np.nan if patch.permittivity_real_std is None else patch.permittivity_real_std
+        loss_std[of_patch] = np.nan if patch.permittivity_loss_std is None else patch.permittivity_loss_std
     return moved, real_std, loss_std
 
 

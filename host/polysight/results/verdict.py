@@ -61,6 +61,9 @@ class Verdict(msgspec.Struct, frozen=True):
         """Return the verdict as files and messages hold it."""
         return to_plain(self)
 
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
     def lines(self, most: int | None = None) -> list[str]:
         """Return text for a terminal: the level, then each reason and remedy; at most `most` reasons."""
         shown_reasons = self.reasons[:most]

@@ -66,6 +66,7 @@ def run_page(page: Page, copy: Path, limit_s: float = LIMIT_S) -> PageRun:
         "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(copy),
     }  # fmt: skip
     rig = None
+    shell = None
     with (work / "output").open("w+") as output:
         try:
             if any("rig" in block.info[1:] for block in page.blocks):
@@ -78,10 +79,11 @@ def run_page(page: Page, copy: Path, limit_s: float = LIMIT_S) -> PageRun:
                 status = shell.wait(limit_s)
             except subprocess.TimeoutExpired:
                 status = 124
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(shell.pid, signal.SIGKILL)  # it, or what it left running
-            shell.wait()
         finally:
+            if shell is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(shell.pid, signal.SIGKILL)  # it, or what it left running
+                shell.wait()
             if rig is not None:
                 _end(rig)
                 shutil.copy(ROOT / "instrument.toml", copy)

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import time
+
 import pytest
 from docs.check.looking import page_faults
-from docs.check.pages import read_page
+from docs.check.pages import ROOT, read_page
 from docs.check.running import run_page, script_of
 
 
@@ -153,6 +159,25 @@ def test_an_unset_variable_and_a_failure_in_a_pipe_are_failures(tmp_path):
 def test_a_command_that_never_ends_is_a_failure_and_is_ended(tmp_path):
     run = run_page(page(tmp_path, "# Page\n\n```sh\nsleep 1000\n```\n"), folder(tmp_path), limit_s=1.0)
     assert run.failed_line
+
+
+def test_the_commands_of_a_page_end_with_the_check(tmp_path):
+    """A check that is terminated had left them running."""
+    pid = tmp_path / "pid"
+    page(tmp_path, f"# Page\n\n```sh\necho $$ > {pid}.part\nmv {pid}.part {pid}\nsleep 10000\n```\n")
+    check = subprocess.Popen(
+        [sys.executable, "-m", "docs.check", "--run", str(tmp_path / "page.md")],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    while not pid.exists():
+        assert check.poll() is None
+        time.sleep(0.05)
+    check.terminate()
+    assert check.wait() == 128 + signal.SIGTERM
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), 0)
 
 
 def test_the_script_has_the_lines_of_the_page(tmp_path):

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +20,7 @@ from polysight.serve.commands import Body
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError
-from polysight_shared.messages import MAX_JOG_MM, Axis, StatusReply
+from polysight_shared.messages import MAX_JOG_MM, Axis
 
 
 class JogRequest(Body, frozen=True):
@@ -54,27 +53,15 @@ class StageControl:
 
     def look(self) -> StagePlace:
         """Where it is. Raises PolysightError, as all of these."""
-        return self._ask(lambda pi, _: pi.status())
+        return self._ask(lambda _pi, _rig: None)
 
     def home(self) -> StagePlace:
         """Start homing."""
-
-        def home(pi: PiClient, rig: Instrument) -> StatusReply:
-            del rig
-            pi.home()
-            return pi.status()
-
-        return self._ask(home)
+        return self._ask(lambda pi, _: pi.home())
 
     def stop(self) -> StagePlace:
         """Stop homing or a jog."""
-
-        def stop(pi: PiClient, rig: Instrument) -> StatusReply:
-            del rig
-            pi.abort("stopped on the page")
-            return pi.status()
-
-        return self._ask(stop)
+        return self._ask(lambda pi, _: pi.abort("stopped on the page"))
 
     def jog(self, request: JogRequest) -> StagePlace:
         """Move, and wait for the end. Refused while another jog of this server moves."""
@@ -87,10 +74,16 @@ class StageControl:
         finally:
             self._jogging.release()
 
-    def _ask(self, work: Callable[[PiClient, Instrument], StatusReply]) -> StagePlace:
+    def _ask(self, work: Callable[[PiClient, Instrument], object]) -> StagePlace:
+        """Do something with the Pi, and ask it for the place afterwards."""
         rig = load_instrument(self._config)
-        with self._connect(rig) as pi:
-            status = work(pi, rig)
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        try:
+            with PiClient(context, rig, self._owner) as pi:
+                work(pi, rig)
+                status = pi.status()
+        finally:
+            context.destroy(linger=0)
         return StagePlace(
             state=status.state,
             homed=status.homed,
@@ -101,12 +94,3 @@ class StageControl:
             travel_x_mm=rig.stage.travel_x_mm,
             travel_y_mm=rig.stage.travel_y_mm,
         )
-
-    @contextmanager
-    def _connect(self, rig: Instrument) -> Iterator[PiClient]:
-        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        try:
-            with PiClient(context, rig, self._owner) as pi:
-                yield pi
-        finally:
-            context.destroy(linger=0)

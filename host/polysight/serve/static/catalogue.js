@@ -74,7 +74,7 @@ function show() {
     old?.node.replaceWith(node);
     cards.set(s.name, { of: s, node });
   }
-  if (waiting > most) setTimeout(show);
+  if (waiting > most) requestAnimationFrame(() => setTimeout(show)); // these are painted first
   const nodes = found.filter((s) => cards.has(s.name)).map((s) => cards.get(s.name).node), now = [...by("list").children];
   if (nodes.length !== now.length || nodes.some((node, i) => node !== now[i])) by("list").replaceChildren(...nodes);
   const all = told.scans.length;
@@ -85,9 +85,9 @@ function show() {
   else if (!by("told").classList.contains("wrong")) by("told").textContent = found.length ? "" : "No scan matches.";
 }
 
-async function look() {
+async function look(answer = get("scans", { since: told.stamp })) {
   try {
-    const now = await get("scans", { since: told.stamp }), held = new Map(now.whole ? [] : told.scans.map((s) => [s.name, s]));
+    const now = await answer, held = new Map(now.whole ? [] : told.scans.map((s) => [s.name, s]));
     complain("told");
     for (const name of now.gone) held.delete(name);
     for (const s of now.scans) held.set(s.name, s);
@@ -133,8 +133,10 @@ by("concentration").addEventListener("click", () => train("concentration", { lib
 by("tools").addEventListener("submit", (event) => event.preventDefault());
 for (const id of ["find", "state", "tag", "sort"]) by(id).addEventListener("input", show);
 
+const list = get("scans"); // a long one takes its time: asked for before the page knows what it may show
+list.catch(() => {}); // `look` says what is wrong
 server = await begin();
-await look();
+await look(list);
 if ((await get("program/train"))?.running) {
   by("train").hidden = false;
   showTraining();

@@ -338,29 +338,10 @@ class ProductsTail:
         return self._verdict
 
 
-class ProgramTail:
-    """The program that a page started last for a scan, `scan` or `process`, and why it failed."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._stamp: list[int] = []
-        self._newest: Program | None = None
-
-    def look(self) -> tuple[Program | None, Finding | None]:
-        """The program, and the reason of a failure."""
-        stamp = []
-        for name in ("scan.json", "scan.status", "process.json", "process.status"):
-            try:
-                stamp.append((self._folder / "program" / name).stat().st_mtime_ns)
-            except OSError:
-                stamp.append(0)
-        # A killed program changes no file.
-        was_running = self._newest is not None and self._newest.running
-        if stamp != self._stamp or was_running:
-            self._stamp = stamp
-            programs = [find_program(self._folder, kind) for kind in ("scan", "process")]
-            self._newest = max((p for p in programs if p is not None), key=lambda p: p.started_utc, default=None)
-        return self._newest, explain_failure(self._newest)
+def find_newest_program(folder: Path) -> Program | None:
+    """The program that a page started last for a scan, `scan` or `process`."""
+    programs = [find_program(folder, kind) for kind in ("scan", "process")]
+    return max((p for p in programs if p is not None), key=lambda p: p.started_utc, default=None)
 
 
 class PiListener:
@@ -472,7 +453,6 @@ class Watch:
         self._manifest = ManifestTail(self.folder / MANIFEST)
         self._events = EventTail(self.folder / EVENTS)
         self._products = ProductsTail(self.folder)
-        self._programs = ProgramTail(self.folder)
         self._history: ScanHistory | None = None
         self._viewer: RowViewer | None = None
         self._listener: PiListener | None = None
@@ -502,7 +482,7 @@ class Watch:
             pi = PiState()
         exists = self.folder.is_dir()
         self._existed |= exists
-        program, failure = self._programs.look()
+        program = find_newest_program(self.folder)
         last_row_utc = ""
         if self._history is not None:
             last_row_utc = self._history.last_row_utc
@@ -515,7 +495,7 @@ class Watch:
             control=self.control,
             problem=self._problem,
             program=program,
-            failure=failure,
+            failure=explain_failure(program),
             gone=self._existed and not exists,
             verdict=self._products.look(last_row_utc),
         )

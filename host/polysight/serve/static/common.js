@@ -11,6 +11,7 @@ const ON_PAGE = [
   [/`polysight process --bands (\d+)`/g, "Process again with $1 sub-bands"],
   [/`?polysight permittivity --layer( NAME,\?,\?)?`?/g, "Fit layers"],
   [/polysight label (SCAN )?--specimen NAME=WHICH/g, "Label, piece"],
+  [/polysight label \/.*; then train again/g, "label it on its page, then train again"],
   [/polysight label SCAN --list shows them/g, "see Label"],
   [/;? to move a box: --remove .*/g, "; or correct the box that has this name"],
   [/--box .*=x0,y0,x1,y1 with/g, "give"],

@@ -123,7 +123,7 @@ function showNotices() {
   by("faults-note").textContent = notices.length ? `${notices.length}, the newest first` : "";
   const shown = allNotices ? notices : notices.slice(0, FEW);
   const items = shown.map((n) => {
-    const item = finding(n, ". ");
+    const item = finding({ ...n, why: n.why && `${n.why}.` }, ". ");
     item.dataset.level = { warning: "warn", error: "bad" }[n.level] ?? n.level;
     if (n.facts.utc) item.prepend(make("time", `${clock(Date.parse(n.facts.utc) / 1000)} `));
     if (n.facts.detail) item.append(nest(make("details"), make("summary", "in full"), make("span", n.facts.detail)));
@@ -221,7 +221,11 @@ function connect() {
     take(JSON.parse(event.data));
   };
   source.addEventListener("alive", heard(() => {}));
-  source.addEventListener("state", heard((told) => { state = told; showAll(); }));
+  source.addEventListener("state", heard((told) => {
+    if (told.status.key !== state?.status.key) look(); // the program's output is that of this state
+    state = told;
+    showAll();
+  }));
   source.addEventListener("motion", heard((told) => {
     motion = told;
     if (state) showStatus();

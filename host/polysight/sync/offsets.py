@@ -534,12 +534,11 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     n = middles.size
     flat = echoes.reshape(len(points), n_rx * n)
     same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
-    noise = _NOISE / FOLD * np.eye(n_rx * n)
     mirror_m = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).min()
     clutter = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(np.linspace(mirror_m, _CLUTTER_M, 8 * n), middles))
     clutter_of_rx = _CLUTTER_POWER / len(clutter) * (clutter.T @ clutter.conj())
-    covariance = (flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + noise
-    covariance = (covariance + np.kron(np.eye(n_rx), clutter_of_rx)).astype(np.complex128)
+    covariance = (flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + np.kron(np.eye(n_rx), clutter_of_rx)
+    covariance = (covariance + _NOISE / FOLD * np.eye(n_rx * n)).astype(np.complex128)
     time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
     model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
     channels_of_half = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]

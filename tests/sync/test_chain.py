@@ -8,6 +8,7 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.sync import BoardSetup, synchronise_row
+from polysight.sync.chain import CubeForm
 from polysight.sync.high_pass_filter import high_pass
 from polysight.sync.loops import estimate_tone
 from polysight_shared.error_codes import ErrorCode
@@ -178,3 +179,27 @@ def test_frames_of_another_rig_are_refused(setup, shape):
 def test_a_truncated_recording_is_refused(setup):
     with refused(ErrorCode.NOT_ENOUGH_DATA, PULSES):
         synchronise_row(np.zeros((4, PULSES, 256), np.complex64), np.ones(2 * PULSES, bool), setup)
+
+
+@pytest.mark.parametrize("conjugate", [False, True])
+def test_a_row_of_a_cube_is_turned_completed_and_masked_where_it_is_empty_or_not_finite(small, conjugate):
+    rng = np.random.default_rng(3)
+    shape = (4, POSITIONS, small.chirp.samples)
+    cube = (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
+    cube[:, 1] = 0
+    cube[2, 3, 7] = np.nan
+    cube[0, 4, 0] = complex(1, -np.inf)
+    # One number is enough
+    cube[:, 6] = 0
+    cube[3, 6, -1] = -1e-30j
+    turn = np.exp(2j * np.pi * rng.uniform(size=(4, small.chirp.samples))).astype(np.complex64)
+    constant = np.arange(4).astype(np.complex64)
+    form = CubeForm(conjugate, turn, constant, None, small.chirp, "")
+    row = form.convert_row(cube[:, ::-1], 16)
+    masked = [POSITIONS - 1 - position for position in (1, 3, 4)]
+    assert np.flatnonzero(~row.valid).tolist() == sorted(masked)
+    assert not row.samples[:, ~row.valid].any()
+    assert row.chirps.tolist() == [16 * valid for valid in row.valid]
+    met = cube[:, ::-1].conj() if conjugate else cube[:, ::-1]
+    expected = met[:, row.valid] * turn[:, None] + constant[:, None, None]
+    np.testing.assert_array_equal(row.samples[:, row.valid], expected)

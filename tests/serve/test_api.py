@@ -304,6 +304,9 @@ def test_the_last_box_can_be_removed(view):
     status, saved = post(view, "/api/labels?scan=one", {"boxes": {"oak": box}})
     assert status == 200, saved
     assert Path(saved["file"]).exists()
+    labelled = {scan["name"]: scan["labelled"] for scan in get(view, "/api/scans")["scans"]}
+    assert labelled == {"one": ["oak"], "two": []}
     assert post(view, "/api/labels?scan=one", {"boxes": {}})[1]["file"] == ""
     assert not Path(saved["file"]).exists()
     assert not get(view, "/api/result?scan=one")["labels"]
+    assert not any(scan["labelled"] for scan in get(view, "/api/scans")["scans"])

@@ -503,7 +503,10 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
         assert labels.metal == "copper"
         assert labels.boxes["my plastic"] == pytest.approx([24, -6, 48, 18], abs=1.5)
         page.check_whole()
+    known = "[...document.getElementById('known').options].map((option) => option.value)"
+    page.browser.wait(f"{known}.join() == 'copper,my plastic'", "names of the first scan, offered in the second")
     page.open("/")
+    assert page.browser.text("list").count("labelled: copper, my plastic") == 2
     page.browser.value("document.querySelectorAll('#list input').forEach(i => i.click())")
     page.browser.click("#train-open")
     page.browser.fill("#train-name", "mine")

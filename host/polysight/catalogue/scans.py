@@ -22,7 +22,7 @@ from msgspec.structs import replace
 
 from polysight.acquisition import LAPSE_S, Life, read_life, read_start_ticks
 from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes
-from polysight.products import IMAGE, MATERIALS, QUALITY, SCAN, ProcessedScan
+from polysight.products import IMAGE, LABELS, MATERIALS, QUALITY, SCAN, ProcessedScan, find_labels
 from polysight.store import MANIFEST, Manifest, manifest
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError, no_such
@@ -49,7 +49,7 @@ CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 GRACE_S = 20.0
 # Files of a scan that its summary is made from; products lie in a folder of their own, or alone.
 _PRODUCTS = (IMAGE, MATERIALS, QUALITY)
-SUMMARISED = (MANIFEST, NOTES, *_PRODUCTS, *(f"products/{name}" for name in _PRODUCTS))
+SUMMARISED = (MANIFEST, NOTES, *(f"{place}{name}" for place in ("", "products/") for name in (LABELS, *_PRODUCTS)))
 Stamp = tuple[tuple[int, int], ...]
 
 
@@ -79,6 +79,8 @@ class Summary(msgspec.Struct, frozen=True):
         When it began, since 1970; 0 where nothing says.
     generation
         Changes whenever its products do, see :func:`read_generation`.
+    labelled
+        Names of boxes drawn by hand.
     """
 
     name: str
@@ -98,6 +100,7 @@ class Summary(msgspec.Struct, frozen=True):
     tags: tuple[str, ...] = ()
     seconds: float = 0.0
     generation: str = ""
+    labelled: tuple[str, ...] = ()
 
 
 def read_generation(products: Path) -> str:
@@ -141,6 +144,10 @@ def summarise(folder: Path, name: str) -> Summary:
     except DataError as e:
         notes = Notes(e.what)
     summary = Summary(name, "begun", notes=notes.notes, tags=notes.tags, seconds=_read_modified_s(folder))
+    with suppress(PolysightError):
+        drawn = find_labels(folder)
+        if drawn is not None:
+            summary = replace(summary, labelled=tuple(drawn[1].boxes)[:MAX_NAMES])
     summary = _add_products(folder, summary)
     content = _read_manifest(folder)
     if content is None:

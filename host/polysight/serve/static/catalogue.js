@@ -7,7 +7,7 @@ const ORDER = { good: 0, care: 1, "": 2, none: 3, damaged: 4 };
 const cards = new Map(), chosen = new Set();
 let server = {}, told = { scans: [] };
 
-const words = (s) => [s.name, s.scan_id, s.rig, s.state, s.notes, s.started_utc, ...s.tags, ...s.materials].join(" ").toLowerCase();
+const words = (s) => [s.name, s.scan_id, s.rig, s.state, s.notes, s.started_utc, ...s.tags, ...s.materials, ...s.labelled].join(" ").toLowerCase();
 
 function card(s) {
   const item = make("li"), [state, level] = STATES[s.state] ?? [s.state, "warn"];
@@ -26,8 +26,9 @@ function card(s) {
   const rows = s.rows ? `${s.committed} of ${s.rows} rows · ` : "";
   const facts = make("div", `${s.seconds ? day(s.seconds) : ""} · ${rows}${bytes(s.bytes)}${s.rig ? ` · ${s.rig}` : ""}`, "facts");
   const found = s.materials.length ? make("div", s.materials.map(called).join(", "), "facts") : "";
+  const labelled = s.labelled.length ? make("div", `labelled: ${s.labelled.join(", ")}`, "facts") : "";
   const reason = s.state === "failed" && s.reason ? make("div", s.reason, "facts") : "";
-  item.append(picture, link, choose, badges, facts, reason, found, s.notes ? make("div", s.notes, "words") : "");
+  item.append(picture, link, choose, badges, facts, reason, found, labelled, s.notes ? make("div", s.notes, "words") : "");
   if (s.tags.length) item.append(nest(make("div", null, "badges"), ...s.tags.map((t) => make("span", t, "tag"))));
   item.classList.toggle("chosen", chosen.has(s.name));
   return item;

@@ -53,7 +53,7 @@ export class Labels {
 
   #row(b, i) {
     const change = (set) => (event) => { set(event.target); this.touched = true; this.changed(); };
-    const name = make("input", null, null, { value: b.name, placeholder: "material", maxLength: 80, "aria-label": `Material of box ${i + 1}`, oninput: change((f) => { b.name = f.value; }) });
+    const name = make("input", null, null, { value: b.name, placeholder: "material", list: "known", maxLength: 80, "aria-label": `Material of box ${i + 1}`, oninput: change((f) => { b.name = f.value; }) });
     const piece = make("input", null, null, { value: b.specimen, placeholder: "piece", maxLength: 80, "aria-label": `Which piece lies in box ${i + 1}`, oninput: change((f) => { b.specimen = f.value; }) });
     const metal = make("input", null, null, { type: "radio", name: "metal", checked: b.metal, onchange: change(() => { this.boxes.forEach((o) => { o.metal = o === b; }); }) });
     const remove = make("button", "Remove", "danger", { type: "button", onclick: () => { this.boxes.splice(i, 1); this.touched = true; this.show(); } });

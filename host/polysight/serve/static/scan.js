@@ -276,7 +276,9 @@ try {
   summary = await get("scan", scan);
   by("side").hidden = by("snippet").hidden = false;
   if (server.starts) {
-    const { libraries } = await get("scans");
+    const { libraries, scans } = await get("scans");
+    const names = new Set(scans.flatMap((s) => s.labelled.map((name) => name.replace(/#.*/, "")))); // the same word in all scans
+    by("known").append(...[...names].sort().map((value) => make("option", null, null, { value })));
     by("library").append(...libraries.map((name) => make("option", name, null, { value: name })));
   }
   noted = { notes: summary.notes, tags: summary.tags };

@@ -55,6 +55,18 @@ def test_an_edge_has_no_level_of_its_own(metal, gains, optics):
     assert not find_reflecting(edge, amplitude * fall, number, learnt).any()
 
 
+def test_what_reflects_less_than_any_medium_is_no_surface(metal, gains, optics):
+    voltages = find_voltages(metal, optics)
+    amplitude = np.abs(metal.h.amplitude)
+    number = np.zeros(len(metal), int)
+    of_foam, of_edge = (
+        find_reflecting(replace(voltages, b=level * voltages.b), level * amplitude, number, gains(optics))
+        for level in (0.05, 0.02)
+    )
+    assert of_foam.mean() > 0.9
+    assert not of_edge.any()
+
+
 def test_a_thin_wall_gives_no_permittivity(see, gains, optics, request):
     for wall_mm in (0.7, 1.6) if request.config.getoption("--long") else (0.7,):
         check_a_thin_wall(see, gains, optics, wall_mm)

@@ -64,6 +64,9 @@ LEVEL_TOLERANCE_WITHOUT_GAINS = 0.9
 # Share of a segment's power at one level: what edges diffract falls off with the angle. Three segments of edges alone
 # had 0.36 to 0.56, surfaces 0.91 and more (simulated).
 MIN_SHARE_AT_LEVEL = 0.75
+# Reflection over metal's below which no surface counts: a half space of permittivity 1.04 at 55 degrees. What the end
+# of a cylinder diffracts had 0.02 (simulated).
+MIN_REFLECTION = 0.03
 # Less than 20 mm from the border of a zone that reflects, a disc of 50 mm is not filled to three quarters. There, edges
 # bend normals by degrees, and H / V of a plate with sharp edges is 10 % too large.
 BORDER_DISC_M = 0.05
@@ -539,13 +542,15 @@ def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.in
     Without path and spreading, a surface of one medium is equally strong everywhere. At the border of the zone that
     reflects half of that is left, and what an edge diffracts falls on from there. The usual level is the median
     weighted by power (`amplitude` [n] of H), for edges are seen from many more places than a small plate reflects to.
-    A segment without a level of its own is that of an edge alone.
+    A segment without a level of its own, or with one that no medium has, is that of an edge alone.
     """
     level = np.log(np.maximum(np.abs(voltages.b[:, 0]), 1e-30))
     tolerance = LEVEL_TOLERANCE_WITHOUT_GAINS
+    reflection = np.ones(len(level))
     if gains is not None:
         level = level - gains.level(voltages.arrival)
         tolerance = LEVEL_TOLERANCE
+        reflection = find_reflection(voltages, gains)
     reflecting = np.zeros(len(level), bool)
     for number in np.unique(segment):
         members = np.flatnonzero(segment == number)
@@ -554,7 +559,8 @@ def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.in
         usual = level[order[np.searchsorted(power, power[-1] / 2)]]
         at_level = np.abs(level[members] - usual) < tolerance
         share = np.sum(amplitude[members[at_level]] ** 2) / power[-1]
-        reflecting[members] = at_level & (share > MIN_SHARE_AT_LEVEL)
+        is_surface = share > MIN_SHARE_AT_LEVEL and np.median(reflection[members[at_level]]) > MIN_REFLECTION
+        reflecting[members] = at_level & is_surface
     return reflecting
 
 

@@ -53,7 +53,7 @@ def test_frames_of_a_first_row_that_was_cut_by_a_reset_are_not_placed_by_their_a
     """Its counters began anew twice: nothing tells which bytes follow which."""
     size = 91 * 4096
     record = Card(size).record(resets=(at,))
-    placed, _ = place(size, record.packets[: len(record.packets) - lost], None, 4096)
+    placed, _ = place(size, record.packets[: len(record.packets) - lost], Counters(0, 1), 4096)
     assert not placed.located
     assert not placed.slipped
 
@@ -100,8 +100,9 @@ def end_state(packet: bytes) -> tuple[int, int]:
 def test_one_anomaly_is_counted_once_and_by_its_name(grid, kind, where, batch):
     frame, frames = grid
     size = frame * frames
-    card = Card(size, 145_600_123, 100_001)
-    past = place(size, card.record().packets, None, frame, batch)[0].past
+    start = Counters(145_600_123, 100_001)
+    card = Card(size, start.byte_count, start.sequence)
+    past = place(size, card.record().packets, start, frame, batch)[0].past
     record = card.record()
     k = int(where * (len(record.packets) - 1))
     placed, out = place(size, spoilt(record.packets, kind, k), past, frame, batch)
@@ -115,8 +116,9 @@ def test_one_anomaly_is_counted_once_and_by_its_name(grid, kind, where, batch):
 def test_late_packets_of_the_record_before_are_left_over(grid, lost_packets, batch):
     frame, frames = grid
     size = frame * frames
-    card = Card(size, 145_600_123, 100_001)
-    past = place(size, card.record().packets, None, frame, batch)[0].past
+    start = Counters(145_600_123, 100_001)
+    card = Card(size, start.byte_count, start.sequence)
+    past = place(size, card.record().packets, start, frame, batch)[0].past
     state_before = card.record()
     lost_packets = min(lost_packets, len(state_before.packets) - 1)
     past = place(size, state_before.packets[lost_packets:], past, frame, batch)[0].past

@@ -15,6 +15,7 @@ from tests.support.store.faulty_disk import FaultyDisk, Killed
 from tests.support.store.plain_scan import errors
 
 from polysight.capture import PACKETS, Evidence, place_record, read_packets, write_index, write_packets
+from polysight.capture.dca1000 import Counters
 from polysight.capture.placement import Past
 from polysight.jobs.recordings import inspect_placement, replace_folder
 from polysight.store import ManifestWriter, ScanFolder, replace_rows
@@ -37,8 +38,8 @@ def scan_with(folder: Path, lost: int, wrong: bool = False) -> tuple[ScanFolder,
         for board in rig.recorded:
             path = scan.row_path(board.name, 0)
             log = make_log(size, packets)
-            evidence = Evidence(size, frame, past=Past())
-            placed, out = place_record(log, frame)
+            evidence = Evidence(size, frame, past=Past(Counters(5000, 7)))
+            placed, out = place_record(log, frame, evidence.past)
             packets_crc = write_packets(path.with_suffix(PACKETS), log, evidence, placed)
             path.write_bytes(out.tobytes())
             facts = {**placed.facts(), "missing": [(0, size)] if wrong else placed.missing}

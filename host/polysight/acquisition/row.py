@@ -192,10 +192,10 @@ class Take:
             held_text = ""
         if capture.packets == 0:
             if radar.detail:
-                detail = f": its radar was {radar.detail}, and may not have obeyed"
+                detail = f"; its radar was {radar.detail}, and may not have obeyed"
             else:
                 detail = ""
-            return TakeFault(FaultKind.NO_DATA, f"no data{detail}", name)
+            return TakeFault(FaultKind.NO_DATA, f"no data: {capture.reason}{detail}", name)
         if displaced is not None:
             if held_text:
                 kind = FaultKind.HELD

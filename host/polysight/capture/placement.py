@@ -6,13 +6,12 @@ known, the start, and one has to be seen, the end: a card that drops bytes befor
 or adds a frame, shows it only in the length of the record. A row is *located* if it starts where it must and ends where
 it must. Everything else is masked as a whole; data is original or masked, never guessed.
 
-States (`Past`): nothing came before (*first*), the start is *known*, or it is *lost*. A card whose start is lost is
-reset by the host before the next row, which makes it known again.
+The start is known behind such a row, or behind a reset by the host, which follows all others (`Past`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -39,11 +38,14 @@ _MIN_PACKETS_OF_A_SIZE = 3
 
 @dataclass(frozen=True)
 class Past:
-    """Where the next record begins, from the records before it. `Past()` is the state *first*."""
+    """Where the next record begins, from the records before it."""
 
-    start: Counters | None = None  # of the next record's first byte; None: unknown
-    # Unknown, and packets of earlier records may still come
-    lost: bool = False
+    start: Counters | None = None  # of the next record's first byte; None: unknown, the card has to be reset
+
+    @property
+    def lost(self) -> bool:
+        """True if the start is unknown."""
+        return self.start is None
 
     @staticmethod
     def after_reset() -> Past:
@@ -168,17 +170,19 @@ def place_record(
     frame_bytes
         Bytes of one frame, 1 if the record has no frames.
     past
-        Knowledge from earlier records.
+        Knowledge from earlier records; default: the card was reset.
     not_before_ns
         Time before the first pulse of the row (clock of the arrivals); 0 if unknown.
     dropped_by_card
         Names of the status bits by which the card reported data dropped before the packets were numbered: bytes are
         missing without a gap in the counters, so that no byte's place is certain.
     """
-    past = past or Past()
+    past = past or Past.after_reset()
     record = _find_record(log, past, not_before_ns)
     row = _Row(log, record)
     cause = _why_not_located(record, row, log, frame_bytes)
+    if past.lost:
+        cause = _Doubt("it is unknown where the last record ended")
     if not cause.text and dropped_by_card:
         cause = _Doubt(f"the card dropped data before numbering it ({dropped_by_card})")
     holes = _merge([*_gaps(row.covered, row.extent), *row.conflicts])
@@ -217,7 +221,7 @@ def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
     reached = np.maximum.accumulate(ends[order])
     fresh = reached - np.maximum(np.append(0, reached[:-1]), starts[order])
     received = int(np.maximum(fresh, 0).sum())
-    complete = not record.doubt and record.ends_as_planned and received == log.expected
+    complete = not past.lost and record.ends_as_planned and received == log.expected
     return Preview(received, complete, record.ended)
 
 
@@ -254,56 +258,13 @@ class _Record:
     ended: bool = False
     # Every sign of an end at the row's last byte
     ends_as_planned: bool = False
-    # Why the start is not certain
-    doubt: str = ""
 
 
 def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
-    """Select the row's packets by where the record starts: as predicted, or else where a whole record stands."""
+    """Select the packets with counters of the record that was predicted."""
     full = find_full_payload(log)
     early = log.arrivals_ns < not_before_ns
-    live = np.flatnonzero(~early)
-    predicted = _select_record(log, past.start or SWITCHED_ON, full, early)
-    if live.size == 0 or (past.start is not None and predicted.of_row.any()):
-        return predicted
-    record = _select_record(log, _start_of_most(log, live, full), full, early)
-    return replace(record, doubt=_doubt_start(log, past, record))
-
-
-def _start_of_most(log: PacketLog, live: Counts, full: int) -> Counters:
-    """Return the lowest counters of the largest group of packets that count on from each other."""
-    seen_first = Counters(int(log.byte_counts[live[0]]), int(log.sequences[live[0]]))
-    ahead = counter_differences(log.byte_counts, seen_first.byte_count, BYTE_COUNT_BITS)
-    steps = counter_differences(log.sequences, seen_first.sequence, SEQUENCE_BITS)
-    _, group, packets = np.unique((ahead - full * steps)[live], return_inverse=True, return_counts=True)
-    largest = live[group == int(np.argmax(packets))]
-    lowest = largest[int(np.argmin(ahead[largest]))]
-    return Counters(int(log.byte_counts[lowest]), int(log.sequences[lowest]))
-
-
-def _doubt_start(log: PacketLog, past: Past, record: _Record) -> str:
-    """Return why a record that was not predicted may begin elsewhere; "" if it came whole, alone and in order."""
-    if not record.ends_as_planned:
-        return "the record is not whole, and its start is unknown"
-    if past.start is not None:
-        return "the record does not begin where the card counts: a second card?"
-    if past.lost:
-        return "it is unknown where the last record ended"
-    is_other = ~record.of_row & ~record.early
-    behind = is_other & (record.offsets < 0) & (record.steps < 0)
-    if (is_other & ~behind).any() or 2 * int(log.sizes[behind].sum()) >= log.expected:
-        return "packets of another record came with it"
-    offsets = record.offsets[record.of_row]
-    sizes = log.sizes[record.of_row]
-    ended_before = ((sizes < record.full) & (offsets + sizes < record.length)).any()
-    _, first_arrival = np.unique(offsets, return_index=True)
-    if ended_before or (np.diff(first_arrival) < 0).any():
-        return "its packets did not come in order, and its start is unknown"
-    return ""
-
-
-def _select_record(log: PacketLog, start: Counters, full: int, early: Flags) -> _Record:
-    """Select the packets of a record that starts with these counters."""
+    start = past.start or SWITCHED_ON
     sizes = log.sizes
     expected = log.expected
     offsets = counter_differences(log.byte_counts, start.byte_count, BYTE_COUNT_BITS)
@@ -384,9 +345,7 @@ def _why_not_located(record: _Record, row: _Row, log: PacketLog, frame_bytes: in
     if log.count == 0:
         return _Doubt("no packet came")
     if not record.of_row.any():
-        return _Doubt("every packet is of an earlier record, by its counters or by its arrival before the first pulse")
-    if record.doubt:
-        return _Doubt(record.doubt)
+        return _Doubt("every packet is of another record, of a second card, or came before the first pulse")
     # A card that restarts within the row counts from its first counters on: again, if the row began with them.
     counted_twice = bool(row.conflicts) or row.counts.late_by_bytes > _FAR_BEHIND * record.full
     if row.counts.restarted or (record.start == SWITCHED_ON and counted_twice):
@@ -417,7 +376,7 @@ def _past_after(record: _Record, why: _Doubt) -> Past:
     """Return where the next record begins: known behind a record whose start and end are certain."""
     is_certain = not why.text or why.frames_missing
     if not is_certain or not record.of_row.any() or record.later.any():
-        return Past(lost=True)
+        return Past()
     return Past(start=record.start.advance(record.length, -(-record.length // record.full)))
 
 

@@ -172,7 +172,7 @@ class Receiver:
         if self._row is not None:
             self._row.segment.discard()
         self._row = None
-        self._past = Past(lost=True)
+        self._past = Past()
 
     def _receive(self) -> None:
         row = self._row

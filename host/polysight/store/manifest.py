@@ -93,7 +93,6 @@ class Reception(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     conflicting: int | None = None
     restarted: int | None = None
     before_pulses: int | None = None
-    clock_jumps: int | None = None
     kernel_drops: int | None = None
     head_bytes: int | None = None
     gaps: int | None = None

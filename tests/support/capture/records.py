@@ -81,7 +81,7 @@ def make_log(size: int, packets: list[bytes], batch: int = 7, t_ns: int = 1) -> 
 
 
 def place(
-    size: int, packets: list[bytes], start: Counters | Past | None = None, frame: int = 1, batch: int = 7
+    size: int, packets: list[bytes], start: Counters | Past, frame: int = 1, batch: int = 7
 ) -> tuple[Placed, np.ndarray]:
     """Place a row that starts at these counters, or after the known earlier records."""
     past = Past(start) if isinstance(start, Counters) else start

@@ -20,7 +20,7 @@ from polysight.acquisition import scan as host_run
 from polysight.acquisition.progress import ScanProgress, ScanResult
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.capture.packet_log import PacketLog
-from polysight.capture.placement import Evidence, place_record
+from polysight.capture.placement import Evidence, Past, place_record
 from polysight.capture.receiver import RowCapture
 from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets
 from polysight.store import manifest
@@ -193,7 +193,7 @@ class SmallRig:
         row, take = self._row
         data = self._samples.of(name, row)
         log = PacketLog(len(data))
-        evidence = Evidence(len(data), self._samples.instrument.frame_bytes)
+        evidence = Evidence(len(data), self._samples.instrument.frame_bytes, past=Past.after_reset())
         for k, packet in enumerate(encode_packets(data, 1, 0)):
             log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), k + 1)
         placed, out = place_record(log, evidence.frame_bytes)

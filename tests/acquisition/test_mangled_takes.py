@@ -31,6 +31,8 @@ GRIDS = [
 ]
 TROUBLES = (*KINDS, *RADAR)
 FRAME_NS = 128_000
+# Share of the right bytes that may be masked, in rows whose place and times are certain
+MAX_MASKED = 0.005
 
 
 @dataclass
@@ -101,12 +103,21 @@ def wrong_bytes(kept: Kept, sent: Sent) -> int:
 
 
 def test_no_wrong_byte_is_kept(request: pytest.FixtureRequest):
-    """Committed as whole or kept incomplete: what is not certain is masked."""
+    """Committed as whole or kept incomplete: what is not certain is masked, and little else.
+
+    A frame without a packet at its pulse's time, as of a network that holds packets, is not certain.
+    """
+    right = masked = 0
     first = int(os.environ.get("MANGLED_FIRST", "0"))
     for seed in range(first, first + (5_000 if request.config.getoption("--long") else 125)):
         for troubles, take, sent in takes(seed):
             wrong = wrong_bytes(take, sent)
             assert wrong == 0, (seed, troubles, wrong, take.whole, take.placed.reason)
+            if take.placed.located and take.frames and not take.frames.contradicted and "held" not in troubles:
+                is_right = take.placed_out == np.frombuffer(sent.data, dtype=np.uint8)
+                right += int(is_right.sum())
+                masked += int((is_right & take.masked).sum())
+    assert masked <= MAX_MASKED * right
 
 
 @pytest.mark.parametrize("grid", range(len(GRIDS)))

@@ -36,8 +36,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # No test asserts on wall-clock speed, Hypothesis' deadline included: the machine may be busy.
 # The same examples every time; `--long` looks for new ones.
-settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
-settings.register_profile("searching", settings.get_profile("patient"), derandomize=False)
+settings.register_profile(
+    "patient", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+)
+settings.register_profile("searching", settings.get_profile("patient"), max_examples=200, derandomize=False)
 settings.load_profile("patient")
 
 

@@ -44,7 +44,7 @@ def scene(rng, plates, metal, patterns_db=1.0):
 @pytest.fixture
 def scenes(request):
     """How many random scenes of each kind; `--long` takes as many as the stated shares are known from."""
-    return 25 if request.config.getoption("--long") else 5
+    return 25 if request.config.getoption("--long") else 3
 
 
 @pytest.mark.parametrize("plates", [1, 2, 3, 4, 6, 9])

@@ -34,7 +34,7 @@ def test_a_scan_is_named_again_as_it_was_named(synthetic, library, name_placemen
             assert again[r.patch.label].probabilities == pytest.approx(r.named.verdict.probabilities, abs=1e-3)
 
 
-@pytest.mark.parametrize("gain", [0.8, 0.9, 1.1, 1.25])
+@pytest.mark.parametrize("gain", [0.8, 1.25])
 def test_brightness_that_all_plates_share_does_not_change_their_names(
     gain, synthetic, library, name_placement, tmp_path
 ):

@@ -15,9 +15,10 @@ import os
 import resource
 import time
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from xdist.scheduler import LoadScopeScheduling
@@ -148,6 +149,24 @@ class Costs:
         self._cpu_s: Counter[str] = Counter()
         self._wall_s: Counter[str] = Counter()
 
+    def pytest_collection_finish(self, session: pytest.Session) -> None:
+        """Tests begin; until now each worker imported and collected all of them."""
+        before_s = self._last_s
+        self._last_s = self._now_s()
+        collected_s = [now - time_before for now, time_before in zip(self._last_s, before_s, strict=True)]
+        if hasattr(session.config, "workeroutput"):
+            session.config.workeroutput[_NAME] = collected_s
+        else:
+            self._add("collection", collected_s)
+
+    def pytest_testnodedown(self, node: Any) -> None:
+        """Add a worker's collection."""
+        self._add("collection", node.workeroutput.get(_NAME, (0.0, 0.0)))
+
+    def _add(self, name: str, spent_s: Sequence[float]) -> None:
+        self._cpu_s[name] += spent_s[0]
+        self._wall_s[name] += spent_s[1]
+
     def _now_s(self) -> tuple[float, float]:
         """Processor time and the clock."""
         return self._times.read_s(), time.monotonic()
@@ -170,9 +189,7 @@ class Costs:
         """Note what a test used."""
         for name, spent_s in report.user_properties:
             if name == _NAME:
-                cpu_s, wall_s = spent_s  # type: ignore[misc]
-                self._cpu_s[report.nodeid] = cpu_s
-                self._wall_s[report.nodeid] = wall_s
+                self._add(report.nodeid, spent_s)  # type: ignore[arg-type]
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         """The table: processor and clock seconds."""

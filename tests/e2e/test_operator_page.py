@@ -20,7 +20,7 @@ from polysight.store import ScanFolder, validate
 
 ROWS = 40
 SCENE = small_scene(10, ROWS, step_mm=(10.0, 5.0))
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rig")]
+pytestmark = pytest.mark.slow
 
 
 class Lab:

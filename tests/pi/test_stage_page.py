@@ -13,7 +13,6 @@ from tests.support.page.live_view import Served, served_folder
 
 from polysight_shared import messages as m
 
-pytestmark = pytest.mark.xdist_group("browser")
 SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
 
 

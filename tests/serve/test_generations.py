@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 
-import pytest
 from tests.support.page.asking import TOKEN
 from tests.support.page.chromium import DESK, Browser
 from tests.support.page.live_view import served_folder
@@ -12,7 +11,6 @@ from tests.support.products import judged_products
 
 from polysight.products import making_products
 
-pytestmark = pytest.mark.xdist_group("browser")
 RUNS = 2
 LONG_RUNS = 20
 # Verdict and seed of the images of the two generations.

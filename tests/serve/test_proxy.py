@@ -20,7 +20,6 @@ from tests.support.processes import wait_for
 from polysight.catalogue import read_notes
 from polysight.serve.guard import Access
 
-pytestmark = pytest.mark.xdist_group("browser")
 # Browsers take every name under `localhost` for this machine.
 NAME = "lab.localhost"
 # Caddy's own: no port of the system's, no certificate from the network, nothing installed.

@@ -27,7 +27,6 @@ from polysight.serve import site as serve_site
 from polysight.serve.guard import Access
 from polysight.serve.site import Programs, Site, Watches
 
-pytestmark = pytest.mark.xdist_group("browser")
 WITHOUT_SCAN = ("empty", "starting", "start_failed", "unreadable", "folder_gone")
 OF_THE_PAGE = ("offline", "server_frozen")
 WORDS: dict[str, Any] = {

@@ -15,7 +15,7 @@ import os
 import resource
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -110,21 +110,22 @@ class ProcessTimes:
     """Processor time of this process and of all programs that it started, directly or not.
 
     A program that was seen once is followed after its parent has ended, too: most processes of a browser are such
-    orphans. What one uses between the last call and its end is lost unless its parent awaits it.
+    orphans. What one used until the last call counts when it has ended and nobody of ours can have awaited it.
     """
 
     def __init__(self) -> None:
-        # Process number and time of start: numbers are given again.
-        self._followed: set[tuple[int, str]] = set()
+        # Process number and time of start (numbers are given again), with the parent's number and ticks until now
+        self._followed: dict[tuple[int, str], tuple[int, int]] = {}
+        self._orphans_ticks = 0
 
     def read_s(self) -> float:
-        """Seconds until now. They decrease when a program ends that nobody awaits."""
+        """Seconds until now."""
+        # Field numbers of proc_pid_stat(5), less the three before: 4 ppid, 14 to 17 times, 22 time of start.
         table = {}
         for folder in filter(str.isdigit, os.listdir("/proc")):  # noqa: PTH208
             with suppress(OSError):
                 line = Path(f"/proc/{folder}/stat").read_text(errors="replace")
                 table[int(folder)] = line.rpartition(") ")[2].split()
-        # Field numbers of proc_pid_stat(5), less the three before: 4 ppid, 14 to 17 times, 22 time of start.
         own = {pid for pid, fields in table.items() if (pid, fields[19]) in self._followed}
         children: dict[int, list[int]] = {}
         for pid, fields in table.items():
@@ -134,10 +135,21 @@ class ProcessTimes:
             new = set(children.get(waiting.pop(), ())) - own
             own |= new
             waiting.extend(new)
-        self._followed = {(pid, table[pid][19]) for pid in own}
-        ticks = sum(int(field) for pid in own for field in table[pid][11:15])
+        self._orphans_ticks += self._count_lost({os.getpid(), *own})
+        self._followed = {(pid, table[pid][19]): (int(table[pid][1]), sum(map(int, table[pid][11:15]))) for pid in own}
+        ticks = self._orphans_ticks + sum(used for _, used in self._followed.values())
         used = [resource.getrusage(process_kind) for process_kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
         return ticks / _TICKS_PER_S + sum(u.ru_utime + u.ru_stime for u in used)
+
+    def _count_lost(self, running: set[int]) -> int:
+        """Ticks of the processes that have ended since the last call without a parent of ours."""
+        ended = {pid: values for (pid, _), values in self._followed.items() if pid not in running}
+        lost = 0
+        for parent, used in ended.values():
+            while parent in ended:
+                parent = ended[parent][0]
+            lost += used if parent not in running else 0
+        return lost
 
 
 class Costs:
@@ -163,7 +175,7 @@ class Costs:
         """Add a worker's collection."""
         self._add("collection", node.workeroutput.get(_NAME, (0.0, 0.0)))
 
-    def _add(self, name: str, spent_s: Sequence[float]) -> None:
+    def _add(self, name: str, spent_s: Any) -> None:
         self._cpu_s[name] += spent_s[0]
         self._wall_s[name] += spent_s[1]
 
@@ -189,7 +201,7 @@ class Costs:
         """Note what a test used."""
         for name, spent_s in report.user_properties:
             if name == _NAME:
-                self._add(report.nodeid, spent_s)  # type: ignore[arg-type]
+                self._add(report.nodeid, spent_s)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         """The table: processor and clock seconds."""

@@ -142,10 +142,26 @@ def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
     lab.wait_end(folder)
 
 
-def test_a_scan_outlives_its_server_and_the_next_one_finds_it(lab):
+def test_the_rig_makes_one_scan_and_it_outlives_its_server(lab):
     folder = lab.start("third", rows=ROWS)
     lab.wait_rows(folder, 1)
     program_before = json.loads((folder / PROGRAM / "scan.json").read_text())
+    pid = program_before["pid"]
+    # The priority of a terminal's program, not of the process that reads
+    assert os.getpriority(os.PRIO_PROCESS, lab.server.process.pid) == os.getpriority(os.PRIO_PROCESS, pid)
+    assert (
+        Path(f"/proc/{pid}/oom_score_adj").read_text().strip() == Path("/proc/self/oom_score_adj").read_text().strip()
+    )
+    lab.open("/new")
+    lab.browser.wait("document.querySelector('.time')", "the plan")
+    lab.fill(name="fourth")
+    lab.click("start")
+    lab.browser.wait("document.getElementById('told').innerText.includes('third is being scanned')", "the refusal")
+    assert not (lab.scans / "fourth").exists()
+    # The refused request
+    lab.browser.errors.clear()
+    lab.open("/watch?scan=third")
+    lab.wait_headline("All is well")
     lab.server.kill()
     lab.browser.wait("document.body.classList.contains('lost')", "that the page says so")
     rows = len(ScanFolder.load(folder).committed_rows())
@@ -157,28 +173,6 @@ def test_a_scan_outlives_its_server_and_the_next_one_finds_it(lab):
     assert _program(folder).running
     lab.click("pause")
     lab.wait_headline("Paused")
-    lab.click("stop")
-    lab.wait_headline("Stopped on request")
-    lab.wait_end(folder)
-
-
-def test_a_scan_has_the_priority_of_a_terminals_not_of_the_reading_process(lab):
-    folder = lab.start("fourth", rows=ROWS)
-    lab.wait_rows(folder, 1)
-    pid = json.loads((folder / PROGRAM / "scan.json").read_text())["pid"]
-    assert os.getpriority(os.PRIO_PROCESS, lab.server.process.pid) == os.getpriority(os.PRIO_PROCESS, pid)
-    assert (
-        Path(f"/proc/{pid}/oom_score_adj").read_text().strip() == Path("/proc/self/oom_score_adj").read_text().strip()
-    )
-    lab.open("/new")  # one rig, one scan
-    lab.browser.wait("document.querySelector('.time')", "the plan")
-    lab.fill(name="fifth")
-    lab.click("start")
-    lab.browser.wait("document.getElementById('told').innerText.includes('fourth is being scanned')", "the refusal")
-    assert not (lab.scans / "fifth").exists()
-    # The refused request
-    lab.browser.errors.clear()
-    lab.open("/watch?scan=fourth")
     lab.click("stop")
     lab.wait_headline("Stopped on request")
     lab.wait_end(folder)

@@ -166,10 +166,11 @@ class Costs:
         before_s = self._last_s
         self._last_s = self._now_s()
         collected_s = [now - time_before for now, time_before in zip(self._last_s, before_s, strict=True)]
-        if hasattr(session.config, "workeroutput"):
-            session.config.workeroutput[_NAME] = collected_s
-        else:
+        output = getattr(session.config, "workeroutput", None)
+        if output is None:
             self._add("collection", collected_s)
+        else:
+            output[_NAME] = collected_s
 
     def pytest_testnodedown(self, node: Any) -> None:
         """Add a worker's collection."""

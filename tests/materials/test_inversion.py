@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from polysight.materials.inversion import (
     SOURCES,
-    PatchMeasurement,
     RigPrior,
     SceneLikelihood,
     invert,
@@ -17,7 +16,7 @@ from polysight.materials.inversion import (
     sample_posterior,
     true_ratio,
 )
-from polysight.materials.kinds import Kind, Kinds, literature, permittivity_slope
+from polysight.materials.kinds import Kind, Kinds, PatchMeasurement, literature, permittivity_slope
 from polysight.materials.phase_sign import join_signs, mirror_phases
 from polysight.polarimetry import fresnel, permittivity_from_ratio
 

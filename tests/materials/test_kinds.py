@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from polysight.materials.kinds import Kinds, literature
+from polysight.materials.kinds import Kinds, inverse_ratio, literature, log_half_space_brightness
+from polysight.polarimetry import fresnel
 
 THETA = np.radians(55.0)
 KINDS = Kinds(literature(), float(THETA))
@@ -25,3 +26,11 @@ def test_no_half_space_lies_at_metal():
     density = KINDS.compute_half_space_density(np.append(near, 1.0), 0.03**2 * np.eye(2))
     everywhere = KINDS.compute_half_space_density(np.array([0.2 - 0.03j]), 0.03**2 * np.eye(2))
     assert density.max() < 0.2 * float(everywhere[0])
+
+
+def test_brightness_of_a_half_space_is_that_of_eq_2():
+    eps = np.array([1.5 - 0.1j, 2.3 - 0.22j, 4.0 - 0.4j, 7.3 - 0.9j, 9.0 - 17.0j])
+    for theta_rad in np.radians([30.0, 55.0, 60.0]):
+        r_s, _ = fresnel(eps, theta_rad)
+        brightness = log_half_space_brightness(inverse_ratio(eps, theta_rad), theta_rad)
+        np.testing.assert_allclose(brightness, np.log(np.abs(r_s)), atol=1e-9)

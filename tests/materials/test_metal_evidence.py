@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from polysight.materials.inversion import PatchMeasurement, RigPrior
-from polysight.materials.kinds import Kinds, literature
+from polysight.materials.inversion import RigPrior
+from polysight.materials.kinds import Kinds, PatchMeasurement, literature
 from polysight.materials.metal import metal_evidence
 
 THETA = np.radians(55.0)

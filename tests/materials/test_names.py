@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.materials import LAYER, UNKNOWN, clean_name
-from polysight.materials.kinds import Kind, Kinds, RatioEvidence, draw_sheets, inverse_ratio, literature
+from polysight.materials.kinds import Kind, Kinds, RatioEvidence, draw_sheets, inverse_ratio, literature, weigh_kinds
 from polysight.materials.names import name_patch
+from polysight.polarimetry import fresnel, multilayer, permittivity_from_ratio
 from polysight_shared.errors import DataError
 
 ANGLES = tuple(np.radians([55.0, 65.0]))
@@ -61,11 +62,47 @@ def test_a_second_angle_makes_a_true_name_surer():
 
 
 def test_what_is_no_half_space_but_a_thin_plate_is_a_possible_layer():
-    t = draw_sheets(ANGLES[0])
+    t, _ = draw_sheets(ANGLES[0])
     far = t[np.argsort(np.abs(t))[int(0.97 * t.size)]]
     names = [name_ratios(complex(far)).verdict.name, name_ratios(-0.25 + 0.2j).verdict.name]
     assert LAYER in names
     assert not set(names) & set(LIBRARY)
+
+
+def layer_probability(plates: int, brightness_std: float) -> tuple[float, float]:
+    """Median probability of a possible layer, of drawn thin plates and of the half spaces of the same ratios.
+
+    The plates are sheets of 0.5 to 3 mm in air, their ratios and brightnesses written out from multilayer's r_s, r_p.
+    """
+    rng = np.random.default_rng(5)
+    probabilities = []
+    while len(probabilities) < plates:
+        eps = rng.uniform(2, 5) * (1 - 1j * rng.uniform(0.001, 0.05))
+        r_s, r_p = multilayer([eps, 1.0], [rng.uniform(0.5e-3, 3e-3), np.inf], 78e9, ANGLES[0])
+        t = complex(r_p / r_s)
+        half_space = permittivity_from_ratio(t, ANGLES[0])
+        if not (half_space.real > 1.3 and -3 < half_space.imag < 0):
+            continue
+        expected = np.log(np.abs(fresnel(half_space, ANGLES[0])[0]))
+        row = []
+        for brightness in (np.log(np.abs(r_s)) - expected, 0.0):
+            off = float(brightness + brightness_std * rng.standard_normal())
+            evidence = RatioEvidence(ANGLES[0], t, 1e-4 * np.eye(2), 0.5, off, brightness_std)
+            row.append(weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet)
+        probabilities.append(row)
+    thin, thick = np.median(probabilities, axis=0)
+    return float(thin), float(thick)
+
+
+def test_brightness_tells_thin_plates_from_half_spaces_of_the_same_ratio():
+    thin, thick = layer_probability(60, brightness_std=0.05)
+    assert thin > 0.5
+    assert thick < 0.05
+
+
+def test_where_plates_are_unevenly_bright_their_brightness_tells_little():
+    thin, thick = layer_probability(60, brightness_std=0.6)
+    assert abs(thin - thick) < 0.2
 
 
 @pytest.mark.slow

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from tests.support.rigs import published_rig
 
-from polysight.materials.inversion import PatchMeasurement, RigPrior, invert
-from polysight.materials.kinds import Kinds, literature
+from polysight.materials.inversion import RigPrior, invert
+from polysight.materials.kinds import Kinds, PatchMeasurement, literature
 from polysight.materials.layers import Layer, Spectrum, predict
 
 THETA_RAD = np.radians(55.0)

@@ -13,6 +13,7 @@ from polysight.results.verdict import (
     apart_reasons,
     background_reasons,
     brightness_reasons,
+    dark_reference_reasons,
     direct_path_reasons,
     disturbance_reasons,
     disturbed_reasons,
@@ -406,3 +407,10 @@ def test_a_terminal_shows_the_heaviest_reasons_and_how_many_more_there_are():
 )  # fmt: skip
 def test_100_percent_is_shown_only_if_nothing_is_missing(part, whole, digits, shown):
     assert percent(part, whole, digits) == shown
+
+
+@pytest.mark.parametrize(("brighter_db", "told"), [(-3.0, False), (5.9, False), (6.1, True), (30.0, True)])
+def test_a_reference_that_a_plate_outshines_is_told(brighter_db, told):
+    reasons = dark_reference_reasons("the given box", 4, brighter_db)
+    assert bool(reasons) is told
+    assert all(f.level == "care" and "patch 4" in f.what for f in reasons)

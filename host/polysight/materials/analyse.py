@@ -16,17 +16,16 @@ import numpy.typing as npt
 from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise, correct_tilt
 from polysight.materials.classify import PAPER, Classifier
 from polysight.materials.common_change import CommonChange, common_change
-from polysight.materials.inversion import (
-    EVEN_LIGHT,
-    MOVED,
-    UNEVEN_LIGHT,
-    Inversion,
-    PatchEstimate,
+from polysight.materials.inversion import EVEN_LIGHT, MOVED, UNEVEN_LIGHT, Inversion, PatchEstimate, RigPrior, invert
+from polysight.materials.kinds import (
+    Kinds,
     PatchMeasurement,
-    RigPrior,
-    invert,
+    RatioEvidence,
+    inverse_ratio,
+    literature,
+    turn_covariance,
+    weigh_kinds,
 )
-from polysight.materials.kinds import Kinds, RatioEvidence, inverse_ratio, literature, turn_covariance, weigh_kinds
 from polysight.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,

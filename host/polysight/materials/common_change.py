@@ -28,18 +28,21 @@ from polysight.materials.measure import Scatter
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
-DRIFTS = {0.002: 0.8, 0.02: 0.1, 0.06: 0.1}
-"""Standard deviations of the drift of ln(V / H) over a scan, each part, with their prior probabilities: of a stable
-rig, of a usual one, and of one that drifts by 15 % and 9 degrees. The probabilities are chosen, not measured."""
+STABLE = 0.8
+"""Probability of a rig that does not drift; what drifts in amplitude does so in phase. Chosen, not measured."""
+DRIFTS: dict[bool, tuple[float, ...]] = {True: (0.002,), False: (0.02, 0.06)}
+"""Standard deviations of the drift of ln(V / H) over a scan, each part, equally probable: of a stable rig, and of one
+that drifts, as usual or by 15 % and 9 degrees."""
 DRIFT_LENGTHS_M = (0.07, 0.15)
 """Lengths over which a drift changes, along the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
 FRINGES = {0.0: 0.95, 0.05: 0.025, 0.15: 0.025}
 """The same of fringes by a second path beside the direct path; the published rig shows 10 to 20 %."""
 FRINGE_LENGTHS_M = (0.03, 0.05)
 """Their lengths: fringes of 0.2 to 0.3 m. Shorter ones average out over a plate."""
-COMMON_SLOPES = (0.1, 1.0, 3.0)
-"""Standard deviations of the slope of ln(V / H) that all plates have by themselves, per metre: H and V that see the
-same place (0.1 to 0.3 in scenes of the independent generator), images some millimetres apart, and a small aperture."""
+COMMON_SLOPES = {0.15: 0.5, 0.5: 0.25, 2.0: 0.25}
+"""Standard deviations of the slope of ln(V / H) that all plates have by themselves, per metre, with their prior
+probabilities: H and V that see the same place (0.1 to 0.3 in scenes of the independent generator), images some
+millimetres apart (0.5), and a small aperture (1 to 3)."""
 OWN_SLOPES = (0.05, 1.0, 3.0)
 """The same of the slope that each plate has of its own: flat plates, uneven or disturbed ones."""
 ALIKE_BOTH_WAYS = 0.7
@@ -123,7 +126,7 @@ def common_change(
         drift=(real.drift + 1j * imag.drift)[0],
         drift_std=(real.drift_std + 1j * imag.drift_std)[0],
         ripple=RIPPLE_M * _own_slopes((real.remaining[0], imag.remaining[0]), noises, border),
-        fringes=float(sum(w for w, (size, _, _) in zip(weight, smooth_fields.shared, strict=True) if size > 0)),
+        fringes=float(sum(w for w, (size, _, _, _) in zip(weight, smooth_fields.shared, strict=True) if size > 0)),
     )
 
 
@@ -202,14 +205,15 @@ class _Fields:
     fringes
         Length in metres to the field of unit variance over the plane.
     shared
-        Size and length of the fringes, and the size of the slopes that all plates have alike.
+        Size and length of the fringes, the size of the slopes that all plates have alike, and whether the rig is
+        stable.
     log_prior
         Logarithm of the prior probability of each of `shared`.
     """
 
     drifts: Sequence[_Field]
     fringes: Mapping[float, _Field]
-    shared: Sequence[tuple[float, float, float]]
+    shared: Sequence[tuple[float, float, float, bool]]
     log_prior: Real
 
     @classmethod
@@ -217,9 +221,10 @@ class _Fields:
         """Return the fields for plates at places [plate, 2], relative to the origin [2]."""
         shared = []
         prior = []
-        for (size, share), length_m, common in itertools.product(FRINGES.items(), FRINGE_LENGTHS_M, COMMON_SLOPES):
-            shared.append((size, length_m, common))
-            prior.append(share)
+        cases = itertools.product(FRINGES.items(), FRINGE_LENGTHS_M, COMMON_SLOPES.items(), (True, False))
+        for (size, share), length_m, (common, share_of_common), stable in cases:
+            shared.append((size, length_m, common, stable))
+            prior.append(share * share_of_common * (STABLE if stable else 1 - STABLE))
         return cls(
             drifts=[_Field.along((0, 1), length_m, places_m, origin_m) for length_m in DRIFT_LENGTHS_M],
             fringes={length_m: _Field.along((1, 1), length_m, places_m, origin_m) for length_m in FRINGE_LENGTHS_M},
@@ -232,14 +237,16 @@ class _Fields:
         parts = [_arrays(self._explain(slopes, noise, *shared)) for shared in self.shared]
         return _Explained(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
-    def _explain(self, slopes: Real, noise: Real, fringe: float, fringe_m: float, common: float) -> _Explained:
+    def _explain(
+        self, slopes: Real, noise: Real, fringe: float, fringe_m: float, common: float, stable: bool
+    ) -> _Explained:
         """Return the same for one of `shared`, averaged over drifts and the plates' own slopes by their evidence."""
         count = slopes.shape[1]
         seen = slopes.ravel()
         fringes = self.fringes[fringe_m]
         alike = common**2 * np.kron(np.eye(2), np.ones((count, count))) + fringe**2 * fringes.of_slopes
         cases = []
-        for field, (drift, probability) in itertools.product(self.drifts, DRIFTS.items()):
+        for field, drift in itertools.product(self.drifts, DRIFTS[stable]):
             explained = alike + drift**2 * field.of_slopes
             own_slopes, share = _own_variances(count)
             total = explained + (noise.ravel() ** 2 + own_slopes)[:, :, None] * np.eye(2 * count)
@@ -249,7 +256,9 @@ class _Fields:
             of_all = of_drift + fringe**2 * fringes.with_slopes
             variance_of_drift = drift**2 * field.of_itself
             case = _Explained(
-                log_evidence=np.log(probability * share) - 0.5 * answer @ seen + 0.5 * np.linalg.slogdet(inverse)[1],
+                log_evidence=np.log(share / len(DRIFTS[stable]))
+                - 0.5 * answer @ seen
+                + 0.5 * np.linalg.slogdet(inverse)[1],
                 mean=answer @ of_all.T,
                 square=_square(answer, inverse, of_all, variance_of_drift + fringe**2 * fringes.of_itself),
                 drift=answer @ of_drift.T,

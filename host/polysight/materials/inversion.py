@@ -37,13 +37,15 @@ from polysight.materials.kinds import (
     USUAL_LIBRARY_SHARE,
     DensityMap,
     Kinds,
+    PatchMeasurement,
     RatioEvidence,
+    brightness_density,
+    log_half_space_brightness,
     move_to_angle,
     permittivity_slope,
     split_complex,
     turn_covariance,
 )
-from polysight.materials.monte_carlo import anneal, resample
 from polysight.materials.specimens import METAL_WITHOUT_BRIGHTNESS, METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import permittivity_from_ratio
 
@@ -53,9 +55,6 @@ Complex = npt.NDArray[np.complex128]
 BRIGHTNESS_RANGE = (0.03, 0.7)
 """Range of the standard deviation of ln kappa in a scene, uniform on a logarithmic scale: flat simulated plates differ
 by 3 %, thin, tilted, unevenly lit ones by a factor of two (published pictures)."""
-ODD_BRIGHTNESS = 0.1
-ODD_BRIGHTNESS_STD = 1.2
-"""Share of patches whose brightness is none of a half space (thin sheets, shadows), and their ln kappa's spread."""
 METAL_BRIGHTNESS_STD = 0.5
 """Prior standard deviation of the metal's own ln kappa."""
 LIBRARY_SHARE = (0.05, 0.95)
@@ -106,45 +105,10 @@ COLUMNS_OF_SOURCE = {
     "incidence": (ANGLE,),
     "tilt": (TURN_BY_RISE, *LIGHT_ACROSS, LIGHT_ALONG),
 }
-# Particles, and draws of a patch's own errors for each particle.
+# Particles, moves at each temperature, and draws of a patch's own errors for each particle.
 PARTICLES = 600
+MOVES = 6
 DRAWS = 8
-# Smallest standard deviation of a ratio: below it a covariance has no inverse in double precision.
-LEAST_RATIO_STD = 1e-6
-
-
-@dataclass(frozen=True)
-class PatchMeasurement:
-    """Measurement of one patch, relative to metal; leakage is not removed.
-
-    Attributes
-    ----------
-    inverse_ratio
-        V / H.
-    std
-        Standard deviation of its real part and of its imaginary part: noise, sidelobes.
-    theta_rad
-        Nominal incidence angle.
-    brightness
-        |H|; None if it is not used.
-    relative_std
-        Standard deviations of ln|V / H| and of its phase by what scatters over the plate: edges, ripple, tilt.
-    rise
-        Rise of the plate along x and across the plane of incidence, radians.
-    """
-
-    inverse_ratio: complex
-    std: float
-    theta_rad: float
-    brightness: float | None = None
-    relative_std: tuple[float, float] = (0.0, 0.0)
-    rise: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def covariance(self) -> Real:
-        """Covariance of real and imaginary part of V / H, float64 [2, 2]."""
-        std = max(self.std, LEAST_RATIO_STD)
-        return std**2 * np.eye(2) + turn_covariance(self.inverse_ratio, np.diag(np.square(self.relative_std)))
 
 
 @dataclass(frozen=True)
@@ -311,7 +275,7 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | Non
         # A patch is measured without the belief that it must be some material itself.
         without_patch = all_evidence.copy()
         without_patch[i + 1] = 0.0
-        particles, _ = anneal(model, posterior, all_evidence, without_patch, rng)
+        particles, _ = _anneal(model, posterior, all_evidence, without_patch, rng)
         patches.append(_estimate(model, particles, i, rng))
     return _solution(model, posterior, log_evidence, tuple(patches))
 
@@ -327,11 +291,11 @@ def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[
     log_weights = []
     for hypothesis, probability in model.hypotheses():
         prior_particles = rng.standard_normal((PARTICLES, model.width))
-        z, log_evidence = anneal(hypothesis, prior_particles, no_evidence, no_evidence + 1, rng)
+        z, log_evidence = _anneal(hypothesis, prior_particles, no_evidence, no_evidence + 1, rng)
         samples.append(hypothesis.within(model.prior, z))
         log_weights.append(np.log(probability) + log_evidence)
     weight = np.exp(np.array(log_weights) - max(log_weights))
-    chosen = resample(np.repeat(weight, PARTICLES), rng)[:: len(samples)]
+    chosen = _resample(np.repeat(weight, PARTICLES), rng)[:: len(samples)]
     return np.concatenate(samples)[chosen], max(log_weights) + float(np.log(weight.sum()))
 
 
@@ -480,10 +444,8 @@ class SceneLikelihood:
         a, _ = self.leakage_of_patches(z)
         t = self.ratios(z)
         angle = self.angle(z)
-        cosine = np.cos(angle)
         with np.errstate(divide="ignore", invalid="ignore"):
-            q = (1 + t) / (1 - t) * np.sin(angle) ** 2 / cosine
-            model = np.log(np.abs((cosine - q) / (cosine + q) * (1 + a * t) / (1 + a)))
+            model = log_half_space_brightness(t, angle) + np.log(np.abs((1 + a * t) / (1 + a)))
         difference = self.log_level - model - METAL_BRIGHTNESS_STD * z[..., METAL_BRIGHTNESS, None]
         difference = difference + self.log_reference_brightness(z)
         return np.where(np.isfinite(difference), np.clip(difference, -10, 10), 10.0)
@@ -504,9 +466,8 @@ class SceneLikelihood:
         """Return log likelihoods [..., 1 + patch]: of all brightnesses, and of each patch to be some material."""
         size = self.brightness_std(z)[..., None]
         brightness_difference = self.brightness_off(z)
-        usual = (1 - ODD_BRIGHTNESS) / size * np.exp(-0.5 * (brightness_difference / size) ** 2)
-        odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (brightness_difference / ODD_BRIGHTNESS_STD) ** 2)
-        brightness_log = np.where(self.bright, np.log(usual + odd + 1e-300), 0.0).sum(axis=-1, keepdims=True)
+        density = brightness_density(brightness_difference, size)
+        brightness_log = np.where(self.bright, np.log(density + 1e-300), 0.0).sum(axis=-1, keepdims=True)
         if self.kinds is None:
             no_evidence = np.zeros((*brightness_log.shape[:-1], self.patch_count))
             return np.concatenate([brightness_log, no_evidence], axis=-1)
@@ -542,6 +503,63 @@ def _place(z: Real, certainty: float, probability: float) -> Real:
 def _complex(z: Real, columns: tuple[int, int]) -> Complex:
     """Return two columns of particles as real and imaginary part, [..., 1]."""
     return z[..., columns[0], None] + 1j * z[..., columns[1], None]
+
+
+def _anneal(model: SceneLikelihood, z: Real, before: Real, after: Real, rng: np.random.Generator) -> tuple[Real, float]:
+    """Move particles of one posterior to another.
+
+    `before`, `after` [1 + patch] weigh the log likelihoods. Return them with the logarithm of the ratio of both
+    evidences.
+    """
+    parts = model.log_likelihoods(z)
+    change = after - before
+    done = 0.0
+    log_evidence = 0.0
+    while done < 1:
+        gain = parts @ change
+        step = _choose_step(gain, 1 - done)
+        done = 1.0 if step >= 1 - done else done + step
+        weight = before + done * change
+        log_evidence += step * float(gain.max()) + float(np.log(np.mean(np.exp(step * (gain - gain.max())))))
+        chosen = _resample(np.exp(step * (gain - gain.max())), rng)
+        z = z[chosen]
+        parts = parts[chosen]
+        # Random walk of the usual size in so many dimensions, shaped as the particles lie.
+        spread = np.linalg.cholesky(np.cov(z.T) + 1e-9 * np.eye(model.width)) * 2.0 / np.sqrt(model.width)
+        for _ in range(MOVES):
+            proposed = z + rng.standard_normal(z.shape) @ spread.T
+            parts_proposed = model.log_likelihoods(proposed)
+            log_odds = (parts_proposed - parts) @ weight - 0.5 * np.sum(proposed**2 - z**2, axis=1)
+            accepted = (np.log(rng.random(len(z))) < log_odds)[:, None]
+            z = np.where(accepted, proposed, z)
+            parts = np.where(accepted, parts_proposed, parts)
+    return z, log_evidence
+
+
+def _choose_step(gain: Real, most: float) -> float:
+    """Return the largest step of the temperature that leaves half of the particles' weight effective."""
+
+    def effective_share(step: float) -> float:
+        weight = np.exp(step * (gain - gain.max()))
+        return float(weight.sum() ** 2 / np.sum(weight**2)) / gain.size
+
+    if effective_share(most) >= 0.5:
+        return most
+    low = 0.0
+    high = most
+    for _ in range(30):
+        middle = (low + high) / 2
+        if effective_share(middle) >= 0.5:
+            low = middle
+        else:
+            high = middle
+    return max(low, 1e-6)
+
+
+def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:
+    """Return indices of particles in proportion to their weights (systematic resampling)."""
+    places = (rng.random() + np.arange(weight.size)) / weight.size
+    return np.minimum(np.searchsorted(np.cumsum(weight) / weight.sum(), places), weight.size - 1)
 
 
 def _solution(model: SceneLikelihood, z: Real, log_evidence: float, patches: tuple[PatchEstimate, ...]) -> Inversion:
@@ -633,7 +651,17 @@ def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvi
     library_share = USUAL_LIBRARY_SHARE
     if kinds.ours.any():
         library_share = float(model.library_share(z).mean())
-    return RatioEvidence(kinds.theta_rad, complex(t.mean()), covariance, library_share)
+    brightness_off = np.nan
+    if model.bright[i]:
+        brightness_off = float(np.median(model.brightness_off(z)[:, i]))
+    return RatioEvidence(
+        theta_rad=kinds.theta_rad,
+        inverse_ratio=complex(t.mean()),
+        covariance=covariance,
+        library_share=library_share,
+        brightness_off=brightness_off,
+        brightness_std=float(np.exp(np.log(model.brightness_std(z)).mean())),
+    )
 
 
 def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:

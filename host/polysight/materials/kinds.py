@@ -50,6 +50,9 @@ STACK_SHARE = 0.05
 """Share of plates that are neither half space nor thin plate in the patches that are none of the library's materials: a
 liquid behind glass may reflect as no passive half space does. Their t is uniform on the unit disk. Without them three
 cups of sugar water moved the estimated leakage by three standard deviations, and their own t by a fifth."""
+ODD_BRIGHTNESS = 0.1
+ODD_BRIGHTNESS_STD = 1.2
+"""Share of patches whose brightness is that of nothing known (shadows, edges), and the spread of its logarithm then."""
 LEAST_LOSS_SPREAD = 0.02
 """Standard deviation of eps'' between specimens of low-loss materials."""
 METAL_SPREAD = 0.01
@@ -57,6 +60,8 @@ METAL_SPREAD = 0.01
 LEAST_STD_OF_T = 1e-6
 MOST_STD_BEYOND = 30.0
 """Least standard deviation of t that a distance is measured in, and largest distance, of no probability in practice."""
+# Smallest standard deviation of a ratio: below it a covariance has no inverse in double precision.
+LEAST_RATIO_STD = 1e-6
 _STEP = 1e-4
 _SHEETS = 6000
 _HALF_SPACES = 4000
@@ -75,6 +80,40 @@ class Kind:
 
 
 @dataclass(frozen=True)
+class PatchMeasurement:
+    """Measurement of one patch, relative to metal; leakage is not removed.
+
+    Attributes
+    ----------
+    inverse_ratio
+        V / H.
+    std
+        Standard deviation of its real part and of its imaginary part: noise, sidelobes.
+    theta_rad
+        Nominal incidence angle.
+    brightness
+        |H|; None if it is not used.
+    relative_std
+        Standard deviations of ln|V / H| and of its phase by what scatters over the plate: edges, ripple, tilt.
+    rise
+        Rise of the plate along x and across the plane of incidence, radians.
+    """
+
+    inverse_ratio: complex
+    std: float
+    theta_rad: float
+    brightness: float | None = None
+    relative_std: tuple[float, float] = (0.0, 0.0)
+    rise: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def covariance(self) -> Real:
+        """Covariance of real and imaginary part of V / H, float64 [2, 2]."""
+        std = max(self.std, LEAST_RATIO_STD)
+        return std**2 * np.eye(2) + turn_covariance(self.inverse_ratio, np.diag(np.square(self.relative_std)))
+
+
+@dataclass(frozen=True)
 class RatioEvidence:
     """What one scan says of a patch, for its name.
 
@@ -86,17 +125,38 @@ class RatioEvidence:
         t, corrected for all estimated errors; float64 [2, 2] of its real and imaginary part.
     library_share
         Expected share of the library's materials in this scan.
+    brightness_off, brightness_std
+        ln |H| over that of the half space of this ratio, relative to the scene's, and its usual size in this scene; NaN
+        if |H| says nothing. Thin plates are brighter or darker than half spaces of the same ratio.
     """
 
     theta_rad: float
     inverse_ratio: complex
     covariance: Real
     library_share: float
+    brightness_off: float = np.nan
+    brightness_std: float = np.nan
 
 
 def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
     """Return t = 1 / P of half spaces (Eq. 2)."""
     return np.asarray(1 / ratio_from_permittivity(permittivity, theta_rad), np.complex128)
+
+
+def log_half_space_brightness(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Real:
+    """Return ln |r_s| of the half space of t = 1 / P (Eq. 2 with :func:`move_to_angle`'s root); NaN for metal."""
+    t = np.asarray(t, np.complex128)
+    cosine = np.cos(theta_rad)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = (1 + t) / (1 - t) * np.sin(theta_rad) ** 2 / cosine
+        return np.asarray(np.log(np.abs((cosine - root) / (cosine + root))), np.float64)
+
+
+def brightness_density(difference: Real | float, size: Real | float) -> Real:
+    """Return the density of ln |H| over its expectation, but for a factor: of the usual size, or odd."""
+    usual = (1 - ODD_BRIGHTNESS) / size * np.exp(-0.5 * (difference / size) ** 2)
+    odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (difference / ODD_BRIGHTNESS_STD) ** 2)
+    return np.asarray(usual + odd, np.float64)
 
 
 def permittivity_slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
@@ -154,8 +214,9 @@ class Kinds:
         none of the library's.
     other
         Share of any other half space in what is none of the library's.
-    sheet_share, sheets
-        Share of thin plates in what is none of the library's (0: plates are thick), and complex [draw]: their t.
+    sheet_share, sheets, sheet_brightness_off
+        Share of thin plates in what is none of the library's (0: plates are thick), and [draw]: their t, and ln |r_s|
+        over that of the half space of the same t.
     """
 
     def __init__(self, kinds: Sequence[Kind], theta_rad: float, sheets: bool = False) -> None:
@@ -167,7 +228,7 @@ class Kinds:
         self.covariance = self.effects @ self.effects.mT + 1e-10 * np.eye(2)
         self.sheet_share = SHEET_SHARE if sheets else 0.0
         self.share, self.other = _shares(self.kinds, self.sheet_share)
-        self.sheets = draw_sheets(theta_rad)
+        self.sheets, self.sheet_brightness_off = draw_sheets(theta_rad)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -284,13 +345,18 @@ def _shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
 
 
 @cache
-def draw_sheets(theta_rad: float, frequency_hz: float = SHEET_HZ) -> Complex:
-    """Return t of thin plates before air or a holder, complex128 [draw]; the same plates at every angle."""
+def draw_sheets(theta_rad: float, frequency_hz: float = SHEET_HZ) -> tuple[Complex, Real]:
+    """Return t of thin plates before air or a holder, complex128 [draw], and ln |r_s| over that of half spaces, [draw].
+
+    The half spaces have the same t. The plates are the same at every angle.
+    """
     eps, holder, thickness_m = _draw_sheet_properties()
     r_s, r_p = multilayer([eps, holder], [thickness_m, np.inf], frequency_hz, theta_rad)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = r_p / r_s
-    return np.where(np.isfinite(t), t, 1e3).astype(np.complex128)
+        brightness_off = np.log(np.abs(r_s)) - log_half_space_brightness(t, theta_rad)
+    sheets = np.where(np.isfinite(t), t, 1e3).astype(np.complex128)
+    return sheets, np.where(np.isfinite(brightness_off), brightness_off, 0.0)
 
 
 @cache
@@ -344,7 +410,8 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
     ours = float(np.mean([evidence.library_share for evidence in seen])) if first.ours.any() else 0.0
     weight = weight * np.where(first.ours, ours, 1 - ours)
     drawn = np.stack([kind.sheets for kind in kinds], axis=1)
-    sheet = (1 - ours) * first.sheet_share * float(np.mean(_normal(drawn, t, errors + SHEET_KERNEL**2 * np.eye(size))))
+    density = _normal(drawn, t, errors + SHEET_KERNEL**2 * np.eye(size)) * _brightness_odds(kinds, seen)
+    sheet = (1 - ours) * first.sheet_share * float(np.mean(density))
     other_weight = (1 - ours) * first.other * _other_density(kinds, seen)
     distance = np.sqrt(distance2 / scipy.special.chdtri(size, 0.01))
     total = float(weight.sum()) + sheet + other_weight
@@ -353,6 +420,17 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
     inside = np.where(distance <= 1, weight, 0.0) / total
     sheet = sheet / total
     return Odds(inside, sheet, 1 - sheet - float(inside.sum()), distance)
+
+
+def _brightness_odds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Real:
+    """Return how much likelier the brightness of a patch is for each drawn thin plate than for a half space, [draw]."""
+    odds = np.ones(kinds[0].sheets.size)
+    for kind, evidence in zip(kinds, seen, strict=True):
+        if np.isfinite(evidence.brightness_off):
+            of_sheets = evidence.brightness_off - kind.sheet_brightness_off
+            density = brightness_density(of_sheets, evidence.brightness_std)
+            odds = odds * density / brightness_density(evidence.brightness_off, evidence.brightness_std)
+    return odds
 
 
 def _normal(draws: Complex, mean: Complex, covariance: Real) -> Real:

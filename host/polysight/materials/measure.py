@@ -16,9 +16,8 @@ import scipy
 from polysight.imaging import Image, Mask
 from polysight.materials.inversion import (
     PatchEstimate,
-    PatchMeasurement,
 )
-from polysight.materials.kinds import permittivity_slope
+from polysight.materials.kinds import PatchMeasurement, permittivity_slope
 from polysight.materials.segment import Patch, Segmentation
 from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import inverse_spread, permittivity_from_ratio

@@ -23,16 +23,8 @@ import numpy.typing as npt
 import scipy
 
 from polysight.imaging import Image, Images, Mask
-from polysight.materials.inversion import (
-    WIDTH,
-    Inversion,
-    PatchMeasurement,
-    RigPrior,
-    SceneLikelihood,
-    invert,
-    sample_posterior,
-)
-from polysight.materials.kinds import METAL_SHARE, METAL_SPREAD, Kinds, inverse_ratio
+from polysight.materials.inversion import WIDTH, Inversion, RigPrior, SceneLikelihood, invert, sample_posterior
+from polysight.materials.kinds import METAL_SHARE, METAL_SPREAD, Kinds, PatchMeasurement, inverse_ratio
 from polysight.materials.segment import Box, Patch, Segmentation, box_mask
 from polysight.materials.specimens import METAL_UNLIKE
 from polysight_shared.error_codes import ErrorCode

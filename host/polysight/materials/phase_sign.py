@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.inversion import Inversion, PatchEstimate, PatchMeasurement, RigPrior
-from polysight.materials.kinds import split_complex
+from polysight.materials.inversion import Inversion, PatchEstimate, RigPrior
+from polysight.materials.kinds import PatchMeasurement, split_complex
 
 Real = npt.NDArray[np.float64]
 

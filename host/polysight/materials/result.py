@@ -399,6 +399,9 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
         evidence_ratio=np.array([e.inverse_ratio for e in evidence], np.complex128),
         evidence_covariance=np.array([e.covariance for e in evidence], np.float64).reshape(-1, 2, 2),
         evidence_share=np.array([e.library_share for e in evidence], np.float64),
+        evidence_brightness=np.array([[e.brightness_off, e.brightness_std] for e in evidence], np.float64).reshape(
+            -1, 2
+        ),
     )
     return out.getvalue()
 
@@ -429,15 +432,22 @@ def read_patches(path: Path) -> ScanPatches:
 
 def _read_evidence(arrays: Mapping[str, npt.NDArray], judged: Sequence[int]) -> dict[int, RatioEvidence]:
     """Return what the names of the judged patches rest on. Raises ValueError if the arrays do not fit."""
+    shares = arrays["evidence_share"]
+    # Products of earlier states hold no brightness.
+    brightness = np.full((shares.size, 2), np.nan)
+    if "evidence_brightness" in arrays:
+        brightness = arrays["evidence_brightness"]
     columns = zip(
         arrays["evidence_theta_rad"],
         arrays["evidence_ratio"],
         arrays["evidence_covariance"],
-        arrays["evidence_share"],
+        shares,
+        brightness,
         strict=True,
     )
     rows = [
-        RatioEvidence(float(angle), complex(t), covariance, float(share)) for angle, t, covariance, share in columns
+        RatioEvidence(float(angle), complex(t), covariance, float(share), float(off), float(std))
+        for angle, t, covariance, share, (off, std) in columns
     ]
     if any(row.covariance.shape != (2, 2) for row in rows):
         raise ValueError("covariances are not [patch, 2, 2]")

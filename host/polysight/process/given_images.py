@@ -59,6 +59,9 @@ OTHER_SIGN = 0.3
 PUBLISHED_OTHER_SIGN = 0.05
 """Probability a priori that images of another program have the other sign of phase, if their file does not say it, and
 that images of the published form have, after `restore_phase_sign`."""
+LEAST_PEAK = 1e-9
+MOST_PEAK = 1e9
+"""Range of a channel's largest amplitude: squares, and their squares, stay within single precision."""
 _EXPECTED = (
     "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid [ny, nx], incidence_deg, simulated, conjugate"
 )
@@ -259,7 +262,7 @@ def _check_square(path: Path, x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.
 
 
 def _valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.bool_]:
-    """Return the pixels to use. Raises DataError if one of them is not finite, or none is left."""
+    """Return the pixels to use. Raises DataError if one is not finite, none is left, or a channel holds nothing."""
     h = arrays["h"]
     v = arrays["v"]
     valid = arrays.get("valid", np.ones(h.shape, bool))
@@ -275,6 +278,18 @@ def _valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np
             "a pixel without data cannot be told from a wrong one",
             "save valid (bool, [ny, nx]), false where there is no data", code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
+    for name, channel in (("h", h), ("v", v)):
+        peak = float(np.abs(channel[valid]).max(initial=0.0))
+        if peak and not LEAST_PEAK < peak < MOST_PEAK:
+            raise DataError(
+                f"{path}: the largest |{name}| is {peak:.3g}", f"expected {LEAST_PEAK:g} to {MOST_PEAK:g}",
+                "multiply both channels by one number", code=ErrorCode.VALUE_INVALID,
+            )  # fmt: skip
+        if not peak and (h[valid] != 0).any() | (v[valid] != 0).any():
+            raise DataError(
+                f"{path}: {name} is zero everywhere", "materials are told by the ratio of both channels",
+                "look at the program that made the images", code=ErrorCode.NO_DATA,
+            )  # fmt: skip
     lit = valid & ((h != 0) | (v != 0))
     if not lit.any():
         raise DataError(

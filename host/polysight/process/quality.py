@@ -43,6 +43,7 @@ from polysight.results import (
     check_plate,
     check_reasons,
     copies_reasons,
+    dark_reference_reasons,
     direct_path_reasons,
     disturbance_reasons,
     disturbed_reasons,
@@ -479,6 +480,10 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
             painted=result.inversion.painted,
             paint_mm=result.inversion.paint_mm,
         )
+        if metal.given:
+            levels = _levels_db(result)
+            brightest = max(levels, key=lambda label: levels[label], default=0)
+            reasons += dark_reference_reasons(patch, brightest, levels.get(brightest, 0.0))
     light = result.calibrated.illumination
     if result.prior.channels_known and (light is None or light.known):
         gains = {"H": result.calibrated.metal_h, "V": result.calibrated.metal_v}
@@ -498,6 +503,17 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
         angle = float(np.degrees(np.mean(result.theta_rad)))
         reasons += incidence_reasons(angle, float(classifier.angles_deg[0]))
     return reasons
+
+
+def _levels_db(result: MaterialsResult) -> dict[int, float]:
+    """Return patch number to the median of |H| relative to metal, dB; without the metal, and patches without data."""
+    levels = {}
+    for r in result.patches:
+        h = np.abs(result.h[r.patch.interior])
+        lit = h[np.isfinite(h) & (h > 0)]
+        if lit.size and r.patch.label != result.metal.label:
+            levels[r.patch.label] = 20 * float(np.log10(np.median(lit)))
+    return levels
 
 
 def _median_level(gain: npt.NDArray[np.complexfloating] | complex | None) -> float | None:

@@ -373,6 +373,11 @@ PAINT_TOLD = 0.2
 """Probability of a painted metal reference from which on the verdict tells it."""
 
 
+MOST_OUTSHINING_DB = 6.0
+"""How much brighter than metal a plate may be: a factor of two by thickness, tilt and illumination (published
+pictures)."""
+
+
 def metal_reasons(
     patch: str,
     likely: bool,
@@ -423,6 +428,18 @@ def metal_reasons(
     if only_patch:
         cause = "nothing else in the scene can show that it is metal"
     return [reason("none", f"no metal reference: {patch} is not shown to be metal", cause, do, 8.0)]
+
+
+def dark_reference_reasons(patch: str, brightest: int, brighter_db: float) -> list[Finding]:
+    """Judge a metal reference `patch` ("patch 3") that another patch outshines in H by `brighter_db`."""
+    if not brighter_db > MOST_OUTSHINING_DB:
+        return []
+    return [reason(
+        "care",
+        f"the given metal reference ({patch}) is {brighter_db:.0f} dB darker in H than patch {brightest}",
+        "nothing reflects more than metal: it is no metal, lies askew, or its box is beside it",
+        "look at the picture of H in the report, and give the box of the metal", 5.0,
+    )]  # fmt: skip
 
 
 def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> list[Finding]:

@@ -8,10 +8,17 @@ import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 
-from polysight_shared.config import Instrument, Section, load_instrument
+from polysight_shared.config import Image, Instrument, MountStep, Section, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import no_such
-from polysight_shared.geometry import direct_path_m, incidence_deg, rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.geometry import (
+    direct_path_m,
+    incidence_deg,
+    place,
+    rx_positions_m,
+    specular_midpoint_m,
+    tx_position_m,
+)
 from polysight_shared.tables import decode, read_toml, to_builtins
 
 
@@ -42,6 +49,24 @@ def test_mounts_reproduce_the_published_antenna_positions(rig: Instrument):
     assert rx_positions_m(rig, v)[0] == pytest.approx((0.6836, 0.1337, 0.0104), abs=6e-5)
     assert direct_path_m(rig, h)[0] == pytest.approx(1.390, abs=5e-4)
     assert incidence_deg(rig, h) == pytest.approx(55.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("axis", "first", "second"), [("x", 1, 2), ("y", 2, 0), ("z", 0, 1)])
+def test_a_mount_turns_right_handed_about_each_axis(axis: str, first: int, second: int):
+    mount = (MountStep(turn_deg=30.0, about=axis),)
+    images = [place(tuple(1000.0 * (i == k) for i in range(3)), mount) for k in range(3)]
+    expected = [[float(i == k) for i in range(3)] for k in range(3)]
+    for k, cosine_at, sine_at, sign in ((first, first, second, 1.0), (second, second, first, -1.0)):
+        expected[k][cosine_at] = math.cos(math.pi / 6)
+        expected[k][sine_at] = sign * 0.5
+    for image, row in zip(images, expected, strict=True):
+        assert image == pytest.approx(row)
+
+
+def test_an_image_has_at_most_four_million_pixels():
+    assert Image(columns=2000, rows=2000).rows == 2000
+    with pytest.raises(ValueError, match="4000000"):
+        Image(columns=2000, rows=2001)
 
 
 def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instrument):

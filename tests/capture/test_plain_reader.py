@@ -62,7 +62,7 @@ def test_segments(board, tmp_path):
     path = tmp_path / "0000.bin"
     with ReceiverProcess(board, 1 << 20) as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as card:
         card.bind((board.card_address, 1024))
-        receiver.begin_row(0, 1, len(sent), 4096, path)
+        receiver.begin_row(0, 1, len(sent), 4096, path, after_reset=True)
         for packet in encode_packets(sent, 1, 0):
             if decode_packet_header(packet)[1] != lost_range[0]:
                 card.sendto(packet, (board.host_address, board.data_port))

@@ -481,9 +481,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
             paint_mm=result.inversion.paint_mm,
         )
         if metal.given:
-            levels = _levels_db(result)
-            brightest = max(levels, key=lambda label: levels[label], default=0)
-            reasons += dark_reference_reasons(patch, brightest, levels.get(brightest, 0.0))
+            reasons += dark_reference_reasons(patch, *_brightest(result))
     light = result.calibrated.illumination
     if result.prior.channels_known and (light is None or light.known):
         gains = {"H": result.calibrated.metal_h, "V": result.calibrated.metal_v}
@@ -505,15 +503,16 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     return reasons
 
 
-def _levels_db(result: MaterialsResult) -> dict[int, float]:
-    """Return patch number to the median of |H| relative to metal, dB; without the metal, and patches without data."""
-    levels = {}
+def _brightest(result: MaterialsResult) -> tuple[int, float]:
+    """Return the number of the brightest patch but the metal, and its median |H| relative to metal, dB; 0, 0: none."""
+    levels_db = {}
     for r in result.patches:
         h = np.abs(result.h[r.patch.interior])
         lit = h[np.isfinite(h) & (h > 0)]
         if lit.size and r.patch.label != result.metal.label:
-            levels[r.patch.label] = 20 * float(np.log10(np.median(lit)))
-    return levels
+            levels_db[r.patch.label] = 20 * float(np.log10(np.median(lit)))
+    brightest = max(levels_db, key=lambda label: levels_db[label], default=0)
+    return brightest, levels_db.get(brightest, 0.0)
 
 
 def _median_level(gain: npt.NDArray[np.complexfloating] | complex | None) -> float | None:

@@ -10,12 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import tomli_w
 from tests.support.paths import POLYSIGHT
 from tests.support.processes import LIMIT_S, Bench, Ended, wait_for
 
-from polysight_shared.tables import to_builtins
-from polysight_simulators.cards import bound_udp
 from polysight_simulators.faults import Faults
 
 NEW_MAC = "12:34:56:78:90:13"
@@ -63,52 +60,6 @@ def test_every_hop_of_every_card(cards, card):
     text = card().out
     for part in ("RH (receive_h)", "not recorded", "replies, FPGA 2.8", "bytes granted", "polysight doctor", "core"):
         assert part in text
-
-
-def test_a_mute_card_is_named_and_its_neighbour_is_sound(cards, card):
-    running_cards = cards("RH", "RV", RV=Faults(mute=True))
-    done = card("--json")
-    assert done.status == 1
-    hops = verdicts(done)
-    assert hops["RH"]["card"]["verdict"] == "ok"
-    assert hops["RV"]["card"]["verdict"] == "error"
-    assert "did not answer ALIVE" in hops["RV"]["card"]["found"]
-    assert hops["RV"]["card"]["remedy"]
-    assert hops["RV"]["receiver"]["verdict"] == "not checked"
-    # Nobody plays LS
-    assert [s["silent_hop"] for s in json.loads(done.out)] == ["card", "", "card"]
-    assert running_cards.endpoints["RV"].counts["requests"] > 0
-    text = card().out
-    assert "error       card" in text
-    assert "not checked receiver, buffer, radar" in text
-
-
-def test_a_port_in_use_and_a_radar_that_does_not_stream(cards, card, rig):
-    cards("RH", streams=True)
-    cards("LS", "RV")
-    done = card("--listen", "1", "--json")
-    assert done.status == 1
-    hops = verdicts(done)
-    assert hops["RH"]["radar"]["verdict"] == "ok", hops["RH"]["radar"]
-    assert int(hops["RH"]["radar"]["found"].split()[0]) > 100
-    assert hops["RV"]["radar"]["verdict"] == "error"
-    assert "not streaming" in hops["RV"]["radar"]["why"]
-    board = rig.by_name("RV")
-    with bound_udp(board.host_address, board.data_port):
-        hop = verdicts(card("--json"))["RV"]["receiver"]
-    assert (hop["verdict"], "is in use" in hop["found"], "ss -ulnp" in hop["remedy"]) == ("error", True, True)
-
-
-def test_a_buffer_below_two_bursts_is_an_error_with_a_remedy(cards, card, rig, tmp_path):
-    cards("LS", "RH", "RV")
-    table = to_builtins(rig)
-    table["card"]["receive_buffer_bytes"] = 8192
-    (tmp_path / "instrument.toml").write_text(tomli_w.dumps(table))
-    done = card("--json")
-    assert done.status == 1
-    hop = verdicts(done)["RH"]["buffer"]
-    assert (hop["verdict"], "less than two bursts" in hop["found"]) == ("error", True)
-    assert "sysctl -w net.core.rmem_max=" in hop["remedy"]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import time
 import pytest
 from docs.check.looking import page_faults
 from docs.check.pages import ROOT, read_page
-from docs.check.running import run_page, script_of
+from docs.check.running import run_page
 
 
 def page(tmp_path, text):
@@ -149,13 +149,6 @@ def test_a_failing_command_is_named_by_its_line(tmp_path):
     assert not (copy / "never").exists()
 
 
-def test_an_unset_variable_and_a_failure_in_a_pipe_are_failures(tmp_path):
-    for command in ("echo $GONE_AWAY", "false | cat"):
-        assert run_page(
-            page(tmp_path, f"# Page\n\n```sh\n{command}\n```\n"), folder(tmp_path / command[:4])
-        ).failed_line
-
-
 def test_a_command_that_never_ends_is_a_failure_and_is_ended(tmp_path):
     run = run_page(page(tmp_path, "# Page\n\n```sh\nsleep 1000\n```\n"), folder(tmp_path), limit_s=1.0)
     assert run.failed_line
@@ -178,11 +171,3 @@ def test_the_commands_of_a_page_end_with_the_check(tmp_path):
     assert check.wait() == 128 + signal.SIGTERM
     with pytest.raises(ProcessLookupError):
         os.kill(int(pid.read_text()), 0)
-
-
-def test_the_script_has_the_lines_of_the_page(tmp_path):
-    page_path = page(tmp_path, RUN)
-    lines = script_of(page_path).splitlines()
-    assert lines[3] == "echo first > made"
-    assert lines[8] == "cat made"
-    assert sum(bool(line) for line in lines) == 4

@@ -6,7 +6,6 @@ Kills are in test_killed_processes.py.
 from __future__ import annotations
 
 import hashlib
-import resource
 
 import pytest
 
@@ -57,23 +56,4 @@ def test_interrupted(rig, times):
     assert times == 2 or not list(path.glob("raw/*/*.part")), "the running row was ended, not cut"
     digests_before = digests(path)
     assert rig.polysight("resume", path, "--no-process").status == 0
-    check_whole(rig, digests_before)
-
-
-def test_full_disk_on_the_pi(rig):
-    """The journal cannot be written: what the Pi says about it is not journalled, and the host must learn it all the
-    same, instead of waiting for the end of a row that nobody will tell."""
-    scan = rig.scan("--no-process")
-    rig.wait_mid_row(scan, 1)
-    journal = next((rig.folder / "rig" / "journal").glob("*.journal"))
-    unlimited = resource.RLIM_INFINITY
-    resource.prlimit(rig.pi.process.pid, resource.RLIMIT_FSIZE, (journal.stat().st_size, unlimited))
-    ended = scan.wait(30)
-    assert ended.status == 6
-    assert "the journal cannot be written" in ended.message
-    assert f"polysight resume {rig.folder / 'scan'}" in ended.message
-    digests_before = digests(rig.folder / "scan")
-    resource.prlimit(rig.pi.process.pid, resource.RLIMIT_FSIZE, (unlimited, unlimited))
-    resumed = rig.polysight("resume", rig.folder / "scan", "--no-process")
-    assert resumed.status == 0, resumed.err
     check_whole(rig, digests_before)

@@ -17,12 +17,11 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-from tests.support.paths import REAL_CAPTURES, RIG_FILE
+from tests.support.paths import RIG_FILE
 from tests.support.scenes import small_scene
 
 from polysight_shared.tables import to_builtins
 
-CAPTURE = REAL_CAPTURES / "test_one_frame.pcap"
 SCENE = small_scene(12, 4, pixels=30, pixel_mm=5.0, metal=False, seed=1)
 
 
@@ -105,15 +104,6 @@ def test_scene_file(bench, old, new, words):
     if old:
         check_refusal(bench.here("train", "--simulate", "scenes", *rig, "--out", "l.npz"), *words, status=2)
     assert {p.name for p in bench.folder.iterdir() if p.is_dir()} == {"scenes", "d"}
-
-
-def test_simulated_rig(bench):
-    """What its processes would refuse, the rig refuses before it starts them."""
-    rig = ("python", "-m", "polysight_simulators.rig", "--config", RIG_FILE, "--pattern", "--dir", "rig")
-    check_refusal(bench.run(*rig, "--faults", "no.toml"), "no.toml: no such file", status=2)
-    check_refusal(bench.run(*rig, "--fault", "RH.los=0.1"), "faults of RH", "los", status=2)
-    check_refusal(bench.run(*rig, "--time-scale", "0"), "--time-scale", status=2)
-    assert not (bench.folder / "rig").exists()
 
 
 def test_rig_file_of_a_training(bench):
@@ -220,13 +210,6 @@ def listening(address: str) -> socket.socket:
     return server
 
 
-def test_pi_ports_in_use(bench, lonely, lonely_instrument, wires):
-    run = ("polysight-pi", "run", "--config", lonely, "--wires", wires)
-    for address in (lonely_instrument.pi.command_address, lonely_instrument.pi.event_address):
-        with listening(address):
-            check_refusal(bench.run(*run), address, "in use", "ss -ltnp", status=5)
-
-
 def test_no_stage(bench, lonely, lonely_instrument, wires, silent_pty):
     run = ("polysight-pi", "run", "--config", lonely, "--wires", wires)
     check_refusal(bench.run(*run), lonely_instrument.stage.port, "No such file", "stage.port", status=5)
@@ -248,12 +231,6 @@ def silent_pty():
 # --- the host and what it talks to ------------------------------------------------------------------------------------
 
 
-def test_no_pi(bench, lonely, lonely_instrument):
-    ended = bench.here("scan", "--config", lonely, "--out", "s")
-    check_refusal(ended, lonely_instrument.pi.command_address, "polysight-pi run", status=5)
-    assert not (bench.folder / "s").exists()
-
-
 def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
     """The Pi's port takes the connection and never answers: Ctrl-C ends the wait."""
     table = to_builtins(lonely_instrument)
@@ -267,32 +244,3 @@ def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
     assert ended.status == 128 + signal.SIGINT
     assert ended.message == "polysight scan: stopped"
     assert not (bench.folder / "s").exists()
-
-
-def test_interrupted_while_simulating(bench):
-    """Ctrl-C reaches both programs, and one of them says so."""
-    (bench.folder / "scene.toml").write_text(small_scene(350, 200, step_mm=(1.0, 1.0)))
-    options = ("--config", RIG_FILE, "--out", "s")
-    simulate = bench.start("polysight", "simulate", "scene.toml", *options)
-    bench.wait_for(lambda: (bench.folder / "s" / "manifest.jsonl").exists(), "the first row")
-    simulate.interrupt()
-    ended = simulate.wait()
-    assert ended.status == 128 + signal.SIGINT
-    assert ended.err == "polysight simulate: stopped\n"
-
-
-def test_cards_that_do_not_serve(rig):
-    """The simulated rig runs; one card after another is wrong."""
-    board = rig.instrument.by_name("RV")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreign_socket:
-        foreign_socket.bind((board.host_address, board.data_port))
-        ended = rig.scan().wait(30)
-        check_refusal(ended, f"{board.host_address}:{board.data_port}", "ss -ulnp", status=5)
-    table = to_builtins(rig.instrument)
-    card = next(b for b in table["boards"] if b["name"] == "RV")
-    card["card_address"] = card["card_address"].rpartition(".")[0] + ".99"
-    rig.config.write_text(tomli_w.dumps(table))
-    ended = rig.scan().wait(30)
-    check_refusal(ended, "RV", card["card_address"], "did not answer", status=5)
-    assert "doctor" not in ended.message
-    assert not (rig.folder / "scan").exists()

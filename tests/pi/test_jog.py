@@ -13,11 +13,10 @@ import zmq
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
-from polysight.acquisition import PiClient, RefusedError
+from polysight.acquisition import PiClient
 from polysight.cli.main import main
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.faults import PiFault
 
 
 @pytest.fixture
@@ -49,20 +48,6 @@ def test_the_command_says_where_the_stage_rests_and_its_limits(rig, write_config
     assert f"x 10.000 mm (limits: 0 and {rig.stage.travel_x_mm:g} mm)" in place
     answer = json.loads("{" + report)
     assert (answer["x_mm"], answer["y_mm"], answer["travel_y_mm"]) == (7.5, 0.0, rig.stage.travel_y_mm)
-
-
-def test_jogs_add_up_and_lead_back(client):
-    assert client.jog("x", 10.0, 20.0).x_mm == 10.0
-    assert client.jog("y", 2.5, 20.0).y_mm == 2.5
-    status = client.jog("x", -10.0, 20.0)
-    assert (status.x_mm, status.y_mm, status.state) == (0.0, 2.5, "homed")
-
-
-def test_a_jog_past_the_end_is_refused_and_nothing_moves(client, stage):
-    with pytest.raises(RefusedError) as refusal:
-        client.jog("x", -0.1, 20.0)
-    assert refusal.value.number == PiFault.BAD_REQUEST
-    assert not [c for c in stage.seen if c.verb == "MOVE"]
 
 
 def test_the_heartbeat_of_the_client_keeps_a_long_jog_moving(client, pi, stage):

@@ -1,7 +1,6 @@
 """The Pi half as the host sees it: real ZeroMQ, a pty, simulated wires."""
 
 import msgspec
-import pytest
 from tests.support.processes import HANG_S
 
 from polysight.acquisition.pi_client import HostHeartbeat
@@ -150,20 +149,6 @@ def test_a_new_host_aborts_the_row_of_the_dead_one(host_in_row, stage):
     assert host.row(0, take=2).status == "done"
 
 
-@pytest.mark.parametrize("wrong", ["skip", "extra"])
-def test_counts_that_differ_fault_the_row_alone(host, stage, wrong):
-    stage.skip, stage.extra = ({5}, False) if wrong == "skip" else (set(), True)
-    done = host.row(0)
-    number = PiFault.EDGE_TIME if wrong == "skip" else PiFault.POINTS_MISMATCH
-    assert (done.status, done.fault) == ("fault", number)
-    assert host.list_events(m.Fault)[0].number == number
-    stage.skip = set()
-    stage.extra = False
-    assert host.until_state("ready").fault == number
-    assert host.row(0, take=2).status == "done"
-    assert host.ask(m.Status()).fault == 0
-
-
 def test_stage_alarm_in_a_row_is_a_fault_until_homed(host, stage):
     stage.alarm_at = {3: StageError.LIMIT_SWITCH}
     done = host.row(0)
@@ -174,16 +159,6 @@ def test_stage_alarm_in_a_row_is_a_fault_until_homed(host, stage):
     assert host.must_refuse(m.RunRow(scan_id="scan", row_index=0, take=2)) == PiFault.NOT_READY
     host.home()
     assert host.row(0, take=2).status == "done"
-
-
-def test_losing_the_stage_is_a_fault(host_in_row, stage):
-    host = host_in_row
-    stage.unplug()
-    done = host.wait(m.RowFinished)
-    assert (done.status, done.fault) == ("fault", PiFault.STAGE_LOST)
-    assert host.until_state("fault").fault == PiFault.STAGE_LOST
-    host.must_accept(m.Home())  # it is still unplugged
-    assert host.until_state("fault").fault == PiFault.STAGE_LOST
 
 
 def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):

@@ -7,16 +7,13 @@ from html import unescape
 
 import numpy as np
 import pytest
-from matplotlib.font_manager import findfont, get_font
 from tests.support.products import make_result
 
 from polysight.imaging import Images
 from polysight.materials import TruthPlate
 from polysight.products import ProcessedScan
-from polysight.report import style
-from polysight.report.figures import figures
 from polysight.report.report import render, write_report
-from polysight.report.style import figure_label, font_families, is_drawable
+from polysight.report.style import figure_label, is_drawable
 from polysight.results import ScanFacts
 
 NAMES = ["木板", "ガラス", "유리 3", "стекло", "Plexiglas®", "\U0001f9f1 brick", "tab\there", "a $b$ c_{", "زجاج"]
@@ -60,12 +57,6 @@ def test_figures_and_page_of_names_are_made_without_warnings(tmp_path):
             assert f"patch {number}: {figure_label(name, 'x').removeprefix('x: ')}" in html
 
 
-def test_a_name_that_no_font_has_is_a_number_and_ascii():
-    assert figure_label("PET", "patch 3") == "PET"
-    odd = "\U0010fffd木 PET"  # a private character: no font has it
-    assert figure_label(odd, "patch 3") == "patch 3: ?? PET"
-
-
 def test_the_page_says_which_name_a_label_stands_for():
     odd = "\U0010fffd木"
     html = render(context([odd, "PET"]), {})
@@ -73,25 +64,6 @@ def test_the_page_says_which_name_a_label_stands_for():
     assert f"plate 1: ?? is {odd}" in html
     assert "is PET" not in html
     assert "fonts do not have" not in render(context(["PET"]), {})
-
-
-def test_an_installed_font_that_has_the_glyph_draws_the_name(monkeypatch):
-    """A font of mathematical signs stands in for one of CJK: both are tried after matplotlib's own."""
-    own_glyphs, other_glyphs = (set(get_font(findfont(f)).get_charmap()) for f in (style.OWN, "STIXGeneral"))
-    glyph = chr(min(other_glyphs - own_glyphs))
-    assert not is_drawable(glyph)
-    monkeypatch.setattr(style, "FALLBACKS", ("no such family", "STIXGeneral"))
-    caches = (style.font_families, style._glyphs)
-    try:
-        for cached in caches:
-            cached.cache_clear()
-        assert font_families() == (style.OWN, "STIXGeneral")
-        assert figure_label(glyph, "patch 1") == glyph
-        drawn = figures(context([glyph]))["materials"]
-        assert drawn != figures(context(["?"]))["materials"]
-    finally:
-        for cached in caches:
-            cached.cache_clear()
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from matplotlib import colormaps
 from tests.support.page.chromium import PHONE
 from tests.support.products import changed, make_result, skip_rendering
 from tests.support.rigs import rig_table
@@ -16,8 +15,8 @@ from polysight.materials import TruthPlate
 from polysight.process.quality import find_masked_runs
 from polysight.report import write_report
 from polysight.report.figures import coverage_figure, find_masked_positions
-from polysight.report.report import format_heading, format_value, imaging_table, quality_tables, render
-from polysight.report.style import assign_colours, png
+from polysight.report.report import format_value, imaging_table, render
+from polysight.report.style import png
 from polysight.results import RxGain, ScanFacts, ScanMaterials, ScanQuality
 from polysight_shared.raster import RasterPlan
 
@@ -226,29 +225,6 @@ def test_dark_and_invalid_images_do_not_fail(scan, tmp_path):
     assert write_report(tmp_path, make_result(dark, {}, {})).exists()
 
 
-def test_one_material_has_one_colour(scan):
-    table = assign_colours(scan)
-    assert {"copper", "acrylic", "cork", "PET <b>", "unknown"} == set(table)
-    assert len(set(table.values())) == len(table)
-
-
-def test_a_heading_keeps_every_word_but_std():
-    assert format_heading("RH if_hz") == "RH IF (Hz)"
-    assert format_heading("zeta_std_width_mm") == "zeta width (mm)"
-    assert format_heading("std_turn") == "turn"
-
-
-def test_numbers_read_well():
-    assert format_value(268800) == "268\u202f800"
-    assert format_value(16) == "16"
-    assert format_value(0.00512) == "0.00512"
-    assert format_value(True) == "yes"
-    assert format_value([]) == "none"
-    assert format_value({"a": 1, "b": [2, 3]}) == "a: 1, b: 2, 3"
-    assert format_heading("RH if_hz") == "RH IF (Hz)"
-    assert format_heading("rows_retaken") == "rows retaken"
-
-
 def with_boards(scan, boards):
     return changed(scan, plan=RasterPlan(6, 4, 10.0, 5.0), quality=ScanQuality.decode({"boards": boards}))
 
@@ -285,27 +261,6 @@ def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(scan):
     assert "deadbeef" not in page.words
 
 
-def test_without_anything_masked_that_is_said(scan):
-    boards = {"RH": {"masked_columns": {}, "rows_recorded": [0, 1, 2, 3]}}
-    assert "Every position of every board has data." in Page(render(with_boards(scan, boards), {})).words
-
-
-def test_the_maps_of_amplitude_keep_their_order_in_grey_and_the_phase_map_is_cyclic():
-    """Amplitudes are told apart by lightness alone, as by any eye; -180 and 180 degrees have one colour."""
-    grey = np.array([0.2126, 0.7152, 0.0722])
-    assert (np.diff(colormaps["cividis"](np.linspace(0, 1, 64))[:, :3] @ grey) > 0).all()
-    ends = colormaps["twilight"](np.array([0.0, 1.0]))
-    assert np.abs(ends[0] - ends[1]).max() < 0.02
-
-
-def test_a_board_s_figures_stand_one_by_one_and_keep_their_units(scan):
-    board = {"frames_expected": 7, "direct_path_hz": {"median": 123.0, "min": 9, "max": 200}, "stage_backlash_mm": None}
-    words = Page(render(with_boards(scan, {"RH": board}), {})).words
-    assert "direct path median (Hz) 123" in words
-    assert "direct path min (Hz) 9" in words
-    assert "stage backlash (mm) –" in words
-
-
 BOARD = {
     "masked_positions": 12,
     "rows_without_data": 0,
@@ -325,13 +280,6 @@ def test_the_imaging_table_has_a_column_for_each_board_and_says_what_is_unknown(
     assert cells["Point response at half power, x × y (mm)"] == ["7.51 × 5.1", "–"]
     assert cells["The paper's r λ / L, x × y (mm)"] == ["2.8 × –", "–"]
     assert "direct sum" in table["caption"]
-
-
-def test_it_is_part_of_the_quality_tables_and_absent_without_data():
-    tables = quality_tables({"imaging": {"RH": BOARD}})
-    assert any("Imaging" in t["caption"] for t in tables)
-    assert imaging_table(None) is None
-    assert imaging_table({}) is None
 
 
 def with_every_number(content, value):

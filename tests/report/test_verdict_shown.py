@@ -30,11 +30,11 @@ from polysight import open_scan
 from polysight.materials import TruthPlate
 from polysight.products import ProcessedScan, read_products
 from polysight.report import write_report
-from polysight.report.figures import channel_figure, draw_materials, permittivity_map, phase_limits_deg
-from polysight.report.permittivity_plot import SHARES, fit_ellipse, place_numbers
+from polysight.report.figures import draw_materials, permittivity_map, phase_limits_deg
+from polysight.report.permittivity_plot import SHARES, fit_ellipse
 from polysight.report.report import budget_table
 from polysight.report.style import shorten_labels
-from polysight.results import ErrorBudget, PermittivityFigures
+from polysight.results import ErrorBudget
 from polysight.results.verdict import LEVELS
 
 RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
@@ -154,26 +154,6 @@ def test_an_ellipse_holds_its_share_of_draws(share, mixed):
     assert inside.mean() == pytest.approx(share, abs=0.005)
 
 
-def test_an_ellipse_leans_as_real_part_and_loss_do():
-    spread = PermittivityFigures(
-        **PERMITTIVITY
-    ).spread  # real and imag rise together: the loss falls as the real part rises
-    assert spread is not None
-    width, height, angle = fit_ellipse(spread.matrix, 0.68)
-    assert np.tan(np.radians(angle if width > height else angle + 90)) < 0
-
-
-@pytest.mark.parametrize("apart_pt", [0.0, 4.0, 30.0])
-def test_numbers_of_close_points_do_not_cover_one_another(apart_pt):
-    grid = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), axis=-1).reshape(-1, 2) * apart_pt
-    places = place_numbers(grid, np.empty((0, 2)))
-    distances = np.abs(places[:, None] - places[None]).max(axis=2) + 100 * np.eye(len(grid))
-    assert distances.min() >= 9
-    if apart_pt:
-        assert np.hypot(*(places - grid).T).max() < 60
-    assert place_numbers(np.empty((0, 2)), np.empty((0, 2))).shape == (0, 2)
-
-
 def test_long_names_of_close_patches_become_numbers_that_do_not_touch(tmp_path):
     rows = [
         {**segments("good")[1], "label": 3 * i + k + 1, "name": f"polyethylene, high density, sheet {i} {k}",
@@ -202,13 +182,6 @@ def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path
     assert phase_limits_deg(changed(scan, materials=None)) is None
     random = np.exp(2j * np.pi * np.random.default_rng(1).uniform(size=p.shape))
     assert phase_limits_deg(changed(scan, images=replace(scan.images, p=random))) is None
-
-
-def test_a_ratio_of_nearly_one_has_no_negative_zero(tmp_path):
-    rows = [{**segments("good")[0], "ratio": {"real": 0.9999, "imag": -1e-4}}]
-    scan = write_products(judged_products(tmp_path, "good"), rows)
-    text = drawn_text(lambda: [channel_figure(scan, key) for key in ("amplitude_p", "phase_p")])
-    assert {"0.0", "0°"} <= set(text.split("\n"))
 
 
 @pytest.mark.parametrize("key", BUDGET)

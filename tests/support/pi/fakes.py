@@ -137,9 +137,9 @@ class FakeStage:
     """A stage behind a pty: speaks the stage line, raises the trigger on simulated wires.
 
     Wrong behaviour on request: `deaf` (answers nothing), `lose` (swallow so many lines), `damage` (garble so many
-    answers), `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `extra` (a trigger
-    too many), `endless` (a row stays at its last point), `alarm_at` (alarm number at a point), `lost` (steps that
-    homing finds lost), `row_end` (where a row ends), `pace_s` (wall time from point to point).
+    answers), `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `endless` (a row
+    stays at its last point), `alarm_at` (alarm number at a point), `lost` (steps that homing finds lost), `row_end`
+    (where a row ends), `pace_s` (wall time from point to point).
     """
 
     def __init__(self, hub: Path | None, trigger: int = 26) -> None:
@@ -154,7 +154,7 @@ class FakeStage:
         self.steps = "200"
         self.lose = self.damage = self.lose_end = 0
         self.skip: set[int] = set()
-        self.extra = self.endless = False
+        self.endless = False
         self.lost = (0, 0)
         self.alarm_at: dict[int, int] = {}
         self.pace_s = 0.0
@@ -353,10 +353,6 @@ class FakeStage:
         self.x, self.y = self.row_end or _rest_after(c)
         if self.endless and self._stopping.wait():
             return StageError.STOPPED
-        if self.extra:
-            self.t_ns += step_ns
-            self._edge(self.t_ns)
-            time.sleep(0.05)
         return 0
 
     def _edge(self, t_ns: int) -> None:

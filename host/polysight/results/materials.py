@@ -2,20 +2,33 @@
 
 The structs are the file format: a field that is UNSET is absent in the file, and unknown keys are ignored.
 
-A figure of a patch is declared once: a field or property of :class:`PatchFigures` whose type carries a :class:`Column`
-with its name, unit and title. Tables, exports, datasets and pages render all columns, in the order of declaration.
+A figure of a patch is declared once in :class:`PatchFigures`, with a :class:`Column` of its name, unit and title: a
+field whose type carries it, or a figure that `derive` or `derive_if_known` computes from fields. Tables, exports,
+datasets and pages render all columns, in the order of declaration.
 """
 
-# Annotations are evaluated in the order in which they stand here: that is the order of the columns.
+# Annotations are evaluated where they stand: columns have the order of the declarations.
 
+import cmath
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import count
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Self, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Generic,
+    NamedTuple,
+    Self,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+    overload,
+)
 
 import msgspec
 import numpy as np
@@ -29,6 +42,7 @@ from polysight_shared.findings import Finding
 Pair = tuple[float | None, float | None]
 Number = float | None
 Text = str | None
+V = TypeVar("V")
 _positions = count()
 
 
@@ -109,16 +123,56 @@ class Figure:
         return f"{text}{unit}".strip()
 
 
+class Derived(Generic[V]):
+    """A figure of a patch that is computed from others, as a property with its type and column."""
+
+    def __init__(self, kind: type, compute: "Callable[[PatchFigures], V]", column: Column) -> None:
+        self.kind = kind
+        self.column = column
+        self._compute = compute
+
+    @overload
+    def __get__(self, patch: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, patch: "PatchFigures", owner: type) -> V: ...
+    def __get__(self, patch: "PatchFigures | None", owner: type) -> Self | V:
+        if patch is None:
+            return self
+        return self._compute(patch)
+
+
+def derive(kind: type[V], compute: "Callable[[PatchFigures], V]", column: Column) -> Derived[V]:
+    """Declare a figure that every patch has."""
+    return Derived(kind, compute, column)
+
+
+def derive_if_known(
+    kind: type[V], source: "str | Callable[[PatchFigures], V | None]", column: Column
+) -> Derived[V | None]:
+    """Declare a figure that some patches lack: a function, or a path of attributes, None where one of them is."""
+    if isinstance(source, str):
+        return Derived(kind, partial(_follow, source.split(".")), column)
+    return Derived(kind, source, column)
+
+
+def _follow(path: Sequence[str], value: Any) -> Any:
+    for name in path:
+        value = getattr(value, name)
+        if value is None or value is UNSET:
+            return None
+    return value
+
+
 @lru_cache
 def declared_figures(kind: type["PatchFigures"]) -> tuple[Figure, ...]:
     """Return the figures declared in a class of patches, in the order of their declaration."""
-    hints = get_type_hints(kind, include_extras=True)
-    for ancestor in reversed(kind.__mro__):
-        for name, member in vars(ancestor).items():
-            if isinstance(member, property) and member.fget is not None:
-                hints[name] = get_type_hints(member.fget, include_extras=True).get("return")
-    figures = []
-    for name, hint in hints.items():
+    figures = [
+        Figure(name, member.kind, member.column)
+        for ancestor in kind.__mro__
+        for name, member in vars(ancestor).items()
+        if isinstance(member, Derived)
+    ]
+    for name, hint in get_type_hints(kind, include_extras=True).items():
         if get_origin(hint) is Annotated:
             bare, *extras = get_args(hint)
             kinds = [part for part in get_args(bare) if part not in (NoneType, UnsetType)]
@@ -150,10 +204,18 @@ class ComplexNumber(msgspec.Struct, frozen=True):
         return complex(*parts)
 
 
-def _complex_value(number: ComplexNumber | None) -> complex | None:
-    if number is None:
+class _NameShare(NamedTuple):
+    """A name, and its probability or share of the pixels."""
+
+    name: str | None = None
+    share: float | None = None
+
+
+def level_db(ratio: complex | None) -> float | None:
+    """Level of a ratio, dB; None for zero, and where it is not known."""
+    if not ratio:
         return None
-    return number.value
+    return 20 * math.log10(abs(ratio))
 
 
 class PermittivityFigures(msgspec.Struct, frozen=True, kw_only=True):
@@ -293,17 +355,10 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     name: Annotated[Text, Column("name", "material; empty where it was not named", "")] = None
     name_source: Annotated[Text, Column("name_source", "where the name is from: library or literature", "")] = None
     confidence: Annotated[Number, Column("confidence", "confidence in the name, 0 to 1")] = None
-
-    @property
-    def runner_up(self) -> Annotated[Text, Column("", "next likeliest material", "", "runner_up")]:
-        """The material with the second largest probability (in products without probabilities: share of pixels)."""
-        return self._second[0]
-
-    @property
-    def runner_up_share(self) -> Annotated[Number, Column("", "probability of runner_up", "1", "runner_up_share")]:
-        """Its probability."""
-        return self._second[1]
-
+    runner_up = derive_if_known(str, "_second.name", Column("", "next likeliest material", "", "runner_up"))
+    runner_up_share = derive_if_known(
+        float, "_second.share", Column("", "probability of runner_up", "1", "runner_up_share")
+    )
     votes: dict[str, float] = {}
     probabilities: dict[str, float] = {}
     literature: dict[str, float] = {}
@@ -313,147 +368,67 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     metal_like: Annotated[bool, Column("metal_like", "True where P is too close to metal for a permittivity")] = False
     box_mm: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     outline_mm: list[tuple[float, float]] = []
-
-    @property
-    def centre_x_mm(self) -> Annotated[float, Column("centre_x_mm", "middle of the patch, x", "mm", "")]:
-        """Middle of the box, x."""
-        return (self.box_mm[0] + self.box_mm[2]) / 2
-
-    @property
-    def centre_y_mm(self) -> Annotated[float, Column("centre_y_mm", "middle of the patch, y", "mm", "")]:
-        """Middle of the box, y."""
-        return (self.box_mm[1] + self.box_mm[3]) / 2
-
-    @property
-    def width_mm(self) -> Annotated[float, Column("width_mm", "extent along x", "mm")]:
-        """Extent along x."""
-        return self.box_mm[2] - self.box_mm[0]
-
-    @property
-    def height_mm(self) -> Annotated[float, Column("height_mm", "extent along y", "mm")]:
-        """Extent along y."""
-        return self.box_mm[3] - self.box_mm[1]
-
+    centre_x_mm = derive(
+        float, lambda patch: (patch.box_mm[0] + patch.box_mm[2]) / 2,
+        Column("centre_x_mm", "middle of the patch, x", "mm", ""),
+    )  # fmt: skip
+    centre_y_mm = derive(
+        float, lambda patch: (patch.box_mm[1] + patch.box_mm[3]) / 2,
+        Column("centre_y_mm", "middle of the patch, y", "mm", ""),
+    )  # fmt: skip
+    width_mm = derive(
+        float, lambda patch: patch.box_mm[2] - patch.box_mm[0], Column("width_mm", "extent along x", "mm")
+    )
+    height_mm = derive(
+        float, lambda patch: patch.box_mm[3] - patch.box_mm[1], Column("height_mm", "extent along y", "mm")
+    )
     pixels: int = 0
     interior_pixels: Annotated[int | None, Column("pixels", "number of pixels behind the numbers")] = None
     incidence_deg: Annotated[
         Number, Column("incidence_deg", "mean incidence angle of the patch", "degree", "patch_incidence_deg")
     ] = None
     permittivity: PermittivityFigures | None = None
-
-    @property
-    def permittivity_value(self) -> Annotated[complex | None, Column("", "relative permittivity", "1", "permittivity")]:
-        """Permittivity eps' - j eps''."""
-        if self.permittivity is None:
-            return None
-        return self.permittivity.value
-
-    @property
-    def permittivity_real(self) -> Annotated[Number, Column("permittivity_real", "eps'", variable="")]:
-        """Real part eps'."""
-        if self.permittivity is None:
-            return None
-        return self.permittivity.real
-
-    @property
-    def permittivity_real_std(
-        self,
-    ) -> Annotated[Number, Column("permittivity_real_standard_error", "standard error of the permittivity, real part")]:
-        """Standard error of eps'."""
-        if self._spread is None:
-            return None
-        return self._spread.real_std
-
-    @property
-    def permittivity_loss(self) -> Annotated[Number, Column("permittivity_loss", "loss eps''", variable="")]:
-        """Loss eps''."""
-        if self.permittivity is None:
-            return None
-        return self.permittivity.loss
-
-    @property
-    def permittivity_loss_std(
-        self,
-    ) -> Annotated[Number, Column("permittivity_loss_standard_error", "standard error of the permittivity, loss part")]:
-        """Standard error of the loss."""
-        if self._spread is None:
-            return None
-        return self._spread.loss_std
-
-    @property
-    def permittivity_covariance(
-        self,
-    ) -> Annotated[
-        Number,
+    permittivity_value = derive_if_known(
+        complex, "permittivity.value", Column("", "relative permittivity", "1", "permittivity")
+    )
+    permittivity_real = derive_if_known(float, "permittivity.real", Column("permittivity_real", "eps'", variable=""))
+    permittivity_real_std = derive_if_known(
+        float, "permittivity.spread.real_std",
+        Column("permittivity_real_standard_error", "standard error of the permittivity, real part"),
+    )  # fmt: skip
+    permittivity_loss = derive_if_known(
+        float, "permittivity.loss", Column("permittivity_loss", "loss eps''", variable="")
+    )
+    permittivity_loss_std = derive_if_known(
+        float, "permittivity.spread.loss_std",
+        Column("permittivity_loss_standard_error", "standard error of the permittivity, loss part"),
+    )  # fmt: skip
+    permittivity_covariance = derive_if_known(
+        float, "permittivity.spread.covariance",
         Column("permittivity_real_loss_covariance", "covariance of the permittivity's real part and loss"),
-    ]:
-        """Covariance of (eps', eps'')."""
-        if self._spread is None:
-            return None
-        return self._spread.covariance
-
-    @property
-    def dominated_by(
-        self,
-    ) -> Annotated[Text, Column("dominated_by", "what most of the permittivity's error comes from", "")]:
-        """Largest source of the permittivity's error."""
-        if self.permittivity is None:
-            return None
-        return self.permittivity.dominated_by
-
+    )  # fmt: skip
+    dominated_by = derive_if_known(
+        str, "permittivity.dominated_by",
+        Column("dominated_by", "what most of the permittivity's error comes from", ""),
+    )  # fmt: skip
     refused: Finding | None = None
-
-    @property
-    def refused_text(self) -> Annotated[Text, Column("refused", "why the patch was not judged, and what to do", "")]:
-        """Why it has no result, and the remedy, in one line; None if it has one."""
-        if self.refused is None:
-            return None
-        return one_line(self.refused)
-
+    refused_text = derive_if_known(
+        str, lambda patch: patch.refused and one_line(patch.refused),
+        Column("refused", "why the patch was not judged, and what to do", ""),
+    )  # fmt: skip
     ratio: ComplexNumber | None = None
-
-    @property
-    def p(self) -> Annotated[complex | None, Column("", "median of P = H / V relative to metal", "1", "ratio")]:
-        """Median of P."""
-        if self.ratio is None:
-            return None
-        return self.ratio.value
-
-    @property
-    def p_real(self) -> Annotated[Number, Column("p_real", "real part of P", variable="")]:
-        """Real part of P."""
-        if self.p is None:
-            return None
-        return self.p.real
-
-    @property
-    def p_imag(self) -> Annotated[Number, Column("p_imag", "imaginary part of P", variable="")]:
-        """Imaginary part of P."""
-        if self.p is None:
-            return None
-        return self.p.imag
-
-    @property
-    def p_abs_db(self) -> Annotated[Number, Column("p_abs_db", "level of P", "dB", "")]:
-        """Level of P, dB; None for zero."""
-        if not self.p:
-            return None
-        return 20 * math.log10(abs(self.p))
-
-    @property
-    def p_abs(self) -> Annotated[Number, Column("", "size of P", variable="", title="|P|", digits=2)]:
-        """Absolute value of P."""
-        if self.p is None:
-            return None
-        return abs(self.p)
-
-    @property
-    def p_phase_deg(self) -> Annotated[Number, Column("p_phase_deg", "phase of P", "degree", "", title="∠P", digits=1)]:
-        """Phase of P."""
-        if self.p is None:
-            return None
-        return math.degrees(math.atan2(self.p.imag, self.p.real))
-
+    p = derive_if_known(complex, "ratio.value", Column("", "median of P = H / V relative to metal", "1", "ratio"))
+    p_real = derive_if_known(float, "p.real", Column("p_real", "real part of P", variable=""))
+    p_imag = derive_if_known(float, "p.imag", Column("p_imag", "imaginary part of P", variable=""))
+    p_abs_db = derive_if_known(float, lambda patch: level_db(patch.p), Column("p_abs_db", "level of P", "dB", ""))
+    p_abs = derive_if_known(
+        float, lambda patch: None if patch.p is None else abs(patch.p),
+        Column("", "size of P", variable="", title="|P|", digits=2),
+    )  # fmt: skip
+    p_phase_deg = derive_if_known(
+        float, lambda patch: None if patch.p is None else math.degrees(cmath.phase(patch.p)),
+        Column("p_phase_deg", "phase of P", "degree", "", title="∠P", digits=1),
+    )  # fmt: skip
     inverse_ratio_std: Annotated[
         Number,
         Column(
@@ -464,64 +439,37 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
     amplitude_h: Number = None
     truth: TruthFigures | None = None
-
-    @property
-    def true_name(self) -> Annotated[Text, Column("true_name", "material of the simulated scene", "", optional=True)]:
-        """True material."""
-        if self.truth is None:
-            return None
-        return self.truth.name
-
-    @property
-    def true_permittivity(
-        self,
-    ) -> Annotated[
-        complex | None,
+    true_name = derive_if_known(
+        str, "truth.name", Column("true_name", "material of the simulated scene", "", optional=True)
+    )
+    true_permittivity = derive_if_known(
+        complex, "truth.permittivity.value",
         Column("", "relative permittivity of the simulated scene", "1", "true_permittivity", optional=True),
-    ]:
-        """True permittivity."""
-        if self.truth is None:
-            return None
-        return _complex_value(self.truth.permittivity)
-
-    @property
-    def true_permittivity_real(self) -> Annotated[Number, Column("true_permittivity_real", variable="")]:
-        """Its real part."""
-        if self.true_permittivity is None:
-            return None
-        return self.true_permittivity.real
-
-    @property
-    def true_permittivity_loss(self) -> Annotated[Number, Column("true_permittivity_loss", variable="")]:
-        """Its loss."""
-        if self.true_permittivity is None:
-            return None
-        return -self.true_permittivity.imag
-
+    )  # fmt: skip
+    true_permittivity_real = derive_if_known(
+        float, "true_permittivity.real", Column("true_permittivity_real", variable="")
+    )
+    true_permittivity_loss = derive_if_known(
+        float, lambda patch: None if patch.true_permittivity is None else -patch.true_permittivity.imag,
+        Column("true_permittivity_loss", variable=""),
+    )  # fmt: skip
     tilt_across_deg: float | UnsetType = UNSET
     bands: list[BandFigures] | UnsetType = UNSET
     box: Annotated[
         str | UnsetType, Column("drawn_as", "what a person called the box of the patch", "", optional=True)
     ] = UNSET
+    # Old products do not tell how many pixels were left after the edges.
+    pixels_used = derive(
+        int, lambda patch: patch.pixels if patch.interior_pixels is None else patch.interior_pixels,
+        Column("", "pixels", "1", "", title="Pixels"),
+    )  # fmt: skip
 
     @property
-    def pixels_used(self) -> Annotated[int, Column("", "pixels", "1", "", title="Pixels")]:
-        """Pixels behind the numbers; in old products the pixels of the whole patch."""
-        if self.interior_pixels is None:
-            return self.pixels
-        return self.interior_pixels
-
-    @property
-    def _spread(self) -> PermittivitySpread | None:
-        if self.permittivity is None:
-            return None
-        return self.permittivity.spread
-
-    @property
-    def _second(self) -> tuple[Text, Number]:
+    def _second(self) -> "_NameShare":
+        """The name with the second largest probability; of the pixels in products without probabilities."""
         shares = self.probabilities or self.votes
-        other_shares = {name: share for name, share in shares.items() if name != self.name}
-        return max(other_shares.items(), key=lambda item: item[1], default=(None, None))
+        other_shares = [_NameShare(name, share) for name, share in shares.items() if name != self.name]
+        return max(other_shares, key=lambda other: other.share or 0.0, default=_NameShare())
 
     def withheld(self) -> Self:
         """Return only place and size: without name, measured values and truth."""

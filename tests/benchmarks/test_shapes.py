@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 import pytest
-from benchmarks import shapes
-from benchmarks.shapes import ObjectFigures, ScanKind, angles_deg, format_line, judge_object, squared_distances
+from benchmarks.shapes import ScanKind, angles_deg, judge_object, squared_distances
 
 SMALL_SCAN = ScanKind(columns=64, rows=44)
 
@@ -30,21 +27,3 @@ def test_distances_in_regions_and_angles_are_those_of_their_definitions():
     assert squared_distances(deviations, covariances) == pytest.approx([25, 1])
     turned = np.array([[0.0, np.sin(0.01), np.cos(0.01)]])
     assert angles_deg(turned, np.array([[0.0, 0.0, 1.0]])) == pytest.approx(np.degrees(0.01))
-
-
-def test_every_option_has_a_default_and_every_kind_a_line():
-    parser = argparse.ArgumentParser()
-    shapes.add_arguments(parser)
-    options = parser.parse_args([])
-    for kind in options.kinds.split(","):
-        figures = ObjectFigures(
-            kind=kind,
-            seed=1,
-            disturbance="none",
-            true_real=4.0,
-            true_loss=0.4,
-            radius_mm=100.0,
-            points=0,
-            stray=0,
-        )
-        assert format_line(kind, [figures], shapes.MUST_HOLD.get(kind)).startswith(kind)

@@ -104,41 +104,11 @@ def test_each_fault_is_found_with_its_line(tmp_path, text, fault):
     assert line in (fence, fence + 1)
 
 
-RUN = """# Page
-
-```sh
-echo first > made
-```
-1. In a list:
-
-   ```console
-   $ cat made
-   first
-   $ touch second
-   ```
-<!-- check: hardware -->
-```sh
-touch never
-```
-<!-- check: asks -->
-```sh
-touch never
-```
-"""
-
-
 def folder(tmp_path):
     """A folder to run in, and beside it the one of the runner."""
     copy = tmp_path / "scratch/copy"
     copy.mkdir(parents=True)
     return copy
-
-
-def test_commands_run_in_the_order_of_the_page_and_only_those_that_may(tmp_path):
-    copy = folder(tmp_path)
-    run = run_page(page(tmp_path, RUN), copy)
-    assert run.failed_line == 0, run.output
-    assert {p.name for p in copy.iterdir()} == {"made", "second"}
 
 
 def test_a_failing_command_is_named_by_its_line(tmp_path):

@@ -43,6 +43,7 @@ PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [10.0, 10.0]}
         ({"name": "t", "plates": [{**PLATE, "metal": True, "rough_mm": -0.1}]}, "rough_mm"),
         ({"name": "t", "plates": [{**PLATE, "metal": True, "rough_length_mm": 0.0}]}, "rough_length_mm"),
         ({"name": "t", "grid": {"columns": 3, "colums": 4}}, "colums"),
+        ({"name": "t", "plates": [{**PLATE, "metal": True, "rough_mm": 0.1, "rough_length_mm": 0.01}]}, "facets"),
         ({"name": "t", "disturbances": {"nois": 1.0}}, "nois"),
         ({"name": "t", "disturbances": {"ideal": 3}}, "ideal"),
         ({"name": "t", "disturbances": {"bend_us": "off"}}, "bend_us"),

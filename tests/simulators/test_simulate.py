@@ -91,3 +91,33 @@ def test_a_full_folder_and_a_burst_that_does_not_fit_are_refused(tmp_path: Path)
     fast = decode_scene({**RAW, "stage": {"speed_mm_s": 600.0, "accel_mm_s2": 20000.0}}, "t")
     with pytest.raises(ConfigError):
         simulate(RIG, fast, tmp_path / "fast")
+
+
+@pytest.mark.parametrize(
+    ("plate", "run", "named"),
+    [
+        ({"centre_mm": [2000.0, 2000.0]}, {}, "extend over"),
+        ({}, {"burst": {"pulses": 400_000, "period_us": 1500.0}, "stage": {"speed_mm_s": 0.001}}, "MB a board"),
+    ],
+)
+def test_what_exceeds_the_memory_is_refused(
+    tmp_path: Path, plate: dict[str, Any], run: dict[str, Any], named: str
+) -> None:
+    copper, acrylic = RAW["plates"]
+    scene = decode_scene({**RAW, **run, "plates": [copper, {**acrylic, **plate}]}, "t")
+    with pytest.raises(ConfigError, match=named):
+        simulate(RIG, scene, tmp_path / "scan")
+
+
+def test_a_scan_ends_when_its_truth_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scan whose simulation ends early is never complete."""
+
+    def refuse(*_args: Any, **_kwargs: Any) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    with pytest.raises(OSError, match="No space left"):
+        simulate(RIG, SCENE, tmp_path)
+    facts = [json.loads(line)["fact"] for line in (tmp_path / "manifest.jsonl").read_text().splitlines()]
+    assert "row_committed" in facts
+    assert "scan_ended" not in facts

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from tests.support.processes import HANG_S
 
 from polysight_shared.errors import DeviceError
-from polysight_shared.wires import WireClient, WireEdge, WireMessage, WireMotion, encode
+from polysight_shared.wires import WireClient, WireEdge, WireMessage, WireMotion
 from polysight_simulators.wires import WireHub
 
 Serve = Callable[..., Path]
@@ -126,18 +124,3 @@ def test_beyond_the_limit_only_the_slow_client_is_disconnected(serve: Serve, joi
         take(slow, len(edges))
     assert len(reports) == 1
     assert "26" in reports[0]
-
-
-@pytest.mark.parametrize("line", [b"S 1 26\n", b"X\n", b"L a\n", b"M 1 2 3\n", b"M 1 2 3 x\n", b"S" * 1000])
-def test_a_client_that_sends_an_invalid_line_is_disconnected(
-    serve: Serve, join: Join, reports: list[str], line: bytes
-) -> None:
-    path = serve()
-    listener = join(path, (26,))
-    with socket.socket(socket.AF_UNIX) as bad:
-        bad.settimeout(HANG_S)
-        bad.connect(str(path))
-        bad.sendall(encode(WireEdge(1, 26, 1)) + line)
-        assert bad.recv(1) == b""
-    assert take(listener, 1) == [WireEdge(1, 26, 1)]
-    assert len(reports) == 1

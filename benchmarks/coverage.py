@@ -113,16 +113,15 @@ class Cubes:
     manifest_faults = ()
     simulated = True
 
-    def __init__(self, rig: Instrument, scene: Scene, drop_rows: int = 0, seed: int | None = None) -> None:
+    def __init__(self, rig: Instrument, scene: Scene, seed: int | None = None) -> None:
         self.instrument: Instrument = apply_scene(rig, scene)
         self.plan: RasterPlan = plan_raster(self.instrument.grid)
         self.scan_id = scene.name
-        self._drop = drop_rows
         self._cubes = {b.name: synced_cube(rig, scene, b.name, seed=seed) for b in self.instrument.receivers}
 
     def rows(self) -> Iterator[int]:
-        """All rows of the plan, but the last ones that were dropped."""
-        yield from range(self.plan.rows - self._drop)
+        """All rows of the plan."""
+        yield from range(self.plan.rows)
 
     def read_row(self, board_name: str, row: int) -> CubeRow:
         """One row, positions as they were met."""

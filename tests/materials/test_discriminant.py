@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.cli.main import main
-from polysight.materials import Classifier, Entry, Library
-from polysight.materials.classify import DISCRIMINANT, PAPER, classifier_sentence, fit_weights
+from polysight.materials.classify import DISCRIMINANT, PAPER, fit_weights
 from polysight.materials.discriminant import REJECTED, ErrorDiscriminant
 from polysight.materials.library import Samples, feature_matrix
 from polysight.materials.train import fit_samples, score, score_unseen_materials
@@ -210,24 +208,3 @@ def test_scans_without_a_common_material_are_refused():
     disjoint = samples.take(np.char.lstrip(samples.names, "m") == np.char.lstrip(samples.groups, "s"))
     with refused(ErrorCode.NOT_ENOUGH_DATA):
         score(disjoint, DISCRIMINANT)
-
-
-def test_the_report_and_the_table_of_models_name_what_was_not_judged(tmp_path, capsys):
-    samples = with_lonely(drawn(12, scans=3, pixels=4))
-    entries = []
-    for patch in np.unique(samples.patches):
-        of_patch = samples.patches == patch
-        h = samples.x[of_patch, 0]
-        v = samples.x[of_patch, 1]
-        q = samples.x[of_patch, 2] + 1j * samples.x[of_patch, 3]
-        (name, *_), (scan, *_) = samples.names[of_patch], samples.groups[of_patch]
-        plain = (h.astype(np.float32), v.astype(np.float32), (1 / q).astype(np.complex64))
-        entries.append(Entry(str(name), str(scan), *plain, 55.0, True))
-    fit = {"model": DISCRIMINANT, "judged": {DISCRIMINANT: {"pixels": 1.0, "patches": 1.0}}}
-    library = Library(tuple(entries), {**fit, "materials": 6, "not_judged": ["lonely"]})
-    answer = classifier_sentence(Classifier(library))
-    assert "6 materials" in answer
-    assert "lonely" in answer
-    library.save(tmp_path / "library.npz")
-    assert main(["classify", str(tmp_path / "library.npz")]) == 0
-    assert "lonely" in capsys.readouterr().out

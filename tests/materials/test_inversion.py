@@ -18,7 +18,7 @@ from polysight.materials.inversion import (
 )
 from polysight.materials.kinds import Kind, Kinds, PatchMeasurement, literature, permittivity_slope
 from polysight.materials.phase_sign import join_signs, mirror_phases
-from polysight.polarimetry import fresnel, permittivity_from_ratio
+from polysight.polarimetry import permittivity_from_ratio
 
 THETA = np.radians(55.0)
 KINDS = Kinds(literature(), float(THETA))
@@ -202,13 +202,6 @@ def test_ratio_error_is_that_of_draws():
     for value, stated in zip(t, ratio_error(result, prior, t), strict=True):
         deviations = np.array([measured_ratio(value, *x) - value for x in zip(a, b, rho, strict=True)])
         assert stated == pytest.approx(np.sqrt(np.mean(np.abs(deviations) ** 2) / 2), rel=0.06)
-
-
-def test_brightness_is_that_of_eq_2():
-    r_s, r_p = fresnel(EPS, THETA)
-    patches = world(np.random.default_rng(7), (0j, 0j), 1e-9, 0.0)
-    np.testing.assert_allclose([s.brightness for s in patches], np.abs(r_s))
-    np.testing.assert_allclose([s.inverse_ratio for s in patches], r_p / r_s, atol=1e-7)
 
 
 @pytest.mark.parametrize("paint_mm", [0.1, 0.15, 0.2])

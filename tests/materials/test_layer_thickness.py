@@ -11,7 +11,7 @@ from tests.support.rigs import published_rig
 from polysight import multilayer
 from polysight.cli.main import main
 from polysight.imaging import sub_bands
-from polysight.materials import METAL, Layer, LayerFit, parse_layer
+from polysight.materials import METAL, Layer, parse_layer
 from polysight.materials.layers import Bands, Spectrum, fit_layer, predict
 from polysight.materials.sub_bands import bands_of_row
 from polysight.results import ScanMaterials
@@ -104,29 +104,6 @@ def test_two_thicknesses_that_fit_are_both_told_in_millimetres():
         assert min(abs(size / true - 1) for size in sizes) < 0.05
     assert fit.ambiguous
     assert any("mm is not excluded" in words for words in fit.warnings())
-
-
-def test_a_thickness_that_is_not_determined_is_told_ambiguous():
-    answer = LayerFit(
-        permittivity=4 - 0.1j,
-        thickness_m=2e-3,
-        std_real=0.02,
-        std_loss=0.02,
-        std_thickness_m=0.1e-3,
-        chi2=5.0,
-        freedom=9,
-    )
-    assert answer.ambiguous
-    assert any("ambiguous" in words for words in answer.warnings())
-    assert not LayerFit(
-        permittivity=4 - 0.1j,
-        thickness_m=2e-3,
-        std_real=0.02,
-        std_loss=0.02,
-        std_thickness_m=0.02e-3,
-        chi2=5.0,
-        freedom=9,
-    ).ambiguous
 
 
 def test_an_uncertain_angle_widens_the_error_bars():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 import shutil
 from pathlib import Path
 
@@ -46,20 +44,6 @@ def test_a_complete_scan_has_all_planned_rows_and_frames(two_plates, tmp_path):
         "positions_absent": 0, "frames_planned": FRAMES, "frames_received": FRAMES, "manifest": [],
     }  # fmt: skip
     assert f"100 % of {FRAMES} planned" in output
-
-
-def test_terminal_and_report_count_all_plates_of_the_scene(two_plates, tmp_path):
-    """Two plates more stand in the truth than in the scene: they are not found, and count as not named right."""
-    scan = shutil.copytree(two_plates, tmp_path / "scan")
-    out = tmp_path / "out"
-    truth = read_json(scan / "truth.json")
-    plate = next(plate for plate in truth["plates"] if not plate.get("metal"))
-    truth["plates"] += [plate | {"centre_mm": [80.0, y], "name": "oak"} for y in (-60.0, 60.0)]
-    (scan / "truth.json").write_text(json.dumps(truth))
-    output = read_output("process", scan, "--out", out, "--metal", METAL)
-    counted = re.search(r"(\d of 3) plates named right", output)
-    assert counted, output
-    assert f"{counted[1]}</b><span>plates named right" in (out / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("command", ["process", "image"])

@@ -61,14 +61,6 @@ def test_images_published_beside_a_scan_are_those_of_all_rows_at_once(scan: Path
         assert np.abs(first_item - second_item)[valid_in_both].max() < 1e-5 * np.abs(second_item[valid_in_both]).max()
 
 
-def test_an_earlier_report_stays_until_the_new_one_is_complete(scan: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "report.html").write_text("earlier")
-    publish_images(process_rows(ScanFolder.load(scan), scan), out)
-    assert [p.name for p in out.iterdir()] == ["report.html"]
-
-
 def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object) -> None:
         raise DataError("no metal", code=ErrorCode.NO_DATA)
@@ -80,12 +72,6 @@ def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monke
     with refused(ErrorCode.NO_DATA):
         make_products(pipeline, out, ())
     assert read_products(out).valid.any()
-
-
-def test_progress_is_reported_before_each_step(scan: Path, tmp_path: Path) -> None:
-    steps: list[str] = []
-    process_rows(ScanFolder.load(scan), scan, Settings(model="none")).finish(tmp_path, (), steps.append)
-    assert steps == ["point response", "materials", "figures and report"]
 
 
 @pytest.mark.parametrize("is_steep", [True, False])

@@ -12,8 +12,6 @@ from tests.support.store.facts import facts_of
 from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
 from polysight.store import manifest
 from polysight_shared.files import read_json
-from polysight_shared.geometry import rx_positions_m, tx_position_m
-from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 COLUMNS = 10
 ROWS = 3
@@ -77,22 +75,3 @@ def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path
         for stage, values in quality["boards"][name]["synchronisation"].items():
             expected = {NAMES[k]: v for k, v in stages[stage].items() if k in NAMES}
             assert values == pytest.approx(expected, rel=1e-9)
-
-
-def test_the_if_of_the_direct_path_follows_from_its_length_and_the_start_frequencies(scan_of, tmp_path):
-    """In quality.json: smallest, median and largest IF over the positions."""
-    offset_hz = 500e3
-    rig = published_rig()
-    disturbances = {"ideal": True, "if_offset_hz": offset_hz, "sync_uncertainty_ns": SYNC_NS}
-    scene = scene_of(EVERYWHERE, columns=12, rows=2, pulses=1, disturbances=disturbances)
-    read_output("image", scan_of(tmp_path / "scan", scene), "--out", tmp_path / "out")
-    boards = read_json(tmp_path / "out" / "quality.json")["boards"]
-    tx = np.array(tx_position_m(rig))
-    reach_hz = rig.chirp.slope_hz_per_s * SYNC_NS * 1e-9  # by which the boards' starts differ at most
-    for board in rig.receivers:
-        path_m = np.linalg.norm(np.array(rx_positions_m(rig, board)) - tx, axis=1).mean()
-        expected = offset_hz + rig.chirp.slope_hz_per_s * path_m / SPEED_OF_LIGHT_M_S
-        direct_path_hz = boards[board.name]["direct_path_hz"]
-        assert expected - reach_hz < direct_path_hz["min"] < expected - 0.3 * reach_hz
-        assert expected + 0.3 * reach_hz < direct_path_hz["max"] < expected + reach_hz
-        assert direct_path_hz["median"] == pytest.approx(expected, abs=0.3 * reach_hz)

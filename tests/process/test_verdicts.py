@@ -40,10 +40,10 @@ def form_images(source):
 
 @pytest.fixture(scope="module")
 def examine(rig):
-    """`examine(scene, drop_rows)`: a perfectly synchronised scene, processed and judged with the shipped rig file."""
+    """`examine(scene)`: a perfectly synchronised scene, processed and judged with the shipped rig file."""
 
-    def make(scene, drop_rows=0):
-        source = Cubes(rig, scene, drop_rows)
+    def make(scene):
+        source = Cubes(rig, scene)
         pipeline, images = form_images(source)
         findings = pipeline.examine(images)
         plates = truth_plates(truth(source.instrument, scene, scene.seed))
@@ -151,13 +151,6 @@ def test_a_weak_direct_path_is_reported(examine):
     findings, _ = examine(world(disturbances={"direct_loss_db": 12.0}))
     assert findings.verdict.level == "care"
     assert "direct path" in reasons(findings)
-
-
-def test_absent_rows_are_counted_against_the_plan(examine):
-    findings, _ = examine(world(), drop_rows=8)
-    assert findings.verdict.level != "good"
-    assert "8 of 41 rows" in reasons(findings)
-    assert "19.5 %" in reasons(findings)
 
 
 def test_an_empty_table_is_no_result(examine):

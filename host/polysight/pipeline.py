@@ -60,7 +60,7 @@ class Pipeline:
         return synced
 
     def form_images(self, from_sums: bool = False) -> imaging.Images:
-        """Form both images on the rig file's plane, divided by the footprint, not referenced; `from_sums`: live."""
+        """Form both images on the rig's plane, divided by the footprint, not referenced; `from_sums`: a live scan's."""
         if self.settings.sparse and not from_sums:
             self.sub_bands = self.samples.fill_missing()
         with self.quality.measure_time("image"):
@@ -90,16 +90,16 @@ class Pipeline:
         """Find patches (unless known), metal reference, permittivities and names; in sub-bands too, if imaged."""
         with self.quality.measure_time("materials"):
             rig = self.plane.apply_to_rig(self.rig)
-            std = self.plane.incidence_std_rad(self.rig)
-            angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, self.settings.incidence)
-            optics = materials.Optics.from_rig(self.rig, angles, std, self.synchroniser.direct_path_known)
+            angle_std = self.plane.incidence_std_rad(self.rig)
+            incidence = polarimetry.incidence_choice(rig, images.x_m, images.y_m, self.settings.incidence)
+            optics = materials.Optics.from_rig(self.rig, incidence, angle_std, self.synchroniser.direct_path_known)
             result = materials.analyse(images, optics, known, classifier)
-            plane = None if known is None else known.plane
-            self.quality.note_materials(result, angles, images.valid, plane)
+            metal_plane = None if known is None else known.plane
+            self.quality.note_materials(result, incidence, images.valid, metal_plane)
         with self.quality.measure_time("sub-bands"):
-            parts = self.sub_bands.finish(self.source.mirrored, self.plane.moved_m)
-            if parts:
-                result = materials.add_bands(result, self.sub_bands.bands, parts, optics, plane)
+            band_images = self.sub_bands.finish(self.source.mirrored, self.plane.moved_m)
+            if band_images:
+                result = materials.add_bands(result, self.sub_bands.bands, band_images, optics, metal_plane)
         return result
 
     def examine(self, images: imaging.Images, plates: materials.Plates = ()) -> process.Findings:
@@ -107,11 +107,12 @@ class Pipeline:
         classifier = process.load_classifier(self.settings, self.rig)
         scene = process.boxes_as_patches(self.settings, self.inputs, images.x_m, images.y_m)
         has_metal = scene.metal is not None
-        plane = self.calibration.metal_plane(self.rig, self.inputs.reference, has_metal, self.settings.bands)
+        metal_plane = self.calibration.metal_plane(self.rig, self.inputs.reference, has_metal, self.settings.bands)
         images = self.place_plane(images)
-        if plane is not None:
-            images = images.within(plane.valid_on(images.x_m, images.y_m))
-            scene = replace(scene, metal=plane)
+        if metal_plane is not None:
+            # A pixel can be judged only where the scan of the metal plate tells its gain.
+            images = images.within(metal_plane.valid_on(images.x_m, images.y_m))
+            scene = replace(scene, metal=metal_plane)
         result = self.find_materials(images, replace(scene, plates=plates), classifier)
         verdict = process.judge(self.quality, result, self.plane, classifier, self.rig.check)
         if not verdict.usable:

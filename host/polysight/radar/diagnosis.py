@@ -31,6 +31,10 @@ JUMPERS = """\
     open      open      set           (mmWave Studio needs SOP1 set too: remove it here)"""
 
 
+# Of the boot status (ICD table 7.3).
+VOLTAGE_MONITOR_BIT = 57
+
+
 class Row(NamedTuple):
     """Result of one step: success (`holds`), expected and actual outcome (`came`), remedy after a failure (`do`)."""
 
@@ -123,25 +127,25 @@ def _row_of_failure(step: Step | None, error: PolysightError) -> Row:
 
 def _judge_supplies(board: RadarBoard) -> Row:
     """Judge the supplies by the main core's power-up and the report of its voltage monitor."""
-    errors = (board.facts.boot or {}).get("boot_errors", 0)
-    monitor = bool(isinstance(errors, int) and errors >> 57 & 1)
+    boot_errors = (board.facts.boot or {}).get("boot_errors", 0)
     expected = "the core runs, no error of the voltage monitor"
-    if monitor:
+    if isinstance(boot_errors, int) and boot_errors >> VOLTAGE_MONITOR_BIT & 1:
         remedy = "measure the RF supplies (1.3 V or 1.0 V), 1.8 V and 3.3 V"
         return Row("power rails", False, expected, "the main core runs; its voltage monitor reports an error", remedy)
     return Row("power rails", True, expected, "the main core runs; no error reported")
 
 
-FORM = 1
+TRACE_VERSION = 1
 INTERRUPT = "HOST_INTR"
 RESET = "NRST"
-# A scan of some thousand rows
+# Largest file that is read as a trace: a scan of some thousand rows takes less.
 MAX_BYTES = 2**26
+# Latest time in a trace, about four months: a later one is no time of a run.
 _MAX_S = 1e7
 
 
 class TracedWords:
-    """A word link (`spi.WordLink`) that logs its traffic.
+    """A word link (`usb.WordLink`) that logs its traffic.
 
     Parameters
     ----------
@@ -168,7 +172,7 @@ class TracedWords:
         self._looks = 0
         self.file = file
         self.ended = ""
-        self._write({"trace": FORM, **facts})
+        self._write({"trace": TRACE_VERSION, **facts})
 
     def write(self, words: Sequence[int]) -> None:
         """Shift words out. Raises DeviceError."""
@@ -388,15 +392,15 @@ def read_trace(file: Path) -> tuple[dict[str, Any], list[TraceLine]]:
                 raise _invalid(file, f"line {number} is not JSON") from None
             continue
         if facts is None:
-            if not isinstance(value, dict) or value.get("trace") != FORM:
-                raise _invalid(file, f"its first line is not that of a trace, version {FORM}")
+            if not isinstance(value, dict) or value.get("trace") != TRACE_VERSION:
+                raise _invalid(file, f"its first line is not that of a trace, version {TRACE_VERSION}")
             facts = value
         elif value is not None:
             records.append(_trace_line(file, number, value))
             if len(records) > 1 and records[-1].t < records[-2].t:
                 raise _invalid(file, f"line {number} has an earlier time than the one before")
     if facts is None:
-        raise _invalid(file, f"its first line is not that of a trace, version {FORM}")
+        raise _invalid(file, f"its first line is not that of a trace, version {TRACE_VERSION}")
     return facts, records
 
 

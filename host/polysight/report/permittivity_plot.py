@@ -44,6 +44,13 @@ _POINT_PT = 5.0
 # Places that `place_numbers` tries: rings around the point, and directions on each.
 _RADII_PT = (11, 17, 25, 34, 45, 58)
 _ANGLES = 16
+# A number further from its point than the nearest ring, with a little room, gets a line to it.
+_LINE_FROM_PT = _RADII_PT[0] + 1
+# Room for ellipses beyond estimates and truths, and an empty margin, as shares of the span of these.
+_ELLIPSE_SHARE = 0.75
+_MARGIN_SHARE = 0.08
+# Smallest span of the axes, real part and loss: points that lie together are not drawn far apart.
+_SMALLEST_SPAN = (0.5, 0.3)
 Array = npt.NDArray[np.float64]
 Point = tuple[float, float]
 Estimate = tuple[PatchFigures, PermittivityFigures]
@@ -71,7 +78,7 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
     [n, 2]: the labels' middles: for each the nearest free place, else the one that covers least.
     """
     taken: list[Array] = []
-    solid = np.concatenate([points, obstacles.reshape(-1, 2)])
+    keep_clear = np.concatenate([points, obstacles.reshape(-1, 2)])
     turns = np.radians(45 + np.arange(_ANGLES) * 360 / _ANGLES)
     ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
     candidates = np.concatenate([radius * ring for radius in _RADII_PT])
@@ -79,9 +86,10 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
         best = point + candidates[0]
         least_cost = math.inf
         for place in point + candidates:
-            labels = sum(bool((np.abs(place - taken_place) < _LABEL_PT).all()) for taken_place in taken)
-            covered = (np.abs(solid - place) < np.array(_LABEL_PT) / 2 + _POINT_PT / 2).all(axis=1).sum()
-            cost = 2.0 * labels + covered
+            labels_covered = sum(bool((np.abs(place - taken_place) < _LABEL_PT).all()) for taken_place in taken)
+            points_covered = (np.abs(keep_clear - place) < np.array(_LABEL_PT) / 2 + _POINT_PT / 2).all(axis=1).sum()
+            # A number on another one cannot be read; one on a point can.
+            cost = 2.0 * labels_covered + points_covered
             if cost < least_cost:
                 best = place
                 least_cost = cost
@@ -140,10 +148,15 @@ def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour
     centre = (e.real, e.loss)
     if e.spread is not None:
         for share, style in _STYLES.items():
-            w, h, angle = fit_ellipse(e.spread.matrix, share)
-            ax.add_patch(Ellipse(centre, w, h, angle=angle, facecolor="none", edgecolor=colour, zorder=2.5, **style))
+            width, height, angle = fit_ellipse(e.spread.matrix, share)
+            outline = Ellipse(
+                centre, width, height, angle=angle, facecolor="none", edgecolor=colour, zorder=2.5, **style
+            )
+            ax.add_patch(outline)
             if share == min(_STYLES):
-                ax.add_patch(Ellipse(centre, w, h, angle=angle, facecolor=colour, alpha=0.18, linewidth=0, zorder=2))
+                # Only the inner region is filled.
+                area = Ellipse(centre, width, height, angle=angle, facecolor=colour, alpha=0.18, linewidth=0, zorder=2)
+                ax.add_patch(area)
     elif e.real_p30_p70 and e.imag_p30_p70:
         real_p30, real_p70 = e.real_p30_p70
         imag_p30, imag_p70 = e.imag_p30_p70
@@ -161,13 +174,16 @@ def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour
 def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequence[Point]) -> None:
     """Set limits around estimates, truths and ellipses; one very uncertain patch must not shrink all others."""
     centres = np.array([(e.real, e.loss) for e in estimates])
-    certain = np.concatenate([centres, np.array(truths, float).reshape(-1, 2)])
-    half = np.array([_half_size(e) for e in estimates])
-    low = certain.min(axis=0)
-    high = certain.max(axis=0)
-    span = np.maximum(high - low, (0.5, 0.3))
-    low = np.minimum(low, np.maximum((centres - half).min(axis=0), low - 0.75 * span)) - 0.08 * span
-    high = np.maximum(high, np.minimum((centres + half).max(axis=0), high + 0.75 * span)) + 0.08 * span
+    always_shown = np.concatenate([centres, np.array(truths, float).reshape(-1, 2)])
+    half_sizes = np.array([_half_size(e) for e in estimates])
+    low = always_shown.min(axis=0)
+    high = always_shown.max(axis=0)
+    span = np.maximum(high - low, _SMALLEST_SPAN)
+    # Ellipses may widen the axes, up to a share of the span.
+    lowest = np.maximum((centres - half_sizes).min(axis=0), low - _ELLIPSE_SHARE * span)
+    highest = np.minimum((centres + half_sizes).max(axis=0), high + _ELLIPSE_SHARE * span)
+    low = np.minimum(low, lowest) - _MARGIN_SHARE * span
+    high = np.maximum(high, highest) + _MARGIN_SHARE * span
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(min(low[1], -0.1), high[1])
 
@@ -212,12 +228,12 @@ def _write_numbers(fig: Figure, ax: Axes, estimates: Sequence[Estimate], truths:
     points = ax.transData.transform(values) / per_point
     crosses = ax.transData.transform(np.array(truths, float).reshape(-1, 2)) / per_point
     places = place_numbers(points, crosses)
-    line = {"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkA": 3, "shrinkB": 3}
+    leader_line = {"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkA": 3, "shrinkB": 3}
     for (patch, e), place, point in zip(estimates, places, points, strict=True):
         offset = place - point
         arrow = None
-        if np.hypot(*offset) > _RADII_PT[0] + 1:
-            arrow = line
+        if np.hypot(*offset) > _LINE_FROM_PT:
+            arrow = leader_line
         ax.annotate(
             str(patch.label), (e.real, e.loss), textcoords="offset points",
             xytext=(float(offset[0]), float(offset[1])), ha="center", va="center", fontsize=8, color=INK, zorder=5,

@@ -361,8 +361,8 @@ class Manifest:
     torn: bool = False
     count: int = 0
     digest: str = ""
-    # One more than the last count that was read.
-    _due: int = 0
+    # One more than the count of the last whole line; less than `count` behind damaged lines.
+    _next_whole: int = 0
     _lines: int = 0
 
     def feed(self, raw: bytes) -> list[Fact]:
@@ -392,7 +392,7 @@ class Manifest:
             self._compare(head.count, head.previous)
             self.count = head.count
         self.count += 1
-        self._due = self.count
+        self._next_whole = self.count
         fact = _decode_fact(head.fact, line)
         # Last, because another thread may compare the number of facts to see that rows were added.
         self._add_up(fact)
@@ -402,10 +402,9 @@ class Manifest:
     def _compare(self, count: int, previous: str) -> None:
         """Compare a line's count and digest with the lines before it, and add faults."""
         missing = count - self.count
-        # The line before.
-        damaged = self._due < self.count
-        # A damaged line end joins two lines.
-        if missing > 0 and damaged:
+        line_before_is_damaged = self._next_whole < self.count
+        if missing > 0 and line_before_is_damaged:
+            # A damaged line end joins two lines: both are lost by the one fault that was found.
             last = self.faults.pop()
             self.faults.append(manifest_fault(last.facts["line"], last.what, last.facts["lost"] + missing))
         elif missing > 0:
@@ -416,10 +415,10 @@ class Manifest:
             self.faults.append(
                 manifest_fault(self._lines, f"{problem} (count {count}, {self.count} expected)", missing)
             )
-        elif count < self._due:
-            problem = f"repeated or out of order (count {count}, {self._due} expected)"
+        elif count < self._next_whole:
+            problem = f"repeated or out of order (count {count}, {self._next_whole} expected)"
             self.faults.append(manifest_fault(self._lines, problem))
-        elif not damaged and previous != self.digest:
+        elif not line_before_is_damaged and previous != self.digest:
             self.faults.append(manifest_fault(self._lines, "the line before it was replaced", 1))
 
     def _add_up(self, fact: Fact) -> None:

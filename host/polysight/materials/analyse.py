@@ -50,9 +50,11 @@ from polysight.materials.metal import (
     MetalReference,
     find_halo,
     find_metal,
+    gains_as_plates,
     metal_by_label,
     metal_evidence,
     metal_in_box,
+    metal_unevenness,
     no_metal,
 )
 from polysight.materials.names import NamedPatch, PatchName, add_explanation, name_patch
@@ -74,7 +76,6 @@ from polysight.materials.segment import (
 from polysight.polarimetry import (
     IncidenceChoice,
     PlaneReference,
-    calibrate,
     divide_by_metal,
     permittivity_from_ratio,
     ratio,
@@ -215,6 +216,9 @@ STEEP = Finding(
     "lay it flat, or measure it as it is with `polysight surface`",
 )
 """Why a steep patch gets no permittivity."""
+UNEVEN_METAL = 0.5
+"""Error of each part of the metal's ln(V / H) over the distance of its root mean squares from its median: where metal
+lies at the end of the scan neither is right (scenes of `benchmarks coverage` with small apertures)."""
 HALO_OF_METAL = 4.0
 HALO_OF_PATCH = 3.0
 """Error of the metal's V / H, and of V on a plate, over the halo of V around them: clipped scenes of an independent
@@ -363,6 +367,8 @@ class Seen:
         Rise of the metal along x and across the plane of incidence, radians.
     halo
         Halo of V around the metal.
+    metal_uneven
+        How far the root mean squares of the metal's pixels are from their median, |ln(V / H)|.
     behind
         Usual mean of H and of V over a place of a plate's size without a plate, relative to metal.
     """
@@ -376,6 +382,7 @@ class Seen:
     lit_evenly: bool
     metal_rise: Rise
     halo: Halo = NO_HALO
+    metal_uneven: float = 0.0
     behind: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
@@ -406,6 +413,7 @@ class Seen:
         at_border = [*(touches_border(p.mask) for p in judged if p.label in scatter), False]
         change = None if metal is None else common_change(scatters, metal.centre_m, at_border)
         halo = NO_HALO if metal is None else find_halo(reference.mask, found.patches, images)
+        uneven = 0.0 if metal is None else metal_unevenness(raw, reference.mask)
         behind = background_mean(raw.h, raw.v, found, images.usable)
         return cls(
             scatter=scatter,
@@ -417,6 +425,7 @@ class Seen:
             lit_evenly=evenly,
             metal_rise=metal_rise,
             halo=halo,
+            metal_uneven=uneven,
             behind=behind,
         )
 
@@ -446,7 +455,10 @@ class Seen:
             return replace(prior, reference_std=LEAST_STD)
         amplitude, phase = relative_errors(self.metal, self.usual)
         std = float(np.hypot(np.hypot(amplitude, phase) / np.sqrt(2), LEAST_STD))
-        return replace(prior, reference_std=float(np.hypot(std, HALO_OF_METAL * self.halo.level)))
+        around = HALO_OF_METAL * self.halo.level
+        return replace(
+            prior, reference_std=float(np.sqrt(std**2 + around**2 + (UNEVEN_METAL * self.metal_uneven) ** 2))
+        )
 
     def measure(self, patch: Patch, channels: tuple[Image, Image], theta_rad: float) -> PatchMeasurement:
         """Measure one patch relative to metal."""
@@ -639,7 +651,7 @@ def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | 
     if reference is not None:
         return reference.apply(images)
     try:
-        return calibrate(images, metal.mask)
+        return divide_by_metal(images, *gains_as_plates(images, metal.mask))
     except DataError:
         if metal.given:
             raise

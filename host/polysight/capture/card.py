@@ -495,8 +495,10 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
     try:
         with tempfile.TemporaryDirectory(prefix="polysight-card-") as folder:
             card.record_stop()
+            card.reset_fpga()  # its counters begin again; where its last record ended is not known
             card.configure(instrument.card)
-            receiver.begin_row(0, 1, instrument.row_bytes, instrument.frame_bytes, Path(folder) / "listened.bin")
+            listened = Path(folder) / "listened.bin"
+            receiver.begin_row(0, 1, instrument.row_bytes, instrument.frame_bytes, listened, after_reset=True)
             card.record_start()
             deadline = time.monotonic() + listen_s
             while time.monotonic() < deadline and not receiver.poll().complete:

@@ -197,23 +197,22 @@ def measure_receivers(rig: Instrument, rates: list[float], seconds: float = _RAT
             busy = stack.enter_context(subprocess.Popen([sys.executable, "-c", _BUSY_LOOP], start_new_session=True))
             stack.callback(busy.kill)
         results = []
-        sent = 0
         for rate in rates:
             packets = max(2, round(rate * seconds))
-            results.append(_measure_rate(rate, sent, packets, receivers, folder))
-            sent += packets
+            results.append(_measure_rate(rate, packets, receivers, folder))
         return results, receivers[0].scheduling
 
 
-def _measure_rate(rate: float, first: int, packets: int, receivers: list[ReceiverProcess], folder: Path) -> LoadResult:
-    """Send `packets` packets to each receiver; like a card, the counters continue from record to record (`first`)."""
+def _measure_rate(rate: float, packets: int, receivers: list[ReceiverProcess], folder: Path) -> LoadResult:
+    """Send `packets` packets to each receiver, as cards do after a reset: after losses a receiver needs one."""
     for receiver in receivers:
-        receiver.begin_row(0, 1, packets * MAX_PAYLOAD_BYTES, 1, folder / f"{receiver.board.name}.part")
+        part = folder / f"{receiver.board.name}.part"
+        receiver.begin_row(0, 1, packets * MAX_PAYLOAD_BYTES, 1, part, after_reset=True)
     senders = []
     for receiver in receivers:
         card = (receiver.board.card_address, CARD_SOURCE_PORT)
         host = (receiver.board.host_address, receiver.board.data_port)
-        words = map(str, (*card, *host, first, packets, rate, MAX_PAYLOAD_BYTES))
+        words = map(str, (*card, *host, 0, packets, rate, MAX_PAYLOAD_BYTES))
         command = [sys.executable, "-I", str(_SENDER), *words]
         senders.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
     # A sender prints the seconds that it took; one that failed prints nothing.

@@ -29,7 +29,7 @@ test: $(VENV)/installed  ## install what is missing, then run every test
 	$(BIN)/python -m pytest -n $(JOBS) $(COSTS)
 
 # Each file that takes more draws with --long.
-LONG := tests/stage tests/store tests/capture/test_adversary.py \
+LONG := tests/stage tests/store tests/capture/test_adversary.py tests/acquisition/test_adversarial_scans.py \
 	tests/acquisition/test_mangled_takes.py tests/acquisition/test_pulse_times.py tests/pi/test_hostile.py \
 	tests/pi/test_edges.py tests/pi/test_stops.py tests/calibration/test_metal.py tests/materials \
 	tests/process/test_metal_scans.py tests/surfaces/test_what_is_no_surface.py tests/e2e/test_killed_processes.py \

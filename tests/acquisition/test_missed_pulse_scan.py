@@ -16,7 +16,7 @@ PULSES = 6
 
 @pytest.fixture
 def paced_rig(make_instrument, request):
-    """Rows of 8 points and 6 pulses, frames sent at the times of their pulses; the parameter is the retakes of a row."""
+    """Rows of 8 points and 6 pulses, frames sent at the times of their pulses; the parameter: a row's retakes."""
     retakes = getattr(request, "param", 1)
     fake = FakeRig(make_instrument(columns=POINTS, rows=2, pulses=PULSES, row_retakes=retakes))
     fake.start()

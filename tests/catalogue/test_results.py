@@ -13,7 +13,7 @@ from tests.support.scenes import COPPER, PET
 from polysight.catalogue import Pixels, compare, draw_comparison, draw_products, probe, read_result, thumbnail
 from polysight.catalogue.pictures import MAPS
 from polysight.catalogue.results import SIGNIFICANT, measure_scatter
-from polysight.polarimetry import permittivity_from_ratio
+from polysight.products import map_permittivity, read_products
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -26,8 +26,10 @@ def test_a_place_tells_its_own_pixel(processed):
     answer = probe(processed / "one", *CENTRE)
     p = complex(pixels.p[row, column])
     assert answer.p.value == pytest.approx(p, abs=1e-4)
-    eps = complex(permittivity_from_ratio(p, pixels.theta_rad))
-    assert answer.permittivity.value == pytest.approx(eps, abs=1e-3)
+    map_of_scan = map_permittivity(read_products(processed / "one"))
+    assert answer.permittivity.value == pytest.approx(complex(map_of_scan.value[row, column]), abs=1e-4)
+    assert answer.permittivity_real_std == pytest.approx(map_of_scan.real_std[row, column], abs=1e-4)
+    assert answer.permittivity_loss_std == pytest.approx(map_of_scan.loss_std[row, column], abs=1e-4)
     assert answer.place_mm == pytest.approx([pixels.x_mm[column], pixels.y_mm[row]], abs=0.01)
     assert answer.patch.truth.name == "PET"
     assert any(near.name.startswith("PET") and near.sigmas < 2 for near in answer.nearest)
@@ -53,21 +55,6 @@ def test_the_image_ends_half_a_pixel_beyond_its_outermost_pixels(processed):
     ):
         with refused(ErrorCode.VALUE_INVALID, "outside the image"):
             pixels.nearest(*place)
-
-
-def test_the_error_of_a_pixel_is_that_of_draws(processed):
-    """Of P as it is drawn with its standard deviation, in each part."""
-    pixels = Pixels(processed / "one" / "products")
-    pixel = pixels.nearest(*CENTRE)
-    # small: the law is of first order
-    p = complex(pixels.p[pixel])
-    sigma = float(pixels.p_std[pixel]) / 20
-    rng = np.random.default_rng(1)
-    drawn = permittivity_from_ratio(
-        p + sigma * (rng.standard_normal(4000) + 1j * rng.standard_normal(4000)), pixels.theta_rad
-    )
-    assert float(pixels.permittivity_sigma[pixel]) / 20 == pytest.approx(np.std(drawn.real), rel=0.06)
-    assert float(pixels.permittivity_sigma[pixel]) / 20 == pytest.approx(np.std(drawn.imag), rel=0.06)
 
 
 def test_the_range_profile_has_its_peak_at_the_plate(processed):

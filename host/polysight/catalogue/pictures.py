@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from polysight.imaging import Images
 from polysight.materials import axis_mm
-from polysight.polarimetry import permittivity_from_ratio, specular_incidence_rad
-from polysight.products import ProcessedScan
+from polysight.polarimetry import specular_incidence_rad
+from polysight.products import PermittivityMap, ProcessedScan, map_permittivity
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -29,8 +29,6 @@ RANGE_DB = 35.0
 # Relative to the brightest: fainter pixels are noise; up to the second level phases fade out.
 FAINT_DB = -26.0
 CLEAR_DB = -18.0
-# Difference quotient of the permittivity.
-RATIO_STEP = 1e-5
 THUMBNAIL_PIXELS = 96
 
 
@@ -104,28 +102,10 @@ class Pixels(ProcessedScan):
         return specular_incidence_rad(self.rig)
 
     @cached_property
-    def permittivity(self) -> NDArray[np.complex128]:
-        """Permittivity eps' - j eps'' as a half space; nan where P is too close to metal or too dark."""
-        p = np.where(self.clear & np.isfinite(self.p), self.p, np.nan).astype(np.complex128)
-        eps = permittivity_from_ratio(p, self.theta_rad)
-        return np.where(np.isfinite(eps), eps, complex(np.nan, np.nan))
-
-    @cached_property
-    def permittivity_sigma(self) -> Real:
-        """Standard deviation of each part of the permittivity: that of P times the slope (the map is analytic)."""
-        p = np.asarray(self.p, np.complex128)
-        with np.errstate(invalid="ignore", over="ignore"):
-            shifted = permittivity_from_ratio(p + RATIO_STEP, self.theta_rad)
-            slope = np.abs((shifted - permittivity_from_ratio(p, self.theta_rad)) / RATIO_STEP)
-            return np.where(np.isfinite(slope), slope, np.nan) * self.p_std
-
-    @cached_property
-    def metal_like(self) -> NDArray[np.bool_]:
-        """Pixels so close to metal that their permittivity is only known to be large."""
-        size = np.abs(self.permittivity)
-        with np.errstate(invalid="ignore"):
-            unsure = np.isfinite(self.p_std) & (self.permittivity_sigma > 0.5 * size)
-            return unsure | (np.abs(self.p - 1) < 0.2) | ~np.isfinite(size)
+    def permittivity(self) -> PermittivityMap:
+        """Permittivity and its errors; masked where it is not known, and where the image is too dark."""
+        known = map_permittivity(self)
+        return replace(known, mask=known.mask & self.clear)
 
     def nearest(self, x_mm: float, y_mm: float) -> tuple[int, int]:
         """Row and column of the pixel at a place. Raises DataError outside the image."""
@@ -251,11 +231,13 @@ def _derive_values(pixels: Pixels, name: str) -> Values:
             "no permittivity is shown", "the images are not referenced to metal, or support no result",
             "process the scan with metal", code=ErrorCode.NO_DATA,
         )  # fmt: skip
-    eps = pixels.permittivity
-    values = {"p_sigma": pixels.p_std, "permittivity": eps.real, "loss": -eps.imag}[name]
-    visible = pixels.clear & np.isfinite(values)
-    if name != "p_sigma":
-        visible &= ~pixels.metal_like
+    if name == "p_sigma":
+        values = pixels.p_std
+        visible = pixels.clear & np.isfinite(values)
+    else:
+        eps = pixels.permittivity
+        values = eps.value.real if name == "permittivity" else -eps.value.imag
+        visible = eps.mask
     # Edges of plates have any value.
     high = percentile(values, visible, 85, 1.0)
     low = 1.0 if name == "permittivity" else 0.0

@@ -170,8 +170,8 @@ class Probe(msgspec.Struct, frozen=True, kw_only=True):
         The pixel's, from the middle of the image.
     lit
         True if the scan illuminates it.
-    permittivity, permittivity_sigma
-        Of this pixel as a half space; `why` it is unknown.
+    permittivity, permittivity_real_std, permittivity_loss_std
+        As a half space, as in the map of permittivities; `why` it is unknown.
     patch
         The patch whose outline holds the place.
     nearest
@@ -188,7 +188,8 @@ class Probe(msgspec.Struct, frozen=True, kw_only=True):
     p_sigma: float | None
     referenced: bool
     permittivity: ComplexNumber | None
-    permittivity_sigma: float | None
+    permittivity_real_std: float | None
+    permittivity_loss_std: float | None
     why: str
     patch: PatchFigures | None
     nearest: list[NearMaterial]
@@ -211,10 +212,12 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
     place = (float(pixels.x_mm[column]), float(pixels.y_mm[row]))
     reason = _why_no_permittivity(pixels, row, column)
     eps = None
-    eps_sigma = None
+    real_std = None
+    loss_std = None
     if not reason:
-        eps = _parts(complex(pixels.permittivity[row, column]))
-        eps_sigma = _number(pixels.permittivity_sigma[row, column])
+        eps = _parts(complex(pixels.permittivity.value[row, column]))
+        real_std = _number(pixels.permittivity.real_std[row, column])
+        loss_std = _number(pixels.permittivity.loss_std[row, column])
     nearest: list[NearMaterial] = []
     if eps:
         nearest = _nearest_materials(pixels, row, column, library)
@@ -231,7 +234,8 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
         p_sigma=_number(pixels.p_std[row, column]),
         referenced=pixels.referenced,
         permittivity=eps,
-        permittivity_sigma=eps_sigma,
+        permittivity_real_std=real_std,
+        permittivity_loss_std=loss_std,
         why=reason,
         patch=patch,
         nearest=nearest,
@@ -245,8 +249,8 @@ def _why_no_permittivity(pixels: Pixels, row: int, column: int) -> str:
         return "the images are not referenced to metal, or support no result"
     if not pixels.clear[row, column]:
         return "too dark: only noise"
-    if pixels.metal_like[row, column]:
-        return "too close to metal: any large permittivity looks like this"
+    if not pixels.permittivity.mask[row, column]:
+        return "too close to metal, where any large permittivity looks the same, or the edge of a plate"
     return ""
 
 
@@ -462,7 +466,8 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
             "take other scans", code=ErrorCode.MISMATCH,
         )  # fmt: skip
     p = np.where(in_both, a.p - b.p[same_place], np.nan).astype(np.complex128)
-    eps = np.where(in_both, a.permittivity - b.permittivity[same_place], np.nan)
+    known_in_both = in_both & a.permittivity.mask & b.permittivity.mask[same_place]
+    eps = np.where(known_in_both, a.permittivity.value - b.permittivity.value[same_place], np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         stated = np.abs(p) / np.hypot(a.p_std, b.p_std[same_place])
     scatter = measure_scatter(stated)

@@ -133,8 +133,8 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
     lines.append(f"|H| {_value(result.h_db)} dB, |V| {_value(result.v_db)} dB")
     lines.append(f"P = {_complex(result.p)} {_error(result.p_sigma)}")
     if result.permittivity:
-        error = _error(result.permittivity_sigma)
-        lines.append(f"permittivity {_complex(result.permittivity)} {error}, as a half space")
+        errors = f"+- {result.permittivity_real_std:.3g} (real part), {result.permittivity_loss_std:.3g} (loss)"
+        lines.append(f"permittivity {_complex(result.permittivity)} {errors}, as a half space")
     else:
         lines.append(f"no permittivity: {result.why}")
     if result.patch is not None:

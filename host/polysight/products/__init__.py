@@ -28,6 +28,7 @@ from polysight.products.folder import (
     making_products,
     products_locked,
 )
+from polysight.products.permittivity_map import PermittivityMap, map_permittivity
 from polysight.products.processed import (
     FINISHED,
     IMAGE,
@@ -56,6 +57,7 @@ __all__ = [
     "QUALITY",
     "REPORT",
     "SCAN",
+    "PermittivityMap",
     "ProcessedScan",
     "Rows",
     "check_products_folder",
@@ -67,6 +69,7 @@ __all__ = [
     "image_dataset",
     "label_folder",
     "making_products",
+    "map_permittivity",
     "patch_coordinates",
     "patch_dataset",
     "permittivity_dataset",

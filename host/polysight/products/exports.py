@@ -27,8 +27,7 @@ import scipy
 from msgspec import UNSET
 
 from polysight.materials import axis_mm, image_centre_mm
-from polysight.polarimetry import incidence_choice, specular_incidence_rad
-from polysight.products.permittivity_map import map_permittivity
+from polysight.products.permittivity_map import map_permittivity, nominal_incidence_rad
 from polysight.products.processed import ProcessedScan, read_products
 from polysight.results import Figure, PatchFigures, Verdict, declared_figures, to_plain
 from polysight.store import MAX_BYTES
@@ -154,24 +153,14 @@ def image_dataset(scan: ProcessedScan) -> xarray.Dataset:
     if images.p_sigma is not None:
         about = "standard deviation of p: root of the mean variance of its real and imaginary part"
         data["p_sigma"] = _describe(PLANE, images.p_sigma, "1", about)
-    angle_deg = _incidence_deg(scan)
-    if angle_deg is not None:
+    angle_rad = nominal_incidence_rad(scan)
+    if np.isfinite(angle_rad).all():
         dims = ()
-        if np.ndim(angle_deg):
+        if np.ndim(angle_rad):
             dims = PLANE
-        data["incidence_deg"] = _describe(dims, angle_deg, "degree", "incidence angle")
-        data["incidence_rad"] = _describe(dims, np.radians(angle_deg), "rad", "incidence angle")
+        data["incidence_deg"] = _describe(dims, np.degrees(angle_rad), "degree", "incidence angle")
+        data["incidence_rad"] = _describe(dims, angle_rad, "rad", "incidence angle")
     return xarray.Dataset(data, _axes(scan), provenance(scan))
-
-
-def _incidence_deg(scan: ProcessedScan) -> Any:
-    """Return the incidence angle, or one for each pixel; None if it is unknown."""
-    incidence = scan.quality.incidence
-    if scan.rig is None:
-        return incidence.one_deg if incidence else None
-    if incidence and incidence.used == "by pixel":
-        return np.degrees(incidence_choice(scan.rig, scan.x_m, scan.y_m, "pixel").used_rad)
-    return np.degrees(specular_incidence_rad(scan.rig))
 
 
 def _axes(scan: ProcessedScan) -> dict[str, Any]:
@@ -240,8 +229,7 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
         raise _no_materials(scan)
     if scan.verdict is not None and not scan.verdict.usable:
         raise scan.verdict.error("the images are kept")
-    angle_deg = _incidence_deg(scan)
-    pixels = map_permittivity(scan, np.nan if angle_deg is None else np.radians(angle_deg))
+    pixels = map_permittivity(scan)
     mask = "True where the permittivity is possible and known to half of its size"
     data = {
         "permittivity": _describe(PLANE, pixels.value, "1", "relative permittivity eps' - j eps'' as a half space"),

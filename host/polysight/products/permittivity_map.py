@@ -14,7 +14,13 @@ import numpy.typing as npt
 from msgspec import UnsetType
 
 from polysight.materials import incidence_std_rad, permittivity_slope
-from polysight.polarimetry import correct_leakage, fresnel, permittivity_from_ratio
+from polysight.polarimetry import (
+    correct_leakage,
+    fresnel,
+    incidence_choice,
+    permittivity_from_ratio,
+    specular_incidence_rad,
+)
 from polysight.products.processed import ProcessedScan
 from polysight.results import ErrorBudget, LeakageError, Pair
 
@@ -49,7 +55,7 @@ class PermittivityMap:
     mask: npt.NDArray[np.bool_]
 
 
-def map_permittivity(scan: ProcessedScan, theta_rad: npt.ArrayLike) -> PermittivityMap:
+def map_permittivity(scan: ProcessedScan) -> PermittivityMap:
     """Return the permittivity of each pixel as a half space.
 
     The leakage and the incidence angle of the error budget are applied to every pixel. The pixels of a patch are moved
@@ -57,16 +63,10 @@ def map_permittivity(scan: ProcessedScan, theta_rad: npt.ArrayLike) -> Permittiv
 
     Eq. 3 is analytic in 1 / P, so the error of P adds the same variance to both parts; that of the angle adds its own.
     `p_sigma` holds noise, metal reference, and what is left of the leakage.
-
-    Parameters
-    ----------
-    scan
-        A scan with materials.
-    theta_rad
-        Nominal angle of incidence, one number or [ny, nx].
+    Without an incidence angle nothing is known.
     """
     budget = (scan.materials and scan.materials.error_budget) or None
-    angle_rad = _estimated_angle(np.asarray(theta_rad, np.float64), budget)
+    angle_rad = _estimated_angle(nominal_incidence_rad(scan), budget)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         measured = 1 / np.where(scan.valid, scan.p, np.nan).astype(np.complex128)
         inverse = measured
@@ -85,6 +85,19 @@ def map_permittivity(scan: ProcessedScan, theta_rad: npt.ArrayLike) -> Permittiv
         real_std = np.fmax(np.hypot(by_ratio * inverse_std, by_angle.real * angle_std_rad), least_real_std)
         loss_std = np.fmax(np.hypot(by_ratio * inverse_std, by_angle.imag * angle_std_rad), least_loss_std)
         return PermittivityMap(value, real_std, loss_std, _is_known_half_space(value, real_std, loss_std))
+
+
+def nominal_incidence_rad(scan: ProcessedScan) -> Real:
+    """Return the incidence angle of the rig, radians: one number or, if the scan used one by pixel, [ny, nx].
+
+    Not a number if neither rig nor angle are known.
+    """
+    incidence = scan.quality.incidence
+    if scan.rig is None:
+        return np.radians(np.float64(incidence.one_deg if incidence else np.nan))
+    if incidence and incidence.used == "by pixel":
+        return incidence_choice(scan.rig, scan.x_m, scan.y_m, "pixel").used_rad
+    return np.asarray(specular_incidence_rad(scan.rig))
 
 
 def _estimated_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:

@@ -29,8 +29,8 @@ export async function showProbe(scan, x, y, library, isCurrent) {
     ["|H|, |V|", `${db(told.h_db)}, ${db(told.v_db)}${told.referenced ? " beside metal" : ""}`],
     ["P", told.p.real === null ? "nothing" : `${complex(told.p)}${told.p_sigma === null ? "" : ` ± ${number(told.p_sigma, 2)}`}`]];
   if (told.permittivity) {
-    const error = { real_std: told.permittivity_sigma, imag_std: told.permittivity_sigma };
-    facts.push(["permittivity", `${permittivity({ ...told.permittivity, ...error })}, of this pixel alone`]);
+    const error = { real_std: told.permittivity_real_std, imag_std: told.permittivity_loss_std };
+    facts.push(["permittivity", `${permittivity({ ...told.permittivity, ...error })}, as a half space`]);
   } else facts.push(["permittivity", told.why]);
   if (told.patch) {
     const p = told.patch;

@@ -8,7 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,18 +35,22 @@ class Server:
     token: str
 
     def reading_process(self) -> int | None:
-        """Number of the reading process; None while there is none."""
-        return self._find_child(b"spawn_main")
+        """Number of the reading process, the one of low priority; None while there is none."""
+        return self._find_child(lambda priority: priority > 0)
 
     def door(self) -> int | None:
-        """Number of the process that accepts connections: it is forked, and has the command line of the server."""
-        return self._find_child(b"serve\0")
+        """Number of the process that accepts connections: it has the priority of the server."""
+        return self._find_child(lambda priority: priority == 0)
 
-    def _find_child(self, word: bytes) -> int | None:
+    def _find_child(self, is_wanted: Callable[[int], bool]) -> int | None:
+        own = os.getpriority(os.PRIO_PROCESS, self.program.pid)
         children = Path(f"/proc/{self.program.pid}/task").glob("*/children")
-        for pid in " ".join(path.read_text() for path in children).split():
-            if word in Path(f"/proc/{pid}/cmdline").read_bytes():
-                return int(pid)
+        for pid in map(int, " ".join(path.read_text() for path in children).split()):
+            # The tracker of the standard library's shared resources is no process of the server.
+            if b"resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                continue
+            if is_wanted(os.getpriority(os.PRIO_PROCESS, pid) - own):
+                return pid
         return None
 
 
@@ -81,7 +85,6 @@ def test_a_scan_is_aborted_while_the_reading_process_is_frozen_killed_and_starte
         wait_for(lambda: ask(server, "/api/scans")[0] == 200, "the list")
         first = server.reading_process()
         assert first is not None
-        assert os.getpriority(os.PRIO_PROCESS, first) > os.getpriority(os.PRIO_PROCESS, server.program.pid)
         os.kill(first, signal.SIGSTOP)
         assert post(server, "/api/control/pause?scan=one", token="wrong")[0] == 403
         assert post(server, "/api/control/pause?scan=one", token=server.token)[0] == 200

@@ -38,6 +38,10 @@ SAME_CURVATURE_M = 0.012
 CELL_M = 0.004
 MIN_POINTS = 8
 MIN_NEIGHBOURS = 6
+# Windows of one surface that tell how far slopes ripple. Near the border of a zone that reflects, its edge ripples by
+# waves of about 100 mm, which a fit within 24 mm takes for curvature.
+RIPPLE_REACH_M = 0.054
+MIN_AROUND = 16
 # Distance at which a window's own curvature counts as a slope: a third of a window.
 LEVER_OF_WINDOW_M = 0.011
 # A smaller radius is an edge or a wire: what it diffracts is no reflection.
@@ -155,20 +159,29 @@ def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
 def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
     """Replace the curvature of each echo's path by a fit to its neighbours in the same surface.
 
-    The fit takes the slopes of all windows near by, g + Q d at the distance d, for the unknown g and Q. What it leaves
-    of the slopes is an error of each that its own window does not show: ripple of edges and of other echoes. Its
-    variance is averaged over the neighbours, for one fit leaves few independent residuals.
+    What a fit leaves of the slopes is an error of each that its own window does not show: ripple of edges and of other
+    echoes. It is as long as the neighbourhood of the curvature, so it is judged over a larger one, in which curvature
+    may change. Its variance is averaged over the neighbours, for one fit leaves few independent residuals.
     """
     bend = echoes.bend.copy()
     slope_std = echoes.slope_std.copy()
+    fits: dict[bytes, SlopeFit] = {}
     for number in np.unique(segment[segment >= 0]):
         members = np.flatnonzero(segment == number)
         at_m = echoes.at_m[members, :2]
-        neighbours = scipy.spatial.KDTree(at_m).query_ball_point(at_m, NEIGHBOURHOOD_M)
+        tree = scipy.spatial.KDTree(at_m)
+        neighbours = tree.query_ball_point(at_m, NEIGHBOURHOOD_M)
+        around = tree.query_ball_point(at_m, RIPPLE_REACH_M)
         ripple = np.zeros((len(members), 2))
         is_fitted = np.array([len(near) >= MIN_NEIGHBOURS for near in neighbours])
         for place in np.flatnonzero(is_fitted):
-            bend[members[place]], ripple[place] = fit_bend(echoes, int(members[place]), members[neighbours[place]])
+            near = neighbours[place]
+            fit = _find_fit(fits, at_m[near] - at_m[place], may_change=False)
+            bend[members[place]], ripple[place] = fit.apply(echoes, members[near])
+            if len(around[place]) >= MIN_AROUND:
+                near = around[place]
+                fit = _find_fit(fits, at_m[near] - at_m[place], may_change=True)
+                _, ripple[place] = fit.apply(echoes, members[near])
         for place in np.flatnonzero(is_fitted):
             near = [other for other in neighbours[place] if is_fitted[other]]
             slope_std[members[place]] = np.hypot(
@@ -177,32 +190,57 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
     return replace(echoes, bend=bend, slope_std=slope_std)
 
 
-def fit_bend(echoes: Echoes, index: int, others: NDArray[np.int_]) -> tuple[Array, Array]:
-    """Symmetric curvature [2, 2] from the slopes of neighbours, and the variance [2] of their ripple.
+class SlopeFit:
+    """Least squares of slope g and curvature Q of a path from those of windows at the offsets `d` [n, 2], metres.
 
-    Ripple is what is neither a smooth change nor noise of the windows. Where there is none, its variance scatters about
-    zero.
+    Slopes are g + Q d at the distance d. If curvature `may_change`, its four derivatives are fitted too. The windows'
+    own curvatures count as slopes at the distance LEVER_OF_WINDOW_M.
     """
-    d = (echoes.at_m[others] - echoes.at_m[index])[:, :2]
-    zero = np.zeros(len(d))
-    ones = np.ones(len(d))
-    # Unknown: g_x, g_y, Q_xx, Q_xy, Q_yy.
-    along_x = np.stack([ones, zero, d[:, 0], d[:, 1], zero], axis=1)
-    along_y = np.stack([zero, ones, zero, d[:, 0], d[:, 1]], axis=1)
-    matrix = np.stack([along_x, along_y])
-    slopes = echoes.slope[others].T
-    # The windows' own curvatures count as slopes at this distance.
-    weight_m2 = LEVER_OF_WINDOW_M**2 * len(d)
-    bend = echoes.bend[others].mean(axis=0)
-    own = np.array([0.0, 0.0, bend[0, 0], bend[0, 1], bend[1, 1]])
-    weights = np.diag([0.0, 0.0, weight_m2, weight_m2, weight_m2])
-    inverse = np.linalg.inv(along_x.T @ along_x + along_y.T @ along_y + weights)
-    fitted = inverse @ (along_x.T @ slopes[0] + along_y.T @ slopes[1] + weights @ own)
-    left = np.mean((slopes - matrix @ fitted) ** 2, axis=1)
-    noise, ripple = correlate_windows(d)
-    noise_left = find_share_left(noise, matrix, inverse) * np.mean(echoes.slope_std[others] ** 2, axis=0)
-    variance = (left - noise_left) / find_share_left(ripple, matrix, inverse)
-    return np.array([[fitted[2], fitted[3]], [fitted[3], fitted[4]]]), variance
+
+    def __init__(self, d: Array, *, may_change: bool) -> None:
+        x, y = d.T
+        zero = np.zeros(len(d))
+        one = np.ones(len(d))
+        # Unknown: g_x, g_y, Q_xx, Q_xy, Q_yy, and with x and y the change of Q_xx, of Q_xy, and of Q_yy.
+        slope_x = [one, zero, x, y, zero, x * x / 2, x * y, y * y / 2, zero]
+        slope_y = [zero, one, zero, x, y, zero, x * x / 2, x * y, y * y / 2]
+        bend_xx = [zero, zero, one, zero, zero, x, y, zero, zero]
+        bend_xy = [zero, zero, zero, one, zero, zero, x, y, zero]
+        bend_yy = [zero, zero, zero, zero, one, zero, zero, x, y]
+        rows = np.moveaxis(np.array([slope_x, slope_y, bend_xx, bend_xy, bend_yy]), 1, 2)
+        if not may_change:
+            rows = rows[..., :5]
+        rows[2:] *= LEVER_OF_WINDOW_M
+        self.matrix = rows[:2]
+        # The windows of a single line do not tell all derivatives.
+        inverse = np.linalg.pinv(np.einsum("rnp,rnq->pq", rows, rows), hermitian=True)
+        self.answer = np.einsum("pq,rnq->prn", inverse, rows)
+        noise, ripple = correlate_windows(d)
+        self.noise_left = find_share_left(noise, self.matrix, inverse)
+        self.ripple_left = find_share_left(ripple, self.matrix, inverse)
+
+    def apply(self, echoes: Echoes, others: NDArray[np.int_]) -> tuple[Array, Array]:
+        """Return the symmetric curvature [2, 2], and the variance [2] of the slopes' ripple.
+
+        Ripple is what is neither a smooth change nor noise of the windows. Where there is none, its variance scatters
+        about zero.
+        """
+        slopes = echoes.slope[others].T
+        bends = echoes.bend[others]
+        levers = LEVER_OF_WINDOW_M * np.stack([bends[:, 0, 0], bends[:, 0, 1], bends[:, 1, 1]])
+        fitted = np.einsum("prn,rn->p", self.answer, np.concatenate([slopes, levers]))
+        left = np.mean((slopes - self.matrix @ fitted) ** 2, axis=1)
+        noise_left = self.noise_left * np.mean(echoes.slope_std[others] ** 2, axis=0)
+        variance = (left - noise_left) / self.ripple_left
+        return np.array([[fitted[2], fitted[3]], [fitted[3], fitted[4]]]), variance
+
+
+def _find_fit(fits: dict[bytes, SlopeFit], d: Array, *, may_change: bool) -> SlopeFit:
+    """Return the fit of a pattern of windows; most windows of a scan have the same neighbours."""
+    pattern = np.round(d / SAME_WINDOW_M).astype(np.int16).tobytes() + bytes([may_change])
+    if pattern not in fits:
+        fits[pattern] = SlopeFit(d, may_change=may_change)
+    return fits[pattern]
 
 
 def correlate_windows(d: Array) -> tuple[Array, Array]:
@@ -223,7 +261,7 @@ def find_share_left(correlation: Array, matrix: Array, inverse: NDArray) -> Arra
     """Share [2] of the variance of errors of both slopes that a fit leaves as residuals.
 
     trace((1 - S) C (1 - S)') / n, with S = `matrix` `inverse` `matrix`' the smoother and C the correlation [2, n, n].
-    `matrix` [2, n, 5]: both slopes in terms of the unknown; `inverse` [5, 5]: of the normal matrix.
+    `matrix` [2, n, p]: both slopes in terms of the unknown; `inverse` [p, p]: of the normal matrix.
     """
     transposed = np.swapaxes(matrix, 1, 2)
     common = transposed @ correlation @ matrix

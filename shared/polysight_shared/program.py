@@ -15,6 +15,8 @@ from types import FrameType
 _RETRY_S = 0.02
 # <linux/prctl.h>
 _PR_SET_PDEATHSIG = 1
+# SIGALRM: the next look of an interrupted command.
+_INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
 
 
 def expand_home(words: Sequence[str]) -> list[str]:
@@ -86,6 +88,34 @@ def _is_importing(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
+
+
+@contextmanager
+def delay_interrupts() -> Iterator[None]:
+    """Block Ctrl-C and SIGTERM in this thread until the block ends.
+
+    Around the start of a process: an exception inside a fork is lost, and the new process begins with both blocked,
+    until it calls :func:`ignore_interrupts`.
+    """
+    old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, old_mask)
+
+
+def ignore_interrupts(*numbers: signal.Signals) -> None:
+    """Ignore these signals in a new process, which its parent ends; programs that it starts do not ignore them.
+
+    Ctrl-C reaches every process of a terminal. The other interrupts have their default effect.
+    """
+    for number in _INTERRUPTS:
+        signal.signal(number, _do_nothing if number in numbers else signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _INTERRUPTS)
+
+
+def _do_nothing(number: int, frame: FrameType | None) -> None:
+    pass
 
 
 def flush_standard_output() -> None:

@@ -120,6 +120,48 @@ def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_no
         assert reading.recv(100).startswith(b"HTTP/1.1 200")
 
 
+INTERRUPT_AT_FORKS = """
+import os, signal, sys
+from polysight.cli.main import main
+forks = iter("123")
+def interrupt():
+    if next(forks) in sys.argv[1]:
+        signal.raise_signal(signal.SIGINT)
+os.register_at_fork(**{sys.argv[2]: interrupt})
+sys.exit(main(sys.argv[3:]))
+"""
+
+
+def serve_interrupted(forks: str, where: str, folder: Path) -> tuple[int, str]:
+    """Exit status and stderr of a server, interrupted at these forks, in itself or in the new processes."""
+    words = [sys.executable, "-c", INTERRUPT_AT_FORKS, forks, where, "serve", str(folder), "--port", "0"]
+    environment = os.environ | {"XDG_STATE_HOME": str(folder)}
+    said = ""
+    with subprocess.Popen(words, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True) as program:
+        assert program.stderr is not None
+        for line in program.stderr:
+            said += line
+            if line.startswith("Ctrl-C"):
+                program.send_signal(signal.SIGINT)
+    return program.returncode, said
+
+
+@pytest.mark.parametrize("fork", "12")
+def test_an_interrupt_at_a_fork_is_not_lost(tmp_path, fork):
+    """Python drops exceptions of what it calls at a fork: the server would go on."""
+    status, said = serve_interrupted(fork, "after_in_parent", tmp_path)
+    assert status == 128 + signal.SIGINT
+    assert said.splitlines() == ["polysight serve: starting", "polysight serve: stopped"]
+
+
+def test_an_interrupt_of_new_processes_is_left_to_the_server(tmp_path):
+    """Ctrl-C reaches all processes of a terminal, and those that begin are no server yet."""
+    status, said = serve_interrupted("12", "after_in_child", tmp_path)
+    assert status == 128 + signal.SIGINT
+    assert "Traceback" not in said
+    assert "Exception ignored" not in said
+
+
 @pytest.mark.parametrize(
     ("head", "answered_here"),
     [

@@ -122,16 +122,6 @@ def ignore_hangup() -> Iterator[None]:
         signal.signal(signal.SIGHUP, old_handler)
 
 
-@contextmanager
-def delay_interrupts() -> Iterator[None]:
-    """Block SIGINT and SIGTERM in this thread until the block ends."""
-    old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, old_mask)
-
-
 class ScanCommand(StrEnum):
     """Commands for a running scan; the values are the names of their files."""
 

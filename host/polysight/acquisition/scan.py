@@ -15,7 +15,7 @@ from typing import Any
 import zmq
 
 from polysight.acquisition.capture_rig import CaptureRig
-from polysight.acquisition.control import StopRequest, delay_interrupts, stop_on_interrupt
+from polysight.acquisition.control import StopRequest, stop_on_interrupt
 from polysight.acquisition.pi_client import PiClient
 from polysight.acquisition.progress import (
     OnProgress,
@@ -71,6 +71,7 @@ from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import PolysightError, ScanError, advice
 from polysight_shared.messages import AnyEvent, BeginRun, HelloReply, RowStarted, RunStarted, is_simulated
+from polysight_shared.program import delay_interrupts
 from polysight_shared.raster import Row, check_burst_fits, plan_raster
 from polysight_shared.tables import to_builtins
 

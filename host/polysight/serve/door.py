@@ -28,6 +28,7 @@ from uvicorn.server import ServerState
 
 from polysight.serve.front import EndingServer
 from polysight.serve.guard import HEAD_BYTES, TOKEN_HEADER
+from polysight_shared.program import delay_interrupts, ignore_interrupts
 
 COMMAND = b"POST /api/control/"
 TOKEN_LINE = TOKEN_HEADER.lower().encode()
@@ -179,13 +180,13 @@ def open_door(listener: socket.socket, token: str, config: uvicorn.Config) -> It
 
     def run() -> None:
         # Ctrl-C and a service manager's end reach the whole group; the door ends when the pages' end is closed.
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
+        ignore_interrupts(signal.SIGINT, signal.SIGTERM)
         pages_end.close()
         asyncio.run(_keep_door(listener, door_end, token, config))
 
     process = multiprocessing.get_context("fork").Process(target=run, name="door", daemon=True)
-    process.start()
+    with delay_interrupts():
+        process.start()
     door_end.close()
     pages_end.setblocking(False)
     try:

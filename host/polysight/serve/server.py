@@ -13,6 +13,7 @@ import logging
 import multiprocessing
 import os
 import secrets
+import signal
 import socket
 import ssl
 import stat
@@ -21,7 +22,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from multiprocessing import connection
+from multiprocessing import connection, resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -41,6 +42,7 @@ from polysight.serve.stage import StageControl
 from polysight.serve.welcome import describe_server
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.program import delay_interrupts, ignore_interrupts
 
 # Priority of the reading process, below capture and scan.
 NICE = 10
@@ -239,7 +241,10 @@ def _reading(first: BaseProcess, shown: Shown, path: Path) -> Iterator[None]:
                 process.join()
                 return
             process = context.Process(target=run_reader, args=(shown, path), name="reading", daemon=True)
-            process.start()
+            # Else `start` begins it, and unblocks Ctrl-C.
+            resource_tracker.ensure_running()
+            with delay_interrupts():
+                process.start()
 
     keeper = threading.Thread(target=keep_running, name="keeper", daemon=True)
     keeper.start()
@@ -261,12 +266,15 @@ def start_first_reader(shown: Shown, path: Path, listener: socket.socket) -> Bas
         run_reader(shown, path)
 
     process = multiprocessing.get_context("fork").Process(target=run, name="reading", daemon=True)
-    process.start()
+    with delay_interrupts():
+        process.start()
     return process
 
 
 def run_reader(shown: Shown, path: Path) -> None:
     """Run the reading process until it is ended, or the process that started it is gone."""
+    # Else it may end in a traceback before the server does.
+    ignore_interrupts(signal.SIGINT)
     programs = None
     if shown.control and shown.only is None:
         programs = Programs()

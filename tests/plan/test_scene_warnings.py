@@ -43,10 +43,19 @@ def test_the_own_scene_is_good_as_it_is():
         ([plate(150)], ["aperture"]),
         ([plate(0, thickness_mm=1.2)], ["thickness"]),
         ([plate(0, thickness_mm=40.0)], []),
+        # They reflect nothing, so there is no ratio to be changed.
+        ([plate(0, thickness_mm=3.0, permittivity=[1.0, 0.0])], []),
+        ([plate(0, thickness_mm=0.0)], []),
     ],
 )
 def test_each_fault_of_a_scene_is_named(tmp_path, plates, expected):
     assert topics(tmp_path, *plates) == expected
+
+
+@pytest.mark.parametrize("axis", ["columns", "rows"])
+def test_one_row_or_column_is_too_small_an_aperture(tmp_path, axis):
+    """It resolves nothing across it: no size and no gap is large enough."""
+    assert set(topics(tmp_path, plate(-30), plate(30), grid=GRID | {axis: 1})) == {"aperture"}
 
 
 def test_plan_and_simulate_say_it(tmp_path, capsys):

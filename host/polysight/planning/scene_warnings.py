@@ -75,8 +75,10 @@ def warn_of_scene(rig: Instrument, plates: Sequence[Plate]) -> Iterator[Finding]
         yield from _warn_of_size(plate, cell_mm)
         yield from _warn_of_aperture(plate, rig)
         yield from _warn_of_thickness(plate, rig)
-    for first, second in combinations(plates, 2):
-        yield from _warn_of_gap(first, second, cell_mm)
+    # One row, or one column, resolves nothing across it; the notes of the aperture say so.
+    if all(map(math.isfinite, cell_mm)):
+        for first, second in combinations(plates, 2):
+            yield from _warn_of_gap(first, second, cell_mm)
 
 
 def _warn_of_gap(first: Plate, second: Plate, cell_mm: Pair) -> Iterator[Finding]:
@@ -102,7 +104,7 @@ def _warn_of_size(plate: Plate, cell_mm: Pair) -> Iterator[Finding]:
     margin_mm = SegmentSettings().margin_mm
     for axis in (0, 1):
         least_mm = 2 * margin_mm + cell_mm[axis]
-        if plate.size_mm[axis] < least_mm:
+        if plate.size_mm[axis] < least_mm < math.inf:
             text = (
                 f"{plate.name} is {plate.size_mm[axis]:.0f} mm wide in {'xy'[axis]}; below {math.ceil(least_mm)} mm no"
                 " pixel is free of its edges"
@@ -135,6 +137,9 @@ def _warn_of_thickness(plate: Plate, rig: Instrument) -> Iterator[Finding]:
     theta_rad = specular_incidence_rad(rig)
     sheet_s, sheet_p = multilayer(eps, plate.thickness_mm / 1e3, frequencies_hz, theta_rad)
     bulk_s, bulk_p = multilayer(eps, np.inf, frequencies_hz, theta_rad)
+    if not (np.all(sheet_s) and np.all(bulk_s)):
+        # Nothing is reflected: air, or no thickness.
+        return
     # V / H stays finite at the Brewster angle.
     change = np.abs(sheet_p / sheet_s - bulk_p / bulk_s) / np.maximum(np.abs(bulk_p / bulk_s), LARGEST_RIPPLE)
     if change.max() > LARGEST_RIPPLE:

@@ -75,12 +75,13 @@ SHEETS = (
             Wire("brake coil -", "15 (2C out)", "power"),
             Wire("contactor 6/T3", "9 (COM)", "power"),
             Wire("contactor 6/T3", "brake coil +", "power"),
-            Wire("GND", "8 (E)", "ground"),
+            Wire("supply -V, UNO GND", "8 (E)", "ground"),
         ),
         (
             "Brake: closed without current. It closes with the",
             "emergency stop, after a reset, with motors off.",
             "Above 0.4 A: a relay with its own diode instead.",
+            "UNO in reset or unplugged: motors hold, brake closed.",
         ),
     ),
     Sheet(
@@ -95,13 +96,14 @@ SHEETS = (
     Sheet(
         "wiring-mains", "Mains side of the drivers' supply", "inlet (IEC C14)", "LRS-150-24",
         (
-            Wire("L, fuse, switch", "1 (AC/L)", "power", "T2A"),
+            Wire("L, fuse, switch", "1 (AC/L)", "power", "T3.15A"),
             Wire("N, switch", "2 (AC/N)", "power"),
             Wire("PE, no switch", "3 (earth)", "ground"),
             Wire("PE", "metal frame", "ground"),
         ),
         (
             "Voltage selector of the supply FIRST: 115 or 230 V.",
+            "Fuse: T3.15A at 230 V, T5A at 115 V.",
             "Covered terminals, a residual current device in the",
             "socket; by who may work on mains where you are.",
         ),

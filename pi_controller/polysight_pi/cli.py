@@ -113,7 +113,7 @@ def _buzz(args: argparse.Namespace, instrument: Instrument) -> int:
 
     refuse_beside_service(instrument)
     if not args.json:
-        _write(f"{args.axis}: 1 mm towards larger coordinates, 2 mm back, 1 mm forward")
+        _write(f"{args.axis}: 1 mm away from its limit switch, 2 mm back, 1 mm forward")
     with BenchStage(instrument.stage) as stage:
         return _print_position(args, stage.buzz(args.axis))
 

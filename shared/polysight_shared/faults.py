@@ -113,10 +113,10 @@ EXPLANATIONS: dict[int, Explanation] = {
     StageError.LIMIT_SWITCH: Explanation(
         "a limit switch was hit",
         "lost steps, or a wrong centre",
-        "move the stage off the switch by hand, then polysight-pi home",
+        "polysight-pi home, which leaves the switch by itself",
     ),
     StageError.HOMING_FAILED: Explanation(
-        "homing did not find the switch", "switch, wiring or direction", "check the switch and board.h"
+        "homing did not find the switch", "switch, wiring or direction", "check the switch, and the direction (polysight-pi buzz)"
     ),
     StageError.EMERGENCY_STOP: Explanation(
         "the emergency stop is pressed", "somebody pressed it", "release it, then polysight-pi home"

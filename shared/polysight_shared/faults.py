@@ -116,7 +116,9 @@ EXPLANATIONS: dict[int, Explanation] = {
         "polysight-pi home, which leaves the switch by itself",
     ),
     StageError.HOMING_FAILED: Explanation(
-        "homing did not find the switch", "switch, wiring or direction", "check the switch, and the direction (polysight-pi buzz)"
+        "homing did not find the switch",
+        "switch, wiring or direction",
+        "check the switch, and the direction (polysight-pi buzz)",
     ),
     StageError.EMERGENCY_STOP: Explanation(
         "the emergency stop is pressed", "somebody pressed it", "release it, then polysight-pi home"

@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 import msgspec
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from polysight.imaging import Images
@@ -122,10 +123,10 @@ PIXEL = (
 def skip_rendering() -> Iterator[None]:
     """Save every figure as one pixel: rendering takes seconds per report, and tests/report covers it."""
 
-    def save(_: Figure, file: BinaryIO, **_options: Any) -> None:
+    def save(_: FigureCanvasAgg, file: BinaryIO, **_options: Any) -> None:
         file.write(PIXEL)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", save)
+        patch.setattr(FigureCanvasAgg, "print_png", save)
         patch.setattr(Figure, "draw_without_rendering", lambda _: None)
         yield

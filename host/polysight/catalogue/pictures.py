@@ -15,20 +15,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.imaging import Images
-from polysight.materials import axis_mm
 from polysight.polarimetry import specular_incidence_rad
-from polysight.products import PermittivityMap, ProcessedScan, map_permittivity
+from polysight.products import (
+    CHANNELS,
+    QUANTITIES,
+    Limits,
+    MapValues,
+    PermittivityMap,
+    ProcessedScan,
+    map_images,
+    map_permittivity,
+    map_scan,
+    percentile,
+    signal_opacity,
+)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
 Real = NDArray[np.float64]
-Limits = tuple[float, float]
 AMPLITUDE = "cividis"
 PHASE = "twilight"
-RANGE_DB = 35.0
-# Relative to the brightest: fainter pixels are noise; up to the second level phases fade out.
-FAINT_DB = -26.0
-CLEAR_DB = -18.0
+UNITS = {"amplitude": "dB", "phase": "°"}
+COLOURS = {"amplitude": AMPLITUDE, "phase": PHASE}
 THUMBNAIL_PIXELS = 96
 
 
@@ -54,30 +62,7 @@ class Pixels(ProcessedScan):
     @cached_property
     def clear(self) -> NDArray[np.bool_]:
         """Pixels bright enough in both channels for a meaningful ratio."""
-        clear = self.valid & np.isfinite(self.h) & np.isfinite(self.v)
-        for channel in (self.h, self.v):
-            amplitude = np.abs(channel)
-            clear = clear & (amplitude > percentile(amplitude, clear, 99.5) * 10 ** (FAINT_DB / 20))
-        return clear
-
-    @cached_property
-    def x_mm(self) -> Real:
-        """Pixel centres from the middle of the image, [nx]."""
-        return axis_mm(self.x_m)
-
-    @cached_property
-    def y_mm(self) -> Real:
-        """The same, [ny]."""
-        return axis_mm(self.y_m)
-
-    @property
-    def extent_mm(self) -> tuple[float, float, float, float]:
-        """Left, right, lower and upper edge of the image."""
-        x = self.x_mm
-        y = self.y_mm
-        half_x = (x[1] - x[0]) / 2
-        half_y = (y[1] - y[0]) / 2
-        return float(x[0] - half_x), float(x[-1] + half_x), float(y[0] - half_y), float(y[-1] + half_y)
+        return signal_opacity(self.images, "p") > 0
 
     @cached_property
     def p_std(self) -> Real:
@@ -133,17 +118,6 @@ class Picture:
     colours: str = AMPLITUDE
 
 
-@dataclass(frozen=True)
-class Values:
-    """Numbers and opacity [ny, nx] of a picture, and the limits of its colours."""
-
-    numbers: NDArray[Any]
-    opacity: NDArray[Any]
-    limits: Limits
-    unit: str = ""
-    colours: str = AMPLITUDE
-
-
 class Map(msgspec.Struct, frozen=True):
     """A picture of a processed scan; some need a reference of metal."""
 
@@ -175,7 +149,12 @@ def draw(images: Images) -> dict[str, Picture]:
 
     P is that of the given images: during a scan it is not referenced to metal.
     """
-    return {name: draw_values(values) for name, values in _channel_values(images).items()}
+    pictures = {}
+    for channel in CHANNELS:
+        for quantity in QUANTITIES:
+            values = map_images(images, channel, quantity)
+            pictures[f"{channel}_{quantity}"] = draw_values(values, UNITS[quantity], COLOURS[quantity])
+    return pictures
 
 
 def draw_products(pixels: Pixels, name: str, limits: Limits | None = None) -> Picture:
@@ -190,41 +169,26 @@ def draw_products(pixels: Pixels, name: str, limits: Limits | None = None) -> Pi
         )  # fmt: skip
     if MAPS[name].needs_metal:
         values = _derive_values(pixels, name)
+        unit = ""
     else:
-        values = _channel_values(pixels)[name]
+        channel, _, quantity = name.partition("_")
+        values = map_scan(pixels, channel, quantity)
+        unit = UNITS[quantity]
     if limits is not None:
         values = replace(values, limits=limits)
-    return draw_values(values)
+    return draw_values(values, unit, MAPS[name].colours)
 
 
 def thumbnail(pixels: Pixels) -> Picture:
     """A small picture of the amplitude of H."""
     step = max(1, -(-max(pixels.h.shape) // THUMBNAIL_PIXELS))
-    values = _amplitude(pixels.h, pixels.valid & np.isfinite(pixels.h))
+    values = map_scan(pixels, "h", "amplitude")
     small = (slice(None, None, step), slice(None, None, step))
-    return draw_values(replace(values, numbers=values.numbers[small], opacity=values.opacity[small]))
+    smaller = replace(values, numbers=values.numbers[small], opacity=values.opacity[small])
+    return draw_values(smaller, UNITS["amplitude"])
 
 
-def _channel_values(images: Images | Pixels) -> dict[str, Values]:
-    visible = images.valid & np.isfinite(images.h) & np.isfinite(images.v)
-    values = {}
-    for name, channel in (("h", images.h), ("v", images.v)):
-        values[f"{name}_amplitude"] = _amplitude(channel, visible)
-        values[f"{name}_phase"] = _phase(channel, _fade(_below_brightest(channel, visible)) * visible)
-    ratio = np.divide(images.h, images.v, out=np.zeros_like(images.h), where=visible & (images.v != 0))
-    fainter = np.minimum(_below_brightest(images.h, visible), _below_brightest(images.v, visible))
-    opacity = _fade(fainter) * visible
-    level = _db(ratio)
-    low = percentile(level, opacity > 0.5, 5, -10.0)
-    high = percentile(level, opacity > 0.5, 95, 10.0)
-    middle = (low + high) / 2
-    half = max((high - low) / 2, 3.0)
-    values["p_amplitude"] = Values(level, opacity, (middle - half, middle + half), "dB")
-    values["p_phase"] = _phase(ratio, opacity)
-    return values
-
-
-def _derive_values(pixels: Pixels, name: str) -> Values:
+def _derive_values(pixels: Pixels, name: str) -> MapValues:
     """Maps derived from P: its error, permittivity, loss."""
     if not pixels.referenced:
         raise DataError(
@@ -241,58 +205,20 @@ def _derive_values(pixels: Pixels, name: str) -> Values:
     # Edges of plates have any value.
     high = percentile(values, visible, 85, 1.0)
     low = 1.0 if name == "permittivity" else 0.0
-    return mask_values(values, visible, (low, max(1.3 * high, low + 1e-3)))
+    return MapValues(values, visible, (low, max(1.3 * high, low + 1e-3)))
 
 
-def mask_values(values: NDArray[Any], visible: NDArray[np.bool_], limits: Limits, colours: str = AMPLITUDE) -> Values:
-    """Numbers without a unit, to be drawn; pixels that are not `visible` are transparent."""
-    return Values(np.where(visible, values, limits[0]), visible.astype(float), limits, colours=colours)
-
-
-def _amplitude(channel: NDArray[np.complex64], visible: NDArray[np.bool_]) -> Values:
-    level = _db(channel)
-    brightest = percentile(level, visible, 99.8)
-    return Values(level, visible.astype(float), (brightest - RANGE_DB, brightest), "dB")
-
-
-def _phase(channel: NDArray[np.complex64], opacity: NDArray[Any]) -> Values:
-    return Values(np.degrees(np.angle(channel)), opacity, (-180.0, 180.0), "°", PHASE)
-
-
-def _db(channel: NDArray[np.complex64]) -> Real:
-    amplitude = np.nan_to_num(np.abs(channel).astype(float), nan=0.0, posinf=0.0)
-    return 20 * np.log10(np.maximum(amplitude, 1e-12))
-
-
-def _below_brightest(channel: NDArray[np.complex64], visible: NDArray[np.bool_]) -> Real:
-    """Level relative to the brightest visible pixels, dB."""
-    level = _db(channel)
-    return level - percentile(level, visible, 99.5)
-
-
-def percentile(values: Real, mask: NDArray[np.bool_], percent: float, default: float = 0.0) -> float:
-    """A percentile of the values under a mask; `default` if it is empty."""
-    if mask.any():
-        return float(np.percentile(values[mask], percent))
-    return default
-
-
-def _fade(level_db: Real) -> Real:
-    return np.clip((level_db - FAINT_DB) / (CLEAR_DB - FAINT_DB), 0.0, 1.0)
-
-
-def draw_values(values: Values) -> Picture:
-    """Draw numbers as a PNG with one pixel each."""
+def draw_values(values: MapValues, unit: str = "", colours: str = AMPLITUDE) -> Picture:
+    """Draw numbers as a PNG with one pixel each; pixels without a number must be transparent."""
     # Imported here: it loads for half a second, and lists need no picture.
     import matplotlib
 
     low, high = values.limits
-    rgba = matplotlib.colormaps[values.colours](np.clip((values.numbers - low) / (high - low), 0.0, 1.0))
+    shown = np.where(values.opacity > 0, values.numbers, low)
+    rgba = matplotlib.colormaps[colours](np.clip((shown - low) / (high - low), 0.0, 1.0))
     rgba[..., 3] = values.opacity
-    digits = 1 if values.unit else 3
-    return Picture(
-        _png(rgba, "lower"), round(float(low), digits), round(float(high), digits), values.unit, values.colours
-    )
+    digits = 1 if unit else 3
+    return Picture(_png(rgba, "lower"), round(float(low), digits), round(float(high), digits), unit, colours)
 
 
 def colour_bar(colours: str) -> bytes:

@@ -12,7 +12,7 @@ import numpy as np
 import skimage
 from numpy.typing import NDArray
 
-from polysight.catalogue.pictures import MAPS, Map, Picture, Pixels, draw_values, mask_values, percentile
+from polysight.catalogue.pictures import AMPLITUDE, MAPS, Map, Picture, Pixels, draw_values
 from polysight.catalogue.scans import read_generation
 from polysight.materials import PATCHES, SIMULATED_LIBRARY, Library, is_metal
 from polysight.pipeline import Pipeline
@@ -23,9 +23,11 @@ from polysight.products import (
     QUALITY,
     REPORT,
     SCAN,
+    MapValues,
     find_labels,
     find_scan_folder,
     label_folder,
+    percentile,
     read_products,
 )
 from polysight.results import ComplexNumber, PatchFigures, PermittivityFigures, Verdict
@@ -599,6 +601,5 @@ def draw_comparison(comparison: Comparison, name: str) -> Picture:
     reach = max(percentile(np.abs(values), visible, share, 1.0), 1e-3)
     if name == "sigmas":
         reach = max(reach, 2 * SIGNIFICANT)
-    if is_signed:
-        return draw_values(mask_values(values, visible, (-reach, reach), DIFFERENCE))
-    return draw_values(mask_values(values, visible, (0.0, reach)))
+    limits = (-reach, reach) if is_signed else (0.0, reach)
+    return draw_values(MapValues(values, visible, limits), colours=DIFFERENCE if is_signed else AMPLITUDE)

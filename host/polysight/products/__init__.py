@@ -28,6 +28,16 @@ from polysight.products.folder import (
     making_products,
     products_locked,
 )
+from polysight.products.maps import (
+    CHANNELS,
+    QUANTITIES,
+    Limits,
+    MapValues,
+    map_images,
+    map_scan,
+    percentile,
+    signal_opacity,
+)
 from polysight.products.permittivity_map import PermittivityMap, map_permittivity
 from polysight.products.processed import (
     FINISHED,
@@ -48,6 +58,7 @@ from polysight.products.processed import (
 )
 
 __all__ = [
+    "CHANNELS",
     "FINISHED",
     "IMAGE",
     "LABELS",
@@ -55,8 +66,11 @@ __all__ = [
     "MATERIALS",
     "PLANE",
     "QUALITY",
+    "QUANTITIES",
     "REPORT",
     "SCAN",
+    "Limits",
+    "MapValues",
     "PermittivityMap",
     "ProcessedScan",
     "Rows",
@@ -69,9 +83,12 @@ __all__ = [
     "image_dataset",
     "label_folder",
     "making_products",
+    "map_images",
     "map_permittivity",
+    "map_scan",
     "patch_coordinates",
     "patch_dataset",
+    "percentile",
     "permittivity_dataset",
     "products_locked",
     "ranges_text",
@@ -79,6 +96,7 @@ __all__ = [
     "read_netcdf",
     "read_products",
     "rx_gains",
+    "signal_opacity",
     "surface_dataset",
     "write_image",
     "write_json",

@@ -29,6 +29,7 @@ from polysight.materials import (
     TruthPlate,
     axis_mm,
     box_mask,
+    image_extent_mm,
     predict_pixel_accuracy,
     read_patches,
 )
@@ -244,6 +245,22 @@ class ProcessedScan:
     def y_m(self) -> npt.NDArray[np.float64]:
         """Pixel centres, float64 [ny], rig frame."""
         return self.images.y_m
+
+    @property
+    def x_mm(self) -> npt.NDArray[np.float64]:
+        """Pixel centres from the middle of the image, float64 [nx]."""
+        return axis_mm(self.x_m)
+
+    @property
+    def y_mm(self) -> npt.NDArray[np.float64]:
+        """Pixel centres from the middle of the image, float64 [ny]."""
+        return axis_mm(self.y_m)
+
+    @property
+    def extent_mm(self) -> tuple[float, float, float, float]:
+        """Left, right, lower and upper edge of the image, from its middle."""
+        left, lower, right, upper = image_extent_mm(self.x_m, self.y_m)
+        return left, right, lower, upper
 
     @property
     def valid(self) -> Mask:

@@ -24,7 +24,7 @@ from matplotlib.text import Text
 from msgspec import UNSET
 
 from polysight.materials import Box, axis_mm
-from polysight.products import ProcessedScan
+from polysight.products import Limits, ProcessedScan, map_scan
 from polysight.report.permittivity_plot import permittivity_figure
 from polysight.report.style import (
     BAR_IN,
@@ -41,7 +41,6 @@ from polysight.report.style import (
     colour_bar,
     draw_outline,
     dress,
-    extent_mm,
     figure_label,
     fit_labels,
     new_figure,
@@ -87,18 +86,10 @@ _MAX_DEG = 300.0
 _METAL_BOX = "#ff9e3d"
 _OTHER_BOX = "#ffffff"
 _FOCUS_RANGE_DB = 30.0
-# Without a metal reference the colours end at this percentile: single bright pixels do not darken the rest.
-_BRIGHT_PERCENTILE = 99.8
-# Range of the amplitude's colours below their end.
-_AMPLITUDE_RANGE_DB = 35
-# Ratio and phase begin to show this far below the brightest pixels, and are opaque 8 dB above that.
-_FADE_BEGINS_DB = -26
-_FADE_WIDTH_DB = 8
 # Room around patches and plates: beside them, below them, and above them, where their names stand.
 _SIDE_ROOM_MM = 20
 _LOWER_ROOM_MM = 12
 _UPPER_ROOM_MM = 24
-Limits = tuple[float, float]
 # Share of a map's height that a label needs.
 _LABEL_HEIGHT = 0.05
 # Share of a map's width between two maps: a colour bar's and an axis's numbers stand there.
@@ -107,27 +98,17 @@ _BETWEEN = 0.26
 _POSITION_COLOURS = ("#dfe5ec", "#882255")
 
 
-def _mask_invalid(scan: ProcessedScan, values: npt.NDArray) -> npt.NDArray:
-    return np.ma.masked_array(values, ~np.isfinite(values) | ~scan.valid)
-
-
-def _db(values: npt.NDArray) -> npt.NDArray[np.float64]:
-    return 20 * np.log10(np.maximum(np.nan_to_num(np.abs(values), nan=0.0, posinf=0.0), 1e-9))
-
-
 def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     """Return the range of the phase of P inside the judged patches, degrees; None if it is nearly the whole circle.
 
     The metal reference, 0 degrees by definition, counts only if there is no other patch. The range is taken around the
     circular mean, so that values on both sides of 180 degrees lie side by side: limits may pass 180.
     """
-    x = axis_mm(scan.x_m)
-    y = axis_mm(scan.y_m)
     inside: list[npt.NDArray] = []
     judged_patches = [patch for patch in scan.segments if patch.refused is None and not patch.metal_reference]
     for patch in judged_patches or scan.segments:
-        near_x = np.abs(x - patch.centre_x_mm) <= _INSIDE * patch.width_mm / 2
-        near_y = np.abs(y - patch.centre_y_mm) <= _INSIDE * patch.height_mm / 2
+        near_x = np.abs(scan.x_mm - patch.centre_x_mm) <= _INSIDE * patch.width_mm / 2
+        near_y = np.abs(scan.y_mm - patch.centre_y_mm) <= _INSIDE * patch.height_mm / 2
         part = scan.p[np.ix_(near_y, near_x)]
         part = part[np.isfinite(part) & (part != 0)]
         if part.size:
@@ -156,68 +137,24 @@ def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | No
 
     Phases span -180 to 180 degrees, or `phase_deg`, which may pass 180.
     """
-    kind, _, channel = key.partition("_")
-    data = {"h": scan.h, "v": scan.v, "p": scan.p}[channel]
+    quantity, _, channel = key.partition("_")
+    values = map_scan(scan, channel, quantity)
+    numbers = values.numbers
+    limits = values.limits
     unit = _amplitude_unit(scan)
     colours = "cividis"
-    opacity = None
-    if kind == "phase" or channel == "p":
-        opacity = _find_opacity(scan)
-    if kind == "phase":
+    if quantity == "phase":
         unit = "degrees"
         colours = "cividis" if phase_deg else "twilight"
-        low, high = phase_deg or (-180.0, 180.0)
-        middle = (low + high) / 2
-        values = np.degrees(np.angle(np.where(np.isfinite(data), data, 1)))
-        values = (values - middle + 180) % 360 - 180 + middle
-    elif channel == "p":
-        values = _db(data)
-        low, high = _ratio_range_db(scan, values)
-    else:
-        values = _db(data)
-        finite = values[np.isfinite(data) & scan.valid]
-        if scan.metal_referenced:
-            high = 0.0
-        elif finite.size:
-            high = float(np.percentile(finite, _BRIGHT_PERCENTILE))
-        else:
-            high = 0.0
-        low = high - _AMPLITUDE_RANGE_DB
+    if quantity == "phase" and phase_deg is not None:
+        limits = phase_deg
+        middle = sum(phase_deg) / 2
+        numbers = (numbers - middle + 180) % 360 - 180 + middle
     image = ax.imshow(
-        _mask_invalid(scan, values), extent=extent_mm(scan), origin="lower", cmap=colours, vmin=low, vmax=high,
-        alpha=opacity, interpolation="nearest",
+        numbers, extent=scan.extent_mm, origin="lower", cmap=colours, vmin=limits[0], vmax=limits[1],
+        alpha=values.opacity, interpolation="nearest",
     )  # fmt: skip
     return image, unit
-
-
-def _ratio_range_db(scan: ProcessedScan, level: npt.NDArray) -> tuple[float, float]:
-    """Return the range of |P| to show, dB: that of the patches' medians if there are any, else of the bright pixels."""
-    levels = [patch.p_abs_db for patch in scan.segments]
-    values = np.array([level for level in levels if level is not None])
-    if values.size == 0:
-        bright = level[(_find_opacity(scan) > 0.5) & np.isfinite(level)]
-        values = np.array([0.0, 20.0])
-        if bright.size:
-            values = np.percentile(bright, [5, 95])
-    low = float(values.min())
-    high = float(values.max())
-    return np.floor(min(low, 0.0) - 1), max(np.ceil(high + 1), np.floor(low) + 6)
-
-
-def _find_opacity(scan: ProcessedScan) -> npt.NDArray[np.float64]:
-    """Return the opacity of ratio and phase: pixels without signal are noise and fade into the background."""
-    return np.clip((_strength_db(scan) - _FADE_BEGINS_DB) / _FADE_WIDTH_DB, 0.0, 1.0)
-
-
-def _strength_db(scan: ProcessedScan) -> npt.NDArray[np.float64]:
-    """Return the level of both channels together, dB, each relative to its own brightest."""
-    power = np.zeros(scan.h.shape)
-    for channel in (scan.h, scan.v):
-        p = np.nan_to_num(np.abs(channel).astype(np.float64) ** 2, nan=0.0, posinf=0.0)
-        top = float(np.percentile(p, 99.5))
-        if top > 0:
-            power += p / top
-    return 10 * np.log10(np.maximum(power, 1e-12))
 
 
 def channel_figure(scan: ProcessedScan, key: str) -> bytes:
@@ -272,7 +209,7 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[Map
     for label, (names, interior) in scan.pixel_names.items():
         if label not in refused:
             rgb[interior] = [to_rgb(colours.get(str(n), UNKNOWN_COLOUR)) for n in names]
-    ax.imshow(rgb, extent=extent_mm(scan), origin="lower", interpolation="nearest")
+    ax.imshow(rgb, extent=scan.extent_mm, origin="lower", interpolation="nearest")
     _crop_to_plates(ax, scan)
     labels = []
     for patch in scan.segments:
@@ -305,7 +242,7 @@ def _keep_inside(ax: Axes, text: Text, top_mm: float) -> None:
 def _crop_to_plates(ax: Axes, scan: ProcessedScan) -> None:
     """Set limits around patches and plates: square, inside the image, the same for map and truth."""
     boxes = [patch.box_mm for patch in scan.segments] + [plate.box_mm for plate in scan.plates]
-    left_mm, right, bottom, top = extent_mm(scan)
+    left_mm, right, bottom, top = scan.extent_mm
     if boxes:
         corners = np.array(boxes)
         x0 = corners[:, 0].min() - _SIDE_ROOM_MM

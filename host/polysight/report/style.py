@@ -29,7 +29,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox, BboxBase
 
-from polysight.materials import TruthPlate, axis_mm
+from polysight.materials import TruthPlate
 from polysight.products import ProcessedScan
 from polysight.results import PatchFigures
 
@@ -113,15 +113,6 @@ def assign_colours(scan: ProcessedScan) -> dict[str, str]:
     names.discard("unknown")
     table = {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(sorted(names))}
     return {**table, "unknown": UNKNOWN_COLOUR}
-
-
-def extent_mm(scan: ProcessedScan) -> tuple[float, float, float, float]:
-    """Return the left, right, bottom, top edge of the image, millimetres from its centre."""
-    x = axis_mm(scan.x_m)
-    y = axis_mm(scan.y_m)
-    hx = (x[1] - x[0]) / 2
-    hy = (y[1] - y[0]) / 2
-    return float(x[0] - hx), float(x[-1] + hx), float(y[0] - hy), float(y[-1] + hy)
 
 
 def new_figure(width: float, height: float, right_in: float) -> Figure:

@@ -33,7 +33,7 @@ from polysight.materials import (
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import ratio_from_permittivity
 from polysight.products import ProcessedScan
-from polysight.report import INK, draw_channel, extent_mm
+from polysight.report import INK, draw_channel
 from polysight.results import ScanFacts, ScanMaterials, ScanQuality
 from polysight.store import TRUTH, RawSource, ScanFolder
 from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, table2
@@ -171,7 +171,7 @@ def _label_plates(ax: Any, scan: ProcessedScan, size: float = 7.5) -> None:
             color="white",
             path_effects=[withStroke(linewidth=2.0, foreground=INK)],
         )
-    x_min, right, bottom, top = extent_mm(scan)
+    x_min, right, bottom, top = scan.extent_mm
     ax.set_xlim(max(x_min, -110), min(right, 110))
     ax.set_ylim(max(bottom, -110), min(top, 110))
 
@@ -303,7 +303,7 @@ def fig14(run: Run) -> Item:
         phase = np.ma.masked_array(angle, ~inside)
         picture = ax.imshow(
             phase,
-            extent=extent_mm(view.scan),
+            extent=view.scan.extent_mm,
             origin="lower",
             cmap="PuOr",
             vmin=-PHASE_DEG,

@@ -283,8 +283,7 @@ def analyse(
     if plane is None:
         signs = solution.signs[:1] if reference.given else solution.signs
         reference = _weigh_metal(images, reference, labels, signs, kinds)
-    # Only known leakage is removed from the pixels: an undetermined estimate leans on what the patches may be.
-    calibrated = remove_leakage(raw, inversion.leakage if inversion.leakage_determined else prior.leakage)
+    calibrated = remove_leakage(raw, inversion.known_leakage(prior))
     sh, sv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
     estimates = dict(zip(labels, inversion.patches, strict=True))

@@ -252,6 +252,15 @@ class Inversion:
         """True if the scene reduced the uncertainty of both leakages to less than half of the prior's."""
         return max(self.leakage_std) < 0.5 * self.prior_std
 
+    def known_leakage(self, prior: RigPrior) -> tuple[complex, complex]:
+        """Return the leakage that is removed from pixels: that of the scene if determined, else the prior's mean.
+
+        An undetermined estimate leans on what the patches may be.
+        """
+        if self.leakage_determined:
+            return self.leakage
+        return prior.leakage
+
 
 def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: npt.ArrayLike = 0j) -> Complex:
     """Return t of a measured V / H: the first formula of the module's docstring, solved for t, at the metal's place."""

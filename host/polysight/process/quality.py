@@ -561,8 +561,7 @@ def error_budget(result: MaterialsResult, plane: PlaneEstimate | None) -> ErrorB
             paint_mm=round(inversion.paint_mm, 3),
         )
     leakage_h, leakage_v = inversion.leakage
-    # `analyse` removes only known leakage from the pixels.
-    removed_h, removed_v = inversion.leakage if inversion.leakage_determined else result.prior.leakage
+    removed_h, removed_v = inversion.known_leakage(result.prior)
     std_h, std_v = inversion.leakage_std
     angle_deg = float(np.degrees(np.mean(result.theta_rad) + inversion.theta_error_rad))
     angle_std_deg = float(np.degrees(inversion.theta_std_rad))

@@ -25,6 +25,9 @@ MAX_PIXELS = 4_000_000
 # The wavelength is 4 mm; the spectral imager's memory grows as one over the size.
 MIN_PIXEL_MM = 0.05
 MAX_PIXEL_MM = 100.0
+# What a scene may hold to both sides. The range gate's matrices grow as the square of an image's size: one of 400 m
+# took all memory of a PC.
+MAX_IMAGE_MM = 4_000.0
 PixelSize = Annotated[float, msgspec.Meta(ge=MIN_PIXEL_MM, le=MAX_PIXEL_MM)]
 # Silence after which a card sends a packet that is not full (docs/spec/dca1000.md, observed).
 CARD_TAIL_S = 2.0
@@ -271,6 +274,11 @@ class Image(Section, frozen=True):
         require(
             self.columns * self.rows <= MAX_PIXELS,
             f"{self.columns} x {self.rows} pixels are more than {MAX_PIXELS}",
+        )
+        longest_mm = max(self.columns, self.rows) * self.pixel_mm
+        require(
+            longest_mm <= MAX_IMAGE_MM,
+            f"image.columns, image.rows x image.pixel_mm: {longest_mm:g} mm are more than {MAX_IMAGE_MM:g} mm",
         )
 
 

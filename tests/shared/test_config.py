@@ -92,6 +92,7 @@ def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instr
         ("image", "pixel_mm", 1e-4, ErrorCode.VALUE_INVALID, ["image.pixel_mm"]),
         ("image", "pixel_mm", 1e4, ErrorCode.VALUE_INVALID, ["image.pixel_mm"]),
         ("image", "columns", 30_000, ErrorCode.VALUE_INVALID, ["30000 x 150 pixels"]),
+        ("image", "columns", 10_000, ErrorCode.VALUE_INVALID, ["image.columns", "image.pixel_mm", 20_000, 4_000]),
         ("pi", "trigger_in", 22, ErrorCode.VALUE_INVALID, ["trigger_in", "sync_out"]),
         ("pi", "sync_out", [22, 23], ErrorCode.VALUE_INVALID, ["sync_out", "wiring"]),
         ("pi", "trigger_bias", "up", ErrorCode.VALUE_INVALID, ["pi.trigger_bias", "'up'"]),

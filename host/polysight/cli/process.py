@@ -20,7 +20,7 @@ from polysight.cli.options import (
     rig_file,
 )
 from polysight.settings import Settings, path_text
-from polysight_shared.config import MAX_PIXEL_MM, MAX_PIXELS, MIN_PIXEL_MM
+from polysight_shared.config import MAX_IMAGE_MM, MAX_PIXEL_MM, MAX_PIXELS, MIN_PIXEL_MM
 
 _shift = number(float, "a shift of at most 1000 mm", lambda value: abs(value) <= 1000)
 _search_range = number(float, "a length of 0.5 to 100 mm", lambda value: 0.5 <= value <= 100)
@@ -245,6 +245,8 @@ def grid(text: str) -> tuple[int, int, float]:
         raise argparse.ArgumentTypeError(
             f"{text!r}: a grid has 2 x 2 to {MAX_PIXELS} pixels, {MIN_PIXEL_MM:g} to {MAX_PIXEL_MM:g} mm apart"
         )
+    if max(columns, rows) * pixel_mm > MAX_IMAGE_MM:
+        raise argparse.ArgumentTypeError(f"{text!r}: an image has a width and height of at most {MAX_IMAGE_MM:g} mm")
     return columns, rows, pixel_mm
 
 

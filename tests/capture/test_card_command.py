@@ -139,3 +139,17 @@ def test_reset(cards, card):
     done = card("reset", "RH")
     assert (done.status, "configures it anew" in done.out) == (0, True), done
     assert running_cards.endpoints["RH"].card._packetiser.sequence == 1
+
+
+def test_listening_ends_with_a_row_and_without_loss_wherever_the_last_record_ended(cards, card, rig):
+    """The card is reset first: behind counters that went on nobody knows where its record begins."""
+    running_cards = cards("RH", "RV", streams=True)
+    packetiser = running_cards.endpoints["RH"].card._packetiser
+    packetiser.sequence = 77_777
+    packetiser.byte_count = 77_776 * packetiser.payload_bytes
+    # Twice the time after which a test has hung.
+    done = card("--listen", "3600", "--json")
+    for name in ("RH", "RV"):
+        radar = verdicts(done)[name]["radar"]
+        assert radar["verdict"] == "ok", radar
+        assert f"{rig.row_bytes} bytes" in radar["found"]

@@ -501,7 +501,8 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
             receiver.begin_row(0, 1, instrument.row_bytes, instrument.frame_bytes, listened, after_reset=True)
             card.record_start()
             deadline = time.monotonic() + listen_s
-            while time.monotonic() < deadline and not receiver.poll().complete:
+            # Not until it is complete: a radar that goes on sends more than a row, which then is never.
+            while time.monotonic() < deadline and receiver.report().received < instrument.row_bytes:
                 card.take_status()
                 time.sleep(_POLL_S)
             card.record_stop()

@@ -181,17 +181,20 @@ def draw_nuisances(rng: Generator, names: str | Sequence[str] = "none", *, stren
 
     With "all" each is drawn from 0 to its upper limit. `strength` multiplies what was drawn.
     """
-    together = names == "all"
+    is_all = names == "all"
     if names == "none":
-        names = ()
-    elif together:
-        names = TOGETHER
+        drawn_names: Sequence[str] = ()
+    elif is_all:
+        drawn_names = TOGETHER
     elif isinstance(names, str):
-        names = (names,)
+        drawn_names = (names,)
+    else:
+        drawn_names = names
     values = {}
-    for name in names:
+    for name in drawn_names:
         for key, (low, high) in RANGES[name].items():
-            values[key] = strength * rng.uniform(0 if together else low, high)
+            least = 0 if is_all else low
+            values[key] = strength * rng.uniform(least, high)
     return Nuisances(seed=int(rng.integers(2**31)), **values)
 
 
@@ -253,9 +256,10 @@ def disturb_plates(world: World, nuisances: Nuisances) -> World:
     rng = np.random.default_rng([nuisances.seed, 1])
     disturbed = []
     for plate in world.plates:
-        heights = rng.uniform(0, 1)
-        tilts = rng.uniform(-1, 1, 2)
-        bows = rng.uniform(-1, 1, 2)
+        # Drawn for the table too: what other plates get does not depend on where it stands in the list.
+        height_share = rng.uniform(0, 1)
+        tilt_shares = rng.uniform(-1, 1, 2)
+        bow_shares = rng.uniform(-1, 1, 2)
         brightness = (1 + nuisances.brightness) ** rng.uniform(-1, 1)
         if plate.name == "table":
             disturbed.append(plate)
@@ -264,15 +268,15 @@ def disturb_plates(world: World, nuisances: Nuisances) -> World:
         waviness_mm = np.hypot(plate.waviness_mm, nuisances.waviness_mm)
         moved = replace(
             plate,
-            height_mm=plate.height_mm + heights * nuisances.height_mm,
-            tilt_x_deg=plate.tilt_x_deg + tilts[0] * nuisances.tilt_deg,
-            tilt_y_deg=plate.tilt_y_deg + tilts[1] * nuisances.tilt_deg,
+            height_mm=plate.height_mm + height_share * nuisances.height_mm,
+            tilt_x_deg=plate.tilt_x_deg + tilt_shares[0] * nuisances.tilt_deg,
+            tilt_y_deg=plate.tilt_y_deg + tilt_shares[1] * nuisances.tilt_deg,
             roughness_mm=float(roughness_mm),
             waviness_mm=float(waviness_mm),
             brightness=plate.brightness * float(brightness),
             bow_mm=(
-                plate.bow_mm[0] + float(bows[0]) * nuisances.bow_mm,
-                plate.bow_mm[1] + float(bows[1]) * nuisances.bow_mm,
+                plate.bow_mm[0] + float(bow_shares[0]) * nuisances.bow_mm,
+                plate.bow_mm[1] + float(bow_shares[1]) * nuisances.bow_mm,
             ),
         )
         disturbed.append(moved)

@@ -49,7 +49,7 @@ Real = NDArray[np.float64]
 FULL_SCALE = 32767
 # Share of the sample rate that the receiver's filter passes.
 PASSBAND = 0.9
-# Rows of a scan used by `fit_start`, and by `fit_filter`.
+# Rows of a scan used by `fit_start`, and by `fit_filter`, which spreads their chirps over many bins of the IF.
 ROWS = 4
 FILTER_ROWS = 6
 # Smallest share of chirps with a direct path.
@@ -158,22 +158,25 @@ def find_direct(
     else:
         cycles = (cycles + 0.5) % 1.0 - 0.5
     rate = chirp.sample_rate_hz
+    # The phase of a drifting IF is drift t^2 / 2 with t in samples: its frequency changes by drift / (2 pi) a sample.
+    drift_hz_per_s = (drift + referenced.drift) * rate**2 / (2 * np.pi)
     return DirectSignal(
-        cycles * rate,
-        power,
-        np.full(power.size, noise),
-        direct_if_hz(rig, board),
-        (drift + referenced.drift) * rate**2 / (2 * np.pi),  # its phase is `drift t^2 / 2`, t in samples
-        int(valid.sum()),
+        if_hz=cycles * rate,
+        power=power,
+        noise_power=np.full(power.size, noise),
+        expected_hz=direct_if_hz(rig, board),
+        drift_hz_per_s=drift_hz_per_s,
+        chirps=int(valid.sum()),
     )
 
 
 def _estimate_recorded_noise(aligned: AlignedRow, noise: NDArray[np.float64]) -> float:
     """Return the noise power of a recorded sample: the estimate divided by the gain of the filter compensation."""
-    raised = (aligned.gain**2 * aligned.good).sum(axis=1) / np.maximum(aligned.good.sum(axis=1), 1)
-    recorded = noise / np.maximum(raised, 1e-12)
-    if np.isfinite(recorded).any():
-        return float(np.nanmedian(recorded))
+    good_chirps = np.maximum(aligned.good.sum(axis=1), 1)
+    power_gain = (aligned.gain**2 * aligned.good).sum(axis=1) / good_chirps
+    recorded_noise = noise / np.maximum(power_gain, 1e-12)
+    if np.isfinite(recorded_noise).any():
+        return float(np.nanmedian(recorded_noise))
     return 0.0
 
 
@@ -295,11 +298,19 @@ def average_in_bins(if_hz: Real, power: Real, noise_power: Real) -> tuple[Real, 
 
     The level comes from the median power, so that chirps with a wrong direct path do not count.
     """
-    bins = np.floor(if_hz / BIN_HZ).astype(int)
-    groups = [(bins == b) & (if_hz > 0) for b in np.unique(bins)]
-    means = [(if_hz[g].mean(), np.median(power[g]), noise_power[g].mean()) for g in groups if g.sum() >= MIN_CHIRPS]
-    means = [(f, p - n) for f, p, n in means if p > MIN_SNR * n]
-    return np.array([f for f, _ in means]), np.sqrt([s for _, s in means])
+    bin_of_chirp = np.floor(if_hz / BIN_HZ).astype(int)
+    mean_if_hz = []
+    signal_power = []
+    for bin_number in np.unique(bin_of_chirp):
+        in_bin = (bin_of_chirp == bin_number) & (if_hz > 0)
+        if in_bin.sum() < MIN_CHIRPS:
+            continue
+        total = np.median(power[in_bin])
+        noise = noise_power[in_bin].mean()
+        if total > MIN_SNR * noise:
+            mean_if_hz.append(if_hz[in_bin].mean())
+            signal_power.append(total - noise)
+    return np.array(mean_if_hz), np.sqrt(signal_power)
 
 
 def _estimate_corner_errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple[Real, float]:

@@ -47,6 +47,7 @@ class _Row:
         self.past = past
         self.stale = self.strangers = self.drops = 0
         self.not_before_ns = 0
+        # What the last report said of the preview: all frames complete, the record ended.
         self._reported = (False, False)
         # Packets.
         self._previewed = 0
@@ -62,9 +63,9 @@ class _Row:
             return False
         self._update()
         self._next_preview_ns = time.monotonic_ns() + _PREVIEW_SHARE * (time.monotonic_ns() - began)
-        reported = self._reported
+        last_reported = self._reported
         self._reported = (self._preview.complete, self._preview.ended)
-        return self._reported != reported and any(self._reported)
+        return self._reported != last_reported and any(self._reported)
 
     def progress(self) -> messages.Progress:
         self._update()

@@ -27,7 +27,8 @@ from polysight_shared.files import open_to_write, read_bounded
 Bytes = NDArray[np.uint8]
 # Each arrival in an index is a pair of these.
 _INDEX_PAIR = np.dtype("<i8")
-# Sixteen million batches of packets.
+# A pair takes 16 bytes: sixteen million arrivals, hundreds of times those of the longest row. A damaged file that is
+# larger is refused before it fills the memory.
 MAX_INDEX_BYTES = 256 << 20
 
 
@@ -39,7 +40,7 @@ def _find_scan(path: Path) -> Path:
 
 
 def write_error(path: Path, done: str, e: OSError) -> DeviceError:
-    """Return the error for a file of a scan; `done` is what failed: "written", "opened", "renamed"."""
+    """Return the error for a file of a scan that cannot be `done`: "written", "opened", "renamed"."""
     is_full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     code = ErrorCode.DISK_FULL if is_full else ErrorCode.FILE_UNWRITABLE
     return DeviceError(

@@ -1,4 +1,8 @@
-"""The operator's notes and tags of a scan, beside its rows; texts and files that others may have made to harm."""
+"""The operator's notes and tags of a scan, in a file beside its rows.
+
+A scan folder may come from anybody: its notes are read only up to a limit, from a regular file, and shown without
+characters that would change the line or the reading direction.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +19,11 @@ from polysight_shared.errors import ConfigError, DataError, ScanError
 from polysight_shared.files import write_atomically
 
 NOTES = "operator.json"
+# Characters of the notes and of a tag, and tags of a scan: more would make the list of scans unreadable.
 MAX_NOTES = 10_000
 MAX_TAG = 40
 MAX_TAGS = 20
+# The longest allowed notes take 10 kB, or 40 kB in UTF-8; a larger file was not written here, and is ignored.
 MAX_NOTES_BYTES = 1 << 17
 
 
@@ -33,7 +39,7 @@ _notes_lock = threading.Lock()
 
 
 def read_notes(folder: Path) -> Notes:
-    """Read the notes of a scan; empty if there are none.
+    """Read the notes of a scan; empty if there are none, or the file is too large to be ours.
 
     Raises
     ------
@@ -69,6 +75,7 @@ def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
         if the present notes differ from `base`, from which these were edited; None: not checked.
     """
     text = printable(notes.notes, keep="\n")
+    # A dictionary drops tags that are given twice, and keeps the order.
     tags = dict.fromkeys(printable(tag).strip() for tag in notes.tags)
     tags.pop("", None)
     longest = max(tags, key=len, default="")

@@ -21,8 +21,11 @@ from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError
 
+# An empty file that tells a folder of an earlier demo, which may be overwritten, from any other.
 _MARK = ".polysight-demo"
+# Starting is mostly imports, of some seconds; the limit is far above them, for an overloaded machine.
 _START_LIMIT_S = 60.0
+# A process that does not end within this time after SIGTERM is killed.
 _STOP_LIMIT_S = 10.0
 TIME_SCALE = 40.0
 """Simulated seconds per second: a row of 18 s takes about half a second."""
@@ -81,8 +84,10 @@ def check_scenes(scenes: Iterable[Path], config: Path) -> None:
 
 def _simulator_error(status: int, output: str) -> PolysightError:
     """Return the error of a simulator that failed: its message and exit status."""
-    kind = {e.exit_status: e for e in (ConfigError, DataError)}.get(status, DeviceError)
-    return kind(output.strip().removeprefix("error: ") or f"a simulator ended with status {status}, without a message")
+    error_types = {error.exit_status: error for error in (ConfigError, DataError)}
+    error_type = error_types.get(status, DeviceError)
+    message = output.strip().removeprefix("error: ")
+    return error_type(message or f"a simulator ended with status {status}, without a message")
 
 
 def _check_folder(out: Path) -> None:
@@ -167,9 +172,9 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
     _fresh_folder(out)
     sys.stderr.write(f"simulated rig: no hardware is involved. Scene {scene}\n")
     with run_simulated_rig(config, scene, out / "rig", time_scale or TIME_SCALE) as rig_file:
-        scan = [sys.executable, "-m", "polysight", "scan", "--config", str(rig_file), "--out", str(out / "scan")]
-        scan += ["--truth", str(rig_file.parent / "truth.json")]
-        status = _run_to_its_end(scan)
+        command = [sys.executable, "-m", "polysight", "scan", "--config", str(rig_file), "--out", str(out / "scan")]
+        command += ["--truth", str(rig_file.parent / "truth.json")]
+        status = _run_to_its_end(command)
     if status in (0, NoResult.exit_status):
         sys.stdout.write(f"simulated demo: {time.monotonic() - began:.0f} s in all\n")
     else:

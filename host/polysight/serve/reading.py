@@ -51,7 +51,7 @@ from polysight_shared.errors import DataError, PolysightError, ScanError
 # A report may come from anywhere: no script runs in it, and nothing is loaded.
 REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
 CHUNK_BYTES = 1 << 18
-# Reads of products that are replaced meanwhile.
+# Products that are replaced while they are read are read again, so many times in all.
 MAX_TRIES = 5
 T = TypeVar("T")
 Endpoint = Callable[[Site, Request], Awaitable[Response]]
@@ -368,7 +368,7 @@ async def _check(site: Site, request: Request) -> Response:
 
 
 async def _use_comparison(site: Site, request: Request, use: Callable[[Comparison], T]) -> T:
-    """`use` of the comparison of the two scans that a request names, in a thread."""
+    """Compare the two scans that a request names, and return what `use` makes of the comparison; in a thread."""
     first = site.name(request, "a")
     second = site.name(request, "b")
     # If one of them hangs, the other is still read alone.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import re
+import shlex
 from collections.abc import Iterable
 from difflib import get_close_matches
 from importlib.util import find_spec
@@ -60,6 +61,14 @@ def expand_paths(text: str) -> str:
     if folder is None:
         return text
     return re.sub(r"(?<![\w/])docs/[\w/-]+\.md", lambda page: str(folder / page[0]), text)
+
+
+def quote(path: Path | str) -> str:
+    """Return a path as a word of a shell's line: with quotes if it needs them, and never like an option."""
+    text = str(path)
+    if text.startswith("-"):
+        text = f"./{text}"
+    return shlex.quote(text)
 
 
 def advice(*parts: str) -> str:

@@ -25,7 +25,7 @@ from typing import Literal
 import msgspec
 
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ScanError
+from polysight_shared.errors import ScanError, quote
 
 CONTROL = "control"
 ALIVE = "alive"
@@ -284,7 +284,7 @@ def send_command(folder: Path, command: ScanCommand, asker: str = "a program", l
     if life is not None and life.killed:
         raise ScanError(
             f"{folder}: no running scan takes `{command}`", "its program was killed",
-            f"`polysight resume {folder}`; the stage has stopped by itself", code=ErrorCode.NO_ANSWER,
+            f"`polysight resume {quote(folder)}`; the stage has stopped by itself", code=ErrorCode.NO_ANSWER,
         )  # fmt: skip
     if life is not None and life.doing == "materials":
         raise ScanError(
@@ -297,7 +297,7 @@ def send_command(folder: Path, command: ScanCommand, asker: str = "a program", l
         raise ScanError(
             f"{folder}: no running scan takes `{command}`: {e.strerror}",
             "no scan runs in this folder, it was moved or renamed, or you may not write to it",
-            f"if its program was killed, resume the scan with `polysight resume {folder}`",
+            f"if its program was killed, resume the scan with `polysight resume {quote(folder)}`",
             code=ErrorCode.NO_ANSWER,
         ) from None
     deadline = time.monotonic() + limit_s

@@ -17,7 +17,7 @@ from polysight.acquisition.row import ON_REQUEST
 from polysight.store import PiDescription
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ScanError
+from polysight_shared.errors import ScanError, quote
 from polysight_shared.faults import PiFault, explain
 from polysight_shared.messages import HelloReply, StatusReply
 from polysight_shared.raster import Stage
@@ -135,8 +135,8 @@ def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
             f"{folder}: {free / 1e9:.2f} GB free, {need / 1e9:.2f} GB needed for {rows} rows and"
             f" {reserve / 1e9:.2f} GB kept free",
             "the disk is too full for this scan",
-            f"free space, then `polysight resume {folder}`; or lower limits.free_disk_bytes in instrument.toml, and add"
-            " --config instrument.toml",
+            f"free space, then `polysight resume {quote(folder)}`; or lower limits.free_disk_bytes in instrument.toml,"
+            " and add --config instrument.toml",
             code=ErrorCode.DISK_FULL,
         )
 

@@ -45,7 +45,7 @@ from polysight.store import (
 )
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ScanError, advice
+from polysight_shared.errors import ScanError, advice, quote
 from polysight_shared.faults import explain
 from polysight_shared.files import sync_folder
 from polysight_shared.messages import Capture, RowFinished
@@ -372,7 +372,9 @@ def explain_incomplete_row(take: Take, faults: list[TakeFault], scan: ScanFolder
     return ScanError(
         f"row {take.row.index} is not complete after {takes} takes: {join_faults(faults)}",
         cause,
-        advice(remedy, f"then `polysight resume {scan.path}`; with --keep-incomplete it keeps such rows, masked"),
+        advice(
+            remedy, f"then `polysight resume {quote(scan.path)}`; with --keep-incomplete it keeps such rows, masked"
+        ),
         code=ErrorCode.ROW_INCOMPLETE,
     )
 
@@ -536,7 +538,7 @@ class RowTaker:
                 raise ScanError(
                     f"row {take.row.index} did not end within {limit_s:.0f} s",
                     "the stage stands still, or the Pi's program hangs",
-                    f"`journalctl -u polysight-pi -n 20` on the Pi, then `polysight resume {self._folder}`",
+                    f"`journalctl -u polysight-pi -n 20` on the Pi, then `polysight resume {quote(self._folder)}`",
                     code=ErrorCode.NO_ANSWER,
                 )
 
@@ -563,7 +565,7 @@ class RowTaker:
             raise ScanError(
                 f"the Pi's program restarted in row {take.row.index}",
                 "power was lost there, or the program ended",
-                f"`polysight resume {self._folder}`; why it ended: `journalctl -u polysight-pi` on the Pi",
+                f"`polysight resume {quote(self._folder)}`; why it ended: `journalctl -u polysight-pi` on the Pi",
                 code=ErrorCode.STAGE_NOT_READY,
             )
         if take.finished is None:
@@ -571,7 +573,7 @@ class RowTaker:
             raise ScanError(
                 f"the Pi stopped in row {take.row.index}: {e.problem}: {status.reason}",
                 e.cause,
-                f"{e.remedy}, then `polysight resume {self._folder}`",
+                f"{e.remedy}, then `polysight resume {quote(self._folder)}`",
                 code=ErrorCode.STAGE_NOT_READY,
             )
 

@@ -69,7 +69,7 @@ from polysight.store import (
 )
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import PolysightError, ScanError, advice
+from polysight_shared.errors import PolysightError, ScanError, advice, quote
 from polysight_shared.messages import AnyEvent, BeginRun, HelloReply, RowStarted, RunStarted, is_simulated
 from polysight_shared.program import delay_interrupts
 from polysight_shared.raster import Row, check_burst_fits, plan_raster
@@ -158,10 +158,10 @@ class RunningScan:
         """Bring the rig to rest after an error, record the reason, and add to the error which rows are safe."""
         self.result.exit_status = "abort" if isinstance(e, KeyboardInterrupt) else "fail"
         safe = f"{len(self._committed)} of {self._plan.rows} rows are safe"
-        resume = f"`polysight resume {self._scan.path}` continues from there"
+        resume = f"`polysight resume {quote(self._scan.path)}` continues from there"
         if isinstance(e, PolysightError):
             # A remedy that names the command already is not told twice.
-            if f"polysight resume {self._scan.path}" in e.remedy:
+            if f"polysight resume {quote(self._scan.path)}" in e.remedy:
                 resume = ""
             e.remedy = advice(e.remedy, safe, resume)
             self._error = e

@@ -41,7 +41,7 @@ from polysight.store import (
 from polysight.sync import HighPass
 from polysight_shared.config import Board, Instrument, MountStep
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError
+from polysight_shared.errors import ConfigError, DataError, DeviceError, quote
 from polysight_shared.tables import decode, read_toml, to_builtins
 
 FORMAT = 1
@@ -574,7 +574,7 @@ def open_raw(folder: Path, rig: Instrument | None = None) -> RawSource:
         raise DataError(
             f"{folder}: no complete row",
             "the scan was stopped in its first row, or files are missing",
-            f"`polysight resume {folder}` records the missing rows",
+            f"`polysight resume {quote(folder)}` records the missing rows",
             code=ErrorCode.NO_DATA,
         )
     return source

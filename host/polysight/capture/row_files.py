@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Evidence, Placed
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError
+from polysight_shared.errors import DataError, DeviceError, quote
 from polysight_shared.files import open_to_write, read_bounded
 
 Bytes = NDArray[np.uint8]
@@ -46,14 +46,17 @@ def write_error(path: Path, done: str, e: OSError) -> DeviceError:
     return DeviceError(
         f"{path}: cannot be {done}: {e.strerror}",
         "the disk is full, read-only or fails",
-        f"free space, then `polysight resume {_find_scan(path)}` continues after the last committed row",
+        f"free space, then `polysight resume {quote(_find_scan(path))}` continues after the last committed row",
         code=code,
     )
 
 
 def _explain_damage(path: Path) -> tuple[str, str]:
     """Return cause and remedy for a row's file that cannot be read."""
-    return "the file is damaged or truncated", f"`polysight validate {_find_scan(path)}` names every damaged file"
+    return (
+        "the file is damaged or truncated",
+        f"`polysight validate {quote(_find_scan(path))}` names every damaged file",
+    )
 
 
 class Segment:

@@ -42,7 +42,7 @@ from polysight.products import (
     label_folder,
 )
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.errors import ConfigError, DataError, quote
 from polysight_shared.files import write_together
 
 METAL = "metal"
@@ -105,7 +105,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
         raise DataError(
             f"{folder}: no {IMAGE} to draw on",
             "the scan was not processed yet, its products lie elsewhere, or the path is wrong",
-            f"polysight process {folder} --out {out}; or give the folder of its products",
+            f"polysight process {quote(folder)} --out {quote(out)}; or give the folder of its products",
             code=ErrorCode.FILE_MISSING,
         )
     saved_labels = find_labels(folder)
@@ -419,6 +419,8 @@ def _describe_boxes(
         lines += ["patches that were found, a box inside each:"]
         lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.description}" for f in patches]
         metal = next((f.number for f in patches if f.description == REFERENCE), "NUMBER")
-        lines.append(f"to name them: polysight label {folder} --from-patches --metal {metal} --rename NUMBER=NAME ...")
-    lines.append(f"to draw one:  polysight label {folder} --box NAME=-20,-20,20,20 (x0,y0,x1,y1 in mm)")
+        lines.append(
+            f"to name them: polysight label {quote(folder)} --from-patches --metal {metal} --rename NUMBER=NAME ..."
+        )
+    lines.append(f"to draw one:  polysight label {quote(folder)} --box NAME=-20,-20,20,20 (x0,y0,x1,y1 in mm)")
     return "".join(f"{line}\n" for line in lines)

@@ -38,7 +38,7 @@ from polysight.acquisition import (
 from polysight.settings import Settings
 from polysight.store import MANIFEST, TRUTH, ScanFolder, check_same_scan, manifest, require_raw
 from polysight_shared.config import Notify, load_instrument
-from polysight_shared.errors import ConfigError, PolysightError, ScanError, advice
+from polysight_shared.errors import ConfigError, PolysightError, ScanError, advice, quote
 
 if TYPE_CHECKING:
     from polysight.jobs.process import LiveProcessing
@@ -158,7 +158,7 @@ def _run_rows(folder: Path, processing: LiveProcessing | None, run_rows: RunScan
             asker = ""
             if stop.asker:
                 asker = f" (asked by {stop.asker})"
-            raise ScanError(f"{folder}: {result.reason}{asker}", "", f"polysight resume {folder}")
+            raise ScanError(f"{folder}: {result.reason}{asker}", "", f"polysight resume {quote(folder)}")
         if processing is None:
             return 0
         return processing.finish()
@@ -173,9 +173,9 @@ def _print(text: str) -> None:
 
 def _add_advice(folder: Path, result: ScanResult, e: BaseException) -> PolysightError:
     """Return the error to raise if processing failed while the scan continued."""
-    remedy = f"the rows are safe: `polysight process {folder} --out DIR` processes them again"
+    remedy = f"the rows are safe: `polysight process {quote(folder)} --out DIR` processes them again"
     if result.exit_status != "success":
-        remedy = f"{result.reason}: `polysight resume {folder}` goes on, and processes all of them again"
+        remedy = f"{result.reason}: `polysight resume {quote(folder)}` goes on, and processes all of them again"
     if isinstance(e, PolysightError):
         e.remedy = advice(e.remedy, remedy)
         return e
@@ -203,7 +203,7 @@ def _check_new(folder: Path) -> None:
         raise ConfigError(
             f"{folder} holds a scan already",
             "scans are never overwritten",
-            f"`polysight resume {folder}` goes on with it; or give another --out",
+            f"`polysight resume {quote(folder)}` goes on with it; or give another --out",
         )
     if not folder.is_dir() or any(p.name not in (MANIFEST, *_BESIDE) for p in folder.iterdir()):
         raise ConfigError(f"{folder} is not an empty folder", "a scan has a folder of its own", "give another --out")

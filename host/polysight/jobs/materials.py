@@ -53,7 +53,7 @@ from polysight.results import NoResult, PatchFigures, PermittivityFigures, one_l
 from polysight.store import is_source
 from polysight_shared.config import Chirp, load_instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.errors import ConfigError, DataError, quote
 from polysight_shared.findings import Finding
 
 # Relative difference of two frequencies that are the same: far above rounding, far below any other chirp.
@@ -140,7 +140,7 @@ def permittivity(
         raise DataError(
             f"{products.folder}: no patch {number}",
             f"its number is not in {MATERIALS}",
-            f"`polysight materials {products.folder}` lists them",
+            f"`polysight materials {quote(products.folder)}` lists them",
         )
     chirp = None
     if stack:
@@ -389,7 +389,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
         raise ConfigError(
             f"{unprocessed}: not a folder of products",
             "several scans are named together from what polysight process wrote",
-            f"polysight process SCAN --out {unprocessed}",
+            f"polysight process SCAN --out {quote(unprocessed)}",
         )  # fmt: skip
     if library is not None or model is not None:
         raise ConfigError(

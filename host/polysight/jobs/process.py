@@ -46,7 +46,7 @@ from polysight.settings import DEFAULT, Settings, path_text
 from polysight.store import ScanFolder, Source, dropped_rows, open_source, raw_source, require_raw
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, advice
+from polysight_shared.errors import ConfigError, DataError, advice, quote
 
 PRODUCTS = "products"
 """Folder of the products of a scan, in the scan's folder."""
@@ -166,7 +166,7 @@ def _no_pixel_error(pipeline: Pipeline, data: Path | None = None) -> DataError:
     return DataError(
         "the image has no valid pixel",
         cause,
-        f"`polysight sync-report {data or 'SCAN'} --out DIR` shows the direct path of each row",
+        f"`polysight sync-report {quote(data or 'SCAN')} --out DIR` shows the direct path of each row",
         code=ErrorCode.NO_DATA,
     )
 

@@ -36,7 +36,7 @@ from polysight.store import (
     utc_now,
 )
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, no_such
+from polysight_shared.errors import ConfigError, DataError, no_such, quote
 from polysight_shared.files import write_atomically
 
 _NAME_WIDTH = 40
@@ -240,7 +240,7 @@ def _drop(scan: ScanFolder, folder: Path, products: Path, yes: bool) -> int:
             raise DataError(
                 f"{folder}: nothing can be dropped",
                 f"{products} is made from none of its rows",
-                f"`polysight process {folder} --out DIR`, then --products DIR",
+                f"`polysight process {quote(folder)} --out DIR`, then --products DIR",
             )
         sys.stdout.write(f"{folder}: every processed row is dropped already\n")
         return 0
@@ -278,7 +278,7 @@ def _check_samples(scan: ScanFolder, rows: set[int]) -> None:
         raise DataError(
             f"{scan.path}: samples of rows {', '.join(map(str, damaged))} are damaged or missing: {', '.join(names)}",
             "without these samples images can be made from the raw data only",
-            f"`polysight process {scan.path} --out DIR` makes them again",
+            f"`polysight process {quote(scan.path)} --out DIR` makes them again",
             code=ErrorCode.FILE_DAMAGED,
         )
 

@@ -50,7 +50,7 @@ from polysight.products import (
 )
 from polysight.settings import Settings
 from polysight.store import TRUTH, open_source, versions
-from polysight_shared.errors import ConfigError, DataError, ScanError
+from polysight_shared.errors import ConfigError, DataError, ScanError, quote
 
 EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
@@ -104,7 +104,7 @@ def check_labelled(data: Path) -> None:
         raise DataError(
             f"{data}: neither {LABELS} nor {TRUTH} is in it",
             "the materials of this scan are not known",
-            f"polysight label {data}; then train again",
+            f"polysight label {quote(data)}; then train again",
         )
     if (saved := find_products(data)) is not None:
         path, labels = saved_labels
@@ -217,7 +217,7 @@ def _no_metal(folder: Path) -> DataError:
     return DataError(
         f"{folder}: no box is metal",
         "features of materials are relative to metal",
-        f"polysight label {folder} --metal NAME, or measure the rig with `polysight calibrate metal`",
+        f"polysight label {quote(folder)} --metal NAME, or measure the rig with `polysight calibrate metal`",
     )
 
 

@@ -18,6 +18,7 @@ from polysight.catalogue import Picture, Program
 from polysight.page.history import BoardCounts, PiState, ScanHistory, TriggerHealth, sentence
 from polysight.results import Verdict
 from polysight.store import ScanEnded
+from polysight_shared.errors import quote
 from polysight_shared.findings import Finding
 from polysight_shared.raster import WIDTH_US
 
@@ -317,7 +318,7 @@ def _notices(inputs: Inputs) -> list[Finding]:
     notices = []
     if inputs.problem:
         cause = "It was written by another release, or is damaged"
-        notices.append(Finding("warning", inputs.problem, cause, f"`polysight validate {inputs.folder}`"))
+        notices.append(Finding("warning", inputs.problem, cause, f"`polysight validate {quote(inputs.folder)}`"))
     history = inputs.history
     if inputs.failure is not None:
         notices.append(inputs.failure)
@@ -361,13 +362,15 @@ def say(key: str, **words: str | int) -> Status:
     """The status of a state of the table, with its words filled in."""
     state = STATES[key]
     filled = {"since": SINCE, **words}
+    # A line that can be pasted into a shell.
+    pasted = {**filled, "folder": quote(str(words.get("folder", "")))}
     return Status(
         key=key,
         level=state.level,
         headline=state.headline.format(**filled),
         detail=state.detail.format(**filled).strip(),
         why=state.why.format(**filled),
-        do=state.do.format(**filled),
+        do=state.do.format(**pasted),
         press=state.press,
     )
 
@@ -451,7 +454,7 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
         key = "aborted" if ended.asked == "abort" else "stopped"
         return say(key, asker=ended.asker or "somebody", safe=safe, folder=folder)
     problem = f"{sentence(ended.reason)}."
-    do = sentence(ended.remedy) or f"`polysight resume {folder}`"
+    do = sentence(ended.remedy) or f"`polysight resume {quote(folder)}`"
     return say("failed", what=problem, safe=safe, why=sentence(ended.why) or "See its terminal", do=do)
 
 
@@ -465,7 +468,7 @@ def _judge_result(inputs: Inputs, gaps: str) -> Status:
     if inputs.verdict is not None:
         return say(f"result_{inputs.verdict.level}", gaps=gaps)
     if inputs.signs.killed:
-        do = f"`polysight process {inputs.folder} --out {inputs.folder}/products`"
+        do = f"`polysight process {quote(inputs.folder)} --out {quote(f'{inputs.folder}/products')}`"
         return say("unprocessed", what="Its program was killed while it computed materials.", why="", do=do)
     if inputs.failure is not None:
         return say_finding("unprocessed", inputs.failure)

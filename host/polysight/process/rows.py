@@ -59,7 +59,7 @@ from polysight.store import (
 from polysight.sync import HighPass
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, quote
 from polysight_shared.files import read_json
 
 HEAD = "samples.json"
@@ -239,7 +239,7 @@ class KeptSamples:
             raise DataError(
                 f"{folder}: no row is recorded whole",
                 "the scan was stopped in its first row, or files are missing",
-                f"`polysight resume {folder}` takes the missing rows of a scan folder",
+                f"`polysight resume {quote(folder)}` takes the missing rows of a scan folder",
                 code=ErrorCode.NO_DATA,
             )
         return [row for row in rows if row not in unreadable]

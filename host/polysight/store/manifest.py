@@ -24,7 +24,7 @@ import msgspec
 
 from polysight.store.logs import AppendFile, LogDigest
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError, PolysightError, no_such
+from polysight_shared.errors import DataError, DeviceError, PolysightError, no_such, quote
 from polysight_shared.files import MAX_JSON_BYTES, open_regular, read_bounded
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan
@@ -552,7 +552,7 @@ class ManifestWriter:
                 raise DeviceError(
                     f"{path}: exists already",
                     f"{path.parent} holds a scan",
-                    f"choose another folder, or `polysight resume {path.parent}`",
+                    f"choose another folder, or `polysight resume {quote(path.parent)}`",
                     code=ErrorCode.FILE_EXISTS,
                 )
             problem = f"{path}: does not exist"

@@ -33,7 +33,7 @@ from polysight.store.manifest import BoardRow, DroppedFile, ManifestWriter, RawD
 from polysight.store.scan_folder import SAMPLES, ScanFolder, dropped_files, utc_now
 from polysight.store.validation import board_faults, to_text
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError, ScanError
+from polysight_shared.errors import DataError, DeviceError, ScanError, quote
 from polysight_shared.files import sync_folder
 
 Digests = dict[str, dict[int, str]]
@@ -84,7 +84,7 @@ def find_droppable(scan: ScanFolder, processed: Digests) -> Droppable:
         raise ScanError(
             f"{scan.path}: {missing} of {scan.plan.rows} rows are not committed",
             "the image of the whole scan needs the raw data of every row",
-            f"`polysight resume {scan.path}` first",
+            f"`polysight resume {quote(scan.path)}` first",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
     files: dict[int, dict[str, Path]] = {}
@@ -136,7 +136,7 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
                     raise DeviceError(
                         f"{path}: cannot be removed: {e.strerror}",
                         "this user may not write there, or the disk fails",
-                        f"correct the rights or the disk, then `polysight drop-raw {scan.path}` deletes the rest",
+                        f"correct rights or disk, then `polysight drop-raw {quote(scan.path)}` deletes the rest",
                         code=ErrorCode.FILE_UNWRITABLE,
                     ) from None
         for folder in {path.parent for files in droppable_files.files.values() for path in files.values()}:

@@ -51,7 +51,7 @@ from polysight.store.source import HEADER_LOCK, RowData, allocate_pages
 from polysight_shared import __version__
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError
+from polysight_shared.errors import ConfigError, DataError, DeviceError, quote
 from polysight_shared.files import open_regular, sync_folder
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan
@@ -345,7 +345,7 @@ class ScanFolder:
             raise DataError(
                 f"{self.path}: row {row} of {board_name} is not committed",
                 "the scan was interrupted before it, or the board was not recorded",
-                f"`polysight resume {self.path}` takes the rows that are missing",
+                f"`polysight resume {quote(self.path)}` takes the rows that are missing",
                 code=ErrorCode.NO_DATA,
             )
         path = self.path / board.file
@@ -393,8 +393,8 @@ class ScanFolder:
 
     def _remedy(self) -> str:
         return (
-            f"restore it from a copy, or `polysight resume {self.path}` takes its row again;"
-            f" `polysight validate {self.path}` names every damaged file"
+            f"restore it from a copy, or `polysight resume {quote(self.path)}` takes its row again;"
+            f" `polysight validate {quote(self.path)}` names every damaged file"
         )
 
 
@@ -484,7 +484,7 @@ def locked_samples(scan: ScanFolder) -> Iterator[None]:
         raise DataError(
             f"{path}: {e.strerror}",
             "the samples of this scan are not kept: images can be made from its raw data only",
-            f"`polysight process {scan.path} --out DIR` keeps them",
+            f"`polysight process {quote(scan.path)} --out DIR` keeps them",
             code=ErrorCode.FILE_MISSING,
         ) from None
     try:

@@ -22,7 +22,7 @@ from polysight.store.scan_folder import (
     dropped_rows,
 )
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, PolysightError
+from polysight_shared.errors import DeviceError, PolysightError, quote
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
 
@@ -93,7 +93,7 @@ def validate(path: Path) -> list[Finding]:
     missing = scan.plan.rows - sum(0 <= r < scan.plan.rows for r in rows)
     ended = scan.facts(ScanEnded)
     if missing:
-        remedy = f"`polysight resume {path}` takes them"
+        remedy = f"`polysight resume {quote(path)}` takes them"
         findings.append(_note(MANIFEST, f"{missing} of {scan.plan.rows} rows are not committed", remedy))
     elif not ended:
         findings.append(_note(MANIFEST, "no scan_ended: the program ended before it was written"))
@@ -111,7 +111,7 @@ def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
         raise DeviceError(
             f"{scan.path / unreadable[0].where}: {unreadable[0].what}",
             f"the disk fails, or its server is away ({len(unreadable)} files); nothing was changed",
-            f"check the disk, then `polysight resume {scan.path}`",
+            f"check the disk, then `polysight resume {quote(scan.path)}`",
             code=ErrorCode.FILE_UNREADABLE,
         )
     return {row: [to_text(f) for f in faults] for row, faults in findings.items() if faults}
@@ -142,7 +142,7 @@ def _what_is_lost(scan: ScanFolder) -> str:
         rows = f"row {absent[0]} is"
     else:
         rows = f"rows {', '.join(map(str, absent))} are"
-    return f"facts are lost: {rows} not committed; `polysight resume {scan.path}` takes them again"
+    return f"facts are lost: {rows} not committed; `polysight resume {quote(scan.path)}` takes them again"
 
 
 def _row(scan: ScanFolder, row: RowCommitted) -> list[Finding]:
@@ -263,7 +263,7 @@ def _check_dropped(scan: ScanFolder) -> list[Finding]:
         findings.append(_note(SAMPLES, "absent: no image can be made again"))
     leftover_files = [file for file in files if (scan.path / file).exists()]
     if leftover_files:
-        remedy = f"`polysight drop-raw {scan.path}` removes them"
+        remedy = f"`polysight drop-raw {quote(scan.path)}` removes them"
         findings.append(_note("raw", f"{len(leftover_files)} files to be dropped are still there", remedy))
     return findings
 

@@ -6,10 +6,11 @@ from pathlib import Path
 import msgspec
 import pytest
 import tomli_w
+from tests.support.calibration import filter_file
 from tests.support.doctor.case import QUICK, RIG, make_context
 from tests.support.rigs import programmed_rig
 
-from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
+from polysight.calibration.files import write_calibration
 from polysight.capture.network import route_interface
 from polysight.cli.main import main
 from polysight.doctor import checks, context
@@ -57,17 +58,7 @@ def join_reasons(context, name):
 
 
 def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
-    board = BoardFilter(
-        corners_khz=[180.5, 355.0],
-        standard_error_khz=[1.0, 2.0],
-        programmed_khz=[175.0, 350.0],
-        if_from_khz=100.0,
-        if_to_khz=1900.0,
-        chirps=640,
-        residual_db=0.05,
-    )
-    file = FilterFile(**header("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board, "RV": board})
-    context = make_context(programmed_rig(calibration={"hpf": str(write_calibration(file, tmp_path))}))
+    context = make_context(programmed_rig(calibration={"hpf": str(write_calibration(filter_file(), tmp_path))}))
     hello = HelloReply(pi_release="", firmware="", backend=WIRES, state="homed", scan_id="", last_seq=0)
     assert check_calibration(dataclasses.replace(context, hello=hello)).level == "ok"
     real = msgspec.structs.replace(hello, backend=GPIOD)

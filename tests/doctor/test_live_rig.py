@@ -8,6 +8,7 @@ import json
 import time
 
 import pytest
+from tests.support.calibration import board_filter, filter_file
 from tests.support.doctor.case import QUICK
 from tests.support.doctor.live_rig import answering
 from tests.support.processes import wait_for
@@ -15,7 +16,7 @@ from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 
 from polysight.acquisition.scan import run_scan
-from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
+from polysight.calibration.files import write_calibration
 from polysight.doctor.checks import run_doctor
 from polysight.doctor.context import DoctorOptions
 from polysight.pipeline import Pipeline
@@ -120,28 +121,8 @@ def test_a_scan_in_progress_is_not_disturbed(live):
 
 
 def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
-    board = BoardFilter(
-        corners_khz=[180.5, 355.0],
-        standard_error_khz=[1.0, 2.0],
-        programmed_khz=[175.0, 350.0],
-        if_from_khz=100.0,
-        if_to_khz=1900.0,
-        chirps=640,
-        residual_db=0.05,
-    )
-    other_filter = BoardFilter(
-        corners_khz=[172.5, 347.0],
-        standard_error_khz=[1.0, 2.0],
-        programmed_khz=[175.0, 350.0],
-        if_from_khz=100.0,
-        if_to_khz=1900.0,
-        chirps=640,
-        residual_db=0.05,
-    )
-    sources = [SourceScan("sweep", "scans/sweep", True, 6)]
-    path = write_calibration(
-        FilterFile(**header("hpf", sources), boards={"RH": board, "RV": other_filter}), live.folder / "calibration"
-    )
+    filters = filter_file(rv=board_filter(172.5, 347.0))
+    path = write_calibration(filters, live.folder / "calibration")
 
     def small(table):
         table["calibration"] = {"hpf": str(path)}
@@ -157,7 +138,7 @@ def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
     }
     assert validate(scan.path) == []
     pipeline = Pipeline(ScanFolder.load(scan.path))
-    assert pipeline.synchroniser.setups["RH"].equaliser.model.corners_hz == (180.5e3, 355e3)
+    assert pipeline.synchroniser.setups["RH"].equaliser.model.corners_hz == (180.5e3, 355.25e3)
     assert pipeline.synchroniser.setups["RV"].equaliser.model.corners_hz == (172.5e3, 347e3)
 
 

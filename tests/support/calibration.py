@@ -14,10 +14,10 @@ from polysight_shared.config import Instrument
 SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
 
 
-def filter_file(corner_khz: float = 180.5) -> FilterFile:
-    """Both receivers with the same corners, measured with the published rig's."""
-    board = BoardFilter(
-        corners_khz=[corner_khz, 355.25],
+def board_filter(first_khz: float = 180.5, second_khz: float = 355.25) -> BoardFilter:
+    """One receiver's corners, measured with those of the published rig."""
+    return BoardFilter(
+        corners_khz=[first_khz, second_khz],
         standard_error_khz=[1.5, 2.5],
         programmed_khz=[175.0, 350.0],
         if_from_khz=100.0,
@@ -25,7 +25,12 @@ def filter_file(corner_khz: float = 180.5) -> FilterFile:
         chirps=640,
         residual_db=0.05,
     )
-    return FilterFile(**header("hpf", SOURCES), boards={"RH": board, "RV": board})
+
+
+def filter_file(first_khz: float = 180.5, rv: BoardFilter | None = None) -> FilterFile:
+    """Both receivers with the same corners, or the second one with its own."""
+    rh = board_filter(first_khz)
+    return FilterFile(**header("hpf", SOURCES), boards={"RH": rh, "RV": rv or rh})
 
 
 def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:

@@ -15,6 +15,7 @@ NAMES = (
     "image",
     "whole",
     "waits",
+    "demo",
     "gpu",
     "scaling",
     "accuracy",

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks import accuracy, gpu, image, measure, sync, waits, whole
+from benchmarks import accuracy, demo, gpu, image, measure, sync, waits, whole
 from benchmarks.__main__ import main
 from benchmarks.measure import THREADS
 
-MODULES = {"sync": sync, "image": image, "whole": whole, "waits": waits, "accuracy": accuracy}
+MODULES = {"sync": sync, "image": image, "whole": whole, "waits": waits, "demo": demo, "accuracy": accuracy}
 
 
 @pytest.mark.slow

@@ -1,0 +1,111 @@
+"""CPU of the demo's scan, for each row and kind of process (host, receivers, Pi, simulators), and of `process`."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from benchmarks.data import ROOT, temporary
+from benchmarks.measure import Line, add_arguments, count_repeats, cpu_s, show, write
+from benchmarks.waits import command
+from polysight.store import MANIFEST
+
+__all__ = ["add_arguments", "run"]
+_LOOK_S = 0.05
+REPEATS = 3
+# Kinds of process by a part of their command line; the first that fits.
+KINDS = {
+    "receiver_process": "receivers",
+    "polysight_pi": "Pi",
+    "polysight_simulators": "simulators",
+    "polysight": "host",
+}
+QUICK = ROOT / "examples" / "own-scene.toml"
+
+
+def run(args: argparse.Namespace) -> int:
+    """Scan and process; print CPU seconds."""
+    # Never in `args.folder`: paths of the rig's sockets must be short.
+    with temporary(None) as folder:
+        scene = ROOT / "examples" / "demo.toml"
+        if args.quick:
+            scene = QUICK
+        rows, by_kind = scan_cpu_s(folder / "demo", scene)
+        processed = [
+            command(["process", str(folder / "demo" / "scan"), "--out", str(folder / f"products{n}")])[0]
+            for n in range(count_repeats(args.quick, REPEATS))
+        ]
+    each = ", ".join(f"{kind} {seconds / rows:.2f}" for kind, seconds in by_kind.items())
+    total = sum(by_kind.values()) / rows
+    process_s = statistics.median(processed)
+    lines = [
+        _least("a row of the demo's scan, all processes, CPU s", total, 0.75, f"{rows} rows: {each}"),
+        _least("process of that scan, CPU s", process_s, 6.0, ", ".join(f"{seconds:.1f}" for seconds in processed)),
+    ]
+    show("the demo's scan, simulated cards, radars, Pi and stage", lines, args.quick)
+    write(args.json, "demo", lines, rows=rows, by_kind=by_kind, process_cpu_s=processed)
+    return 0
+
+
+def scan_cpu_s(out: Path, scene: Path) -> tuple[int, dict[str, float]]:
+    """Run the demo; return the rows between the first commit and the last, and CPU seconds of each kind meanwhile.
+
+    So the scene's field, computed before, and the products are not in it. Raises RuntimeError if the demo fails.
+    """
+    words = [sys.executable, "-m", "polysight", "demo", "--scene", str(scene), "--out", str(out)]
+    demo = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL)
+    first = last = None
+    while demo.poll() is None:
+        committed = _count_commits(out / "scan" / MANIFEST)
+        if committed and (last is None or committed > last[0]):
+            last = committed, _cpu_of_tree(demo.pid)
+            first = first or last
+        time.sleep(_LOOK_S)
+    if demo.returncode or first is None or last is None or first[0] == last[0]:
+        raise RuntimeError(f"the demo ended with status {demo.returncode}")
+    by_kind = dict.fromkeys(KINDS.values(), 0.0)
+    for pid, (kind, seconds) in last[1].items():
+        by_kind[kind] += seconds - first[1].get(pid, (kind, 0.0))[1]
+    return last[0] - first[0], by_kind
+
+
+def _count_commits(manifest: Path) -> int:
+    if not manifest.exists():
+        return 0
+    return manifest.read_text(encoding="utf-8").count('"row_committed"')
+
+
+def _cpu_of_tree(root: int) -> dict[int, tuple[str, float]]:
+    """Return kind and CPU seconds of a process and all below it, by process id."""
+    parents = dict(_parents())
+    tree = {}
+    for pid in parents:
+        above = pid
+        while above not in (root, 0):
+            above = parents.get(above, 0)
+        if above == root:
+            try:
+                words = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace").replace("-", "_")
+                tree[pid] = next((name for part, name in KINDS.items() if part in words), "host"), cpu_s(pid)
+            except (FileNotFoundError, ProcessLookupError):
+                continue
+    return tree
+
+
+def _parents() -> Iterator[tuple[int, int]]:
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit():
+            try:
+                status = (process / "stat").read_text(encoding="utf-8", errors="replace")
+            except (FileNotFoundError, ProcessLookupError):
+                continue
+            yield int(process.name), int(status.rsplit(")", 1)[1].split()[1])
+
+
+def _least(name: str, value: float, limit: float, note: str) -> Line:
+    return Line(name, f"{value:.2f} s", "", value, limit, limit, higher_is_better=False, note=note)

@@ -90,6 +90,7 @@ class ReflectionTable:
 
     def __init__(self, stack: Stack, frequency_hz: float) -> None:
         cosines = np.linspace(0, 1, self.POINTS)
+        # Exactly along the surface the admittances of air are 0 and infinite.
         cosines[0] = 1e-6
         self._tables = [table.astype(np.complex64) for table in reflect(stack, frequency_hz, cosines)]
 

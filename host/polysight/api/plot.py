@@ -10,8 +10,12 @@ from matplotlib.figure import Figure
 from polysight.products import ProcessedScan
 from polysight.report import draw_overview, figure_label, font_families
 
-# Width of one picture
+# Width of one picture, and what its colour bar and the axis of the next one add; height of a title and axis.
 _PANEL_IN = 3.8
+_BETWEEN_IN = 1.2
+_TITLE_IN = 0.4
+# The title of the whole figure.
+_HEAD_IN = 0.5
 
 
 class NotebookFigure(Figure):
@@ -25,10 +29,16 @@ class NotebookFigure(Figure):
 
 def plot_scan(done: ProcessedScan) -> Figure:
     """Amplitude of H, V, P in dB, and the materials where the images are relative to metal; axes in mm."""
-    named = done.metal_referenced
-    rows, columns = (2, 2) if named else (1, 3)
-    height_in = _PANEL_IN * min(2.0, max(0.4, done.labels.shape[0] / done.labels.shape[1]))
-    size = (columns * (_PANEL_IN + 1.2), rows * (height_in + 0.4) + 0.5)
+    rows = 1
+    columns = 3
+    if done.metal_referenced:
+        # The materials are the fourth picture.
+        rows = 2
+        columns = 2
+    # A long narrow image is cut neither to a line nor to a tower.
+    height_over_width = done.labels.shape[0] / done.labels.shape[1]
+    height_in = _PANEL_IN * min(2.0, max(0.4, height_over_width))
+    size = (columns * (_PANEL_IN + _BETWEEN_IN), rows * (height_in + _TITLE_IN) + _HEAD_IN)
     fig = NotebookFigure(figsize=size, dpi=100, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
     draw_overview(fig, list(fig.subplots(rows, columns).flat), done, bar_labels=True)

@@ -39,10 +39,11 @@ from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
 from polysight_shared.findings import Finding
 
 ATTEMPTS = 3
-# A second card answers a request as soon as the first.
+# How long a second answer to one request is awaited: a second card answers as soon as the first.
 _TWIN_S = 0.05
+# How long the card's report of a failed write is awaited after its reply.
 EEPROM_REPORT_S = 0.5
-# In the EEPROM.
+# Command and data port, as the EEPROM holds them.
 _PORTS = struct.Struct("<HH")
 DEFAULT_MAC = "12:34:56:78:90:12"
 _OTHER_MAC = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"

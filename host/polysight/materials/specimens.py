@@ -40,9 +40,12 @@ METAL_SPECIMENS = 0.1
 """|V/H - 1| below which a material is metal, whose specimens do not differ."""
 SOFT = 0.05
 """|V / H| below which its errors are additive (leakage, noise) instead of relative (gain, phase)."""
+# Difference quotient of the features by ln eps' and ln eps''.
 _STEP = 1e-4
+# Expectation maximisation ends after these rounds, or when one changes the pooled variances by less than this share.
 _ROUNDS = 300
 _SETTLED = 1e-3
+# Without any loss ln eps'' would not exist.
 _LEAST_LOSS = 1e-3
 
 
@@ -111,33 +114,39 @@ def fit_spread(
     material's own. A material with a single specimen is ignored.
     """
     is_single = np.array([np.unique(specimen[material == k]).size < 2 for k in range(len(effects))])
-    telling = ~is_single & (np.abs(effects).max(axis=(1, 2), initial=0) > 0)
-    _, group = np.unique(specimen, return_inverse=True)
-    count = np.bincount(group)
-    kind = np.zeros(count.size, np.intp)
-    kind[group] = material
-    sums = np.stack([np.bincount(group, c) for c in residuals.T], axis=1)
-    used = telling[kind]
-    f = effects[kind]
+    has_spread = ~is_single & (np.abs(effects).max(axis=(1, 2), initial=0) > 0)
+    _, specimen_of_patch = np.unique(specimen, return_inverse=True)
+    patches_of_specimen = np.bincount(specimen_of_patch)
+    material_of_specimen = np.zeros(patches_of_specimen.size, np.intp)
+    material_of_specimen[specimen_of_patch] = material
+    residual_sums = np.stack([np.bincount(specimen_of_patch, c) for c in residuals.T], axis=1)
+    is_used = has_spread[material_of_specimen]
+    effect_of_specimen = effects[material_of_specimen]
     prior = np.square(PUBLISHED_SPREAD)
     pooled = prior
     placement = noise
-    second = np.zeros((count.size, 2))
+    second_moments = np.zeros((patches_of_specimen.size, 2))
     for _ in range(_ROUNDS):
-        information = f.mT @ np.linalg.inv(placement + _floor(noise))
-        spread = np.linalg.inv(np.diag(1 / pooled) + count[:, None, None] * (information @ f))
-        spread[~used] = 0.0
-        mean = np.einsum("gab,gbd,gd->ga", spread, information, sums)
-        second = mean**2 + np.einsum("gaa->ga", spread)
+        # Expectation: deviation of each specimen given its patches, normal with this mean and covariance.
+        information = effect_of_specimen.mT @ np.linalg.inv(placement + _floor(noise))
+        posterior = np.linalg.inv(
+            np.diag(1 / pooled) + patches_of_specimen[:, None, None] * (information @ effect_of_specimen)
+        )
+        posterior[~is_used] = 0.0
+        posterior_mean = np.einsum("gab,gbd,gd->ga", posterior, information, residual_sums)
+        second_moments = posterior_mean**2 + np.einsum("gaa->ga", posterior)
+        # Maximisation: spread of specimens and covariance of placements given these deviations.
         pooled_before = pooled
-        pooled = (PRIOR_FREEDOM * prior + second[used].sum(axis=0)) / (PRIOR_FREEDOM + used.sum())
-        residuals_left = residuals - np.einsum("gda,ga->gd", f, mean)[group]
-        blur = np.einsum("g,gda,gab,geb->de", count.astype(float), f, spread, f)
-        placement = (residuals_left.T @ residuals_left + blur) / len(residuals)
+        pooled = (PRIOR_FREEDOM * prior + second_moments[is_used].sum(axis=0)) / (PRIOR_FREEDOM + is_used.sum())
+        residuals_left = residuals - np.einsum("gda,ga->gd", effect_of_specimen, posterior_mean)[specimen_of_patch]
+        uncertainty = np.einsum(
+            "g,gda,gab,geb->de", patches_of_specimen.astype(float), effect_of_specimen, posterior, effect_of_specimen
+        )
+        placement = (residuals_left.T @ residuals_left + uncertainty) / len(residuals)
         placement = average_channels(placement) if gains_alike else placement
         if np.abs(pooled / pooled_before - 1).max() < _SETTLED:
             break
-    return _each(pooled, second, kind, telling), placement
+    return _each(pooled, second_moments, material_of_specimen, has_spread), placement
 
 
 def _each(pooled: Real, second: Real, kind: npt.NDArray[np.intp], telling: npt.NDArray[np.bool_]) -> Real:

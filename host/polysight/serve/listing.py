@@ -14,6 +14,7 @@ import msgspec
 
 from polysight.catalogue import Summary
 
+# Random bytes that tell the states of this server from those of one that ran before.
 ORIGIN_BYTES = 4
 
 
@@ -49,11 +50,11 @@ class ChangingList:
         with self._lock:
             self._take_over({scan.name: scan for scan in scans})
             reached = f"{self._origin}-{self._number}"
-            known = self._find_state(stamp)
-            if known is None:
+            shown_state = self._find_state(stamp)
+            if shown_state is None:
                 return ListChanges(stamp=reached, whole=True, scans=list(self._scans.values()), gone=[])
-            changed = [scan for name, scan in self._scans.items() if self._changed_in[name] > known]
-            gone = [name for name, number in self._gone_in.items() if number > known]
+            changed = [scan for name, scan in self._scans.items() if self._changed_in[name] > shown_state]
+            gone = [name for name, number in self._gone_in.items() if number > shown_state]
         return ListChanges(stamp=reached, whole=False, scans=changed, gone=gone)
 
     def _take_over(self, scans: dict[str, ListedScan]) -> None:

@@ -115,7 +115,8 @@ def read_log(path: Path) -> PacketLog | None:
     return PacketLog(sequence, size, at_s)
 
 
-# That a stream may span: what is missing is filled with zeros.
+# A stream may span at most this many times the bytes of a row and its file: what is missing is filled with zeros, so
+# that one damaged packet number could fill the memory.
 _MAX_ROWS = 16
 
 

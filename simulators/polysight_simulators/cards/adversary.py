@@ -233,16 +233,16 @@ class Adversary:
         if "drop_inside" in troubles or "drop_frames" in troubles:
             sent.whole = False
             if "drop_frames" in troubles:
-                many = frame * chance.randint(1, 3)
+                dropped_bytes = frame * chance.randint(1, 3)
             else:
-                many = 16 * chance.randint(1, 200)
-            cut = chance.randrange(max(1, len(data) - many))
-            data = np.delete(data, slice(cut, cut + many))
+                dropped_bytes = 16 * chance.randint(1, 200)
+            cut = chance.randrange(max(1, len(data) - dropped_bytes))
+            data = np.delete(data, slice(cut, cut + dropped_bytes))
         if "two_drops" in troubles:
             sent.whole = False
-            many = frame * chance.randint(1, 2)
-            part = 16 * chance.randint(1, many // 16 - 1)
-            for size in (part, many - part):
+            dropped_bytes = frame * chance.randint(1, 2)
+            first_part = 16 * chance.randint(1, dropped_bytes // 16 - 1)
+            for size in (first_part, dropped_bytes - first_part):
                 cut = chance.randrange(max(1, len(data) - size))
                 data = np.delete(data, slice(cut, cut + size))
         if "reset_between" in troubles:

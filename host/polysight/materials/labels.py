@@ -446,7 +446,7 @@ def _metal_by_name(boxes: Mapping[str, Box]) -> str | None:
         raise DataError(
             f"the metal reference among the {len(boxes)} boxes is not known: {candidates}",
             "training data are relative to metal in the same scan",
-            f"add --metal NAME: {', '.join(metals or boxes)}",
+            f"name its box, --metal NAME (in Python metal=NAME): {', '.join(metals or boxes)}",
             code=ErrorCode.KEY_MISSING,
         )
     return None

@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 from polysight_pi.edges import EdgeTimes, RowMotion
 from polysight_pi.journal import JournalThread
@@ -141,7 +141,7 @@ class Machine:
     @property
     def wire_state(self) -> m.State:
         """The name of the state in messages."""
-        return WIRE_STATE.get(self.state) or self.state  # pyright: ignore[reportReturnType]
+        return cast(m.State, WIRE_STATE.get(self.state, self.state))
 
     def _nothing(self, *_: object) -> None:
         pass

@@ -22,7 +22,7 @@ def run(notebook: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebooks_are_valid_and_stripped(notebook):
-    content = nbformat.read(notebook, as_version=4)
+    content: Any = nbformat.read(notebook, as_version=4)
     nbformat.validate(content)
     assert content.cells[0].cell_type == "markdown"
     assert "Simulated: no hardware" in content.cells[0].source

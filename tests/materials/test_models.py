@@ -91,6 +91,8 @@ def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
     groups_seen = []
 
     class Spy(Model):
+        distributions = None
+
         def fit(self, samples):
             self.known = {row.tobytes() for row in samples.x}
             self.name = samples.names[0]

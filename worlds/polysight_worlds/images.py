@@ -7,6 +7,7 @@ length), the range gate is the sum over frequencies, and the image a matched fil
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -65,7 +66,7 @@ class ImagePair:
         """What is true, for JSON; complex numbers as [real, imaginary]. Also a label file for the instrument."""
         plates = []
         for plate in self.world.plates:
-            written = asdict(plate)
+            written: dict[str, Any] = asdict(plate)
             stack = written.pop("stack")
             ratio = self.plate_ratio(plate)
             written["box_m"] = plate.box_m

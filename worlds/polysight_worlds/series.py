@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -87,7 +88,7 @@ def sphere_coefficients(
     x = k * radius_m
     orders = needed_orders(x)
     count = len(orders) - 1
-    psi = x * special.spherical_jn(orders, x)
+    psi: Any = x * special.spherical_jn(orders, x)
     xi = psi + 1j * x * special.spherical_yn(orders, x)
     n = orders[1:]
     if permittivity is None:
@@ -168,8 +169,8 @@ class _RadialWaves:
 
     def __init__(self, rho: NDArray) -> None:
         self._rho = rho
-        self._last = np.exp(1j * rho) / rho
-        self._now = -1j * self._last
+        self._last: NDArray = np.exp(1j * rho) / rho
+        self._now: NDArray = -1j * self._last
         # h_{-1} = cos + i sin over rho; h_0 = -i exp(i rho) / rho.
         self._order = 0
 

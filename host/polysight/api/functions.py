@@ -159,7 +159,7 @@ def compare(first: Scan | PathText, second: Scan | PathText) -> xarray.Dataset:
         "pair_sigmas": ("pair", [np.nan if pair.sigmas is None else pair.sigmas for pair in pairs]),
     }
     image = image_dataset(scans[0].read_or_process())
-    attributes = {
+    attributes: dict[str, object] = {
         "first": scans[0].scan_id,
         "second": scans[1].scan_id,
         "notes": "; ".join(comparison.figures.notes),

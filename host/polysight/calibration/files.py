@@ -455,9 +455,11 @@ class Calibration:
 
 def load_calibration(paths: dict[str, Path]) -> Calibration:
     """Load calibration files by kind. Raises ConfigError or DataError for an invalid file."""
-    kinds = {"direct_path": PlacesFile, "hpf": FilterFile, "metal": MetalFile, "sphere": SphereFile}
-    files = {kind: read_calibration(path, kinds[kind], kind) for kind, path in paths.items()}
-    metal = files.get("metal")
+
+    def load(name: str, kind: type[F]) -> F | None:
+        return read_calibration(paths[name], kind, name) if name in paths else None
+
+    metal = load("metal", MetalFile)
     if metal is not None and Path(metal.images).name != metal.images:
         raise DataError(
             f"{paths['metal']}: the images {metal.images!r} are not in the same folder",
@@ -466,10 +468,10 @@ def load_calibration(paths: dict[str, Path]) -> Calibration:
             code=ErrorCode.PATH_OUTSIDE,
         )
     return Calibration(
-        places=files.get("direct_path"),
-        filters=files.get("hpf"),
+        places=load("direct_path", PlacesFile),
+        filters=load("hpf", FilterFile),
         metal=metal,
-        sphere=files.get("sphere"),
+        sphere=load("sphere", SphereFile),
         paths=dict(paths),
     )
 

@@ -218,7 +218,7 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
             code=ErrorCode.NO_DATA,
         )
     # Noise is white in the raw samples, so its covariance in the reduced samples is that of the reduction.
-    power, directions = scipy.linalg.eigh(maps.matrix @ maps.matrix.conj().T)
+    power, directions = np.linalg.eigh(maps.matrix @ maps.matrix.conj().T)
     has_noise = power > _MIN_NOISE * power[-1]
     whitening = directions[:, has_noise].conj().T / np.sqrt(power[has_noise])[:, None]
     samples = (samples / gains[:, None, None]) @ whitening.T

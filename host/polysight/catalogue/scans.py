@@ -11,7 +11,7 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import islice
@@ -428,7 +428,7 @@ class Scans:
         self._reading: set[str] = set()
         self._lock = threading.Lock()
 
-    def list(self) -> list[Summary]:
+    def list(self) -> Sequence[Summary]:
         """Every scan, the newest first; what has changed since the last call is read again.
 
         A folder that takes longer than `READ_S` is listed as `silent`. Its thread cannot be ended: the folder is read
@@ -497,7 +497,7 @@ class Scans:
             if life is not None:
                 yield name, life
 
-    def left_out(self) -> list[str]:
+    def left_out(self) -> Sequence[str]:
         """Names in the folder that hold a scan and are not listed: links, and names that cannot be shown; in ASCII."""
         if self.only is not None:
             return []

@@ -17,7 +17,6 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
-from urllib.error import URLError
 from urllib.request import Request, urlopen
 
 from msgspec.structs import replace
@@ -293,6 +292,6 @@ def _post(url: str, content: bytes) -> None:
 def _report_failure(send: Callable[[], None], name: str) -> None:
     try:
         send()
-    except (OSError, ValueError, subprocess.SubprocessError, URLError) as e:
+    except (OSError, ValueError, subprocess.SubprocessError) as e:
         with suppress(OSError):
             sys.stderr.write(f"note: {name} of the rig file did not work: {type(e).__name__}\n")

@@ -135,7 +135,7 @@ class PaperKnn(Model):
         return self
 
     @property
-    def distributions(self) -> ErrorDiscriminant:  # type: ignore[override]
+    def distributions(self) -> ErrorDiscriminant:
         """The materials' distributions, fitted when they are asked for: pixels are named without them."""
         if self._distributions is None:
             self._distributions = ErrorDiscriminant().fit(self._samples)

@@ -48,7 +48,9 @@ def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -
         copies = _copies_in(patches, amplitude, pixel_mm)
         if copies is not None and not _are_plates(copies, patches, other, pixel_mm):
             copies_of_channels.append(copies)
-    return max(copies_of_channels, key=lambda copies: len(copies.labels), default=None)
+    if not copies_of_channels:
+        return None
+    return max(copies_of_channels, key=lambda copies: len(copies.labels))
 
 
 def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pixel_mm: float) -> bool:

@@ -361,7 +361,7 @@ class SceneLikelihood:
 
     def hypotheses(self) -> list[tuple[SceneLikelihood, float]]:
         """Return the same scene with each certainty on what the prior leaves open, and the probability of each."""
-        out = []
+        out: list[tuple[SceneLikelihood, float]] = []
         for moved, painted in itertools.product(_certainties(self.prior.moved), _certainties(self._painted())):
             hypothesis = copy.copy(self)
             hypothesis.prior = replace(self.prior, moved=moved[0], painted=painted[0])

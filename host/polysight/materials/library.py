@@ -495,8 +495,11 @@ class Model(ABC):
 
     knows_scans = False
     """True if `by_scan` uses errors common to the patches of a scan."""
-    distributions: Any
-    """The materials' distributions (`discriminant.py`), used by every model to recognise unknown patches."""
+
+    @property
+    @abstractmethod
+    def distributions(self) -> Any:
+        """The materials' distributions (`discriminant.py`), used by every model to recognise unknown patches."""
 
     @abstractmethod
     def fit(self, samples: Samples) -> Model:

@@ -386,8 +386,8 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
         truth = r.truth.name if r.truth else None
         rows.append({"label": r.patch.label, "centre_mm": r.patch.centre_mm, "truth": truth, "pixels": int(ix.size)})
     angle = float(np.degrees(np.mean(result.theta_rad)))
-    meta = {"format": PATCHES_FORMAT, "angle_deg": angle, "simulated": simulated, "patches": rows}
-    meta["judged"] = list(result.evidence)
+    judged = list(result.evidence)
+    meta = {"format": PATCHES_FORMAT, "angle_deg": angle, "simulated": simulated, "patches": rows, "judged": judged}
     evidence = result.evidence.values()
     out = io.BytesIO()
     np.savez_compressed(

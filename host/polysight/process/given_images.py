@@ -376,7 +376,8 @@ def place_rig(rig: Instrument, incidence_deg: float) -> Instrument:
             f"an incidence angle of {incidence_deg:g} degrees", "the rig's geometry has no plane with this angle",
             "give an angle between 5 and 80 degrees", code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
-    return place_plane(float(scipy.optimize.brentq(miss, _NEAREST_MM, _FARTHEST_MM, xtol=1e-9)))
+    distance_mm: Any = scipy.optimize.brentq(miss, _NEAREST_MM, _FARTHEST_MM, xtol=1e-9)
+    return place_plane(float(distance_mm))
 
 
 @dataclass(frozen=True)

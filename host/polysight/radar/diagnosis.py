@@ -237,7 +237,13 @@ def trace_words(words: WordLink, clock: Clock, file: Path, rig: Instrument, boar
     """Log a board's link to `file`, whose first line has board, place, rig, version and time."""
     place = rig.radar.native[board].place
     now = round(time.time(), 3)
-    facts = {"board": board, "place": place, "rig": rig.name, "polysight": __version__, "unix_s": now}
+    facts: dict[str, object] = {
+        "board": board,
+        "place": place,
+        "rig": rig.name,
+        "polysight": __version__,
+        "unix_s": now,
+    }
     return TracedWords(words, clock, file, facts)
 
 

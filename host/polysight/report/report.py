@@ -389,7 +389,7 @@ def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[st
         add(f"{count.right} of {count.plates}", f"plates named right{aside}")
     elif rows:
         add(str(len(rows)), "patches found")
-    accuracy = scan.materials and scan.materials.pixel_accuracy
+    accuracy = None if scan.materials is None else scan.materials.pixel_accuracy
     if accuracy is not None:
         expected = scan.expected_accuracy
         aside = ""

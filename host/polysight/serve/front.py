@@ -13,7 +13,7 @@ import struct
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -242,7 +242,7 @@ class RunningScans:
         self._running: list[RunningScan] = []
         self._lock = threading.Lock()
 
-    def list(self) -> list[RunningScan]:
+    def list(self) -> Sequence[RunningScan]:
         """All of them, and those that were killed a short while ago; the last ones while their drive is waited for."""
         if time.monotonic() - self._listed_at < RUNNING_AGE_S or not self._lock.acquire(blocking=False):
             return self._running

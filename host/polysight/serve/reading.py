@@ -124,7 +124,7 @@ async def _scans(site: Site, request: Request) -> Response:
             **asdict(changes),
             free_bytes=free_bytes,
             libraries=list(site.libraries()),
-            left_out=site.scans.left_out(),
+            left_out=list(site.scans.left_out()),
         )
 
     return json_answer(await site.read("", list_scans))

@@ -367,7 +367,7 @@ class ScanFolder:
                 for start in range(0, bytes_to_read, memory.size):
                     piece = memory[: board.bytes - start]
                     file.readinto(piece.data)
-                    digest = crc32(piece, digest)
+                    digest = crc32(piece.data, digest)
                     yield piece
         except OSError as e:
             problem = f"{path}: cannot be read: {e.strerror}"

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -458,18 +459,23 @@ class Uncertainty:
 
 def disturb_optics(optics: Optics, uncertainty: Uncertainty) -> list[tuple[str, Optics]]:
     """Return the rigs that differ by one standard error in one property, with the source's name."""
+
+    def replace_antenna(name: str, antenna: Antenna) -> Optics:
+        change: dict[str, Any] = {name: antenna}
+        return replace(optics, **change)
+
     rigs = []
     for name in ("tx", "h", "v"):
         antenna: Antenna = getattr(optics, name)
         for axis in np.eye(3):
             moved = replace(antenna, at_m=antenna.at_m + uncertainty.place_m * axis)
-            rigs.append(("places", replace(optics, **{name: moved})))
-        rigs.append(("axes", replace(optics, **{name: antenna.turn(uncertainty.axis_rad)})))
+            rigs.append(("places", replace_antenna(name, moved)))
+        rigs.append(("axes", replace_antenna(name, antenna.turn(uncertainty.axis_rad))))
     for name in ("h", "v"):
         antenna = getattr(optics, name)
         for part in (1, 1j):
             leaking = replace(antenna, leakage=antenna.leakage + uncertainty.leakage * part)
-            rigs.append(("leakage", replace(optics, **{name: leaking})))
+            rigs.append(("leakage", replace_antenna(name, leaking)))
     return rigs
 
 

@@ -331,7 +331,7 @@ def synthesise(
     echo = factors[..., None] * (waves * valid[:, None].astype(np.float32))[:, None]
     if fit.board.model is not None:
         echo = fit.model.astype(np.complex64) @ echo
-    return echo
+    return echo.astype(np.complex64, copy=False)
 
 
 def no_echoes() -> Echoes:

@@ -88,7 +88,8 @@ def reflect_layers(
     media = [(x.epsilon, x.thickness_mm) for x in layers]
     if media[-1][1] is not None:
         media.append((1.0 + 0j, None))
-    z_s = z_p = np.zeros(theta.shape, np.complex128)
+    z_s: Complex = np.zeros(theta.shape, np.complex128)
+    z_p: Complex = z_s
     for epsilon, thickness_mm in reversed(media):
         q: Complex = np.sqrt(np.asarray(epsilon - sin**2, dtype=np.complex128))
         own_s = 1 / q

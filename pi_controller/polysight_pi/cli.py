@@ -8,20 +8,21 @@ import math
 import signal
 import sys
 from pathlib import Path
-from typing import Any
-
-import msgspec
+from typing import TYPE_CHECKING, Any
 
 from polysight_pi import AS_THE_SERVICE
 from polysight_shared import __version__
-from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.errors import PolysightError, os_error
-from polysight_shared.faults import explain
-from polysight_shared.program import close_standard_output, expand_home, open_standard_streams
-from polysight_shared.raster import WIDTH_TEXT
+from polysight_shared.program import (
+    close_standard_output,
+    expand_home,
+    interrupts_between_imports,
+    open_standard_streams,
+)
 
-# Commands import their modules when they are called, so `--help` needs no other package.
+if TYPE_CHECKING:
+    from polysight_shared.config import Instrument
 
+# Commands import their modules when they are called: `--help` needs no other package, and Ctrl-C ends in no traceback.
 
 # Between the bursts of `pulse`.
 PAUSE_NS = 10_000_000
@@ -62,6 +63,8 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight_pi.lines import open_lines
     from polysight_pi.service import log
     from polysight_pi.trigger import BurstSpec, send_burst
+    from polysight_shared.faults import explain
+    from polysight_shared.raster import WIDTH_TEXT
 
     refuse_beside_service(instrument)
     lines = open_lines(instrument, args.wires)
@@ -202,6 +205,10 @@ def _option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
 
 def _rig(args: argparse.Namespace) -> Instrument:
     """Load the rig file, with the values given on the command line."""
+    import msgspec
+
+    from polysight_shared.config import load_instrument
+
     rig = load_instrument(args.config)
     overrides = {key: value for key, value in vars(args).items() if value is not None}
     pi_values = {key: overrides[key] for key in ("journal_dir", "command_address", "event_address") if key in overrides}
@@ -291,21 +298,26 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Entry point. Returns 0 on success; an error is one message on stderr, without a trace."""
     open_standard_streams()
-    args = _parser().parse_args(expand_home(sys.argv[1:] if argv is None else argv))
     try:
-        if args.action is _keys:
-            return args.action(args)
-        return args.action(args, _rig(args))
-    except PolysightError as e:
-        sys.stderr.write(f"error: {e}\n")
-        return e.exit_status
+        with interrupts_between_imports():
+            args = _parser().parse_args(expand_home(sys.argv[1:] if argv is None else argv))
+            if args.action is _keys:
+                return args.action(args)
+            return args.action(args, _rig(args))
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except BrokenPipeError:
         # Whoever read our output has enough.
         close_standard_output()
         return 0
-    except OSError as e:
-        error = os_error(e, "a path is wrong, the disk is full, or it belongs to another user", AS_THE_SERVICE)
+    except Exception as e:
+        from polysight_shared.errors import PolysightError, os_error
+
+        if isinstance(e, OSError):
+            error = os_error(e, "a path is wrong, the disk is full, or it belongs to another user", AS_THE_SERVICE)
+        elif isinstance(e, PolysightError):
+            error = e
+        else:
+            raise
         sys.stderr.write(f"error: {error}\n")
         return error.exit_status

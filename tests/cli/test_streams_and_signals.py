@@ -110,3 +110,18 @@ def test_an_interrupt_at_any_moment_ends_in_one_line():
             break
     assert len(ends) > 1
     assert set(ends[:-1]) == {(128 + signal.SIGINT, "polysight plan: stopped\n")}
+
+
+INTERRUPT_THE_PI = """
+import signal, sys
+from polysight_pi import cli
+assert "msgspec" not in sys.modules
+cli._parser = lambda: signal.raise_signal(signal.SIGINT)
+sys.exit(cli.main([]))
+"""
+
+
+def test_an_early_interrupt_on_the_pi_is_no_traceback():
+    """Its modules take a second to load on a Pi: they are loaded where Ctrl-C is handled."""
+    done = subprocess.run([sys.executable, "-c", INTERRUPT_THE_PI], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGINT, "")

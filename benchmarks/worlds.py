@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.data import find_packaged
-from polysight.imaging import Antennas, Illumination, Images, illumination_geometry
+from polysight.imaging import Antennas, Dispersion, Illumination, Images, illumination_geometry
 from polysight.materials import (
     UNKNOWN,
     Classifier,
@@ -219,6 +219,16 @@ def illumination_of_worlds(shape: tuple[int, int], pixel_m: float) -> Illuminati
     return Illumination(np.ones((2, *shape), np.complex64), moved, steep, (pixel_m, pixel_m))
 
 
+def dispersion_of_worlds(pair: ImagePair) -> Dispersion:
+    """Return the change of the images over the sweep."""
+    first_hz, last_hz = pair.rig.frequencies_hz[[0, -1]].tolist()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        h, v = (
+            (last_hz - first_hz) * slope / image for slope, image in ((pair.h_slope, pair.h), (pair.v_slope, pair.v))
+        )
+    return Dispersion(h, v, (first_hz, last_hz))
+
+
 def pixel_boxes(pair: ImagePair) -> list[tuple[Plate, tuple[int, int, int, int]]]:
     """Return the plates within the picture with their boxes in pixels: left, bottom, right, top."""
     out = []
@@ -249,7 +259,7 @@ def analyse_world(
     v = pair.v.astype(np.complex64)
     usable: npt.NDArray[np.bool_] = np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
     light = illumination_of_worlds(h.shape, float(pair.x_m[1] - pair.x_m[0]))
-    images = Images(h, v, pair.x_m, pair.y_m, usable, illumination=light)
+    images = Images(h, v, pair.x_m, pair.y_m, usable, illumination=light, dispersion=dispersion_of_worlds(pair))
     plates = {f"{plate.name} {i}": (plate, box) for i, (plate, box) in enumerate(pixel_boxes(pair))}
     metal_name = next((name for name, (plate, _) in plates.items() if plate.name == declared), None)
     known_scene = KnownScene()

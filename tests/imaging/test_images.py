@@ -189,6 +189,30 @@ def test_random_offsets_of_every_chirp_do_not_change_the_image(make_rig, points_
         assert abs(np.vdot(got, want)) / np.linalg.norm(got) / np.linalg.norm(want) > 0.98
 
 
+@pytest.mark.parametrize("change", [0.0, 0.2 - 0.3j])
+def test_the_change_of_a_plane_over_the_sweep_is_what_its_reflectivity_changes(make_rig, synced_row, change):
+    """A mirror whose reflectivity grows as 1 + change (f - middle) / sweep; the sweep is that of the linear part."""
+    rig = make_rig(31, 21, 8.0, 8.0, pixels=(12, 10))
+    chirp = rig.chirp
+    first, last = chirp.linear_samples
+    place = (np.arange(chirp.samples) - (first + last - 1) / 2) / (last - 1 - first)
+    builder = ImageBuilder(rig)
+    for board in rig.receivers:
+        antennas = Antennas.from_rig(rig, board)
+        # Samples are conjugates of fields.
+        echo = mirror_samples(antennas, float(np.mean(builder.grid.z_m)), chirp) * (1 + np.conj(change) * place)
+        row = np.broadcast_to((1 / antennas.direct_m[:, None] + echo)[:, None], (4, 31, 256))
+        for index in range(21):
+            builder.add_row(board.name, index, synced_row(np.ascontiguousarray(row, np.complex64)))
+    dispersion = builder.disperse()
+    valid = builder.finish().valid
+    for channel in (dispersion.h, dispersion.v):
+        # The window leaves a little of the direct path.
+        np.testing.assert_allclose(channel[valid], change, atol=0.02)
+    ends = chirp.first_sample_hz + chirp.hz_per_sample * np.array([first, last - 1])
+    np.testing.assert_allclose(dispersion.band_hz, ends)
+
+
 def _random_rows(rig, synced_row, rng):
     """(board, index, row) of noise with a direct path, in random order, some rows twice, some positions missing."""
     columns = rig.grid.columns

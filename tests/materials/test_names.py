@@ -1,5 +1,7 @@
 """Names of the library, of the literature, possible layers: their probabilities and what they are called."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from benchmarks.foreign import judge_scene
@@ -7,7 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.materials import LAYER, UNKNOWN, clean_name
-from polysight.materials.kinds import Kind, Kinds, RatioEvidence, draw_sheets, inverse_ratio, literature, weigh_kinds
+from polysight.materials.kinds import (
+    Kind,
+    Kinds,
+    PatchDispersion,
+    RatioEvidence,
+    draw_sheets,
+    inverse_ratio,
+    layer_odds,
+    literature,
+    weigh_kinds,
+)
 from polysight.materials.names import name_patch
 from polysight.polarimetry import fresnel, multilayer, permittivity_from_ratio
 from polysight_shared.errors import DataError
@@ -105,8 +117,62 @@ def test_where_plates_are_unevenly_bright_their_brightness_tells_little():
     assert abs(thin - thick) < 0.2
 
 
+BAND_HZ = (76.3e9, 79.75e9)
+
+
+def dispersion(change: np.ndarray, std: float = 0.01) -> PatchDispersion:
+    return PatchDispersion(change, np.full(3, std), BAND_HZ)
+
+
+def test_a_change_over_the_sweep_tells_layers_from_half_spaces():
+    """Changes of plates before half spaces, from multilayer's r_s and r_p at both ends of a band of a tenth."""
+    rng = np.random.default_rng(7)
+    centre_hz = np.mean(BAND_HZ)
+    width_hz = BAND_HZ[1] - BAND_HZ[0]
+    layered = []
+    for _ in range(100):
+        eps = rng.uniform(2, 7) * (1 - 1j * rng.uniform(0.001, 0.05))
+        stack = [eps, rng.uniform(2, 9) * (1 - 1j * rng.uniform(0, 1.5))], [rng.uniform(1e-3, 5e-3), np.inf]
+        logs = [np.log(np.array(multilayer(*stack, centre_hz + part * width_hz, ANGLES[0]))) for part in (-0.05, 0.05)]
+        of_s, of_p = (logs[1] - logs[0]) / 0.1
+        change = np.array([of_s.real, (of_p - of_s).real, (of_p - of_s).imag])
+        layered.append(float(np.mean(layer_odds(dispersion(change), ANGLES[0]))))
+    assert np.median(layered) > 1e3
+    half_spaces = [float(np.mean(layer_odds(dispersion(x), ANGLES[0]))) for x in 0.01 * rng.standard_normal((100, 3))]
+    assert np.median(half_spaces) < 0.1
+    assert max(half_spaces) < 1
+
+
+def test_a_change_over_the_sweep_that_is_not_known_well_tells_nothing():
+    unknown = layer_odds(dispersion(np.array([0.5, -0.4, 0.6]), std=30.0), ANGLES[0])
+    assert np.median(unknown) == pytest.approx(1, abs=0.05)
+
+
+def test_a_ratio_of_a_half_space_that_changes_over_the_sweep_is_named_a_layer():
+    wood = Kind("wood", 2.6 - 0.1j)
+    kinds = Kinds([wood, *literature()], ANGLES[0], sheets=True)
+    t = complex(inverse_ratio(2.6 - 0.1j, ANGLES[0]))
+    evidence = RatioEvidence(ANGLES[0], t, 1e-5 * np.eye(2), 0.5)
+    still = name_patch((kinds,), (replace(evidence, dispersion=dispersion(np.zeros(3))),), np.array([[t]])).verdict
+    changing = dispersion(np.array([0.2, -0.1, 0.3]))
+    rippled = name_patch((kinds,), (replace(evidence, dispersion=changing),), np.array([[t]])).verdict
+    assert still.name == "wood"
+    assert still.confidence > 0.9
+    assert rippled.name == LAYER
+
+
 @pytest.mark.slow
 def test_materials_that_the_library_lacks_get_no_sure_name_of_it():
     pieces = judge_scene("plates", 0)
     assert len(pieces) == 8
     assert not [p for p in pieces if p.source == "library" and p.confidence >= 0.9]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["dishes", "sheets"])
+def test_what_reflects_at_two_faces_gets_no_name_of_the_library_and_no_wrong_value(kind):
+    pieces = judge_scene(kind, 1)
+    assert not [p for p in pieces if p.source == "library" and p.confidence >= 0.8]
+    # A sheet whose brightness happens to peak in the middle of the sweep looks like a half space.
+    assert sum(p.misled for p in pieces) <= 1
+    assert sum(p.thin or p.name == LAYER for p in pieces) >= 5

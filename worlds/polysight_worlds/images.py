@@ -24,6 +24,7 @@ from polysight_worlds.world import Nuisances, Plate, World, disturb_plates
 class ImagePair:
     """Images of one scan in the rig frame, and what is true.
 
+    h_slope, v_slope: what h and v change per Hz: image of the data times (f - mean) over the variance of f.
     h, v: complex64 [ny, nx], row 0 at the smallest y, relative to the direct path. Phases fall with the path, as fields
     of exp(+j omega t) do: H / V of a plate over that of metal is r_s / r_p, and a lossy permittivity eps' - j eps''.
     `world`: as it was scanned, with the plates' drawn heights and tilts. `rig`: the nominal one.
@@ -36,6 +37,8 @@ class ImagePair:
     world: World
     nuisances: Nuisances
     rig: Rig
+    h_slope: NDArray
+    v_slope: NDArray
 
     @property
     def incidence_deg(self) -> float:
@@ -107,7 +110,10 @@ def simulate(
     true_rig = disturb_rig(nominal, nuisances)
     rng = np.random.default_rng([nuisances.seed, 3])
     positions = _draw_bad_positions(rng, nominal, nuisances)
+    from_middle_hz = nominal.frequencies_hz - nominal.frequencies_hz.mean()
+    slope_weights = (from_middle_hz / np.mean(from_middle_hz**2)).astype(np.float32)[:, None, None]
     images = []
+    slopes = []
     for channel in ("h", "v"):
         true_rx: Antenna = getattr(true_rig, channel)
         echoes = record(true_rig, true_rx, true_world, seed=nuisances.seed)
@@ -115,7 +121,9 @@ def simulate(
         data = disturb_data(
             rng=rng, rig=nominal, echoes=echoes, direct=direct, nuisances=nuisances, channel=channel, dark=positions
         )
-        images.append(backproject(nominal, getattr(nominal, channel), data, pixels, kaiser_beta))
+        rx: Antenna = getattr(nominal, channel)
+        images.append(backproject(nominal, rx, data, pixels, kaiser_beta))
+        slopes.append(backproject(nominal, rx, data * slope_weights, pixels, kaiser_beta))
     x_m, y_m = pixel_centres(nominal, pixels)
     return ImagePair(
         h=images[0],
@@ -125,6 +133,8 @@ def simulate(
         world=true_world,
         nuisances=nuisances,
         rig=nominal,
+        h_slope=slopes[0],
+        v_slope=slopes[1],
     )
 
 

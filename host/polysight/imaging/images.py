@@ -221,6 +221,23 @@ class Illumination:
 
 
 @dataclass(frozen=True)
+class Dispersion:
+    """Change of the reflectivity over the sweep: none of a half space; a thin plate's ripples.
+
+    `h`, `v` complex [ny, nx]: change of ln h and ln v from the first to the last frequency, `band_hz`, relative to a
+    mirror on the plane; NaN where nothing is seen. Each channel has a constant of its own until metal's is subtracted.
+    """
+
+    h: Image
+    v: Image
+    band_hz: tuple[float, float]
+
+    def transpose(self) -> Dispersion:
+        """Return the same with x and y swapped."""
+        return replace(self, h=np.ascontiguousarray(self.h.T), v=np.ascontiguousarray(self.v.T))
+
+
+@dataclass(frozen=True)
 class Images:
     """Both channels on one grid; what is added on the way is None before. Row 0 is the smallest y.
 
@@ -246,6 +263,8 @@ class Images:
         complex64 [ny, nx]: the images before the footprint was divided out, with the phase of the samples.
     illumination
         Illumination of the plane by both channels, to correct tilted plates.
+    dispersion
+        Change over the sweep; None where it was not formed.
     rx_gains
         Board name to complex128 [rx]: gain of each RX, from the direct path, which was divided out.
     notices
@@ -264,6 +283,7 @@ class Images:
     h_raw: Image | None = None
     v_raw: Image | None = None
     illumination: Illumination | None = None
+    dispersion: Dispersion | None = None
     rx_gains: Mapping[str, NDArray[np.complex128]] = field(default_factory=dict)
     notices: tuple[str, ...] = ()
 
@@ -284,7 +304,8 @@ class Images:
             if isinstance(value := getattr(self, f.name), np.ndarray) and value.ndim == 2
         }
         illumination = None if self.illumination is None else self.illumination.transpose()
-        return replace(self, **turned, x_m=self.y_m, y_m=self.x_m, illumination=illumination)
+        dispersion = None if self.dispersion is None else self.dispersion.transpose()
+        return replace(self, **turned, x_m=self.y_m, y_m=self.x_m, illumination=illumination, dispersion=dispersion)
 
     def level(self, plate: Mask) -> Images:
         """Return the images with the tilt of one plate, bool [ny, nx], corrected."""
@@ -419,6 +440,7 @@ class ImageBuilder:
         gated = reduction(rig.chirp, self.gate_m)
         self._antennas = antennas
         self._middle_hz = float(np.mean(gated.frequencies_hz))
+        self._band_hz = float(gated.frequencies_hz[0]), float(gated.frequencies_hz[-1])
         self.boards = {b.name: BoardSamples(rig, b, self.grid, gated, weights, live) for b in rig.receivers}
 
     def add_row(
@@ -451,6 +473,12 @@ class ImageBuilder:
         """
         grid = replace(self.grid, z_m=self.grid.z_m + offset_m) if offset_m else None
         return self._channels({name: board.image(grid) for name, board in self.boards.items()}, offset_m)
+
+    def disperse(self, offset_m: float = 0.0) -> Dispersion:
+        """Form the change of both images over the sweep; `offset_m` as of :meth:`finish`."""
+        grid = replace(self.grid, z_m=self.grid.z_m + offset_m) if offset_m else None
+        h, v = (board.dispersion(grid).conj() for board in self.boards.values())
+        return Dispersion(h, v, self._band_hz)
 
     def current(self) -> Images:
         """Return the images from running sums, within 1e-6 of the peak; fast if the builder is `live`."""

@@ -340,7 +340,9 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
 def move_to_plane(
     builder: ImageBuilder, images: Images, masks: Sequence[NDArray[np.bool_]], transposed: bool, move: bool
 ) -> tuple[PlaneEstimate, Images]:
-    """Estimate the plane of patches; return it and the images on it, if it differs from the rig file's plane.
+    """Estimate the plane of patches; return it and the images on it with their dispersion.
+
+    Images are formed again if the plane differs from the rig file's.
 
     Parameters
     ----------
@@ -354,10 +356,13 @@ def move_to_plane(
         False: return the images unchanged.
     """
     plane = find_plane(builder, [mask.T if transposed else mask for mask in masks])
-    if move and plane.worth_moving:
+    if not move:
+        return plane, images
+    if plane.worth_moving:
         images = builder.finish(plane.offset_m)
         images = images.transpose() if transposed else images
-    return plane, images
+    dispersion = builder.disperse(plane.moved_m)
+    return plane, replace(images, dispersion=dispersion.transpose() if transposed else dispersion)
 
 
 def _heights_by_range(

@@ -343,6 +343,7 @@ class BoardSamples:
         self._stale = set(range(shape[0]))
         # Image of the rows so far, once it was formed
         self._image: tuple[Image, Image, str | None] | None = None
+        self._slope: tuple[Image, Image] | None = None
         # Rows differ from the lattice of the live image
         self._moved = False
         self._live = None
@@ -432,6 +433,7 @@ class BoardSamples:
                 self._live = None
         self._stale.add(index)
         self._image = None
+        self._slope = None
         self._show(index, 1)
 
     def _apply_gate(self, samples: NDArray[np.complex64], sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
@@ -505,6 +507,7 @@ class BoardSamples:
         """Discard everything that was computed from the samples."""
         self._live = None
         self._image = None
+        self._slope = None
         self._stale = set(range(len(self.valid)))
 
     def _show(self, index: int, sign: int) -> None:
@@ -565,8 +568,7 @@ class BoardSamples:
         else:
             imager, notice = self._imager(grid)
             image = imager.image(self._cube * (gains[:, None, None, None] * self.weights))
-        mirror = self.mirror if grid is None else self._mirror_samples(float(np.mean(grid.z_m)))
-        footprint: Any = imager.constant(mirror.astype(np.complex64), self.weights) / self.count
+        footprint: Any = imager.constant(self._mirror(grid).astype(np.complex64), self.weights) / self.count
         return (image / self.count).astype(np.complex64), footprint.astype(np.complex64), notice
 
     def range_profile(self, point_m: NDArray[np.float64], shifts_m: NDArray[np.float64]) -> NDArray[np.complex64]:
@@ -585,17 +587,46 @@ class BoardSamples:
         focused = (gains[:, None] * (cube * turned).sum(axis=-1)).sum(axis=0)
         return (np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(shifts_m, f)) @ focused).astype(np.complex64)
 
-    def range_slope(self) -> tuple[Image, Image]:
+    def range_slope(self, grid: ImageGrid | None = None) -> tuple[Image, Image]:
         """Return the derivative of image and footprint by range (excess path), without carrier; 1 / m.
 
         The matched filter of path d is S(d) = sum_m y_m exp(-j 2 pi f_m d / c), so its derivative is the image of the
-        samples times -j 2 pi (f_m - f) / c, with f the middle of the sweep.
+        samples times -j 2 pi (f_m - f) / c, with f the middle of the sweep. `grid` as of :meth:`image`.
         """
-        imager, _ = self._imager(None)
+        if grid is not None:
+            return self._form_slope(grid)
+        if self._slope is None:
+            self._slope = self._form_slope(None)
+        return self._slope
+
+    def _form_slope(self, grid: ImageGrid | None) -> tuple[Image, Image]:
+        imager, _ = self._imager(grid)
         factors = self._compute_range_slope_factors()
         gains = (1 / self.rx_calibration()).astype(np.complex64)
         image: Any = imager.image(self._cube * (gains[:, None, None, None] * factors[:, None, None] * self.weights))
-        return (image / self.count).astype(np.complex64), self.mirror_slope(0.0)
+        return (image / self.count).astype(np.complex64), self._constant_image(self._mirror(grid) * factors, grid)
+
+    def dispersion(self, grid: ImageGrid | None = None) -> Image:
+        """Return the change of ln(image / footprint) from the first to the last frequency, complex64 [ny, nx].
+
+        NaN where nothing is seen. For an echo that grows as 1 + s (f - f0) the slope of :meth:`range_slope` exceeds the
+        mirror's by -j 2 pi s var(f) / c; the mirror's own second derivative tells the variance of f under the window.
+
+        Parameters
+        ----------
+        grid
+            As of :meth:`image`.
+        """
+        image, footprint, _ = self.image(grid)
+        slope, mirror_slope = self.range_slope(grid)
+        mirror_bend = self._constant_image(self._mirror(grid) * self._compute_range_slope_factors() ** 2, grid)
+        f = self._reduction.frequencies_hz
+        sweep_per_m = -2j * np.pi * (f[-1] - f[0]) / SPEED_OF_LIGHT_M_S
+        with np.errstate(divide="ignore", invalid="ignore"):
+            of_mirror = mirror_slope / footprint
+            variance = mirror_bend / footprint - of_mirror**2
+            change = (slope / image - of_mirror) / variance * sweep_per_m
+        return np.where(np.isfinite(change), change, complex(np.nan, np.nan)).astype(np.complex64)
 
     def mirror_image(self, height_m: float) -> Image:
         """Return the footprint of a mirror `height_m` behind the rig file's plane, complex64 [ny, nx]."""
@@ -606,14 +637,18 @@ class BoardSamples:
         echo = self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m)
         return self._constant_image(echo * self._compute_range_slope_factors())
 
-    def _constant_image(self, echo: NDArray[np.complexfloating]) -> Image:
-        imager, _ = self._imager(None)
+    def _constant_image(self, echo: NDArray[np.complexfloating], grid: ImageGrid | None = None) -> Image:
+        imager, _ = self._imager(grid)
         image: Any = imager.constant(echo.astype(np.complex64), self.weights)
         return (image / self.count).astype(np.complex64)
 
     def _compute_range_slope_factors(self) -> NDArray[np.complex64]:
         f = self._reduction.frequencies_hz
         return (-2j * np.pi * (f - f.mean()) / SPEED_OF_LIGHT_M_S).astype(np.complex64)
+
+    def _mirror(self, grid: ImageGrid | None) -> NDArray[np.complex128]:
+        """Return the samples of a mirror on the plane of the pixels after the range gate, [rx, frequency]."""
+        return self.mirror if grid is None else self._mirror_samples(float(np.mean(grid.z_m)))
 
     def _mirror_samples(self, z_m: float) -> NDArray[np.complex128]:
         return mirror_reduced(self._antennas, z_m, self._chirp, self._reduction)

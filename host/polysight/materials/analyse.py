@@ -19,6 +19,7 @@ from polysight.materials.common_change import CommonChange, common_change
 from polysight.materials.inversion import EVEN_LIGHT, MOVED, UNEVEN_LIGHT, Inversion, PatchEstimate, RigPrior, invert
 from polysight.materials.kinds import (
     Kinds,
+    PatchDispersion,
     PatchMeasurement,
     RatioEvidence,
     inverse_ratio,
@@ -37,6 +38,7 @@ from polysight.materials.measure import (
     background,
     background_mean,
     check_patches,
+    measure_dispersions,
     measure_patch,
     measure_scatter,
     median_ratio,
@@ -226,7 +228,7 @@ generator (by 10 to 50 %)."""
 THIN = Finding(
     "error",
     POSSIBLE_LAYER,
-    "its V / H is that of a thin plate, which reflects at both faces, rather than of any half space",
+    "its V / H, or what it changes over the sweep, is that of a thin plate or a stack rather than of a half space",
     "fit it as a layer: `polysight process --bands 5`, then `polysight permittivity --layer NAME,?,?`",
 )
 """Why a possible layer gets no permittivity."""
@@ -253,7 +255,7 @@ def analyse(
     plane = known_scene.plane
     if plane is not None:
         plane.check_axes(images.x_m, images.y_m)
-        images = images.within(plane.valid)
+        images = replace(images.within(plane.valid), dispersion=None)
     images, apart_mm = align(images)
     segmentation = _patches(images, known_scene)
     images, tilts = level(images, segmentation)
@@ -275,14 +277,14 @@ def analyse(
         tilts=tilts,
     )
     prior = scene.prior(optics.prior, float(np.hypot(*apart_mm)))
-    measured = [scene.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
+    dispersions = measure_dispersions(images, segmentation, judged, reference.mask)
+    measured = [scene.measure(p, (rh, rv), _angle(theta, p), d) for p, d in zip(judged, dispersions, strict=True)]
     kinds = _kinds(classifier, float(np.mean(theta)))
     labels = [p.label for p in judged]
     solution = _solve(measured, prior, kinds, optics.other_sign)
     inversion = solution.inversion
     if plane is None:
-        signs = solution.signs[:1] if reference.given else solution.signs
-        reference = _weigh_metal(images, reference, labels, signs, kinds)
+        reference = _weigh_metal(images, reference, labels, solution, kinds)
     calibrated = remove_leakage(raw, inversion.known_leakage(prior))
     sh, sv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
@@ -459,7 +461,9 @@ class Seen:
             prior, reference_std=float(np.sqrt(std**2 + around**2 + (UNEVEN_METAL * self.metal_uneven) ** 2))
         )
 
-    def measure(self, patch: Patch, channels: tuple[Image, Image], theta_rad: float) -> PatchMeasurement:
+    def measure(
+        self, patch: Patch, channels: tuple[Image, Image], theta_rad: float, dispersion: PatchDispersion | None
+    ) -> PatchMeasurement:
         """Measure one patch relative to metal."""
         local_std = self.metal_spread or 0.0
         if touches_border(patch.mask) and self.metal is not None:
@@ -469,16 +473,10 @@ class Seen:
         change = None
         if scatter is not None and self.change is not None:
             change = self.change.log_ratio(list(self.scatter).index(patch.label))
-        patch_measurement = measure_patch(
-            patch,
-            *channels,
-            theta_rad,
-            scatter=scatter,
-            usual=self.usual,
-            change=change,
-            local_std=local_std,
-            rise=rise,
+        of_ratio = measure_patch(
+            patch, *channels, theta_rad, scatter, self.usual, change=change, local_std=local_std, rise=rise
         )
+        patch_measurement = replace(of_ratio, dispersion=dispersion)
         if not patch_measurement.brightness:
             return patch_measurement
         around = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0) / patch_measurement.brightness
@@ -589,16 +587,16 @@ def _weigh_metal(
     images: Images,
     metal: MetalReference,
     labels: Sequence[int],
-    signs: Sequence[tuple[list[PatchMeasurement], RigPrior, Inversion]],
+    solution: _Solution,
     kinds: Kinds,
 ) -> MetalReference:
     """Return the metal reference with the evidence for metal and against.
 
-    `signs` are the other patches, the prior, and their inversion with each sign of the phases that is possible: the
-    one that speaks least for metal counts.
+    Of the signs of the phases that are possible for a metal that nobody declared the one that speaks least for metal
+    counts.
     """
     evidence = []
-    for measured, prior, inversion in signs:
+    for measured, prior, inversion in solution.signs[:1] if metal.given else solution.signs:
         channel_ratio = _channel_ratio(images, metal) if prior.channels_known else None
         patches = dict(zip(labels, measured, strict=True))
         evidence.append(metal_evidence(patches, prior, channel_ratio, kinds, inversion))

@@ -41,6 +41,7 @@ from polysight.materials.kinds import (
     RatioEvidence,
     brightness_density,
     log_half_space_brightness,
+    log_layer_odds,
     move_to_angle,
     permittivity_slope,
     split_complex,
@@ -333,6 +334,8 @@ class SceneLikelihood:
         # Of one part of the measured ratio
         self.own_variance = np.array([np.trace(s.covariance) / 2 for s in seen], np.float64)
         self.maps = () if kinds is None else self._maps(kinds)
+        self.dispersions = tuple(s.dispersion for s in seen)
+        self.log_layer_odds = np.array([log_layer_odds(d, kinds) for d in self.dispersions])
 
     def _own_covariances(self, seen: Sequence[PatchMeasurement]) -> Real:
         """Return the covariance of each patch's t by its own errors, [patch, 2, 2]: those of V / H, to first order."""
@@ -488,7 +491,8 @@ class SceneLikelihood:
         log_others = np.log1p(-library_share)
         patch_logs = []
         for i, density in enumerate(self.maps):
-            of_library, of_others = density.log_densities(t[..., i])
+            of_library, of_half_spaces, of_layers = density.log_densities(t[..., i])
+            of_others = np.logaddexp(of_half_spaces, of_layers + self.log_layer_odds[i])
             patch_logs.append(np.logaddexp(log_ours + of_library, log_others + of_others))
         return np.concatenate([brightness_log, np.stack(patch_logs, axis=-1)], axis=-1)
 
@@ -670,6 +674,7 @@ def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvi
         library_share=library_share,
         brightness_off=brightness_off,
         brightness_std=float(np.exp(np.log(model.brightness_std(z)).mean())),
+        dispersion=model.dispersions[i],
     )
 
 

@@ -53,6 +53,13 @@ cups of sugar water moved the estimated leakage by three standard deviations, an
 ODD_BRIGHTNESS = 0.1
 ODD_BRIGHTNESS_STD = 1.2
 """Share of patches whose brightness is that of nothing known (shadows, edges), and the spread of its logarithm then."""
+DISPERSION_KERNEL = 0.05
+DISPERSION_MODEL = 0.2
+"""Errors of a thin plate's change over the sweep: smoothing of the drawn plates, and a share of each change (edges, and
+second echoes from beside)."""
+ODD_DISPERSION = 0.02
+ODD_DISPERSION_STD = 0.05
+"""Share of half spaces whose change over the sweep is that of their surroundings, and the usual size of it then."""
 LEAST_LOSS_SPREAD = 0.02
 """Standard deviation of eps'' between specimens of low-loss materials."""
 METAL_SPREAD = 0.01
@@ -65,6 +72,8 @@ LEAST_RATIO_STD = 1e-6
 _STEP = 1e-4
 _SHEETS = 6000
 _HALF_SPACES = 4000
+_FREQUENCIES = 9
+_LEAST_DENSITY = 1e-100
 
 
 @dataclass(frozen=True)
@@ -77,6 +86,23 @@ class Kind:
     source: Source = "library"
     family: str = ""
     """Class of a material of the literature: "polymer", "wood"."""
+
+
+@dataclass(frozen=True)
+class PatchDispersion:
+    """Change of one patch over the sweep relative to metal, from its first to its last frequency.
+
+    Attributes
+    ----------
+    change, std
+        float64 [3]: of ln |H|, ln |V / H| and the phase of V / H, and their standard deviations.
+    band_hz
+        First and last frequency.
+    """
+
+    change: Real
+    std: Real
+    band_hz: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -97,6 +123,8 @@ class PatchMeasurement:
         Standard deviations of ln|V / H| and of its phase by what scatters over the plate: edges, ripple, tilt.
     rise
         Rise of the plate along x and across the plane of incidence, radians.
+    dispersion
+        Change over the sweep; None if it is not known.
     """
 
     inverse_ratio: complex
@@ -105,6 +133,7 @@ class PatchMeasurement:
     brightness: float | None = None
     relative_std: tuple[float, float] = (0.0, 0.0)
     rise: tuple[float, float] = (0.0, 0.0)
+    dispersion: PatchDispersion | None = None
 
     @property
     def covariance(self) -> Real:
@@ -128,6 +157,8 @@ class RatioEvidence:
     brightness_off, brightness_std
         ln |H| over that of the half space of this ratio, relative to the scene's, and its usual size in this scene; NaN
         if |H| says nothing. Thin plates are brighter or darker than half spaces of the same ratio.
+    dispersion
+        Change over the sweep; None if it is not known.
     """
 
     theta_rad: float
@@ -136,6 +167,7 @@ class RatioEvidence:
     library_share: float
     brightness_off: float = np.nan
     brightness_std: float = np.nan
+    dispersion: PatchDispersion | None = None
 
 
 def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
@@ -236,13 +268,14 @@ class Kinds:
         return tuple(kind.name for kind in self.kinds)
 
     def density_map(self, low: complex, high: complex, covariance: Real, cells: int = 96) -> DensityMap:
-        """Return the densities of the library's kinds and of all others on a rectangle of t, for quick looking up."""
+        """Return the densities of what patches may be on a rectangle of t, for quick looking up."""
         real = np.linspace(low.real, high.real, cells)
         imag = np.linspace(low.imag, high.imag, cells)
         other_density = self.other * self.compute_half_space_density(real[None, :] + 1j * imag[:, None], covariance)
+        layers = np.zeros_like(other_density)
         if self.sheet_share:
-            other_density += self.sheet_share * _histogram(self.sheets, real, imag, covariance)
-        density = np.stack([np.zeros_like(other_density), other_density])
+            layers += self.sheet_share * _histogram(self.sheets, real, imag, covariance)
+        density = np.stack([np.zeros_like(other_density), other_density, layers])
         summed = self.covariance + covariance
         reach = 4.5 * np.sqrt(summed[:, (0, 1), (0, 1)])
         columns = np.searchsorted(real, self.t.real + np.array([-1, 1])[:, None] * reach[:, 0])
@@ -255,7 +288,8 @@ class Kinds:
             y = (imag[window[0]] - self.t[k].imag)[:, None]
             distance2 = inverse[k, 0, 0] * x**2 + 2 * inverse[k, 0, 1] * x * y + inverse[k, 1, 1] * y**2
             density[0 if self.ours[k] else 1][window] += scale[k] * np.exp(-0.5 * distance2)
-        density[1] = (1 - STACK_SHARE) * density[1] + STACK_SHARE / np.pi
+        density[1:] *= 1 - STACK_SHARE
+        density[2] += STACK_SHARE / np.pi
         return DensityMap(low, high, np.log(density + 1e-12))
 
     def compute_half_space_density(self, t: Complex, covariance: Real) -> Real:
@@ -283,9 +317,9 @@ class Kinds:
 
 @dataclass(frozen=True)
 class DensityMap:
-    """Logarithms of the densities of the library's kinds and of all others on a rectangle from `low` to `high`.
+    """Logarithms of densities on a rectangle from `low` to `high`: the library's, other half spaces, and layers.
 
-    `log_density` float64 [2, imaginary, real].
+    `log_density` float64 [3, imaginary, real].
     """
 
     low: complex
@@ -293,7 +327,7 @@ class DensityMap:
     log_density: Real
 
     def log_densities(self, t: Complex) -> Real:
-        """Return the logarithms of both densities at t [...], [2, ...]; beyond the rectangle those of its border."""
+        """Return the logarithms of the densities at t [...], [3, ...]; beyond the rectangle those of its border."""
         _, rows, columns = self.log_density.shape
         parts = split_complex(t)
         x = (parts[..., 0] - self.low.real) / (self.high.real - self.low.real) * (columns - 1)
@@ -360,6 +394,53 @@ def draw_sheets(theta_rad: float, frequency_hz: float = SHEET_HZ) -> tuple[Compl
 
 
 @cache
+def draw_sheet_dispersions(theta_rad: float, band_hz: tuple[float, float]) -> Real:
+    """Return the change of the thin plates of :func:`draw_sheets` over a sweep, float64 [draw, 3].
+
+    Of ln |r_s|, ln |t| and the phase of t: the slope over frequency, weighted as the range gate weighs the sweep.
+    """
+    eps, holder, thickness_m = _draw_sheet_properties()
+    place = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES - 0.5
+    weight = scipy.signal.windows.hann(_FREQUENCIES + 1, sym=False)[1:]
+    first_hz, last_hz = band_hz
+    mean = np.zeros((2, eps.size), np.complex128)
+    slope = np.zeros((2, eps.size), np.complex128)
+    for part, share in zip(place, weight / weight.sum(), strict=True):
+        frequency_hz = first_hz + (part + 0.5) * (last_hz - first_hz)
+        coefficients = np.stack(multilayer([eps, holder], [thickness_m, np.inf], frequency_hz, theta_rad))
+        mean += share * coefficients
+        slope += share * part * coefficients
+    variance = float(np.sum(weight * place**2) / weight.sum())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        of_s, of_p = slope / mean / variance
+    change = np.stack([of_s.real, (of_p - of_s).real, (of_p - of_s).imag], axis=-1)
+    return np.where(np.isfinite(change), change, 0.0)
+
+
+def layer_odds(dispersion: PatchDispersion, theta_rad: float) -> Real:
+    """Return how much likelier a change over the sweep is for each drawn thin plate than for a half space, [draw]."""
+    of_sheets = draw_sheet_dispersions(theta_rad, dispersion.band_hz)
+    width = np.sqrt(dispersion.std**2 + DISPERSION_KERNEL**2 + (DISPERSION_MODEL * of_sheets) ** 2)
+    layers = _normal_product(dispersion.change - of_sheets, width)
+    usual = (1 - ODD_DISPERSION) * _normal_product(dispersion.change, dispersion.std)
+    odd_std = np.hypot(dispersion.std, ODD_DISPERSION_STD)
+    half_space = usual + ODD_DISPERSION * _normal_product(dispersion.change, odd_std)
+    return np.asarray(layers / np.maximum(half_space, _LEAST_DENSITY), np.float64)
+
+
+def log_layer_odds(dispersion: PatchDispersion | None, kinds: Kinds | None) -> float:
+    """Return ln of how much likelier a change over the sweep is for layers than for half spaces; 0 if it is unknown."""
+    if dispersion is None or kinds is None:
+        return 0.0
+    return float(np.log(max(np.mean(layer_odds(dispersion, kinds.theta_rad)), _LEAST_DENSITY)))
+
+
+def _normal_product(difference: Real, std: Real) -> Real:
+    """Return the product of normal densities over the last axis."""
+    return np.prod(np.exp(-0.5 * (difference / std) ** 2) / (np.sqrt(2 * np.pi) * std), axis=-1)
+
+
+@cache
 def _draw_sheet_properties() -> tuple[Complex, Complex, Real]:
     """Return permittivity, permittivity behind, and thickness in metres of thin plates, [draw] each."""
     unit = np.random.default_rng(0).random((_SHEETS, 5))
@@ -382,7 +463,7 @@ def _histogram(draws: Complex, real: Real, imag: Real, covariance: Real) -> Real
 
 @dataclass(frozen=True)
 class Odds:
-    """Probabilities of what a patch may be: float64 [kind], of a thin plate, of any other half space; they sum to 1.
+    """Probabilities of what a patch may be: float64 [kind], of layers, of any other half space; they sum to 1.
 
     `distance` [kind] is that of the measurement over the 99 % region of each kind; beyond 1 the probability is 0.
     """
@@ -410,8 +491,11 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
     ours = float(np.mean([evidence.library_share for evidence in seen])) if first.ours.any() else 0.0
     weight = weight * np.where(first.ours, ours, 1 - ours)
     drawn = np.stack([kind.sheets for kind in kinds], axis=1)
-    density = _normal(drawn, t, errors + SHEET_KERNEL**2 * np.eye(size)) * _brightness_odds(kinds, seen)
+    by_dispersion = _dispersion_odds(kinds, seen)
+    density = _normal(drawn, t, errors + SHEET_KERNEL**2 * np.eye(size)) * _brightness_odds(kinds, seen) * by_dispersion
     sheet = (1 - ours) * first.sheet_share * float(np.mean(density))
+    if any(evidence.dispersion is not None for evidence in seen):
+        sheet += (1 - ours) * STACK_SHARE / np.pi ** len(seen) * float(np.mean(by_dispersion))
     other_weight = (1 - ours) * first.other * _other_density(kinds, seen)
     distance = np.sqrt(distance2 / scipy.special.chdtri(size, 0.01))
     total = float(weight.sum()) + sheet + other_weight
@@ -420,6 +504,15 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
     inside = np.where(distance <= 1, weight, 0.0) / total
     sheet = sheet / total
     return Odds(inside, sheet, 1 - sheet - float(inside.sum()), distance)
+
+
+def _dispersion_odds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Real:
+    """Return how much likelier the change over the sweep is for each drawn thin plate than for a half space, [draw]."""
+    odds = np.ones(kinds[0].sheets.size)
+    for kind, evidence in zip(kinds, seen, strict=True):
+        if evidence.dispersion is not None:
+            odds = odds * layer_odds(evidence.dispersion, kind.theta_rad)
+    return odds
 
 
 def _brightness_odds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Real:

@@ -23,7 +23,7 @@ from msgspec import UNSET, structs
 from polysight.imaging import Image, Images, Rise
 from polysight.materials.common_change import CommonChange
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
-from polysight.materials.kinds import RatioEvidence
+from polysight.materials.kinds import PatchDispersion, RatioEvidence
 from polysight.materials.labels import Labels
 from polysight.materials.library import Real, feature_matrix
 from polysight.materials.measure import Permittivity, background, ratio_sigma
@@ -402,8 +402,22 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
         evidence_brightness=np.array([[e.brightness_off, e.brightness_std] for e in evidence], np.float64).reshape(
             -1, 2
         ),
+        evidence_dispersion=np.array([_pack_dispersion(e.dispersion) for e in evidence], np.float64).reshape(-1, 8),
     )
     return out.getvalue()
+
+
+def _pack_dispersion(dispersion: PatchDispersion | None) -> Real:
+    """Return change, standard deviations, and the band in Hz, float64 [8]; NaN if they are not known."""
+    if dispersion is None:
+        return np.full(8, np.nan)
+    return np.concatenate([dispersion.change, dispersion.std, dispersion.band_hz])
+
+
+def _unpack_dispersion(row: Real) -> PatchDispersion | None:
+    if not np.isfinite(row).all():
+        return None
+    return PatchDispersion(row[:3], row[3:6], (float(row[6]), float(row[7])))
 
 
 def read_patches(path: Path) -> ScanPatches:
@@ -433,21 +447,25 @@ def read_patches(path: Path) -> ScanPatches:
 def _read_evidence(arrays: Mapping[str, npt.NDArray], judged: Sequence[int]) -> dict[int, RatioEvidence]:
     """Return what the names of the judged patches rest on. Raises ValueError if the arrays do not fit."""
     shares = arrays["evidence_share"]
-    # Products of earlier states hold no brightness.
+    # Products of earlier states hold neither brightness nor dispersion.
     brightness = np.full((shares.size, 2), np.nan)
     if "evidence_brightness" in arrays:
         brightness = arrays["evidence_brightness"]
+    dispersions = np.full((shares.size, 8), np.nan)
+    if "evidence_dispersion" in arrays:
+        dispersions = arrays["evidence_dispersion"]
     columns = zip(
         arrays["evidence_theta_rad"],
         arrays["evidence_ratio"],
         arrays["evidence_covariance"],
         shares,
         brightness,
+        map(_unpack_dispersion, dispersions),
         strict=True,
     )
     rows = [
-        RatioEvidence(float(angle), complex(t), covariance, float(share), float(off), float(std))
-        for angle, t, covariance, share, (off, std) in columns
+        RatioEvidence(float(angle), complex(t), covariance, float(share), float(off), float(std), dispersion)
+        for angle, t, covariance, share, (off, std), dispersion in columns
     ]
     if any(row.covariance.shape != (2, 2) for row in rows):
         raise ValueError("covariances are not [patch, 2, 2]")

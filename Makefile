@@ -57,14 +57,14 @@ mutants: $(VENV)/installed  ## change the code at 100 random places: do the test
 quick: $(VENV)/installed  ## under a minute: lint, types of what differs from the last commit, the fastest laws
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(if $(CHANGED),$(BIN)/pyrefly check $(CHANGED),@echo "types: nothing differs from the last commit")
+	$(if $(CHANGED),$(BIN)/pyright $(CHANGED),@echo "types: nothing differs from the last commit")
 	$(BIN)/lint-imports >/dev/null || $(BIN)/lint-imports
 	$(BIN)/python -m pytest -q -n $(JOBS) $(LAWS)
 
 check: $(VENV)/installed  ## lint, format, types, import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyrefly check
+	$(BIN)/pyright
 	$(BIN)/lint-imports
 
 bench: $(VENV)/installed  ## speed as ratios, measured side by side in one run

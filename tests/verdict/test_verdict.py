@@ -37,7 +37,9 @@ from polysight.results.verdict import (
     signal_reasons,
     tilt_reasons,
 )
+from polysight_shared.findings import Finding
 
+GAINS = Finding("error", "a gain", "leakage", "measure it")
 ALL = [
     reason("care", "a", "because", "do a", 1.0),
     reason("care", "b", "because", "do b", 3.0),
@@ -227,6 +229,7 @@ def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels)
         (tilt_reasons({1: 0.6, 4: -2.0}), ("patch 4", "-2.0 degrees", "(2 patches in all)"), "patch 1"),
         (tilt_reasons({1: 0.6, 4: 0.1}), ("patch 1", "+0.6 degrees"), "in all"),
         (signal_reasons({1: "noise", 3: "noise"}, 3), ("patches 1, 3 not judged: noise",), "patch 1"),
+        (passivity_reasons({3: GAINS, 5: GAINS}), ("patches 3, 5 have no permittivity: a gain; leakage",), "patch "),
         (disturbed_reasons({3: 0.2, 1: 0.1, 2: 0.01}), ("within patches 1, 3,", "up to 20 %"), "2,"),
         (rows(1000, 0.25), ("25.0 % of the recorded",), "absent"),
         (path(-3.0), ("RH: the direct path is weak, -3 dB",), "missing"),
@@ -253,7 +256,7 @@ def test_reasons_come_from_the_recording_to_the_names():
         path(-3.0),
         metal_reasons("metal", True, False, False, False, False),
         path(phase_rad=0.1),
-        passivity_reasons({1: "a gain"}),
+        passivity_reasons({1: GAINS}),
         signal_reasons({1: "noise"}, 2),
         incidence_reasons(57.0, 55.0),
         brightness_reasons({1: 0.4}),

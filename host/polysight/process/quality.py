@@ -445,7 +445,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     reasons: list[Finding] = []
     refused = {r.patch.label: r.refused.what for r in result.patches if r.refused is not None}
     gaining = {
-        r.patch.label: r.refused.what
+        r.patch.label: r.refused
         for r in result.patches
         if r.refused is not None and r.refused.what in NOT_PASSIVE and r.permittivity.value is not None
     }

@@ -623,16 +623,19 @@ def tilt_reasons(across_deg: Mapping[int, float]) -> list[Finding]:
     )]  # fmt: skip
 
 
-def passivity_reasons(gaining: Mapping[int, str]) -> list[Finding]:
-    """Judge patches whose permittivity is impossible for a passive material: number to the fault."""
-    return [
-        reason(
-            "care", f"patch {label} has no permittivity: {fault}",
-            "it points to leakage, a layered plate, a wrong metal reference, or H and V not on the same place",
-            "measure leakage; if the plate is thin, fit it as a layer (polysight permittivity --layer)", 2.2,
-        )
-        for label, fault in gaining.items()
-    ]  # fmt: skip
+def passivity_reasons(refused: Mapping[int, Finding]) -> list[Finding]:
+    """Judge patches that are no passive half space: number to why."""
+    labels: dict[str, list[int]] = {}
+    for label, fault in refused.items():
+        labels.setdefault(fault.what, []).append(label)
+    out = []
+    for patches in labels.values():
+        fault = refused[patches[0]]
+        named = f"patch {patches[0]} has"
+        if len(patches) > 1:
+            named = f"patches {', '.join(map(str, patches))} have"
+        out.append(reason("care", f"{named} no permittivity: {fault.what}", fault.why, fault.do, 2.2))
+    return out
 
 
 def brightness_reasons(off: Mapping[int, float]) -> list[Finding]:

@@ -1,5 +1,7 @@
 """Calibration files read back, a scan uses its own copies, and unsuitable or changed files are refused."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -100,7 +102,8 @@ def test_without_files_nothing_changes(make_rig):
 
 
 def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, hpf):
-    metal = write_metal(metal_reference(make_rig()), SOURCES, hpf.parent)
+    dispersion = (0.1 - 0.2j, 0.05j)
+    metal = write_metal(replace(metal_reference(make_rig()), dispersion=dispersion), SOURCES, hpf.parent)
     scan = create(tmp_path / "scan", rig_naming(hpf=hpf, metal=metal))
     assert sorted(facts_of(scan, "scan_started")[0]["calibration"]) == ["hpf", "metal"]
     assert not [f for f in validate(scan.path) if f.level == "error"]
@@ -111,6 +114,7 @@ def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, 
     assert copies_after.filters == copies_before.filters
     assert copies_after.high_pass("RH").corners_hz == (180.5e3, 355.25e3)
     np.testing.assert_array_equal(copies_after.reference().h, copies_before.reference().h)
+    assert copies_after.reference().dispersion == dispersion
     assert set(copies_after.files()) == {"hpf", "metal"}
 
 

@@ -17,8 +17,9 @@ from polysight.jobs.process import form_scan_images
 from polysight.materials import parse_layer, read_truth
 from polysight.materials.analyse import KnownScene
 from polysight.materials.layers import fit_layer
+from polysight.materials.measure import measure_dispersions
 from polysight.materials.sub_bands import bands_of_row
-from polysight.polarimetry import Leakage, PlaneReference
+from polysight.polarimetry import Leakage, PlaneReference, multilayer
 from polysight.settings import Settings
 from polysight_shared.config import Instrument
 from polysight_simulators.scene import decode_scene, simulate
@@ -115,6 +116,37 @@ def test_layers_are_recovered_where_a_half_space_is_wrong(scan, reference, rig, 
         assert abs(fit.permittivity - truth) < 0.05 * abs(truth)
     assert not fit.ambiguous
     assert not fit.warnings()
+
+
+def slope_over_sweep(stack: list[dict], band_hz: tuple[float, float]) -> np.ndarray:
+    """Change of ln |r_s|, ln |r_p / r_s| and its phase over a band, by the slope in its middle."""
+    eps = [complex(x["permittivity"][0], -x["permittivity"][1]) for x in stack]
+    thick_m = [x.get("thickness_mm", np.inf) / 1e3 for x in stack]
+    if np.isfinite(thick_m[-1]):
+        eps.append(1.0)
+        thick_m.append(np.inf)
+    middle_hz = np.mean(band_hz)
+    step_hz = 1e7
+    ends = (multilayer(eps, thick_m, middle_hz + side * step_hz, np.radians(55.0)) for side in (-1, 1))
+    before, after = (np.log(np.array(end)) for end in ends)
+    of_s, of_p = (after - before) * (band_hz[1] - band_hz[0]) / (2 * step_hz)
+    return np.array([of_s.real, (of_p - of_s).real, (of_p - of_s).imag])
+
+
+@pytest.mark.parametrize("name", ["plate", "acrylic 1", "water"])
+def test_the_change_over_the_sweep_is_that_of_the_plate_beside_metal_scanned_apart(scan, reference, name):
+    pipeline, images = form_scan_images(scan(name, hv_gain_db=-2.0), Settings())
+    result = pipeline.find_materials(pipeline.place_plane(images), KnownScene(metal=reference))
+    (patch,) = result.patches
+    images = pipeline.place_plane(images)
+    (measured,) = measure_dispersions(images, result.segmentation, [patch.patch], patch.patch.interior, reference)
+    assert measured is not None
+    expected = np.zeros(3)
+    if name != "plate":
+        expected = slope_over_sweep(PLATES[name].get("layers", [PLATES[name]]), measured.band_hz)
+    # The slope in the middle of the band is not quite that over the window.
+    assert (np.abs(measured.change - expected) < 0.05 * np.abs(expected) + 3 * measured.std).all()
+    assert measured.std[0] < 0.05
 
 
 @pytest.fixture(scope="module")

@@ -293,6 +293,8 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
         arrays = {name: getattr(reference, name) for name in IMAGES}
         if reference.bands:
             arrays |= {f"band_{n}": np.stack([getattr(part, n) for part in reference.bands]) for n in IMAGES}
+        if reference.dispersion is not None:
+            arrays["dispersion"] = np.array(reference.dispersion)
         np.savez_compressed(images, x_m=reference.x_m, y_m=reference.y_m, **arrays)
         digest = f"{zlib.crc32(images.read_bytes()):08x}"
         path.unlink()
@@ -319,6 +321,11 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
         )
     with open_npz(images) as f:
         arrays: dict[str, NDArray[Any]] = dict(f)
+    dispersion = None
+    # Files of earlier states hold none.
+    if "dispersion" in arrays:
+        h, v = arrays["dispersion"].tolist()
+        dispersion = (h, v)
     reference = PlaneReference(
         *(arrays[name] for name in IMAGES),
         x_m=arrays["x_m"],
@@ -326,6 +333,7 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
         spread=file.spread,
         how=file.how,
         made_with=file.imaged_with,
+        dispersion=dispersion,
     )
     parts = (
         replace(reference, spread=band.spread, how=band.how, **{n: arrays[f"band_{n}"][k] for n in IMAGES})

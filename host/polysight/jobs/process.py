@@ -190,8 +190,13 @@ def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> 
     if is_given_images(folder):
         return make_reference(read_given_images(folder, rig_of_images(config)))
     pipeline, images = form_scan_images(folder, Settings(config=path_text(config), bands=bands))
-    parts = tuple(make_plane_reference(pipeline, band) for band in pipeline.sub_bands.finish(pipeline.source.mirrored))
-    return replace(make_plane_reference(pipeline, images), bands=parts)
+    mirrored = pipeline.source.mirrored
+    parts = tuple(make_plane_reference(pipeline, band) for band in pipeline.sub_bands.finish(mirrored))
+    dispersion = pipeline.images.disperse()
+    reference = make_plane_reference(pipeline, images).add_dispersion(
+        dispersion.transpose() if mirrored else dispersion
+    )
+    return replace(reference, bands=parts)
 
 
 def load_inputs(settings: Settings) -> Inputs:

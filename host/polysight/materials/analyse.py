@@ -255,7 +255,7 @@ def analyse(
     plane = known_scene.plane
     if plane is not None:
         plane.check_axes(images.x_m, images.y_m)
-        images = replace(images.within(plane.valid), dispersion=None)
+        images = images.within(plane.valid)
     images, apart_mm = align(images)
     segmentation = _patches(images, known_scene)
     images, tilts = level(images, segmentation)
@@ -277,7 +277,7 @@ def analyse(
         tilts=tilts,
     )
     prior = scene.prior(optics.prior, float(np.hypot(*apart_mm)))
-    dispersions = measure_dispersions(images, segmentation, judged, reference.mask)
+    dispersions = measure_dispersions(images, segmentation, judged, reference.mask, plane)
     measured = [scene.measure(p, (rh, rv), _angle(theta, p), d) for p, d in zip(judged, dispersions, strict=True)]
     kinds = _kinds(classifier, float(np.mean(theta)))
     labels = [p.label for p in judged]

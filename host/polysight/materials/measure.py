@@ -20,7 +20,7 @@ from polysight.materials.inversion import (
 from polysight.materials.kinds import PatchDispersion, PatchMeasurement, permittivity_slope
 from polysight.materials.segment import Patch, Segmentation
 from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
-from polysight.polarimetry import inverse_spread, permittivity_from_ratio
+from polysight.polarimetry import PlaneReference, inverse_spread, permittivity_from_ratio
 from polysight_shared.findings import Finding
 
 AMPLITUDE_OF_BLOCKS = 1.0
@@ -344,15 +344,26 @@ def measure_patch(
 
 
 def measure_dispersions(
-    images: Images, found: Segmentation, judged: Sequence[Patch], metal: Mask
+    images: Images,
+    found: Segmentation,
+    judged: Sequence[Patch],
+    metal: Mask,
+    plane: PlaneReference | None,
 ) -> list[PatchDispersion | None]:
     """Measure the change of patches over the sweep relative to metal; None where it or the metal's is not known.
+
+    `metal` is the metal's interior in the scene, `plane` metal that was scanned separately.
 
     What lies behind the plates adds to each channel's change what its own first moment over the sweep is of the plate's
     level: a table 100 mm behind, 20 dB below a plate, 0.8.
     """
     dispersion = images.dispersion
-    of_metal = None if dispersion is None else _median_change(dispersion, metal)
+    of_metal = None
+    if dispersion is not None and plane is None:
+        of_metal = _median_change(dispersion, metal)
+    elif plane is not None and plane.dispersion is not None:
+        h, v = plane.dispersion
+        of_metal = np.array([h.real, (v - h).real, (v - h).imag]), np.zeros(3)
     if dispersion is None or of_metal is None:
         return [None] * len(judged)
     metal_change, metal_spread = of_metal

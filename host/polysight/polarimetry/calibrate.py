@@ -43,7 +43,7 @@ import numpy.typing as npt
 import scipy
 from msgspec import UNSET
 
-from polysight.imaging import Image, ImagedWith, Images, Mask
+from polysight.imaging import Dispersion, Image, ImagedWith, Images, Mask
 from polysight.results import MetalPlate
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
@@ -200,6 +200,8 @@ class PlaneReference:
         References of the imaged sub-bands.
     made_with
         Settings that the gains depend on; None if unknown.
+    dispersion
+        Median change of ln h and ln v of the plate over the sweep; None if unknown.
     """
 
     h: Image
@@ -211,6 +213,15 @@ class PlaneReference:
     how: str
     bands: tuple[PlaneReference, ...] = ()
     made_with: ImagedWith | None = None
+    dispersion: tuple[complex, complex] | None = None
+
+    def add_dispersion(self, dispersion: Dispersion) -> PlaneReference:
+        """Return the reference with the plate's change over the sweep, from the same scan."""
+        h, v = (
+            complex(np.nanmedian(change[self.valid].real), np.nanmedian(change[self.valid].imag))
+            for change in (dispersion.h, dispersion.v)
+        )
+        return replace(self, dispersion=(h, v))
 
     def apply(self, images: Images) -> Images:
         """Divide both channels of another scan by the reference; NaN where it is not valid."""

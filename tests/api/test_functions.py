@@ -67,7 +67,7 @@ def test_an_array_with_labels_is_one_medium(which):
 
 
 def test_types_say_whether_labels_are_kept():
-    """`assert_type` is judged by pyrefly: tests/api is among the files of `make check`."""
+    """`assert_type` is judged by pyright: tests/api is among the files of `make check`."""
     plain = np.array([2.0, 3.0])
     labelled = xarray.DataArray(plain, dims="kind")
     assert_type(permittivity_from_ratio(plain, 0.9), Complex)

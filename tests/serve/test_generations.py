@@ -34,6 +34,10 @@ def test_a_page_never_shows_a_mixture_of_two_generations(browser: Browser, tmp_p
     with served_folder(tmp_path, TOKEN) as view:
         browser.visit(f"{view.address}/scan?scan=one#token={TOKEN}", DESK)
         browser.wait("document.querySelector('#scale img')", "the first image")
+        # The range of |P| follows from the patches; that of |H| is the same for all scans relative to metal.
+        amplitudes = json.dumps(browser.value("document.getElementById('scale').innerText"))
+        browser.click("#maps button[value=p_amplitude]")
+        browser.wait(f"document.getElementById('scale').innerText !== {amplitudes}", "the image of P")
         parts = browser.value(PARTS)
         whole = [parts]
         browser.value("document.querySelector('canvas.imageview').focus()")

@@ -15,7 +15,7 @@ const ON_PAGE = [
   [/polysight label SCAN --list shows them/g, "see Label"],
   [/;? to move a box: --remove .*/g, "; or correct the box that has this name"],
   [/--box .*=x0,y0,x1,y1 with/g, "give"],
-  [/add --metal NAME: /g, "mark the metal, one of "],
+  [/name its box, --metal NAME \(in Python metal=NAME\): /g, "mark the metal, one of "],
   [/with --bands (\d+)/g, "with $1 sub-bands"],
   [/: --value water=0/g, " in it, such as water (0%)"],
   [/\(--value NAME=PERCENT gives it\)/g, ""],

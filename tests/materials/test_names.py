@@ -144,8 +144,16 @@ def test_a_change_over_the_sweep_tells_layers_from_half_spaces():
 
 
 def test_a_change_over_the_sweep_that_is_not_known_well_tells_nothing():
-    unknown = layer_odds(dispersion(np.array([0.5, -0.4, 0.6]), std=30.0), ANGLES[0])
-    assert np.median(unknown) == pytest.approx(1, abs=0.05)
+    for std in (30.0, 1e60):
+        unknown = layer_odds(dispersion(np.array([0.5, -0.4, 0.6]), std=std), ANGLES[0])
+        assert np.median(unknown) == pytest.approx(1, abs=0.05)
+
+
+def test_a_change_of_any_size_has_finite_odds():
+    for change in (0.0, 1.0, 1e3, 1e9):
+        odds = layer_odds(dispersion(np.full(3, change), std=0.006), ANGLES[0])
+        assert np.isfinite(odds).all()
+        assert (odds > 0).all()
 
 
 def test_a_ratio_of_a_half_space_that_changes_over_the_sweep_is_named_a_layer():

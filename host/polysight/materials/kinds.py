@@ -73,7 +73,7 @@ _STEP = 1e-4
 _SHEETS = 6000
 _HALF_SPACES = 4000
 _FREQUENCIES = 9
-_LEAST_DENSITY = 1e-100
+_MOST_LOG_ODDS = 200.0
 
 
 @dataclass(frozen=True)
@@ -421,23 +421,23 @@ def layer_odds(dispersion: PatchDispersion, theta_rad: float) -> Real:
     """Return how much likelier a change over the sweep is for each drawn thin plate than for a half space, [draw]."""
     of_sheets = draw_sheet_dispersions(theta_rad, dispersion.band_hz)
     width = np.sqrt(dispersion.std**2 + DISPERSION_KERNEL**2 + (DISPERSION_MODEL * of_sheets) ** 2)
-    layers = _normal_product(dispersion.change - of_sheets, width)
-    usual = (1 - ODD_DISPERSION) * _normal_product(dispersion.change, dispersion.std)
-    odd_std = np.hypot(dispersion.std, ODD_DISPERSION_STD)
-    half_space = usual + ODD_DISPERSION * _normal_product(dispersion.change, odd_std)
-    return np.asarray(layers / np.maximum(half_space, _LEAST_DENSITY), np.float64)
+    layers = _log_normal(dispersion.change - of_sheets, width)
+    usual = np.log(1 - ODD_DISPERSION) + _log_normal(dispersion.change, dispersion.std)
+    odd = np.log(ODD_DISPERSION) + _log_normal(dispersion.change, np.hypot(dispersion.std, ODD_DISPERSION_STD))
+    log_odds = layers - np.logaddexp(usual, odd)
+    return np.asarray(np.exp(np.clip(log_odds, -_MOST_LOG_ODDS, _MOST_LOG_ODDS)), np.float64)
 
 
 def log_layer_odds(dispersion: PatchDispersion | None, kinds: Kinds | None) -> float:
     """Return ln of how much likelier a change over the sweep is for layers than for half spaces; 0 if it is unknown."""
     if dispersion is None or kinds is None:
         return 0.0
-    return float(np.log(max(np.mean(layer_odds(dispersion, kinds.theta_rad)), _LEAST_DENSITY)))
+    return float(np.log(np.mean(layer_odds(dispersion, kinds.theta_rad))))
 
 
-def _normal_product(difference: Real, std: Real) -> Real:
-    """Return the product of normal densities over the last axis."""
-    return np.prod(np.exp(-0.5 * (difference / std) ** 2) / (np.sqrt(2 * np.pi) * std), axis=-1)
+def _log_normal(difference: Real, std: Real) -> Real:
+    """Return the logarithm of the product of normal densities over the last axis, but for a constant factor."""
+    return np.sum(-0.5 * (difference / std) ** 2 - np.log(std), axis=-1)
 
 
 @cache

@@ -372,11 +372,11 @@ def measure_dispersions(
     out: list[PatchDispersion | None] = []
     for patch in judged:
         of_patch = _median_change(dispersion, patch.interior)
-        if of_patch is None:
+        level_h, level_v = (np.median(np.abs(channel[patch.interior])) for channel in (images.h, images.v))
+        if of_patch is None or not min(level_h, level_v) > 0:
             out.append(None)
             continue
         change, spread = of_patch
-        level_h, level_v = (np.median(np.abs(channel[patch.interior])) for channel in (images.h, images.v))
         behind_h, behind_v = DISPERSION_BEHIND * behind[0] / level_h, DISPERSION_BEHIND * behind[1] / level_v
         of_behind = np.array([behind_h, np.hypot(behind_h, behind_v), np.hypot(behind_h, behind_v)])
         variance = floor**2 + DISPERSION_SHARE**2 * (spread**2 + metal_spread**2) + of_behind**2

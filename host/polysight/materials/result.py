@@ -464,7 +464,7 @@ def _read_evidence(arrays: Mapping[str, npt.NDArray], judged: Sequence[int]) -> 
         strict=True,
     )
     rows = [
-        RatioEvidence(float(angle), complex(t), covariance, float(share), float(off), float(std), dispersion)
+        RatioEvidence(float(angle), complex(t), covariance, float(share), float(off), float(std), dispersion=dispersion)
         for angle, t, covariance, share, (off, std), dispersion in columns
     ]
     if any(row.covariance.shape != (2, 2) for row in rows):

@@ -216,9 +216,12 @@ class PlaneReference:
     dispersion: tuple[complex, complex] | None = None
 
     def add_dispersion(self, dispersion: Dispersion) -> PlaneReference:
-        """Return the reference with the plate's change over the sweep, from the same scan."""
+        """Return the reference with the plate's change over the sweep, from the same scan; unchanged if it has none."""
+        seen = self.valid & np.isfinite(dispersion.h) & np.isfinite(dispersion.v)
+        if not seen.any():
+            return self
         h, v = (
-            complex(np.nanmedian(change[self.valid].real), np.nanmedian(change[self.valid].imag))
+            complex(np.median(change[seen].real), np.median(change[seen].imag))
             for change in (dispersion.h, dispersion.v)
         )
         return replace(self, dispersion=(h, v))

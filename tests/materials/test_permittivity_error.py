@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from polysight.materials.measure import estimate_permittivity
-from polysight.polarimetry import permittivity_from_ratio, ratio_from_permittivity
+from polysight.materials.segment import patches_at_border
+from polysight.polarimetry import PlaneReference, permittivity_from_ratio, ratio_from_permittivity
 
 THETA = np.radians(55.0)
 
@@ -43,3 +45,34 @@ def test_a_shifted_plate_stays_within_its_error_bar(synthetic, request):
     assert len(z) > 10 * placements
     assert max(np.abs(z)) < 3
     assert np.sqrt(np.mean(np.square(z))) < 1.2
+
+
+def errors_beside_metal_apart(scene, lit, segmentation):
+    """Patch number to the error of its real part, with metal that was seen at the pixels `lit` alone."""
+    ones = np.ones(scene.h.shape, complex)
+    metal = PlaneReference(ones, ones, lit, scene.x_m, scene.y_m, spread=1e-3, how="drawn")
+    patches = scene.analyse(metal=metal, segmentation=segmentation).patches
+    return {p.patch.label: p.permittivity.real_std for p in patches if p.permittivity.value is not None}
+
+
+def test_a_plate_that_the_end_of_a_small_aperture_lights_is_known_less_well(synthetic):
+    """Metal that was scanned apart was lit by the same aperture, but not beside the edges of these plates."""
+    scene = synthetic(3, noise=0.002)
+    segmentation = scene.analyse().segmentation
+    everywhere = np.ones(scene.h.shape, bool)
+    inside = errors_beside_metal_apart(scene, everywhere, segmentation)
+    beside = next(p for p in segmentation.patches if p.label in inside)
+    columns = np.flatnonzero(beside.mask.any(axis=0))
+    lit = everywhere.copy()
+    lit[:, columns[-1] + 2 :] = False
+    at_border = errors_beside_metal_apart(scene, lit, segmentation)
+    assert at_border[beside.label] > 1.2 * inside[beside.label]
+
+
+def test_a_plate_that_fills_the_lit_pixels_is_lit_as_the_metal_was(synthetic):
+    scene = synthetic(3)
+    patch = scene.analyse().segmentation.patches[0]
+    assert patches_at_border([patch], lit=patch.mask) == frozenset()
+    lit = ndimage.binary_dilation(patch.mask)
+    assert patches_at_border([patch], lit=lit) == {patch.label}
+    assert patches_at_border([patch], lit=np.ones(patch.mask.shape, bool)) == frozenset()

@@ -71,8 +71,8 @@ from polysight.materials.segment import (
     align,
     axis_mm,
     match_truth,
+    patches_at_border,
     segment,
-    touches_border,
     whole_plane,
 )
 from polysight.polarimetry import (
@@ -360,6 +360,8 @@ class Seen:
         separately.
     metal_spread
         Relative spread of the pixels of metal that was scanned separately; None: it is in the scene.
+    at_border
+        Numbers of the judged patches that the end of the aperture lights.
     tilts
         Tilts of the plates.
     lit_evenly
@@ -379,6 +381,7 @@ class Seen:
     metal: Scatter | None
     change: CommonChange | None
     metal_spread: float | None
+    at_border: frozenset[int]
     tilts: Tilts
     lit_evenly: bool
     metal_rise: Rise
@@ -411,8 +414,9 @@ class Seen:
         spread = None if plane is None else plane.spread
         metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
         evenly = images.illumination is not None and images.illumination.known
-        at_border = [*(touches_border(p.mask) for p in judged if p.label in scatter), False]
-        change = None if metal is None else common_change(scatters, metal.centre_m, at_border)
+        at_border = patches_at_border(judged, None if plane is None else images.usable & plane.valid)
+        border_flags = [*(label in at_border for label in scatter), False]
+        change = None if metal is None else common_change(scatters, metal.centre_m, border_flags)
         halo = NO_HALO if metal is None else find_halo(reference.mask, found.patches, images)
         uneven = 0.0 if metal is None else metal_unevenness(raw, reference.mask)
         behind = background_mean(raw.h, raw.v, found, images.usable)
@@ -422,6 +426,7 @@ class Seen:
             metal=metal,
             change=change,
             metal_spread=spread,
+            at_border=at_border,
             tilts=tilts,
             lit_evenly=evenly,
             metal_rise=metal_rise,
@@ -466,8 +471,8 @@ class Seen:
     ) -> PatchMeasurement:
         """Measure one patch relative to metal."""
         local_std = self.metal_spread or 0.0
-        if touches_border(patch.mask) and self.metal is not None:
-            local_std = BORDER_STD
+        if patch.label in self.at_border:
+            local_std = float(np.hypot(local_std, BORDER_STD))
         scatter = self.scatter.get(patch.label)
         rise = self.tilts.in_plane(patch.label)
         change = None

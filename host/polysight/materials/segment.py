@@ -10,7 +10,7 @@ do not are counted (`Segmentation.left_out`). Where the true plates are known, `
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -263,6 +263,23 @@ def segment(
 def touches_border(mask: Mask) -> bool:
     """Return true if a mask reaches the first or the last row or column of the image."""
     return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
+
+
+def patches_at_border(patches: Sequence[Patch], lit: Mask | None) -> frozenset[int]:
+    """Return the numbers of the patches that the end of the aperture lights.
+
+    They reach the border of the image, or, where metal that was scanned apart was seen at the pixels `lit` alone, come
+    within two pixels of others. A patch that fills `lit` is lit as the metal was.
+    """
+    labels = []
+    for patch in patches:
+        at_border = touches_border(patch.mask)
+        if lit is not None:
+            near = np.asarray(scipy.ndimage.binary_dilation(patch.mask, iterations=2), bool)
+            at_border = (at_border or bool((near & ~lit).any())) and bool((lit & ~patch.mask).any())
+        if at_border:
+            labels.append(patch.label)
+    return frozenset(labels)
 
 
 def _is_cut(mask: Mask, smallest_px: float) -> bool:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polysight.surfaces import Uncertainty, analyse_surface, find_voltages
-from polysight.surfaces.permittivity import find_interior, find_reflecting
-from polysight.surfaces.result import estimate_wall_std
+from polysight.surfaces import Uncertainty, analyse_surface, find_shape, find_voltages
+from polysight.surfaces.permittivity import find_interior, find_reflecting, receive, reflect_points
+from polysight.surfaces.result import NO_SINGLE_MEDIUM, describe_segment, estimate_wall_std, judge_segment
 from polysight_worlds.media import Stack
 from polysight_worlds.shapes import cylinder, plate
 
@@ -82,6 +82,22 @@ def check_a_thin_wall(see, gains, optics, wall_mm):
     # Both faces make one echo: points lie millimetres off, which their errors say.
     away_m = np.abs(tube.project(surface.points_m)[0])
     assert np.mean(away_m < 1.96 * surface.position_std_m) >= 0.9
+
+
+def test_a_small_body_says_whether_one_medium_explains_it(metal, gains, optics):
+    """Below 40 mm nothing has a permittivity; the points of a wall lie off all the same, and its reason says so."""
+    learnt = gains(optics)
+    voltages = find_voltages(metal, optics)
+    gain = np.exp(learnt.level(voltages.arrival))[:, None]
+    gain = gain * np.stack([np.ones(len(metal)), 1 / learnt.ratio(voltages.arrival)], axis=1)
+    received = gain * receive(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
+    ball = replace(describe_segment(0, find_shape(metal.h, optics)), radius_mm=30.0)
+    for level, rise, reason in ((1.0, 0.0, "below 40 mm"), (1.0, 0.1, NO_SINGLE_MEDIUM), (1.2, 0.0, NO_SINGLE_MEDIUM)):
+        band_rise = np.tile(learnt.band_rise + rise, (len(metal), 1))
+        changed = replace(voltages, b=level * received, band_rise=band_rise)
+        judged, fit = judge_segment(ball, changed, learnt, [], optics.wave_number)
+        assert reason in judged.reason
+        assert fit is None
 
 
 def test_points_near_the_border_of_a_segment_are_told_but_not_where_the_scan_ends():

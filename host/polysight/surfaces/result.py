@@ -314,13 +314,14 @@ def judge_segment(
     ratio = complex(np.median(ratios.real), np.median(ratios.imag))
     if abs(ratio - 1) < METAL_RATIO:
         return replace(segment, reason="its ratio is that of metal", name="metal"), None
-    if segment.radius_mm is not None and segment.radius_mm < 1e3 * MIN_RADIUS_M:
-        cause = f"radius {segment.radius_mm:.0f} mm: below {1e3 * MIN_RADIUS_M:.0f} mm only the shape is reliable"
-        return replace(segment, reason=cause), None
     fit = fit_permittivity(voltages, gains, wave_number)
     level, rise = judge_medium(fit, voltages, gains, disturbed, wave_number)
     if level > MAX_LEVEL_MISS or rise > MAX_BAND_RISE:
         return replace(segment, reason=NO_SINGLE_MEDIUM), None
+    # A small body may be a thin wall, too, whose points lie off: that is judged before the radius.
+    if segment.radius_mm is not None and segment.radius_mm < 1e3 * MIN_RADIUS_M:
+        cause = f"radius {segment.radius_mm:.0f} mm: below {1e3 * MIN_RADIUS_M:.0f} mm only the shape is reliable"
+        return replace(segment, reason=cause), None
     return segment, fit
 
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
-from polysight.surfaces import Uncertainty, analyse_surface, find_shape, find_voltages
+from polysight.surfaces import Seen, Uncertainty, analyse_surface, find_shape, find_voltages
 from polysight.surfaces.permittivity import find_interior, find_reflecting, receive, reflect_points
-from polysight.surfaces.result import NO_SINGLE_MEDIUM, describe_segment, estimate_wall_std, judge_segment
+from polysight.surfaces.result import (
+    NO_SINGLE_MEDIUM,
+    describe_segment,
+    estimate_wall_std,
+    find_depth_behind,
+    judge_segment,
+)
 from polysight_worlds.media import Stack
 from polysight_worlds.shapes import cylinder, plate
 
@@ -98,6 +104,22 @@ def test_a_small_body_says_whether_one_medium_explains_it(metal, gains, optics):
         judged, fit = judge_segment(ball, changed, learnt, [], optics.wave_number)
         assert reason in judged.reason
         assert fit is None
+
+
+def test_what_the_windows_of_a_body_see_behind_it_may_be_an_echo_from_inside(metal, optics):
+    def add_echo(path_m, shift_m=0.0):
+        """Points of the front, and an echo of each later by `path_m`, seen from `shift_m` farther away in x."""
+        later = replace(metal.h, path_m=metal.h.path_m + path_m, at_m=metal.h.at_m + np.array([shift_m, 0.0, 0.0]))
+        echoes = [{f.name: getattr(h, f.name) for f in fields(h)} for h in (metal.h, later)]
+        h = replace(metal.h, **{name: np.concatenate([part[name] for part in echoes]) for name in echoes[0]})
+        segment = np.repeat([0, 1], len(metal))
+        return Seen(h, h, segment), find_shape(h, optics)
+
+    # 53 degrees of incidence: an echo 1.2 times the depth later.
+    assert find_depth_behind(*add_echo(0.2), 1) == pytest.approx(0.166, rel=0.05)
+    assert find_depth_behind(*add_echo(0.2), 0) is None
+    assert find_depth_behind(*add_echo(0.02), 1) is None
+    assert find_depth_behind(*add_echo(0.2, shift_m=0.5), 1) is None
 
 
 def test_points_near_the_border_of_a_segment_are_told_but_not_where_the_scan_ends():

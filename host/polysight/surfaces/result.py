@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polysight.store import open_npz
 from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS
-from polysight.surfaces.measure import Seen, Shape, find_shape
+from polysight.surfaces.measure import SAME_WINDOW_M, Seen, Shape, find_shape
 from polysight.surfaces.optics import Optics
 from polysight.surfaces.permittivity import (
     DisturbedScan,
@@ -60,6 +60,11 @@ MAX_GAIN_SIGMA = 3.0
 MAX_LEVEL_MISS = 0.1
 MAX_BAND_RISE = 0.02
 NO_SINGLE_MEDIUM = "no single medium reflects so: a thin wall, a coating, an edge, or a second echo at the same place"
+# A segment of which so many points lie at least so far behind another surface may be an echo from inside a body. Less
+# far, a window does not resolve both.
+MIN_SHARE_BEHIND = 0.8
+MIN_DEPTH_M = 0.03
+BEHIND_ANOTHER = "no single medium reflects so, and it lies behind another surface: an echo from inside a body"
 # What an edge diffracts changes the slopes of windows near the border of the zone that its surface reflects to: by up
 # to 0.01, in the root mean square 0.0065 (half a plane, tests/surfaces/test_slope_errors.py).
 EDGE_SLOPE_STD = 0.0065
@@ -157,12 +162,19 @@ def analyse_surface(
     edge_std = np.where(interior, 0.0, EDGE_SLOPE_STD)[:, None]
     of_h = replace(echoes.h, slope_std=np.hypot(echoes.h.slope_std, edge_std))
     position_std_m, normal_std_rad = find_shape_errors(of_h, shape, optics, uncertainty)
-    # A wall is not told from other things that no single medium explains.
-    for segment in segments:
-        if gains is not None and segment.reason == NO_SINGLE_MEDIUM:
-            is_wall = echoes.segment == segment.number
-            reflection = np.median(find_reflection(voltages[is_wall], gains))
-            position_std_m[is_wall] = np.hypot(position_std_m[is_wall], estimate_wall_std(reflection))
+    for index, segment in enumerate(segments):
+        if gains is None or segment.reason != NO_SINGLE_MEDIUM:
+            continue
+        members = echoes.segment == segment.number
+        depth_m = find_depth_behind(echoes, shape, segment.number)
+        if depth_m is None:
+            # A wall is not told from other things that no single medium explains.
+            unknown_m = estimate_wall_std(np.median(find_reflection(voltages[members], gains)))
+        else:
+            segments[index] = replace(segment, reason=BEHIND_ANOTHER)
+            # That of an even distribution as far as the surface before.
+            unknown_m = depth_m / np.sqrt(3)
+        position_std_m[members] = np.hypot(position_std_m[members], unknown_m)
     return Surface(
         scan_id=scan_id,
         simulated=simulated,
@@ -279,6 +291,31 @@ def estimate_wall_std(reflection: float) -> float:
     """Return the standard error of the points of a thin wall, metres, by its reflection over that of metal."""
     cancelled = max(1.0, WALL_REFLECTION / max(reflection, 0.05))
     return WALL_STD_M * cancelled**WALL_EXPONENT
+
+
+def find_depth_behind(echoes: Seen, shape: Shape, number: int) -> float | None:
+    """Return how far a segment's points lie behind another surface that the same windows see, metres, or None.
+
+    What comes back from inside a body has no place of its own: rays bend where they enter, and are slow inside. It is
+    seen by the windows that see the body's front, beneath it.
+    """
+    window = np.unique(np.round(echoes.h.at_m / SAME_WINDOW_M), axis=0, return_inverse=True)[1].reshape(-1)
+    members = np.flatnonzero(echoes.segment == number)
+    others = np.flatnonzero(echoes.segment != number)
+    others = others[np.argsort(echoes.h.path_m[others], kind="stable")]
+    windows, first = np.unique(window[others], return_index=True)
+    if not windows.size:
+        return None
+    place = np.minimum(np.searchsorted(windows, window[members]), windows.size - 1)
+    before = others[first[place]]
+    is_shared = windows[place] == window[members]
+    away = shape.points[members] - shape.points[before]
+    depth_m = -np.einsum("ni,ni->n", away, shape.normals[before])
+    beside_m = np.sqrt(np.maximum(0, np.sum(away**2, axis=1) - depth_m**2))
+    is_behind = is_shared & (depth_m > MIN_DEPTH_M) & (beside_m < depth_m)
+    if is_behind.mean() < MIN_SHARE_BEHIND:
+        return None
+    return float(np.median(depth_m[is_behind]))
 
 
 def describe_segment(number: int, shape: Shape) -> Segment:

@@ -213,6 +213,14 @@ def _draw_bottle(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
     return bottle("bottle", wall, drawn.point_behind(radius_m), radius_m, 0.16, axis=drawn.axis), radius_m
 
 
+def _draw_thin_sheet(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radius_m = drawn.rng.uniform(0.15, 0.6)
+    turn_deg = float(drawn.rng.uniform(0, 180))
+    wall = Stack(((drawn.stack.below, drawn.rng.uniform(0.5e-3, 3e-3)),), 1.0)
+    bends = (1 / radius_m, 0.0, 0.0)
+    return (plate("thin sheet", wall, drawn.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radius_m
+
+
 KINDS: dict[str, Callable[[_Draw], tuple[tuple[Shape, ...], float]]] = {
     "plate": _draw_plate,
     "sphere": _draw_sphere(0.1, 0.2),
@@ -226,7 +234,10 @@ KINDS: dict[str, Callable[[_Draw], tuple[tuple[Shape, ...], float]]] = {
     "barrel": _draw_barrel,
     "saddle": _draw_saddle,
     "sheet": _draw_sheet,
+    "thin sheet": _draw_thin_sheet,
 }
+# Both faces of a thin wall reflect: it has no single surface.
+THIN_WALLS = ("bottle", "thin sheet")
 
 
 def draw_shapes(
@@ -240,7 +251,7 @@ def draw_shapes(
     if kind is None:
         kind = str(rng.choice(list(KINDS)))
     medium = complex(rng.uniform(2, 9), -rng.uniform(0, 1))
-    is_metal = rng.random() < metal_share and kind != "bottle"
+    is_metal = rng.random() < metal_share and kind not in THIN_WALLS
     x, y = published_rig().centre_m + rng.uniform(-0.04, 0.04, 2)
     front_m = float(x), float(y), float(0.499 + rng.uniform(-0.02, 0.03))
     # Axes lie within 10 degrees of the picture's plane, in any direction of it.
@@ -259,6 +270,6 @@ def draw_shapes(
         shapes=shapes,
         permittivity=None if is_metal else medium,
         radius_m=float(radius_m),
-        is_uniform=kind != "bottle",
+        is_uniform=kind not in THIN_WALLS,
         background=background,
     )

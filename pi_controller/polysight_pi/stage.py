@@ -37,28 +37,33 @@ from polysight_shared.stage_line import (
 )
 from polysight_shared.units import NS_PER_S
 
-# On the line: with start and stop bit.
+# A byte on the serial line, with start and stop bit.
 BITS_PER_BYTE = 10
 # The first opening of the port resets an UNO, whose boot loader takes up to 2 s.
 BANNER_TIMEOUT_S = 3.0
 # The longest line and its answer take 14 ms at 115200 baud; the rest is for a busy machine.
 ANSWER_TIMEOUT_S = 0.5
+# How often a line is sent before the stage counts as lost.
 TRIES = 4
+# Answers that tell of a damaged line: it is sent again.
 RETRIED = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
-# While moving.
+# Status requests to a moving stage per heartbeat, so that a lost one does not stop it.
 STATUS_PER_HEARTBEAT = 4
 # Timeout of a status request, in heartbeats. With the time until the next request and the read timeout, a silent stage
 # is noticed before its own heartbeat stops it.
 SILENT_HEARTBEATS = 0.5
 # Timeout at rest: nothing has to be stopped, and a busy machine may answer late.
 SILENT_AT_REST_S = 3.0
+# Interval of status requests to a stage at rest.
 IDLE_STATUS_S = 1.0
-# From STOP to standstill.
+# Longest time from STOP to standstill.
 STOP_TIMEOUT_S = 3.0
+# Between two attempts to clear an alarm of a stage that still moves.
 CLEAR_RETRY_S = 0.05
-# Longer than a line and its retries take.
+# A thread that commands the stage hangs if it has not completed a turn for so long: longer than a line and its retries
+# take.
 CALLER_LATE_S = 3.0
-# Limit of a position in the messages.
+# Largest position in the messages; a reply with a larger one was damaged.
 MAX_MM = 1e6
 # No motion takes longer than homing.
 MOTION_TIMEOUT_S = HOMING_TIMEOUT_S
@@ -97,9 +102,10 @@ class StatusWatch:
         self._asked_s = now_s
         self._unanswered_since_s: float | None = None
         self._looked_s = now_s
-        # Interval for calling `is_due` and `silent_s`
+        # The reader calls `is_due` and `silent_s` at this interval.
         self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)
-        self.interval_s = 0.0  # between status requests; 0: none
+        # Between status requests; 0: there are none.
+        self.interval_s = 0.0
 
     def ask_every(self, interval_s: float, now_s: float) -> None:
         """Request the status at this interval from now on, 0: never; an open request's timeout begins again."""
@@ -348,7 +354,8 @@ class StageLink:
         try:
             reply = Reply.decode(line.replace(b"\r\n", b"\n"))
         except ProtocolError:
-            self.bad_lines += 1  # if it was an answer, its line is retried
+            # If it was an answer, its line is retried.
+            self.bad_lines += 1
             return
         # Only the answer to the request is a sign of life; a serial line can chatter without end, and repeat itself.
         asked_ns = 0

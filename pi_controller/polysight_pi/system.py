@@ -25,6 +25,7 @@ SWITCH_INTERVAL_S = 100e-6
 MAX_BYTES = 160 << 20
 # Minimum above the memory left after a cut: not all freed memory returns to the system.
 SPARE_BYTES = 64 << 20
+# Time between two looks at the memory, and for how long connections are cut after too much was seen.
 LOOK_S = 0.05
 SETTLE_S = 0.5
 

@@ -5,7 +5,7 @@ dependence exp(+j omega t)). Signs of the paper's Eq. 2: a perfect conductor has
 P = r_s / r_p = 1. The echo is physical optics on flat plates, each with its own height and tilt.
 
 A receiver's samples are the conjugate of the wave: a delay is exp(-j 2 pi f tau) in the wave and +2 pi f tau in the
-samples. So complex factors of the wave (reflection, leakage) enter here as their conjugate, :func:`sampled`.
+samples. So complex factors of the wave (reflection, leakage) enter here as their conjugate, :func:`conjugate`.
 
 Amplitudes are relative to the direct path: a free path of length R has amplitude d / R, d the board's direct path to
 RX1. Antenna patterns are modelled only by one constant, the scene's `object_gain`.
@@ -88,19 +88,20 @@ def reflect_layers(
     media = [(x.epsilon, x.thickness_mm) for x in layers]
     if media[-1][1] is not None:
         media.append((1.0 + 0j, None))
+    # Impedance of what lies behind the layer: of nothing yet.
     z_s: Complex = np.zeros(theta.shape, np.complex128)
     z_p: Complex = z_s
     for epsilon, thickness_mm in reversed(media):
         q: Complex = np.sqrt(np.asarray(epsilon - sin**2, dtype=np.complex128))
-        own_s = 1 / q
-        own_p = q / epsilon
+        layer_s = 1 / q
+        layer_p = q / epsilon
         if thickness_mm is None:
-            z_s = own_s
-            z_p = own_p
+            z_s = layer_s
+            z_p = layer_p
             continue
         t = np.tan(2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S * thickness_mm / 1e3 * q)
-        z_s = own_s * (z_s + 1j * own_s * t) / (own_s + 1j * z_s * t)
-        z_p = own_p * (z_p + 1j * own_p * t) / (own_p + 1j * z_p * t)
+        z_s = layer_s * (z_s + 1j * layer_s * t) / (layer_s + 1j * z_s * t)
+        z_p = layer_p * (z_p + 1j * layer_p * t) / (layer_p + 1j * z_p * t)
     # Signs of Eq. 2: both are -1 for a perfect conductor (no impedance).
     return (z_s * cos - 1) / (z_s * cos + 1), (z_p - cos) / (z_p + cos)
 
@@ -288,10 +289,10 @@ def field_exact(
             z = ant.plane_z_m + plate.height_mm / 1e3 + slope[0] * px + slope[1] * py + parts.height_m[row, column]
             for n, (ox, oy) in enumerate(offsets_m):
                 r1, r2, theta, oblique = ant.legs(cx + px - ox, cy + py - oy, rx, z, slope)
-                common = area * oblique / (r1 * r2)
+                weight = area * oblique / (r1 * r2)
                 for k, f in enumerate(frequencies_hz):
                     phase = np.exp(2j * np.pi * f / SPEED_OF_LIGHT_M_S * (r1 + r2))
-                    out[n, k] += plate_scale(ant, scene, f) * np.sum(common * reflect(plate, f, theta) * phase)
+                    out[n, k] += plate_scale(ant, scene, f) * np.sum(weight * reflect(plate, f, theta) * phase)
     for point in scene.points:
         px, py = ant.centre_m[:2] + np.array(point.position_mm) / 1e3
         z = ant.plane_z_m + point.height_mm / 1e3

@@ -1,7 +1,7 @@
-"""The emulated UNO at real time: `python -m polysight_simulators.stage` with the flashed machine code itself.
+"""The emulated UNO in real time: like `python -m polysight_simulators.stage`, but it runs the flashed machine code.
 
-`--time-scale` is the speed of the whole board, its heartbeat clock included: a host that asks for the status four
-times per heartbeat allows 2, and a machine that cannot keep up slows the simulated world down.
+`--time-scale` is the speed of the whole board, its heartbeat clock included. Use at most 2 with a program that asks for
+the status four times per heartbeat. On a machine that cannot keep up, the simulated world runs slower than asked for.
 """
 
 from __future__ import annotations
@@ -53,10 +53,15 @@ def _run(args: argparse.Namespace) -> None:
         problem = f"not installed: {' '.join(missing_packages)}"
         raise PolysightError(problem, "the emulated board is compiled on this machine", ENABLING_COMMAND)
     rig = load_instrument(args.config)
-    zero = homing_zero()
+    switch_position = homing_zero()
     program = str(emulator())
     command = [program, "--pty", str(args.link), "--speed", repr(args.time_scale), "--boot-ms", str(args.boot_ms)]
-    command += ["--zero", f"{zero},{zero}", "--um-per-step", repr(1000.0 / rig.stage.steps_per_mm)]
+    command += [
+        "--zero",
+        f"{switch_position},{switch_position}",
+        "--um-per-step",
+        repr(1000.0 / rig.stage.steps_per_mm),
+    ]
     command += ["--line", str(rig.pi.trigger_in)]
     if args.wires:
         command += ["--wires", str(args.wires)]

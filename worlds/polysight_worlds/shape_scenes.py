@@ -1,7 +1,10 @@
-"""Drawn scenes of shapes, what disturbs their scan, and the samples of the scan.
+"""Random scenes of shapes, what disturbs their scan, and the samples of the scan.
 
 `draw_shapes` makes a scene of one object of a kind, with or without a table behind; `scan_shapes` gives its samples as
-the instrument holds them, with noise and a rig that stands a little otherwise than the nominal one.
+the instrument holds them, with noise and a rig whose boards stand a little beside their nominal places.
+
+Each quantity has a random stream of its own, numbered after the seed (`[seed, 11]`), so that switching one disturbance
+on does not change the others.
 """
 
 from __future__ import annotations
@@ -21,10 +24,14 @@ from polysight_worlds.shapes import Shape, Sphere, bottle, cylinder, plate, sphe
 
 # The linear part of the published chirp, in as many frequencies as hold a range gate of 0.5 m.
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 24)
-# Noise of a position in the published rig: 5.5 dB below the direct path in each of 192 samples of 16 chirps. The direct
-# path is 1.39 m long, and echoes are 1.35 times as strong, as it leaves at the patterns' edge.
-NOISE_A_SAMPLE = 10 ** (-5.5 / 20) / 4 / 1.39 / 1.35
+# Linear samples of the published chirp.
 SAMPLES = 192
+# Noise of a sample, where a free path of 1 m has amplitude 1. In the published rig it is 5.5 dB below the direct path
+# in each chirp, and a position averages 16 of them (a fourth of the noise). The direct path is 1.39 m long, and echoes
+# are 1.35 times as strong, as it leaves at the patterns' edge.
+NOISE_A_SAMPLE = 10 ** (-5.5 / 20) / np.sqrt(16) / 1.39 / 1.35
+# From the rig's origin to the middle of the picture: the published rig's object plane.
+PLANE_M = 0.499
 
 
 @dataclass(frozen=True)
@@ -136,7 +143,7 @@ def scan_offsets(columns: int = 350, rows: int = 200, step_m: float = 0.002, *, 
 def reference_sphere(radius_m: float = 0.125) -> Sphere:
     """Return a metal sphere whose front is at the middle of the picture."""
     x, y = published_rig().centre_m
-    return sphere("reference", METAL, (float(x), float(y), 0.499 + radius_m), radius_m)
+    return sphere("reference", METAL, (float(x), float(y), PLANE_M + radius_m), radius_m)
 
 
 @dataclass(frozen=True)
@@ -149,6 +156,7 @@ class _Draw:
     axis: tuple[float, float, float]
 
     def point_behind(self, depth_m: float) -> tuple[float, float, float]:
+        """Centre of a body whose front lies `depth_m` before it."""
         x, y, z = self.front_m
         return x, y, z + depth_m
 
@@ -221,6 +229,7 @@ def _draw_thin_sheet(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
     return (plate("thin sheet", wall, drawn.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radius_m
 
 
+# What draws the pieces of each kind of object, and the smaller radius of its front in metres.
 KINDS: dict[str, Callable[[_Draw], tuple[tuple[Shape, ...], float]]] = {
     "plate": _draw_plate,
     "sphere": _draw_sphere(0.1, 0.2),
@@ -253,11 +262,11 @@ def draw_shapes(
     medium = complex(rng.uniform(2, 9), -rng.uniform(0, 1))
     is_metal = rng.random() < metal_share and kind not in THIN_WALLS
     x, y = published_rig().centre_m + rng.uniform(-0.04, 0.04, 2)
-    front_m = float(x), float(y), float(0.499 + rng.uniform(-0.02, 0.03))
+    front_m = float(x), float(y), float(PLANE_M + rng.uniform(-0.02, 0.03))
     # Axes lie within 10 degrees of the picture's plane, in any direction of it.
-    around = rng.uniform(0, np.pi)
-    towards = rng.uniform(-0.17, 0.17)
-    axis = float(np.cos(around)), float(np.sin(around)), float(towards)
+    direction_rad = rng.uniform(0, np.pi)
+    out_of_plane_rad = rng.uniform(-0.17, 0.17)
+    axis = float(np.cos(direction_rad)), float(np.sin(direction_rad)), float(out_of_plane_rad)
     stack = METAL if is_metal else Stack(below=medium)
     shapes, radius_m = KINDS[kind](_Draw(rng, front_m, stack, axis))
     background: tuple[Shape, ...] = ()

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from xarray import DataArray
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-# Arrays without labels: `ArrayLike` would hold the ones with labels, too.
+# Values without labels. `ArrayLike` would accept a `DataArray`, too, and hide the first overloads.
 Plain = complex | np.generic | npt.NDArray[Any] | Sequence[Any]
 
 
@@ -140,7 +140,7 @@ def _take_arrays_as_one_medium(function: Function) -> Function:
 
 
 def _list_one_medium(value: Any) -> Any:
-    """Return a `DataArray` as the list of it, anything else as it is."""
+    """Return a `DataArray` in a list of one, anything else as it is."""
     xarray = sys.modules.get("xarray")
     if xarray is not None and isinstance(value, xarray.DataArray):
         return [value]

@@ -25,6 +25,7 @@ PAPER = {"frequency_hz": 138.0, "phase_rad": 0.022}
 
 QUANTITIES = ("frequency_hz", "phase_rad", "amplitude")
 _LABELS = ("frequency (Hz)", "phase (rad)", "amplitude / mean - 1")
+# Of a histogram; an odd number has a bin about zero.
 _BINS = 121
 # Histograms reach this many standard deviations of the first row to either side.
 _REACH = 5.0
@@ -32,7 +33,10 @@ _REACH = 5.0
 
 @dataclass
 class _Stage:
-    """Running sums of one stage: squares, count, and a histogram over the range of the first row."""
+    """Running sums of one stage: squares, count, and a histogram of each of `QUANTITIES`.
+
+    `reach` [3]: the histograms go from -reach to reach, which the first row decides.
+    """
 
     reach: NDArray[np.float64]
     squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
@@ -40,7 +44,7 @@ class _Stage:
     n: int = 0
 
     def add(self, values: NDArray[np.float64]) -> None:
-        """Errors [3, n]."""
+        """Add the errors [3, n] of n positions or chirps."""
         self.squares += (values**2).sum(axis=1)
         self.n += values.shape[1]
         for i, reach in enumerate(self.reach):
@@ -96,13 +100,14 @@ class SyncReport:
         n = self._samples
         chirps = self.chirps / max(self.positions, 1)
 
-        def tone(snr: float) -> tuple[float, float, float]:
+        def bound_tone(snr: float) -> tuple[float, float, float]:
             phase = 1 / np.sqrt(2 * snr * n)
             f = np.sqrt(6 / (snr * n * (n**2 - 1))) / (2 * np.pi) * self._rate
             return float(f), float(phase), float(phase)
 
-        single_chirp = tone(self.snr * self._rx)
-        mean = tone(self.snr * self._rx * chirps)
+        single_chirp = bound_tone(self.snr * self._rx)
+        mean = bound_tone(self.snr * self._rx * chirps)
+        # The residual of this stage is a difference of two signals with equal noise.
         f, phase, amplitude = (float(np.sqrt(2)) * bound for bound in mean)
         return {"aligned": single_chirp, "averaged": mean, "referenced": (f, phase, amplitude)}
 

@@ -34,8 +34,9 @@ COMMAND = b"POST /api/control/"
 TOKEN_LINE = TOKEN_HEADER.lower().encode()
 # Connections that are accepted, or taken over, before other work of the process is done.
 ACCEPTED_AT_ONCE = 64
-# Connections that have not sent anything; and those that the pages' process has not taken yet.
+# Connections that have not sent anything. With one more, the one that is silent for longest is closed.
 MOST_SILENT = 1024
+# Connections that the pages' process has not taken yet. With one more, the oldest is answered `BUSY`.
 MOST_WAITING = 512
 BUSY = b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
@@ -160,6 +161,7 @@ async def _keep_door(listener: socket.socket, pages: socket.socket, token: str, 
     config.load()
     make_protocol = partial(H11Protocol, config=config, server_state=ServerState(), app_state={})
     loop = asyncio.get_running_loop()
+    # The loop itself keeps no reference to a task, which could be collected before it ends.
     beginning: set[asyncio.Task[Any]] = set()
 
     def serve(client: socket.socket) -> None:

@@ -18,12 +18,16 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError, ScanError
 from polysight_shared.files import write_atomically
 
+# More than a weekend of scans of two hours each.
 MAX_WAITING = 50
+# Time between two attempts to start the next scan.
 LOOK_S = 2.0
+# States of a scan (`page.status`) after which a person has to look at the rig.
+UNFINISHED = ("stopped", "failed", "lost", "frozen", "damaged")
 
 
 class Waiting(msgspec.Struct, frozen=True):
-    """The names in the queue, the next one first, and why it waits for a person; "" while it does not."""
+    """The names in the queue, the next one first. `held`: why the queue waits for a person, "" while it does not."""
 
     names: list[str]
     held: str = ""
@@ -76,6 +80,7 @@ class Queue:
         self._last = ""
 
     def _requests(self) -> list[tuple[str, Path]]:
+        """Names and files of the requests, in the order in which they came; files that are no requests are left out."""
         requests = []
         for path in sorted(self._folder.glob("*.json")):
             try:
@@ -90,6 +95,7 @@ class Queue:
                 self._start_next()
 
     def _start_next(self) -> None:
+        """Start the first request if the rig is free; hold the queue if the last scan, or this start, failed."""
         requests = self._requests()
         if not requests or self._held:
             return
@@ -98,7 +104,7 @@ class Queue:
             state = "finished"
             if self._last:
                 state = self._state_of(self._last)
-            if state in ("stopped", "failed", "lost", "frozen", "damaged"):
+            if state in UNFINISHED:
                 self._held = f"{self._last}: {state}"
                 return
             self._start(path.read_bytes())

@@ -14,15 +14,15 @@ from polysight.serve.guard import Access
 SIOCGIFADDR = 0x8915
 # A documentation address (RFC 5737): it stands for every network that is reached by the default route.
 ELSEWHERE = ("203.0.113.1", 9)
-# By dark modules of the upper and the lower row. Colours are given, black on white, since the terminal's own may be
-# either way round and a camera reads no inverted code.
+# One character shows two modules of the code, the keys say whether the upper and the lower one are dark. Colours are
+# given, black on white, since the terminal's own may be either way round and a camera reads no inverted code.
 HALF_BLOCKS = {(0, 0): " ", (1, 0): "\u2580", (0, 1): "\u2584", (1, 1): "\u2588"}
 BLACK_ON_WHITE = "\033[38;5;16;48;5;231m"
 RESET = "\033[0m"
 
 
 def describe_server(access: Access, what: str, bound: tuple[str, int]) -> str:
-    """The text for a server of `what` on the address and port to which its socket is `bound`."""
+    """Return the text for a server of `what` ("scans") on the address and port to which its socket is `bound`."""
     host, port = bound
     if host in ("0.0.0.0", "::"):
         names = [*find_addresses(), socket.gethostname()]
@@ -40,8 +40,8 @@ def describe_server(access: Access, what: str, bound: tuple[str, int]) -> str:
     else:
         lines.append("read-only; --control adds buttons to pause and stop the scan")
     if not ipaddress.ip_address(host).is_loopback:
-        plain = "" if access.secure else "; nothing is encrypted: --certificate and --key do that"
-        lines.append(f"anyone who reaches this machine and has the token can read all scans{plain}")
+        warning = "" if access.secure else "; nothing is encrypted: --certificate and --key do that"
+        lines.append(f"anyone who reaches this machine and has the token can read all scans{warning}")
         if sys.stderr.isatty():
             lines.append(draw_code(addresses[0]))
     lines.append("Ctrl-C ends the page; started programs go on\n")

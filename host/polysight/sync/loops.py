@@ -165,12 +165,12 @@ def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
     top = np.argmax(spectrum.real**2 + spectrum.imag**2, axis=-1)
     spectrum_rows = np.arange(len(spectrum))
     bin_below, bin_value, bin_above = (spectrum[spectrum_rows, (top + d) % size] for d in (-1, 0, 1))
-    part = peak_between(np.abs(bin_below), np.abs(bin_value), np.abs(bin_above))
+    fraction = peak_between(np.abs(bin_below), np.abs(bin_value), np.abs(bin_above))
     bin_frequency = np.where(top < size // 2, top, top - size) / size
     # The transform of a symmetrical window is real, so the phase of the bin is that of the tone at the centre.
     amplitude = bin_value * cis(2 * np.pi * bin_frequency * (samples - 1) / 2)
     shape = z.shape[:-1]
-    return Tone((bin_frequency + part / size).reshape(shape), amplitude.reshape(shape))
+    return Tone((bin_frequency + fraction / size).reshape(shape), amplitude.reshape(shape))
 
 
 def estimate_tone(z: NDArray[np.complex64], steps: int = 3) -> Tone:
@@ -290,12 +290,12 @@ def against_others(
         float64 and complex128 [position, chirp]: the tone from `refine`, two Newton steps from zero.
     energy
         float32 [position, chirp]: energy of the chirp, over RX and blocks.
-    level
+    sum_energy
         float64 [position, part]: energy of the good chirps' sum, in each of eight parts of a chirp.
-    apart
+    half_difference
         float64 [2, position, chirp]: difference of the tones from even and from odd RX, with the chirp itself in the
         sum: cycles per sample, and radians.
-    left
+    residual_energy
         float64 [position, chirp, part]: energy of a chirp's part that is no multiple of the others' sum.
     """
     positions, chirps, rx, blocks = reduced.shape
@@ -309,17 +309,17 @@ def against_others(
     sums = np.add.reduceat(halves, starts, axis=-1).astype(complex)
     energy = (reduced.real**2 + reduced.imag**2).sum(axis=2)
     own_energy = np.add.reduceat(energy, starts, axis=-1).astype(np.float64)
-    level = np.add.reduceat((total.real**2 + total.imag**2).sum(axis=(1, 2)), starts, axis=-1).astype(np.float64)
+    sum_energy = np.add.reduceat((total.real**2 + total.imag**2).sum(axis=(1, 2)), starts, axis=-1).astype(np.float64)
     correlation = sums[0] + sums[1]
     with_others = correlation - np.where(good[..., None], own_energy, 0)
-    others_energy = level[:, None] - np.where(good[..., None], 2 * correlation.real - own_energy, 0)
+    others_energy = sum_energy[:, None] - np.where(good[..., None], 2 * correlation.real - own_energy, 0)
     has_others = others_energy > 1e-30
     explained = np.divide(np.abs(with_others) ** 2, others_energy, out=own_energy.copy(), where=has_others)
     residual_energy = own_energy - explained
     tone = refine(with_others, times, steps=2)
     split = refine(sums * cis(-2 * np.pi * tone.frequency[..., None] * times), times, steps=1)
     half_difference = split.frequency[0] - split.frequency[1], np.angle(split.amplitude[0] * split.amplitude[1].conj())
-    return tone, own_energy.sum(axis=-1).astype(np.float32), level, np.stack(half_difference), residual_energy
+    return tone, own_energy.sum(axis=-1).astype(np.float32), sum_energy, np.stack(half_difference), residual_energy
 
 
 def average(

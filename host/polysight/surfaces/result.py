@@ -162,19 +162,10 @@ def analyse_surface(
     edge_std = np.where(interior, 0.0, EDGE_SLOPE_STD)[:, None]
     of_h = replace(echoes.h, slope_std=np.hypot(echoes.h.slope_std, edge_std))
     position_std_m, normal_std_rad = find_shape_errors(of_h, shape, optics, uncertainty)
-    for index, segment in enumerate(segments):
-        if gains is None or segment.reason != NO_SINGLE_MEDIUM:
-            continue
-        members = echoes.segment == segment.number
-        depth_m = find_depth_behind(echoes, shape, segment.number)
-        if depth_m is None:
-            # A wall is not told from other things that no single medium explains.
-            unknown_m = estimate_wall_std(np.median(find_reflection(voltages[members], gains)))
-        else:
-            segments[index] = replace(segment, reason=BEHIND_ANOTHER)
-            # That of an even distribution as far as the surface before.
-            unknown_m = depth_m / np.sqrt(3)
-        position_std_m[members] = np.hypot(position_std_m[members], unknown_m)
+    if gains is not None:
+        reflection = find_reflection(voltages, gains)
+        segments, unknown_m = doubt_places(segments, echoes, shape, reflection)
+        position_std_m = np.hypot(position_std_m, unknown_m)
     return Surface(
         scan_id=scan_id,
         simulated=simulated,
@@ -291,6 +282,29 @@ def estimate_wall_std(reflection: float) -> float:
     """Return the standard error of the points of a thin wall, metres, by its reflection over that of metal."""
     cancelled = max(1.0, WALL_REFLECTION / max(reflection, 0.05))
     return WALL_STD_M * cancelled**WALL_EXPONENT
+
+
+def doubt_places(
+    segments: Sequence[Segment], echoes: Seen, shape: Shape, reflection: Array
+) -> tuple[list[Segment], Array]:
+    """Return the segments with their reasons, and the standard error of places that no single medium explains, metres.
+
+    `reflection` [n]: level over that of metal. A wall is not told from other things that no single medium explains.
+    """
+    judged = list(segments)
+    unknown_m = np.zeros(len(echoes))
+    for index, segment in enumerate(segments):
+        if segment.reason != NO_SINGLE_MEDIUM:
+            continue
+        members = echoes.segment == segment.number
+        depth_m = find_depth_behind(echoes, shape, segment.number)
+        if depth_m is None:
+            unknown_m[members] = estimate_wall_std(float(np.median(reflection[members])))
+        else:
+            judged[index] = replace(segment, reason=BEHIND_ANOTHER)
+            # That of an even distribution as far as the surface before.
+            unknown_m[members] = depth_m / np.sqrt(3)
+    return judged, unknown_m
 
 
 def find_depth_behind(echoes: Seen, shape: Shape, number: int) -> float | None:

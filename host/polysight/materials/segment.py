@@ -386,7 +386,8 @@ def _regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -
 
     def take(mask: Mask) -> None:
         taken.append(_smooth_outline(mask))
-        rest[np.asarray(scipy.ndimage.distance_transform_edt(~mask)) <= skirt_px] = False
+        window = _window(mask, int(skirt_px) + 1)
+        rest[window][np.asarray(scipy.ndimage.distance_transform_edt(~mask[window])) <= skirt_px] = False
 
     for threshold in np.arange(float(level[usable].max()), cfg.floor_db, -STEP_DB) - STEP_DB:
         grown: list[_Growing] = []
@@ -410,19 +411,37 @@ def _regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -
 
 def _smooth_outline(mask: Mask) -> Mask:
     """Fill the holes of a region and cut off what is narrower than half of it: speckle, and bridges to a neighbour."""
-    filled = np.asarray(scipy.ndimage.binary_fill_holes(mask), bool)
+    # The Gaussian below ends after 4 pixels.
+    window = _window(mask, 5)
+    filled = np.asarray(scipy.ndimage.binary_fill_holes(mask[window]), bool)
     half_width = float(np.asarray(scipy.ndimage.distance_transform_edt(np.pad(filled, 1))).max())
     body = max(_components(_open_mask(filled, BODY * half_width)), key=lambda part: int(part.sum()), default=filled)
-    return np.asarray(scipy.ndimage.gaussian_filter(body.astype(float), 1.0) > 0.5, bool)
+    smooth = np.zeros_like(mask)
+    smooth[window] = np.asarray(scipy.ndimage.gaussian_filter(body.astype(float), 1.0)) > 0.5
+    return smooth
 
 
 def _open_mask(mask: Mask, radius_px: float) -> Mask:
     """Remove what is narrower than a disk of this radius (morphological opening, by distances)."""
-    depth = np.asarray(scipy.ndimage.distance_transform_edt(np.pad(mask, 1)))[1:-1, 1:-1]
+    window = _window(mask)
+    inside = mask[window]
+    opened = np.zeros_like(mask)
+    depth = np.asarray(scipy.ndimage.distance_transform_edt(np.pad(inside, 1)))[1:-1, 1:-1]
     core = depth > radius_px
-    if not core.any():
-        return core
-    return mask & (np.asarray(scipy.ndimage.distance_transform_edt(~core)) <= radius_px)
+    if core.any():
+        opened[window] = inside & (np.asarray(scipy.ndimage.distance_transform_edt(~core)) <= radius_px)
+    return opened
+
+
+def _window(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
+    """Return the rows and columns that hold a mask, and `margin` more around it within the image."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    if not rows.size:
+        return slice(0, 0), slice(0, 0)
+    return (
+        slice(max(0, int(rows[0]) - margin), int(rows[-1]) + margin + 1),
+        slice(max(0, int(columns[0]) - margin), int(columns[-1]) + margin + 1),
+    )
 
 
 def _components(mask: Mask) -> list[Mask]:
@@ -486,7 +505,7 @@ def reduce_variation(level: Real, weight: float) -> Real:
         smooth = level + change
         np.subtract(smooth[1:], smooth[:-1], out=gradient[0, :-1])
         np.subtract(smooth[:, 1:], smooth[:, :-1], out=gradient[1, :, :-1])
-        steepness = np.hypot(gradient[0], gradient[1])
+        steepness = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
         cost = float(np.vdot(change, change)) + weight * float(steepness.sum())
         if first_cost == np.inf:
             first_cost = cost

@@ -245,10 +245,10 @@ class _Fields:
         seen = slopes.ravel()
         fringes = self.fringes[fringe_m]
         alike = common**2 * np.kron(np.eye(2), np.ones((count, count))) + fringe**2 * fringes.of_slopes
+        own_slopes, share = _own_variances(count)
         cases = []
         for field, drift in itertools.product(self.drifts, DRIFTS[stable]):
             explained = alike + drift**2 * field.of_slopes
-            own_slopes, share = _own_variances(count)
             total = explained + (noise.ravel() ** 2 + own_slopes)[:, :, None] * np.eye(2 * count)
             inverse = np.asarray(np.linalg.inv(total), np.float64)
             answer = inverse @ seen
@@ -284,7 +284,7 @@ def _own_variances(count: int) -> tuple[Real, Real]:
 
 def _square(answer: Real, inverse: Real, with_slopes: Real, of_itself: Real) -> Real:
     """Return the mean square of a field at each plate, [case, plate], from its covariance with the slopes."""
-    known = np.einsum("ps,cst,pt->cp", with_slopes, inverse, with_slopes, optimize=True)
+    known = np.sum(with_slopes @ inverse * with_slopes, axis=-1)
     return np.maximum(of_itself - known, 0.0) + (answer @ with_slopes.T) ** 2
 
 

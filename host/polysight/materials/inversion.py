@@ -35,7 +35,7 @@ import scipy
 
 from polysight.materials.kinds import (
     USUAL_LIBRARY_SHARE,
-    DensityMap,
+    DensityMaps,
     Kinds,
     PatchMeasurement,
     RatioEvidence,
@@ -333,7 +333,7 @@ class SceneLikelihood:
         self.own = self._own_covariances(seen)
         # Of one part of the measured ratio
         self.own_variance = np.array([np.trace(s.covariance) / 2 for s in seen], np.float64)
-        self.maps = () if kinds is None else self._maps(kinds)
+        self.densities = None if kinds is None or not seen else self._densities(kinds)
         self.dispersions = tuple(s.dispersion for s in seen)
         self.log_layer_odds = np.array([log_layer_odds(d, kinds) for d in self.dispersions])
 
@@ -347,7 +347,7 @@ class SceneLikelihood:
         beside = self._correct_ratios(self.measured + step, nominal)[0]
         return turn_covariance((beside - at_measured) / step, np.stack([s.covariance for s in seen]))
 
-    def _maps(self, kinds: Kinds) -> tuple[DensityMap, ...]:
+    def _densities(self, kinds: Kinds) -> DensityMaps:
         """Return the density of each patch's ratio over its possible values."""
         drawn = self.ratios(np.random.default_rng(1).standard_normal((PARTICLES, self.width)))
         maps = []
@@ -360,7 +360,7 @@ class SceneLikelihood:
             low = complex(t.real.min() - reach, t.imag.min() - reach)
             high = complex(t.real.max() + reach, t.imag.max() + reach)
             maps.append(kinds.density_map(low, high, self.own[i]))
-        return tuple(maps)
+        return DensityMaps.collect(maps)
 
     def hypotheses(self) -> list[tuple[SceneLikelihood, float]]:
         """Return the same scene with each certainty on what the prior leaves open, and the probability of each."""
@@ -453,11 +453,13 @@ class SceneLikelihood:
 
     def brightness_off(self, z: Real) -> Real:
         """Return ln |H| of every patch minus that of Eq. 2 and the metal's, [..., patch]."""
+        return self._brightness_off(z, self.ratios(z))
+
+    def _brightness_off(self, z: Real, t: Complex) -> Real:
+        """Return the same, given the ratios of these particles."""
         a, _ = self.leakage_of_patches(z)
-        t = self.ratios(z)
-        angle = self.angle(z)
         with np.errstate(divide="ignore", invalid="ignore"):
-            model = log_half_space_brightness(t, angle) + np.log(np.abs((1 + a * t) / (1 + a)))
+            model = log_half_space_brightness(t, self.angle(z)) + np.log(np.abs((1 + a * t) / (1 + a)))
         difference = self.log_level - model - METAL_BRIGHTNESS_STD * z[..., METAL_BRIGHTNESS, None]
         difference = difference + self.log_reference_brightness(z)
         return np.where(np.isfinite(difference), np.clip(difference, -10, 10), 10.0)
@@ -476,25 +478,23 @@ class SceneLikelihood:
 
     def log_likelihoods(self, z: Real) -> Real:
         """Return log likelihoods [..., 1 + patch]: of all brightnesses, and of each patch to be some material."""
-        size = self.brightness_std(z)[..., None]
-        brightness_difference = self.brightness_off(z)
-        density = brightness_density(brightness_difference, size)
+        return self._log_likelihoods(z, self.ratios(z))
+
+    def _log_likelihoods(self, z: Real, t: Complex) -> Real:
+        """Return the same, given the ratios of these particles."""
+        density = brightness_density(self._brightness_off(z, t), self.brightness_std(z)[..., None])
         brightness_log = np.where(self.bright, np.log(density + 1e-300), 0.0).sum(axis=-1, keepdims=True)
         if self.kinds is None:
             no_evidence = np.zeros((*brightness_log.shape[:-1], self.patch_count))
             return np.concatenate([brightness_log, no_evidence], axis=-1)
-        if not self.maps:
+        if self.densities is None:
             return brightness_log
-        t = self.ratios_of_kinds(z, self.kinds)
-        library_share = self.library_share(z)
-        log_ours = np.log(library_share)
-        log_others = np.log1p(-library_share)
-        patch_logs = []
-        for i, density in enumerate(self.maps):
-            of_library, of_half_spaces, of_layers = density.log_densities(t[..., i])
-            of_others = np.logaddexp(of_half_spaces, of_layers + self.log_layer_odds[i])
-            patch_logs.append(np.logaddexp(log_ours + of_library, log_others + of_others))
-        return np.concatenate([brightness_log, np.stack(patch_logs, axis=-1)], axis=-1)
+        moved = move_to_angle(t, self.angle(z), self.kinds.theta_rad)
+        of_library, of_half_spaces, of_layers = self.densities.log_densities(moved)
+        of_others = np.logaddexp(of_half_spaces, of_layers + self.log_layer_odds)
+        library_share = self.library_share(z)[..., None]
+        of_some_kind = np.logaddexp(np.log(library_share) + of_library, np.log1p(-library_share) + of_others)
+        return np.concatenate([brightness_log, of_some_kind], axis=-1)
 
 
 def _certainties(probability: float) -> list[tuple[float, float]]:

@@ -326,16 +326,51 @@ class DensityMap:
     high: complex
     log_density: Real
 
+
+@dataclass(frozen=True)
+class DensityMaps:
+    """The maps of all patches, which have equally many cells.
+
+    Attributes
+    ----------
+    low, cells_per_unit
+        complex128 [patch]: corner of each rectangle, and cells per unit of t along both axes.
+    log_density
+        float64 [3, patch, imaginary, real].
+    """
+
+    low: Complex
+    cells_per_unit: Complex
+    log_density: Real
+
+    @classmethod
+    def collect(cls, maps: Sequence[DensityMap]) -> DensityMaps:
+        """Return the maps together."""
+        low = np.array([one.low for one in maps], np.complex128)
+        size = np.array([one.high for one in maps], np.complex128) - low
+        log_density = np.stack([one.log_density for one in maps], axis=1)
+        _, _, rows, columns = log_density.shape
+        return cls(low, (columns - 1) / size.real + 1j * (rows - 1) / size.imag, log_density)
+
     def log_densities(self, t: Complex) -> Real:
-        """Return the logarithms of the densities at t [...], [3, ...]; beyond the rectangle those of its border."""
-        _, rows, columns = self.log_density.shape
-        parts = split_complex(t)
-        x = (parts[..., 0] - self.low.real) / (self.high.real - self.low.real) * (columns - 1)
-        y = (parts[..., 1] - self.low.imag) / (self.high.imag - self.low.imag) * (rows - 1)
-        place = np.stack([y, x])
-        return np.stack(
-            [scipy.ndimage.map_coordinates(part, place, order=1, mode="nearest") for part in self.log_density]
+        """Return the logarithms of the densities at each patch's t [..., patch], [3, ..., patch].
+
+        They are interpolated linearly; beyond the rectangle they are those of its border.
+        """
+        _, patches, rows, columns = self.log_density.shape
+        x = np.fmin(np.fmax((t.real - self.low.real) * self.cells_per_unit.real, 0.0), columns - 1)
+        y = np.fmin(np.fmax((t.imag - self.low.imag) * self.cells_per_unit.imag, 0.0), rows - 1)
+        column = np.minimum(x.astype(np.intp), columns - 2)
+        row = np.minimum(y.astype(np.intp), rows - 2)
+        beside = x - column
+        beyond = y - row
+        corner = (np.arange(patches) * rows + row) * columns + column
+        at, right, up, across = (
+            self.log_density.reshape(3, -1).take(corner + step, axis=1) for step in (0, 1, columns, columns + 1)
         )
+        near = at + beside * (right - at)
+        far = up + beside * (across - up)
+        return near + beyond * (far - near)
 
 
 def literature(library: Collection[str] = ()) -> list[Kind]:

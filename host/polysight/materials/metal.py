@@ -163,12 +163,12 @@ class _DielectricReference(SceneLikelihood):
         root = np.sqrt(self.reference_permittivity(z) - (1 - cosine**2))
         return np.log(np.abs((cosine - root) / (cosine + root)))
 
-    def log_likelihoods(self, z: Real) -> Real:
+    def _log_likelihoods(self, z: Real, t: Complex) -> Real:
         """Return log likelihoods [..., 1 + patch] of the measured ratios, which are t over that of the reference."""
-        parts = super().log_likelihoods(z)
+        parts = super()._log_likelihoods(z, t)
         reference = self.reference_ratio(z)
         size = np.abs(reference)
-        measured = self.ratios(z) / reference
+        measured = t / reference
         # The density of a measured ratio is |t0|^2 that of t. Two plates may be of the same material, as metal is
         # beside metal.
         variance = METAL_SPREAD**2 + self.own_variance

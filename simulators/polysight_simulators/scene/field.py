@@ -38,8 +38,7 @@ from numpy.typing import NDArray
 
 from polysight_shared.config import Board, Instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
-from polysight_shared.raster import mean_burst_travel_mm
+from polysight_shared.errors import DataError
 from polysight_shared.tables import to_builtins
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene.optics import (
@@ -56,108 +55,7 @@ from polysight_simulators.scene.optics import (
 )
 from polysight_simulators.scene.scene_file import Facets, Scene, draw_specimens, facets, slopes
 from polysight_simulators.scene.shapes import shape_field
-
-# Length of the kernel's fade-out beyond the scene
-FADE_M = 0.06
-# Taps of the windowed sinc
-TAPS = 12
-# Offsets beyond the aperture, for the taps of the sinc
-MARGIN_M = 0.012
-OVERSAMPLING = 2
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One axis of the computation: range of offsets and spectral grid, metres."""
-
-    low_u: float
-    high_u: float
-    low_w: float
-    high_w: float
-    step: float
-
-    @property
-    def points(self) -> int:
-        """Number of kernel positions, a fast length of an FFT."""
-        point_count = int(np.ceil((self.high_w - self.low_w + 2 * FADE_M) / self.step)) + 1
-        return int(scipy.fft.next_fast_len(point_count) or 0)
-
-    @property
-    def w(self) -> Real:
-        """Kernel positions (object point minus stage offset)."""
-        return self.low_w - FADE_M + self.step * np.arange(self.points)
-
-    @property
-    def fade(self) -> Real:
-        """Fade-out of the kernel: 1 within the scene, smoothly 0 outside."""
-        w = self.w
-        beyond = np.maximum(self.low_w - w, w - self.high_w) / FADE_M
-        return np.cos(np.pi / 2 * np.clip(beyond, 0.0, 1.0)) ** 4
-
-    @property
-    def kappa(self) -> Real:
-        """Spatial frequencies of the DFT, rad/m."""
-        return 2 * np.pi * np.fft.fftfreq(self.points, self.step)
-
-    @property
-    def first_u(self) -> float:
-        """First offset of the output grid, some taps before the aperture."""
-        return self.low_u - (TAPS // 2) * self.step / OVERSAMPLING
-
-    @property
-    def outputs(self) -> int:
-        """Number of offsets of the output grid."""
-        return int(np.ceil((self.high_u - self.low_u) / self.step * OVERSAMPLING)) + TAPS + 1
-
-
-# About 24 arrays of these points are in memory: 1.6 GB in all. A scene as wide as the stage (0.8 x 0.5 m) has 0.6e6.
-MAX_KERNEL_POINTS = 4_000_000
-
-
-def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -> tuple[Axis, Axis]:
-    """Return extent and pitch in x and y from the extent of the scene and the steepest phase of the kernel.
-
-    A tilt moves the specular point of a plate (26 mm per degree), but the kernel already extends from every offset to
-    the edges of every plate.
-    """
-    travel = 2 * mean_burst_travel_mm(rig.burst, rig.stage) + abs(scene.disturbances.backlash_mm)
-    edges = [(*p.centre_mm, p.size_mm[0] / 2, p.size_mm[1] / 2) for p in scene.plates]
-    edges += [(*p.position_mm, 0.0, 0.0) for p in scene.points]
-    table = np.array(edges or [(0.0, 0.0, 0.0, 0.0)])
-    spans = []
-    for i, (n, step, extra) in enumerate(
-        ((rig.grid.columns, rig.grid.step_x_mm, travel + 1.0), (rig.grid.rows, rig.grid.step_y_mm, 1.0))
-    ):
-        half = (n - 1) / 2 * step + extra
-        low_v = ant.centre_m[i] * 1e3 + np.min(table[:, i] - table[:, i + 2])
-        high_v = ant.centre_m[i] * 1e3 + np.max(table[:, i] + table[:, i + 2])
-        spans.append(np.array([-half, half, low_v - half, high_v + half]) / 1e3 + [0, 0, -MARGIN_M, MARGIN_M])
-    corners = np.meshgrid(*(np.linspace(s[2] - FADE_M, s[3] + FADE_M, 9) for s in spans))
-    wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
-    nearest_z = ant.plane_z_m + min([0.0, *(p.height_mm for p in (*scene.plates, *scene.points))]) / 1e3
-    axes = []
-    for i, span in enumerate(spans):
-        steepest = 0.0
-        for rx in ant.rx_m:
-            slope = np.zeros_like(corners[0])
-            for antenna in (ant.tx_m, rx):
-                distances_m = np.stack([corners[0] - antenna[0], corners[1] - antenna[1]])
-                slope += distances_m[i] / np.sqrt(
-                    distances_m[0] ** 2 + distances_m[1] ** 2 + (nearest_z - antenna[2]) ** 2
-                )
-            steepest = max(steepest, wave * float(np.abs(slope).max()))
-        step = min(np.pi / (1.1 * steepest + 6 * np.pi / FADE_M), 4e-3)
-        axes.append(Axis(span[0], span[1], span[2], span[3], step))
-    if axes[0].points * axes[1].points > MAX_KERNEL_POINTS:
-        width_m, height_m = (axis.high_w - axis.low_w for axis in axes)
-        raise ConfigError(
-            f"scene {scene.name}: plates, points and grid extend over {width_m:.2f} x {height_m:.2f} m",
-            "the simulation of such a field needs more memory than computers have",
-            "move plates and points nearer to the image centre, or narrow the grid",
-            code=ErrorCode.VALUES_CONFLICT,
-        )
-    return axes[0], axes[1]
-
+from polysight_simulators.scene.spectral_grid import OVERSAMPLING, TAPS, Axis, oversample, spectral_axes
 
 # Error of the Chebyshev series in the local angle
 _ANGLE_TOLERANCE = 1e-4
@@ -392,25 +290,17 @@ def compute(
     series = [_angle_series(plane.scene, reflect, nodes_hz, (low, high)) for plane in planes]
     ax = planes[0].x
     ay = planes[0].y
-    values = np.zeros((ay.outputs, ax.outputs, len(rx), len(nodes_hz)), dtype=np.complex64)
+    by_channel = np.zeros((len(rx), len(nodes_hz), ay.outputs, ax.outputs), dtype=np.complex64)
     for plane, of_plates in zip(planes, series, strict=True):
         levels_of_plane = [level for level_plane, level in levels if level_plane is plane]
-        kernels = [(level, *_factors(level, low, high, of_plates.shape[2])) for level in levels_of_plane]
+        kernels = [_Kernels.prepare(plane, level, (low, high), of_plates.shape[2], centre) for level in levels_of_plane]
         for q, f in enumerate(nodes_hz):
             total = np.zeros((len(rx), plane.y.points, plane.x.points), dtype=np.complex64)
-            for level, angle, shares in kernels:
-                _add_level(
-                    total=total,
-                    plane=plane,
-                    level=level,
-                    series=of_plates[:, q],
-                    f=f,
-                    centre_m=centre,
-                    angle=angle,
-                    shares=shares,
-                )
+            for of_level in kernels:
+                of_level.add_spectra(total, plane, of_plates[:, q], f)
             for r, spectrum in enumerate(total):
-                values[:, :, r, q] += _oversample(_oversample(spectrum, plane.y, 0), plane.x, 1)
+                by_channel[r, q] += oversample(oversample(spectrum, plane.y, 0), plane.x, 1)
+    values = np.ascontiguousarray(by_channel.transpose(2, 3, 0, 1))
     steps = ax.step / OVERSAMPLING, ay.step / OVERSAMPLING
     if scene.shapes:
         ant = planes[0].ant
@@ -484,58 +374,73 @@ def _frequencies(scene: Scene, levels: list[tuple[_Plane, _Level]], samples_hz: 
     return samples_hz[0] + (samples_hz[-1] - samples_hz[0]) * (cheb_nodes(nodes) + 1) / 2, centre
 
 
-def _factors(level: _Level, low: float, high: float, orders: int) -> tuple[Real, list[list[Real] | None]]:
-    """Return Chebyshev polynomials of the local angle, [rx, y, x, order], and shares of dpath/dz by RX."""
-    theta = np.stack([leg[2] for leg in level.legs])
-    angle = chebyshev.chebvander((theta - (low + high) / 2) / max((high - low) / 2, 1e-9), orders - 1)
-    return angle, [level.shares(leg[3]) for leg in level.legs]
+@dataclass(frozen=True)
+class _Kernels:
+    """What the kernels of a level have in common at all frequencies.
+
+    Attributes
+    ----------
+    level
+        Plates and points of similar height.
+    paths_m
+        float64 [rx, y, x]: paths over the kernel, less the one whose phase is removed.
+    fall
+        float32 [rx, m][y, x]: what spherical waves lose, faded at the borders, by share of dpath/dz.
+    angle
+        float32 [rx, order, y, x]: obliquity times the Chebyshev polynomials of the local angle.
+    """
+
+    level: _Level
+    paths_m: list[Real]
+    fall: list[list[NDArray[np.float32]]]
+    angle: NDArray[np.float32]
+
+    @classmethod
+    def prepare(
+        cls, plane: _Plane, level: _Level, theta: tuple[float, float], orders: int, centre_m: float
+    ) -> _Kernels:
+        """Return the factors over the range of angles of the whole scene."""
+        fade = np.outer(plane.y.fade, plane.x.fade)
+        low, high = theta
+        paths_m = []
+        fall = []
+        angle = []
+        for r1, r2, incidence, oblique in level.legs:
+            lost = fade / (r1 * r2)
+            shares = level.shares(oblique)
+            paths_m.append(r1 + r2 - centre_m)
+            fall.append([(lost if shares is None else lost * share).astype(np.float32) for share in shares or [1.0]])
+            place = (incidence - (low + high) / 2) / max((high - low) / 2, 1e-9)
+            polynomials = chebyshev.chebvander(place, orders - 1)
+            angle.append(np.moveaxis(oblique[..., None] * polynomials, -1, 0).astype(np.float32))
+        return cls(level, paths_m, fall, np.stack(angle))
+
+    def add_spectra(self, total: NDArray[np.complex64], plane: _Plane, series: Complex, f: float) -> None:
+        """Add the level's spectra at one frequency to `total` [rx, kappa_y, kappa_x]; series [plate, order]."""
+        waves = [_unit_phasors(f / SPEED_OF_LIGHT_M_S * path_m) for path_m in self.paths_m]
+        for m in range(len(self.level.steepness)):
+            maps = plane.plate_maps(self.level, series, f, m)
+            point_map = plane.point_map(self.level, f, m)
+            for r, wave in enumerate(waves):
+                base = wave * self.fall[r][m]
+                for plate_map, angle in zip(maps, self.angle[r], strict=False):
+                    total[r] += plate_map * _transform_back(base * angle)
+                if point_map is not None:
+                    total[r] += point_map * _transform_back(base)
 
 
-def _add_level(
-    total: NDArray[np.complex64],
-    plane: _Plane,
-    level: _Level,
-    series: Complex,
-    f: float,
-    centre_m: float,
-    angle: Real,
-    shares: list[list[Real] | None],
-) -> None:
-    """Add a level's spectra at one frequency to `total` [rx, kappa_y, kappa_x]; series [plate, order]."""
-    fade = np.outer(plane.y.fade, plane.x.fade)
-    bases = []
-    for r1, r2, _, _ in level.legs:
-        phase = np.exp(2j * np.pi * f / SPEED_OF_LIGHT_M_S * (r1 + r2 - centre_m))
-        bases.append(phase * (fade / (r1 * r2)))
-    for m in range(len(level.steepness)):
-        maps = plane.plate_maps(level, series, f, m)
-        point_map = plane.point_map(level, f, m)
-        for r, spectrum in enumerate(bases):
-            part = shares[r]
-            base = spectrum
-            if part is not None:
-                base = spectrum * part[m]
-            for j, plate_map in enumerate(maps):
-                kernel = (base * level.legs[r][3] * angle[r, :, :, j]).astype(np.complex64)
-                total[r] += plate_map * np.asarray(scipy.fft.ifft2(kernel, norm="forward"))
-            if point_map is not None:
-                total[r] += point_map * np.asarray(scipy.fft.ifft2(base.astype(np.complex64), norm="forward"))
+def _unit_phasors(cycles: Real) -> NDArray[np.complex64]:
+    """Return exp(2 pi j cycles): the fraction of a cycle, which single precision holds to 4e-7 rad, is left."""
+    phase = (2 * np.pi * (cycles - np.rint(cycles))).astype(np.float32)
+    phasors = np.empty(phase.shape, np.complex64)
+    np.cos(phase, out=phasors.real)
+    np.sin(phase, out=phasors.imag)
+    return phasors
 
 
-def _oversample(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDArray[np.complex64]:
-    """Return the inverse DFT along an axis on the finer output grid, limited to its offsets."""
-    n = axis.points
-    shape = list(spectrum.shape)
-    shape[along] = n * OVERSAMPLING
-    padded = np.zeros(shape, dtype=np.complex64)
-    head = (n + 1) // 2
-    tail = n // 2
-    lead = (slice(None),) * along
-    padded[(*lead, slice(0, head))] = spectrum[(*lead, slice(0, head))]
-    padded[(*lead, slice(-tail, None))] = spectrum[(*lead, slice(n - tail, n))]
-    line = np.asarray(scipy.fft.ifft(padded, axis=along), dtype=np.complex64)
-    line *= np.float32(OVERSAMPLING)
-    return line[(*lead, slice(0, axis.outputs))]
+def _transform_back(kernel: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """Return the inverse DFT of a kernel, which is overwritten, without its 1 / n."""
+    return np.asarray(scipy.fft.ifft2(kernel, norm="forward", overwrite_x=True))
 
 
 # Version of the content of cached fields

@@ -1,0 +1,134 @@
+"""The grid on which an object field is computed: kernel positions, spatial frequencies, and offsets of the output."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+from polysight_shared.raster import mean_burst_travel_mm
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_simulators.scene.optics import Antennas, Real
+from polysight_simulators.scene.scene_file import Scene
+
+# Length of the kernel's fade-out beyond the scene
+FADE_M = 0.06
+# Taps of the windowed sinc
+TAPS = 12
+# Offsets beyond the aperture, for the taps of the sinc
+MARGIN_M = 0.012
+OVERSAMPLING = 2
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of the computation: range of offsets and spectral grid, metres."""
+
+    low_u: float
+    high_u: float
+    low_w: float
+    high_w: float
+    step: float
+
+    @property
+    def points(self) -> int:
+        """Number of kernel positions, a fast length of an FFT."""
+        point_count = int(np.ceil((self.high_w - self.low_w + 2 * FADE_M) / self.step)) + 1
+        return int(scipy.fft.next_fast_len(point_count) or 0)
+
+    @property
+    def w(self) -> Real:
+        """Kernel positions (object point minus stage offset)."""
+        return self.low_w - FADE_M + self.step * np.arange(self.points)
+
+    @property
+    def fade(self) -> Real:
+        """Fade-out of the kernel: 1 within the scene, smoothly 0 outside."""
+        w = self.w
+        beyond = np.maximum(self.low_w - w, w - self.high_w) / FADE_M
+        return np.cos(np.pi / 2 * np.clip(beyond, 0.0, 1.0)) ** 4
+
+    @property
+    def kappa(self) -> Real:
+        """Spatial frequencies of the DFT, rad/m."""
+        return 2 * np.pi * np.fft.fftfreq(self.points, self.step)
+
+    @property
+    def first_u(self) -> float:
+        """First offset of the output grid, some taps before the aperture."""
+        return self.low_u - (TAPS // 2) * self.step / OVERSAMPLING
+
+    @property
+    def outputs(self) -> int:
+        """Number of offsets of the output grid."""
+        return int(np.ceil((self.high_u - self.low_u) / self.step * OVERSAMPLING)) + TAPS + 1
+
+
+# About 24 arrays of these points are in memory: 1.6 GB in all. A scene as wide as the stage (0.8 x 0.5 m) has 0.6e6.
+MAX_KERNEL_POINTS = 4_000_000
+
+
+def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -> tuple[Axis, Axis]:
+    """Return extent and pitch in x and y from the extent of the scene and the steepest phase of the kernel.
+
+    A tilt moves the specular point of a plate (26 mm per degree), but the kernel already extends from every offset to
+    the edges of every plate.
+    """
+    travel = 2 * mean_burst_travel_mm(rig.burst, rig.stage) + abs(scene.disturbances.backlash_mm)
+    edges = [(*p.centre_mm, p.size_mm[0] / 2, p.size_mm[1] / 2) for p in scene.plates]
+    edges += [(*p.position_mm, 0.0, 0.0) for p in scene.points]
+    table = np.array(edges or [(0.0, 0.0, 0.0, 0.0)])
+    spans = []
+    for i, (n, step, extra) in enumerate(
+        ((rig.grid.columns, rig.grid.step_x_mm, travel + 1.0), (rig.grid.rows, rig.grid.step_y_mm, 1.0))
+    ):
+        half = (n - 1) / 2 * step + extra
+        low_v = ant.centre_m[i] * 1e3 + np.min(table[:, i] - table[:, i + 2])
+        high_v = ant.centre_m[i] * 1e3 + np.max(table[:, i] + table[:, i + 2])
+        spans.append(np.array([-half, half, low_v - half, high_v + half]) / 1e3 + [0, 0, -MARGIN_M, MARGIN_M])
+    corners = np.meshgrid(*(np.linspace(s[2] - FADE_M, s[3] + FADE_M, 9) for s in spans))
+    wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
+    nearest_z = ant.plane_z_m + min([0.0, *(p.height_mm for p in (*scene.plates, *scene.points))]) / 1e3
+    axes = []
+    for i, span in enumerate(spans):
+        steepest = 0.0
+        for rx in ant.rx_m:
+            slope = np.zeros_like(corners[0])
+            for antenna in (ant.tx_m, rx):
+                distances_m = np.stack([corners[0] - antenna[0], corners[1] - antenna[1]])
+                slope += distances_m[i] / np.sqrt(
+                    distances_m[0] ** 2 + distances_m[1] ** 2 + (nearest_z - antenna[2]) ** 2
+                )
+            steepest = max(steepest, wave * float(np.abs(slope).max()))
+        step = min(np.pi / (1.1 * steepest + 6 * np.pi / FADE_M), 4e-3)
+        axes.append(Axis(span[0], span[1], span[2], span[3], step))
+    if axes[0].points * axes[1].points > MAX_KERNEL_POINTS:
+        width_m, height_m = (axis.high_w - axis.low_w for axis in axes)
+        raise ConfigError(
+            f"scene {scene.name}: plates, points and grid extend over {width_m:.2f} x {height_m:.2f} m",
+            "the simulation of such a field needs more memory than computers have",
+            "move plates and points nearer to the image centre, or narrow the grid",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
+    return axes[0], axes[1]
+
+
+def oversample(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDArray[np.complex64]:
+    """Return the inverse DFT along an axis on the finer output grid, limited to its offsets."""
+    n = axis.points
+    shape = list(spectrum.shape)
+    shape[along] = n * OVERSAMPLING
+    padded = np.zeros(shape, dtype=np.complex64)
+    head = (n + 1) // 2
+    tail = n // 2
+    lead = (slice(None),) * along
+    padded[(*lead, slice(0, head))] = spectrum[(*lead, slice(0, head))]
+    padded[(*lead, slice(-tail, None))] = spectrum[(*lead, slice(n - tail, n))]
+    line = np.asarray(scipy.fft.ifft(padded, axis=along), dtype=np.complex64)
+    line *= np.float32(OVERSAMPLING)
+    return line[(*lead, slice(0, axis.outputs))]

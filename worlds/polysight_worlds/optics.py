@@ -17,7 +17,7 @@ from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable, Stack
 
 # Facets times positions that are evaluated at once: some 200 MB.
 CHUNK = 400_000
-# Side lobes keep some power beside and behind the main lobe.
+# Smallest gain (-30 dB): side lobes keep some power beside and behind the main lobe.
 PATTERN_FLOOR = 0.03
 
 
@@ -133,12 +133,13 @@ def respond(tx: Antenna, rx: Antenna, points: NDArray, normals: NDArray) -> Resp
     s_part = _dot(field, s_axis)
     p_part = _dot(field, p_axis_in)
     received = rx.field(-scattered)
-    turned = _cross(scattered, received)
+    # The receive antenna's magnetic field times the impedance of free space.
+    received_magnetic = _cross(scattered, received)
     n_cross_s = _cross(normals, s_axis)
     n_cross_p = _cross(normals, p_axis_out)
     # Reflected wave of unit s: E = s, eta H = p_out; of unit p: E = p_out, eta H = -s.
-    from_s = _dot(received, n_cross_p) - _dot(turned, n_cross_s)
-    from_p = -_dot(received, n_cross_s) - _dot(turned, n_cross_p)
+    from_s = _dot(received, n_cross_p) - _dot(received_magnetic, n_cross_s)
+    from_p = -_dot(received, n_cross_s) - _dot(received_magnetic, n_cross_p)
     spread = np.where(lit, -1 / (out_m * back_m), 0)
     return Response(
         path_m=out_m + back_m,
@@ -197,9 +198,9 @@ def scatter(
             k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
             r_s, r_p = tables[i].look_up(response.cos_incidence)
             terms = r_s * response.s_weight + r_p * response.p_weight
-            shape = integrate_phase(response, facets.edge_u[:, None], facets.edge_v[:, None], frequency_hz)
+            phase_integral = integrate_phase(response, facets.edge_u[:, None], facets.edge_v[:, None], frequency_hz)
             phase = np.exp(-1j * k * response.path_m)
-            sums[chunk, i] = 1j * k / (4 * np.pi) * (terms * shape * phase) @ area_m2
+            sums[chunk, i] = 1j * k / (4 * np.pi) * (terms * phase_integral * phase) @ area_m2
     return sums
 
 
@@ -233,8 +234,9 @@ def ellipsoid(centre: NDArray, radii: NDArray, facet_m: float, half_widths: NDAr
     root = np.sqrt(1 - (x / radii[0]) ** 2 - (y / radii[1]) ** 2)
     slope_x = radii[2] * x / radii[0] ** 2 / root
     slope_y = radii[2] * y / radii[1] ** 2 / root
-    flat = np.zeros_like(x)
+    zero = np.zeros_like(x)
     centres = np.asarray(centre, float)[:, None] + np.stack([x, y, -radii[2] * root])
-    edge_x = np.stack([flat + step[0], flat, slope_x * step[0]])
-    edge_y = np.stack([flat, flat + step[1], slope_y * step[1]])
+    edge_x = np.stack([zero + step[0], zero, slope_x * step[0]])
+    edge_y = np.stack([zero, zero + step[1], slope_y * step[1]])
+    # In this order their product points out of the body, to smaller z.
     return Facets(centres, edge_y, edge_x)

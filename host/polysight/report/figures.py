@@ -63,9 +63,12 @@ VIEWS = (
     ((2, 1), "From the side", ("z (mm), away from the rig", "y (mm)")),
     ((0, 2), "From above", ("x (mm)", "z (mm), away from the rig")),
 )
+# Normals drawn in a view of a surface, and their length; more of them would hide the points.
 NORMALS_SHOWN = 60
 NORMAL_MM = 12.0
+# Segments that are described below a surface.
 MAX_LINES = 8
+# Colour of points without a permittivity.
 NO_PERMITTIVITY = "#9aa3ad"
 
 FIGURES: dict[str, str] = {
@@ -85,6 +88,7 @@ _MAX_DEG = 300.0
 # Outlines of boxes drawn by hand.
 _METAL_BOX = "#ff9e3d"
 _OTHER_BOX = "#ffffff"
+# Levels below the peak that the images of `focus` show.
 _FOCUS_RANGE_DB = 30.0
 # Room around patches and plates: beside them, below them, and above them, where their names stand.
 _SIDE_ROOM_MM = 20
@@ -116,8 +120,8 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     if not inside:
         return None
     middle = np.angle(sum(part.mean() for part in inside))
-    turned = np.degrees(np.angle(np.concatenate(inside) * np.exp(-1j * middle)))
-    low, high = np.percentile(turned, _PERCENTILES) + np.degrees(middle)
+    from_middle = np.degrees(np.angle(np.concatenate(inside) * np.exp(-1j * middle)))
+    low, high = np.percentile(from_middle, _PERCENTILES) + np.degrees(middle)
     margin = max(0.15 * (high - low), (_LEAST_DEG - (high - low)) / 2)
     low = float(np.floor((low - margin) / 5) * 5)
     high = float(np.ceil((high + margin) / 5) * 5)
@@ -294,10 +298,13 @@ def map_figure(scan: ProcessedScan, draw: Callable[[Axes, ProcessedScan], list[M
 
 
 def permittivity_map(scan: ProcessedScan) -> bytes | None:
-    """Return a PNG of eps' with its standard error in each patch, and of the relative error; None without errors."""
+    """Return a PNG of eps' with its standard error in each patch, and of the relative error; None without errors.
+
+    The relative error is the root of both variances over |eps|, in percent.
+    """
     real: dict[int, float] = {}
     errors: dict[int, float] = {}
-    middle: dict[int, str] = {}
+    texts: dict[int, str] = {}
     for patch in scan.segments:
         e = patch.permittivity
         if e is not None and e.spread is not None:
@@ -307,7 +314,7 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
                 errors[patch.label] = 100 * math.hypot(e.spread.real_std, e.spread.loss_std) / size
             else:
                 errors[patch.label] = 0.0
-            middle[patch.label] = f"{e.real:.2f}\n± {e.spread.real_std:.2f}"
+            texts[patch.label] = f"{e.real:.2f}\n± {e.spread.real_std:.2f}"
     if not real:
         return None
     fig = new_figure(9.4, 4.6, BAR_IN)
@@ -316,7 +323,7 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
     high = max(real.values())
     margin = max(0.1 * (high - low), 0.25)
     value_axes, error_axes = fig.subplots(1, 2, gridspec_kw={"wspace": _BETWEEN})
-    _fill_patches(fig, value_axes, scan, real, middle, ("viridis", low - margin, high + margin, "real part ε′"))
+    _fill_patches(fig, value_axes, scan, real, texts, ("viridis", low - margin, high + margin, "real part ε′"))
     _fill_patches(
         fig, error_axes, scan, errors, percents, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|")
     )

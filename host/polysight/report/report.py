@@ -89,7 +89,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         undefined=StrictUndefined,
         trim_blocks=True,
     )
-    environment.filters["code"] = _code
+    environment.filters["code"] = _mark_commands
     colours = assign_colours(scan)
     rows = [_format_patch_row(patch, colours) for patch in scan.segments]
     names_found = {row["truth"] for row in rows}
@@ -108,21 +108,21 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         missed_plates = [plate.name for plate in scan.plates if plate.name not in names_found]
     config: list[tuple[str, str]] = []
     if scan.rig is not None:
-        config = _config(scan.rig)
+        config = _summarise_rig(scan.rig)
     return environment.get_template("report.html").render(
         scan=scan,
         title=f"Scan {scan.scan_id}".strip(),
         simulated=scan.stamped,
-        notes=_notes(scan),
+        notes=_list_notes(scan),
         metal_how=metal_how,
         library=library,
         images={key: base64.b64encode(pictures.get(key, b"")).decode("ascii") for key in ALTERNATIVE_TEXTS},
         alt=ALTERNATIVE_TEXTS,
-        lead=_lead(scan),
+        lead=_write_lead(scan),
         keys=key_numbers(scan, rows),
         centre=centre,
         verdict=scan.verdict,
-        remedies=_remedies(rows),
+        remedies=_list_remedies(rows),
         rows=rows,
         headings=[figure.column.title for figure in _shown_figures(scan)],
         with_errors=any(patch.permittivity and patch.permittivity.spread for patch in scan.segments),
@@ -133,11 +133,11 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         coverage=coverage_sentence(find_masked_positions(scan)),
         config=config,
         rig_file=tomli_w.dumps(scan.facts.instrument or {}),
-        provenance=_provenance(scan),
+        provenance=_list_provenance(scan),
     )
 
 
-def _notes(scan: ProcessedScan) -> list[str]:
+def _list_notes(scan: ProcessedScan) -> list[str]:
     """Return the sentences at the top: damage of the manifest, and why nothing was named."""
     notes = [NOT_ON_HARDWARE]
     if scan.quality.coverage and scan.quality.coverage.damage:
@@ -147,7 +147,7 @@ def _notes(scan: ProcessedScan) -> list[str]:
     return notes
 
 
-def _config(rig: Instrument) -> list[tuple[str, str]]:
+def _summarise_rig(rig: Instrument) -> list[tuple[str, str]]:
     """Return a short summary of the rig file: name and text."""
     chirp = rig.chirp
     grid = rig.grid
@@ -169,7 +169,7 @@ def _config(rig: Instrument) -> list[tuple[str, str]]:
     ]
 
 
-def _provenance(scan: ProcessedScan) -> list[tuple[str, str]]:
+def _list_provenance(scan: ProcessedScan) -> list[tuple[str, str]]:
     processed = scan.facts.processed_utc or ""
     if not processed:
         return []
@@ -183,7 +183,7 @@ def _shown_figures(scan: ProcessedScan) -> list[Figure]:
     return [figure for figure in declared_figures(kind) if figure.column.title]
 
 
-def _code(words: str) -> Markup:
+def _mark_commands(words: str) -> Markup:
     """Escape text and mark `commands` in it as code."""
     parts = [escape(part) for part in words.split("`")]
     # Every second part stood between two backquotes.
@@ -191,7 +191,7 @@ def _code(words: str) -> Markup:
     return Markup("").join(parts)
 
 
-def _remedies(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+def _list_remedies(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Return the measurements that would shrink the errors, each with the patches that it helps."""
     patches_by_remedy: dict[tuple[str, str], list[str]] = {}
     for row in rows:
@@ -209,7 +209,7 @@ def _list_replaced_names(scan: ProcessedScan) -> list[str]:
     return [f"{label} is {name}" for label, name in pairs if label != name]
 
 
-def _lead(scan: ProcessedScan) -> str:
+def _write_lead(scan: ProcessedScan) -> str:
     ny, nx = scan.h.shape
     pixel_mm = abs(float(scan.x_m[1] - scan.x_m[0])) * 1e3
     kind = "simulated scan" if scan.stamped else "scan"
@@ -240,7 +240,7 @@ def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str,
         "strange": False,
         "right": False,
         "why": patch.why,
-        "votes": _share(patch.confidence, 0),
+        "votes": _format_share(patch.confidence, 0),
         "real": DASH,
         "loss": DASH,
         **dict.fromkeys(("real_error", "loss_error", "real_range", "loss_range", "dominated_by", "share", "do"), ""),
@@ -312,7 +312,7 @@ def imaging_table(imaging: Any) -> Table | None:
     for key, heading in _IMAGING_ROWS:
         if any(key in board for board in boards.values()):
             between = " × " if key.endswith("_mm") else ", "
-            rows.append(_cells(heading, *(_number(board.get(key), between) for board in boards.values())))
+            rows.append(_cells(heading, *(_format_number(board.get(key), between) for board in boards.values())))
     caption = "Imaging. The point response is computed for the middle of the image, with taper and mask as they are."
     for notice in imaging.get("notices", ()):
         caption += f" {notice}."
@@ -324,17 +324,17 @@ def _is_unknown(value: Any) -> bool:
     return value is None or (isinstance(value, float | np.floating) and not np.isfinite(value))
 
 
-def _share(value: float | None, digits: int) -> str:
+def _format_share(value: float | None, digits: int) -> str:
     if value is None or _is_unknown(value):
         return DASH
     return f"{100 * value:.{digits}f} %"
 
 
-def _number(value: Any, between: str = " × ") -> str:
+def _format_number(value: Any, between: str = " × ") -> str:
     if _is_unknown(value):
         return DASH
     if isinstance(value, list | tuple):
-        return between.join(_number(v) for v in value)
+        return between.join(_format_number(v) for v in value)
     if isinstance(value, float):
         return f"{value:.3g}"
     return str(value)
@@ -394,8 +394,8 @@ def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[st
         expected = scan.expected_accuracy
         aside = ""
         if expected is not None:
-            aside = f"; their own confidence expects {_share(expected, 1)}"
-        add(_share(accuracy, 1), f"of interior pixels named right{aside}")
+            aside = f"; their own confidence expects {_format_share(expected, 1)}"
+        add(_format_share(accuracy, 1), f"of interior pixels named right{aside}")
     errors = [abs(r["relative_error"]) for r in rows if r["relative_error"] is not None]
     if errors:
         add(f"{100 * float(np.median(errors)):.1f} %", f"median error of ε′, worst {100 * max(errors):.1f} %")
@@ -430,10 +430,10 @@ def quality_tables(quality: dict[str, Any]) -> list[Table]:
     shown_elsewhere = {"boards", "seconds_per_stage", "imaging", "verdict", "error_budget"}
     boards = quality.get("boards")
     parts = (
-        _boards(boards),
-        _residuals(boards),
+        _tabulate_boards(boards),
+        _tabulate_residuals(boards),
         imaging_table(quality.get("imaging")),
-        _seconds(quality.get("seconds_per_stage")),
+        _tabulate_seconds(quality.get("seconds_per_stage")),
     )
     out = [part for part in parts if part]
     if rest := {k: v for k, v in quality.items() if k not in shown_elsewhere}:
@@ -517,7 +517,7 @@ def _cells(*cells: str, share: float | None = None) -> dict[str, Any]:
     return {"cells": list(cells), "share": share}
 
 
-def _boards(boards: Any) -> Table | None:
+def _tabulate_boards(boards: Any) -> Table | None:
     """Return a table with a line for each figure and a column for each board: narrow enough for a phone."""
     if not isinstance(boards, dict) or not boards:
         return None
@@ -546,7 +546,7 @@ def _flatten_board(board: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _residuals(boards: Any) -> Table | None:
+def _tabulate_residuals(boards: Any) -> Table | None:
     """Return a table of `synchronisation` of all boards: a line for each stage, a column for each quantity."""
     if not isinstance(boards, dict):
         return None
@@ -578,7 +578,7 @@ def _flatten(value: dict[str, Any], prefix: str = "", nested: bool = True) -> di
     return out
 
 
-def _seconds(seconds: Mapping[str, float] | None) -> Table | None:
+def _tabulate_seconds(seconds: Mapping[str, float] | None) -> Table | None:
     if not seconds:
         return None
     longest = max([*seconds.values(), 1e-9])

@@ -40,6 +40,7 @@ STRIDE_M = 0.008
 MAX_SLOPE = 0.47
 # Bins of the coarse search per resolution cell.
 SLOPE_BINS = 19
+# Most echoes of one window.
 MAX_ECHOES = 5
 # Share of a window's power that a plane wave explains; noise alone gives 0.01.
 MIN_SHARE = 0.05
@@ -93,7 +94,7 @@ class _Search:
         return np.stack([self.paths[path], self.slopes[gx], self.slopes[gy], bends, flat, bends], axis=1)
 
 
-def _fit_one(fit: BoardFit, windows: Windows, values: Array) -> Maximum:
+def _fit_echo(fit: BoardFit, windows: Windows, values: Array) -> Maximum:
     """Fit an echo; the RX are added up twice, first for the coarse path."""
     maximum = maximise(fit, add_up(fit, windows, values), windows.valid, windows.offsets, values)
     return maximise(fit, add_up(fit, windows, maximum.values), windows.valid, windows.offsets, maximum.values)
@@ -115,7 +116,7 @@ def find_echoes(board: Samples, gate_m: tuple[float, float]) -> Echoes:
     shape = board.valid.shape
     steps = [max(1, round(STRIDE_M * n / WINDOW_M)) for n in (height, width)]
     columns = np.arange(0, shape[1] - width + 1, steps[1])
-    loudest = _loudest(board)
+    strongest = _measure_strongest(board)
     parts = []
     for row in range(0, shape[0] - height + 1, steps[0]):
         rows = np.full(columns.size, row)
@@ -124,18 +125,19 @@ def find_echoes(board: Samples, gate_m: tuple[float, float]) -> Echoes:
         windows = gather_windows(board, rows, columns, at_m)
         # A window with half of its positions is worth a fit; one without power holds no echo.
         power = (np.abs(windows.samples) ** 2).mean(axis=(1, 2, 3))
-        worth = (windows.valid.mean(axis=1) > 0.5) & (power > MIN_POWER * loudest)
+        worth = (windows.valid.mean(axis=1) > 0.5) & (power > MIN_POWER * strongest)
         if worth.any():
             parts += _separate(fit, search, select_windows(windows, worth))
     if not parts:
         return no_echoes()
     echoes = Echoes.join(parts)
     level = np.abs(echoes.amplitude)
-    loud = level**2 > MIN_POWER * np.percentile(level, 99) ** 2
-    return echoes[loud]
+    is_strong = level**2 > MIN_POWER * np.percentile(level, 99) ** 2
+    return echoes[is_strong]
 
 
-def _loudest(board: Samples) -> float:
+def _measure_strongest(board: Samples) -> float:
+    """Power of the strongest positions, without the one per cent that a glint may be."""
     power = (np.abs(board.cube) ** 2).mean(axis=(0, 1))
     return float(np.percentile(power, 99)) if power.size else 0.0
 
@@ -148,7 +150,7 @@ def _separate(fit: BoardFit, search: _Search, windows: Windows) -> list[Echoes]:
     energy = np.sum(np.abs(rest) ** 2, axis=(1, 2, 3))
     for rank in range(MAX_ECHOES):
         part = select_windows(replace_samples(windows, rest), active)
-        first = _fit_one(fit, part, search.find(part))
+        first = _fit_echo(fit, part, search.find(part))
         share = _power_share(fit, part, first, energy[active])
         keep = share > (MIN_LEFT if rank else MIN_SHARE)
         if not keep.any():
@@ -180,26 +182,26 @@ def _refine(
     members, weakest = echoes[-1]
     part = select_windows(windows, members)
     places = [np.isin(others, members) for others, _ in echoes]
-    values = np.stack([found.values[place] for place, (_, found) in zip(places, echoes, strict=True)], axis=1)
-    amplitude = np.stack([found.amplitude[place] for place, (_, found) in zip(places, echoes, strict=True)], axis=1)
+    values = np.stack([maximum.values[place] for place, (_, maximum) in zip(places, echoes, strict=True)], axis=1)
+    amplitude = np.stack([maximum.amplitude[place] for place, (_, maximum) in zip(places, echoes, strict=True)], axis=1)
     joint = JointFit(fit, part, values, amplitude)
     joint.run()
     joint.part_merged_echoes()
     widening = joint.find_widening()
-    apart = widening[..., 0].max(axis=1) < MERGED_WIDENING
-    for index, (place, (_, found)) in enumerate(zip(places, echoes, strict=True)):
+    is_separate = widening[..., 0].max(axis=1) < MERGED_WIDENING
+    for index, (place, (_, maximum)) in enumerate(zip(places, echoes, strict=True)):
         values = joint.values[:, index]
         alone = replace_samples(part, joint.rest + joint.synthesise(index))
         better = maximise(fit, add_up(fit, alone, values), part.valid, part.offsets, values, iterations=0)
         # The other echoes make an echo's amplitude and path less certain.
         better.rest = better.rest * widening[:, index, 0]
         better.std = better.std * widening[:, index, 1:]
-        kept = np.flatnonzero(place)[apart]
+        kept = np.flatnonzero(place)[is_separate]
         for field in fields(Maximum):
-            getattr(found, field.name)[kept] = getattr(better, field.name)[apart]
-    rest[members[apart]] = joint.rest[apart]
-    echoes[-1] = (members[apart], select_maxima(weakest, apart))
-    return members[apart]
+            getattr(maximum, field.name)[kept] = getattr(better, field.name)[is_separate]
+    rest[members[is_separate]] = joint.rest[is_separate]
+    echoes[-1] = (members[is_separate], select_maxima(weakest, is_separate))
+    return members[is_separate]
 
 
 def _power_share(fit: BoardFit, windows: Windows, found: Maximum, energy: Array) -> Array:

@@ -35,9 +35,11 @@ LATE_S = 60.0
 DIRECT_RAD = 0.1
 # Share of positions without a direct path that gives a warning.
 MASKED_SHARE = 0.05
+# Notices of the manifest that a page lists.
 MAX_NOTICES = 30
 # Characters of an ISO time up to its seconds: the page and the manifest write different fractions.
 ISO_SECONDS_CHARACTERS = 19
+# Letter of a row by the end of its last take; a row without one has a dot.
 MARKS = {"committed": "c", "kept": "k", "rejected": "r"}
 
 
@@ -226,19 +228,19 @@ class Motion(msgspec.Struct, frozen=True, kw_only=True):
 def make_snapshot(inputs: Inputs) -> Snapshot:
     """Describe the whole state of a scan."""
     history = inputs.history
-    pictures = inputs.shown
+    shown = inputs.shown
     if history is None:
         return Snapshot(status=judge(inputs), notices=_notices(inputs), control=inputs.control)
     plan = history.plan
     marks = history.marks
     boards = history.boards
     for board in boards:
-        board.masked = sum(sync.masked for sync in pictures.sync.get(board.name, {}).values())
+        board.masked = sum(row.masked for row in shown.sync.get(board.name, {}).values())
     sync = {
-        name: {row: round(math.degrees(sync.object_rad), 3) for row, sync in rows.items()}
-        for name, rows in pictures.sync.items()
+        name: {number: round(math.degrees(row.object_rad), 3) for number, row in rows.items()}
+        for name, rows in shown.sync.items()
     }
-    snr_db = {name: {row: round(sync.snr_db, 1) for row, sync in rows.items()} for name, rows in pictures.sync.items()}
+    snr_db = {name: {number: round(row.snr_db, 1) for number, row in rows.items()} for name, rows in shown.sync.items()}
     verdict = None
     if _may_have_result(inputs, history):
         verdict = inputs.verdict
@@ -264,8 +266,8 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
         ),
         boards=boards,
         trigger=history.trigger,
-        pictures=_pictures(history, pictures),
-        profile=pictures.profile,
+        pictures=_describe_pictures(history, shown),
+        profile=shown.profile,
         sync=sync,
         snr_db=snr_db,
         lost=history.lost_shares,
@@ -304,7 +306,7 @@ def estimate_time_left(history: ScanHistory, now_s: float) -> tuple[int | None, 
     return round(time_left(rows_left, row_s, in_row_s)), basis
 
 
-def _pictures(history: ScanHistory, shown: Shown) -> PicturesState:
+def _describe_pictures(history: ScanHistory, shown: Shown) -> PicturesState:
     image = history.instrument.image
     waiting = max(0, len(history.takes) - len(shown.rows))
     scales = {name: (p.low, p.high, p.unit) for name, p in shown.pictures.items()}
@@ -529,14 +531,14 @@ def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
 def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
     """Rows that are retaken, late, or poor."""
     pi = inputs.pi
-    newest = next((notice for notice in reversed(history.notices) if notice.level == "warning"), None)
+    newest_warning = next((notice for notice in reversed(history.notices) if notice.level == "warning"), None)
     if pi.row >= 0 and history.marks.get(pi.row) == "rejected":
-        return say_finding("retake", newest, row=pi.row, take=pi.take)
+        return say_finding("retake", newest_warning, row=pi.row, take=pi.take)
     late_since_s = _late_since_s(history, inputs.signs)
     if late_since_s:
         return say_since("late", late_since_s)
-    if history.rows_since_trouble < RECENT_ROWS and newest is not None:
-        return say_finding("after_fault", newest)
+    if history.rows_since_trouble < RECENT_ROWS and newest_warning is not None:
+        return say_finding("after_fault", newest_warning)
     poor = sync_notices(inputs.shown, history.plan.columns)
     if poor:
         return say_finding("poor", poor[0])

@@ -51,7 +51,7 @@ PAGES = {
     "/check": ("check", "Check plate · polysight", "scan"),
 }
 MEDIA_TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-# While the reading process starts, or is started again.
+# How long a request waits for the reading process to start, or to be started again, and the time between two tries.
 READER_PATIENCE_S = 20.0
 CONNECT_INTERVAL_S = 0.1
 CHUNK_BYTES = 1 << 16
@@ -59,13 +59,19 @@ CHUNK_BYTES = 1 << 16
 RUNNING_AGE_S = 0.5
 # The header of every page shows a killed scan for this long; later, only the list of scans does.
 KILLED_SHOWN_S = 3600.0
-# Headers of one connection, and those that this process adds by itself.
+# Headers of an answer that are not passed on: they concern the connection to the reading process, or uvicorn adds its
+# own.
 OWN_HEADERS = (b"connection", b"keep-alive", b"transfer-encoding", b"date", b"server")
 T = TypeVar("T")
 
 
 class PageFacts(msgspec.Struct, frozen=True):
-    """What a page may show; `known`: its token is right, or not needed. `states` are those of a page that is alone."""
+    """What a page may show.
+
+    `control`: scans may be commanded. `starts`: programs can be started. `known`: the page's token is right, or not
+    needed. `only`: name of the one scan that is served; None for a folder of scans. `badges`: words and colour of each
+    state in lists. `states`: the words for a page whose server does not answer.
+    """
 
     control: bool
     starts: bool
@@ -76,7 +82,10 @@ class PageFacts(msgspec.Struct, frozen=True):
 
 
 class RunningScan(msgspec.Struct, frozen=True):
-    """A scan for the header of every page: `state` is `running`, `frozen` or `lost`, as lists have them."""
+    """A scan for the header of every page: `state` is `running`, `frozen` or `lost`, as lists have them.
+
+    `doing` is its program's step, `asked` the command that it has not carried out yet ("": none).
+    """
 
     name: str
     state: str

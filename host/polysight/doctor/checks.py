@@ -139,7 +139,9 @@ def run_doctor(
     system: System = System(),  # noqa: B008 - immutable
     bundle: Path | None = None,
 ) -> int:
-    """Run and print all checks; return 1 if a check failed, otherwise 0. `bundle`: also write an archive for helpers.
+    """Run and print all checks; return 1 if a check failed, otherwise 0.
+
+    `bundle` is an archive to write as well, for somebody who is asked for help.
 
     Raises
     ------
@@ -155,11 +157,11 @@ def run_doctor(
         for finding in run_checks(context):
             findings.append(finding)
             if not as_json:
-                sys.stdout.write(_lines(finding))
+                sys.stdout.write(_format_finding(finding))
                 sys.stdout.flush()
     failed = [f.where for f in findings if f.level == "error"]
     simulated = context.hello is not None and is_simulated(context.hello.backend)
-    summary = _summary(findings, failed)
+    summary = _count_verdicts(findings, failed)
     if simulated:
         summary += f" ({SIMULATED})"
     if as_json:
@@ -168,13 +170,14 @@ def run_doctor(
     else:
         sys.stdout.write(f"{summary}\n")
     if bundle is not None:
-        text = "".join(map(_lines, findings)) + f"{summary}\n"
+        text = "".join(map(_format_finding, findings)) + f"{summary}\n"
         write_bundle(bundle, options, context.loaded_rig, findings, text, system.root)
         sys.stderr.write(f"{bundle}: written, without raw data and keys. Read it before you send it\n")
     return int(bool(failed))
 
 
-def _lines(finding: Finding) -> str:
+def _format_finding(finding: Finding) -> str:
+    """The lines of a finding: verdict, check and what was found; below them why, and what to do."""
     lines = f"{verdict(finding):{_VERDICT_WIDTH}}{finding.where:{_NAME_WIDTH}} {finding.what}".rstrip() + "\n"
     for word, text in (("why", finding.why), ("do", finding.do)):
         if text:
@@ -182,7 +185,7 @@ def _lines(finding: Finding) -> str:
     return lines
 
 
-def _summary(findings: list[Finding], failed: list[str]) -> str:
+def _count_verdicts(findings: list[Finding], failed: list[str]) -> str:
     verdicts = [verdict(finding) for finding in findings]
     counts = (
         f"{verdicts.count('ok')} ok, {verdicts.count('warning')} warnings, {len(failed)} errors,"

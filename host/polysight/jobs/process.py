@@ -153,6 +153,7 @@ def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
                     f"{out} holds the earlier products; `polysight image` with another --out writes the images"
                 )
                 raise DataError(e.what, e.why, advice(e.remedy, images_note), code=e.code) from None
+            # Raised below, behind the `with`: an error inside it would throw the new images away.
             failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
     raise failed
 

@@ -27,14 +27,14 @@ UNLIKELY_SIGN = 0.005
 """Probability of the other sign of the phases below which it is left out of the errors."""
 
 
-def mirror_phases(seen: Sequence[PatchMeasurement], prior: RigPrior) -> tuple[list[PatchMeasurement], RigPrior]:
+def mirror_phases(measured: Sequence[PatchMeasurement], prior: RigPrior) -> tuple[list[PatchMeasurement], RigPrior]:
     """Return the patches and the prior as they are if all phases have the other sign.
 
     Tilts are read from phases, too.
     """
     patches = [
         replace(patch, inverse_ratio=patch.inverse_ratio.conjugate(), rise=(-patch.rise[0], -patch.rise[1]))
-        for patch in seen
+        for patch in measured
     ]
     along, across = prior.metal_rise
     return patches, replace(prior, metal_rise=(-along, -across))
@@ -50,8 +50,8 @@ def join_signs(as_given: Inversion, mirrored: Inversion, prior_probability: floa
     probability = float(scipy.special.expit(log_odds))
     if probability < UNLIKELY_SIGN:
         return as_given, probability
-    both = zip(as_given.patches, mirrored.patches, strict=True)
-    patches = tuple(_join_estimates(patch, other, probability) for patch, other in both)
+    pairs = zip(as_given.patches, mirrored.patches, strict=True)
+    patches = tuple(_join_estimates(patch, other, probability) for patch, other in pairs)
     return replace(as_given, patches=patches), probability
 
 
@@ -59,8 +59,9 @@ def _join_estimates(patch: PatchEstimate, other: PatchEstimate, probability: flo
     """Return an estimate whose covariances hold another one, which is the right one with this probability."""
 
     def join(middle: complex, covariance: Real, other_middle: complex, other_covariance: Real) -> Real:
-        apart = split_complex(other_middle - middle)
-        return (1 - probability) * covariance + probability * (other_covariance + np.outer(apart, apart))
+        # Mean square about `middle` of a mixture of two distributions.
+        shift = split_complex(other_middle - middle)
+        return (1 - probability) * covariance + probability * (other_covariance + np.outer(shift, shift))
 
     ratio_covariance = join(
         patch.inverse_ratio, patch.inverse_ratio_covariance, other.inverse_ratio, other.inverse_ratio_covariance
@@ -77,8 +78,9 @@ def _join_estimates(patch: PatchEstimate, other: PatchEstimate, probability: flo
     if other.permittivity is None or other.covariance is None:
         return joined_estimate
     covariance = join(patch.permittivity, patch.covariance, other.permittivity, other.covariance)
-    kept = float(np.trace(patch.covariance) / np.trace(covariance))
-    shares = {source: min(kept, 1.0) * share for source, share in patch.shares.items()}
+    # What the sign adds to the variance is its share; the shares of the other sources shrink accordingly.
+    share_of_others = float(np.trace(patch.covariance) / np.trace(covariance))
+    shares = {source: min(share_of_others, 1.0) * share for source, share in patch.shares.items()}
     if shares:
-        shares[PHASE_SIGN] = max(0.0, 1.0 - kept)
+        shares[PHASE_SIGN] = max(0.0, 1.0 - share_of_others)
     return replace(joined_estimate, covariance=covariance, shares=shares)

@@ -47,9 +47,13 @@ def allocate_pages(size: int) -> NDArray[np.uint8]:
 
 def split_pieces(payload: NDArray[np.uint8]) -> Pieces:
     """Return the pieces of a payload in memory."""
-    return lambda size: (
-        payload[i : i + (size or payload.size)] for i in range(0, payload.size, size or payload.size or 1)
-    )
+
+    def pieces(size: int) -> Iterator[NDArray[np.uint8]]:
+        step = size or max(1, payload.size)
+        for start in range(0, payload.size, step):
+            yield payload[start : start + step]
+
+    return pieces
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,11 @@ class RowData:
     @cached_property
     def payload(self) -> NDArray[np.uint8]:
         """The whole payload."""
-        return ([*self.pieces(0)] or [np.empty(0, np.uint8)])[0]
+        # To the end: damage is told after the last piece.
+        pieces = list(self.pieces(0))
+        if not pieces:
+            return np.empty(0, np.uint8)
+        return pieces[0]
 
     @property
     def missing_bytes(self) -> int:

@@ -323,11 +323,11 @@ def test_card_that_sent_nothing_is_set_up_again_before_the_retake(rig, tmp_path)
 
     def answer(p) -> None:
         if (p.state, p.row, p.phase) == ("running", 1, "state"):
-            card.silent_data = card.seen.count(CONFIGURE) == 2
+            card.silent_data = card.codes_received.count(CONFIGURE) == 2
 
     result = run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert (result.exit_status, result.retakes) == ("success", 1)
-    assert (card.seen.count(CONFIGURE), rig.cards["RV"].seen.count(CONFIGURE)) == (4, 2)
+    assert (card.codes_received.count(CONFIGURE), rig.cards["RV"].codes_received.count(CONFIGURE)) == (4, 2)
 
 
 @pytest.mark.parametrize(("limit_s", "warned"), [(0.25, True), (3.0, False)])

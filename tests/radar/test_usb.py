@@ -22,7 +22,7 @@ FRAMES = 4
 
 @pytest.fixture
 def bus(monkeypatch):
-    """An empty bus, and a pyftdi that knows of nothing."""
+    """An empty simulated bus, with pyftdi's caches as they are in a new process."""
     usb = usb_bus.Bus()
     monkeypatch.setattr(usb_bus, "BUS", usb)
     monkeypatch.setattr(UsbTools, "BACKENDS", ("tests.support.radar.usb_bus",))
@@ -71,21 +71,23 @@ def test_split_answers_are_joined(bus, clock, packet):
 def test_slow_mode_is_one_word_a_transfer(plugged_chip):
     words = open_usb("FT1234", slow=True)
     assert plugged_chip.chip.spi_hz == 1e6
-    state_before = plugged_chip.transfers
+    transfers_before = plugged_chip.transfers
     words.write([1, 2, 3])
-    assert plugged_chip.transfers == state_before + 3
+    assert plugged_chip.transfers == transfers_before + 3
     assert plugged_chip.chip.words_written == [1, 2, 3]
     words.close()
 
 
 def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged_chip):
     """pyftdi opens any of the chips when given a bus address alone, in the order of a set."""
-    other_items = [chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
-    for foreign_serial in other_items:
-        bus.plug(foreign_serial)
+    other_chips = [chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
+    for other_chip in other_chips:
+        bus.plug(other_chip)
+
     open_usb("usb:1-4.2").write([0x1234])
     assert plugged_chip.chip.words_written == [0x1234]
-    assert all(o.chip.words_written == [] and o.modes == {} for o in other_items)
+    assert all(other.chip.words_written == [] and other.modes == {} for other in other_chips)
+
     with refused(ErrorCode.NO_ANSWER, "usb:1-7", "1-4.1, 1-4.2"):
         open_usb("usb:1-7")
 
@@ -117,7 +119,7 @@ def test_a_missing_chip_is_an_error_with_its_serial_number():
 
 
 def test_a_chip_that_is_plugged_in_later_is_found(bus, board):
-    """pyftdi caches an empty bus, too."""
+    """pyftdi caches what it has enumerated, an empty bus, too."""
     with pytest.raises(DeviceError):
         open_usb("FT7")
     bus.plug(chip(board, "FT7"))
@@ -144,7 +146,7 @@ def test_a_replugged_chip_is_found_and_the_old_one_closed(bus, plugged_chip, clo
 
 
 def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged_chip):
-    """At each transfer of an opening in turn: an error that names the chip, nothing left open, and it comes back."""
+    """At each transfer of an opening, the error names the chip, nothing stays open, and a plugged chip opens again."""
     words = open_usb("FT1234")
     transfers = plugged_chip.transfers
     words.close()

@@ -1,4 +1,7 @@
-"""Noise on line and switches of an emulated UNO with the compiled sketch, in lockstep: nothing moves."""
+"""Noise on the line and the switches of an emulated UNO with the compiled sketch must move nothing.
+
+The test turns the emulator's clock (`run_ms`); times are cycles of its processor.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,21 @@ import random
 
 import pytest
 
+from polysight_shared.faults import StageError
 from polysight_shared.stage_line import Immediate, Parameter
 from polysight_simulators.uno import HZ
 
 US = HZ // 1_000_000
 MS = HZ // 1000
+# Pins of the UNO.
 TRIGGER = 2
 X_PUL = 5
 DRIVERS_OFF = 7
-WATCHDOG_MS = 250 * 1.1  # its oscillator is one of 10 %
-# Steps/s
+# The watchdog's oscillator is accurate to 10 %.
+WATCHDOG_MS = 250 * 1.1
+# Highest rate of the stage, steps per second.
 TOP_RATE = 20_000
+# By kind: what comes within a millisecond, more than the line carries at 115,200 baud.
 CHATTER = {
     "silence": lambda _: b"",
     "yes": lambda _: b"y\n" * 6,
@@ -25,7 +32,7 @@ CHATTER = {
     "heartbeats without end": lambda _: bytes([Immediate.STATUS]) * 12,
     "half lines": lambda _: b"N1 MOVE 0 0",
     "a wrong baud rate": lambda rng: bytes(rng.choice([0x00, 0x78, 0x80, 0x84, 0xE6, 0xF8]) for _ in range(12)),
-}  # each a millisecond and more of the line at 115,200 baud
+}
 
 
 @pytest.mark.parametrize("kind", CHATTER)
@@ -45,7 +52,10 @@ def test_chatter_is_no_heartbeat(host, kind: str):
         host.uno.feed(CHATTER[kind](rng))
         host.uno.run_ms(1)
     steps = [e.cycle for e in host.uno.edges if e.value]
+
+    # The heartbeat is 500 ms, to within 100 ms; the ramp from 4000 steps/s takes 100 ms.
     assert silent_from + 400 * MS < steps[-1] <= silent_from + (600 + 100 + 10) * MS
+
     host.uno.settle()
     host.uno.run_ms(50)
     host.uno.received.clear()
@@ -53,13 +63,14 @@ def test_chatter_is_no_heartbeat(host, kind: str):
     host.uno.run_ms(20)
     host.uno.received.clear()
     status = host.status()
-    assert (status.integer("alarm"), status.integer("homed")) == (11, 0)
+    assert (status.integer("alarm"), status.integer("homed")) == (StageError.HEARTBEAT_LOST, 0)
+
     host.uno.edges.clear()
     host.uno.run_ms(500)
     assert host.uno.edges == []
+
     host.must_obey("CLEAR")
-    # Home first
-    assert host.command("MOVE", 0, 0, 4000).number == 8
+    assert host.command("MOVE", 0, 0, 4000).number == StageError.NOT_HOMED
 
 
 @pytest.mark.parametrize("verb", ["MOVE", "ROW", "HOME"])
@@ -72,29 +83,33 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
     host.must_obey(verb, *arguments)
     host.uno.run_ms(800)
     host.uno.edges.clear()
+
     host.uno.hang()
     hung = host.uno.cycle
-    # A host that notices nothing
+    # The host notices nothing and goes on asking for the status.
     for _ in range(20):
         host.uno.feed(bytes([Immediate.STATUS]))
         host.uno.run_ms(25)
+
     assert host.uno.troubles == ["watchdog"]
     assert [e.cycle for e in host.uno.edges if e.pin == X_PUL and e.value][-1] <= hung + WATCHDOG_MS * MS
     assert [(e.pin, e.value) for e in host.uno.edges][-1] == (DRIVERS_OFF, 1)
     replies = host.replies()
     assert replies[0].kind == "banner"
     assert replies[-1].integer("homed") == 0
-    assert host.command("MOVE", 0, 0, 4000).number == 18
+
+    # After a reset it asks for everything again: a greeting, motors on, homing.
+    assert host.command("MOVE", 0, 0, 4000).number == StageError.SEQUENCE
     host.must_obey("HELLO")
-    assert host.command("MOVE", 0, 0, 4000).number == 19
+    assert host.command("MOVE", 0, 0, 4000).number == StageError.DISABLED
     host.must_obey("ENABLE", 1)
-    assert host.command("MOVE", 0, 0, 4000).number == 8
+    assert host.command("MOVE", 0, 0, 4000).number == StageError.NOT_HOMED
     host.set(Parameter.HEARTBEAT, 60_000)
     host.motion("HOME")
 
 
 def test_a_program_that_works_is_never_reset(host):
-    """Four seconds of rows and of everything that takes the main program's time, with 250 ms of watchdog."""
+    """Rows for four seconds, with the longest lines and status requests between: the watchdog's 250 ms never pass."""
     for turn in range(4):
         host.must_obey("ROW", 6000, 40, 150, 400 * (turn % 2), TOP_RATE)
         for _ in range(40):
@@ -108,7 +123,7 @@ def test_a_program_that_works_is_never_reset(host):
 
 @pytest.mark.parametrize("mask", [1, 2, 4, 7])
 def test_a_glitch_is_no_switch(host, request: pytest.FixtureRequest, mask: int):
-    """Up to 100 us long, at any moment of a row at 100 mm/s: the row ends as if there had been none."""
+    """A switch that closes for up to 100 us at any moment of a row at 100 mm/s does not change the row."""
     rng = random.Random(mask)
     host.set(Parameter.ACCEL, 400_000)
     host.uno.edges.clear()
@@ -131,17 +146,19 @@ def test_a_glitch_is_no_switch(host, request: pytest.FixtureRequest, mask: int):
 
 
 @pytest.mark.parametrize("rate", [500, 4000, TOP_RATE])
-@pytest.mark.parametrize(("mask", "number"), [(1, 12), (4, 14)])
+@pytest.mark.parametrize(("mask", "number"), [(1, StageError.LIMIT_SWITCH), (4, StageError.EMERGENCY_STOP)])
 def test_a_real_switch_stops_at_once(host, rate: int, mask: int, number: int):
-    """One that stays closed for 15 ms, as every switch does: within five steps or six."""
+    """A switch stays closed for 15 ms at least: the stage stops within six steps."""
     host.set(Parameter.ACCEL, 400_000)
     host.uno.watch(X_PUL)
     host.must_obey("MOVE", 40_000, 0, rate)
     host.uno.run_ms(400)
     host.uno.edges.clear()
+
     pressed = host.uno.cycle
     host.uno.press(mask)
     host.uno.run_ms(15)
+
     steps = [e.cycle for e in host.uno.edges if e.value]
     assert len(steps) <= 6
     assert not steps or steps[-1] <= pressed + 6 * HZ // rate
@@ -151,7 +168,7 @@ def test_a_real_switch_stops_at_once(host, rate: int, mask: int, number: int):
 
 
 def test_no_stray_byte_ends_a_hold(host):
-    """Every byte but STOP during a hold: the stage does not move, and RESUME continues the row."""
+    """No byte but STOP moves the stage or ends the row during a hold; RESUME continues the row."""
     host.uno.watch(X_PUL)
     host.must_obey("ROW", 4000, 200, 60, 500, 4000)
     host.uno.run_ms(1200)
@@ -171,7 +188,7 @@ def test_no_stray_byte_ends_a_hold(host):
 
 @pytest.mark.parametrize("accel", [400, 2_000, 40_000])
 def test_homing_overruns_the_switch_by_little(host, accel: int):
-    """At any acceleration of rows at most about a millimetre, which a switch must tolerate."""
+    """Homing overruns the switch by about a millimetre, which a switch tolerates, at any acceleration of the rows."""
     host.motion("MOVE", 12_000, 300, TOP_RATE)
     host.set(Parameter.ACCEL, accel)
     host.uno.watch(X_PUL)
@@ -180,7 +197,7 @@ def test_homing_overruns_the_switch_by_little(host, accel: int):
     host.uno.rest()
     host.replies()
     lowest = min(e.x for e in host.uno.edges)
-    # Steps behind the closing point; 200 are 1 mm
+    # Steps behind the closing point, 200 of which are 1 mm.
     assert -250 <= lowest <= 0
     assert host.motion("ROW", 6000 if accel > 400 else 60_000, 200, 3, 500, 1000).integer("points") == 3
 

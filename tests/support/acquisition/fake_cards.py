@@ -35,13 +35,14 @@ class FakeCard:
         self.recording = False
         self.mute = False
         self.silent_data = False
-        self.seen: list[int] = []
-        # faults by (row, take): packets to leave out, frames to leave out (as a radar that missed triggers)
+        self.codes_received: list[int] = []
+        # Faults by (row, take): numbers of the packets that are lost, and bytes that the record lacks at its end, as if
+        # the radar had missed triggers.
         self.drop: dict[tuple[int, int], set[int]] = {}
         self.short: dict[tuple[int, int], int] = {}
-        # Pulses, of rows that are sent at their pace
+        # Pulses that the radar missed, for rows that are sent frame by frame.
         self.missed: dict[tuple[int, int], set[int]] = {}
-        # Before this pulse an edge nobody sent; frames are counted
+        # Before this pulse the radar takes an edge that nobody sent for a pulse: all later frames come one too early.
         self.extra: dict[tuple[int, int], int] = {}
         self._rest = b""
         self._stop = threading.Event()
@@ -55,13 +56,13 @@ class FakeCard:
             except TimeoutError:
                 continue
             code = struct.unpack_from("<H", raw, 2)[0]
-            self.seen.append(code)
+            self.codes_received.append(code)
             if not self.mute:
                 self._command(code, sender)
 
     def _command(self, code: int, sender: tuple[str, int]) -> None:
         self.recording = {1: False, 5: True, 6: False}.get(code, self.recording)
-        # Reset
+        # A reset begins the counters again.
         if code == 1:
             self.sequence = 1
             self.count = 0
@@ -96,7 +97,8 @@ class FakeCard:
         if body:
             packet = encode_packet(self.sequence, self.count, body)
             self.out.sendto(packet, (self.board.host_address, self.board.data_port))
-            self.sequence, self.count = self.sequence + 1, self.count + len(body)
+            self.sequence += 1
+            self.count += len(body)
 
     def send_row(self, row: int, take: int) -> None:
         if not self.recording or self.silent_data:

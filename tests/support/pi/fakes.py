@@ -32,7 +32,7 @@ class FakeDriver:
         self.x_mm = self.y_mm = 0.0
         self.firmware = "fake"
         self.number = 0
-        # What it asks of an open link
+        # It is its own link: what the machine asks of an open link, it asks of this.
         self.link = self
 
     def connect(self) -> None: ...
@@ -215,7 +215,7 @@ class FakeStage:
             if is_open and not open_before:
                 self.moving = False
                 if self.banner:
-                    # A boot, and the port's flush on opening
+                    # A board boots before it greets, and the host's port is flushed when it is opened.
                     time.sleep(0.05)
                     self.say(Reply("banner", fields={"fw": "fake", "proto": "2"}))
             open_before = is_open
@@ -302,9 +302,9 @@ class FakeStage:
 
     def _move(self, c: Command) -> None:
         try:
-            number = self._row(c) if c.verb == "ROW" else self._elsewhere(c)
+            number = self._run_row(c) if c.verb == "ROW" else self._run_other_motion(c)
         except PolysightError:
-            # The wires are gone
+            # The hub of the wires was closed.
             return
         self.moving = self.held = False
         if self._closed.is_set():
@@ -322,7 +322,7 @@ class FakeStage:
         else:
             self.say(end)
 
-    def _elsewhere(self, c: Command) -> int:
+    def _run_other_motion(self, c: Command) -> int:
         if self._stopping.wait(self.pace_s):
             return StageError.STOPPED
         if c.verb != "BUZZ":
@@ -330,7 +330,7 @@ class FakeStage:
             self.x, self.y = c.args[:2] if c.verb == "MOVE" else (0, 0)
         return 0
 
-    def _row(self, c: Command) -> int:
+    def _run_row(self, c: Command) -> int:
         x0, dx, n, self.y, feed = c.args
         self.rows_run += 1
         step_ns = abs(dx) * 10**9 // feed
@@ -348,7 +348,8 @@ class FakeStage:
             self.points += 1
             if i not in self.skip:
                 self._edge(self.t_ns)
-        if self._stopping.wait(2 * self.pace_s):  # it runs on and slows down
+        # It runs on and slows down.
+        if self._stopping.wait(2 * self.pace_s):
             return StageError.STOPPED
         self.x, self.y = self.row_end or _rest_after(c)
         if self.endless and self._stopping.wait():

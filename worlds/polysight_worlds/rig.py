@@ -42,8 +42,8 @@ class Rig:
     def incidence_deg(self, channel: str) -> float:
         """Angle of incidence at the mirror point of receiver "h" or "v": the same wherever a plate lies."""
         mirror_point = find_mirror_point(self.tx.position, getattr(self, channel).position, self.plane_m)
-        way = mirror_point - self.tx.position
-        return float(np.degrees(np.arccos(way[2] / np.linalg.norm(way))))
+        incident = mirror_point - self.tx.position
+        return float(np.degrees(np.arccos(incident[2] / np.linalg.norm(incident))))
 
     def offsets_m(self) -> tuple[NDArray, NDArray]:
         """Stage offsets in x [columns] and y [rows]."""
@@ -162,7 +162,7 @@ def load_boards(file: Path) -> Boards:
 
 
 def read_boards(content: dict, leakage: tuple[complex, complex] = (0j, 0j)) -> Boards:
-    """Return the boards of an instrument file's content; `leakage` as of `rig_of`."""
+    """Return the boards of an instrument file's content; `leakage` as of `read_rig`."""
     steps = {}
     for board in content["boards"]:
         places = [place(board["mount"], antenna_mm)[0] for antenna_mm in content["antennas"]["rx_mm"]]

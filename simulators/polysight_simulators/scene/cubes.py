@@ -53,7 +53,7 @@ def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) ->
         path_m = np.full_like(direct_m, field.centre_path_m)
         if remove_direct:
             path_m = field.centre_path_m - direct_m
-        cubes[board.name] = _read(field, rig, f, path_m, np.ones(len(path_m), np.complex64), 0.0)
+        cubes[board.name] = _sample_field(field, rig, f, path_m, np.ones(len(path_m), np.complex64), 0.0)
     return cubes
 
 
@@ -105,13 +105,13 @@ def synced_cube(
     else:
         channels = list(rx)
     field = build_field(rig, scene, board, f, rx=channels)
-    all_m = antennas(rig, board).direct_m
-    direct_m = all_m[channels]
+    direct_of_all_m = antennas(rig, board).direct_m
+    direct_m = direct_of_all_m[channels]
     gains = power_on(rig, scene, board, seed).gains[channels]
-    cube = _read(field, rig, f, field.centre_path_m - direct_m, gains, d.backlash_mm)
+    cube = _sample_field(field, rig, f, field.centre_path_m - direct_m, gains, d.backlash_mm)
     cube *= _drift_of_positions(rig, scene, board)[:, :, None]
     if direct:
-        level = direct_factor(board, scene) * d.direct_gain * all_m[0] / direct_m
+        level = direct_factor(board, scene) * d.direct_gain * direct_of_all_m[0] / direct_m
         cube += (gains * level).astype(np.complex64)[:, None, None, None]
     if noise is None:
         noise = _burst_noise(rig, scene, board, seed, field.centre_path_m)
@@ -154,19 +154,28 @@ def _burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m:
     return float(averaged / np.abs(high_pass(np.array(if_hz), chirp)[0]))
 
 
-def _read(
-    field: ObjectField, rig: Instrument, f: Real, away_m: Real, gains: NDArray[np.complexfloating], backlash_mm: float
+def _sample_field(
+    field: ObjectField,
+    rig: Instrument,
+    f: Real,
+    path_m_of_rx: Real,
+    gains: NDArray[np.complexfloating],
+    backlash_mm: float,
 ) -> NDArray[np.complex64]:
-    """Return the field at the true positions, [rx, row, column, frequency], with the phase of path `away_m` [rx]."""
+    """Return the field at the true positions, [rx, row, column, frequency], with the phase of path `path_m_of_rx` [rx].
+
+    Complex `gains` [rx] multiply the samples; in rows towards -x the stage lags behind by `backlash_mm`.
+    """
     if np.array_equal(field.nodes_hz, f):
         base = np.eye(len(f))
     else:
         base = node_matrix(field, f)[0]
-    turn = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(away_m, f)) * gains[:, None]
+    turn = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(path_m_of_rx, f)) * gains[:, None]
+    # From the field's own frequencies to those asked for, with phase and gain: [rx, node, frequency].
     expand = (base * turn[:, None]).astype(np.complex64)
     plan = plan_raster(rig.grid)
     travel = mean_burst_travel_mm(rig.burst, rig.stage)
-    cube = np.empty((len(away_m), plan.rows, plan.columns, len(f)), dtype=np.complex64)
+    cube = np.empty((len(path_m_of_rx), plan.rows, plan.columns, len(f)), dtype=np.complex64)
     for row in plan:
         x = np.array(row.x_mm) + row.direction * travel
         if row.direction < 0:

@@ -46,14 +46,12 @@ Axis = Literal["x", "y"]
 RowStatus = Literal["done", "aborted", "fault"]
 ExitStatus = Literal["success", "abort", "fail"]
 State = Literal["idle", "homing", "jogging", "homed", "ready", "running", "held", "done", "fault"]
-# Backends of the Pi's SYNC_IN output (`HelloReply.backend`).
-# Kernel.
+# Backends of the Pi's SYNC_IN output (`HelloReply.backend`): the kernel's GPIO lines, the SPI controller, and simulated
+# wires.
 GPIOD = "gpiod"
-# SPI controller.
 SPI = "spi"
-# Simulated.
 WIRES = "wires"
-# The last one in scans of old releases: GPIO registers.
+# "gpiomem", the registers of the GPIO lines, is in scans of old releases.
 _HARDWARE = (GPIOD, SPI, "gpiomem")
 Timing = Literal["", "spi", "one-shot", "program"]
 """Timing source of a burst: SPI controller (widths and periods), one-shot (widths, periods by the program), program;

@@ -40,7 +40,8 @@ _MIN_PACKETS_OF_A_SIZE = 3
 class Past:
     """Where the next record begins, from the records before it."""
 
-    start: Counters | None = None  # of the next record's first byte; None: unknown, the card has to be reset
+    # Counters of the next record's first byte. None: they are unknown, and the card has to be reset.
+    start: Counters | None = None
 
     @property
     def lost(self) -> bool:
@@ -58,27 +59,27 @@ class PacketCounts:
     """Packets of one row by result: every packet is in exactly one of the first eight; the others are subsets."""
 
     placed: int = 0
-    # Every byte was there already, and equal
+    # Every byte of them was there already, with the same value.
     duplicates: int = 0
-    # Other bytes than a packet with equal counters: masked where they overlap
+    # Their bytes differ from those of a packet with equal counters; both are masked where they overlap.
     conflicting: int = 0
     # Packets of an earlier record.
     leftover: int = 0
-    # After the card restarted within the row and reset its counters
+    # They came after the card restarted within the row and reset its counters.
     restarted: int = 0
     # Packets behind the record's last expected byte, or not kept for lack of memory.
     outside: int = 0
-    # Byte count and sequence contradict each other
+    # Their byte count and sequence contradict each other.
     disagreeing: int = 0
     # Packets without payload, or longer than the card's.
     malformed: int = 0
-    # Placed, after a packet that follows it
+    # Placed packets that came after one that follows them.
     late: int = 0
     # Largest delay of these, bytes
     late_by_bytes: int = 0
-    # Placed, not full; normally only the last of a record
+    # Placed packets that are not full: normally only the last one of a record.
     short: int = 0
-    # Leftover, identified by arrival before the row's first pulse
+    # Those of `leftover` that came before the row's first pulse.
     before_pulses: int = 0
 
 
@@ -96,9 +97,8 @@ class Losses:
 class Placed:
     """Result of placing one record."""
 
-    # Bytes
+    # Bytes of the whole row, and those that are in place.
     expected: int
-    # Bytes
     received: int
     # Byte ranges (start, stop) that are missing or uncertain: sorted, not touching
     missing: list[Gap]
@@ -269,32 +269,33 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     expected = log.expected
     offsets = counter_differences(log.byte_counts, start.byte_count, BYTE_COUNT_BITS)
     steps = counter_differences(log.sequences, start.sequence, SEQUENCE_BITS)
-    on_line = (offsets == full * steps) & (offsets >= 0)
-    is_own = on_line & (offsets < expected) & ~early
+    # All packets before it were full, as they are up to the last one of a record.
+    counters_agree = (offsets == full * steps) & (offsets >= 0)
+    is_of_row = counters_agree & (offsets < expected) & ~early
     length = 0
     ended = False
-    if is_own.any():
-        stops = (offsets + sizes)[is_own]
+    if is_of_row.any():
+        stops = (offsets + sizes)[is_of_row]
         length = int(stops.max())
-        ended = bool((sizes[is_own][stops == length] < full).all())
+        ended = bool((sizes[is_of_row][stops == length] < full).all())
     is_near = (offsets < 2 * expected + 2 * full) & (steps > 0) & (steps * full < 4 * expected + 4 * full) & ~early
-    beyond = is_near & on_line & (offsets >= expected)
-    later = is_near & ~on_line & (offsets >= max(length, full))
+    beyond = is_near & counters_agree & (offsets >= expected)
+    later = is_near & ~counters_agree & (offsets >= max(length, full))
     ends_in_short = expected % full > 0
-    counts_on_anew = np.zeros_like(is_own)
-    if start.byte_count > 2 * expected and is_own.any():
+    counts_on_anew = np.zeros_like(is_of_row)
+    if start.byte_count > 2 * expected and is_of_row.any():
         counts_anew = (log.byte_counts == full * (log.sequences - 1)) & (log.byte_counts < expected)
-        is_behind = np.arange(log.count) > int(np.argmax(is_own))
-        counts_on_anew = counts_anew & is_behind & ~early & ~is_own
+        is_behind = np.arange(log.count) > int(np.argmax(is_of_row))
+        counts_on_anew = counts_anew & is_behind & ~early & ~is_of_row
     return _Record(
         start=start,
         offsets=offsets,
         steps=steps,
-        of_row=is_own,
+        of_row=is_of_row,
         beyond=beyond,
         later=later & ~counts_on_anew,
         early=early,
-        too_early=early & on_line & (offsets < expected),
+        too_early=early & counters_agree & (offsets < expected),
         after_restart=counts_on_anew,
         full=full,
         length=length,
@@ -372,9 +373,9 @@ def _why_not_located(record: _Record, row: _Row, log: PacketLog, frame_bytes: in
     return _Doubt(text, frames_missing=clean)
 
 
-def _past_after(record: _Record, why: _Doubt) -> Past:
+def _past_after(record: _Record, doubt: _Doubt) -> Past:
     """Return where the next record begins: known behind a record whose start and end are certain."""
-    is_certain = not why.text or why.frames_missing
+    is_certain = not doubt.text or doubt.frames_missing
     if not is_certain or not record.of_row.any() or record.later.any():
         return Past()
     return Past(start=record.start.advance(record.length, -(-record.length // record.full)))

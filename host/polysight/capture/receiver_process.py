@@ -30,8 +30,9 @@ from polysight_shared.errors import DeviceError, PolysightError
 
 # Batches fetched before requests are checked again.
 _MAX_BATCHES = 64
-# Previews take at most 1/20 of the time.
+# A preview is followed by a pause of so many times its own duration: previews take a twentieth of the time at most.
 _PREVIEW_SHARE = 20
+# Remedy for errors in the order of requests, which are the program's own.
 _RESTART = "start the scan again"
 # Pause in which packets gather in the kernel's buffer: fewer, larger batches.
 _GATHER_MS = 1
@@ -49,7 +50,7 @@ class _Row:
         self.not_before_ns = 0
         # What the last report said of the preview: all frames complete, the record ended.
         self._reported = (False, False)
-        # Packets.
+        # Number of packets at the last preview.
         self._previewed = 0
         self._next_preview_ns = 0
         self._preview = Preview(0, request.expected_bytes == 0, ended=False)
@@ -68,10 +69,16 @@ class _Row:
         return self._reported != last_reported and any(self._reported)
 
     def progress(self) -> messages.Progress:
+        """How far the row is, by the packets so far."""
         self._update()
-        p = self._preview
-        r = self.request
-        return messages.Progress(r.row, r.take, p.received, p.complete, self.log.last_arrival_ns, p.ended)
+        return messages.Progress(
+            row=self.request.row,
+            take=self.request.take,
+            received=self._preview.received,
+            complete=self._preview.complete,
+            last_arrival_ns=self.log.last_arrival_ns,
+            ended=self._preview.ended,
+        )
 
     def _update(self) -> None:
         if self.log.count != self._previewed:
@@ -138,11 +145,13 @@ class Receiver:
         self._socket = bind_udp(request.host_address, request.data_port, f"{request.board} data")
         granted = enlarge_receive_buffer(self._socket, request.buffer_bytes)
         self._batches = BatchReceiver(self._socket, request.card_address)
-        priority, ordinary = take_priority()
-        core, unpinned = take_core(request.core, request.own_core, urgent=not ordinary)
+        priority, priority_warning = take_priority()
+        core, core_warning = take_core(request.core, request.own_core, urgent=not priority_warning)
         scheduling = f"{'any core' if core is None else f'core {core}'}, {priority}"
         port = self._socket.getsockname()[1]
-        return messages.Opened(granted, port, scheduling, [w for w in (unpinned, ordinary) if w])
+        return messages.Opened(
+            granted, port, scheduling, [warning for warning in (core_warning, priority_warning) if warning]
+        )
 
     def _begin(self, request: messages.BeginRow) -> messages.Answer:
         if self._socket is None or self._batches is None:

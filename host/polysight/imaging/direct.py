@@ -1,4 +1,7 @@
-"""Direct imager: matched filter by direct summation, for any antennas, positions and voxels."""
+"""Direct imager: matched filter by direct summation, for any antennas, positions and voxels.
+
+`xp` is the array library of the samples (array API standard): NumPy, or one of a GPU.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ import numpy.typing as npt
 from polysight.imaging.geometry import Aperture, excess_path_m, get_device, namespace, turn
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Products of position and voxel in memory
+# Products of position and voxel that are in memory at a time.
 _CHUNK = 1 << 20
 
 
@@ -80,10 +83,11 @@ def backproject(
             for k, f in enumerate(scene.frequencies):
                 image += xp.sum(s[part, k : k + 1] * turn(xp, delay * f, xp.float64, xp.complex128), axis=0)
             continue
-        turned = turn(xp, delay * scene.step, xp.float64, xp.complex128)
-        total = s[part, -1:] * xp.ones_like(turned)
+        # Horner's rule: from one frequency to the next every phase grows by that of the spacing.
+        phase_step = turn(xp, delay * scene.step, xp.float64, xp.complex128)
+        total = s[part, -1:] * xp.ones_like(phase_step)
         for k in range(len(scene.frequencies) - 2, -1, -1):
-            total *= turned
+            total *= phase_step
             total += s[part, k : k + 1]
         image += xp.sum(total * turn(xp, delay * scene.frequencies[0], xp.float64, xp.complex128), axis=0)
     return image
@@ -137,8 +141,8 @@ class _Scene:
         """Spacing of three or more evenly spaced frequencies, Hz; otherwise None."""
         f = np.array(self.frequencies)
         step = (f[-1] - f[0]) / max(1, f.size - 1)
-        even = f.size > 2 and np.allclose(np.diff(f), step, rtol=1e-9, atol=1e-6 * abs(step))
-        return float(step) if even else None
+        is_even = f.size > 2 and np.allclose(np.diff(f), step, rtol=1e-9, atol=1e-6 * abs(step))
+        return float(step) if is_even else None
 
     def delays(self) -> Iterator[tuple[slice, Any]]:
         """Yield chunks of positions and their delays to all voxels, float64 [position, voxel], seconds."""

@@ -51,9 +51,9 @@ from polysight_shared.errors import DataError, PolysightError
 
 def ratio(h: Image, v: Image) -> Image:
     """Return the polarisation ratio h / v, complex; NaN where v is zero or either is not finite."""
-    ok = (v != 0) & np.isfinite(v) & np.isfinite(h)
+    is_usable = (v != 0) & np.isfinite(v) & np.isfinite(h)
     out = np.full(np.broadcast_shapes(h.shape, v.shape), complex(np.nan, np.nan), np.result_type(h, v))
-    np.divide(h, v, out=out, where=ok)
+    np.divide(h, v, out=out, where=is_usable)
     return out
 
 
@@ -175,8 +175,10 @@ def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
     return out.astype(image.dtype)
 
 
+# Defaults of `plane_reference`: width of the Gaussian window, lowest level relative to the plate's 90th percentile.
 SMOOTH_MM = 8.0
 FLOOR_DB = -10.0
+# A smaller area of metal is no plate that covers the plane.
 MIN_PIXELS = 100
 
 
@@ -217,11 +219,11 @@ class PlaneReference:
 
     def add_dispersion(self, dispersion: Dispersion) -> PlaneReference:
         """Return the reference with the plate's change over the sweep, from the same scan; unchanged if it has none."""
-        seen = self.valid & np.isfinite(dispersion.h) & np.isfinite(dispersion.v)
-        if not seen.any():
+        is_known = self.valid & np.isfinite(dispersion.h) & np.isfinite(dispersion.v)
+        if not is_known.any():
             return self
         h, v = (
-            complex(np.median(change[seen].real), np.median(change[seen].imag))
+            complex(np.median(change[is_known].real), np.median(change[is_known].imag))
             for change in (dispersion.h, dispersion.v)
         )
         return replace(self, dispersion=(h, v))
@@ -288,14 +290,14 @@ class PlaneReference:
         pixels = self.valid
         h = self.h[pixels]
         v = self.v[pixels]
-        turned = np.angle(h / v * np.conj(np.mean(h / v)))
+        phase_from_mean = np.angle(h / v * np.conj(np.mean(h / v)))
         return MetalPlate(
             how=self.how,
             share_of_plane=round(float(pixels.mean()), 4),
             h_variation_db=_variation_db(h),
             v_variation_db=_variation_db(v),
             ratio_variation_db=_variation_db(h / v),
-            ratio_variation_deg=round(float(np.degrees(np.std(turned))), 4),
+            ratio_variation_deg=round(float(np.degrees(np.std(phase_from_mean))), 4),
             spread=round(self.spread, 5),
             sub_bands=len(self.bands) or UNSET,
         )

@@ -35,6 +35,7 @@ from polysight_shared.tables import to_builtins
 
 # Least size of a plate that serves as reference.
 LEAST_PIXELS = 100
+# No estimate of the leakage counts as more exact than this: the standards' own errors do not show in it.
 LEAST_LEAKAGE_STD = 1e-3
 # Real mounts leak up to 0.1; a plate in the place of strips gives 1.
 MAX_LEAKAGE = 0.5
@@ -224,7 +225,7 @@ def leakage_of_scans(
     plate_reference = make_plane_reference(pipeline, images)
     theta = specular_incidence_rad(pipeline.rig)
     mask = plate_reference.valid & images.valid
-    turned = []
+    strips_by_angle = []
     names = [pipeline.source.scan_id]
     simulated = pipeline.source.simulated
     for degrees, folder in strips:
@@ -232,7 +233,7 @@ def leakage_of_scans(
         plate_reference.check_rig(strips_pipeline.calibration.imaged_with(strips_pipeline.rig), str(plate))
         plate_reference.check_axes(strip_images.x_m, strip_images.y_m)
         mask = mask & strip_images.valid
-        turned.append((float(np.radians(degrees)), strip_images.h, strip_images.v))
+        strips_by_angle.append((float(np.radians(degrees)), strip_images.h, strip_images.v))
         names.append(strips_pipeline.source.scan_id)
         simulated = simulated or strips_pipeline.source.simulated
     if int(mask.sum()) < LEAST_PIXELS:
@@ -241,7 +242,7 @@ def leakage_of_scans(
             "plate and strips must cover the same part of the plane",
             "scan them in the same place, larger than the grid on every side",
         )
-    leakage = leakage_from_images((plate_reference.h, plate_reference.v), turned, mask, theta)
+    leakage = leakage_from_images((plate_reference.h, plate_reference.v), strips_by_angle, mask, theta)
     largest = max(abs(leakage.h), abs(leakage.v))
     if largest > MAX_LEAKAGE:
         raise DataError(
@@ -250,7 +251,7 @@ def leakage_of_scans(
             "correct the angle, DEG of --strips DEG=SCAN, or scan the strips again",
             code=ErrorCode.VALUE_INVALID,
         )
-    std = _leakage_std((plate_reference.h, plate_reference.v), turned, mask, theta)
+    std = _leakage_std((plate_reference.h, plate_reference.v), strips_by_angle, mask, theta)
     facts = {"scans": names, "simulated": simulated, "pixels": int(mask.sum()), "leakage_std": std}
     return leakage, {**facts, "incidence_deg": float(np.degrees(theta))}
 

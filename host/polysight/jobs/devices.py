@@ -39,7 +39,7 @@ from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.findings import Finding
 from polysight_shared.messages import Axis
 
-# Limit of one question to a card that is perhaps just starting, all attempts together
+# Timeout of a question to a card that may be starting, all attempts together, and the time between two questions.
 _ASK_S = 1.5
 _PAUSE_S = 0.2
 
@@ -51,13 +51,13 @@ def show_cards(config: Path, listen_s: float, as_json: bool) -> int:
         sys.stderr.write(f"listening for at most {listen_s:g} s: let the radars be triggered now\n")
     surveys = survey_cards(rig, listen_s)
     if as_json:
-        print_json([_facts(s) for s in surveys])
+        print_json([_describe_survey(s) for s in surveys])
     else:
-        sys.stdout.write("\n".join(_survey_text(s) for s in surveys))
+        sys.stdout.write("\n".join(_format_survey(s) for s in surveys))
     return exit_status(all(s.ok for s in surveys if s.board.record))
 
 
-def _facts(survey: CardSurvey) -> dict[str, object]:
+def _describe_survey(survey: CardSurvey) -> dict[str, object]:
     """Survey results as plain data."""
     board = survey.board
     keys = ("name", "role", "record", "card_address", "host_address", "command_port", "data_port")
@@ -66,11 +66,11 @@ def _facts(survey: CardSurvey) -> dict[str, object]:
         "ok": survey.ok,
         "silent_hop": survey.silent,
         "fpga_version": survey.version,
-        "hops": [_hop(hop) for hop in survey.hops],
+        "hops": [_describe_hop(hop) for hop in survey.hops],
     }
 
 
-def _hop(finding: Finding) -> dict[str, str]:
+def _describe_hop(finding: Finding) -> dict[str, str]:
     """One hop as plain data; a note says that the hop was not checked."""
     verdict = finding.level
     if verdict == "note":
@@ -84,7 +84,7 @@ def _hop(finding: Finding) -> dict[str, str]:
     }
 
 
-def _survey_text(survey: CardSurvey) -> str:
+def _format_survey(survey: CardSurvey) -> str:
     """Survey results as text."""
     b = survey.board
     if b.record:
@@ -93,14 +93,14 @@ def _survey_text(survey: CardSurvey) -> str:
         role = f"{b.role}, not recorded: only asked"
     unchecked = [hop.where for hop in survey.hops if hop.level == "note" and not hop.what]
     text = f"{b.name} ({role}): card {b.card_address}:{b.command_port}, data to {b.host_address}:{b.data_port}\n"
-    text += "".join(_line(hop) for hop in survey.hops if hop.where not in unchecked)
+    text += "".join(_format_hop(hop) for hop in survey.hops if hop.where not in unchecked)
     if unchecked:
         text += f"  not checked {', '.join(unchecked)}\n"
     return text
 
 
-def _line(finding: Finding) -> str:
-    hop = _hop(finding)
+def _format_hop(finding: Finding) -> str:
+    hop = _describe_hop(finding)
     line = f"  {hop['verdict']:12}{finding.where:10}{finding.what}".rstrip() + "\n"
     for word, text in (("why", finding.why), ("do", finding.do)):
         if text:
@@ -108,7 +108,7 @@ def _line(finding: Finding) -> str:
     return line
 
 
-def _board(rig: Instrument, name: str, config: Path) -> Board:
+def _find_board(rig: Instrument, name: str, config: Path) -> Board:
     try:
         return rig.by_name(name)
     except KeyError:
@@ -144,7 +144,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
         when the card is silent or refuses, or was not seen at its new address within `wait_s`.
     """
     rig = load_instrument(config)
-    board = _board(rig, name, config)
+    board = _find_board(rig, name, config)
     settings = EepromSettings.of_board(board, mac)
     twins = [b.name for b in rig.boards if b.name != name and b.card_address == board.card_address]
     if twins:
@@ -186,7 +186,7 @@ def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
         else:
             if was_off:
                 return version
-        # An interface that is down answers at once
+        # An interface that is down refuses at once.
         time.sleep(_PAUSE_S)
     missing = "the card was not switched off"
     if was_off:
@@ -201,7 +201,7 @@ def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
 def reset_card(config: Path, name: str, radar: bool) -> int:
     """Reset a card's FPGA, or with `radar` the radar board on it. Raises ConfigError or DeviceError."""
     rig = load_instrument(config)
-    with CardClient(_board(rig, name, config), rig.limits.command_timeout_s) as card:
+    with CardClient(_find_board(rig, name, config), rig.limits.command_timeout_s) as card:
         if radar:
             card.reset_radar()
             sys.stdout.write(f"{name}: the radar is reset; it must be armed again\n")
@@ -212,6 +212,7 @@ def reset_card(config: Path, name: str, radar: bool) -> int:
     return 0
 
 
+# Word for a step that holds, or does not.
 _WORDS = {True: "ok", False: "FAILED"}
 
 
@@ -220,7 +221,7 @@ def plan_radars(config: Path) -> int:
 
     Raises ConfigError.
     """
-    lines, holds = plan_lines(_native(config))
+    lines, holds = plan_lines(_load_rig_of_native(config))
     sys.stdout.write("\n".join(lines) + "\n")
     return exit_status(holds)
 
@@ -230,7 +231,7 @@ def check_radar(config: Path, name: str, trace: Path | None, slow: bool, as_json
     rig = _load_native_rig(config, name)
     _check_trace(trace)
     clock = SystemClock()
-    return _check(rig, name, clock, lambda: _open(rig, name, clock, trace, slow), as_json)
+    return _run_check(rig, name, clock, lambda: _open_words(rig, name, clock, trace, slow), as_json)
 
 
 def replay_radar(config: Path, trace: Path, as_json: bool) -> int:
@@ -239,7 +240,7 @@ def replay_radar(config: Path, trace: Path, as_json: bool) -> int:
     name = str(words.facts.get("board", ""))
     if not as_json:
         sys.stdout.write(f"replayed from {trace}, not a board\n")
-    return _check(_load_native_rig(config, name), name, words, lambda: words, as_json)
+    return _run_check(_load_native_rig(config, name), name, words, lambda: words, as_json)
 
 
 def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path | None, slow: bool) -> int:
@@ -248,17 +249,17 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
     Raises ConfigError, DeviceError, OSError.
     """
     rig = _load_native_rig(config, name)
-    checked = read_image(image)
+    checked_image = read_image(image)
     clock = SystemClock()
-    sys.stdout.write(f"{image.name}: whole, for an AWR2243, patches {' and '.join(checked.patches)}\n")
+    sys.stdout.write(f"{image.name}: whole, for an AWR2243, patches {' and '.join(checked_image.patches)}\n")
     _check_trace(trace)
-    words = _open(rig, name, clock, trace, slow)
+    words = _open_words(rig, name, clock, trace, slow)
     # A flash is written by a board that was started without this image.
-    image_for_ram = None if flash else checked
+    image_for_ram = None if flash else checked_image
     board = radar_board(rig, name, words, clock, image_for_ram)
     try:
         if flash:
-            sys.stdout.write(f"{name}: {_write_flash(board, image, checked)}\n")
+            sys.stdout.write(f"{name}: {_write_flash(board, image, checked_image)}\n")
         else:
             board.configure()
             sys.stdout.write(
@@ -270,13 +271,13 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
     return 0
 
 
-def _check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], WordLink], as_json: bool) -> int:
+def _run_check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], WordLink], as_json: bool) -> int:
     rows: list[Row] = []
 
     def tell(row: Row) -> None:
         rows.append(row)
         if not as_json:
-            sys.stdout.write(_step_text(name, row))
+            sys.stdout.write(_format_step(name, row))
             sys.stdout.flush()
 
     firmware = read_firmware(rig)
@@ -295,7 +296,7 @@ def _check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], Wo
     return exit_status(all(row.holds for row in rows))
 
 
-def _step_text(name: str, row: Row) -> str:
+def _format_step(name: str, row: Row) -> str:
     lines = [f"{name}  {row.step:12} {_WORDS[row.holds]:6}  {row.came}"]
     if not row.holds:
         lines += [f"      expected: {row.expected}", f"      do: {row.do}"]
@@ -332,14 +333,14 @@ def _check_trace(trace: Path | None) -> None:
         raise ConfigError(f"{trace} exists already", "traces are never overwritten", "give another name")
 
 
-def _open(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, slow: bool) -> WordLink:
+def _open_words(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, slow: bool) -> WordLink:
     words = open_board(rig.radar.native[name].place, slow or rig.radar.slow_spi)
     if trace is None:
         return words
     return trace_words(words, clock, trace, rig, name)
 
 
-def _native(config: Path) -> Instrument:
+def _load_rig_of_native(config: Path) -> Instrument:
     rig = load_instrument(config)
     if not rig.radar.native:
         raise ConfigError(
@@ -351,7 +352,7 @@ def _native(config: Path) -> Instrument:
 
 
 def _load_native_rig(config: Path, name: str) -> Instrument:
-    rig = _native(config)
+    rig = _load_rig_of_native(config)
     if name not in rig.radar.native:
         raise ConfigError(f"radar.native has no board {name!r}", "a typing error", f"one of {sorted(rig.radar.native)}")
     require(rig, rig.grid.columns * rig.burst.pulses)

@@ -67,7 +67,7 @@ SHRINKS = {
     "incidence": "measure where the antennas are: `polysight calibrate direct-path`",
     "phase sign": "save `conjugate` (true or false) with the images",
 }
-"""Source of error to the measurement that reduces it."""
+"""By source of error: the measurement that reduces it."""
 
 
 @dataclass(frozen=True)
@@ -362,8 +362,13 @@ def make_labels(result: MaterialsResult, description: str = "") -> Labels:
     """Return boxes around the interiors of a result's patches, in pixels, with unique names as drawn or classified."""
     out: dict[str, Box] = {}
     for r in result.patches:
-        named = r.verdict.name if r.verdict is not None and r.verdict.source == "library" else None
-        name = result.boxes.get(r.patch.label) or ("metal" if r.patch.label == result.metal.label else named or "patch")
+        name = "patch"
+        if result.boxes.get(r.patch.label):
+            name = result.boxes[r.patch.label]
+        elif r.patch.label == result.metal.label:
+            name = "metal"
+        elif r.verdict is not None and r.verdict.source == "library":
+            name = r.verdict.name
         inside = r.patch.interior if r.patch.interior.any() else r.patch.mask
         rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
         key = name if name not in out else f"{name} ({r.patch.label})"
@@ -464,8 +469,10 @@ def _read_evidence(arrays: Mapping[str, npt.NDArray], judged: Sequence[int]) -> 
         strict=True,
     )
     rows = [
-        RatioEvidence(float(angle), complex(t), covariance, float(share), float(off), float(std), dispersion=dispersion)
-        for angle, t, covariance, share, (off, std), dispersion in columns
+        RatioEvidence(
+            float(angle), complex(ratio), covariance, float(share), float(off), float(std), dispersion=dispersion
+        )
+        for angle, ratio, covariance, share, (off, std), dispersion in columns
     ]
     if any(row.covariance.shape != (2, 2) for row in rows):
         raise ValueError("covariances are not [patch, 2, 2]")
@@ -485,7 +492,7 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
     """
     out = []
     for patch in scans[0].patches:
-        partners = [p for other_scan in scans[1:] if (p := _partner(patch, scans[0], other_scan)) is not None]
+        partners = [p for other_scan in scans[1:] if (p := _find_partner(patch, scans[0], other_scan)) is not None]
         if len(partners) < len(scans) - 1:
             continue
         pairs = zip(scans, (patch, *partners), strict=True)
@@ -494,20 +501,20 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
         columns = [patch.features]
         near_enough = np.ones(len(places), bool)
         for partner in partners:
-            theirs = partner.places_mm - partner.centre_mm
-            if len(theirs):
-                far, nearest_index = scipy.spatial.KDTree(theirs).query(places)
-            else:
-                far = np.full(len(places), np.inf)
-                nearest_index = 0
-            near_enough &= far <= NEAR_MM
-            columns.append(partner.features[np.minimum(nearest_index, len(theirs) - 1)] if len(theirs) else columns[0])
+            partner_places = partner.places_mm - partner.centre_mm
+            if not len(partner_places):
+                near_enough[:] = False
+                columns.append(columns[0])
+                continue
+            distance_mm, nearest_index = scipy.spatial.KDTree(partner_places).query(places)
+            near_enough &= distance_mm <= NEAR_MM
+            columns.append(partner.features[np.minimum(nearest_index, len(partner_places) - 1)])
         complete = evidence if len(evidence) == len(scans) else None
         out.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[near_enough], complete))
     return out
 
 
-def _partner(patch: ScanPatch, own_scan: ScanPatches, other_scan: ScanPatches) -> ScanPatch | None:
+def _find_partner(patch: ScanPatch, own_scan: ScanPatches, other_scan: ScanPatches) -> ScanPatch | None:
     """Return the other scan's patch nearest to this one, if this one is also the nearest to it."""
 
     def nearest(to: ScanPatch, among: ScanPatches) -> ScanPatch | None:

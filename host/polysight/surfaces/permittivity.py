@@ -619,7 +619,9 @@ def judge_medium(
 
     levels = find_levels(fit.eps, v, gains)
     level = float(np.median(levels))
-    variance = _spread(levels) ** 2 / blocks
+    # Where the reference does not tell the ratio of the gains, it does not tell their level either.
+    unknown_std = float(np.median(gains.estimate_unknown_std(v.arrival)))
+    variance = _spread(levels) ** 2 / blocks + unknown_std**2
     # A rig that is known badly gives a wrong permittivity, and with it a wrong level.
     miss = find_misses(v, gains, reflect_points(fit.eps, v, wave_number))
     for scan in disturbed:

@@ -55,10 +55,10 @@ METAL_RATIO = 0.15
 # A loss below zero by so many standard deviations is no property of one medium.
 MAX_GAIN_SIGMA = 3.0
 # Level of H over that of the medium fitted, and its rise over the band, logarithms: beyond, no single surface reflects.
-# Beyond what the rig's errors explain the level of 29 drawn solids is at most 0.02 off, that of a bottle which looked
-# like a medium 0.17.
-MAX_LEVEL_MISS = 0.1
-MAX_BAND_RISE = 0.02
+# Beyond what the rig's errors explain 46 drawn solids have at most 0.020 and 0.0034; walls that pass as a medium which
+# is not theirs have more than 0.05, or 0.01 (tests/surfaces/test_what_is_no_surface.py).
+MAX_LEVEL_MISS = 0.05
+MAX_BAND_RISE = 0.01
 NO_SINGLE_MEDIUM = "no single medium reflects so: a thin wall, a coating, an edge, or a second echo at the same place"
 # A segment of which so many points lie at least so far behind another surface may be an echo from inside a body. Less
 # far, a window does not resolve both.

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable, Stack
 
-# Facets times positions that are evaluated at once: some 200 MB.
-CHUNK = 400_000
+# Facets times positions that are evaluated at once: their arrays stay in the processor's cache.
+CHUNK = 20_000
+# Side lobes keep some power beside and behind the main lobe.
 # Smallest gain (-30 dB): side lobes keep some power beside and behind the main lobe.
 PATTERN_FLOOR = 0.03
 
@@ -80,7 +81,11 @@ def _dot(a: NDArray, b: NDArray) -> NDArray:
 
 def _cross(a: NDArray, b: NDArray) -> NDArray:
     a, b = _column(a, b), _column(b, a)
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    product = np.empty(np.broadcast_shapes(a.shape, b.shape), np.result_type(a, b))
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        np.multiply(a[j], b[k], out=product[i])
+        product[i] -= a[k] * b[j]
+    return product
 
 
 def _carry(start: NDArray, end: NDArray, vector: NDArray) -> NDArray:
@@ -106,6 +111,10 @@ class Response:
     p_weight: NDArray
     cos_incidence: NDArray
 
+    def path_steps(self, edge_u: NDArray, edge_v: NDArray) -> tuple[NDArray, NDArray]:
+        """Change of the path along both edges [3, ...] of the facets, metres."""
+        return _dot(self.gradient, edge_u), _dot(self.gradient, edge_v)
+
 
 def respond(tx: Antenna, rx: Antenna, points: NDArray, normals: NDArray) -> Response:
     """Response of facets at `points` [3, ...] with unit `normals` [3, ...] or [3] towards the antennas."""
@@ -121,10 +130,12 @@ def respond(tx: Antenna, rx: Antenna, points: NDArray, normals: NDArray) -> Resp
 
     s_axis = _cross(incident, normals)
     length = np.sqrt(_dot(s_axis, s_axis))
-    # At normal incidence any axis across will do.
-    fallback = _cross(incident, np.array([0.6, 0.8, 0.0]))
-    s_axis = np.where(length > 1e-9, s_axis, fallback)
-    s_axis = s_axis / np.sqrt(_dot(s_axis, s_axis))
+    is_normal = length <= 1e-9
+    if is_normal.any():
+        # At normal incidence any axis across will do.
+        s_axis = np.where(is_normal, _cross(incident, np.array([0.6, 0.8, 0.0])), s_axis)
+        length = np.sqrt(_dot(s_axis, s_axis))
+    s_axis = s_axis / length
     reflected = incident + 2 * cos_incidence * normals
     p_axis_in = _cross(s_axis, incident)
     p_axis_out = _cross(reflected, s_axis)
@@ -153,9 +164,23 @@ def respond(tx: Antenna, rx: Antenna, points: NDArray, normals: NDArray) -> Resp
 
 def integrate_phase(response: Response, edge_u: NDArray, edge_v: NDArray, frequency_hz: float) -> NDArray:
     """Integral of the linear phase over a parallelogram with the given edges [3, ...], relative to its area."""
-    per_metre = frequency_hz / LIGHT_M_PER_S
-    over_u = np.sinc(per_metre * _dot(response.gradient, edge_u))
-    return over_u * np.sinc(per_metre * _dot(response.gradient, edge_v))
+    return integrate_steps(response.path_steps(edge_u, edge_v), frequency_hz)
+
+
+def integrate_steps(steps_m: tuple[NDArray, NDArray], frequency_hz: float) -> NDArray:
+    """The same, from the path's change along both edges, see `Response.path_steps`."""
+    over_u, over_v = (np.sinc(frequency_hz / LIGHT_M_PER_S * step_m) for step_m in steps_m)
+    return over_u * over_v
+
+
+def turn_back(path_m: NDArray, frequency_hz: float) -> NDArray:
+    """exp(-j k path), complex64: less than a turn is left, which single precision holds to 4e-7 rad."""
+    turns = frequency_hz / LIGHT_M_PER_S * path_m
+    angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+    phasors = np.empty(angle.shape, np.complex64)
+    np.cos(angle, out=phasors.real)
+    np.sin(-angle, out=phasors.imag)
+    return phasors
 
 
 def receive_direct(tx: Antenna, rx: Antenna, frequencies_hz: NDArray) -> NDArray:

@@ -25,6 +25,8 @@ from polysight_worlds.optics import Antenna
 # A wave absorbed by exp(-2 ABSORBED) on its way through comes back as rounding: then both kinds of inner waves are the
 # same, and only the one that is found downwards is stable.
 ABSORBED = 10.0
+# Azimuthal orders whose terms are computed together.
+ORDERS_AT_ONCE = 32
 # Terms beyond the size parameter x: Wiscombe's criterion for double precision, 4.05 x^(1/3) + 2, and some more.
 MORE_TERMS = 12
 # Places of the integrand over the axial wave number, in units of sqrt(1 / second derivative of the phase), and how much
@@ -221,8 +223,7 @@ class EndlessCylinder:
         a = self.radius_m
         n = orders[:, None]
         x = eta * a
-        j_below = special.jv(n - 1, x)
-        j = np.concatenate([j_below[1:], special.jv(n[-1:], x)])
+        j_below, j = _bessel(len(orders), x)
         h1_below, h1 = _hankel(len(orders), x)
         j_rate, h1_rate = (eta * (below - n / x * value) for below, value in ((j_below, j), (h1_below, h1)))
         # Orders that miss the body give nothing, with Hankel functions beyond all numbers.
@@ -262,6 +263,37 @@ class EndlessCylinder:
             rate = (n - 1) / y - 1 / (rate + n / y)
         rates[0] = rate
         return rates
+
+
+def _bessel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
+    """J_{n-1}(x) and J_n(x) for n = 0 .. count - 1, each [count, x], by Miller's recurrence.
+
+    It is stable downwards; the scale is that of J_0 + 2 (u J_1 + u^2 J_2 + ..) = exp(u x), u = +-j, whichever is large.
+    """
+    most = max(count, float(np.abs(x).max()))
+    top = int(most + 4.05 * most ** (1 / 3)) + 30
+    values = np.zeros((count, *x.shape), x.dtype)
+    above = np.zeros_like(x)
+    value = np.full_like(x, 1e-200)
+    unit = np.where(np.imag(x) > 0, -1j, 1j)
+    turns = (np.ones_like(unit), unit, -np.ones_like(unit), -unit)
+    total = np.zeros_like(unit)
+    for n in range(top, -1, -1):
+        if n < count:
+            values[n] = value
+        total += (2 if n else 1) * turns[n % 4] * value
+        above, value = value, 2 * n / x * value - above
+        if n % 8 == 0:
+            # Far below the order they grow without end.
+            grown = np.abs(above) > 1e100
+            if grown.any():
+                shrink = np.where(grown, 1e-200, 1.0)
+                above, value, total = above * shrink, value * shrink, total * shrink
+                values[n:] *= shrink
+    scale = np.exp(unit * x) / total
+    values = values * (scale if np.iscomplexobj(x) else scale.real)
+    # J_{-1} = -J_1
+    return np.concatenate([-values[1:2], values[:-1]]), values
 
 
 def _hankel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
@@ -349,23 +381,27 @@ def sum_orders(
 ) -> NDArray:
     """Integrand at axial wave numbers h [n] over exp(i h x + i sqrt(k^2 - h^2) path_m): sum over azimuthal orders."""
     eta = np.sqrt(k**2 - h**2)
-    m_m, n_n, m_n = coefficients
+    m_m = coefficients[0]
     ends = [_AzimuthalWaves(*end, eta, h, k) for end in _ends(pair)]
     turn = np.exp(1j * (ends[0].angle - ends[1].angle))
     # Both ends' waves are scaled by exp(-i eta rho).
     scale = np.exp(1j * eta * (ends[0].rho + ends[1].rho - path_m)) / eta**2
     total = np.zeros(h.shape, complex)
     power = np.ones_like(turn)
-    for n in range(m_m.shape[1]):
-        (z, rate), (z_tx, rate_tx) = (end.step(n) for end in ends)
-        for order, phase in ((n, power), (-n, 1 / power)) if n else ((0, power),):
-            # Coefficients that couple M and N change sign with the order, the others do not.
-            coupling = m_n[:, n] * (1 if order >= 0 else -1)
-            q_m, q_n = ends[0].products(order, z, rate)
-            p_m, p_n = ends[1].products(order, z_tx, rate_tx)
-            wave = q_m * (m_m[:, n] * p_m + coupling * p_n) + q_n * (n_n[:, n] * p_n + coupling * p_m)
-            total += wave * phase
-        power = power * turn
+    for first in range(0, m_m.shape[1], ORDERS_AT_ONCE):
+        orders = np.arange(first, min(first + ORDERS_AT_ONCE, m_m.shape[1]))
+        (q_m, q_m_back), (q_n, q_n_back) = ends[0].products(orders)
+        (p_m, p_m_back), (p_n, p_n_back) = ends[1].products(orders)
+        m, n, coupling = (table[:, orders].T for table in coefficients)
+        # Coefficients that couple M and N change sign with the order, the others do not.
+        wave = q_m * (m * p_m + coupling * p_n) + q_n * (n * p_n + coupling * p_m)
+        wave_back = q_m_back * (m * p_m_back - coupling * p_n_back) + q_n_back * (n * p_n_back - coupling * p_m_back)
+        wave_back[orders == 0] = 0
+        factors = np.repeat(turn[None], len(orders), axis=0)
+        factors[0] = power
+        powers = np.cumprod(factors, axis=0)
+        total += np.sum(wave * powers + wave_back * powers.conj(), axis=0)
+        power = powers[-1] * turn
     return total * scale
 
 
@@ -405,10 +441,16 @@ class _AzimuthalWaves:
             self._now = following
         return self._now, self._last - n / self._argument * self._now
 
-    def products(self, n: int, z: NDArray, rate: NDArray) -> tuple[NDArray, NDArray]:
-        """Dipole times M and N of order n."""
-        slope = self._eta * rate
-        around = n / self.rho * z
-        m = 1j * self._sign * around * self._radial - slope * self._azimuthal
-        n_wave = 1j * self._sign * self._h * slope * self._radial - self._h * around * self._azimuthal
-        return m, (n_wave + self._eta**2 * z * self._axial) / self._k
+    def products(self, orders: NDArray) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
+        """Dipole times M and times N of these orders and of their negatives, [orders, n] each; asked for in turn."""
+        steps = [self.step(n) for n in orders.tolist()]
+        z = np.array([value for value, _ in steps])
+        slope = np.array([rate for _, rate in steps]) * self._eta
+        around = orders[:, None] * z / self.rho
+        m_odd = around * (1j * self._sign * self._radial)
+        m_even = slope * self._azimuthal
+        n_odd = around * (self._h / self._k * self._azimuthal)
+        n_even = slope * (1j * self._sign * self._h / self._k * self._radial) + z * (
+            self._eta**2 / self._k * self._axial
+        )
+        return (m_odd - m_even, -m_odd - m_even), (n_even - n_odd, n_even + n_odd)

@@ -17,11 +17,19 @@ from scipy import ndimage
 
 from polysight_worlds.bends import find_bend_terms
 from polysight_worlds.media import LIGHT_M_PER_S
-from polysight_worlds.optics import CHUNK, Antenna, integrate_phase, rectangle, respond
+from polysight_worlds.optics import CHUNK, Antenna, integrate_steps, rectangle, respond, turn_back
 from polysight_worlds.rig import Boards
 from polysight_worlds.series import Pair, scatter_cylinder, scatter_sphere
 from polysight_worlds.shapes import Revolved, Shape, Sphere, find_specular, follow_path
-from polysight_worlds.zones import CosineTable, place_antennas, spread_of_ray, sum_window, window, window_units
+from polysight_worlds.zones import (
+    CosineTable,
+    place_antennas,
+    reflect_facets,
+    spread_of_ray,
+    sum_window,
+    window,
+    window_units,
+)
 
 # What edges diffract turns by a wave in 13 mm of the stage's way, relative to the specular path. The series has none.
 LATTICE_M = 0.005
@@ -266,10 +274,10 @@ def _sum_facets(
         points = facets.centres[:, None] - offsets[chunk].T[:, :, None]
         response = respond(tx, rx, points, normal)
         rest_m = response.path_m - middle_path_m[chunk, None]
-        for i, frequency_hz in enumerate(nodes_hz):
+        steps_m = response.path_steps(facets.edge_u[:, :1, None], facets.edge_v[:, :1, None])
+        reflected = reflect_facets(tables, response)
+        for i, (frequency_hz, reflections) in enumerate(zip(nodes_hz, reflected, strict=True)):
             k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
-            r_s, r_p = tables[i].look_up(response.cos_incidence)
-            spread = integrate_phase(response, facets.edge_u[:, :1, None], facets.edge_v[:, :1, None], frequency_hz)
-            terms = (r_s * response.s_weight + r_p * response.p_weight) * spread
-            slow[i, chunk] = 1j * k / (4 * np.pi) * area_m2 * (terms * np.exp(-1j * k * rest_m)).sum(axis=1)
+            terms = reflections * integrate_steps(steps_m, frequency_hz) * turn_back(rest_m, frequency_hz)
+            slow[i, chunk] = 1j * k / (4 * np.pi) * area_m2 * terms.sum(axis=1)
     return _add_carrier(slow, middle_path_m - direct_m, frequencies_hz, expand)

@@ -7,13 +7,14 @@ boundaries, which physical optics has wrong.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polysight_worlds.media import LIGHT_M_PER_S, Stack, reflect
-from polysight_worlds.optics import CHUNK, Antenna, Response, respond
+from polysight_worlds.optics import CHUNK, Antenna, Response, respond, turn_back
 from polysight_worlds.shapes import Patch, PathAt, Shape, follow_path
 
 # Window exp(-x) (1 + x + .. + x^4 / 24), x = (distance / WIDTH)^2 / 2, in units of the Fresnel zone, sqrt(1 / (k second
@@ -97,11 +98,11 @@ def sum_window(
         response = respond(tx, rx, moved, patch.normal)
         area = patch.area * zone_area[:, None] * weights * shape.cover(a, b) * _fade_shadow(patch.normal, response)
         rest_m = response.path_m - path.length_m[:, None]
-        for i, frequency_hz in enumerate(frequencies_hz):
+        reflected = reflect_facets(tables, response)
+        for i, (frequency_hz, reflections) in enumerate(zip(frequencies_hz, reflected, strict=True)):
             k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
-            r_s, r_p = tables[i].look_up(response.cos_incidence)
-            terms = (r_s * response.s_weight + r_p * response.p_weight) * area
-            sums[i, chunk] = 1j * k / (4 * np.pi) * (terms * np.exp(-1j * k * rest_m)).sum(axis=1)
+            terms = reflections * area * turn_back(rest_m, frequency_hz)
+            sums[i, chunk] = 1j * k / (4 * np.pi) * terms.sum(axis=1)
     return sums
 
 
@@ -119,20 +120,37 @@ class CosineTable:
     """Reflection coefficients of a medium over the cosine of incidence, linear between 513 places."""
 
     @staticmethod
-    @lru_cache(maxsize=256)
     def get_cached(stack: Stack, frequency_hz: float) -> CosineTable:
-        """Return the table of a medium, made once."""
-        return CosineTable(stack, frequency_hz)
+        """Return the table of a medium, made once; without layers it is the same at all frequencies."""
+        return _make_table(stack, frequency_hz if stack.layers else 0.0)
 
     def __init__(self, stack: Stack, frequency_hz: float) -> None:
         cosines = np.linspace(0, 1, 513)
         cosines[0] = 1e-6
-        self._tables = [np.ascontiguousarray(table) for table in reflect(stack, frequency_hz, cosines)]
+        tables = reflect(stack, frequency_hz, cosines)
+        self._tables = [(np.ascontiguousarray(table), np.diff(table, append=table[-1:])) for table in tables]
 
     def look_up(self, cos_incidence: NDArray) -> tuple[NDArray, NDArray]:
         """(r_s, r_p) as complex128."""
         place = np.clip(cos_incidence, 0, 1) * 512
         left_index = np.minimum(place.astype(np.int32), 511)
         share = place - left_index
-        s, p = (table[left_index] + share * (table[left_index + 1] - table[left_index]) for table in self._tables)
+        s, p = (values.take(left_index) + share * steps.take(left_index) for values, steps in self._tables)
         return s, p
+
+
+def reflect_facets(tables: Sequence[CosineTable], response: Response) -> Iterator[NDArray]:
+    """Yield r_s s_weight + r_p p_weight by each table; once computed for tables that are the same."""
+    last = None
+    terms = np.zeros(0)
+    for table in tables:
+        if table is not last:
+            r_s, r_p = table.look_up(response.cos_incidence)
+            terms = r_s * response.s_weight + r_p * response.p_weight
+            last = table
+        yield terms
+
+
+@lru_cache(maxsize=256)
+def _make_table(stack: Stack, frequency_hz: float) -> CosineTable:
+    return CosineTable(stack, frequency_hz)

@@ -465,8 +465,8 @@ def test_a_view_that_is_read_only_has_no_buttons_that_ask(browser, scans):
 def test_advice_for_a_terminal_is_in_the_words_of_the_page(page):
     """No text on materials that pages show names an option, which no page has."""
     texts = []
-    for name in ("results/verdict.py", "materials/analyse.py", "materials/labels.py", "materials/sub_bands.py",
-                 "materials/training_advice.py"):  # fmt: skip
+    for name in ("results/verdict.py", "results/rules.py", "materials/analyse.py", "materials/labels.py",
+                 "materials/sub_bands.py", "materials/training_advice.py"):  # fmt: skip
         source = (Path(polysight.__file__).parent / name).read_text(encoding="utf-8")
         texts += re.findall(r'"([^"\n]*--[a-z][^"\n]*)"', re.sub(r"\{[^}]*\}", "5", source))
     assert len(texts) > 9

@@ -6,36 +6,15 @@ import re
 
 import pytest
 
+from polysight.results import rules
 from polysight.results.verdict import (
     Coverage,
     NoResult,
     Verdict,
-    apart_reasons,
-    background_reasons,
-    brightness_reasons,
-    dark_reference_reasons,
-    direct_path_reasons,
-    disturbance_reasons,
-    disturbed_reasons,
-    drift_reasons,
-    fit_reasons,
-    fringe_reasons,
-    halo_reasons,
-    incidence_reasons,
     join_reasons,
-    leakage_reasons,
-    level_reasons,
-    metal_reasons,
-    moved_reasons,
-    passivity_reasons,
     percent,
-    plane_reasons,
     read_verdict,
     reason,
-    reconstruction_reasons,
-    recording_reasons,
-    signal_reasons,
-    tilt_reasons,
 )
 from polysight_shared.findings import Finding
 
@@ -108,50 +87,50 @@ def level(reasons):
     ],
 )
 def test_metal_is_never_judged_by_itself(likely, certain, given, contradicted, only_patch, want):
-    assert level(metal_reasons("patch 3", likely, certain, given, contradicted, only_patch)) == want
+    assert level(rules.judge_metal("patch 3", likely, certain, given, contradicted, only_patch)) == want
 
 
 def test_evidence_without_a_limit_has_its_level():
-    assert level(signal_reasons({}, 0)) == "none"
-    assert level(signal_reasons({1: "noise"}, 1)) == "none"
-    assert level(signal_reasons({1: "noise"}, 2)) == "care"
-    assert level(leakage_reasons(True, False, 0.5)) == "good"
-    assert level(plane_reasons(False, 0.0, (0.0, 0.0), 0.3)) == "care"
-    assert level(recording_reasons(Coverage(27, 27, 2700, 2700, ("line 6: damaged",)), 0.0)) == "care"
+    assert level(rules.judge_patches({}, 0)) == "none"
+    assert level(rules.judge_patches({1: "noise"}, 1)) == "none"
+    assert level(rules.judge_patches({1: "noise"}, 2)) == "care"
+    assert level(rules.judge_leakage(True, False, 0.5)) == "good"
+    assert level(rules.judge_plane(False, 0.0, (0.0, 0.0), 0.3)) == "care"
+    assert level(rules.judge_recording(Coverage(27, 27, 2700, 2700, ("line 6: damaged",)), 0.0)) == "care"
 
 
 def test_what_is_not_known_is_not_held_against_a_result():
-    assert level(direct_path_reasons("RH", None, None, 1.0)) == "good"
-    assert level(level_reasons({"H": None})) == "good"
+    assert level(rules.judge_direct_path("RH", None, None, 1.0)) == "good"
+    assert level(rules.judge_levels({"H": None})) == "good"
 
 
 def test_every_reason_says_what_why_and_what_to_do():
     reasons = [
-        *recording_reasons(Coverage(9, 5, 900, 400, ("x",)), 0.3),
-        *direct_path_reasons("RH", -20.0, None, 1.0),
-        *direct_path_reasons("RH", -6.0, 0.3, 1.0),
-        *signal_reasons({1: "noise"}, 2),
-        *signal_reasons({}, 0),
-        *metal_reasons("patch 1", False, False, False, True, False),
-        *metal_reasons("patch 1", False, False, True, True, False),
-        *metal_reasons("patch 1", True, False, False, False, False),
-        *leakage_reasons(False, True, 0.1),
-        *plane_reasons(False, 0.0, (0.0, 0.0), 0.3),
-        *plane_reasons(True, 14.0, (0.0, 0.0), 0.3),
-        *plane_reasons(True, 9.0, (0.9, 0.0), 0.3),
-        *level_reasons({"H": 9.0, "V": 0.1}),
-        *incidence_reasons(57.0, 54.9),
-        *tilt_reasons({1: 1.0, 4: -2.0}),
-        *brightness_reasons({1: 0.4, 4: -0.4}),
-        *apart_reasons((3.0, -1.0)),
-        *drift_reasons(0.1, 0.05),
-        *halo_reasons(0.02),
-        *background_reasons(0.1),
-        *fit_reasons((0.1, 0.05), 0.0),
-        *fit_reasons((0.1, 0.05), 0.1),
-        *fringe_reasons(0.9),
-        *disturbed_reasons({2: 0.2}),
-        *moved_reasons(1.0),
+        *rules.judge_recording(Coverage(9, 5, 900, 400, ("x",)), 0.3),
+        *rules.judge_direct_path("RH", -20.0, None, 1.0),
+        *rules.judge_direct_path("RH", -6.0, 0.3, 1.0),
+        *rules.judge_patches({1: "noise"}, 2),
+        *rules.judge_patches({}, 0),
+        *rules.judge_metal("patch 1", False, False, False, True, False),
+        *rules.judge_metal("patch 1", False, False, True, True, False),
+        *rules.judge_metal("patch 1", True, False, False, False, False),
+        *rules.judge_leakage(False, True, 0.1),
+        *rules.judge_plane(False, 0.0, (0.0, 0.0), 0.3),
+        *rules.judge_plane(True, 14.0, (0.0, 0.0), 0.3),
+        *rules.judge_plane(True, 9.0, (0.9, 0.0), 0.3),
+        *rules.judge_levels({"H": 9.0, "V": 0.1}),
+        *rules.judge_incidence(57.0, 54.9),
+        *rules.judge_tilts({1: 1.0, 4: -2.0}),
+        *rules.judge_brightness({1: 0.4, 4: -0.4}),
+        *rules.judge_image_shift((3.0, -1.0)),
+        *rules.judge_drift(0.1, 0.05),
+        *rules.judge_halo(0.02),
+        *rules.judge_background(0.1),
+        *rules.judge_flatness((0.1, 0.05), 0.0),
+        *rules.judge_flatness((0.1, 0.05), 0.1),
+        *rules.judge_fringes(0.9),
+        *rules.judge_disturbed_plates({2: 0.2}),
+        *rules.judge_moved_boards(1.0),
     ]
     assert len(reasons) >= 24
     for r in reasons:
@@ -160,15 +139,15 @@ def test_every_reason_says_what_why_and_what_to_do():
 
 
 def rows(recorded, masked=0.0):
-    return recording_reasons(Coverage(1000, recorded, 1000, recorded), masked)
+    return rules.judge_recording(Coverage(1000, recorded, 1000, recorded), masked)
 
 
 def path(snr_db=5.5, phase_rad=0.004, share=1.0):
-    return direct_path_reasons("RH", snr_db, phase_rad, share)
+    return rules.judge_direct_path("RH", snr_db, phase_rad, share)
 
 
 def plane(offset_mm=0.0, tilt_deg=(0.0, 0.0)):
-    return plane_reasons(True, offset_mm, tilt_deg, 0.1)
+    return rules.judge_plane(True, offset_mm, tilt_deg, 0.1)
 
 
 @pytest.mark.parametrize(
@@ -180,35 +159,35 @@ def plane(offset_mm=0.0, tilt_deg=(0.0, 0.0)):
         (lambda masked: rows(1000, masked), 0.5, 0.501, ("care", "none")),
         (path, 0.0, -0.01, ("good", "care")),
         (path, -14.0, -14.01, ("care", "none")),
-        (lambda clipped: disturbance_reasons("RH", clipped, 0.0, 0.0), 0.05, 0.051, ("good", "care")),
-        (lambda disturbed: disturbance_reasons("RH", 0.0, disturbed, 0.0), 0.05, 0.051, ("good", "care")),
-        (lambda positions: disturbance_reasons("RH", 0.01, 0.0, positions), 0.005, 0.0051, ("good", "care")),
-        (lambda db: dark_reference_reasons("the given box", 4, db), 5.9, 6.1, ("good", "care")),
+        (lambda clipped: rules.judge_left_out_chirps("RH", clipped, 0.0, 0.0), 0.05, 0.051, ("good", "care")),
+        (lambda disturbed: rules.judge_left_out_chirps("RH", 0.0, disturbed, 0.0), 0.05, 0.051, ("good", "care")),
+        (lambda positions: rules.judge_left_out_chirps("RH", 0.01, 0.0, positions), 0.005, 0.0051, ("good", "care")),
+        (lambda db: rules.judge_dark_reference("the given box", 4, db), 5.9, 6.1, ("good", "care")),
         (lambda phase: path(phase_rad=phase), 0.05, 0.0501, ("good", "care")),
         (lambda share: path(share=share), 0.5, 0.499, ("good", "none")),
-        (lambda level: level_reasons({"H": level}), 0.4, 0.399, ("good", "care")),
-        (lambda level: level_reasons({"H": level}), 3.0, 3.01, ("good", "care")),
+        (lambda level: rules.judge_levels({"H": level}), 0.4, 0.399, ("good", "care")),
+        (lambda level: rules.judge_levels({"H": level}), 3.0, 3.01, ("good", "care")),
         (plane, 3.0, 3.01, ("good", "care")),
         (plane, -3.0, -3.01, ("good", "care")),
         (plane, 13.0, 13.01, ("care", "none")),
         (plane, -13.0, -13.01, ("care", "none")),
         (lambda tilt: plane(0.0, (0.0, tilt)), 0.5, 0.501, ("good", "care")),
         (lambda tilt: plane(0.0, (tilt, 0.0)), -0.5, -0.501, ("good", "care")),
-        (lambda across: tilt_reasons({1: across}), 0.5, 0.501, ("good", "care")),
-        (lambda ln: brightness_reasons({1: ln}), 0.2, 0.201, ("good", "care")),
-        (lambda ln: brightness_reasons({1: ln}), -0.2, -0.201, ("good", "care")),
-        (lambda mm: apart_reasons((0.0, mm)), 1.0, 1.01, ("good", "care")),
-        (lambda drift: drift_reasons(0.0, drift), 0.035, 0.0351, ("good", "care")),
-        (fringe_reasons, 0.5, 0.501, ("good", "care")),
-        (lambda error: disturbed_reasons({1: error}), 0.05, 0.051, ("good", "care")),
-        (moved_reasons, 0.5, 0.501, ("good", "care")),
-        (halo_reasons, 0.005, 0.0051, ("good", "care")),
-        (background_reasons, 0.04, 0.0401, ("good", "care")),
-        (lambda ripple: fit_reasons((ripple, 0.0), 0.0), 0.03, 0.0301, ("good", "care")),
-        (lambda relief: fit_reasons((0.0, 0.0), relief), 0.035, 0.0351, ("good", "care")),
-        (lambda error: leakage_reasons(False, False, error), 0.0199, 0.02, ("good", "care")),
-        (lambda angle: incidence_reasons(angle, 55.0), 55.299, 55.301, ("good", "care")),
-        (lambda angle: incidence_reasons(angle, 55.0), 54.701, 54.699, ("good", "care")),
+        (lambda across: rules.judge_tilts({1: across}), 0.5, 0.501, ("good", "care")),
+        (lambda ln: rules.judge_brightness({1: ln}), 0.2, 0.201, ("good", "care")),
+        (lambda ln: rules.judge_brightness({1: ln}), -0.2, -0.201, ("good", "care")),
+        (lambda mm: rules.judge_image_shift((0.0, mm)), 1.0, 1.01, ("good", "care")),
+        (lambda drift: rules.judge_drift(0.0, drift), 0.035, 0.0351, ("good", "care")),
+        (rules.judge_fringes, 0.5, 0.501, ("good", "care")),
+        (lambda error: rules.judge_disturbed_plates({1: error}), 0.05, 0.051, ("good", "care")),
+        (rules.judge_moved_boards, 0.5, 0.501, ("good", "care")),
+        (rules.judge_halo, 0.005, 0.0051, ("good", "care")),
+        (rules.judge_background, 0.04, 0.0401, ("good", "care")),
+        (lambda ripple: rules.judge_flatness((ripple, 0.0), 0.0), 0.03, 0.0301, ("good", "care")),
+        (lambda relief: rules.judge_flatness((0.0, 0.0), relief), 0.035, 0.0351, ("good", "care")),
+        (lambda error: rules.judge_leakage(False, False, error), 0.0199, 0.02, ("good", "care")),
+        (lambda angle: rules.judge_incidence(angle, 55.0), 55.299, 55.301, ("good", "care")),
+        (lambda angle: rules.judge_incidence(angle, 55.0), 54.701, 54.699, ("good", "care")),
     ],
 )
 def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels):
@@ -218,19 +197,27 @@ def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels)
 @pytest.mark.parametrize(
     ("reasons", "said", "never"),
     [
-        (brightness_reasons({1: 0.4}), ("patch 1 is 49 % brighter",), "darker"),
-        (brightness_reasons({1: -0.4}), ("patch 1 is 33 % darker",), "brighter"),
-        (level_reasons({"H": 10.0}), ("H: the direct path is weak", "+20 dB", "weakens the direct path"), "weaker"),
-        (level_reasons({"V": 0.1}), ("V: the direct path is strong", "-20 dB", "weaker than the"), "weakens"),
+        (rules.judge_brightness({1: 0.4}), ("patch 1 is 49 % brighter",), "darker"),
+        (rules.judge_brightness({1: -0.4}), ("patch 1 is 33 % darker",), "brighter"),
+        (
+            rules.judge_levels({"H": 10.0}),
+            ("H: the direct path is weak", "+20 dB", "weakens the direct path"),
+            "weaker",
+        ),
+        (rules.judge_levels({"V": 0.1}), ("V: the direct path is strong", "-20 dB", "weaker than the"), "weakens"),
         (plane(20.0), ("+20 mm",), "-20"),
         (plane(-20.0), ("-20 mm",), "+20"),
         (plane(-4.0), ("-4.0 mm",), "+4"),
         (plane(0.0, (-0.9, 0.2)), ("0.9 degrees",), "0.2"),
-        (tilt_reasons({1: 0.6, 4: -2.0}), ("patch 4", "-2.0 degrees", "(2 patches in all)"), "patch 1"),
-        (tilt_reasons({1: 0.6, 4: 0.1}), ("patch 1", "+0.6 degrees"), "in all"),
-        (signal_reasons({1: "noise", 3: "noise"}, 3), ("patches 1, 3 not judged: noise",), "patch 1"),
-        (passivity_reasons({3: GAINS, 5: GAINS}), ("patches 3, 5 have no permittivity: a gain; leakage",), "patch "),
-        (disturbed_reasons({3: 0.2, 1: 0.1, 2: 0.01}), ("within patches 1, 3,", "up to 20 %"), "2,"),
+        (rules.judge_tilts({1: 0.6, 4: -2.0}), ("patch 4", "-2.0 degrees", "(2 patches in all)"), "patch 1"),
+        (rules.judge_tilts({1: 0.6, 4: 0.1}), ("patch 1", "+0.6 degrees"), "in all"),
+        (rules.judge_patches({1: "noise", 3: "noise"}, 3), ("patches 1, 3 not judged: noise",), "patch 1"),
+        (
+            rules.judge_passivity({3: GAINS, 5: GAINS}),
+            ("patches 3, 5 have no permittivity: a gain; leakage",),
+            "patch ",
+        ),
+        (rules.judge_disturbed_plates({3: 0.2, 1: 0.1, 2: 0.01}), ("within patches 1, 3,", "up to 20 %"), "2,"),
         (rows(1000, 0.25), ("25.0 % of the recorded",), "absent"),
         (path(-3.0), ("RH: the direct path is weak, -3 dB",), "missing"),
         (path(share=0.25), ("missing (25 % of the positions",), "weak"),
@@ -246,24 +233,27 @@ def test_a_reason_shows_the_figure_with_its_sign_and_the_patches_concerned(reaso
 def test_reasons_come_from_the_recording_to_the_names():
     """The cause of the others first: without a direct path all is meaningless, without metal every permittivity."""
     assert order(
-        path(-20.0), signal_reasons({}, 0), metal_reasons("metal", False, False, False, True, False), plane(20.0)
+        path(-20.0),
+        rules.judge_patches({}, 0),
+        rules.judge_metal("metal", False, False, False, True, False),
+        plane(20.0),
     ) == ["direct path is missing", "no patch", "no metal", "off the rig"]
     reasons = (
-        recording_reasons(Coverage(10, 10, 10, 10, ("a damaged line",))),
+        rules.judge_recording(Coverage(10, 10, 10, 10, ("a damaged line",))),
         rows(900),
         rows(1000, 0.2),
-        level_reasons({"H": 9.0}),
+        rules.judge_levels({"H": 9.0}),
         path(-3.0),
-        metal_reasons("metal", True, False, False, False, False),
+        rules.judge_metal("metal", True, False, False, False, False),
         path(phase_rad=0.1),
-        passivity_reasons({1: GAINS}),
-        signal_reasons({1: "noise"}, 2),
-        incidence_reasons(57.0, 55.0),
-        brightness_reasons({1: 0.4}),
+        rules.judge_passivity({1: GAINS}),
+        rules.judge_patches({1: "noise"}, 2),
+        rules.judge_incidence(57.0, 55.0),
+        rules.judge_brightness({1: 0.4}),
         plane(4.0),
-        leakage_reasons(False, False, 0.1),
+        rules.judge_leakage(False, False, 0.1),
         plane(0.0, (1.0, 0.0)),
-        tilt_reasons({1: 1.0}),
+        rules.judge_tilts({1: 1.0}),
     )
     assert order(*reasons) == [
         "a damaged",
@@ -305,22 +295,22 @@ def test_no_verdict_shows_a_number_that_is_none(x):
     """Each rule with a figure that is not finite: what is not known is said so, or not judged."""
     number = 0.0 if x is None else x
     reasons = [
-        *direct_path_reasons("RH", x, x, 1.0),
-        *direct_path_reasons("RH", x, 0.2, 1.0),
-        *level_reasons({"H": x, "V": 30.0}),
-        *leakage_reasons(False, False, number),
-        *plane_reasons(True, number, (0.0, 0.0), 0.1),
-        *plane_reasons(True, 1.0, (number, 0.0), 0.1),
-        *plane_reasons(True, 1.0, (0.0, number), 0.1),
-        *plane_reasons(False, 1.0, (0.0, 0.0), number),
-        *tilt_reasons({1: number, 2: 3.0}),
-        *brightness_reasons({1: number, 2: 0.4}),
-        *fringe_reasons(number),
-        *disturbed_reasons({1: number, 2: 0.3}),
-        *moved_reasons(number),
-        *incidence_reasons(number, 55.0),
-        *incidence_reasons(55.0, x),
-        *reconstruction_reasons([("RH", 0.3, x)]),
+        *rules.judge_direct_path("RH", x, x, 1.0),
+        *rules.judge_direct_path("RH", x, 0.2, 1.0),
+        *rules.judge_levels({"H": x, "V": 30.0}),
+        *rules.judge_leakage(False, False, number),
+        *rules.judge_plane(True, number, (0.0, 0.0), 0.1),
+        *rules.judge_plane(True, 1.0, (number, 0.0), 0.1),
+        *rules.judge_plane(True, 1.0, (0.0, number), 0.1),
+        *rules.judge_plane(False, 1.0, (0.0, 0.0), number),
+        *rules.judge_tilts({1: number, 2: 3.0}),
+        *rules.judge_brightness({1: number, 2: 0.4}),
+        *rules.judge_fringes(number),
+        *rules.judge_disturbed_plates({1: number, 2: 0.3}),
+        *rules.judge_moved_boards(number),
+        *rules.judge_incidence(number, 55.0),
+        *rules.judge_incidence(55.0, x),
+        *rules.judge_reconstruction([("RH", 0.3, x)]),
     ]
     assert len(reasons) > 4
     text = " ".join(join_reasons(reasons).lines())

@@ -37,32 +37,10 @@ from polysight.results import (
     Residual,
     ScanQuality,
     Verdict,
-    apart_reasons,
-    background_reasons,
-    brightness_reasons,
     check_plate,
     check_reasons,
-    copies_reasons,
-    dark_reference_reasons,
-    direct_path_reasons,
-    disturbance_reasons,
-    disturbed_reasons,
-    drift_reasons,
-    fit_reasons,
-    fringe_reasons,
-    halo_reasons,
-    incidence_reasons,
     join_reasons,
-    leakage_reasons,
-    level_reasons,
-    metal_reasons,
-    moved_reasons,
-    passivity_reasons,
-    plane_reasons,
-    reconstruction_reasons,
-    recording_reasons,
-    signal_reasons,
-    tilt_reasons,
+    rules,
 )
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import SyncedRow, block_frequencies_hz, estimate_backlash, object_filter, sample_frequencies_hz
@@ -383,11 +361,11 @@ def recording_verdict(quality: Quality) -> list[Finding]:
         received = _ratio(board.frames_received, board.frames_expected, default=0.0)
         # Positions without a whole frame have no direct path either; do not count that loss twice.
         share_of_received = _ratio(share_with_path, received, default=1.0)
-        missing += direct_path_reasons(name, board.direct_snr_db, board.residual("averaged"), share_of_received)
+        missing += rules.judge_direct_path(name, board.direct_snr_db, board.residual("averaged"), share_of_received)
         missing += _disturbances(name, list(board.figures.values()))
-    recorded = recording_reasons(coverage, _ratio(masked, positions, default=1.0))
+    recorded = rules.judge_recording(coverage, _ratio(masked, positions, default=1.0))
     filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]
-    return recorded + missing + reconstruction_reasons(filled)
+    return recorded + missing + rules.judge_reconstruction(filled)
 
 
 def _ratio(part: float, whole: float, default: float) -> float:
@@ -404,7 +382,7 @@ def _disturbances(name: str, rows: list[RowFigures]) -> list[Finding]:
     clipped = sum(r.chirps_clipped for r in rows)
     disturbed = sum(r.chirps_disturbed for r in rows)
     positions_clipped = sum(r.positions_clipped for r in rows)
-    return disturbance_reasons(
+    return rules.judge_left_out_chirps(
         name,
         clipped=clipped / max(1, chirps),
         disturbed=disturbed / max(1, chirps),
@@ -450,26 +428,26 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
         if r.refused is not None and r.refused.what in NOT_PASSIVE and r.permittivity.value is not None
     }
     no_plates = {k: v for k, v in refused.items() if k not in gaining}
-    reasons += signal_reasons(no_plates, len(result.patches), result.segmentation.left_out)
+    reasons += rules.judge_patches(no_plates, len(result.patches), result.segmentation.left_out)
     pixel_mm = abs(float(result.calibrated.x_m[1] - result.calibrated.x_m[0])) * 1e3
     copies = find_copies([r.patch for r in result.patches], result.calibrated.h, result.calibrated.v, pixel_mm)
     if copies is not None:
-        reasons += copies_reasons(copies.labels, copies.shift_mm, copies.level_db)
-    reasons += apart_reasons(result.apart_mm)
+        reasons += rules.judge_copies(copies.labels, copies.shift_mm, copies.level_db)
+    reasons += rules.judge_image_shift(result.apart_mm)
     if result.drift is not None:
-        reasons += drift_reasons(*result.drift.largest_drift())
-        reasons += fringe_reasons(result.drift.fringes)
-    reasons += halo_reasons(result.halo)
-    reasons += background_reasons(result.behind)
-    reasons += fit_reasons(result.ripple, result.relief_rad)
-    reasons += disturbed_reasons({k: error for k, error in result.disturbed.items() if k not in refused})
-    reasons += passivity_reasons(gaining)
+        reasons += rules.judge_drift(*result.drift.largest_drift())
+        reasons += rules.judge_fringes(result.drift.fringes)
+    reasons += rules.judge_halo(result.halo)
+    reasons += rules.judge_background(result.behind)
+    reasons += rules.judge_flatness(result.ripple, result.relief_rad)
+    reasons += rules.judge_disturbed_plates({k: error for k, error in result.disturbed.items() if k not in refused})
+    reasons += rules.judge_passivity(gaining)
     metal = result.metal
     if result.patches and metal.evidence is not None:
         evidence = metal.evidence
         patch = "the given box" if metal.label is None else f"patch {metal.label}"
         enough = evidence.enough and (metal.given or metal.label not in refused)
-        reasons += metal_reasons(
+        reasons += rules.judge_metal(
             patch,
             likely=enough,
             certain=enough and evidence.sure,
@@ -481,25 +459,25 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
             paint_mm=result.inversion.paint_mm,
         )
         if metal.given:
-            reasons += dark_reference_reasons(patch, *_brightest(result))
+            reasons += rules.judge_dark_reference(patch, *_brightest(result))
     light = result.calibrated.illumination
     if result.prior.channels_known and (light is None or light.known):
         gains = {"H": result.calibrated.metal_h, "V": result.calibrated.metal_v}
-        reasons += level_reasons({channel: _median_level(gain) for channel, gain in gains.items()})
-    reasons += moved_reasons(result.inversion.moved)
-    reasons += leakage_reasons(
+        reasons += rules.judge_levels({channel: _median_level(gain) for channel, gain in gains.items()})
+    reasons += rules.judge_moved_boards(result.inversion.moved)
+    reasons += rules.judge_leakage(
         result.prior.leakage_measured, result.inversion.leakage_determined, _leakage_error(result)
     )
     if plane is not None:
         std = float(np.degrees(result.prior.theta_std_rad))
         tilt = (float(np.degrees(plane.tilt_rad[0])), float(np.degrees(plane.tilt_rad[1])))
-        reasons += plane_reasons(plane.known, 1e3 * plane.offset_m, tilt, std)
+        reasons += rules.judge_plane(plane.known, 1e3 * plane.offset_m, tilt, std)
     judged = {r.patch.label for r in result.patches if r.refused is None}
-    reasons += tilt_reasons({k: float(np.degrees(result.tilts.across_rad(k))) for k in judged})
-    reasons += brightness_reasons({k: ln for k, ln in result.brightness_off.items() if k in judged})
+    reasons += rules.judge_tilts({k: float(np.degrees(result.tilts.across_rad(k))) for k in judged})
+    reasons += rules.judge_brightness({k: ln for k, ln in result.brightness_off.items() if k in judged})
     if classifier is not None and len(classifier.angles_deg) == 1:
         angle = float(np.degrees(np.mean(result.theta_rad)))
-        reasons += incidence_reasons(angle, float(classifier.angles_deg[0]))
+        reasons += rules.judge_incidence(angle, float(classifier.angles_deg[0]))
     return reasons
 
 

@@ -3,11 +3,11 @@
 `ScanMaterials`, `ScanQuality` and `ScanFacts` are the content of materials.json, quality.json and scan.json; their
 `read` takes files of any release. `PatchFigures` declares each figure of a patch once, with name, unit and title
 (`Column`); `declared_figures` lists them for tables, exports and datasets. With the verdict "no result" a
-`ScanMaterials` cannot hold names or permittivities. The functions `*_reasons` are the rules of the verdict,
-`join_reasons` joins them.
-`to_plain` converts all of it to JSON types.
+`ScanMaterials` cannot hold names or permittivities. `rules` holds the rules of the verdict, `join_reasons`
+joins what they find. `to_plain` converts all of it to JSON types.
 """
 
+from polysight.results import rules
 from polysight.results.check_plate import (
     ACTION_SIGMAS,
     WARNING_SIGMAS,
@@ -54,32 +54,9 @@ from polysight.results.verdict import (
     Coverage,
     NoResult,
     Verdict,
-    apart_reasons,
-    background_reasons,
-    brightness_reasons,
-    copies_reasons,
-    dark_reference_reasons,
-    direct_path_reasons,
-    disturbance_reasons,
-    disturbed_reasons,
-    drift_reasons,
-    fit_reasons,
-    fringe_reasons,
-    halo_reasons,
-    incidence_reasons,
     join_reasons,
-    leakage_reasons,
-    level_reasons,
-    metal_reasons,
-    moved_reasons,
-    passivity_reasons,
     percent,
-    plane_reasons,
     reason,
-    reconstruction_reasons,
-    recording_reasons,
-    signal_reasons,
-    tilt_reasons,
 )
 
 __all__ = [
@@ -118,38 +95,16 @@ __all__ = [
     "ScanQuality",
     "TruthFigures",
     "Verdict",
-    "apart_reasons",
-    "background_reasons",
-    "brightness_reasons",
     "check_plate",
     "check_reasons",
-    "copies_reasons",
     "damage_error",
-    "dark_reference_reasons",
     "declared_figures",
-    "direct_path_reasons",
-    "disturbance_reasons",
-    "disturbed_reasons",
-    "drift_reasons",
-    "fit_reasons",
-    "fringe_reasons",
-    "halo_reasons",
-    "incidence_reasons",
     "join_reasons",
     "json_text",
-    "leakage_reasons",
-    "level_reasons",
-    "metal_reasons",
-    "moved_reasons",
     "one_line",
-    "passivity_reasons",
     "percent",
-    "plane_reasons",
     "read_object",
     "reason",
-    "reconstruction_reasons",
-    "recording_reasons",
-    "signal_reasons",
-    "tilt_reasons",
+    "rules",
     "to_plain",
 ]

@@ -1,0 +1,514 @@
+"""The rules of the verdict: each function turns one kind of evidence into findings, none if the evidence is good.
+
+A finding says what was found, why it matters and what to do; `join_reasons` joins them to a verdict. All limits are
+constants of this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from polysight.results.verdict import Coverage, is_known, reason
+from polysight_shared.findings import Finding
+
+FEW_POSITIONS = 0.5
+"""Share of absent or masked positions above which there is no result."""
+SOME_POSITIONS = 0.005
+"""Share of masked positions above which the result needs care."""
+SOME_CHIRPS = 0.05
+"""Share of chirps left out as clipped or disturbed above which the result needs care."""
+RECONSTRUCTION_NONE = 0.15
+"""Expected error of an image with reconstructed positions, above which there is no result. True errors of points stay
+below twice the expected ones (tests/imaging/test_sparse.py); of nine simulated plates they were 0.1 to 1.2 times."""
+DIRECT_SNR_NONE_DB = -14.0
+"""Direct path over noise in one sample of one chirp and channel, below which it counts as missing."""
+DIRECT_SNR_CARE_DB = 0.0
+"""Same, below which it counts as weak. The simulated rig has 5.5 dB, as the paper's phase errors suggest."""
+DIRECT_LEVELS = (0.4, 3.0)
+"""Range of metal's brightness relative to the direct path; in published data both are equal within a factor of 1.5."""
+DIRECT_PHASE_CARE_RAD = 0.05
+"""Standard deviation of the object's phase from position to position; usually 0.004."""
+PLANE_FAR_MM = 3.0
+PLANE_TILT_DEG = 0.5
+"""Distance and tilt of the plates' plane against the rig file, above which the result needs care."""
+PLANE_GATE_MM = 13.0
+"""Distance at which the plates lie at the edge of the range gate."""
+APART_MM = 1.0
+"""Distance of the images of H and V above which boards are out of place; undisturbed scenes have up to 0.6 mm."""
+DRIFT_CARE = 0.035
+"""Drift of ln(V / H) between plates above which the result needs care, each part."""
+HALO_CARE = 0.005
+"""Halo of V around the metal above which a receiver is overdriven."""
+BACKGROUND_CARE = 0.04
+"""Error of P by what lies behind the plates: about 3 % of a permittivity."""
+RIPPLE_CARE = 0.03
+"""Scatter of V / H inside plates above which the result needs care; undisturbed scenes have up to 0.012."""
+DISTURBED_CARE = 0.05
+"""Error of V / H by slopes that a plate has of its own, above which it is named. Undisturbed plates stay below 0.025,
+seven of nine scenes with a second path have one above (scenes of the independent generator)."""
+FRINGES_CARE = 0.5
+"""Probability of fringes above which they are told: undisturbed scenes have less than 0.01."""
+MOVED_CARE = 0.5
+"""Probability that boards have turned above which it is told: undisturbed scenes have less than 0.02."""
+RELIEF_CARE_RAD = 0.035
+"""Scatter of the phase of H inside plates above which they are uneven; flat ones have up to 0.005, tilted ones 0.03."""
+PLATE_ACROSS_DEG = 0.5
+"""Tilt of a plate across the plane of incidence; turns the polarisation by 0.4 degrees: 3 to 6 % of a permittivity."""
+BRIGHTNESS_CARE = 0.2
+"""ln of |H| over that of a half space: rough, tilted, high plates stay within 0.13 (simulated), thin sheets to 0.5."""
+LEAKAGE_SHARE = 0.02
+"""Relative error of permittivities by leakage, above which the result needs care."""
+LIBRARY_ANGLE_DEG = 0.3
+"""Difference from the library's angle; the ratio of a material changes by 3 % in 0.3 degrees."""
+PAINT_TOLD = 0.2
+"""Probability of a painted metal reference from which on the verdict tells it."""
+MOST_OUTSHINING_DB = 6.0
+"""How much brighter than metal a plate may be: a factor of two by thickness, tilt and illumination (published
+pictures)."""
+
+
+def judge_recording(coverage: Coverage, masked_share: float = 0.0) -> list[Finding]:
+    """Judge rows, frames and manifest against the plan; `masked_share` of the recorded positions is masked."""
+    out = []
+    if coverage.rows_planned:
+        absent = 1 - coverage.rows_recorded / coverage.rows_planned
+    else:
+        absent = 1.0
+    if coverage.rows_recorded < coverage.rows_planned:
+        level = "none" if absent > FEW_POSITIONS else "care"
+        missing = coverage.rows_planned - coverage.rows_recorded
+        out.append(reason(
+            level, f"{missing} of {coverage.rows_planned} rows are absent ({100 * absent:.1f} % of the positions)",
+            "the scan was stopped, or rows were lost; plates there are missing or distorted",
+            "`polysight resume SCAN` records the missing rows", 5 + absent,
+        ))  # fmt: skip
+    out += [
+        reason("care", fault, "a recorded row is missing in the images", "run `polysight validate SCAN`", 6.0)
+        for fault in coverage.manifest
+    ]
+    if coverage.frames_planned:
+        frames = 1 - coverage.frames_received / coverage.frames_planned
+    else:
+        frames = 1.0
+    lost_share = max(masked_share, frames - absent)
+    if lost_share > SOME_POSITIONS:
+        out.append(reason(
+            "none" if lost_share > FEW_POSITIONS else "care",
+            f"{100 * lost_share:.1f} % of the recorded positions or frames are masked",
+            "packets were lost, or the direct path was not found there",
+            "look at each board's frames in the report; `polysight doctor` checks the network", 4 + lost_share,
+        ))  # fmt: skip
+    return out
+
+
+def judge_reconstruction(boards: Iterable[tuple[str, float, float | None]]) -> list[Finding]:
+    """Judge reconstructed positions by board: its name, their share, and the expected error of its image."""
+    out = []
+    for board, missing_share, image_error in boards:
+        if missing_share <= SOME_POSITIONS:
+            continue
+        if not is_known(image_error):
+            level = "none"
+            error = "too few rows were recorded to measure its error"
+        else:
+            level = "none" if image_error > RECONSTRUCTION_NONE else "care"
+            error = f"its image is expected to be wrong by {100 * image_error:.1f} %"
+        out.append(reason(
+            level, f"{100 * missing_share:.1f} % of the positions of {board} were reconstructed: {error}",
+            "a reconstruction is right only where the scene is mostly empty, such as separate plates",
+            "record the missing rows, or scan with a smaller step (`polysight plan`)", 3 + missing_share,
+        ))  # fmt: skip
+    return out
+
+
+def judge_left_out_chirps(board: str, clipped: float, disturbed: float, positions_clipped: float) -> list[Finding]:
+    """Judge one board's shares of chirps that were left out, and of positions without data because all were clipped."""
+    out = []
+    if clipped > SOME_CHIRPS or positions_clipped > SOME_POSITIONS:
+        out.append(reason(
+            "care", f"{board}: {100 * clipped:.1f} % of the chirps are clipped, {100 * positions_clipped:.1f} % of the"
+            " positions have no others",
+            "the echo or the direct path overdrives the receiver; bright plates lose their strongest positions",
+            "lower `rx_gain_db` and scan again", 4 + clipped,
+        ))  # fmt: skip
+    if disturbed > SOME_CHIRPS:
+        out.append(reason(
+            "care", f"{board}: {100 * disturbed:.1f} % of the chirps are left out, unlike the others of their burst",
+            "another radar transmits in the same band, a cable is loose, or the direct path is very weak",
+            "switch other radars off; scan again", 3 + disturbed,
+        ))  # fmt: skip
+    return out
+
+
+def judge_direct_path(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Finding]:
+    """Judge one board's direct path: its level over noise, the residual phase, and the share of positions with one."""
+    if found_share < FEW_POSITIONS or (is_known(snr_db) and snr_db < DIRECT_SNR_NONE_DB):
+        return [reason(
+            "none", f"{board}: the direct path is missing ({100 * found_share:.0f} % of the positions have one)",
+            "without it no position is synchronised, and the images are meaningless",
+            "clear the line of sight from transmitter to receiver; check that the transmitter is on", 10.0,
+        )]  # fmt: skip
+    out = []
+    if is_known(snr_db) and snr_db < DIRECT_SNR_CARE_DB:
+        out.append(reason(
+            "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise in one chirp (5 dB are usual)",
+            "it is partly blocked, or the antennas point elsewhere; it is the reference of all phases",
+            "clear the line of sight; check the antennas' direction", 3.0,
+        ))  # fmt: skip
+    if is_known(phase_rad) and phase_rad > DIRECT_PHASE_CARE_RAD:
+        out.append(reason(
+            "care", f"{board}: residual phase {phase_rad:.3f} rad from position to position (0.004 is usual)",
+            "a weak direct path, or a strong reflector near it", "look at the synchronisation table of the report", 2.5,
+        ))  # fmt: skip
+    return out
+
+
+def judge_levels(levels: Mapping[str, float | None]) -> list[Finding]:
+    """Judge metal's brightness relative to the direct path in each channel (None: not known)."""
+    out = []
+    for channel, level in levels.items():
+        if is_known(level) and level > 0 and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
+            weak = level > DIRECT_LEVELS[1]
+            state = "weak" if weak else "strong"
+            problem = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB relative to it"
+            if weak:
+                cause = "something in its way weakens the direct path; the object disturbs its estimate"
+            else:
+                cause = (
+                    "the object is far weaker than the direct path: the antennas point elsewhere, or it is not metal"
+                )
+            do = "clear the line of sight from transmitter to receivers, and check the antennas' direction"
+            out.append(reason("care", problem, cause, do, 3.5))
+    return out
+
+
+def judge_patches(refused: Mapping[int, str], patches: int, left_out: int = 0) -> list[Finding]:
+    """Judge the patches; `refused` maps numbers of patches that are no plates to why (noise, several materials).
+
+    `left_out` bright regions of a plate's size do not stand out enough from the background to be patches.
+    """
+    if patches == 0:
+        return [reason(
+            "none", "no patch was found", "nothing in the image stands out from its background",
+            "check that the object lies on the plane and in the image (polysight image)", 9.0,
+        )]  # fmt: skip
+    if len(refused) == patches:
+        faults = sorted(set(refused.values()))
+        return [reason(
+            "none", f"none of the {patches} patches is a plate: {'; '.join(faults)}",
+            "there is no flat object on the plane, or the data are noise",
+            "look at the images; check the direct path and the range profile (polysight doctor)", 9.0,
+        )]  # fmt: skip
+    by_reason: dict[str, list[int]] = {}
+    for label, fault in refused.items():
+        by_reason.setdefault(fault, []).append(label)
+    if left_out:
+        aside = [
+            reason(
+                "good",
+                f"{left_out} region{'s' * (left_out > 1)} of a plate's size within 25 dB of the brightest: no patch",
+                "no brighter than the background scatters: sidelobes, clutter or very weak plates",
+                "draw a box where a plate lies (polysight label; process --labels)",
+                0.5,
+            )
+        ]
+    else:
+        aside = []
+    return aside + [
+        reason(
+            "care",
+            f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {fault}",
+            "results hold for one flat plate per patch",
+            "move the plates apart, or draw their boxes (polysight label; process --labels)",
+            2.0,
+        )
+        for fault, labels in by_reason.items()
+    ]
+
+
+def judge_metal(
+    patch: str,
+    likely: bool,
+    certain: bool,
+    given: bool,
+    contradicted: bool,
+    only_patch: bool,
+    culprit: int | None = None,
+    painted: float = 0.0,
+    paint_mm: float = 0.0,
+) -> list[Finding]:
+    """Judge the metal reference `patch` ("patch 3").
+
+    By the other patches it is `likely` or `certain` to be metal; `contradicted`: by its own V / H against the direct
+    path; `only_patch`: there are no others; `culprit`: the other patch that fits it least, if they speak against it.
+    `given`: the user chose it. `painted` is the probability that it is metal with a coating, `paint_mm` thick.
+    """
+    do = "lay a metal plate into the scene and name it (--metal-box X0,Y0,X1,Y1), or use `polysight calibrate metal`"
+    if given and contradicted:
+        return [reason(
+            "care" if likely or only_patch else "none",
+            f"the given metal reference ({patch}) does not look like metal",
+            "relative to the direct path it reflects far less of V than of H, as no metal does", do, 8.0,
+        )]  # fmt: skip
+    if given and painted > PAINT_TOLD:
+        return [reason(
+            "care", f"the given metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
+            "all patches have the same additional phase of V / H beside it, as a coating on metal makes it;"
+            " permittivities are corrected for it, with its error",
+            f"take the paint or film off {patch}, or use bare metal", 2.7,
+        )]  # fmt: skip
+    if given and culprit is not None and not likely:
+        return [reason(
+            "care",
+            f"the given metal reference ({patch}) may be no metal: patch {culprit} and others look odd beside it",
+            "the others fit a dielectric reference better; so may thin plates, liquids, or H and V of different"
+            " places",
+            f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 4.4,
+        )]  # fmt: skip
+    if given or certain:
+        return []
+    if likely:
+        return [reason(
+            "care", f"the metal reference ({patch}) is likely metal, not certainly",
+            "a wet or conducting plate could look like it; all permittivities depend on it", do, 2.8,
+        )]  # fmt: skip
+    cause = "relative to it the other patches are impossible materials, or too few of them give evidence"
+    if only_patch:
+        cause = "nothing else in the scene can show that it is metal"
+    return [reason("none", f"no metal reference: {patch} is not shown to be metal", cause, do, 8.0)]
+
+
+def judge_dark_reference(patch: str, brightest: int, brighter_db: float) -> list[Finding]:
+    """Judge a metal reference `patch` ("patch 3") that another patch outshines in H by `brighter_db`."""
+    if not brighter_db > MOST_OUTSHINING_DB:
+        return []
+    return [reason(
+        "care",
+        f"the given metal reference ({patch}) is {brighter_db:.0f} dB darker in H than patch {brightest}",
+        "nothing reflects more than metal: it is no metal, lies askew, or its box is beside it",
+        "look at the picture of H in the report, and give the box of the metal", 5.0,
+    )]  # fmt: skip
+
+
+def judge_leakage(measured: bool, determined: bool, relative_error: float) -> list[Finding]:
+    """Judge leakage that was not measured; `relative_error` is its median effect on the permittivities."""
+    if measured or relative_error < LEAKAGE_SHARE:
+        return []
+    source = "estimated from the scene" if determined else "never measured; its prior is used"
+    if is_known(relative_error):
+        share = f"{100 * relative_error:.0f} %"
+    else:
+        share = "an unknown share"
+    return [reason(
+        "care",
+        f"leakage was {source}: permittivities are uncertain by {share}, names less reliable",
+        "the rig file has no leakage_std: leakage up to 0.1 of any phase is possible",
+        "measure it once with metal strips: `polysight leakage` (docs/how-to/calibration.md)", 1.5,
+    )]  # fmt: skip
+
+
+def judge_plane(known: bool, offset_mm: float, tilt_deg: tuple[float, float], theta_std_deg: float) -> list[Finding]:
+    """Judge the position of the plates' plane against the rig file."""
+    if not known or not all(map(is_known, (offset_mm, *tilt_deg))):
+        error = ""
+        if is_known(theta_std_deg):
+            error = f", +-{theta_std_deg:.2f} degrees"
+        return [reason(
+            "care",
+            f"the plane was not found; the angle is the rig file's{error}",
+            "no patch has a clear echo", "measure the plane's distance, or scan a flat plate (polysight focus)", 2.0,
+        )]  # fmt: skip
+    if abs(offset_mm) > PLANE_GATE_MM:
+        return [reason(
+            "none", f"the plates lie {offset_mm:+.0f} mm off the rig file's plane",
+            "they are at the edge of the range gate",
+            "measure geometry.object_distance_mm and correct the rig file", 7.0,
+        )]  # fmt: skip
+    out = []
+    tilt = max(abs(t) for t in tilt_deg)
+    if abs(offset_mm) > PLANE_FAR_MM:
+        out.append(reason(
+            "care", f"the plates lie {offset_mm:+.1f} mm off the rig file's plane; the angle was corrected for it",
+            "the object is at another distance, or object_distance_mm is wrong",
+            "correct geometry.object_distance_mm in the rig file", 1.6,
+        ))  # fmt: skip
+    if tilt > PLANE_TILT_DEG:
+        out.append(reason(
+            "care", f"the plates' plane is tilted by {tilt:.1f} degrees",
+            "tilted plates reflect past the scanned positions",
+            "lay the plates parallel to the stage", 1.4,
+        ))  # fmt: skip
+    return out
+
+
+def judge_copies(labels: Sequence[int], shift_mm: tuple[float, float], level_db: float) -> list[Finding]:
+    """Judge patches that are shifted, weaker copies of the plates; none without `labels`."""
+    if not labels:
+        return []
+    place = f"x {shift_mm[0]:+.0f}, y {shift_mm[1]:+.0f} mm away and {-level_db:.0f} dB weaker"
+    return [reason(
+        "care", f"patches {', '.join(map(str, labels))} repeat the plates, {place}",
+        "a second path beside the direct path (multipath) modulates the scan; the plates are disturbed by it as much",
+        "take reflectors away from the line between transmitter and receivers, or cover them with absorber", 4.5,
+    )]  # fmt: skip
+
+
+def judge_image_shift(apart_mm: tuple[float, float]) -> list[Finding]:
+    """Judge where the image of V lay relative to that of H (x, y)."""
+    distance = float(np.hypot(*apart_mm))
+    if not is_known(distance) or distance <= APART_MM:
+        return []
+    return [reason(
+        "care",
+        f"the images of H and V lay {distance:.1f} mm apart (x {apart_mm[0]:+.1f}, y {apart_mm[1]:+.1f} mm)",
+        "boards are out of place by a few millimetres, or all plates lie high; the images were laid on each other",
+        "measure where the antennas are (`polysight calibrate direct-path`) and correct the rig file", 1.9,
+    )]  # fmt: skip
+
+
+def judge_drift(amplitude: float, phase_rad: float) -> list[Finding]:
+    """Judge the drift of V / H over the scan: its largest root mean square at a plate, relative to the metal."""
+    if not (is_known(amplitude) and is_known(phase_rad)) or max(amplitude, phase_rad) <= DRIFT_CARE:
+        return []
+    return [reason(
+        "care", f"V / H drifts by {100 * amplitude:.0f} % and {np.degrees(phase_rad):.0f} degrees between the plates",
+        "the gains of the boards change during the scan (temperature); it is corrected to about a half",
+        "let the boards warm up for half an hour; put the metal into the middle of the scan", 2.7,
+    )]  # fmt: skip
+
+
+def judge_fringes(probability: float) -> list[Finding]:
+    """Judge fringes of a second path, by their probability."""
+    if not is_known(probability) or probability <= FRINGES_CARE:
+        return []
+    return [reason(
+        "care", "V / H changes over the scan in fringes, more than the plates can tell",
+        "a second path beside the direct path (multipath), or a receiver that is overdriven, changes the gains",
+        "take reflectors away from the line between transmitter and receivers, or cover them with absorber", 4.3,
+    )]  # fmt: skip
+
+
+def judge_disturbed_plates(errors: Mapping[int, float]) -> list[Finding]:
+    """Judge plates that something disturbs: patch number to the error of V / H by slopes that it has of its own."""
+    worst = {label: error for label, error in errors.items() if is_known(error) and error > DISTURBED_CARE}
+    if not worst:
+        return []
+    patches = f"patch {min(worst)}" if len(worst) == 1 else f"patches {', '.join(map(str, sorted(worst)))}"
+    return [reason(
+        "care", f"V / H changes within {patches}, by an error of up to {100 * max(worst.values()):.0f} %",
+        "copies of other plates lie there: a second path beside the direct path, clipping, or positions without data",
+        "take reflectors away from the line between transmitter and receivers; scan all positions", 2.5,
+    )]  # fmt: skip
+
+
+def judge_moved_boards(probability: float) -> list[Finding]:
+    """Judge the probability that the mount has moved since its leakage was measured."""
+    if not is_known(probability) or probability <= MOVED_CARE:
+        return []
+    return [reason(
+        "care", f"boards have turned since their leakage was measured, with a probability of {probability:.2f}",
+        "the patches fit materials only with another leakage; theirs is estimated and counted in the error bars",
+        "fix the boards and measure the leakage again: `polysight leakage` (docs/how-to/calibration.md)", 4.0,
+    )]  # fmt: skip
+
+
+def judge_halo(level: float) -> list[Finding]:
+    """Judge the halo of V around the metal: its amplitude relative to the metal."""
+    if not is_known(level) or level <= HALO_CARE:
+        return []
+    return [reason(
+        "care", f"V has a halo around the metal, {20 * np.log10(level):.0f} dB, that H does not have",
+        "the receiver of V is overdriven (clipping): the metal's V is too weak, its neighbours are disturbed",
+        "lower the gain of the receivers (rx_gain_db), or use a smaller piece of metal", 4.2,
+    )]  # fmt: skip
+
+
+def judge_background(relative_std: float) -> list[Finding]:
+    """Judge what lies behind the plates: the error of each part of ln(V / H) that it makes in the usual patch."""
+    if not is_known(relative_std) or relative_std <= BACKGROUND_CARE:
+        return []
+    return [reason(
+        "care", f"what lies behind the plates disturbs P by {100 * relative_std:.0f} %, which the error bars contain",
+        "a table, a wall or a holder behind them returns waves too, and they add to those of the plates",
+        "cover it with absorber, or move it 300 mm away from the plates", 2.9,
+    )]  # fmt: skip
+
+
+def judge_flatness(ripple: tuple[float, float], relief_rad: float) -> list[Finding]:
+    """Judge how well flat plates fit: usual scatter of ln|V / H| and of its phase inside them, and their relief.
+
+    A flat plate has one V / H, and a phase of H that is a plane.
+    """
+    if is_known(relief_rad) and relief_rad > RELIEF_CARE_RAD:
+        return [reason(
+            "care", f"plates are rough, wavy or bent: the phase of H scatters by {np.degrees(relief_rad):.0f} degrees",
+            "an uneven surface is seen from other places by H and V; errors are larger, counted by the scatter",
+            "lay flat plates, or press them onto a plane", 2.1,
+        )]  # fmt: skip
+    if not all(map(is_known, ripple)) or max(ripple) <= RIPPLE_CARE:
+        return []
+    return [reason(
+        "care",
+        f"V / H ripples by {100 * ripple[0]:.0f} % and {np.degrees(ripple[1]):.0f} degrees inside the plates",
+        "a second path beside the direct path, positions without data, interference, or a small aperture do that",
+        "take reflectors away from the line between transmitter and receivers; scan all positions", 2.4,
+    )]  # fmt: skip
+
+
+def judge_tilts(across_deg: Mapping[int, float]) -> list[Finding]:
+    """Judge the tilts of plates across the plane of incidence: patch number to degrees."""
+    tilted = {label: angle for label, angle in across_deg.items() if is_known(angle) and abs(angle) > PLATE_ACROSS_DEG}
+    if not tilted:
+        return []
+    worst = max(tilted, key=lambda label: abs(tilted[label]))
+    remark = ""
+    if len(tilted) != 1:
+        remark = f" ({len(tilted)} patches in all)"
+    return [reason(
+        "care", f"patch {worst} rises by {tilted[worst]:+.1f} degrees across the plane of incidence{remark}",
+        "the polarisation turns with it: 5 to 13 % of a permittivity per degree, corrected to about a quarter",
+        "lay plates and metal flat; shim the tilted one", 1.3,
+    )]  # fmt: skip
+
+
+def judge_passivity(refused: Mapping[int, Finding]) -> list[Finding]:
+    """Judge patches that are no passive half space: number to why."""
+    labels: dict[str, list[int]] = {}
+    for label, fault in refused.items():
+        labels.setdefault(fault.what, []).append(label)
+    out = []
+    for patches in labels.values():
+        fault = refused[patches[0]]
+        named = f"patch {patches[0]} has"
+        if len(patches) > 1:
+            named = f"patches {', '.join(map(str, patches))} have"
+        out.append(reason("care", f"{named} no permittivity: {fault.what}", fault.why, fault.do, 2.2))
+    return out
+
+
+def judge_brightness(off: Mapping[int, float]) -> list[Finding]:
+    """Judge brightness: patch number to ln of |H| over that of a half space of its permittivity."""
+    out = []
+    for label, ln in off.items():
+        if is_known(ln) and abs(ln) > BRIGHTNESS_CARE:
+            share = 100 * abs(float(np.expm1(ln)))
+            than = "brighter" if ln > 0 else "darker"
+            out.append(reason(
+                "care", f"patch {label} is {share:.0f} % {than} than a half space of its permittivity",
+                "it may be thin, layered, rough, or partly in a shadow; the permittivity of a thin plate is then wrong",
+                "fit it as a layer (polysight permittivity --layer), or lay it flat and free", 1.7,
+            ))  # fmt: skip
+    return out
+
+
+def judge_incidence(angle_deg: float, library_deg: float | None) -> list[Finding]:
+    """Judge the incidence angle against the library's."""
+    if not is_known(library_deg) or not is_known(angle_deg) or abs(angle_deg - library_deg) <= LIBRARY_ANGLE_DEG:
+        return []
+    return [reason(
+        "care", f"the scan has an incidence angle of {angle_deg:.2f} degrees, the library {library_deg:.2f}",
+        "the ratio of a material changes by 10 % in a degree: names may be wrong",
+        "make a library at this angle, or move the plane", 1.8,
+    )]  # fmt: skip

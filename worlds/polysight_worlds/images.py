@@ -13,8 +13,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from polysight_worlds.media import LIGHT_M_PER_S, reflect
-from polysight_worlds.optics import Antenna, receive_direct
+from polysight_worlds.media import reflect
+from polysight_worlds.optics import Antenna, receive_direct, turn_back
 from polysight_worlds.rig import Rig, published_rig, turn
 from polysight_worlds.scan import fast_length, fft2, ifft2, record, signed_lags
 from polysight_worlds.world import Nuisances, Plate, World, disturb_plates
@@ -122,8 +122,9 @@ def simulate(
             rng=rng, rig=nominal, echoes=echoes, direct=direct, nuisances=nuisances, channel=channel, dark=positions
         )
         rx: Antenna = getattr(nominal, channel)
-        images.append(backproject(nominal, rx, data, pixels, kaiser_beta))
-        slopes.append(backproject(nominal, rx, data * slope_weights, pixels, kaiser_beta))
+        image, slope = backproject(nominal, rx, np.stack([data, data * slope_weights]), pixels, kaiser_beta)
+        images.append(image)
+        slopes.append(slope)
     x_m, y_m = pixel_centres(nominal, pixels)
     return ImagePair(
         h=images[0],
@@ -273,7 +274,7 @@ def pixel_centres(rig: Rig, pixels: int) -> tuple[NDArray, NDArray]:
 
 
 def backproject(rig: Rig, rx: Antenna, data: NDArray, pixels: int, kaiser_beta: float = 0.0) -> NDArray:
-    """Matched filter of complex64 `data` [frequencies, rows, columns] on the object plane: complex64 [pixels, pixels].
+    """Matched filter of complex64 `data` [..., frequencies, rows, columns] on the object plane, [..., pixels, pixels].
 
     I(v) = sum over offsets u and frequencies of w(u) data(u, f) exp(+jk (path(v - u) - direct)), over the sum of w.
     """
@@ -286,12 +287,11 @@ def backproject(rig: Rig, rx: Antenna, data: NDArray, pixels: int, kaiser_beta: 
     out = _distance(rig.tx, x, y, rig.plane_m)
     back = _distance(rx, x, y, rig.plane_m)
     excess_m = out + back - np.linalg.norm(rx.position - rig.tx.position)
-    spectrum = np.zeros(shape, np.complex64)
+    spectrum = np.zeros((*data.shape[:-3], *shape), np.complex64)
     for index, frequency_hz in enumerate(rig.frequencies_hz):
-        k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
-        kernel = np.exp(1j * k * excess_m).astype(np.complex64)
-        spectrum += fft2(window * data[index], shape) * fft2(kernel)
-    image = ifft2(spectrum)[:pixels, :pixels] / (window.sum() * len(rig.frequencies_hz))
+        kernel = turn_back(-excess_m, frequency_hz)
+        spectrum += fft2(window * data[..., index, :, :], shape) * fft2(kernel)
+    image = ifft2(spectrum)[..., :pixels, :pixels] / (window.sum() * len(rig.frequencies_hz))
     return image.astype(np.complex64)
 
 

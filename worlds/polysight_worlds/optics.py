@@ -17,7 +17,6 @@ from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable, Stack
 
 # Facets times positions that are evaluated at once: their arrays stay in the processor's cache.
 CHUNK = 20_000
-# Side lobes keep some power beside and behind the main lobe.
 # Smallest gain (-30 dB): side lobes keep some power beside and behind the main lobe.
 PATTERN_FLOOR = 0.03
 
@@ -169,7 +168,7 @@ def integrate_phase(response: Response, edge_u: NDArray, edge_v: NDArray, freque
 
 def integrate_steps(steps_m: tuple[NDArray, NDArray], frequency_hz: float) -> NDArray:
     """The same, from the path's change along both edges, see `Response.path_steps`."""
-    over_u, over_v = (np.sinc(frequency_hz / LIGHT_M_PER_S * step_m) for step_m in steps_m)
+    over_u, over_v = (np.sinc((frequency_hz / LIGHT_M_PER_S * step_m).astype(np.float32)) for step_m in steps_m)
     return over_u * over_v
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable
-from polysight_worlds.optics import Antenna, integrate_phase, respond, scatter
+from polysight_worlds.optics import Antenna, integrate_steps, respond, scatter
 from polysight_worlds.rig import Rig
 from polysight_worlds.world import Plate, World
 
@@ -107,8 +107,13 @@ class PlateEchoes:
         if surface.local_slopes is not None:
             variations += [(slopes[0] + SLOPE_STEP, slopes[1]), (slopes[0], slopes[1] + SLOPE_STEP)]
         self._responses = [respond(rig.tx, rx, points, _normal(varied)) for varied in variations]
-        self._tables = [ReflectionTable(plate.stack, f) for f in rig.frequencies_hz]
+        # Without layers a medium reflects alike at all frequencies.
+        many = rig.frequencies_hz if plate.stack.layers else rig.frequencies_hz[:1]
+        self._tables = [ReflectionTable(plate.stack, f) for f in many]
+        self._terms: list[NDArray] = []
         main = self._responses[0]
+        along_x, along_y = self._edges()
+        self._steps_m = main.path_steps(along_x, along_y)
         self._phase = _PhaseSteps(main.path_m, rig.frequencies_hz)
         weight = np.abs(main.s_weight) + np.abs(main.p_weight)
         weight /= np.sum(weight)
@@ -134,22 +139,31 @@ class PlateEchoes:
         z = rig.plane_m - plate.height_mm / 1000
         return np.stack(np.broadcast_arrays(x[None, :], y[:, None], z))
 
+    def _edges(self) -> tuple[NDArray, NDArray]:
+        """Edges of a cell along x and y, [3] each."""
+        step = self._rig.step_m
+        slope_x, slope_y = self._surface.mean_slopes
+        return np.array([step, 0, slope_x * step]), np.array([0, step, slope_y * step])
+
+    def _reflect(self, index: int) -> list[NDArray]:
+        """What cells of each slope reflect at frequency `index`."""
+        if not self._terms or len(self._tables) > 1:
+            self._terms = []
+            for response in self._responses:
+                r_s, r_p = self._tables[index].look_up(response.cos_incidence)
+                self._terms.append(r_s * response.s_weight + r_p * response.p_weight)
+        return self._terms
+
     def add_echoes(self, data: NDArray, index: int) -> None:
         """Add the echoes at frequency `index` to complex `data` [rows, columns]."""
         rig = self._rig
         surface = self._surface
         frequency_hz = rig.frequencies_hz[index]
         k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
-        step = rig.step_m
-        slope_x, slope_y = surface.mean_slopes
-        edges = np.array([step, 0, slope_x * step]), np.array([0, step, slope_y * step])
-        shape = integrate_phase(self._responses[0], *edges, frequency_hz)
-        area_m2 = step**2 * np.sqrt(1 + slope_x**2 + slope_y**2)
+        shape = integrate_steps(self._steps_m, frequency_hz)
+        area_m2 = float(np.linalg.norm(np.cross(*self._edges())))
         common = (1j * k / (4 * np.pi) * area_m2 * shape).astype(np.complex64) * self._phase.phases(index)
-        terms = []
-        for response in self._responses:
-            r_s, r_p = self._tables[index].look_up(response.cos_incidence)
-            terms.append(r_s * response.s_weight + r_p * response.p_weight)
+        terms = self._reflect(index)
         kernel = (common * terms[0]).astype(np.complex64)
         mask = self._brightness * surface.cover * np.exp(-1j * k * self._path_mean)
         spectrum = self._multiply(mask, kernel)

@@ -14,17 +14,8 @@ from tests.support.scenes import scene_of
 from tests.support.store.plain_scan import write_scan
 
 from polysight.cli.main import main
+from polysight.jobs import batch
 from polysight.jobs import batch as many
-from polysight.jobs.batch import (
-    Outcome,
-    find_scans,
-    fit_scans,
-    is_finished,
-    make_jobs,
-    memory_bytes,
-    process_many,
-    table,
-)
 from polysight.process import cores
 from polysight.products.processed import FINISHED
 from polysight.settings import Settings
@@ -80,13 +71,13 @@ def scans(folder, *names):
 
 def make_job(data, out, **options):
     text = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
-    return make_jobs([(data, Settings(**text))], out)[0]
+    return batch.make_jobs([(data, Settings(**text))], out)[0]
 
 
 def jobs(folder, *names):
-    scans_found = find_scans([folder])
+    scans_found = batch.find_scans([folder])
     assert sorted(p.name for p in scans_found) == sorted(names)
-    return make_jobs([(data, Settings()) for data in scans_found], folder.parent / "out")
+    return batch.make_jobs([(data, Settings()) for data in scans_found], folder.parent / "out")
 
 
 def runs(folder):
@@ -97,7 +88,7 @@ def runs(folder):
 def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not_finished(tmp_path, capsys):
     names = ("a", "bad", "c", "killed")
     scans(tmp_path / "in", *names)
-    first = process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
+    first = batch.process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
     assert {o.name: o.status for o in first} == {"a": "done", "bad": "failed", "c": "done", "killed": "failed"}
     assert [o.name for o in first] == list(names)
     answer = {o.name: o.message for o in first}
@@ -108,7 +99,7 @@ def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not
     summary = json.loads((tmp_path / "out" / "processed.json").read_text())
     assert [s["status"] for s in summary["scans"]] == ["done", "failed", "done", "failed"]
 
-    again = process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
+    again = batch.process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
     assert [o.status for o in again] == ["skipped", "failed", "skipped", "failed"]
     assert runs(tmp_path) == sorted([*names, "bad", "killed"])
     assert "2 finished before, 2 to process" in capsys.readouterr().err
@@ -133,24 +124,24 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
         options = {"library": library, "config": config, **changes}
         return make_job(folder, tmp_path / "out", **options)
 
-    assert not is_finished(job())
-    process_many([job()], tmp_path / "out", 1)
-    assert is_finished(job())
+    assert not batch.is_finished(job())
+    batch.process_many([job()], tmp_path / "out", 1)
+    assert batch.is_finished(job())
     for change in ({"metal_box_mm": (0.0, 0.0, 1.0, 1.0)}, {"library": None}, {"config": None}):
-        assert not is_finished(job(**change)), change
+        assert not batch.is_finished(job(**change)), change
     (folder / "RH").mkdir()
     for path in (library, rig, folder / "RH" / "0_0.bin"):
         state_before = path.read_bytes() if path.exists() else b""
         path.write_bytes(b"2")
-        assert not is_finished(job()), path
+        assert not batch.is_finished(job()), path
         path.write_bytes(state_before)
     (folder / "RH" / "0_0.bin").unlink()
-    assert is_finished(job())
+    assert batch.is_finished(job())
     (tmp_path / "out" / "a" / "image.npz").unlink()
-    assert not is_finished(job())
-    process_many([job()], tmp_path / "out", 1, again=True)
+    assert not batch.is_finished(job())
+    batch.process_many([job()], tmp_path / "out", 1, again=True)
     (tmp_path / "out" / "a" / FINISHED).write_text("[1]")
-    assert not is_finished(job())
+    assert not batch.is_finished(job())
 
 
 @pytest.mark.usefixtures("worker")
@@ -158,10 +149,10 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
     """Notes, programs of the page, exports and labels are no data; manifest, rows, calibration and truth are."""
     folder = write_scan(tmp_path / "in" / "scan")
     sample_file = folder / "samples" / "RH.npy"
-    process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
+    batch.process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
 
     def done():
-        return is_finished(jobs(tmp_path / "in", "scan")[0])
+        return batch.is_finished(jobs(tmp_path / "in", "scan")[0])
 
     no_data = ("operator.json", "program/process.log", "export/image.nc", "labels.json", "control/request.json")
     for name in (*no_data, "products/report.html", "samples/RH.npy", "raw/RH/0004.part"):
@@ -183,7 +174,7 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
             os.utime(file, ns=(times, times))
         assert done(), name
     drop(ScanFolder.load(folder), raw_digests(folder), tmp_path / "out" / "scan")
-    process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
+    batch.process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
     assert done()
     sample_file.write_text("other samples")
     assert not done()  # they are all that is left
@@ -204,7 +195,7 @@ def test_ended_early_its_programs_end_too(tmp_path):
     assert (first.name, first.status) == ("slow2", "done")
     # Else this takes the 600 s that it sleeps, more than a test may
     results.close()
-    assert not is_finished(todo[0])
+    assert not batch.is_finished(todo[0])
 
 
 def test_names_folders_and_what_is_a_scan(tmp_path):
@@ -213,18 +204,18 @@ def test_names_folders_and_what_is_a_scan(tmp_path):
     raw = tmp_path / "raw" / "s1"
     raw.mkdir(parents=True)
     (raw / "RH_synced.npy").touch()
-    assert find_scans([tmp_path / "unsynced"]) == scans_found
-    assert find_scans([raw, scans_found[1]]) == [raw, scans_found[1]]
-    assert find_scans([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
+    assert batch.find_scans([tmp_path / "unsynced"]) == scans_found
+    assert batch.find_scans([raw, scans_found[1]]) == [raw, scans_found[1]]
+    assert batch.find_scans([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
     with refused(ErrorCode.NAME_TAKEN, "s1"):
-        make_jobs([(scans_found[0], Settings()), (raw, Settings())], tmp_path / "out")
+        batch.make_jobs([(scans_found[0], Settings()), (raw, Settings())], tmp_path / "out")
 
 
 def test_scans_at_a_time_follow_cores_and_memory():
-    need = memory_bytes(70_000)
-    assert fit_scans(70_000, cores=8, free_bytes=100 * need) == 8
-    assert fit_scans(70_000, cores=8, free_bytes=3 * need) == 2
-    assert fit_scans(70_000, cores=8, free_bytes=0) == 1
+    need = batch.memory_bytes(70_000)
+    assert batch.fit_scans(70_000, cores=8, free_bytes=100 * need) == 8
+    assert batch.fit_scans(70_000, cores=8, free_bytes=3 * need) == 2
+    assert batch.fit_scans(70_000, cores=8, free_bytes=0) == 1
     assert many.free_memory_bytes() > 0
     assert cores() >= 1
 
@@ -233,7 +224,9 @@ def test_the_table_names_every_scan_and_counts(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "quality.json").write_text('{"boards": {"RH": {"positions": 200, "positions_masked": 3}}}')
     (tmp_path / "a" / "materials.json").write_text('{"segments": [{"label": 1}, {"label": 2}]}')
-    text = table([Outcome("a", "done", 61.0, 0.54), Outcome("b", "failed", 2.0, 0.0, "broken")], tmp_path)
+    text = batch.table(
+        [batch.Outcome("a", "done", 61.0, 0.54), batch.Outcome("b", "failed", 2.0, 0.0, "broken")], tmp_path
+    )
     head, a, b, end = text.splitlines()
     assert head.split() == ["scan", "result", "seconds", "memory", "masked", "patches"]
     assert a.split() == ["a", "done", "61", "0.5", "GB", "1.5", "%", "2"]
@@ -272,9 +265,9 @@ def test_a_dask_cluster_does_the_same(tmp_path):
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0", protocol="tcp"
     ) as cluster:
-        outcomes = process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)
+        outcomes = batch.process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)
     assert [o.status for o in outcomes] == ["done", "failed", "done"]
-    assert all(is_finished(j) == (j.name != "bad") for j in todo)
+    assert all(batch.is_finished(j) == (j.name != "bad") for j in todo)
     with refused(ErrorCode.NO_ANSWER):
         list(many.run_on_dask(todo, "tcp://127.0.0.1:9", timeout="1s"))
 
@@ -286,7 +279,7 @@ def test_a_scan_that_carries_its_mark_is_done_and_not_processed_again(tmp_path):
     (job,) = jobs(tmp_path / "in", "a")
     assert [many.run_scan(job).status for _ in range(3)] == ["done"] * 3
     assert (tmp_path / "out" / "runs.txt").read_text() == "a\n"
-    again = process_many([job], tmp_path / "out", 1, again=True)
+    again = batch.process_many([job], tmp_path / "out", 1, again=True)
     assert [o.status for o in again] == ["done"]
     assert (tmp_path / "out" / "runs.txt").read_text() == "a\na\n"
 
@@ -339,7 +332,7 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
             n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", protocol="tcp"
         ) as cluster,
     ):
-        outcomes = process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)
+        outcomes = batch.process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)
     assert {o.name: o.status for o in outcomes} == dict.fromkeys(names, "done")
     assert (tmp_path / "out" / "runs.txt").read_text().split().count("slow") == 2
 

@@ -19,21 +19,8 @@ from tests.support.refusals import refused
 from tests.support.rigs import published_rig, timed_by_spi
 
 from polysight_pi import lines as pi_lines
+from polysight_pi import trigger
 from polysight_pi.lines import SpiWireLines
-from polysight_pi.trigger import (
-    DEFAULT_BUFSIZ,
-    FIRST_PULSE_DELAY_NS,
-    MIN_BYTES,
-    BurstSent,
-    BurstSpec,
-    Counts,
-    Edge,
-    LoopFault,
-    SpiBurst,
-    TriggerLoop,
-    send_burst,
-    spi_burst,
-)
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.faults import PiFault
@@ -41,7 +28,7 @@ from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_WIDTH_NS
 from polysight_shared.wires import WireClient, WireEdge
 
 PERIOD = 1_500_000
-SPEC = BurstSpec(16, PERIOD, 1000)
+SPEC = trigger.BurstSpec(16, PERIOD, 1000)
 
 
 @given(
@@ -53,8 +40,8 @@ SPEC = BurstSpec(16, PERIOD, 1000)
 def test_deadlines_do_not_drift(pulses, period, start, late):
     """Each pulse is late by its own lateness alone, whatever happened to those before it."""
     lines = FakeLines(late=lambda n: late[n // 2 % len(late)] if n % 2 == 0 else 0)
-    spec = BurstSpec(pulses, period + 50_000, 1000)
-    sent = send_burst(lines, spec, start + 1)
+    spec = trigger.BurstSpec(pulses, period + 50_000, 1000)
+    sent = trigger.send_burst(lines, spec, start + 1)
     assert sent.fault == 0
     lateness = [late[k % len(late)] for k in range(pulses)]
     assert lines.rises == [start + 1 + k * spec.period_ns + lateness[k] for k in range(pulses)]
@@ -66,7 +53,7 @@ def test_deadlines_do_not_drift(pulses, period, start, late):
 def test_a_start_that_has_passed_moves_the_whole_burst():
     lines = FakeLines()
     lines.t = 5_000
-    send_burst(lines, SPEC, 1_000)
+    trigger.send_burst(lines, SPEC, 1_000)
     assert lines.rises == [5_000 + k * PERIOD for k in range(16)]
 
 
@@ -74,14 +61,14 @@ def test_a_start_that_has_passed_moves_the_whole_burst():
 def test_width_is_an_upper_bound_of_every_pulse(k, set_ns, clear_ns):
     """The line changes at an unknown time within each call, so the bound covers both calls completely."""
     lines = FakeLines(long=lambda n: set_ns if n == 2 * k else clear_ns if n == 2 * k + 1 else 0)
-    sent = send_burst(lines, SPEC, 1_000)
+    sent = trigger.send_burst(lines, SPEC, 1_000)
     worst = max(1000, set_ns) + clear_ns
     assert sent.width_max_ns == worst
     assert sent.fault == (PiFault.PULSE_TOO_LONG if worst > 4000 else 0)
     assert sent.pulses == (k + 1 if worst > 4000 else 16)
     lines = FakeLines(long=lines.long)
     lines.check_width = False
-    unchecked = send_burst(lines, SPEC, 1_000)
+    unchecked = trigger.send_burst(lines, SPEC, 1_000)
     assert (unchecked.fault, unchecked.pulses) == (0, 16)
 
 
@@ -89,7 +76,7 @@ def test_width_is_an_upper_bound_of_every_pulse(k, set_ns, clear_ns):
 def test_a_pulse_too_early_for_the_radar_is_never_sent(k, late):
     """Pulse k is late; the next one may be too close, and is then left out."""
     lines = FakeLines(late=lambda n: late if n == 2 * (k - 1) else 0)
-    sent = send_burst(lines, SPEC, 1_000)
+    sent = trigger.send_burst(lines, SPEC, 1_000)
     gaps = [b - a for a, b in zip(lines.rises, lines.rises[1:], strict=False)]
     assert all(g >= MIN_PERIOD_NS for g in gaps)
     assert sent.fault == (PiFault.PERIOD_TOO_SHORT if late > PERIOD - MIN_PERIOD_NS and k < 16 else 0)
@@ -97,7 +84,7 @@ def test_a_pulse_too_early_for_the_radar_is_never_sent(k, late):
 
 
 def test_the_spacing_includes_the_previous_burst():
-    sent = send_burst(FakeLines(), SPEC, 1_000_000, previous_rise_ns=1_000_000 - MIN_PERIOD_NS + 1)
+    sent = trigger.send_burst(FakeLines(), SPEC, 1_000_000, previous_rise_ns=1_000_000 - MIN_PERIOD_NS + 1)
     assert (sent.pulses, sent.fault) == (0, PiFault.PERIOD_TOO_SHORT)
 
 
@@ -105,12 +92,12 @@ class Loop:
     def __init__(self, points=3, lines=None):
         self.lines = lines or FakeLines()
         self.posted = queue.SimpleQueue()
-        self.loop = TriggerLoop(self.lines, self.posted.put, lambda: None)
+        self.loop = trigger.TriggerLoop(self.lines, self.posted.put, lambda: None)
         self.job = self.loop.arm(points, SPEC)
         self.loop.start()
 
     def edge(self, t_ms, seqno):
-        self.lines.edges.put(Edge(t_ms * 1_000_000, seqno))
+        self.lines.edges.put(trigger.Edge(t_ms * 1_000_000, seqno))
 
     def next(self):
         return self.posted.get(timeout=HANG_S)
@@ -131,8 +118,8 @@ def test_each_edge_gets_its_burst_at_a_fixed_delay():
         for i in range(3):
             sent = x.next()
             assert (sent.point, sent.edge_ns, sent.record.pulses) == (i, 100_000_000 * (i + 1), 16)
-            assert sent.record.first_ns == sent.edge_ns + FIRST_PULSE_DELAY_NS
-        assert x.loop.disarm() == Counts(3, 3, 48)
+            assert sent.record.first_ns == sent.edge_ns + trigger.FIRST_PULSE_DELAY_NS
+        assert x.loop.disarm() == trigger.Counts(3, 3, 48)
 
 
 @pytest.mark.parametrize(
@@ -148,16 +135,16 @@ def test_fault_table_of_the_loop(edges, number, bursts):
         for e in edges:
             x.edge(*e)
         for _ in range(bursts):
-            assert isinstance(x.next(), BurstSent)
+            assert isinstance(x.next(), trigger.BurstSent)
         fault = x.next()
-        assert isinstance(fault, LoopFault)
+        assert isinstance(fault, trigger.LoopFault)
         assert (fault.number, fault.job) == (number, x.job)
         # Nothing is answered after a fault
         x.edge(900, 99)
         x.edge(901, 100)
         while x.loop.strays < 2:
             pass
-        assert x.loop.disarm() == Counts(len(edges), bursts, 16 * bursts)
+        assert x.loop.disarm() == trigger.Counts(len(edges), bursts, 16 * bursts)
 
 
 @pytest.mark.parametrize("number", [PiFault.PULSE_TOO_LONG, PiFault.PERIOD_TOO_SHORT])
@@ -224,13 +211,13 @@ def test_disarming_ends_a_running_burst_after_its_pulse():
     with Loop(lines=FakeLines(late=disarm)) as x:
         x.edge(100, 1)
         assert x.next().record.pulses == 3
-        assert counted.get(timeout=HANG_S) == Counts(1, 1, 3)
+        assert counted.get(timeout=HANG_S) == trigger.Counts(1, 1, 3)
 
 
 def test_stop_within_a_burst_ends_it_at_a_whole_pulse():
     stop = iter([False, False, True])
     lines = FakeLines()
-    assert send_burst(lines, SPEC, 0, stop=lambda: next(stop)).pulses == 2
+    assert trigger.send_burst(lines, SPEC, 0, stop=lambda: next(stop)).pulses == 2
     assert not lines.level
 
 
@@ -247,7 +234,7 @@ def list_set_bits(data: bytes) -> list[int]:
 @given(bursts)
 def test_one_set_bit_a_pulse_at_its_place(burst):
     pulses, period_ns, width_ns = burst
-    made_burst = spi_burst(BurstSpec(pulses, period_ns, width_ns), LARGE_BUFFER)
+    made_burst = trigger.spi_burst(trigger.BurstSpec(pulses, period_ns, width_ns), LARGE_BUFFER)
     assert made_burst.bit_ns == pytest.approx(width_ns, rel=1e-5), "the width that was asked for"
     set_bits = list_set_bits(made_burst.data)
     assert tuple(set_bits) == made_burst.bits
@@ -257,32 +244,32 @@ def test_one_set_bit_a_pulse_at_its_place(burst):
     for a, b in itertools.pairwise(set_bits):
         assert abs((b - a) * made_burst.bit_ns - period_ns) <= made_burst.bit_ns + 1
     assert made_burst.data[0] == made_burst.data[-1] == 0, "low before and after"
-    assert len(made_burst.data) >= MIN_BYTES
+    assert len(made_burst.data) >= trigger.MIN_BYTES
 
 
-@given(bursts, st.integers(MIN_BYTES, 65_536))
+@given(bursts, st.integers(trigger.MIN_BYTES, 65_536))
 def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
-    needed_bytes = len(spi_burst(BurstSpec(*burst), LARGE_BUFFER).data)
+    needed_bytes = len(trigger.spi_burst(trigger.BurstSpec(*burst), LARGE_BUFFER).data)
     if needed_bytes > bufsiz:
         with refused(ErrorCode.VALUES_CONFLICT, bufsiz) as e:
-            spi_burst(BurstSpec(*burst), bufsiz)
+            trigger.spi_burst(trigger.BurstSpec(*burst), bufsiz)
         advised_bytes = int(e.value.remedy.partition("bufsiz=")[2].partition("`")[0])
         assert needed_bytes <= advised_bytes
-        spi_burst(BurstSpec(*burst), advised_bytes)
+        trigger.spi_burst(trigger.BurstSpec(*burst), advised_bytes)
     else:
-        assert len(spi_burst(BurstSpec(*burst), bufsiz).data) == needed_bytes
+        assert len(trigger.spi_burst(trigger.BurstSpec(*burst), bufsiz).data) == needed_bytes
 
 
 @pytest.mark.parametrize("width_ns", [MIN_WIDTH_NS, 499, 2001, MAX_WIDTH_NS])
 def test_a_width_that_the_controller_cannot_make_is_refused(width_ns):
     with refused(ErrorCode.VALUES_CONFLICT, "0.5..2 us"):
-        spi_burst(BurstSpec(1, PERIOD, width_ns), LARGE_BUFFER)
+        trigger.spi_burst(trigger.BurstSpec(1, PERIOD, width_ns), LARGE_BUFFER)
 
 
 def test_the_published_burst_fits_every_pi_as_it_comes():
     b = published_rig().burst
-    burst = spi_burst(BurstSpec.from_burst(b))
-    assert SpiWireLines.bufsiz == DEFAULT_BUFSIZ == 4096
+    burst = trigger.spi_burst(trigger.BurstSpec.from_burst(b))
+    assert SpiWireLines.bufsiz == trigger.DEFAULT_BUFSIZ == 4096
     assert (burst.clock_hz, len(burst.data)) == (1_000_000, 2815)
     assert [y - x for x, y in itertools.pairwise(burst.bits)] == [1500] * 15
 
@@ -299,7 +286,7 @@ class Controller:
         self.rate = rate
         self.late_ns = late_ns
         self.bufsiz = bufsiz
-        self.sent: list[tuple[int, SpiBurst]] = []
+        self.sent: list[tuple[int, trigger.SpiBurst]] = []
 
     def now_ns(self) -> int:
         return self.t
@@ -311,7 +298,7 @@ class Controller:
     def look_back(self, sent: int) -> None: ...
     def close(self) -> None: ...
 
-    def transfer(self, burst: SpiBurst) -> tuple[int, int]:
+    def transfer(self, burst: trigger.SpiBurst) -> tuple[int, int]:
         start_t = self.t
         self.t = self.t + self.late_ns + round(burst.duration_ns / self.rate)
         self.sent.append((start_t + self.late_ns, burst))
@@ -321,7 +308,7 @@ class Controller:
 @pytest.mark.parametrize("late_ns", [0, 30_000, 200_000])
 def test_a_record_bounds_what_the_controller_did(late_ns):
     lines = Controller(late_ns=late_ns)
-    record = send_burst(lines, SPEC, 1_000_000)
+    record = trigger.send_burst(lines, SPEC, 1_000_000)
     ((began, burst),) = lines.sent
     first = began + round(burst.bits[0] * burst.bit_ns)
     assert (record.pulses, record.fault) == (16, 0)
@@ -339,28 +326,28 @@ def test_no_position_is_lost_to_a_width_fault():
     faults = 0
     for _ in range(10_000):
         lines.late_ns = rng.randrange(5_000_000)
-        faults += send_burst(lines, SPEC, lines.t + 100_000_000).fault != 0
+        faults += trigger.send_burst(lines, SPEC, lines.t + 100_000_000).fault != 0
     assert (faults, len(lines.sent)) == (0, 10_000)
 
 
 def test_a_burst_can_be_stopped_only_before_it_begins():
     lines = Controller()
     questions = []
-    record = send_burst(lines, SPEC, 0, None, lambda: bool(questions.append(1)))
+    record = trigger.send_burst(lines, SPEC, 0, None, lambda: bool(questions.append(1)))
     assert (record.pulses, len(questions)) == (16, 1)
-    assert send_burst(lines, SPEC, 50_000_000, None, lambda: True).pulses == 0
+    assert trigger.send_burst(lines, SPEC, 50_000_000, None, lambda: True).pulses == 0
     assert len(lines.sent) == 1
 
 
 @pytest.mark.parametrize(("rate", "fault"), [(1.0, 0), (1.6, PiFault.PERIOD_TOO_SHORT), (0.2, PiFault.PULSE_TOO_LONG)])
 def test_a_wrong_clock_is_a_fault(rate, fault):
     """A Pi's core clock changes where `core_freq` is not fixed, and with it the SPI clock."""
-    assert send_burst(Controller(rate), SPEC, 0).fault == fault
+    assert trigger.send_burst(Controller(rate), SPEC, 0).fault == fault
 
 
 def test_a_burst_that_would_come_too_soon_is_not_sent():
     lines = Controller()
-    record = send_burst(lines, SPEC, 1_000_000, previous_rise_ns=1_000_000 - MIN_PERIOD_NS + 50_000)
+    record = trigger.send_burst(lines, SPEC, 1_000_000, previous_rise_ns=1_000_000 - MIN_PERIOD_NS + 50_000)
     assert (record.pulses, record.fault, lines.sent) == (0, PiFault.PERIOD_TOO_SHORT, [])
 
 
@@ -418,9 +405,9 @@ def test_pulses_that_are_not_seen_are_a_fault(seen):
     lines = FakeLines()
     lines.seen = seen
     posted = []
-    loop = TriggerLoop(lines, posted.append, lambda: None)
+    loop = trigger.TriggerLoop(lines, posted.append, lambda: None)
     loop.arm(2, SPEC)
-    loop._take(Edge(100_000_000, 1))
+    loop._take(trigger.Edge(100_000_000, 1))
     sent, fault = posted
     assert (sent.record.pulses, fault.number) == (seen(16), PiFault.PULSES_UNSEEN)
     assert f"16 pulses sent, {seen(16)} seen" in fault.detail

@@ -9,46 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from polysight.radar import commands as c
 from polysight.radar.calibration_data import InitCalibrations, RestoreCalibration, SaveCalibration
-from polysight.radar.commands import (
-    APLL_BANDWIDTH,
-    DATA_PATH,
-    DATA_PATH_CLOCK,
-    DEVICE_CONFIGURATION,
-    GET_DIE_ID,
-    GET_MAIN_VERSION,
-    GET_RF_VERSION,
-    GET_TEMPERATURES,
-    HSI_CLOCK,
-    LANE_ENABLE,
-    LOW_POWER_OFF,
-    LVDS_LANES,
-    READ_FRAME,
-    RF_DEVICE,
-    RF_INIT,
-    RF_POWER_UP,
-    SLOPE_HZ_PER_S_PER_CODE,
-    START,
-    START_HZ_PER_CODE,
-    STOP_AT_FRAME_END,
-    STOP_WHILE_WAITING,
-    AdcOutput,
-    Channels,
-    Chirp,
-    Command,
-    DataFormat,
-    Frame,
-    FrameApply,
-    FrameControl,
-    LdoBypass,
-    Profile,
-    slope_code,
-    start_code,
-)
 from polysight.radar.firmware import file_chunks
 from polysight.radar.messages import command, decode, encode
 
-PUBLISHED = Profile(
+PUBLISHED = c.Profile(
     start_hz=76.01e9,
     slope_hz_per_s=38.816929e12,
     idle_us=100.0,
@@ -61,7 +27,7 @@ PUBLISHED = Profile(
     rx_gain_db=30,
     rf_gain_target_db=30,
 )
-OTHER = Profile(
+OTHER = c.Profile(
     start_hz=76.01087e9,
     slope_hz_per_s=38.816929e12,
     idle_us=100.0,
@@ -76,19 +42,19 @@ OTHER = Profile(
     tx_backoff_db=3,
 )
 # What TI's mmWaveLink library writes to its SPI driver for these parameters (run beside this project).
-VECTORS: list[tuple[Command, str]] = [
-    (DEVICE_CONFIGURATION, "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"),
-    (RF_POWER_UP, "3412214305801400001400000100e56b00400400f1e663c9"),
-    (Channels(tx=0b010), "3412214301011c00002400000100e1da80000c000f0002000000200063bd8fee"),
-    (AdcOutput("complex1x"), "3412214301011c00003400000100e1ca82000c000200010000000000f1fde42d"),
-    (AdcOutput("complex2x"), "3412214301011c00004400000100e1ba82000c000200020000000000ed524a69"),
-    (LdoBypass(), "341221438105180000540000010065a6cc0208000000000019a7ce6f"),
-    (LdoBypass(bypass=True), "34122143810518000064000001006596cc020800010000007fa1e435"),
-    (DataFormat(), "3412214385802000007400000100590b414010000f0002000100000000000000cc565a60"),
-    (LOW_POWER_OFF, "3412214301011800008400000100e57a83000800000000001a845d5e"),
-    (APLL_BANDWIDTH, "3412214301012400009400000100d96a8d001400010826090000000000000000000000000a1a13dd"),
-    (RF_DEVICE, "341221430101200000a400000100dd5a86001000050000000000000001000000e20bc2f4"),
-    (RF_INIT, "341221438101140000b400000100694ac00004004867aad4"),
+VECTORS: list[tuple[c.Command, str]] = [
+    (c.DEVICE_CONFIGURATION, "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"),
+    (c.RF_POWER_UP, "3412214305801400001400000100e56b00400400f1e663c9"),
+    (c.Channels(tx=0b010), "3412214301011c00002400000100e1da80000c000f0002000000200063bd8fee"),
+    (c.AdcOutput("complex1x"), "3412214301011c00003400000100e1ca82000c000200010000000000f1fde42d"),
+    (c.AdcOutput("complex2x"), "3412214301011c00004400000100e1ba82000c000200020000000000ed524a69"),
+    (c.LdoBypass(), "341221438105180000540000010065a6cc0208000000000019a7ce6f"),
+    (c.LdoBypass(bypass=True), "34122143810518000064000001006596cc020800010000007fa1e435"),
+    (c.DataFormat(), "3412214385802000007400000100590b414010000f0002000100000000000000cc565a60"),
+    (c.LOW_POWER_OFF, "3412214301011800008400000100e57a83000800000000001a845d5e"),
+    (c.APLL_BANDWIDTH, "3412214301012400009400000100d96a8d001400010826090000000000000000000000000a1a13dd"),
+    (c.RF_DEVICE, "341221430101200000a400000100dd5a86001000050000000000000001000000e20bc2f4"),
+    (c.RF_INIT, "341221438101140000b400000100694ac00004004867aad4"),
     (
         PUBLISHED,
         "341221430102400000c400000100bd3900013000000000004a9f745410270000bc0200003232000000000000000000002403000000016608000000001e0000004e5a5104",
@@ -97,35 +63,35 @@ VECTORS: list[tuple[Command, str]] = [
         OTHER,
         "341221430102400000d400000100bd290001300000000000a4de7454102700008a020000323200000303030000000000240300000002881302030000a800000045fc8d4f",
     ),
-    (Chirp(tx=0b010), "341221430102280000e400000100d519010118000000000000000000000000000000000000000200aa998d3b"),
-    (DATA_PATH, "3412214385801c0000f4000001005c8b42400c00010100020000000046a469ae"),
-    (DATA_PATH_CLOCK, "3412214385801800000400000100617b4440080001010000e10cb60d"),
-    (HSI_CLOCK, "3412214301011800001400000100e5ea8500080009000000ddef4a25"),
-    (LANE_ENABLE, "3412214385801800002400000100615b434008000f000000c1a45aec"),
-    (LVDS_LANES, "3412214385801800003400000100614b45400800000001006f51ef83"),
+    (c.Chirp(tx=0b010), "341221430102280000e400000100d519010118000000000000000000000000000000000000000200aa998d3b"),
+    (c.DATA_PATH, "3412214385801c0000f4000001005c8b42400c00010100020000000046a469ae"),
+    (c.DATA_PATH_CLOCK, "3412214385801800000400000100617b4440080001010000e10cb60d"),
+    (c.HSI_CLOCK, "3412214301011800001400000100e5ea8500080009000000ddef4a25"),
+    (c.LANE_ENABLE, "3412214385801800002400000100615b434008000f000000c1a45aec"),
+    (c.LVDS_LANES, "3412214385801800003400000100614b45400800000001006f51ef83"),
     (
-        Frame(frames=5600, period_us=1300.0, samples=256),
+        c.Frame(frames=5600, period_us=1300.0, samples=256),
         "3412214301022c00004400000100d1b902011c000000000000000100e0150002a0f703000200000000000000c512bb5b",
     ),
-    (FrameApply(samples=256), "3412214385811c000054000001005d2ac0400c00010000000002000002cbcd89"),
+    (c.FrameApply(samples=256), "3412214385811c000054000001005d2ac0400c00010000000002000002cbcd89"),
     (
-        Frame(frames=350, period_us=10000.0, samples=256, loops=16, trigger_delay_us=2.0),
+        c.Frame(frames=350, period_us=10000.0, samples=256, loops=16, trigger_delay_us=2.0),
         "3412214301022c00006400000100d19902011c0000000000000010005e01000280841e000200000090010000b0a60481",
     ),
-    (FrameApply(samples=256, chirps=16), "3412214385811c000074000001005d0ac0400c00100000000002000056c726ac"),
-    (FrameControl(START), "3412214381021800008400000100657940010800010000005e5b90a3"),
-    (FrameControl(STOP_AT_FRAME_END), "34122143810218000094000001006569400108000000000005e18ef3"),
-    (FrameControl(STOP_WHILE_WAITING), "341221438102180000a4000001006559400108000400000051177a9e"),
-    (GET_RF_VERSION, "341221434104140000b400000100a947200204009e8d2da9"),
-    (GET_MAIN_VERSION, "34122143c581140000c40000010024bae04004006c141ab5"),
-    (GET_TEMPERATURES, "34122143c105140000d4000001002926ea020400fd69edbf"),
+    (c.FrameApply(samples=256, chirps=16), "3412214385811c000074000001005d0ac0400c00100000000002000056c726ac"),
+    (c.FrameControl(c.START), "3412214381021800008400000100657940010800010000005e5b90a3"),
+    (c.FrameControl(c.STOP_AT_FRAME_END), "34122143810218000094000001006569400108000000000005e18ef3"),
+    (c.FrameControl(c.STOP_WHILE_WAITING), "341221438102180000a4000001006559400108000400000051177a9e"),
+    (c.GET_RF_VERSION, "341221434104140000b400000100a947200204009e8d2da9"),
+    (c.GET_MAIN_VERSION, "34122143c581140000c40000010024bae04004006c141ab5"),
+    (c.GET_TEMPERATURES, "34122143c105140000d4000001002926ea020400fd69edbf"),
 ]
 
 
 # The same without the request of an acknowledgement.
-_PROFILE = Profile(
-    start_hz=1435384036 * START_HZ_PER_CODE,
-    slope_hz_per_s=414 * SLOPE_HZ_PER_S_PER_CODE,
+_PROFILE = c.Profile(
+    start_hz=1435384036 * c.START_HZ_PER_CODE,
+    slope_hz_per_s=414 * c.SLOPE_HZ_PER_S_PER_CODE,
     idle_us=10.0,
     adc_start_us=7.0,
     ramp_end_us=60.0,
@@ -137,8 +103,8 @@ _PROFILE = Profile(
     rf_gain_target_db=36,
     index=3,
 )
-WITHOUT_ACKNOWLEDGEMENT: list[tuple[Command, str]] = [
-    (READ_FRAME, "34122143410214000c24000001009dd922010400a14f580e"),
+WITHOUT_ACKNOWLEDGEMENT: list[tuple[c.Command, str]] = [
+    (c.READ_FRAME, "34122143410214000c24000001009dd922010400a14f580e"),
     (InitCalibrations(0x0B10), "34122143010120000c4400000100d1ba89001000100b00000000000000000000d0762e17"),
     (SaveCalibration(0), "34122143410118000c540000010099aaab0008000000000081be78de"),
     (SaveCalibration(1), "34122143410118000c6400000100999aab00080000000100c3eef525"),
@@ -152,7 +118,7 @@ WITHOUT_ACKNOWLEDGEMENT: list[tuple[Command, str]] = [
         "656c737a81888f969da4abb2b9c0c7ced5dce3eaf1f8040b121920272e353c434a51585f666d747b828990979ea5acb36df8"
         "cb05",
     ),
-    (GET_DIE_ID, "34122143410414000c14000001009de723020400940f23a0"),
+    (c.GET_DIE_ID, "34122143410414000c14000001009de723020400940f23a0"),
     (
         _PROFILE,
         "34122143010240000c2400000100b1d90001300003000000e4388e55e8030000bc0200007017000000000000000000009e01"
@@ -164,9 +130,9 @@ WITHOUT_ACKNOWLEDGEMENT: list[tuple[Command, str]] = [
 @pytest.mark.parametrize(
     ("sent", "expected"),
     VECTORS + WITHOUT_ACKNOWLEDGEMENT,
-    ids=lambda v: v.name if isinstance(v, Command) else "",
+    ids=lambda v: v.name if isinstance(v, c.Command) else "",
 )
-def test_bytes_are_those_of_ti_s_library(sent: Command, expected: str):
+def test_bytes_are_those_of_ti_s_library(sent: c.Command, expected: str):
     message = decode(bytes.fromhex(expected))
     assert message.blocks == (sent.block(),)
     assert message.message_id == sent.block().message_id
@@ -193,14 +159,14 @@ def test_parts_of_an_image_are_those_of_the_reference_encoder():
 
 @given(st.integers(0x5471C71C, 0x5A000000), st.integers(-5510, 5510))
 def test_codes_are_the_nearest(start: int, slope: int):
-    assert start_code(start * START_HZ_PER_CODE) == start
-    assert slope_code(slope * SLOPE_HZ_PER_S_PER_CODE) == slope
-    assert start_code((start + 0.49) * START_HZ_PER_CODE) == start
+    assert c.start_code(start * c.START_HZ_PER_CODE) == start
+    assert c.slope_code(slope * c.SLOPE_HZ_PER_S_PER_CODE) == slope
+    assert c.start_code((start + 0.49) * c.START_HZ_PER_CODE) == start
 
 
 @given(st.integers(0, 65535), st.floats(300.0, 1.342e6), st.integers(1, 255))
 def test_frames_can_be_decoded_from_their_bytes(frames: int, period_us: float, loops: int):
-    data = Frame(frames, period_us, 256, loops).data()
+    data = c.Frame(frames, period_us, 256, loops).data()
     assert len(data) == 24
     fields = struct.unpack("<6HIHHI", data)
     assert (fields[3], fields[4], fields[7]) == (loops, frames, 2)
@@ -209,6 +175,6 @@ def test_frames_can_be_decoded_from_their_bytes(frames: int, period_us: float, l
 
 def test_a_value_that_exceeds_its_field_is_refused():
     with pytest.raises(ValueError, match="Frame"):
-        Frame(70_000, 1300.0, 256).block()
+        c.Frame(70_000, 1300.0, 256).block()
     with pytest.raises(ValueError, match="Chirp"):
-        Chirp(tx=-1).block()
+        c.Chirp(tx=-1).block()

@@ -8,31 +8,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.radar.messages import (
-    DEVICE_SYNC,
-    Direction,
-    Kind,
-    Message,
-    SubBlock,
-    checksum,
-    command,
-    crc,
-    decode,
-    decode_header,
-    encode,
-)
+from polysight.radar import messages as m
 from polysight_shared.errors import ProtocolError
 
 
 @st.composite
-def message(draw) -> Message:
+def message(draw) -> m.Message:
     ident = draw(st.integers(0, 1023))
     numbers = st.integers(0, 31).map(lambda n: ident * 32 + n)
     sizes = st.binary(max_size=40).filter(lambda b: len(b) % 4 == 0)
-    blocks = draw(st.lists(st.builds(SubBlock, numbers, sizes), max_size=5))
-    return Message(
-        direction=draw(st.sampled_from(Direction)),
-        kind=draw(st.sampled_from(Kind)),
+    blocks = draw(st.lists(st.builds(m.SubBlock, numbers, sizes), max_size=5))
+    return m.Message(
+        direction=draw(st.sampled_from(m.Direction)),
+        kind=draw(st.sampled_from(m.Kind)),
         message_id=ident,
         blocks=tuple(blocks),
         sequence=draw(st.integers(0, 15)),
@@ -42,47 +30,47 @@ def message(draw) -> Message:
 
 
 @given(message())
-def test_round_trip(original: Message):
-    raw = encode(original)
+def test_round_trip(original: m.Message):
+    raw = m.encode(original)
     assert len(raw) % 4 == 0
-    assert decode(raw) == original
-    assert decode_header(raw).length == len(raw) - 4
+    assert m.decode(raw) == original
+    assert m.decode_header(raw).length == len(raw) - 4
 
 
 @given(message(), st.data())
-def test_any_flipped_bit_is_detected(original: Message, data):
-    raw = bytearray(encode(original))
+def test_any_flipped_bit_is_detected(original: m.Message, data):
+    raw = bytearray(m.encode(original))
     bit = data.draw(st.integers(0, 8 * len(raw) - 1))
     raw[bit // 8] ^= 1 << bit % 8
     with pytest.raises(ProtocolError):
-        decode(bytes(raw))
+        m.decode(bytes(raw))
 
 
 @given(st.binary(max_size=300))
 def test_noise_is_refused(noise: bytes):
     with pytest.raises(ProtocolError):
-        decode(DEVICE_SYNC + noise[: len(noise) // 2] + b"\0")
+        m.decode(m.DEVICE_SYNC + noise[: len(noise) // 2] + b"\0")
 
 
 def test_checksum_of_the_control_document():
     """Its table 2.6."""
     words = struct.pack("<5H", 0x0281, 0x0800, 0x040C, 0x0000, 0x0001)
-    assert checksum(words) == 0xF171
+    assert m.checksum(words) == 0xF171
 
 
 def test_the_16_bit_crc_is_ccitt_false():
     """Its check value; messages with it are in test_received.py."""
-    assert crc(b"123456789", 2) == bytes.fromhex("b129")
+    assert m.crc(b"123456789", 2) == bytes.fromhex("b129")
 
 
 @pytest.mark.parametrize(
     ("blocks", "sequence", "value"),
     [
-        ((SubBlock(0x4080, bytes(240)),), 0, "256"),
-        ((SubBlock(0x0100), SubBlock(0x4040)), 0, "message id"),
-        ((SubBlock(0x0100),), 16, "sequence 16"),
+        ((m.SubBlock(0x4080, bytes(240)),), 0, "256"),
+        ((m.SubBlock(0x0100), m.SubBlock(0x4040)), 0, "message id"),
+        ((m.SubBlock(0x0100),), 16, "sequence 16"),
     ],
 )
 def test_a_message_that_exceeds_its_limits_is_refused(blocks, sequence, value):
     with pytest.raises(ValueError, match=value):
-        encode(command(blocks, sequence=sequence))
+        m.encode(m.command(blocks, sequence=sequence))

@@ -13,19 +13,9 @@ import pytest
 from tests.support.radar.boards import VirtualClock
 from tests.support.refusals import refused
 
+from polysight.radar import messages as m
 from polysight.radar.commands import DEVICE_CONFIGURATION, GET_MAIN_VERSION, LOW_POWER_OFF, RF_POWER_UP
 from polysight.radar.link import Link
-from polysight.radar.messages import (
-    BOOT_STATUS,
-    MAIN_CPU_FAULT,
-    MAIN_POWER_UP,
-    Direction,
-    Kind,
-    SubBlock,
-    decode,
-    decode_event,
-    decode_header,
-)
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.radars.cores import frame, ones_sum
 
@@ -95,28 +85,28 @@ def connect(*messages: bytes) -> tuple[Link, Sent]:
 
 @pytest.mark.parametrize("raw", RECEIVED.values(), ids=RECEIVED.keys())
 def test_every_received_message_is_decoded(raw):
-    message = decode(raw)
-    assert decode_header(raw).crc_bytes == (4 if raw is AWR2243_ERROR else 2)
-    assert message.kind in (Kind.RESPONSE, Kind.EVENT)
+    message = m.decode(raw)
+    assert m.decode_header(raw).crc_bytes == (4 if raw is AWR2243_ERROR else 2)
+    assert message.kind in (m.Kind.RESPONSE, m.Kind.EVENT)
 
 
 def test_an_error_has_message_id_0_error_number_and_sub_block():
-    message = decode(AWR2243_ERROR)
-    assert (message.message_id, message.sequence, message.direction) == (0, 10, Direction.RF_TO_HOST)
+    message = m.decode(AWR2243_ERROR)
+    assert (message.message_id, message.sequence, message.direction) == (0, 10, m.Direction.RF_TO_HOST)
     assert message.error == (62, 0x0105)
 
 
 @pytest.mark.parametrize(("raw", "error"), [(AWR1243_ERROR, (None, None)), (AWR1243_RF_UP, None)])
 def test_a_message_without_a_body_is_an_error_by_its_kind_alone(raw, error):
-    message = decode(raw)
+    message = m.decode(raw)
     assert (message.blocks, message.error) == ((), error)
 
 
 @pytest.mark.parametrize("raw", [AWR1243_UP_EMPTY, AWR1243_UP_WRITTEN])
 def test_power_up_events_of_either_length_report_no_boot_error(raw):
-    event = decode_event(decode(raw).blocks[0])
+    event = m.decode_event(m.decode(raw).blocks[0])
     assert (event.id, event.fatal, event.values["boot_errors"], event.values["tests_failed"]) == (
-        MAIN_POWER_UP,
+        m.MAIN_POWER_UP,
         False,
         0,
         0,
@@ -125,8 +115,8 @@ def test_power_up_events_of_either_length_report_no_boot_error(raw):
 
 
 def test_the_fault_during_loading_is_a_register_read_back_error():
-    event = decode_event(decode(AWR2243_FAULT).blocks[0])
-    assert event.id == MAIN_CPU_FAULT
+    event = m.decode_event(m.decode(AWR2243_FAULT).blocks[0])
+    assert event.id == m.MAIN_CPU_FAULT
     assert "register read-back" in event.detail
 
 
@@ -212,9 +202,9 @@ def test_an_answer_with_a_missing_chunk_is_no_answer(chunks):
         (1 << 47, "bit 47", ""),
     ],
 )
-@pytest.mark.parametrize("number", [MAIN_POWER_UP, BOOT_STATUS])
+@pytest.mark.parametrize("number", [m.MAIN_POWER_UP, m.BOOT_STATUS])
 def test_boot_bits_have_their_meaning(number, bits, meaning, cure):
-    event = decode_event(SubBlock(number, bytes(4) + bits.to_bytes(8, "little") + bytes(8)))
+    event = m.decode_event(m.SubBlock(number, bytes(4) + bits.to_bytes(8, "little") + bytes(8)))
     assert meaning in event.detail
     assert event.values["cure"] == cure
     assert not event.fatal

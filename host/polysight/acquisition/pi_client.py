@@ -19,42 +19,11 @@ import msgspec
 import zmq
 
 from polysight.capture import take_priority
+from polysight_shared import messages as m
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, ProtocolError, ScanError
 from polysight_shared.faults import PiFault
-from polysight_shared.messages import (
-    JOURNALLED,
-    Abort,
-    Accepted,
-    Alive,
-    AnyCommand,
-    AnyEvent,
-    AnyReply,
-    Axis,
-    BeginRun,
-    EndRun,
-    ExitStatus,
-    Heartbeat,
-    Hello,
-    HelloReply,
-    Home,
-    Jog,
-    Pulse,
-    Pulsed,
-    Refused,
-    Replay,
-    ReplayReply,
-    RowFinished,
-    RowStarted,
-    RunRow,
-    State,
-    Status,
-    StatusReply,
-    pack,
-    unpack_event,
-    unpack_reply,
-)
 from polysight_shared.sockets import HandshakeMonitor, requester, subscriber
 
 # Number of times that a command is sent before the Pi counts as silent.
@@ -66,14 +35,14 @@ _SILENT_BEATS = 10
 # Time to wait for a reply to `Alive` before it is sent again.
 _ALIVE_TIMEOUT_S = 1.0
 # States that change without a command.
-MOVING: tuple[State, ...] = ("homing", "jogging", "running", "held", "done")
+MOVING: tuple[m.State, ...] = ("homing", "jogging", "running", "held", "done")
 _REST_TIMEOUT_S = 10.0
 # Period of the heartbeat during a jog where the rig file has none for rows.
 _JOG_HEARTBEAT_MS = 100
 _POLL_S = 0.05
 # Events that one reply brings from the Pi's journal.
 _REPLAY_LIMIT = 1000
-R = TypeVar("R", bound=AnyReply)
+R = TypeVar("R", bound=m.AnyReply)
 
 
 class HostHeartbeat:
@@ -86,7 +55,7 @@ class HostHeartbeat:
         self, context: zmq.Context[Any], instrument: Instrument, scan_id: str, interval_s: float, owner: str = ""
     ) -> None:
         self._socket = requester(context, instrument.pi.command_address, Path(instrument.pi.key_dir))
-        self._alive = pack(Alive(scan_id=scan_id, owner=owner))
+        self._alive = m.pack(m.Alive(scan_id=scan_id, owner=owner))
         self._interval_s = interval_s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
@@ -118,7 +87,7 @@ class HostHeartbeat:
 class RefusedError(ScanError):
     """The Pi refused a command; `number` is of shared/polysight_shared/faults.py."""
 
-    def __init__(self, command: str, refusal: Refused) -> None:
+    def __init__(self, command: str, refusal: m.Refused) -> None:
         problem = f"the Pi refused {command}: {refusal.problem}"
         super().__init__(problem, refusal.cause, refusal.remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = refusal.number
@@ -139,7 +108,7 @@ class PiClient:
         self._event_address = instrument.pi.event_address
         self._timeout_s = instrument.limits.command_timeout_s
         self._silence_s = max(10 * instrument.pi.heartbeat_ms / 1e3, instrument.limits.command_timeout_s)
-        self._on_event: Callable[[AnyEvent], object] = lambda _: None
+        self._on_event: Callable[[m.AnyEvent], object] = lambda _: None
         keys = Path(instrument.pi.key_dir)
         self._events = subscriber(context, self._event_address, keys)
         self._commands = requester(context, self._address, keys)
@@ -148,18 +117,18 @@ class PiClient:
         self._scan_id = ""
         self._last_seq = 0
         self._last_heard_s = time.monotonic()
-        self._pending: deque[AnyEvent] = deque()
+        self._pending: deque[m.AnyEvent] = deque()
         # Events that PUB lost and the journal contained.
         self.gaps_filled = 0
         # State of the Pi in its last heartbeat.
-        self.state: State = "idle"
+        self.state: m.State = "idle"
 
     @property
     def event_socket(self) -> zmq.Socket[bytes]:
         """The event socket, for a poller."""
         return self._events
 
-    def follow(self, scan_id: str, last_seq: int, on_event: Callable[[AnyEvent], None]) -> None:
+    def follow(self, scan_id: str, last_seq: int, on_event: Callable[[m.AnyEvent], None]) -> None:
         """Follow the events of a scan: call `on_event` exactly once with each event after `last_seq`, in order."""
         self._scan_id = scan_id
         self._last_seq = last_seq
@@ -167,15 +136,15 @@ class PiClient:
 
     # --- commands ---
 
-    def hello(self) -> HelloReply:
+    def hello(self) -> m.HelloReply:
         """Identify the Pi. Raises DeviceError if it does not answer, ProtocolError for another release."""
-        return self._ask(Hello(), HelloReply)
+        return self._ask(m.Hello(), m.HelloReply)
 
-    def status(self) -> StatusReply:
+    def status(self) -> m.StatusReply:
         """Return the Pi's status. Raises DeviceError."""
-        return self._ask(Status(), StatusReply)
+        return self._ask(m.Status(), m.StatusReply)
 
-    def begin_run(self, run: BeginRun) -> None:
+    def begin_run(self, run: m.BeginRun) -> None:
         """Begin or resume a run and send its heartbeat until the run's end. Safe to repeat.
 
         Waits some heartbeats if the Pi still considers a killed program of the same scan alive.
@@ -186,7 +155,7 @@ class PiClient:
         deadline = time.monotonic() + _SILENT_BEATS * run.heartbeat_ms / 1e3
         while True:
             try:
-                self._ask(run, Accepted)
+                self._ask(run, m.Accepted)
                 break
             except RefusedError as e:
                 same_scan = e.number == PiFault.NOT_READY and self.status().scan_id == run.scan_id
@@ -198,18 +167,20 @@ class PiClient:
             interval_s = run.heartbeat_ms / 1e3
             self._heartbeat = HostHeartbeat(self._context, self._instrument, run.scan_id, interval_s, self._owner)
 
-    def end_run(self, scan_id: str, exit_status: ExitStatus, reason: str) -> None:
+    def end_run(self, scan_id: str, exit_status: m.ExitStatus, reason: str) -> None:
         """End the run. Raises RefusedError, DeviceError."""
-        self._ask(EndRun(scan_id=scan_id, exit_status=exit_status, reason=reason[:500], owner=self._owner), Accepted)
+        self._ask(
+            m.EndRun(scan_id=scan_id, exit_status=exit_status, reason=reason[:500], owner=self._owner), m.Accepted
+        )
         self._stop_heartbeat()
 
     def home(self) -> None:
         """Start homing; retry without a reply if the stage does not home. Raises RefusedError, DeviceError."""
-        command = Home(owner=self._owner)
+        command = m.Home(owner=self._owner)
         if self._once(command, self._timeout_s) is None and self.status().state != "homing":
-            self._ask(command, Accepted)
+            self._ask(command, m.Accepted)
 
-    def jog(self, axis: Axis, distance_mm: float, speed_mm_s: float) -> StatusReply:
+    def jog(self, axis: m.Axis, distance_mm: float, speed_mm_s: float) -> m.StatusReply:
         """Move one axis of the homed stage and wait for its end; return the status there.
 
         The stage stops if this program ends or is interrupted. Raises RefusedError, DeviceError, or ScanError if the
@@ -217,7 +188,7 @@ class PiClient:
         """
         from_mm = _find_place_mm(self.status(), axis)
         heartbeat_ms = self._instrument.pi.host_heartbeat_ms or _JOG_HEARTBEAT_MS
-        command = Jog(
+        command = m.Jog(
             axis=axis,
             from_mm=from_mm,
             distance_mm=distance_mm,
@@ -227,7 +198,7 @@ class PiClient:
         )
         heartbeat = HostHeartbeat(self._context, self._instrument, "", heartbeat_ms / 1e3, self._owner)
         try:
-            self._ask(command, Accepted)
+            self._ask(command, m.Accepted)
             status = self.status()
             while status.state == "jogging":
                 time.sleep(_POLL_S)
@@ -255,10 +226,10 @@ class PiClient:
 
         Raises RefusedError, DeviceError.
         """
-        command = RunRow(scan_id=scan_id, row_index=row_index, take=take, owner=self._owner)
+        command = m.RunRow(scan_id=scan_id, row_index=row_index, take=take, owner=self._owner)
         for _ in range(ATTEMPTS):
             reply = self._once(command, self._timeout_s / ATTEMPTS)
-            if isinstance(reply, Accepted):
+            if isinstance(reply, m.Accepted):
                 # The reply is newer than the last heartbeat.
                 self.state = reply.state
                 return
@@ -270,19 +241,19 @@ class PiClient:
                 return
         raise self._no_answer("RunRow")
 
-    def pulse(self, pulses: int, period_us: float, width_us: float) -> Pulsed:
+    def pulse(self, pulses: int, period_us: float, width_us: float) -> m.Pulsed:
         """Send one burst on SYNC_IN with the stage at rest. No retry: a second burst would add frames.
 
         Raises RefusedError, DeviceError.
         """
-        reply = self._once(Pulse(pulses=pulses, period_us=period_us, width_us=width_us), self._timeout_s)
-        if not isinstance(reply, Pulsed):
+        reply = self._once(m.Pulse(pulses=pulses, period_us=period_us, width_us=width_us), self._timeout_s)
+        if not isinstance(reply, m.Pulsed):
             raise self._no_answer("Pulse")
         return reply
 
     def abort(self, reason: str) -> None:
         """Abort the row now; safe to repeat. Raises RefusedError, DeviceError."""
-        self._ask(Abort(reason=reason[:500], owner=self._owner), Accepted)
+        self._ask(m.Abort(reason=reason[:500], owner=self._owner), m.Accepted)
 
     def come_to_rest(self, reason: str) -> None:
         """Abort the row and wait until the stage stands, which `end_run` needs; do nothing in another host's run.
@@ -296,7 +267,7 @@ class PiClient:
         while self.status().state in MOVING and time.monotonic() < deadline:
             time.sleep(_POLL_S)
 
-    def _ask(self, command: AnyCommand, kind: type[R]) -> R:
+    def _ask(self, command: m.AnyCommand, kind: type[R]) -> R:
         """Send a command with retries; for commands that are safe to repeat."""
         for _ in range(ATTEMPTS):
             reply = self._once(command, self._timeout_s / ATTEMPTS)
@@ -307,18 +278,18 @@ class PiClient:
                 raise ProtocolError(problem, code=ErrorCode.MESSAGE_INVALID)
         raise self._no_answer(type(command).__name__)
 
-    def _once(self, command: AnyCommand, timeout_s: float) -> AnyReply | None:
+    def _once(self, command: m.AnyCommand, timeout_s: float) -> m.AnyReply | None:
         """Send once and return the reply, None after the timeout. A new request replaces the old (relaxed REQ)."""
         try:
-            self._commands.send(pack(command))
+            self._commands.send(m.pack(command))
         except zmq.Again:
             # There is no connection.
             return None
         if not self._commands.poll(round(timeout_s * 1e3)):
             return None
-        reply = unpack_reply(self._commands.recv())
+        reply = m.unpack_reply(self._commands.recv())
         self._last_heard_s = time.monotonic()
-        if isinstance(reply, Refused):
+        if isinstance(reply, m.Refused):
             raise RefusedError(type(command).__name__, reply)
         return reply
 
@@ -341,7 +312,7 @@ class PiClient:
 
     # --- events ---
 
-    def events(self) -> list[AnyEvent]:
+    def events(self) -> list[m.AnyEvent]:
         """Return the scan's journalled events that have arrived, in order, without waiting; fetch lost ones.
 
         Raises DeviceError if the Pi is silent on both sockets, or its journal lacks the lost events.
@@ -349,12 +320,12 @@ class PiClient:
         while self._events.poll(0):
             parts = self._events.recv_multipart()
             self._last_heard_s = time.monotonic()
-            event = unpack_event(parts[-1])
-            if isinstance(event, Heartbeat):
+            event = m.unpack_event(parts[-1])
+            if isinstance(event, m.Heartbeat):
                 self.state = event.state
             if event.scan_id != self._scan_id or not self._scan_id:
                 continue
-            if isinstance(event, JOURNALLED) and event.seq == self._last_seq + 1:
+            if isinstance(event, m.JOURNALLED) and event.seq == self._last_seq + 1:
                 self._take(event)
             elif event.seq > self._last_seq:
                 self._catch_up(event.seq)
@@ -365,7 +336,7 @@ class PiClient:
         self._pending.clear()
         return out
 
-    def _take(self, event: AnyEvent) -> None:
+    def _take(self, event: m.AnyEvent) -> None:
         self._last_seq = event.seq
         self._pending.append(event)
         self._on_event(event)
@@ -374,7 +345,7 @@ class PiClient:
         """Fetch the missing journalled events up to `to_seq`."""
         while self._last_seq < to_seq:
             reply = self._ask(
-                Replay(scan_id=self._scan_id, from_seq=self._last_seq + 1, limit=_REPLAY_LIMIT), ReplayReply
+                m.Replay(scan_id=self._scan_id, from_seq=self._last_seq + 1, limit=_REPLAY_LIMIT), m.ReplayReply
             )
             seq_before = self._last_seq
             for event in reply.events:
@@ -413,13 +384,13 @@ class PiClient:
         self.close()
 
 
-def _find_place_mm(status: StatusReply, axis: Axis) -> float:
+def _find_place_mm(status: m.StatusReply, axis: m.Axis) -> float:
     if axis == "x":
         return status.x_mm
     return status.y_mm
 
 
-def _belongs_to_take(event: AnyEvent, row_index: int, take: int) -> bool:
-    if isinstance(event, RowStarted):
+def _belongs_to_take(event: m.AnyEvent, row_index: int, take: int) -> bool:
+    if isinstance(event, m.RowStarted):
         return event.row.index == row_index and event.take == take
-    return isinstance(event, RowFinished) and (event.row_index, event.take) == (row_index, take)
+    return isinstance(event, m.RowFinished) and (event.row_index, event.take) == (row_index, take)

@@ -10,32 +10,9 @@ from pathlib import Path
 
 import msgspec
 
+from polysight.doctor import rig_checks
 from polysight.doctor.bundle import write_bundle
 from polysight.doctor.context import CheckContext, DoctorOptions, System, finding_facts, not_checked, verdict
-from polysight.doctor.rig_checks import (
-    SIMULATED,
-    check_buffer,
-    check_calibration,
-    check_card,
-    check_config,
-    check_direct_path,
-    check_disk,
-    check_free,
-    check_host_clock,
-    check_keys,
-    check_level,
-    check_library,
-    check_network,
-    check_pi,
-    check_pi_clock,
-    check_pulses,
-    check_radar,
-    check_receivers,
-    check_skew,
-    check_stage,
-    check_time,
-    check_trigger,
-)
 from polysight_shared.config import Board
 from polysight_shared.errors import PolysightError, no_such, os_error
 from polysight_shared.findings import Finding
@@ -62,27 +39,27 @@ class Check:
 
 
 CHECKS = (
-    Check("config", check_config),
-    Check("host clock", check_host_clock),
-    Check("keys", check_keys, ("config",)),
-    Check("pi", check_pi, ("keys",)),
-    Check("pi clock", check_pi_clock, ("pi",)),
-    Check("rig is free", check_free, ("pi",)),
-    Check("calibration", check_calibration, ("config",)),
-    Check("library", check_library, ("config",)),
-    Check("stage", check_stage, ("pi",)),
-    Check("card", check_card, ("config",), ("rig is free",), each_board=True),
-    Check("network", check_network, ("config",), each_board=True),
-    Check("buffer", check_buffer, ("card",), each_board=True),
-    Check("receivers", check_receivers, ("config",), ("rig is free",)),
-    Check("disk", check_disk, ("config",), ("rig is free",)),
-    Check("scan time", check_time, ("config",)),
-    Check("trigger line", check_trigger, ("rig is free", "stage")),
-    Check("pulses", check_pulses, ("pi", "rig is free")),
-    Check("radar", check_radar, ("buffer", "pulses"), each_board=True),
-    Check("level", check_level, ("radar",), each_board=True),
-    Check("direct path", check_direct_path, ("level",), each_board=True),
-    Check("trigger skew", check_skew, ("direct path",)),
+    Check("config", rig_checks.check_config),
+    Check("host clock", rig_checks.check_host_clock),
+    Check("keys", rig_checks.check_keys, ("config",)),
+    Check("pi", rig_checks.check_pi, ("keys",)),
+    Check("pi clock", rig_checks.check_pi_clock, ("pi",)),
+    Check("rig is free", rig_checks.check_free, ("pi",)),
+    Check("calibration", rig_checks.check_calibration, ("config",)),
+    Check("library", rig_checks.check_library, ("config",)),
+    Check("stage", rig_checks.check_stage, ("pi",)),
+    Check("card", rig_checks.check_card, ("config",), ("rig is free",), each_board=True),
+    Check("network", rig_checks.check_network, ("config",), each_board=True),
+    Check("buffer", rig_checks.check_buffer, ("card",), each_board=True),
+    Check("receivers", rig_checks.check_receivers, ("config",), ("rig is free",)),
+    Check("disk", rig_checks.check_disk, ("config",), ("rig is free",)),
+    Check("scan time", rig_checks.check_time, ("config",)),
+    Check("trigger line", rig_checks.check_trigger, ("rig is free", "stage")),
+    Check("pulses", rig_checks.check_pulses, ("pi", "rig is free")),
+    Check("radar", rig_checks.check_radar, ("buffer", "pulses"), each_board=True),
+    Check("level", rig_checks.check_level, ("radar",), each_board=True),
+    Check("direct path", rig_checks.check_direct_path, ("level",), each_board=True),
+    Check("trigger skew", rig_checks.check_skew, ("direct path",)),
 )
 
 
@@ -163,7 +140,7 @@ def run_doctor(
     simulated = context.hello is not None and is_simulated(context.hello.backend)
     summary = _count_verdicts(findings, failed)
     if simulated:
-        summary += f" ({SIMULATED})"
+        summary += f" ({rig_checks.SIMULATED})"
     if as_json:
         document = {"ok": not failed, "simulated": simulated, "findings": [finding_facts(f) for f in findings]}
         sys.stdout.write(json.dumps(document, indent=1) + "\n")

@@ -52,20 +52,10 @@ from polysight.store import (
     ScanStarted,
 )
 from polysight.sync import SyncedRow
+from polysight_shared import messages as m
 from polysight_shared.config import Chirp, Instrument
 from polysight_shared.errors import PolysightError, ProtocolError
 from polysight_shared.findings import Finding
-from polysight_shared.messages import (
-    AnyEvent,
-    Capture,
-    Fault,
-    Heartbeat,
-    RowFinished,
-    RowStarted,
-    StageStatus,
-    unpack_event,
-    unpack_with_crc,
-)
 from polysight_shared.raster import plan_raster
 from polysight_shared.sockets import observer
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -283,17 +273,17 @@ class EventTail:
     def __init__(self, path: Path) -> None:
         self.file = GrowingFile(path)
 
-    def look(self) -> list[AnyEvent]:
+    def look(self) -> list[m.AnyEvent]:
         """Events since the last look."""
         raw = self.file.look()
         unpacker = msgpack.Unpacker(raw=True, max_buffer_size=max(len(raw), 1))
         unpacker.feed(raw)
-        events: list[AnyEvent] = []
+        events: list[m.AnyEvent] = []
         end = 0
         try:
             while True:
                 unpacker.skip()
-                events.append(unpack_with_crc(raw[end : unpacker.tell()]))
+                events.append(m.unpack_with_crc(raw[end : unpacker.tell()]))
                 end = unpacker.tell()
         except (msgpack.OutOfData, msgpack.UnpackException, ValueError, ProtocolError):
             self.file.take(end)
@@ -373,14 +363,14 @@ class PiListener:
 
     def _receive(self, raw: bytes) -> None:
         try:
-            event = unpack_event(raw)
+            event = m.unpack_event(raw)
         except ProtocolError as e:
             self.state = replace(self.state, deaf=notice_of_error(e, "note"))
             return
         state = replace(self.state, heard_s=time.monotonic(), heard_utc_s=int(time.time()), deaf=None)
-        if isinstance(event, Heartbeat):
+        if isinstance(event, m.Heartbeat):
             state = replace(state, state=event.state)
-        elif isinstance(event, StageStatus):
+        elif isinstance(event, m.StageStatus):
             stage = self._instrument.stage
             state = replace(state, x_mm=event.x_mm - stage.centre_x_mm, y_mm=event.y_mm - stage.centre_y_mm)
         elif event.scan_id == self._scan_id:
@@ -393,18 +383,18 @@ class PiListener:
         self._thread.join()
 
 
-def _follow_row(state: PiState, event: AnyEvent) -> PiState:
+def _follow_row(state: PiState, event: m.AnyEvent) -> PiState:
     """The state after an event of the scan's rows."""
-    if isinstance(event, RowStarted):
+    if isinstance(event, m.RowStarted):
         return replace(state, row=event.row.index, take=event.take, point=0, state="running")
-    if isinstance(event, Capture):
+    if isinstance(event, m.Capture):
         return replace(state, row=event.row_index, take=event.take, point=event.point + 1)
-    if isinstance(event, RowFinished):
+    if isinstance(event, m.RowFinished):
         faults = state.faults
         if event.status == "done":
             faults = ()
         return replace(state, row=-1, point=0, faults=faults)
-    if isinstance(event, Fault):
+    if isinstance(event, m.Fault):
         return replace(state, faults=(*state.faults, notice_of_fault(event))[-MAX_FAULTS:])
     return state
 

@@ -12,24 +12,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from polysight.radar import messages
 from polysight.radar.commands import RF_POWER_UP, Command
-from polysight.radar.messages import (
-    DEVICE_SYNC,
-    HEADER_BYTES,
-    READY_TO_READ,
-    RESTARTED,
-    SYNC_BYTES,
-    Direction,
-    Event,
-    Kind,
-    Message,
-    command,
-    decode,
-    decode_event,
-    decode_header,
-    describe_refusal,
-    encode,
-)
 from polysight.radar.usb import Clock, WordLink
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, ProtocolError
@@ -106,7 +90,7 @@ class Link:
         self._clock = clock
         self._on_sent = on_sent
         self.sequence = 0
-        self._events: deque[Event] = deque()
+        self._events: deque[messages.Event] = deque()
         self.may_start = True
         self.warnings: list[str] = []
 
@@ -116,7 +100,7 @@ class Link:
         self._events.clear()
         self.may_start = True
 
-    def call(self, sent: Command, *, timeout_s: float = RESPONSE_TIMEOUT_S, remaining: int = 0) -> Message:
+    def call(self, sent: Command, *, timeout_s: float = RESPONSE_TIMEOUT_S, remaining: int = 0) -> messages.Message:
         """Send a command, with retries, and return the device's answer; RF power-up is never sent twice.
 
         Raises DeviceError if the device does not answer or refuses the command.
@@ -125,15 +109,15 @@ class Link:
         retry = False
         attempts = 1 if sent is RF_POWER_UP else ATTEMPTS
         for _ in range(attempts):
-            request = command((sent.block(),), sequence=self.sequence, retry=retry, remaining=remaining)
-            self._write(encode(request))
+            request = messages.command((sent.block(),), sequence=self.sequence, retry=retry, remaining=remaining)
+            self._write(messages.encode(request))
             answer, problem = self._await_answer(request, timeout_s)
             if answer is None:
                 problems.append(problem)
                 retry = True
                 continue
             self.sequence = (self.sequence + 1) % 16
-            if answer.kind is Kind.NACK:
+            if answer.kind is messages.Kind.NACK:
                 problems.append(_lost_message("the device received a damaged message", _DISTURBED))
                 retry = False
                 continue
@@ -142,7 +126,7 @@ class Link:
             if answer.error is not None:
                 self._detect_restart()
                 raise DeviceError(
-                    f"{self._name}: the radar refuses {sent}: {describe_refusal(*answer.error)}",
+                    f"{self._name}: the radar refuses {sent}: {messages.describe_refusal(*answer.error)}",
                     "the device does not support a setting, or it is in an unexpected state",
                     "correct [chirp], [burst] or [radar]; docs/spec/mmwavelink.md",
                     code=ErrorCode.REFUSED_BY_PEER,
@@ -163,14 +147,16 @@ class Link:
             self._read_messages()
             self._clock.sleep(_INTERVAL_S)
 
-    def poll(self) -> list[Event]:
+    def poll(self) -> list[messages.Event]:
         """Read pending messages and return the new events. Raises DeviceError if the link is lost."""
         self._read_messages()
         events = list(self._events)
         self._events.clear()
         return events
 
-    def wait_for(self, ids: Sequence[int], timeout_s: float, on_event: Callable[[Event], None]) -> Event:
+    def wait_for(
+        self, ids: Sequence[int], timeout_s: float, on_event: Callable[[messages.Event], None]
+    ) -> messages.Event:
         """Wait for the first of these events; call `on_event` with every event until then.
 
         Raises NotReportedError after the timeout, DeviceError if the link is lost.
@@ -212,11 +198,11 @@ class Link:
         self._warn("it sends messages without a pause; the rest is read later")
         return None
 
-    def _await_answer(self, request: Message, timeout_s: float) -> tuple[Message | None, Finding]:
+    def _await_answer(self, request: messages.Message, timeout_s: float) -> tuple[messages.Message | None, Finding]:
         """Return the answer to the last message, or None and the reason; keep events that arrive before it."""
         deadline = self._clock.now() + timeout_s
         problem = _lost_message(f"no answer within {timeout_s:g} s", _SILENT)
-        parts: list[Message] = []
+        parts: list[messages.Message] = []
         while self._clock.now() <= deadline:
             if not self._words.interrupt():
                 self._clock.sleep(_INTERVAL_S)
@@ -224,7 +210,7 @@ class Link:
             message, reason = self._receive()
             if message is None:
                 problem = reason
-            elif message.kind is Kind.EVENT:
+            elif message.kind is messages.Kind.EVENT:
                 self._keep(message)
             elif not _answers(message, request):
                 self._warn(f"late answer to an earlier message (sequence {message.sequence})")
@@ -238,18 +224,18 @@ class Link:
             problem = _lost_message("parts of the answer are missing", _DISTURBED)
         return None, problem
 
-    def _receive(self) -> tuple[Message | None, Finding]:
+    def _receive(self) -> tuple[messages.Message | None, Finding]:
         """Read one message while the interrupt is high; return None and the reason if it cannot be read."""
         self._clock.sleep(SETTLE_S)
-        self._write(READY_TO_READ)
+        self._write(messages.READY_TO_READ)
         if not self._wait_for_low():
-            self._write(READY_TO_READ)
+            self._write(messages.READY_TO_READ)
             if not self._wait_for_low():
                 return None, _lost_message("the host interrupt stays high", _NOT_CLOCKED)
         self._clock.sleep(DATA_DELAY_S)
-        head = self._read(SYNC_BYTES)
+        head = self._read(messages.SYNC_BYTES)
         searched = 0
-        while head[-SYNC_BYTES:] != DEVICE_SYNC:
+        while head[-messages.SYNC_BYTES :] != messages.DEVICE_SYNC:
             if searched >= _SYNC_SEARCH_BYTES:
                 # The same byte again and again comes from a line that nothing drives.
                 is_constant = len(set(head)) == 1
@@ -257,15 +243,15 @@ class Link:
                 return None, _lost_message(f"no sync word in {searched} bytes", cause)
             head += self._read(2)
             searched += 2
-        head = head[-SYNC_BYTES:] + self._read(HEADER_BYTES)
+        head = head[-messages.SYNC_BYTES :] + self._read(messages.HEADER_BYTES)
         try:
-            header = decode_header(head)
+            header = messages.decode_header(head)
         except ProtocolError as e:
             self._read(_FLUSH_BYTES)
             return None, _lost_message(e.what, _DISTURBED)
         body = self._read(header.body_bytes)
         try:
-            return decode(head + body), _lost_message("", "")
+            return messages.decode(head + body), _lost_message("", "")
         except ProtocolError as e:
             return None, _lost_message(e.what, _DISTURBED)
 
@@ -277,14 +263,14 @@ class Link:
             self._clock.sleep(SETTLE_S)
         return True
 
-    def _keep(self, message: Message) -> None:
+    def _keep(self, message: messages.Message) -> None:
         """Keep the events of a message for the next poll. Raises UnexpectedRestartError."""
-        if message.kind is not Kind.EVENT:
+        if message.kind is not messages.Kind.EVENT:
             self._warn(f"unexpected answer (sequence {message.sequence})")
             return
-        for event in map(decode_event, message.blocks):
+        for event in map(messages.decode_event, message.blocks):
             self._events.append(event)
-            if event.id in RESTARTED:
+            if event.id in messages.RESTARTED:
                 if not self.may_start:
                     self._warn(str(event))
                     raise UnexpectedRestartError(self._name)
@@ -307,24 +293,26 @@ def _lost_message(what: str, why: str) -> Finding:
     return Finding("warning", what, why)
 
 
-def _answers(message: Message, request: Message) -> bool:
+def _answers(message: messages.Message, request: messages.Message) -> bool:
     """Return True if a response or NACK belongs to a command, by its message id and sequence number.
 
     A refusal has message id 0 (ICD 4.4). The only known refusal without a body had sequence number 0; it is not known
     if such a device repeats the number of the command. One with number 0 therefore always ends the command.
     """
-    if message.kind is Kind.NACK:
+    if message.kind is messages.Kind.NACK:
         return True
-    back = {Direction.HOST_TO_RF: Direction.RF_TO_HOST}.get(request.direction, Direction.MAIN_TO_HOST)
-    of_device = message.direction in (Direction.RF_TO_HOST, Direction.MAIN_TO_HOST)
+    back = {messages.Direction.HOST_TO_RF: messages.Direction.RF_TO_HOST}.get(
+        request.direction, messages.Direction.MAIN_TO_HOST
+    )
+    of_device = message.direction in (messages.Direction.RF_TO_HOST, messages.Direction.MAIN_TO_HOST)
     if message.error == (None, None) and message.sequence == 0 and of_device:
         return True
-    if message.kind is not Kind.RESPONSE or message.direction is not back:
+    if message.kind is not messages.Kind.RESPONSE or message.direction is not back:
         return False
     same_command = message.message_id == request.message_id or message.error is not None
     return same_command and message.sequence == request.sequence
 
 
-def _join_chunks(parts: Sequence[Message]) -> Message:
+def _join_chunks(parts: Sequence[messages.Message]) -> messages.Message:
     """Join the chunks of an answer (ICD 2.3.2, REMCHUNKS)."""
     return replace(parts[-1], blocks=tuple(block for part in parts for block in part.blocks))

@@ -25,32 +25,8 @@ from msgspec import UNSET
 
 from polysight.materials import Box, axis_mm
 from polysight.products import Limits, ProcessedScan, map_scan
+from polysight.report import style
 from polysight.report.permittivity_plot import permittivity_figure
-from polysight.report.style import (
-    BAR_IN,
-    HATCH,
-    INK,
-    METAL_COLOUR,
-    MUTED,
-    REFUSED_COLOUR,
-    RIGHT_IN,
-    STAMP,
-    UNKNOWN_COLOUR,
-    MapLabel,
-    assign_colours,
-    colour_bar,
-    draw_outline,
-    dress,
-    figure_label,
-    fit_labels,
-    new_figure,
-    patch_colour,
-    patch_label,
-    plate_label,
-    png,
-    shorten_labels,
-    write_label,
-)
 from polysight.results import BoardQuality
 from polysight.surfaces import Segment, Surface, describe_form, describe_material
 from polysight_shared.raster import RasterPlan
@@ -163,22 +139,22 @@ def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | No
 
 def channel_figure(scan: ProcessedScan, key: str) -> bytes:
     """Return a PNG of one of FIGURES with a colour bar. The phase of P spans the range of the patches."""
-    fig = new_figure(5.0, 4.6, BAR_IN)
+    fig = style.new_figure(5.0, 4.6, style.BAR_IN)
     ax = fig.add_subplot()
     limits = phase_limits_deg(scan) if key == "phase_p" else None
     image, unit = draw_channel(ax, scan, key, limits)
-    dress(ax, FIGURES[key], scan.stamped)
+    style.dress(ax, FIGURES[key], scan.stamped)
     if key.endswith("_p"):
         _write_ratios(ax, scan, key)
     if limits is None:
-        bar = colour_bar(fig, ax, image, unit)
+        bar = style.colour_bar(fig, ax, image, unit)
         if unit == "degrees":
             bar.set_ticks([-180, -90, 0, 90, 180])
     else:
-        bar = colour_bar(fig, ax, image, unit, extend="both")
+        bar = style.colour_bar(fig, ax, image, unit, extend="both")
         ticks = [t for t in bar.get_ticks() if limits[0] <= t <= limits[1]]
         bar.set_ticks(ticks, labels=[_wrap_degrees(t) for t in ticks])
-    return png(fig)
+    return style.png(fig)
 
 
 def _wrap_degrees(angle: float) -> str:
@@ -197,42 +173,44 @@ def _write_ratios(ax: Axes, scan: ProcessedScan, key: str) -> None:
             else:
                 # Adding zero after rounding removes the sign of a negative zero.
                 number = f"{round(patch.p_abs_db, 1) + 0.0:.1f}"
-            write_label(ax, patch.centre_x_mm, patch.centre_y_mm, number, 9, on_dark=True)
+            style.write_label(ax, patch.centre_x_mm, patch.centre_y_mm, number, 9, on_dark=True)
 
 
-def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[MapLabel]:
+def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[style.MapLabel]:
     """Draw the material map: each patch in the colour of its name, each interior pixel in that of its own name.
 
     Patches that were not judged are hatched grey. Return the labels.
     """
-    colours = assign_colours(scan)
+    colours = style.assign_colours(scan)
     rgb = np.ones((*scan.h.shape, 3)) * np.array(to_rgb("#f3f5f8"))
     for patch in scan.segments:
-        rgb[scan.labels == patch.label] = 0.55 + 0.45 * np.array(to_rgb(patch_colour(patch, colours)))
+        rgb[scan.labels == patch.label] = 0.55 + 0.45 * np.array(to_rgb(style.patch_colour(patch, colours)))
     refused = {patch.label for patch in scan.segments if patch.refused is not None}
     for label, (names, interior) in scan.pixel_names.items():
         if label not in refused:
-            rgb[interior] = [to_rgb(colours.get(str(n), UNKNOWN_COLOUR)) for n in names]
+            rgb[interior] = [to_rgb(colours.get(str(n), style.UNKNOWN_COLOUR)) for n in names]
     ax.imshow(rgb, extent=scan.extent_mm, origin="lower", interpolation="nearest")
     _crop_to_plates(ax, scan)
     labels = []
     for patch in scan.segments:
         _, y0, _, y1 = patch.box_mm
         if patch.refused is not None:
-            ax.add_patch(draw_outline(patch, fill=False, edgecolor=REFUSED_COLOUR, hatch=HATCH, linewidth=0.0))
+            ax.add_patch(
+                style.draw_outline(patch, fill=False, edgecolor=style.REFUSED_COLOUR, hatch=style.HATCH, linewidth=0.0)
+            )
         if patch.outline_mm or patch.refused is not None:
-            ax.add_patch(draw_outline(patch, fill=False, edgecolor=INK, linewidth=0.9))
-        name = patch_label(patch)
+            ax.add_patch(style.draw_outline(patch, fill=False, edgecolor=style.INK, linewidth=0.9))
+        name = style.patch_label(patch)
         second_line = ""
         if patch.refused is not None:
             second_line = "not judged"
         elif patch.confidence is not None:
             second_line = f"{100 * patch.confidence:.0f} %"
-        text = write_label(ax, patch.centre_x_mm, y1 + 0.5, name, size, above=True)
+        text = style.write_label(ax, patch.centre_x_mm, y1 + 0.5, name, size, above=True)
         _keep_inside(ax, text, y1)
         # Two lines above the patch would reach the next one.
-        write_label(ax, patch.centre_x_mm, y0 + 1.0, second_line, size, above=True)
-        labels.append(MapLabel(text, str(patch.label), name, patch_colour(patch, colours)))
+        style.write_label(ax, patch.centre_x_mm, y0 + 1.0, second_line, size, above=True)
+        labels.append(style.MapLabel(text, str(patch.label), name, style.patch_colour(patch, colours)))
     return labels
 
 
@@ -264,37 +242,39 @@ def _crop_to_plates(ax: Axes, scan: ProcessedScan) -> None:
     ax.set_ylim(bottom, top)
 
 
-def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[MapLabel]:
+def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[style.MapLabel]:
     """Draw the true plates. Return the labels."""
-    colours = assign_colours(scan)
+    colours = style.assign_colours(scan)
     _crop_to_plates(ax, scan)
     left_mm, right = ax.get_xlim()
     bottom, top = ax.get_ylim()
     labels = []
     for number, plate in enumerate(scan.plates, 1):
         x0, y0, x1, y1 = plate.box_mm
-        name = plate_label(plate, number)
+        name = style.plate_label(plate, number)
         colour = colours[plate.name]
-        ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=colour, edgecolor=INK, linewidth=0.9))
+        ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=colour, edgecolor=style.INK, linewidth=0.9))
         if y1 < top:
-            text = write_label(ax, (x0 + x1) / 2, y1 + 0.5, name, size, above=True)
+            text = style.write_label(ax, (x0 + x1) / 2, y1 + 0.5, name, size, above=True)
             _keep_inside(ax, text, y1)
         else:
             # The plate is larger than the image: a name above it would be far outside the picture.
-            text = write_label(ax, (max(x0, left_mm) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size)
-        labels.append(MapLabel(text, str(number), name, colour))
+            text = style.write_label(
+                ax, (max(x0, left_mm) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size
+            )
+        labels.append(style.MapLabel(text, str(number), name, colour))
     return labels
 
 
-def map_figure(scan: ProcessedScan, draw: Callable[[Axes, ProcessedScan], list[MapLabel]], title: str) -> bytes:
+def map_figure(scan: ProcessedScan, draw: Callable[[Axes, ProcessedScan], list[style.MapLabel]], title: str) -> bytes:
     """Return a PNG of a material map or of the truth. If names lack room all become numbers, with a legend below."""
-    fig = new_figure(4.6, 4.6, RIGHT_IN)
+    fig = style.new_figure(4.6, 4.6, style.RIGHT_IN)
     ax = fig.add_subplot()
     labels = draw(ax, scan)
-    dress(ax, title, scan.stamped)
+    style.dress(ax, title, scan.stamped)
     ax.set_facecolor("#f3f5f8")
-    fit_labels(fig, labels, RIGHT_IN)
-    return png(fig)
+    style.fit_labels(fig, labels, style.RIGHT_IN)
+    return style.png(fig)
 
 
 def permittivity_map(scan: ProcessedScan) -> bytes | None:
@@ -317,7 +297,7 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
             texts[patch.label] = f"{e.real:.2f}\n± {e.spread.real_std:.2f}"
     if not real:
         return None
-    fig = new_figure(9.4, 4.6, BAR_IN)
+    fig = style.new_figure(9.4, 4.6, style.BAR_IN)
     percents = {label: _format_percent(error) for label, error in errors.items()}
     low = min(real.values())
     high = max(real.values())
@@ -327,12 +307,12 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
     _fill_patches(
         fig, error_axes, scan, errors, percents, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|")
     )
-    dress(value_axes, "Permittivity ε′ ± standard error", simulated=False)
-    dress(error_axes, "Relative error of ε", scan.stamped)
+    style.dress(value_axes, "Permittivity ε′ ± standard error", simulated=False)
+    style.dress(error_axes, "Relative error of ε", scan.stamped)
     for ax in (value_axes, error_axes):
         ax.set_facecolor("#f3f5f8")
     error_axes.set_ylabel("")
-    return png(fig)
+    return style.png(fig)
 
 
 def _format_percent(value: float) -> str:
@@ -355,24 +335,27 @@ def _fill_patches(
     """
     colours = ScalarMappable(Normalize(scale[1], scale[2]), scale[0])
     for patch in scan.segments:
-        fill: Any = METAL_COLOUR if patch.metal_reference else "#e4e7ec"
+        fill: Any = style.METAL_COLOUR if patch.metal_reference else "#e4e7ec"
         if patch.label in values:
             fill = colours.to_rgba(np.array([values[patch.label]]))[0]
-        ax.add_patch(draw_outline(patch, facecolor=fill, edgecolor=INK, linewidth=0.9))
+        ax.add_patch(style.draw_outline(patch, facecolor=fill, edgecolor=style.INK, linewidth=0.9))
         text = "–"
         if patch.refused is not None:
-            ax.add_patch(draw_outline(patch, fill=False, edgecolor=REFUSED_COLOUR, hatch=HATCH, linewidth=0.0))
+            ax.add_patch(
+                style.draw_outline(patch, fill=False, edgecolor=style.REFUSED_COLOUR, hatch=style.HATCH, linewidth=0.0)
+            )
             text = "not\njudged"
         if patch.metal_reference or patch.metal_like:
             text = "metal"
-        write_label(ax, patch.centre_x_mm, patch.centre_y_mm, texts.get(patch.label, text), 8)
+        style.write_label(ax, patch.centre_x_mm, patch.centre_y_mm, texts.get(patch.label, text), 8)
         ax.annotate(
             str(patch.label), (patch.box_mm[0], patch.box_mm[3]), textcoords="offset points", xytext=(2.5, -2),
-            ha="left", va="top", fontsize=6.5, color=INK, path_effects=[withStroke(linewidth=2, foreground="white")],
+            ha="left", va="top", fontsize=6.5, color=style.INK,
+            path_effects=[withStroke(linewidth=2, foreground="white")],
         )  # fmt: skip
     _crop_to_plates(ax, scan)
     ax.set_aspect("equal")
-    colour_bar(fig, ax, colours, scale[3])
+    style.colour_bar(fig, ax, colours, scale[3])
 
 
 def find_masked_positions(scan: ProcessedScan) -> dict[str, npt.NDArray[np.bool_]]:
@@ -414,9 +397,9 @@ def coverage_figure(scan: ProcessedScan, masks: dict[str, npt.NDArray[np.bool_]]
     for ax, (name, mask) in zip(fig.subplots(1, len(masks), squeeze=False)[0], masks.items(), strict=True):
         colours = ListedColormap(_POSITION_COLOURS)
         ax.imshow(mask, origin="lower", extent=extent, cmap=colours, vmin=0, vmax=1, interpolation="nearest")
-        dress(ax, f"{name}: {mask.mean():.2%} masked", scan.stamped)
-        ax.set_xlabel("stage offset x (mm)", fontsize=9, color=MUTED)
-        ax.set_ylabel("stage offset y (mm)", fontsize=9, color=MUTED)
+        style.dress(ax, f"{name}: {mask.mean():.2%} masked", scan.stamped)
+        ax.set_xlabel("stage offset x (mm)", fontsize=9, color=style.MUTED)
+        ax.set_ylabel("stage offset y (mm)", fontsize=9, color=style.MUTED)
     return fig
 
 
@@ -429,16 +412,16 @@ def draw_overview(fig: Figure, axes: Sequence[Axes], scan: ProcessedScan, bar_la
         strict=True,
     ):
         image, unit = draw_channel(ax, scan, key)
-        dress(ax, title, scan.stamped)
+        style.dress(ax, title, scan.stamped)
         label = ""
         if bar_labels:
             label = unit
-        colour_bar(fig, ax, image, label)
+        style.colour_bar(fig, ax, image, label)
     labels = []
     for ax in axes[3:]:
         labels += draw_materials(ax, scan, size=6.5)
-        dress(ax, _map_title(scan), scan.stamped)
-    shorten_labels(fig, labels)
+        style.dress(ax, _map_title(scan), scan.stamped)
+    style.shorten_labels(fig, labels)
 
 
 def _map_title(scan: ProcessedScan) -> str:
@@ -457,7 +440,7 @@ def figures(scan: ProcessedScan) -> dict[str, bytes]:
         out |= {name: picture for name, picture in permittivities.items() if picture is not None}
     masks = find_masked_positions(scan)
     if any(m.any() for m in masks.values()):
-        out["coverage"] = png(coverage_figure(scan, masks))
+        out["coverage"] = style.png(coverage_figure(scan, masks))
     if scan.plates:
         out["truth"] = map_figure(scan, draw_truth, "Truth")
     return out
@@ -475,12 +458,12 @@ def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | 
     metal
         Name of the metal reference; None without one.
     """
-    fig = new_figure(5.4, 4.8, BAR_IN)
+    fig = style.new_figure(5.4, 4.8, style.BAR_IN)
     ax = fig.add_subplot()
     image, unit = draw_channel(ax, scan, "amplitude_h")
     labels = []
     for number, (name, (x0, y0, x1, y1)) in enumerate(boxes_mm.items(), 1):
-        text = figure_label(name, f"box {number}")
+        text = style.figure_label(name, f"box {number}")
         written = text
         colour = _OTHER_BOX
         below = ""
@@ -490,12 +473,12 @@ def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | 
             written = f"{text}\nmetal"
         for edge, width in (("#10141b", 3.0), (colour, 1.5)):
             ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=edge, linewidth=width))
-        middle = write_label(ax, (x0 + x1) / 2, (y0 + y1) / 2, written, 8.5, on_dark=True)
-        labels.append(MapLabel(middle, str(number), text, colour, below))
-    dress(ax, "Amplitude H, and the boxes", scan.stamped)
-    colour_bar(fig, ax, image, unit)
-    fit_labels(fig, labels, BAR_IN)
-    return png(fig)
+        middle = style.write_label(ax, (x0 + x1) / 2, (y0 + y1) / 2, written, 8.5, on_dark=True)
+        labels.append(style.MapLabel(middle, str(number), text, colour, below))
+    style.dress(ax, "Amplitude H, and the boxes", scan.stamped)
+    style.colour_bar(fig, ax, image, unit)
+    style.fit_labels(fig, labels, style.BAR_IN)
+    return style.png(fig)
 
 
 def focus_figure(
@@ -514,15 +497,15 @@ def focus_figure(
     FigureCanvasAgg(fig)
     curve, *pictures = fig.subplots(1, 3, width_ratios=[1.1, 1, 1])
     curve.plot(sweep["depths_mm"], sweep["sharpness"], "o-", color="#44AA99", markersize=4)
-    curve.axvline(0, color=MUTED, linewidth=1, linestyle=":", label="rig file")
+    curve.axvline(0, color=style.MUTED, linewidth=1, linestyle=":", label="rig file")
     curve.axvline(sweep["depth_mm"], color="#882255", linewidth=1.4, label=f"found: {sweep['depth_mm']:+.2f} mm")
-    curve.set_xlabel("plane, relative to the rig file (mm)", fontsize=9, color=MUTED)
-    curve.set_ylabel("sharpness of the untilted plane", fontsize=9, color=MUTED)
+    curve.set_xlabel("plane, relative to the rig file (mm)", fontsize=9, color=style.MUTED)
+    curve.set_ylabel("sharpness of the untilted plane", fontsize=9, color=style.MUTED)
     tilt = sweep["tilt_deg"]
     title = "No clear maximum"
     if sweep["certain"]:
         title = f"Tilt found: {tilt[0]:+.2f}° in x, {tilt[1]:+.2f}° in y"
-    curve.set_title(title, loc="left", fontsize=10, color=INK)
+    curve.set_title(title, loc="left", fontsize=10, color=style.INK)
     curve.legend(fontsize=8, frameon=False)
     top = max(float(np.abs(before).max()), float(np.abs(after).max()), 1e-30)
     x = axis_mm(x_m)
@@ -534,13 +517,13 @@ def focus_figure(
         mesh = ax.pcolormesh(
             x, y, level, cmap="cividis", vmin=-_FOCUS_RANGE_DB, vmax=0, shading="nearest", rasterized=True
         )
-        ax.set_title(title, loc="left", fontsize=10, color=INK)
+        ax.set_title(title, loc="left", fontsize=10, color=style.INK)
         ax.set_aspect("equal")
-        ax.set_xlabel("x (mm)", fontsize=9, color=MUTED)
-        colour_bar(fig, ax, mesh, "dB")
+        ax.set_xlabel("x (mm)", fontsize=9, color=style.MUTED)
+        style.colour_bar(fig, ax, mesh, "dB")
     if simulated:
-        fig.suptitle("SIMULATED", fontsize=9, color=STAMP, fontweight="bold", x=0.99, ha="right")
-    return png(fig)
+        fig.suptitle("SIMULATED", fontsize=9, color=style.STAMP, fontweight="bold", x=0.99, ha="right")
+    return style.png(fig)
 
 
 def surface_figure(surface: Surface) -> bytes:
@@ -566,17 +549,19 @@ def surface_figure(surface: Surface) -> bytes:
         start = points_mm[::stride]
         needle = NORMAL_MM * surface.normals[::stride]
         ends = start + needle
-        ax.plot([start[:, across], ends[:, across]], [start[:, up], ends[:, up]], color=INK, linewidth=0.5, alpha=0.6)
-        dress(ax, title, surface.simulated)
-        ax.set_xlabel(label_x, fontsize=9, color=MUTED)
-        ax.set_ylabel(label_y, fontsize=9, color=MUTED)
+        ax.plot(
+            [start[:, across], ends[:, across]], [start[:, up], ends[:, up]], color=style.INK, linewidth=0.5, alpha=0.6
+        )
+        style.dress(ax, title, surface.simulated)
+        ax.set_xlabel(label_x, fontsize=9, color=style.MUTED)
+        ax.set_ylabel(label_y, fontsize=9, color=style.MUTED)
         ax.set_aspect("equal", adjustable="datalim")
     if np.isfinite(colour).any() and coloured is not None:
         bar = fig.colorbar(coloured, ax=panels, shrink=0.85, pad=0.01)
-        bar.set_label("permittivity, real part", fontsize=9, color=MUTED)
+        bar.set_label("permittivity, real part", fontsize=9, color=style.MUTED)
     lines = [segment_text(segment) for segment in surface.segments[:MAX_LINES]]
-    fig.supxlabel("\n".join(lines), fontsize=9, color=INK, x=0.01, ha="left")
-    return png(fig)
+    fig.supxlabel("\n".join(lines), fontsize=9, color=style.INK, x=0.01, ha="left")
+    return style.png(fig)
 
 
 def surface_colours(surface: Surface) -> npt.NDArray[np.float64]:

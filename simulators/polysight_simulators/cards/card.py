@@ -21,18 +21,7 @@ from numpy.typing import NDArray
 from polysight_shared.config import Board, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, PolysightError
-from polysight_simulators.cards.dca1000 import (
-    DATA_HEADER_BYTES,
-    SOURCE_PORT,
-    TAIL_S,
-    Card,
-    Message,
-    Network,
-    Output,
-    Packetiser,
-    Packets,
-    parse_request,
-)
+from polysight_simulators.cards import dca1000
 from polysight_simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults, fault_generator
 from polysight_simulators.cards.sync_in import RECOVERY_US, Pulse, StageTrack, SyncInput
 from polysight_simulators.faults import Faults
@@ -210,7 +199,7 @@ class CardSender:
     def _send(self, rows: Rows) -> None:
         size = rows.shape[1]
         self.packets += len(rows)
-        self.payload_bytes += len(rows) * max(0, size - DATA_HEADER_BYTES)
+        self.payload_bytes += len(rows) * max(0, size - dca1000.DATA_HEADER_BYTES)
         if self._segmented and len(rows) > 1:
             segment = [(socket.IPPROTO_UDP, _UDP_SEGMENT, struct.pack("=H", size))]
             self._send_datagram(np.ascontiguousarray(rows).data, self._data_to, segment)
@@ -295,7 +284,7 @@ class CardEndpoint:
     def __init__(
         self,
         name: str,
-        network: Network,
+        network: dca1000.Network,
         faults: Faults,
         seed: int,
         time_scale: float,
@@ -304,7 +293,7 @@ class CardEndpoint:
     ) -> None:
         self.name = name
         self.counts: Counter[str] = Counter()
-        self.card = Card(
+        self.card = dca1000.Card(
             network,
             no_data_floor_s=NO_DATA_FLOOR_S * time_scale,
         )
@@ -315,19 +304,19 @@ class CardEndpoint:
         self._network_faults = NetworkFaults(faults, seed, name, self.counts)
         self._status_rng = fault_generator(seed, name, "status")
         if faults.twin:
-            self._twin = Packetiser(sequence=700, byte_count=1 << 40)
+            self._twin = dca1000.Packetiser(sequence=700, byte_count=1 << 40)
         else:
             self._twin = None
         self._deaf_until_s = float("-inf")
         self.bindings = 0
         self._bind(network)
 
-    def _bind(self, network: Network) -> None:
+    def _bind(self, network: dca1000.Network) -> None:
         self._commands = bound_udp(network.card_address, network.command_port)
         self._commands.setblocking(False)
         try:
             self.sender = CardSender(
-                (network.card_address, SOURCE_PORT),
+                (network.card_address, dca1000.SOURCE_PORT),
                 (network.host_address, network.command_port),
                 (network.host_address, network.data_port),
                 self._wait_for_receiver,
@@ -370,7 +359,7 @@ class CardEndpoint:
             self._serve(datagram)
 
     def _serve(self, datagram: bytes) -> None:
-        request = parse_request(datagram)
+        request = dca1000.parse_request(datagram)
         if request is None:
             self.counts["not_requests"] += 1
             return
@@ -382,16 +371,16 @@ class CardEndpoint:
             self.counts["requests_unanswered"] += 1
             return
         reply, *further_replies = self.card.command(datagram, self.wire_s())
-        if isinstance(reply, Message):
+        if isinstance(reply, dca1000.Message):
             self.counts["replies"] += 1
             for _ in range(2 if self._twin else 1):
                 self.sender.reply(reply.payload)
         self.emit(further_replies)
 
-    def emit(self, outputs: Sequence[Output]) -> None:
+    def emit(self, outputs: Sequence[dca1000.Output]) -> None:
         """Send the card's output through the faults of the network."""
         for output in outputs:
-            if isinstance(output, Packets):
+            if isinstance(output, dca1000.Packets):
                 self._emit_packets(output)
                 continue
             if not self.card.recording:
@@ -403,13 +392,13 @@ class CardEndpoint:
                 self.counts["statuses"] += 1
                 self.sender.put_status(output.payload)
 
-    def _emit_packets(self, packets: Packets) -> None:
+    def _emit_packets(self, packets: dca1000.Packets) -> None:
         self.counts["packets_made"] += len(packets.rows)
         self.counts["bytes_made"] += packets.payload_bytes
         for rows in self._network_faults.carry(packets.rows):
             self.sender.put_packets(rows)
         if self._twin is not None:
-            reversed_payload = packets.rows[:, DATA_HEADER_BYTES:].reshape(-1)[::-1]
+            reversed_payload = packets.rows[:, dca1000.DATA_HEADER_BYTES :].reshape(-1)[::-1]
             self.sender.put_packets(self._twin.feed(np.ascontiguousarray(reversed_payload)))
 
     @property
@@ -472,7 +461,7 @@ class SimulatedCard:
         self.line = rig.pi.sync_out[0]
         self._source = source
         self._clock_s = clock_s
-        network = Network(board.host_address, board.card_address, MAC, board.command_port, board.data_port)
+        network = dca1000.Network(board.host_address, board.card_address, MAC, board.command_port, board.data_port)
         self.endpoint = CardEndpoint(
             name=board.name,
             network=network,
@@ -502,7 +491,7 @@ class SimulatedCard:
         self._sync.arm()
 
     @property
-    def card(self) -> Card:
+    def card(self) -> dca1000.Card:
         """Its DCA1000."""
         return self.endpoint.card
 
@@ -543,7 +532,7 @@ class SimulatedCard:
         the record: while the stage moves, or has raised triggers that no pulse has followed yet, 2 s of wall time are
         waited for. In real time both are the same.
         """
-        if more_expected and self._clock_s() - self.last_data_wall_s < TAIL_S:
+        if more_expected and self._clock_s() - self.last_data_wall_s < dca1000.TAIL_S:
             return
         self.endpoint.tick()
 

@@ -34,7 +34,6 @@ from polysight.materials.library import (
     Samples,
     channel_distances,
     count_votes,
-    find_neighbours,
     majority,
     ratio_columns,
     split_by_angle,
@@ -202,7 +201,7 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     neighbours = Weights.neighbours
     same_scan = few.groups[:, None] == few.groups[None, :]
     # Every pixel must find so many in other scans.
-    voters = min(neighbours, int((~same_scan).sum(axis=1).min()))
+    judge = _LeftOut.prepare(few, same_scan, min(neighbours, int((~same_scan).sum(axis=1).min())))
     grid = [(0.0, 0.0)] if channels == "P" else [(0.0, 0.0), *product(GRID, GRID)]
     tried: list[tuple[float, float, Weights]] = []
     alone: dict[str, float] = {}
@@ -211,14 +210,14 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
         scale = [1 / max(float(np.median(c)), 1e-12) for c in distances]
         for wh, wv in grid:
             w = Weights(wh * scale[0], wv * scale[1], scale[2], measure)
-            accuracy = _left_out(combine(distances, w), voters, few, same_scan)
+            accuracy = judge.accuracy(combine(distances, w))
             tried.append((accuracy, -abs(np.log(max(wh, 0.1))) - abs(np.log(max(wv, 0.1))), w))
             if wh == wv == 0:
                 alone[measure] = accuracy
     top = max(accuracy for accuracy, _, _ in tried)
     accuracy, _, weights = max((t for t in tried if t[0] >= top - 0.005), key=lambda t: t[1])
     distances = channel_distances(few.x, few.x, weights.measure)
-    by_channel = {c: _left_out(distances[i], voters, few, same_scan) for i, c in enumerate("hv")}
+    by_channel = {c: judge.accuracy(distances[i]) for i, c in enumerate("hv")}
     by_channel["p"] = alone[weights.measure]
     return Fit(weights, accuracy, by_channel, _thresholds(combine(distances, weights), neighbours, few))
 
@@ -230,12 +229,31 @@ def _few(samples: Samples) -> Samples:
     return samples.take(np.sort(np.concatenate(picked)))
 
 
-def _left_out(distance: Real, voters: int, few: Samples, same_scan: npt.NDArray[np.bool_]) -> float:
-    """Return the pixel accuracy, mean over the materials of two or more scans, without votes of the same scan."""
-    names, classes = np.unique(few.names, return_inverse=True)
-    nearest = find_neighbours(np.where(same_scan, np.inf, distance), voters)
-    predicted = names[count_votes(classes[nearest], names.size).argmax(axis=1)]
-    return float(np.mean([(predicted[few.names == n] == n).mean() for n in np.unique(few.names[few.shared])]))
+@dataclass(frozen=True)
+class _LeftOut:
+    """Judges distances by votes of `voters` pixels of other scans.
+
+    `classes` [n] numbers the materials; `shared` are those of two or more scans; `same_scan` [n, n].
+    """
+
+    classes: npt.NDArray[np.intp]
+    shared: npt.NDArray[np.intp]
+    same_scan: npt.NDArray[np.bool_]
+    voters: int
+
+    @classmethod
+    def prepare(cls, few: Samples, same_scan: npt.NDArray[np.bool_], voters: int) -> _LeftOut:
+        """Number the materials of these pixels."""
+        classes = np.unique(few.names, return_inverse=True)[1]
+        return cls(classes, np.unique(classes[few.shared]), same_scan, voters)
+
+    def accuracy(self, distance: Real) -> float:
+        """Return the pixel accuracy for distances [n, n], mean over the materials of two or more scans."""
+        others = np.where(self.same_scan, np.inf, distance)
+        nearest = np.argpartition(others, self.voters - 1, axis=1)[:, : self.voters]
+        count = np.bincount(self.classes)
+        voted = count_votes(self.classes[nearest], count.size).argmax(axis=1)
+        return float(np.mean((np.bincount(self.classes, voted == self.classes) / count)[self.shared]))
 
 
 def _thresholds(distance: Real, neighbours: int, few: Samples) -> dict[str, float]:

@@ -314,14 +314,16 @@ def _two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: 
     """Least squares of patch means = material + scan: offsets [scans, d], of mean zero, and levels [materials, d]."""
     offset = np.zeros((scan.max() + 1, mean.shape[1]))
     level = np.zeros((material.max() + 1, mean.shape[1]))
+    of_material = np.arange(len(level))[:, None] == material
+    of_scan = (np.arange(len(offset))[:, None] == scan) & informative
+    material_mean, scan_mean = (
+        members / np.maximum(members.sum(axis=1, keepdims=True), 1) for members in (of_material, of_scan)
+    )
+    informed = of_scan.any(axis=1)
     for _ in range(TWO_WAY_ROUNDS):
-        for k in np.unique(material):
-            of_material = material == k
-            level[k] = (mean[of_material] - offset[scan[of_material]] * informative[of_material, None]).mean(axis=0)
-        for s in np.unique(scan[informative]):
-            of_material = (scan == s) & informative
-            offset[s] = (mean[of_material] - level[material[of_material]]).mean(axis=0)
-        offset -= offset[np.unique(scan[informative])].mean(axis=0)
+        level = material_mean @ (mean - offset[scan] * informative[:, None])
+        offset = scan_mean @ (mean - level[material])
+        offset[informed] -= offset[informed].mean(axis=0)
     return offset, level
 
 

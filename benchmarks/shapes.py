@@ -28,34 +28,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+import polysight_worlds as worlds
+from polysight import surfaces
 from polysight.data import find_packaged
-from polysight.surfaces import (
-    Gains,
-    Optics,
-    Samples,
-    Seen,
-    Segment,
-    Surface,
-    Uncertainty,
-    analyse_surface,
-    find_voltages,
-    learn_gains,
-    make_optics,
-    see_points,
-)
 from polysight_shared.config import load_instrument
-from polysight_worlds import (
-    KINDS,
-    Boards,
-    Shape,
-    ShapeNuisances,
-    ShapeScene,
-    draw_shapes,
-    load_boards,
-    reference_sphere,
-    scan_offsets,
-    scan_shapes,
-)
 from polysight_worlds.shape_scenes import FREQUENCIES_HZ
 
 CHI2_95 = 5.991
@@ -74,17 +50,17 @@ DISTURBANCES: dict[str, dict[str, float]] = {
 }
 # Standard errors that the host is told: those of the disturbance (each axis of a place, each part of a leakage), and
 # what a rig that stands as its file says is known to.
-EXACT = Uncertainty(leakage=0.001, axis_rad=0.001, place_m=0.00001)
+EXACT = surfaces.Uncertainty(leakage=0.001, axis_rad=0.001, place_m=0.00001)
 PLACES = {"place_m": 0.001 / np.sqrt(3)}
 AXES = {"axis_rad": float(np.radians(2.0))}
 LEAKAGE = {"leakage": 0.05 / np.sqrt(2)}
-KNOWN: dict[str, Uncertainty] = {
+KNOWN: dict[str, surfaces.Uncertainty] = {
     "none": EXACT,
     "table": EXACT,
     "misplaced": replace(EXACT, **PLACES),
     "axes": replace(EXACT, **AXES),
     "leakage": replace(EXACT, **LEAKAGE),
-    "all": Uncertainty(**PLACES, **AXES, **LEAKAGE),
+    "all": surfaces.Uncertainty(**PLACES, **AXES, **LEAKAGE),
 }
 # Points of the reference that are kept, as `polysight calibrate sphere` keeps them.
 KEPT_POINTS = 240
@@ -147,20 +123,20 @@ class ScanKind:
         every = 1
         if self.is_quick:
             every = QUICK_STEP
-        return scan_offsets(self.columns, self.rows, every=every)
+        return worlds.scan_offsets(self.columns, self.rows, every=every)
 
     @property
-    def boards(self) -> Boards:
+    def boards(self) -> worlds.Boards:
         """Antennas of the rig file; of a quick scan, one RX of each board."""
-        boards = load_boards(RIG_FILE)
+        boards = worlds.load_boards(RIG_FILE)
         if self.is_quick:
             return replace(boards, h=boards.h[1:2], v=boards.v[1:2])
         return boards
 
     @property
-    def optics(self) -> Optics:
+    def optics(self) -> surfaces.Optics:
         """The rig as the host takes it."""
-        optics = make_optics(load_instrument(RIG_FILE))
+        optics = surfaces.make_optics(load_instrument(RIG_FILE))
         if not self.is_quick:
             return optics
         h_m = self.boards.h[0].position
@@ -175,46 +151,50 @@ class ScanKind:
         return 1.0
 
 
-def see_shapes(shapes: Sequence[Shape], nuisances: ShapeNuisances, scan: ScanKind, number: int) -> Seen:
+def see_shapes(
+    shapes: Sequence[worlds.Shape], nuisances: worlds.ShapeNuisances, scan: ScanKind, number: int
+) -> surfaces.Seen:
     """Scan shapes and find their specular points."""
     boards = scan.boards
-    cubes = scan_shapes(shapes, scan.offsets_m, nuisances, boards=boards, number=number)
+    cubes = worlds.scan_shapes(shapes, scan.offsets_m, nuisances, boards=boards, number=number)
     valid = np.ones(scan.offsets_m.shape[:2], bool)
     samples = []
     for channel, receivers in boards.receivers().items():
         rx_m = np.array([rx.position for rx in receivers])
-        samples.append(Samples(cubes[channel], valid, scan.offsets_m, FREQUENCIES_HZ, boards.tx.position, rx_m))
-    return see_points(samples[0], samples[1], scan.optics, GATE_M)
+        samples.append(
+            surfaces.Samples(cubes[channel], valid, scan.offsets_m, FREQUENCIES_HZ, boards.tx.position, rx_m)
+        )
+    return surfaces.see_points(samples[0], samples[1], scan.optics, GATE_M)
 
 
 @cache
-def see_reference(nuisances: ShapeNuisances, scan: ScanKind) -> Seen:
+def see_reference(nuisances: worlds.ShapeNuisances, scan: ScanKind) -> surfaces.Seen:
     """Find the points of the metal sphere that the same rig scanned before."""
-    points = see_shapes([reference_sphere()], nuisances, scan, number=1)
+    points = see_shapes([worlds.reference_sphere()], nuisances, scan, number=1)
     metal = points[points.segment == 0]
     kept_indices = np.linspace(0, len(metal) - 1, min(KEPT_POINTS, len(metal))).round().astype(int)
     return metal[kept_indices]
 
 
 def analyse_shapes(
-    scene: ShapeScene, nuisances: ShapeNuisances, known: Uncertainty, scan: ScanKind
-) -> tuple[Surface, float]:
+    scene: worlds.ShapeScene, nuisances: worlds.ShapeNuisances, known: surfaces.Uncertainty, scan: ScanKind
+) -> tuple[surfaces.Surface, float]:
     """Scan a scene and its reference; return what the host finds, and the seconds of CPU that its analysis took."""
     metal = see_reference(nuisances, scan)
 
-    def reference(optics: Optics) -> Gains:
-        return learn_gains(find_voltages(metal, optics), optics.wave_number)
+    def reference(optics: surfaces.Optics) -> surfaces.Gains:
+        return surfaces.learn_gains(surfaces.find_voltages(metal, optics), optics.wave_number)
 
     points = see_shapes((*scene.shapes, *scene.background), nuisances, scan, number=2)
     started = time.process_time()
-    surface = analyse_surface(points, scan.optics, reference, uncertainty=known, simulated=True)
+    surface = surfaces.analyse_surface(points, scan.optics, reference, uncertainty=known, simulated=True)
     return surface, time.process_time() - started
 
 
 def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> ObjectFigures:
     """Draw, scan and judge one object."""
-    scene = draw_shapes(seed, kind, with_table=disturbance in ("table", "all"))
-    nuisances = ShapeNuisances(seed=seed, noise=scan.noise, gain_db=1.5, **DISTURBANCES[disturbance])
+    scene = worlds.draw_shapes(seed, kind, with_table=disturbance in ("table", "all"))
+    nuisances = worlds.ShapeNuisances(seed=seed, noise=scan.noise, gain_db=1.5, **DISTURBANCES[disturbance])
     surface, seconds = analyse_shapes(scene, nuisances, KNOWN[disturbance], scan)
     truth = None
     if scene.is_uniform:
@@ -265,7 +245,11 @@ def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> Obje
 
 
 def judge_permittivity(
-    figures: ObjectFigures, segment: Segment, surface: Surface, members: NDArray, truth: complex | None
+    figures: ObjectFigures,
+    segment: surfaces.Segment,
+    surface: surfaces.Surface,
+    members: NDArray,
+    truth: complex | None,
 ) -> ObjectFigures:
     """Add what the object's largest segment says of its medium; a permittivity without truth has an endless error."""
     if segment.permittivity is None or segment.covariance is None:
@@ -378,7 +362,7 @@ def format_points_line(title: str, figures: Sequence[ObjectFigures]) -> str:
 def print_tables(figures: Sequence[ObjectFigures]) -> None:
     """Print the tables of objects and of points, by disturbance and kind."""
     disturbances = [name for name in DISTURBANCES if any(f.disturbance == name for f in figures)]
-    kinds = [kind for kind in KINDS if any(f.kind == kind for f in figures)]
+    kinds = [kind for kind in worlds.KINDS if any(f.kind == kind for f in figures)]
     print(OBJECTS_HEAD)
     for name in disturbances:
         for kind in kinds:
@@ -400,7 +384,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the benchmark."""
     parser.add_argument("--objects", type=int, default=1, help="objects of each kind and disturbance")
     parser.add_argument("--first", type=int, default=100, help="seed of the first object")
-    parser.add_argument("--kinds", default=",".join(KINDS), help="separated by commas")
+    parser.add_argument("--kinds", default=",".join(worlds.KINDS), help="separated by commas")
     parser.add_argument("--disturbances", default="none", help=f"of: {', '.join(DISTURBANCES)}")
     parser.add_argument("--columns", type=int, default=350, help="stage positions in x, 2 mm apart")
     parser.add_argument("--rows", type=int, default=200, help="stage positions in y")

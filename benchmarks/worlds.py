@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+import polysight_worlds as generator
 from polysight.data import find_packaged
 from polysight.imaging import Antennas, Dispersion, Illumination, Images, illumination_geometry
 from polysight.materials import (
@@ -46,18 +47,6 @@ from polysight.polarimetry import fresnel
 from polysight.process.quality import scene_reasons
 from polysight.results import join_reasons
 from polysight_shared.config import load_instrument
-from polysight_worlds import (
-    NUISANCES,
-    TABLE_2,
-    ImagePair,
-    Plate,
-    Stack,
-    World,
-    draw_nuisances,
-    draw_world,
-    published_rig,
-    simulate,
-)
 
 UNMEASURED = ("leakage", "all")
 """Nuisances of rigs whose leakage was never measured."""
@@ -187,7 +176,7 @@ def table_2_classifier(theta_rad: float) -> Classifier:
     rng = np.random.default_rng(0)
     entries = []
     for piece in range(4):
-        for name, permittivity in {**TABLE_2, "copper": None}.items():
+        for name, permittivity in {**generator.TABLE_2, "copper": None}.items():
             t = 1.0 + 0j
             level = 1.0
             if permittivity is not None:
@@ -219,7 +208,7 @@ def illumination_of_worlds(shape: tuple[int, int], pixel_m: float) -> Illuminati
     return Illumination(np.ones((2, *shape), np.complex64), moved, steep, (pixel_m, pixel_m))
 
 
-def dispersion_of_worlds(pair: ImagePair) -> Dispersion:
+def dispersion_of_worlds(pair: generator.ImagePair) -> Dispersion:
     """Return the change of the images over the sweep."""
     first_hz, last_hz = pair.rig.frequencies_hz[[0, -1]].tolist()
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -229,7 +218,7 @@ def dispersion_of_worlds(pair: ImagePair) -> Dispersion:
     return Dispersion(h, v, (first_hz, last_hz))
 
 
-def pixel_boxes(pair: ImagePair) -> list[tuple[Plate, tuple[int, int, int, int]]]:
+def pixel_boxes(pair: generator.ImagePair) -> list[tuple[generator.Plate, tuple[int, int, int, int]]]:
     """Return the plates within the picture with their boxes in pixels: left, bottom, right, top."""
     out = []
     for plate in pair.world.plates:
@@ -242,13 +231,13 @@ def pixel_boxes(pair: ImagePair) -> list[tuple[Plate, tuple[int, int, int, int]]
 
 
 def analyse_world(
-    pair: ImagePair,
+    pair: generator.ImagePair,
     declared: str | None = "copper",
     leakage: tuple[complex, complex] | None = (0j, 0j),
     classifier: Classifier | None = None,
     searched: bool = False,
     theta_error_rad: float = 0.0,
-) -> tuple[MaterialsResult, dict[int, Plate]]:
+) -> tuple[MaterialsResult, dict[int, generator.Plate]]:
     """Analyse the images of a world; return the result, and patch number to true plate.
 
     `declared` is the plate that is given as the metal reference; None: it is looked for. `leakage` is that of p into H
@@ -282,7 +271,7 @@ def analyse_world(
     return analysis, match_plates(analysis.segmentation, list(plates.values()))
 
 
-def box_in_mm(box: tuple[int, int, int, int], pair: ImagePair) -> tuple[float, float, float, float]:
+def box_in_mm(box: tuple[int, int, int, int], pair: generator.ImagePair) -> tuple[float, float, float, float]:
     """Return a box in pixels as millimetres from the picture's middle, x0, y0, x1, y1."""
     left, bottom, right, top = box
     x_mm = axis_mm(pair.x_m)
@@ -291,8 +280,8 @@ def box_in_mm(box: tuple[int, int, int, int], pair: ImagePair) -> tuple[float, f
 
 
 def match_plates(
-    segmentation: Segmentation, plates: Sequence[tuple[Plate, tuple[int, int, int, int]]]
-) -> dict[int, Plate]:
+    segmentation: Segmentation, plates: Sequence[tuple[generator.Plate, tuple[int, int, int, int]]]
+) -> dict[int, generator.Plate]:
     """Return patch number to the plate that most of the patch lies on; patches without one are missing."""
     out = {}
     for patch in segmentation.patches:
@@ -302,18 +291,18 @@ def match_plates(
     return out
 
 
-def draw_pair(nuisance: str, seed: int, mixed: bool = False) -> ImagePair:
+def draw_pair(nuisance: str, seed: int, mixed: bool = False) -> generator.ImagePair:
     """Draw and scan one world: eight materials of Table 2 as half spaces, and copper.
 
     `mixed`: a drawn share of them, between `LIBRARY_SHARE`, is of Table 2; the others are pieces that no library has.
     """
     rng = np.random.default_rng([seed, sum(map(ord, nuisance))])
-    rig = published_rig()
+    rig = generator.published_rig()
     materials = None
     if mixed:
         materials = draw_mixed_materials(np.random.default_rng([seed, sum(map(ord, nuisance)), 2]))
-    world = draw_world(rng, tuple(rig.centre_m), materials=materials, half_spaces=True)
-    return simulate(world, draw_nuisances(rng, nuisance), rig)
+    world = generator.draw_world(rng, tuple(rig.centre_m), materials=materials, half_spaces=True)
+    return generator.simulate(world, generator.draw_nuisances(rng, nuisance), rig)
 
 
 def draw_piece(rng: np.random.Generator, permittivity: complex) -> complex:
@@ -323,15 +312,15 @@ def draw_piece(rng: np.random.Generator, permittivity: complex) -> complex:
     )
 
 
-def draw_mixed_materials(rng: np.random.Generator) -> dict[str, complex | Stack]:
+def draw_mixed_materials(rng: np.random.Generator) -> dict[str, complex | generator.Stack]:
     """Draw nine materials: of Table 2, or of those that no library has, whose names are marked."""
     of_library = rng.random(9) < rng.uniform(*LIBRARY_SHARE)
-    members = rng.choice(list(TABLE_2), 9, replace=False)
+    members = rng.choice(list(generator.TABLE_2), 9, replace=False)
     strangers = rng.choice(list(FOREIGN), 9, replace=False)
-    materials: dict[str, complex | Stack] = {}
+    materials: dict[str, complex | generator.Stack] = {}
     for is_member, member, stranger in zip(of_library, members.tolist(), strangers.tolist(), strict=True):
         if is_member:
-            materials[member] = TABLE_2[member]
+            materials[member] = generator.TABLE_2[member]
         else:
             materials[f"foreign {stranger}"] = draw_piece(rng, FOREIGN[stranger])
     return materials
@@ -370,7 +359,7 @@ def judge_world(nuisance: str, seed: int, searched: bool = False, mixed: bool = 
     )
 
 
-def declared_figures(nuisance: str, patch: PatchResult, plate: Plate) -> PatchFigures:
+def declared_figures(nuisance: str, patch: PatchResult, plate: generator.Plate) -> PatchFigures:
     """Compare one patch with its plate."""
     e = patch.permittivity
     if patch.refused is None:
@@ -421,17 +410,17 @@ class MetalFigures:
     names: tuple[str, ...]
 
 
-def draw_metal_world(rng: np.random.Generator, with_metal: bool) -> World:
+def draw_metal_world(rng: np.random.Generator, with_metal: bool) -> generator.World:
     """Draw plates, thin sheets in air and dishes of liquids, with copper or without."""
-    rig = published_rig()
-    materials: dict[str, complex | Stack] = dict(TABLE_2)
+    rig = generator.published_rig()
+    materials: dict[str, complex | generator.Stack] = dict(generator.TABLE_2)
     for name, liquid in LIQUIDS.items():
-        materials[name] = Stack(((6.9 - 0.5j, rng.uniform(1e-3, 3e-3)),), liquid)
+        materials[name] = generator.Stack(((6.9 - 0.5j, rng.uniform(1e-3, 3e-3)),), liquid)
     for number in range(4):
         sheet = rng.uniform(2, 5) * (1 - 1j * rng.uniform(0.001, 0.05))
-        materials[f"sheet {number}"] = Stack(((sheet, rng.uniform(0.5e-3, 3e-3)),), 1.0)
+        materials[f"sheet {number}"] = generator.Stack(((sheet, rng.uniform(0.5e-3, 3e-3)),), 1.0)
     pieces = int(rng.integers(3, 10))
-    return draw_world(
+    return generator.draw_world(
         rng, tuple(rig.centre_m), materials=materials, half_spaces=True, with_metal=with_metal, pieces=pieces
     )
 
@@ -440,7 +429,7 @@ def judge_metal(kind: str, seed: int, searched: bool) -> MetalFigures:
     """Judge one scene of `METAL_KINDS`."""
     rng = np.random.default_rng([seed, METAL_KINDS.index(kind)])
     world = draw_metal_world(rng, with_metal=kind != "no metal")
-    pair = simulate(world, draw_nuisances(rng, "none"), published_rig())
+    pair = generator.simulate(world, generator.draw_nuisances(rng, "none"), generator.published_rig())
     declared = {"copper declared": "copper", "no metal": None}.get(kind)
     if kind == "dielectric declared":
         declared = next(plate.name for plate in world.plates if not plate.stack.layers and not plate.stack.is_metal)
@@ -538,7 +527,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the benchmark."""
     parser.add_argument("--scenes", type=int, default=1, help="scenes for each nuisance")
     parser.add_argument("--first", type=int, default=100, help="seed of the first scene")
-    parser.add_argument("--nuisances", default=",".join(("none", *NUISANCES, "all")), help="separated by commas")
+    parser.add_argument(
+        "--nuisances", default=",".join(("none", *generator.NUISANCES, "all")), help="separated by commas"
+    )
     parser.add_argument("--metal", type=int, default=0, help="judge so many scenes of each kind of metal instead")
     parser.add_argument("--searched", action="store_true", help="search for patches instead of giving boxes")
     parser.add_argument("--mixed", action="store_true", help="a drawn share of the plates is of no library")

@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.materials import (
-    Entry,
-    Labels,
-    Library,
-    box_name,
-    check_labels,
-    clean_name,
-    pack_labels,
-    read_labels,
-)
+from polysight import materials
 from polysight.process import Inputs, boxes_as_patches
 from polysight.settings import DEFAULT
 from polysight_shared.error_codes import ErrorCode
@@ -30,7 +21,7 @@ NAN = float("nan")
 
 
 def check_boxes(boxes, **more):
-    return check_labels(Labels(boxes, "mm", **more), X_M, Y_M)
+    return materials.check_labels(materials.Labels(boxes, "mm", **more), X_M, Y_M)
 
 
 INVALID = ErrorCode.VALUE_INVALID
@@ -79,7 +70,7 @@ def test_a_box_where_nothing_was_scanned_is_refused():
     valid = np.ones((50, 50), bool)
     valid[:, 25:] = False
     with refused(ErrorCode.NO_DATA, "oak"):
-        check_labels(Labels({"copper": COPPER, "oak": OAK}, "mm"), X_M, Y_M, valid)
+        materials.check_labels(materials.Labels({"copper": COPPER, "oak": OAK}, "mm"), X_M, Y_M, valid)
 
 
 def test_one_box_needs_no_metal_and_a_second_piece_has_a_name_of_its_own():
@@ -100,24 +91,24 @@ def test_one_box_needs_no_metal_and_a_second_piece_has_a_name_of_its_own():
     ],
 )
 def test_names_of_any_script_are_kept_in_one_form(text, name):
-    assert box_name(text) == name
-    assert clean_name(name.partition("#")[0]) == name.partition("#")[0]
+    assert materials.box_name(text) == name
+    assert materials.clean_name(name.partition("#")[0]) == name.partition("#")[0]
 
 
 @pytest.mark.parametrize("mark", ["\u200b", "\u00ad", "\u2060", "\ufeff"])
 def test_marks_that_show_nothing_are_no_part_of_a_name(mark):
     with refused(ErrorCode.VALUE_INVALID):
-        clean_name(f"rubber{mark}")
+        materials.clean_name(f"rubber{mark}")
 
 
 def test_label_files_are_read_back_and_pixels_become_millimetres(tmp_path):
     path = tmp_path / "labels.json"
     labels = check_boxes({"copper": COPPER, "\u6a61\u6728": OAK}, specimens={"\u6a61\u6728": "board 7"})
-    path.write_bytes(pack_labels(labels))
-    assert read_labels(path) == labels
+    path.write_bytes(materials.pack_labels(labels))
+    assert materials.read_labels(path) == labels
     assert "\u6a61\u6728" in path.read_text(encoding="utf-8")
     path.write_text(json.dumps({"labels": {"copper": [5, 20, 20, 30]}}))  # as earlier releases wrote them
-    old = read_labels(path)
+    old = materials.read_labels(path)
     assert (old.unit, old.by_hand, old.metal) == ("pixel", False, None)
     assert old.is_metal("copper")
     assert old.in_mm(X_M, Y_M).boxes["copper"] == pytest.approx(COPPER)
@@ -131,26 +122,26 @@ def test_keys_of_another_form_are_refused(tmp_path, more):
     path = tmp_path / "labels.json"
     path.write_text(json.dumps({"labels": {"copper": [5, 20, 20, 30]}, **more}))
     with refused(ErrorCode.VALUE_INVALID, path, next(iter(more))):
-        read_labels(path)
+        materials.read_labels(path)
 
 
 def test_boxes_by_hand_are_judged_before_a_scan_is_processed_with_them():
-    overlapping = Labels({"copper": COPPER, "oak": (-15.0, -10.0, 40.0, 10.0)}, "mm", by_hand=True)
+    overlapping = materials.Labels({"copper": COPPER, "oak": (-15.0, -10.0, 40.0, 10.0)}, "mm", by_hand=True)
     with refused(ErrorCode.VALUES_CONFLICT, "copper", "oak"):
         boxes_as_patches(DEFAULT, Inputs(overlapping), X_M, Y_M)
-    labels = Labels({"tin": COPPER, "oak": OAK}, "mm", "tin", by_hand=True)
+    labels = materials.Labels({"tin": COPPER, "oak": OAK}, "mm", "tin", by_hand=True)
     drawn = boxes_as_patches(DEFAULT, Inputs(labels), X_M, Y_M)
     assert (drawn.metal, drawn.names) == (1, {1: "tin", 2: "oak"})
 
 
 def test_libraries_keep_the_specimen_and_old_files_have_none(tmp_path):
     ones = np.ones(3, np.float32)
-    entry = Entry("oak", "a", ones, ones, np.ones(3, np.complex64), 55.0, simulated=False, specimen="board 7")
-    Library((entry,)).save(tmp_path / "l.npz")
-    assert Library.load(tmp_path / "l.npz").entries[0].specimen == "board 7"
+    entry = materials.Entry("oak", "a", ones, ones, np.ones(3, np.complex64), 55.0, simulated=False, specimen="board 7")
+    materials.Library((entry,)).save(tmp_path / "l.npz")
+    assert materials.Library.load(tmp_path / "l.npz").entries[0].specimen == "board 7"
     with np.load(tmp_path / "l.npz") as z:
         content = dict(z)
     meta = json.loads(content["meta"].tobytes())
     del meta["entries"][0]["specimen"]
     np.savez(tmp_path / "old.npz", **(content | {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)}))
-    assert Library.load(tmp_path / "old.npz").entries[0].specimen is None
+    assert materials.Library.load(tmp_path / "old.npz").entries[0].specimen is None

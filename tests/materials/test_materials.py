@@ -8,19 +8,7 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.materials import (
-    PAPER,
-    UNKNOWN,
-    Classifier,
-    Library,
-    analyse,
-    estimate_permittivity,
-    fit_library,
-    make_library,
-    pixel_accuracy,
-    predict_pixel_accuracy,
-    read_truth,
-)
+from polysight import materials
 from polysight.materials.analyse import Optics
 from polysight.materials.classify import Weights
 from polysight.materials.library import FORMAT, majority, ratio_distance
@@ -37,7 +25,7 @@ THETA = np.radians(55.0)
 
 def test_library_round_trips(tmp_path, library):
     library.save(tmp_path / "l.npz")
-    again = Library.load(tmp_path / "l.npz")
+    again = materials.Library.load(tmp_path / "l.npz")
     assert again.names == library.names
     assert again.scans == library.scans
     assert again.fit == json.loads(json.dumps(library.fit))
@@ -88,19 +76,19 @@ def test_pickles_and_damaged_files_are_refused(tmp_path, library):
     }
     for path, code in codes.items():
         with refused(code, path):
-            Library.load(path)
+            materials.Library.load(path)
 
 
 def test_at_least_eight_of_nine_named_right(name_placement):
     shares = []
     for seed in range(5):
         result = name_placement(seed)
-        shares.append((pixel_accuracy(result), predict_pixel_accuracy(result)))
+        shares.append((materials.pixel_accuracy(result), materials.predict_pixel_accuracy(result)))
         named = [r for r in result.patches if r.verdict is not None]
         # The metal reference is not named by itself
         assert len(named) == 8
         assert sum(r.verdict.name == r.truth.name for r in named) >= 7
-        assert pixel_accuracy(result) > 0.75
+        assert materials.pixel_accuracy(result) > 0.75
         for r in named:
             assert 0 < r.verdict.confidence <= 1
             assert sum(r.verdict.votes.values()) == pytest.approx(1)
@@ -110,8 +98,11 @@ def test_at_least_eight_of_nine_named_right(name_placement):
 
 
 def test_without_truth_or_probabilities_no_share_of_right_pixels_is_expected(synthetic, library, analyse_placement):
-    assert predict_pixel_accuracy(analyse_placement(4)) is None
-    assert predict_pixel_accuracy(synthetic(4).analyse(classifier=Classifier(library, model="knn"))) is None
+    assert materials.predict_pixel_accuracy(analyse_placement(4)) is None
+    assert (
+        materials.predict_pixel_accuracy(synthetic(4).analyse(classifier=materials.Classifier(library, model="knn")))
+        is None
+    )
 
 
 def test_polarimetry_beats_one_channel(library):
@@ -123,39 +114,39 @@ def test_polarimetry_beats_one_channel(library):
 
 def test_far_material_is_unknown(synthetic, library):
     strange = {"copper": None, "water": 9.37 - 18.0j, "foam": 1.3 - 0.0j, "rubber": 5.06 - 1.11j}
-    result = synthetic(11, strange, noise=0.002).analyse(classifier=Classifier(library))
+    result = synthetic(11, strange, noise=0.002).analyse(classifier=materials.Classifier(library))
     names = {r.truth.name: r.verdict.name for r in result.patches if r.truth and r.verdict}
-    assert names["water"] == UNKNOWN
+    assert names["water"] == materials.UNKNOWN
     assert names["rubber"] == "rubber"
     # The reference
     assert "copper" not in names
 
 
 def of_scans(library, count):
-    return Library(tuple(e for e in library.entries if e.scan in library.scans[:count]))
+    return materials.Library(tuple(e for e in library.entries if e.scan in library.scans[:count]))
 
 
 def test_one_scan_is_not_enough_and_splits_are_by_scan(library):
     with refused(ErrorCode.NOT_ENOUGH_DATA):
-        fit_library(of_scans(library, 1))
+        materials.fit_library(of_scans(library, 1))
     # With names shuffled among patches only the patch's own pixels could tell: a split that leaks would succeed.
     some = of_scans(library, 4)
     names = np.random.default_rng(0).permutation([e.name for e in some.entries])
-    shuffled = Library(tuple(replace(e, name=str(n)) for e, n in zip(some.entries, names, strict=True)))
-    fit = fit_library(shuffled).fit["angles"]["55"]
+    shuffled = materials.Library(tuple(replace(e, name=str(n)) for e, n in zip(some.entries, names, strict=True)))
+    fit = materials.fit_library(shuffled).fit["angles"]["55"]
     assert all(judged["pixels"] < 0.4 for judged in fit["judged"].values())
-    knn = fit["judged"][PAPER]
+    knn = fit["judged"][materials.PAPER]
     # The patch knows itself
     assert knn["pixels_split_by_pixel"] > 2 * knn["pixels"]
 
 
 def test_unusable_libraries_are_refused(library):
     with refused(ErrorCode.NO_DATA):
-        Classifier(Library(()))
+        materials.Classifier(materials.Library(()))
     with refused(ErrorCode.VALUE_INVALID):
-        Classifier(Library(library.entries, {"weights": {"h": 1}}))
+        materials.Classifier(materials.Library(library.entries, {"weights": {"h": 1}}))
     with refused(ErrorCode.NO_DATA):
-        make_library([])
+        materials.make_library([])
 
 
 def test_distances_are_distances():
@@ -172,11 +163,11 @@ def test_distances_are_distances():
 
 def test_pixels_that_are_not_finite_are_unknown(library):
     some = pixel_features([0.5, np.nan, 0.5], [0.1, 0.1, 0.1], [4 + 1j, 4 + 1j, 0])
-    verdicts, empty = Classifier(library, Weights()).scan([some, pixel_features([], [], [])])
-    assert verdicts.names[1] == verdicts.names[2] == UNKNOWN
-    assert verdicts.names[0] != UNKNOWN
+    verdicts, empty = materials.Classifier(library, Weights()).scan([some, pixel_features([], [], [])])
+    assert verdicts.names[1] == verdicts.names[2] == materials.UNKNOWN
+    assert verdicts.names[0] != materials.UNKNOWN
     assert np.isinf(verdicts.distance[1:]).all()
-    assert empty.verdict.name == UNKNOWN
+    assert empty.verdict.name == materials.UNKNOWN
 
 
 def test_a_majority_names_the_patch():
@@ -194,7 +185,7 @@ def test_permittivity_of_table2_is_recovered_with_noise(row):
     rng = np.random.default_rng(row.number)
     r_s, r_p = fresnel(row.permittivity, THETA)
     n = rng.standard_normal((4, 150)) * 0.003
-    e = estimate_permittivity(r_s + n[0] + 1j * n[1], r_p + n[2] + 1j * n[3], THETA)
+    e = materials.estimate_permittivity(r_s + n[0] + 1j * n[1], r_p + n[2] + 1j * n[3], THETA)
     assert e.value.real == pytest.approx(row.permittivity.real, rel=0.05)
     assert e.value.imag == pytest.approx(row.permittivity.imag, abs=0.15)
     assert e.real_range[0] <= e.value.real <= e.real_range[1]
@@ -204,10 +195,10 @@ def test_permittivity_of_table2_is_recovered_with_noise(row):
 def test_metal_has_no_permittivity():
     rng = np.random.default_rng(0)
     n = rng.standard_normal((4, 150)) * 0.01
-    e = estimate_permittivity(1 + n[0] + 1j * n[1], 1 + n[2] + 1j * n[3], THETA)
+    e = materials.estimate_permittivity(1 + n[0] + 1j * n[1], 1 + n[2] + 1j * n[3], THETA)
     assert e.value is None
     assert e.metal_distance < 0.05
-    assert estimate_permittivity(np.zeros(0, complex), np.zeros(0, complex), THETA).value is None
+    assert materials.estimate_permittivity(np.zeros(0, complex), np.zeros(0, complex), THETA).value is None
 
 
 def test_median_ratio_is_unbiased_where_v_nearly_vanishes():
@@ -260,10 +251,10 @@ def test_rows_are_plain_json(name_placement):
 def test_truth_is_carried_but_never_used(synthetic, library, name_placement):
     scene = synthetic(4)
     answer = name_placement(4)
-    blind = analyse(scene.pair, Optics(THETA), classifier=Classifier(library))
+    blind = materials.analyse(scene.pair, Optics(THETA), classifier=materials.Classifier(library))
     assert [r.verdict for r in answer.patches] == [r.verdict for r in blind.patches]
     assert all(r.truth is None for r in blind.patches)
-    assert pixel_accuracy(blind) is None
+    assert materials.pixel_accuracy(blind) is None
 
 
 def test_truth_files(tmp_path):
@@ -272,16 +263,16 @@ def test_truth_files(tmp_path):
     path.write_text(
         json.dumps({"plates": [plate, {"name": "Cu", "centre_mm": [0, 0], "size_mm": [1, 1], "metal": True}]})
     )
-    pet, copper = read_truth(path)
+    pet, copper = materials.read_truth(path)
     assert pet.permittivity == 3.78 - 0.7j
     assert pet.box_mm == (-12.5, -35.0, 32.5, -5.0)
     assert copper.metal
     for text in ("{}", '{"plates": [{"name": "x"}]}', "no json"):
         path.write_text(text)
         with pytest.raises(DataError):
-            read_truth(path)
+            materials.read_truth(path)
     with pytest.raises(DataError):
-        read_truth(tmp_path / "absent.json")
+        materials.read_truth(tmp_path / "absent.json")
 
 
 def test_table2_is_complete():

@@ -111,8 +111,8 @@ def test_pages_of_a_scan_without_a_name_lead_to_the_list(view, page):
 
 def test_a_pair_is_compared_once_for_all_its_maps(view, scans, monkeypatch):
     done: list[tuple[Path, Path]] = []
-    real = site.compare
-    monkeypatch.setattr(site, "compare", lambda a, b: done.append((a, b)) or real(a, b))
+    real = site.catalogue.compare
+    monkeypatch.setattr(site.catalogue, "compare", lambda a, b: done.append((a, b)) or real(a, b))
     for path in ("compare", "compare/sigmas", "compare/p", "compare/loss"):
         assert ask(view, f"/api/{path}?a=one&b=two")[0] == 200, path
     assert len(done) == 1

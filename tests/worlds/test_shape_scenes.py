@@ -6,35 +6,26 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from polysight_worlds import (
-    KINDS,
-    Boards,
-    ShapeNuisances,
-    draw_shapes,
-    published_boards,
-    reference_sphere,
-    scan_offsets,
-    scan_shapes,
-)
+import polysight_worlds as worlds
 from polysight_worlds.shape_scenes import disturb_boards
 from polysight_worlds.shapes import find_specular
 
-WHOLE = published_boards()
-BOARDS = Boards(WHOLE.tx, WHOLE.h[:1], WHOLE.v[:1])
-OFFSETS_M = scan_offsets(every=50)
+WHOLE = worlds.published_boards()
+BOARDS = worlds.Boards(WHOLE.tx, WHOLE.h[:1], WHOLE.v[:1])
+OFFSETS_M = worlds.scan_offsets(every=50)
 FREQUENCIES_HZ = np.linspace(76.3e9, 79.7e9, 3)
 
 
-def scan(nuisances: ShapeNuisances, number: int = 0) -> dict[str, np.ndarray]:
-    return scan_shapes(
-        [reference_sphere()], OFFSETS_M, nuisances, boards=BOARDS, frequencies_hz=FREQUENCIES_HZ, number=number
+def scan(nuisances: worlds.ShapeNuisances, number: int = 0) -> dict[str, np.ndarray]:
+    return worlds.scan_shapes(
+        [worlds.reference_sphere()], OFFSETS_M, nuisances, boards=BOARDS, frequencies_hz=FREQUENCIES_HZ, number=number
     )
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", worlds.KINDS)
 def test_a_drawn_object_is_seen_and_its_truth_is_where_its_rays_are(kind):
-    scene = draw_shapes(5, kind, with_table=True)
-    samples = scan_shapes(scene.shapes, OFFSETS_M, boards=BOARDS, frequencies_hz=FREQUENCIES_HZ)
+    scene = worlds.draw_shapes(5, kind, with_table=True)
+    samples = worlds.scan_shapes(scene.shapes, OFFSETS_M, boards=BOARDS, frequencies_hz=FREQUENCIES_HZ)
     brightest = np.abs(samples["h"]).max()
     # Brighter than a thousandth of a mirror, darker than a concave one.
     assert 6e-4 < brightest < 2
@@ -52,8 +43,8 @@ def test_a_drawn_object_is_seen_and_its_truth_is_where_its_rays_are(kind):
 
 
 def test_a_seed_gives_one_scene():
-    assert repr(draw_shapes(8)) == repr(draw_shapes(8))
-    assert {draw_shapes(seed, metal_share=1.0, kind="sphere").permittivity for seed in range(3)} == {None}
+    assert repr(worlds.draw_shapes(8)) == repr(worlds.draw_shapes(8))
+    assert {worlds.draw_shapes(seed, metal_share=1.0, kind="sphere").permittivity for seed in range(3)} == {None}
 
 
 @pytest.mark.parametrize(
@@ -62,8 +53,8 @@ def test_a_seed_gives_one_scene():
     ids=lambda change: next(iter(change)),
 )
 def test_each_disturbance_changes_the_samples_and_repeats(change):
-    quiet = scan(ShapeNuisances(noise=0))
-    nuisances = ShapeNuisances(noise=0, seed=3, **change)
+    quiet = scan(worlds.ShapeNuisances(noise=0))
+    nuisances = worlds.ShapeNuisances(noise=0, seed=3, **change)
     disturbed = scan(nuisances)
     largest = max(np.abs(disturbed[channel] - quiet[channel]).max() / np.abs(quiet[channel]).max() for channel in quiet)
     assert 0.01 < largest < 2.5
@@ -73,7 +64,7 @@ def test_each_disturbance_changes_the_samples_and_repeats(change):
 
 def test_the_back_of_a_body_is_no_surface_that_is_seen():
     """A table that touches it has another normal."""
-    scene = draw_shapes(5, "barrel")
+    scene = worlds.draw_shapes(5, "barrel")
     middle_m = np.array(scene.shapes[0].place_m)
     front = -scene.shapes[0].axes[:, 2]
     radius_m = scene.radius_m
@@ -97,7 +88,7 @@ def test_disturbances_are_normally_distributed_with_the_size_given(change, std):
     # Sizes that are all the same lie inside every region by construction: they could not refute a covariance.
     deviations = []
     for seed in range(400):
-        true_boards = disturb_boards(BOARDS, ShapeNuisances(seed=seed, **change))
+        true_boards = disturb_boards(BOARDS, worlds.ShapeNuisances(seed=seed, **change))
         for antenna, true_antenna in ((BOARDS.h[0], true_boards.h[0]), (BOARDS.v[0], true_boards.v[0])):
             across = complex(np.cross(antenna.boresight, antenna.polarisation) @ true_antenna.polarisation)
             if "misplaced_mm" in change:
@@ -110,7 +101,7 @@ def test_disturbances_are_normally_distributed_with_the_size_given(change, std):
 
 
 def test_noise_differs_between_scans_of_one_rig():
-    quiet = scan(ShapeNuisances(noise=0))["h"]
-    first, second = (scan(ShapeNuisances(noise=1), number)["h"] - quiet for number in (0, 1))
+    quiet = scan(worlds.ShapeNuisances(noise=0))["h"]
+    first, second = (scan(worlds.ShapeNuisances(noise=1), number)["h"] - quiet for number in (0, 1))
     assert np.std(first) == pytest.approx(np.std(second), rel=0.3)
     assert not np.allclose(first, second)

@@ -5,27 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from polysight_worlds import (
-    METAL,
-    Boards,
-    Shape,
-    Stack,
-    cylinder,
-    plate,
-    published_boards,
-    published_rig,
-    record_shapes,
-    sphere,
-)
+import polysight_worlds as worlds
 from polysight_worlds.media import LIGHT_M_PER_S, reflect
 from polysight_worlds.optics import Antenna
 from polysight_worlds.shapes import find_specular, follow_path
 
-BOARDS = published_boards()
-ONE_RX = Boards(BOARDS.tx, BOARDS.h[2:3], BOARDS.v[2:3])
+BOARDS = worlds.published_boards()
+ONE_RX = worlds.Boards(BOARDS.tx, BOARDS.h[2:3], BOARDS.v[2:3])
 FREQUENCIES_HZ = np.linspace(76.3e9, 79.7e9, 9)
-CENTRE_M = np.array([*published_rig().centre_m, 0.499])
-DIELECTRIC = Stack(below=4 - 0.4j)
+CENTRE_M = np.array([*worlds.published_rig().centre_m, 0.499])
+DIELECTRIC = worlds.Stack(below=4 - 0.4j)
 OFFSETS_M = np.array([[0.0, 0, 0], [0.05, 0.02, 0], [-0.1, 0.06, 0], [0.12, -0.05, 0]])
 
 
@@ -35,15 +24,17 @@ def point_behind(depth_m: float) -> tuple[float, float, float]:
 
 
 SHAPES = [
-    sphere("sphere", METAL, point_behind(0.1), 0.1),
-    cylinder("cylinder", DIELECTRIC, point_behind(0.1), 0.1, 0.6, axis=(0.3, 1.0, 0.1)),
-    cylinder("cone", METAL, point_behind(0.09), 0.09, 0.6, slope=-0.15),
-    plate("saddle", METAL, point_behind(0.0), (0.3, 0.3), bends=(7.0, -6.0, 1.0)),
-    plate("tilted", DIELECTRIC, point_behind(0.0), (0.9, 0.9), tilt_deg=(4.0, -2.0), is_soft=True),
+    worlds.sphere("sphere", worlds.METAL, point_behind(0.1), 0.1),
+    worlds.cylinder("cylinder", DIELECTRIC, point_behind(0.1), 0.1, 0.6, axis=(0.3, 1.0, 0.1)),
+    worlds.cylinder("cone", worlds.METAL, point_behind(0.09), 0.09, 0.6, slope=-0.15),
+    worlds.plate("saddle", worlds.METAL, point_behind(0.0), (0.3, 0.3), bends=(7.0, -6.0, 1.0)),
+    worlds.plate("tilted", DIELECTRIC, point_behind(0.0), (0.9, 0.9), tilt_deg=(4.0, -2.0), is_soft=True),
 ]
 
 
-def geometrical_optics(shape: Shape, tx: Antenna, rx: Antenna, offset_m: np.ndarray, frequency_hz: float) -> complex:
+def geometrical_optics(
+    shape: worlds.Shape, tx: Antenna, rx: Antenna, offset_m: np.ndarray, frequency_hz: float
+) -> complex:
     """Ray at the specular point: Fresnel's coefficients, spreading by the path's second derivatives."""
     places = (antenna.position[:, None] + offset_m[:, None] for antenna in (tx, rx))
     tx_m, rx_m = places
@@ -75,7 +66,7 @@ def geometrical_optics(shape: Shape, tx: Antenna, rx: Antenna, offset_m: np.ndar
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.name)
 def test_a_shape_reflects_by_geometrical_optics_but_for_a_few_per_cent(shape):
-    cubes = record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:1], OFFSETS_M)
+    cubes = worlds.record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:1], OFFSETS_M)
     for channel, receivers in ONE_RX.receivers().items():
         expected = np.array([geometrical_optics(shape, BOARDS.tx, receivers[0], u, 76.3e9) for u in OFFSETS_M])
         assert np.abs(cubes[channel][0, 0] - expected).max() < 0.04 * np.abs(expected).max()
@@ -111,8 +102,8 @@ def test_curvatures_are_those_of_the_solids():
 def test_a_whole_scan_is_that_of_its_single_positions(shape):
     x = 0.002 * np.arange(-30, 30)
     offsets = np.stack([*np.meshgrid(x, x), np.zeros((60, 60))], axis=-1)
-    full_scan = record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets)
-    some = record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets[::20, ::20])
+    full_scan = worlds.record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets)
+    some = worlds.record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets[::20, ::20])
     for channel in full_scan:
         difference = np.abs(full_scan[channel][..., ::20, ::20] - some[channel]).max()
         assert difference < 5e-3 * np.abs(some[channel]).max()
@@ -121,17 +112,17 @@ def test_a_whole_scan_is_that_of_its_single_positions(shape):
 def test_a_large_flat_plate_is_the_same_in_facets_and_in_zones():
     # The mean over Fresnel zones of the edges: plates of growing size swing around the one without edges.
     widths_m = np.linspace(0.5, 0.56, 9)
-    sharp = [plate("sharp", DIELECTRIC, point_behind(0.0), (w, w), tilt_deg=(4.0, -2.0)) for w in widths_m]
+    sharp = [worlds.plate("sharp", DIELECTRIC, point_behind(0.0), (w, w), tilt_deg=(4.0, -2.0)) for w in widths_m]
     few = OFFSETS_M[:2]
-    first = [record_shapes([piece], ONE_RX, FREQUENCIES_HZ[:1], few)["h"] for piece in sharp]
-    second = record_shapes([SHAPES[4]], ONE_RX, FREQUENCIES_HZ[:1], few)["h"]
+    first = [worlds.record_shapes([piece], ONE_RX, FREQUENCIES_HZ[:1], few)["h"] for piece in sharp]
+    second = worlds.record_shapes([SHAPES[4]], ONE_RX, FREQUENCIES_HZ[:1], few)["h"]
     assert np.mean(first, axis=0) == pytest.approx(second, rel=0.03)
 
 
 def test_the_phase_is_that_of_the_path_beyond_the_direct_one():
     rx = BOARDS.h[0]
     direct_m = np.linalg.norm(rx.position - BOARDS.tx.position)
-    echo = record_shapes([SHAPES[0]], BOARDS, FREQUENCIES_HZ, OFFSETS_M[:1])["h"][0, :, 0]
+    echo = worlds.record_shapes([SHAPES[0]], BOARDS, FREQUENCIES_HZ, OFFSETS_M[:1])["h"][0, :, 0]
     slope_m = np.ptp(np.unwrap(np.angle(echo))) / (2 * np.pi * np.ptp(FREQUENCIES_HZ)) * LIGHT_M_PER_S
     tx_m = BOARDS.tx.position[:, None]
     rx_m = rx.position[:, None]

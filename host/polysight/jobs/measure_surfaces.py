@@ -10,29 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from polysight import surfaces
 from polysight.calibration import SphereFile
 from polysight.imaging import BoardSamples
 from polysight.materials import STEEP, Classifier, name_permittivity
 from polysight.pipeline import Pipeline
 from polysight.process import load_classifier
 from polysight.products import read_products
-from polysight.surfaces import (
-    Echoes,
-    Gains,
-    Optics,
-    Reference,
-    Samples,
-    Seen,
-    Segment,
-    Surface,
-    Uncertainty,
-    analyse_surface,
-    find_voltages,
-    learn_gains,
-    make_optics,
-    see_points,
-    write_surface,
-)
 from polysight_shared.config import Instrument
 from polysight_shared.files import write_atomically
 
@@ -45,16 +29,16 @@ CALIBRATED_PLACE_STD_M = 3e-4
 AXIS_STD_RAD = 0.0175
 
 
-def take_samples(pipeline: Pipeline) -> tuple[Samples, Samples]:
+def take_samples(pipeline: Pipeline) -> tuple[surfaces.Samples, surfaces.Samples]:
     """Return the samples of H and V that a pipeline holds, x from TX to RX."""
     h, v = (take_board_samples(board, pipeline.source.mirrored) for board in pipeline.images.boards.values())
     return h, v
 
 
-def take_board_samples(board: BoardSamples, is_mirrored: bool) -> Samples:
+def take_board_samples(board: BoardSamples, is_mirrored: bool) -> surfaces.Samples:
     """Return the samples of one board; a scan recorded by columns is held mirrored in x = y."""
     antennas = board.aperture.antennas
-    samples = Samples(
+    samples = surfaces.Samples(
         cube=board.calibrate_samples(),
         valid=board.valid,
         offsets_m=board.aperture.offsets_m,
@@ -77,7 +61,7 @@ def take_board_samples(board: BoardSamples, is_mirrored: bool) -> Samples:
     )
 
 
-def find_uncertainty(rig: Instrument, *, places_known: bool) -> Uncertainty:
+def find_uncertainty(rig: Instrument, *, places_known: bool) -> surfaces.Uncertainty:
     """Return the standard errors of leakage, axes and places of a rig."""
     polarimetry = rig.polarimetry
     # The prior is the size of the complex leakage; an error is that of one of its two parts.
@@ -85,41 +69,41 @@ def find_uncertainty(rig: Instrument, *, places_known: bool) -> Uncertainty:
     if polarimetry.leakage_std is not None:
         leakage = polarimetry.leakage_std
     place_std_m = CALIBRATED_PLACE_STD_M if places_known else PLACE_STD_M
-    return Uncertainty(float(leakage), AXIS_STD_RAD, place_std_m)
+    return surfaces.Uncertainty(float(leakage), AXIS_STD_RAD, place_std_m)
 
 
-def make_rig_optics(rig: Instrument) -> Optics:
+def make_rig_optics(rig: Instrument) -> surfaces.Optics:
     """Return the antennas of a rig with its leakage, if measured."""
     polarimetry = rig.polarimetry
     if polarimetry.leakage_std is None:
-        return make_optics(rig)
-    return make_optics(rig, (complex(*polarimetry.leakage_h), complex(*polarimetry.leakage_v)))
+        return surfaces.make_optics(rig)
+    return surfaces.make_optics(rig, (complex(*polarimetry.leakage_h), complex(*polarimetry.leakage_v)))
 
 
-def see_rows(pipeline: Pipeline, optics: Optics) -> Seen:
+def see_rows(pipeline: Pipeline, optics: surfaces.Optics) -> surfaces.Seen:
     """Find the specular points in the rows that a pipeline holds."""
     h, v = take_samples(pipeline)
     low, high = pipeline.images.gate_m
     direct_m = float(h.direct_m.mean())
-    return see_points(h, v, optics, (low + direct_m, high + direct_m))
+    return surfaces.see_points(h, v, optics, (low + direct_m, high + direct_m))
 
 
-def make_reference(metal: Seen) -> Reference:
+def make_reference(metal: surfaces.Seen) -> surfaces.Reference:
     """Return the gains that points of metal give, for any rig."""
 
-    def learn(optics: Optics) -> Gains:
-        return learn_gains(find_voltages(metal, optics), optics.wave_number)
+    def learn(optics: surfaces.Optics) -> surfaces.Gains:
+        return surfaces.learn_gains(surfaces.find_voltages(metal, optics), optics.wave_number)
 
     return learn
 
 
-def load_sphere_points(file: SphereFile) -> Seen:
+def load_sphere_points(file: SphereFile) -> surfaces.Seen:
     """Return the points of a metal sphere from its calibration file."""
     h, v = (_parse_echoes(np.array(file.points[channel])) for channel in ("h", "v"))
-    return Seen(h, v, np.zeros(len(h), int))
+    return surfaces.Seen(h, v, np.zeros(len(h), int))
 
 
-def _parse_echoes(rows: np.ndarray) -> Echoes:
+def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
     """Return the echoes of a calibration file.
 
     Columns: position (3), path, slope (2), bend (xx, xy, yy), amplitude (real, imaginary), its error, rise over the
@@ -131,7 +115,7 @@ def _parse_echoes(rows: np.ndarray) -> Echoes:
     band_rise = np.zeros(count)
     if rows.shape[1] > 12:
         band_rise = rows[:, 12]
-    return Echoes(
+    return surfaces.Echoes(
         at_m=rows[:, :3],
         path_m=rows[:, 3],
         slope=rows[:, 4:6],
@@ -145,18 +129,20 @@ def _parse_echoes(rows: np.ndarray) -> Echoes:
     )
 
 
-def thin_out(metal: Seen) -> Seen:
+def thin_out(metal: surfaces.Seen) -> surfaces.Seen:
     """Return `KEPT_POINTS` points of metal, evenly taken: neighbours overlap."""
     chosen = np.linspace(0, len(metal) - 1, min(KEPT_POINTS, len(metal))).round().astype(int)
     return metal[chosen]
 
 
-def analyse_points(pipeline: Pipeline, optics: Optics, seen_rows: Seen, gains: Reference | None = None) -> Surface:
+def analyse_points(
+    pipeline: Pipeline, optics: surfaces.Optics, seen_rows: surfaces.Seen, gains: surfaces.Reference | None = None
+) -> surfaces.Surface:
     """Return the surfaces of a scan's points, named; without `gains` those of the calibration's sphere count."""
     calibration = pipeline.calibration
     if gains is None and calibration.sphere is not None:
         gains = make_reference(load_sphere_points(calibration.sphere))
-    surface = analyse_surface(
+    surface = surfaces.analyse_surface(
         seen_rows,
         optics,
         gains,
@@ -170,7 +156,7 @@ def analyse_points(pipeline: Pipeline, optics: Optics, seen_rows: Seen, gains: R
     return replace(surface, segments=tuple(name_segment(segment, classifier) for segment in surface.segments))
 
 
-def name_segment(segment: Segment, classifier: Classifier) -> Segment:
+def name_segment(segment: surfaces.Segment, classifier: Classifier) -> surfaces.Segment:
     """Name a segment by its permittivity, with the library that names flat patches; others stay as they are."""
     if segment.permittivity is None or segment.covariance is None:
         return segment
@@ -178,11 +164,11 @@ def name_segment(segment: Segment, classifier: Classifier) -> Segment:
     return replace(segment, name=named.name, confidence=named.confidence)
 
 
-def save_surface(out: Path, surface: Surface) -> None:
+def save_surface(out: Path, surface: surfaces.Surface) -> None:
     """Write surface.npz, surface.ply and surface.png into a folder."""
     from polysight.report import surface_figure
 
-    write_surface(out, surface)
+    surfaces.write_surface(out, surface)
     write_atomically(out / "surface.png", surface_figure(surface))
 
 

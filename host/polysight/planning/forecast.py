@@ -20,21 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.imaging import (
-    TAPERS,
-    Antennas,
-    Aperture,
-    FieldLimits,
-    PhaseSlope,
-    PointResponse,
-    field_limits,
-    image_grid,
-    point_response,
-    reduction,
-    scan_offsets_m,
-    scene_gate_m,
-    window_weights,
-)
+from polysight import imaging
 from polysight.process import why_unnamed
 from polysight.radar import constraints
 from polysight.settings import DEFAULT
@@ -234,8 +220,8 @@ class Forecast:
     time: ScanTime
     raw_bytes: int
     burst: BurstForecast
-    response: PointResponse
-    field: FieldLimits
+    response: imaging.PointResponse
+    field: imaging.FieldLimits
     noise: NoiseForecast
     noise_source: str
     warnings: tuple[Finding, ...]
@@ -264,27 +250,27 @@ def forecast(
         time=scan_time(rig, row_overhead_s),
         raw_bytes=rig.scan_bytes,
         burst=predict_burst(rig),
-        response=point_response(aperture, taper),
-        field=field_limits(rig),
+        response=imaging.point_response(aperture, taper),
+        field=imaging.field_limits(rig),
         noise=predict_noise(rig, noise),
         noise_source=noise.source,
         warnings=find_warnings(rig, noise, scene_mm),
     )
 
 
-def describe_aperture(rig: Instrument) -> tuple[Aperture, Real]:
+def describe_aperture(rig: Instrument) -> tuple[imaging.Aperture, Real]:
     """Return the aperture of the H receiver and its taper [row, column]."""
-    grid = image_grid(rig)
-    antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
-    frequencies = reduction(
-        rig.chirp, scene_gate_m(antennas, plan_raster(rig.grid), grid), _FAST_TIME_WINDOW
+    grid = imaging.image_grid(rig)
+    antennas = tuple(imaging.Antennas.from_rig(rig, board) for board in rig.receivers)
+    frequencies = imaging.reduction(
+        rig.chirp, imaging.scene_gate_m(antennas, plan_raster(rig.grid), grid), _FAST_TIME_WINDOW
     ).frequencies_hz
-    return Aperture(antennas[0], scan_offsets_m(rig), frequencies, grid), np.outer(*_tapers(rig))
+    return imaging.Aperture(antennas[0], imaging.scan_offsets_m(rig), frequencies, grid), np.outer(*_tapers(rig))
 
 
 def _tapers(rig: Instrument) -> tuple[Real, Real]:
-    name = TAPERS[rig.image.apodisation]
-    return window_weights(name, rig.grid.rows), window_weights(name, rig.grid.columns)
+    name = imaging.TAPERS[rig.image.apodisation]
+    return imaging.window_weights(name, rig.grid.rows), imaging.window_weights(name, rig.grid.columns)
 
 
 def predict_burst(rig: Instrument) -> BurstForecast:
@@ -294,7 +280,7 @@ def predict_burst(rig: Instrument) -> BurstForecast:
     travel_mm = stage.speed_mm_s * burst_duration_s(rig.burst)
     middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * sum(rig.chirp.linear_samples) / 2
     half_m = (grid.columns - 1) / 2 * grid.step_x_mm / 1e3
-    change_rad = travel_mm / 1e3 * abs(PhaseSlope(rig, 0).slope(half_m, middle_hz))
+    change_rad = travel_mm / 1e3 * abs(imaging.PhaseSlope(rig, 0).slope(half_m, middle_hz))
     return BurstForecast(
         duration_ms=rig.burst.pulses * rig.burst.period_us * 1e-3,
         between_ms=1e3 * grid.step_x_mm / stage.speed_mm_s,
@@ -315,7 +301,7 @@ def predict_noise(rig: Instrument, noise: Noise) -> NoiseForecast:
     rx = len(rig.antennas.rx_mm)
     position = 10 ** (noise.direct_snr_db / 10) * rig.burst.chirps_a_position
     gain = rx
-    for window in (window_weights(_FAST_TIME_WINDOW, samples), *_tapers(rig)):
+    for window in (imaging.window_weights(_FAST_TIME_WINDOW, samples), *_tapers(rig)):
         gain *= window.sum() ** 2 / (window**2).sum()
     return NoiseForecast(
         position_db=float(10 * np.log10(position)),
@@ -451,7 +437,7 @@ def _radar_warnings(rig: Instrument) -> Iterator[Finding]:
 
 def _field_warnings(rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple[float, float]) -> Iterator[Finding]:
     grid = rig.grid
-    field = field_limits(rig)
+    field = imaging.field_limits(rig)
     axes = (("x", grid.step_x_mm, grid.columns), ("y", grid.step_y_mm, grid.rows))
     for i, (axis, step, count) in enumerate(axes):
         scene = scene_mm[i]

@@ -20,24 +20,7 @@ from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
-from polysight.catalogue import (
-    AMPLITUDE,
-    DIFFERENCE,
-    EXPORT,
-    PHASE,
-    Comparison,
-    Picture,
-    Program,
-    colour_bar,
-    draw_comparison,
-    find_program,
-    find_programs,
-    list_files,
-    probe,
-    read_generation,
-    read_notes,
-    read_result,
-)
+from polysight import catalogue
 from polysight.page import Watch
 from polysight.products import REPORT, read_products
 from polysight.results import ACTION_SIGMAS, WARNING_SIGMAS, CheckResult
@@ -107,7 +90,7 @@ class ScanDetails(ListedScan, frozen=True, kw_only=True):
     """One scan, with its folder and the programs that were started for it, the newest first."""
 
     folder: str
-    programs: list[Program]
+    programs: list[catalogue.Program]
 
 
 async def _scans(site: Site, request: Request) -> Response:
@@ -134,9 +117,9 @@ async def _scan(site: Site, request: Request) -> Response:
     name = site.name(request)
 
     def read_details(folder: Path) -> ScanDetails:
-        facts = asdict(site.scans.summary(name)) | asdict(read_notes(folder))
+        facts = asdict(site.scans.summary(name)) | asdict(catalogue.read_notes(folder))
         place = str(folder.absolute())
-        return ScanDetails(**facts, bytes=site.size(name), folder=place, programs=find_programs(folder))
+        return ScanDetails(**facts, bytes=site.size(name), folder=place, programs=catalogue.find_programs(folder))
 
     return json_answer(await site.read_scan(request, read_details))
 
@@ -166,7 +149,7 @@ async def _program(site: Site, request: Request) -> Response:
     kind = request.path_params["kind"]
     if kind not in ("doctor", "train", "concentration"):
         return json_answer(None)
-    return json_answer(find_program(site.logs, kind))
+    return json_answer(catalogue.find_program(site.logs, kind))
 
 
 # --- the live view ---
@@ -198,17 +181,17 @@ async def _live_picture(site: Site, request: Request) -> Response:
 async def _bar(site: Site, request: Request) -> Response:
     del site
     kind = request.path_params["kind"]
-    colours = {"phase": PHASE, "amplitude": AMPLITUDE}.get(kind, str(kind))
-    if colours not in (AMPLITUDE, PHASE, DIFFERENCE):
+    colours = {"phase": catalogue.PHASE, "amplitude": catalogue.AMPLITUDE}.get(kind, str(kind))
+    if colours not in (catalogue.AMPLITUDE, catalogue.PHASE, catalogue.DIFFERENCE):
         return refuse(404, ErrorCode.VALUE_INVALID, "There are no such colours", "", "use the page")
-    return Response(colour_bar(colours), media_type="image/png")
+    return Response(catalogue.colour_bar(colours), media_type="image/png")
 
 
 # --- results ---
 
 
 async def _result(site: Site, request: Request) -> Response:
-    return json_answer(await _read_products(site, request, read_result))
+    return json_answer(await _read_products(site, request, catalogue.read_result))
 
 
 async def _read_products(site: Site, request: Request, work: Callable[[Path], T]) -> T:
@@ -220,17 +203,17 @@ async def _read_products(site: Site, request: Request, work: Callable[[Path], T]
 
     def read(folder: Path) -> T:
         for _ in range(MAX_TRIES):
-            generation_before = read_generation(read_products(folder).folder)
+            generation_before = catalogue.read_generation(read_products(folder).folder)
             if shown_generation and generation_before != shown_generation:
                 break
             try:
                 result = work(folder)
             except (PolysightError, OSError):
                 # Half of it may be of the folder before, half of the one behind.
-                if read_generation(read_products(folder).folder) == generation_before:
+                if catalogue.read_generation(read_products(folder).folder) == generation_before:
                     raise
                 continue
-            if read_generation(read_products(folder).folder) == generation_before:
+            if catalogue.read_generation(read_products(folder).folder) == generation_before:
                 return result
         raise ScanError(
             "the scan was processed again meanwhile", "another program replaced its products", "load the page again",
@@ -256,7 +239,7 @@ async def _probe(site: Site, request: Request) -> Response:
     y_mm = _number(request, "y")
     name = request.query_params.get("library", "")
     library = site.libraries().get(name)
-    return json_answer(await _read_products(site, request, lambda folder: probe(folder, x_mm, y_mm, library)))
+    return json_answer(await _read_products(site, request, lambda folder: catalogue.probe(folder, x_mm, y_mm, library)))
 
 
 async def _file(site: Site, request: Request) -> Response:
@@ -265,13 +248,13 @@ async def _file(site: Site, request: Request) -> Response:
     kind = request.query_params.get("of", "products")
 
     def find_file(folder: Path) -> tuple[str, Path]:
-        if not any(file.name == name and file.of == kind for file in list_files(folder)):
+        if not any(file.name == name and file.of == kind for file in catalogue.list_files(folder)):
             raise DataError(
                 f"no file is called {name[:80]!r}", "it was not made, or the name is wrong", "see the scan's page",
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
-        if kind == EXPORT:
-            return folder.name, folder / EXPORT / name
+        if kind == catalogue.EXPORT:
+            return folder.name, folder / catalogue.EXPORT / name
         return folder.name, read_products(folder).folder / name
 
     scan, path = await site.read_scan(request, find_file)
@@ -299,7 +282,7 @@ class Download(StreamingResponse):
             yield chunk
 
 
-def _picture_answer(picture: Picture) -> Response:
+def _picture_answer(picture: catalogue.Picture) -> Response:
     """A map, with the values at the ends of its colours as headers."""
     unit = "deg" if picture.unit == "°" else picture.unit
     headers = {"X-Low": f"{picture.low:g}", "X-High": f"{picture.high:g}", "X-Unit": unit}
@@ -367,7 +350,7 @@ async def _check(site: Site, request: Request) -> Response:
 # --- comparisons ---
 
 
-async def _use_comparison(site: Site, request: Request, use: Callable[[Comparison], T]) -> T:
+async def _use_comparison(site: Site, request: Request, use: Callable[[catalogue.Comparison], T]) -> T:
     """Compare the two scans that a request names, and return what `use` makes of the comparison; in a thread."""
     first = site.name(request, "a")
     second = site.name(request, "b")
@@ -383,4 +366,6 @@ async def _compare(site: Site, request: Request) -> Response:
 
 async def _compare_map(site: Site, request: Request) -> Response:
     name = request.path_params["name"]
-    return _picture_answer(await _use_comparison(site, request, lambda comparison: draw_comparison(comparison, name)))
+    return _picture_answer(
+        await _use_comparison(site, request, lambda comparison: catalogue.draw_comparison(comparison, name))
+    )

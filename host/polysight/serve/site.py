@@ -23,20 +23,7 @@ from typing import TypeVar
 import anyio
 from starlette.requests import Request
 
-from polysight.catalogue import (
-    PROGRAM,
-    Comparison,
-    Picture,
-    Pixels,
-    Scans,
-    compare,
-    draw_products,
-    find_program,
-    folder_bytes,
-    is_plain,
-    read_generation,
-    thumbnail,
-)
+from polysight import catalogue
 from polysight.page import Watch
 from polysight.products import read_products
 from polysight.results import CheckResult, check_plate
@@ -79,7 +66,7 @@ class Site:
 
     def __init__(
         self,
-        scans: Scans,
+        scans: catalogue.Scans,
         watches: Watches,
         programs: Programs | None = None,
         config: Path | None = None,
@@ -180,12 +167,12 @@ class Site:
             self._programs.close()
 
 
-def draw_map(folder: Path, name: str, limits: tuple[float, float] | None = None) -> Picture:
+def draw_map(folder: Path, name: str, limits: tuple[float, float] | None = None) -> catalogue.Picture:
     """A map of a scan's products, or its `thumbnail`; drawn again only when these have changed. Raises DataError."""
     return _draw(*_stamp_products(folder), name, limits)
 
 
-def compare_products(first: Path, second: Path) -> Comparison:
+def compare_products(first: Path, second: Path) -> catalogue.Comparison:
     """Two processed scans compared, computed again only when their products have changed. Raises DataError."""
     return _compare(first, second, _stamp_products(first), _stamp_products(second))
 
@@ -198,16 +185,16 @@ def check_products(folder: Path) -> CheckResult | None:
 def _stamp_products(folder: Path) -> tuple[Path, str]:
     """The folder of a scan's products, and what changes when these do."""
     products = read_products(folder).folder
-    return products, read_generation(products)
+    return products, catalogue.read_generation(products)
 
 
 @lru_cache(maxsize=MAX_PICTURES)
-def _draw(products: Path, stamp: str, name: str, limits: tuple[float, float] | None) -> Picture:
+def _draw(products: Path, stamp: str, name: str, limits: tuple[float, float] | None) -> catalogue.Picture:
     del stamp
-    pixels = Pixels(products)
+    pixels = catalogue.Pixels(products)
     if name == THUMBNAIL:
-        return thumbnail(pixels)
-    return draw_products(pixels, name, limits)
+        return catalogue.thumbnail(pixels)
+    return catalogue.draw_products(pixels, name, limits)
 
 
 @lru_cache(maxsize=MAX_CHECKS)
@@ -220,9 +207,9 @@ def _check(products: Path, stamp: str) -> CheckResult | None:
 
 
 @lru_cache(maxsize=MAX_COMPARISONS)
-def _compare(first: Path, second: Path, *stamps: tuple[Path, str]) -> Comparison:
+def _compare(first: Path, second: Path, *stamps: tuple[Path, str]) -> catalogue.Comparison:
     del stamps
-    return compare(first, second)
+    return catalogue.compare(first, second)
 
 
 class Readers:
@@ -313,7 +300,7 @@ class Sizes:
             threading.Thread(target=self._count, args=(folder,), name="sizes", daemon=True).start()
 
     def _count(self, folder: Path) -> None:
-        self._counted[folder] = (folder_bytes(folder), time.monotonic())
+        self._counted[folder] = (catalogue.folder_bytes(folder), time.monotonic())
         with self._lock:
             del self._counting_since[folder]
             self._next()
@@ -442,14 +429,14 @@ class Programs:
             if none can be started.
         """
         with self._lock:
-            earlier = find_program(folder, kind)
+            earlier = catalogue.find_program(folder, kind)
             if earlier is not None and earlier.running:
                 raise ScanError(
                     f"{folder}: {kind} runs already", "it was started before", "wait for it, or stop it",
                     code=ErrorCode.BUSY,
                 )  # fmt: skip
-            _check_place(folder / PROGRAM, kind)
-            base = str((folder / PROGRAM).absolute() / kind)
+            _check_place(folder / catalogue.PROGRAM, kind)
+            base = str((folder / catalogue.PROGRAM).absolute() / kind)
             command = [sys.executable, "-m", "polysight", *map(str, words)]
             answer = self._ask(json.dumps({"words": command, "cwd": str(Path.cwd()), "base": base}))
         if answer:
@@ -484,7 +471,7 @@ def _check_place(place: Path, kind: str) -> None:
     """Refuse a folder of logs with links, through which other files would be overwritten. Raises DeviceError."""
     files = [place / f"{kind}{suffix}" for suffix in (".json", ".log", ".status", ".part")]
     for path in (place, *files):
-        if path.is_symlink() or (path != place and path.exists() and not is_plain(path)):
+        if path.is_symlink() or (path != place and path.exists() and not catalogue.is_plain(path)):
             raise DeviceError(
                 f"{path} is a link or not a regular file", "the folder was made by another program",
                 "remove it, and find out who made it", code=ErrorCode.PATH_OUTSIDE,

@@ -15,19 +15,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from polysight.capture import (
-    PACKETS,
-    Evidence,
-    Placed,
-    place_record,
-    read_index,
-    read_packets,
-    valid_frames,
-    write_durably,
-    write_error,
-    write_index,
-    write_packets,
-)
+from polysight import capture
 from polysight.store.logs import crc32
 from polysight.store.manifest import BoardRow, DroppedFile, ManifestWriter, RawDropped, RowCommitted
 from polysight.store.scan_folder import SAMPLES, ScanFolder, dropped_files, utc_now
@@ -155,7 +143,7 @@ def _make_durable(folder: Path) -> None:
             with path.open("rb") as file:
                 os.fsync(file.fileno())
         except OSError as e:
-            raise write_error(path, "made durable", e) from None
+            raise capture.write_error(path, "made durable", e) from None
     sync_folder(folder)
 
 
@@ -188,8 +176,8 @@ class Replaced:
 class PlacedAgain:
     """A row placed again from its packets."""
 
-    evidence: Evidence
-    placed: Placed
+    evidence: capture.Evidence
+    placed: capture.Placed
     # uint8, the payload as placed now
     payload: np.ndarray
     # Missing bytes as committed, [start, stop)
@@ -207,9 +195,9 @@ def place_again(path: Path) -> PlacedAgain:
         problem = f"{path}: cannot be read: {e.strerror}"
         remedy = "give SCAN/raw/BOARD/ROW.bin"
         raise DataError(problem, cause, remedy, code=ErrorCode.FILE_UNREADABLE) from None
-    index, _ = read_index(path.with_suffix(".idx"))
-    evidence, log = read_packets(path.with_suffix(PACKETS), row)
-    placed, payload = place_record(
+    index, _ = capture.read_index(path.with_suffix(".idx"))
+    evidence, log = capture.read_packets(path.with_suffix(capture.PACKETS), row)
+    placed, payload = capture.place_record(
         log, evidence.frame_bytes, evidence.past, evidence.not_before_ns, evidence.dropped_by_card
     )
     missing = [(int(start), int(stop)) for start, stop in index.get("missing", [])]
@@ -267,7 +255,7 @@ def _commit_changed_boards(
     old_files: list[Path] = []
     for name, again in changed.items():
         path = scan.path / boards[name].file
-        old_files += [path.with_suffix(suffix) for suffix in (".bin", ".idx", PACKETS)]
+        old_files += [path.with_suffix(suffix) for suffix in (".bin", ".idx", capture.PACKETS)]
         boards[name] = _write_new_files(scan, boards[name], again)
     kept_incomplete = row.kept_incomplete
     faults = row.faults
@@ -289,18 +277,18 @@ def _write_new_files(scan: ScanFolder, board: BoardRow, again: PlacedAgain) -> B
     placed = again.placed
     frame_bytes = scan.instrument.frame_bytes
     path = scan.path / board.file
-    index, _ = read_index(path.with_suffix(".idx"))
-    _, log = read_packets(path.with_suffix(PACKETS), np.fromfile(path, dtype=np.uint8))
+    index, _ = capture.read_index(path.with_suffix(".idx"))
+    _, log = capture.read_packets(path.with_suffix(capture.PACKETS), np.fromfile(path, dtype=np.uint8))
     new_path = _find_free_name(path)
-    crc = write_durably(new_path, again.payload.tobytes())
-    index_crc = write_index(new_path.with_suffix(".idx"), {**index, **placed.facts()}, placed.arrivals)
-    packets_crc = write_packets(new_path.with_suffix(PACKETS), log, again.evidence, placed)
+    crc = capture.write_durably(new_path, again.payload.tobytes())
+    index_crc = capture.write_index(new_path.with_suffix(".idx"), {**index, **placed.facts()}, placed.arrivals)
+    packets_crc = capture.write_packets(new_path.with_suffix(capture.PACKETS), log, again.evidence, placed)
     sync_folder(new_path.parent)
     frames = placed.expected // frame_bytes
     return msgspec.structs.replace(
         board,
         file=str(new_path.relative_to(scan.path)),
-        frames_received=int(valid_frames(placed.missing, frames, frame_bytes).sum()),
+        frames_received=int(capture.valid_frames(placed.missing, frames, frame_bytes).sum()),
         missing_bytes=sum(stop - start for start, stop in placed.missing),
         crc32=f"{crc:08x}",
         index_crc32=f"{index_crc:08x}",

@@ -67,7 +67,7 @@ def wait_until_answered(view: Served, address: str) -> None:
 
 
 def test_other_scans_are_read_while_one_folder_hangs(dead, view):
-    dead.stop(reading, "read_result")
+    dead.stop(reading.catalogue, "read_result")
     answers: list[tuple[int, bytes, dict[str, str]]] = []
     many = [threading.Thread(target=lambda: answers.append(ask(view, "/api/result?scan=dead"))) for _ in range(20)]
     for request in many:
@@ -116,7 +116,7 @@ def test_a_dead_folder_stops_no_other_live_view(dead, view):
 
 def test_the_size_of_a_dead_folder_is_not_waited_for(dead, root, monkeypatch):
     monkeypatch.setattr(site, "SIZE_S", LIMIT_S)
-    dead.stop(site, "folder_bytes")
+    dead.stop(site.catalogue, "folder_bytes")
     sizes = site.Sizes()
     assert sizes.read_size(root / "dead") is None
     wait_for(lambda: sizes.read_size(root / "alive") is not None, "the size of another folder")

@@ -436,7 +436,8 @@ def draw_sheet_dispersions(theta_rad: float, band_hz: tuple[float, float]) -> Re
     """
     eps, holder, thickness_m = _draw_sheet_properties()
     place = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES - 0.5
-    weight = scipy.signal.windows.hann(_FREQUENCIES + 1, sym=False)[1:]
+    # Hann's window; scipy.signal takes a second to load.
+    weight = np.hanning(_FREQUENCIES + 2)[1:-1]
     first_hz, last_hz = band_hz
     mean = np.zeros((2, eps.size), np.complex128)
     slope = np.zeros((2, eps.size), np.complex128)

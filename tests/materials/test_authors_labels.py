@@ -7,15 +7,7 @@ import pytest
 from tests.support.drawn_files import Errors, Material, write_labels
 from tests.support.refusals import refused
 
-from polysight.materials.train import (
-    ORIENTATIONS,
-    PUBLISHED_PIXELS,
-    angle_in_text,
-    entries_of_boxes,
-    image_orientation,
-    label_folders,
-    read_labelled_scan,
-)
+from polysight.materials import train
 from polysight.polarimetry import ratio_from_permittivity
 from polysight_shared.error_codes import ErrorCode
 
@@ -34,22 +26,22 @@ def write_scan(folder, seed=1, name="scan_7", **more):
 
 @pytest.mark.parametrize("upside_down", [False, True])
 def test_boxes_give_the_materials_ratios_relative_to_metal(tmp_path, upside_down):
-    scan = read_labelled_scan(write_scan(tmp_path, upside_down=upside_down))
-    orientation = image_orientation([scan])
+    scan = train.read_labelled_scan(write_scan(tmp_path, upside_down=upside_down))
+    orientation = train.image_orientation([scan])
     assert ("last row" in orientation) == upside_down
-    entries = {e.name: e for e in entries_of_boxes(scan.orient(orientation), 60.0)}
+    entries = {e.name: e for e in train.entries_of_boxes(scan.orient(orientation), 60.0)}
     assert set(entries) == set(BOXES)
     for name, e in entries.items():
         eps = MATERIALS[name].permittivity
         true = 1.0 if eps is None else complex(ratio_from_permittivity(eps, np.radians(60.0)))
         assert np.median(e.p.real) + 1j * np.median(e.p.imag) == pytest.approx(true, rel=0.05)
         assert (e.scan, e.incidence_deg, e.reference, e.simulated) == ("scan_7", 60.0, "Copper plate", True)
-        assert e.h.size == PUBLISHED_PIXELS
+        assert e.h.size == train.PUBLISHED_PIXELS
 
 
-@pytest.mark.parametrize("how", list(ORIENTATIONS))
+@pytest.mark.parametrize("how", list(train.ORIENTATIONS))
 def test_the_right_reading_is_found_among_all(tmp_path, how):
-    scan = read_labelled_scan(write_scan(tmp_path))
+    scan = train.read_labelled_scan(write_scan(tmp_path))
     back = {
         "x to the right, y along the rows": lambda a: a,
         "y from the last row": lambda a: a[::-1],
@@ -58,7 +50,7 @@ def test_the_right_reading_is_found_among_all(tmp_path, how):
     }[how]
     for name in ("sar_h", "sar_v"):
         np.save(tmp_path / scan.scan / f"{name}.npy", back(np.load(tmp_path / scan.scan / f"{name}.npy")))
-    assert image_orientation([read_labelled_scan(tmp_path / scan.scan)]) == how
+    assert train.image_orientation([train.read_labelled_scan(tmp_path / scan.scan)]) == how
 
 
 def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):
@@ -67,24 +59,24 @@ def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):
     del text["labels"]["Copper plate"]
     (folder / "scan_7.json").write_text(json.dumps(text))
     with refused(ErrorCode.NO_DATA, "scan_7"):
-        entries_of_boxes(read_labelled_scan(folder), 60.0)
+        train.entries_of_boxes(train.read_labelled_scan(folder), 60.0)
     np.save(folder / "sar_h.npy", np.ones(3))
     with refused(ErrorCode.TYPE_WRONG, "sar_h.npy", "float64"):
-        read_labelled_scan(folder)
+        train.read_labelled_scan(folder)
     np.save(folder / "sar_h.npy", np.array([{}], dtype=object), allow_pickle=True)
     with refused(ErrorCode.FILE_UNREADABLE, "sar_h.npy"):
-        read_labelled_scan(folder)
+        train.read_labelled_scan(folder)
     (folder / "scan_7.json").unlink()
     with refused(ErrorCode.FILE_MISSING):
-        read_labelled_scan(folder)
+        train.read_labelled_scan(folder)
 
 
 def test_folders_and_angles(tmp_path):
     write_scan(tmp_path)
     write_scan(tmp_path, name="another")
     (tmp_path / "empty").mkdir()
-    assert [f.name for f in label_folders(tmp_path)] == ["another", "scan_7"]
-    assert label_folders(tmp_path / "none") == []
-    assert angle_in_text(["a scan", "plates_at_55deg"]) == 55.0
-    assert angle_in_text(["60 degrees"]) == 60.0
-    assert angle_in_text(["scan 12"]) is None
+    assert [f.name for f in train.label_folders(tmp_path)] == ["another", "scan_7"]
+    assert train.label_folders(tmp_path / "none") == []
+    assert train.angle_in_text(["a scan", "plates_at_55deg"]) == 55.0
+    assert train.angle_in_text(["60 degrees"]) == 60.0
+    assert train.angle_in_text(["scan 12"]) is None

@@ -6,15 +6,8 @@ from collections import Counter
 import pytest
 from tests.support.refusals import refused
 
+from polysight import materials
 from polysight.cli.main import main
-from polysight.materials import (
-    CATALOGUE,
-    find_material,
-    load_catalogue,
-    normalise_name,
-    read_catalogue,
-    same_material,
-)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.tables import read_toml
 
@@ -41,7 +34,7 @@ ITU = {
 
 def value(name: str) -> tuple[complex, float]:
     """Permittivity and frequency in GHz of a material of the catalogue."""
-    material = find_material(name)
+    material = materials.find_material(name)
     assert material is not None, name
     return material.permittivity, material.frequency_hz / 1e9
 
@@ -59,7 +52,7 @@ def debye(water_c: float, ghz: float) -> complex:
 
 
 def test_values_are_of_passive_dielectrics_at_millimetre_waves():
-    for material in load_catalogue():
+    for material in materials.load_catalogue():
         assert 1 < material.permittivity.real < 100, material
         assert material.permittivity.imag <= 0, material
         assert 10e9 <= material.frequency_hz <= 300e9, material
@@ -67,17 +60,17 @@ def test_values_are_of_passive_dielectrics_at_millimetre_waves():
 
 
 def test_names_are_unique_over_aliases():
-    names = Counter(normalise_name(name) for m in load_catalogue() for name in (m.name, *m.aliases))
+    names = Counter(materials.normalise_name(name) for m in materials.load_catalogue() for name in (m.name, *m.aliases))
     assert [name for name, count in names.items() if count > 1] == []
-    for material in load_catalogue():
+    for material in materials.load_catalogue():
         for name in (material.name, *material.aliases):
-            assert find_material(name) is material
+            assert materials.find_material(name) is material
 
 
 def test_every_source_is_used_and_every_value_has_one():
-    listed = read_toml(CATALOGUE)["sources"]
-    assert {source.key for m in load_catalogue() for source in m.sources} == set(listed)
-    assert all(material.sources for material in load_catalogue())
+    listed = read_toml(materials.CATALOGUE)["sources"]
+    assert {source.key for m in materials.load_catalogue() for source in m.sources} == set(listed)
+    assert all(material.sources for material in materials.load_catalogue())
     assert all(len(text) > 40 for text in listed.values())
 
 
@@ -97,24 +90,24 @@ def test_water_is_the_double_debye_formula(celsius):
 
 
 def test_names_of_one_material():
-    assert same_material("Acrylic (3 mm)", "PMMA")
-    assert same_material("PCB", "FR4")
-    assert same_material("glass fibre", "fr-4")
-    assert same_material("rubber", "RUBBER")
-    assert same_material("water", "water at 37 degrees")
-    assert same_material("glass", "borosilicate glass")
-    assert same_material("wood", "plywood")
-    assert not same_material("plywood", "chipboard")
-    assert not same_material("copper", "PTFE")
-    assert not same_material("own mixture 7", "own mixture 8")
+    assert materials.same_material("Acrylic (3 mm)", "PMMA")
+    assert materials.same_material("PCB", "FR4")
+    assert materials.same_material("glass fibre", "fr-4")
+    assert materials.same_material("rubber", "RUBBER")
+    assert materials.same_material("water", "water at 37 degrees")
+    assert materials.same_material("glass", "borosilicate glass")
+    assert materials.same_material("wood", "plywood")
+    assert not materials.same_material("plywood", "chipboard")
+    assert not materials.same_material("copper", "PTFE")
+    assert not materials.same_material("own mixture 7", "own mixture 8")
 
 
 def test_same_is_symmetric():
     names = ["wood", "plywood", "PMMA", "acrylic", "glass", "Pyrex", "water", "copper", "cardboard (rough)"]
     for first_name in names:
-        assert same_material(first_name, first_name)
+        assert materials.same_material(first_name, first_name)
         for second_name in names:
-            assert same_material(first_name, second_name) == same_material(second_name, first_name)
+            assert materials.same_material(first_name, second_name) == materials.same_material(second_name, first_name)
 
 
 def test_a_spread_is_of_the_line_or_the_default_of_the_kind(tmp_path):
@@ -122,7 +115,7 @@ def test_a_spread_is_of_the_line_or_the_default_of_the_kind(tmp_path):
     text = f'materials = [{{ name = "a", {line} }}, {{ name = "b", spread = [0.01, 0.2], {line} }}]\n'
     path = tmp_path / "catalogue.toml"
     path.write_text(text + '[sources]\nOwn = "Own"\n[kinds]\nfelt = { generic = ["textile"], spread = [0.1, 0.5] }\n')
-    default, own_spread = read_catalogue(path)
+    default, own_spread = materials.read_catalogue(path)
     assert default.spread_is_default
     assert default.spread == (0.1, 0.5)
     assert not own_spread.spread_is_default
@@ -132,17 +125,17 @@ def test_a_spread_is_of_the_line_or_the_default_of_the_kind(tmp_path):
 def test_a_bad_file_is_refused(tmp_path):
     path = tmp_path / "catalogue.toml"
     with refused(ErrorCode.FILE_MISSING, path):
-        read_catalogue(path)
+        materials.read_catalogue(path)
     path.write_text("materials = [")
     with refused(ErrorCode.FILE_DAMAGED, path):
-        read_catalogue(path)
+        materials.read_catalogue(path)
     line = '{ name = "a", real = 2.0, loss = 0.1, ghz = 77, source = ["Nobody"], kind = "felt" }'
     path.write_text(f"materials = [{line}]\n[sources]\n[kinds]\n")
     with refused(ErrorCode.KEY_MISSING, path, "felt"):
-        read_catalogue(path)
+        materials.read_catalogue(path)
     path.write_text(f"materials = [{line}]\n[sources]\n[kinds]\nfelt = {{ generic = [], spread = [0.1, 0.5] }}\n")
     with refused(ErrorCode.KEY_MISSING, path, "Nobody"):
-        read_catalogue(path)
+        materials.read_catalogue(path)
 
 
 @pytest.mark.parametrize("arguments", [[], ["--catalogue", "scans/one"]])

@@ -7,16 +7,8 @@ from hypothesis import strategies as st
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
+from polysight import polarimetry
 from polysight.imaging import Images
-from polysight.polarimetry import (
-    calibrate,
-    correct_leakage,
-    divide_by_metal,
-    fresnel,
-    incidence_choice,
-    smooth,
-    specular_incidence_rad,
-)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.geometry import incidence_deg, specular_midpoint_m
 
@@ -38,8 +30,8 @@ def channels(eps, gain_h=1.0, gain_v=1.0, a=0.0, b=0.0, common=None, noise=0.0):
     """H and V of a metal and a dielectric plate with gains, leakage, a common phase per pixel and noise."""
     r_s = np.zeros(SHAPE, complex)
     r_p = np.zeros(SHAPE, complex)
-    r_s[METAL], r_p[METAL] = fresnel(np.inf, THETA)
-    r_s[PLATE], r_p[PLATE] = fresnel(eps, THETA)
+    r_s[METAL], r_p[METAL] = polarimetry.fresnel(np.inf, THETA)
+    r_s[PLATE], r_p[PLATE] = polarimetry.fresnel(eps, THETA)
     rng = np.random.default_rng(1)
     h = gain_h * (r_s + a * r_p)
     v = gain_v * (r_p + b * r_s)
@@ -53,17 +45,17 @@ def channels(eps, gain_h=1.0, gain_v=1.0, a=0.0, b=0.0, common=None, noise=0.0):
 @given(complex_gain, complex_gain)
 def test_metal_is_one_and_gain_is_recovered(gain_h, gain_v):
     h, v = channels(4 - 0.4j, gain_h, gain_v)
-    out = calibrate(make_images(h, v), METAL)
+    out = polarimetry.calibrate(make_images(h, v), METAL)
     np.testing.assert_allclose(out.p[METAL], 1, rtol=1e-9)
     np.testing.assert_allclose(np.abs(out.h[METAL]), 1, rtol=1e-9)
     assert out.metal_h / out.metal_v == pytest.approx(gain_h / gain_v, rel=1e-9)
-    r_s, r_p = fresnel(4 - 0.4j, THETA)
+    r_s, r_p = polarimetry.fresnel(4 - 0.4j, THETA)
     np.testing.assert_allclose(out.p[PLATE], r_s / r_p, rtol=1e-9)
 
 
 def test_metal_is_one_within_noise():
     h, v = channels(4 - 0.4j, 2.0j, 0.7, noise=0.02)
-    p = calibrate(make_images(h, v), METAL).p[METAL]
+    p = polarimetry.calibrate(make_images(h, v), METAL).p[METAL]
     assert abs(p.mean() - 1) < 0.005
     assert np.abs(p - 1).max() < 0.02 / 0.7 * 6
 
@@ -71,10 +63,10 @@ def test_metal_is_one_within_noise():
 @given(complex_gain, st.floats(-200, 200), st.floats(-200, 200))
 def test_common_gain_and_distance_phase_do_not_change_p(gain, tilt_x, tilt_y):
     h, v = channels(3.78 - 0.7j, 1.3j, 0.8)
-    reference = calibrate(make_images(h, v), METAL).p
+    reference = polarimetry.calibrate(make_images(h, v), METAL).p
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 100
     common = gain * np.exp(1j * (tilt_x * x + tilt_y * y))
-    moved = calibrate(make_images(h * common, v * common), METAL).p
+    moved = polarimetry.calibrate(make_images(h * common, v * common), METAL).p
     inside = METAL | PLATE
     np.testing.assert_allclose(moved[inside], reference[inside], rtol=1e-9)
 
@@ -82,9 +74,9 @@ def test_common_gain_and_distance_phase_do_not_change_p(gain, tilt_x, tilt_y):
 @given(leak, leak, complex_gain, complex_gain)
 def test_set_leakage_is_removed(a, b, gain_h, gain_v):
     h, v = channels(4.69 - 0.7j, gain_h, gain_v, a, b)
-    out = calibrate(make_images(h, v), METAL)
-    s, p = correct_leakage(out.h, out.v, a, b)
-    r_s, r_p = fresnel(4.69 - 0.7j, THETA)
+    out = polarimetry.calibrate(make_images(h, v), METAL)
+    s, p = polarimetry.correct_leakage(out.h, out.v, a, b)
+    r_s, r_p = polarimetry.fresnel(4.69 - 0.7j, THETA)
     np.testing.assert_allclose(s[PLATE] / p[PLATE], r_s / r_p, rtol=1e-9)
     np.testing.assert_allclose(s[METAL] / p[METAL], 1, rtol=1e-9)
     np.testing.assert_allclose(np.abs(s[PLATE]), abs(r_s), rtol=1e-9)
@@ -103,8 +95,8 @@ def test_reference_over_the_whole_plane_removes_uneven_illumination():
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 40
     light_h = (1 + 0.3 * x) * np.exp(2j * y)
     light_v = (1.2 - 0.2 * y) * np.exp(1j * x)
-    out = divide_by_metal(make_images(h * light_h, v * light_v), -light_h, -light_v)
-    r_s, r_p = fresnel(4 - 0.4j, THETA)
+    out = polarimetry.divide_by_metal(make_images(h * light_h, v * light_v), -light_h, -light_v)
+    r_s, r_p = polarimetry.fresnel(4 - 0.4j, THETA)
     np.testing.assert_allclose(out.p[PLATE], r_s / r_p, rtol=1e-9)
     np.testing.assert_allclose(out.p[METAL], 1, rtol=1e-9)
 
@@ -113,27 +105,27 @@ def test_dark_or_empty_metal_regions_are_refused():
     h, v = channels(4.0)
     for mask in (np.zeros(SHAPE, bool), ~(METAL | PLATE)):
         with refused(ErrorCode.NO_DATA):
-            calibrate(make_images(h, v), mask)
+            polarimetry.calibrate(make_images(h, v), mask)
     with refused(ErrorCode.MISMATCH, (2, 2)):
-        calibrate(make_images(h, v), np.ones((2, 2), bool))
+        polarimetry.calibrate(make_images(h, v), np.ones((2, 2), bool))
 
 
 def test_single_precision_stays_single():
     h, v = (a.astype(np.complex64) for a in channels(4.0, noise=0.01))
-    out = calibrate(make_images(h, v), METAL)
+    out = polarimetry.calibrate(make_images(h, v), METAL)
     assert out.h.dtype == out.v.dtype == out.p.dtype == np.complex64
-    assert correct_leakage(out.h, out.v, 0.05, 0.05)[0].dtype == np.complex64
-    assert smooth(out.h, 1.0).dtype == np.complex64
+    assert polarimetry.correct_leakage(out.h, out.v, 0.05, 0.05)[0].dtype == np.complex64
+    assert polarimetry.smooth(out.h, 1.0).dtype == np.complex64
 
 
 def test_smoothing_keeps_constants_reduces_noise_and_respects_holes():
     image = np.full(SHAPE, 2 - 1j)
-    np.testing.assert_allclose(smooth(image, 1.5), image)
+    np.testing.assert_allclose(polarimetry.smooth(image, 1.5), image)
     rng = np.random.default_rng(2)
     noise = rng.standard_normal(SHAPE) + 1j * rng.standard_normal(SHAPE)
-    assert smooth(noise, 2.0).std() < noise.std() / 5
+    assert polarimetry.smooth(noise, 2.0).std() < noise.std() / 5
     image[3, 4] = np.nan
-    out = smooth(image, 1.5)
+    out = polarimetry.smooth(image, 1.5)
     assert np.isnan(out[3, 4])
     out[3, 4] = 2 - 1j
     np.testing.assert_allclose(out, 2 - 1j)
@@ -141,16 +133,16 @@ def test_smoothing_keeps_constants_reduces_noise_and_respects_holes():
 
 def test_the_incidence_angle_is_that_of_the_specular_midpoint():
     rig = published_rig()
-    assert np.degrees(specular_incidence_rad(rig)) == pytest.approx(
+    assert np.degrees(polarimetry.specular_incidence_rad(rig)) == pytest.approx(
         np.mean([incidence_deg(rig, b) for b in rig.receivers]), abs=0.02
     )
     mx, my, _ = specular_midpoint_m(rig, rig.receivers[0])
     x = mx + np.linspace(-0.15, 0.15, 7)
     y = my + np.linspace(-0.15, 0.15, 5)
-    angles = incidence_choice(rig, x, y, "one")
+    angles = polarimetry.incidence_choice(rig, x, y, "one")
     assert angles.one_rad.shape == angles.pixel_rad.shape == (5, 7)
     assert np.ptp(angles.one_rad) == 0
     # Half of the Fresnel zone is some 70 mm wide in x: the weighted angle is less by hundredths of a degree.
     assert -0.15 < np.degrees(angles.pixel_rad - angles.one_rad)[2, 3] < 0
-    outside = incidence_choice(rig, np.array([mx + 2.0]), np.array([my]), "pixel").used_rad
-    assert outside[0, 0] == pytest.approx(specular_incidence_rad(rig), abs=1e-3)
+    outside = polarimetry.incidence_choice(rig, np.array([mx + 2.0]), np.array([my]), "pixel").used_rad
+    assert outside[0, 0] == pytest.approx(polarimetry.specular_incidence_rad(rig), abs=1e-3)

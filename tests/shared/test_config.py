@@ -8,17 +8,10 @@ import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 
+from polysight_shared import geometry
 from polysight_shared.config import Image, Instrument, MountStep, Section, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import no_such
-from polysight_shared.geometry import (
-    direct_path_m,
-    incidence_deg,
-    place,
-    rx_positions_m,
-    specular_midpoint_m,
-    tx_position_m,
-)
 from polysight_shared.tables import decode, read_toml, to_builtins
 
 
@@ -44,17 +37,17 @@ def test_published_chirp(rig: Instrument):
 
 def test_mounts_reproduce_the_published_antenna_positions(rig: Instrument):
     h, v = rig.receivers
-    assert tx_position_m(rig) == pytest.approx((-0.7055, 0.0974, 0.0130), abs=6e-5)
-    assert rx_positions_m(rig, h)[0] == pytest.approx((0.6843, 0.1035, 0.0094), abs=6e-5)
-    assert rx_positions_m(rig, v)[0] == pytest.approx((0.6836, 0.1337, 0.0104), abs=6e-5)
-    assert direct_path_m(rig, h)[0] == pytest.approx(1.390, abs=5e-4)
-    assert incidence_deg(rig, h) == pytest.approx(55.0, abs=0.1)
+    assert geometry.tx_position_m(rig) == pytest.approx((-0.7055, 0.0974, 0.0130), abs=6e-5)
+    assert geometry.rx_positions_m(rig, h)[0] == pytest.approx((0.6843, 0.1035, 0.0094), abs=6e-5)
+    assert geometry.rx_positions_m(rig, v)[0] == pytest.approx((0.6836, 0.1337, 0.0104), abs=6e-5)
+    assert geometry.direct_path_m(rig, h)[0] == pytest.approx(1.390, abs=5e-4)
+    assert geometry.incidence_deg(rig, h) == pytest.approx(55.0, abs=0.1)
 
 
 @pytest.mark.parametrize(("axis", "first", "second"), [("x", 1, 2), ("y", 2, 0), ("z", 0, 1)])
 def test_a_mount_turns_right_handed_about_each_axis(axis: str, first: int, second: int):
     mount = (MountStep(turn_deg=30.0, about=axis),)
-    images = [place(tuple(1000.0 * (i == k) for i in range(3)), mount) for k in range(3)]
+    images = [geometry.place(tuple(1000.0 * (i == k) for i in range(3)), mount) for k in range(3)]
     expected = [[float(i == k) for i in range(3)] for k in range(3)]
     for k, cosine_at, sine_at, sign in ((first, first, second, 1.0), (second, second, first, -1.0)):
         expected[k][cosine_at] = math.cos(math.pi / 6)
@@ -71,10 +64,10 @@ def test_an_image_has_at_most_four_million_pixels():
 
 def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instrument):
     for board in rig.receivers:
-        rx = rx_positions_m(rig, board)[0]
-        mid = specular_midpoint_m(rig, board)
+        rx = geometry.rx_positions_m(rig, board)[0]
+        mid = geometry.specular_midpoint_m(rig, board)
         out = math.degrees(math.atan2(math.hypot(mid[0] - rx[0], mid[1] - rx[1]), mid[2] - rx[2]))
-        assert out == pytest.approx(incidence_deg(rig, board), abs=1e-9)
+        assert out == pytest.approx(geometry.incidence_deg(rig, board), abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -14,17 +14,8 @@ from tests.support.rigs import published_rig
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
-from polysight_simulators.scene import Plate, Scene, apply_scene, decode_scene
+from polysight_simulators.scene import Plate, Scene, apply_scene, decode_scene, optics
 from polysight_simulators.scene.field import ObjectField, build_field, node_matrix
-from polysight_simulators.scene.optics import (
-    antennas,
-    board_reflectivity,
-    direct_factor,
-    field_exact,
-    half_space,
-    plate_reflection,
-    slab,
-)
 from polysight_simulators.scene.radar import sample_frequencies_hz
 
 GRID = {"columns": 29, "rows": 21, "step_x_mm": 10.0, "step_y_mm": 10.0}
@@ -54,7 +45,7 @@ def test_interpolation_between_frequencies_is_exact() -> None:
     offset = np.array([[0.021, -0.033]])
     assert len(field.nodes_hz) < 16
     everywhere = read(field, offset, samples, 0, samples)
-    exact = field_exact(rig, scene, board, offset, samples)
+    exact = optics.field_exact(rig, scene, board, offset, samples)
     # What a common factor cannot explain is the interpolation over frequency alone.
     common = np.vdot(everywhere, exact) / np.vdot(everywhere, everywhere)
     assert np.abs(everywhere * common - exact).max() < 1e-4 * np.abs(exact).max()
@@ -66,7 +57,7 @@ def test_a_large_mirror_shows_the_image_of_the_transmitter(role: str) -> None:
     rig, scene = setup(plates=[{"name": "m", "centre_mm": [0.0, 0.0], "size_mm": size, "metal": True}], object_gain=1.0)
     scene = scene.with_disturbances(leakage_h="off", leakage_v="off")
     board = rig.by_role(role)
-    ant = antennas(rig, board)
+    ant = optics.antennas(rig, board)
     rng = np.random.default_rng(1)
     offsets = rng.uniform(-0.06, 0.06, (200, 2))
     samples = sample_frequencies_hz(rig)
@@ -87,8 +78,8 @@ def test_echoes_add_up() -> None:
     offsets = np.array([[0.01, 0.02]])
     f = np.array([77e9, 80e9])
     for board in rig.receivers:
-        total = field_exact(rig, both_plates, board, offsets, f)
-        assert np.allclose(total, sum(field_exact(rig, s, board, offsets, f) for s in parts), atol=1e-12)
+        total = optics.field_exact(rig, both_plates, board, offsets, f)
+        assert np.allclose(total, sum(optics.field_exact(rig, s, board, offsets, f) for s in parts), atol=1e-12)
 
 
 def test_leakage_mixes_the_two_polarisations() -> None:
@@ -98,7 +89,7 @@ def test_leakage_mixes_the_two_polarisations() -> None:
     h, v = rig.receivers
 
     def interpolate_field(board: Any, **d: Any) -> complex:
-        return complex(field_exact(rig, scene.with_disturbances(ideal=True, **d), board, offsets, f)[0, 0])
+        return complex(optics.field_exact(rig, scene.with_disturbances(ideal=True, **d), board, offsets, f)[0, 0])
 
     # From no leakage to full leakage H gains all of p: linear in between.
     s_only = interpolate_field(h)
@@ -107,13 +98,13 @@ def test_leakage_mixes_the_two_polarisations() -> None:
     assert np.isclose(interpolate_field(h, leakage_v=[0.1, 0.0]), s_only)
     assert not np.isclose(interpolate_field(v, leakage_v=[0.1, 0.0]), interpolate_field(v))
     leaky = scene.with_disturbances(leakage_v=[0.0, 0.1])
-    assert direct_factor(v, leaky) == 1 - 0.1j  # as sampled
+    assert optics.direct_factor(v, leaky) == 1 - 0.1j  # as sampled
 
 
 def test_a_point_at_the_specular_midpoint_equals_its_amplitude() -> None:
     rig, scene = setup(points=[{"position_mm": [0.0, 0.0], "amplitude": [0.6, 0.0]}])
     ideal = scene.with_disturbances(ideal=True)
-    got = field_exact(rig, ideal, rig.receivers[0], np.zeros((1, 2)), np.array([78e9]))
+    got = optics.field_exact(rig, ideal, rig.receivers[0], np.zeros((1, 2)), np.array([78e9]))
     assert np.isclose(abs(got[0, 0]), 0.6)
 
 
@@ -131,8 +122,8 @@ F = 78.5e9
 
 @given(st.floats(0.01, 1.5))
 def test_a_good_conductor_tends_to_metal_with_p_of_plus_one(theta: float) -> None:
-    s, p = half_space(1e12 - 1e12j, theta)
-    m_s, m_p = plate_reflection(Plate("m", (0, 0), (1, 1), metal=True), F, np.array(theta))
+    s, p = optics.half_space(1e12 - 1e12j, theta)
+    m_s, m_p = optics.plate_reflection(Plate("m", (0, 0), (1, 1), metal=True), F, np.array(theta))
     assert m_s == m_p == -1
     assert abs(s - m_s) < 1e-4
     assert abs(p - m_p) < 1e-4 / np.cos(theta)
@@ -142,8 +133,8 @@ def test_scene_plates_choose_their_model() -> None:
     theta = np.array([0.9, 1.0])
     half = Plate("h", (0, 0), (1, 1), permittivity=(3.78, 0.7))
     thin = Plate("s", (0, 0), (1, 1), permittivity=(3.78, 0.7), thickness_mm=0.5)
-    assert np.allclose(plate_reflection(half, F, theta), half_space(3.78 - 0.7j, theta))
-    assert np.allclose(plate_reflection(thin, F, theta), slab(3.78 - 0.7j, 0.5e-3, F, theta))
+    assert np.allclose(optics.plate_reflection(half, F, theta), optics.half_space(3.78 - 0.7j, theta))
+    assert np.allclose(optics.plate_reflection(thin, F, theta), optics.slab(3.78 - 0.7j, 0.5e-3, F, theta))
 
 
 def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None:
@@ -159,7 +150,7 @@ def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None
     # Snell
     inside_m = 2 * thick_m * np.sqrt(eps - np.sin(theta) ** 2)
     for board in rig.receivers:
-        reflect = board_reflectivity(board, Scene("one sheet", plates=(sheet,)).with_disturbances(ideal=True))
+        reflect = optics.board_reflectivity(board, Scene("one sheet", plates=(sheet,)).with_disturbances(ideal=True))
         amplitudes = np.abs(later @ np.array([complex(reflect(sheet, hz, theta)) for hz in f]))
         back = np.where(np.abs(path_m) > 0.15, amplitudes, 0)
         assert abs(path_m[np.argmax(back)] - inside_m) < 0.01

@@ -5,17 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from polysight_worlds import METAL, Stack, cylinder, published_boards, published_rig, sphere
+from polysight_worlds import METAL, Stack, cylinder, published_boards, published_rig, series, sphere
 from polysight_worlds.media import LIGHT_M_PER_S
-from polysight_worlds.series import (
-    EndlessCylinder,
-    Pair,
-    needed_orders,
-    scatter_cylinder,
-    scatter_sphere,
-    sphere_coefficients,
-    sum_orders,
-)
 from polysight_worlds.shape_echoes import choose_solution, solve_cylinder, sum_bent
 from polysight_worlds.shapes import Shape, find_specular, follow_path
 from polysight_worlds.zones import place_antennas, sum_window
@@ -27,26 +18,26 @@ S_AXIS = np.array([[0.0], [1.0], [0.0]])
 P_AXIS = np.array([[0.0], [0.0], [1.0]])
 
 
-def dipoles(tx_m: tuple[float, ...], rx_m: tuple[float, ...], sent: np.ndarray, received: np.ndarray) -> Pair:
+def dipoles(tx_m: tuple[float, ...], rx_m: tuple[float, ...], sent: np.ndarray, received: np.ndarray) -> series.Pair:
     """One pair of dipoles about the origin."""
-    return Pair(np.array(tx_m)[:, None], np.array(rx_m)[:, None], sent + 0j, received + 0j)
+    return series.Pair(np.array(tx_m)[:, None], np.array(rx_m)[:, None], sent + 0j, received + 0j)
 
 
-def random_pair(seed: int) -> tuple[Pair, Pair]:
+def random_pair(seed: int) -> tuple[series.Pair, series.Pair]:
     """Dipoles at drawn places, and the same with TX and RX exchanged."""
     rng = np.random.default_rng(seed)
     places = rng.normal(size=(2, 3, 1))
     places[:, 2] -= 1
     places *= 0.7 / np.linalg.norm(places, axis=1, keepdims=True)
     axes = rng.normal(size=(2, 3, 1)) + 1j * rng.normal(size=(2, 3, 1))
-    return Pair(places[0], places[1], axes[0], axes[1]), Pair(places[1], places[0], axes[1], axes[0])
+    return series.Pair(places[0], places[1], axes[0], axes[1]), series.Pair(places[1], places[0], axes[1], axes[0])
 
 
 def test_a_large_metal_sphere_has_its_radar_cross_section():
     radius_m = 0.1
     distance_m = 60.0
     receiver_m = (0.0, 0.0, -distance_m)
-    echo = scatter_sphere(dipoles(receiver_m, receiver_m, S_AXIS, S_AXIS), radius_m, None, FREQUENCY_HZ)[0]
+    echo = series.scatter_sphere(dipoles(receiver_m, receiver_m, S_AXIS, S_AXIS), radius_m, None, FREQUENCY_HZ)[0]
     # sigma = 4 pi |E_s|^2 R^4 for a unit wave at 1 m; geometrical optics: pi a^2.
     section = 4 * np.pi * abs(echo) ** 2 * distance_m**4
     assert section == pytest.approx(np.pi * radius_m**2, rel=0.02)
@@ -57,14 +48,14 @@ def test_a_tiny_sphere_is_rayleighs_dipole():
     distance_m = 10.0
     eps = 4.0
     pair = dipoles((0, 0, -distance_m), (distance_m, 0, 0), S_AXIS, S_AXIS)
-    echo = abs(scatter_sphere(pair, radius_m, eps - 1e-9j, FREQUENCY_HZ, with_inside=True)[0])
+    echo = abs(series.scatter_sphere(pair, radius_m, eps - 1e-9j, FREQUENCY_HZ, with_inside=True)[0])
     expected = K**2 * radius_m**3 * (eps - 1) / (eps + 2) / distance_m**2
     assert echo == pytest.approx(expected, rel=1e-2)
 
 
 @pytest.mark.parametrize("permittivity", [None, 3.0 - 1e-12j])
 def test_a_sphere_without_loss_scatters_all_it_takes(permittivity):
-    a, b = sphere_coefficients(0.02, K, permittivity, with_inside=True)
+    a, b = series.sphere_coefficients(0.02, K, permittivity, with_inside=True)
     # |1 - 2 a| = 1 for each multipole.
     assert np.abs(1 - 2 * a) == pytest.approx(1, abs=1e-6)
     assert np.abs(1 - 2 * b) == pytest.approx(1, abs=1e-6)
@@ -72,7 +63,7 @@ def test_a_sphere_without_loss_scatters_all_it_takes(permittivity):
 
 def test_a_sphere_with_loss_takes_more_than_it_scatters():
     for with_inside in (False, True):
-        for part in sphere_coefficients(0.02, K, 4 - 0.4j, with_inside=with_inside):
+        for part in series.sphere_coefficients(0.02, K, 4 - 0.4j, with_inside=with_inside):
             assert np.abs(1 - 2 * part).max() <= 1 + 1e-9
 
 
@@ -80,11 +71,11 @@ def test_a_sphere_with_loss_takes_more_than_it_scatters():
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_transmitter_and_receiver_may_be_exchanged(permittivity, seed):
     forth, back = random_pair(seed)
-    exchanged = scatter_sphere(forth, 0.05, permittivity, FREQUENCY_HZ)
-    assert scatter_sphere(back, 0.05, permittivity, FREQUENCY_HZ) == pytest.approx(exchanged, rel=1e-9)
+    exchanged = series.scatter_sphere(forth, 0.05, permittivity, FREQUENCY_HZ)
+    assert series.scatter_sphere(back, 0.05, permittivity, FREQUENCY_HZ) == pytest.approx(exchanged, rel=1e-9)
     path_m = np.array([1.3])
-    exchanged = scatter_cylinder(forth, 0.05, permittivity, FREQUENCY_HZ, path_m)
-    assert scatter_cylinder(back, 0.05, permittivity, FREQUENCY_HZ, path_m) == pytest.approx(exchanged, rel=1e-9)
+    exchanged = series.scatter_cylinder(forth, 0.05, permittivity, FREQUENCY_HZ, path_m)
+    assert series.scatter_cylinder(back, 0.05, permittivity, FREQUENCY_HZ, path_m) == pytest.approx(exchanged, rel=1e-9)
 
 
 # What creeps around metal is no part of a smooth integrand.
@@ -98,20 +89,20 @@ def test_the_stationary_axial_wave_gives_the_whole_integral(permittivity, tolera
     # A turn of both dipoles, so that all parts of the sum are there.
     tx_m, rx_m = places
     pair = dipoles(tx_m, rx_m, sent + 0.3 * S_AXIS, received + 0.2 * P_AXIS)
-    body = EndlessCylinder(radius_m, permittivity, False)
+    body = series.EndlessCylinder(radius_m, permittivity, False)
     round_x = cylinder("cylinder", METAL, (0.0, 0.0, 0.0), radius_m, 2.0, axis=(1.0, 0.0, 0.0))
     path = follow_path(round_x.evaluate(*find_specular(round_x, pair.tx_m, pair.rx_m)), pair.tx_m, pair.rx_m)
     specular = np.sqrt(path.length_m**2 - (pair.rx_m[0] - pair.tx_m[0]) ** 2)
     # The contour passes below the branch point k and above -k.
     t = np.linspace(-2.2 * k, 2.2 * k, 4001)
     h = t * (1 - 0.02j)
-    many = Pair(*(np.repeat(part, len(t), axis=1) for part in vars(pair).values()))
-    m_m, n_n, m_n = (table.T for table in body.coefficients(k, h, needed_orders(k * radius_m)))
-    integrand = sum_orders(many, (m_m, n_n, m_n), k, h, np.zeros(len(t))) * np.exp(
+    many = series.Pair(*(np.repeat(part, len(t), axis=1) for part in vars(pair).values()))
+    m_m, n_n, m_n = (table.T for table in body.coefficients(k, h, series.needed_orders(k * radius_m)))
+    integrand = series.sum_orders(many, (m_m, n_n, m_n), k, h, np.zeros(len(t))) * np.exp(
         1j * h * (pair.rx_m[0] - pair.tx_m[0])
     )
     full_integral = np.conj(0.5j * integrand.sum() * (h[1] - h[0]))
-    quick = scatter_cylinder(pair, radius_m, permittivity, frequency_hz, specular)[0]
+    quick = series.scatter_cylinder(pair, radius_m, permittivity, frequency_hz, specular)[0]
     assert quick == pytest.approx(full_integral, rel=tolerance)
 
 

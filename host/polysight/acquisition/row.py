@@ -17,18 +17,10 @@ from typing import Any
 
 import zmq
 
+from polysight.acquisition import pulse_times
 from polysight.acquisition.capture_rig import CaptureRig, record_ended
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.pi_client import PiClient
-from polysight.acquisition.pulse_times import (
-    PlacedFrames,
-    ReceivedCapture,
-    describe,
-    find_frames,
-    first_pulse_ns,
-    frames_to_move,
-    rewrite_row,
-)
 from polysight.capture import PACKETS, RowCapture, silent_radar, valid_frames, write_error
 from polysight.radar import BoardState, RadarControl, RadarState
 from polysight.store import (
@@ -129,13 +121,13 @@ class Take:
     captures: dict[str, RowCapture] = field(default_factory=dict)
     # Why the host aborted the row, or did not begin it
     aborted: TakeFault | None = None
-    events: list[ReceivedCapture] = field(default_factory=list)
+    events: list[pulse_times.ReceivedCapture] = field(default_factory=list)
     # Latest states
     radars: dict[str, BoardState] = field(default_factory=dict)
     # Radars that did not confirm the end of all frames
     not_done: list[str] = field(default_factory=list)
     # Frames placed by their arrival times, for rows of a certain length.
-    frames: dict[str, PlacedFrames] = field(default_factory=dict)
+    frames: dict[str, pulse_times.PlacedFrames] = field(default_factory=dict)
 
     def faults(self, pulses_per_point: int) -> list[TakeFault]:
         """List the faults of this take; empty if it is complete."""
@@ -172,7 +164,7 @@ class Take:
             return TakeFault(FaultKind.COUNTS_DIFFER, text)
         return None
 
-    def find_displaced(self, name: str) -> PlacedFrames | None:
+    def find_displaced(self, name: str) -> pulse_times.PlacedFrames | None:
         """Return where a board's frames are if they are not at their pulses; None if they are, or it is unknown."""
         frames = self.frames.get(name)
         if frames is None or not frames.is_timed:
@@ -203,7 +195,7 @@ class Take:
                 kind = FaultKind.PULSES_MISSED
             else:
                 kind = FaultKind.SLIPPED
-            return TakeFault(kind, describe(displaced, pulses_per_point) + held_text, name)
+            return TakeFault(kind, pulse_times.describe(displaced, pulses_per_point) + held_text, name)
         if not capture.located:
             # The kind with the clearest remedy goes first; the text lists all that is known.
             frames = self.frames.get(name)
@@ -278,7 +270,7 @@ def commit_row(
         final = scan.row_path(name, take.row.index)
         frames = take.frames.get(name)
         # Frames that were not seen at the pulse of their number; None if the record can stay as it came.
-        moved = frames_to_move(capture, frames)
+        moved = pulse_times.frames_to_move(capture, frames)
         # Without times to compare them with, the pulse of each frame follows from its number alone.
         untimed = 0
         if capture.located and (frames is None or not frames.is_timed):
@@ -287,7 +279,7 @@ def commit_row(
         if capture.slipped and frames is not None:
             missed = frames.pulses - frames.slots.size
         if moved is not None:
-            capture = rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
+            capture = pulse_times.rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
             take.captures[name] = capture
         try:
             final.with_suffix(PART).rename(final)
@@ -588,7 +580,7 @@ class RowTaker:
         """Keep the Pi's events of this take; those of other rows and takes are ignored."""
         for event in self._pi.events():
             if isinstance(event, Capture) and (event.row_index, event.take) == (take.row.index, take.number):
-                take.events.append(ReceivedCapture(event, time.monotonic_ns()))
+                take.events.append(pulse_times.ReceivedCapture(event, time.monotonic_ns()))
                 self._on_point(event.point + 1)
             elif isinstance(event, RowFinished) and (event.row_index, event.take) == (take.row.index, take.number):
                 take.finished = event
@@ -609,7 +601,7 @@ class RowTaker:
         """Stop the records and make the rows durable; notify while a slow disk delays this."""
         began = time.monotonic()
         with ThreadPoolExecutor(1, thread_name_prefix="disk") as executor:
-            ending = executor.submit(self._rig.end_row, first_pulse_ns(take.events) or 0)
+            ending = executor.submit(self._rig.end_row, pulse_times.first_pulse_ns(take.events) or 0)
             while not wait([ending], _DISK_NOTICE_S).done:
                 waited_s = time.monotonic() - began
                 self._notify("wait", f"row {take.row.index} is not written after {waited_s:.0f} s: the disk is slow")
@@ -620,7 +612,7 @@ class RowTaker:
         for name, capture in take.captures.items():
             path = self._folder / "raw" / name / f"{take.row.index:04d}{PART}"
             if capture.located or capture.slipped:
-                take.frames[name] = find_frames(path, take.row, take.events, self._instrument)
+                take.frames[name] = pulse_times.find_frames(path, take.row, take.events, self._instrument)
 
 
 class _SilenceCheck:
@@ -635,7 +627,7 @@ class _SilenceCheck:
         self._checked_ns = 0
         self._all_heard = False
 
-    def find_silent_boards(self, events: list[ReceivedCapture]) -> list[str]:
+    def find_silent_boards(self, events: list[pulse_times.ReceivedCapture]) -> list[str]:
         """Return the boards without a byte `end_of_record_s` after enough bursts. Asks the receivers no more often."""
         now = time.monotonic_ns()
         if self._all_heard or len(events) < self._bursts or now - self._checked_ns < self._limit_ns:

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET
 
+from polysight import process
 from polysight.data import find_packaged
 from polysight.imaging import Images
 from polysight.jobs.label import save_labels
@@ -31,15 +32,6 @@ from polysight.materials import (
 )
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import Incidence
-from polysight.process import (
-    Inputs,
-    analyse_given_images,
-    collect_imaged_scan,
-    collect_processed_scan,
-    is_given_images,
-    read_given_images,
-    why_unnamed,
-)
 from polysight.products import (
     IMAGE,
     LABELS,
@@ -132,7 +124,7 @@ def open_scan(
         incidence=incidence,
         incidence_deg=incidence_deg,
     )
-    if is_given_images(path):
+    if process.is_given_images(path):
         return Scan(path, None, _analyse_images(path, rig, settings), settings)
     process_again = fresh or settings != Settings()
     if (path / IMAGE).exists() and not (path / MANIFEST).exists():
@@ -173,7 +165,7 @@ def _analyse_images(path: Path, rig: str | os.PathLike[str] | Instrument | None,
         )
     if not isinstance(rig, Instrument):
         rig = load_instrument(find_packaged(RIG) if rig is None else Path(rig))
-    scan, _, _ = analyse_given_images(read_given_images(path, rig), settings, Inputs(), rig)
+    scan, _, _ = process.analyse_given_images(process.read_given_images(path, rig), settings, process.Inputs(), rig)
     return scan
 
 
@@ -617,7 +609,7 @@ class Processing:
     def unreferenced(self) -> ProcessedScan:
         """Images in arbitrary units, as `polysight image` writes them. Raises PolysightError."""
         pipeline = self.pipeline
-        return collect_imaged_scan(self.folder, self.source, pipeline.rig, self._images, pipeline.quality)
+        return process.collect_imaged_scan(self.folder, self.source, pipeline.rig, self._images, pipeline.quality)
 
     @cached_property
     def referenced(self) -> ProcessedScan:
@@ -629,12 +621,14 @@ class Processing:
             when no metal is found, a row is damaged, or library or metal reference do not fit the scan.
         """
         pipeline = self.pipeline
-        unnamed = why_unnamed(self.settings, pipeline.rig)
+        unnamed = process.why_unnamed(self.settings, pipeline.rig)
         plates, note = find_truth(self.folder)
         if note:
             warnings.warn(note, stacklevel=2)
         findings = pipeline.examine(self._images, plates)
-        return collect_processed_scan(self.folder, self.source, pipeline.rig, findings, pipeline.quality, unnamed)
+        return process.collect_processed_scan(
+            self.folder, self.source, pipeline.rig, findings, pipeline.quality, unnamed
+        )
 
 
 def patch_table(done: ProcessedScan) -> str:

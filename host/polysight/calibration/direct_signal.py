@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight import sync
 from polysight.calibration.files import (
     BoardFilter,
     BoardStart,
@@ -29,17 +30,6 @@ from polysight.calibration.files import (
 )
 from polysight.radar import direct_if_hz
 from polysight.store import RawSource
-from polysight.sync import (
-    FOLD,
-    AlignedRow,
-    BoardSetup,
-    HighPass,
-    align_row,
-    cis,
-    fit_high_pass,
-    reference,
-    whole_blocks,
-)
 from polysight_shared.config import Board, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -98,7 +88,7 @@ class DirectSignal:
     def start_delay_s(self, rig: Instrument) -> tuple[float, float]:
         """Return the mean start delay of the board relative to the transmitter, and its standard error; seconds."""
         chirp = rig.chirp
-        first, end = whole_blocks(chirp.linear_samples)
+        first, end = sync.whole_blocks(chirp.linear_samples)
         middle_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * (first + end - 1) / 2
         expected = self.expected_hz + self.crystal_ppm(rig) * 1e-6 * middle_hz
         delay = (expected - unwrap_if(self.if_hz, rig)) / chirp.slope_hz_per_s
@@ -130,28 +120,30 @@ def jitter_hz(rig: Instrument) -> float:
 
 
 def find_direct(
-    rig: Instrument, board: Board, words: NDArray[Any], valid: NDArray[np.bool_], setup: BoardSetup | None = None
+    rig: Instrument, board: Board, words: NDArray[Any], valid: NDArray[np.bool_], setup: sync.BoardSetup | None = None
 ) -> DirectSignal:
     """Find the direct path in bursts: words int16 [frame, sample, 2, rx], `valid` bool [frame] those received whole.
 
     `setup` is that of the board, if it exists already.
     """
-    setup = setup or BoardSetup.from_rig(rig, board)
+    setup = setup or sync.BoardSetup.from_rig(rig, board)
     chirp = rig.chirp
     shape = (len(words) // setup.pulses, setup.pulses)
-    aligned = align_row(
+    aligned = sync.align_row(
         words.reshape(*shape, *words.shape[1:]), valid.reshape(shape), chirp.linear_samples, setup.equaliser, FULL_SCALE
     )
     # The drift estimate is linearised: the first pass finds 2 ppm within a tenth, the second the rest.
-    drift = reference(aligned, setup.path, chirp).drift
-    time = np.arange(aligned.halves.shape[-1]) * float(FOLD)
+    drift = sync.reference(aligned, setup.path, chirp).drift
+    time = np.arange(aligned.halves.shape[-1]) * float(sync.FOLD)
     time -= time.mean()
-    without_drift = aligned._replace(halves=aligned.halves * cis(-0.5 * drift * time**2))
-    referenced = reference(without_drift, setup.path, chirp)
+    without_drift = aligned._replace(halves=aligned.halves * sync.cis(-0.5 * drift * time**2))
+    referenced = sync.reference(without_drift, setup.path, chirp)
     has_direct_path = aligned.good & referenced.found[:, None]
     cycles = (referenced.frequency[:, None] + aligned.frequency)[has_direct_path]
     power = _measure_power(words[has_direct_path.ravel()], cycles, setup, drift + referenced.drift)
-    noise = _estimate_recorded_noise(aligned, referenced.noise) * (np.abs(setup.path.estimator[0]) ** 2).sum() / FOLD
+    noise = (
+        _estimate_recorded_noise(aligned, referenced.noise) * (np.abs(setup.path.estimator[0]) ** 2).sum() / sync.FOLD
+    )
     # Cycles a sample repeat after one: bring them into the receiver's band.
     if chirp.if_mode == "complex1x":
         cycles = cycles % 1.0
@@ -170,7 +162,7 @@ def find_direct(
     )
 
 
-def _estimate_recorded_noise(aligned: AlignedRow, noise: NDArray[np.float64]) -> float:
+def _estimate_recorded_noise(aligned: sync.AlignedRow, noise: NDArray[np.float64]) -> float:
     """Return the noise power of a recorded sample: the estimate divided by the gain of the filter compensation."""
     good_chirps = np.maximum(aligned.good.sum(axis=1), 1)
     power_gain = (aligned.gain**2 * aligned.good).sum(axis=1) / good_chirps
@@ -181,19 +173,19 @@ def _estimate_recorded_noise(aligned: AlignedRow, noise: NDArray[np.float64]) ->
 
 
 def _measure_power(
-    words: NDArray[np.int16], cycles: NDArray[np.float64], setup: BoardSetup, drift: float
+    words: NDArray[np.int16], cycles: NDArray[np.float64], setup: sync.BoardSetup, drift: float
 ) -> NDArray[np.float64]:
     """Return the power of the direct path in each chirp [chirp], by the estimator that suppresses the object."""
     if not len(words):
         return np.zeros(0)
-    first, end = whole_blocks(setup.chirp.linear_samples)
+    first, end = sync.whole_blocks(setup.chirp.linear_samples)
     n = end - first
     path = setup.path
     time = np.arange(n) - (n - 1) / 2
     # [chirp, sample, rx]
     raw = words[:, first:end, 0] + 1j * words[:, first:end, 1].astype(np.float32)
-    still = raw * cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
-    folded = still.reshape(len(words), n // FOLD, FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
+    still = raw * sync.cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
+    folded = still.reshape(len(words), n // sync.FOLD, sync.FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
     return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2
 
 
@@ -204,7 +196,7 @@ def fit_start(source: RawSource, board_name: str) -> BoardStart:
     """
     rig = source.instrument
     board = rig.by_name(board_name)
-    setup = BoardSetup.from_rig(rig, board)
+    setup = sync.BoardSetup.from_rig(rig, board)
     signals = [find_direct(rig, board, words, ok, setup) for _, words, ok in board_rows(source, board_name, ROWS)]
     if_hz = np.concatenate([s.if_hz for s in signals])
     chirps = sum(s.chirps for s in signals)
@@ -253,7 +245,7 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
 
     Raises DataError if the direct path is not found, or the sweep does not determine the corners.
     """
-    setups: dict[str, BoardSetup] = {}
+    setups: dict[str, sync.BoardSetup] = {}
     powers = [_measure_power_of_scan(scan, scan.instrument.by_name(board_name), setups) for scan in scans]
     if_hz, power, noise_power = (np.concatenate(parts) for parts in zip(*powers, strict=True))
     middles, levels = average_in_bins(if_hz, power, noise_power)
@@ -261,7 +253,7 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
         raise DataError(
             f"no direct path of {board_name}", "see `polysight doctor`", "measure again", code=ErrorCode.NO_DATA
         )
-    model = fit_high_pass(middles, levels)
+    model = sync.fit_high_pass(middles, levels)
     corners = np.array(model.corners_hz)
     errors, residual = _estimate_corner_errors(middles, levels, corners)
     chirp = scans[0].instrument.chirp
@@ -276,13 +268,15 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
     )
 
 
-def _measure_power_of_scan(scan: RawSource, board: Board, setups: dict[str, BoardSetup]) -> tuple[Real, Real, Real]:
+def _measure_power_of_scan(
+    scan: RawSource, board: Board, setups: dict[str, sync.BoardSetup]
+) -> tuple[Real, Real, Real]:
     """Return IF (Hz), power and noise power (ADC counts squared) of the direct path in the chirps of some rows."""
     rig = scan.instrument
     # Scans of one sweep share the setup
     key = f"{places_crc32(rig)} {rig.chirp} {rig.burst!r}"
     if key not in setups:
-        setups[key] = BoardSetup.from_rig(rig, board)
+        setups[key] = sync.BoardSetup.from_rig(rig, board)
     signals = [
         find_direct(rig, board, words, ok, setups[key]) for _, words, ok in board_rows(scan, board.name, FILTER_ROWS)
     ]
@@ -317,7 +311,7 @@ def _estimate_corner_errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple
     """Return the standard errors of the corners (Hz), and the residual of the log levels (dB, RMS)."""
 
     def residual(logs: Real) -> Real:
-        out = np.log(level) - np.log(np.abs(HighPass(tuple(np.exp(logs))).response(if_hz)))
+        out = np.log(level) - np.log(np.abs(sync.HighPass(tuple(np.exp(logs))).response(if_hz)))
         return out - out.mean()
 
     logs = np.log(corners_hz)

@@ -24,15 +24,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.calibration.files import (
-    BoardPlace,
-    PlacesFile,
-    SourceScan,
-    Vector,
-    board_rows,
-    header,
-    places_crc32,
-)
+from polysight.calibration import files
 from polysight.imaging import Antennas, image_grid, reduction, row_offsets_m, scene_gate_m
 from polysight.store import RawSource
 from polysight.sync import (
@@ -199,7 +191,7 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
     direct = []
     offsets = []
     stride = max(1, int(np.ceil(np.sqrt(plan.positions / POSITIONS))))
-    for row, words, valid in board_rows(source, name):
+    for row, words, valid in files.board_rows(source, name):
         if row % stride:
             continue
         synced = synchronise_row(words, valid, setup)
@@ -296,7 +288,7 @@ def _take_some_positions(b: BoardEchoes) -> BoardEchoes:
     return BoardEchoes(antennas, b.samples[:1, picked], b.echo, b.offsets_m[picked], b.frequencies_hz)
 
 
-def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[SourceScan]) -> PlacesFile:
+def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[files.SourceScan]) -> files.PlacesFile:
     """Return a fit as a calibration file. Raises DataError if the points explain too little of the data."""
     if fit.explained < _MIN_EXPLAINED:
         raise DataError(
@@ -313,7 +305,7 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[Sour
         vector_before = antennas.rx_m[0] - antennas.tx_m
         vector_after = vector_before + fit.values[board_values] / 1e3
         along = vector_after / np.linalg.norm(vector_after)
-        boards[name] = BoardPlace(
+        boards[name] = files.BoardPlace(
             _vector(fit.values[board_values]),
             _vector(errors[board_values]),
             float(np.linalg.norm(vector_after) * 1e3),
@@ -321,9 +313,9 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[Sour
             float(np.sqrt(along @ fit.covariance[board_values, board_values] @ along)),
         )
     depth, x, y, turn = (float(v) for v in fit.values[-4:])
-    return PlacesFile(
-        **header("direct_path", sources),
-        rig_crc32=places_crc32(rig),
+    return files.PlacesFile(
+        **files.header("direct_path", sources),
+        rig_crc32=files.places_crc32(rig),
         boards=boards,
         object_distance_mm=rig.geometry.object_distance_mm + depth,
         object_distance_was_mm=rig.geometry.object_distance_mm,
@@ -337,6 +329,6 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[Sour
     )
 
 
-def _vector(values: Real) -> Vector:
+def _vector(values: Real) -> files.Vector:
     x, y, z = (float(v) for v in values)
     return x, y, z

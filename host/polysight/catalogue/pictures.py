@@ -14,21 +14,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight import products
 from polysight.imaging import Images
 from polysight.polarimetry import specular_incidence_rad
-from polysight.products import (
-    CHANNELS,
-    QUANTITIES,
-    Limits,
-    MapValues,
-    PermittivityMap,
-    ProcessedScan,
-    map_images,
-    map_permittivity,
-    map_scan,
-    percentile,
-    signal_opacity,
-)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -44,11 +32,11 @@ THUMBNAIL_PIXELS = 96
 
 
 @dataclass(frozen=True)
-class Pixels(ProcessedScan):
+class Pixels(products.ProcessedScan):
     """Saved products with permittivity and errors of each pixel. Arrays are [ny, nx], row 0 the smallest y."""
 
     @classmethod
-    def from_scan(cls, scan: ProcessedScan) -> Self:
+    def from_scan(cls, scan: products.ProcessedScan) -> Self:
         """Return the pixels of a result, saved or just computed."""
         pixels = cls(scan.folder)
         vars(pixels).update(vars(scan))
@@ -62,7 +50,7 @@ class Pixels(ProcessedScan):
     @cached_property
     def clear(self) -> NDArray[np.bool_]:
         """Pixels bright enough in both channels for a meaningful ratio."""
-        return signal_opacity(self.images, "p") > 0
+        return products.signal_opacity(self.images, "p") > 0
 
     @cached_property
     def p_std(self) -> Real:
@@ -87,9 +75,9 @@ class Pixels(ProcessedScan):
         return specular_incidence_rad(self.rig)
 
     @cached_property
-    def permittivity(self) -> PermittivityMap:
+    def permittivity(self) -> products.PermittivityMap:
         """Permittivity and its errors; masked where it is not known, and where the image is too dark."""
-        known = map_permittivity(self)
+        known = products.map_permittivity(self)
         return replace(known, mask=known.mask & self.clear)
 
     def nearest(self, x_mm: float, y_mm: float) -> tuple[int, int]:
@@ -150,14 +138,14 @@ def draw(images: Images) -> dict[str, Picture]:
     P is that of the given images: during a scan it is not referenced to metal.
     """
     pictures = {}
-    for channel in CHANNELS:
-        for quantity in QUANTITIES:
-            values = map_images(images, channel, quantity)
+    for channel in products.CHANNELS:
+        for quantity in products.QUANTITIES:
+            values = products.map_images(images, channel, quantity)
             pictures[f"{channel}_{quantity}"] = draw_values(values, UNITS[quantity], COLOURS[quantity])
     return pictures
 
 
-def draw_products(pixels: Pixels, name: str, limits: Limits | None = None) -> Picture:
+def draw_products(pixels: Pixels, name: str, limits: products.Limits | None = None) -> Picture:
     """Draw one of `MAPS` of a processed scan; `limits` replaces the limits of its colours.
 
     Raises DataError if there is no such picture, or nothing to draw.
@@ -172,7 +160,7 @@ def draw_products(pixels: Pixels, name: str, limits: Limits | None = None) -> Pi
         unit = ""
     else:
         channel, _, quantity = name.partition("_")
-        values = map_scan(pixels, channel, quantity)
+        values = products.map_scan(pixels, channel, quantity)
         unit = UNITS[quantity]
     if limits is not None:
         values = replace(values, limits=limits)
@@ -182,13 +170,13 @@ def draw_products(pixels: Pixels, name: str, limits: Limits | None = None) -> Pi
 def thumbnail(pixels: Pixels) -> Picture:
     """A small picture of the amplitude of H."""
     step = max(1, -(-max(pixels.h.shape) // THUMBNAIL_PIXELS))
-    values = map_scan(pixels, "h", "amplitude")
+    values = products.map_scan(pixels, "h", "amplitude")
     small = (slice(None, None, step), slice(None, None, step))
     smaller = replace(values, numbers=values.numbers[small], opacity=values.opacity[small])
     return draw_values(smaller, UNITS["amplitude"])
 
 
-def _derive_values(pixels: Pixels, name: str) -> MapValues:
+def _derive_values(pixels: Pixels, name: str) -> products.MapValues:
     """Maps derived from P: its error, permittivity, loss."""
     if not pixels.referenced:
         raise DataError(
@@ -203,12 +191,12 @@ def _derive_values(pixels: Pixels, name: str) -> MapValues:
         values = eps.value.real if name == "permittivity" else -eps.value.imag
         visible = eps.mask
     # Edges of plates have any value.
-    high = percentile(values, visible, 85, 1.0)
+    high = products.percentile(values, visible, 85, 1.0)
     low = 1.0 if name == "permittivity" else 0.0
-    return MapValues(values, visible, (low, max(1.3 * high, low + 1e-3)))
+    return products.MapValues(values, visible, (low, max(1.3 * high, low + 1e-3)))
 
 
-def draw_values(values: MapValues, unit: str = "", colours: str = AMPLITUDE) -> Picture:
+def draw_values(values: products.MapValues, unit: str = "", colours: str = AMPLITUDE) -> Picture:
     """Draw numbers as a PNG with one pixel each; pixels without a number must be transparent."""
     # Imported here: it loads for half a second, and lists need no picture.
     import matplotlib

@@ -30,17 +30,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.imaging import geometry
 from polysight.imaging.direct import DirectImager
-from polysight.imaging.geometry import (
-    Antennas,
-    Aperture,
-    ImageGrid,
-    Window,
-    irregular,
-    row_starts_m,
-    scan_offsets_m,
-    window_weights,
-)
 from polysight.imaging.spectral import SLACK_M, IncrementalImager, SpectralImager
 from polysight.sync import FOLD, SyncedRow, decimation, sample_frequencies_hz
 from polysight_shared.config import Board, Chirp, Instrument
@@ -121,7 +112,7 @@ class Reduction:
 
 
 def scene_gate_m(
-    antennas: tuple[Antennas, ...], plan: RasterPlan, grid: ImageGrid, depth_m: float = 0.0
+    antennas: tuple[geometry.Antennas, ...], plan: RasterPlan, grid: geometry.ImageGrid, depth_m: float = 0.0
 ) -> tuple[float, float]:
     """Return the smallest and largest excess path of all pixels (`depth_m` nearer and farther) and stage positions."""
     # 2 mm more: the travel within a burst
@@ -137,7 +128,7 @@ def scene_gate_m(
 
 
 @lru_cache(maxsize=8)
-def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann", extra: int = 6) -> Reduction:
+def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window = "hann", extra: int = 6) -> Reduction:
     """Return the linear maps of a range gate.
 
     Parameters
@@ -153,7 +144,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
     """
     a, b = chirp.linear_samples
     sweep = sample_frequencies_hz(chirp)[a:b]
-    weight = window_weights(window, b - a)
+    weight = geometry.window_weights(window, b - a)
     weight = weight / weight.sum()
     band = sweep[-1] - sweep[0]
     product = (gate_m[1] - gate_m[0]) * band / SPEED_OF_LIGHT_M_S
@@ -238,7 +229,7 @@ class Imager(Protocol):
     """
 
     @property
-    def aperture(self) -> Aperture:
+    def aperture(self) -> geometry.Aperture:
         """Positions, antennas, frequencies and pixels."""
         ...
 
@@ -255,9 +246,9 @@ class Imager(Protocol):
         ...
 
 
-def choose_imager(aperture: Aperture) -> tuple[Imager, str | None]:
+def choose_imager(aperture: geometry.Aperture) -> tuple[Imager, str | None]:
     """Choose the imager: spectral if the aperture is regular, otherwise the slower direct sum (with a notice)."""
-    reason = irregular(aperture)
+    reason = geometry.irregular(aperture)
     if reason is None:
         return SpectralImager(aperture), None
     rx, _, rows, columns = aperture.shape
@@ -266,14 +257,16 @@ def choose_imager(aperture: Aperture) -> tuple[Imager, str | None]:
     return DirectImager(aperture), notice
 
 
-def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.complex128]:
+def mirror_samples(antennas: geometry.Antennas, z_m: float, chirp: Chirp) -> NDArray[np.complex128]:
     """Return the referenced samples of a mirror, [rx, sample]; amplitude relative to a direct path of one metre."""
     path = antennas.mirror_m(z_m)
     phase = 2j * np.pi * np.outer(path - antennas.direct_m, sample_frequencies_hz(chirp)) / SPEED_OF_LIGHT_M_S
     return (np.exp(phase) / path[:, None]).astype(np.complex128)
 
 
-def mirror_reduced(antennas: Antennas, z_m: float, chirp: Chirp, reduction: Reduction) -> NDArray[np.complex128]:
+def mirror_reduced(
+    antennas: geometry.Antennas, z_m: float, chirp: Chirp, reduction: Reduction
+) -> NDArray[np.complex128]:
     """Return the samples of a mirror after the range gate, [rx, frequency]."""
     return mirror_samples(antennas, z_m, chirp) @ reduction.matrix.T
 
@@ -310,7 +303,7 @@ class BoardSamples:
         self,
         rig: Instrument,
         board: Board,
-        grid: ImageGrid,
+        grid: geometry.ImageGrid,
         reduction: Reduction,
         taper: NDArray[np.float32],
         live: bool = False,
@@ -323,17 +316,17 @@ class BoardSamples:
         # Maps for pairs of real numbers and the samples they use, by the row's number of samples.
         self._maps: dict[int, tuple[slice, NDArray[np.float32]]] = {}
         self._filters = burst_filters(rig)
-        self._antennas = Antennas.from_rig(rig, board)
+        self._antennas = geometry.Antennas.from_rig(rig, board)
         self._chirp = rig.chirp
         self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
-        self._offsets = scan_offsets_m(rig)
-        self._planned = row_starts_m(self._offsets)
+        self._offsets = geometry.scan_offsets_m(rig)
+        self._planned = geometry.row_starts_m(self._offsets)
         rx = len(self._antennas.rx_m)
         shape = taper.shape
         self._cube = np.zeros((rx, reduction.frequencies_hz.size, *shape), np.complex64)
         self._direct = np.zeros((rx, *shape), np.complex64)
         self.valid = np.zeros(shape, bool)
-        regular = irregular(self.aperture) is None
+        regular = geometry.irregular(self.aperture) is None
         self._final: SpectralImager | None = None
         # Spectra of the rows along x, for the final image
         self._spectra = np.zeros(0, np.complex64)
@@ -353,9 +346,9 @@ class BoardSamples:
             self._prepare()
 
     @property
-    def aperture(self) -> Aperture:
+    def aperture(self) -> geometry.Aperture:
         """Geometry of antennas, positions and pixels."""
-        return Aperture(self._antennas, self._offsets, self._reduction.frequencies_hz, self._grid)
+        return geometry.Aperture(self._antennas, self._offsets, self._reduction.frequencies_hz, self._grid)
 
     @property
     def model(self) -> NDArray[np.complex128]:
@@ -428,8 +421,8 @@ class BoardSamples:
             self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
             self._final = None
             self._moved = True
-            moved = abs(row_starts_m(self._offsets)[index] - self._planned[index])
-            if moved > SLACK_M or irregular(self.aperture) is not None:
+            moved = abs(geometry.row_starts_m(self._offsets)[index] - self._planned[index])
+            if moved > SLACK_M or geometry.irregular(self.aperture) is not None:
                 self._live = None
         self._stale.add(index)
         self._image = None
@@ -454,7 +447,7 @@ class BoardSamples:
 
     def _prepare(self) -> None:
         """Create the spectral imager of all rows if the aperture is regular; keep it while positions do not change."""
-        if self._final is None and irregular(self.aperture) is None:
+        if self._final is None and geometry.irregular(self.aperture) is None:
             # Shares spectra with the live imager
             self._final = SpectralImager(self.aperture, slack_m=SLACK_M)
             self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)
@@ -519,7 +512,7 @@ class BoardSamples:
             white = self._final.spectra_of_row(weights.astype(np.complex64), index)
             self._live.add_spectra(index, sign * self._row_spectra(self._final, index), white)
         else:
-            start = float(row_starts_m(self._offsets)[index])
+            start = float(geometry.row_starts_m(self._offsets)[index])
             self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
 
     def rx_calibration(self) -> NDArray[np.complex128]:
@@ -539,7 +532,7 @@ class BoardSamples:
         image = self._live.image_of_sum(1 / self.rx_calibration())
         return image / self.count, self._live.constant_of_sum() / self.count, None
 
-    def image(self, grid: ImageGrid | None = None) -> tuple[Image, Image, str | None]:
+    def image(self, grid: geometry.ImageGrid | None = None) -> tuple[Image, Image, str | None]:
         """Return image and footprint of the rows so far, complex64 [ny, nx], and a notice if imaging is slow.
 
         The result is bit-exact for the same rows in any order.
@@ -555,7 +548,7 @@ class BoardSamples:
             self._image = self._form(None)
         return self._image
 
-    def _form(self, grid: ImageGrid | None) -> tuple[Image, Image, str | None]:
+    def _form(self, grid: geometry.ImageGrid | None) -> tuple[Image, Image, str | None]:
         gains = (1 / self.rx_calibration()).astype(np.complex64)
         notice = None
         if grid is None:
@@ -587,7 +580,7 @@ class BoardSamples:
         focused = (gains[:, None] * (cube * turned).sum(axis=-1)).sum(axis=0)
         return (np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(shifts_m, f)) @ focused).astype(np.complex64)
 
-    def range_slope(self, grid: ImageGrid | None = None) -> tuple[Image, Image]:
+    def range_slope(self, grid: geometry.ImageGrid | None = None) -> tuple[Image, Image]:
         """Return the derivative of image and footprint by range (excess path), without carrier; 1 / m.
 
         The matched filter of path d is S(d) = sum_m y_m exp(-j 2 pi f_m d / c), so its derivative is the image of the
@@ -599,14 +592,14 @@ class BoardSamples:
             self._slope = self._form_slope(None)
         return self._slope
 
-    def _form_slope(self, grid: ImageGrid | None) -> tuple[Image, Image]:
+    def _form_slope(self, grid: geometry.ImageGrid | None) -> tuple[Image, Image]:
         imager, _ = self._imager(grid)
         factors = self._compute_range_slope_factors()
         gains = (1 / self.rx_calibration()).astype(np.complex64)
         image: Any = imager.image(self._cube * (gains[:, None, None, None] * factors[:, None, None] * self.weights))
         return (image / self.count).astype(np.complex64), self._constant_image(self._mirror(grid) * factors, grid)
 
-    def dispersion(self, grid: ImageGrid | None = None) -> Image:
+    def dispersion(self, grid: geometry.ImageGrid | None = None) -> Image:
         """Return the change of ln(image / footprint) from the first to the last frequency, complex64 [ny, nx].
 
         NaN where nothing is seen. For an echo that grows as 1 + s (f - f0) the slope of :meth:`range_slope` exceeds the
@@ -637,7 +630,7 @@ class BoardSamples:
         echo = self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m)
         return self._constant_image(echo * self._compute_range_slope_factors())
 
-    def _constant_image(self, echo: NDArray[np.complexfloating], grid: ImageGrid | None = None) -> Image:
+    def _constant_image(self, echo: NDArray[np.complexfloating], grid: geometry.ImageGrid | None = None) -> Image:
         imager, _ = self._imager(grid)
         image: Any = imager.constant(echo.astype(np.complex64), self.weights)
         return (image / self.count).astype(np.complex64)
@@ -646,14 +639,14 @@ class BoardSamples:
         f = self._reduction.frequencies_hz
         return (-2j * np.pi * (f - f.mean()) / SPEED_OF_LIGHT_M_S).astype(np.complex64)
 
-    def _mirror(self, grid: ImageGrid | None) -> NDArray[np.complex128]:
+    def _mirror(self, grid: geometry.ImageGrid | None) -> NDArray[np.complex128]:
         """Return the samples of a mirror on the plane of the pixels after the range gate, [rx, frequency]."""
         return self.mirror if grid is None else self._mirror_samples(float(np.mean(grid.z_m)))
 
     def _mirror_samples(self, z_m: float) -> NDArray[np.complex128]:
         return mirror_reduced(self._antennas, z_m, self._chirp, self._reduction)
 
-    def _imager(self, grid: ImageGrid | None) -> tuple[Imager, str | None]:
+    def _imager(self, grid: geometry.ImageGrid | None) -> tuple[Imager, str | None]:
         """Return the imager of the rig file's grid or of another one, and a notice if it is slow."""
         if grid is None and self._final is not None:
             return self._final, None

@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 from msgspec import UNSET
 
+from polysight import store
 from polysight.acquisition import BADGES, STATES, ScanCommand, send_command
 from polysight.catalogue import (
     Notes,
@@ -25,16 +26,6 @@ from polysight.jobs.output import confirm, print_json
 from polysight.materials import UNKNOWN
 from polysight.products import QUALITY, REPORT, products_locked, read_products, write_json
 from polysight.results import ComplexNumber, RawDropped, read_object, to_plain
-from polysight.store import (
-    Digests,
-    ScanFolder,
-    damaged_samples,
-    drop,
-    dropped_rows,
-    find_droppable,
-    locked_samples,
-    utc_now,
-)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, no_such, quote
 from polysight_shared.files import write_atomically
@@ -220,19 +211,19 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
     DeviceError
         when the scan is being processed or recorded.
     """
-    scan = ScanFolder.load(folder)
+    scan = store.ScanFolder.load(folder)
     payloads = [scan.path / board.file for row in scan.committed_rows().values() for board in row.boards.values()]
-    if dropped_rows(scan) and not any(path.exists() for path in payloads):
+    if store.dropped_rows(scan) and not any(path.exists() for path in payloads):
         sys.stdout.write(f"{folder}: every processed row is dropped already\n")
         return 0
     products = read_products(products or folder, REPORT).folder
-    with products_locked(products), locked_samples(scan):
+    with products_locked(products), store.locked_samples(scan):
         return _drop(scan, folder, products, yes)
 
 
-def _drop(scan: ScanFolder, folder: Path, products: Path, yes: bool) -> int:
+def _drop(scan: store.ScanFolder, folder: Path, products: Path, yes: bool) -> int:
     processed = find_processed_digests(products)
-    rows = find_droppable(scan, processed)
+    rows = store.find_droppable(scan, processed)
     for line in rows.kept_files:
         sys.stdout.write(f"kept: {line}\n")
     if not rows.files:
@@ -260,14 +251,14 @@ def _drop(scan: ScanFolder, folder: Path, products: Path, yes: bool) -> int:
             f"nothing dropped: answered {answer!r}", f"the answer was not {WORD!r}", f"type {WORD}, or --yes"
         )
     _keep(products, scan)
-    drop(scan, processed, products)
+    store.drop(scan, processed, products)
     sys.stdout.write(f"{folder}: dropped; its digests stay in the manifest\n")
     return 0
 
 
-def _check_samples(scan: ScanFolder, rows: set[int]) -> None:
+def _check_samples(scan: store.ScanFolder, rows: set[int]) -> None:
     """Check that images can be made without the raw data of these rows. Raises DataError."""
-    damaged = {row: names for row, names in damaged_samples(scan).items() if row in rows}
+    damaged = {row: names for row, names in store.damaged_samples(scan).items() if row in rows}
     if not damaged:
         from polysight.pipeline import Pipeline
 
@@ -283,15 +274,15 @@ def _check_samples(scan: ScanFolder, rows: set[int]) -> None:
         )
 
 
-def _keep(products: Path, scan: ScanFolder) -> None:
+def _keep(products: Path, scan: store.ScanFolder) -> None:
     """Mark the products as the only remaining data of the scan, so that they are never overwritten."""
-    mark = RawDropped(scan_id=scan.scan_id, scan=str(scan.path.resolve()), dropped_utc=utc_now())
+    mark = RawDropped(scan_id=scan.scan_id, scan=str(scan.path.resolve()), dropped_utc=store.utc_now())
     # The object of the file, not its struct: keys of a later release stay.
     content = read_object(products / QUALITY) or {}
     write_json(products / QUALITY, {**content, "raw_dropped": mark})
 
 
-def find_processed_digests(folder: Path) -> Digests:
+def find_processed_digests(folder: Path) -> store.Digests:
     """Return the CRCs of the processed rows, by board. Raises DataError."""
     products = read_products(folder)
     # Raises when it cannot be read

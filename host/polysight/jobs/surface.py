@@ -8,14 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from polysight.calibration import SphereFile, header, open_raw, source_scan, write_calibration
-from polysight.jobs.measure_surfaces import (
-    analyse_points,
-    make_reference,
-    make_rig_optics,
-    save_surface,
-    see_rows,
-    thin_out,
-)
+from polysight.jobs import measure_surfaces
 from polysight.jobs.output import load_rig_file, print_json, print_lines, say
 from polysight.jobs.process import process_rows
 from polysight.pipeline import Pipeline
@@ -52,9 +45,9 @@ def process_to_points(data: Path, config: Path | None) -> tuple[Pipeline, Optics
     """Process the rows of a scan, and find the specular points in it. Raises PolysightError."""
     source = open_source(data, config, dropped=True)
     pipeline = process_rows(source, data, Settings(config=path_text(config), depth_range_mm=1e3 * DEPTH_M))
-    optics = make_rig_optics(pipeline.rig)
+    optics = measure_surfaces.make_rig_optics(pipeline.rig)
     say("specular points")
-    points = see_rows(pipeline, optics)
+    points = measure_surfaces.see_rows(pipeline, optics)
     if not len(points):
         raise DataError(
             f"{data}: no surface shows a specular point",
@@ -85,7 +78,7 @@ def surface(
     if len(surfaces) > 1:
         rig = open_source(scans[0], config, dropped=True).instrument
         joined = join_turned(surfaces, turned_deg, find_axis(rig, axis_mm or (0.0, 0.0)))
-    save_surface(out, joined)
+    measure_surfaces.save_surface(out, joined)
     if as_json:
         row = {
             "scan_id": joined.scan_id,
@@ -123,8 +116,8 @@ def make_surface(data: Path, config: Path | None = None, reference: Path | None 
     gains: Reference | None = None
     if reference is not None:
         _, _, metal = process_to_points(reference, config)
-        gains = make_reference(thin_out(metal[metal.segment == 0]))
-    return analyse_points(pipeline, optics, points, gains)
+        gains = measure_surfaces.make_reference(measure_surfaces.thin_out(metal[metal.segment == 0]))
+    return measure_surfaces.analyse_points(pipeline, optics, points, gains)
 
 
 def _list_rows(echoes: Echoes) -> list[list[float]]:
@@ -164,7 +157,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
             "give the sphere's true radius, or calibrate the places of the boards first",
             code=ErrorCode.MISMATCH,
         )
-    chosen_metal = thin_out(metal)
+    chosen_metal = measure_surfaces.thin_out(metal)
     gains = learn_gains(find_voltages(chosen_metal, optics), optics.wave_number)
     file = SphereFile(
         **header("sphere", [source_scan(raw, scan)]),

@@ -13,22 +13,9 @@ from typing import Literal
 
 import msgspec
 
+from polysight import store
 from polysight.acquisition import FaultKind, typical_row_s
 from polysight.planning import scan_time
-from polysight.store import (
-    Fact,
-    Manifest,
-    RowCommitted,
-    RowFault,
-    RowRejected,
-    RowWithdrawn,
-    ScanContinued,
-    ScanEnded,
-    ScanPaused,
-    ScanResumed,
-    ScanStarted,
-    with_connection,
-)
 from polysight_shared.config import Instrument
 from polysight_shared.errors import PolysightError
 from polysight_shared.faults import PiFault, explain
@@ -114,7 +101,7 @@ def notice_of_fault(event: Fault) -> Finding:
     )
 
 
-def _cause(faults: Sequence[RowFault]) -> tuple[str, str]:
+def _cause(faults: Sequence[store.RowFault]) -> tuple[str, str]:
     """Likely cause and remedy of a row's faults: those of the first known kind."""
     for fault in faults:
         if fault.kind == K.PI_FAULT and fault.number:
@@ -125,7 +112,9 @@ def _cause(faults: Sequence[RowFault]) -> tuple[str, str]:
     return "", ""
 
 
-def notice_of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[RowFault], utc: str) -> Finding:
+def notice_of_rejection(
+    row: int, take: int, reasons: Sequence[str], faults: Sequence[store.RowFault], utc: str
+) -> Finding:
     """Notice of a rejected take; one that somebody asked for is no fault."""
     cause, remedy = _cause(faults)
     remedy = remedy or "Nothing: the row is retaken automatically"
@@ -135,7 +124,7 @@ def notice_of_rejection(row: int, take: int, reasons: Sequence[str], faults: Seq
     return _row_notice(row, f"Row {row}, take {take}, was rejected", (cause, remedy), reasons, utc)
 
 
-def is_on_request(faults: Sequence[RowFault]) -> bool:
+def is_on_request(faults: Sequence[store.RowFault]) -> bool:
     """True if a take was rejected only because somebody aborted the scan."""
     return bool(faults) and all(fault.kind == K.ON_REQUEST for fault in faults)
 
@@ -224,7 +213,7 @@ class ScanHistory:
         The worst of all bursts; None before the first.
     """
 
-    def __init__(self, content: Manifest, started: ScanStarted) -> None:
+    def __init__(self, content: store.Manifest, started: store.ScanStarted) -> None:
         self.content = content
         self.instrument: Instrument = decode_config(started.instrument, Instrument, "the manifest's instrument")
         self.plan: RasterPlan = plan_raster(self.instrument.grid)
@@ -243,7 +232,7 @@ class ScanHistory:
     # --- the manifest ---
 
     @property
-    def ended(self) -> ScanEnded | None:
+    def ended(self) -> store.ScanEnded | None:
         """Last fact of a run that ended; None while it goes on, or if it was killed."""
         return self.content.ended
 
@@ -296,30 +285,30 @@ class ScanHistory:
                 shares.setdefault(name, {})[row] = round(100 * part.missing_bytes / max(1, part.bytes), 3)
         return shares
 
-    def add_fact(self, fact: Fact) -> None:
+    def add_fact(self, fact: store.Fact) -> None:
         """Add times and notices of the next fact of `content`. Raises ValueError for a time of another form."""
-        if isinstance(fact, RowCommitted):
+        if isinstance(fact, store.RowCommitted):
             self._row_committed(fact)
-        elif isinstance(fact, RowRejected):
+        elif isinstance(fact, store.RowRejected):
             if not is_on_request(fact.faults):
                 self.rows_since_trouble = 0
             self.notices.append(notice_of_rejection(fact.row, fact.take, fact.reasons, fact.faults, fact.rejected_utc))
-        elif isinstance(fact, RowWithdrawn):
+        elif isinstance(fact, store.RowWithdrawn):
             problem = f"Row {fact.row} on the disk differs from what was committed"
             why_do = ("The disk is faulty, or the file was changed", "Nothing: the row is retaken")
             self.notices.append(_row_notice(fact.row, problem, why_do, fact.reasons, fact.withdrawn_utc))
-        elif isinstance(fact, ScanResumed):
+        elif isinstance(fact, store.ScanResumed):
             self.run_started_s = seconds(fact.resumed_utc)
             if fact.rig:
                 # The Pi has another address from now on.
-                self.instrument = with_connection(self.instrument, fact.rig)
-        elif isinstance(fact, ScanPaused):
+                self.instrument = store.with_connection(self.instrument, fact.rig)
+        elif isinstance(fact, store.ScanPaused):
             self._paused_at = seconds(fact.paused_utc)
-        elif isinstance(fact, ScanContinued) and self.last_commit_s:
+        elif isinstance(fact, store.ScanContinued) and self.last_commit_s:
             # A pause does not count.
             self.last_commit_s += seconds(fact.continued_utc) - self._paused_at
 
-    def _row_committed(self, fact: RowCommitted) -> None:
+    def _row_committed(self, fact: store.RowCommitted) -> None:
         self.rows_since_trouble += 1
         if fact.kept_incomplete:
             self.rows_since_trouble = 0

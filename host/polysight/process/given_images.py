@@ -20,18 +20,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from polysight import materials
 from polysight.imaging import UNKNOWN_PLANE, Antennas, Illumination, Images, illumination_geometry
-from polysight.materials import (
-    Labels,
-    MaterialsResult,
-    Optics,
-    TruthPlate,
-    analyse,
-    image_orientation,
-    pixel_accuracy,
-    read_labelled_scan,
-    read_labels,
-)
 from polysight.polarimetry import IncidenceChoice, PlaneReference, plane_reference, specular_incidence_rad
 from polysight.process.inputs import Inputs, boxes_as_patches, load_classifier, why_unnamed
 from polysight.process.quality import scene_reasons
@@ -98,7 +88,7 @@ class GivenPair:
     images: Images
     x_m: npt.NDArray[np.float64]
     y_m: npt.NDArray[np.float64]
-    labels: Labels | None
+    labels: materials.Labels | None
     incidence_deg: float | None
     simulated: bool
     assumed: tuple[str, ...]
@@ -111,7 +101,7 @@ class GivenPair:
             return self.path.stem
         return self.path.name
 
-    def boxes(self, drawn: Labels | None) -> Labels | None:
+    def boxes(self, drawn: materials.Labels | None) -> materials.Labels | None:
         """Return drawn boxes, or else those that came with the images, in millimetres from the image centre."""
         labels = self.labels
         if drawn is not None:
@@ -330,8 +320,8 @@ def _ascending(
 
 def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
     """Read `labels/<scan>`; row 0 of its images is the top of the published pictures."""
-    scan = read_labelled_scan(folder)
-    orientation = image_orientation([scan])
+    scan = materials.read_labelled_scan(folder)
+    orientation = materials.image_orientation([scan])
     scan = scan.orient(orientation)
     arrays = {"h": scan.h, "v": scan.v}
     _check_channels(folder, arrays)
@@ -343,7 +333,7 @@ def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
     file = next(iter([folder / f"{folder.name}.json", *sorted(folder.glob("*.json"))]))
     labels = None
     if scan.boxes:
-        labels = read_labels(file)
+        labels = materials.read_labels(file)
     images = _ascending(scan.h, scan.v, _valid(folder, arrays), x_m, y_m)
     return GivenPair(
         path=folder,
@@ -448,7 +438,7 @@ TOLD_TILT_DEG = 0.5
 """Tilt of a plate across the plane of incidence from which on the verdict tells how its polarisations were turned."""
 
 
-def turn_reasons(result: MaterialsResult) -> list[Finding]:
+def turn_reasons(result: materials.MaterialsResult) -> list[Finding]:
     """Return what limits the verdict if plates are tilted: images do not say to which side the antennas are turned."""
     tilted = [
         r.patch.label
@@ -502,7 +492,7 @@ def analyse_given_images(
     settings: Settings,
     inputs: Inputs,
     rig: Instrument,
-    plates: tuple[TruthPlate, ...] = (),
+    plates: tuple[materials.TruthPlate, ...] = (),
 ) -> tuple[ProcessedScan, Findings, str]:
     """Find the materials of given images; return the result, its findings, and why nothing was named, or "".
 
@@ -520,17 +510,17 @@ def analyse_given_images(
         images = images.within(plane.valid_on(images.x_m, images.y_m))
         scene = replace(scene, metal=plane)
     everywhere = np.full(images.h.shape, np.radians(angle.deg))
-    optics = Optics.from_rig(
+    optics = materials.Optics.from_rig(
         rig, IncidenceChoice("one", everywhere, everywhere), theta_std_rad=UNKNOWN_PLANE.incidence_std_rad(rig)
     )
     scene = replace(scene, plates=plates)
     optics = replace(optics, other_sign=pair.other_sign)
-    result = analyse(images, optics, scene, classifier)
+    result = materials.analyse(images, optics, scene, classifier)
     conjugated = result.other_sign > 0.5
     painted = result.inversion.painted
     if conjugated:
         images = conjugate(images)
-        result = analyse(images, replace(optics, other_sign=1 - pair.other_sign), scene, classifier)
+        result = materials.analyse(images, replace(optics, other_sign=1 - pair.other_sign), scene, classifier)
     sign = sign_reasons(result.other_sign, conjugated, painted)
     limits = [*given_reasons(pair, angle), *sign, *turn_reasons(result)]
     verdict = join_reasons([*limits, *scene_reasons(result, None, classifier)])
@@ -540,7 +530,7 @@ def analyse_given_images(
     quality = ScanQuality(
         seconds_per_stage={"materials": round(time.perf_counter() - began, 4)},
         verdict=verdict,
-        pixel_accuracy=pixel_accuracy(result),
+        pixel_accuracy=materials.pixel_accuracy(result),
         incidence=IncidenceAngles(used="one number for the image", one_deg=round(angle.deg, 4)),
         given_images=GivenImages(
             file=str(pair.path),

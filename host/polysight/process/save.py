@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from polysight import products
 from polysight.imaging import Images, PlaneEstimate
 from polysight.materials import (
     PATCHES,
@@ -25,17 +26,6 @@ from polysight.materials import (
 )
 from polysight.polarimetry import with_ratio
 from polysight.process.quality import Quality, error_budget, recording_verdict
-from polysight.products import (
-    IMAGE,
-    LABELS,
-    MATERIALS,
-    QUALITY,
-    SCAN,
-    ProcessedScan,
-    rx_gains,
-    write_image,
-    write_json,
-)
 from polysight.results import MetalSource, NoResult, ScanFacts, ScanMaterials, ScanQuality, Verdict, join_reasons
 from polysight.store import Scan, versions
 from polysight_shared.config import Instrument
@@ -108,14 +98,14 @@ class Findings:
 
 def collect_imaged_scan(
     folder: Path, source: Scan, rig: Instrument, images: Images, quality: Quality, backlash: bool = True
-) -> ProcessedScan:
+) -> products.ProcessedScan:
     """Return the result of a scan of which only images were made; p is h / v in arbitrary units.
 
     `rig` is the rig that the images were formed with, `folder` where the data are. `backlash=False` leaves the
     estimate of the stage's backlash out.
     """
     verdict = join_reasons(recording_verdict(quality))
-    return ProcessedScan.from_results(
+    return products.ProcessedScan.from_results(
         folder,
         images=with_ratio(images),
         quality=quality.result(verdict, backlash=backlash),
@@ -126,7 +116,7 @@ def collect_imaged_scan(
 
 def collect_processed_scan(
     folder: Path, source: Scan, rig: Instrument, findings: Findings, quality: Quality, unnamed: str
-) -> ProcessedScan:
+) -> products.ProcessedScan:
     """Return the result of a scan with its materials; `unnamed` is the reason why nothing was named, or ""."""
     return assemble_result(
         folder,
@@ -145,7 +135,7 @@ def assemble_result(
     findings: Findings,
     unnamed: str,
     plan: RasterPlan | None = None,
-) -> ProcessedScan:
+) -> products.ProcessedScan:
     """Return the result with its materials, from findings; parameters as of :func:`collect_processed_scan`."""
     analysis = findings.analysis
     library = unnamed or "Nothing was named."
@@ -164,7 +154,7 @@ def assemble_result(
         pixel_accuracy=pixel_accuracy(analysis),
         segments=analysis.rows(),
     )
-    return ProcessedScan.from_results(
+    return products.ProcessedScan.from_results(
         folder,
         images=findings.calibrated,
         quality=quality,
@@ -182,19 +172,19 @@ def _facts(source: Scan, rig: Instrument, images: Images) -> ScanFacts:
         simulated=source.simulated,
         processed_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         versions=versions(),
-        rx_gains=rx_gains(images),
+        rx_gains=products.rx_gains(images),
         instrument=to_builtins(rig),
     )
 
 
-def save_images(out: Path, scan: ProcessedScan) -> None:
+def save_images(out: Path, scan: products.ProcessedScan) -> None:
     """Write image.npz, scan.json and quality.json."""
-    write_image(out / IMAGE, scan.images)
-    write_json(out / SCAN, scan.facts)
-    write_json(out / QUALITY, scan.quality)
+    products.write_image(out / products.IMAGE, scan.images)
+    products.write_json(out / products.SCAN, scan.facts)
+    products.write_json(out / products.QUALITY, scan.quality)
 
 
-def save_materials(out: Path, scan: ProcessedScan, result: MaterialsResult, unnamed: str) -> Products:
+def save_materials(out: Path, scan: products.ProcessedScan, result: MaterialsResult, unnamed: str) -> Products:
     """Write all products: metal-referenced image.npz, quality.json, materials.json, patches, labels, figures, report.
 
     `result` is the analysis behind the scan, `unnamed` the reason why nothing was named; "" if patches were named.
@@ -204,9 +194,9 @@ def save_materials(out: Path, scan: ProcessedScan, result: MaterialsResult, unna
 
     save_images(out, scan)
     boxes = make_labels(result, f"patches of scan {scan.scan_id}, in pixels of image.npz")
-    write_atomically(out / LABELS, pack_labels(boxes))
+    write_atomically(out / products.LABELS, pack_labels(boxes))
     write_atomically(out / PATCHES, pack_patches(result, scan.images.x_m, scan.images.y_m, scan.stamped))
-    write_json(out / MATERIALS, scan.materials)
+    products.write_json(out / products.MATERIALS, scan.materials)
     write_report(out, scan)
     verdict = scan.verdict or Verdict("good")
     lines = [*verdict.lines(3), *_result_lines(scan, result)]
@@ -217,7 +207,7 @@ def save_materials(out: Path, scan: ProcessedScan, result: MaterialsResult, unna
     return Products(out, tuple(lines), verdict)
 
 
-def _result_lines(scan: ProcessedScan, result: MaterialsResult) -> tuple[str, ...]:
+def _result_lines(scan: products.ProcessedScan, result: MaterialsResult) -> tuple[str, ...]:
     """Return lines for the terminal: number of patches, metal reference, and names compared with the truth."""
     patches = scan.segments
     head = f"scan {scan.scan_id}: {len(patches)} patches; metal {result.metal.how}"

@@ -18,16 +18,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from polysight.radar import calibration_data
 from polysight.radar import commands as c
 from polysight.radar import messages as e
-from polysight.radar.calibration_data import (
-    ALL,
-    NO_DIE,
-    RESTORED,
-    CalibrationFiles,
-    read_calibration,
-    restore_calibration,
-)
 from polysight.radar.commands import Program
 from polysight.radar.firmware import TO_FLASH, TO_RAM, Image, describe_patch, require_family, require_rom, send_image
 from polysight.radar.link import Link, NotReportedError, UnexpectedRestartError
@@ -333,20 +326,20 @@ class BringUp:
         restored = ""
         if self._board.calibration is not None:
             die = self._read_die()
-            if die == NO_DIE:
+            if die == calibration_data.NO_DIE:
                 self._link.warnings.append(f"{self._board.name}: its die id is 0, so its calibration is not saved")
             else:
                 saved = self._board.calibration.load(die)
         if saved is not None:
-            restored = "; " + restore_calibration(
+            restored = "; " + calibration_data.restore_calibration(
                 self._link, self._board.name, saved, _CALIBRATION_TIMEOUT_S, self.note
             )
         self._link.call(c.RF_INIT)
         event = self._link.wait_for((e.RF_INIT_DONE,), _CALIBRATION_TIMEOUT_S, self.note)
         self._board.facts.calibration = dict(event.values)
-        requested = ALL
+        requested = calibration_data.ALL
         if restored:
-            requested = ALL & ~RESTORED
+            requested = calibration_data.ALL & ~calibration_data.RESTORED
         if failed := e.list_failed_calibrations(event, self._board.program.transmits, requested):
             raise DeviceError(
                 f"{self._board.name}: RF init failed: {', '.join(failed)} ({event})",
@@ -354,8 +347,8 @@ class BringUp:
                 "measure the RF supplies; power-cycle the board; replace it if the fault remains",
                 code=ErrorCode.RADAR_FAULT,
             )
-        if self._board.calibration is not None and saved is None and die != NO_DIE:
-            self._board.calibration.save(die, read_calibration(self._link, self._board.name))
+        if self._board.calibration is not None and saved is None and die != calibration_data.NO_DIE:
+            self._board.calibration.save(die, calibration_data.read_calibration(self._link, self._board.name))
         self._board.facts.calibration_restored = bool(restored)
         return str(event) + restored
 
@@ -442,7 +435,7 @@ class RadarBoard:
         program: Program,
         firmware: Image | None = None,
         die_id: str = "",
-        calibration: CalibrationFiles | None = None,
+        calibration: calibration_data.CalibrationFiles | None = None,
     ) -> None:
         self.name = name
         self.words = words

@@ -9,18 +9,9 @@ from pathlib import Path
 import msgspec
 
 from polysight.capture import PACKETS, read_index
-from polysight.store import manifest
+from polysight.store import manifest, scan_folder
 from polysight.store.logs import LogDigest, crc32, read_events
 from polysight.store.manifest import MANIFEST, BoardRow, RowCommitted, ScanEnded
-from polysight.store.scan_folder import (
-    EVENTS,
-    PART,
-    SAMPLES,
-    ScanFolder,
-    damaged_samples,
-    dropped_files,
-    dropped_rows,
-)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, PolysightError, quote
 from polysight_shared.findings import Finding
@@ -71,7 +62,7 @@ def validate(path: Path) -> list[Finding]:
     if content.torn:
         findings.append(_note(MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off"))
     try:
-        scan = ScanFolder(path, content)
+        scan = scan_folder.ScanFolder(path, content)
         rows = scan.committed_rows()
     except PolysightError as e:
         lost_lines = [_lost_lines(fault, "its facts are lost") for fault in content.faults]
@@ -100,7 +91,7 @@ def validate(path: Path) -> list[Finding]:
     return findings
 
 
-def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
+def damaged_rows(scan: scan_folder.ScanFolder) -> dict[int, list[str]]:
     """Return the committed rows whose files differ from the commit, with the faults of each; reads every byte.
 
     Raises DeviceError on a read error: the row may be undamaged and must not be taken again.
@@ -117,7 +108,7 @@ def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
     return {row: [to_text(f) for f in faults] for row, faults in findings.items() if faults}
 
 
-def describe_damage(scan: ScanFolder, path: Path) -> str:
+def describe_damage(scan: scan_folder.ScanFolder, path: Path) -> str:
     """Compare a row's files with the manifest; return the faults, "" if there are none. `path` is its payload."""
     for row in scan.committed_rows().values():
         for board in row.boards.values():
@@ -133,7 +124,7 @@ def _lost_lines(fault: Finding, lost: str) -> Finding:
     return msgspec.structs.replace(fault, level="note", do=_ALL_THERE)
 
 
-def _what_is_lost(scan: ScanFolder) -> str:
+def _what_is_lost(scan: scan_folder.ScanFolder) -> str:
     """Describe the rows that are not committed; "" if every row is, so that lost lines do not matter."""
     absent = scan.rows_absent
     if not absent:
@@ -145,7 +136,7 @@ def _what_is_lost(scan: ScanFolder) -> str:
     return f"facts are lost: {rows} not committed; `polysight resume {quote(scan.path)}` takes them again"
 
 
-def _row(scan: ScanFolder, row: RowCommitted) -> list[Finding]:
+def _row(scan: scan_folder.ScanFolder, row: RowCommitted) -> list[Finding]:
     place = f"row {row.row}"
     if not 0 <= row.row < scan.plan.rows:
         return [_error(place, f"outside the plan's {scan.plan.rows} rows")]
@@ -164,7 +155,7 @@ def _row(scan: ScanFolder, row: RowCommitted) -> list[Finding]:
     return findings
 
 
-def board_faults(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
+def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     """Compare the files of one board's committed row of `frames` frames with the manifest."""
     place = board.file
     path = scan.path / board.file
@@ -172,7 +163,7 @@ def board_faults(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding
     expected = frames * scan.instrument.frame_bytes
     if (board.bytes, board.frames_expected) != (expected, frames):
         findings.append(_error(place, f"{board.bytes} bytes of {board.frames_expected} frames, planned {expected}"))
-    is_kept = board.file not in dropped_files(scan) or path.exists()
+    is_kept = board.file not in scan_folder.dropped_files(scan) or path.exists()
     try:
         # Only the committed digest is left of a dropped payload.
         if is_kept:
@@ -212,7 +203,7 @@ def board_faults(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding
     return findings
 
 
-def _packets(scan: ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
+def _packets(scan: scan_folder.ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
     """Compare the row's packet file with its digest; rows of earlier releases have none."""
     if not board.packets_crc32:
         return []
@@ -246,21 +237,21 @@ def _digest(path: Path) -> tuple[int, int]:
     return size, crc
 
 
-def _check_dropped(scan: ScanFolder) -> list[Finding]:
-    files = dropped_files(scan)
+def _check_dropped(scan: scan_folder.ScanFolder) -> list[Finding]:
+    files = scan_folder.dropped_files(scan)
     if not files:
         return []
     last = list(files.values())[-1]
     problem = f"the raw data of {len({f.row for f in files.values()})} rows was dropped after processing"
     findings = [_note("raw", f"{problem} into {last.products} ({last.dropped_utc}); digests are kept")]
-    if (scan.path / SAMPLES).exists():
-        rows_without_raw = dropped_rows(scan)
+    if (scan.path / scan_folder.SAMPLES).exists():
+        rows_without_raw = scan_folder.dropped_rows(scan)
         remedy_of_samples = "its raw data was dropped: restore the file from a copy, or images leave it out"
-        for row, names in damaged_samples(scan).items():
+        for row, names in scan_folder.damaged_samples(scan).items():
             problem = f"row {row} is damaged or missing (CRC)"
             findings += [_error(name, problem, remedy_of_samples) for name in names if row in rows_without_raw]
     else:
-        findings.append(_note(SAMPLES, "absent: no image can be made again"))
+        findings.append(_note(scan_folder.SAMPLES, "absent: no image can be made again"))
     leftover_files = [file for file in files if (scan.path / file).exists()]
     if leftover_files:
         remedy = f"`polysight drop-raw {quote(scan.path)}` removes them"
@@ -268,25 +259,25 @@ def _check_dropped(scan: ScanFolder) -> list[Finding]:
     return findings
 
 
-def _strays(scan: ScanFolder, rows: dict[int, RowCommitted]) -> list[Finding]:
+def _strays(scan: scan_folder.ScanFolder, rows: dict[int, RowCommitted]) -> list[Finding]:
     committed_files = {scan.path / b.file for r in rows.values() for b in r.boards.values()}
     committed_files |= {p.with_suffix(suffix) for p in committed_files for suffix in (".idx", PACKETS)}
     return [
         _note(str(p.relative_to(scan.path)), "belongs to no committed row", "resume replaces it")
         for p in sorted((scan.path / "raw").rglob("*"))
-        if p.is_file() and p not in committed_files and p.suffix in (".bin", ".idx", PACKETS, PART)
+        if p.is_file() and p not in committed_files and p.suffix in (".bin", ".idx", PACKETS, scan_folder.PART)
     ]
 
 
-def _events(scan: ScanFolder) -> list[Finding]:
-    path = scan.path / EVENTS
+def _events(scan: scan_folder.ScanFolder) -> list[Finding]:
+    path = scan.path / scan_folder.EVENTS
     try:
         log = read_events(path)
     except PolysightError as e:
-        return [_error(EVENTS, e.what, e.remedy)]
+        return [_error(scan_folder.EVENTS, e.what, e.remedy)]
     findings = []
     if log.torn:
-        findings.append(_note(EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
+        findings.append(_note(scan_folder.EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
     commits = [(fact.row, fact.events) for fact in scan.facts(RowCommitted) if fact.events is not None]
     if commits:
         row, committed = commits[-1]
@@ -298,13 +289,13 @@ def _events(scan: ScanFolder) -> list[Finding]:
     is_known = bool(commits) or not scan.facts(RowCommitted)
     is_committed_damage = bool(log.damage) and not (is_known and log.length >= committed.bytes)
     if is_committed_damage:
-        findings.append(_error(EVENTS, log.damage, _FETCHED))
+        findings.append(_error(scan_folder.EVENTS, log.damage, _FETCHED))
     elif log.damage:
-        findings.append(_note(EVENTS, log.damage, _FETCHED))
+        findings.append(_note(scan_folder.EVENTS, log.damage, _FETCHED))
     if {e.scan_id for e in log.events} - {scan.scan_id}:
-        findings.append(_error(EVENTS, "holds events of another scan"))
+        findings.append(_error(scan_folder.EVENTS, "holds events of another scan"))
     if [e.seq for e in log.events] != list(range(1, len(log.events) + 1)):
-        findings.append(_error(EVENTS, "the sequence of the events has gaps"))
+        findings.append(_error(scan_folder.EVENTS, "the sequence of the events has gaps"))
     if commits and not is_committed_damage:
         findings += _committed_events(path, log.length, row, committed)
     return findings
@@ -315,10 +306,10 @@ def _committed_events(path: Path, length: int, row: int, committed: LogDigest) -
     size = committed.bytes
     when = f"row {row} was committed"
     if length < size:
-        return [_error(EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
+        return [_error(scan_folder.EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
     with path.open("rb") as f:
         is_whole = f"{crc32(f.read(size)):08x}" == committed.crc32
     problem = f"not the events that were there when {when} (CRC)"
     if is_whole:
         return []
-    return [_error(EVENTS, problem, "restore it from a copy")]
+    return [_error(scan_folder.EVENTS, problem, "restore it from a copy")]

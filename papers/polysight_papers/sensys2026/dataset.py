@@ -16,21 +16,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from polysight import materials
 from polysight.jobs.output import print_lines
-from polysight.materials import (
-    METALS,
-    Entry,
-    LabelledScan,
-    Library,
-    accuracy_lines,
-    angle_in_text,
-    entries_of_boxes,
-    fit_library,
-    image_orientation,
-    label_folders,
-    read_labelled_scan,
-    read_material,
-)
 from polysight.polarimetry import correct_leakage
 from polysight.store import COLLECTION, build_rig, open_npz, read_settings
 from polysight_papers.sensys2026.item import Published, table2
@@ -78,7 +65,7 @@ class AuthorsData:
 
     folder: Path
     base: Instrument
-    sources: dict[str, Library]
+    sources: dict[str, materials.Library]
     meaning: dict[str, int]
     notices: tuple[str, ...]
 
@@ -87,12 +74,12 @@ class AuthorsData:
         """True if any of it was simulated."""
         return any(library.simulated for library in self.sources.values())
 
-    def select(self, source: str, numbers: range, angle_deg: float) -> Library:
+    def select(self, source: str, numbers: range, angle_deg: float) -> materials.Library:
         """Return the entries of a source for these rows of Table 2, under about this angle."""
         names = {m.name for m in table2() if m.number in numbers}
         library = self.sources[source]
         near = (e for e in library.entries if abs(e.incidence_deg - angle_deg) <= SAME_ANGLE_DEG)
-        return Library(tuple(e for e in near if e.name in names), {}, library.note)
+        return materials.Library(tuple(e for e in near if e.name in names), {}, library.note)
 
 
 def read_authors(folder: Path, config: Path, images: Path | None = None, names: Path | None = None) -> AuthorsData:
@@ -125,10 +112,10 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
     notices = []
     libraries = {}
     if pickles := sorted((folder / "materials").glob("*.pkl")):
-        libraries[MATERIALS] = _readable(read_material, pickles, notices)
-    scans = _readable(read_labelled_scan, label_folders(folder / "labels"), notices)
+        libraries[MATERIALS] = _readable(materials.read_material, pickles, notices)
+    scans = _readable(materials.read_labelled_scan, materials.label_folders(folder / "labels"), notices)
     if scans:
-        orientation = image_orientation(scans)
+        orientation = materials.image_orientation(scans)
         notices.append(f"boxes of labels/ are read with {orientation}: so they explain the images' brightness best")
         turned = [s.orient(orientation) for s in scans]
         angles = {s.scan: _angle(folder, s, base, notices) for s in scans}
@@ -166,17 +153,19 @@ def _readable(read: Callable[[Path], T], paths: Sequence[Path], notices: list[st
     return out
 
 
-def _entries(scans: list[LabelledScan], angles: Mapping[str, float], notices: list[str]) -> list[Entry]:
+def _entries(
+    scans: list[materials.LabelledScan], angles: Mapping[str, float], notices: list[str]
+) -> list[materials.Entry]:
     entries = []
     for scan in scans:
         try:
-            entries += entries_of_boxes(scan, angles[scan.scan])
+            entries += materials.entries_of_boxes(scan, angles[scan.scan])
         except DataError as e:
             notices.append(f"left out: {e.what}")
     return entries
 
 
-def _angle(folder: Path, scan: LabelledScan, base: Instrument, notices: list[str]) -> float:
+def _angle(folder: Path, scan: materials.LabelledScan, base: Instrument, notices: list[str]) -> float:
     """Return the incidence angle of a labelled scan: from its raw data, else from its text, else the rig's."""
     for form in ("unsynced", "raw"):
         path = folder / form / scan.scan
@@ -184,14 +173,14 @@ def _angle(folder: Path, scan: LabelledScan, base: Instrument, notices: list[str
             rig, notices_of_rig = build_rig(read_settings(path), base, path)
             notices += notices_of_rig
             return incidence_deg(rig, rig.receivers[0])
-    if (angle := angle_in_text([scan.description, scan.scan])) is not None:
+    if (angle := materials.angle_in_text([scan.description, scan.scan])) is not None:
         return angle
     angle = incidence_deg(base, base.receivers[0])
     notices.append(f"{scan.scan}: no file has its incidence angle; that of the rig file is used, {angle:.1f} degrees")
     return angle
 
 
-def _imaged_here(scan: LabelledScan, images: Path, notices: list[str]) -> LabelledScan | None:
+def _imaged_here(scan: materials.LabelledScan, images: Path, notices: list[str]) -> materials.LabelledScan | None:
     """Return the scan's boxes with our own images, in the orientation of the authors' images."""
     file = images / scan.scan / "image.npz"
     try:
@@ -225,8 +214,8 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _rename_entries(
-    entries_by_source: Mapping[str, list[Entry]], given: Mapping[str, int], notices: list[str]
-) -> tuple[dict[str, int], dict[str, Library]]:
+    entries_by_source: Mapping[str, list[materials.Entry]], given: Mapping[str, int], notices: list[str]
+) -> tuple[dict[str, int], dict[str, materials.Library]]:
     """Rename the entries as in Table 2; entries of unknown names are skipped and listed in the notices."""
     rows = find_rows(((e.name, e.thickness_mm) for entries in entries_by_source.values() for e in entries), given)
     titles = {m.number: m.name for m in table2()}
@@ -241,7 +230,7 @@ def _rename_entries(
             else:
                 renamed_entries.append(replace(e, name=titles[number]))
         if renamed_entries:
-            sources[source] = Library(tuple(renamed_entries), {}, source)
+            sources[source] = materials.Library(tuple(renamed_entries), {}, source)
     if unknown:
         skipped = ", ".join(sorted(unknown))
         notices.append(
@@ -267,7 +256,7 @@ def words(name: str) -> frozenset[str]:
                 number = word
             out.append(f"{float(number):g}")
         else:
-            if word in METALS:
+            if word in materials.METALS:
                 out += ["metal"]
             else:
                 out += str(_ALIASES.get(word, word)).split()
@@ -346,11 +335,11 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
         sys.stderr.write(f"note: {notice}\n")
     library = authors_library(data)
     fits: dict[str, Any] = {}
-    fitted: list[Entry] = []
+    fitted: list[materials.Entry] = []
     for angle in library.angles_deg:
         own_library = library.at_angle(angle)
         try:
-            fits |= fit_library(own_library).fit["angles"]
+            fits |= materials.fit_library(own_library).fit["angles"]
             fitted += own_library.entries
         except DataError as e:
             sys.stderr.write(f"note: {angle:g} degrees left out: {e.what}\n")
@@ -358,22 +347,22 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
         raise DataError(
             f"{folder}: no angle has scans enough", "models are chosen with whole scans left out", "add more scans"
         )
-    library = Library(tuple(fitted), {"angles": fits}, library.note)
+    library = materials.Library(tuple(fitted), {"angles": fits}, library.note)
     library.save(out)
     head = f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans"
-    print_lines([head, *accuracy_lines(library)])
+    print_lines([head, *materials.accuracy_lines(library)])
     return 0
 
 
-def authors_library(data: AuthorsData) -> Library:
+def authors_library(data: AuthorsData) -> materials.Library:
     """Return the patches of all sources except our own images, without leakage and without duplicates."""
     a = complex(*data.base.polarimetry.leakage_h)
     b = complex(*data.base.polarimetry.leakage_v)
-    merged: dict[tuple[str, str, int], list[Entry]] = {}
+    merged: dict[tuple[str, str, int], list[materials.Entry]] = {}
     for source, library in data.sources.items():
         if source == IMAGES:
             continue
-        entries_of_source: dict[tuple[str, str, int], list[Entry]] = {}
+        entries_of_source: dict[tuple[str, str, int], list[materials.Entry]] = {}
         for e in library.entries:
             entries_of_source.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(_without_leakage(e, a, b))
         merged = {**merged, **entries_of_source}
@@ -381,10 +370,10 @@ def authors_library(data: AuthorsData) -> Library:
     kind = "files"
     if data.simulated:
         kind = "simulated files"
-    return Library(entries, {}, f"{kind} of {data.folder.name}")
+    return materials.Library(entries, {}, f"{kind} of {data.folder.name}")
 
 
-def _without_leakage(entry: Entry, leak_hv: complex, leak_vh: complex) -> Entry:
+def _without_leakage(entry: materials.Entry, leak_hv: complex, leak_vh: complex) -> materials.Entry:
     """Return an entry with at most `PIXELS` pixels, with the cross-polar leakage removed."""
     picked = np.unique(np.linspace(0, entry.p.size - 1, min(PIXELS, entry.p.size)).round().astype(int))
     # A common phase of H and V has no effect

@@ -26,19 +26,8 @@ from polysight.materials import (
 )
 from polysight.polarimetry import brewster_angle_rad, fresnel, permittivity_from_ratio, ratio_from_permittivity
 from polysight.report import INK, PALETTE
+from polysight_papers.sensys2026 import item
 from polysight_papers.sensys2026.images import plate, process_scan, simulate_scan
-from polysight_papers.sensys2026.item import (
-    MARKERS,
-    Item,
-    Picture,
-    Published,
-    Run,
-    Table,
-    dress,
-    new_figure,
-    published_values,
-    table2,
-)
 from polysight_papers.sensys2026.patches import calibrated_errors, count_draws, draw, groups
 
 Complex = npt.NDArray[np.complex128]
@@ -46,7 +35,7 @@ Complex = npt.NDArray[np.complex128]
 COMMON = (1, 3, 6, 12, 13, 15, 21)
 CONTRAST = (1, 13, 16, 12, 18, 6, 3)
 CLUTTERED = ("Cardboard", "PET (1 mm)", "Acrylic (3 mm)")
-WATER = Published(0, "Water (without glass, 75 GHz)", 9.37 - 18.0j, None, "literature value quoted in section 9.2")
+WATER = item.Published(0, "Water (without glass, 75 GHz)", 9.37 - 18.0j, None, "literature value quoted in section 9.2")
 LINES = ("-", "--", "-.", ":")
 # Fig. 17.
 PLACEMENTS = 8
@@ -56,16 +45,16 @@ MATERIALS = {"PET": 6, "ceramic": 12}
 """Rows of Table 2."""
 
 
-def _rows(numbers: tuple[int, ...]) -> tuple[Published, ...]:
-    return tuple(table2()[n - 1] for n in numbers)
+def _rows(numbers: tuple[int, ...]) -> tuple[item.Published, ...]:
+    return tuple(item.table2()[n - 1] for n in numbers)
 
 
-def fig3(run: Run) -> Item:
+def fig3(run: item.Run) -> item.Item:
     """Reflectances |r_s|^2 and |r_p|^2 and their ratio over the incidence angle (no random errors)."""
     del run
     materials = (*_rows(COMMON), WATER)
     angle = np.arange(0.0, 90.0, 0.25)
-    fig = new_figure(11.5, 4.4)
+    fig = item.new_figure(11.5, 4.4)
     axes = fig.subplots(1, 3)
     rows = []
     curves = {}
@@ -86,17 +75,17 @@ def fig3(run: Run) -> Item:
         ("reflectance |r_s|²", "reflectance |r_p|²", "|P| (dB)"),
         strict=True,
     ):
-        dress(ax, title, "incidence angle (degrees)", unit)
+        item.dress(ax, title, "incidence angle (degrees)", unit)
         ax.set_xlim(0, 90)
     axes[2].axvspan(55, 65, color="#DDCC77", alpha=0.35, lw=0)
     axes[2].set_ylim(-2, 42)
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    table = Table(
+    table = item.Table(
         "Angle of least p-reflectance (arctan √|ε|) and |P| at three angles",
         ("Material", "(pseudo-)Brewster", "|P| at 0°", "|P| at 55°", "|P| at 60°"),
         tuple(rows),
     )
-    return Item(
+    return item.Item(
         "fig3",
         "Fig. 3: Fresnel reflection of common materials",
         (
@@ -105,7 +94,7 @@ def fig3(run: Run) -> Item:
             " vanishes at the Brewster angle; the paper's text says s.",
         ),
         (table,),
-        {"reflectance": Picture(fig, "Reflectance of s and p, and their ratio, against the incidence angle.")},
+        {"reflectance": item.Picture(fig, "Reflectance of s and p, and their ratio, against the incidence angle.")},
         {"angle_deg": angle, "curves": curves},
     )
 
@@ -115,11 +104,11 @@ def _d_prime(a: np.ndarray, b: np.ndarray) -> float:
     return float(abs(a.mean() - b.mean()) / np.sqrt((a.var() + b.var()) / 2))
 
 
-def fig16(run: Run) -> Item:
+def fig16(run: item.Run) -> item.Item:
     """Level of |H| at 0 degrees and of |P| at 55 and 60, pixels of eight scans each."""
     materials = _rows(CONTRAST)
     errors = calibrated_errors("solids", count_draws(run.quick))
-    fig = new_figure(11.5, 4.6)
+    fig = item.new_figure(11.5, 4.6)
     axes = fig.subplots(1, 3, sharex=True)
     levels: dict[str, dict[str, np.ndarray]] = {}
     for ax, (angle, quantity) in zip(axes, ((0.0, "|H|"), (55.0, "|P|"), (60.0, "|P|")), strict=True):
@@ -132,20 +121,20 @@ def fig16(run: Run) -> Item:
         levels[f"{angle:.0f}"] = {m.name: level[:, j].ravel() for j, m in enumerate(materials)}
         for j in range(len(materials)):
             x = j + np.random.default_rng(j).uniform(-0.28, 0.28, level[:, j].size)
-            ax.plot(x, level[:, j].ravel(), MARKERS[j], ms=2.6, color=PALETTE[j], alpha=0.6)
+            ax.plot(x, level[:, j].ravel(), item.MARKERS[j], ms=2.6, color=PALETTE[j], alpha=0.6)
             ax.plot([j - 0.35, j + 0.35], 2 * [float(np.median(level[:, j]))], color=INK, lw=1.4)
-        dress(ax, f"incidence {angle:.0f}°: {quantity}", "", f"{quantity} relative to metal (dB)")
+        item.dress(ax, f"incidence {angle:.0f}°: {quantity}", "", f"{quantity} relative to metal (dB)")
         ax.set_xticks(range(len(materials)), [m.name for m in materials], rotation=35, ha="right", fontsize=8)
     rows = [
         (f"{a} / {b}", *(f"{_d_prime(level[a], level[b]):.1f}" for level in levels.values()))
         for a, b in combinations(CLUTTERED, 2)
     ]
-    table = Table(
+    table = item.Table(
         "Distance of two materials' pixels, in standard deviations (0°: |H|, else |P|)",
         ("Pair", "0°", "55°", "60°"),
         tuple(rows),
     )
-    return Item(
+    return item.Item(
         "fig16",
         "Fig. 16: contrast across incidence angles",
         (
@@ -156,7 +145,7 @@ def fig16(run: Run) -> Item:
             " it differs from both at every angle.",
         ),
         (table,),
-        {"contrast": Picture(fig, "Pixels (dots) and their median (bar) at three incidence angles.")},
+        {"contrast": item.Picture(fig, "Pixels (dots) and their median (bar) at three incidence angles.")},
         {"level_db": levels, "errors": vars(errors)},
     )
 
@@ -171,11 +160,11 @@ def _draw_estimates(axes: Any, estimates: list[tuple[complex, complex, float]], 
     axes[1].errorbar(-true.imag, -estimated.imag, **bars)
 
 
-def table2_item(run: Run) -> Item:
+def table2_item(run: item.Run) -> item.Item:
     """Estimate Table 2 by Eq. 3 from pixels drawn at the published permittivities."""
     rows = []
     data = []
-    fig = new_figure(10.5, 4.6)
+    fig = item.new_figure(10.5, 4.6)
     axes = fig.subplots(1, 2)
     for colour, (name, group) in zip((PALETTE[0], PALETTE[6], PALETTE[3]), groups().items(), strict=True):
         errors = calibrated_errors(name, count_draws(run.quick))
@@ -207,11 +196,11 @@ def table2_item(run: Run) -> Item:
             estimated.append((true, e.value, e.real_std))
         _draw_estimates(axes, estimated, colour, f"{name}, {group.angle_deg:.0f}°")
     for ax, part in zip(axes, ("real part ε′", "loss ε″"), strict=True):
-        dress(ax, part, f"published {part}", f"recovered {part}")
+        item.dress(ax, part, f"published {part}", f"recovered {part}")
         ax.axline((1, 1), slope=1, color=INK, lw=0.8, ls=":")
         ax.legend(fontsize=8, frameon=False)
     worst = max((d for d in data if "relative_error" in d), key=lambda d: d["relative_error"])
-    return Item(
+    return item.Item(
         "table2",
         "Table 2: permittivity of 36 materials",
         (
@@ -222,13 +211,13 @@ def table2_item(run: Run) -> Item:
             f"Furthest from the truth: {worst['name']}, {100 * worst['relative_error']:.1f} % of |ε|.",
         ),
         (
-            Table(
+            item.Table(
                 "Permittivity by Eq. 3 from 96 pixels of eight placements; ± is the standard error of one patch",
                 ("No.", "Material", "published ε′", "published ε″", "simulated ε′", "simulated ε″", "±", "apart"),
                 tuple(rows),
             ),
         ),
-        {"permittivity": Picture(fig, "Recovered against published; the dotted line is equality.")},
+        {"permittivity": item.Picture(fig, "Recovered against published; the dotted line is equality.")},
         {"materials": data},
     )
 
@@ -247,12 +236,12 @@ def places(seed: int, count: int = 3) -> list[tuple[float, float]]:
     return centres
 
 
-def fig17(run: Run) -> Item:
+def fig17(run: item.Run) -> item.Item:
     """Return the permittivities of all pixels of PET and ceramic in scans with other placements."""
     count = PLACEMENTS
     if run.quick:
         count = 3
-    true = {name: table2()[n - 1].permittivity for name, n in MATERIALS.items()}
+    true = {name: item.table2()[n - 1].permittivity for name, n in MATERIALS.items()}
     pixels: dict[str, list[Complex]] = {name: [] for name in true}
     centres = []
     for i in range(count):
@@ -270,18 +259,18 @@ def fig17(run: Run) -> Item:
     return _item(true, pixels, centres)
 
 
-def _item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: list[dict[str, Any]]) -> Item:
-    fig = new_figure(11.5, 4.6)
+def _item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: list[dict[str, Any]]) -> item.Item:
+    fig = item.new_figure(11.5, 4.6)
     rows = []
     data = {}
     for ax, (name, eps) in zip(fig.subplots(1, 2), true.items(), strict=True):
         for i, values in enumerate(pixels[name]):
-            ax.plot(values.real, -values.imag, MARKERS[i % 10], ms=3, color=PALETTE[i], label=f"placement {i + 1}")
+            ax.plot(values.real, -values.imag, item.MARKERS[i % 10], ms=3, color=PALETTE[i], label=f"placement {i + 1}")
         ax.plot(eps.real, -eps.imag, "x", color=INK, ms=11, mew=2.2, label="truth", zorder=5)
-        dress(ax, name, "real part ε′", "loss ε″")
+        item.dress(ax, name, "real part ε′", "loss ε″")
         all_pixels = np.concatenate(pixels[name])
         medians = np.array([np.median(v.real) - 1j * np.median(-v.imag) for v in pixels[name]])
-        printed = published_values()["location_variance"][name]
+        printed = item.published_values()["location_variance"][name]
         for part, take, key in (("ε′", np.real, "real"), ("ε″", np.imag, "loss")):
             within = float(np.mean([take(v).var() for v in pixels[name]]))
             row = {"published": printed[key], "all": float(take(all_pixels).var()), "within": within}
@@ -300,7 +289,7 @@ def _item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: l
     larger = [
         f"{n} {p}" for n in true for k, p in parts.items() if data[f"{n} {k}"]["all"] > data[f"{n} {k}"]["published"]
     ]
-    return Item(
+    return item.Item(
         "fig17",
         "Fig. 17: location independence",
         (
@@ -312,13 +301,13 @@ def _item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: l
             " quite those of the paper's.",
         ),
         (
-            Table(
+            item.Table(
                 "Variance of the permittivity of pixels; within: mean over placements, between: of the medians",
                 ("Material", "part", "published", "simulated, all pixels", "within a placement", "between placements"),
                 tuple(rows),
             ),
         ),
-        {"location": Picture(fig, "Permittivity of each pixel, a colour and marker for each placement.")},
+        {"location": item.Picture(fig, "Permittivity of each pixel, a colour and marker for each placement.")},
         {"variances": data, "centres_mm": centres},
     )
 
@@ -326,21 +315,21 @@ def _item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: l
 WATER_IN_GLASS = "Water (with glass)"
 
 
-def fig21(run: Run) -> Item:
+def fig21(run: item.Run) -> item.Item:
     """Water and five solutions in eight scans; each concentration is estimated by a line through the others."""
     group = groups()["liquids"]
     errors = calibrated_errors("liquids", count_draws(run.quick))
-    materials = tuple(m for m in table2() if m.name == WATER_IN_GLASS or m.name.startswith("Cane Sugar"))
+    materials = tuple(m for m in item.table2() if m.name == WATER_IN_GLASS or m.name.startswith("Cane Sugar"))
     library = draw(materials, group.angle_deg, errors, seed=21).library()
     result = fit_concentration(library, {WATER_IN_GLASS: 0.0})
-    printed = published_values()["sugar_median_error_percent"]
+    printed = item.published_values()["sugar_median_error_percent"]
     value = concentrations(library.names, {WATER_IN_GLASS: 0.0})
-    fig = new_figure(11.5, 4.2)
+    fig = item.new_figure(11.5, 4.2)
     left_axes, centre, right = fig.subplots(1, 3)
     _draw_line(left_axes, library, value, result)
     _draw_permittivity(centre, library, value, {value[m.name]: m.permittivity.real for m in materials})
     _draw_errors(right, result, printed)
-    return Item(
+    return item.Item(
         "fig21",
         "Fig. 21: concentration of sugar in water",
         (
@@ -351,14 +340,14 @@ def fig21(run: Run) -> Item:
             f"Water and five solutions at {group.angle_deg:.0f} degrees with the errors of the liquids.",
         ),
         (
-            Table(
+            item.Table(
                 "Each concentration estimated from the others, mean over eight scans",
                 ("Solution", "true", "simulated", "90 % interval", "median error"),
                 _concentration_rows(value, result),
             ),
         ),
         {
-            "sugar": Picture(
+            "sugar": item.Picture(
                 fig,
                 "The calibration line with its interval, the permittivity by Eq. 3, and the distribution of errors.",
             )
@@ -381,7 +370,9 @@ def _draw_line(ax: Axes, library: Library, value: Mapping[str, float], result: C
     low, high = result.line.interval(np.radians(line_angles))
     ax.plot(line_angles, result.line.percent(np.radians(line_angles)), color=INK, lw=1.4, label="line")
     ax.fill_between(line_angles, low, high, color=PALETTE[1], alpha=0.35, lw=0, label="90 % of new patches")
-    dress(ax, "Concentration by polarisation angle", "polarisation angle arctan |P| (degrees)", "sugar (% by weight)")
+    item.dress(
+        ax, "Concentration by polarisation angle", "polarisation angle arctan |P| (degrees)", "sugar (% by weight)"
+    )
     ax.legend(fontsize=8, frameon=False)
 
 
@@ -396,7 +387,7 @@ def _draw_permittivity(
     ax.plot([value[e.name] for e in library.entries], eps, "o", ms=4, color=PALETTE[0], label="patches, simulated")
     printed = zip(*sorted(published_eps.items()), strict=True)
     ax.plot(*printed, "x-", color=PALETTE[6], ms=7, lw=1.0, label="published, Table 2")
-    dress(ax, "Apparent permittivity", "sugar (% by weight)", "real part ε′")
+    item.dress(ax, "Apparent permittivity", "sugar (% by weight)", "real part ε′")
     ax.legend(fontsize=8, frameon=False)
 
 
@@ -406,7 +397,7 @@ def _draw_errors(ax: Axes, result: ConcentrationResult, printed: float) -> None:
     ax.step(np.concatenate([[0], error]), np.arange(error.size + 1) / error.size, where="post", color=PALETTE[0])
     ax.axvline(printed, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {printed:g} %")
     ax.axvline(result.median_error, color=INK, ls=":", lw=1.2, label=f"simulated median {result.median_error:.3f} %")
-    dress(ax, "Error, each concentration left out", "error (% by weight)", "share of patches")
+    item.dress(ax, "Error, each concentration left out", "error (% by weight)", "share of patches")
     ax.legend(fontsize=8, facecolor="white", framealpha=1.0, edgecolor="none", loc="lower right")
 
 

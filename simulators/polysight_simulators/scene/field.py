@@ -41,18 +41,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 from polysight_shared.tables import to_builtins
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
-from polysight_simulators.scene.optics import (
-    Antennas,
-    Complex,
-    Real,
-    Reflectivity,
-    antennas,
-    board_reflectivity,
-    conjugate,
-    direct_factor,
-    plate_scale,
-    point_scale,
-)
+from polysight_simulators.scene import optics
 from polysight_simulators.scene.scene_file import Facets, Scene, draw_specimens, facets, slopes
 from polysight_simulators.scene.shapes import shape_field
 from polysight_simulators.scene.spectral_grid import OVERSAMPLING, TAPS, Axis, oversample, spectral_axes
@@ -65,13 +54,13 @@ _RELIEF_TOLERANCE = 2e-4
 _LEVEL_MM = 2.0
 
 
-def cheb_nodes(q: int) -> Real:
+def cheb_nodes(q: int) -> optics.Real:
     """Return the q zeros of the Chebyshev polynomial of order q, descending."""
     return np.cos(np.pi * (np.arange(q) + 0.5) / q)
 
 
 def _angle_series(
-    scene: Scene, reflect: Reflectivity, nodes_hz: Real, theta: tuple[float, float]
+    scene: Scene, reflect: optics.Reflectivity, nodes_hz: optics.Real, theta: tuple[float, float]
 ) -> NDArray[np.complexfloating]:
     """Return the Chebyshev coefficients of r(theta) for each plate and node, [plate, node, order]."""
     centre = (theta[0] + theta[1]) / 2
@@ -88,7 +77,7 @@ def _angle_series(
     return series[:, :, :orders]
 
 
-def _spectra(axis: Axis, centres: Real, sizes: Real, shifts: Real | float = 0.0) -> Complex:
+def _spectra(axis: Axis, centres: optics.Real, sizes: optics.Real, shifts: optics.Real | float = 0.0) -> optics.Complex:
     """Return the Fourier transforms of intervals (or points, size 0) along an axis, [item, kappa], on the grid.
 
     `shifts` [item] are linear phases over each interval, rad/m, zero at its centre.
@@ -130,15 +119,15 @@ class _Level:
 
     plates: list[int]
     points: list[int]
-    lift_m: Real
-    point_lift_m: Real
-    legs: list[tuple[Real, Real, Real, Real]]
+    lift_m: optics.Real
+    point_lift_m: optics.Real
+    legs: list[tuple[optics.Real, optics.Real, optics.Real, optics.Real]]
     bend: float
-    steepness: Real
+    steepness: optics.Real
     middle: float
     half: float
 
-    def shares(self, oblique: Real) -> list[Real] | None:
+    def shares(self, oblique: optics.Real) -> list[optics.Real] | None:
         """Return l_m of dpath/dz over the kernel for each m; None for a single node."""
         n = len(self.steepness)
         if n == 1:
@@ -148,7 +137,7 @@ class _Level:
         everywhere = chebyshev.chebvander((2 * oblique - self.middle) / self.half, n - 1)
         return [everywhere @ row for row in at_nodes]
 
-    def lift_phase(self, lift_m: Real, wave: float, m: int) -> Complex | float:
+    def lift_phase(self, lift_m: optics.Real, wave: float, m: int) -> optics.Complex | float:
         """Return the phase factors of heights relative to the level, with the mean change of dpath/dz."""
         if not lift_m.any():
             return 1.0
@@ -159,12 +148,12 @@ class _Level:
 class _Plane:
     """Scene and grid of the computation."""
 
-    ant: Antennas
+    ant: optics.Antennas
     scene: Scene
     x: Axis
     y: Axis
     surfaces: tuple[Facets, ...]
-    amplitudes: Complex
+    amplitudes: optics.Complex
 
     def levels(self, rx: Sequence[int], top_hz: float) -> list[_Level]:
         """Group plates and points by height; at least one level, also for an empty scene."""
@@ -223,7 +212,7 @@ class _Plane:
             half=half,
         )
 
-    def plate_maps(self, level: _Level, series: Complex, f: float, m: int) -> list[NDArray[np.complex64]]:
+    def plate_maps(self, level: _Level, series: optics.Complex, f: float, m: int) -> list[NDArray[np.complex64]]:
         """Return the spectra of a level's plates by order of the local angle, with the phases of C_m."""
         if not level.plates:
             return []
@@ -232,7 +221,7 @@ class _Plane:
         plates = [self.scene.plates[i] for i in level.plates]
         table = np.array([(*p.centre_mm, *p.size_mm) for p in plates]) / 1e3
         turn = wave * level.steepness[m] * np.array([slopes(p) for p in plates])
-        weights = series[level.plates] * plate_scale(ant, self.scene, f)
+        weights = series[level.plates] * optics.plate_scale(ant, self.scene, f)
         weights = weights * np.reshape(level.lift_phase(level.lift_m, wave, m), (-1, 1))
         smooth = np.array([self.surfaces[i].height_m.size == 1 for i in level.plates])
         x = _spectra(self.x, ant.centre_m[0] + table[smooth, 0], table[smooth, 2], turn[smooth, 0])
@@ -246,7 +235,9 @@ class _Plane:
                 target_map += np.complex64(weights[n, j]) * plate_map
         return maps
 
-    def _rough_map(self, parts: Facets, centre_m: Real, turn: Real, per_metre: float) -> NDArray[np.complex64]:
+    def _rough_map(
+        self, parts: Facets, centre_m: optics.Real, turn: optics.Real, per_metre: float
+    ) -> NDArray[np.complex64]:
         """Return the spectrum of a plate of facets: `turn` is the phase of its tilt in rad/m, `per_metre` of height."""
         x = _spectra(
             self.x, self.ant.centre_m[0] + centre_m[0] + parts.x_m, np.full(parts.x_m.shape, parts.size_m[0]), turn[0]
@@ -270,14 +261,14 @@ class _Plane:
         return _outer(y, self.amplitudes[level.points] * lifted, x)
 
 
-def _range(legs: list[tuple[Real, Real, Real, Real]]) -> tuple[float, float]:
+def _range(legs: list[tuple[optics.Real, optics.Real, optics.Real, optics.Real]]) -> tuple[float, float]:
     """Return the smallest and largest dpath/dz over the kernel."""
     return 2 * min(float(leg[3].min()) for leg in legs), 2 * max(float(leg[3].max()) for leg in legs)
 
 
 def compute(
-    rig: Instrument, scene: Scene, board: Board, samples_hz: Real, rx: Sequence[int]
-) -> tuple[NDArray[np.complex64], tuple[float, float], tuple[float, float], Real, float]:
+    rig: Instrument, scene: Scene, board: Board, samples_hz: optics.Real, rx: Sequence[int]
+) -> tuple[NDArray[np.complex64], tuple[float, float], tuple[float, float], optics.Real, float]:
     """Return the fields of :class:`polysight_simulators.scene.field.ObjectField` for a scene of drawn specimens."""
     top_hz = float(samples_hz[-1])
     planes = _planes(rig, scene, board, top_hz)
@@ -286,7 +277,7 @@ def compute(
     legs = [leg for _, level in levels for leg in level.legs]
     low = min(leg[2].min() for leg in legs)
     high = max(leg[2].max() for leg in legs)
-    reflect = board_reflectivity(board, scene)
+    reflect = optics.board_reflectivity(board, scene)
     series = [_angle_series(plane.scene, reflect, nodes_hz, (low, high)) for plane in planes]
     ax = planes[0].x
     ay = planes[0].y
@@ -318,10 +309,10 @@ def _planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) -> list[
 
     All parts have the same step and the same range of offsets, so that their fields add up.
     """
-    ant = antennas(rig, board)
+    ant = optics.antennas(rig, board)
     surfaces = tuple(facets(p, i, scene.seed) for i, p in enumerate(scene.plates))
-    amplitudes = conjugate(np.array([complex(*p.amplitude) for p in scene.points])) * point_scale(ant)
-    amplitudes = amplitudes * direct_factor(board, scene)
+    amplitudes = optics.conjugate(np.array([complex(*p.amplitude) for p in scene.points])) * optics.point_scale(ant)
+    amplitudes = amplitudes * optics.direct_factor(board, scene)
     is_background = [p.background for p in scene.plates]
     if any(is_background) and not all(is_background):
         parts = [False, True]
@@ -348,7 +339,9 @@ def _planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) -> list[
     return [replace(p, x=replace(p.x, step=step_x), y=replace(p.y, step=step_y)) for p in planes]
 
 
-def _frequencies(scene: Scene, levels: list[tuple[_Plane, _Level]], samples_hz: Real) -> tuple[Real, float]:
+def _frequencies(
+    scene: Scene, levels: list[tuple[_Plane, _Level]], samples_hz: optics.Real
+) -> tuple[optics.Real, float]:
     """Return the nodes in the samples' band (the samples if they are fewer), and the path whose phase is removed."""
     ranges = []
     for plane, level in levels:
@@ -391,7 +384,7 @@ class _Kernels:
     """
 
     level: _Level
-    paths_m: list[Real]
+    paths_m: list[optics.Real]
     fall: list[list[NDArray[np.float32]]]
     angle: NDArray[np.float32]
 
@@ -415,7 +408,7 @@ class _Kernels:
             angle.append(np.moveaxis(oblique[..., None] * polynomials, -1, 0).astype(np.float32))
         return cls(level, paths_m, fall, np.stack(angle))
 
-    def add_spectra(self, total: NDArray[np.complex64], plane: _Plane, series: Complex, f: float) -> None:
+    def add_spectra(self, total: NDArray[np.complex64], plane: _Plane, series: optics.Complex, f: float) -> None:
         """Add the level's spectra at one frequency to `total` [rx, kappa_y, kappa_x]; series [plate, order]."""
         waves = [_unit_phasors(f / SPEED_OF_LIGHT_M_S * path_m) for path_m in self.paths_m]
         for m in range(len(self.level.steepness)):
@@ -429,7 +422,7 @@ class _Kernels:
                     total[r] += point_map * _transform_back(base)
 
 
-def _unit_phasors(cycles: Real) -> NDArray[np.complex64]:
+def _unit_phasors(cycles: optics.Real) -> NDArray[np.complex64]:
     """Return exp(2 pi j cycles): the fraction of a cycle, which single precision holds to 4e-7 rad, is left."""
     phase = (2 * np.pi * (cycles - np.rint(cycles))).astype(np.float32)
     phasors = np.empty(phase.shape, np.complex64)
@@ -468,10 +461,10 @@ class ObjectField:
     values: NDArray[np.complex64]
     start_m: tuple[float, float]
     step_m: tuple[float, float]
-    nodes_hz: Real
+    nodes_hz: optics.Real
     centre_path_m: float
 
-    def interpolate(self, x_m: Real, y_m: Real) -> NDArray[np.complex64]:
+    def interpolate(self, x_m: optics.Real, y_m: optics.Real) -> NDArray[np.complex64]:
         """Return the field at stage offsets, complex64 [n, rx, node], without the phase of the centre path.
 
         Raises
@@ -491,7 +484,7 @@ class ObjectField:
             out[on] = np.einsum("nt,nt...->n...", wx[on], line[ix[on] - low])
         return out
 
-    def covers(self, x_m: Real, y_m: Real) -> NDArray[np.bool_]:
+    def covers(self, x_m: optics.Real, y_m: optics.Real) -> NDArray[np.bool_]:
         """True for offsets inside the field's aperture, bool [n]."""
         inside = np.ones(len(x_m), dtype=np.bool_)
         for axis, u in enumerate((x_m, y_m)):
@@ -507,7 +500,7 @@ class ObjectField:
         n = self.values.shape[1 - axis]
         return first + (half - 1) * step, first + (n - half - 1) * step
 
-    def _taps(self, u: Real, axis: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    def _taps(self, u: optics.Real, axis: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
         """Return grid indices [n, taps] and weights of the Kaiser-windowed sinc at offsets u."""
         low, high = self._reach(axis)
         if u.min() < low or u.max() > high:
@@ -526,7 +519,7 @@ class ObjectField:
         return index, (np.sinc(distance) * window).astype(np.float32)
 
 
-def node_matrix(field: ObjectField, frequencies_hz: Real) -> tuple[Real, Real]:
+def node_matrix(field: ObjectField, frequencies_hz: optics.Real) -> tuple[optics.Real, optics.Real]:
     """Return the interpolation from nodes to frequencies, and its derivative per Hz: two float64 [node, k].
 
     It uses the discrete orthogonality of the Chebyshev polynomials on their nodes.
@@ -548,7 +541,7 @@ def build_field(
     rig: Instrument,
     scene: Scene,
     board: Board,
-    samples_hz: Real,
+    samples_hz: optics.Real,
     cache_dir: Path | None = None,
     rx: Sequence[int] | None = None,
 ) -> ObjectField:

@@ -20,16 +20,7 @@ from polysight_shared.errors import ConfigError
 from polysight_shared.geometry import Vector, incidence_deg, specular_midpoint_m
 from polysight_shared.raster import Grid, RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
 from polysight_shared.tables import to_builtins
-from polysight_simulators.scene.layouts import (
-    AuthorsLayout,
-    Gaps,
-    Layout,
-    OwnLayout,
-    Skipped,
-    packet_payload_bytes,
-    require_empty,
-    versions,
-)
+from polysight_simulators.scene import layouts
 from polysight_simulators.scene.radar import SimulatedRig
 from polysight_simulators.scene.scene_file import Pair, Plate, Scene, apply_scene, draw_specimens, stream_key
 
@@ -61,7 +52,7 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
     return {
         "simulated": True,
         "seed": seed,
-        "versions": versions(),
+        "versions": layouts.versions(),
         "image_centre_m": list(centre),
         "incidence_deg": {b.name: incidence_deg(rig, b) for b in rig.receivers},
         "mean_burst_travel_mm": mean_burst_travel_mm(rig.burst, rig.stage),
@@ -109,15 +100,15 @@ def row_offsets_mm(radar: SimulatedRig, row: Row) -> tuple[NDArray[np.floating],
     return x, np.full(len(x), row.y_mm)
 
 
-def lost_bytes(radar: SimulatedRig, board_name: str, row: Row) -> Gaps:
+def lost_bytes(radar: SimulatedRig, board_name: str, row: Row) -> layouts.Gaps:
     """Return the byte ranges of a row in lost packets, sorted and merged."""
     loss = radar.scene.disturbances.packet_loss
     size = row.points * radar.rig.burst.pulses * radar.rig.frame_bytes
-    full = packet_payload_bytes(radar.rig)
+    full = layouts.packet_payload_bytes(radar.rig)
     if loss == 0.0:
         return []
     rng = np.random.default_rng([stream_key(radar.seed, "loss", board_name), row.index])
-    gaps: Gaps = []
+    gaps: layouts.Gaps = []
     for k in np.flatnonzero(rng.random(-(-size // full)) < loss):
         start = int(k) * full
         stop = min((int(k) + 1) * full, size)
@@ -139,7 +130,7 @@ def simulate(
     cache_dir: Path | None = None,
     progress: Progress | None = None,
     by_columns: bool = False,
-    skipped: Skipped | None = None,
+    skipped: layouts.Skipped | None = None,
 ) -> Path:
     """Write a scan of a scene.
 
@@ -179,7 +170,7 @@ def simulate(
     facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id}
     if layout == "own":
         stamp = datetime.fromtimestamp(started_s, UTC).isoformat(timespec="seconds")
-        own_layout = OwnLayout(out, rig, plan, scan_id, stamp)
+        own_layout = layouts.OwnLayout(out, rig, plan, scan_id, stamp)
         return _write_scan(
             writer=own_layout,
             radar=radar,
@@ -189,7 +180,7 @@ def simulate(
             progress=progress,
             facts=facts,
         )
-    authors = AuthorsLayout(
+    authors = layouts.AuthorsLayout(
         path=out,
         rig=rig,
         scan_id=scan_id,
@@ -207,7 +198,7 @@ def simulate(
 
 
 def _write_scan(
-    writer: OwnLayout | AuthorsLayout,
+    writer: layouts.OwnLayout | layouts.AuthorsLayout,
     radar: SimulatedRig,
     plan: RasterPlan,
     boards: Sequence[Board],
@@ -216,7 +207,7 @@ def _write_scan(
     facts: dict[str, Any],
 ) -> Path:
     """Write a scan with its truth.json of these facts; return its folder."""
-    require_empty(writer.folder)
+    layouts.require_empty(writer.folder)
     # Before the first file: a scene that cannot be simulated leaves no folder
     radar.prepare()
     writer.start()
@@ -252,7 +243,7 @@ def _check_row_size(rig: Instrument, grid: Grid) -> None:
 
 
 def _write_rows(
-    writer: Layout,
+    writer: layouts.Layout,
     radar: SimulatedRig,
     plan: RasterPlan,
     boards: Sequence[Board],

@@ -212,8 +212,13 @@ class _Plane:
             half=half,
         )
 
-    def plate_maps(self, level: _Level, series: optics.Complex, f: float, m: int) -> list[NDArray[np.complex64]]:
-        """Return the spectra of a level's plates by order of the local angle, with the phases of C_m."""
+    def plate_maps(
+        self, level: _Level, series: optics.Complex, f: float, m: int
+    ) -> list[tuple[NDArray[np.complex64], optics.Complex]]:
+        """Return spectra with the phases of C_m, each with the series of its kernel in the local angle, [order].
+
+        There is one for each order, or for each plate if there are fewer of them: as few as there can be kernels.
+        """
         if not level.plates:
             return []
         wave = 2 * np.pi * f / SPEED_OF_LIGHT_M_S
@@ -223,17 +228,22 @@ class _Plane:
         turn = wave * level.steepness[m] * np.array([slopes(p) for p in plates])
         weights = series[level.plates] * optics.plate_scale(ant, self.scene, f)
         weights = weights * np.reshape(level.lift_phase(level.lift_m, wave, m), (-1, 1))
-        smooth = np.array([self.surfaces[i].height_m.size == 1 for i in level.plates])
-        x = _spectra(self.x, ant.centre_m[0] + table[smooth, 0], table[smooth, 2], turn[smooth, 0])
-        y = _spectra(self.y, ant.centre_m[1] + table[smooth, 1], table[smooth, 3], turn[smooth, 1])
-        maps = [_outer(y, weights[smooth, j], x) for j in range(series.shape[1])]
-        for n in np.flatnonzero(~smooth):
+        is_smooth = np.array([self.surfaces[i].height_m.size == 1 for i in level.plates])
+        x = _spectra(self.x, ant.centre_m[0] + table[:, 0], table[:, 2], turn[:, 0])
+        y = _spectra(self.y, ant.centre_m[1] + table[:, 1], table[:, 3], turn[:, 1])
+        orders = weights.shape[1]
+        if len(plates) < orders:
+            shares, kernel_series = np.eye(len(plates), dtype=np.complex128), weights
+        else:
+            shares, kernel_series = weights.T, np.eye(orders, dtype=np.complex128)
+        maps = [_outer(y[is_smooth], share[is_smooth], x[is_smooth]) for share in shares]
+        for n in np.flatnonzero(~is_smooth):
             plate_map = self._rough_map(
                 self.surfaces[level.plates[n]], table[n, :2], turn[n], wave * level.steepness[m]
             )
-            for j, target_map in enumerate(maps):
-                target_map += np.complex64(weights[n, j]) * plate_map
-        return maps
+            for share, target_map in zip(shares, maps, strict=True):
+                target_map += np.complex64(share[n]) * plate_map
+        return list(zip(maps, kernel_series, strict=True))
 
     def _rough_map(
         self, parts: Facets, centre_m: optics.Real, turn: optics.Real, per_metre: float
@@ -416,10 +426,23 @@ class _Kernels:
             point_map = plane.point_map(self.level, f, m)
             for r, wave in enumerate(waves):
                 base = wave * self.fall[r][m]
-                for plate_map, angle in zip(maps, self.angle[r], strict=False):
-                    total[r] += plate_map * _transform_back(base * angle)
+                for plate_map, orders in maps:
+                    total[r] += plate_map * _transform_back(base * _add_orders(orders, self.angle[r]))
                 if point_map is not None:
                     total[r] += point_map * _transform_back(base)
+
+
+def _add_orders(
+    series: optics.Complex, polynomials: NDArray[np.float32]
+) -> NDArray[np.complex64] | NDArray[np.float32]:
+    """Return the sum of a series over polynomials [order, y, x]; without BLAS threads."""
+    (few,) = np.nonzero(series)
+    if len(few) == 1 and series[few[0]] == 1:
+        return polynomials[few[0]]
+    summed = np.empty(polynomials.shape[1:], np.complex64)
+    summed.real = np.einsum("j,jyx->yx", series.real.astype(np.float32), polynomials)
+    summed.imag = np.einsum("j,jyx->yx", series.imag.astype(np.float32), polynomials)
+    return summed
 
 
 def _unit_phasors(cycles: optics.Real) -> NDArray[np.complex64]:

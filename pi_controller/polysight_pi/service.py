@@ -36,8 +36,11 @@ from polysight_shared.faults import PiFault
 from polysight_shared.program import die_with_parent
 from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, make_server_context, publisher, replier
 
+# How long closed sockets go on sending.
 LINGER_MS = 200
+# A thread of a socket that has nothing to do completes a turn this often.
 POLL_MS = 250
+# Each part gets this long to end; a thread that hangs is left alone then.
 END_TIMEOUT_S = 0.8
 # File beside the journals with a key that every run accepts from a person at the Pi.
 TAKE_OVER_KEY = "take-over-key"
@@ -53,7 +56,7 @@ class Server:
         self._allowed = AllowedKeys(key_dir)
         self._secret = not is_loopback(command_address)
         try:
-            # Before the others are bound: it authenticates their connections
+            # Bound before the others, whose connections it authenticates.
             self._zap = authenticator(self._context)
             self._commands = replier(self._context, command_address, key_dir)
             self._events = publisher(self._context, event_address, key_dir)
@@ -67,7 +70,8 @@ class Server:
         self._replies: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
         self._unsent: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._publisher: threading.Thread | None = None
-        self._turned_s: dict[str, float] = {}  # when each socket's thread last completed a turn
+        # When the thread of each socket last completed a turn.
+        self._turned_s: dict[str, float] = {}
         self._stop = False
 
     def publish(self, events: list[bytes]) -> None:
@@ -162,7 +166,8 @@ class Server:
         frames = self._commands.recv_multipart(copy=False)
         parts = [f.bytes for f in frames]
         if b"" not in parts[1:-1]:
-            return  # no REQ framing: no client waits for a reply
+            # Without the framing of a REQ socket no client waits for a reply.
+            return
         end = parts.index(b"", 1) + 1
         envelope = tuple(parts[:end])
         if self._secret and not self._allowed.client_name(bytes.fromhex(str(frames[-1].get("User-Id")))):
@@ -176,7 +181,7 @@ class Server:
         try:
             self._commands.send_multipart([*envelope, raw], zmq.NOBLOCK)
         except zmq.ZMQError:
-            # The client is gone or does not read; it will retry
+            # The client is gone, or does not read and will retry.
             return
 
     def close(self) -> None:

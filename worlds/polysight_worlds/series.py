@@ -177,7 +177,7 @@ class _RadialWaves:
         self._order = 0
 
     def step(self, n: int) -> tuple[NDArray, NDArray]:
-        """Orders are asked for in turn, from 1."""
+        """Return h_n and (rho h_n)' / rho. To be called for n = 1, 2, .. in turn."""
         self._last, self._now = self._now, (2 * n - 1) / self._rho * self._now - self._last
         return self._now, self._last - n / self._rho * self._now
 
@@ -196,7 +196,7 @@ class _Legendre:
         self._now = (ones, zero, zero)
 
     def step(self, n: int) -> tuple[NDArray, NDArray, NDArray]:
-        """Orders are asked for in turn, from 1."""
+        """Return P_n, its first and second derivative. To be called for n = 1, 2, .. in turn."""
         value = ((2 * n - 1) * self._c * self._now[0] - (n - 1) * self._last[0]) / n
         # P_n' = P_{n-2}' + (2 n - 1) P_{n-1}, and once more.
         first = self._last[1] + (2 * n - 1) * self._now[0]

@@ -31,7 +31,7 @@ from polysight_simulators.scene.radar import sample_frequencies_hz
 from polysight_simulators.scene.scene_file import Scene, apply_scene
 
 Gaps = list[tuple[int, int]]
-# Sequence number and byte count before each payload
+# Sequence number and byte count, before each payload.
 _HEADER_BYTES = 10
 
 
@@ -58,10 +58,11 @@ def versions() -> dict[str, str]:
 
 def packet_payload_bytes(rig: Instrument) -> int:
     """Return the payload of a full data packet: configured size without header, at most 1456 (DCA1000)."""
+    # The card's setting counts 4 bytes more than header and payload: 1470 makes the 1456 of a full packet.
     return min(rig.card.packet_bytes - _HEADER_BYTES - 4, 1456)
 
 
-def blank(payload: NDArray[np.int16], gaps: Gaps) -> bytes:
+def blank_gaps(payload: NDArray[np.int16], gaps: Gaps) -> bytes:
     """Return the bytes of a payload with zeros in lost packets."""
     raw = bytearray(payload.astype("<i2", copy=False).tobytes())
     for start, stop in gaps:
@@ -86,7 +87,7 @@ def new_folder(path: Path) -> None:
     path.mkdir(parents=True, exist_ok=True)
 
 
-def _calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, str]]]:
+def _copy_calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, str]]]:
     """Copy the files that `[calibration]` names into the scan; return the entry for the manifest."""
     facts = {}
     for kind, name in to_builtins(rig.calibration).items():
@@ -97,7 +98,7 @@ def _calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, s
         try:
             (path / copy).parent.mkdir(exist_ok=True)
             (path / copy).write_bytes(source.read_bytes())
-            # Gains of a metal reference
+            # The gains of a metal reference lie in a second file.
             images = source.with_suffix(".npz")
             if images.exists():
                 (path / "calibration" / images.name).write_bytes(images.read_bytes())
@@ -142,7 +143,7 @@ class OwnLayout:
             instrument=to_builtins(self._rig),
             plan=to_builtins(self._plan),
             versions=versions(),
-            **_calibration(self._rig, self.folder),
+            **_copy_calibration(self._rig, self.folder),
         )
         self._event(RunStarted(plan=self._plan, **self._stamp()))
 
@@ -151,7 +152,7 @@ class OwnLayout:
         pulses = self._rig.burst.pulses
         boards = {}
         for name, payload in payloads.items():
-            raw = blank(payload, gaps[name])
+            raw = blank_gaps(payload, gaps[name])
             file = Path("raw") / name / f"{row.index:04d}.bin"
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             with name_in_errors(self.folder / file):
@@ -311,7 +312,7 @@ class AuthorsLayout:
             lost_ranges = [(a, min(b, sent.nbytes)) for a, b in gaps[name] if a < sent.nbytes]
             folder = self.folder / name
             folder.mkdir(exist_ok=True)
-            raw = blank(sent, lost_ranges)
+            raw = blank_gaps(sent, lost_ranges)
             if not self._zero_filling:
                 ends = [0, *(e for gap in lost_ranges for e in gap), len(raw)]
                 pieces = [raw[a:b] for a, b in zip(ends[::2], ends[1::2], strict=True)]

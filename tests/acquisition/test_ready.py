@@ -69,7 +69,7 @@ def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, asked):
     """A stage that is still `ready` has not begun: its lost steps would be those of the homing before."""
     sent = []
     pi: Any = SimpleNamespace(_owner="",
-        _timeout_s=1.0, _once=lambda *given: sent.append(given), _ask=lambda *given: sent.append(given),
+        _timeout_s=1.0, _send_once=lambda *given: sent.append(given), _ask=lambda *given: sent.append(given),
         status=lambda: SimpleNamespace(state=state),
     )  # fmt: skip
     PiClient.home(pi)

@@ -39,6 +39,7 @@ MOVING: tuple[m.State, ...] = ("homing", "jogging", "running", "held", "done")
 _REST_TIMEOUT_S = 10.0
 # Period of the heartbeat during a jog where the rig file has none for rows.
 _JOG_HEARTBEAT_MS = 100
+# Between two questions for the Pi's status.
 _POLL_S = 0.05
 # Events that one reply brings from the Pi's journal.
 _REPLAY_LIMIT = 1000
@@ -177,7 +178,7 @@ class PiClient:
     def home(self) -> None:
         """Start homing; retry without a reply if the stage does not home. Raises RefusedError, DeviceError."""
         command = m.Home(owner=self._owner)
-        if self._once(command, self._timeout_s) is None and self.status().state != "homing":
+        if self._send_once(command, self._timeout_s) is None and self.status().state != "homing":
             self._ask(command, m.Accepted)
 
     def jog(self, axis: m.Axis, distance_mm: float, speed_mm_s: float) -> m.StatusReply:
@@ -228,7 +229,7 @@ class PiClient:
         """
         command = m.RunRow(scan_id=scan_id, row_index=row_index, take=take, owner=self._owner)
         for _ in range(ATTEMPTS):
-            reply = self._once(command, self._timeout_s / ATTEMPTS)
+            reply = self._send_once(command, self._timeout_s / ATTEMPTS)
             if isinstance(reply, m.Accepted):
                 # The reply is newer than the last heartbeat.
                 self.state = reply.state
@@ -246,7 +247,7 @@ class PiClient:
 
         Raises RefusedError, DeviceError.
         """
-        reply = self._once(m.Pulse(pulses=pulses, period_us=period_us, width_us=width_us), self._timeout_s)
+        reply = self._send_once(m.Pulse(pulses=pulses, period_us=period_us, width_us=width_us), self._timeout_s)
         if not isinstance(reply, m.Pulsed):
             raise self._no_answer("Pulse")
         return reply
@@ -270,7 +271,7 @@ class PiClient:
     def _ask(self, command: m.AnyCommand, kind: type[R]) -> R:
         """Send a command with retries; for commands that are safe to repeat."""
         for _ in range(ATTEMPTS):
-            reply = self._once(command, self._timeout_s / ATTEMPTS)
+            reply = self._send_once(command, self._timeout_s / ATTEMPTS)
             if isinstance(reply, kind):
                 return reply
             if reply is not None:
@@ -278,7 +279,7 @@ class PiClient:
                 raise ProtocolError(problem, code=ErrorCode.MESSAGE_INVALID)
         raise self._no_answer(type(command).__name__)
 
-    def _once(self, command: m.AnyCommand, timeout_s: float) -> m.AnyReply | None:
+    def _send_once(self, command: m.AnyCommand, timeout_s: float) -> m.AnyReply | None:
         """Send once and return the reply, None after the timeout. A new request replaces the old (relaxed REQ)."""
         try:
             self._commands.send(m.pack(command))

@@ -37,7 +37,8 @@ from polysight_shared.errors import ConfigError, DataError
 DEPTH_M = 0.12
 # Points of a metal sphere that its radius and gains are taken from; with few the directions are not covered.
 LEAST_METAL_POINTS = 60
-# The radius of a metal sphere of 125 mm is found within 0.5 %, with antennas misplaced by 1 mm too (simulated).
+# A larger deviation of the radius means another object. That of a metal sphere of 125 mm is found within 0.5 %, with
+# antennas misplaced by 1 mm, too (simulated).
 RADIUS_TOLERANCE = 0.15
 
 

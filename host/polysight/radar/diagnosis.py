@@ -30,8 +30,7 @@ JUMPERS = """\
    [ o o ]   [ o o ]   [ o=o ]        o=o  jumper set      o o  open
     open      open      set           (mmWave Studio needs SOP1 set too: remove it here)"""
 
-
-# Of the boot status (ICD table 7.3).
+# Bit of the boot status (ICD table 7.3) that reports an error of the voltage monitor.
 VOLTAGE_MONITOR_BIT = 57
 
 
@@ -168,7 +167,7 @@ class TracedWords:
         self._began = clock.now()
         self._file = file.open("w", encoding="utf-8")
         self._level: bool | None = None
-        # Queries of the interrupt without a change since the last line
+        # Queries of the interrupt since the last line, all with the same level.
         self._looks = 0
         self.file = file
         self.ended = ""
@@ -207,7 +206,7 @@ class TracedWords:
     def close(self) -> None:
         """Close link and file; may be called twice."""
         self._words.close()
-        # Closing tries to write the rest
+        # Closing writes what is buffered, and fails on a full disk.
         with suppress(OSError):
             self._file.close()
 
@@ -284,6 +283,7 @@ class ReplayedWords:
 
     def __init__(self, file: Path) -> None:
         self.facts, self._lines = read_trace(file)
+        # Index of the next line.
         self._at = 0
         self._time = 0.0
         self._level = False

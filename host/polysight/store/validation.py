@@ -17,7 +17,9 @@ from polysight_shared.errors import DeviceError, PolysightError, quote
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
 
+# Bytes of a file that are in memory at a time.
 _CHUNK = 1 << 22
+# What can be done about a damaged file, a damaged manifest and a damaged event log.
 _COPY = "restore it from a copy, or resume takes its row again"
 _ALL_THERE = "every row is committed"
 _FETCHED = "resume fetches the rest from the Pi's journal"
@@ -65,13 +67,13 @@ def validate(path: Path) -> list[Finding]:
         scan = scan_folder.ScanFolder(path, content)
         rows = scan.committed_rows()
     except PolysightError as e:
-        lost_lines = [_lost_lines(fault, "its facts are lost") for fault in content.faults]
+        lost_lines = [_add_lost_rows(fault, "its facts are lost") for fault in content.faults]
         return [*findings, *lost_lines, _error(MANIFEST, e.what, e.remedy)]
-    findings += [_lost_lines(fault, _what_is_lost(scan)) for fault in scan.manifest_faults]
+    findings += [_add_lost_rows(fault, _what_is_lost(scan)) for fault in scan.manifest_faults]
     if scan.plan != plan_raster(scan.instrument.grid):
         findings.append(_error(MANIFEST, "the plan is not that of the rig file's grid"))
     for row in rows.values():
-        findings += _row(scan, row)
+        findings += _check_row(scan, row)
     if being_written:
         # Files of the row that is being recorded, and its events, are not complete yet.
         problem = f"a program is recording this scan: {len(rows)} of {scan.plan.rows} rows are committed"
@@ -79,8 +81,8 @@ def validate(path: Path) -> list[Finding]:
             _note(MANIFEST, problem, "validate again when it has ended")
         ]
     findings += _check_dropped(scan)
-    findings += _strays(scan, rows)
-    findings += _events(scan)
+    findings += _find_strays(scan, rows)
+    findings += _check_events(scan)
     missing = scan.plan.rows - sum(0 <= r < scan.plan.rows for r in rows)
     ended = scan.facts(ScanEnded)
     if missing:
@@ -96,7 +98,7 @@ def damaged_rows(scan: scan_folder.ScanFolder) -> dict[int, list[str]]:
 
     Raises DeviceError on a read error: the row may be undamaged and must not be taken again.
     """
-    findings = {row.row: _row(scan, row) for row in scan.committed_rows().values()}
+    findings = {row.row: _check_row(scan, row) for row in scan.committed_rows().values()}
     unreadable = [f for faults in findings.values() for f in faults if f.code is ErrorCode.FILE_UNREADABLE]
     if unreadable:
         raise DeviceError(
@@ -117,7 +119,7 @@ def describe_damage(scan: scan_folder.ScanFolder, path: Path) -> str:
     return "the manifest has no such committed row"
 
 
-def _lost_lines(fault: Finding, lost: str) -> Finding:
+def _add_lost_rows(fault: Finding, lost: str) -> Finding:
     """Add to a fault of the manifest which rows are `lost`; it is a note if none is."""
     if lost:
         return msgspec.structs.replace(fault, level="error", do=lost)
@@ -136,7 +138,7 @@ def _what_is_lost(scan: scan_folder.ScanFolder) -> str:
     return f"facts are lost: {rows} not committed; `polysight resume {quote(scan.path)}` takes them again"
 
 
-def _row(scan: scan_folder.ScanFolder, row: RowCommitted) -> list[Finding]:
+def _check_row(scan: scan_folder.ScanFolder, row: RowCommitted) -> list[Finding]:
     place = f"row {row.row}"
     if not 0 <= row.row < scan.plan.rows:
         return [_error(place, f"outside the plan's {scan.plan.rows} rows")]
@@ -167,18 +169,18 @@ def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> 
     try:
         # Only the committed digest is left of a dropped payload.
         if is_kept:
-            size, crc = _digest(path)
+            size, crc = _compute_digest(path)
         else:
             size = board.bytes
             crc = int(board.crc32, 16)
     except OSError as e:
-        return [*findings, _not_read(place, e)]
+        return [*findings, _error_of_reading(place, e)]
     if size != board.bytes:
         findings.append(_error(place, f"{size} bytes, {board.bytes} were committed", _COPY))
     elif f"{crc:08x}" != board.crc32:
         findings.append(_error(place, "differs from the committed data (CRC)", _COPY))
     index = path.with_suffix(".idx")
-    findings += _packets(scan, board, path.with_suffix(PACKETS))
+    findings += _check_packets(scan, board, path.with_suffix(PACKETS))
     place = str(index.relative_to(scan.path))
     if not index.exists():
         is_needed = board.missing_bytes > 0 or board.index_crc32 != ""
@@ -188,7 +190,7 @@ def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> 
     try:
         index_crc = crc32(index.read_bytes())
     except OSError as e:
-        return [*findings, _not_read(place, e)]
+        return [*findings, _error_of_reading(place, e)]
     if board.index_crc32 and f"{index_crc:08x}" != board.index_crc32:
         return [*findings, _error(place, "differs from the committed data (CRC)", _COPY)]
     try:
@@ -203,24 +205,24 @@ def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> 
     return findings
 
 
-def _packets(scan: scan_folder.ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
+def _check_packets(scan: scan_folder.ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
     """Compare the row's packet file with its digest; rows of earlier releases have none."""
     if not board.packets_crc32:
         return []
     place = str(path.relative_to(scan.path))
     try:
-        _, crc = _digest(path)
+        _, crc = _compute_digest(path)
     except FileNotFoundError:
         return [_error(place, "absent", _COPY)]
     except OSError as e:
-        return [_not_read(place, e)]
+        return [_error_of_reading(place, e)]
     right = f"{crc:08x}" == board.packets_crc32
     if right:
         return []
     return [_error(place, "differs from the committed data (CRC)", _COPY)]
 
 
-def _not_read(where: str, e: OSError) -> Finding:
+def _error_of_reading(where: str, e: OSError) -> Finding:
     if isinstance(e, FileNotFoundError):
         code = ErrorCode.FILE_MISSING
     else:
@@ -228,7 +230,7 @@ def _not_read(where: str, e: OSError) -> Finding:
     return _error(where, f"cannot be read: {e.strerror}", _COPY, code)
 
 
-def _digest(path: Path) -> tuple[int, int]:
+def _compute_digest(path: Path) -> tuple[int, int]:
     size = crc = 0
     with path.open("rb") as f:
         while chunk := f.read(_CHUNK):
@@ -259,7 +261,7 @@ def _check_dropped(scan: scan_folder.ScanFolder) -> list[Finding]:
     return findings
 
 
-def _strays(scan: scan_folder.ScanFolder, rows: dict[int, RowCommitted]) -> list[Finding]:
+def _find_strays(scan: scan_folder.ScanFolder, rows: dict[int, RowCommitted]) -> list[Finding]:
     committed_files = {scan.path / b.file for r in rows.values() for b in r.boards.values()}
     committed_files |= {p.with_suffix(suffix) for p in committed_files for suffix in (".idx", PACKETS)}
     return [
@@ -269,7 +271,7 @@ def _strays(scan: scan_folder.ScanFolder, rows: dict[int, RowCommitted]) -> list
     ]
 
 
-def _events(scan: scan_folder.ScanFolder) -> list[Finding]:
+def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
     path = scan.path / scan_folder.EVENTS
     try:
         log = read_events(path)
@@ -297,11 +299,11 @@ def _events(scan: scan_folder.ScanFolder) -> list[Finding]:
     if [e.seq for e in log.events] != list(range(1, len(log.events) + 1)):
         findings.append(_error(scan_folder.EVENTS, "the sequence of the events has gaps"))
     if commits and not is_committed_damage:
-        findings += _committed_events(path, log.length, row, committed)
+        findings += _check_committed_events(path, log.length, row, committed)
     return findings
 
 
-def _committed_events(path: Path, length: int, row: int, committed: LogDigest) -> list[Finding]:
+def _check_committed_events(path: Path, length: int, row: int, committed: LogDigest) -> list[Finding]:
     """Compare the event log, of `length` good bytes, with its digest when a row was committed."""
     size = committed.bytes
     when = f"row {row} was committed"

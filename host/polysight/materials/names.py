@@ -120,17 +120,17 @@ def name_of_literature(kinds: Kinds, odds: Odds) -> tuple[str, npt.NDArray[np.bo
         if material_count > MOST_NAMES or not foreign.any():
             continue
         meant = np.isin(member, order[:material_count]) & ~kinds.ours
-        said = []
+        group_names = []
         for group in order[:material_count]:
-            alone = np.where(member == group, foreign, 0.0)
-            likeliest = int(alone.argmax())
-            by_itself = alone[likeliest] >= MOST_OF_IT * share[group]
-            said.append(str(names[likeliest]) if by_itself else str(labels[group]))
-        return f"like {_either(said)} (literature)", meant
+            of_group = np.where(member == group, foreign, 0.0)
+            likeliest = int(of_group.argmax())
+            one_holds_most = of_group[likeliest] >= MOST_OF_IT * share[group]
+            group_names.append(str(names[likeliest]) if one_holds_most else str(labels[group]))
+        return f"like {_join_with_or(group_names)} (literature)", meant
     return "", np.zeros(len(names), np.bool_)
 
 
-def _either(names: Sequence[str]) -> str:
+def _join_with_or(names: Sequence[str]) -> str:
     *first, last = names
     return f"{', '.join(first)} or {last}" if first else last
 
@@ -163,7 +163,7 @@ def name_patch(
     at_first = kinds[0]
     names = np.array(at_first.names)
     foreign_name, in_foreign_name = name_of_literature(at_first, odds)
-    verdict = replace(_verdict(at_first, odds, foreign_name, in_foreign_name), pixels=int(good.sum()))
+    verdict = replace(_find_verdict(at_first, odds, foreign_name, in_foreign_name), pixels=int(good.sum()))
 
     # Pixels get the corrections of their patch: leakage, tilt, and the common change over the plane.
     middle = np.median(inverse_ratios[good].real, axis=0) + 1j * np.median(inverse_ratios[good].imag, axis=0)
@@ -175,7 +175,7 @@ def name_patch(
     return NamedPatch(pixel_names, pixel_distance, replace(verdict, votes=share_of_pixels(pixel_names)), confidence)
 
 
-def _verdict(kinds: Kinds, odds: Odds, foreign_name: str, in_foreign_name: npt.NDArray[np.bool_]) -> PatchName:
+def _find_verdict(kinds: Kinds, odds: Odds, foreign_name: str, in_foreign_name: npt.NDArray[np.bool_]) -> PatchName:
     """Return the patch's name and its probabilities, without votes of pixels.
 
     `foreign_name` is what the literature's materials are called together, `in_foreign_name` bool [kind] those meant.
@@ -252,37 +252,45 @@ def nothing_named(pixels: int) -> NamedPatch:
 
 def _name_pixels(
     kinds: Sequence[Kinds],
-    seen: Sequence[RatioEvidence],
-    t: npt.NDArray[np.complex128],
-    of_patch: Real,
+    kind_evidence: Sequence[RatioEvidence],
+    inverse_ratios: npt.NDArray[np.complex128],
+    patch_odds: Real,
     called: npt.NDArray[np.str_],
 ) -> tuple[npt.NDArray, Real, Real]:
-    """Return name, distance over the threshold, and probability of the name of each pixel, [n] each."""
-    good = np.isfinite(t).all(axis=1)
+    """Return name, distance over the threshold, and probability of the name of each pixel, [n] each.
+
+    `inverse_ratios` complex [n, scan] are V / H of the pixels with the corrections of their patch, `patch_odds` [kind]
+    the probabilities of the patch's kinds, and `called` [kind] the name that each kind gets.
+    """
+    good = np.isfinite(inverse_ratios).all(axis=1)
     first = kinds[0]
-    named = called != UNKNOWN
-    size = 2 * len(seen)
-    values = split_complex(t[good]).reshape(-1, size)
-    pixel = np.cov(values.T) if len(values) > 2 else np.zeros((size, size))
-    effects = np.concatenate([kind.effects[named] for kind in kinds], axis=1)
-    errors = scipy.linalg.block_diag(*(evidence.covariance for evidence in seen)) + pixel + 1e-10 * np.eye(size)
+    has_name = called != UNKNOWN
+    parts = 2 * len(kind_evidence)
+    values = split_complex(inverse_ratios[good]).reshape(-1, parts)
+    pixel_covariance = np.cov(values.T) if len(values) > 2 else np.zeros((parts, parts))
+    effects = np.concatenate([kind.effects[has_name] for kind in kinds], axis=1)
+    errors = (
+        scipy.linalg.block_diag(*(evidence.covariance for evidence in kind_evidence))
+        + pixel_covariance
+        + 1e-10 * np.eye(parts)
+    )
     inverse = np.linalg.inv(effects @ effects.mT + errors)
-    middles = np.stack([kind.t[named] for kind in kinds], axis=1)
-    usable: npt.NDArray[np.complex128] = np.where(good.reshape(-1, 1), t, 0)
-    difference = split_complex(usable[:, None, :] - middles).reshape(t.shape[0], -1, size)
+    middles = np.stack([kind.t[has_name] for kind in kinds], axis=1)
+    usable: npt.NDArray[np.complex128] = np.where(good.reshape(-1, 1), inverse_ratios, 0)
+    difference = split_complex(usable[:, None, :] - middles).reshape(inverse_ratios.shape[0], -1, parts)
     distance2 = np.einsum("nki,kij,nkj->nk", difference, inverse, difference)
-    ours = np.take(first.ours, np.flatnonzero(named))
-    prior = (1 - INCLUSIONS) * of_patch[named] + INCLUSIONS * ours / max(ours.sum(), 1)
+    ours = np.take(first.ours, np.flatnonzero(has_name))
+    prior = (1 - INCLUSIONS) * patch_odds[has_name] + INCLUSIONS * ours / max(ours.sum(), 1)
     likelihood = prior * np.sqrt(np.linalg.det(inverse)) * np.exp(-0.5 * np.minimum(distance2, 1400))
-    labels, member = np.unique(called[named], return_inverse=True)
-    of_label = likelihood @ np.equal.outer(member, np.arange(labels.size))
-    label = of_label.argmax(axis=1)
-    row = np.arange(t.shape[0])
-    nearest = np.where(np.equal.outer(label, member), distance2, np.inf).min(axis=1)
-    far = np.where(good, np.sqrt(nearest / scipy.special.chdtri(size, 0.01)), np.inf)
-    share = of_label[row, label] / np.maximum(of_label.sum(axis=1), 1e-300)
-    names = np.where(far <= 1, labels[label], UNKNOWN)
-    return names, far, np.where(good, share * min(1.0, float(of_patch[named].sum()) + INCLUSIONS), 0.0)
+    labels, member = np.unique(called[has_name], return_inverse=True)
+    label_odds = likelihood @ np.equal.outer(member, np.arange(labels.size))
+    label = label_odds.argmax(axis=1)
+    row = np.arange(inverse_ratios.shape[0])
+    least_distance2 = np.where(np.equal.outer(label, member), distance2, np.inf).min(axis=1)
+    distance = np.where(good, np.sqrt(least_distance2 / scipy.special.chdtri(parts, 0.01)), np.inf)
+    share = label_odds[row, label] / np.maximum(label_odds.sum(axis=1), 1e-300)
+    names = np.where(distance <= 1, labels[label], UNKNOWN)
+    return names, distance, np.where(good, share * min(1.0, float(patch_odds[has_name].sum()) + INCLUSIONS), 0.0)
 
 
 def add_explanation(
@@ -297,7 +305,7 @@ def add_explanation(
     has none. `known` are the library's permittivities.
     """
     name = named.verdict
-    estimate = _estimate(permittivity, covariance)
+    estimate = _format_estimate(permittivity, covariance)
     nearest = name.nearest
     if name.name in known:
         nearest = name.name
@@ -317,13 +325,13 @@ def add_explanation(
         values = _list_values(name.literature)
         explanation = f"{estimate} is like {values} of the literature; not measured by this library{near}"
     else:
-        explanation = f"{estimate} matches the library's {nearest_text}{_rivals(name)}"
+        explanation = f"{estimate} matches the library's {nearest_text}{_list_rivals(name)}"
         if not estimate:
-            explanation = f"it looks like the library's {nearest_text}{_rivals(name)}"
+            explanation = f"it looks like the library's {nearest_text}{_list_rivals(name)}"
     return replace(named, verdict=replace(name, why=explanation))
 
 
-def _rivals(name: PatchName) -> str:
+def _list_rivals(name: PatchName) -> str:
     """Say which other names are likely; nothing of the KNN, which has no probabilities."""
     other_names = [f"{n} {100 * p:.0f} %" for n, p in name.probabilities.items() if n not in (name.name, UNKNOWN)]
     if other_names:
@@ -333,7 +341,7 @@ def _rivals(name: PatchName) -> str:
     return ""
 
 
-def _estimate(permittivity: complex | None, covariance: npt.NDArray[np.float64] | None) -> str:
+def _format_estimate(permittivity: complex | None, covariance: npt.NDArray[np.float64] | None) -> str:
     if permittivity is None:
         return ""
     text = f"permittivity {format_permittivity(permittivity)}"

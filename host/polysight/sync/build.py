@@ -25,7 +25,8 @@ SOURCES = ("burst.c", "direct_path.c")
 
 _FLAGS = "-std=c99 -Werror=implicit-function-declaration -O3 -fPIC"
 _FLAGS += " -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
-_FLAGS += " -fassociative-math"  # not -ffast-math, which changes rounding in other libraries
+# Not -ffast-math, which changes rounding in other libraries, too.
+_FLAGS += " -fassociative-math"
 _WIDTHS = {
     128: "",
     256: "-mavx2 -mfma",
@@ -58,7 +59,7 @@ def find_compiler(environment: Mapping[str, str] = os.environ) -> list[str] | No
         path = shutil.which(name, path=environment.get("PATH"))
         if path:
             return [path]
-    return _zig()
+    return _find_zig()
 
 
 def build(folder: Path = HERE, target: str = "") -> Path:
@@ -71,9 +72,10 @@ def build(folder: Path = HERE, target: str = "") -> Path:
     BuildError
         if there is no compiler, or it fails.
     """
-    from concurrent.futures import ThreadPoolExecutor  # `loops.py` needs this module, but no threads
+    # Here, because `loops.py` needs this module, but no threads.
+    from concurrent.futures import ThreadPoolExecutor
 
-    compiler = _zig() if target else find_compiler()
+    compiler = _find_zig() if target else find_compiler()
     if compiler is None:
         raise BuildError("no C compiler was found")
     if target:
@@ -97,22 +99,25 @@ def build(folder: Path = HERE, target: str = "") -> Path:
         _run([*compiler, "-O3", "-fno-sanitize=undefined", "-s", "-shared", "-o", library, *objects, "-lm"])
         new = folder / f".{LIBRARY}-{os.getpid()}"
         new.write_bytes(Path(library).read_bytes() + source_digest().encode())
-        new.replace(folder / LIBRARY)  # atomic: programs that use the old library keep it
+        # In one step: programs that use the old library keep it.
+        new.replace(folder / LIBRARY)
     return folder / LIBRARY
 
 
-def _zig() -> list[str] | None:
-    return [sys.executable, "-m", "ziglang", "cc"] if importlib.util.find_spec("ziglang") else None
+def _find_zig() -> list[str] | None:
+    """Return the command of the package `ziglang`; None without it."""
+    if importlib.util.find_spec("ziglang") is None:
+        return None
+    return [sys.executable, "-m", "ziglang", "cc"]
 
 
 def _run(command: Sequence[str]) -> None:
     try:
         done = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
-        message, failed = done.stderr.strip(), done.returncode != 0
     except OSError as e:
-        message, failed = str(e), True
-    if failed:
-        raise BuildError(f"{shlex.join(command)}\n{message}")
+        raise BuildError(f"{shlex.join(command)}\n{e}") from None
+    if done.returncode != 0:
+        raise BuildError(f"{shlex.join(command)}\n{done.stderr.strip()}")
 
 
 def main() -> int:

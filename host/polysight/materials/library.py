@@ -362,8 +362,10 @@ class Samples:
             return self.groups
         joined = {g: g for g in np.unique(self.groups).tolist()}
         with_specimen = self.specimens != ""
-        for plate in np.unique(self.plates[with_specimen]):
-            joined_groups = {joined[g] for g in np.unique(self.groups[with_specimen & (self.plates == plate)]).tolist()}
+        plates = self.plates[with_specimen]
+        groups = self.groups[with_specimen]
+        for plate in np.unique(plates):
+            joined_groups = {joined[g] for g in np.unique(groups[plates == plate]).tolist()}
             joined = {g: min(joined_groups) if target in joined_groups else target for g, target in joined.items()}
         out = np.array([joined[g] for g in self.groups.tolist()])
         return out if np.unique(out).size > 1 else self.groups

@@ -449,7 +449,6 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
     """
     from sklearn.model_selection import GroupKFold, StratifiedKFold
 
-    groups = np.unique(samples.independent)
     if by_pixel:
         sizes = np.unique(samples.names, return_counts=True)[1]
         if sizes.max() < 2:
@@ -465,6 +464,8 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
             pairs = list(folds_kept.split(samples.x, samples.names))
         yield from pairs
         return
+    independent = samples.independent
+    groups = np.unique(independent)
     if groups.size < 2:
         raise DataError(
             f"{groups.size} scan to judge a classifier on",
@@ -482,7 +483,7 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
         )
     if held_out.min() <= -(-groups.size // folds):
         folds = groups.size
-    yield from GroupKFold(min(folds, groups.size)).split(samples.x, samples.names, samples.independent)
+    yield from GroupKFold(min(folds, groups.size)).split(samples.x, samples.names, independent)
 
 
 def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool = False, folds: int = FOLDS) -> Score:

@@ -66,18 +66,20 @@ def points_rows(synced_row):
     ) -> Iterator[tuple[int, SyncedRow]]:
         rng = np.random.default_rng(4)
         antennas = Antennas.from_rig(rig, board)
-        f = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
         for row in plan_raster(rig.grid):
             u = np.column_stack([row_offsets_m(rig, row), np.zeros(row.points)])
             u[:, 0] += 0 if shifts_m is None else shifts_m[row.index]
             u += 0 if jitter_m is None else jitter_m[row.index]
-            s = np.tile((direct / antennas.direct_m)[:, None, None].astype(complex), (1, row.points, f.size))
+            s = np.tile((direct / antennas.direct_m)[:, None, None].astype(complex), (1, row.points, rig.chirp.samples))
             for point, amplitude in zip(points, amplitudes, strict=True):
                 d = np.linalg.norm(point - u - antennas.tx_m, axis=1) + np.linalg.norm(
                     point - u - antennas.rx_m[:, None], axis=2
                 )
-                excess = d - antennas.direct_m[:, None]
-                s += amplitude * np.exp(2j * np.pi * f * excess[..., None] / SPEED_OF_LIGHT_M_S)
+                turn_per_hz = 2j * np.pi / SPEED_OF_LIGHT_M_S * (d - antennas.direct_m[:, None])
+                # Each sample turns on by the same angle: faster than as many exponentials.
+                waves = np.repeat(np.exp(turn_per_hz * rig.chirp.hz_per_sample)[..., None], rig.chirp.samples, axis=2)
+                waves[..., 0] = amplitude * np.exp(turn_per_hz * rig.chirp.first_sample_hz)
+                s += np.cumprod(waves, axis=2)
             if noise:
                 s += noise * (rng.standard_normal(s.shape) + 1j * rng.standard_normal(s.shape))
             yield row.index, synced_row(s * np.array(gains)[:, None, None])

@@ -18,6 +18,7 @@ from polysight.materials.kinds import (
     inverse_ratio,
     layer_odds,
     literature,
+    may_be_thin,
     weigh_kinds,
 )
 from polysight.materials.names import name_patch
@@ -115,6 +116,19 @@ def test_brightness_tells_thin_plates_from_half_spaces_of_the_same_ratio():
 def test_where_plates_are_unevenly_bright_their_brightness_tells_little():
     thin, thick = layer_probability(60, brightness_std=0.6)
     assert abs(thin - thick) < 0.2
+
+
+def test_a_patch_that_is_a_layer_with_a_chance_of_one_in_four_is_measured_as_no_half_space():
+    """Its 95 % region would leave out a quarter; the same ratio as bright as a half space is measured."""
+    eps = 3.0 - 0.03j
+    r_s, r_p = multilayer([eps, 1.0], [0.9e-3, np.inf], 78e9, ANGLES[0])
+    as_bright = RatioEvidence(ANGLES[0], complex(r_p / r_s), 1e-4 * np.eye(2), 0.5, 0.0, 0.05)
+    offs = np.linspace(0.0, 0.4, 81)
+    evidences = [replace(as_bright, brightness_off=float(off)) for off in offs]
+    odds = np.array([weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet for evidence in evidences])
+    assert odds[0] < 0.1
+    assert np.any((odds > 0.25) & (odds < 0.5))
+    assert [may_be_thin(evidence, AT_ANGLES[0]) for evidence in evidences] == (odds > 0.2).tolist()
 
 
 BAND_HZ = (76.3e9, 79.75e9)

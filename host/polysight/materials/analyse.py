@@ -24,8 +24,8 @@ from polysight.materials.kinds import (
     RatioEvidence,
     inverse_ratio,
     literature,
+    may_be_thin,
     turn_covariance,
-    weigh_kinds,
 )
 from polysight.materials.measure import (
     AMPLIFIES,
@@ -572,14 +572,9 @@ def _no_material(e: Permittivity) -> Finding | None:
 def _impossible(
     patches: Mapping[int, Permittivity], estimates: Mapping[int, PatchEstimate], kinds: Kinds
 ) -> dict[int, Finding]:
-    """Return why patches are no half spaces: an impossible permittivity, or rather a thin plate."""
-    thin = {label: THIN for label, e in estimates.items() if _is_thin(e, kinds)}
+    """Return why patches are no half spaces: an impossible permittivity, or possibly a thin plate."""
+    thin = {label: THIN for label, e in estimates.items() if e.evidence is not None and may_be_thin(e.evidence, kinds)}
     return thin | {label: reason for label, e in patches.items() if (reason := _no_material(e)) is not None}
-
-
-def _is_thin(estimate: PatchEstimate, kinds: Kinds) -> bool:
-    """True if a patch is rather a thin plate than a half space."""
-    return estimate.evidence is not None and weigh_kinds((kinds,), (estimate.evidence,)).sheet > 0.5
 
 
 def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:

@@ -62,6 +62,9 @@ ODD_DISPERSION_STD = 0.05
 """Share of half spaces whose change over the sweep is that of their surroundings, and the usual size of it then."""
 LEAST_LOSS_SPREAD = 0.02
 """Standard deviation of eps'' between specimens of low-loss materials."""
+POSSIBLY_THIN = 0.2
+"""Probability of layers from which on a patch gets no permittivity: a region that holds 95 % may not leave out more. Of
+383 half spaces of the independent generator none has more, of the published picture's plates none more than 0.08."""
 METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat."""
 LEAST_STD_OF_T = 1e-6
@@ -540,6 +543,11 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
     inside = np.where(distance <= 1, weight, 0.0) / total
     sheet = sheet / total
     return Odds(inside, sheet, 1 - sheet - float(inside.sum()), distance)
+
+
+def may_be_thin(evidence: RatioEvidence, kinds: Kinds) -> bool:
+    """Return true if a patch is too probably a thin plate or a stack to be measured as a half space."""
+    return weigh_kinds((kinds,), (evidence,)).sheet > POSSIBLY_THIN
 
 
 def _dispersion_odds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Real:

@@ -287,6 +287,7 @@ class Polarimetry(Section, frozen=True):
 
     The leakage is used only with `leakage_std`, the measured standard error of each of its parts. Without it the
     leakage counts as not measured: `leakage_h` and `leakage_v` are ignored, and `leakage_prior` is its expected size.
+    Its phases are those of time as exp(+j omega t), where a permittivity with losses is eps' - j eps''.
     """
 
     leakage_h: tuple[float, float] = (0.0, 0.0)

@@ -432,7 +432,9 @@ def judge_metal(kind: str, seed: int, searched: bool) -> MetalFigures:
     pair = generator.simulate(world, generator.draw_nuisances(rng, "none"), generator.published_rig())
     declared = {"copper declared": "copper", "no metal": None}.get(kind)
     if kind == "dielectric declared":
-        declared = next(plate.name for plate in world.plates if not plate.stack.layers and not plate.stack.is_metal)
+        dielectrics = [plate for plate in world.plates if not plate.stack.is_metal]
+        # The first half space; a few scenes have sheets and dishes alone.
+        declared = min(dielectrics, key=lambda plate: bool(plate.stack.layers)).name
     classifier = table_2_classifier(float(np.radians(pair.incidence_deg)))
     analysis, _ = analyse_world(pair, declared, classifier=classifier, searched=searched)
     verdict = join_reasons(scene_reasons(analysis, None, classifier))

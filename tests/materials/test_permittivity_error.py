@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from polysight.materials.measure import estimate_permittivity
-from polysight.materials.segment import patches_at_border
+from polysight.materials.segment import find_patches_at_border
 from polysight.polarimetry import PlaneReference, permittivity_from_ratio, ratio_from_permittivity
 
 THETA = np.radians(55.0)
@@ -72,7 +72,7 @@ def test_a_plate_that_the_end_of_a_small_aperture_lights_is_known_less_well(synt
 def test_a_plate_that_fills_the_lit_pixels_is_lit_as_the_metal_was(synthetic):
     scene = synthetic(3)
     patch = scene.analyse().segmentation.patches[0]
-    assert patches_at_border([patch], lit=patch.mask) == frozenset()
+    assert find_patches_at_border([patch], lit=patch.mask) == frozenset()
     lit = ndimage.binary_dilation(patch.mask)
-    assert patches_at_border([patch], lit=lit) == {patch.label}
-    assert patches_at_border([patch], lit=np.ones(patch.mask.shape, bool)) == frozenset()
+    assert find_patches_at_border([patch], lit=lit) == {patch.label}
+    assert find_patches_at_border([patch], lit=np.ones(patch.mask.shape, bool)) == frozenset()

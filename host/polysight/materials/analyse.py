@@ -70,8 +70,8 @@ from polysight.materials.segment import (
     TruthPlate,
     align,
     axis_mm,
+    find_patches_at_border,
     match_truth,
-    patches_at_border,
     segment,
     whole_plane,
 )
@@ -228,7 +228,7 @@ generator (by 10 to 50 %)."""
 THIN = Finding(
     "error",
     POSSIBLE_LAYER,
-    "its V / H, or what it changes over the sweep, is that of a thin plate or a stack rather than of a half space",
+    "its V / H, or what it changes over the sweep, is that of a thin plate or a stack with a probability above 0.2",
     "fit it as a layer: `polysight process --bands 5`, then `polysight permittivity --layer NAME,?,?`",
 )
 """Why a possible layer gets no permittivity."""
@@ -414,7 +414,7 @@ class Seen:
         spread = None if plane is None else plane.spread
         metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
         evenly = images.illumination is not None and images.illumination.known
-        at_border = patches_at_border(judged, None if plane is None else images.usable & plane.valid)
+        at_border = find_patches_at_border(judged, None if plane is None else images.usable & plane.valid)
         border_flags = [*(label in at_border for label in scatter), False]
         change = None if metal is None else common_change(scatters, metal.centre_m, border_flags)
         halo = NO_HALO if metal is None else find_halo(reference.mask, found.patches, images)

@@ -250,6 +250,7 @@ class _LeftOut:
     def accuracy(self, distance: Real) -> float:
         """Return the pixel accuracy for distances [n, n], mean over the materials of two or more scans."""
         others = np.where(self.same_scan, np.inf, distance)
+        # As `find_neighbours` but unsorted: votes need no order.
         nearest = np.argpartition(others, self.voters - 1, axis=1)[:, : self.voters]
         count = np.bincount(self.classes)
         voted = count_votes(self.classes[nearest], count.size).argmax(axis=1)

@@ -377,7 +377,8 @@ def measure_dispersions(
             out.append(None)
             continue
         change, spread = of_patch
-        behind_h, behind_v = DISPERSION_BEHIND * behind[0] / level_h, DISPERSION_BEHIND * behind[1] / level_v
+        behind_h = DISPERSION_BEHIND * behind[0] / level_h
+        behind_v = DISPERSION_BEHIND * behind[1] / level_v
         of_behind = np.array([behind_h, np.hypot(behind_h, behind_v), np.hypot(behind_h, behind_v)])
         variance = floor**2 + DISPERSION_SHARE**2 * (spread**2 + metal_spread**2) + of_behind**2
         out.append(PatchDispersion(change - metal_change, np.sqrt(variance), dispersion.band_hz))

@@ -265,21 +265,23 @@ def touches_border(mask: Mask) -> bool:
     return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
-def patches_at_border(patches: Sequence[Patch], lit: Mask | None) -> frozenset[int]:
+def find_patches_at_border(patches: Sequence[Patch], lit: Mask | None) -> frozenset[int]:
     """Return the numbers of the patches that the end of the aperture lights.
 
-    They reach the border of the image, or, where metal that was scanned apart was seen at the pixels `lit` alone, come
-    within two pixels of others. A patch that fills `lit` is lit as the metal was.
+    Metal in the scene (`lit` is None) was lit inside: these are the patches that reach the border of the image. Metal
+    that was scanned apart was lit by the same end, at the pixels `lit`, bool [ny, nx], alone: these are the patches
+    that the end of `lit` cuts, but for one that fills it as the metal did.
     """
-    labels = []
-    for patch in patches:
-        at_border = touches_border(patch.mask)
-        if lit is not None:
-            near = np.asarray(scipy.ndimage.binary_dilation(patch.mask, iterations=2), bool)
-            at_border = (at_border or bool((near & ~lit).any())) and bool((lit & ~patch.mask).any())
-        if at_border:
-            labels.append(patch.label)
-    return frozenset(labels)
+    if lit is None:
+        return frozenset(patch.label for patch in patches if touches_border(patch.mask))
+    return frozenset(patch.label for patch in patches if _reaches_end(patch.mask, lit))
+
+
+def _reaches_end(mask: Mask, lit: Mask) -> bool:
+    """Return true if a mask comes within two pixels of the end of what is lit, and does not fill it."""
+    inside = np.asarray(scipy.ndimage.binary_erosion(lit, iterations=2), bool)
+    fills = not (lit & ~mask).any()
+    return bool((mask & ~inside).any()) and not fills
 
 
 def _is_cut(mask: Mask, smallest_px: float) -> bool:

@@ -14,7 +14,6 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
-from tests.support.acquisition.receivers import find_receiver
 from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
@@ -150,7 +149,7 @@ def test_homing_that_another_program_started_is_waited_for():
 
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
-def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, tmp_path, board):
+def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, receivers, tmp_path, board):
     """For each board: the Pi gets Abort, and the error is reported before the queued rows are processed."""
     rig.pi.hang_at = {1}
     answer = []
@@ -160,7 +159,7 @@ def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, tmp_
     def progress(p) -> None:
         answer.append(p.phase)
         if p.phase == "state" and (p.state, p.row) == ("running", 1):
-            os.kill(find_receiver(board), signal.SIGKILL)
+            os.kill(receivers[board], signal.SIGKILL)
         if p.phase == "end":
             said_at_end.append((release.is_set(), p.message))
             release.set()

@@ -13,7 +13,6 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 import zmq
-from tests.support.acquisition.receivers import receivers
 from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
@@ -88,24 +87,21 @@ def test_rows_of_an_earlier_run_hold_nothing_up(rig, tmp_path):
     assert waits == []
 
 
-def test_slow_disk_holds_the_scan_up_and_loses_nothing(rig, payload, tmp_path, monkeypatch):
-    """The receivers are stopped (SIGSTOP) while they write row 1, until the notice appears."""
+def test_slow_disk_holds_the_scan_up_and_loses_nothing(rig, receivers, payload, tmp_path, monkeypatch):
+    """The receivers are stopped (SIGSTOP) before they are told to write row 1, until the notice appears."""
     monkeypatch.setattr(row, "_DISK_NOTICE_S", 0.05)
-    stopped: list[int] = []
     notices: list[tuple[int, str]] = []
 
     def progress(p) -> None:
-        if p.state == "writing" and p.row == 1 and p.phase == "state" and not stopped:
-            stopped.extend(receivers())
-            for pid in stopped:
+        if p.state == "writing" and p.row == 1 and p.phase == "state" and not notices:
+            for pid in receivers.values():
                 os.kill(pid, signal.SIGSTOP)
         if p.phase == "wait" and p.row == 1 and not notices:
             notices.append((len(rig.pi.rows_run), p.message))
-            for pid in stopped:
+            for pid in receivers.values():
                 os.kill(pid, signal.SIGCONT)
 
     result = run_scan(rig.instrument, tmp_path / "s", progress=progress)
-    assert len(stopped) == 2
     assert notices[0][0] == 2, "the next row has not begun"
     assert "disk" in notices[0][1]
     assert (result.exit_status, result.retakes) == ("success", 0)
@@ -129,12 +125,12 @@ def test_full_disk_between_rows_ends_the_scan_before_the_next_row(rig, tmp_path,
     assert resume_scan(tmp_path / "s").exit_status == "success"
 
 
-def test_disk_that_cannot_hold_the_row_is_an_error_before_its_first_pulse(rig, tmp_path):
+def test_disk_that_cannot_hold_the_row_is_an_error_before_its_first_pulse(rig, receivers, tmp_path):
     """Reserving the file fails: a limit on the size of files (RLIMIT_FSIZE) replaces a full disk."""
 
     def progress(p) -> None:
         if p.state == "waiting" and len(rig.pi.rows_run) == 2:
-            for pid in receivers():
+            for pid in receivers.values():
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, (1000, 1000))
 
     with refused(ErrorCode.DISK_FULL, "resume"):
@@ -146,7 +142,7 @@ def test_disk_that_cannot_hold_the_row_is_an_error_before_its_first_pulse(rig, t
     assert validate(tmp_path / "s") == []
 
 
-def test_capture_has_priority_over_processing(rig, tmp_path):
+def test_capture_has_priority_over_processing(rig, receivers, tmp_path):
     """A receiver has real-time priority or, if that is not permitted, a nice value lower by at least NICE."""
     processing = []
     capture = []
@@ -156,7 +152,7 @@ def test_capture_has_priority_over_processing(rig, tmp_path):
 
     def progress(p) -> None:
         if p.state == "running" and not capture:
-            for pid in receivers():
+            for pid in receivers.values():
                 rt = os.sched_getscheduler(pid) in (os.SCHED_RR, os.SCHED_FIFO)
                 capture.append(-100 if rt else os.getpriority(os.PRIO_PROCESS, pid))
 

@@ -7,8 +7,8 @@ and `scan_shapes` draw and disturb such scans. Only numpy and scipy are used, no
 simulators, so that tests may compare the two.
 """
 
-from polysight_worlds.images import ImagePair, backproject, simulate
-from polysight_worlds.media import COPPER, METAL, Stack, reflect
+from polysight_worlds.images import ImagePair, simulate
+from polysight_worlds.media import METAL, Stack, reflect
 from polysight_worlds.rig import Boards, Rig, load_boards, load_rig, published_boards, published_rig
 from polysight_worlds.scan import record
 from polysight_worlds.shape_echoes import record_shapes
@@ -21,56 +21,13 @@ from polysight_worlds.shape_scenes import (
     scan_offsets,
     scan_shapes,
 )
-from polysight_worlds.shapes import Shape, bottle, cylinder, plate, sphere
+from polysight_worlds.shapes import Shape, cylinder, plate, sphere
 from polysight_worlds.world import (
     NUISANCES,
     TABLE_2,
     Body,
-    Nuisances,
     Plate,
     World,
-    dish,
     draw_nuisances,
     draw_world,
-    table,
 )
-
-__all__ = [
-    "COPPER",
-    "KINDS",
-    "METAL",
-    "NUISANCES",
-    "TABLE_2",
-    "Boards",
-    "Body",
-    "ImagePair",
-    "Nuisances",
-    "Plate",
-    "Rig",
-    "Shape",
-    "ShapeNuisances",
-    "ShapeScene",
-    "Stack",
-    "World",
-    "backproject",
-    "bottle",
-    "cylinder",
-    "dish",
-    "draw_nuisances",
-    "draw_shapes",
-    "draw_world",
-    "load_boards",
-    "load_rig",
-    "plate",
-    "published_boards",
-    "published_rig",
-    "record",
-    "record_shapes",
-    "reference_sphere",
-    "reflect",
-    "scan_offsets",
-    "scan_shapes",
-    "simulate",
-    "sphere",
-    "table",
-]

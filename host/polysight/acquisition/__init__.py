@@ -32,33 +32,3 @@ from polysight.acquisition.ready import make_ready, stage_differences
 from polysight.acquisition.row import FaultKind
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.acquisition.states import BADGES, STATES, Button, StateLevel
-
-__all__ = [
-    "BADGES",
-    "LAPSE_S",
-    "STATES",
-    "Button",
-    "CaptureRig",
-    "ControlFolder",
-    "FaultKind",
-    "Life",
-    "OnProgress",
-    "OnRow",
-    "PiClient",
-    "RefusedError",
-    "ScanCommand",
-    "ScanProgress",
-    "ScanResult",
-    "StateLevel",
-    "StopRequest",
-    "ignore_hangup",
-    "make_ready",
-    "read_life",
-    "read_start_ticks",
-    "resume_scan",
-    "run_scan",
-    "send_command",
-    "stage_differences",
-    "time_left",
-    "typical_row_s",
-]

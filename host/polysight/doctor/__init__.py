@@ -8,5 +8,3 @@ are in `rig_checks`. `write_bundle` (`bundle.py`) collects findings, versions an
 
 from polysight.doctor.checks import run_doctor
 from polysight.doctor.context import DoctorOptions
-
-__all__ = ["DoctorOptions", "run_doctor"]

@@ -38,7 +38,7 @@ from polysight.materials.classify import (
     Classifier,
     classifier_sentence,
 )
-from polysight.materials.copies import Copies, find_copies
+from polysight.materials.copies import find_copies
 from polysight.materials.discriminant import REJECTED, ErrorDiscriminant
 from polysight.materials.kinds import permittivity_slope
 from polysight.materials.labels import (
@@ -150,7 +150,6 @@ __all__ = [
     "CatalogueMaterial",
     "Classifier",
     "ConcentrationResult",
-    "Copies",
     "Entry",
     "ErrorDiscriminant",
     "KnownScene",

@@ -6,5 +6,3 @@ snapshot for all pages. `polysight.serve` serves it.
 """
 
 from polysight.page.watch import Watch
-
-__all__ = ["Watch"]

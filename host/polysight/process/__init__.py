@@ -8,7 +8,6 @@ on the result; `save_images` and `save_materials` write the products. `polysight
 """
 
 from polysight.process.given_images import (
-    GivenPair,
     analyse_given_images,
     is_given_images,
     make_reference,
@@ -33,31 +32,3 @@ from polysight.process.save import (
     save_images,
     save_materials,
 )
-
-__all__ = [
-    "NO_INPUTS",
-    "Findings",
-    "GivenPair",
-    "Inputs",
-    "KeptSamples",
-    "Products",
-    "Progress",
-    "Quality",
-    "Use",
-    "analyse_given_images",
-    "boxes_as_patches",
-    "collect_imaged_scan",
-    "collect_processed_scan",
-    "cores",
-    "is_given_images",
-    "judge",
-    "load_classifier",
-    "make_reference",
-    "map_boards",
-    "map_rows",
-    "no_progress",
-    "read_given_images",
-    "save_images",
-    "save_materials",
-    "why_unnamed",
-]

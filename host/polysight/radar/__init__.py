@@ -22,30 +22,3 @@ from polysight.radar.control import (
 from polysight.radar.diagnosis import ReplayedWords, Row, check_board, trace_words
 from polysight.radar.firmware import Image, read_image
 from polysight.radar.usb import Clock, SystemClock, WordLink
-
-__all__ = [
-    "INTER_FRAME_US",
-    "TRIGGER_MARGIN_US",
-    "BoardState",
-    "Clock",
-    "Image",
-    "RadarBoard",
-    "RadarControl",
-    "RadarState",
-    "ReplayedWords",
-    "Row",
-    "SystemClock",
-    "WordLink",
-    "check_board",
-    "chirp_us",
-    "constraints",
-    "direct_if_hz",
-    "open_board",
-    "plan_lines",
-    "radar_board",
-    "radar_control",
-    "read_firmware",
-    "read_image",
-    "require",
-    "trace_words",
-]

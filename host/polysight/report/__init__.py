@@ -8,22 +8,3 @@ from polysight.report.figures import draw_channel, draw_overview, focus_figure, 
 from polysight.report.report import write_report
 from polysight.report.style import INK, MUTED, PALETTE, STAMP, figure_label, font_families, png
 from polysight.report.sync_report import QUANTITIES, SyncReport, write_sync_report
-
-__all__ = [
-    "INK",
-    "MUTED",
-    "PALETTE",
-    "QUANTITIES",
-    "STAMP",
-    "SyncReport",
-    "draw_channel",
-    "draw_overview",
-    "figure_label",
-    "focus_figure",
-    "font_families",
-    "label_figure",
-    "png",
-    "surface_figure",
-    "write_report",
-    "write_sync_report",
-]

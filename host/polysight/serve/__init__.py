@@ -10,9 +10,3 @@ Threat model: docs/decisions/0014-operators-page.md.
 """
 
 from polysight.serve.server import Place, preview, serve
-
-__all__ = [
-    "Place",
-    "preview",
-    "serve",
-]

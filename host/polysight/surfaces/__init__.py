@@ -7,9 +7,8 @@ files. In order: `window` (fit of one echo), `joint` (of several), `paths` (sear
 (both receivers, segments), `optics` (polarisation, curved reflection), `permittivity`, `result`.
 """
 
-from polysight.surfaces.measure import Seen, Shape, find_shape, see_points
+from polysight.surfaces.measure import Seen, find_shape, see_points
 from polysight.surfaces.optics import (
-    Antenna,
     Optics,
     VisibleNormals,
     aim_antenna,
@@ -35,41 +34,4 @@ from polysight.surfaces.result import (
     summary_lines,
     write_surface,
 )
-from polysight.surfaces.window import Echoes, Samples, find_mirror_path
-
-__all__ = [
-    "POINTS",
-    "SURFACE",
-    "Antenna",
-    "Echoes",
-    "Gains",
-    "Optics",
-    "Reference",
-    "Samples",
-    "Seen",
-    "Segment",
-    "Shape",
-    "Surface",
-    "Uncertainty",
-    "VisibleNormals",
-    "aim_antenna",
-    "analyse_surface",
-    "describe_form",
-    "describe_material",
-    "find_mirror_path",
-    "find_shape",
-    "find_voltages",
-    "join_turned",
-    "learn_gains",
-    "make_optics",
-    "mirror_point",
-    "mix_twisted",
-    "plain_segment",
-    "read_surface",
-    "reflect_curved",
-    "reflect_flat",
-    "see_points",
-    "summary_lines",
-    "visible_normals",
-    "write_surface",
-]
+from polysight.surfaces.window import Echoes, Samples

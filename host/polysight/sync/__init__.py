@@ -21,25 +21,3 @@ from polysight.sync.offsets import (
     sample_frequencies_hz,
     whole_blocks,
 )
-
-__all__ = [
-    "FOLD",
-    "STAGES",
-    "AlignedRow",
-    "BoardSetup",
-    "HighPass",
-    "RowSynchroniser",
-    "SyncedRow",
-    "align_row",
-    "block_frequencies_hz",
-    "cis",
-    "decimation",
-    "estimate_backlash",
-    "fit_high_pass",
-    "high_pass",
-    "object_filter",
-    "reference",
-    "sample_frequencies_hz",
-    "synchronise_row",
-    "whole_blocks",
-]

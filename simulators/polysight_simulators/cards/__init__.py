@@ -7,22 +7,5 @@ sockets; `card` adds sockets and a radar; `sender` sends many packets per call; 
 """
 
 from polysight_simulators.cards.adversary import KINDS, RADAR, Adversary, Arrival, Sent
-from polysight_simulators.cards.card import MAC, CardEndpoint, CardSender, SimulatedCard, bound_udp
+from polysight_simulators.cards.card import MAC, CardEndpoint, bound_udp
 from polysight_simulators.cards.dca1000 import SOURCE_PORT, Network
-from polysight_simulators.cards.sync_in import StageTrack
-
-__all__ = [
-    "KINDS",
-    "MAC",
-    "RADAR",
-    "SOURCE_PORT",
-    "Adversary",
-    "Arrival",
-    "CardEndpoint",
-    "CardSender",
-    "Network",
-    "Sent",
-    "SimulatedCard",
-    "StageTrack",
-    "bound_udp",
-]

@@ -8,5 +8,3 @@ MATLAB servers.
 from polysight_simulators.radars.board import FUNCTIONAL, Fault, RadarBoard
 from polysight_simulators.radars.control import LineServer, RadarSocket, UsbChip
 from polysight_simulators.radars.cores import make_image
-
-__all__ = ["FUNCTIONAL", "Fault", "LineServer", "RadarBoard", "RadarSocket", "UsbChip", "make_image"]

@@ -11,14 +11,13 @@ the published data set's layout (`layouts`), with truth.json.
 from polysight_simulators.scene.cubes import reference_cube, synced_cube
 from polysight_simulators.scene.layouts import AuthorsLayout, OwnLayout, write_cube
 from polysight_simulators.scene.optics import reflect_layers, strips
-from polysight_simulators.scene.radar import PatternSource, SignalSource, SimulatedRig, pattern_frames
+from polysight_simulators.scene.radar import PatternSource, SignalSource, SimulatedRig
 from polysight_simulators.scene.scene_file import (
     Disturbances,
     Layer,
     Plate,
     Point,
     Scene,
-    Shape,
     apply_scene,
     decode_scene,
     draw_specimens,
@@ -26,32 +25,3 @@ from polysight_simulators.scene.scene_file import (
     without_offset,
 )
 from polysight_simulators.scene.simulated_scan import lost_bytes, row_offsets_mm, simulate, truth
-
-__all__ = [
-    "AuthorsLayout",
-    "Disturbances",
-    "Layer",
-    "OwnLayout",
-    "PatternSource",
-    "Plate",
-    "Point",
-    "Scene",
-    "Shape",
-    "SignalSource",
-    "SimulatedRig",
-    "apply_scene",
-    "decode_scene",
-    "draw_specimens",
-    "load_scene",
-    "lost_bytes",
-    "pattern_frames",
-    "reference_cube",
-    "reflect_layers",
-    "row_offsets_mm",
-    "simulate",
-    "strips",
-    "synced_cube",
-    "truth",
-    "without_offset",
-    "write_cube",
-]

@@ -8,5 +8,3 @@ the same ticks and send the same lines.
 from polysight_simulators.stage.logic import homing_zero
 from polysight_simulators.stage.motion import NS_PER_TICK, TICK_HZ
 from polysight_simulators.stage.python_stage import PythonStage, Rig
-
-__all__ = ["NS_PER_TICK", "TICK_HZ", "PythonStage", "Rig", "homing_zero"]

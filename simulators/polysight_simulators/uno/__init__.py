@@ -4,6 +4,4 @@
 demand; :func:`missing` lists the packages needed.
 """
 
-from polysight_simulators.uno.board import ENABLING_COMMAND, HZ, Cost, EmulatedUno, PinEdge, emulator, firmware, missing
-
-__all__ = ["ENABLING_COMMAND", "HZ", "Cost", "EmulatedUno", "PinEdge", "emulator", "firmware", "missing"]
+from polysight_simulators.uno.board import ENABLING_COMMAND, HZ, EmulatedUno, PinEdge, emulator, firmware, missing

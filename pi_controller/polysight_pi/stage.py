@@ -56,6 +56,8 @@ SILENT_HEARTBEATS = 0.5
 SILENT_AT_REST_S = 3.0
 # Interval of status requests to a stage at rest.
 IDLE_STATUS_S = 1.0
+# Longest interval of status requests to a moving stage, however long its heartbeat: shorter than at rest.
+MOVING_STATUS_S = 0.5
 # Longest time from STOP to standstill.
 STOP_TIMEOUT_S = 3.0
 # Between two attempts to clear an alarm of a stage that still moves.
@@ -513,7 +515,7 @@ class StageDriver:
 
     def _start(self, verb: str, *args: int) -> int:
         # The heartbeat has to begin before the motion does.
-        self.link.ask_status_every(self.config.heartbeat_ms / 1e3 / STATUS_PER_HEARTBEAT)
+        self.link.ask_status_every(min(self.config.heartbeat_ms / 1e3 / STATUS_PER_HEARTBEAT, MOVING_STATUS_S))
         try:
             answer = self.link.request(verb, *args)
         except StageRefusedError:

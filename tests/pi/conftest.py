@@ -31,7 +31,7 @@ def instrument(tmp_path: Path) -> Instrument:
         rig,
         grid=replace(rig.grid, columns=8, rows=4),
         burst=replace(rig.burst, pulses=4),
-        stage=replace(rig.stage, port=str(tmp_path / "no-stage"), heartbeat_ms=1000),  # patience on a busy machine
+        stage=replace(rig.stage, port=str(tmp_path / "no-stage"), heartbeat_ms=20_000),  # this process may be held
         pi=replace(
             rig.pi,
             command_address="tcp://127.0.0.1:*",
@@ -130,8 +130,8 @@ def host(pi: Running) -> HostSide:
 
 @pytest.fixture
 def host_in_row(host: HostSide, stage: FakeStage) -> HostSide:
-    """The same during row 0: its first burst has been sent, and its points are 50 ms apart."""
-    stage.pace_s = 0.05
+    """The same during row 0, which stays behind its second point until `stage.stays_after` changes."""
+    stage.stays_after = 2
     host.start_row()
     host.wait(m.Capture)
     return host

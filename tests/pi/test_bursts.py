@@ -371,7 +371,7 @@ def rises(hub, instrument):
     with closing(WireClient(hub, listen=instrument.pi.sync_out)) as radar:
 
         def rises(pulses, width_ns=1000):
-            edges = [radar.receive(5) for _ in range(2 * pulses)]
+            edges = [radar.receive(HANG_S) for _ in range(2 * pulses)]
             assert all(isinstance(e, WireEdge) for e in edges)
             assert [e.value for e in edges] == [1, 0] * pulses
             assert {b.t_ns - a.t_ns for a, b in zip(edges[::2], edges[1::2], strict=True)} == {width_ns}

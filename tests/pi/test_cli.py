@@ -31,7 +31,7 @@ def test_sigterm_ends_the_row_and_the_program(instrument, start, hub, stage):
     host.must_accept(host.begin())
     host.home()
     assert host.row(0).status == "done"
-    stage.pace_s = 0.05
+    stage.stays_after = 2
     host.start_row(1)
     host.wait(m.Capture, lambda e: e.row_index == 1)
     assert program.end() == (0, "", "")

@@ -244,6 +244,7 @@ def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     host = host_in_row
     good = host.list_events(m.Capture)[0].seq
     monkeypatch.setattr(journal_module.os, "pwrite", full)
+    stage.stays_after = None
     fault = host.wait(m.Fault)
     done = host.wait(m.RowFinished)
     monkeypatch.undo()
@@ -253,7 +254,6 @@ def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     last = host.ask(m.Hello()).last_seq
     assert fault.seq == done.seq == last >= good
     host.home()
-    stage.pace_s = 0.0
     assert host.row(0, take=2).status == "done"
     replayed = host.replay()
     assert [e.seq for e in replayed] == list(range(1, len(replayed) + 1))

@@ -175,11 +175,11 @@ def test_replies_are_short_while_a_row_runs_and_whole_before_and_after(bench):
 
 @pytest.fixture
 def owner_in_row(pi, stage):
-    """The host that owns the run, during row 0."""
+    """The host that owns the run, during row 0, which stays behind its second point."""
     host = pi.host
     host.must_accept(host.begin(owner="mine", heartbeat_ms=10_000))
     host.home("mine")
-    stage.pace_s = 0.05
+    stage.stays_after = 2
     host.start_row(owner="mine")
     host.wait(m.Capture)
     return host
@@ -200,7 +200,7 @@ def hang(pi):
     released.set()
 
 
-def test_only_the_owner_commands_a_run(owner_in_row):
+def test_only_the_owner_commands_a_run(owner_in_row, stage):
     host = owner_in_row
     for owner in ("", "other", "min", "mine-"):
         for command in (
@@ -210,6 +210,7 @@ def test_only_the_owner_commands_a_run(owner_in_row):
         ):  # fmt: skip
             assert host.must_refuse(command) == PiFault.NOT_OWNER, command
         assert host.must_refuse(host.begin(owner=owner)) == PiFault.NOT_READY, "its host is alive"
+    stage.stays_after = None
     assert host.wait(m.RowFinished).status == "done"
     assert host.must_refuse(m.Home(owner="other")) == PiFault.NOT_OWNER, "between two rows as well"
     host.must_accept(m.EndRun(scan_id="scan", exit_status="success", owner="mine"))
@@ -267,10 +268,11 @@ def test_a_jog_moves_once_and_within_its_limits(host, stage):
     assert host.row(0).status == "done"
 
 
-def test_a_jog_is_refused_in_a_row_and_to_strangers_while_the_host_lives(owner_in_row):
+def test_a_jog_is_refused_in_a_row_and_to_strangers_while_the_host_lives(owner_in_row, stage):
     host = owner_in_row
     assert host.must_refuse(make_jog(0, 10, owner="mine")) == PiFault.NOT_READY
     assert host.must_refuse(make_jog(0, 10, owner="other")) == PiFault.NOT_OWNER
+    stage.stays_after = None
     host.wait(m.RowFinished)
     assert host.must_refuse(make_jog(0, 10, owner="other")) == PiFault.NOT_OWNER
 

@@ -1,7 +1,11 @@
 """The Pi half as the host sees it: real ZeroMQ, a pty, simulated wires."""
 
+from contextlib import closing
+
 import msgspec
+from tests.support.pi.host_side import Running
 from tests.support.processes import HANG_S
+from tests.support.rigs import at_stage_port
 
 from polysight.acquisition.pi_client import HostHeartbeat
 from polysight_pi.lines import GpiodLines, SpiLines, WireLines
@@ -38,7 +42,7 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     for c in captures:
         assert c.last_pulse_ns - c.first_pulse_ns == (burst.pulses - 1) * round(burst.period_us * 1e3)
         assert (c.pulses, c.width_max_ns, c.jitter_ns) == (burst.pulses, round(burst.width_us * 1e3), 0)
-    edges = [radar.receive(5) for _ in range(2 * done.pulses)]
+    edges = [radar.receive(HANG_S) for _ in range(2 * done.pulses)]
     rises = [e.t_ns for e in edges if isinstance(e, WireEdge) and e.value]
     falls = [e.t_ns for e in edges if isinstance(e, WireEdge) and not e.value]
     assert {b - a for a, b in zip(rises, falls, strict=True)} == {1000}
@@ -51,18 +55,23 @@ def test_only_pins_count_as_hardware():
     assert all(is_simulated(unknown) for unknown in ("", "fake", "gpio", "GPIOD", "lgpio"))
 
 
-def test_stage_gets_the_row_in_steps_and_a_heartbeat(host, stage):
-    # The row takes longer than two quarters of a heartbeat
-    stage.pace_s = 0.1
-    host.row(0)
+def test_stage_gets_the_row_in_steps_and_a_heartbeat(instrument, stage, hub):
+    rig = msgspec.structs.replace(instrument, stage=msgspec.structs.replace(instrument.stage, heartbeat_ms=1000))
+    with closing(Running(at_stage_port(rig, stage.port), hub)) as pi:
+        pi.host.must_accept(pi.host.begin())
+        pi.host.home()
+        stage.stays_after = 2
+        pi.host.start_row()
+        pi.host.wait(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
+        pi.host.wait(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
+        stage.stays_after = None
+        pi.host.wait(m.RowFinished)
     row = next(c for c in stage.seen if c.verb == "ROW")
     half = 3.5 * 2 * 200
     y = 250 * 200 - 1.5 * 2 * 200
     assert row.args == (400 * 200 - half, 400, 8, y, 4000)
     sets = {c.args[0]: c.args[1] for c in stage.seen if c.verb == "SET"}
     assert sets == {0: 40000, 1: 1000, 2: 20, 3: 160000, 4: 100000, 5: 8000, 6: 0, 7: 0}
-    assert stage.bytes_seen.count(Immediate.STATUS) >= 2
-    assert any(e.state == "row" for e in host.list_events(m.StageStatus))
 
 
 def test_homing_reports_lost_steps(host, stage):
@@ -77,10 +86,12 @@ def test_homing_reports_lost_steps(host, stage):
 
 def test_repeated_requests_act_once(host, stage):
     host.must_accept(host.begin())
-    stage.pace_s = 0.02
+    stage.stays_after = 2
     assert host.must_accept(RUN_0).state == "running"
     assert host.must_accept(RUN_0).state == "running"
+    stage.stays_after = None
     host.wait(m.RowFinished)
+    host.until_state("ready")
     assert host.must_accept(RUN_0).state == "ready"
     assert stage.rows_run == 1
     assert host.row(0, take=2).status == "done"
@@ -122,6 +133,7 @@ def test_hold_and_resume_lose_nothing(host_in_row, stage):
     assert host.must_accept(m.Hold()).state == "held"
     assert host.ask(m.Status()).row_index == 0
     assert host.must_accept(m.Resume()).state == "running"
+    stage.stays_after = None
     assert host.wait(m.RowFinished).status == "done"
     assert stage.bytes_seen.count(Immediate.HOLD) == 1
 
@@ -133,7 +145,7 @@ def test_abort_ends_the_row_and_the_next_one_runs_without_homing(host_in_row, st
     assert (done.status, done.fault, done.reason) == ("aborted", PiFault.ABORTED, "enough")
     assert done.bursts == len(host.list_events(m.Capture)) < 8
     host.until_state("ready")
-    stage.pace_s = 0.0
+    stage.stays_after = None
     assert host.row(0, take=2).status == "done"
     assert sum(c.verb == "HOME" for c in stage.seen) == 1
 
@@ -145,7 +157,7 @@ def test_a_new_host_aborts_the_row_of_the_dead_one(host_in_row, stage):
     event_before = host.journalled[-2]
     assert isinstance(event_before, m.RowFinished)
     assert (event_before.status, started.seq) == ("aborted", event_before.seq + 1)
-    stage.pace_s = 0.0
+    stage.stays_after = None
     assert host.row(0, take=2).status == "done"
 
 
@@ -166,17 +178,20 @@ def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
     host = pi.host
     host.must_accept(host.begin(heartbeat_ms=100))
     host.home()
-    stage.pace_s = 0.2
+    stage.stays_after = 2
     pi_settings = msgspec.structs.replace(instrument.pi, command_address=pi.service.server.command_address)
     beats = HostHeartbeat(host.context, msgspec.structs.replace(instrument, pi=pi_settings), "scan", 0.05)
     host.start_row()
-    host.wait(m.Capture, lambda e: e.point == 4)
+    host.wait(m.Capture)
+    # Three times the silence that a row is allowed
+    pi.clock.sleep(1.2)
+    assert host.ask(m.Status()).state == "running"
     beats.stop()
     done = host.wait(m.RowFinished)
     assert (done.status, done.fault) == ("fault", PiFault.HOST_LOST), done.reason
     assert Immediate.STOP in stage.bytes_seen
     assert host.until_state("ready").fault == PiFault.HOST_LOST
-    stage.pace_s = 0.0
+    stage.stays_after = None
     host.must_accept(host.begin())
     assert host.row(0, take=2).status == "done"
 
@@ -222,8 +237,9 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(pi, 
     monkeypatch.setattr("threading.excepthook", lambda args: raised.append(args.exc_type))
     monkeypatch.setattr("polysight_pi.machine.Machine.on_burst", fail)
     # The reply to the row goes out before its first edge comes
-    stage.pace_s = 0.2
+    stage.stays_after = 0
     host.start_row()
+    stage.stays_after = None
     pi.thread.join(HANG_S)
     assert raised == [ZeroDivisionError, DeviceError], "in the executor's thread, and out of `serve`"
     pi.service._loop.stop()

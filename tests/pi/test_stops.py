@@ -73,10 +73,10 @@ def disk(monkeypatch) -> Iterator[FrozenDisk]:
 
 @pytest.fixture
 def owned_run(pi, stage):
-    """A begun run with an owner; the stage is homed, points are 50 ms apart."""
+    """A begun run with an owner; the stage is homed, a row stays behind its second point."""
     pi.host.must_accept(pi.host.begin(owner=OWNER))
     pi.host.home(OWNER)
-    stage.pace_s = 0.05
+    stage.stays_after = 2
     return pi.host
 
 
@@ -89,6 +89,7 @@ def test_abort_stops_and_is_answered_while_the_disk_hangs(owned_run, stage, disk
     owned_run.wait(m.Capture)
     events_before = len(owned_run.journalled)
     disk.freeze()
+    stage.stays_after = 4
     assert disk.blocked.wait(HANG_S)
     stage.bytes_seen.clear()
     owned_run.must_accept(m.Abort(owner=OWNER))
@@ -108,10 +109,12 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     host = pi.host
     host.must_accept(host.begin(heartbeat_ms=0 if beats else 100, owner=OWNER))
     host.home(OWNER)
-    stage.pace_s = 0.05
-    stage.endless = True
+    stage.stays_after = 2
+    pi.clock.stands = True
     host.start_row(owner=OWNER)
     disk.freeze()
+    stage.stays_after = 4
+    pi.clock.stands = False
     wait_for(lambda: stop_is_sent(stage), "STOP")
     number = PiFault.PROGRAM_LATE if beats else PiFault.HOST_LOST
     assert host.until_state("ready").fault == number
@@ -119,7 +122,7 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     monkeypatch.setattr(pi.service.executor, "_turned", lambda: fed.append(True))
     wait_for(lambda: pi.service._find_late() != "", "that the journal is late")
     fed.clear()
-    time.sleep(3 * executors.TURN_S)
+    pi.clock.sleep(3 * executors.TURN_S)
     assert not fed, "the watchdog is fed for each part or not at all"
     disk.thaw()
     assert host.wait(m.RowFinished).fault == number
@@ -134,18 +137,16 @@ def test_sockets_are_served_between_rare_heartbeats(instrument, stage, hub):
         # Without a stage there are no statuses to send either
         stage.unplug()
         pi.host.until_state("fault")
-        time.sleep(LATE_S)
+        pi.clock.sleep(LATE_S)
         wait_for(lambda: pi.service.server.find_late(LATE_S) == "", "that each socket is served")
 
 
-def test_a_program_that_was_paused_blames_no_part_of_it_alone(host_in_row, pi, stage, monkeypatch):
+def test_a_program_that_was_paused_blames_no_part_of_it_alone(host_in_row, pi, monkeypatch):
     """As when a busy machine gives it no processor: the executor, which judges, is as late as the others."""
-    # The row outlasts the pause
-    stage.pace_s = 1.0
     monkeypatch.setattr(executors, "LATE_S", LATE_S)
 
     def pause() -> None:
-        time.sleep(1.5 * LATE_S)
+        pi.clock.sleep(1.5 * LATE_S)
         monkeypatch.setattr(pi.service.executor, "_find_late", lambda: "the event socket has not been served")
 
     pi.service.executor.post(pause)
@@ -211,15 +212,14 @@ def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
     host = pi.host
     host.must_accept(host.begin())
     host.home()
-    stage.pace_s = 0.05
-    stage.endless = True
+    stage.stays_after = 2
     host.start_row()
     host.wait(m.Capture)
     go_on = threading.Event()
     pi.service.executor.post(lambda: go_on.wait(HANG_S))
     wait_for(lambda: stop_is_sent(stage), "STOP")
     status_requests = stage.bytes_seen.count(Immediate.STATUS)
-    time.sleep(LATE_S)
+    pi.clock.sleep(LATE_S)
     assert stage.bytes_seen.count(Immediate.STATUS) == status_requests, "its own heartbeat stops it as well"
     go_on.set()
     assert host.wait(m.RowFinished).fault == PiFault.STAGE_LOST
@@ -233,8 +233,7 @@ def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, which):
     go_on = threading.Event()
     host.must_accept(host.begin())
     host.home()
-    stage.pace_s = 0.05
-    stage.endless = True
+    stage.stays_after = 2
     host.start_row()
     host.wait(m.Capture)
     busy = "_send_replies" if which == "command" else "_beat"
@@ -286,7 +285,7 @@ def test_leaving_subscribers_keep_no_command_waiting(start, instrument, hub, req
 
 
 @pytest.mark.slow
-def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, request, record_testsuite_property):
+def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, instrument, request, record_testsuite_property):
     """From the last heartbeat, or the command to abort, to STOP: within half a second, wherever the disk hangs."""
     moments = 4
     moments_of_a_minute: tuple[int, ...] = ()
@@ -299,7 +298,7 @@ def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, request, record_te
     # Silent for four of these
     heartbeat_ms = 90
     stage.pace_s = 0.02
-    stage.endless = True
+    stage.stays_after = instrument.grid.columns
     host.must_accept(host.begin(owner=OWNER, heartbeat_ms=heartbeat_ms))
     host.home(OWNER)
     for take in range(1, moments + 1):

@@ -58,7 +58,8 @@ def environment(
         Label of the chip.
     faults
         `denied` (no permission), `no-edges` (no interrupts), `busy:LINE` (held by another program), `slow:US` (duration
-        of each change of an output). Signal :data:`VANISH` makes the chip vanish.
+        of each change of an output), `stuck` (the call that sets an output high does not return). Signal
+        :data:`VANISH` makes the chip vanish.
     wire_time
         The thread that reads edges uses wire time, in which a sleep is exact and returns at once, so that nothing is
         late on a busy machine. Else real time.

@@ -5,7 +5,7 @@
  *   GPIOSHIM_WIRES=SOCKET  hub of the simulated wires (shared/polysight_shared/wires.py): S lines in are levels on inputs, S lines out are
  *                          changes of outputs, with the time (CLOCK_MONOTONIC) at which they were made
  *   GPIOSHIM_LABEL, GPIOSHIM_LINES                                    label and size of the chip
- *   GPIOSHIM_FAULTS=denied,no-edges,busy:LINE,slow:US                 faults from the start
+ *   GPIOSHIM_FAULTS=denied,no-edges,busy:LINE,slow:US,stuck           faults from the start
  *   GPIOSHIM_SPI=PATH      a spidev device beside it: spidev.c
  *   GPIOSHIM_CLOCK=wires   edges carry their wire time, which the thread that reads them uses: a sleep returns at once and
  *                          takes exactly its duration. So a burst is exact even on a busy machine. The chip reports a
@@ -39,7 +39,7 @@
 #define BUFSIZ_FILE "/sys/module/spidev/parameters/bufsiz"
 
 static char chip[200], spi[200];
-static int no_edges, denied, slow_us;
+static int no_edges, denied, slow_us, stuck;
 static uint8_t is_chip[MAX_FD], is_spi[MAX_FD];
 static struct request *by_fd[MAX_FD];
 
@@ -206,6 +206,7 @@ int ioctl(int fd, unsigned long what, ...) {
   const int error = gone ? ENODEV : is_chip[fd] ? ask_chip(what, arg) : ask_lines(by_fd[fd], fd, what, arg);
   pthread_mutex_unlock(&mutex);
   if (slow_us && what == GPIO_V2_LINE_SET_VALUES_IOCTL) usleep(slow_us);
+  while (stuck && what == GPIO_V2_LINE_SET_VALUES_IOCTL && ((struct gpio_v2_line_values *)arg)->bits) pause();
   errno = error;
   return error ? -1 : 0;
 }
@@ -276,6 +277,7 @@ static void read_faults(char *list) {
   for (char *word = strtok(list, ","); word; word = strtok(0, ",")) {
     if (!strcmp(word, "denied")) denied = 1;
     else if (!strcmp(word, "no-edges")) no_edges = 1;
+    else if (!strcmp(word, "stuck")) stuck = 1;
     else if (sscanf(word, "slow:%d", &slow_us) == 1) continue;
     else if (sscanf(word, "busy:%u", &n) == 1 && n < n_lines) {
       lines[n].flags = GPIO_V2_LINE_FLAG_USED | GPIO_V2_LINE_FLAG_OUTPUT;

@@ -137,9 +137,9 @@ class FakeStage:
     """A stage behind a pty: speaks the stage line, raises the trigger on simulated wires.
 
     Wrong behaviour on request: `deaf` (answers nothing), `lose` (swallow so many lines), `damage` (garble so many
-    answers), `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `endless` (a row
-    stays at its last point), `alarm_at` (alarm number at a point), `lost` (steps that homing finds lost), `row_end`
-    (where a row ends), `pace_s` (wall time from point to point).
+    answers), `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `stays_after` (a row
+    stays behind so many points until that changes), `alarm_at` (alarm number at a point), `lost` (steps that homing
+    finds lost), `row_end` (where a row ends), `pace_s` (wall time from point to point).
     """
 
     def __init__(self, hub: Path | None, trigger: int = 26) -> None:
@@ -154,7 +154,7 @@ class FakeStage:
         self.steps = "200"
         self.lose = self.damage = self.lose_end = 0
         self.skip: set[int] = set()
-        self.endless = False
+        self.stays_after: int | None = None
         self.lost = (0, 0)
         self.alarm_at: dict[int, int] = {}
         self.pace_s = 0.0
@@ -339,7 +339,7 @@ class FakeStage:
             self.t_ns += step_ns
             if self._stopping.wait(self.pace_s):
                 return StageError.STOPPED
-            while self.held:
+            while self.held or self.stays_after == self.points:
                 if self._stopping.wait(0.005):
                     return StageError.STOPPED
             if i in self.alarm_at:
@@ -348,12 +348,13 @@ class FakeStage:
             self.points += 1
             if i not in self.skip:
                 self._edge(self.t_ns)
+        while self.stays_after == self.points:
+            if self._stopping.wait(0.005):
+                return StageError.STOPPED
         # It runs on and slows down.
         if self._stopping.wait(2 * self.pace_s):
             return StageError.STOPPED
         self.x, self.y = self.row_end or _rest_after(c)
-        if self.endless and self._stopping.wait():
-            return StageError.STOPPED
         return 0
 
     def _edge(self, t_ns: int) -> None:

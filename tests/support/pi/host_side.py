@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import zmq
 
+from polysight_pi import executor, journal, lines, service, stage
 from polysight_pi.service import Service
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
@@ -17,6 +22,44 @@ from polysight_shared.sockets import requester, subscriber
 from tests.support.processes import LIMIT_S, idle_s, wait_for
 
 POLL_MS = 100
+TICK_S = 0.01
+
+
+class TickingClock:
+    """The Pi's clock in this process: each turn of a thread moves it on by `TICK_S`, however long the turn takes.
+
+    So nothing is late because a busy machine holds the process, or gives it little processor time. It stands still
+    while `stands`.
+    """
+
+    def __init__(self) -> None:
+        self.stands = False
+        self._now_s = time.monotonic()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._tick)
+        self._patches = ExitStack()
+        times = SimpleNamespace(**{**vars(time), "monotonic": self})
+        for module in (executor, journal, lines, service, stage):
+            self._patches.enter_context(patch.object(module, "time", times))
+        self._thread.start()
+
+    def __call__(self) -> float:
+        return self._now_s
+
+    def _tick(self) -> None:
+        while not self._stop.wait(TICK_S):
+            if not self.stands:
+                self._now_s += TICK_S
+
+    def sleep(self, seconds: float) -> None:
+        """Return when the clock has moved on by this much."""
+        end_s = self._now_s + seconds
+        wait_for(lambda: self._now_s >= end_s, f"{seconds} s of the Pi's clock")
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._patches.close()
 
 
 class HostSide:
@@ -121,10 +164,12 @@ class HostSide:
 
 
 class Running:
-    """A service in a thread, and the host's end of its sockets."""
+    """A service in a thread with a clock of its own, and the host's end of its sockets."""
 
     def __init__(self, instrument: Instrument, wires: Path) -> None:
+        self.clock = TickingClock()
         self.service = Service(instrument, wires)
+        self.service.executor._machine._clock = self.clock
         self.thread = threading.Thread(target=self.service.serve)
         self.thread.start()
         server = self.service.server
@@ -135,3 +180,4 @@ class Running:
         self.service.stop()
         self.thread.join()
         self.service.close()
+        self.clock.close()

@@ -102,7 +102,7 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
     state = answer(watch)
     assert not state["running"]
     assert "polysight resume" in state["status"]["do"]
-    assert json.loads(watch.motion.data)["left_s"] is None
+    wait_for(lambda: json.loads(watch.motion.data)["left_s"] is None, "that no time is left")
     wait_for(lives, "that it lives again")
 
 

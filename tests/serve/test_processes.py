@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,12 +45,14 @@ class Server:
     def _find_child(self, is_wanted: Callable[[int], bool]) -> int | None:
         own = os.getpriority(os.PRIO_PROCESS, self.program.pid)
         children = Path(f"/proc/{self.program.pid}/task").glob("*/children")
-        for pid in map(int, " ".join(path.read_text() for path in children).split()):
-            # The tracker of the standard library's shared resources is no process of the server.
-            if b"resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                continue
-            if is_wanted(os.getpriority(os.PRIO_PROCESS, pid) - own):
-                return pid
+        # One may end while it is looked at.
+        with suppress(FileNotFoundError, ProcessLookupError):
+            for pid in map(int, " ".join(path.read_text() for path in children).split()):
+                # The tracker of the standard library's shared resources is no process of the server.
+                if b"resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                    continue
+                if is_wanted(os.getpriority(os.PRIO_PROCESS, pid) - own):
+                    return pid
         return None
 
 
@@ -102,6 +104,8 @@ def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_no
     """More silent connections than are kept; a request that came with them is answered when the pages go on."""
     with serving(scans, tmp_path / "state") as server, open_control(scans / "one") as stop, ExitStack() as clients:
         assert ask(server, "/api/page")[2]["connection"] == "close"
+        # Until it has its priority it looks like the door.
+        wait_for(lambda: server.reading_process() is not None, "the reading process")
         door = server.door()
         assert door is not None
         # They come for the whole group, and the server ends its door by itself.

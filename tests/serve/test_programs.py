@@ -6,23 +6,29 @@ import json
 import os
 import shutil
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
+import tomli_w
+import zmq
 from tests.support.page.asking import TOKEN, get, post
 from tests.support.page.live_view import served_folder
-from tests.support.paths import RIG_FILE
-from tests.support.processes import wait_for
+from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
+from tests.support.rigs import published_rig
 
 from polysight.catalogue import PROGRAM, find_program
 from polysight.jobs.live_scan import _check_new
 from polysight.serve import launcher
 from polysight.serve.site import Programs
 from polysight.store import validate
+from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.faults import PiFault
+from polysight_shared.tables import to_builtins
 
 
 @pytest.fixture
@@ -105,36 +111,62 @@ def test_a_scan_may_begin_beside_its_program_and_its_notes(tmp_path):
         _check_new(tmp_path)
 
 
-def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
-    with served_folder(tmp_path, TOKEN, config=RIG_FILE) as view:
+@pytest.fixture
+def refusing_pi(tmp_path: Path) -> Iterator[tuple[Path, Callable[[], None]]]:
+    """A rig file, and what makes its Pi refuse the next command; without that its programs wait for an answer."""
+    rig = published_rig()
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    pi = context.socket(zmq.REP)
+    pi.bind("tcp://127.0.0.1:*")
+    addresses = msgspec.structs.replace(rig.pi, command_address=pi.getsockopt_string(zmq.LAST_ENDPOINT))
+    limits = msgspec.structs.replace(rig.limits, command_timeout_s=HANG_S)
+    config = tmp_path / "rig.toml"
+    config.write_text(tomli_w.dumps(to_builtins(msgspec.structs.replace(rig, pi=addresses, limits=limits))))
+
+    def refuse() -> None:
+        assert pi.poll(round(HANG_S * 1e3))
+        pi.recv()
+        pi.send(m.pack(m.Refused(number=int(PiFault.NOT_READY), problem="its lid is open", cause="", remedy="")))
+
+    yield config, refuse
+    context.destroy(linger=0)
+
+
+def test_a_scan_starts_with_its_plan_and_a_pi_that_refuses_it_says_why(refusing_pi, tmp_path):
+    config, refuse = refusing_pi
+    root = tmp_path / "scans"
+    root.mkdir()
+    with served_folder(root, TOKEN, config=config) as view:
         wrong = [
             {"name": "a"} | wrong_plan
             for wrong_plan in ({"plan": {"rows": 0}}, {"x": 1}, {"plan": {"columns": 1999}}, {"library": "no"})
         ]
         for body, status in [({"name": "../out"}, 404), ({"name": ".hidden"}, 404), *((body, 400) for body in wrong)]:
             assert post(view, "/api/start", body)[0] == status, body
-        assert [p.name for p in tmp_path.iterdir()] == []
+        assert [p.name for p in root.iterdir()] == []
         assert (
             post(view, "/api/start", {"name": "week/one", "plan": {"rows": 3}, "notes": "n", "tags": ["t"]})[0] == 200
         )
-        folder = tmp_path / "week" / "one"
+        folder = root / "week" / "one"
         rig = tomllib.loads((folder / PROGRAM / "instrument.toml").read_text())
         assert rig["grid"]["rows"] == 3
         assert get(view, "/api/scan?scan=week/one")["state"] == "begun"
         assert post(view, "/api/start", {"name": "two"})[0] == 409  # one rig
-        assert not (tmp_path / "two").exists()
+        assert not (root / "two").exists()
+        refuse()
         end_program(folder, "scan")
         wait_for(lambda: find_program(folder, "scan").status is not None, "its status")
         assert find_program(folder, "scan").status != 0
         wait_for(lambda: get(view, "/api/scan?scan=week/one")["state"] == "failed", "the state")
         reason = get(view, "/api/scan?scan=week/one")["reason"]
-        assert len(reason) > 10
+        assert "its lid is open" in reason
         assert "polysight" not in reason
         assert reason in find_program(folder, "scan").log
         assert get(view, "/api/scans")["scans"][0]["tags"] == ["t"]
         # Once more, by the same name
         assert post(view, "/api/start", {"name": "week/one"})[0] == 200
         assert get(view, "/api/scan?scan=week/one")["notes"] == "n"
+        refuse()
         end_program(folder, "scan")
 
 

@@ -5,10 +5,10 @@ import pytest
 from scipy import ndimage
 
 from polysight.imaging import Images
-from polysight.materials.analyse import KnownScene, Optics, analyse, to_metal
+from polysight.materials.analyse import KnownScene, Optics, analyse
 from polysight.materials.common_change import common_change
 from polysight.materials.measure import Scatter, median_ratio
-from polysight.materials.metal import find_halo, metal_by_label, metal_unevenness
+from polysight.materials.metal import find_halo, metal_by_label, metal_unevenness, to_metal
 from polysight.materials.segment import align, segment
 from polysight.polarimetry import calibrate as to_metal_by_paper
 

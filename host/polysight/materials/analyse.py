@@ -16,7 +16,7 @@ import numpy.typing as npt
 from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise, correct_tilt
 from polysight.materials.classify import PAPER, Classifier
 from polysight.materials.common_change import CommonChange, common_change
-from polysight.materials.inversion import EVEN_LIGHT, MOVED, UNEVEN_LIGHT, Inversion, PatchEstimate, RigPrior, invert
+from polysight.materials.inversion import EVEN_LIGHT, MOVED, UNEVEN_LIGHT, Inversion, RigPrior, invert
 from polysight.materials.kinds import (
     Kinds,
     PatchDispersion,
@@ -24,16 +24,11 @@ from polysight.materials.kinds import (
     RatioEvidence,
     inverse_ratio,
     literature,
-    may_be_thin,
     turn_covariance,
 )
 from polysight.materials.measure import (
-    AMPLIFIES,
-    BELOW_AIR,
     BORDER_STD,
     LEAST_STD,
-    POSSIBLE_LAYER,
-    Permittivity,
     Scatter,
     background,
     background_mean,
@@ -43,6 +38,7 @@ from polysight.materials.measure import (
     measure_scatter,
     median_ratio,
     permittivity_of_patch,
+    refuse_impossible,
     relative_errors,
     usual_scatter,
 )
@@ -50,14 +46,15 @@ from polysight.materials.metal import (
     NO_HALO,
     Halo,
     MetalReference,
+    channel_ratio_of,
     find_halo,
     find_metal,
-    gains_as_plates,
     metal_by_label,
     metal_evidence,
     metal_in_box,
     metal_unevenness,
     no_metal,
+    to_metal,
 )
 from polysight.materials.names import NamedPatch, PatchName, add_explanation, name_patch
 from polysight.materials.phase_sign import join_signs, mirror_phases
@@ -78,14 +75,12 @@ from polysight.materials.segment import (
 from polysight.polarimetry import (
     IncidenceChoice,
     PlaneReference,
-    divide_by_metal,
     permittivity_from_ratio,
     ratio,
     remove_leakage,
     smooth,
 )
 from polysight_shared.config import Instrument
-from polysight_shared.errors import DataError
 from polysight_shared.findings import Finding
 
 LEAST_LEAKAGE_STD = 5e-4
@@ -225,13 +220,6 @@ HALO_OF_METAL = 4.0
 HALO_OF_PATCH = 3.0
 """Error of the metal's V / H, and of V on a plate, over the halo of V around them: clipped scenes of an independent
 generator (by 10 to 50 %)."""
-THIN = Finding(
-    "error",
-    POSSIBLE_LAYER,
-    "its V / H, or what it changes over the sweep, is that of a thin plate or a stack with a probability above 0.2",
-    "fit it as a layer: `polysight process --bands 5`, then `polysight permittivity --layer NAME,?,?`",
-)
-"""Why a possible layer gets no permittivity."""
 ANGLE_BY_APART = 1.0
 """Error of the incidence angle, radians per metre between the images of H and V: boards 2 to 5 mm out of place turn it
 by 2 mrad and move the images 2 mm apart (rms; geometry of the published rig)."""
@@ -239,8 +227,6 @@ FILLED = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material."""
 POSSIBLE_SIGN = 0.05
 """Probability of the other sign of the phases from which on a metal that nobody declared has to be one with it, too."""
-ACTIVE = 2.0
-"""Limit in standard deviations of gain, or of a real part below 1, for a permittivity to be impossible."""
 
 
 def analyse(
@@ -294,7 +280,7 @@ def analyse(
         p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _angle(theta, p), estimates.get(p.label))
         for p in segmentation.patches
     }
-    refused |= _impossible(patches, estimates, kinds)
+    refused |= refuse_impossible(patches, estimates, kinds)
     named = _names(classifier, (sh, sv, sp), inversion, judged)
     truth = match_truth(segmentation.patches, known_scene.plates)
     labelled = [(p, p.label) for p in segmentation.patches]
@@ -556,27 +542,6 @@ def name_permittivity(permittivity: complex, covariance: npt.NDArray[np.float64]
     return name_patch((kinds,), (evidence,), np.array([[inverse]])).verdict
 
 
-def _no_material(e: Permittivity) -> Finding | None:
-    """Return why a permittivity is impossible for a passive material, beyond its error; None if it is possible."""
-    if e.value is None or e.real_std is None or e.loss_std is None:
-        return None
-    remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
-    causes = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
-    if e.value.imag > ACTIVE * e.loss_std + 0.02:
-        return Finding("error", AMPLIFIES, causes, remedy)
-    if e.value.real < 1 - ACTIVE * e.real_std - 0.02:
-        return Finding("error", BELOW_AIR, causes, remedy)
-    return None
-
-
-def _impossible(
-    patches: Mapping[int, Permittivity], estimates: Mapping[int, PatchEstimate], kinds: Kinds
-) -> dict[int, Finding]:
-    """Return why patches are no half spaces: an impossible permittivity, or possibly a thin plate."""
-    thin = {label: THIN for label, e in estimates.items() if e.evidence is not None and may_be_thin(e.evidence, kinds)}
-    return thin | {label: reason for label, e in patches.items() if (reason := _no_material(e)) is not None}
-
-
 def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
     """Return the mean incidence angle over a patch, radians."""
     inside = theta[patch.interior] if theta.ndim and patch.interior.any() else theta
@@ -597,20 +562,10 @@ def _weigh_metal(
     """
     evidence = []
     for measured, prior, inversion in solution.signs[:1] if metal.given else solution.signs:
-        channel_ratio = _channel_ratio(images, metal) if prior.channels_known else None
+        channel_ratio = channel_ratio_of(images, metal) if prior.channels_known else None
         patches = dict(zip(labels, measured, strict=True))
         evidence.append(metal_evidence(patches, prior, channel_ratio, kinds, inversion))
     return replace(metal, evidence=min(evidence, key=lambda of_sign: of_sign.score))
-
-
-def _channel_ratio(images: Images, metal: MetalReference) -> complex | None:
-    """Return V / H of the metal reference in the images; None without signal."""
-    h = images.h[metal.mask]
-    v = images.v[metal.mask]
-    power = float(np.sum(np.abs(h.astype(np.complex128)) ** 2))
-    if power > 0:
-        return complex(np.vdot(h.astype(np.complex128), v)) / power
-    return None
 
 
 def _patches(images: Images, known: KnownScene) -> Segmentation:
@@ -638,21 +593,6 @@ def _reference(images: Images, known: KnownScene, found: Segmentation) -> MetalR
     if known.metal is not None:
         return metal_in_box(known.metal, found, images.x_m, images.y_m, images.valid)
     return find_metal(images.h, images.v, found) or no_metal(images.usable)
-
-
-def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | None) -> Images:
-    """Divide both channels by metal, in the scene or scanned separately; leakage is not removed.
-
-    Without any signal of metal to divide by, the images are returned unchanged.
-    """
-    if reference is not None:
-        return reference.apply(images)
-    try:
-        return divide_by_metal(images, *gains_as_plates(images, metal.mask))
-    except DataError:
-        if metal.given:
-            raise
-        return divide_by_metal(images, 1.0 + 0j, 1.0 + 0j)
 
 
 def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:

@@ -17,7 +17,7 @@ from polysight.imaging import Dispersion, Image, Images, Mask
 from polysight.materials.inversion import (
     PatchEstimate,
 )
-from polysight.materials.kinds import PatchDispersion, PatchMeasurement, permittivity_slope
+from polysight.materials.kinds import Kinds, PatchDispersion, PatchMeasurement, may_be_thin, permittivity_slope
 from polysight.materials.segment import Patch, Segmentation
 from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import PlaneReference, inverse_spread, permittivity_from_ratio
@@ -81,6 +81,15 @@ BELOW_AIR = "its permittivity would be below that of air"
 POSSIBLE_LAYER = "possible layer"
 NOT_PASSIVE = (AMPLIFIES, BELOW_AIR, POSSIBLE_LAYER)
 """Reasons for refusing plates that are no half spaces; they may be fitted as layers."""
+THIN = Finding(
+    "error",
+    POSSIBLE_LAYER,
+    "its V / H, or what it changes over the sweep, is that of a thin plate or a stack with a probability above 0.2",
+    "fit it as a layer: `polysight process --bands 5`, then `polysight permittivity --layer NAME,?,?`",
+)
+"""Why a possible layer gets no permittivity."""
+ACTIVE = 2.0
+"""Limit in standard deviations of gain, or of a real part below 1, for a permittivity to be impossible."""
 
 
 def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[float, float]:
@@ -595,3 +604,24 @@ def permittivity_of_patch(
         covariance=estimate.covariance,
         shares=estimate.shares,
     )
+
+
+def _no_material(e: Permittivity) -> Finding | None:
+    """Return why a permittivity is impossible for a passive material, beyond its error; None if it is possible."""
+    if e.value is None or e.real_std is None or e.loss_std is None:
+        return None
+    remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
+    causes = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
+    if e.value.imag > ACTIVE * e.loss_std + 0.02:
+        return Finding("error", AMPLIFIES, causes, remedy)
+    if e.value.real < 1 - ACTIVE * e.real_std - 0.02:
+        return Finding("error", BELOW_AIR, causes, remedy)
+    return None
+
+
+def refuse_impossible(
+    patches: Mapping[int, Permittivity], estimates: Mapping[int, PatchEstimate], kinds: Kinds
+) -> dict[int, Finding]:
+    """Return why patches are no half spaces: an impossible permittivity, or possibly a thin plate."""
+    thin = {label: THIN for label, e in estimates.items() if e.evidence is not None and may_be_thin(e.evidence, kinds)}
+    return thin | {label: reason for label, e in patches.items() if (reason := _no_material(e)) is not None}

@@ -28,7 +28,7 @@ from polysight.materials.kinds import METAL_SHARE, METAL_SPREAD, Kinds, PatchMea
 from polysight.materials.measure import median_ratio
 from polysight.materials.segment import Box, Patch, Segmentation, box_mask
 from polysight.materials.specimens import METAL_UNLIKE
-from polysight.polarimetry import metal_gains
+from polysight.polarimetry import PlaneReference, divide_by_metal, metal_gains
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -310,6 +310,31 @@ def gains_as_plates(images: Images, metal_mask: Mask) -> tuple[complex, complex]
     if not np.isfinite(metal_p) or metal_p == 0:
         return gain_h, gain_v
     return gain_h * metal_p, gain_v
+
+
+def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | None) -> Images:
+    """Divide both channels by metal, in the scene or scanned separately; leakage is not removed.
+
+    Without any signal of metal to divide by, the images are returned unchanged.
+    """
+    if reference is not None:
+        return reference.apply(images)
+    try:
+        return divide_by_metal(images, *gains_as_plates(images, metal.mask))
+    except DataError:
+        if metal.given:
+            raise
+        return divide_by_metal(images, 1.0 + 0j, 1.0 + 0j)
+
+
+def channel_ratio_of(images: Images, metal: MetalReference) -> complex | None:
+    """Return V / H of the metal reference in the images; None without signal."""
+    h = images.h[metal.mask]
+    v = images.v[metal.mask]
+    power = float(np.sum(np.abs(h.astype(np.complex128)) ** 2))
+    if power > 0:
+        return complex(np.vdot(h.astype(np.complex128), v)) / power
+    return None
 
 
 def metal_unevenness(images: Images, metal_mask: Mask) -> float:

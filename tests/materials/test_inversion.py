@@ -231,7 +231,7 @@ def test_a_mount_that_has_moved_is_found_whatever_is_drawn(draw):
     prior = RigPrior(0.0015, leakage_std=0.003, leakage_measured=True, channels_known=True, moved=0.05)
     turned = world(np.random.default_rng(0), (0j, 0.055), eps=PUBLISHED[:8])
     model = SceneLikelihood(turned, prior, kinds)
-    particles, _ = sample_posterior(model, np.random.default_rng(draw))
+    particles, _, _ = sample_posterior(model, np.random.default_rng(draw))
     assert model.has_moved(particles).mean() > 0.9
     _, into_v = model.leakage(particles)
     assert abs(into_v.mean() - 0.055) < 0.015

@@ -7,7 +7,7 @@ from tests.support.refusals import refused
 
 from polysight.materials import Labels, SegmentSettings, pack_labels, read_labels
 from polysight.materials.labels import patches_from_labels
-from polysight.materials.metal import find_metal, metal_by_label, metal_in_box
+from polysight.materials.metal import find_metals, metal_by_label, metal_in_box
 from polysight.materials.segment import box_mask, match_truth, segment
 from polysight_shared.error_codes import ErrorCode
 
@@ -117,7 +117,7 @@ def test_metal_is_found_by_itself_whatever_the_gains(synthetic, request):
     for seed in range(4 if request.config.getoption("--long") else 2):
         scene = synthetic(seed, gain_v=0.05j)
         segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-        metal = find_metal(scene.h, scene.v, segmentation)
+        metal = find_metals(scene.h, scene.v, segmentation)[0]
         assert match_truth(segmentation.patches, scene.plates)[metal.label].name == "copper"
         assert scene.analyse().metal.certain
         assert "brightest in both channels" in metal.how

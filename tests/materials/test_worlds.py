@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.worlds import CHI2_95, analyse_world, judge_world
+from benchmarks.worlds import CHI2_95, analyse_world, judge_world, pixel_boxes
 
 from polysight.materials import UNKNOWN
 from polysight_worlds import METAL, Plate, Stack, World, published_rig, simulate
@@ -79,3 +79,22 @@ def test_declared_copper_is_never_withdrawn(beside):
 def test_a_dielectric_declared_as_metal_is_found_out(eps):
     analysis, _ = analyse_world(simulate(world(half_space(3.0 - 0.1j), half_space(eps))), declared="plate 1")
     assert analysis.metal.evidence.against
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "coat", [(3.2 - 0.1j, 0.15e-3), (2.7 - 0.02j, 1.8e-3)], ids=["paint", "a sheet of plastic on metal"]
+)
+def test_the_reference_is_bare_metal_though_coated_metal_beside_it_is_brighter(coat):
+    pair = simulate(world(*map(half_space, (2.6 - 0.02j, 4 - 0.4j, 5 - 1.1j)), Stack((coat,), METAL.below)))
+    # As other plates, metal may be lit less than its neighbours.
+    (left, bottom, right, top), *_ = (box for plate, box in pixel_boxes(pair) if plate.name == "copper")
+    for channel in (pair.h, pair.v):
+        channel[bottom - 4 : top + 4, left - 4 : right + 4] *= 0.9
+    analysis, plates = analyse_world(pair, declared=None)
+    level = {
+        plates[p.label].name: np.median(np.abs((analysis.h * analysis.v)[p.interior]))
+        for p in analysis.segmentation.patches
+    }
+    assert level["plate 3"] > level["copper"]
+    assert plates[analysis.metal.label].name == "copper"

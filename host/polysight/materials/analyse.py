@@ -48,7 +48,7 @@ from polysight.materials.metal import (
     MetalReference,
     channel_ratio_of,
     find_halo,
-    find_metal,
+    find_metals,
     metal_by_label,
     metal_evidence,
     metal_in_box,
@@ -245,33 +245,14 @@ def analyse(
     images, apart_mm = align(images)
     segmentation = _patches(images, known_scene)
     images, tilts = level(images, segmentation)
-    reference = _reference(images, known_scene, segmentation)
-    raw = to_metal(images, reference, plane)
-    rh, rv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (raw.h, raw.v))
-    refused = check_patches(segmentation, rh, rv, background(raw.h, raw.v, segmentation, images.usable), reference.mask)
-    refused |= {p.label: STEEP for p in segmentation.patches if p.label in tilts.steep}
-    judged = [p for p in segmentation.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
-    scene = Seen.collect(
-        channels=(rh, rv),
-        raw=raw,
-        judged=judged,
-        found=segmentation,
-        reference=reference,
-        plane=plane,
-        images=images,
-        tilts=tilts,
-    )
-    prior = scene.prior(optics.prior, float(np.hypot(*apart_mm)))
-    dispersions = measure_dispersions(images, segmentation, judged, reference.mask, plane)
-    measured = [scene.measure(p, (rh, rv), _angle(theta, p), d) for p, d in zip(judged, dispersions, strict=True)]
     kinds = _kinds(classifier, float(np.mean(theta)))
+    scene = _Scene(images, segmentation, tilts, float(np.hypot(*apart_mm)), plane, optics, kinds)
+    relative = _most_like_metal([scene.relative_to(metal) for metal in _references(images, known_scene, segmentation)])
+    reference, raw, judged, solution = relative.metal, relative.raw, relative.judged, relative.solution
     labels = [p.label for p in judged]
-    solution = _solve(measured, prior, kinds, optics.other_sign)
     inversion = solution.inversion
-    if plane is None:
-        reference = _weigh_metal(images, reference, labels, solution, kinds)
-    calibrated = remove_leakage(raw, inversion.known_leakage(prior))
+    calibrated = remove_leakage(raw, inversion.known_leakage(relative.prior))
     sh, sv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
     estimates = dict(zip(labels, inversion.patches, strict=True))
@@ -280,19 +261,20 @@ def analyse(
         p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _angle(theta, p), estimates.get(p.label))
         for p in segmentation.patches
     }
-    refused |= refuse_impossible(patches, estimates, kinds)
+    refused = relative.refused | refuse_impossible(patches, estimates, kinds)
     named = _names(classifier, (sh, sv, sp), inversion, judged)
     truth = match_truth(segmentation.patches, known_scene.plates)
     labelled = [(p, p.label) for p in segmentation.patches]
     results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in labelled)
     return MaterialsResult(
         calibrated=calibrated, h=sh, v=sv, p=sp, metal=reference, segmentation=segmentation, patches=results,
-        theta_rad=theta, inversion=inversion, prior=prior, tilts=tilts,
+        theta_rad=theta, inversion=inversion, prior=relative.prior, tilts=tilts,
         boxes=dict(known_scene.names), library=() if classifier is None else classifier.names,
         brightness_off={label: ln for label, ln in brightness_off.items() if np.isfinite(ln)},
         evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
-        apart_mm=apart_mm, drift=scene.change, halo=scene.halo.level, behind=scene.usual_background(measured),
-        ripple=scene.usual, disturbed=scene.disturbed, relief_rad=scene.relief_rad, other_sign=solution.other_sign,
+        apart_mm=apart_mm, drift=relative.seen.change, halo=relative.seen.halo.level,
+        behind=relative.seen.usual_background(relative.measured), ripple=relative.seen.usual,
+        disturbed=relative.seen.disturbed, relief_rad=relative.seen.relief_rad, other_sign=solution.other_sign,
     )  # fmt: skip
 
 
@@ -490,6 +472,87 @@ class Seen:
         return 0.0
 
 
+@dataclass(frozen=True)
+class _Relative:
+    """A scene relative to a metal reference, which has the evidence of the other patches if it is in the scene.
+
+    Attributes
+    ----------
+    raw
+        Images relative to it.
+    refused
+        Patch number to why the patch is no flat plate; the others but for the reference are `judged`.
+    seen, prior
+        What the plates show of the scene's errors, and the prior of the rig's errors with it.
+    measured
+        The judged patches as the joint inversion takes them.
+    """
+
+    metal: MetalReference
+    raw: Images
+    refused: dict[int, Finding]
+    judged: list[Patch]
+    seen: Seen
+    prior: RigPrior
+    measured: list[PatchMeasurement]
+    solution: _Solution
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A scene before anything is divided by metal: images, patches, and what is known of the rig and of materials."""
+
+    images: Images
+    segmentation: Segmentation
+    tilts: Tilts
+    apart_mm: float
+    plane: PlaneReference | None
+    optics: Optics
+    kinds: Kinds
+
+    def relative_to(self, reference: MetalReference) -> _Relative:
+        """Measure and solve the scene relative to this reference, and weigh whether it is metal."""
+        images = self.images
+        found = self.segmentation
+        theta = np.asarray(self.optics.theta_rad, np.float64)
+        raw = to_metal(images, reference, self.plane)
+        rh, rv = (smooth_inside(c, found, self.optics.smooth_px) for c in (raw.h, raw.v))
+        refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
+        refused |= {p.label: STEEP for p in found.patches if p.label in self.tilts.steep}
+        judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
+        seen = Seen.collect(
+            channels=(rh, rv),
+            raw=raw,
+            judged=judged,
+            found=found,
+            reference=reference,
+            plane=self.plane,
+            images=images,
+            tilts=self.tilts,
+        )
+        prior = seen.prior(self.optics.prior, self.apart_mm)
+        dispersions = measure_dispersions(images, found, judged, reference.mask, self.plane)
+        measured = [seen.measure(p, (rh, rv), _angle(theta, p), d) for p, d in zip(judged, dispersions, strict=True)]
+        solution = _solve(measured, prior, self.kinds, self.optics.other_sign)
+        if self.plane is None:
+            labels = [p.label for p in judged]
+            reference = _weigh_metal(images, reference, labels, solution, self.kinds)
+        return _Relative(reference, raw, refused, judged, seen, prior, measured, solution)
+
+
+def _most_like_metal(relatives: Sequence[_Relative]) -> _Relative:
+    """Return the scene relative to the reference that the other patches show best to be bare metal: the first in doubt.
+
+    What contradicts itself by its own V / H is none.
+    """
+
+    def bare(relative: _Relative) -> float:
+        evidence = relative.metal.evidence
+        return -np.inf if evidence is None or evidence.against else evidence.bare
+
+    return max(relatives, key=bare)
+
+
 def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
     """Return what the patches may be: the library's materials at the library's angle, if there is one, and others."""
     if classifier is None or len(classifier.kinds) != 1:
@@ -584,15 +647,15 @@ def _patches(images: Images, known: KnownScene) -> Segmentation:
     return segmentation
 
 
-def _reference(images: Images, known: KnownScene, found: Segmentation) -> MetalReference:
-    """Return the given metal reference, or else the brightest patch; none without patches."""
+def _references(images: Images, known: KnownScene, found: Segmentation) -> tuple[MetalReference, ...]:
+    """Return the given metal reference, or else the brightest patch and others like it; none without patches."""
     if isinstance(known.metal, PlaneReference):
-        return MetalReference(known.metal.valid, None, known.metal.how, given=True)
+        return (MetalReference(known.metal.valid, None, known.metal.how, given=True),)
     if isinstance(known.metal, int):
-        return metal_by_label(known.metal, found)
+        return (metal_by_label(known.metal, found),)
     if known.metal is not None:
-        return metal_in_box(known.metal, found, images.x_m, images.y_m, images.valid)
-    return find_metal(images.h, images.v, found) or no_metal(images.usable)
+        return (metal_in_box(known.metal, found, images.x_m, images.y_m, images.valid),)
+    return find_metals(images.h, images.v, found) or (no_metal(images.usable),)
 
 
 def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:

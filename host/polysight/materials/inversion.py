@@ -136,8 +136,6 @@ class RigPrior:
         Probability that a mount whose leakage was measured has moved since.
     metal_rise
         Rise of the metal reference along x and across the plane of incidence, radians.
-    turn, turn_std
-        Leakage by the rise across the plane of incidence, per radian, and its standard deviation.
     lighting_std
         Standard deviation of G along x and across: per radian of a plate's rise.
     painted
@@ -153,8 +151,6 @@ class RigPrior:
     brightness_range: tuple[float, float] = BRIGHTNESS_RANGE
     moved: float = 0.0
     metal_rise: tuple[float, float] = (0.0, 0.0)
-    turn: float = TURN
-    turn_std: float = TURN_STD
     lighting_std: tuple[float, float] = UNEVEN_LIGHT
     painted: float = PAINTED
 
@@ -218,8 +214,8 @@ class Inversion:
         float64 [6, 6] of a, b, rho (real and imaginary parts), in standard deviations of their prior.
     moved
         Probability that the mount has moved since its leakage was measured.
-    painted
-        Probability that the metal reference is painted.
+    painted, log_bare
+        Probability that the metal reference is painted, and the logarithm of the probability that it is bare.
     paint_rad
         Phase of its 1 / P by the paint, if it is: the mean.
     log_evidence
@@ -239,6 +235,7 @@ class Inversion:
     nuisance_covariance: Real = field(repr=False)
     moved: float
     painted: float
+    log_bare: float
     paint_rad: float
     log_evidence: float
     fit: Real = field(repr=False)
@@ -278,35 +275,38 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | Non
     """
     model = SceneLikelihood(seen, prior, kinds)
     rng = np.random.default_rng(0)
-    posterior, log_evidence = sample_posterior(model, rng)
+    drawn = sample_posterior(model, rng)
     all_evidence = np.ones(model.patch_count + 1)
     patches = []
     for i in range(model.patch_count):
         # A patch is measured without the belief that it must be some material itself.
         without_patch = all_evidence.copy()
         without_patch[i + 1] = 0.0
-        particles, _ = _anneal(model, posterior, all_evidence, without_patch, rng)
+        particles, _ = _anneal(model, drawn[0], all_evidence, without_patch, rng)
         patches.append(_estimate(model, particles, i, rng))
-    return _solution(model, posterior, log_evidence, tuple(patches))
+    return _solution(model, drawn, tuple(patches))
 
 
-def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[Real, float]:
-    """Return particles of the posterior of the common errors, and the log evidence.
+def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[Real, float, float]:
+    """Return particles of the posterior of the common errors, the log evidence, and the log probability of bare metal.
 
     Whether the mount has moved and whether the metal is painted are sampled apart and weighed by their evidence: what
     fits of each is so small a part of its prior that among few particles of all none may lie there.
     """
     no_evidence = np.zeros(model.patch_count + 1)
     samples = []
-    log_weights = []
+    log_weights: list[float] = []
+    log_bare = -np.inf
     for hypothesis, probability in model.hypotheses():
         prior_particles = rng.standard_normal((PARTICLES, model.width))
         z, log_evidence = _anneal(hypothesis, prior_particles, no_evidence, no_evidence + 1, rng)
         samples.append(hypothesis.within(model.prior, z))
-        log_weights.append(np.log(probability) + log_evidence)
-    weight = np.exp(np.array(log_weights) - max(log_weights))
-    chosen = _resample(np.repeat(weight, PARTICLES), rng)[:: len(samples)]
-    return np.concatenate(samples)[chosen], max(log_weights) + float(np.log(weight.sum()))
+        log_weights.append(float(np.log(probability) + log_evidence))
+        if hypothesis.prior.painted == 0:
+            log_bare = np.logaddexp(log_bare, log_weights[-1])
+    log_evidence = float(scipy.special.logsumexp(log_weights))
+    chosen = _resample(np.repeat(np.exp(np.array(log_weights) - log_evidence), PARTICLES), rng)[:: len(samples)]
+    return np.concatenate(samples)[chosen], log_evidence, float(log_bare) - log_evidence
 
 
 class SceneLikelihood:
@@ -402,7 +402,7 @@ class SceneLikelihood:
 
     def turn(self, z: Real) -> Real:
         """Return the turn of the polarisations by a rise across the plane of incidence, [..., 1], per radian."""
-        return self.prior.turn + self.prior.turn_std * z[..., TURN_BY_RISE, None]
+        return TURN + TURN_STD * z[..., TURN_BY_RISE, None]
 
     def lighting(self, z: Real) -> Complex:
         """Return the change of ln(V / H) of each patch by its rise relative to the metal's, [..., patch]."""
@@ -451,12 +451,8 @@ class SceneLikelihood:
         """Return the permittivity of every patch, [..., patch]."""
         return np.asarray(permittivity_from_ratio(self.ratios(z), self.angle(z)), np.complex128)
 
-    def brightness_off(self, z: Real) -> Real:
-        """Return ln |H| of every patch minus that of Eq. 2 and the metal's, [..., patch]."""
-        return self._brightness_off(z, self.ratios(z))
-
-    def _brightness_off(self, z: Real, t: Complex) -> Real:
-        """Return the same, given the ratios of these particles."""
+    def brightness_off(self, z: Real, t: Complex) -> Real:
+        """Return ln |H| of every patch minus that of Eq. 2 and the metal's, [..., patch], given `ratios` of z."""
         a, _ = self.leakage_of_patches(z)
         with np.errstate(divide="ignore", invalid="ignore"):
             model = log_half_space_brightness(t, self.angle(z)) + np.log(np.abs((1 + a * t) / (1 + a)))
@@ -482,7 +478,7 @@ class SceneLikelihood:
 
     def _log_likelihoods(self, z: Real, t: Complex) -> Real:
         """Return the same, given the ratios of these particles."""
-        density = brightness_density(self._brightness_off(z, t), self.brightness_std(z)[..., None])
+        density = brightness_density(self.brightness_off(z, t), self.brightness_std(z)[..., None])
         brightness_log = np.where(self.bright, np.log(density + 1e-300), 0.0).sum(axis=-1, keepdims=True)
         if self.kinds is None:
             no_evidence = np.zeros((*brightness_log.shape[:-1], self.patch_count))
@@ -575,8 +571,11 @@ def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:
     return np.minimum(np.searchsorted(np.cumsum(weight) / weight.sum(), places), weight.size - 1)
 
 
-def _solution(model: SceneLikelihood, z: Real, log_evidence: float, patches: tuple[PatchEstimate, ...]) -> Inversion:
-    """Collect the solution from particles of the posterior."""
+def _solution(
+    model: SceneLikelihood, drawn: tuple[Real, float, float], patches: tuple[PatchEstimate, ...]
+) -> Inversion:
+    """Collect the solution from what `sample_posterior` returns."""
+    z, log_evidence, log_bare = drawn
     prior = model.prior
     paint = model.paint(z)
     painted = paint > 0
@@ -596,13 +595,14 @@ def _solution(model: SceneLikelihood, z: Real, log_evidence: float, patches: tup
         prior_std=prior.leakage_std,
         theta_error_rad=float(prior.theta_std_rad * z[:, ANGLE].mean()),
         theta_std_rad=float(prior.theta_std_rad * np.std(z[:, ANGLE])),
-        brightness_off=np.where(model.bright, np.median(model.brightness_off(z), axis=0), np.nan),
+        brightness_off=np.where(model.bright, np.median(model.brightness_off(z, model.ratios(z)), axis=0), np.nan),
         brightness_std=float(np.exp(np.log(model.brightness_std(z)).mean())),
         nuisance_covariance=covariance,
         moved=float(model.has_moved(z).mean()),
         painted=float(painted.mean()),
         paint_rad=float(paint[painted].mean()) if painted.any() else 0.0,
         log_evidence=log_evidence,
+        log_bare=log_bare,
         fit=model.log_likelihoods(z)[:, 1:].mean(axis=0),
     )
 
@@ -666,7 +666,7 @@ def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvi
         library_share = float(model.library_share(z).mean())
     brightness_off = np.nan
     if model.bright[i]:
-        brightness_off = float(np.median(model.brightness_off(z)[:, i]))
+        brightness_off = float(np.median(model.brightness_off(z, model.ratios(z))[:, i]))
     return RatioEvidence(
         theta_rad=kinds.theta_rad,
         inverse_ratio=complex(t.mean()),

@@ -55,8 +55,14 @@ CONFLICT_SCORE = 0.0
 """Score below which a declared metal is told to be doubtful, with the patch that fits it least: a dielectric fits the
 others better. Metal has 1.3 or more in 52 scenes of a generator that knows nothing of this estimator, dielectrics
 declared as metal -0.3 to -8 in eleven."""
-LEAST_PROBABILITY = 1e-3
-"""Least probability that is told from zero with so few particles."""
+PAINT_SCORE = 7.0
+"""Score that painted metal lacks at most to count as metal: paint is told apart from it, and its error is counted."""
+ALIKE_DB = 2.5
+LEAST_METAL_LEVEL = 0.15
+MOST_METALS = 3
+"""V / H and |H||V| relative to the brightest patch's from which on another patch may be the metal instead, and how many
+patches are compared: coated metal (sheets, boards with copper behind) may be the brighter one. Dielectrics reflect p by
+8 dB less; all nuisances together have made bare metal darker than a coated one by a factor of four."""
 HALO_MM = (6.0, 36.0)
 """Distances from the metal's edge at which its halo is measured."""
 AROUND_MM = (4.0, 14.0)
@@ -81,7 +87,7 @@ class MetalEvidence:
     score
         Logarithm of the ratio of the evidences of metal and of a dielectric; positive values support metal.
     bare
-        The same for metal without any paint.
+        The same for metal without any paint; of several patches like metal the one with the largest is the reference.
     others
         Number of other patches that differ from the judged one. Similar patches give no evidence: metal beside metal
         looks like water beside water.
@@ -99,15 +105,20 @@ class MetalEvidence:
 
     @property
     def needed(self) -> float:
-        """Least score of bare metal to count as metal that nobody declared."""
+        """Least score to count as metal that nobody declared."""
         if self.others == 0:
             return np.inf
         return LEAST_SCORE * float(np.sqrt(self.others))
 
     @property
+    def metal(self) -> float:
+        """Score of metal that may be painted, which costs `PAINT_SCORE` at most."""
+        return max(self.bare, self.score - PAINT_SCORE)
+
+    @property
     def sure(self) -> bool:
         """True if it is certainly metal: very lossy dielectrics (wet, conducting) come close to metal."""
-        return self.enough and self.bare >= self.needed + SURE_MARGIN
+        return self.enough and self.metal >= self.needed + SURE_MARGIN
 
     @property
     def against(self) -> bool:
@@ -116,9 +127,9 @@ class MetalEvidence:
 
     @property
     def enough(self) -> bool:
-        """True if the patch is shown to be bare metal."""
+        """True if the patch is shown to be metal."""
         doubtful = self.channel_ratio_db is not None and self.channel_ratio_db < DOUBTFUL_V_DB
-        return self.bare >= self.needed and not doubtful
+        return self.metal >= self.needed and not doubtful
 
 
 def log_evidence_of_dielectric(
@@ -210,7 +221,7 @@ def metal_evidence(
     score = inversion.log_evidence - log_evidence_of_dielectric(measurements, prior, kinds, level_db)
     if level_db is not None:
         score -= 0.5 * (level_db / CHANNEL_RATIO_STD_DB) ** 2
-    bare = score + float(np.log(max(1 - inversion.painted, LEAST_PROBABILITY) / (1 - prior.painted)))
+    bare = score + inversion.log_bare - float(np.log1p(-prior.painted))
     culprit = None
     if score < CONFLICT_SCORE:
         fit = dict(zip(patches, inversion.fit.tolist(), strict=True))
@@ -343,32 +354,36 @@ def metal_unevenness(images: Images, metal_mask: Mask) -> float:
     return float(abs(np.log(rms_v / rms_h)))
 
 
-def find_metal(h: Image, v: Image, segmentation: Segmentation) -> MetalReference | None:
-    """Return the patch that is brightest in both channels; None without patches.
+def find_metals(h: Image, v: Image, segmentation: Segmentation) -> tuple[MetalReference, ...]:
+    """Return the patch that is brightest in both channels, then others that may be the metal; empty without patches.
 
     The measure is median |H||V| over the interior. Metal reflects both polarisations fully (|r_s| = |r_p| = 1), every
     dielectric loses most of p at these angles; the product does not depend on the unknown gains of H and V. The
     brightest patch of a scene without metal is a dielectric: whether it is metal is another question
-    (:func:`metal_evidence`).
+    (:func:`metal_evidence`), as is which of several is bare.
     """
-    scores = sorted(
-        (
-            (float(np.median(np.abs(h[p.interior]) * np.abs(v[p.interior]))), p)
-            for p in segmentation.patches
-            if p.interior.any()
-        ),
-        key=lambda s: -s[0],
-    )
-    if not scores:
-        return None
-    best, patch = scores[0]
-    margin = best / scores[1][0] if len(scores) > 1 and scores[1][0] > 0 else float("inf")
-    if len(scores) == 1:
-        beside = "the only patch found"
-    else:
+    seen = [p for p in segmentation.patches if p.interior.any()]
+    size_h, size_v = (np.array([np.median(np.abs(image[p.interior])) for p in seen]) for image in (h, v))
+    product = size_h * size_v
+    order = np.argsort(-product, kind="stable")
+    if not seen:
+        return ()
+    best = order[0]
+    beside = "the only patch found"
+    if len(seen) > 1:
+        margin = np.inf if product[order[1]] == 0 else product[best] / product[order[1]]
         beside = f"|H||V| {margin:.1f} times the next"
-    description = f"chosen as the patch that is brightest in both channels ({beside})"
-    return MetalReference(patch.interior, patch.label, description)
+    described = f"chosen as the patch that is brightest in both channels ({beside})"
+    metals = [MetalReference(seen[best].interior, seen[best].label, described)]
+    for i in order[1:MOST_METALS]:
+        alike = size_v[i] * size_h[best] > size_v[best] * size_h[i] * 10 ** (-ALIKE_DB / 20)
+        if alike and product[i] > LEAST_METAL_LEVEL * product[best]:
+            described = (
+                f"chosen as bare metal by the other patches (|H||V| {product[i] / product[best]:.1f} times that of "
+            )
+            described += f"patch {seen[best].label}, which is brighter and fits them less)"
+            metals.append(MetalReference(seen[i].interior, seen[i].label, described))
+    return tuple(metals)
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,27 @@ def test_commands_are_obeyed_once(control):
     assert stop.now
 
 
+def test_a_sender_waits_until_its_command_is_obeyed(tmp_path):
+    """The scan's thread is held on its way from the command's file to the stop request."""
+    still_waiting = []
+
+    class HeldRequest(StopRequest):
+        def request(self, asker: str = "") -> None:
+            sender.join(0.3)
+            still_waiting.append(sender.is_alive())
+            super().request(asker)
+
+    stop = HeldRequest()
+    sender = threading.Thread(target=lambda: send_command(tmp_path, ScanCommand.STOP))
+    with ControlFolder(tmp_path, stop) as control:
+        control.open()
+        wait_for((tmp_path / CONTROL / ALIVE).exists, "the first sign of life")
+        sender.start()
+        sender.join()
+        assert stop.after_row
+    assert still_waiting == [True]
+
+
 def test_touch_in_a_shell_is_a_command(control):
     folder, stop = control
     (folder / CONTROL / "pause").touch()

@@ -2,7 +2,7 @@
 
 Ctrl-C and SIGTERM set a `StopRequest`, which any thread may read. Other programs send a `ScanCommand` by creating an
 empty file with the command's name in `<scan>/control/`; `touch SCAN/control/pause` in a shell does the same. The scan
-creates that folder when it begins, removes each command file and then obeys it, writes `alive` once a second, and
+creates that folder when it begins, renames each command file, obeys and removes it, writes `alive` once a second, and
 removes the folder at its end. A command file may hold who sent it. `alive` says which process scans, what it does and
 what it was asked (`read_life`), so that page, list and terminal tell a killed scan from one that runs. Specification:
 docs/spec/scan-folder.md.
@@ -233,12 +233,16 @@ class ControlFolder:
             (self._folder / ALIVE).touch()
 
     def _obey(self, command: ScanCommand) -> None:
-        """Obey a command if its file exists. The file is removed first, or it would be obeyed again and again."""
+        """Obey a command if its file exists.
+
+        The file is renamed first: its sender can no longer withdraw it, and waits. A file that cannot be renamed is not
+        obeyed, because it would be obeyed again and again.
+        """
         path = self._folder / command
         if not path.exists():
             return
         asker = _read_asker(path)
-        path.unlink()
+        accepted = path.replace(_accepted_path(path))
         if command in (ScanCommand.PAUSE, ScanCommand.CONTINUE):
             self._stop.paused = command is ScanCommand.PAUSE
             self._stop.asker = asker
@@ -248,6 +252,7 @@ class ControlFolder:
         # A second `stop` (double click) must not abort the row.
         elif not self._stop.after_row:
             self._stop.request(asker)
+        accepted.unlink()
 
     def _clear(self) -> None:
         for path in self._folder.iterdir():
@@ -266,6 +271,11 @@ class ControlFolder:
         self.close()
 
 
+def _accepted_path(path: Path) -> Path:
+    """Path of a command's file while the command is being obeyed."""
+    return path.with_name(f".{path.name}.accepted")
+
+
 def _read_asker(path: Path) -> str:
     """Who sent a command: the text of its file, which a shell's `touch` leaves empty."""
     with path.open("rb") as f:
@@ -275,7 +285,7 @@ def _read_asker(path: Path) -> str:
 
 
 def send_command(folder: Path, command: ScanCommand, asker: str = "a program", limit_s: float = _TIMEOUT_S) -> None:
-    """Send a command to the scan that runs in `folder`, in the name of `asker`; return when it has been accepted.
+    """Send a command to the scan that runs in `folder`, in the name of `asker`; return when it has been obeyed.
 
     Raises ScanError if no scan runs there, or it does not accept the command in time; the command is then withdrawn.
     """
@@ -301,16 +311,19 @@ def send_command(folder: Path, command: ScanCommand, asker: str = "a program", l
             code=ErrorCode.NO_ANSWER,
         ) from None
     deadline = time.monotonic() + limit_s
-    while path.exists():
+    while path.exists() or _accepted_path(path).exists():
         if time.monotonic() > deadline:
-            with suppress(FileNotFoundError):
+            try:
                 path.unlink()
-                raise ScanError(
-                    f"{folder}: the scan did not accept `{command}` within {limit_s:g} s; the command is withdrawn",
-                    "its program was killed, or hangs",
-                    "press Ctrl-C in its terminal; the emergency stop stops the stage",
-                    code=ErrorCode.NO_ANSWER,
-                )
+            except FileNotFoundError:
+                # Accepted at the last moment.
+                return
+            raise ScanError(
+                f"{folder}: the scan did not accept `{command}` within {limit_s:g} s; the command is withdrawn",
+                "its program was killed, or hangs",
+                "press Ctrl-C in its terminal; the emergency stop stops the stage",
+                code=ErrorCode.NO_ANSWER,
+            )
         time.sleep(_POLL_S / 4)
 
 

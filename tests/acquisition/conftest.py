@@ -4,20 +4,46 @@ from __future__ import annotations
 
 import pytest
 import tomli_w
+import zmq
 from tests.support.acquisition.fake_cards import make_payload
 from tests.support.acquisition.fake_rig import FakeRig, small_instrument
 from tests.support.page.fixtures import finished, samples
 
-from polysight.acquisition import capture_rig
-from polysight.capture import ReceiverProcess
+from polysight.acquisition import capture_rig, scan
+from polysight.acquisition.pi_client import PiClient
+from polysight.capture import CardClient, ReceiverProcess
 from polysight_shared.tables import to_builtins
 
 __all__ = ["finished", "samples"]
 
 
 @pytest.fixture
-def rig():
+def rig(monkeypatch):
+    """The timeout of a command passes where the fake Pi loses its reply or the fake card is mute, and nowhere else."""
     fake = FakeRig(small_instrument())
+
+    class Pi(PiClient):
+        def __init__(self, *settings):
+            super().__init__(*settings)
+            lost = fake.pi.replies_lost
+            poll = self._commands.poll
+
+            def poll_until_lost(_):
+                nonlocal lost
+                while not poll(5):
+                    if fake.pi.replies_lost > lost:
+                        lost += 1
+                        return 0
+                return zmq.POLLIN
+
+            self._commands.poll = poll_until_lost
+
+    class Card(CardClient):
+        def _try(self, code, data, limit_s):
+            return super()._try(code, data, 0.01 if fake.cards[self.board.name].mute else limit_s)
+
+    monkeypatch.setattr(scan, "PiClient", Pi)
+    monkeypatch.setattr(capture_rig, "CardClient", Card)
     fake.start()
     yield fake
     fake.close()

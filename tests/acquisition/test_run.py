@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from tests.support.acquisition.fake_cards import FULL, FakeCard, make_payload
 from tests.support.acquisition.fake_rig import FakeRig
-from tests.support.processes import wait_for
+from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 from tests.support.store.plain_scan import errors
 
+from polysight.acquisition import capture_rig
 from polysight.acquisition.capture_rig import CaptureRig
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.scan import resume_scan, run_scan, takes_so_far
@@ -173,8 +174,9 @@ def test_killed_host_resumes_and_committed_rows_stay(rig, config, payload, tmp_p
     with subprocess.Popen([sys.executable, "-c", code, str(config), str(tmp_path / "s")]) as host:
         wait_for(lambda: rig.pi.hanging is not None, "row 2")
         host.kill()
-    rig.pi.finish_hanging()
     rig.pi.hang_at = set()
+    rig.pi.wanted_end = True
+    wait_for(lambda: rig.pi.hanging is None, "the end of row 2")
     scan = ScanFolder.load(tmp_path / "s")
     state_before = digests(scan)
     assert list(scan.rows()) == [0, 1]
@@ -298,9 +300,11 @@ class LateCard(FakeCard):
 
 
 @pytest.mark.parametrize("lag_ms", [0, 5, 30])
-def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tmp_path, lag_ms):
+def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tmp_path, monkeypatch, lag_ms):
     """The Pi reports a fault in row 1. The last packet and the status arrive some ms after the reply to the stop."""
-    rig = FakeRig(make_instrument(rows=2, end_of_record_s=10.0))
+    assert lag_ms < 1000 * capture_rig._COMPLETED_TIMEOUT_S / 2
+    monkeypatch.setattr(capture_rig, "_COMPLETED_TIMEOUT_S", HANG_S)
+    rig = FakeRig(make_instrument(rows=2, end_of_record_s=HANG_S))
     for board in rig.instrument.recorded:
         card = LateCard(board, rig.instrument.row_bytes, lag_ms / 1e3)
         card.cut[1, 1] = 4 * FULL + 100

@@ -197,7 +197,6 @@ def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
 
     def end() -> None:
         rig.pi.hang_at = set()
-        rig.pi.state = "ready"
         rig.pi.wanted_end = True
 
     result = run_scan(rig.instrument, tmp_path / "s", progress=progress)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 import tomli_w
 from tests.support.capture.cards import Cards, ScriptedCard
+from tests.support.processes import HANG_S
 from tests.support.rigs import rig_with
 
 from polysight.capture.card import CardClient
+from polysight.capture.dca1000 import Code, Reply
 from polysight_shared.config import Board, Instrument
 from polysight_shared.tables import to_builtins
 from polysight_simulators.faults import Faults
@@ -19,10 +22,10 @@ from polysight_simulators.loopback import move_to_free_subnet
 
 
 def small_rig() -> Instrument:
-    """A free subnet, a grid whose rows are small, and little patience."""
+    """A free subnet, a grid whose rows fit in the receive buffer, and much patience."""
     grid = {"columns": 12, "rows": 2}
     card = {"receive_buffer_bytes": 1 << 20}
-    return move_to_free_subnet(rig_with(grid=grid, limits={"command_timeout_s": 1.5}, card=card))
+    return move_to_free_subnet(rig_with(grid=grid, limits={"command_timeout_s": HANG_S}, card=card))
 
 
 @pytest.fixture
@@ -43,11 +46,11 @@ def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
     """Starts cards of the named boards (or of other boards given whole)."""
     with ExitStack() as stack:
 
-        def start(*names: str, streams: bool = False, more: tuple[Board, ...] = (), **faults: Faults) -> Cards:
+        def start(*names: str, streamed_bytes: int = 0, more: tuple[Board, ...] = (), **faults: Faults) -> Cards:
             cards = Cards()
             stack.callback(cards.close)
             for board in (*(rig.by_name(n) for n in names), *more):
-                cards.add(board.name, cards.card_network(board), faults.get(board.name, Faults()), streams=streams)
+                cards.add(board.name, cards.card_network(board), faults.get(board.name, Faults()), streamed_bytes)
             cards.start()
             return cards
 
@@ -56,13 +59,26 @@ def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
 
 @pytest.fixture
 def scripted_card(rig: Instrument) -> Iterator[Callable[..., tuple[CardClient, ScriptedCard]]]:
-    """Makes a client and a card with scripted answers, of board RV."""
+    """Makes a client and a card with scripted answers, of board RV.
+
+    An attempt's time is over when the card has left it `unanswered` (code and count, as for the answers), and never
+    before.
+    """
     board = rig.by_name("RV")
     with ExitStack() as stack:
 
-        def make(answers, timeout_s: float = 30.0, source_port: int = 1024) -> tuple[CardClient, ScriptedCard]:
-            card = ScriptedCard(board, answers, source_port)
+        def make(
+            answers, source_port: int = 1024, unanswered: Collection[tuple[Code, int]] = ()
+        ) -> tuple[CardClient, ScriptedCard]:
+            sent: Counter[Code] = Counter()
+
+            class Client(CardClient):
+                def _try(self, code: Code, data: bytes, limit_s: float) -> Reply | None:
+                    sent[code] += 1
+                    return super()._try(code, data, 0.0 if (code, sent[code]) in unanswered else limit_s)
+
+            card = ScriptedCard(board, lambda code, n: [] if (code, n) in unanswered else answers(code, n), source_port)
             stack.callback(card.close)
-            return stack.enter_context(CardClient(board, timeout_s)), card
+            return stack.enter_context(Client(board, 3 * HANG_S)), card
 
         yield make

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import select
 import time
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.support.capture.cards import reply
-from tests.support.processes import wait_for
+from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
 
+from polysight.capture import card, dca1000
 from polysight.capture.card import CardClient, EepromSettings, program_eeprom, survey_cards
 from polysight.capture.dca1000 import Code, Status
 from polysight.capture.network import card_mac
@@ -69,15 +72,34 @@ def test_status_messages_are_not_replies(scripted_card):
 
 
 def test_lost_reply_is_retried(scripted_card):
-    client, card = scripted_card(lambda code, n: [] if n == 1 else [reply(code)], timeout_s=6.0)
+    client, card = scripted_card(lambda code, _: [reply(code)], unanswered=[(Code.ALIVE, 1)])
     client.alive()
     assert [c for c, _ in card.seen] == [Code.ALIVE, Code.ALIVE]
 
 
+def test_a_reply_that_waits_when_the_program_goes_on_is_no_lost_one(scripted_card, monkeypatch):
+    """The program is held behind its request, or the machine sleeps: the time is over, and the reply is there."""
+    client, sent_to = scripted_card(lambda code, _: [reply(code)])
+    requests = []
+    clock_s = itertools.count(0.0, 1e6)
+
+    def encode(code, data):
+        requests.append(code)
+        return dca1000.encode_request(code, data)
+
+    def monotonic() -> float:
+        if requests:
+            assert select.select([client], [], [], HANG_S)[0], "a reply is there"
+        return next(clock_s)
+
+    monkeypatch.setattr(card, "dca1000", SimpleNamespace(**vars(dca1000) | {"encode_request": encode}))
+    monkeypatch.setattr(card, "time", SimpleNamespace(monotonic=monotonic))
+    client.alive()
+    assert [code for code, _ in sent_to.seen] == [Code.ALIVE]
+
+
 def test_record_start_is_never_sent_twice_without_a_stop(scripted_card):
-    client, card = scripted_card(
-        lambda code, n: [] if code == Code.RECORD_START and n == 1 else [reply(code)], timeout_s=6.0
-    )
+    client, card = scripted_card(lambda code, _: [reply(code)], unanswered=[(Code.RECORD_START, 1)])
     client.record_start()
     assert [c for c, _ in card.seen] == [Code.RECORD_START, Code.RECORD_STOP, Code.RECORD_START]
 
@@ -90,7 +112,7 @@ def test_refusal_is_an_error_but_not_for_stop(scripted_card):
 
 
 def test_silent_card_is_named(scripted_card):
-    client, card = scripted_card(lambda *_: [], timeout_s=0.15)
+    client, card = scripted_card(lambda *_: [], unanswered=[(Code.ALIVE, n) for n in (1, 2, 3)])
     with refused(ErrorCode.NO_ANSWER, "RV", ":4202", "ALIVE", "EEPROM"):
         client.alive()
     wait_for(lambda: len(card.seen) == 3, "three requests")
@@ -113,7 +135,7 @@ def test_end_of_the_record_before_is_not_that_of_this_one(scripted_card, between
     client.record_stop()
     if not between:
         card.say(reply(Code.STATUS, Status.RECORD_COMPLETED | Status.DDR_FULL))
-        assert select.select([client], [], [], 60.0)[0]
+        assert select.select([client], [], [], HANG_S)[0]
     client.record_start()
     assert client.take_status() == Status(0)
 
@@ -128,7 +150,7 @@ def test_wait_for_a_completed_record_has_a_timeout(scripted_card):
     client, _ = scripted_card(answers)
     client.record_start()
     client.record_stop()
-    client.wait_completed(60.0)
+    client.wait_completed(HANG_S)
     assert client.take_status() == Status.RECORD_COMPLETED
     client.record_start()
     client.wait_completed(0.05)
@@ -182,13 +204,13 @@ def read_settings(client: CardClient) -> EepromSettings:
     return EepromSettings.of_board(client.board, "12:34:56:78:90:13")
 
 
-def card_that(status: int = 0, answer: int | None = 0):
+def card_that(status: int = 0, answer: int = 0):
     """Answers of a card that reports `status` and replies `answer` when it is to write its EEPROM."""
 
     def answers(code: int, _: int) -> list[bytes]:
         if code != Code.CONFIGURE_EEPROM:
             return [reply(code)]
-        return [reply(Code.STATUS, status)] * bool(status) + ([] if answer is None else [reply(code, answer)])
+        return [reply(Code.STATUS, status)] * bool(status) + [reply(code, answer)]
 
     return answers
 
@@ -209,34 +231,55 @@ def test_nothing_is_sent_unconfirmed(scripted_card, confirmed):
 
 
 @pytest.mark.parametrize(
-    ("status", "answer", "code"),
+    ("status", "answer", "unanswered", "code"),
     [
-        (Status.EEPROM_FAILURE, 0, ErrorCode.REFUSED_BY_PEER),
-        (0, 1, ErrorCode.REFUSED_BY_PEER),
-        (0, None, ErrorCode.NO_ANSWER),
+        (Status.EEPROM_FAILURE, 0, [], ErrorCode.REFUSED_BY_PEER),
+        (0, 1, [], ErrorCode.REFUSED_BY_PEER),
+        (0, 0, [(Code.CONFIGURE_EEPROM, 1)], ErrorCode.NO_ANSWER),
     ],
 )
-def test_a_card_that_could_not_write_it(scripted_card, status, answer, code):
-    client, card = scripted_card(card_that(status, answer), timeout_s=3.0)
+def test_a_card_that_could_not_write_it(scripted_card, status, answer, unanswered, code):
+    client, card = scripted_card(card_that(status, answer), unanswered=unanswered)
     settings = read_settings(client)
     with refused(code):
         program_eeprom(client, settings, settings.confirmation)
-    assert [code for code, _ in card.seen].count(Code.CONFIGURE_EEPROM) == 1
+    wait_for(lambda: card.seen[1:], "the command")
+    assert [code for code, _ in card.seen] == [Code.ALIVE, Code.CONFIGURE_EEPROM]
 
 
-def test_a_second_card_with_the_same_address_is_refused(rig, cards):
-    """Both answer one request."""
-    cards(*(board.name for board in rig.boards), RV=Faults(twin=True))
-    for name, refused_board in (("RH", False), ("RV", True)):
-        with CardClient(rig.by_name(name), 30.0) as client:
-            if refused_board:
-                with refused(ErrorCode.VALUES_CONFLICT, "2 answers to one request"):
-                    client.require_alone()
-            else:
-                client.require_alone()
-    surveys = {s.board.name: s.silent for s in survey_cards(rig)}
-    assert surveys["RV"] == "card"
-    assert surveys["RH"] == ""
+@pytest.mark.parametrize(
+    ("asked_again", "answers", "alone"), [(0, 1, True), (0, 2, False), (1, 2, True), (1, 3, False)]
+)
+def test_a_late_answer_is_not_that_of_a_second_card(scripted_card, monkeypatch, asked_again, answers, alone):
+    """The first request's answer comes with the second's: one card has answered both."""
+    client, _ = scripted_card(
+        lambda code, _: [reply(code, 0x0402)] * answers,
+        unanswered=[(Code.VERSION, n) for n in range(1, 1 + asked_again)],
+    )
+    if alone:
+        client.require_alone()
+    else:
+        monkeypatch.setattr(card, "_TWIN_S", HANG_S)
+        with refused(ErrorCode.VALUES_CONFLICT, f"{answers} answers"):
+            client.require_alone()
+
+
+def test_a_second_card_with_the_same_address_is_refused(rig, cards, monkeypatch):
+    """Both answer one request. The second answer is waited for as long as it takes; of one card there is none."""
+    names = [board.name for board in rig.boards]
+    cards(*names[1:], **dict.fromkeys(names[2:], Faults(twin=True)))
+    with CardClient(rig.boards[1], HANG_S) as client:
+        client.require_alone()
+    monkeypatch.setattr(card, "_TWIN_S", HANG_S)
+    with CardClient(rig.boards[2], HANG_S) as client, refused(ErrorCode.VALUES_CONFLICT, "2 answers to one request"):
+        client.require_alone()
+
+
+def test_second_cards_are_told_of_every_board(rig, cards, monkeypatch):
+    names = [board.name for board in rig.boards]
+    cards(*names, **dict.fromkeys(names, Faults(twin=True)))
+    monkeypatch.setattr(card, "_TWIN_S", HANG_S)
+    assert [survey.silent for survey in survey_cards(rig)] == ["card"] * 3
 
 
 def test_mac_addresses_of_cards_are_read_from_the_kernel(tmp_path):

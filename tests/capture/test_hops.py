@@ -128,7 +128,8 @@ ip address add 192.168.33.30/24 dev c0
 try no-link
 ip link set c1 up
 try no-device
-unshare -n sleep 20 & other=$!
+unshare -n sleep infinity & other=$!
+trap 'kill $other' EXIT
 until [ "$(readlink /proc/$other/ns/net)" != "$(readlink /proc/self/ns/net)" ]; do :; done
 ip link set c1 netns $other
 nsenter -t $other -n sh -c 'ip link set c1 up; ip address add 192.168.33.180/24 dev c1'
@@ -136,7 +137,6 @@ until nsenter -t $other -n ip link show c1 | grep -q 'state UP'; do :; done
 until ip link show c0 | grep -q 'state UP'; do :; done
 ip neigh flush dev c0
 try mute
-kill $other
 """
 
 

@@ -95,16 +95,26 @@ class CardClient:
         Raises DeviceError if there are two, or no answer. A second card sends whole rows that look like this one's.
         """
         macs = {card_mac(self.board.card_address, self._kernel_root)}
-        versions = [self.version()]
+        versions: list[Version] = []
+        requests = 0
+        while not versions:
+            if requests == ATTEMPTS:
+                raise self._silent(Code.VERSION, ATTEMPTS)
+            requests += 1
+            reply = self._try(Code.VERSION, b"", self._timeout_s / ATTEMPTS)
+            if reply is not None:
+                versions.append(dca1000.decode_version(reply.status))
+        # The answer to an earlier attempt may only be late.
         deadline = time.monotonic() + _TWIN_S
-        while (remaining_s := deadline - time.monotonic()) > 0:
+        while len(versions) <= requests and (remaining_s := deadline - time.monotonic()) > 0:
             reply = self._receive(remaining_s)
             if reply is not None and reply.code == Code.VERSION:
                 versions.append(dca1000.decode_version(reply.status))
         macs.add(card_mac(self.board.card_address, self._kernel_root))
         macs.discard("")
-        if len(versions) > 1 or len(macs) > 1:
-            answers = f"{len(versions)} answers to one request (FPGA {', '.join(map(str, versions))})"
+        if len(versions) > requests or len(macs) > 1:
+            asked = "one request" if requests == 1 else f"{requests} requests"
+            answers = f"{len(versions)} answers to {asked} (FPGA {', '.join(map(str, versions))})"
             if len(macs) > 1:
                 answers += f", MAC addresses {' and '.join(sorted(macs))}"
             raise DeviceError(
@@ -217,9 +227,9 @@ class CardClient:
             problem = f"sending to {self._name()} failed: {e.strerror}"
             raise silent_card(self.board, problem, self._kernel_root) from e
         deadline = time.monotonic() + limit_s
-        while (remaining_s := deadline - time.monotonic()) > 0:
-            reply = self._receive(remaining_s)
-            if reply is not None and reply.code == code:
+        # The replies that are there are read even if the time is over: this program may have been held meanwhile.
+        while (reply := self._receive(max(0.0, deadline - time.monotonic()))) is not None:
+            if reply.code == code:
                 return reply
         return None
 

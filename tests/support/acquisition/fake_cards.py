@@ -44,7 +44,11 @@ class FakeCard:
         self.missed: dict[tuple[int, int], set[int]] = {}
         # Before this pulse the radar takes an edge that nobody sent for a pulse: all later frames come one too early.
         self.extra: dict[tuple[int, int], int] = {}
+        # Of rows that are sent frame by frame: bytes of the record so far, and when they would arrive.
+        self.arrivals_ns: dict[int, int] = {}
+        self._record_bytes = 0
         self._rest = b""
+        self._arrival_ns = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
@@ -62,6 +66,9 @@ class FakeCard:
 
     def _command(self, code: int, sender: tuple[str, int]) -> None:
         self.recording = {1: False, 5: True, 6: False}.get(code, self.recording)
+        if code == 5:
+            self.arrivals_ns = {}
+            self._record_bytes = 0
         # A reset begins the counters again.
         if code == 1:
             self.sequence = 1
@@ -74,8 +81,9 @@ class FakeCard:
         status = struct.pack("<HHHH", 0xA55A, 0x0A, bits, 0xEEAA)
         self.out.sendto(status, (self.board.host_address, self.board.command_port))
 
-    def send_frame(self, row: int, take: int, slot: int, frame_bytes: int) -> None:
+    def send_frame(self, row: int, take: int, slot: int, frame_bytes: int, arrival_ns: int) -> None:
         """Send the frame of one pulse, unless the radar missed it; packets are sent when they are full."""
+        self._arrival_ns = arrival_ns
         extra = self.extra.get((row, take))
         last = slot == self.row_bytes // frame_bytes - 1
         if slot == extra:
@@ -99,6 +107,8 @@ class FakeCard:
             self.out.sendto(packet, (self.board.host_address, self.board.data_port))
             self.sequence += 1
             self.count += len(body)
+            self._record_bytes += len(body)
+            self.arrivals_ns[self._record_bytes] = self._arrival_ns
 
     def send_row(self, row: int, take: int) -> None:
         if not self.recording or self.silent_data:

@@ -13,7 +13,11 @@ from polysight_shared.config import Instrument
 from polysight_shared.raster import Row
 from polysight_simulators.loopback import move_to_free_subnet
 from tests.support.acquisition.fake_cards import FakeCard
+from tests.support.processes import HANG_S
 from tests.support.rigs import rig_with
+
+# The Pi's clock, less the host's
+PI_AHEAD_NS = 77_000_000_000
 
 
 class FakePi:
@@ -32,7 +36,9 @@ class FakePi:
         self.lost_mm = (0.0, 0.0)
         # Number of events that PUB loses
         self.lose_events = 0
+        # Number of replies to lose, and of those lost so far
         self.lose_replies = 0
+        self.replies_lost = 0
         # (row, take): fault number
         self.fail_rows: dict[tuple[int, int], int] = {}
         # number and reason of the first fault
@@ -40,8 +46,8 @@ class FakePi:
         self.latched = ""
         # Rows that never end; half of their data is sent
         self.hang_at: set[int] = set()
-        # Frames are sent at the times of their pulses
-        self.paced = False
+        # Frames are sent one by one, and the times of their pulses are those of a real row
+        self.timed = False
         self.hang_after_captures = False  # such rows send their bursts before they hang
         # Reason in RowFinished of a completed row
         self.notes: dict[tuple[int, int], str] = {}
@@ -73,15 +79,16 @@ class FakePi:
                     self.commands.append(command)
                 if self.lose_replies and not isinstance(command, m.Alive):
                     self.lose_replies -= 1
+                    self.replies_lost += 1
                 else:
                     self.rep.send_multipart([*envelope, m.pack(reply)])
                 self._finish_command()
             if self.wanted_end and self.hanging is not None:
                 self.wanted_end = False
-                self.finish_hanging()
+                self._finish_hanging()
             if time.monotonic() - last > 0.05:
                 last = time.monotonic()
-                scan = self.run.scan_id if self.run else ""
+                scan = self._scan_id()
                 beat = m.Heartbeat(
                     scan_id=scan, seq=len(self.journal.get(scan, [])), t_mono_ns=1, state=self.state, period_ms=50
                 )
@@ -89,6 +96,11 @@ class FakePi:
         self.rep.close(linger=0)
         self.pub.close(linger=0)
         self.context.term()
+
+    def _scan_id(self) -> str:
+        # A test may replace it meanwhile.
+        run = self.run
+        return run.scan_id if run else ""
 
     def _emit(self, kind: type, **content: object) -> None:
         assert self.run is not None
@@ -102,7 +114,7 @@ class FakePi:
 
     def _answer(self, c: m.AnyCommand) -> m.AnyReply:
         self._todo = None
-        scan = self.run.scan_id if self.run else ""
+        scan = self._scan_id()
         last = len(self.journal.get(scan, []))
         if isinstance(c, m.Hello):
             return m.HelloReply(
@@ -168,8 +180,8 @@ class FakePi:
             if self.hang_after_captures:
                 self._captures(row, c.take)
             return
-        if self.paced:
-            self._run_at_its_pace(row, c.take)
+        if self.timed:
+            self._send_frames(row, c.take)
         else:
             self._captures(row, c.take)
             for card in self.cards:
@@ -194,37 +206,38 @@ class FakePi:
                 last_pulse_ns=i, pulses=self.run.pulses, width_max_ns=1, jitter_ns=1,
             )  # fmt: skip
 
-    def _run_at_its_pace(self, row: Row, take: int) -> None:
-        """Send bursts 60 ms apart with pulses 1.5 ms apart, on its own clock, and each frame 0.1 ms after its pulse."""
+    def _send_frames(self, row: Row, take: int) -> None:
+        """Send all frames at once, with the times of a row that has run until now.
+
+        Bursts are 60 ms apart and pulses 1.5 ms, on the Pi's own clock; a frame arrives 0.1 ms after its pulse.
+        """
         assert self.run is not None
         n = self.run.pulses
-        period = 1_500_000
-        ahead = 77_000_000_000
-        begin = time.monotonic_ns() + 20_000_000
+        begin = time.monotonic_ns() - row.points * 60_000_000
         for point in range(row.points):
-            first = begin + point * 60_000_000
-            for k in range(n):
-                while (left_ns := first + k * period + 100_000 - time.monotonic_ns()) > 0:
-                    time.sleep(left_ns * 1e-9 if left_ns > 2_000_000 else 0)
+            pulses = [begin + point * 60_000_000 + k * 1_500_000 for k in range(n)]
+            for k, pulse_ns in enumerate(pulses):
                 for card in self.cards:
-                    card.send_frame(row.index, take, point * n + k, self.rig.frame_bytes)
+                    card.send_frame(row.index, take, point * n + k, self.rig.frame_bytes, pulse_ns + 100_000)
+            first = pulses[0] + PI_AHEAD_NS
             self._emit(
-                m.Capture, row_index=row.index, take=take, point=point, column=row.column(point), edge_ns=first + ahead,
-                first_pulse_ns=first + ahead, last_pulse_ns=first + (n - 1) * period + ahead, pulses=n, width_max_ns=1,
-                jitter_ns=1,
+                m.Capture, row_index=row.index, take=take, point=point, column=row.column(point), edge_ns=first,
+                first_pulse_ns=first, last_pulse_ns=pulses[-1] + PI_AHEAD_NS, pulses=n, width_max_ns=1, jitter_ns=1,
             )  # fmt: skip
         for card in self.cards:
             card.end_frames()
 
-    def finish_hanging(self) -> None:
-        """End the hanging row as done."""
+    def _finish_hanging(self) -> None:
+        """End the hanging row as done; the stage is not held any more."""
         assert self.hanging is not None
-        (row, take), self.hanging = self.hanging, None
+        row, take = self.hanging
         n = row.points
         self._emit(
             m.RowFinished, row_index=row.index, take=take, status="done", points=n, edges=n, bursts=n,
             pulses=n * self.rig.burst.pulses,
         )  # fmt: skip
+        self.state = "ready"
+        self.hanging = None
 
     def close(self) -> None:
         self._stop.set()
@@ -255,8 +268,11 @@ class FakeRig:
 
 
 def small_instrument(columns: int = 3, rows: int = 4, pulses: int = 3, **limits: float) -> Instrument:
-    """The published rig with a small grid and few pulses, on a loopback subnet that is free."""
-    limits = {"end_of_record_s": 0.25, "command_timeout_s": 1.5, "free_disk_bytes": 0, **limits}
+    """The published rig with a small grid and few pulses, on a loopback subnet that is free.
+
+    Each of the three attempts at a command waits for its reply until a test hangs.
+    """
+    limits = {"end_of_record_s": 0.25, "command_timeout_s": 3 * HANG_S, "free_disk_bytes": 0, **limits}
     card = {"receive_buffer_bytes": 1 << 20}
     grid = {"columns": columns, "rows": rows}
     return move_to_free_subnet(rig_with(grid=grid, burst={"pulses": pulses}, limits=limits, card=card))

@@ -23,21 +23,21 @@ MAX_QUEUED_BYTES = 1 << 20
 
 
 class Cards:
-    """Simulated cards, all served by one thread; the radars of some stream frames without end."""
+    """Simulated cards, all served by one thread; the radars of some stream."""
 
     def __init__(self) -> None:
         self.endpoints: dict[str, CardEndpoint] = {}
-        self._streaming: set[str] = set()
+        # Bytes that their radars stream, by card
+        self._streaming: dict[str, int] = {}
         self._tasks: list[Callable[[], None]] = []
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._serve)
 
-    def add(self, name: str, network: Network, faults: Faults, *, streams: bool) -> None:
+    def add(self, name: str, network: Network, faults: Faults, streamed_bytes: int) -> None:
         self.endpoints[name] = CardEndpoint(
             name=name, network=network, faults=faults, seed=0, time_scale=1.0, clock_s=time.monotonic
         )
-        if streams:
-            self._streaming.add(name)
+        self._streaming[name] = streamed_bytes
 
     @staticmethod
     def card_network(board: Board) -> Network:
@@ -61,7 +61,8 @@ class Cards:
             for name, endpoint in self.endpoints.items():
                 endpoint.serve_commands()
                 has_room = endpoint.sender.queued_bytes < MAX_QUEUED_BYTES
-                if name in self._streaming and endpoint.card.recording and has_room:
+                streams = endpoint.counts["bytes_made"] < self._streaming[name]
+                if streams and endpoint.card.recording and has_room:
                     endpoint.emit(endpoint.card.lvds(FRAMES, endpoint.wire_s()))
                 endpoint.tick()
                 endpoint.flush()

@@ -33,13 +33,13 @@ Complex = NDArray[np.complex128]
 SEED = 20260
 
 
-def _noise(rng: np.random.Generator, shape: tuple[int, ...], snr_db: float) -> Complex:
+def _draw_noise(rng: np.random.Generator, shape: tuple[int, ...], snr_db: float) -> Complex:
     """Complex white noise this far below a tone of amplitude one."""
     sigma = 10 ** (-snr_db / 20) / np.sqrt(2)
     return sigma * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
 
 
-def _paths(rig: Instrument, board: Board, cycles_away: float = 0.0) -> tuple[Complex, Complex]:
+def _simulate_paths(rig: Instrument, board: Board, cycles_away: float = 0.0) -> tuple[Complex, Complex]:
     """Direct path and echo of the mirror point, each of amplitude one: complex [rx, sample]."""
     tx = np.array(tx_position_m(rig))
     rx = np.array(rx_positions_m(rig, board))
@@ -51,7 +51,7 @@ def _paths(rig: Instrument, board: Board, cycles_away: float = 0.0) -> tuple[Com
     return first, second * np.exp(2j * np.pi * cycles_away)
 
 
-def _words(bursts: NDArray[np.complexfloating]) -> NDArray[np.int16]:
+def _quantise_bursts(bursts: NDArray[np.complexfloating]) -> NDArray[np.int16]:
     """int16 [position, chirp, sample, 2, rx] of bursts [position, chirp, rx, sample]; 1 is a thousand counts."""
     positions, chirps, rx, samples = bursts.shape
     flat = 1000 * bursts.transpose(2, 0, 1, 3).reshape(rx, positions * chirps, samples)
@@ -80,15 +80,15 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
     chirp = rig.chirp
     pulses = rig.burst.pulses
     a, b = chirp.linear_samples
-    direct, _ = _paths(rig, board)
+    direct, _ = _simulate_paths(rig, board)
     n = np.arange(chirp.samples)
     bursts = np.empty((positions, pulses, *direct.shape), np.complex64)
     truth = rng.uniform(-0.1, 0.1, (positions, pulses))
     for p in range(positions):
-        signal = np.add(*_paths(rig, board, rng.uniform()))
+        signal = np.add(*_simulate_paths(rig, board, rng.uniform()))
         turn = np.exp(2j * np.pi * (truth[p][:, None] * n + rng.uniform(size=(pulses, 1))))
-        bursts[p] = signal * turn[:, None] + _noise(rng, bursts.shape[1:], snr_db)
-    aligned = align_row(_words(bursts), np.ones(truth.shape, bool), chirp.linear_samples)
+        bursts[p] = signal * turn[:, None] + _draw_noise(rng, bursts.shape[1:], snr_db)
+    aligned = align_row(_quantise_bursts(bursts), np.ones(truth.shape, bool), chirp.linear_samples)
     method = Synchroniser(rig, board)
     divided = np.array([method.offsets(np.swapaxes(burst, 0, 1))[0] for burst in bursts])
     half_bin = 0.5 / (b - a)
@@ -110,7 +110,7 @@ def one_tone(snr_db: float, trials: int = 4000, samples: int = 192) -> tuple[flo
     frequency = rng.uniform(-0.4, 0.4, trials)
     phase = rng.uniform(-np.pi, np.pi, trials)
     t = np.arange(samples) - (samples - 1) / 2
-    z = np.exp(1j * (2 * np.pi * frequency[:, None] * t + phase[:, None])) + _noise(rng, (trials, samples), snr_db)
+    z = np.exp(1j * (2 * np.pi * frequency[:, None] * t + phase[:, None])) + _draw_noise(rng, (trials, samples), snr_db)
     tone = estimate_tone(z.astype(np.complex64))
     power = 10 ** (-snr_db / 10)
     f_bound = np.sqrt(power / 2 / (t**2).sum()) / (2 * np.pi)
@@ -150,24 +150,26 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
     rig = at_bins(rig, board, bins)
     chirp = rig.chirp
     a, b = chirp.linear_samples
-    direct, echo = _paths(rig, board)
+    direct, echo = _simulate_paths(rig, board)
     n = np.arange(chirp.samples) - (a + b - 1) / 2
     frequency = rng.uniform(0.2, 0.6, trials)
     phase, between = rng.uniform(-np.pi, np.pi, (2, trials))
     turn = np.exp(1j * (2 * np.pi * frequency[:, None] * n + phase[:, None]))
     signal = (direct + np.exp(1j * between)[:, None, None] * echo) * turn[:, None]
-    received = (signal + _noise(rng, signal.shape, snr_db)).astype(np.complex64)
-    aligned = align_row(_words(received[:, None]), np.ones((trials, 1), bool), chirp.linear_samples)
+    received = (signal + _draw_noise(rng, signal.shape, snr_db)).astype(np.complex64)
+    aligned = align_row(_quantise_bursts(received[:, None]), np.ones((trials, 1), bool), chirp.linear_samples)
     done = reference(aligned, prepare(rig, board), chirp)
     error = np.angle(done.amplitude * np.exp(-1j * phase))[done.found]
     # The direct path's own, constant
     error = np.angle(np.exp(1j * (error - np.angle(np.exp(1j * error).mean()))))
     rms = float(np.sqrt((error**2).mean()))
-    bound = np.sqrt(np.mean([_phase_bound(direct, echo, x, (a, b), snr_db) for x in between[:200]]))
+    bound = np.sqrt(np.mean([_compute_phase_bound(direct, echo, x, (a, b), snr_db) for x in between[:200]]))
     return rms, rms / float(bound)
 
 
-def _phase_bound(direct: Complex, echo: Complex, between: float, linear: tuple[int, int], snr_db: float) -> float:
+def _compute_phase_bound(
+    direct: Complex, echo: Complex, between: float, linear: tuple[int, int], snr_db: float
+) -> float:
     """Cramer-Rao bound of the direct path's phase, variance in rad^2; inverse of the Fisher information (Kay 1993)."""
     inside = slice(*linear)
     d = direct[:, inside]
@@ -280,13 +282,13 @@ def run(args: argparse.Namespace) -> int:
         tones = {snr: one_tone(snr, trials=30_000 // few) for snr in TONE_SNR_DB}
         pairs = {b.name: two_tones(rig, b, BINS, TWO_TONE_SNR_DB, trials=6000 // few) for b in rig.receivers}
         images = {b.name: image_error(rig, b) for b in rig.receivers}
-    lines = [*_alignment_lines(aligned), *_tone_lines(tones, pairs), _image_line(images)]
+    lines = [*_measure_alignment(aligned), *_measure_tone(tones, pairs), _image_line(images)]
     show("accuracy, simulated signals of known truth", lines, args.quick)
     write(args.json, "accuracy", lines, alignment=[asdict(a) for a in aligned], one_tone=tones, two_tones=pairs)
     return 0
 
 
-def _alignment_lines(aligned: Sequence[Alignment]) -> list[Line]:
+def _measure_alignment(aligned: Sequence[Alignment]) -> list[Line]:
     ratios = [a.ours_hz / a.division_hz for a in aligned]
     chirps = sum(a.chirps for a in aligned)
     gross = sum(a.ours_gross for a in aligned)
@@ -315,7 +317,7 @@ def _alignment_lines(aligned: Sequence[Alignment]) -> list[Line]:
     ]
 
 
-def _tone_lines(tones: Mapping[float, tuple[float, float]], pairs: Mapping[str, tuple[float, float]]) -> list[Line]:
+def _measure_tone(tones: Mapping[float, tuple[float, float]], pairs: Mapping[str, tuple[float, float]]) -> list[Line]:
     return [
         Line(
             "one tone, 7-30 dB: rms error over Cramer-Rao",

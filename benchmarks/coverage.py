@@ -275,7 +275,7 @@ def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigur
     return out
 
 
-def _table(rows: list[PatchFigures], title: str) -> dict[str, float]:
+def _print_coverage(rows: list[PatchFigures], title: str) -> dict[str, float]:
     d = np.array([r.distance2 for r in rows])
     if d.size == 0:
         return {}
@@ -329,11 +329,11 @@ def print_pulls(rows: list[PatchFigures]) -> dict[str, Any]:
     return out
 
 
-def _one(job: tuple[int, str, bool]) -> list[PatchFigures]:
+def _measure_scene(job: tuple[int, str, bool]) -> list[PatchFigures]:
     return figures(*job)
 
 
-def _names(seed: int) -> list[tuple[float, bool]]:
+def _read_names(seed: int) -> list[tuple[float, bool]]:
     """Probability beside each name of one scene, and whether the name is right."""
     scene, rig, findings, _ = judge_scan(seed, "named")
     plates = truth_plates(truth(rig, scene, scene.seed))
@@ -343,7 +343,7 @@ def _names(seed: int) -> list[tuple[float, bool]]:
     return [(v.confidence, v.name == plate.name) for v, plate in named if v is not None and v.name != UNKNOWN]
 
 
-def _reliability(pairs: list[tuple[float, bool]]) -> list[dict[str, float]]:
+def _print_reliability(pairs: list[tuple[float, bool]]) -> list[dict[str, float]]:
     """How often names are right beside the probability they were given; printed and returned by bin."""
     out = []
     for low, high in itertools.pairwise(SURE):
@@ -389,29 +389,31 @@ def run(args: argparse.Namespace) -> int:
     jobs = [(i, "full", False) for i in seeds] + [(args.first + i, "full", True) for i in range(args.raw)]
     print("simulated scenes; regions of the permittivity (real and imaginary part together)")
     with ProcessPoolExecutor(args.jobs) as pool:
-        results = list(pool.map(_one, jobs))
+        results = list(pool.map(_measure_scene, jobs))
         thin = [
             r
             for result in pool.map(figures, [*range(args.first, args.first + args.sheets)], ["sheet"] * args.sheets)
             for r in result
         ]
         wide_jobs = [(args.first + i, "wide", False) for i in range(args.wide)]
-        wide = [r for result in pool.map(_one, wide_jobs) for r in result]
+        wide = [r for result in pool.map(_measure_scene, wide_jobs) for r in result]
         kinds = [(args.first + i, KINDS[1 + i % 4]) for i in range(args.without)]
         without = list(pool.map(_judge_without_result, kinds))
-        named = [pair for result in pool.map(_names, range(args.first, args.first + args.named)) for pair in result]
+        named = [
+            pair for result in pool.map(_read_names, range(args.first, args.first + args.named)) for pair in result
+        ]
     rows = [r for result in results[: args.scenes] for r in result]
     raw = [r for result in results[args.scenes :] for r in result]
-    out: dict[str, Any] = {"all": _table(rows, "all, from samples")}
-    out["raw"] = _table(raw, "all, from raw data")
+    out: dict[str, Any] = {"all": _print_coverage(rows, "all, from samples")}
+    out["raw"] = _print_coverage(raw, "all, from raw data")
     for name in CLASSES:
-        out[name] = _table([r for r in rows if r.kind == name], f"  {name}")
+        out[name] = _print_coverage([r for r in rows if r.kind == name], f"  {name}")
     for measured, title in ((True, "  leakage measured"), (False, "  leakage not measured")):
-        out[title.strip()] = _table([r for r in rows if r.leakage_measured == measured], title)
+        out[title.strip()] = _print_coverage([r for r in rows if r.leakage_measured == measured], title)
     for inside, title in ((True, "  metal in the scene"), (False, "  metal scanned on its own")):
-        out[title.strip()] = _table([r for r in rows if r.metal_in_scene == inside], title)
-    out["beside a sheet"] = _table([r for r in thin if not r.sheet], "  beside a thin sheet, undeclared")
-    out["sheet"] = _table([r for r in thin if r.sheet], "  the sheet itself, as a half space")
+        out[title.strip()] = _print_coverage([r for r in rows if r.metal_in_scene == inside], title)
+    out["beside a sheet"] = _print_coverage([r for r in thin if not r.sheet], "  beside a thin sheet, undeclared")
+    out["sheet"] = _print_coverage([r for r in thin if r.sheet], "  the sheet itself, as a half space")
     print(f"  sheets: {args.sheets}; without a permittivity {args.sheets - sum(r.sheet for r in thin)}")
     out["pulls"] = print_pulls(wide)
     same = {(r.scene, r.material): r for r in rows}
@@ -426,7 +428,7 @@ def run(args: argparse.Namespace) -> int:
     for w in said:
         print("   ", w)
     print(f"names of the library's materials, {args.named} scenes with every nuisance but other specimens")
-    reliability = _reliability(named)
+    reliability = _print_reliability(named)
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         content = {

@@ -44,8 +44,10 @@ def run(args: argparse.Namespace) -> int:
     total = sum(by_kind.values()) / rows
     process_s = statistics.median(processed)
     lines = [
-        _least("a row of the demo's scan, all processes, CPU s", total, 0.75, f"{rows} rows: {each}"),
-        _least("process of that scan, CPU s", process_s, 6.0, ", ".join(f"{seconds:.1f}" for seconds in processed)),
+        _report_least("a row of the demo's scan, all processes, CPU s", total, 0.75, f"{rows} rows: {each}"),
+        _report_least(
+            "process of that scan, CPU s", process_s, 6.0, ", ".join(f"{seconds:.1f}" for seconds in processed)
+        ),
     ]
     show("the demo's scan, simulated cards, radars, Pi and stage", lines, args.quick)
     write(args.json, "demo", lines, rows=rows, by_kind=by_kind, process_cpu_s=processed)
@@ -63,7 +65,7 @@ def scan_cpu_s(out: Path, scene: Path) -> tuple[int, dict[str, float]]:
     while demo.poll() is None:
         committed = _count_commits(out / "scan" / MANIFEST)
         if committed and (last is None or committed > last[0]):
-            last = committed, _cpu_of_tree(demo.pid)
+            last = committed, _measure_cpu_of_tree(demo.pid)
             first = first or last
         time.sleep(_LOOK_S)
     if demo.returncode or first is None or last is None or first[0] == last[0]:
@@ -80,9 +82,9 @@ def _count_commits(manifest: Path) -> int:
     return manifest.read_text(encoding="utf-8").count('"row_committed"')
 
 
-def _cpu_of_tree(root: int) -> dict[int, tuple[str, float]]:
+def _measure_cpu_of_tree(root: int) -> dict[int, tuple[str, float]]:
     """Return kind and CPU seconds of a process and all below it, by process id."""
-    parents = dict(_parents())
+    parents = dict(_list_parents())
     tree = {}
     for pid in parents:
         above = pid
@@ -97,7 +99,7 @@ def _cpu_of_tree(root: int) -> dict[int, tuple[str, float]]:
     return tree
 
 
-def _parents() -> Iterator[tuple[int, int]]:
+def _list_parents() -> Iterator[tuple[int, int]]:
     for process in Path("/proc").iterdir():
         if process.name.isdigit():
             try:
@@ -107,5 +109,5 @@ def _parents() -> Iterator[tuple[int, int]]:
             yield int(process.name), int(status.rsplit(")", 1)[1].split()[1])
 
 
-def _least(name: str, value: float, limit: float, note: str) -> Line:
+def _report_least(name: str, value: float, limit: float, note: str) -> Line:
     return Line(name, f"{value:.2f} s", "", value, limit, limit, higher_is_better=False, note=note)

@@ -329,7 +329,7 @@ def measure_authors(checkout: Path, rig: Instrument, board: Board, folder: Path,
         seconds = json.loads(program.stdout.splitlines()[-1])
         authors_images = np.load(theirs)
         likeness = max(
-            _likeness(turned, image)
+            _correlate(turned, image)
             for turned in (authors_images, authors_images[::-1], authors_images[:, ::-1], authors_images[::-1, ::-1])
         )
         answer[str(bins)] = {"seconds": seconds, "likeness": likeness}
@@ -340,7 +340,7 @@ def measure_authors(checkout: Path, rig: Instrument, board: Board, folder: Path,
     return answer
 
 
-def _likeness(one: Image, other: Image) -> float:
+def _correlate(one: Image, other: Image) -> float:
     """Normalised correlation of two images' magnitudes, 1 if equal but for a factor."""
     if one.shape != other.shape:
         return 0.0

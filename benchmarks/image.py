@@ -43,13 +43,13 @@ class Bench:
     def ours(self, live: bool = False) -> Image:
         """From disk to pixels: all rows, then the image; or an image that every row updates."""
         samples = ImageBuilder(self.rig, live=live).boards[self.board.name]
-        for row, met in self._rows():
+        for row, met in self._map_rows():
             samples.add_row(row, as_synced(self.rig, met))
         if live:
             return samples.current()[0]
         return samples.image()[0]
 
-    def _rows(self) -> Iterator[tuple[int, NDArray[np.complex64]]]:
+    def _map_rows(self) -> Iterator[tuple[int, NDArray[np.complex64]]]:
         """Rows [rx, position, sample] as met, mapped from the file like the published method's."""
         cube = np.load(self.path, mmap_mode="r")
         for row in range(cube.shape[1]):

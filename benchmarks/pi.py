@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure and print; 0 when processor and memory are within their limits."""
     points = 20 if args.quick else args.points
     with temporary(args.folder) as folder, ExitStack() as stack:
-        figures = _measure(_rig(folder, min(points, ROW_POINTS)), points, folder, stack)
+        figures = _measure(_make_rig(folder, min(points, ROW_POINTS)), points, folder, stack)
     print(f"\nthe Pi half, simulated: {points} positions, 10 a second, 16 pulses each; this machine, not a Pi")
     this_machine = machine()
     print(f"{this_machine['cpu']}, {this_machine['cores']} cores, load {this_machine['load_average'][0]}")
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if within or args.quick else 1
 
 
-def _rig(folder: Path, points: int) -> Instrument:
+def _make_rig(folder: Path, points: int) -> Instrument:
     rig = load_instrument(RIG)
     replace = msgspec.structs.replace
     stage = replace(rig.stage, port=str(folder / "tty"), centre_x_mm=points + 5.0, centre_y_mm=2.0)
@@ -112,10 +112,10 @@ def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> di
         "faults of those": sorted(set(rows.faults)),
         "CPU, share of a core": round(rows.cpu_s / rows.wall_s, 3),
         "memory at most, MB": round(int(status[status.index("VmHWM:") + 1]) / 1e3, 1),
-        "edge to first pulse, us: p50, p99.9, worst": _quantiles(late_us),
-        "period off by, us: p50, p99.9, worst": _quantiles(error_us),
-        "pulse width, us: p50, p99.9, worst": _quantiles(high_us),
-        "reported bound of a burst's widest, us: p50, p99.9": _quantiles(width_us)[:2],
+        "edge to first pulse, us: p50, p99.9, worst": _compute_quantiles(late_us),
+        "period off by, us: p50, p99.9, worst": _compute_quantiles(error_us),
+        "pulse width, us: p50, p99.9, worst": _compute_quantiles(high_us),
+        "reported bound of a burst's widest, us: p50, p99.9": _compute_quantiles(width_us)[:2],
     }
 
 
@@ -162,7 +162,7 @@ class _Rows:
             for event in self._client.events():
                 if isinstance(event, Capture):
                     if not captures:
-                        cpu = _cpu_s(self._pid)
+                        cpu = _read_cpu_s(self._pid)
                         began = time.monotonic()
                     captures.append(event)
                 if isinstance(event, RowFinished):
@@ -170,7 +170,7 @@ class _Rows:
                 else:
                     finished = finished
         if captures:
-            self.cpu_s += _cpu_s(self._pid) - cpu
+            self.cpu_s += _read_cpu_s(self._pid) - cpu
             self.wall_s += time.monotonic() - began
         while isinstance(message := self._wires.receive(0.5), WireEdge):
             edges.append(message)
@@ -185,11 +185,11 @@ class _Rows:
             start += 2 * c.pulses
 
 
-def _cpu_s(pid: int) -> float:
+def _read_cpu_s(pid: int) -> float:
     user, system = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
     return (int(user) + int(system)) * TICK_S
 
 
-def _quantiles(values: list[float]) -> list[float]:
+def _compute_quantiles(values: list[float]) -> list[float]:
     shares = [0.5, 0.999, 1.0]
     return [round(values[min(len(values) - 1, int(q * len(values)))], 2) for q in shares]

@@ -192,8 +192,8 @@ def form_image(
     a, b = chirp.linear_samples
     n_rx, rows, columns, _ = cube.shape
     ny, nx = grid.shape
-    y = _lattice(grid.y_m, rows)
-    x = _lattice(grid.x_m, columns)
+    y = _make_lattice(grid.y_m, rows)
+    x = _make_lattice(grid.x_m, columns)
     excess = Antennas.from_rig(rig, board).excess_m(x[None, :], y[:, None], grid.z_m)
     start_hz = chirp.first_sample_hz + chirp.hz_per_sample * a
     full = rows + y.size - 1, columns + x.size - 1
@@ -226,7 +226,7 @@ def form_image(
     return image
 
 
-def _lattice(axis_m: NDArray[np.float64], positions: int) -> NDArray[np.float64]:
+def _make_lattice(axis_m: NDArray[np.float64], positions: int) -> NDArray[np.float64]:
     """Every pixel minus every position along one axis, ascending, metres."""
     pixel = axis_m[1] - axis_m[0]
     first = axis_m[0] - (positions - 1) / 2 * pixel

@@ -108,7 +108,7 @@ def draw_scene(seed: int, gap_cells: float, same_material: bool) -> PlateScene:
         noise = rng.standard_normal((2, *s.shape))
         noise = np.fft.ifft2(np.fft.fft2(noise[0] + 1j * noise[1]) * transfer)
         noise *= 10 ** (-35 / 20) * brightest / np.sqrt(np.mean(np.abs(noise) ** 2))
-        light = np.exp(rng.uniform(0.0, 0.15) * _uneven_light(rng, s.shape))
+        light = np.exp(rng.uniform(0.0, 0.15) * _draw_uneven_light(rng, s.shape))
         channels.append(np.fft.ifft2(np.fft.fft2(channel * light) * transfer) + noise)
     return PlateScene(channels[0], channels[1], x_mm / 1e3, y_mm / 1e3, tuple(plates))
 
@@ -127,7 +127,7 @@ def _transfer(shape: tuple[int, ...], cells_mm: NDArray[np.float64], tapered: bo
     return factors[1][:, None] * factors[0][None, :]
 
 
-def _uneven_light(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.complex128]:
+def _draw_uneven_light(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.complex128]:
     """Return a complex random field of unit scatter, correlated over about 30 mm."""
     wavenumbers = [np.fft.fftfreq(count, PIXEL_MM) for count in shape]
     passed = np.exp(-((wavenumbers[0][:, None] * 60) ** 2) - (wavenumbers[1][None, :] * 60) ** 2)

@@ -117,16 +117,20 @@ def run(args: argparse.Namespace) -> int:
     for stage, limit in (("image", 0.1), ("report", 4.0)):
         waited = [seconds_by_stage[stage] for seconds_by_stage in behind]
         note = ", ".join(f"{seconds:.2f}" for seconds in waited)
-        lines.append(_least(f"last committed row to {stage}, wall s", statistics.median(waited), limit, limit, note))
+        lines.append(
+            _report_least(f"last committed row to {stage}, wall s", statistics.median(waited), limit, limit, note)
+        )
     for name, took in (("its own plane", same), ("another plane", other_seconds)):
-        lines.append(_least(f"image from kept samples, {name}, a board, CPU s", took.median / boards, 0.15, 0.1))
+        lines.append(_report_least(f"image from kept samples, {name}, a board, CPU s", took.median / boards, 0.15, 0.1))
     for name, took in (("first look", first), ("later", again)):
         note = f"{took.median_wall:.2f} s wall"
-        lines.append(_least(f"list of 200 scans of the operator's page, {name}, CPU s", took.median, 1.0, 0.5, note))
+        lines.append(
+            _report_least(f"list of 200 scans of the operator's page, {name}, CPU s", took.median, 1.0, 0.5, note)
+        )
     for name, times in typed.items():
         cpu, wall = (statistics.median(t[k] for t in times) for k in (0, 1))
         note = f"{wall:.2f} s wall"
-        lines.append(_least(f"polysight {name.split()[0]}, CPU s", cpu, COMMANDS[name], COMMANDS[name], note))
+        lines.append(_report_least(f"polysight {name.split()[0]}, CPU s", cpu, COMMANDS[name], COMMANDS[name], note))
     show("waiting times, simulated rows", lines, args.quick)
     write(args.json, "waits", lines, behind=behind, commands=typed)
     return 0
@@ -152,5 +156,5 @@ def small_products(folder: Path) -> Path:
     return products
 
 
-def _least(name: str, value: float, at_least: float, aim: float, note: str = "") -> Line:
+def _report_least(name: str, value: float, at_least: float, aim: float, note: str = "") -> Line:
     return Line(name, f"{value:.3f} s", "", value, at_least, aim, higher_is_better=False, note=note)

@@ -161,8 +161,8 @@ def run(args: argparse.Namespace) -> int:
     seconds = statistics.median((r["cpu_s"] - r["once_cpu_s"]) * scale + r["once_cpu_s"] for r in ours)
     lines = [
         _time_line(seconds, statistics.median(theirs), statistics.median(theirs_tuned), part),
-        _last_row_line(beside_scan),
-        _memory_line(memory, part),
+        _measure_last_row(beside_scan),
+        _measure_memory(memory, part),
     ]
     show("a whole scan, one core, simulated rows repeated", lines, args.quick)
     write(args.json, "whole", lines, ours=ours, live=beside_scan, published_s=theirs, published_tuned_s=theirs_tuned)
@@ -182,7 +182,7 @@ def _time_line(seconds: float, published_s: float, tuned_s: float, part: str) ->
     )
 
 
-def _last_row_line(live: dict[str, list[float]]) -> Line:
+def _measure_last_row(live: dict[str, list[float]]) -> Line:
     last = statistics.median(live["last_row_wall_s"])
     last_cpu = statistics.median(live["last_row_cpu_s"])
     return Line(
@@ -198,7 +198,7 @@ def _last_row_line(live: dict[str, list[float]]) -> Line:
     )
 
 
-def _memory_line(memory: int, part: str) -> Line:
+def _measure_memory(memory: int, part: str) -> Line:
     return Line(
         "anonymous memory of a full scan, GB",
         f"{memory / 1e9:.2f} GB",

@@ -70,15 +70,17 @@ def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
     keys = Path(pi.key_dir)
     yield attempt("plan", _plan, instrument)
     if wires is not None:
-        yield attempt("simulated wires", _wires, instrument, wires)
+        yield attempt("simulated wires", _check_wires, instrument, wires)
     else:
-        yield _real_time()
+        yield _check_real_time()
         yield from check_lines(instrument)
-    yield attempt("stage", _stage, instrument)
-    yield attempt("journal", _journal, Path(pi.journal_dir), min(instrument.limits.free_disk_bytes, JOURNAL_BYTES))
-    yield attempt("keys", _keys, keys, (pi.command_address, pi.event_address))
-    yield attempt("command address", _address, replier, pi.command_address, keys)
-    yield attempt("event address", _address, publisher, pi.event_address, keys)
+    yield attempt("stage", _check_stage, instrument)
+    yield attempt(
+        "journal", _check_journal, Path(pi.journal_dir), min(instrument.limits.free_disk_bytes, JOURNAL_BYTES)
+    )
+    yield attempt("keys", _check_keys, keys, (pi.command_address, pi.event_address))
+    yield attempt("command address", _check_address, replier, pi.command_address, keys)
+    yield attempt("event address", _check_address, publisher, pi.event_address, keys)
 
 
 def _plan(instrument: Instrument) -> str:
@@ -87,12 +89,12 @@ def _plan(instrument: Instrument) -> str:
     return f"burst of {b.pulses} x {b.period_us:g} us ends before the next point"
 
 
-def _wires(instrument: Instrument, wires: Path) -> str:
+def _check_wires(instrument: Instrument, wires: Path) -> str:
     open_lines(instrument, wires).close()
     return f"{wires}: trigger {instrument.pi.trigger_in}, SYNC_IN {', '.join(map(str, instrument.pi.sync_out))}"
 
 
-def _real_time() -> Finding:
+def _check_real_time() -> Finding:
     """Request the same real-time rights as the service, so that pulse widths are measured with them."""
     refused = dict.fromkeys(system.prepare_process() + system.prepare_thread())
     if refused:
@@ -101,13 +103,13 @@ def _real_time() -> Finding:
     return Finding("ok", "SCHED_FIFO and locked memory are permitted", where="real time")
 
 
-def _stage(instrument: Instrument) -> str:
+def _check_stage(instrument: Instrument) -> str:
     with BenchStage(instrument.stage) as stage:
         x_mm, y_mm = stage.position()
         return f"{instrument.stage.port} answers, firmware {stage.firmware or '?'}, at {x_mm:.2f}, {y_mm:.2f} mm"
 
 
-def _journal(path: Path, needed_bytes: int) -> str:
+def _check_journal(path: Path, needed_bytes: int) -> str:
     Journal(path).close()
     free = shutil.disk_usage(path).free
     if free < needed_bytes:
@@ -116,7 +118,7 @@ def _journal(path: Path, needed_bytes: int) -> str:
     return f"{path} can be written, {free >> 20} MiB are free"
 
 
-def _keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
+def _check_keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
     if all(is_loopback(a) for a in addresses):
         return "not needed: both addresses are loopback"
     secret = folder / "pi.key_secret"
@@ -129,7 +131,7 @@ def _keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
     return f"{secret}"
 
 
-def _address(make: Callable[..., zmq.Socket[bytes]], address: str, key_dir: Path) -> str:
+def _check_address(make: Callable[..., zmq.Socket[bytes]], address: str, key_dir: Path) -> str:
     context = make_server_context()
     try:
         make(context, address, key_dir).close()
@@ -149,14 +151,14 @@ def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MOD
     `model` is the device tree's file with the computer's name, `modules` the folder of the kernel modules' parameters.
     """
     pi = instrument.pi
-    chip = attempt("GPIO chip", _chip, pi)
+    chip = attempt("GPIO chip", _check_chip, pi)
     yield chip
     if chip.level == "ok":
         yield attempt(f"trigger line {pi.trigger_in}", _trigger, pi)
-        check_output = _output
+        check_output = _check_output
         measure = measure_width
         if pi.wiring == "spi":
-            check_output = _spi
+            check_output = _check_spi
             measure = measure_clock
         yield attempt(f"SYNC_IN line {pi.sync_out[0]}", check_output, pi)
         yield Finding("ok", pi.pulse_source, where="pulses")
@@ -165,7 +167,7 @@ def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MOD
         yield _release(modules)
 
 
-def _chip(pi: Pi) -> str:
+def _check_chip(pi: Pi) -> str:
     path = find_chip(pi.gpio_chip)
     try:
         with load_gpiod().Chip(path) as c:
@@ -179,12 +181,12 @@ def _trigger(pi: Pi) -> str:
     return f"rising edges with time stamps, {pi.trigger_bias}, debounced by {pi.trigger_debounce_us} us"
 
 
-def _output(pi: Pi) -> str:
+def _check_output(pi: Pi) -> str:
     request_output(pi).release()
     return "is available, and is low"
 
 
-def _spi(pi: Pi) -> str:
+def _check_spi(pi: Pi) -> str:
     device = SpiDevice(pi.spi_device)
     device.close()
     return f"MOSI of {pi.spi_device}, low; it accepts transfers of {device.bufsiz} bytes"

@@ -144,7 +144,7 @@ def _print_position(args: argparse.Namespace, at: Any) -> int:
     return 0
 
 
-def _events(args: argparse.Namespace, instrument: Instrument) -> int:
+def _show_events(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight_pi.client import follow_events, replay_events
 
     if args.scan_id:
@@ -158,10 +158,10 @@ def _events(args: argparse.Namespace, instrument: Instrument) -> int:
     return 0
 
 
-def _keys(args: argparse.Namespace) -> int:
+def _make_keys(args: argparse.Namespace) -> int:
     from polysight_pi.keys import COPY, allow, make_keys, read_allowed, revoke
 
-    folder = args.dir or Path(_rig(args).pi.key_dir)
+    folder = args.dir or Path(_load_rig(args).pi.key_dir)
     if args.revoke:
         revoke(folder, args.revoke)
     if args.client:
@@ -185,25 +185,25 @@ def _take_over(args: argparse.Namespace, instrument: Instrument) -> int:
     return 0
 
 
-def _positive(text: str) -> int:
+def _parse_positive(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError("must be at least 1")
     return value
 
 
-def _speed(text: str) -> float:
+def _parse_speed(text: str) -> float:
     value = float(text)
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError("must be above 0")
     return value
 
 
-def _option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+def _make_option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
     return names, how
 
 
-def _rig(args: argparse.Namespace) -> Instrument:
+def _load_rig(args: argparse.Namespace) -> Instrument:
     """Load the rig file, with the values given on the command line."""
     import msgspec
 
@@ -217,58 +217,58 @@ def _rig(args: argparse.Namespace) -> Instrument:
     return replace(rig, pi=replace(rig.pi, **pi_values), stage=replace(rig.stage, **stage_values))
 
 
-WIRES = _option("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
-STAGE_PORT = _option("--stage-port", metavar="TTY", help="serial port of the stage; replaces stage.port")
-JOURNAL = _option(
+WIRES = _make_option("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
+STAGE_PORT = _make_option("--stage-port", metavar="TTY", help="serial port of the stage; replaces stage.port")
+JOURNAL = _make_option(
     "--journal", dest="journal_dir", metavar="DIR", help="folder of the journals; replaces pi.journal_dir"
 )
-JSON = _option("--json", action="store_true", help="print JSON, for programs")
-COUNT = {"type": _positive, "metavar": "N"}
+JSON = _make_option("--json", action="store_true", help="print JSON, for programs")
+COUNT = {"type": _parse_positive, "metavar": "N"}
 MM = {"type": float, "default": 0.0, "metavar": "MM"}
 # name, action, help, example, options
 COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str, Any]], ...]], ...] = (
     ("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml", (
         WIRES, STAGE_PORT, JOURNAL,
-        _option("--command-address", metavar="tcp://HOST:PORT", help="replaces pi.command_address"),
-        _option("--event-address", metavar="tcp://HOST:PORT", help="replaces pi.event_address"),
+        _make_option("--command-address", metavar="tcp://HOST:PORT", help="replaces pi.command_address"),
+        _make_option("--event-address", metavar="tcp://HOST:PORT", help="replaces pi.event_address"),
     )),
     ("check", _check, "check lines, ports, permissions, keys and disk; nothing moves", "--config instrument.toml", (
         WIRES, STAGE_PORT, JOURNAL, JSON,
     )),
     ("pulse", _pulse, "send bursts on SYNC_IN and print their width and jitter", "--count 100", (
-        WIRES, JSON, _option("--count", **COUNT, default=10, help="number of bursts (%(default)s)"),
+        WIRES, JSON, _make_option("--count", **COUNT, default=10, help="number of bursts (%(default)s)"),
     )),
     ("buzz", _buzz, "move an axis by 1 mm each way, slowly, before the first homing", "x", (
-        _option("axis", choices=("x", "y"), help="axis; y is the vertical one"), STAGE_PORT, JSON,
+        _make_option("axis", choices=("x", "y"), help="axis; y is the vertical one"), STAGE_PORT, JSON,
     )),
     ("jog", _jog, "move the stage by a distance (home it first)", "--dx 10 --dy -5", (
-        STAGE_PORT, JSON, _option("--dx", **MM, help="along x, millimetres (0)"),
-        _option("--dy", **MM, help="along y, millimetres (0)"),
-        _option("--speed", type=_speed, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)"),
+        STAGE_PORT, JSON, _make_option("--dx", **MM, help="along x, millimetres (0)"),
+        _make_option("--dy", **MM, help="along y, millimetres (0)"),
+        _make_option("--speed", type=_parse_speed, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)"),
     )),
     ("home", _home, "home the stage, through the service if it runs", "--config instrument.toml", (
         STAGE_PORT, JSON,
     )),
-    ("events", _events, "print events as JSON lines, live or from the journal", "--scan-id my-scan --from-seq 1", (
-        _option("--scan-id", metavar="ID", help="print the journal of this scan instead of live events"),
-        _option("--from-seq", **COUNT, default=1, help="first event from the journal (%(default)s)"),
-        _option("--count", **COUNT, help="stop after this number of events"),
-        _option("--limit-s", type=float, default=10.0, metavar="S", help="timeout without an event (%(default)s)"),
+    ("events", _show_events, "print events as JSON lines, live or from the journal", "--scan-id my-scan --from-seq 1", (
+        _make_option("--scan-id", metavar="ID", help="print the journal of this scan instead of live events"),
+        _make_option("--from-seq", **COUNT, default=1, help="first event from the journal (%(default)s)"),
+        _make_option("--count", **COUNT, help="stop after this number of events"),
+        _make_option("--limit-s", type=float, default=10.0, metavar="S", help="timeout without an event (%(default)s)"),
     )),
-    ("keys", _keys, "make CURVE keys for addresses that are not loopback", "--dir /etc/polysight/keys", (
-        _option("--dir", type=Path, metavar="DIR", help="folder of the keys; replaces pi.key_dir"),
-        _option("--replace", action="store_true", help="replace existing keys"),
-        _option("--client", metavar="NAME", help="make keys for one more client and allow it"),
-        _option("--revoke", metavar="NAME", help="remove this client from the list, at once"),
-        _option("--list", action="store_true", help="list the allowed clients"),
+    ("keys", _make_keys, "make CURVE keys for addresses that are not loopback", "--dir /etc/polysight/keys", (
+        _make_option("--dir", type=Path, metavar="DIR", help="folder of the keys; replaces pi.key_dir"),
+        _make_option("--replace", action="store_true", help="replace existing keys"),
+        _make_option("--client", metavar="NAME", help="make keys for one more client and allow it"),
+        _make_option("--revoke", metavar="NAME", help="remove this client from the list, at once"),
+        _make_option("--list", action="store_true", help="list the allowed clients"),
     )),
     ("take-over", _take_over, "control the run of another program, as a person at the Pi", "abort", (
-        _option("what", choices=("hold", "resume", "abort", "end"), help="action on the run"), JOURNAL,
+        _make_option("what", choices=("hold", "resume", "abort", "end"), help="action on the run"), JOURNAL,
     )),
 )  # fmt: skip
 
 
-def _parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="polysight-pi",
         description="The Raspberry Pi half of the instrument: controls the stage, answers its triggers with SYNC_IN "
@@ -300,10 +300,10 @@ def main(argv: list[str] | None = None) -> int:
     open_standard_streams()
     try:
         with interrupts_between_imports():
-            args = _parser().parse_args(expand_home(sys.argv[1:] if argv is None else argv))
-            if args.action is _keys:
+            args = _make_parser().parse_args(expand_home(sys.argv[1:] if argv is None else argv))
+            if args.action is _make_keys:
                 return args.action(args)
-            return args.action(args, _rig(args))
+            return args.action(args, _load_rig(args))
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except BrokenPipeError:

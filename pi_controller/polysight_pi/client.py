@@ -26,14 +26,14 @@ CONNECT_TIMEOUT_S = 2.0
 Ask = Callable[..., Any]
 
 
-def _no_answer(address: str) -> DeviceError:
+def _no_answer_error(address: str) -> DeviceError:
     cause = "the service `polysight-pi run` is not running on this Pi, or it hangs"
     remedy = "start it: `sudo systemctl restart polysight-pi`"
     return DeviceError(f"no answer from {address}", cause, remedy, code=ErrorCode.NO_ANSWER)
 
 
 @contextmanager
-def _service(instrument: Instrument) -> Iterator[Ask]:
+def _open_service(instrument: Instrument) -> Iterator[Ask]:
     """Connect and give a function that sends a command and returns its reply.
 
     The function raises DeviceError if the service refuses or does not reply in time.
@@ -47,9 +47,9 @@ def _service(instrument: Instrument) -> Iterator[Ask]:
             try:
                 client.send(m.pack(command))
             except zmq.Again:  # not connected
-                raise _no_answer(address) from None
+                raise _no_answer_error(address) from None
             if not client.poll(round(instrument.limits.command_timeout_s * 1e3)):
-                raise _no_answer(address)
+                raise _no_answer_error(address)
             reply = m.unpack_reply(client.recv())
             if isinstance(reply, m.Refused):
                 summary = f"{type(command).__name__} was refused: {reply.problem}"
@@ -61,7 +61,7 @@ def _service(instrument: Instrument) -> Iterator[Ask]:
         context.destroy(linger=0)
 
 
-def _listens(address: str) -> bool:
+def _is_listening(address: str) -> bool:
     """True if any program listens there. Needs no answer, which a busy machine would give late."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     try:
@@ -73,7 +73,7 @@ def _listens(address: str) -> bool:
 
 def refuse_beside_service(instrument: Instrument) -> None:
     """Raise DeviceError if the service of this rig runs: it holds lines, stage and ports."""
-    if _listens(instrument.pi.command_address):
+    if _is_listening(instrument.pi.command_address):
         raise DeviceError(
             f"polysight-pi run serves at {instrument.pi.command_address}",
             "it holds the lines, the stage and the ports",
@@ -88,9 +88,9 @@ def home_by_service(instrument: Instrument) -> m.StatusReply | None:
 
     Raises DeviceError if the service refuses, for example because the host of a run is alive, or if homing fails.
     """
-    if not _listens(instrument.pi.command_address):
+    if not _is_listening(instrument.pi.command_address):
         return None
-    with _service(instrument) as ask:
+    with _open_service(instrument) as ask:
         ask(m.Home())
         deadline = time.monotonic() + MOTION_TIMEOUT_S
         while time.monotonic() < deadline:
@@ -121,7 +121,7 @@ def take_over(instrument: Instrument, action: str) -> str:
     except OSError as e:
         raise os_error(e, "polysight-pi run is not running here, or you are not its user", AS_THE_SERVICE) from None
     reason = "a person at the Pi took over the run"
-    with _service(instrument) as ask:
+    with _open_service(instrument) as ask:
         if action == "end":
             scan_id = ask(m.Status()).scan_id
             return ask(m.EndRun(scan_id=scan_id, exit_status="abort", reason=reason, owner=owner)).state
@@ -136,14 +136,14 @@ def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:
         listener = subscriber(context, instrument.pi.event_address, Path(instrument.pi.key_dir))
         while listener.poll(round(timeout_s * 1e3)):
             yield msgspec.to_builtins(m.unpack_event(listener.recv_multipart()[-1]))
-        raise _no_answer(instrument.pi.event_address)
+        raise _no_answer_error(instrument.pi.event_address)
     finally:
         context.destroy(linger=0)
 
 
 def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterator[Any]:
     """Yield a scan's journalled events as plain objects. Raises DeviceError without an answer or a journal."""
-    with _service(instrument) as ask:
+    with _open_service(instrument) as ask:
         while True:
             reply = ask(m.Replay(scan_id=scan_id, from_seq=from_seq))
             if reply.last_seq == 0:

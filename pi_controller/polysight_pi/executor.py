@@ -131,7 +131,7 @@ class Executor:
         self._ending = self._ended = False
         self.crash: BaseException | None = None
         self._thread = threading.Thread(target=self._live, name="executor", daemon=True)
-        self._refresh()
+        self._refresh_replies()
 
     # --- for other threads ------------------------------------------------------------------------------------------
 
@@ -187,7 +187,7 @@ class Executor:
 
     def start(self) -> None:
         """Start this thread and the journal's. The stage has to be connected."""
-        self._refresh()
+        self._refresh_replies()
         self.journal.start()
         self._thread.start()
 
@@ -221,7 +221,7 @@ class Executor:
             late += f", nor has the executor turned for {self.unresponsive_s:.1f} s: the computer was too busy or slept"
         if late:
             self._machine.stop_motion(PiFault.PROGRAM_LATE, late)
-        self._refresh()
+        self._refresh_replies()
         self._send_replies()
         self._turned_s = time.monotonic()
         if not late:
@@ -278,7 +278,7 @@ class Executor:
         else:
             item()
         if row is not None and machine.row is not row:
-            self._row_ended((row.row.index, row.take))
+            self._end_row((row.row.index, row.take))
 
     def _answer_pulses(self, reply: m.AnyReply) -> None:
         self._replies += [(request, reply) for request in self._pulsing]
@@ -450,7 +450,7 @@ class Executor:
         if self._run is None and command.scan_id == self.journal.position[0]:
             # A repeated request
             return self._accept()
-        self._need_run(command.scan_id)
+        self._require_run(command.scan_id)
         self._machine.require("EndRun")
 
         def write(journal: Journal) -> None:
@@ -490,7 +490,7 @@ class Executor:
 
         self.journal.call(write, lambda error: self._inbox.put(partial(finish, error)))
 
-    def _need_run(self, scan_id: str) -> m.BeginRun:
+    def _require_run(self, scan_id: str) -> m.BeginRun:
         if self._run is None or self._run.scan_id != scan_id:
             active = "no run"
             if self._run is not None:
@@ -500,7 +500,7 @@ class Executor:
         return self._run
 
     def _run_row(self, command: m.RunRow) -> m.Accepted:
-        run = self._need_run(command.scan_id)
+        run = self._require_run(command.scan_id)
         running = self._machine.row
         index = command.row_index
         repeated = running is not None and (index, command.take) == (running.row.index, running.take)
@@ -521,7 +521,7 @@ class Executor:
         self._takes[index] = command.take
         return accepted
 
-    def _row_ended(self, row: tuple[int, int]) -> None:
+    def _end_row(self, row: tuple[int, int]) -> None:
         self._last_row = row
         if self._after_row is not None:
             request = self._after_row
@@ -533,7 +533,7 @@ class Executor:
         self._ending = True
         self._ended = not self._machine.terminate()
 
-    def _refresh(self) -> None:
+    def _refresh_replies(self) -> None:
         """Update the replies to Hello and Status; they are replaced as a whole, so other threads may read them.
 
         Their `scan_id` and `last_seq` are those of the journal when they are sent.

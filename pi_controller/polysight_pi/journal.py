@@ -64,7 +64,7 @@ class JournalFullError(DeviceError):
         super().__init__(summary, cause, "free space on the Pi", code=ErrorCode.DISK_FULL)
 
 
-def _crc(seq: int, payload: bytes) -> int:
+def _compute_crc(seq: int, payload: bytes) -> int:
     return zlib.crc32(payload, zlib.crc32(seq.to_bytes(4, "little")))
 
 
@@ -88,7 +88,7 @@ def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
         if length > MAX_RECORD_BYTES or seq <= last:
             return
         payload = file.read(length)
-        if len(payload) < length or _crc(seq, payload) != crc:
+        if len(payload) < length or _compute_crc(seq, payload) != crc:
             return
         yield offset, seq, payload
         offset += _HEAD.size + length
@@ -101,7 +101,7 @@ def _holds_records(tail: bytes) -> bool:
         length, seq, crc = _HEAD.unpack_from(tail, offset)
         start = offset + _HEAD.size
         payload = tail[start : start + length]
-        if 0 < length <= MAX_RECORD_BYTES and len(payload) == length and _crc(seq, payload) == crc:
+        if 0 < length <= MAX_RECORD_BYTES and len(payload) == length and _compute_crc(seq, payload) == crc:
             return True
     return False
 
@@ -186,7 +186,7 @@ class JournalFile:
         data = bytearray()
         for seq, payload in enumerate(payloads, self.last_seq + 1):
             places.append((seq, self._end + len(data)))
-            data += _HEAD.pack(len(payload), seq, _crc(seq, payload)) + payload
+            data += _HEAD.pack(len(payload), seq, _compute_crc(seq, payload)) + payload
         done = 0
         try:
             while done < len(data):
@@ -212,7 +212,7 @@ class JournalFile:
         for seq, offset in self._places[first : first + limit]:
             length, _, crc = _HEAD.unpack(os.pread(self._fd, _HEAD.size, offset))
             payload = os.pread(self._fd, length, offset + _HEAD.size)
-            if _crc(seq, payload) != crc:
+            if _compute_crc(seq, payload) != crc:
                 summary = f"{self.path}: record {seq} is damaged"
                 raise DataError(summary, "the disk or card fails", "replace it", code=ErrorCode.FILE_DAMAGED)
             payloads.append(payload)

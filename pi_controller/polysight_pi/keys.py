@@ -51,7 +51,7 @@ def read_allowed(folder: Path) -> dict[str, str]:
         lines = (folder / ALLOWED).read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
         with suppress(OSError, ValueError):
-            return {_public(folder, "host"): "host"}
+            return {_derive_public(folder, "host"): "host"}
         return {}
     keys = (line.strip().partition(" ") for line in lines)
     return {key: name.strip() or "nameless" for key, _, name in keys if len(key) == KEY_CHARACTERS}
@@ -75,7 +75,7 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
         )
     folder.mkdir(parents=True, exist_ok=True)
     files = [path for name in PARTIES for path in _create(folder, name)]
-    _write_allowed(folder, {_public(folder, "host"): "host"})
+    _write_allowed(folder, {_derive_public(folder, "host"): "host"})
     return files
 
 
@@ -89,7 +89,7 @@ def allow(folder: Path, name: str) -> list[Path]:
             code=ErrorCode.NAME_TAKEN,
         )
     files = _create(folder, name)
-    _write_allowed(folder, read_allowed(folder) | {_public(folder, name): name})
+    _write_allowed(folder, read_allowed(folder) | {_derive_public(folder, name): name})
     return files
 
 
@@ -103,7 +103,7 @@ def revoke(folder: Path, name: str) -> None:
     _write_allowed(folder, remaining)
 
 
-def _public(folder: Path, name: str) -> str:
+def _derive_public(folder: Path, name: str) -> str:
     return load_certificate(folder / f"{name}.key")[0].decode("ascii")
 
 

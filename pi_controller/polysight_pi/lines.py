@@ -173,7 +173,7 @@ def _is_stamped_by_the_kernel(pi: Pi) -> bool:
         return chip.get_line_info(pi.trigger_in).event_clock == gpiod.line.Clock.MONOTONIC
 
 
-def _lost(e: OSError) -> DeviceError:
+def _line_lost_error(e: OSError) -> DeviceError:
     return DeviceError(
         f"GPIO lines are gone: {e.strerror}", "the chip vanished or its driver was unloaded", "`polysight-pi check`"
     )
@@ -209,7 +209,7 @@ class TriggerInput:
             if not self._events and self._input.wait_edge_events(timedelta(seconds=timeout_s)):
                 self._events.extend(self._input.read_edge_events())
         except OSError as e:
-            raise _lost(e) from None
+            raise _line_lost_error(e) from None
         if not self._events:
             return None
         event = self._events.popleft()
@@ -252,7 +252,7 @@ class GpiodLines(TriggerInput):
             while self._return.wait_edge_events(timedelta(seconds=LOOK_BACK_S if pulses < sent else 0)):
                 pulses += len(self._return.read_edge_events())
         except OSError as e:
-            raise _lost(e) from None
+            raise _line_lost_error(e) from None
         return Seen(pulses)
 
     def sleep_until(self, t_ns: int) -> None:
@@ -287,7 +287,7 @@ class GpiodLines(TriggerInput):
             clear()
             return begin_ns, now()
         except OSError as e:
-            raise _lost(e) from None
+            raise _line_lost_error(e) from None
 
     def close(self) -> None:
         """Set SYNC_IN low and release the lines."""
@@ -311,7 +311,7 @@ class SpiDevice:
         try:
             self._fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except OSError as e:
-            raise self._error(e) from None
+            raise self._line_error(e) from None
         try:
             try:
                 fcntl.ioctl(self._fd, WRITE_MODE, bytes([MODE_NO_CS]))
@@ -320,7 +320,7 @@ class SpiDevice:
             self.transfer(bytes(1), 1_000_000)
         except OSError as e:
             os.close(self._fd)
-            raise self._error(e) from None
+            raise self._line_error(e) from None
         except DeviceError:
             os.close(self._fd)
             raise
@@ -347,9 +347,9 @@ class SpiDevice:
             fcntl.ioctl(self._fd, MESSAGE, message)
             return begin_ns, time.monotonic_ns()
         except OSError as e:
-            raise self._error(e) from None
+            raise self._line_error(e) from None
 
-    def _error(self, e: OSError) -> DeviceError:
+    def _line_error(self, e: OSError) -> DeviceError:
         unknown = f"the kernel says: {e.strerror}", "look at the kernel's log (dmesg)"
         cause, remedy = _SPI_REASONS.get(e.errno or 0, unknown)
         return DeviceError(f"fault {int(PiFault.TRIGGER_LINE_LOST)}: {self.path}: {e.strerror}", cause, remedy)

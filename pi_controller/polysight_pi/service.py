@@ -127,7 +127,7 @@ class Server:
                     return
                 self._events.send_multipart([EVENT_TOPIC, raw])
             except queue.Empty:
-                if time.monotonic() >= next_beat and self._beat(executor):
+                if time.monotonic() >= next_beat and self._publish_heartbeat(executor):
                     next_beat = max(next_beat + self._heartbeat_ms / 1e3, time.monotonic())
             if not self._stop:
                 self._turned_s["event"] = time.monotonic()
@@ -221,7 +221,7 @@ class Server:
             return None
         return make_refusal(PiFault.NOT_READY, "too many commands are waiting", "", "wait for replies")
 
-    def _beat(self, executor: Executor) -> bool:
+    def _publish_heartbeat(self, executor: Executor) -> bool:
         """Publish a heartbeat, unless the executor hangs. Return False if an event up to its number is not sent yet."""
         status = executor.status
         if not self._unsent.empty():

@@ -37,7 +37,7 @@ def prepare_process() -> list[str]:
     """
     gc.freeze()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    refused = _schedule(OTHERS_PRIORITY)
+    refused = _list_schedule(OTHERS_PRIORITY)
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(_MCL_CURRENT_FUTURE_ONFAULT) != 0:
         refused.append(
@@ -51,11 +51,11 @@ def prepare_thread(priority: int = PRIORITY) -> list[str]:
     """Set the trigger thread's priority and the shortest timer slack. Returns as :func:`prepare_process`."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) != 0:
-        return ["timer slack stays at 50 us: pulses may be that late", *_schedule(priority)]
-    return _schedule(priority)
+        return ["timer slack stays at 50 us: pulses may be that late", *_list_schedule(priority)]
+    return _list_schedule(priority)
 
 
-def _schedule(priority: int) -> list[str]:
+def _list_schedule(priority: int) -> list[str]:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as e:

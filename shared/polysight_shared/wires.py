@@ -110,7 +110,7 @@ class WireClient:
             self._socket.sendall(hello)
             deadline = time.monotonic() + timeout_s
             for _ in range(hello.count(b"\n")):
-                if self._next_line(max(0.0, deadline - time.monotonic())) != "K":
+                if self._read_line(max(0.0, deadline - time.monotonic())) != "K":
                     raise ProtocolError(f"simulated wires at {path}: no confirmation", code=ErrorCode.NO_ANSWER)
 
     def fileno(self) -> int:
@@ -126,10 +126,10 @@ class WireClient:
 
     def receive(self, timeout_s: float | None) -> WireMessage | None:
         """Return the next message, or None after `timeout_s`. Raises DeviceError if the hub is gone."""
-        line = self._next_line(timeout_s)
+        line = self._read_line(timeout_s)
         return None if line is None else parse(line)
 
-    def _next_line(self, timeout_s: float | None) -> str | None:
+    def _read_line(self, timeout_s: float | None) -> str | None:
         while not self._pending:
             self._socket.settimeout(timeout_s if timeout_s is None else max(timeout_s, 1e-6))
             try:

@@ -52,7 +52,7 @@ def compile_once(product: str, sources: Iterable[Path], command: Sequence[str], 
     # A file that is there is used, from a read-only folder too.
     if (FOLDER / name).is_file():
         return FOLDER / name
-    result = _folder() / name
+    result = _make_folder() / name
     if result.is_file():
         return result
     with tempfile.TemporaryDirectory(prefix=".making-", dir=result.parent) as folder:
@@ -74,7 +74,7 @@ def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
         raise DeviceError(f"{product} does not compile on this machine:\n{message}", *on_failure)
 
 
-def _folder() -> Path:
+def _make_folder() -> Path:
     """Return a writable folder for compiled programs. Raises DeviceError if the last one belongs to another user."""
     places = [FOLDER]
     # A user without a home

@@ -56,7 +56,7 @@ def _set_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
             board["start_offset_hz"] = if_offset_hz or _NATIVE_OFFSET_HZ
 
 
-def _as_programmed(table: dict[str, Any], if_offset_hz: float) -> None:
+def _apply_if_offset(table: dict[str, Any], if_offset_hz: float) -> None:
     """Add the scene's IF offset to the start offsets of the receivers, as if they were programmed so."""
     for board in table["boards"]:
         if board["role"] != "transmit":
@@ -78,7 +78,7 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     if native:
         _set_native_control(table, offset_hz)
     elif table["radar"]["control"] != "native" and scene is not None:
-        _as_programmed(table, scene.disturbances.if_offset_hz)
+        _apply_if_offset(table, scene.disturbances.if_offset_hz)
     if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
         # The boards start with an empty flash
         table["radar"]["firmware"] = str(folder / IMAGE_FILE)
@@ -110,7 +110,7 @@ class Child:
     @property
     def ready(self) -> bool:
         """True if it has printed `ready`."""
-        return any(line.startswith("ready") for line in self._lines())
+        return any(line.startswith("ready") for line in self._format_lines())
 
     def check(self) -> None:
         """Raise DeviceError with the last lines of its log if the process has ended."""
@@ -124,9 +124,9 @@ class Child:
 
     def last_lines(self) -> str:
         """Return the end of its log."""
-        return "\n".join(f"    {line}" for line in self._lines()[-_LOG_LINES:])
+        return "\n".join(f"    {line}" for line in self._format_lines()[-_LOG_LINES:])
 
-    def _lines(self) -> list[str]:
+    def _format_lines(self) -> list[str]:
         return self.log.read_text(encoding="utf-8", errors="replace").splitlines()
 
     def send_signal(self, number: signal.Signals) -> None:
@@ -180,18 +180,20 @@ class RigProcesses:
     def _start(self, rig: Instrument, scene: Path | None, options: RigOptions) -> None:
         wires = str(self._folder / "wires.sock")
         config = str(self._folder / "instrument.toml")
-        self._wait([self._module("wires", "wires", "--socket", wires)])
+        self._wait([self._start_module("wires", "wires", "--socket", wires)])
         common = ["--config", config, "--wires", wires, "--time-scale", repr(options.time_scale)]
-        started = [self._module("stage", "uno" if options.uno else "stage", *common, "--link", rig.stage.port)]
+        started = [self._start_module("stage", "uno" if options.uno else "stage", *common, "--link", rig.stage.port)]
         for group in card_groups(rig):
             name = f"cards-{group.partition(',')[0]}"
             card_options = ["--boards", group, "--report", str(self._folder / f"{name}.json")]
-            started.append(self._module(name, "cards", *common, *card_options, *_card_options(scene, options)))
+            started.append(
+                self._start_module(name, "cards", *common, *card_options, *_list_card_options(scene, options))
+            )
         self._wait(started)
         if options.with_pi:
-            self._wait([self._launch("pi", [_pi_program(), "run", "--config", config, "--wires", wires])])
+            self._wait([self._launch("pi", [_find_pi_program(), "run", "--config", config, "--wires", wires])])
 
-    def _module(self, name: str, module: str, *arguments: str) -> Child:
+    def _start_module(self, name: str, module: str, *arguments: str) -> Child:
         return self._launch(name, [sys.executable, "-m", f"polysight_simulators.{module}", *arguments])
 
     def _launch(self, name: str, command: list[str]) -> Child:
@@ -238,7 +240,7 @@ def card_groups(rig: Instrument) -> list[str]:
     return [",".join(g) for g in groups]
 
 
-def _card_options(scene: Path | None, options: RigOptions) -> list[str]:
+def _list_card_options(scene: Path | None, options: RigOptions) -> list[str]:
     words = []
     if scene is not None:
         words += ["--scene", str(scene), "--offset-in-rig"]
@@ -253,7 +255,7 @@ def _card_options(scene: Path | None, options: RigOptions) -> list[str]:
     return words
 
 
-def _pi_program() -> str:
+def _find_pi_program() -> str:
     program = Path(sys.executable).parent / "polysight-pi"
     if not program.exists():
         raise ConfigError(

@@ -421,7 +421,7 @@ def test_a_return_wire_that_is_off_ends_the_row(pi, hub, instrument, monkeypatch
         pi.host.home()
         assert pi.host.row(0).pulses_seen
         cutter._socket.sendall(f"X {instrument.pi.pulses_in} 1\n".encode())
-        assert cutter._next_line(HANG_S) == "K"
+        assert cutter._read_line(HANG_S) == "K"
         done = pi.host.row(1)
         assert (done.fault, done.pulses, done.pulses_seen) == (PiFault.PULSES_UNSEEN, 0, True)
         assert all(c.pulses_seen for c in pi.host.list_events(m.Capture))

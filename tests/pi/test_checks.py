@@ -121,33 +121,33 @@ def test_spi_that_is_off_has_its_remedy(rig_with, tmp_path):
 
 def test_journal_and_disk(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    assert attempt("journal", checks._journal, tmp_path / "file" / "journal", 0).level == "error"
+    assert attempt("journal", checks._check_journal, tmp_path / "file" / "journal", 0).level == "error"
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(100, 99, 1 << 20))
-    finding = attempt("journal", checks._journal, tmp_path, checks.JOURNAL_BYTES)
+    finding = attempt("journal", checks._check_journal, tmp_path, checks.JOURNAL_BYTES)
     assert (finding.level, "1 MiB" in finding.what, "100 MiB" in finding.what) == ("error", True, True)
 
 
 def test_keys(tmp_path):
     folder = tmp_path / "keys"
     addresses = ("tcp://127.0.0.1:1", "tcp://0.0.0.0:2")
-    assert attempt("keys", checks._keys, folder, addresses[:1]).level == "ok"
-    finding = attempt("keys", checks._keys, folder, addresses)
+    assert attempt("keys", checks._check_keys, folder, addresses[:1]).level == "ok"
+    finding = attempt("keys", checks._check_keys, folder, addresses)
     assert (finding.level, finding.do) == ("error", "polysight-pi keys")
     make_keys(folder)
-    assert attempt("keys", checks._keys, folder, addresses).level == "ok"
+    assert attempt("keys", checks._check_keys, folder, addresses).level == "ok"
     (folder / "pi.key_secret").chmod(0o644)
-    finding = attempt("keys", checks._keys, folder, addresses)
+    finding = attempt("keys", checks._check_keys, folder, addresses)
     assert (finding.level, "chmod 600" in finding.do) == ("warning", True)
 
 
 def test_addresses_and_bursts(tmp_path, gpio_rig):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
-        assert attempt("command address", checks._address, replier, address, tmp_path).level == "error"
-    finding = attempt("event address", checks._address, publisher, "tcp://0.0.0.0:*", tmp_path)
+        assert attempt("command address", checks._check_address, replier, address, tmp_path).level == "error"
+    finding = attempt("event address", checks._check_address, publisher, "tcp://0.0.0.0:*", tmp_path)
     assert (finding.level, "polysight-pi keys" in finding.do) == ("error", True)
-    assert attempt("event address", checks._address, publisher, "tcp//x", tmp_path).level == "error"
+    assert attempt("event address", checks._check_address, publisher, "tcp//x", tmp_path).level == "error"
     slow = replace(gpio_rig, burst=replace(gpio_rig.burst, pulses=100))
     assert attempt("plan", checks._plan, slow).level == "error", "the burst does not end before the next point"
 

@@ -214,6 +214,6 @@ def test_keys_of_another_user_are_an_error_with_its_remedy(config, monkeypatch, 
     said = capsys.readouterr().err
     assert "Permission denied" in said
     assert "sudo -u polysight" in said
-    finding = attempt("keys", checks._keys, config.parent / "keys", (ELSEWHERE,))
+    finding = attempt("keys", checks._check_keys, config.parent / "keys", (ELSEWHERE,))
     assert (finding.level, "sudo -u polysight" in finding.do) == ("error", True)
     assert "pi.key_secret: Permission denied" in finding.what

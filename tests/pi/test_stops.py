@@ -236,7 +236,7 @@ def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, which):
     stage.stays_after = 2
     host.start_row()
     host.wait(m.Capture)
-    busy = "_send_replies" if which == "command" else "_beat"
+    busy = "_send_replies" if which == "command" else "_publish_heartbeat"
     real = getattr(server, busy)
     monkeypatch.setattr(server, busy, lambda *a: (go_on.wait(HANG_S), real(*a))[1])
     wait_for(lambda: stop_is_sent(stage), "STOP")

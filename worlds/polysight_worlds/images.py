@@ -284,8 +284,8 @@ def backproject(rig: Rig, rx: Antenna, data: NDArray, pixels: int, kaiser_beta: 
     offsets_x, offsets_y = rig.offsets_m()
     x = x_m[0] - offsets_x[0] + signed_lags(shape[1], pixels) * rig.step_m
     y = y_m[0] - offsets_y[0] + signed_lags(shape[0], pixels) * rig.step_m
-    out = _distance(rig.tx, x, y, rig.plane_m)
-    back = _distance(rx, x, y, rig.plane_m)
+    out = _measure_distance(rig.tx, x, y, rig.plane_m)
+    back = _measure_distance(rx, x, y, rig.plane_m)
     excess_m = out + back - np.linalg.norm(rx.position - rig.tx.position)
     spectrum = np.zeros((*data.shape[:-3], *shape), np.complex64)
     for index, frequency_hz in enumerate(rig.frequencies_hz):
@@ -295,6 +295,6 @@ def backproject(rig: Rig, rx: Antenna, data: NDArray, pixels: int, kaiser_beta: 
     return image.astype(np.complex64)
 
 
-def _distance(antenna: Antenna, x: NDArray, y: NDArray, z: float) -> NDArray:
+def _measure_distance(antenna: Antenna, x: NDArray, y: NDArray, z: float) -> NDArray:
     ax, ay, az = antenna.position
     return np.sqrt((x[None, :] - ax) ** 2 + (y[:, None] - ay) ** 2 + (z - az) ** 2)

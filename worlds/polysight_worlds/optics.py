@@ -63,23 +63,23 @@ class Antenna:
         gain = np.maximum(np.maximum(cosine, 0) ** self.exponent, PATTERN_FLOOR)
         if self.is_dipole:
             along = _dot(self.polarisation, directions)
-            return gain * (_column(self.polarisation, directions) - along * directions)
+            return gain * (_make_column(self.polarisation, directions) - along * directions)
         return gain * _carry(self.boresight, directions, self.polarisation)
 
 
-def _column(vector: NDArray, like: NDArray) -> NDArray:
+def _make_column(vector: NDArray, like: NDArray) -> NDArray:
     if vector.ndim == 1:
         return vector.reshape(3, *(1,) * (like.ndim - 1))
     return vector
 
 
 def _dot(a: NDArray, b: NDArray) -> NDArray:
-    a, b = _column(a, b), _column(b, a)
+    a, b = _make_column(a, b), _make_column(b, a)
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _cross(a: NDArray, b: NDArray) -> NDArray:
-    a, b = _column(a, b), _column(b, a)
+    a, b = _make_column(a, b), _make_column(b, a)
     product = np.empty(np.broadcast_shapes(a.shape, b.shape), np.result_type(a, b))
     for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
         np.multiply(a[j], b[k], out=product[i])
@@ -89,8 +89,8 @@ def _cross(a: NDArray, b: NDArray) -> NDArray:
 
 def _carry(start: NDArray, end: NDArray, vector: NDArray) -> NDArray:
     """Turn `vector` as the unit vector `start` is turned to `end` on the shortest arc."""
-    start = _column(start, end)
-    vector = _column(vector, end)
+    start = _make_column(start, end)
+    vector = _make_column(vector, end)
     summed = start + end
     return vector - summed * (_dot(vector, end) / np.maximum(1 + _dot(start, end), 1e-6))
 
@@ -117,13 +117,13 @@ class Response:
 
 def respond(tx: Antenna, rx: Antenna, points: NDArray, normals: NDArray) -> Response:
     """Response of facets at `points` [3, ...] with unit `normals` [3, ...] or [3] towards the antennas."""
-    out = points - _column(tx.position, points)
-    back = _column(rx.position, points) - points
+    out = points - _make_column(tx.position, points)
+    back = _make_column(rx.position, points) - points
     out_m = np.sqrt(_dot(out, out))
     back_m = np.sqrt(_dot(back, back))
     incident = out / out_m
     scattered = back / back_m
-    normals = _column(normals, points)
+    normals = _make_column(normals, points)
     cos_incidence = -_dot(incident, normals)
     lit = (cos_incidence > 0) & (_dot(scattered, normals) > 0)
 

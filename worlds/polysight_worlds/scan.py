@@ -86,7 +86,7 @@ def _draw_surface(rng: np.random.Generator, shape: tuple[int, int], length_cells
     return smooth * 2 * np.sqrt(np.pi) * sigma
 
 
-def _normal(slopes: tuple[float, float]) -> NDArray:
+def _compute_normal(slopes: tuple[float, float]) -> NDArray:
     """Unit normal towards the antennas of a surface z = slope_x x + slope_y y."""
     normal = np.array([slopes[0], slopes[1], -1.0])
     return normal / np.linalg.norm(normal)
@@ -101,18 +101,18 @@ class PlateEchoes:
         self._brightness = plate.brightness
         rows, columns = surface.cover.shape
         self._shape = fast_length(rig.rows + rows - 1), fast_length(rig.columns + columns - 1)
-        points = self._points(plate)
+        points = self._list_points(plate)
         slopes = surface.mean_slopes
         variations = [slopes]
         if surface.local_slopes is not None:
             variations += [(slopes[0] + SLOPE_STEP, slopes[1]), (slopes[0], slopes[1] + SLOPE_STEP)]
-        self._responses = [respond(rig.tx, rx, points, _normal(varied)) for varied in variations]
+        self._responses = [respond(rig.tx, rx, points, _compute_normal(varied)) for varied in variations]
         # Without layers a medium reflects alike at all frequencies.
         many = rig.frequencies_hz if plate.stack.layers else rig.frequencies_hz[:1]
         self._tables = [ReflectionTable(plate.stack, f) for f in many]
         self._terms: list[NDArray] = []
         main = self._responses[0]
-        along_x, along_y = self._edges()
+        along_x, along_y = self._find_edges()
         self._steps_m = main.path_steps(along_x, along_y)
         self._phase = _PhaseSteps(main.path_m, rig.frequencies_hz)
         weight = np.abs(main.s_weight) + np.abs(main.p_weight)
@@ -129,7 +129,7 @@ class PlateEchoes:
             self._orders += 1
             term *= 2 * largest / self._orders
 
-    def _points(self, plate: Plate) -> NDArray:
+    def _list_points(self, plate: Plate) -> NDArray:
         """Cell minus offset for all circular lags, [3, lags_y, lags_x]."""
         rig = self._rig
         surface = self._surface
@@ -139,7 +139,7 @@ class PlateEchoes:
         z = rig.plane_m - plate.height_mm / 1000
         return np.stack(np.broadcast_arrays(x[None, :], y[:, None], z))
 
-    def _edges(self) -> tuple[NDArray, NDArray]:
+    def _find_edges(self) -> tuple[NDArray, NDArray]:
         """Edges of a cell along x and y, [3] each."""
         step = self._rig.step_m
         slope_x, slope_y = self._surface.mean_slopes
@@ -161,7 +161,7 @@ class PlateEchoes:
         frequency_hz = rig.frequencies_hz[index]
         k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
         shape = integrate_steps(self._steps_m, frequency_hz)
-        area_m2 = float(np.linalg.norm(np.cross(*self._edges())))
+        area_m2 = float(np.linalg.norm(np.cross(*self._find_edges())))
         common = (1j * k / (4 * np.pi) * area_m2 * shape).astype(np.complex64) * self._phase.phases(index)
         terms = self._reflect(index)
         kernel = (common * terms[0]).astype(np.complex64)

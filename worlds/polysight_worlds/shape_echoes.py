@@ -77,7 +77,7 @@ def simulate_echo(
     if shape.is_flat_plate:
         return _sum_facets(shape, tx, rx, frequencies_hz, offsets, direct_m)
     solution = choose_solution(shape)
-    nodes_hz, expand = _frequency_nodes(frequencies_hz)
+    nodes_hz, expand = _place_frequency_nodes(frequencies_hz)
     lattice, coordinates = _make_lattice(offsets, LATTICE_M if solution is sum_bent else LATTICE_OF_SERIES_M)
     if shows_inside(shape):
         # What crossed the body has paths of its own: no lattice of positions or frequencies holds it.
@@ -120,7 +120,7 @@ def shows_inside(shape: Shape) -> bool:
     return bool(np.exp(-2 * np.pi * 78e9 / LIGHT_M_PER_S * loss * across_m) > INSIDE_LEVEL)
 
 
-def _medium(shape: Shape) -> complex | None:
+def _find_medium(shape: Shape) -> complex | None:
     return None if shape.stack.is_metal else shape.stack.below
 
 
@@ -133,7 +133,9 @@ def solve_sphere(
     pair = Pair.aim(tx, rx, offsets, np.asarray(shape.place_m), patch.point)
     waves = []
     for frequency_hz in frequencies_hz:
-        wave = scatter_sphere(pair, shape.scale_m()[0], _medium(shape), frequency_hz, with_inside=shows_inside(shape))
+        wave = scatter_sphere(
+            pair, shape.scale_m()[0], _find_medium(shape), frequency_hz, with_inside=shows_inside(shape)
+        )
         waves.append(wave * np.exp(2j * np.pi * frequency_hz / LIGHT_M_PER_S * path_m))
     return np.stack(waves)
 
@@ -149,7 +151,7 @@ def solve_cylinder(
     waves = []
     for frequency_hz in frequencies_hz:
         wave = scatter_cylinder(
-            pair, shape.scale_m()[1], _medium(shape), frequency_hz, across_m, with_inside=shows_inside(shape)
+            pair, shape.scale_m()[1], _find_medium(shape), frequency_hz, across_m, with_inside=shows_inside(shape)
         )
         waves.append(wave * np.exp(2j * np.pi * frequency_hz / LIGHT_M_PER_S * path_m))
     return np.stack(waves)
@@ -198,7 +200,7 @@ def _interpolate(values: NDArray, coordinates: NDArray) -> NDArray:
     return np.asarray(ndimage.map_coordinates(values, coordinates, order=5, mode="nearest"))
 
 
-def _frequency_nodes(frequencies_hz: NDArray, count: int = 5) -> tuple[NDArray, NDArray]:
+def _place_frequency_nodes(frequencies_hz: NDArray, count: int = 5) -> tuple[NDArray, NDArray]:
     """Chebyshev nodes over the band and the matrix [frequencies, nodes] that interpolates from them."""
     if len(frequencies_hz) <= count:
         return frequencies_hz, np.eye(len(frequencies_hz))
@@ -265,7 +267,7 @@ def _sum_facets(
     middle_path_m = np.linalg.norm(middle - antennas[0], axis=0) + np.linalg.norm(middle - antennas[1], axis=0)
     # Paths over a plate differ by less than its diagonal: so many radians to either side over half of the band.
     radians = np.pi / 2 * float(np.hypot(*shape.size_m)) * np.ptp(frequencies_hz) / LIGHT_M_PER_S
-    nodes_hz, expand = _frequency_nodes(frequencies_hz, 5 + int(np.ceil(radians)))
+    nodes_hz, expand = _place_frequency_nodes(frequencies_hz, 5 + int(np.ceil(radians)))
     tables = [CosineTable.get_cached(shape.stack, f) for f in nodes_hz]
     slow = np.empty((len(nodes_hz), len(offsets)), complex)
     at_once = max(1, CHUNK // len(facets.centres[0]))

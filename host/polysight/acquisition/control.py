@@ -208,7 +208,7 @@ class ControlFolder:
                     cleared = True
                 if self._doing == "rows":
                     for command in ScanCommand:
-                        self._obey(command)
+                        self._obey_command(command)
                 pending = self._stop.pending
                 asker = ""
                 if pending:
@@ -232,7 +232,7 @@ class ControlFolder:
             # The disk is full: the old content with a new time is a sign of life, too.
             (self._folder / ALIVE).touch()
 
-    def _obey(self, command: ScanCommand) -> None:
+    def _obey_command(self, command: ScanCommand) -> None:
         """Obey a command if its file exists.
 
         The file is renamed first: its sender can no longer withdraw it, and waits. A file that cannot be renamed is not

@@ -59,10 +59,10 @@ class HostHeartbeat:
         self._alive = m.pack(m.Alive(scan_id=scan_id, owner=owner))
         self._interval_s = interval_s
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._thread = threading.Thread(target=self._take_heartbeat, name="heartbeat", daemon=True)
         self._thread.start()
 
-    def _beat(self) -> None:
+    def _take_heartbeat(self) -> None:
         # Without permission for real time, a busy machine may delay a heartbeat and so cause a retake.
         take_priority(REAL_TIME)
         try:
@@ -240,7 +240,7 @@ class PiClient:
             self._catch_up(status.last_seq)
             if any(_belongs_to_take(e, row_index, take) for e in self._pending):
                 return
-        raise self._no_answer("RunRow")
+        raise self._no_answer_error("RunRow")
 
     def pulse(self, pulses: int, period_us: float, width_us: float) -> m.Pulsed:
         """Send one burst on SYNC_IN with the stage at rest. No retry: a second burst would add frames.
@@ -249,7 +249,7 @@ class PiClient:
         """
         reply = self._send_once(m.Pulse(pulses=pulses, period_us=period_us, width_us=width_us), self._timeout_s)
         if not isinstance(reply, m.Pulsed):
-            raise self._no_answer("Pulse")
+            raise self._no_answer_error("Pulse")
         return reply
 
     def abort(self, reason: str) -> None:
@@ -277,7 +277,7 @@ class PiClient:
             if reply is not None:
                 problem = f"the Pi answered {type(command).__name__} with {type(reply).__name__}"
                 raise ProtocolError(problem, code=ErrorCode.MESSAGE_INVALID)
-        raise self._no_answer(type(command).__name__)
+        raise self._no_answer_error(type(command).__name__)
 
     def _send_once(self, command: m.AnyCommand, timeout_s: float) -> m.AnyReply | None:
         """Send once and return the reply, None after the timeout. A new request replaces the old (relaxed REQ)."""
@@ -294,7 +294,7 @@ class PiClient:
             raise RefusedError(type(command).__name__, reply)
         return reply
 
-    def _no_answer(self, command: str) -> DeviceError:
+    def _no_answer_error(self, command: str) -> DeviceError:
         if self._handshake.is_refused():
             return DeviceError(
                 f"the Pi at {self._address} refuses this host's key",

@@ -191,7 +191,7 @@ def _find_trains(
     is_whole = int(arrivals[-1, 1]) == pulses_ns.size * frame_bytes
     expected = _predict_arrivals(pulses_ns, received_ns, entries, frame_bytes, is_whole)
 
-    period_ns = _period_ns(pulses_ns)
+    period_ns = _find_period_ns(pulses_ns)
     silence_ns = min(SILENCE_NS, period_ns // 2)
     heads = np.flatnonzero(np.diff(came_ns, prepend=came_ns[:1] - 2 * silence_ns) > silence_ns)
     tails = np.append(heads[1:], came_ns.size) - 1
@@ -230,7 +230,7 @@ def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int) -> PlacedFr
     is_in_place = trains.punctual & ~is_displaced
     # A train or two at later pulses were delayed: packets came out of order there, or the machine stalled.
     max_early = 0 if is_sharp else _DISPLACED - 1
-    contradicted = is_early.sum() > max_early or _longest_run(is_displaced) >= _DISPLACED
+    contradicted = is_early.sum() > max_early or _measure_longest_run(is_displaced) >= _DISPLACED
     trains = trains._replace(punctual=is_in_place, astray=trains.astray | is_displaced)
     slots = np.where(_select_seen(trains, frame_bytes, pulses), np.arange(pulses), -1)
     reason = ""
@@ -241,7 +241,7 @@ def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int) -> PlacedFr
     return PlacedFrames(slots, [], pulses)
 
 
-def _longest_run(flags: Flags) -> int:
+def _measure_longest_run(flags: Flags) -> int:
     """Length of the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return int((edges[1::2] - edges[::2]).max(initial=0))
@@ -289,7 +289,7 @@ def _find_missed(slots: Times, pulses: int) -> list[int]:
     return out
 
 
-def _period_ns(pulses_ns: Times) -> int:
+def _find_period_ns(pulses_ns: Times) -> int:
     """Shortest time between two pulses."""
     return int(np.diff(pulses_ns.reshape(-1)).min(initial=_NO_BOUND))
 
@@ -358,7 +358,7 @@ def _predict_arrivals(
     sharing = max(_AGREEING, (rest.size + 1) // 2)
     widths = rest[sharing - 1 :] - rest[: rest.size - sharing + 1]
     narrowest = int(np.argmin(widths))
-    if widths[narrowest] > min(_AGREE * _period_ns(pulses_ns), _AGREE_NS):
+    if widths[narrowest] > min(_AGREE * _find_period_ns(pulses_ns), _AGREE_NS):
         raise _DisturbedError("the delays of the bursts differ by more than a pulse period")
     pulses = pulses_ns.reshape(-1)
     return pulses + float(delays[0]) + drift * (pulses - start_ns) + rest[narrowest]
@@ -369,7 +369,7 @@ def _estimate_drift(at: NDArray[np.float64], delay: NDArray[np.float64], pulses_
     if at.size >= _DRIFT_BURSTS:
         low, high = scipy.stats.theilslopes(delay, at)[2:]
         return float(np.clip(np.clip(0.0, low, high), -_MAX_DRIFT, _MAX_DRIFT))
-    if _USUAL_DRIFT * float(np.ptp(pulses_ns)) > _EARLY * _period_ns(pulses_ns):
+    if _USUAL_DRIFT * float(np.ptp(pulses_ns)) > _EARLY * _find_period_ns(pulses_ns):
         raise _UndeterminedError(f"{at.size} bursts came in time: too few for the drift between the clocks")
     return 0.0
 
@@ -405,7 +405,7 @@ def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instru
     arrivals = read_index(path.with_suffix(".idx"))[1]
     frame_us = (rig.burst.chirps - 1) * rig.burst.chirp_us + rig.chirp.ramp_end_us
     return place_frames(
-        *_event_times(events),
+        *_collect_pulse_times(events),
         arrivals,
         frame_bytes=rig.frame_bytes,
         payload_bytes=rig.card.payload_bytes,
@@ -419,12 +419,12 @@ def first_pulse_ns(events: list[ReceivedCapture]) -> int | None:
     if not events or events[0].event.point != 0:
         return None
     try:
-        return int(_find_pauses(*_event_times(events))[0])
+        return int(_find_pauses(*_collect_pulse_times(events))[0])
     except _UndeterminedError:
         return None
 
 
-def _event_times(events: list[ReceivedCapture]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _collect_pulse_times(events: list[ReceivedCapture]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the time of each pulse (Pi's clock), int64 [burst, pulse], and of each event's receipt, int64 [burst]."""
     first = [e.event.first_pulse_ns for e in events]
     last = [e.event.last_pulse_ns for e in events]
@@ -470,7 +470,7 @@ def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_byt
         "located": True,
         "reason": "",
         "pulses_missed": placed.missed,
-        "frames": _runs(placed.slots),
+        "frames": _find_runs(placed.slots),
     }
     index_crc = write_index(path.with_suffix(".idx"), {**facts, **changed}, arrivals)
     return msgspec.structs.replace(
@@ -494,13 +494,13 @@ def move_frames(
     """
     out = np.zeros_like(received)
     present: list[Gap] = []
-    for first, slot, count in _runs(slots):
+    for first, slot, count in _find_runs(slots):
         start = first * frame_bytes
         stop = min((first + count) * frame_bytes, extent)
         move = (slot - first) * frame_bytes
         out[start + move : stop + move] = received[start:stop]
-        present += [(a + move, b + move) for a, b in _outside(holes, start, stop)]
-    missing = _outside(present, 0, received.size)
+        present += [(a + move, b + move) for a, b in _subtract_ranges(holes, start, stop)]
+    missing = _subtract_ranges(present, 0, received.size)
     for start, stop in missing:
         out[start:stop] = 0
     return out, missing
@@ -528,7 +528,7 @@ def _keep_payload(path: Path, received: NDArray[np.uint8]) -> int:
     return write_packets(path, log, evidence, None)
 
 
-def _runs(slots: NDArray[np.int64]) -> list[tuple[int, int, int]]:
+def _find_runs(slots: NDArray[np.int64]) -> list[tuple[int, int, int]]:
     """Return runs of consecutive placed frames: first frame, its slot, length."""
     placed = np.flatnonzero(slots >= 0)
     if not placed.size:
@@ -538,7 +538,7 @@ def _runs(slots: NDArray[np.int64]) -> list[tuple[int, int, int]]:
     return [(int(placed[a]), int(slots[placed[a]]), int(b - a)) for a, b in zip(starts, stops, strict=True)]
 
 
-def _outside(ranges: list[Gap], start: int, stop: int) -> list[Gap]:
+def _subtract_ranges(ranges: list[Gap], start: int, stop: int) -> list[Gap]:
     """Return the parts of [start, stop) outside the ranges, which are sorted and may touch."""
     out = []
     for a, b in ranges:

@@ -135,7 +135,7 @@ class Take:
             TakeFault(FaultKind.RADAR_STOPPED, f"the radar has stopped: {s.detail}", name)
             for name, s in self.stopped_radars.items()
         ]
-        if fault := self._fault_of_row(self.row.points * pulses_per_point):
+        if fault := self._read_fault_of_pi(self.row.points * pulses_per_point):
             faults.append(fault)
         faults += [
             TakeFault(FaultKind.RADAR_WAITS, "the radar still waits for pulses, it missed some", name)
@@ -149,7 +149,7 @@ class Take:
         )
         return faults + [fault for fault in board_faults if fault is not None]
 
-    def _fault_of_row(self, pulses: int) -> TakeFault | None:
+    def _read_fault_of_pi(self, pulses: int) -> TakeFault | None:
         """Return the fault that the Pi reported; None if the row was run as planned."""
         f = self.finished
         if f is None:
@@ -300,7 +300,7 @@ def commit_row(
             packets_crc32=packets_crc32,
             pulses_missed=missed,
             frames_untimed=untimed,
-            **_reception(capture),
+            **_describe_reception(capture),
         )
     pulses = 0
     if take.finished:
@@ -333,13 +333,13 @@ def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
             take=take.number,
             reasons=[str(f) for f in faults],
             faults=[f.to_row_fault() for f in faults],
-            boards={name: Reception(**_reception(capture)) for name, capture in take.captures.items()},
+            boards={name: Reception(**_describe_reception(capture)) for name, capture in take.captures.items()},
             rejected_utc=utc_now(),
         )
     )
 
 
-def _reception(capture: RowCapture) -> dict[str, Any]:
+def _describe_reception(capture: RowCapture) -> dict[str, Any]:
     """Return the counts of `capture` under the names of the manifest; both types use the same names, but for bytes."""
     counts = {kind: getattr(capture, kind) for kind in Reception.__struct_fields__ if hasattr(capture, kind)}
     return {**counts, "received_bytes": capture.bytes}
@@ -510,7 +510,7 @@ class RowTaker:
             elif self._stop.now:
                 fault = ON_REQUEST
             else:
-                fault = self._fatal_fault(take, silence)
+                fault = self._find_fatal_fault(take, silence)
             if fault is not None:
                 take.aborted = fault
                 deadline = time.monotonic() + _ABORT_TIMEOUT_S
@@ -534,7 +534,7 @@ class RowTaker:
                     code=ErrorCode.NO_ANSWER,
                 )
 
-    def _fatal_fault(self, take: Take, silence: _SilenceCheck) -> TakeFault | None:
+    def _find_fatal_fault(self, take: Take, silence: _SilenceCheck) -> TakeFault | None:
         """Return a fault for which the row is aborted because it cannot become complete; None if there is none."""
         take.radars = self._radars.states()
         if stopped := take.stopped_radars:

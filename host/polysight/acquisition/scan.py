@@ -141,7 +141,7 @@ class RunningScan:
                 events.sync()
                 self._queue.add_earlier(sorted(self._committed))
                 self._write_radar_report({})
-                self._rows(events)
+                self._record_rows(events)
                 self._check_lost_steps()
                 self._end(begun)
                 events.sync()
@@ -200,7 +200,7 @@ class RunningScan:
                     f" here, the scan continues with event {event.seq}"
                 )
 
-    def _rows(self, events: EventWriter) -> None:
+    def _record_rows(self, events: EventWriter) -> None:
         """Record every missing row, in order."""
         todo = [row for row in self._plan if row.index not in self._committed]
         check_disk(self._scan.path, self._instrument, len(todo))
@@ -220,7 +220,7 @@ class RunningScan:
             if self._stop.after_row:
                 break
             self._row_began = time.monotonic()
-            self._row(row, takes.get(row.index, 0) + 1, taker, events)
+            self._record_row(row, takes.get(row.index, 0) + 1, taker, events)
             if row.index not in self._committed:
                 break
             self._row_seconds.append(time.monotonic() - self._row_began)
@@ -250,11 +250,11 @@ class RunningScan:
                 " rows may be displaced; check belts, screws and drivers, and scan again"
             )
 
-    def _row(self, row: Row, first_take: int, taker: RowTaker, events: EventWriter) -> None:
+    def _record_row(self, row: Row, first_take: int, taker: RowTaker, events: EventWriter) -> None:
         """Record and commit a row, with retakes; return without commit if asked to stop."""
         last_take = first_take + self._instrument.limits.row_retakes
         for number in range(first_take, last_take + 1):
-            transaction = RowTransaction(self._on_state)
+            transaction = RowTransaction(self._follow_state)
             try:
                 take = self._take(row, number, taker, transaction)
                 if take is None:
@@ -444,7 +444,7 @@ class RunningScan:
             self._progress = None
             self.result.warnings.append(f"progress is no longer reported: {type(e).__name__}: {e}")
 
-    def _on_state(self, state: RowState) -> None:
+    def _follow_state(self, state: RowState) -> None:
         self._state = str(state)
         self._notify("state", "")
 

@@ -105,7 +105,7 @@ class Classifier(ClassifierMixin, BaseEstimator):
             count = min(NEIGHBOURS, len(pixels))
             self._model: Any = PaperKNeighborsClassifier(count).fit(pixels, names)
         else:
-            self._model = ErrorDiscriminant().fit(_samples(pixels, names, groups))
+            self._model = ErrorDiscriminant().fit(_collect_samples(pixels, names, groups))
         return self
 
     def predict_proba(self, X: npt.ArrayLike) -> Columns:
@@ -138,7 +138,7 @@ class Classifier(ClassifierMixin, BaseEstimator):
         return score(Samples.from_library(library), SHORT[self.model])
 
 
-def _samples(X: Columns, y: Names, groups: npt.ArrayLike | None) -> Samples:
+def _collect_samples(X: Columns, y: Names, groups: npt.ArrayLike | None) -> Samples:
     """Return labelled pixels; those of one material in one scan are a patch."""
     scans = np.zeros(len(X), np.intp) if groups is None else np.asarray(groups)
     if scans.shape != (len(X),):

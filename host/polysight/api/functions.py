@@ -77,8 +77,8 @@ def plan(rig: PathText | Instrument | None = None, *, scene: Scene | None = None
     ConfigError
         if the rig file or a value is wrong.
     """
-    instrument = rig if isinstance(rig, Instrument) else load_instrument(_rig_path(rig))
-    with _scene_file(scene) as path:
+    instrument = rig if isinstance(rig, Instrument) else load_instrument(_find_rig(rig))
+    with _open_scene_file(scene) as path:
         return Plan(forecast_scene(instrument, Changes(**changes), path))  # type: ignore[arg-type]
 
 
@@ -104,13 +104,13 @@ def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: 
     PolysightError
         if the scene is wrong or does not fit the rig, the folder is not empty, or the simulators are not installed.
     """
-    with _scene_file(scene) as path:
+    with _open_scene_file(scene) as path:
         if path is None:
             raise ConfigError(
                 "no scene was given", "a scene says which objects lie where", "see help(polysight.simulate)"
             )
         _warn_of_whole_grid(path)
-        simulate_scene(path, _rig_path(rig), Path(out), seed)
+        simulate_scene(path, _find_rig(rig), Path(out), seed)
     return open_scan(out)
 
 
@@ -216,12 +216,12 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
     return xarray.Dataset(table, {"scan": [name for name, _ in checked]}, {"plate": results[-1].name})
 
 
-def _rig_path(rig: PathText | None) -> Path:
+def _find_rig(rig: PathText | None) -> Path:
     return find_packaged(RIG) if rig is None else Path(rig)
 
 
 @contextmanager
-def _scene_file(scene: Scene | None) -> Iterator[Path | None]:
+def _open_scene_file(scene: Scene | None) -> Iterator[Path | None]:
     """Yield the path of a scene file; the content of a scene is written into a temporary one."""
     if scene is None:
         yield None

@@ -128,7 +128,7 @@ def open_scan(
         return Scan(path, None, _analyse_images(path, rig, settings), settings)
     process_again = fresh or settings != Settings()
     if (path / IMAGE).exists() and not (path / MANIFEST).exists():
-        return _products_only(path, settings, process_again)
+        return _open_products_only(path, settings, process_again)
     source = _open_source(path, rig)
     saved = None if process_again else find_products(path)
     if saved is not None and isinstance(source, ScanFolder) and not _is_current(saved, source):
@@ -169,7 +169,7 @@ def _analyse_images(path: Path, rig: str | os.PathLike[str] | Instrument | None,
     return scan
 
 
-def _products_only(path: Path, settings: Settings, anew: bool) -> Scan:
+def _open_products_only(path: Path, settings: Settings, anew: bool) -> Scan:
     if anew:
         raise ConfigError(
             f"{path}: products cannot be processed again", "the recorded rows are not in this folder",
@@ -319,7 +319,7 @@ class Scan:
         """
         angles = ("patch_incidence_deg", "patch_incidence_rad")
         ratios = ("ratio", "inverse_ratio_standard_error")
-        return self._columns((*_PERMITTIVITY, *ratios, *angles, "name", "pixels", "true_permittivity"))
+        return self._select_columns((*_PERMITTIVITY, *ratios, *angles, "name", "pixels", "true_permittivity"))
 
     def permittivity_map(self) -> xarray.Dataset:
         """Permittivity of each pixel as a half space, with its standard errors.
@@ -420,7 +420,7 @@ class Scan:
             as :meth:`image`.
         """
         names = ("name", "confidence", "runner_up", "runner_up_share", "metal_reference", "pixels")
-        return self._columns((*names, *_PERMITTIVITY, "true_name"))
+        return self._select_columns((*names, *_PERMITTIVITY, "true_name"))
 
     def layers(self, *stack: str, bands: int | None = None, amplitude_percent: float = 10.0) -> xarray.Dataset:
         """Permittivity and thickness of the one unknown layer of a stack, on dimension `patch`, with standard errors.
@@ -550,12 +550,12 @@ class Scan:
         if self._saved is not None and self._saved.metal_referenced == metal_referenced:
             return self._saved
         if self._source is None:
-            raise self._other_kind(metal_referenced)
+            raise self._wrong_kind_error(metal_referenced)
         if metal_referenced:
             return self._processing.referenced
         return self._processing.unreferenced
 
-    def _other_kind(self, metal_referenced: bool) -> DataError:
+    def _wrong_kind_error(self, metal_referenced: bool) -> DataError:
         if metal_referenced:
             return DataError(
                 f"{self.folder}: these images are not referenced to metal", "only images were made of this scan",
@@ -573,7 +573,7 @@ class Scan:
             " quality.json is missing", "open the scan folder instead", code=ErrorCode.KEY_MISSING,
         )  # fmt: skip
 
-    def _columns(self, names: Sequence[str]) -> xarray.Dataset:
+    def _select_columns(self, names: Sequence[str]) -> xarray.Dataset:
         """These variables of the patches, where they exist, with the coordinates of their dimension."""
         patches = self.patches()
         chosen = patches[[name for name in names if name in patches]]

@@ -501,7 +501,7 @@ def calibration_of_scan(scan: Source) -> Calibration:
         named = {kind: name for kind, name in to_builtins(scan.instrument.calibration).items() if name}
         return load_calibration({kind: check_inside(scan.path, name) for kind, name in named.items()})
     paths: dict[str, Path] = {}
-    for kind, fact in _manifest_entries(scan, recorded).items():
+    for kind, fact in _read_manifest_entries(scan, recorded).items():
         path = paths[kind] = check_inside(scan.path, fact["file"])
         if not path.is_file() or f"{zlib.crc32(path.read_bytes()):08x}" != fact["crc32"]:
             raise DataError(
@@ -513,7 +513,7 @@ def calibration_of_scan(scan: Source) -> Calibration:
     return load_calibration(paths)
 
 
-def _manifest_entries(scan: ScanFolder, recorded: Any) -> dict[str, dict[str, str]]:
+def _read_manifest_entries(scan: ScanFolder, recorded: Any) -> dict[str, dict[str, str]]:
     """Return the manifest's entries for the scan's copies, by kind. Raises DataError if they are invalid."""
     try:
         return msgspec.convert(recorded, dict[str, dict[str, str]])

@@ -156,7 +156,10 @@ def fit_places(
     boards = list(echoes.values())
 
     def misfit(unknown: Real, sigma: float) -> Real:
-        parts = [_residual(b, unknown[3 * i : 3 * i + 3], _places_m(centre, mm, unknown)) for i, b in enumerate(boards)]
+        parts = [
+            _subtract_echoes(b, unknown[3 * i : 3 * i + 3], _place_points(centre, mm, unknown))
+            for i, b in enumerate(boards)
+        ]
         flat = np.concatenate([p.ravel() for p in parts]) / sigma
         return np.concatenate([flat.real, flat.imag, unknown / scale])
 
@@ -219,7 +222,7 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
     return BoardEchoes(Antennas.from_rig(rig, board), samples, whitening @ maps.model, places, maps.frequencies_hz)
 
 
-def _places_m(centre: Real, mm: Real, unknown: Real) -> Real:
+def _place_points(centre: Real, mm: Real, unknown: Real) -> Real:
     """Return the positions of the target's points, metres [point, 3], rig frame."""
     depth, x, y, turn = unknown[-4:]
     c = np.cos(np.radians(turn))
@@ -253,7 +256,7 @@ def _rotate_phase(cycles: Real) -> NDArray[np.complex128]:
     return np.exp(2j * np.pi * (cycles - np.round(cycles)))
 
 
-def _residual(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
+def _subtract_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
     """Return the samples minus the best-fitting sum of the points' echoes."""
     design = _model_echoes(board, shift_mm, places_m)
     samples = board.samples.reshape(-1)
@@ -269,7 +272,7 @@ def _find_target(boards: list[BoardEchoes], centre: Real, mm: Real) -> tuple[flo
     steps = np.arange(-_REACH_MM, _REACH_MM + _STEP_MM / 2, _STEP_MM)
     for x in steps:
         for y in steps:
-            places = _places_m(centre, mm, np.array([0.0, x, y, 0.0]))
+            places = _place_points(centre, mm, np.array([0.0, x, y, 0.0]))
             total = 0.0
             for board in small_boards:
                 design = _model_echoes(board, np.zeros(3), places)
@@ -306,8 +309,8 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[file
         vector_after = vector_before + fit.values[board_values] / 1e3
         along = vector_after / np.linalg.norm(vector_after)
         boards[name] = files.BoardPlace(
-            _vector(fit.values[board_values]),
-            _vector(errors[board_values]),
+            _make_vector(fit.values[board_values]),
+            _make_vector(errors[board_values]),
             float(np.linalg.norm(vector_after) * 1e3),
             float(np.linalg.norm(vector_before) * 1e3),
             float(np.sqrt(along @ fit.covariance[board_values, board_values] @ along)),
@@ -329,6 +332,6 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[file
     )
 
 
-def _vector(values: Real) -> files.Vector:
+def _make_vector(values: Real) -> files.Vector:
     x, y, z = (float(v) for v in values)
     return x, y, z

@@ -83,7 +83,7 @@ class CardClient:
 
     def alive(self) -> None:
         """Check that the card replies; otherwise raise DeviceError with the first hop that does not work."""
-        self._command(Code.ALIVE)
+        self._send_command(Code.ALIVE)
 
     def version(self) -> Version:
         """Return the card's FPGA version. Raises DeviceError."""
@@ -127,16 +127,18 @@ class CardClient:
 
     def configure(self, card: Card, lanes: int = 4) -> None:
         """Configure raw 16-bit capture of `lanes` LVDS lanes to Ethernet, and the packet delay. Raises DeviceError."""
-        self._command(Code.CONFIGURE_FPGA, dca1000.configure_fpga_data(lanes))
-        self._command(Code.CONFIGURE_PACKET, dca1000.configure_packet_data(card.packet_bytes, card.packet_delay_us))
+        self._send_command(Code.CONFIGURE_FPGA, dca1000.configure_fpga_data(lanes))
+        self._send_command(
+            Code.CONFIGURE_PACKET, dca1000.configure_packet_data(card.packet_bytes, card.packet_delay_us)
+        )
 
     def reset_fpga(self) -> None:
         """Reset the FPGA; its configuration is lost. Raises DeviceError."""
-        self._command(Code.RESET_FPGA)
+        self._send_command(Code.RESET_FPGA)
 
     def reset_radar(self) -> None:
         """Reset the radar board on the card; it must be armed again. Raises DeviceError."""
-        self._command(Code.RESET_RADAR)
+        self._send_command(Code.RESET_RADAR)
 
     def write_eeprom(self, body: bytes) -> Status:
         """Send the 18 bytes of command 0x04; return the status bits that the card reports. For `program_eeprom`.
@@ -163,7 +165,7 @@ class CardClient:
                 return
             if attempt < ATTEMPTS - 1:
                 self.record_stop()
-        raise self._silent(Code.RECORD_START, ATTEMPTS)
+        raise self._no_answer_error(Code.RECORD_START, ATTEMPTS)
 
     def record_stop(self) -> None:
         """Stop the record; a card that does not record may refuse. Raises DeviceError if there is no reply."""
@@ -195,7 +197,7 @@ class CardClient:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _command(self, code: Code, data: bytes = b"") -> None:
+    def _send_command(self, code: Code, data: bytes = b"") -> None:
         self._check(self._exchange(code, data, ATTEMPTS), code)
 
     def _check(self, reply: Reply, code: Code) -> None:
@@ -212,7 +214,7 @@ class CardClient:
             reply = self._try(code, data, self._timeout_s / attempts)
             if reply is not None:
                 return reply
-        raise self._silent(code, attempts)
+        raise self._no_answer_error(code, attempts)
 
     def _try(self, code: Code, data: bytes, limit_s: float) -> Reply | None:
         """Send once and wait for the reply to this code."""
@@ -259,7 +261,7 @@ class CardClient:
     def _name(self) -> str:
         return f"capture card of {self.board.name} at {self.board.card_address}:{self.board.command_port}"
 
-    def _silent(self, code: Code, attempts: int) -> DeviceError:
+    def _no_answer_error(self, code: Code, attempts: int) -> DeviceError:
         """Return the error for a card that does not answer, with the hop that does not work, if known."""
         tried = "1 attempt"
         if attempts > 1:
@@ -295,7 +297,7 @@ class EepromSettings:
             if address.is_multicast or int(address) & 0xFF in (0, 0xFF):
                 raise self._wrong(f"{address} is not the address of one machine")
         try:
-            mac = self._mac()
+            mac = self._parse_mac()
         except ValueError:
             raise self._wrong(f"{self.card_mac!r} is not a MAC address such as {DEFAULT_MAC}", _OTHER_MAC) from None
         if len(mac) != 6 or mac[0] & 1 or not any(mac):
@@ -318,7 +320,7 @@ class EepromSettings:
 
     def encode(self) -> bytes:
         """Return the 18 bytes of the command: host, card and MAC address with reversed bytes, and the ports."""
-        parts = (self._address(self.host_address).packed, self._address(self.card_address).packed, self._mac())
+        parts = (self._address(self.host_address).packed, self._address(self.card_address).packed, self._parse_mac())
         return b"".join(part[::-1] for part in parts) + _PORTS.pack(self.command_port, self.data_port)
 
     def text(self) -> str:
@@ -328,7 +330,7 @@ class EepromSettings:
             f" data to port {self.data_port} after it is next switched on"
         )
 
-    def _mac(self) -> bytes:
+    def _parse_mac(self) -> bytes:
         return bytes.fromhex(self.card_mac.replace(":", "").replace("-", ""))
 
     def _address(self, text: str) -> ipaddress.IPv4Address:
@@ -522,10 +524,10 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
         return _wrong("radar", e)
     if got.packets == 0:
         return _wrong("radar", silent_radar(card.board, got))
-    return _streams(got)
+    return _report_stream(got)
 
 
-def _streams(got: RowCapture) -> Finding:
+def _report_stream(got: RowCapture) -> Finding:
     """Report a radar's data; the start of its record is unknown, so only gaps between packets count as lost."""
     text = f"{got.packets} packets, {got.bytes} bytes came"
     if got.lost_before_packets:

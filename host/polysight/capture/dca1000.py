@@ -170,7 +170,7 @@ def row_words(
     Parameters, `valid` and errors as of :func:`decode_row`; the words are int16 [frame, sample, 2, rx], I before Q,
     undefined for invalid frames.
     """
-    words = _words(payload, frames * samples * rx * 2).reshape(frames, samples, 2, rx)
+    words = _split_words(payload, frames * samples * rx * 2).reshape(frames, samples, 2, rx)
     return words, valid_frames(missing, frames, samples * rx * 4)
 
 
@@ -217,7 +217,7 @@ def decode_row(
         if the payload is shorter than the shape requires.
     """
     words, valid = row_words(payload, missing, frames, samples, rx)
-    out = _complex(words.transpose(2, 3, 0, 1), swap_iq)
+    out = _join_iq(words.transpose(2, 3, 0, 1), swap_iq)
     out[:, ~valid] = 0
     return out, valid
 
@@ -233,11 +233,11 @@ def decode_two_lane(
         problem = f"a 2-lane chirp has an even number of samples, not {samples}"
         cause = "a wrong number of samples was given"
         raise DataError(problem, cause, "correct the samples of a chirp", code=ErrorCode.VALUE_INVALID)
-    words = _words(payload, chirps * samples * rx * 2).reshape(chirps, rx, samples // 2, 2, 2)
-    return _complex(words.transpose(3, 1, 0, 2, 4).reshape(2, rx, chirps, samples), swap_iq)
+    words = _split_words(payload, chirps * samples * rx * 2).reshape(chirps, rx, samples // 2, 2, 2)
+    return _join_iq(words.transpose(3, 1, 0, 2, 4).reshape(2, rx, chirps, samples), swap_iq)
 
 
-def _complex(parts: NDArray[np.int16], swap_iq: bool = False) -> NDArray[np.complex64]:
+def _join_iq(parts: NDArray[np.int16], swap_iq: bool = False) -> NDArray[np.complex64]:
     """Join I and Q, int16 [2, rx, chirp, sample] (with `swap_iq` Q and I)."""
     out = np.empty(parts.shape[1:], dtype=np.complex64)
     if swap_iq:
@@ -256,7 +256,7 @@ def valid_frames(missing: Gaps, frames: int, frame_bytes: int) -> NDArray[np.boo
     return valid
 
 
-def _words(payload: bytes | memoryview | NDArray[np.uint8], count: int) -> NDArray[np.int16]:
+def _split_words(payload: bytes | memoryview | NDArray[np.uint8], count: int) -> NDArray[np.int16]:
     raw = np.frombuffer(payload, dtype=np.uint8)
     if raw.size < count * 2:
         raise DataError(

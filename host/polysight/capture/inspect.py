@@ -172,7 +172,7 @@ def inspect_bin(path: Path, layout: Layout = Layout()) -> Report:
         size = path.stat().st_size
         payload = np.fromfile(path, dtype=np.uint8, count=MAX_BYTES)
     except OSError as e:
-        raise _unreadable(path, e) from None
+        raise _unreadable_error(path, e) from None
     kind = recognise_format(payload[:4096].tobytes())
     if kind not in ("empty", "unknown bytes"):
         problem = f"{path}: not a capture: it begins as {kind}"
@@ -189,7 +189,7 @@ def inspect_bin(path: Path, layout: Layout = Layout()) -> Report:
     return report
 
 
-def _unreadable(path: Path, e: OSError) -> DataError:
+def _unreadable_error(path: Path, e: OSError) -> DataError:
     """Return the error for a recording that cannot be read."""
     problem = f"{path}: cannot be read: {e.strerror}"
     return DataError(problem, "the path is wrong", "give a recording", code=ErrorCode.FILE_UNREADABLE)
@@ -239,7 +239,7 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
             "give a row (.bin) or a packet capture (.pcap)",
             code=ErrorCode.FILE_FOREIGN,
         )
-    report.remarks = _remarks(report, is_mirrored(mean))
+    report.remarks = _collect_remarks(report, is_mirrored(mean))
     return report
 
 
@@ -254,7 +254,7 @@ def is_mirrored(power: NDArray[np.float64]) -> bool:
     return bool(power[n - n // 4 : n - rim].sum() > 4 * power[rim + 1 : n // 4 + 1].sum())
 
 
-def _remarks(r: Report, mirrored: bool) -> list[str]:
+def _collect_remarks(r: Report, mirrored: bool) -> list[str]:
     remarks = []
     if max(r.rx_rms) == 0:
         return ["every sample is zero: nothing was recorded"]
@@ -305,7 +305,7 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
     try:
         raw = read_bounded(path, _MAX_PCAP_BYTES)
     except OSError as e:
-        raise _unreadable(path, e) from None
+        raise _unreadable_error(path, e) from None
     try:
         reader = dpkt.pcap.UniversalReader(io.BytesIO(raw))
     except (dpkt.Error, ValueError, struct.error):

@@ -74,9 +74,9 @@ class PacketLog:
         if n == 0:
             return
         if self.count + n > len(self._sizes):
-            self._heads = _double(self._heads, n)
-            self._sizes = _double(self._sizes, n)
-            self._times = _double(self._times, n)
+            self._heads = _double_capacity(self._heads, n)
+            self._sizes = _double_capacity(self._sizes, n)
+            self._times = _double_capacity(self._times, n)
         new = slice(self.count, self.count + n)
         self._heads[new] = packets[:, :PACKET_HEADER_BYTES]
         self._sizes[new] = sizes
@@ -168,6 +168,6 @@ class PacketLog:
         return log
 
 
-def _double(array: NDArray[Any], more: int) -> NDArray[Any]:
+def _double_capacity(array: NDArray[Any], more: int) -> NDArray[Any]:
     """Return a copy of the array with room for twice its entries plus `more`, filled with zeros."""
     return np.concatenate([array, np.zeros((len(array) + more, *array.shape[1:]), dtype=array.dtype)])

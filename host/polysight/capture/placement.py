@@ -180,12 +180,12 @@ def place_record(
     past = past or Past.after_reset()
     record = _find_record(log, past, not_before_ns)
     row = _Row(log, record)
-    cause = _why_not_located(record, row, log, frame_bytes)
+    cause = _find_doubt(record, row, log, frame_bytes)
     if past.lost:
         cause = _Doubt("it is unknown where the last record ended")
     if not cause.text and dropped_by_card:
         cause = _Doubt(f"the card dropped data before numbering it ({dropped_by_card})")
-    holes = _merge([*_gaps(row.covered, row.extent), *row.conflicts])
+    holes = _merge([*_find_gaps(row.covered, row.extent), *row.conflicts])
     missing = _merge([*holes, (row.extent, log.expected)])
     if cause.text:
         out = row.bytes(holes)
@@ -200,8 +200,8 @@ def place_record(
         located=not cause.text,
         reason=cause.text,
         counts=row.counts,
-        losses=_losses(missing, row.extent, log.expected),
-        past=_past_after(record, cause),
+        losses=_count_losses(missing, row.extent, log.expected),
+        past=_continue_past(record, cause),
         offsets=row.offsets,
         arrivals=row.arrivals(),
         holes=holes,
@@ -338,7 +338,7 @@ class _Doubt:
     frames_missing: bool = False
 
 
-def _why_not_located(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) -> _Doubt:
+def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) -> _Doubt:
     """Decide if the place of every byte is certain."""
     expected = log.expected
     if expected == 0:
@@ -373,7 +373,7 @@ def _why_not_located(record: _Record, row: _Row, log: PacketLog, frame_bytes: in
     return _Doubt(text, frames_missing=clean)
 
 
-def _past_after(record: _Record, doubt: _Doubt) -> Past:
+def _continue_past(record: _Record, doubt: _Doubt) -> Past:
     """Return where the next record begins: known behind a record whose start and end are certain."""
     is_certain = not doubt.text or doubt.frames_missing
     if not is_certain or not record.of_row.any() or record.later.any():
@@ -462,15 +462,15 @@ class _Row:
         firsts = np.flatnonzero(new)
         for i, j in zip(firsts.tolist(), [*firsts[1:].tolist(), order.size], strict=True):
             if j - i > 1:
-                self._overlap(packets[order[i:j]].tolist())
+                self._compare_overlap(packets[order[i:j]].tolist())
 
-    def _overlap(self, packets: list[int]) -> None:
+    def _compare_overlap(self, packets: list[int]) -> None:
         """Compare packets of one place, in order of arrival, with the longest so far."""
         longest = packets[0]
         for k in packets[1:]:
             offset = int(self._record.offsets[k])
             common = min(int(self._stops[k]), int(self._stops[longest])) - offset
-            if not np.array_equal(self._payload(k)[:common], self._payload(longest)[:common]):
+            if not np.array_equal(self._slice_payload(k)[:common], self._slice_payload(longest)[:common]):
                 self.conflicts.append((offset, offset + common))
                 self._placed[k] = False
                 self._conflicting[k] = True
@@ -484,7 +484,7 @@ class _Row:
                 self._placed[k] = False
                 self._duplicate[k] = True
 
-    def _payload(self, k: int) -> Bytes:
+    def _slice_payload(self, k: int) -> Bytes:
         return self._log.payload[self._starts[k] : self._starts[k] + self._sizes[k]]
 
     def arrivals(self) -> Counts:
@@ -528,7 +528,7 @@ class _Row:
             out[a:b] = self._log.payload[starts[i] : starts[i] + b - a]
 
 
-def _losses(missing: list[Gap], extent: int, expected: int) -> Losses:
+def _count_losses(missing: list[Gap], extent: int, expected: int) -> Losses:
     if not extent:
         return Losses(tail_bytes=expected)
     head = sum(b - a for a, b in missing if a == 0)
@@ -536,7 +536,7 @@ def _losses(missing: list[Gap], extent: int, expected: int) -> Losses:
     return Losses(head, len(inner), sum(inner), expected - extent)
 
 
-def _gaps(covered: list[Gap], extent: int) -> list[Gap]:
+def _find_gaps(covered: list[Gap], extent: int) -> list[Gap]:
     """Return the ranges of [0, extent) that are not covered."""
     edges = [0, *(edge for gap in covered for edge in gap), extent]
     return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]

@@ -343,7 +343,7 @@ class ReceiverProcess:
     def poll(self) -> Progress:
         """Return the latest progress that the process has sent, without waiting."""
         while self._connection.poll():
-            self._take(self._next())
+            self._take(self._receive_answer())
         return self._progress
 
     def report(self, not_before_ns: int = 0) -> Progress:
@@ -379,7 +379,7 @@ class ReceiverProcess:
         elif isinstance(answer, Failed):
             raise DeviceError(answer.what, answer.why, answer.remedy, code=ErrorCode(answer.code))
 
-    def _next(self) -> Answer:
+    def _receive_answer(self) -> Answer:
         try:
             return _answers.decode(self._connection.recv_bytes())
         except (EOFError, OSError):
@@ -400,7 +400,7 @@ class ReceiverProcess:
             raise self._process_error() from None
         deadline = time.monotonic() + timeout_s
         while self._connection.poll(max(0.0, deadline - time.monotonic())):
-            answer = self._next()
+            answer = self._receive_answer()
             self._take(answer)
             if isinstance(answer, kind):
                 return answer

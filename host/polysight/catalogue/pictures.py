@@ -206,17 +206,17 @@ def draw_values(values: products.MapValues, unit: str = "", colours: str = AMPLI
     rgba = matplotlib.colormaps[colours](np.clip((shown - low) / (high - low), 0.0, 1.0))
     rgba[..., 3] = values.opacity
     digits = 1 if unit else 3
-    return Picture(_png(rgba, "lower"), round(float(low), digits), round(float(high), digits), unit, colours)
+    return Picture(_encode_png(rgba, "lower"), round(float(low), digits), round(float(high), digits), unit, colours)
 
 
 def colour_bar(colours: str) -> bytes:
     """Draw a colour map from left to right, as PNG of 256 x 1 pixels."""
     import matplotlib
 
-    return _png(matplotlib.colormaps[colours](np.linspace(0, 1, 256))[None], "upper")
+    return _encode_png(matplotlib.colormaps[colours](np.linspace(0, 1, 256))[None], "upper")
 
 
-def _png(rgba: NDArray[Any], origin: Literal["lower", "upper"]) -> bytes:
+def _encode_png(rgba: NDArray[Any], origin: Literal["lower", "upper"]) -> bytes:
     from matplotlib.image import imsave
 
     file = io.BytesIO()

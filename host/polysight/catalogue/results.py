@@ -114,12 +114,12 @@ def read_result(folder: Path) -> Result:
         metal=metal_how,
         verdict=pixels.verdict,
         patches=pixels.segments,
-        labels=_labels(folder, pixels),
+        labels=_load_labels(folder, pixels),
         files=list_files(folder),
     )
 
 
-def _labels(folder: Path, pixels: Pixels) -> DrawnLabels | None:
+def _load_labels(folder: Path, pixels: Pixels) -> DrawnLabels | None:
     try:
         labelled = find_labels(folder)
         if labelled is None:
@@ -212,27 +212,27 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
     pixels = Pixels(read_products(folder).folder)
     row, column = pixels.nearest(x_mm, y_mm)
     place = (float(pixels.x_mm[column]), float(pixels.y_mm[row]))
-    reason = _why_no_permittivity(pixels, row, column)
+    reason = _explain_no_permittivity(pixels, row, column)
     eps = None
     real_std = None
     loss_std = None
     if not reason:
-        eps = _parts(complex(pixels.permittivity.value[row, column]))
+        eps = _split_parts(complex(pixels.permittivity.value[row, column]))
         real_std = _number(pixels.permittivity.real_std[row, column])
         loss_std = _number(pixels.permittivity.loss_std[row, column])
     nearest: list[NearMaterial] = []
     if eps:
-        nearest = _nearest_materials(pixels, row, column, library)
+        nearest = _rank_materials(pixels, row, column, library)
     patch = None
     if pixels.referenced:
         patch = _find_patch(pixels.segments, place)
-    profile, profile_why = _profile(folder, float(pixels.x_m[column]), float(pixels.y_m[row]))
+    profile, profile_why = _focus_profile(folder, float(pixels.x_m[column]), float(pixels.y_m[row]))
     return Probe(
         place_mm=(round(place[0], 2), round(place[1], 2)),
         lit=bool(pixels.valid[row, column]),
-        h_db=_db(complex(pixels.h[row, column])),
-        v_db=_db(complex(pixels.v[row, column])),
-        p=_parts(complex(pixels.p[row, column])),
+        h_db=_convert_to_db(complex(pixels.h[row, column])),
+        v_db=_convert_to_db(complex(pixels.v[row, column])),
+        p=_split_parts(complex(pixels.p[row, column])),
         p_sigma=_number(pixels.p_std[row, column]),
         referenced=pixels.referenced,
         permittivity=eps,
@@ -246,7 +246,7 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
     )
 
 
-def _why_no_permittivity(pixels: Pixels, row: int, column: int) -> str:
+def _explain_no_permittivity(pixels: Pixels, row: int, column: int) -> str:
     if not pixels.referenced:
         return "the images are not referenced to metal, or support no result"
     if not pixels.clear[row, column]:
@@ -266,7 +266,7 @@ def _find_patch(patches: list[PatchFigures], place_mm: tuple[float, float]) -> P
 
 
 @lru_cache(maxsize=4)
-def _library_ratios(path: Path, changed_ns: int, angle_deg: float) -> dict[str, tuple[complex, float]]:
+def _average_library(path: Path, changed_ns: int, angle_deg: float) -> dict[str, tuple[complex, float]]:
     """Mean of V / H and spread of its patches (of each part), by material. A file that has changed is read again."""
     del changed_ns
     patches: dict[str, list[complex]] = {}
@@ -283,11 +283,11 @@ def _library_ratios(path: Path, changed_ns: int, angle_deg: float) -> dict[str, 
     return ratios
 
 
-def _nearest_materials(pixels: Pixels, row: int, column: int, library: Path | None) -> list[NearMaterial]:
+def _rank_materials(pixels: Pixels, row: int, column: int, library: Path | None) -> list[NearMaterial]:
     """Materials of the library by the distance of their ratio, in standard deviations of pixel and material."""
     path = library or SIMULATED_LIBRARY
     try:
-        ratios = _library_ratios(path, path.stat().st_mtime_ns, float(np.degrees(pixels.theta_rad)))
+        ratios = _average_library(path, path.stat().st_mtime_ns, float(np.degrees(pixels.theta_rad)))
     except (PolysightError, OSError):
         # A library of another angle.
         return []
@@ -303,7 +303,7 @@ def _nearest_materials(pixels: Pixels, row: int, column: int, library: Path | No
         if mean and not is_metal(name):
             half_space = complex(permittivity_from_ratio(1 / mean, pixels.theta_rad))
             if np.isfinite(half_space):
-                eps = _parts(half_space)
+                eps = _split_parts(half_space)
         sigmas = None
         if p:
             sigmas = round(abs(1 / p - mean) / std, 1)
@@ -317,7 +317,7 @@ def _sort_by_sigmas(material: NearMaterial) -> float:
     return material.sigmas
 
 
-def _profile(folder: Path, x_m: float, y_m: float) -> tuple[FocusedProfile | None, str]:
+def _focus_profile(folder: Path, x_m: float, y_m: float) -> tuple[FocusedProfile | None, str]:
     """Focused range profile through a place, from the scan's kept samples, or why there is none."""
     scan = find_scan_folder(folder)
     if scan is None or not (scan / MANIFEST).exists():
@@ -356,7 +356,7 @@ def _restore_rows(scan: Path, changed_ns: int) -> Pipeline | None:
     return None
 
 
-def _db(value: complex) -> float | None:
+def _convert_to_db(value: complex) -> float | None:
     if value and np.isfinite(value):
         return round(float(20 * np.log10(abs(value))), 2)
     return None
@@ -368,7 +368,7 @@ def _number(value: float) -> float | None:
     return round(float(value), 5)
 
 
-def _parts(value: complex) -> ComplexNumber:
+def _split_parts(value: complex) -> ComplexNumber:
     return ComplexNumber(_number(value.real), _number(value.imag))
 
 
@@ -483,7 +483,7 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
         rounded_scatter = round(scatter, 3)
     figures = ComparisonFigures(
         patches=_pair_patches(a.segments, b.segments),
-        notes=_notes(a, b, scatter),
+        notes=_collect_notes(a, b, scatter),
         extent_mm=a.extent_mm,
         compared=int(np.isfinite(p).sum()),
         significant_share=significant_share,
@@ -512,7 +512,7 @@ def _match_axes(first: Real, second: Real) -> tuple[NDArray[np.intp], NDArray[np
     return nearest, np.abs(first - second[nearest]) <= pixel * 0.51
 
 
-def _notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
+def _collect_notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
     notes = []
     if scatter < 1:
         notes.append(
@@ -537,17 +537,17 @@ def _pair_patches(first: list[PatchFigures], second: list[PatchFigures]) -> list
     for patch in first:
         if patch.metal_reference or not candidates:
             continue
-        nearest = min(candidates, key=lambda other, patch=patch: _distance_mm(patch, other))
-        if _distance_mm(patch, nearest) <= NEAR_MM:
-            pairs.append(_pair(patch, nearest))
+        nearest = min(candidates, key=lambda other, patch=patch: _measure_distance_mm(patch, other))
+        if _measure_distance_mm(patch, nearest) <= NEAR_MM:
+            pairs.append(_describe_pair(patch, nearest))
     return pairs
 
 
-def _distance_mm(a: PatchFigures, b: PatchFigures) -> float:
+def _measure_distance_mm(a: PatchFigures, b: PatchFigures) -> float:
     return float(np.hypot(a.centre_x_mm - b.centre_x_mm, a.centre_y_mm - b.centre_y_mm))
 
 
-def _pair(a: PatchFigures, b: PatchFigures) -> PatchPair:
+def _describe_pair(a: PatchFigures, b: PatchFigures) -> PatchPair:
     pair = PatchPair(
         place_mm=(round(a.centre_x_mm, 1), round(a.centre_y_mm, 1)),
         names=(a.name, b.name),
@@ -557,7 +557,7 @@ def _pair(a: PatchFigures, b: PatchFigures) -> PatchPair:
     if a.permittivity is None or b.permittivity is None:
         return pair
     difference = a.permittivity.value - b.permittivity.value
-    covariance = _covariance(a.permittivity) + _covariance(b.permittivity)
+    covariance = _read_covariance(a.permittivity) + _read_covariance(b.permittivity)
     real = round(difference.real, 4)
     imag = round(difference.imag, 4)
     if not np.isfinite(covariance).all() or np.linalg.det(covariance) <= 0:
@@ -571,7 +571,7 @@ def _pair(a: PatchFigures, b: PatchFigures) -> PatchPair:
     )
 
 
-def _covariance(permittivity: PermittivityFigures) -> Real:
+def _read_covariance(permittivity: PermittivityFigures) -> Real:
     """Covariance of (real, imaginary); nan if an earlier release did not write it."""
     if permittivity.covariance is None:
         return np.full((2, 2), np.nan)

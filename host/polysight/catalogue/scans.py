@@ -477,7 +477,7 @@ class Scans:
                 entry = waiting.popleft()
                 self._reading.add(entry)
                 try:
-                    self._listed[entry] = [self._summary(name) for name in self._find_names_below(entry)]
+                    self._listed[entry] = [self._summarise(name) for name in self._find_names_below(entry)]
                 finally:
                     self._reading.discard(entry)
 
@@ -509,7 +509,7 @@ class Scans:
     def summary(self, name: str) -> Summary:
         """One of them. Raises DataError as :meth:`folder`."""
         self.folder(name)
-        return self._summary(name)
+        return self._summarise(name)
 
     def folder(self, name: str, new: bool = False) -> Path:
         """The folder of a scan.
@@ -560,7 +560,7 @@ class Scans:
             raise DataError(f"{path}: not a scan", cause, "choose a name from the list", code=ErrorCode.FILE_MISSING)
         return path
 
-    def _summary(self, name: str) -> Summary:
+    def _summarise(self, name: str) -> Summary:
         folder = self.root / name
         stamp = _read_stamp(folder)
         stored = self._summaries.get(name)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from polysight.materials import Layer
 
 
-def _materials(args: argparse.Namespace) -> int:
+def _run_materials(args: argparse.Namespace) -> int:
     from polysight.jobs.materials import catalogue, materials
 
     if bool(args.data) == args.catalogue:
@@ -31,7 +31,7 @@ def _materials(args: argparse.Namespace) -> int:
     return materials(args.data, args.as_json)
 
 
-def _permittivity(args: argparse.Namespace) -> int:
+def _run_permittivity(args: argparse.Namespace) -> int:
     from polysight.jobs.materials import permittivity
 
     options = {"--bands": args.bands, "--amplitude": args.amplitude, "--config": args.config}
@@ -55,7 +55,7 @@ def _permittivity(args: argparse.Namespace) -> int:
     )
 
 
-def _layer(text: str) -> Layer:
+def _parse_layer_option(text: str) -> Layer:
     from polysight.materials import LAYER_FORMS, parse_layer
 
     try:
@@ -64,7 +64,7 @@ def _layer(text: str) -> Layer:
         raise argparse.ArgumentTypeError(f"{text!r} is no layer: write {LAYER_FORMS}") from None
 
 
-def _value(text: str) -> tuple[str, float]:
+def _parse_value(text: str) -> tuple[str, float]:
     name, _, number = text.rpartition("=")
     try:
         return name, _percent(number)
@@ -92,7 +92,7 @@ def add_commands(add: Add) -> None:
 def _add_results(add: Add) -> None:
     sub = add(
         "materials",
-        _materials,
+        _run_materials,
         "print names and permittivities of the patches of processed scans, or the catalogue of the literature",
         "polysight materials out/one\n  polysight materials --catalogue",
     )
@@ -112,7 +112,7 @@ def _add_results(add: Add) -> None:
 def _add_permittivity(add: Add) -> None:
     sub = add(
         "permittivity",
-        _permittivity,
+        _run_permittivity,
         "print the permittivity of patches, also of a layer in a stack",
         "polysight permittivity out/one --patch 3 --layer glass,5.5,0.05,3 --layer liquid,?\n"
         "  polysight permittivity out/one --layer sheet,?,0.5-3 --layer plate,metal",
@@ -121,7 +121,7 @@ def _add_permittivity(add: Add) -> None:
     sub.add_argument("--patch", "--segment", type=int, metavar="N", help="this patch only (default: all)")
     sub.add_argument(
         "--layer",
-        type=_layer,
+        type=_parse_layer_option,
         action="append",
         default=[],
         metavar="LAYER",
@@ -153,7 +153,7 @@ def _add_concentration(add: Add) -> None:
     sub.add_argument(
         "--value",
         dest="values",
-        type=_value,
+        type=_parse_value,
         action="append",
         default=[],
         metavar="NAME=PERCENT",
@@ -276,7 +276,7 @@ def _label(args: argparse.Namespace) -> int:
     return label(args.scan, edits, args.list, input if sys.stdin.isatty() else None)
 
 
-def _box(text: str) -> tuple[str, tuple[float, float, float, float]]:
+def _parse_box(text: str) -> tuple[str, tuple[float, float, float, float]]:
     name, _, corners = text.rpartition("=")
     try:
         x0, y0, x1, y1 = (float(part) for part in corners.split(","))
@@ -285,7 +285,7 @@ def _box(text: str) -> tuple[str, tuple[float, float, float, float]]:
     return name, (x0, y0, x1, y1)
 
 
-def _pair(text: str) -> str:
+def _parse_pair(text: str) -> str:
     if "=" not in text.strip("="):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=TEXT")
     return text
@@ -302,11 +302,16 @@ def _add_label(add: Add) -> None:
     sub.add_argument("scan", type=Path, metavar="SCAN", help="processed scan folder, or a folder of products")
     sub.add_argument("--from-patches", action="store_true", help="begin with the patches found, named by number")
     sub.add_argument(
-        "--rename", type=_pair, action="append", default=[], metavar="OLD=NEW", help="rename a box or a patch's number"
+        "--rename",
+        type=_parse_pair,
+        action="append",
+        default=[],
+        metavar="OLD=NEW",
+        help="rename a box or a patch's number",
     )
     sub.add_argument(
         "--box",
-        type=_box,
+        type=_parse_box,
         action="append",
         default=[],
         metavar="NAME=x0,y0,x1,y1",
@@ -316,7 +321,7 @@ def _add_label(add: Add) -> None:
     sub.add_argument("--metal", metavar="NAME", help="the metal reference (default: the box with a metal's name)")
     sub.add_argument(
         "--specimen",
-        type=_pair,
+        type=_parse_pair,
         action="append",
         default=[],
         metavar="NAME=WHICH",

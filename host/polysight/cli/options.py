@@ -168,7 +168,7 @@ Box = tuple[float, float, float, float]
 
 def box(text: str) -> Box:
     """Parse the corners `x0,y0,x1,y1` of a box, millimetres from the image's centre."""
-    x0, y0, x1, y1 = _four_numbers(text, "x0,y0,x1,y1 in mm, e.g. -20,-20,20,20")
+    x0, y0, x1, y1 = _parse_four_numbers(text, "x0,y0,x1,y1 in mm, e.g. -20,-20,20,20")
     if x0 >= x1 or y0 >= y1:
         raise argparse.ArgumentTypeError(f"{text!r}: x0 must be below x1 and y0 below y1")
     return x0, y0, x1, y1
@@ -176,7 +176,7 @@ def box(text: str) -> Box:
 
 def parse_centred_box(text: str) -> Box:
     """Parse `x,y,width,height`, the form of a box in earlier releases; say how it is written now."""
-    x, y, width, height = _four_numbers(text, "x,y,width,height in mm, e.g. 0,0,40,40")
+    x, y, width, height = _parse_four_numbers(text, "x,y,width,height in mm, e.g. 0,0,40,40")
     if width <= 0 or height <= 0:
         raise argparse.ArgumentTypeError(f"width and height of {text!r} must be positive")
     corners = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
@@ -185,7 +185,7 @@ def parse_centred_box(text: str) -> Box:
     return corners
 
 
-def _four_numbers(text: str, form: str) -> Box:
+def _parse_four_numbers(text: str, form: str) -> Box:
     try:
         a, b, c, d = (float(part) for part in text.split(","))
     except ValueError:

@@ -32,18 +32,18 @@ _turn = number(float, "angles of at most 360 degrees, as 0,30,60", lambda value:
 _degrees = number(float, "`one`, `pixel` or an angle of 5 to 80 degrees", lambda value: 5 <= value <= 80)
 
 
-def _angles(text: str) -> tuple[float, ...]:
+def _parse_angles(text: str) -> tuple[float, ...]:
     """Angles of a turntable, separated by commas."""
     return tuple(_turn(part) for part in text.split(","))
 
 
-def _axis(text: str) -> tuple[float, float]:
+def _parse_axis(text: str) -> tuple[float, float]:
     """Two lengths in millimetres, separated by a comma."""
     x, _, z = text.partition(",")
     return _shift(x), _shift(z)
 
 
-def _incidence(text: str) -> str | float:
+def _parse_incidence(text: str) -> str | float:
     """`one`, `pixel`, or degrees."""
     if text in ("one", "pixel"):
         return text
@@ -80,7 +80,7 @@ def _process(args: argparse.Namespace) -> int:
     return process_several(several, args.out, args.jobs, args.dask, args.again)
 
 
-def _surface(args: argparse.Namespace) -> int:
+def _run_surface(args: argparse.Namespace) -> int:
     from polysight.jobs.surface import surface
 
     return surface(
@@ -109,13 +109,13 @@ def _image(args: argparse.Namespace) -> int:
     return image(args.data, args.out, settings)
 
 
-def _focus(args: argparse.Namespace) -> int:
+def _run_focus(args: argparse.Namespace) -> int:
     from polysight.jobs.process import focus
 
     return focus(args.data, args.out, rig_file(args.config, args.data), args.depth)
 
 
-def _sync_report(args: argparse.Namespace) -> int:
+def _run_sync_report(args: argparse.Namespace) -> int:
     from polysight.jobs.process import sync_report
 
     return sync_report(args.data, args.out, rig_file(args.config, args.data))
@@ -124,21 +124,21 @@ def _sync_report(args: argparse.Namespace) -> int:
 def _add_surface(add: Add) -> None:
     sub = add(
         "surface",
-        _surface,
+        _run_surface,
         "measure shape and permittivity of curved and tilted objects",
         "polysight surface scans/bottle --out out/bottle",
     )
     _add_data(sub, several=True)
     sub.add_argument(
         "--turned",
-        type=_angles,
+        type=_parse_angles,
         default=(),
         metavar="DEGREES,...",
         help="join scans of an object on a turntable, one angle for each scan: 0,30,60",
     )
     sub.add_argument(
         "--axis",
-        type=_axis,
+        type=_parse_axis,
         metavar="X,Z",
         help="turntable's axis: mm from the grid's middle, and from the object plane (default: 0,0)",
     )
@@ -181,7 +181,7 @@ def add_commands(add: Add) -> None:
     _add_sparse(sub)
     sub = add(
         "focus",
-        _focus,
+        _run_focus,
         "find the distance and tilt of the object plane by the sharpness of the image",
         "polysight focus scans/one --out out/focus",
     )
@@ -191,7 +191,7 @@ def add_commands(add: Add) -> None:
     )
     sub = add(
         "sync-report",
-        _sync_report,
+        _run_sync_report,
         "report the errors that synchronisation leaves, beside the Cramer-Rao bound",
         "polysight sync-report scans/one --out out/sync",
     )
@@ -259,7 +259,7 @@ def _add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument(
         "--incidence",
-        type=_incidence,
+        type=_parse_incidence,
         default="one",
         metavar="one|pixel|DEG",
         help="incidence angle: one for the image (default), or each pixel's own; degrees for given images",

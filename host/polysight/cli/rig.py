@@ -87,7 +87,7 @@ def _plan(args: argparse.Namespace) -> int:
     return run_plan(args.config, Changes(**{name: getattr(args, name) for name in names}), options)
 
 
-def _size(text: str) -> tuple[float, float]:
+def _parse_size(text: str) -> tuple[float, float]:
     try:
         width, height = (_scene_side(part) for part in text.split(","))
     except (ValueError, argparse.ArgumentTypeError):
@@ -109,7 +109,7 @@ def _add_plan(add: Add) -> None:
     sub.add_argument("--count", type=count, default=5, metavar="N", help="number of proposals (default: 5)")
     sub.add_argument("--like", type=Path, metavar="SCAN", help="take noise and standstill between rows from this scan")
     sub.add_argument("--scene", type=Path, metavar="FILE", help="scene file whose plates are checked, with its grid")
-    sub.add_argument("--scene-mm", type=_size, metavar="W,H", help="size of the scene (default: the image's)")
+    sub.add_argument("--scene-mm", type=_parse_size, metavar="W,H", help="size of the scene (default: the image's)")
     sub.add_argument(
         "--snr-db",
         type=_decibels,
@@ -131,7 +131,7 @@ def _add_plan(add: Add) -> None:
 # --- doctor ---
 
 
-def _doctor(args: argparse.Namespace) -> int:
+def _run_doctor(args: argparse.Namespace) -> int:
     from polysight.doctor import DoctorOptions, run_doctor
 
     if args.move and not args.pulse:
@@ -146,7 +146,7 @@ def _doctor(args: argparse.Namespace) -> int:
 def _add_doctor(add: Add) -> None:
     sub = add(
         "doctor",
-        _doctor,
+        _run_doctor,
         "check every hop of the rig in order and say what to do; nothing moves without --move",
         "polysight doctor --config instrument.toml --out scans",
         ("--config", "--move", "--bundle"),
@@ -175,20 +175,20 @@ def _add_doctor(add: Add) -> None:
 # --- card ---
 
 
-def _card(args: argparse.Namespace) -> int:
+def _run_card(args: argparse.Namespace) -> int:
     """`polysight card` without an action."""
     from polysight.jobs.devices import show_cards
 
     return show_cards(args.config, args.listen, args.as_json)
 
 
-def _card_program(args: argparse.Namespace) -> int:
+def _program_card(args: argparse.Namespace) -> int:
     from polysight.jobs.devices import program_card
 
     return program_card(args.config, args.name, args.mac, args.at, args.yes, args.wait)
 
 
-def _card_reset(args: argparse.Namespace) -> int:
+def _reset_card(args: argparse.Namespace) -> int:
     from polysight.jobs.devices import reset_card
 
     return reset_card(args.config, args.name, args.radar)
@@ -204,7 +204,9 @@ def _add_own_config(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_card(add: Add) -> None:
-    card = add("card", _card, "check the network path to each capture card; program or reset a card", "polysight card")
+    card = add(
+        "card", _run_card, "check the network path to each capture card; program or reset a card", "polysight card"
+    )
     add_config_option(card)
     card.add_argument(
         "--listen",
@@ -219,7 +221,7 @@ def _add_card(add: Add) -> None:
     sub = add_action(
         actions,
         "program",
-        _card_program,
+        _program_card,
         "write a board's addresses and ports from the rig file into its card's EEPROM",
         "polysight card program RH --mac 12:34:56:78:90:13 --at 192.168.33.180:4096",
     )
@@ -236,7 +238,7 @@ def _add_card(add: Add) -> None:
         "--wait", type=_seconds, default=120.0, metavar="S", help="look for the card afterwards (default: 120 s; 0: no)"
     )
     _add_own_config(sub)
-    sub = add_action(actions, "reset", _card_reset, "reset a card's FPGA, or its radar", "polysight card reset RH")
+    sub = add_action(actions, "reset", _reset_card, "reset a card's FPGA, or its radar", "polysight card reset RH")
     _add_board(sub)
     sub.add_argument("--radar", action="store_true", help="reset the radar board, which must be armed again")
     _add_own_config(sub)
@@ -428,7 +430,7 @@ def _add_scans(add: Add) -> None:
     sub.add_argument("--yes", action="store_true", help="do not ask for confirmation")
 
 
-def _demo(args: argparse.Namespace) -> int:
+def _run_demo(args: argparse.Namespace) -> int:
     from polysight.jobs.demo import run_demo
 
     return run_demo(find_packaged(args.scene), args.config, args.out, args.time_scale)
@@ -457,7 +459,7 @@ def _warn_of_plates(scene: Path, config: Path) -> None:
         sys.stderr.write(f"note, {warning.where}: {warning.what}\n")
 
 
-def _reproduce(args: argparse.Namespace) -> int:
+def _run_reproduce(args: argparse.Namespace) -> int:
     from polysight.jobs.demo import require_package
 
     if args.config != find_packaged(RIG):
@@ -485,7 +487,7 @@ def _reproduce(args: argparse.Namespace) -> int:
 def _add_simulated(add: Add) -> None:
     sub = add(
         "demo",
-        _demo,
+        _run_demo,
         "scan a scene with a simulated rig and write the report; needs no hardware",
         "polysight demo --out out/demo",
         ("--out", "--scene"),
@@ -526,7 +528,7 @@ def _add_simulated(add: Add) -> None:
 
     sub = add(
         "reproduce",
-        _reproduce,
+        _run_reproduce,
         "make the paper's tables and figures beside the published values",
         "polysight reproduce --out out/reproduce fig18 fig20\n"
         "  polysight reproduce --authors dataset --out out/authors",

@@ -40,7 +40,7 @@ def _serve(args: argparse.Namespace) -> int:
     return serve(args.root, _place(args), config, not args.read_only)
 
 
-def _preview(args: argparse.Namespace) -> int:
+def _run_preview(args: argparse.Namespace) -> int:
     _check_extra()
     if args.folder.exists() and not args.folder.is_dir():
         raise ConfigError(
@@ -68,7 +68,7 @@ def _place(args: argparse.Namespace) -> Place:
     return Place(args.host, args.port, tuple(args.allow_host), args.certificate, args.key)
 
 
-def _port(text: str) -> int:
+def _parse_port(text: str) -> int:
     """A TCP port, 0 for any that is free."""
     if not text.isdecimal() or int(text) > 65535:
         raise argparse.ArgumentTypeError(f"{text!r} is not a port, 0..65535")
@@ -89,7 +89,7 @@ def _add_serve(add: Add) -> None:
     _add_place(sub)
     sub = add(
         "preview",
-        _preview,
+        _run_preview,
         "serve the live view of one running or finished scan",
         "polysight preview scans/one                           # then open http://127.0.0.1:8080/\n"
         "  polysight preview scans/one --control --port 8081     # with buttons to pause and stop",
@@ -109,7 +109,7 @@ def _add_folder(sub: argparse.ArgumentParser) -> None:
 
 def _add_place(sub: argparse.ArgumentParser) -> None:
     """Options of the address."""
-    sub.add_argument("--port", type=_port, default=8080, help="TCP port (default: 8080; 0: any free one)")
+    sub.add_argument("--port", type=_parse_port, default=8080, help="TCP port (default: 8080; 0: any free one)")
     sub.add_argument(
         "--host", default="127.0.0.1", metavar="ADDRESS", help="address (default: this machine; 0.0.0.0: the network)"
     )

@@ -102,7 +102,7 @@ def write_bundle(
     redacted = Redactor(keys)
     try:
         with open_to_write(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in _contents(options, rig, findings, text, root):
+            for name, content in _collect_contents(options, rig, findings, text, root):
                 archive.writestr(name, redacted(content))
     except OSError as e:
         raise DeviceError(
@@ -110,7 +110,7 @@ def write_bundle(
         ) from None
 
 
-def _contents(
+def _collect_contents(
     options: DoctorOptions, rig: Instrument | None, findings: Sequence[Finding], text: str, root: Path
 ) -> Iterator[tuple[str, str]]:
     """Yield name and text of every file."""
@@ -118,30 +118,30 @@ def _contents(
     yield "README.txt", README.format(hidden=HIDDEN, **about)
     yield "findings.txt", text
     yield "findings.json", json.dumps([finding_facts(f) for f in findings], indent=1)
-    yield "versions.json", json.dumps(_versions(), indent=1)
-    yield "kernel.txt", _kernel(root)
-    yield "network.json", json.dumps(_network(root), indent=1)
-    if (config := _tail(options.config, _TAIL_BYTES)) is not None:
+    yield "versions.json", json.dumps(_list_versions(), indent=1)
+    yield "kernel.txt", _read_kernel_log(root)
+    yield "network.json", json.dumps(_describe_network(root), indent=1)
+    if (config := _read_tail(options.config, _TAIL_BYTES)) is not None:
         # Comments are for who wrote them, and whoever is told of a scan's end may be reached by a secret address.
         config = re.sub(r"(?m)(^|[ \t])#.*$", "", config)
         yield "rig.toml", re.sub(r"(?m)^(\s*(?:url|command)\s*=\s*).+$", rf'\1"{HIDDEN}"', config)
-    for folder in _newest_scans(options.out):
+    for folder in _find_newest_scans(options.out):
         with suppress(OSError, DataError):
             lines = read_bounded(folder / MANIFEST, _MANIFEST_BYTES).decode("utf-8", "replace").splitlines()
             yield f"scans/{folder.resolve().name}.jsonl", "\n".join(lines[-_LINES:]) + "\n"
     places = [options.config.parent, options.config.parent / "logs", options.out, options.out / "logs"]
-    yield from _files("logs", _newest(places, "*.log", _LOGS), _TAIL_BYTES)
+    yield from _collect_files("logs", _find_newest(places, "*.log", _LOGS), _TAIL_BYTES)
     if rig is not None and rig.radar.trace_dir:
-        yield from _files("traces", _newest([Path(rig.radar.trace_dir)], "*", _TRACES), _TRACE_BYTES)
+        yield from _collect_files("traces", _find_newest([Path(rig.radar.trace_dir)], "*", _TRACES), _TRACE_BYTES)
 
 
-def _files(folder: str, paths: Sequence[Path], most: int) -> Iterator[tuple[str, str]]:
+def _collect_files(folder: str, paths: Sequence[Path], most: int) -> Iterator[tuple[str, str]]:
     for number, path in enumerate(paths):
-        if (text := _tail(path, most)) is not None:
+        if (text := _read_tail(path, most)) is not None:
             yield f"{folder}/{number}-{path.name}", text
 
 
-def _tail(path: Path, most: int) -> str | None:
+def _read_tail(path: Path, most: int) -> str | None:
     """Return at most the last `most` bytes of a file as text; None if it cannot be read."""
     try:
         with path.open("rb") as file:
@@ -152,38 +152,38 @@ def _tail(path: Path, most: int) -> str | None:
         return None
 
 
-def _newest(folders: Sequence[Path], pattern: str, count: int) -> list[Path]:
+def _find_newest(folders: Sequence[Path], pattern: str, count: int) -> list[Path]:
     matches = {p.resolve() for folder in folders for p in folder.glob(pattern) if p.is_file() and not p.is_symlink()}
     return sorted(matches, key=lambda p: (p.stat().st_mtime, p), reverse=True)[:count]
 
 
-def _newest_scans(out: Path) -> list[Path]:
-    manifests = _newest([out, *(p for p in out.glob("*") if p.is_dir())], MANIFEST, _SCANS)
+def _find_newest_scans(out: Path) -> list[Path]:
+    manifests = _find_newest([out, *(p for p in out.glob("*") if p.is_dir())], MANIFEST, _SCANS)
     return [path.parent for path in manifests]
 
 
-def _versions() -> dict[str, object]:
+def _list_versions() -> dict[str, object]:
     system = {name: getattr(platform, name)() for name in ("platform", "machine", "python_version", "libc_ver")}
     installed = {d.metadata["Name"]: d.version for d in distributions()}
     return {**versions(), **system, "cores": os.cpu_count(), "packages": dict(sorted(installed.items()))}
 
 
-def _kernel(root: Path) -> str:
+def _read_kernel_log(root: Path) -> str:
     limits = ("RLIMIT_RTPRIO", "RLIMIT_MEMLOCK", "RLIMIT_NOFILE", "RLIMIT_NICE")
     parts = [f"{platform.uname()}", *(f"{name} {resource.getrlimit(getattr(resource, name))}" for name in limits)]
     for name in _KERNEL:
-        text = _tail(root / name, _TAIL_BYTES)
+        text = _read_tail(root / name, _TAIL_BYTES)
         if text is None:
             text = "not available"
         parts.append(f"== /{name}\n{text.rstrip()}")
     return "\n".join(parts) + "\n"
 
 
-def _network(root: Path) -> dict[str, object]:
+def _describe_network(root: Path) -> dict[str, object]:
     try:
         names = sorted(p.name for p in (root / "sys/class/net").iterdir())
     except OSError:
         names = []
     interfaces = [asdict(read_interface(name, root)) for name in names]
-    tables = {name: _tail(root / "proc/net" / name, _TAIL_BYTES) for name in ("route", "arp", "dev")}
+    tables = {name: _read_tail(root / "proc/net" / name, _TAIL_BYTES) for name in ("route", "arp", "dev")}
     return {"interfaces": interfaces, **tables}

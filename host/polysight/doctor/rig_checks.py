@@ -178,7 +178,7 @@ def check_receivers(context: CheckContext) -> Finding:
 def check_disk(context: CheckContext) -> Finding:
     """Check free space for a scan and the reserve, and for twice the scan's data rate."""
     rig = context.rig
-    folder = _nearest_existing(context.options.out)
+    folder = _find_existing_parent(context.options.out)
     need = rig.scan_bytes
     reserve = rig.limits.free_disk_bytes
     free = shutil.disk_usage(folder).free
@@ -199,7 +199,7 @@ def check_disk(context: CheckContext) -> Finding:
     return ok(observed, **facts)
 
 
-def _nearest_existing(folder: Path) -> Path:
+def _find_existing_parent(folder: Path) -> Path:
     observed = folder.resolve()
     while not observed.exists():
         observed = observed.parent
@@ -352,13 +352,13 @@ def _run_row(context: CheckContext) -> RowFinished:
     try:
         make_ready(pi, StopRequest(), lambda _phase, _message: None)
         pi.run_row(scan_id, 0, 1)
-        return _row_end(context)
+        return _take_row_end(context)
     finally:
         pi.come_to_rest("end of polysight doctor")
         pi.end_run(scan_id, "success", "polysight doctor --move")
 
 
-def _row_end(context: CheckContext) -> RowFinished:
+def _take_row_end(context: CheckContext) -> RowFinished:
     deadline = time.monotonic() + _ROW_TIMEOUT_S
     while time.monotonic() < deadline:
         context.pi.event_socket.poll(_POLL_MS)
@@ -608,7 +608,7 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
         observed = f"no direct path in {missed} of {signal.chirps} chirps; {predicted}"
         if outside:
             cause = "its IF is outside the receiver's band, so it is filtered out or aliased"
-            return error(observed, cause, _better_start(rig, board, expected), **facts)
+            return error(observed, cause, _suggest_start_offset(rig, board, expected), **facts)
         return error(
             observed,
             "the transmitter is off or not armed, something stands between the boards, or the start frequencies"
@@ -628,14 +628,14 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
             f"{observed}; {predicted}, outside {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
             "this is an alias: the anti-aliasing filter attenuates it, and the high-pass filter is inverted at the"
             " wrong frequency",
-            _better_start(rig, board, expected),
+            _suggest_start_offset(rig, board, expected),
             **facts,
         )
     if median - spread < low or median + spread > high or signal.if_hz.size < _MIN_DETECTED * signal.chirps:
         return error(
             f"{observed}: too near the edge of {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
             f"5 ns of trigger jitter move it by {spread / 1e3:.0f} kHz, so that some chirps are lost",
-            _better_start(rig, board, median),
+            _suggest_start_offset(rig, board, median),
             **facts,
         )
     # The crystals' share of the delay is not known here, and left out.
@@ -652,7 +652,7 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
     return ok(f"{observed}; {predicted}", **facts)
 
 
-def _better_start(rig: Instrument, board: Board, if_hz: float) -> str:
+def _suggest_start_offset(rig: Instrument, board: Board, if_hz: float) -> str:
     """Remedy: the start offset that moves a direct path with this true IF to the middle of the band."""
     return f"start_offset_hz = {board.start_offset_hz + sum(band_hz(rig)) / 2 - if_hz:.0f} for {board.name}"
 

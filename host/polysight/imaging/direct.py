@@ -172,7 +172,7 @@ class DirectImager:
         total = 0
         for r in range(rx):
             by_position = xp.permute_dims(xp.reshape(samples[r, ...], (m, rows * columns)), (1, 0))
-            total = total + backproject(by_position, *self._places(r))
+            total = total + backproject(by_position, *self._convert_places(r))
         return xp.reshape(total, self.aperture.grid.shape)
 
     def constant(self, echo: Any, weights: Any) -> Any:
@@ -185,10 +185,10 @@ class DirectImager:
         xp = namespace(image)
         rx, m, rows, columns = self.aperture.shape
         pixels = xp.reshape(image, (-1,))
-        answers = [xp.permute_dims(project(pixels, *self._places(r)), (1, 0)) for r in range(rx)]
+        answers = [xp.permute_dims(project(pixels, *self._convert_places(r)), (1, 0)) for r in range(rx)]
         return xp.reshape(xp.stack(answers), (rx, m, rows, columns))
 
-    def _places(self, rx: int) -> tuple[Any, ...]:
+    def _convert_places(self, rx: int) -> tuple[Any, ...]:
         """Return the arguments of `backproject` after the samples."""
         a = self.aperture
         shift = a.offsets_m.reshape(-1, 3)

@@ -139,11 +139,11 @@ class Illumination:
         for along in (0, 1):
             # The phase of the conjugate falls where the plate rises.
             step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in channels) / len(channels)
-            slope = self._slope(float(np.angle(step)), h, along, mask, plate) if abs(step) > _COHERENT else 0.0
+            slope = self._estimate_slope(float(np.angle(step)), h, along, mask, plate) if abs(step) > _COHERENT else 0.0
             out.append(slope)
         return out[0], out[1]
 
-    def _slope(self, step_rad: float, h: Image, along: int, mask: Mask, plate: Mask | None) -> float:
+    def _estimate_slope(self, step_rad: float, h: Image, along: int, mask: Mask, plate: Mask | None) -> float:
         """Return the rise of a plate along x (0) or y (1) from its phase step."""
         slope_per_rad = 1 / (self.pixel_m[along] * float(self.steepness_rad_m.mean()))
         slope = slope_per_rad * step_rad
@@ -472,7 +472,7 @@ class ImageBuilder:
         `offset_m`: distance of the imaged plane behind the rig file's plane.
         """
         grid = replace(self.grid, z_m=self.grid.z_m + offset_m) if offset_m else None
-        return self._channels({name: board.image(grid) for name, board in self.boards.items()}, offset_m)
+        return self._make_channels({name: board.image(grid) for name, board in self.boards.items()}, offset_m)
 
     def disperse(self, offset_m: float = 0.0) -> Dispersion:
         """Form the change of both images over the sweep; `offset_m` as of :meth:`finish`."""
@@ -482,9 +482,9 @@ class ImageBuilder:
 
     def current(self) -> Images:
         """Return the images from running sums, within 1e-6 of the peak; fast if the builder is `live`."""
-        return self._channels({name: board.current() for name, board in self.boards.items()})
+        return self._make_channels({name: board.current() for name, board in self.boards.items()})
 
-    def _channels(self, made: dict[str, tuple[Image, Image, str | None]], offset_m: float = 0.0) -> Images:
+    def _make_channels(self, made: dict[str, tuple[Image, Image, str | None]], offset_m: float = 0.0) -> Images:
         h, v = made.values()
         visible = np.ones(self.grid.shape, bool)
         for _, weight, _ in (h, v):
@@ -501,12 +501,12 @@ class ImageBuilder:
             valid=visible,
             h_raw=h[0],
             v_raw=v[0],
-            illumination=self._illumination(np.stack([h[1], v[1]]), float(np.mean(self.grid.z_m)) + offset_m),
+            illumination=self._compute_illumination(np.stack([h[1], v[1]]), float(np.mean(self.grid.z_m)) + offset_m),
             rx_gains={name: board.rx_calibration() for name, board in self.boards.items()},
             notices=tuple(f"{name}: {notice}" for name, (_, _, notice) in made.items() if notice),
         )
 
-    def _illumination(self, footprints: NDArray[np.complex64], z_m: float) -> Illumination:
+    def _compute_illumination(self, footprints: NDArray[np.complex64], z_m: float) -> Illumination:
         """Return the illumination of the plane at `z_m` by both channels."""
         moved, steep = zip(*(illumination_geometry(a, z_m, self._middle_hz) for a in self._antennas), strict=True)
         pitch = self.grid.pixel_m
@@ -581,7 +581,7 @@ class SubBandImages:
 
     def __init__(self, rig: Instrument, count: int, gate_m: tuple[float, float] | None = None) -> None:
         self.bands = sub_bands(rig.chirp, count) if count > 1 else ()
-        self.builders = tuple(ImageBuilder(_part(rig, band), gate_m=gate_m) for band in self.bands)
+        self.builders = tuple(ImageBuilder(_limit_to_band(rig, band), gate_m=gate_m) for band in self.bands)
 
     def add_row(self, board_name: str, row_index: int, row: SyncedRow) -> None:
         """Add a synchronised row of a board; a row added again replaces the earlier one."""
@@ -597,7 +597,7 @@ class SubBandImages:
         return tuple(images.transpose() if transposed else images for images in band_images)
 
 
-def _part(rig: Instrument, band: SubBand) -> Instrument:
+def _limit_to_band(rig: Instrument, band: SubBand) -> Instrument:
     """Return the rig with the linear samples limited to a sub-band."""
     chirp = msgspec.structs.replace(rig.chirp, linear_samples=band.samples)
     return msgspec.structs.replace(rig, chirp=chirp)
@@ -637,7 +637,7 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
         boards = (rig.transmitter, *rig.receivers)
         models = {b.name: filters.get(b.name) or high_pass(chirp) for b in rig.receivers}
         return cls(
-            places_mm={b.name: list(_places_mm(rig, b)) for b in boards},
+            places_mm={b.name: list(_list_places_mm(rig, b)) for b in boards},
             object_distance_mm=rig.geometry.object_distance_mm,
             band_hz=(
                 chirp.first_sample_hz + chirp.hz_per_sample * first,
@@ -650,9 +650,9 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
 
     def differences(self, now: ImagedWith) -> list[str]:
         """Return the differences to `now`, in a few words each; empty if the gains apply."""
-        return list(self._differences(now))
+        return list(self._list_differences(now))
 
-    def _differences(self, now: ImagedWith) -> Iterator[str]:
+    def _list_differences(self, now: ImagedWith) -> Iterator[str]:
         if set(self.places_mm) != set(now.places_mm):
             yield f"the boards are {', '.join(now.places_mm)}, not {', '.join(self.places_mm)}"
         for name in self.places_mm.keys() & now.places_mm.keys():
@@ -668,7 +668,7 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
             yield f"the object plane is at {now.object_distance_mm:.2f} mm, not {self.object_distance_mm:.2f} mm"
         difference_hz = max(abs(a - b) for a, b in zip(self.band_hz, now.band_hz, strict=True))
         if difference_hz > SAME_HZ or self.samples != now.samples:
-            yield f"the linear samples are {_band(now)}, not {_band(self)}"
+            yield f"the linear samples are {_describe_band(now)}, not {_describe_band(self)}"
         if self.apodisation != now.apodisation:
             yield f"image.apodisation is {now.apodisation!r}, not {self.apodisation!r}"
         for name in self.high_pass_khz.keys() & now.high_pass_khz.keys():
@@ -676,10 +676,10 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
             corners = now.high_pass_khz[name]
             same = len(was) == len(corners)
             if not same or any(abs(a - b) > SAME_CORNER_KHZ for a, b in zip(was, corners, strict=True)):
-                yield f"{name}'s high-pass corners are {_corners(corners)}, not {_corners(was)}"
+                yield f"{name}'s high-pass corners are {_describe_corners(corners)}, not {_describe_corners(was)}"
 
 
-def _places_mm(rig: Instrument, board: Board) -> Iterator[Vector]:
+def _list_places_mm(rig: Instrument, board: Board) -> Iterator[Vector]:
     """Yield antennas in use and two points along a board's x and y, rig frame, rounded to a nanometre."""
     antennas = rig.antennas
     used = (antennas.tx_mm[board.tx_antenna],) if board.role == "transmit" else antennas.rx_mm
@@ -688,10 +688,10 @@ def _places_mm(rig: Instrument, board: Board) -> Iterator[Vector]:
         yield (x, y, z)
 
 
-def _band(made: ImagedWith) -> str:
+def _describe_band(made: ImagedWith) -> str:
     first, last = made.band_hz
     return f"{made.samples} of {first / 1e9:.4f}..{last / 1e9:.4f} GHz"
 
 
-def _corners(khz: list[float]) -> str:
+def _describe_corners(khz: list[float]) -> str:
     return " and ".join(f"{c:.0f}" for c in khz) + " kHz" if khz else "none"

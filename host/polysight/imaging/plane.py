@@ -126,7 +126,7 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
         for board in builder.boards.values():
             image = board.image(replace(grid, z_m=float(np.mean(grid.z_m)) + depth))[0]
             stack[i] += np.abs(image) ** 2
-    cells = _cell_areas(builder, depths)
+    cells = _compute_cell_areas(builder, depths)
     x = grid.x_m - grid.x_m.mean()
     y = grid.y_m - grid.y_m.mean()
 
@@ -154,7 +154,7 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
     return Focus(1e3 * depths, flat / flat.max(), float(depth), (float(tilt[0]), float(tilt[1])), float(gain))
 
 
-def _cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the relative area of a resolution cell at every pixel of every plane, [plane, ny, nx].
 
     Interpolated from nine points per plane, for it varies slowly.
@@ -300,7 +300,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     grid = builder.grid
     x = grid.x_m - grid.x_m.mean()
     y = grid.y_m - grid.y_m.mean()
-    ranges = [_heights_by_range(board, masks) for board in builder.boards.values()]
+    ranges = [_estimate_heights_by_range(board, masks) for board in builder.boards.values()]
     precision = np.stack([1 / std**2 for _, std in ranges])
     total = precision.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -311,12 +311,12 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         return replace(UNKNOWN_PLANE, heights_m=np.full(len(masks), np.nan))
     places = np.array([(x[m.any(axis=0)].mean(), y[m.any(axis=1)].mean()) if m.any() else (0.0, 0.0) for m in masks])
     plane, covariance = _fit(places[determined], heights[determined], np.hypot(stds[determined], _MIN_STD_M))
-    phase = _heights_by_phase(next(iter(builder.boards.values())), masks, places, plane)
+    phase = _estimate_heights_by_phase(next(iter(builder.boards.values())), masks, places, plane)
     fine = determined & np.isfinite(phase[0])
     by_phase = False
     if fine.sum() >= 2:
         finer, fine_covariance = _fit(places[fine], phase[0][fine], np.full(int(fine.sum()), _PHASE_STD_M))
-        residual = phase[0][fine] - _plane_heights(finer, places[fine])
+        residual = phase[0][fine] - _evaluate_plane(finer, places[fine])
         on_one_plane = float(np.sqrt(np.mean((residual * phase[1]) ** 2))) < _PHASE_FITS_RAD
         # Thin sheets change the phase themselves: accept the plane only if the ranges agree.
         like_ranges = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, 3e-3, 3e-3]
@@ -365,7 +365,7 @@ def move_to_plane(
     return plane, replace(images, dispersion=dispersion.transpose() if transposed else dispersion)
 
 
-def _heights_by_range(
+def _estimate_heights_by_range(
     board: BoardSamples, masks: Sequence[NDArray[np.bool_]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the height of each patch from the range of its echo, and its standard deviation, metres."""
@@ -397,7 +397,7 @@ def _heights_by_range(
     return heights, stds
 
 
-def _heights_by_phase(
+def _estimate_heights_by_phase(
     board: BoardSamples,
     masks: Sequence[NDArray[np.bool_]],
     places: NDArray[np.float64],
@@ -451,11 +451,11 @@ def _fit(
     information = rows.T @ rows + np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
     plane = np.asarray(np.linalg.solve(information, rows.T @ (heights / stds)), np.float64)
     covariance = np.linalg.inv(information)
-    residual = (heights - _plane_heights(plane, places)) / stds
+    residual = (heights - _evaluate_plane(plane, places)) / stds
     freedom = max(len(places) - 3, 1)
     return plane, np.asarray(covariance * max(1.0, float(np.sum(residual**2)) / freedom), np.float64)
 
 
-def _plane_heights(plane: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _evaluate_plane(plane: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the heights of a plane at places [patch, 2]."""
     return plane[0] + places @ plane[1:]

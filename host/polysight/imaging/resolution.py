@@ -64,7 +64,7 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
 
     Positions are combined into at most 24 x 24 blocks at their mean positions, exact enough within the evaluated range.
     """
-    blocks, block_weights = _blocks(aperture, weights)
+    blocks, block_weights = _combine_positions(aperture, weights)
     grid = aperture.grid
     point = np.array([grid.x_m.mean(), grid.y_m.mean(), float(np.mean(grid.z_m))])
     limit = [limit_m(aperture, point, axis) for axis in (0, 1)]
@@ -75,8 +75,8 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
     length = np.ptp(aperture.offsets_m[..., :2], axis=(0, 1))
     distance = point[2] - aperture.offsets_m[..., 2].mean()
     paper = [1e3 * distance * wave / n if n > 0 else np.inf for n in length]
-    widths = [1e3 * _width(cut) * step for cut, step in cuts]
-    sidelobes = [_sidelobe_db(cut) for cut, _ in cuts]
+    widths = [1e3 * _measure_width(cut) * step for cut, step in cuts]
+    sidelobes = [_measure_sidelobe_db(cut) for cut, _ in cuts]
     return PointResponse(
         (float(widths[0]), float(widths[1])),
         (1e3 * limit[0], 1e3 * limit[1]),
@@ -85,7 +85,7 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
     )
 
 
-def _blocks(aperture: Aperture, weights: NDArray[np.floating]) -> tuple[Aperture, NDArray[np.float64]]:
+def _combine_positions(aperture: Aperture, weights: NDArray[np.floating]) -> tuple[Aperture, NDArray[np.float64]]:
     """Return the aperture with neighbouring positions combined, and the sums of their weights."""
     rows, columns = weights.shape
     at_rows, at_columns = (np.unique(np.linspace(0, n, _BLOCKS + 1).astype(int)[:-1]) for n in (rows, columns))
@@ -131,7 +131,7 @@ def _cut(
     return cut / (cut[count] or 1.0), step
 
 
-def _width(cut: NDArray[np.float64]) -> float:
+def _measure_width(cut: NDArray[np.float64]) -> float:
     """Return the half-power width in points; infinite if the amplitude never falls that low."""
     middle = cut.size // 2
     sides = []
@@ -144,7 +144,7 @@ def _width(cut: NDArray[np.float64]) -> float:
     return float(sum(sides))
 
 
-def _sidelobe_db(cut: NDArray[np.float64]) -> float:
+def _measure_sidelobe_db(cut: NDArray[np.float64]) -> float:
     """Return the strongest value beyond the first minimum on either side, dB."""
     middle = cut.size // 2
     levels = []
@@ -251,11 +251,13 @@ def field_limits(rig: Instrument) -> FieldLimits:
         zone.append(1e3 * float(np.sqrt(2 * np.pi / change)))
         size_m = (count - 1) * step_mm / 1e3
         places = np.linspace(-size_m / 4, size_m / 4, _PLACES)
-        free.append(1e3 * min(_nearest_ghost_m(slope, high, 2e3 * np.pi / step_mm, p) for p in places))
+        free.append(1e3 * min(_find_nearest_ghost_m(slope, high, 2e3 * np.pi / step_mm, p) for p in places))
     return FieldLimits((free[0], free[1]), (zone[0], zone[1]))
 
 
-def _nearest_ghost_m(slope: PhaseSlope, frequency_hz: float, difference_rad_per_m: float, centre_m: float) -> float:
+def _find_nearest_ghost_m(
+    slope: PhaseSlope, frequency_hz: float, difference_rad_per_m: float, centre_m: float
+) -> float:
     """Distance between two places around `centre_m` whose slopes differ by `difference_rad_per_m`."""
 
     def too_far(distance_m: float) -> bool:

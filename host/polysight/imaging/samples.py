@@ -360,7 +360,7 @@ class BoardSamples:
         """Taper of each position, 0 where not valid, float32 [row, column]."""
         return self.taper * self.valid
 
-    def _row_weights(self, index: int) -> NDArray[np.float32]:
+    def _compute_row_weights(self, index: int) -> NDArray[np.float32]:
         """Return one row of :attr:`weights`."""
         return self.taper[index] * self.valid[index]
 
@@ -387,9 +387,9 @@ class BoardSamples:
             if the row is not in the plan.
         """
         if not 0 <= index < self._plan.rows:
-            raise _wrong_row(f"row {index} of board {self.board.name!r} is not in this scan")
+            raise _wrong_row_error(f"row {index} of board {self.board.name!r} is not in this scan")
         if row.valid.shape != (self._plan.columns,):
-            raise _wrong_row(
+            raise _wrong_row_error(
                 f"row {index} of board {self.board.name} has {row.valid.size} positions, the plan {self._plan.columns}"
             )
         forward = slice(None, None, self._plan.row(index).direction)
@@ -435,7 +435,7 @@ class BoardSamples:
         if samples.strides[1] < 0:
             return self._apply_gate(samples[:, ::-1], sweep_hz)[..., ::-1]
         if sweep_hz.size not in self._maps:
-            self._maps[sweep_hz.size] = _on_pairs(self._reduction.maps(sweep_hz))
+            self._maps[sweep_hz.size] = _pair_maps(self._reduction.maps(sweep_hz))
         used, maps = self._maps[sweep_hz.size]
         pairs = np.asarray(samples, np.complex64).view(np.float32)[..., used]
         out = np.empty((*pairs.shape[:2], maps.shape[1]), np.float32)
@@ -454,11 +454,11 @@ class BoardSamples:
             self._padded = np.zeros((*self._cube.shape[:2], self._final.period), np.complex64)
             self._stale = set(range(len(self.valid)))
 
-    def _row_spectra(self, imager: SpectralImager, index: int) -> NDArray[np.complex64]:
+    def _compute_row_spectra(self, imager: SpectralImager, index: int) -> NDArray[np.complex64]:
         """Return the spectra of a row, [rx, frequency, k]; row by row, so that results are bit-exact in any order."""
         if index in self._stale:
             row = self._padded[..., : self.taper.shape[1]]
-            np.multiply(self._cube[:, :, index], self._row_weights(index), out=row)
+            np.multiply(self._cube[:, :, index], self._compute_row_weights(index), out=row)
             self._spectra[:, :, index] = imager.spectra_of_row(self._padded, index)
             self._stale.remove(index)
         return self._spectra[:, :, index]
@@ -505,12 +505,12 @@ class BoardSamples:
 
     def _show(self, index: int, sign: int) -> None:
         """Add a row to the live image, or subtract it (`sign` -1)."""
-        weights = sign * self._row_weights(index)
+        weights = sign * self._compute_row_weights(index)
         if self._live is None or not weights.any():
             return
         if self._final is not None and not self._moved:
             white = self._final.spectra_of_row(weights.astype(np.complex64), index)
-            self._live.add_spectra(index, sign * self._row_spectra(self._final, index), white)
+            self._live.add_spectra(index, sign * self._compute_row_spectra(self._final, index), white)
         else:
             start = float(geometry.row_starts_m(self._offsets)[index])
             self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
@@ -543,23 +543,23 @@ class BoardSamples:
             Other pixels than the rig file's, within the range gate.
         """
         if grid is not None:
-            return self._form(grid)
+            return self._form_images(grid)
         if self._image is None:
-            self._image = self._form(None)
+            self._image = self._form_images(None)
         return self._image
 
-    def _form(self, grid: geometry.ImageGrid | None) -> tuple[Image, Image, str | None]:
+    def _form_images(self, grid: geometry.ImageGrid | None) -> tuple[Image, Image, str | None]:
         gains = (1 / self.rx_calibration()).astype(np.complex64)
         notice = None
         if grid is None:
             self._prepare()
         if grid is None and self._final is not None:
             for index in range(len(self.valid)):
-                self._row_spectra(self._final, index)
+                self._compute_row_spectra(self._final, index)
             imager: Imager = self._final
             image: Any = self._final.image_of_spectra(self._spectra, gains)
         else:
-            imager, notice = self._imager(grid)
+            imager, notice = self._choose_imager(grid)
             image = imager.image(self._cube * (gains[:, None, None, None] * self.weights))
         footprint: Any = imager.constant(self._mirror(grid).astype(np.complex64), self.weights) / self.count
         return (image / self.count).astype(np.complex64), footprint.astype(np.complex64), notice
@@ -587,17 +587,17 @@ class BoardSamples:
         samples times -j 2 pi (f_m - f) / c, with f the middle of the sweep. `grid` as of :meth:`image`.
         """
         if grid is not None:
-            return self._form_slope(grid)
+            return self._form_slope_images(grid)
         if self._slope is None:
-            self._slope = self._form_slope(None)
+            self._slope = self._form_slope_images(None)
         return self._slope
 
-    def _form_slope(self, grid: geometry.ImageGrid | None) -> tuple[Image, Image]:
-        imager, _ = self._imager(grid)
+    def _form_slope_images(self, grid: geometry.ImageGrid | None) -> tuple[Image, Image]:
+        imager, _ = self._choose_imager(grid)
         factors = self._compute_range_slope_factors()
         gains = (1 / self.rx_calibration()).astype(np.complex64)
         image: Any = imager.image(self._cube * (gains[:, None, None, None] * factors[:, None, None] * self.weights))
-        return (image / self.count).astype(np.complex64), self._constant_image(self._mirror(grid) * factors, grid)
+        return (image / self.count).astype(np.complex64), self._make_constant_image(self._mirror(grid) * factors, grid)
 
     def dispersion(self, grid: geometry.ImageGrid | None = None) -> Image:
         """Return the change of ln(image / footprint) from the first to the last frequency, complex64 [ny, nx].
@@ -612,7 +612,7 @@ class BoardSamples:
         """
         image, footprint, _ = self.image(grid)
         slope, mirror_slope = self.range_slope(grid)
-        mirror_bend = self._constant_image(self._mirror(grid) * self._compute_range_slope_factors() ** 2, grid)
+        mirror_bend = self._make_constant_image(self._mirror(grid) * self._compute_range_slope_factors() ** 2, grid)
         f = self._reduction.frequencies_hz
         sweep_per_m = -2j * np.pi * (f[-1] - f[0]) / SPEED_OF_LIGHT_M_S
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -623,15 +623,15 @@ class BoardSamples:
 
     def mirror_image(self, height_m: float) -> Image:
         """Return the footprint of a mirror `height_m` behind the rig file's plane, complex64 [ny, nx]."""
-        return self._constant_image(self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m))
+        return self._make_constant_image(self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m))
 
     def mirror_slope(self, height_m: float) -> Image:
         """Return the derivative of :meth:`mirror_image` by range, see :meth:`range_slope`."""
         echo = self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m)
-        return self._constant_image(echo * self._compute_range_slope_factors())
+        return self._make_constant_image(echo * self._compute_range_slope_factors())
 
-    def _constant_image(self, echo: NDArray[np.complexfloating], grid: geometry.ImageGrid | None = None) -> Image:
-        imager, _ = self._imager(grid)
+    def _make_constant_image(self, echo: NDArray[np.complexfloating], grid: geometry.ImageGrid | None = None) -> Image:
+        imager, _ = self._choose_imager(grid)
         image: Any = imager.constant(echo.astype(np.complex64), self.weights)
         return (image / self.count).astype(np.complex64)
 
@@ -646,7 +646,7 @@ class BoardSamples:
     def _mirror_samples(self, z_m: float) -> NDArray[np.complex128]:
         return mirror_reduced(self._antennas, z_m, self._chirp, self._reduction)
 
-    def _imager(self, grid: geometry.ImageGrid | None) -> tuple[Imager, str | None]:
+    def _choose_imager(self, grid: geometry.ImageGrid | None) -> tuple[Imager, str | None]:
         """Return the imager of the rig file's grid or of another one, and a notice if it is slow."""
         if grid is None and self._final is not None:
             return self._final, None
@@ -656,7 +656,7 @@ class BoardSamples:
         return imager, notice
 
 
-def _on_pairs(maps: NDArray[np.complex128]) -> tuple[slice, NDArray[np.float32]]:
+def _pair_maps(maps: NDArray[np.complex128]) -> tuple[slice, NDArray[np.float32]]:
     """Return complex maps [map, sample] as real ones for pairs (re, im), float32 [2 sample, 2 map], and their slice.
 
     `pairs[..., slice] @ out` are the pairs of `maps @ x`: a real product is 1.5 times as fast as such a narrow complex
@@ -673,7 +673,7 @@ def _on_pairs(maps: NDArray[np.complex128]) -> tuple[slice, NDArray[np.float32]]
     return slice(2 * used[0], 2 * used[1] + 2), out.reshape(2 * maps.shape[1], -1)
 
 
-def _wrong_row(what: str) -> DataError:
+def _wrong_row_error(what: str) -> DataError:
     return DataError(
         what, "the data were recorded with another rig file", "use the rig file of this scan", code=ErrorCode.MISMATCH
     )

@@ -110,7 +110,7 @@ def reconstruct(
 
     matched = adjoint(data)
     # Steps of 1 / lipschitz cannot overshoot.
-    lipschitz = _largest_eigenvalue(lambda x: adjoint(forward(x)), matched)
+    lipschitz = _estimate_largest_eigenvalue(lambda x: adjoint(forward(x)), matched)
     threshold = strength * float(np.abs(matched).max()) / lipschitz
     norm = float(np.linalg.norm(data)) or 1.0
     x = np.zeros_like(matched) if start is None else start
@@ -137,7 +137,7 @@ def _shrink_amplitudes(x: NDArray[np.complexfloating], threshold: float) -> NDAr
     return (x * (np.maximum(size - threshold, 0) / np.maximum(size, 1e-30))).astype(np.complex64)
 
 
-def _largest_eigenvalue(
+def _estimate_largest_eigenvalue(
     operator: Callable[[NDArray[np.complex64]], NDArray[np.complex64]], start: NDArray[np.complex64]
 ) -> float:
     """Return the largest eigenvalue of a positive operator by power iteration, with a margin."""

@@ -107,8 +107,8 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     last = grid.x_m[-1] - x.min() + slack_m
     step = column_step_m(offsets) or grid.pixel_m
     spans = (last - first) / step + 1
-    columns = _fast(math.ceil(spans + max(_FADE * spans, _FADE_COLUMNS)))  # of one period
-    band = _band(aperture, first, last, step, columns)
+    columns = _find_fast_length(math.ceil(spans + max(_FADE * spans, _FADE_COLUMNS)))  # of one period
+    band = _find_band(aperture, first, last, step, columns)
     stride_x = -(-band.size // columns)
     pitch = step / stride_x
     return Lattice(
@@ -118,7 +118,7 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
         first_lag_m=(float(first), float(grid.y_m[0] - y.max())),
         exact_x=math.ceil((last - first) / pitch) + 1,
         band=band,
-        size_y=row_stride * _fast(-(-lags // row_stride)),
+        size_y=row_stride * _find_fast_length(-(-lags // row_stride)),
         pitch_y_m=pitch_y,
         row_stride=row_stride,
         pixel_stride=pixel_stride,
@@ -154,7 +154,7 @@ def cross_fade(xp: Any, kernel: Any, size: int) -> Any:
     return period
 
 
-def _band(aperture: Aperture, first: float, last: float, step: float, columns: int) -> NDArray[np.intp]:
+def _find_band(aperture: Aperture, first: float, last: float, step: float, columns: int) -> NDArray[np.intp]:
     """Return the spectral bins along x with kernel energy for lags `first` to `last` and a period of `columns` steps.
 
     Computed on a finer lattice, for the first and the last frequency, all RX, and nine lags in y.
@@ -176,7 +176,7 @@ def _band(aperture: Aperture, first: float, last: float, step: float, columns: i
     return np.arange(round(filled.min()), round(filled.max()) + 1)
 
 
-def _fast(n: int) -> int:
+def _find_fast_length(n: int) -> int:
     """Return the smallest fast transform length of at least `n`."""
     return int(scipy.fft.next_fast_len(n) or n)
 
@@ -186,14 +186,14 @@ def get_cached(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
     if key not in _cache:
         _cache[key] = make()
     _cache.move_to_end(key)
-    while len(_cache) > 1 and sum(_bytes(a) for a in _cache.values()) > KEEP_BYTES:
+    while len(_cache) > 1 and sum(_count_bytes(a) for a in _cache.values()) > KEEP_BYTES:
         _cache.popitem(last=False)
     return _cache[key]
 
 
-def _bytes(arrays: Any) -> int:
+def _count_bytes(arrays: Any) -> int:
     if isinstance(arrays, tuple):
-        return sum(_bytes(a) for a in arrays)
+        return sum(_count_bytes(a) for a in arrays)
     # The size of a lattice is negligible
     return math.prod(getattr(arrays, "shape", (0,))) * 8
 
@@ -346,8 +346,10 @@ class SpectralImager(RowSpectra):
         channels = self.xp.reshape(samples, (rx * m, rows, columns))
         total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
         for c in range(rx * m):
-            total += self._kernels[c, :, :] * self._along_y(self.transform_rows(channels[c, :, :], self._ramps))
-        return self._inverse(total)
+            total += self._kernels[c, :, :] * self._transform_along_y(
+                self.transform_rows(channels[c, :, :], self._ramps)
+            )
+        return self._invert_transform(total)
 
     def spectra_of_row(self, samples: Any, index: int) -> Any:
         """Return the spectra [..., k] of a row [..., column] for :meth:`image_of_spectra`."""
@@ -360,9 +362,9 @@ class SpectralImager(RowSpectra):
         for r in range(rx):
             part = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
             for c in range(m):
-                part += self._kernels[r * m + c, :, :] * self._along_y(spectra[r, c, :, :])
+                part += self._kernels[r * m + c, :, :] * self._transform_along_y(spectra[r, c, :, :])
             total += part * factors[r]
-        return self._inverse(total)
+        return self._invert_transform(total)
 
     def constant(self, echo: Any, weights: Any) -> Any:
         """Return the image of an echo [rx, frequency] at every position, times weights [row, column]."""
@@ -370,8 +372,8 @@ class SpectralImager(RowSpectra):
         echo = self.xp.asarray(echo, dtype=self.xp.complex64)
         if self._echo is None or not bool(xp.all(self._echo[0] == echo)):
             self._echo = (echo, xp.tensordot(xp.reshape(echo, (-1,)), self._kernels, axes=1))
-        weight_spectra = self._along_y(self.transform_rows(xp.astype(weights, xp.complex64), self._ramps))
-        return self._inverse(self._echo[1] * weight_spectra)
+        weight_spectra = self._transform_along_y(self.transform_rows(xp.astype(weights, xp.complex64), self._ramps))
+        return self._invert_transform(self._echo[1] * weight_spectra)
 
     def samples(self, image: Any) -> Any:
         """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
@@ -388,7 +390,7 @@ class SpectralImager(RowSpectra):
             out.append(self.transform_rows_adjoint(xp.take(product, self._rows, axis=0), self._ramps))
         return xp.reshape(xp.stack(out), self.aperture.shape)
 
-    def _along_y(self, lines: Any) -> Any:
+    def _transform_along_y(self, lines: Any) -> Any:
         """Return the 2-D spectrum on the lattice [ky, k] of the rows' spectra [row, k]."""
         self._padded_lines[: lines.shape[0], :] = lines
         spectrum = self._fft.fft(self._padded_lines, axis=0)
@@ -396,7 +398,7 @@ class SpectralImager(RowSpectra):
             return spectrum
         return self.xp.take(spectrum, self._repeat, axis=0)
 
-    def _inverse(self, total: Any) -> Any:
+    def _invert_transform(self, total: Any) -> Any:
         lines = self.xp.take(self._fft.ifft(total, axis=0), self._pixel_rows, axis=0)
         return self.evaluate_pixels(lines)
 
@@ -420,7 +422,7 @@ class IncrementalImager(RowSpectra):
         lines = aperture.grid.shape[0]
         self._last = self.lattice.row_stride * (rows - 1)
         self._span = self.lattice.pixel_stride * (lines - 1) + 1
-        self._kernels, self._components = get_cached(self.key("rows"), self._principal_kernels)
+        self._kernels, self._components = get_cached(self.key("rows"), self._compute_principal_kernels)
         self._clear(np.zeros(aperture.shape[:2]) if echo is None else echo)
 
     def add_row(self, index: int, samples: Any, weights: Any, start_m: float) -> None:
@@ -448,7 +450,7 @@ class IncrementalImager(RowSpectra):
         by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
         for r in range(rx):
             by_rx[:, r * m : (r + 1) * m, r] = lines[r, :, :].mT
-        lags = self._lags(index)
+        lags = self._find_lags(index)
         self._sum += xp.matmul(self._kernels[:, lags, :], xp.matmul(self._components, by_rx))
         self._constant += self._echo_kernel[:, lags] * weight_spectra[:, None]
 
@@ -482,7 +484,7 @@ class IncrementalImager(RowSpectra):
         ramps = self.ramps(row_starts_m(self.aperture.offsets_m))
         out = []
         for index in range(rows):
-            parts = xp.matmul(xp.conj(self._kernels[:, self._lags(index), :]).mT, lines)
+            parts = xp.matmul(xp.conj(self._kernels[:, self._find_lags(index), :]).mT, lines)
             row_spectra = xp.matmul(xp.conj(self._components).mT, parts)[:, :, 0]
             out.append(self.transform_rows_adjoint(row_spectra.mT, ramps[index, :]))
         return xp.permute_dims(xp.reshape(xp.stack(out), (rows, rx, m, columns)), (1, 2, 0, 3))
@@ -501,12 +503,12 @@ class IncrementalImager(RowSpectra):
         for index, start in enumerate(row_starts_m(self.aperture.offsets_m)):
             self.add_row(index, samples[:, :, index, :], weights[index, :], float(start))
 
-    def _lags(self, index: int) -> slice:
+    def _find_lags(self, index: int) -> slice:
         """Return the lags in y between a row of positions and every row of pixels."""
         first = self._last - index * self.lattice.row_stride
         return slice(first, first + self._span, self.lattice.pixel_stride)
 
-    def _principal_kernels(self) -> tuple[Any, Any]:
+    def _compute_principal_kernels(self) -> tuple[Any, Any]:
         """Return kernels [k, lag, component], and the transform from channels, [k, component, channel]."""
         xp = self.xp
         kernels = self.kernels()

@@ -208,7 +208,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     may have been killed between the mark and its answer.
     """
     if is_finished(job):
-        return _done(job)
+        return _end_outcome(job)
     began = time.monotonic()
     log = job.out.with_name(job.name + ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -228,10 +228,10 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     seconds = time.monotonic() - began
     # The child may have been killed after it wrote the mark.
     if child.returncode == 0 or is_finished(job):
-        return _done(job, seconds)
+        return _end_outcome(job, seconds)
     if stop is not None and stop.is_set():
         return Outcome(job.name, "stopped", seconds)
-    return Outcome(job.name, "failed", seconds, message=_failure(log, child.returncode, on_dask=stop is None))
+    return Outcome(job.name, "failed", seconds, message=_read_failure(log, child.returncode, on_dask=stop is None))
 
 
 def _follow(child: subprocess.Popen[bytes], job: Job, stop: Event | None) -> None:
@@ -249,12 +249,12 @@ def _follow(child: subprocess.Popen[bytes], job: Job, stop: Event | None) -> Non
             child.wait()
 
 
-def _done(job: Job, seconds: float = 0.0) -> Outcome:
+def _end_outcome(job: Job, seconds: float = 0.0) -> Outcome:
     mark = read_json(job.out / FINISHED)
     return Outcome(job.name, "done", seconds or float(mark.get("seconds", 0.0)), float(mark["memory_gb"]))
 
 
-def _failure(log: Path, status: int, on_dask: bool) -> str:
+def _read_failure(log: Path, status: int, on_dask: bool) -> str:
     """The last message in a program's log, or the signal that killed it."""
     if status < 0:
         what_to_do = "start fewer workers on one machine" if on_dask else "give --jobs 1"
@@ -313,7 +313,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
                 yield future.result()
             elif is_finished(jobs_by_name[named[future]]):
                 # The worker was lost after it wrote the mark.
-                yield _done(jobs_by_name[named[future]])
+                yield _end_outcome(jobs_by_name[named[future]])
             else:
                 yield Outcome(named[future], "failed", message=f"its workers were lost: {future.exception()}")
 
@@ -393,7 +393,7 @@ def process_several(
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out} is a file", "several scans need a folder", "give another --out")
     jobs = make_jobs(scans, out)
-    positions = max((_positions(folder) for folder, _ in scans), default=0)
+    positions = max((_count_positions(folder) for folder, _ in scans), default=0)
     n = at_a_time or fit_scans(positions, cores(), free_memory_bytes())
     n = min(n, len(jobs))
     if dask is None:
@@ -403,7 +403,7 @@ def process_several(
     return exit_status(all(o.has_products for o in outcomes))
 
 
-def _positions(data: Path) -> int:
+def _count_positions(data: Path) -> int:
     """Number of positions of a scan; of the published grid if it cannot be read quickly."""
     try:
         if (data / COLLECTION).exists():
@@ -421,7 +421,7 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
     for o in outcomes:
         masked = patches = verdict = ""
         if o.has_products:
-            masked, patches, verdict = _results(out / o.name)
+            masked, patches, verdict = _read_results(out / o.name)
         if o.seconds:
             seconds = f"{o.seconds:.0f}"
         else:
@@ -442,7 +442,7 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
     return "\n".join([*lines, end, ""])
 
 
-def _results(products: Path) -> tuple[str, str, str]:
+def _read_results(products: Path) -> tuple[str, str, str]:
     """Share of masked or missing positions, number of patches, and the verdict unless it is `good`; "" if unknown."""
     saved = ProcessedScan(products)
     try:

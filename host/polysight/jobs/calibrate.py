@@ -251,12 +251,12 @@ def leakage_of_scans(
             "correct the angle, DEG of --strips DEG=SCAN, or scan the strips again",
             code=ErrorCode.VALUE_INVALID,
         )
-    std = _leakage_std((plate_reference.h, plate_reference.v), strips_by_angle, mask, theta)
+    std = _estimate_leakage_std((plate_reference.h, plate_reference.v), strips_by_angle, mask, theta)
     facts = {"scans": names, "simulated": simulated, "pixels": int(mask.sum()), "leakage_std": std}
     return leakage, {**facts, "incidence_deg": float(np.degrees(theta))}
 
 
-def _leakage_std(
+def _estimate_leakage_std(
     plate: tuple[Image, Image], strips: Sequence[tuple[float, Image, Image]], mask: Mask, theta_rad: float
 ) -> float:
     """Standard error of each part of the leakage: how far the quarters of the plane disagree, not less than 0.001.

@@ -98,7 +98,7 @@ def _check_folder(out: Path) -> None:
         raise ConfigError(f"{out} is not empty", "it holds something else than a demo", "give another --out")
 
 
-def _fresh_folder(out: Path) -> None:
+def _make_fresh_folder(out: Path) -> None:
     """Make an empty folder; an existing demo folder is overwritten."""
     if out.exists() and any(out.iterdir()):
         shutil.rmtree(out)
@@ -169,7 +169,7 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
     load_instrument(config)
     _check_folder(out)
     check_scenes([scene], config)
-    _fresh_folder(out)
+    _make_fresh_folder(out)
     sys.stderr.write(f"simulated rig: no hardware is involved. Scene {scene}\n")
     with run_simulated_rig(config, scene, out / "rig", time_scale or TIME_SCALE) as rig_file:
         command = [sys.executable, "-m", "polysight", "scan", "--config", str(rig_file), "--out", str(out / "scan")]

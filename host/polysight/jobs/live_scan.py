@@ -49,7 +49,7 @@ _BESIDE = ("program", "operator.json")
 RunScan = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
 
-def _clock(seconds: float | None) -> str:
+def _format_clock(seconds: float | None) -> str:
     """`1:02:03` or `2:03` left; empty when unknown."""
     if seconds is None:
         return ""
@@ -97,7 +97,7 @@ class ScanBar:
 
     def update(self, p: ScanProgress) -> None:
         """Show the progress of the scan."""
-        self._bars.update(self._rows, total=p.rows, completed=p.committed, left=_clock(p.remaining_s))
+        self._bars.update(self._rows, total=p.rows, completed=p.committed, left=_format_clock(p.remaining_s))
         if p.row_points:
             text = f"row {p.row}"
             if p.take > 1:
@@ -112,7 +112,7 @@ class ScanBar:
             tenth = 10 * p.committed // max(1, p.rows)
             if tenth != self._printed_tenth:
                 self._printed_tenth = tenth
-                self._console.print(f"{p.committed} of {p.rows} rows, {_clock(p.remaining_s)}", highlight=False)
+                self._console.print(f"{p.committed} of {p.rows} rows, {_format_clock(p.remaining_s)}", highlight=False)
 
 
 def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, notifier: Notify) -> int:

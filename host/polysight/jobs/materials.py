@@ -74,7 +74,7 @@ def print_verdict(products: ProcessedScan, to_terminal: bool = True) -> int:
     return NoResult.exit_status
 
 
-def _chirp(products: ProcessedScan, config: Path | None) -> Chirp:
+def _find_chirp(products: ProcessedScan, config: Path | None) -> Chirp:
     """The chirp of the products, or that of `config` if given. Raises DataError, ConfigError."""
     rig = products.rig
     if config is not None:
@@ -144,7 +144,7 @@ def permittivity(
         )
     chirp = None
     if stack:
-        chirp = _chirp(products, config)
+        chirp = _find_chirp(products, config)
     rows: list[dict[str, Any]] = []
     for patch in patches:
         row = {"label": patch.label, "name": patch.name, "single_interface": to_plain(patch.permittivity)}
@@ -174,10 +174,10 @@ def _line(patch: PatchFigures, layer: Mapping[str, Any] | None) -> str:
         text = f"{head} metal-like: no permittivity"
     else:
         text = f"{head} one interface {_estimate(patch.permittivity)}"
-    return (text + _layer_text(layer)).rstrip() + "\n"
+    return (text + _format_layer(layer)).rstrip() + "\n"
 
 
-def _layer_text(layer: Mapping[str, Any] | None) -> str:
+def _format_layer(layer: Mapping[str, Any] | None) -> str:
     """The fit of a layer as text, with a line for each note."""
     if layer is None:
         return ""
@@ -287,13 +287,13 @@ def catalogue(as_json: bool) -> int:
         return 0
     sources = {source.key: source.citation for material in entries for source in material.sources}
     number = {key: k for k, key in enumerate(sorted(sources), 1)}
-    print_lines(_catalogue_line(material, number) for material in entries)
+    print_lines(_format_catalogue_line(material, number) for material in entries)
     print_lines(["", "spread: standard deviation between specimens; * is the default of the kind"])
     print_lines(f"[{number[key]}] {sources[key]}" for key in number)
     return 0
 
 
-def _catalogue_line(material: CatalogueMaterial, number: Mapping[str, int]) -> str:
+def _format_catalogue_line(material: CatalogueMaterial, number: Mapping[str, int]) -> str:
     """Name, permittivity and spreads, frequency and numbers of the sources."""
     value = format_permittivity(material.permittivity, 4, 8)
     real, loss = (100 * spread for spread in material.spread)
@@ -441,10 +441,10 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
     status = max(print_verdict(p, to_terminal=not as_json) for p in products)
     if status:
         if as_json:
-            print_json(_nothing_named(products))
+            print_json(_describe_unnamed(products))
         return status
     library = Library.load(library_path)
-    scans = [_classifiable(p) for p in products]
+    scans = [_select_classifiable(p) for p in products]
     classifier = Classifier(library, model=model, angles_deg=[s.angle_deg for s in scans])
     matched = match_patches(scans)
     if not matched:
@@ -459,8 +459,8 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
         "incidence_deg": [s.angle_deg for s in scans],
         "model": classifier.model,
         "library": classifier_sentence(classifier),
-        "patches": [_row(m, n.verdict, n.names) for m, n in zip(matched, named, strict=True)],
-        "contradictions": _contradictions(library, model, classifier.angles_deg, matched, named),
+        "patches": [_describe_named_patch(m, n.verdict, n.names) for m, n in zip(matched, named, strict=True)],
+        "contradictions": _describe_contradictions(library, model, classifier.angles_deg, matched, named),
         "patches_not_in_every_scan": sum(len(s.patches) for s in scans) - len(scans) * len(matched),
         "refused": [
             {"products": str(p.folder), "label": patch.label, **to_plain(patch.refused)}
@@ -480,7 +480,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
     return 0
 
 
-def _classifiable(products: ProcessedScan) -> ScanPatches:
+def _select_classifiable(products: ProcessedScan) -> ScanPatches:
     """Patches of a scan without the refused ones and the metal reference, which is never judged by itself."""
     left_out = {patch.label for patch in products.segments if patch.refused is not None or patch.metal_reference}
     scan = products.patches
@@ -512,7 +512,7 @@ def _print_names(content: dict[str, Any], several: bool) -> None:
         sys.stdout.write(f"{refused['label']:>3}  not judged{place}: {text}\n")
 
 
-def _contradictions(
+def _describe_contradictions(
     library: Library,
     model: str | None,
     angles_deg: Sequence[float],
@@ -553,7 +553,7 @@ def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
         sys.stdout.write(f"{right} of {len(judged)} patches named right, {share:.1%} of their pixels\n")
 
 
-def _nothing_named(products: Sequence[ProcessedScan]) -> dict[str, Any]:
+def _describe_unnamed(products: Sequence[ProcessedScan]) -> dict[str, Any]:
     """JSON of `classify` if a scan has no result: its patches without names."""
     nothing = {"name": None, "confidence": None, "votes": {}, "probabilities": {}}
     for scan in products:
@@ -566,7 +566,7 @@ def _nothing_named(products: Sequence[ProcessedScan]) -> dict[str, Any]:
     raise ValueError("every scan has a result")
 
 
-def _row(matched: MatchedPatch, verdict: PatchName, pixels: npt.NDArray[np.str_]) -> dict[str, Any]:
+def _describe_named_patch(matched: MatchedPatch, verdict: PatchName, pixels: npt.NDArray[np.str_]) -> dict[str, Any]:
     """Return a named patch as JSON; `pixels` are the names of its pixels."""
     distance = None
     if np.isfinite(verdict.distance):

@@ -384,12 +384,12 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
     (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *pixel_axes(pipeline), source.simulated))
     head = name_scan(source.scan_id, source.simulated)
-    print_lines(_focus_lines(head, pipeline.rig.geometry.object_distance_mm, sharpest, plates_plane))
+    print_lines(_format_focus(head, pipeline.rig.geometry.object_distance_mm, sharpest, plates_plane))
     sys.stdout.write(f"figure: {out / 'focus.png'}\n")
     return 0
 
 
-def _focus_lines(head: str, distance_mm: float, sharpest: Focus, plates: PlaneEstimate) -> list[str]:
+def _format_focus(head: str, distance_mm: float, sharpest: Focus, plates: PlaneEstimate) -> list[str]:
     """Text of `focus`: the plane by the plates, if there are any, and by sharpness."""
     lines = []
     if plates.known:

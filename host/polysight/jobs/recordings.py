@@ -45,7 +45,7 @@ def format_report(report: Report) -> str:
         head += " of a simulated scan"
     lines = [head]
     if report.card is not None:
-        lines += _card_lines(report.card)
+        lines += _format_card(report.card)
     if report.chirps:
         layout = report.layout
         first_of_pair = "Q" if layout.q_first else "I"
@@ -56,13 +56,13 @@ def format_report(report: Report) -> str:
             f"peak       {report.peak_db:.1f} dB over the median at bin {report.peak_bin} of {layout.samples}",
             f"level      rms {rms} counts on RX 0.., DC {max(report.rx_dc):.1f}",
             f"clipping   {report.clipped} values at full scale",
-            f"profile    {_sparkline(report.profile_db)}",
+            f"profile    {_draw_sparkline(report.profile_db)}",
         ]
     lines += [f"note       {remark}" for remark in report.remarks]
     return "\n".join(lines) + "\n"
 
 
-def _card_lines(card: CardReport) -> list[str]:
+def _format_card(card: CardReport) -> list[str]:
     commands = ", ".join(command for command, _ in card.replies)
     lines = [f"card       {card.address}, {len(card.replies)} replies: {commands}"]
     # Replies to these two carry a value; to any other command, a status other than 0 is a refusal.
@@ -89,7 +89,7 @@ def _card_lines(card: CardReport) -> list[str]:
 _SPARKLINE_CHARACTERS = 64
 
 
-def _sparkline(profile_db: NDArray[np.float64]) -> str:
+def _draw_sparkline(profile_db: NDArray[np.float64]) -> str:
     """Draw the profile as a line of bars, each as high as the maximum of its bins; negative levels are blank."""
     bars = " ▁▂▃▄▅▆▇█"
     highest = len(bars) - 1
@@ -236,11 +236,11 @@ def inspect_placement(file: Path, as_json: bool) -> int:
     if as_json:
         print_json({**again.placed.facts(), "committed_missing": again.missing_before, "same": same})
     else:
-        sys.stdout.write("\n".join(_placement_lines(file, again, same)) + "\n")
+        sys.stdout.write("\n".join(_format_placement(file, again, same)) + "\n")
     return exit_status(same)
 
 
-def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
+def _format_placement(file: Path, again: PlacedAgain, same: bool) -> list[str]:
     placed = again.placed
     evidence = again.evidence
     counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(placed.counts).items() if n)

@@ -42,7 +42,7 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
     odd = ""
     if left_out := catalogue.left_out():
         odd = f"; not listed, because they are links or have unprintable names: {', '.join(left_out)}"
-    matching = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _searchable_text(s)]
+    matching = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _join_searchable_text(s)]
     if as_json:
         rows = [msgspec.to_builtins(s) | {"bytes": _count_bytes(root, s)} for s in matching]
         print_json({"scans": rows})
@@ -70,7 +70,7 @@ def _line(s: Summary) -> str:
     parts.append(s.verdict)
     if s.images_only:
         parts.append("images only")
-    parts.append(", ".join(map(_shown_name, s.materials)))
+    parts.append(", ".join(map(_format_name, s.materials)))
     if s.simulated:
         parts.append("simulated")
     parts.append(" ".join(f"#{tag}" for tag in s.tags))
@@ -79,7 +79,7 @@ def _line(s: Summary) -> str:
     return "  ".join(part for part in parts if part)
 
 
-def _searchable_text(s: Summary) -> str:
+def _join_searchable_text(s: Summary) -> str:
     return " ".join((s.name, s.scan_id, s.rig, s.state, s.notes, *s.tags, *s.materials)).casefold()
 
 
@@ -121,15 +121,15 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
     lines = [f"x {result.place_mm[0]:g} mm, y {result.place_mm[1]:g} mm from the image's centre"]
     if not result.lit:
         lines.append("the scan does not light this place")
-    lines.append(f"|H| {_value(result.h_db)} dB, |V| {_value(result.v_db)} dB")
-    lines.append(f"P = {_complex(result.p)} {_error(result.p_sigma)}")
+    lines.append(f"|H| {_format_value(result.h_db)} dB, |V| {_format_value(result.v_db)} dB")
+    lines.append(f"P = {_format_complex(result.p)} {_format_error(result.p_sigma)}")
     if result.permittivity:
         errors = f"+- {result.permittivity_real_std:.3g} (real part), {result.permittivity_loss_std:.3g} (loss)"
-        lines.append(f"permittivity {_complex(result.permittivity)} {errors}, as a half space")
+        lines.append(f"permittivity {_format_complex(result.permittivity)} {errors}, as a half space")
     else:
         lines.append(f"no permittivity: {result.why}")
     if result.patch is not None:
-        lines.append(f"in patch {result.patch.label}: {_shown_name(result.patch.name)}")
+        lines.append(f"in patch {result.patch.label}: {_format_name(result.patch.name)}")
     lines += [f"  {n.sigmas:g} standard deviations from {n.name}" for n in result.nearest]
     lines.append(result.profile_why or "range profile: --json")
     sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
@@ -152,12 +152,12 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         share = f"{100 * values.significant_share:.1f} %"
         lines.append(f"P differs by more than {values.significant_sigmas:g} standard deviations in {share} of them")
     for pair in values.patches:
-        names = " and ".join(map(_shown_name, pair.names))
+        names = " and ".join(map(_format_name, pair.names))
         place = f"x {pair.place_mm[0]:g}, y {pair.place_mm[1]:g} mm ({names})"
         if pair.difference is None:
             lines.append(f"{place}: no permittivity in one of them")
             continue
-        line = f"{place}: permittivity differs by {_complex(pair.difference)}"
+        line = f"{place}: permittivity differs by {_format_complex(pair.difference)}"
         if pair.sigmas is not None:
             line += f": {pair.sigmas:g} standard deviations"
         lines.append(line)
@@ -165,27 +165,27 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
     return 0
 
 
-def _shown_name(name: str | None) -> str:
+def _format_name(name: str | None) -> str:
     """A material's name as people read it."""
     if name == UNKNOWN:
         return "not in the library"
     return name or "not named"
 
 
-def _error(std: float | None) -> str:
+def _format_error(std: float | None) -> str:
     """Standard error of a complex number as text."""
     if std is None:
         return "(its error is not known)"
     return f"+- {std:.3g} (real and imaginary part)"
 
 
-def _value(value: float | None) -> str:
+def _format_value(value: float | None) -> str:
     if value is None:
         return "not known"
     return f"{value:.3g}"
 
 
-def _complex(number: ComplexNumber | PermittivityDifference) -> str:
+def _format_complex(number: ComplexNumber | PermittivityDifference) -> str:
     """`3.1 - 0.2j`."""
     if number.real is None or number.imag is None:
         return "not known"

@@ -75,7 +75,7 @@ def training_scan(data: Path, config: Path) -> TrainingScan:
         return _process_simulated(scan, config)
     path, labels = saved_labels
     try:
-        saved = _products_without_rows(data, scan)
+        saved = _read_products_without_rows(data, scan)
         if saved is not None:
             return _load_images(saved, labels)
         return _process_rows(scan, config, labels)
@@ -114,7 +114,7 @@ def check_labelled(data: Path) -> None:
             raise DataError(f"{path}: {e.what}", e.why, e.remedy) from None
 
 
-def _products_without_rows(data: Path, scan: Path) -> ProcessedScan | None:
+def _read_products_without_rows(data: Path, scan: Path) -> ProcessedScan | None:
     """Return the products if the raw rows are deleted, else None. Raises DataError."""
     if find_scan_folder(data) is None:
         return read_products(data)
@@ -132,7 +132,7 @@ def _process_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
     images = pipeline.form_images()
     checked = check_labels(labels, images.x_m, images.y_m, images.valid)
     if checked.metal is None and pipeline.calibration.reference() is None:
-        raise _no_metal(data)
+        raise _no_metal_error(data)
     pipeline.inputs = Inputs(labels=checked)
     findings = pipeline.examine(images)
     if not findings.verdict.usable:
@@ -148,7 +148,7 @@ def _load_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
     segmentation, names = checked.patches(saved.x_m, saved.y_m)
     metal = next((label for label, name in names.items() if name == checked.metal), None)
     if metal is None:
-        raise _no_metal(saved.folder)
+        raise _no_metal_error(saved.folder)
     pair = Images(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
     materials = analyse(pair, _read_optics(saved), KnownScene(segmentation, metal))
     return _add_labels(saved.scan_id, materials, saved.simulated is not False, checked)
@@ -213,7 +213,7 @@ def _process_simulated(data: Path, config: Path) -> TrainingScan:
     )
 
 
-def _no_metal(folder: Path) -> DataError:
+def _no_metal_error(folder: Path) -> DataError:
     return DataError(
         f"{folder}: no box is metal",
         "features of materials are relative to metal",
@@ -279,7 +279,7 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
         note = "simulated scans of " + ", ".join(dict.fromkeys(s.scan for s in scans))
     library = make_library(number_equal_names(scans), note)
     library.save(out)
-    print_lines([*_summary(out, library), *accuracy_lines(library)])
+    print_lines([*_summarise_library(out, library), *accuracy_lines(library)])
     return 0
 
 
@@ -311,7 +311,7 @@ def _count(number: int, singular: str, plural: str) -> str:
     return f"{number} {noun}"
 
 
-def _summary(out: Path, library: Library) -> list[str]:
+def _summarise_library(out: Path, library: Library) -> list[str]:
     """Describe the contents of a library by material; note names that differ only in case."""
     lines = [f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans"]
     for name in library.names:

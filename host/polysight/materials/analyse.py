@@ -173,14 +173,14 @@ def level(images: Images, found: Segmentation, tilts: Tilts | None = None) -> tu
     if images.illumination is None:
         return images, Tilts({}, 1)
     if tilts is None:
-        tilts = _tilts(images, images.illumination, found)
+        tilts = _estimate_tilts(images, images.illumination, found)
     risen_patches = [p for p in found.patches if p.label in tilts.rises]
     masks = [p.mask for p in risen_patches]
     rises = [tilts.rises[p.label] for p in risen_patches]
     return correct_tilt(images, masks, rises), tilts
 
 
-def _tilts(images: Images, illumination: Illumination, found: Segmentation) -> Tilts:
+def _estimate_tilts(images: Images, illumination: Illumination, found: Segmentation) -> Tilts:
     """Estimate the rise of each patch from its phase; patches that are steeper than what is modelled are marked."""
     rises = {p.label: illumination.rise(images.h, images.v, p.interior, p.mask) for p in found.patches}
     bends = {p.label: illumination.bend(images.h, images.v, p.interior) for p in found.patches}
@@ -243,10 +243,10 @@ def analyse(
         plane.check_axes(images.x_m, images.y_m)
         images = images.within(plane.valid)
     images, apart_mm = align(images)
-    segmentation = _patches(images, known_scene)
+    segmentation = _select_patches(images, known_scene)
     images, tilts = level(images, segmentation)
     theta = np.asarray(optics.theta_rad, np.float64)
-    kinds = _kinds(classifier, float(np.mean(theta)))
+    kinds = _list_kinds(classifier, float(np.mean(theta)))
     scene = _Scene(images, segmentation, tilts, float(np.hypot(*apart_mm)), plane, optics, kinds)
     relative = _most_like_metal([scene.relative_to(metal) for metal in _references(images, known_scene, segmentation)])
     reference, raw, judged, solution = relative.metal, relative.raw, relative.judged, relative.solution
@@ -258,11 +258,11 @@ def analyse(
     estimates = dict(zip(labels, inversion.patches, strict=True))
     brightness_off = dict(zip(labels, inversion.brightness_off.tolist(), strict=True))
     patches = {
-        p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _angle(theta, p), estimates.get(p.label))
+        p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _mean_angle(theta, p), estimates.get(p.label))
         for p in segmentation.patches
     }
     refused = relative.refused | refuse_impossible(patches, estimates, kinds)
-    named = _names(classifier, (sh, sv, sp), inversion, judged)
+    named = _name_patches(classifier, (sh, sv, sp), inversion, judged)
     truth = match_truth(segmentation.patches, known_scene.plates)
     labelled = [(p, p.label) for p in segmentation.patches]
     results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in labelled)
@@ -532,7 +532,9 @@ class _Scene:
         )
         prior = seen.prior(self.optics.prior, self.apart_mm)
         dispersions = measure_dispersions(images, found, judged, reference.mask, self.plane)
-        measured = [seen.measure(p, (rh, rv), _angle(theta, p), d) for p, d in zip(judged, dispersions, strict=True)]
+        measured = [
+            seen.measure(p, (rh, rv), _mean_angle(theta, p), d) for p, d in zip(judged, dispersions, strict=True)
+        ]
         solution = _solve(measured, prior, self.kinds, self.optics.other_sign)
         if self.plane is None:
             labels = [p.label for p in judged]
@@ -553,14 +555,14 @@ def _most_like_metal(relatives: Sequence[_Relative]) -> _Relative:
     return max(relatives, key=bare)
 
 
-def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
+def _list_kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
     """Return what the patches may be: the library's materials at the library's angle, if there is one, and others."""
     if classifier is None or len(classifier.kinds) != 1:
         return Kinds(literature(), theta_rad, sheets=True)
     return classifier.kinds[0]
 
 
-def _names(
+def _name_patches(
     classifier: Classifier | None, channels: tuple[Image, Image, Image], inversion: Inversion, judged: list[Patch]
 ) -> dict[int, NamedPatch]:
     """Name the judged patches from the joint inversion; return patch number to name."""
@@ -605,7 +607,7 @@ def name_permittivity(permittivity: complex, covariance: npt.NDArray[np.float64]
     return name_patch((kinds,), (evidence,), np.array([[inverse]])).verdict
 
 
-def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
+def _mean_angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
     """Return the mean incidence angle over a patch, radians."""
     inside = theta[patch.interior] if theta.ndim and patch.interior.any() else theta
     return float(np.mean(inside))
@@ -631,7 +633,7 @@ def _weigh_metal(
     return replace(metal, evidence=min(evidence, key=lambda of_sign: of_sign.score))
 
 
-def _patches(images: Images, known: KnownScene) -> Segmentation:
+def _select_patches(images: Images, known: KnownScene) -> Segmentation:
     """Return the known patches, cut to the valid pixels, or else find them."""
     if known.segmentation is not None:
         cut = tuple(replace(p, interior=p.interior & images.valid) for p in known.segmentation.patches)

@@ -102,7 +102,7 @@ def read_catalogue(path: Path) -> tuple[CatalogueMaterial, ...]:
     """
     file = decode(read_toml(path), _File, str(path), keys="docs/spec/catalogue.md explains every key")
     try:
-        return tuple(_material(row, file) for row in file.materials)
+        return tuple(_read_material_line(row, file) for row in file.materials)
     except KeyError as error:
         raise ConfigError(
             f"{path}: {error} is used, but not listed",
@@ -112,7 +112,7 @@ def read_catalogue(path: Path) -> tuple[CatalogueMaterial, ...]:
         ) from None
 
 
-def _material(row: _Row, file: _File) -> CatalogueMaterial:
+def _read_material_line(row: _Row, file: _File) -> CatalogueMaterial:
     """The material of a line. Raises KeyError if its kind or a source is not listed."""
     kind = file.kinds[row.kind]
     return CatalogueMaterial(
@@ -141,27 +141,27 @@ def normalise_name(name: str) -> str:
 
 
 @cache
-def _names() -> dict[str, CatalogueMaterial]:
+def _index_names() -> dict[str, CatalogueMaterial]:
     """Materials by each of their normalised names."""
     return {normalise_name(name): m for m in load_catalogue() for name in (m.name, *m.aliases)}
 
 
 def find_material(name: str) -> CatalogueMaterial | None:
     """The material of the catalogue that has this name or alias; None if it has none."""
-    return _names().get(normalise_name(name))
+    return _index_names().get(normalise_name(name))
 
 
 def same_material(name: str, other: str) -> bool:
     """True if both names are, or may be, of one material: equal, aliases, or one the generic name of the other."""
     first = normalise_name(name)
     second = normalise_name(other)
-    return first == second or second in _all_names(first) or first in _all_names(second)
+    return first == second or second in _collect_all_names(first) or first in _collect_all_names(second)
 
 
 @cache
-def _all_names(name: str) -> frozenset[str]:
+def _collect_all_names(name: str) -> frozenset[str]:
     """A normalised name with its aliases and generic names, normalised."""
-    material = _names().get(name)
+    material = _index_names().get(name)
     if material is None:
         return frozenset((name,))
     return frozenset(map(normalise_name, (material.name, *material.aliases, *material.generic)))

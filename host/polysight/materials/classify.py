@@ -197,7 +197,7 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
             "process more scans with other placements",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
-    few = _few(samples)
+    few = _draw_few_pixels(samples)
     neighbours = Weights.neighbours
     same_scan = few.groups[:, None] == few.groups[None, :]
     # Every pixel must find so many in other scans.
@@ -219,10 +219,10 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     distances = channel_distances(few.x, few.x, weights.measure)
     by_channel = {c: judge.accuracy(distances[i]) for i, c in enumerate("hv")}
     by_channel["p"] = alone[weights.measure]
-    return Fit(weights, accuracy, by_channel, _thresholds(combine(distances, weights), neighbours, few))
+    return Fit(weights, accuracy, by_channel, _compute_thresholds(combine(distances, weights), neighbours, few))
 
 
-def _few(samples: Samples) -> Samples:
+def _draw_few_pixels(samples: Samples) -> Samples:
     """Return at most `FIT_PIXELS` random pixels of every patch."""
     rng = np.random.default_rng(0)
     picked = [rng.permutation(np.flatnonzero(samples.patches == i))[:FIT_PIXELS] for i in np.unique(samples.patches)]
@@ -257,7 +257,7 @@ class _LeftOut:
         return float(np.mean((np.bincount(self.classes, voted == self.classes) / count)[self.shared]))
 
 
-def _thresholds(distance: Real, neighbours: int, few: Samples) -> dict[str, float]:
+def _compute_thresholds(distance: Real, neighbours: int, few: Samples) -> dict[str, float]:
     """Return thresholds: 99th percentile of the distances of a material's pixels between scans, times a margin.
 
     At least half of the materials' median: metal is the reference, so its own distances are zero. At most three times
@@ -348,7 +348,7 @@ class Classifier:
         self.library = library
         self.fit = fit
         self.angles_deg = tuple(p.angles_deg[0] for p in parts)
-        self.model = PAPER if weights else _model_name(model or fit.get("model", PAPER))
+        self.model = PAPER if weights else _check_model_name(model or fit.get("model", PAPER))
         if self.model == PAPER:
             if weights is None:
                 weights = Weights.from_dict(fit["weights"]) if "weights" in fit else Weights()
@@ -363,11 +363,11 @@ class Classifier:
         self.names = library.names
         # Permittivities of the library's patches as half spaces; metals have none.
         self.permittivities: dict[str, complex] = self.distributions.permittivities
-        kinds = (*self._library_kinds(), *literature(library.names))
+        kinds = (*self._make_library_kinds(), *literature(library.names))
         # What a patch may be, at each angle.
         self.kinds = tuple(Kinds(kinds, float(np.radians(angle)), sheets=True) for angle in self.angles_deg)
 
-    def _library_kinds(self) -> tuple[Kind, ...]:
+    def _make_library_kinds(self) -> tuple[Kind, ...]:
         """Return the library's materials as half spaces, with the spread of their specimens and the mean's error."""
         spread = dict(zip(self.distributions.names.tolist(), np.sqrt(self.distributions.spread), strict=True))
         out = []
@@ -422,7 +422,7 @@ class Classifier:
         return NamedPatch(pixel_names, pixel_distance, verdict)
 
 
-def _model_name(given: str) -> str:
+def _check_model_name(given: str) -> str:
     name = DISCRIMINANT if given in EARLIER else SHORT.get(given, given)
     if name not in MODELS:
         raise DataError(

@@ -125,12 +125,12 @@ def common_change(
         std=(real.std + 1j * imag.std)[0],
         drift=(real.drift + 1j * imag.drift)[0],
         drift_std=(real.drift_std + 1j * imag.drift_std)[0],
-        ripple=RIPPLE_M * _own_slopes((real.remaining[0], imag.remaining[0]), noises, border),
+        ripple=RIPPLE_M * _estimate_own_slopes((real.remaining[0], imag.remaining[0]), noises, border),
         fringes=float(sum(w for w, (size, _, _, _) in zip(weight, smooth_fields.shared, strict=True) if size > 0)),
     )
 
 
-def _own_slopes(remaining: Sequence[Real], noises: Sequence[Real], border: npt.NDArray[np.bool_]) -> Real:
+def _estimate_own_slopes(remaining: Sequence[Real], noises: Sequence[Real], border: npt.NDArray[np.bool_]) -> Real:
     """Return the root mean square of each plate's own slopes beyond their errors, [plate], per metre.
 
     `remaining` and `noises` are those of the real part and of the imaginary part, [2, plate] each, along x and y. What
@@ -142,12 +142,14 @@ def _own_slopes(remaining: Sequence[Real], noises: Sequence[Real], border: npt.N
     (noise_real_x, _), (noise_imag_x, noise_imag_y) = noises
     slopes = np.stack([real_x, imag_x, imag_y])
     errors = np.stack([noise_real_x, noise_imag_x, noise_imag_y])
-    usual = float(np.mean([_excess_variance(s[~border], e[~border]) for s, e in zip(slopes, errors, strict=True)]))
+    usual = float(
+        np.mean([_estimate_excess_variance(s[~border], e[~border]) for s, e in zip(slopes, errors, strict=True)])
+    )
     own = np.where(border, len(slopes) * usual, np.maximum(np.sum(slopes**2 - errors**2, axis=0), 0.0))
     return np.sqrt((USUAL_RIPPLE * usual + own) / (USUAL_RIPPLE + len(slopes)))
 
 
-def _excess_variance(slopes: Real, errors: Real) -> float:
+def _estimate_excess_variance(slopes: Real, errors: Real) -> float:
     """Return the variance of slopes [plate] beyond their errors; robust: one plate that hardly reflects V is no ripple.
 
     The mean is known already, so that the median deviation is about zero.
@@ -234,7 +236,7 @@ class _Fields:
 
     def explain(self, slopes: Real, noise: Real) -> _Explained:
         """Return what the slopes [2, plate] of one part and their errors tell, for each of `shared`."""
-        parts = [_arrays(self._explain(slopes, noise, *shared)) for shared in self.shared]
+        parts = [_stack_arrays(self._explain(slopes, noise, *shared)) for shared in self.shared]
         return _Explained(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _explain(
@@ -245,7 +247,7 @@ class _Fields:
         seen = slopes.ravel()
         fringes = self.fringes[fringe_m]
         alike = common**2 * np.kron(np.eye(2), np.ones((count, count))) + fringe**2 * fringes.of_slopes
-        own_slopes, share = _own_variances(count)
+        own_slopes, share = _estimate_own_variances(count)
         cases = []
         for field, drift in itertools.product(self.drifts, DRIFTS[stable]):
             explained = alike + drift**2 * field.of_slopes
@@ -260,16 +262,16 @@ class _Fields:
                 - 0.5 * answer @ seen
                 + 0.5 * np.linalg.slogdet(inverse)[1],
                 mean=answer @ of_all.T,
-                square=_square(answer, inverse, of_all, variance_of_drift + fringe**2 * fringes.of_itself),
+                square=_compute_mean_square(answer, inverse, of_all, variance_of_drift + fringe**2 * fringes.of_itself),
                 drift=answer @ of_drift.T,
-                drift_square=_square(answer, inverse, of_drift, variance_of_drift),
+                drift_square=_compute_mean_square(answer, inverse, of_drift, variance_of_drift),
                 remaining=slopes - (answer @ explained).reshape(-1, 2, count),
             )
             cases.append(case)
         return _Explained.average_over(cases)
 
 
-def _own_variances(count: int) -> tuple[Real, Real]:
+def _estimate_own_variances(count: int) -> tuple[Real, Real]:
     """Return variances of the plates' own slopes along x and y, [case, 2 plate], and the probability of each case."""
     variances = []
     shares = []
@@ -282,7 +284,7 @@ def _own_variances(count: int) -> tuple[Real, Real]:
     return np.array(variances), np.array(shares)
 
 
-def _square(answer: Real, inverse: Real, with_slopes: Real, of_itself: Real) -> Real:
+def _compute_mean_square(answer: Real, inverse: Real, with_slopes: Real, of_itself: Real) -> Real:
     """Return the mean square of a field at each plate, [case, plate], from its covariance with the slopes."""
     known = np.sum(with_slopes @ inverse * with_slopes, axis=-1)
     return np.maximum(of_itself - known, 0.0) + (answer @ with_slopes.T) ** 2
@@ -314,7 +316,7 @@ class _Explained:
     @classmethod
     def average_over(cls, parts: Sequence[_Explained]) -> _Explained:
         """Return one case for all cases of `parts`, weighed by their evidence."""
-        together = cls(*(np.concatenate(arrays) for arrays in zip(*map(_arrays, parts), strict=True)))
+        together = cls(*(np.concatenate(arrays) for arrays in zip(*map(_stack_arrays, parts), strict=True)))
         largest = float(together.log_evidence.max())
         weight = np.exp(together.log_evidence - largest)
         average = together.average(weight / weight.sum())
@@ -322,7 +324,7 @@ class _Explained:
 
     def average(self, weight: Real) -> _Explained:
         """Return one case, the average with weights [case]."""
-        return _Explained(*(np.tensordot(weight, array, 1)[None] for array in _arrays(self)))
+        return _Explained(*(np.tensordot(weight, array, 1)[None] for array in _stack_arrays(self)))
 
     @property
     def std(self) -> Real:
@@ -335,5 +337,5 @@ class _Explained:
         return np.sqrt(np.maximum(self.drift_square - self.drift**2, 0.0))
 
 
-def _arrays(explained: _Explained) -> tuple[Real, ...]:
+def _stack_arrays(explained: _Explained) -> tuple[Real, ...]:
     return tuple(getattr(explained, field.name) for field in fields(explained))

@@ -45,7 +45,7 @@ def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -
     amplitudes = [np.abs(h), np.abs(v)]
     copies_of_channels = []
     for amplitude, other in (amplitudes, amplitudes[::-1]):
-        copies = _copies_in(patches, amplitude, pixel_mm)
+        copies = _find_copies_in_channel(patches, amplitude, pixel_mm)
         if copies is not None and not _are_plates(copies, patches, other, pixel_mm):
             copies_of_channels.append(copies)
     if not copies_of_channels:
@@ -63,11 +63,11 @@ def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pix
     seen = [p for p in patches if p.label in copies.labels and float(np.median(other[p.mask])) > VISIBLE * brightest]
     if len(seen) < len(copies.labels):
         return False
-    again = _copies_in(patches, other, pixel_mm)
+    again = _find_copies_in_channel(patches, other, pixel_mm)
     return again is None or not set(copies.labels) & set(again.labels)
 
 
-def _copies_in(patches: Sequence[Patch], amplitude: np.ndarray, pixel_mm: float) -> Copies | None:
+def _find_copies_in_channel(patches: Sequence[Patch], amplitude: np.ndarray, pixel_mm: float) -> Copies | None:
     """Find the copies of one channel, of `amplitude` float [ny, nx]."""
     if len(patches) < 4:
         return None

@@ -103,8 +103,8 @@ class ErrorDiscriminant(Model):
         """Estimate means and covariances."""
         self.names, material_index = np.unique(samples.names, return_inverse=True)
         self.angles_rad = [math.radians(a) for a in samples.angles_deg]
-        self._anchor(samples.x, material_index)
-        d = self._deviations(samples.x)[np.arange(material_index.size), material_index]
+        self._set_anchors(samples.x, material_index)
+        d = self._compute_deviations(samples.x)[np.arange(material_index.size), material_index]
         width = d.shape[1]
         _, patch, count = np.unique(samples.patches, return_inverse=True, return_counts=True)
         first = np.zeros(count.size, np.intp)
@@ -113,11 +113,11 @@ class ErrorDiscriminant(Model):
         scan = np.unique(samples.groups, return_inverse=True)[1][first]
         plate = samples.plates[first]
         mean = np.stack([np.bincount(patch, c) for c in d.T], axis=1) / count[:, None]
-        informative = ~self._metal_like(samples.x, patch)
+        informative = ~self._find_metal_like(samples.x, patch)
         if not informative.any():
             informative[:] = True
 
-        offset, self.level = _two_way(mean, material, scan, informative)
+        offset, self.level = _fit_two_way(mean, material, scan, informative)
         self.pixels = float(np.median(count))
         self.placements = np.bincount(material).astype(float)
         self.plates = np.array([np.unique(plate[material == k]).size for k in range(self.names.size)], np.float64)
@@ -126,14 +126,16 @@ class ErrorDiscriminant(Model):
         dof = max(int(informative.sum()) - np.unique(material[informative]).size - scans + 1, 1)
         pixel = d - mean[patch]
         used = informative[patch]
-        self.within = self._independent(_covariance(pixel[used], max(int(used.sum() - informative.sum()), 1)))
-        self._effects = self._specimen_effects()
+        self.within = self._decorrelate_angles(
+            _compute_covariance(pixel[used], max(int(used.sum() - informative.sum()), 1))
+        )
+        self._effects = self._compute_specimen_effects()
         self._fit_patches(
             residual[informative] * np.sqrt(informative.sum() / dof), material[informative], plate[informative], dof
         )
         pixels_per_scan = max(informative.sum() / scans, 1.0)
-        common = self._independent(_covariance(offset[np.unique(scan[informative])], max(scans - 1, 1)))
-        self.scan = _positive(common - self.between / pixels_per_scan) + 1e-8 * np.eye(width)
+        common = self._decorrelate_angles(_compute_covariance(offset[np.unique(scan[informative])], max(scans - 1, 1)))
+        self.scan = _clip_eigenvalues(common - self.between / pixels_per_scan) + 1e-8 * np.eye(width)
         self._set_thresholds(
             (mean - self.level[material])[informative],
             material[informative],
@@ -163,20 +165,20 @@ class ErrorDiscriminant(Model):
         Of the models of all channels only: the features are ln|H|, ln|V| and arg P.
         """
         log_h = self._anchor_h[:, None] - self._anchor_h
-        differences = self._chosen(relative(log_h, self._anchor_t[:, None] - self._anchor_t, self._anchor_t))
+        differences = self._select_channels(relative(log_h, self._anchor_t[:, None] - self._anchor_t, self._anchor_t))
         of_patch = self._patch_covariances(self.pixels) + self.scan
         inverse = np.linalg.inv((of_patch[:, None] + of_patch) / 2)
         return np.sqrt(np.einsum("abd,abde,abe->ab", differences, inverse, differences))
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Classify each pixel independently: return its name, and its distance over the threshold."""
-        q, cost = costs(self._deviations(x) - self.level, self._pixel_covariances())
+        q, cost = costs(self._compute_deviations(x) - self.level, self._compute_pixel_covariances())
         best = cost.argmin(axis=1)
         return self.names[best], np.sqrt(q[np.arange(len(x)), best] / self.pixel_level)
 
     def pixel_probabilities(self, x: Real) -> Real:
         """Return the probability of each material for pixels classified independently, [n, materials]."""
-        _, cost = costs(self._deviations(x) - self.level, self._pixel_covariances())
+        _, cost = costs(self._compute_deviations(x) - self.level, self._compute_pixel_covariances())
         return shares_of_materials(cost)
 
     def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
@@ -185,11 +187,11 @@ class ErrorDiscriminant(Model):
         Pixels are named independently of each other.
         """
         ids, patch = np.unique(patches, return_inverse=True)
-        deviations = self._deviations(x) - self.level
+        deviations = self._compute_deviations(x) - self.level
         mean = np.stack([deviations[patch == i].mean(axis=0) for i in range(ids.size)])
         pixels = float(min([self.pixels, *np.bincount(patch).tolist()]))
         patch_covariances = self._patch_covariances(pixels)
-        informative = ~self._metal_like(x, patch)
+        informative = ~self._find_metal_like(x, patch)
         shift, spread = estimate_common_error(mean[informative], patch_covariances, self.scan, self.patch_level)
 
         distance2, cost = costs(mean - shift, patch_covariances + spread)
@@ -218,22 +220,22 @@ class ErrorDiscriminant(Model):
     def _fit_patches(self, residual: Real, material: npt.NDArray, plate: npt.NDArray, dof: int) -> None:
         """Estimate the covariance of placements, and of each material's specimens, from patches' residuals."""
         width = residual.shape[1]
-        total = self._independent(_covariance(residual, len(residual)))
+        total = self._decorrelate_angles(_compute_covariance(residual, len(residual)))
         shrink = width / (width + dof)
         self.spread, placement = fit_spread(
             residual, material, plate, self._effects, total, gains_alike=self.channels == "H+V+P"
         )
-        placement = self._independent(placement) * self._gain_and_phase
+        placement = self._decorrelate_angles(placement) * self._gain_and_phase
         placement = (1 - shrink) * placement + shrink * np.diag(np.diag(placement))
-        self.between = _positive(placement - self.within / self.pixels) + 1e-8 * np.eye(width)
+        self.between = _clip_eigenvalues(placement - self.within / self.pixels) + 1e-8 * np.eye(width)
 
-    def _specimen_effects(self) -> Real:
+    def _compute_specimen_effects(self) -> Real:
         """Return the effect of specimens' deviations on the features of each material, [materials, features, 2]."""
         anchor_effects = np.stack([effect(t, self.angles_rad) for t in self._anchor_t])
         effect_matrices = anchor_effects.reshape(*self._anchor_t.shape, 3, 2).transpose(0, 3, 1, 2)
-        return self._chosen(effect_matrices).swapaxes(1, 2)
+        return self._select_channels(effect_matrices).swapaxes(1, 2)
 
-    def _anchor(self, x: Real, of: npt.NDArray[np.intp]) -> None:
+    def _set_anchors(self, x: Real, of: npt.NDArray[np.intp]) -> None:
         """Set the expansion point of each material's features: the means of its pixels."""
         h, v, t = split_by_angle(x)
         logs = np.log(np.maximum(h, 1e-6)), np.log(np.maximum(v, 1e-6))
@@ -241,37 +243,37 @@ class ErrorDiscriminant(Model):
         self._anchor_h, self._anchor_v, self._anchor_t = (
             np.stack([c[members].mean(axis=0) for members in of_material]) for c in (*logs, t)
         )
-        width = len(self._chosen(np.zeros((1, 1, 3)))[0])
+        width = len(self._select_channels(np.zeros((1, 1, 3)))[0])
         features = width * h.shape[1]
         self._same_angle = np.arange(features)[:, None] // width == np.arange(features)[None] // width
         self.level = np.zeros((self.names.size, features))
         phase = np.tile({"P": [0, 1], "H+V+P": [0, 0, 1]}.get(self.channels, [0]), h.shape[1])
         self._gain_and_phase = (phase[:, None] == phase[None]).astype(float)
 
-    def _deviations(self, x: Real) -> Real:
+    def _compute_deviations(self, x: Real) -> Real:
         """Return the deviations from every material's anchor, [n, materials, features]."""
         h, v, t = split_by_angle(x)
         # Alone, by its own logarithm
         if self.channels == "V":
             return np.log(np.maximum(v, 1e-6))[:, None] - self._anchor_v
         log_h = np.log(np.maximum(h, 1e-6))[:, None] - self._anchor_h
-        return self._chosen(relative(log_h, t[:, None] - self._anchor_t, self._anchor_t))
+        return self._select_channels(relative(log_h, t[:, None] - self._anchor_t, self._anchor_t))
 
-    def _chosen(self, every: Real) -> Real:
+    def _select_channels(self, every: Real) -> Real:
         """Select the model's channels of ln|H|, ln|V|, arg P [..., angles, 3]; return [..., features]."""
         h, v, angle = (every[..., i] for i in range(3))
         columns = {"H": (h,), "V": (v,), "P": (v - h, angle), "H+V+P": (h, v, angle)}[self.channels]
         return np.stack(columns, axis=-1).reshape(*every.shape[:-2], -1)
 
     @staticmethod
-    def _metal_like(x: Real, patch: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+    def _find_metal_like(x: Real, patch: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
         """Return true for patches 0, 1, ... whose median V / H is nearly 1 under all angles, bool [patch]."""
         q = split_by_angle(x)[2]
         parts = [q[patch == i] for i in range(patch.max() + 1)]
         middle = np.stack([np.median(p.real, axis=0) + 1j * np.median(p.imag, axis=0) for p in parts])
         return np.asarray((np.abs(middle - 1) < METAL_WITHOUT_ERROR).all(axis=1), np.bool_)
 
-    def _independent(self, covariance: Real) -> Real:
+    def _decorrelate_angles(self, covariance: Real) -> Real:
         """Remove correlations between angles: errors of their scans are independent (effects of specimens are not)."""
         return np.where(self._same_angle, covariance, 0.0)
 
@@ -284,7 +286,7 @@ class ErrorDiscriminant(Model):
         differ = self._effects * (self.spread * (1 + 1 / self.plates[:, None]))[:, None]
         return self.within / pixels + self.between * placement_factor + differ @ self._effects.mT
 
-    def _pixel_covariances(self) -> Real:
+    def _compute_pixel_covariances(self) -> Real:
         return self._patch_covariances(1.0) + self.scan
 
     def _set_thresholds(self, patches: Real, material: npt.NDArray, pixels: Real, of: npt.NDArray, dof: float) -> None:
@@ -307,10 +309,10 @@ class ErrorDiscriminant(Model):
             return float(np.quantile(q, 1 - REJECTED))
 
         self.patch_level = max(law, farthest(patches, material, self._patch_covariances(self.pixels) + self.scan))
-        self.pixel_level = max(law, farthest(pixels, of, self._pixel_covariances()))
+        self.pixel_level = max(law, farthest(pixels, of, self._compute_pixel_covariances()))
 
 
-def _two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: npt.NDArray) -> tuple[Real, Real]:
+def _fit_two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: npt.NDArray) -> tuple[Real, Real]:
     """Least squares of patch means = material + scan: offsets [scans, d], of mean zero, and levels [materials, d]."""
     offset = np.zeros((scan.max() + 1, mean.shape[1]))
     level = np.zeros((material.max() + 1, mean.shape[1]))
@@ -327,11 +329,11 @@ def _two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: 
     return offset, level
 
 
-def _covariance(residual: Real, dof: int) -> Real:
+def _compute_covariance(residual: Real, dof: int) -> Real:
     return residual.T @ residual / max(dof, 1)
 
 
-def _positive(a: Real) -> Real:
+def _clip_eigenvalues(a: Real) -> Real:
     """Return the nearest matrix without negative eigenvalues."""
     values, vectors = np.linalg.eigh((a + a.T) / 2)
     return (vectors * np.maximum(values, 0)) @ vectors.T

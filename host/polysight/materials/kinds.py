@@ -258,11 +258,11 @@ class Kinds:
         self.kinds = (*kinds, Kind("metal", None, source="literature", family="metal"))
         self.theta_rad = theta_rad
         self.ours = np.array([kind.source == "library" for kind in self.kinds])
-        self.t = np.array([_mean(kind, theta_rad) for kind in self.kinds], np.complex128)
-        self.effects = np.stack([_effects(kind, theta_rad) for kind in self.kinds])
+        self.t = np.array([_average_ratio(kind, theta_rad) for kind in self.kinds], np.complex128)
+        self.effects = np.stack([_compute_effects(kind, theta_rad) for kind in self.kinds])
         self.covariance = self.effects @ self.effects.mT + 1e-10 * np.eye(2)
         self.sheet_share = SHEET_SHARE if sheets else 0.0
-        self.share, self.other = _shares(self.kinds, self.sheet_share)
+        self.share, self.other = _compute_shares(self.kinds, self.sheet_share)
         self.sheets, self.sheet_brightness_off = draw_sheets(theta_rad)
 
     @property
@@ -277,7 +277,7 @@ class Kinds:
         other_density = self.other * self.compute_half_space_density(real[None, :] + 1j * imag[:, None], covariance)
         layers = np.zeros_like(other_density)
         if self.sheet_share:
-            layers += self.sheet_share * _histogram(self.sheets, real, imag, covariance)
+            layers += self.sheet_share * _compute_histogram(self.sheets, real, imag, covariance)
         density = np.stack([np.zeros_like(other_density), other_density, layers])
         summed = self.covariance + covariance
         reach = 4.5 * np.sqrt(summed[:, (0, 1), (0, 1)])
@@ -385,13 +385,13 @@ def literature(library: Collection[str] = ()) -> list[Kind]:
     ]
 
 
-def _mean(kind: Kind, theta_rad: float) -> complex:
+def _average_ratio(kind: Kind, theta_rad: float) -> complex:
     if kind.permittivity is None:
         return 1.0 + 0j
     return complex(inverse_ratio(kind.permittivity, theta_rad))
 
 
-def _effects(kind: Kind, theta_rad: float) -> Real:
+def _compute_effects(kind: Kind, theta_rad: float) -> Real:
     """Return the effect on t of one standard deviation of ln eps' and of eps'' between specimens, [part, deviation]."""
     if kind.permittivity is None:
         return METAL_SPREAD * np.eye(2)
@@ -402,7 +402,7 @@ def _effects(kind: Kind, theta_rad: float) -> Real:
     return np.asarray((slopes * np.array([[kind.spread[0]], [loss_std]])).T, np.float64)
 
 
-def _shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
+def _compute_shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
     """Return the share of each kind in the library or in the rest, and that of any other half space in the rest."""
     ours = np.array([kind.source == "library" for kind in kinds])
     metal = np.array([kind.permittivity is None for kind in kinds]) & ~ours
@@ -491,7 +491,7 @@ def _draw_sheet_properties() -> tuple[Complex, Complex, Real]:
     return real * (1 - 1j * tangent), behind.astype(np.complex128), size_mm / 1e3
 
 
-def _histogram(draws: Complex, real: Real, imag: Real, covariance: Real) -> Real:
+def _compute_histogram(draws: Complex, real: Real, imag: Real, covariance: Real) -> Real:
     """Return the density of draws on a grid [imaginary, real], smoothed by the errors."""
     step = np.array([imag[1] - imag[0], real[1] - real[0]])
     edges = [np.append(axis - d / 2, axis[-1] + d / 2) for axis, d in zip((imag, real), step, strict=True)]
@@ -530,12 +530,16 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
     ours = float(np.mean([evidence.library_share for evidence in seen])) if first.ours.any() else 0.0
     weight = weight * np.where(first.ours, ours, 1 - ours)
     drawn = np.stack([kind.sheets for kind in kinds], axis=1)
-    by_dispersion = _dispersion_odds(kinds, seen)
-    density = _normal(drawn, t, errors + SHEET_KERNEL**2 * np.eye(size)) * _brightness_odds(kinds, seen) * by_dispersion
+    by_dispersion = _weigh_dispersion(kinds, seen)
+    density = (
+        _evaluate_normal(drawn, t, errors + SHEET_KERNEL**2 * np.eye(size))
+        * _weigh_brightness(kinds, seen)
+        * by_dispersion
+    )
     sheet = (1 - ours) * first.sheet_share * float(np.mean(density))
     if any(evidence.dispersion is not None for evidence in seen):
         sheet += (1 - ours) * STACK_SHARE / np.pi ** len(seen) * float(np.mean(by_dispersion))
-    other_weight = (1 - ours) * first.other * _other_density(kinds, seen)
+    other_weight = (1 - ours) * first.other * _evaluate_other_density(kinds, seen)
     distance = np.sqrt(distance2 / scipy.special.chdtri(size, 0.01))
     total = float(weight.sum()) + sheet + other_weight
     if not total > 0:
@@ -550,7 +554,7 @@ def may_be_thin(evidence: RatioEvidence, kinds: Kinds) -> bool:
     return weigh_kinds((kinds,), (evidence,)).sheet > POSSIBLY_THIN
 
 
-def _dispersion_odds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Real:
+def _weigh_dispersion(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Real:
     """Return how much likelier the change over the sweep is for each drawn thin plate than for a half space, [draw]."""
     odds = np.ones(kinds[0].sheets.size)
     for kind, evidence in zip(kinds, seen, strict=True):
@@ -559,7 +563,7 @@ def _dispersion_odds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> R
     return odds
 
 
-def _brightness_odds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Real:
+def _weigh_brightness(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Real:
     """Return how much likelier the brightness of a patch is for each drawn thin plate than for a half space, [draw]."""
     odds = np.ones(kinds[0].sheets.size)
     for kind, evidence in zip(kinds, seen, strict=True):
@@ -570,7 +574,7 @@ def _brightness_odds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> R
     return odds
 
 
-def _normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
+def _evaluate_normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
     """Return the normal density of draws [draw, scan] about `mean` [scan], with `covariance` [2 scan, 2 scan]."""
     inverse = np.linalg.inv(covariance)
     difference = split_complex(draws - mean).reshape(len(draws), -1)
@@ -578,7 +582,7 @@ def _normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
     return scale * np.exp(-0.5 * np.einsum("ni,ij,nj->n", difference, inverse, difference))
 
 
-def _other_density(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> float:
+def _evaluate_other_density(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> float:
     """Return the density of the measured ratios as any half space.
 
     With several angles by half spaces that are drawn from the measurement that is known best.
@@ -595,5 +599,7 @@ def _other_density(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> flo
     for i, evidence in enumerate(seen):
         if i != best:
             ratio = inverse_ratio(eps, evidence.theta_rad)
-            density = density * _normal(ratio[:, None], np.array([evidence.inverse_ratio]), evidence.covariance)
+            density = density * _evaluate_normal(
+                ratio[:, None], np.array([evidence.inverse_ratio]), evidence.covariance
+            )
     return float(np.mean(density))

@@ -36,7 +36,7 @@ def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
     content is invalid.
     """
     try:
-        return tuple(_plate(p) for p in truth["plates"] if not p.get("background", False))
+        return tuple(_read_plate(p) for p in truth["plates"] if not p.get("background", False))
     except (AttributeError, KeyError, TypeError, ValueError, IndexError, OverflowError) as e:
         raise DataError(
             f"the content of the truth file is invalid: {type(e).__name__}: {e}",
@@ -90,7 +90,7 @@ def find_truth(folder: Path) -> tuple[Plates, str]:
         return (), f"{e.what}; {e.why}. The truth is not used.".replace("\n", " ")
 
 
-def _plate(raw: Mapping[str, Any]) -> TruthPlate:
+def _read_plate(raw: Mapping[str, Any]) -> TruthPlate:
     cx, cy = (float(c) for c in raw["centre_mm"])
     w, h = (float(s) for s in raw["size_mm"])
     eps = None
@@ -381,7 +381,7 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
     missing = [n for n in (*specimens, *([] if metal is None else [metal])) if n not in boxes]
     if missing:
         raise no_box(missing[0], boxes)
-    return replace(labels_mm, boxes=boxes, specimens=specimens, metal=metal or _metal_by_name(boxes))
+    return replace(labels_mm, boxes=boxes, specimens=specimens, metal=metal or _find_metal_by_name(boxes))
 
 
 def name_taken(name: str, twin: str) -> DataError:
@@ -436,7 +436,7 @@ def _check_apart(one: str, a: Box, other: str, b: Box) -> None:
         )
 
 
-def _metal_by_name(boxes: Mapping[str, Box]) -> str | None:
+def _find_metal_by_name(boxes: Mapping[str, Box]) -> str | None:
     """Return the only box with a metal's name. Raises DataError if there are several boxes and not exactly one."""
     metals = [name for name in boxes if is_metal(material_name(name))]
     if len(metals) == 1:

@@ -513,7 +513,7 @@ class _Model:
         order = np.argsort(chi2[tuple(index.T)])[:STARTS]
         return [grid[tuple(cell)] for cell in index[order]]
 
-    def _slopes(self, x: Real) -> Real:
+    def _differentiate(self, x: Real) -> Real:
         """Return the Jacobian of the residuals, [data, n], by central differences."""
         step = np.diag(1e-6 * np.maximum(np.abs(x), 0.1))
         residuals = self.residuals(np.concatenate([x + step, x - step]))
@@ -527,7 +527,7 @@ class _Model:
             np.clip(start, self.lower + 1e-9 * width, self.upper - 1e-9 * width),
             bounds=(self.lower, self.upper),
             x_scale="jac",
-            jac=cast("Any", self._slopes),  # scipy-stubs accept only a name
+            jac=cast("Any", self._differentiate),  # scipy-stubs accept only a name
             xtol=precision,
             ftol=precision,
             gtol=precision,
@@ -540,7 +540,7 @@ class _Model:
         """Return a solution with its error bars; by samples of the posterior if `drawn` and the valley is bent."""
         n = self.unknowns
         covariance = np.asarray(np.linalg.pinv(one.jacobian.T @ one.jacobian), np.float64)
-        own_covariance = self._drawn(one, covariance) if drawn else covariance[:n, :n]
+        own_covariance = self._draw_second_moments(one, covariance) if drawn else covariance[:n, :n]
         wider = max(1.0, one.chi2 / self.freedom) if self.freedom > 0 else 1.0
         units = np.array([1.0, 1.0, 1e-3])[:n]
         own_covariance = np.asarray(wider * own_covariance * np.outer(units, units), np.float64)
@@ -560,14 +560,14 @@ class _Model:
             covariance=own_covariance,
         )
 
-    def _drawn(self, one: _Solution, covariance: Real) -> Real:
+    def _draw_second_moments(self, one: _Solution, covariance: Real) -> Real:
         """Return second moments of the posterior about a solution, [unknowns, unknowns]; linear in straight valleys.
 
         By importance sampling along index and phase, where the valley is straighter than in thickness.
         """
         n = self.unknowns
         x = one.x
-        to_z = self._straight(x)
+        to_z = self._differentiate_straight(x)
         spread = to_z @ covariance @ to_z.T
         spread = spread + np.diag(1e-12 * np.maximum(np.diag(spread), 1e-18))
         # A wide proposal (Student's t, five degrees of freedom); beyond _REACH there is another valley: a rival.
@@ -591,7 +591,7 @@ class _Model:
         ratio = np.sqrt(np.diag(second) / np.maximum(np.diag(linear), 1e-30))
         return second if np.any(ratio > _BENT) else linear
 
-    def _straight(self, x: Real) -> Real:
+    def _differentiate_straight(self, x: Real) -> Real:
         """Return derivatives of (eps', eps'', phase instead of thickness, angle) by the unknowns, [n, n]."""
         out = np.eye(x.size)
         if self.sized:

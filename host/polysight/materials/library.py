@@ -201,14 +201,14 @@ class Library:
                 code=ErrorCode.VERSION_UNSUPPORTED,
             )  # fmt: skip
         try:
-            return Library(_entries(meta["entries"], h, v, p), dict(meta["fit"]), str(meta["note"]))
+            return Library(_read_entries(meta["entries"], h, v, p), dict(meta["fit"]), str(meta["note"]))
         except (KeyError, TypeError, ValueError) as e:
             raise DataError(
                 bad, f"its description does not fit its arrays: {e}", "train it again", code=ErrorCode.FILE_DAMAGED
             ) from None
 
 
-def _entries(rows: list[dict[str, Any]], h: npt.NDArray, v: npt.NDArray, p: npt.NDArray) -> tuple[Entry, ...]:
+def _read_entries(rows: list[dict[str, Any]], h: npt.NDArray, v: npt.NDArray, p: npt.NDArray) -> tuple[Entry, ...]:
     if not h.shape == v.shape == p.shape or h.ndim != 1 or sum(r["pixels"] for r in rows) != h.size:
         raise ValueError(f"arrays {h.shape}, {v.shape}, {p.shape}")
     out = []

@@ -94,10 +94,10 @@ ACTIVE = 2.0
 
 def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[float, float]:
     """Return the rms of |H| and |V| away from all patches (noise and sidelobes); NaN without such pixels."""
-    background_mask = _away_from_patches(h, v, found, usable)
+    background_mask = _select_background(h, v, found, usable)
     if not background_mask.any():
         return float("nan"), float("nan")
-    return _rms(h[background_mask]), _rms(v[background_mask])
+    return _compute_rms(h[background_mask]), _compute_rms(v[background_mask])
 
 
 def background_mean(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[float, float]:
@@ -107,21 +107,21 @@ def background_mean(h: Image, v: Image, found: Segmentation, usable: Mask) -> tu
     little over a plate, so that neither averaging nor the scatter of the plate's pixels tells of it: on the published
     picture the mean over a plate's size is only 6 dB below the background itself. 0 without such places.
     """
-    background_mask = _away_from_patches(h, v, found, usable)
+    background_mask = _select_background(h, v, found, usable)
     widths = [np.sqrt(patch.interior.sum()) for patch in found.patches if patch.interior.any()]
     if not widths:
         return 0.0, 0.0
     width_px = max(1, round(float(np.median(widths))))
-    window_is_whole = _window_mean(background_mask.astype(np.complex128), width_px).real > 1 - 1e-6
+    window_is_whole = _average_window(background_mask.astype(np.complex128), width_px).real > 1 - 1e-6
     if not window_is_whole.any():
         return 0.0, 0.0
     behind_h, behind_v = (
-        _window_mean(np.where(background_mask, channel, 0), width_px)[window_is_whole] for channel in (h, v)
+        _average_window(np.where(background_mask, channel, 0), width_px)[window_is_whole] for channel in (h, v)
     )
-    return _rms(behind_h), _rms(behind_v)
+    return _compute_rms(behind_h), _compute_rms(behind_v)
 
 
-def _away_from_patches(h: Image, v: Image, found: Segmentation, usable: Mask) -> Mask:
+def _select_background(h: Image, v: Image, found: Segmentation, usable: Mask) -> Mask:
     """Return the usable pixels with some distance to every patch."""
     background_mask = usable & np.isfinite(h) & np.isfinite(v)
     for patch in found.patches:
@@ -129,12 +129,12 @@ def _away_from_patches(h: Image, v: Image, found: Segmentation, usable: Mask) ->
     return background_mask
 
 
-def _window_mean(values: Image, width_px: int) -> Image:
+def _average_window(values: Image, width_px: int) -> Image:
     """Return the mean over a square window around each pixel, with zeros beyond the image."""
     return np.asarray(scipy.ndimage.uniform_filter(values, width_px, mode="constant"), np.complex128)
 
 
-def _rms(values: Image) -> float:
+def _compute_rms(values: Image) -> float:
     return float(np.sqrt(np.mean(np.abs(values.astype(np.complex128)) ** 2)))
 
 
@@ -272,11 +272,11 @@ def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Sca
         slope=slope_of,
         slope_std=unit * about,
         centre_m=(x, y),
-        relief_rad=_relief(h[pixels], centred),
+        relief_rad=_measure_relief(h[pixels], centred),
     )
 
 
-def _relief(h: Image, centred: Real) -> float:
+def _measure_relief(h: Image, centred: Real) -> float:
     """Return the standard deviation of the phase of pixels [n] about a plane over their places [n, 2], radians."""
     mean = complex(h.astype(np.complex128).sum())
     phase = np.angle(h * np.conj(mean)).astype(np.float64)
@@ -340,7 +340,7 @@ def measure_patch(
     inverse = 1 / ratio if ratio else complex(np.inf, 0.0)
     level = np.abs(h[pixels])
     level = level[np.isfinite(level)]
-    std = float(np.hypot(LEAST_STD, TILT_STD * _phase_spread(h[pixels])))
+    std = float(np.hypot(LEAST_STD, TILT_STD * _measure_phase_spread(h[pixels])))
     amplitude, phase = relative_errors(scatter, usual)
     if change is not None:
         common, (more_amplitude, more_phase) = change
@@ -369,7 +369,7 @@ def measure_dispersions(
     dispersion = images.dispersion
     of_metal = None
     if dispersion is not None and plane is None:
-        of_metal = _median_change(dispersion, metal)
+        of_metal = _measure_median_change(dispersion, metal)
     elif plane is not None and plane.dispersion is not None:
         h, v = plane.dispersion
         of_metal = np.array([h.real, (v - h).real, (v - h).imag]), np.zeros(3)
@@ -380,7 +380,7 @@ def measure_dispersions(
     floor = np.array([DISPERSION_STD[0], DISPERSION_STD[1], DISPERSION_STD[1]])
     out: list[PatchDispersion | None] = []
     for patch in judged:
-        of_patch = _median_change(dispersion, patch.interior)
+        of_patch = _measure_median_change(dispersion, patch.interior)
         level_h, level_v = (np.median(np.abs(channel[patch.interior])) for channel in (images.h, images.v))
         if of_patch is None or not min(level_h, level_v) > 0:
             out.append(None)
@@ -394,7 +394,7 @@ def measure_dispersions(
     return out
 
 
-def _median_change(dispersion: Dispersion, pixels: Mask) -> tuple[Real, Real] | None:
+def _measure_median_change(dispersion: Dispersion, pixels: Mask) -> tuple[Real, Real] | None:
     """Return medians over pixels of the change of ln |H|, ln |V / H| and its phase, and robust deviations, [3] each."""
     h = dispersion.h[pixels]
     ratio = dispersion.v[pixels] - h
@@ -406,7 +406,7 @@ def _median_change(dispersion: Dispersion, pixels: Mask) -> tuple[Real, Real] | 
     return middle, 0.7413 * (high - low)
 
 
-def _phase_spread(h: Image) -> float:
+def _measure_phase_spread(h: Image) -> float:
     """Return the circular standard deviation of the phase of H over a patch, radians; a tilt increases it."""
     h = h[np.isfinite(h)].astype(np.complex128)
     coherent = abs(h.sum()) / max(float(np.abs(h).sum()), 1e-300)
@@ -606,7 +606,7 @@ def permittivity_of_patch(
     )
 
 
-def _no_material(e: Permittivity) -> Finding | None:
+def _find_impossibility(e: Permittivity) -> Finding | None:
     """Return why a permittivity is impossible for a passive material, beyond its error; None if it is possible."""
     if e.value is None or e.real_std is None or e.loss_std is None:
         return None
@@ -624,4 +624,4 @@ def refuse_impossible(
 ) -> dict[int, Finding]:
     """Return why patches are no half spaces: an impossible permittivity, or possibly a thin plate."""
     thin = {label: THIN for label, e in estimates.items() if e.evidence is not None and may_be_thin(e.evidence, kinds)}
-    return thin | {label: reason for label, e in patches.items() if (reason := _no_material(e)) is not None}
+    return thin | {label: reason for label, e in patches.items() if (reason := _find_impossibility(e)) is not None}

@@ -153,7 +153,7 @@ class _DielectricReference(SceneLikelihood):
         self.channel_ratio_db = channel_ratio_db
         super().__init__(seen, prior, kinds)
 
-    def _painted(self) -> float:
+    def _estimate_paint_probability(self) -> float:
         return 0.0
 
     def reference_permittivity(self, z: Real) -> Complex:
@@ -166,11 +166,11 @@ class _DielectricReference(SceneLikelihood):
 
     def reference_ratio(self, z: Real) -> Complex:
         """Return t of the reference, [..., 1]."""
-        return inverse_ratio(self.reference_permittivity(z), self._middle_angle())
+        return inverse_ratio(self.reference_permittivity(z), self._find_middle_angle())
 
     def log_reference_brightness(self, z: Real) -> Real:
         """Return ln |r_s| of the reference, [..., 1], by Eq. 2."""
-        cosine = np.cos(self._middle_angle())
+        cosine = np.cos(self._find_middle_angle())
         root = np.sqrt(self.reference_permittivity(z) - (1 - cosine**2))
         return np.log(np.abs((cosine - root) / (cosine + root)))
 
@@ -192,7 +192,7 @@ class _DielectricReference(SceneLikelihood):
             brightness_log = brightness_log - 0.5 * (too_dark_db / CHANNEL_RATIO_STD_DB) ** 2
         return np.concatenate([brightness_log, patch_logs], axis=-1)
 
-    def _middle_angle(self) -> float:
+    def _find_middle_angle(self) -> float:
         return float(self.theta.mean()) if self.theta.size else 0.0
 
 
@@ -418,25 +418,25 @@ def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
     strongest = max((float(np.median(relative[1][patch.interior])) for patch in other_plates), default=0.0)
     if OVERDRIVING * strongest > 1:
         return Halo()
-    free = images.usable & (_distance_mm(plates, pixel_mm) > AROUND_MM[0])
-    level = _excess(relative, free, metal_mask, HALO_MM, pixel_mm)
+    free = images.usable & (_measure_distance_mm(plates, pixel_mm) > AROUND_MM[0])
+    level = _measure_excess(relative, free, metal_mask, HALO_MM, pixel_mm)
     if level == 0:
         return Halo()
-    from_metal_mm = _distance_mm(metal_mask, pixel_mm)
+    from_metal_mm = _measure_distance_mm(metal_mask, pixel_mm)
     around = {}
     for patch in patches:
-        around[patch.label] = _excess(relative, free, patch.mask, AROUND_MM, pixel_mm)
+        around[patch.label] = _measure_excess(relative, free, patch.mask, AROUND_MM, pixel_mm)
         # The halo reaches under a plate beside the metal, where nothing is free to measure it.
         if patch.mask.any() and float(from_metal_mm[patch.mask].min()) <= HALO_MM[1]:
             around[patch.label] = max(around[patch.label], level)
     return Halo(level, around)
 
 
-def _excess(
+def _measure_excess(
     relative: Sequence[np.ndarray], free: Mask, plate: Mask, reach_mm: tuple[float, float], pixel_mm: float
 ) -> float:
     """Return the amplitude of V beside a plate beyond its usual one; 0 if it is no halo, or nothing is free."""
-    distance = _distance_mm(plate, pixel_mm)
+    distance = _measure_distance_mm(plate, pixel_mm)
     ring = free & (distance > reach_mm[0]) & (distance <= reach_mm[1])
     if not ring.any():
         return 0.0
@@ -447,5 +447,5 @@ def _excess(
     return float(np.sqrt(max(0.0, power_v - USUAL_POWER * power_h)))
 
 
-def _distance_mm(mask: Mask, pixel_mm: float) -> np.ndarray:
+def _measure_distance_mm(mask: Mask, pixel_mm: float) -> np.ndarray:
     return np.asarray(scipy.ndimage.distance_transform_edt(~mask)) * pixel_mm

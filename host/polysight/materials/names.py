@@ -195,10 +195,10 @@ def _find_verdict(kinds: Kinds, odds: Odds, foreign_name: str, in_foreign_name: 
         distances[foreign_name] = float(odds.distance[in_foreign_name].min())
     if kinds.sheet_share:
         probability[LAYER] = odds.sheet
-    likely = _likeliest_first(probability)
+    likely = _sort_likeliest_first(probability)
     # Names of little probability count as unknown, so that the sum stays one.
     likely[UNKNOWN] = round(1.0 - sum(likely.values()), 4)
-    likely = _likeliest_first(likely, least=0.0)
+    likely = _sort_likeliest_first(likely, least=0.0)
 
     name = next(iter(likely))
     distance = distances.get(name, np.inf)
@@ -212,12 +212,12 @@ def _find_verdict(kinds: Kinds, odds: Odds, foreign_name: str, in_foreign_name: 
         pixels=0,
         probabilities=likely,
         nearest=nearest,
-        literature=_likeliest_first(literature),
+        literature=_sort_likeliest_first(literature),
         from_literature=name == foreign_name,
     )
 
 
-def _likeliest_first(probability: Mapping[str, float], least: float = LIKELY) -> dict[str, float]:
+def _sort_likeliest_first(probability: Mapping[str, float], least: float = LIKELY) -> dict[str, float]:
     """Return the probabilities of at least `least`, rounded, largest first."""
     ordered = sorted(probability.items(), key=lambda item: -item[1])
     return {name: round(p, 4) for name, p in ordered if p >= least}

@@ -188,7 +188,7 @@ class MaterialsResult:
 
     def rows(self) -> list[PatchFigures]:
         """Return the figures of each patch, for materials.json."""
-        figures = [self._figures(r) for r in self.patches]
+        figures = [self._describe_patch(r) for r in self.patches]
         if self.withheld:
             return [patch.withheld() for patch in figures]
         return figures
@@ -218,7 +218,7 @@ class MaterialsResult:
             inside = self.theta_rad
         return float(np.degrees(np.mean(inside)))
 
-    def _figures(self, r: PatchResult) -> PatchFigures:
+    def _describe_patch(self, r: PatchResult) -> PatchFigures:
         label = r.patch.label
         e = r.permittivity
         x0, y0, x1, y1 = r.patch.box_mm
@@ -234,18 +234,18 @@ class MaterialsResult:
             interior_pixels=e.pixels,
             incidence_deg=self.incidence_deg(r.patch),
             ratio=ComplexNumber.from_complex(e.ratio),
-            inverse_ratio_std=_finite(e.inverse_std),
+            inverse_ratio_std=_replace_infinite(e.inverse_std),
             amplitude_h=round(float(np.median(level)), 6) if level.size else None,
             refused=r.refused,
             bands=self.bands.get(label, UNSET),
             box=self.boxes.get(label, UNSET),
         )
         if r.truth is not None:
-            figures = structs.replace(figures, truth=_truth_figures(r.truth, self.library))
+            figures = structs.replace(figures, truth=_describe_truth(r.truth, self.library))
         if r.verdict is not None:
             figures = _add_name(figures, r.verdict)
         if r.refused is None:
-            figures = structs.replace(figures, permittivity=_permittivity_figures(e))
+            figures = structs.replace(figures, permittivity=_describe_permittivity(e))
             if label in self.tilts.rises:
                 across_deg = round(float(np.degrees(self.tilts.across_rad(label))), 3)
                 figures = structs.replace(figures, tilt_across_deg=across_deg)
@@ -263,16 +263,16 @@ def _add_name(figures: PatchFigures, name: PatchName) -> PatchFigures:
         probabilities=name.probabilities,
         literature=name.literature,
         why=name.why,
-        distance=_finite(name.distance),
+        distance=_replace_infinite(name.distance),
     )
 
 
-def _finite(value: float) -> float | None:
+def _replace_infinite(value: float) -> float | None:
     """Return a number for a file; None for infinity and for what is no number."""
     return value if math.isfinite(value) else None
 
 
-def _permittivity_figures(e: Permittivity) -> PermittivityFigures | None:
+def _describe_permittivity(e: Permittivity) -> PermittivityFigures | None:
     """Return value and errors for materials.json; None if it is not known."""
     if e.value is None or e.real_range is None or e.imag_range is None:
         return None
@@ -290,7 +290,7 @@ def _permittivity_figures(e: Permittivity) -> PermittivityFigures | None:
     )
 
 
-def _truth_figures(truth: TruthPlate, library: tuple[str, ...]) -> TruthFigures:
+def _describe_truth(truth: TruthPlate, library: tuple[str, ...]) -> TruthFigures:
     return TruthFigures(
         name=truth.name,
         metal=truth.metal,
@@ -535,7 +535,7 @@ def pixel_accuracy(result: MaterialsResult) -> float | None:
 
     Patches rightly called unknown, because the library does not hold their material, do not count.
     """
-    right = [n.names == truth for n, truth in _pixels_with_truth(result)]
+    right = [n.names == truth for n, truth in _select_true_patches(result)]
     return float(np.concatenate(right).mean()) if right else None
 
 
@@ -545,14 +545,14 @@ def predict_pixel_accuracy(result: MaterialsResult) -> float | None:
     It is the mean probability of each pixel's likeliest material, so that no choice of names is expected to do better
     on these data. None without known truth, or if the classifier gives no probabilities.
     """
-    shares = [n.confidence for n, _ in _pixels_with_truth(result)]
+    shares = [n.confidence for n, _ in _select_true_patches(result)]
     known_shares = [s for s in shares if s is not None]
     if known_shares and len(known_shares) == len(shares):
         return float(np.concatenate(known_shares).mean())
     return None
 
 
-def _pixels_with_truth(result: MaterialsResult) -> list[tuple[NamedPatch, str]]:
+def _select_true_patches(result: MaterialsResult) -> list[tuple[NamedPatch, str]]:
     """Return the named patches of known truth, each with the true name; without those rightly called unknown."""
     judged = [(r.named, r.verdict.name, r.truth.name) for r in result.patches if r.named and r.verdict and r.truth]
     return [(n, truth) for n, name, truth in judged if n.names.size and (name != UNKNOWN or truth in result.library)]

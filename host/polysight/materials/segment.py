@@ -239,10 +239,10 @@ def segment(
     pixel_mm = abs(float(axis_mm(x_m)[1] - axis_mm(x_m)[0]))
     level = np.maximum(level_db(h, v, usable, cfg.smooth_px, cfg.smallest_mm / pixel_mm / 2), cfg.floor_db)
     even = _remove_speckle(level, usable, cfg, pixel_mm)
-    least_db = _least_level_db(even, usable, cfg, pixel_mm)
+    least_db = _find_least_level_db(even, usable, cfg, pixel_mm)
     masks: list[Mask] = []
     left_out = 0
-    for mask in _regions(even, usable, cfg, pixel_mm):
+    for mask in _find_regions(even, usable, cfg, pixel_mm):
         # Smoothing its outline may have left nothing of it.
         if float(mask.sum()) * pixel_mm**2 < SMALLEST_SHARE * cfg.smallest_mm**2:
             continue
@@ -253,7 +253,7 @@ def segment(
             left_out += 1
     labels = np.zeros(h.shape, np.int32)
     patches = []
-    for mask in sorted(masks, key=lambda mask: _reading_order(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
+    for mask in sorted(masks, key=lambda mask: _sort_by_position(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
         labels[mask] = len(patches) + 1
         patch = make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable)
         patches.append(replace(patch, cut=_is_cut(mask, cfg.smallest_mm / pixel_mm)))
@@ -294,7 +294,7 @@ def _is_cut(mask: Mask, smallest_px: float) -> bool:
     return float(at_border.sum()) > smallest_px
 
 
-def _least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> float:
+def _find_least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> float:
     """Return the least level of a patch, dB: above the background by its scatter; infinite if all is background."""
     level = image[usable]
     if np.ptp(level) == 0:
@@ -309,7 +309,7 @@ def _least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: f
     return max(background + max(cfg.least_contrast_db, cfg.least_scatter * scatter), cfg.dimmest_db)
 
 
-def _reading_order(mask: Mask, y_mm: Real, row_pitch_mm: float) -> tuple[float, float]:
+def _sort_by_position(mask: Mask, y_mm: Real, row_pitch_mm: float) -> tuple[float, float]:
     """Sort key of a patch: top row first, then from left to right."""
     rows, cols = np.nonzero(mask)
     return -round(float(y_mm[rows].mean()) / row_pitch_mm), float(cols.mean())
@@ -373,7 +373,7 @@ class _Growing:
         return min(self.masks, key=lambda step: abs(step[0] - edge_db))[1]
 
 
-def _regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> list[Mask]:
+def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> list[Mask]:
     """Return the masks of all regions that stand out from what surrounds them, bright ones first.
 
     The threshold falls from the brightest level, and connected regions grow with it. A region is complete when its
@@ -388,12 +388,12 @@ def _regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -
 
     def take(mask: Mask) -> None:
         taken.append(_smooth_outline(mask))
-        window = _window(mask, int(skirt_px) + 1)
+        window = _find_window(mask, int(skirt_px) + 1)
         rest[window][np.asarray(scipy.ndimage.distance_transform_edt(~mask[window])) <= skirt_px] = False
 
     for threshold in np.arange(float(level[usable].max()), cfg.floor_db, -STEP_DB) - STEP_DB:
         grown: list[_Growing] = []
-        for region in _components(_open_mask((level > threshold) & rest, opening_px)):
+        for region in _find_components(_open_mask((level > threshold) & rest, opening_px)):
             inside = [node for node in growing if (node.mask & region).any()]
             complete = [node for node in inside if node.level_db - threshold >= cfg.least_contrast_db]
             overflows = any(region.sum() > OVERFLOW * node.mask.sum() for node in complete)
@@ -414,10 +414,12 @@ def _regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -
 def _smooth_outline(mask: Mask) -> Mask:
     """Fill the holes of a region and cut off what is narrower than half of it: speckle, and bridges to a neighbour."""
     # The Gaussian below ends after 4 pixels.
-    window = _window(mask, 5)
+    window = _find_window(mask, 5)
     filled = np.asarray(scipy.ndimage.binary_fill_holes(mask[window]), bool)
     half_width = float(np.asarray(scipy.ndimage.distance_transform_edt(np.pad(filled, 1))).max())
-    body = max(_components(_open_mask(filled, BODY * half_width)), key=lambda part: int(part.sum()), default=filled)
+    body = max(
+        _find_components(_open_mask(filled, BODY * half_width)), key=lambda part: int(part.sum()), default=filled
+    )
     smooth = np.zeros_like(mask)
     smooth[window] = np.asarray(scipy.ndimage.gaussian_filter(body.astype(float), 1.0)) > 0.5
     return smooth
@@ -425,7 +427,7 @@ def _smooth_outline(mask: Mask) -> Mask:
 
 def _open_mask(mask: Mask, radius_px: float) -> Mask:
     """Remove what is narrower than a disk of this radius (morphological opening, by distances)."""
-    window = _window(mask)
+    window = _find_window(mask)
     inside = mask[window]
     opened = np.zeros_like(mask)
     depth = np.asarray(scipy.ndimage.distance_transform_edt(np.pad(inside, 1)))[1:-1, 1:-1]
@@ -435,7 +437,7 @@ def _open_mask(mask: Mask, radius_px: float) -> Mask:
     return opened
 
 
-def _window(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
+def _find_window(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
     """Return the rows and columns that hold a mask, and `margin` more around it within the image."""
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     if not rows.size:
@@ -446,7 +448,7 @@ def _window(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
     )
 
 
-def _components(mask: Mask) -> list[Mask]:
+def _find_components(mask: Mask) -> list[Mask]:
     labels = np.asarray(skimage.measure.label(mask, connectivity=1))
     return [labels == i for i in range(1, int(labels.max()) + 1)]
 
@@ -456,8 +458,8 @@ def align(images: Images) -> tuple[Images, tuple[float, float]]:
 
     The images are returned unchanged if they lie on each other, or show no edges to compare.
     """
-    edges_h = _edges(images.h, images.usable)
-    edges_v = _edges(images.v, images.usable)
+    edges_h = _measure_edges(images.h, images.usable)
+    edges_v = _measure_edges(images.v, images.usable)
     if not edges_h.any() or not edges_v.any():
         return images, (0.0, 0.0)
     # None is documented; the stub takes the default's type.
@@ -475,7 +477,7 @@ def align(images: Images) -> tuple[Images, tuple[float, float]]:
     return replace(images, v=v.astype(images.v.dtype)), (float(apart_mm[0]), float(apart_mm[1]))
 
 
-def _edges(channel: Image, usable: Mask) -> np.ndarray:
+def _measure_edges(channel: Image, usable: Mask) -> np.ndarray:
     """Return how steeply the level of one channel changes, float [ny, nx]; 0 far below its brightest part."""
     amplitude = np.where(usable, np.abs(channel), 0.0)
     level = np.log(amplitude + EDGE_FLOOR * max(float(amplitude.max()), 1e-30))

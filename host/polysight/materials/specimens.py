@@ -128,7 +128,7 @@ def fit_spread(
     second_moments = np.zeros((patches_of_specimen.size, 2))
     for _ in range(_ROUNDS):
         # Expectation: deviation of each specimen given its patches, normal with this mean and covariance.
-        information = effect_of_specimen.mT @ np.linalg.inv(placement + _floor(noise))
+        information = effect_of_specimen.mT @ np.linalg.inv(placement + _compute_floor(noise))
         posterior = np.linalg.inv(
             np.diag(1 / pooled) + patches_of_specimen[:, None, None] * (information @ effect_of_specimen)
         )
@@ -146,10 +146,12 @@ def fit_spread(
         placement = average_channels(placement) if gains_alike else placement
         if np.abs(pooled / pooled_before - 1).max() < _SETTLED:
             break
-    return _each(pooled, second_moments, material_of_specimen, has_spread), placement
+    return _spread_each_material(pooled, second_moments, material_of_specimen, has_spread), placement
 
 
-def _each(pooled: Real, second: Real, kind: npt.NDArray[np.intp], telling: npt.NDArray[np.bool_]) -> Real:
+def _spread_each_material(
+    pooled: Real, second: Real, kind: npt.NDArray[np.intp], telling: npt.NDArray[np.bool_]
+) -> Real:
     """Return the spread of each material: the pooled one, corrected by its own specimens' squares [specimen, 2]."""
     spreads = np.tile(pooled, (telling.size, 1))
     for k in np.flatnonzero(telling):
@@ -172,5 +174,5 @@ def average_channels(covariance: Real) -> Real:
     return out
 
 
-def _floor(covariance: Real) -> Real:
+def _compute_floor(covariance: Real) -> Real:
     return (1e-9 * np.trace(covariance) + 1e-14) * np.eye(len(covariance))

@@ -123,16 +123,16 @@ def band_rows(
     parts: dict[int, list[BandFigures]] = {r.patch.label: [] for r in found.patches}
     for k, (band, band_images) in enumerate(zip(bands, images, strict=True)):
         reference = references[k] if references is not None else None
-        h, v, error = _relative_to_metal(found, band_images, leakage, smooth_px, reference)
+        h, v, error = _divide_by_metal(found, band_images, leakage, smooth_px, reference)
         for r in found.patches:
             pixels = r.patch.interior & band_images.valid
             full_band = (found.h[pixels], found.v[pixels])
             parts[r.patch.label].append(_measure_band(band, h[pixels], v[pixels], full_band, error))
-    std_by_label = {r.patch.label: _own_std(found, r.patch.interior) for r in found.patches}
+    std_by_label = {r.patch.label: _estimate_own_std(found, r.patch.interior) for r in found.patches}
     return {label: _add_covariance(rows, found, std_by_label[label]) for label, rows in parts.items()}
 
 
-def _own_std(found: MaterialsResult, interior: Mask) -> float:
+def _estimate_own_std(found: MaterialsResult, interior: Mask) -> float:
     """Return the standard error of a patch's V / H, each part, by what scatters over the plate; NaN if not known."""
     images = found.calibrated
     scatter = measure_scatter(interior, found.h, found.v, images.x_m, images.y_m)
@@ -159,7 +159,7 @@ def _add_covariance(rows: list[BandFigures], found: MaterialsResult, common: flo
     ]
 
 
-def _relative_to_metal(
+def _divide_by_metal(
     found: MaterialsResult,
     made: Images,
     leakage: tuple[complex, complex],
@@ -178,7 +178,7 @@ def _relative_to_metal(
     h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (pair.h, pair.v))
     relative = remove_leakage(to_metal(replace(pair, h=h, v=v), metal, reference), leakage)
     h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
-    return h, v, _reference_spread(h, v, metal, reference)
+    return h, v, _measure_reference_spread(h, v, metal, reference)
 
 
 def _measure_band(band: SubBand, h: Image, v: Image, whole: tuple[Image, Image], error: float) -> BandFigures:
@@ -291,7 +291,7 @@ def parse_layer(text: str) -> Layer:
     real, loss, *thickness = (float(part) for part in rest)
     if not (np.isfinite(real) and np.isfinite(loss)):
         raise ValueError(text)
-    return Layer(name, complex(real, -loss), _metres(thickness[0]) if thickness else None)
+    return Layer(name, complex(real, -loss), _parse_metres(thickness[0]) if thickness else None)
 
 
 def _parse_unknown_layer(name: str, size: str = "") -> Layer:
@@ -300,14 +300,14 @@ def _parse_unknown_layer(name: str, size: str = "") -> Layer:
     if size == "?":
         return Layer(name, thickness_range_m=THICKNESS_RANGE_M)
     if between := _RANGE.fullmatch(size):
-        low, high = (_metres(float(mm)) for mm in between.groups())
+        low, high = (_parse_metres(float(mm)) for mm in between.groups())
         if low >= high:
             raise ValueError(size)
         return Layer(name, thickness_range_m=(low, high))
-    return Layer(name, None, _metres(float(size)))
+    return Layer(name, None, _parse_metres(float(size)))
 
 
-def _metres(mm: float) -> float:
+def _parse_metres(mm: float) -> float:
     if not 0 < mm < np.inf:
         raise ValueError(mm)
     return mm / 1e3
@@ -374,20 +374,20 @@ def layer_content(fit: LayerFit) -> dict[str, Any]:
     else:
         covariance = (fit.covariance * np.outer(units, units)).tolist()
     return {
-        **_solution(fit),
+        **_read_solution(fit),
         "std_real": fit.std_real,
         "std_loss": fit.std_loss,
         "thickness_std_mm": 1e3 * fit.std_thickness_m if sized else None,
         "covariance": covariance,
         "freedom": fit.freedom,
         "ambiguous": fit.ambiguous,
-        "rivals": [_solution(r) for r in fit.rivals],
+        "rivals": [_read_solution(r) for r in fit.rivals],
         "at_limit": list(fit.at_limit),
         "warnings": fit.warnings(),
     }
 
 
-def _solution(fit: LayerFit) -> dict[str, Any]:
+def _read_solution(fit: LayerFit) -> dict[str, Any]:
     return {
         "permittivity": [fit.permittivity.real, -fit.permittivity.imag],
         "thickness_mm": None if fit.thickness_m is None else 1e3 * fit.thickness_m,
@@ -543,7 +543,7 @@ def fit_concentration(
     return ConcentrationResult(Line.through(x, y), tuple(rows))
 
 
-def _reference_spread(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
+def _measure_reference_spread(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
     """Return the relative spread of the metal's pixels."""
     if reference is None:
         spread = inverse_spread(h[metal.mask], v[metal.mask])

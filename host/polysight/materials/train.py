@@ -304,8 +304,8 @@ def read_material(path: Path) -> Entry:
     raw = read_pickle(path)
     most = path.stat().st_size
     try:
-        p, h, v = (_pixels(x, most) for x in raw["values"])
-        ref_p, ref_h, ref_v = (_pixels(x, most) for x in raw["ref_values"])
+        p, h, v = (_read_pixels(x, most) for x in raw["values"])
+        ref_p, ref_h, ref_v = (_read_pixels(x, most) for x in raw["ref_values"])
         name = str(raw["name"])
         angle = float(raw["incident_angle"])
         scan = str(raw["collection_name"])
@@ -355,7 +355,7 @@ def read_materials(folder: Path) -> Library:
     return Library(tuple(read_material(f) for f in files), {}, f"{len(files)} material files of {folder.name}")
 
 
-def _pixels(values: Any, most: int) -> npt.NDArray[np.complex128]:
+def _read_pixels(values: Any, most: int) -> npt.NDArray[np.complex128]:
     """Return the numbers of a file of `most` bytes. Raises ValueError: nested references can expand to any size."""
     plain = isinstance(values, list | tuple) and all(isinstance(v, int | float | complex) for v in values)
     if isinstance(values, np.ndarray):
@@ -516,7 +516,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
             unknown[test_set] = (predicted.distance > 1)[row]
             sure[test_set] = predicted.confidence[row]
     names = np.unique(samples.names)
-    tables = [_confusion(samples.names[learnt], predicted[learnt], names) for predicted in (alone, in_scan, of_patch)]
+    tables = [_tabulate(samples.names[learnt], predicted[learnt], names) for predicted in (alone, in_scan, of_patch)]
     judged = np.isin(names, samples.names[learnt])
     first = np.unique(samples.patches, return_index=True)[1]
     first = first[learnt[first]]
@@ -540,7 +540,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     )
 
 
-def _confusion(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Real:
+def _tabulate(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Real:
     table = np.zeros((names.size, names.size))
     np.add.at(table, (np.searchsorted(names, true), np.searchsorted(names, found)), 1)
     return table / np.maximum(table.sum(axis=1, keepdims=True), 1)

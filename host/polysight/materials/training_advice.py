@@ -26,7 +26,7 @@ def accuracy_lines(library: Library) -> list[str]:
                 " but of metal. Scan each material once more, placed anew, and train on all scans"
             )
             continue
-        lines += _confidence_lines(angle, fit)
+        lines += _judge_confidence(angle, fit)
         lines.append(
             f"{angle} degrees: on scans left out {100 * fit['pixel_accuracy']:.1f} % of the pixels and"
             f" {100 * fit['patch_accuracy']:.1f} % of the patches are named right ({fit['model']},"
@@ -46,7 +46,7 @@ ALIKE_STD = 2.0
 SHOWN_PAIRS = 3
 
 
-def _confidence_lines(angle: str, fit: Mapping[str, Any]) -> list[str]:
+def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
     """Say if the names' probabilities are too large or too small, why, and how many specimens the library needs."""
     if fit.get("named") is None:
         # Libraries of earlier releases do not say.

@@ -101,7 +101,7 @@ def notice_of_fault(event: Fault) -> Finding:
     )
 
 
-def _cause(faults: Sequence[store.RowFault]) -> tuple[str, str]:
+def _find_cause(faults: Sequence[store.RowFault]) -> tuple[str, str]:
     """Likely cause and remedy of a row's faults: those of the first known kind."""
     for fault in faults:
         if fault.kind == K.PI_FAULT and fault.number:
@@ -116,12 +116,12 @@ def notice_of_rejection(
     row: int, take: int, reasons: Sequence[str], faults: Sequence[store.RowFault], utc: str
 ) -> Finding:
     """Notice of a rejected take; one that somebody asked for is no fault."""
-    cause, remedy = _cause(faults)
+    cause, remedy = _find_cause(faults)
     remedy = remedy or "Nothing: the row is retaken automatically"
     if is_on_request(faults):
-        notice = _row_notice(row, f"Row {row} was ended on request", (cause, remedy), reasons, utc)
+        notice = _make_row_notice(row, f"Row {row} was ended on request", (cause, remedy), reasons, utc)
         return msgspec.structs.replace(notice, level="note")
-    return _row_notice(row, f"Row {row}, take {take}, was rejected", (cause, remedy), reasons, utc)
+    return _make_row_notice(row, f"Row {row}, take {take}, was rejected", (cause, remedy), reasons, utc)
 
 
 def is_on_request(faults: Sequence[store.RowFault]) -> bool:
@@ -129,7 +129,7 @@ def is_on_request(faults: Sequence[store.RowFault]) -> bool:
     return bool(faults) and all(fault.kind == K.ON_REQUEST for fault in faults)
 
 
-def _row_notice(row: int, problem: str, why_do: tuple[str, str], reasons: Sequence[str], utc: str) -> Finding:
+def _make_row_notice(row: int, problem: str, why_do: tuple[str, str], reasons: Sequence[str], utc: str) -> Finding:
     """Notice of a row; the page shows the reasons in full on demand, and the time if it is known."""
     return Finding("warning", problem, *why_do, where=f"row {row}", facts={"detail": "; ".join(reasons), "utc": utc})
 
@@ -288,7 +288,7 @@ class ScanHistory:
     def add_fact(self, fact: store.Fact) -> None:
         """Add times and notices of the next fact of `content`. Raises ValueError for a time of another form."""
         if isinstance(fact, store.RowCommitted):
-            self._row_committed(fact)
+            self._add_committed_row(fact)
         elif isinstance(fact, store.RowRejected):
             if not is_on_request(fact.faults):
                 self.rows_since_trouble = 0
@@ -296,7 +296,7 @@ class ScanHistory:
         elif isinstance(fact, store.RowWithdrawn):
             problem = f"Row {fact.row} on the disk differs from what was committed"
             why_do = ("The disk is faulty, or the file was changed", "Nothing: the row is retaken")
-            self.notices.append(_row_notice(fact.row, problem, why_do, fact.reasons, fact.withdrawn_utc))
+            self.notices.append(_make_row_notice(fact.row, problem, why_do, fact.reasons, fact.withdrawn_utc))
         elif isinstance(fact, store.ScanResumed):
             self.run_started_s = seconds(fact.resumed_utc)
             if fact.rig:
@@ -308,12 +308,14 @@ class ScanHistory:
             # A pause does not count.
             self.last_commit_s += seconds(fact.continued_utc) - self._paused_at
 
-    def _row_committed(self, fact: store.RowCommitted) -> None:
+    def _add_committed_row(self, fact: store.RowCommitted) -> None:
         self.rows_since_trouble += 1
         if fact.kept_incomplete:
             self.rows_since_trouble = 0
             problem = f"Row {fact.row} is kept with gaps, which are masked"
-            notice = _row_notice(fact.row, problem, _cause(fact.faults), fact.kept_incomplete, fact.committed_utc)
+            notice = _make_row_notice(
+                fact.row, problem, _find_cause(fact.faults), fact.kept_incomplete, fact.committed_utc
+            )
             self.notices.append(notice)
         if not fact.committed_utc:
             # Made in one step, by `polysight simulate`.

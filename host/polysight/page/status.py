@@ -230,7 +230,7 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
     history = inputs.history
     shown = inputs.shown
     if history is None:
-        return Snapshot(status=judge(inputs), notices=_notices(inputs), control=inputs.control)
+        return Snapshot(status=judge(inputs), notices=_collect_notices(inputs), control=inputs.control)
     plan = history.plan
     marks = history.marks
     boards = history.boards
@@ -246,7 +246,7 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
         verdict = inputs.verdict
     return Snapshot(
         status=judge(inputs),
-        notices=_notices(inputs),
+        notices=_collect_notices(inputs),
         control=inputs.control,
         running=history.ended is None and inputs.signs.alive,
         paused=history.paused,
@@ -315,7 +315,7 @@ def _describe_pictures(history: ScanHistory, shown: Shown) -> PicturesState:
     return PicturesState(shown.revision, len(shown.rows), waiting, width_mm, height_mm, scales)
 
 
-def _notices(inputs: Inputs) -> list[Finding]:
+def _collect_notices(inputs: Inputs) -> list[Finding]:
     """All notices, the newest first, each once."""
     notices = []
     if inputs.problem:
@@ -534,7 +534,7 @@ def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
     newest_warning = next((notice for notice in reversed(history.notices) if notice.level == "warning"), None)
     if pi.row >= 0 and history.marks.get(pi.row) == "rejected":
         return say_finding("retake", newest_warning, row=pi.row, take=pi.take)
-    late_since_s = _late_since_s(history, inputs.signs)
+    late_since_s = _find_late_since_s(history, inputs.signs)
     if late_since_s:
         return say_since("late", late_since_s)
     if history.rows_since_trouble < RECENT_ROWS and newest_warning is not None:
@@ -545,7 +545,7 @@ def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
     return None
 
 
-def _late_since_s(history: ScanHistory, signs: LifeSigns) -> float:
+def _find_late_since_s(history: ScanHistory, signs: LifeSigns) -> float:
     """When the last row ended, if that is much longer ago than a row takes; otherwise 0."""
     if history.row_seconds is None:
         return 0.0

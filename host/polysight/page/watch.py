@@ -140,7 +140,7 @@ class RowViewer:
         if self._thread.is_alive():
             self._thread.join()
 
-    def _waiting(self) -> list[tuple[int, int]]:
+    def _list_waiting(self) -> list[tuple[int, int]]:
         """Rows and takes that are not processed."""
         with self._lock:
             takes = self._to_show.items()
@@ -149,7 +149,7 @@ class RowViewer:
     def _run(self) -> None:
         pipeline: Pipeline | None = None
         while not self._ended.is_set():
-            waiting = self._waiting()
+            waiting = self._list_waiting()
             if not waiting:
                 self._ended.wait(POLL_S)
                 continue
@@ -178,10 +178,10 @@ class RowViewer:
                 sync = sync._replace(snr_db=-20 * math.log10(scatter))
             self._sync.setdefault(name, {})[row] = sync
         if draws or time.monotonic() - self._drawn_at > PICTURE_INTERVAL_S:
-            self._publish(draw(pipeline.images.current()), self._profile(pipeline, row))
+            self._publish(draw(pipeline.images.current()), self._compute_profile(pipeline, row))
             self._drawn_at = time.monotonic()
 
-    def _profile(self, pipeline: Pipeline, row: int) -> Profile:
+    def _compute_profile(self, pipeline: Pipeline, row: int) -> Profile:
         """The profile of a row, synchronised anew: kept samples hold the scene, but not the direct path."""
         rig = pipeline.source.instrument
         nearest, farthest = scene_m(rig)
@@ -457,13 +457,13 @@ class Watch:
                 self._turn()
             except Exception as e:  # noqa: BLE001  a view that has failed must not show "All is well"
                 self._problem = f"the live view fails: {type(e).__name__}: {e}"
-                nothing = Inputs(self.folder, None, self._signs(PiState()), problem=self._problem)
+                nothing = Inputs(self.folder, None, self._read_life_signs(PiState()), problem=self._problem)
                 self.state = self.state.publish(make_snapshot(nothing))
 
     def _turn(self) -> None:
         """Read everything once, and publish what has changed."""
         self._read()
-        self._attend()
+        self._update_tasks()
         if self._viewer is not None:
             self.shown = self._viewer.shown
         if self._listener is not None:
@@ -479,7 +479,7 @@ class Watch:
         inputs = Inputs(
             folder=self.folder,
             history=self._history,
-            signs=self._signs(pi),
+            signs=self._read_life_signs(pi),
             pi=pi,
             shown=self.shown,
             control=self.control,
@@ -517,7 +517,7 @@ class Watch:
         if self._history is not None:
             self._history.add_events(self._events.look())
 
-    def _attend(self) -> None:
+    def _update_tasks(self) -> None:
         """Start and stop the row viewer and the listener as needed."""
         history = self._history
         if history is None:
@@ -532,7 +532,7 @@ class Watch:
             self._listener.close()
             self._listener = None
 
-    def _signs(self, pi: PiState) -> LifeSigns:
+    def _read_life_signs(self, pi: PiState) -> LifeSigns:
         """Signs of life of the scan program and the Pi."""
         now = time.monotonic()
         wall_s = time.time()

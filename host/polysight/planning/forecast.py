@@ -265,10 +265,12 @@ def describe_aperture(rig: Instrument) -> tuple[imaging.Aperture, Real]:
     frequencies = imaging.reduction(
         rig.chirp, imaging.scene_gate_m(antennas, plan_raster(rig.grid), grid), _FAST_TIME_WINDOW
     ).frequencies_hz
-    return imaging.Aperture(antennas[0], imaging.scan_offsets_m(rig), frequencies, grid), np.outer(*_tapers(rig))
+    return imaging.Aperture(antennas[0], imaging.scan_offsets_m(rig), frequencies, grid), np.outer(
+        *_compute_tapers(rig)
+    )
 
 
-def _tapers(rig: Instrument) -> tuple[Real, Real]:
+def _compute_tapers(rig: Instrument) -> tuple[Real, Real]:
     name = imaging.TAPERS[rig.image.apodisation]
     return imaging.window_weights(name, rig.grid.rows), imaging.window_weights(name, rig.grid.columns)
 
@@ -301,7 +303,7 @@ def predict_noise(rig: Instrument, noise: Noise) -> NoiseForecast:
     rx = len(rig.antennas.rx_mm)
     position = 10 ** (noise.direct_snr_db / 10) * rig.burst.chirps_a_position
     gain = rx
-    for window in (imaging.window_weights(_FAST_TIME_WINDOW, samples), *_tapers(rig)):
+    for window in (imaging.window_weights(_FAST_TIME_WINDOW, samples), *_compute_tapers(rig)):
         gain *= window.sum() ** 2 / (window**2).sum()
     return NoiseForecast(
         position_db=float(10 * np.log10(position)),
@@ -321,11 +323,11 @@ def find_warnings(rig: Instrument, noise: Noise, scene_mm: tuple[float, float] |
     image_mm = (rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm)
     scene_mm = scene_mm or image_mm
     warnings = [
-        *_stage_warnings(rig),
-        *_burst_warnings(rig, predict_burst(rig)),
-        *_card_warnings(rig),
-        *_radar_warnings(rig),
-        *_field_warnings(rig, scene_mm, image_mm),
+        *_check_stage(rig),
+        *_check_burst(rig, predict_burst(rig)),
+        *_check_card(rig),
+        *_check_radar(rig),
+        *_check_field(rig, scene_mm, image_mm),
     ]
     phase = predict_noise(rig, noise).direct_phase_rad
     if phase > _PUBLISHED_PHASE_RAD:
@@ -340,23 +342,23 @@ def _note(topic: str, text: str) -> Finding:
     return Finding("note", text, where=topic)
 
 
-def _refusal(topic: str, text: str) -> Finding:
+def _make_refusal(topic: str, text: str) -> Finding:
     return Finding("error", text, where=topic)
 
 
-def _stage_warnings(rig: Instrument) -> Iterator[Finding]:
+def _check_stage(rig: Instrument) -> Iterator[Finding]:
     stage = rig.stage
     grid = rig.grid
     rate = stage.speed_mm_s * stage.steps_per_mm
     if rate > MAX_STEPS_PER_S:
         limit = MAX_STEPS_PER_S / stage.steps_per_mm
         text = f"{stage.speed_mm_s:g} mm/s are {rate:g} steps/s; the maximum of the stage is {limit:g} mm/s"
-        yield _refusal("speed", text)
+        yield _make_refusal("speed", text)
     for axis, step in (("x", grid.step_x_mm), ("y", grid.step_y_mm)):
         steps = step * stage.steps_per_mm
         if abs(steps - round(steps)) > 1e-6:
             text = f"a step of {step:g} mm in {axis} is {steps:g} motor steps, not a whole number"
-            yield _refusal(f"step {axis}", text)
+            yield _make_refusal(f"step {axis}", text)
     if stage.speed_mm_s > _PUBLISHED_SPEED_MM_S:
         yield _note(
             "speed",
@@ -366,7 +368,7 @@ def _stage_warnings(rig: Instrument) -> Iterator[Finding]:
         )
 
 
-def _burst_warnings(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
+def _check_burst(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
     max_pulses = int(1e3 * burst.between_ms / rig.burst.period_us)
     try:
         check_burst_fits(rig.grid, rig.burst, rig.stage)
@@ -374,7 +376,7 @@ def _burst_warnings(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
         remedy = f"at most {1e3 * rig.grid.step_x_mm / burst.duration_ms:.3g} mm/s"
         if max_pulses:
             remedy += f", or at most {max_pulses} pulses"
-        yield _refusal("burst", f"too fast for the burst: {e.what}; {remedy}")
+        yield _make_refusal("burst", f"too fast for the burst: {e.what}; {remedy}")
     if burst.edge_loss_db > _MAX_BURST_LOSS_DB:
         yield _note(
             "motion",
@@ -390,7 +392,7 @@ def _burst_warnings(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
         yield _note("burst", text)
 
 
-def _card_warnings(rig: Instrument) -> Iterator[Finding]:
+def _check_card(rig: Instrument) -> Iterator[Finding]:
     if whole_packets(rig):
         yield _note(
             "card",
@@ -405,7 +407,7 @@ def _card_warnings(rig: Instrument) -> Iterator[Finding]:
             " total",
         )
     if rig.frame_bytes < rig.card.payload_bytes:
-        yield _refusal(
+        yield _make_refusal(
             "card",
             f"a frame of {rig.frame_bytes} bytes is smaller than a packet of {rig.card.payload_bytes}: a missed and a"
             " spurious edge within a packet cannot be seen; use more samples or chirps a frame",
@@ -417,7 +419,7 @@ def _card_warnings(rig: Instrument) -> Iterator[Finding]:
         yield _note("card", text)
 
 
-def _radar_warnings(rig: Instrument) -> Iterator[Finding]:
+def _check_radar(rig: Instrument) -> Iterator[Finding]:
     native = rig.radar.control == "native"
     offsets_known = native or any(b.start_offset_hz for b in rig.boards)
     for c in constraints(rig, rig.grid.columns * rig.burst.pulses):
@@ -435,7 +437,7 @@ def _radar_warnings(rig: Instrument) -> Iterator[Finding]:
         )
 
 
-def _field_warnings(rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple[float, float]) -> Iterator[Finding]:
+def _check_field(rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple[float, float]) -> Iterator[Finding]:
     grid = rig.grid
     field = imaging.field_limits(rig)
     axes = (("x", grid.step_x_mm, grid.columns), ("y", grid.step_y_mm, grid.rows))

@@ -197,14 +197,14 @@ def _vary_bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iter
     if rig.burst.chirps > 1:
         for speed in _list_speeds(rig, minutes):
             plan = _set_burst(rig, speed, rig.burst.pulses, rig.burst.period_us)
-            if _max_pulses(plan) >= rig.burst.pulses and scan_time(plan, row_overhead_s).minutes <= minutes:
+            if _find_max_pulses(plan) >= rig.burst.pulses and scan_time(plan, row_overhead_s).minutes <= minutes:
                 yield plan
                 return
         return
     for period in {rig.burst.period_us, min(rig.burst.period_us, shortest_period_us(rig))}:
         for speed in _list_speeds(rig, minutes):
             plan = _set_burst(rig, speed, 2, period)
-            most = _max_pulses(plan)
+            most = _find_max_pulses(plan)
             with_short_last_packet = (n for n in range(most, 1, -1) if not whole_packets(plan, n))
             pulses = next(with_short_last_packet, most)
             if pulses < 2:
@@ -222,7 +222,7 @@ def _set_burst(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float
     return msgspec.structs.replace(rig, stage=stage, burst=burst)
 
 
-def _max_pulses(rig: Instrument) -> int:
+def _find_max_pulses(rig: Instrument) -> int:
     """Largest number of pulses of a burst: by time, by travel during the burst, by the radar's frames in a row."""
     by_time = _MAX_DUTY * 1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us
     travel = predict_burst(rig).travel_wavelengths
@@ -340,7 +340,7 @@ def _format_table(plans: list[Forecast]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _finite_or_none(values: tuple[float, float]) -> list[float | None]:
+def _replace_infinite(values: tuple[float, float]) -> list[float | None]:
     return [float(v) if math.isfinite(v) else None for v in values]
 
 
@@ -373,13 +373,13 @@ def forecast_values(f: Forecast) -> dict[str, Any]:
             "standstill": t.overhead_s,
         },
         "raw_bytes": f.raw_bytes,
-        "point_width_mm": _finite_or_none(r.width_mm),
-        "point_limit_mm": _finite_or_none(r.limit_mm),
-        "point_paper_mm": _finite_or_none(r.paper_mm),
-        "alias_free_mm": _finite_or_none(f.field.alias_free_mm),
-        "mirror_zone_mm": _finite_or_none(f.field.mirror_zone_mm),
+        "point_width_mm": _replace_infinite(r.width_mm),
+        "point_limit_mm": _replace_infinite(r.limit_mm),
+        "point_paper_mm": _replace_infinite(r.paper_mm),
+        "alias_free_mm": _replace_infinite(f.field.alias_free_mm),
+        "mirror_zone_mm": _replace_infinite(f.field.mirror_zone_mm),
         "visible_normals_deg": [normals.x_deg, normals.y_deg],
-        "alias_tilt_deg": _finite_or_none(normals.alias_deg),
+        "alias_tilt_deg": _replace_infinite(normals.alias_deg),
         "burst_ms": f.burst.duration_ms,
         "between_positions_ms": f.burst.between_ms,
         "burst_travel_mm": f.burst.travel_mm,

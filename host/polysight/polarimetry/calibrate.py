@@ -294,16 +294,16 @@ class PlaneReference:
         return MetalPlate(
             how=self.how,
             share_of_plane=round(float(pixels.mean()), 4),
-            h_variation_db=_variation_db(h),
-            v_variation_db=_variation_db(v),
-            ratio_variation_db=_variation_db(h / v),
+            h_variation_db=_measure_variation_db(h),
+            v_variation_db=_measure_variation_db(v),
+            ratio_variation_db=_measure_variation_db(h / v),
             ratio_variation_deg=round(float(np.degrees(np.std(phase_from_mean))), 4),
             spread=round(self.spread, 5),
             sub_bands=len(self.bands) or UNSET,
         )
 
 
-def _variation_db(gain: Image) -> float:
+def _measure_variation_db(gain: Image) -> float:
     """Return the standard deviation of the level of a gain over its pixels."""
     return round(float(np.std(20 * np.log10(np.abs(gain)))), 4)
 
@@ -331,7 +331,7 @@ def plane_reference(
         top = float(np.percentile(power[usable], 90)) if usable.any() else 0.0
         strong &= power >= max(top * 10 ** (floor_db / 10), np.finfo(np.float32).tiny)
     # The border of the image does not count as an edge of the plate.
-    inside = np.asarray(scipy.ndimage.binary_erosion(strong, _disk(round(2 * smooth_px)), border_value=1), bool)
+    inside = np.asarray(scipy.ndimage.binary_erosion(strong, _make_disk(round(2 * smooth_px)), border_value=1), bool)
     if int(inside.sum()) < MIN_PIXELS:
         raise DataError(
             "the reference scan shows no metal plate",
@@ -354,7 +354,7 @@ def plane_reference(
     )
 
 
-def _disk(radius: int) -> npt.NDArray[np.bool_]:
+def _make_disk(radius: int) -> npt.NDArray[np.bool_]:
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     return x**2 + y**2 <= radius**2
 

@@ -43,13 +43,13 @@ Incidence = Literal["one", "pixel"]
 """One angle for the image (specular), or one per pixel (:func:`effective_incidence_map`)."""
 
 
-def _normal_wavenumber(eps: Complex, sine: Real) -> Complex:
+def _compute_normal_wavenumber(eps: Complex, sine: Real) -> Complex:
     """Return index times cosine in the medium, sqrt(eps - sin^2 theta_i), the root that decays (Im <= 0)."""
     q: Complex = np.sqrt(eps - sine**2)
     return np.where((q.real == 0) & (q.imag > 0), -q, q)
 
 
-def _media(
+def _broadcast_media(
     eps: npt.ArrayLike, theta_rad: npt.ArrayLike
 ) -> tuple[Complex, Real, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Broadcast permittivity and angle; return them made finite, and masks of metal (infinite) and of NaN."""
@@ -75,10 +75,10 @@ def fresnel(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> tuple[Complex, Comp
         complex128, broadcast shape: s (perpendicular to the plane of incidence) and p (parallel to it). NaN where
         `eps` or the angle is NaN.
     """
-    eps, theta, metal, unknown = _media(eps, theta_rad)
+    eps, theta, metal, unknown = _broadcast_media(eps, theta_rad)
     c = np.cos(theta)
     s = np.sin(theta)
-    q = _normal_wavenumber(eps, s)
+    q = _compute_normal_wavenumber(eps, s)
     r_s = np.where(metal, -1.0, (c - q) / (c + q))
     # cos(theta_t) = q / n, so n_i cos(theta_t) -+ n_t cos(theta_i) is (q -+ eps c) / n: no square root of eps needed.
     r_p = np.where(metal, -1.0, (q - eps * c) / (q + eps * c))
@@ -91,9 +91,9 @@ def ratio_from_permittivity(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Com
     Evaluated as (q cos + sin^2) / (q cos - sin^2) with q = sqrt(eps - sin^2), which has no 0/0 at eps = 1. Infinite
     permittivity gives 1 (metal), the Brewster angle of a lossless medium infinity. Parameters as :func:`fresnel`.
     """
-    eps, theta, metal, unknown = _media(eps, theta_rad)
+    eps, theta, metal, unknown = _broadcast_media(eps, theta_rad)
     s = np.sin(theta)
-    a = _normal_wavenumber(eps, s) * np.cos(theta)
+    a = _compute_normal_wavenumber(eps, s) * np.cos(theta)
     pole = a == s**2
     ratio = (a + s**2) / np.where(pole, 1.0, a - s**2)
     ratio = np.where(metal, 1.0, np.where(pole, complex(np.inf, 0.0), ratio))
@@ -140,7 +140,7 @@ def brewster_angle_rad(eps: npt.ArrayLike) -> Real:
     return np.arctan(np.sqrt(np.abs(np.asarray(eps, np.complex128))))[()]
 
 
-def _entries(value: Sequence[npt.ArrayLike] | npt.ArrayLike) -> list[Any]:
+def _list_entries(value: Sequence[npt.ArrayLike] | npt.ArrayLike) -> list[Any]:
     """Return the entries of a list, tuple or array; a number becomes a list of one."""
     if isinstance(value, list | tuple):
         return list(value)
@@ -155,9 +155,9 @@ def _stack(
 
     Raises PolysightError as :func:`multilayer`.
     """
-    media: list[Complex] = [np.asarray(e, np.complex128) for e in _entries(eps)]
+    media: list[Complex] = [np.asarray(e, np.complex128) for e in _list_entries(eps)]
     media = [np.where(np.isinf(e), _CONDUCTOR, e) for e in media]
-    layers = [np.asarray(d, np.float64) for d in _entries(thickness_m)]
+    layers = [np.asarray(d, np.float64) for d in _list_entries(thickness_m)]
     if not media or len(layers) not in (len(media) - 1, len(media)):
         raise PolysightError(
             f"multilayer: {len(media)} permittivities with {len(layers)} thicknesses",
@@ -217,7 +217,7 @@ def multilayer(
     theta = np.asarray(theta_rad, np.float64)
     s = np.sin(theta)
     k0 = 2 * np.pi * np.asarray(frequency_hz, np.float64) / SPEED_OF_LIGHT_M_S
-    q = [np.cos(theta).astype(np.complex128), *(_normal_wavenumber(e, s) for e in media[1:])]
+    q = [np.cos(theta).astype(np.complex128), *(_compute_normal_wavenumber(e, s) for e in media[1:])]
     y = [qi / ei for qi, ei in zip(q, media, strict=True)]
     r_s: Complex = (q[-2] - q[-1]) / (q[-2] + q[-1])
     r_p: Complex = (y[-1] - y[-2]) / (y[-1] + y[-2])
@@ -231,7 +231,7 @@ def multilayer(
     return np.broadcast_to(r_s, shape)[()], np.broadcast_to(r_p, shape)[()]
 
 
-def _half_bistatic(rig: Instrument, board_index: int, points_m: Real) -> tuple[Real, Real]:
+def _compute_half_bistatic(rig: Instrument, board_index: int, points_m: Real) -> tuple[Real, Real]:
     """Return half the angle TX-point-RX1 (radians) and the path TX-point-RX1 (metres) for points [..., 3]."""
     a = np.asarray(tx_position_m(rig)) - points_m
     b = np.asarray(rx_positions_m(rig, rig.receivers[board_index])[0]) - points_m
@@ -245,7 +245,7 @@ def specular_incidence_rad(rig: Instrument) -> float:
     """Return the incidence angle at the specular midpoint, radians; mean of H and V, which differ by 0.01 degrees."""
     angles = []
     for i, board in enumerate(rig.receivers):
-        angle, _ = _half_bistatic(rig, i, np.asarray(specular_midpoint_m(rig, board)))
+        angle, _ = _compute_half_bistatic(rig, i, np.asarray(specular_midpoint_m(rig, board)))
         angles.append(float(angle))
     return float(np.mean(angles))
 
@@ -281,8 +281,8 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         points[..., 0] = middle[0] + dx[None, :]
         points[..., 1] = middle[1] + dy[:, None]
         points[..., 2] = middle[2]
-        angle, path = _half_bistatic(rig, i, points)
-        specular, shortest = _half_bistatic(rig, i, middle)
+        angle, path = _compute_half_bistatic(rig, i, points)
+        specular, shortest = _compute_half_bistatic(rig, i, middle)
         weight = np.exp(-((2 * np.pi / wavelength * (path - shortest)) ** 2) / 8)
         deviation, mass = (_convolve(visited, map_part) for map_part in (weight * (angle - specular), weight))
         # Sample (row, column) of the full convolution is the pixel at offset + displacement from the midpoint.

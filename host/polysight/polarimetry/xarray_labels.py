@@ -92,7 +92,7 @@ def keep_labels(*results: str) -> Callable[[Function], Function]:
             if xarray is None:
                 return function(*arguments, **named)
             values = [*arguments, *named.values()]
-            entries = [entry for value in values for entry in _entries(value)]
+            entries = [entry for value in values for entry in _list_entries(value)]
             if not any(isinstance(entry, xarray.DataArray) for entry in entries):
                 return function(*arguments, **named)
 
@@ -114,7 +114,7 @@ def keep_labels(*results: str) -> Callable[[Function], Function]:
     return decorate
 
 
-def _entries(value: Any) -> list[Any]:
+def _list_entries(value: Any) -> list[Any]:
     return list(value) if isinstance(value, list | tuple) else [value]
 
 

@@ -132,15 +132,15 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     assumed: list[str] = []
     h = arrays["h"]
     v = arrays["v"]
-    x_m = _axis(path, arrays, "x_m", h.shape[1], rig, assumed)
-    y_m = _axis(path, arrays, "y_m", h.shape[0], rig, assumed)
+    x_m = _make_axis(path, arrays, "x_m", h.shape[1], rig, assumed)
+    y_m = _make_axis(path, arrays, "y_m", h.shape[0], rig, assumed)
     _check_square(path, x_m, y_m)
     unused = sorted(set(arrays) - {*CHANNELS, *AXES, *OPTIONAL, "p", OWN_ERROR})
     if unused:
         assumed.append(f"not used: {', '.join(unused)}")
-    valid = _valid(path, arrays)
+    valid = _find_valid(path, arrays)
     angle = _number(path, arrays, "incidence_deg")
-    images = _ascending(h, v, valid, x_m, y_m)
+    images = _sort_axes(h, v, valid, x_m, y_m)
     simulated = bool(_number(path, arrays, "simulated") or False)
     is_conjugate = _number(path, arrays, "conjugate")
     # Only our own images hold the error of P.
@@ -212,7 +212,7 @@ def _shape(array: npt.NDArray[Any]) -> str:
     return " x ".join(map(str, array.shape)) or "a single number"
 
 
-def _axis(
+def _make_axis(
     path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str, size: int, rig: Instrument, assumed: list[str]
 ) -> npt.NDArray[np.float64]:
     """Return the pixel centres along one axis, metres; the rig file's pixel, centred, if the file has none."""
@@ -251,7 +251,7 @@ def _check_square(path: Path, x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.
         )  # fmt: skip
 
 
-def _valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.bool_]:
+def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.bool_]:
     """Return the pixels to use. Raises DataError if one is not finite, none is left, or a channel holds nothing."""
     h = arrays["h"]
     v = arrays["v"]
@@ -302,7 +302,7 @@ def _number(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str) -> fl
     return float(value.reshape(-1)[0])
 
 
-def _ascending(
+def _sort_axes(
     h: npt.NDArray[Any],
     v: npt.NDArray[Any],
     valid: npt.NDArray[np.bool_],
@@ -325,8 +325,8 @@ def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
     scan = scan.orient(orientation)
     arrays = {"h": scan.h, "v": scan.v}
     _check_channels(folder, arrays)
-    x_m = _axis(folder, arrays, "x_m", scan.h.shape[1], rig, [])
-    y_m = _axis(folder, arrays, "y_m", scan.h.shape[0], rig, [])[::-1]
+    x_m = _make_axis(folder, arrays, "x_m", scan.h.shape[1], rig, [])
+    y_m = _make_axis(folder, arrays, "y_m", scan.h.shape[0], rig, [])[::-1]
     assumed = [
         f"no geometry: pixels of {rig.image.pixel_mm:g} mm (rig file), row 0 is the highest; boxes: {orientation}"
     ]
@@ -334,7 +334,7 @@ def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
     labels = None
     if scan.boxes:
         labels = materials.read_labels(file)
-    images = _ascending(scan.h, scan.v, _valid(folder, arrays), x_m, y_m)
+    images = _sort_axes(scan.h, scan.v, _find_valid(folder, arrays), x_m, y_m)
     return GivenPair(
         path=folder,
         images=images,

@@ -90,7 +90,7 @@ class RowQuality:
     Attributes
     ----------
     direct_hz, direct_snr
-        float64 [position]: IF of the direct path, NaN where not valid, and its SNR, see `_direct_snr`.
+        float64 [position]: IF of the direct path, NaN where not valid, and its SNR, see `_compute_direct_snr`.
     echo
         complex64 [rx, position]: echo of the mirror point, for the estimate of the backlash.
     """
@@ -130,7 +130,7 @@ class BoardRows:
         )
         direct_hz = np.where(synced.valid, synced.direct_hz, np.nan)
         echo = synced.through(self._filters[synced.sweep_hz.size])
-        self.rows[row] = RowQuality(figures, direct_hz, _direct_snr(synced), echo)
+        self.rows[row] = RowQuality(figures, direct_hz, _compute_direct_snr(synced), echo)
 
     @property
     def figures(self) -> dict[int, RowFigures]:
@@ -163,7 +163,7 @@ class BoardRows:
 
         None if unknown (cubes that another program synchronised).
         """
-        values = _finite_values([r.direct_snr for r in self.rows.values()])
+        values = _collect_finite_values([r.direct_snr for r in self.rows.values()])
         if values.size:
             return float(10 * np.log10(np.median(values)))
         return None
@@ -181,7 +181,7 @@ class BoardRows:
         `backlash=False` skips the estimate of the stage's backlash, which takes 2 ms per row.
         """
         figures = self.figures
-        direct = _finite_values([self.rows[row].direct_hz for row in figures])
+        direct = _collect_finite_values([self.rows[row].direct_hz for row in figures])
         snr = self.direct_snr_db
         if snr is not None:
             snr = round(snr, 2)
@@ -198,13 +198,13 @@ class BoardRows:
             chirps_clipped=sum(r.chirps_clipped for r in figures.values()),
             chirps_disturbed=sum(r.chirps_disturbed for r in figures.values()),
             positions_clipped=sum(r.positions_clipped for r in figures.values()),
-            direct_path_hz=_frequency_range(direct),
+            direct_path_hz=_find_frequency_range(direct),
             direct_path_snr_db=snr,
             stage_backlash_mm=shift,
             masked_columns={row: r.masked_columns for row, r in figures.items() if r.masked_columns},
             rows_recorded=list(figures),
             raw_crc32={row: r.crc32 for row, r in figures.items() if r.crc32},
-            synchronisation=_residuals(list(figures.values())),
+            synchronisation=_collect_residuals(list(figures.values())),
         )
 
     def _estimate_backlash(self) -> Backlash | None:
@@ -215,13 +215,13 @@ class BoardRows:
         return Backlash(shift=round(estimate.shift_mm, 4), std=round(estimate.std_mm, 4))
 
 
-def _frequency_range(direct_hz: NDArray[np.float64]) -> FrequencyRange | UnsetType:
+def _find_frequency_range(direct_hz: NDArray[np.float64]) -> FrequencyRange | UnsetType:
     if direct_hz.size == 0:
         return UNSET
     return FrequencyRange(float(np.median(direct_hz)), float(direct_hz.min()), float(direct_hz.max()))
 
 
-def _residuals(rows: list[RowFigures]) -> dict[str, Residual]:
+def _collect_residuals(rows: list[RowFigures]) -> dict[str, Residual]:
     """Return the RMS over rows of the residuals after each stage, weighted by valid positions."""
     residuals = {}
     for stage in dict.fromkeys(name for row in rows for name in row.residuals):
@@ -233,7 +233,7 @@ def _residuals(rows: list[RowFigures]) -> dict[str, Residual]:
     return residuals
 
 
-def _direct_snr(row: SyncedRow) -> NDArray[np.float64]:
+def _compute_direct_snr(row: SyncedRow) -> NDArray[np.float64]:
     """Return the SNR of the direct path in one sample of one chirp and channel, power ratio, float64 [position].
 
     NaN at invalid positions and where the noise is unknown.
@@ -245,7 +245,7 @@ def _direct_snr(row: SyncedRow) -> NDArray[np.float64]:
     return out
 
 
-def _finite_values(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _collect_finite_values(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return the finite values of all rows in one array."""
     if not rows:
         return np.zeros(0)
@@ -357,25 +357,25 @@ def recording_verdict(quality: Quality) -> list[Finding]:
     masked = sum(b.positions_masked for b in quality.boards.values())
     missing: list[Finding] = []
     for name, board in quality.boards.items():
-        share_with_path = _ratio(board.positions - board.positions_masked, board.positions, default=0.0)
-        received = _ratio(board.frames_received, board.frames_expected, default=0.0)
+        share_with_path = _divide(board.positions - board.positions_masked, board.positions, default=0.0)
+        received = _divide(board.frames_received, board.frames_expected, default=0.0)
         # Positions without a whole frame have no direct path either; do not count that loss twice.
-        share_of_received = _ratio(share_with_path, received, default=1.0)
+        share_of_received = _divide(share_with_path, received, default=1.0)
         missing += rules.judge_direct_path(name, board.direct_snr_db, board.residual("averaged"), share_of_received)
-        missing += _disturbances(name, list(board.figures.values()))
-    recorded = rules.judge_recording(coverage, _ratio(masked, positions, default=1.0))
+        missing += _report_disturbances(name, list(board.figures.values()))
+    recorded = rules.judge_recording(coverage, _divide(masked, positions, default=1.0))
     filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]
     return recorded + missing + rules.judge_reconstruction(filled)
 
 
-def _ratio(part: float, whole: float, default: float) -> float:
+def _divide(part: float, whole: float, default: float) -> float:
     """Return part / whole; `default` if there is no whole."""
     if not whole:
         return default
     return part / whole
 
 
-def _disturbances(name: str, rows: list[RowFigures]) -> list[Finding]:
+def _report_disturbances(name: str, rows: list[RowFigures]) -> list[Finding]:
     """Return reasons from the chirps of a board that were left out."""
     chirps = sum(r.frames_received for r in rows)
     positions = sum(r.positions for r in rows)
@@ -459,14 +459,14 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
             paint_mm=result.inversion.paint_mm,
         )
         if metal.given:
-            reasons += rules.judge_dark_reference(patch, *_brightest(result))
+            reasons += rules.judge_dark_reference(patch, *_find_brightest(result))
     light = result.calibrated.illumination
     if result.prior.channels_known and (light is None or light.known):
         gains = {"H": result.calibrated.metal_h, "V": result.calibrated.metal_v}
-        reasons += rules.judge_levels({channel: _median_level(gain) for channel, gain in gains.items()})
+        reasons += rules.judge_levels({channel: _measure_median_level(gain) for channel, gain in gains.items()})
     reasons += rules.judge_moved_boards(result.inversion.moved)
     reasons += rules.judge_leakage(
-        result.prior.leakage_measured, result.inversion.leakage_determined, _leakage_error(result)
+        result.prior.leakage_measured, result.inversion.leakage_determined, _estimate_leakage_error(result)
     )
     if plane is not None:
         std = float(np.degrees(result.prior.theta_std_rad))
@@ -481,7 +481,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     return reasons
 
 
-def _brightest(result: MaterialsResult) -> tuple[int, float]:
+def _find_brightest(result: MaterialsResult) -> tuple[int, float]:
     """Return the number of the brightest patch but the metal, and its median |H| relative to metal, dB; 0, 0: none."""
     levels_db = {}
     for r in result.patches:
@@ -493,7 +493,7 @@ def _brightest(result: MaterialsResult) -> tuple[int, float]:
     return brightest, levels_db.get(brightest, 0.0)
 
 
-def _median_level(gain: npt.NDArray[np.complexfloating] | complex | None) -> float | None:
+def _measure_median_level(gain: npt.NDArray[np.complexfloating] | complex | None) -> float | None:
     """Median of metal's magnitude where it is known; a reference plate need not cover the image. None: nowhere."""
     if gain is None:
         return None
@@ -504,7 +504,7 @@ def _median_level(gain: npt.NDArray[np.complexfloating] | complex | None) -> flo
     return float(np.median(magnitude))
 
 
-def _leakage_error(result: MaterialsResult) -> float:
+def _estimate_leakage_error(result: MaterialsResult) -> float:
     """Return the median relative error of the permittivities due to leakage; 0 without permittivities."""
     parts = []
     for r in result.patches:

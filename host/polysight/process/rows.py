@@ -246,7 +246,7 @@ class KeptSamples:
 
     def is_kept(self, row: int) -> bool:
         """True if a row can be restored."""
-        return self._records(row) is not None
+        return self._read_records(row) is not None
 
     def fill_missing(self) -> SubBandImages:
         """Reconstruct missing positions from the rows so far: set `filled`, and return the images of sub-bands."""
@@ -258,19 +258,19 @@ class KeptSamples:
 
     def restore(self, row: int) -> bool:
         """Restore a row into the images; return False if it must be synchronised instead."""
-        records = self._records(row)
+        records = self._read_records(row)
         for board, (record, figures) in (records or {}).items():
             self._put(board, row, record, figures)
         return records is not None
 
-    def _records(self, row: int) -> dict[str, tuple[Any, RowFigures]] | None:
+    def _read_records(self, row: int) -> dict[str, tuple[Any, RowFigures]] | None:
         """Return a row's record and figures by board; None if one of them is missing, damaged or outdated."""
         line = self._line(row)
         if line is None:
             return None
         records = {}
         for board, entry in line["boards"].items():
-            array = self._array(board)
+            array = self._map_array(board)
             figures = _read_figures(entry["figures"])
             if array is None or figures is None or record_digest(array[row]) != entry["crc32"]:
                 return None
@@ -279,7 +279,7 @@ class KeptSamples:
 
     def save(self, row: int) -> None:
         """Save a row that was just added to the images; log a warning if it cannot be written."""
-        digests = self._digests(row)
+        digests = self._read_digests(row)
         if digests is not None:
             with self._lock:
                 self._save(row, digests)
@@ -304,7 +304,7 @@ class KeptSamples:
             self._keep = False
             _log.warning("samples are not kept in %s: %s", self._folder, e)
 
-    def _digests(self, row: int) -> dict[str, str] | None:
+    def _read_digests(self, row: int) -> dict[str, str] | None:
         """Return the digests of a committed row's raw data, by receiver; None if this source keeps no samples."""
         if self._scan is None:
             return None
@@ -315,17 +315,17 @@ class KeptSamples:
 
     def _line(self, row: int) -> dict[str, Any] | None:
         """Return the line of rows.jsonl for a row, if it was made from the committed raw data."""
-        digests = self._digests(row)
+        digests = self._read_digests(row)
         if digests is None or not self._head:
             return None
         with self._lock:
-            if self._kept_digests(row) != digests:
+            if self._read_kept_digests(row) != digests:
                 self._read_lines()
-            if self._kept_digests(row) != digests:
+            if self._read_kept_digests(row) != digests:
                 return None
             return self._lines[row]
 
-    def _kept_digests(self, row: int) -> dict[str, str] | None:
+    def _read_kept_digests(self, row: int) -> dict[str, str] | None:
         """Return the digests of the raw data that a saved row was made from; None if it is not saved."""
         if row not in self._lines:
             return None
@@ -351,7 +351,7 @@ class KeptSamples:
         lines, self._read_bytes = read_sample_rows(self._folder, self._read_bytes)
         self._lines |= lines
 
-    def _array(self, board: str) -> NDArray[Any] | None:
+    def _map_array(self, board: str) -> NDArray[Any] | None:
         """Return a board's records, memory-mapped; None if the file does not fit samples.json."""
         if board not in self._arrays:
             records = open_records(self._folder / f"{board}.npy")
@@ -408,7 +408,7 @@ class KeptSamples:
         except BlockingIOError:
             self._keep = False
             return None
-        if not self._head or any(self._array(board) is None for board in self._quality.boards):
+        if not self._head or any(self._map_array(board) is None for board in self._quality.boards):
             self._create(scan, rows)
         self._read_lines()
         # A killed program may have cut its last line: the next one would be joined to it.

@@ -109,7 +109,7 @@ def collect_imaged_scan(
         folder,
         images=with_ratio(images),
         quality=quality.result(verdict, backlash=backlash),
-        facts=_facts(source, rig, images),
+        facts=_collect_facts(source, rig, images),
         plan=source.plan,
     )
 
@@ -120,7 +120,7 @@ def collect_processed_scan(
     """Return the result of a scan with its materials; `unnamed` is the reason why nothing was named, or ""."""
     return assemble_result(
         folder,
-        _facts(source, rig, findings.images),
+        _collect_facts(source, rig, findings.images),
         quality.result(findings.verdict, pixel_accuracy(findings.analysis)),
         findings,
         unnamed,
@@ -166,7 +166,7 @@ def assemble_result(
     )
 
 
-def _facts(source: Scan, rig: Instrument, images: Images) -> ScanFacts:
+def _collect_facts(source: Scan, rig: Instrument, images: Images) -> ScanFacts:
     return ScanFacts(
         scan_id=source.scan_id,
         simulated=source.simulated,
@@ -199,7 +199,7 @@ def save_materials(out: Path, scan: products.ProcessedScan, result: MaterialsRes
     products.write_json(out / products.MATERIALS, scan.materials)
     write_report(out, scan)
     verdict = scan.verdict or Verdict("good")
-    lines = [*verdict.lines(3), *_result_lines(scan, result)]
+    lines = [*verdict.lines(3), *_summarise_result(scan, result)]
     if scan.quality.coverage:
         lines += scan.quality.coverage.lines()
     if unnamed:
@@ -207,7 +207,7 @@ def save_materials(out: Path, scan: products.ProcessedScan, result: MaterialsRes
     return Products(out, tuple(lines), verdict)
 
 
-def _result_lines(scan: products.ProcessedScan, result: MaterialsResult) -> tuple[str, ...]:
+def _summarise_result(scan: products.ProcessedScan, result: MaterialsResult) -> tuple[str, ...]:
     """Return lines for the terminal: number of patches, metal reference, and names compared with the truth."""
     patches = scan.segments
     head = f"scan {scan.scan_id}: {len(patches)} patches; metal {result.metal.how}"
@@ -216,13 +216,13 @@ def _result_lines(scan: products.ProcessedScan, result: MaterialsResult) -> tupl
     count = scan.plates_named
     if count is None:
         return (head,)
-    names = f"{count.right} of {count.plates} plates named right{_pixels_right(result)}"
+    names = f"{count.right} of {count.plates} plates named right{_count_right_pixels(result)}"
     if count.strange:
         names += f"; {count.strange} not in the library, and called unknown"
     return (head, names)
 
 
-def _pixels_right(result: MaterialsResult) -> str:
+def _count_right_pixels(result: MaterialsResult) -> str:
     accuracy = pixel_accuracy(result)
     expected = predict_pixel_accuracy(result)
     if accuracy is None:

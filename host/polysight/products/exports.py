@@ -119,7 +119,7 @@ def provenance(scan: ProcessedScan) -> dict[str, Any]:
     return attrs
 
 
-def _numbers(values: Sequence[Any]) -> npt.NDArray[np.float64]:
+def _convert_numbers(values: Sequence[Any]) -> npt.NDArray[np.float64]:
     """Return numbers as an array; None becomes NaN."""
     return np.array(values, np.float64)
 
@@ -160,10 +160,10 @@ def image_dataset(scan: ProcessedScan) -> xarray.Dataset:
             dims = PLANE
         data["incidence_deg"] = _describe(dims, np.degrees(angle_rad), "degree", "incidence angle")
         data["incidence_rad"] = _describe(dims, angle_rad, "rad", "incidence angle")
-    return xarray.Dataset(data, _axes(scan), provenance(scan))
+    return xarray.Dataset(data, _make_axes(scan), provenance(scan))
 
 
-def _axes(scan: ProcessedScan) -> dict[str, Any]:
+def _make_axes(scan: ProcessedScan) -> dict[str, Any]:
     """Return the coordinates of the pixels. `axis` lets programs for maps find x and y."""
     axes: dict[str, Any] = {}
     for name, place_m in (("y", scan.y_m), ("x", scan.x_m)):
@@ -195,14 +195,14 @@ def patch_dataset(scan: ProcessedScan) -> xarray.Dataset:
     import xarray
 
     if scan.materials is None:
-        raise _no_materials(scan)
+        raise _no_materials_error(scan)
     data = {"label": _describe(PLANE, scan.labels, "1", "number of the patch that holds the pixel, 0 for none")}
     if scan.interior is not None:
         data["interior"] = _describe(PLANE, scan.interior, "1", "True where the pixel is used for the patch's numbers")
-    data |= _figure_variables(scan.segments) | _band_variables(scan.segments)
+    data |= _make_figure_variables(scan.segments) | _make_band_variables(scan.segments)
     naming = {"library": scan.materials.library, "model": scan.materials.model}
     attributes = provenance(scan) | {key: text for key, text in naming.items() if text}
-    return xarray.Dataset(data, _axes(scan) | patch_coordinates(scan), attributes)
+    return xarray.Dataset(data, _make_axes(scan) | patch_coordinates(scan), attributes)
 
 
 def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
@@ -226,7 +226,7 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
     import xarray
 
     if scan.materials is None:
-        raise _no_materials(scan)
+        raise _no_materials_error(scan)
     if scan.verdict is not None and not scan.verdict.usable:
         raise scan.verdict.error("the images are kept")
     pixels = map_permittivity(scan)
@@ -237,10 +237,10 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
         "permittivity_loss_standard_error": _describe(PLANE, pixels.loss_std, "1", "standard error of eps''"),
         "mask": _describe(PLANE, pixels.mask, "1", mask),
     }
-    return xarray.Dataset(data, _axes(scan), provenance(scan))
+    return xarray.Dataset(data, _make_axes(scan), provenance(scan))
 
 
-def _no_materials(scan: ProcessedScan) -> DataError:
+def _no_materials_error(scan: ProcessedScan) -> DataError:
     return DataError(
         f"scan {scan.scan_id} has no materials",
         "only images were made of this scan",
@@ -252,8 +252,8 @@ def _no_materials(scan: ProcessedScan) -> DataError:
 def patch_coordinates(scan: ProcessedScan) -> dict[str, Any]:
     """Return number and middle of each patch, as coordinates of a dataset."""
     numbers = np.array([patch.label for patch in scan.segments], np.int32)
-    centre_x_mm = _numbers([patch.centre_x_mm for patch in scan.segments])
-    centre_y_mm = _numbers([patch.centre_y_mm for patch in scan.segments])
+    centre_x_mm = _convert_numbers([patch.centre_x_mm for patch in scan.segments])
+    centre_y_mm = _convert_numbers([patch.centre_y_mm for patch in scan.segments])
     return {
         "patch": _describe(("patch",), numbers, "1", "number of the patch in label"),
         "centre_x_mm": _describe(("patch",), centre_x_mm, "mm", "middle of the patch, x from the image's centre"),
@@ -261,7 +261,7 @@ def patch_coordinates(scan: ProcessedScan) -> dict[str, Any]:
     }
 
 
-def _figure_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
+def _make_figure_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
     """Return a variable on dimension `patch` for each declared figure, and angles in radians too."""
     variables = {}
     for figure in _patch_figures(patches):
@@ -277,7 +277,7 @@ def _figure_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
     return variables
 
 
-def _band_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
+def _make_band_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
     """Return the variables on dimensions `patch`, `band`; empty unless every patch has sub-bands."""
     rows = [patch.bands for patch in patches if patch.bands]
     if not rows or len(rows) < len(patches):
@@ -287,7 +287,7 @@ def _band_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
         for j, band in enumerate(row):
             if band.ratio is not None:
                 ratios[i, j] = band.ratio.value
-    errors = [_numbers([band.inverse_ratio_std for band in row]) for row in rows]
+    errors = [_convert_numbers([band.inverse_ratio_std for band in row]) for row in rows]
     first_hz = [band.first_hz for band in rows[0]]
     last_hz = [band.last_hz for band in rows[0]]
     plane = ("patch", "band")
@@ -528,9 +528,9 @@ def pack_mat(scan: ProcessedScan) -> bytes:
         "y_mm": axis_mm(images.y_m)[:, None],
         "x_m": images.x_m[None, :],
         "y_m": images.y_m[:, None],
-        "materials": {figure.column.name: _column(figure, scan) for figure in table_figures(scan)},
-        "config": _struct(scan.facts.instrument or {}),
-        "versions": _struct(scan.facts.versions or {}),
+        "materials": {figure.column.name: _convert_column(figure, scan) for figure in table_figures(scan)},
+        "config": _convert_struct(scan.facts.instrument or {}),
+        "versions": _convert_struct(scan.facts.versions or {}),
         "scan_id": scan.scan_id,
         "simulated": np.nan if scan.simulated is None else scan.simulated,
         "convention": CONVENTION,
@@ -545,7 +545,7 @@ def pack_mat(scan: ProcessedScan) -> bytes:
     return buffer.getvalue()
 
 
-def _column(figure: Figure, scan: ProcessedScan) -> Any:
+def _convert_column(figure: Figure, scan: ProcessedScan) -> Any:
     """Return a column of numbers (NaN if unknown) or of bools, or a cell array of text."""
     column = figure.array(scan.segments)
     if figure.kind is str:
@@ -553,16 +553,16 @@ def _column(figure: Figure, scan: ProcessedScan) -> Any:
     return column[:, None]
 
 
-def _struct(node: Any) -> Any:
+def _convert_struct(node: Any) -> Any:
     """Convert nested dicts to structs with MATLAB's names; lists other than of numbers become cell arrays."""
     if isinstance(node, dict):
-        return {_name(k): _struct(v) for k, v in node.items() if v is not None} or np.zeros((0, 0))
+        return {_name(k): _convert_struct(v) for k, v in node.items() if v is not None} or np.zeros((0, 0))
     if isinstance(node, list | tuple):
         if node and all(isinstance(v, int | float) and not isinstance(v, bool) for v in node):
             return np.array(node, np.float64)[None, :]
         cells = np.empty((1, len(node)), dtype=object)
         for i, v in enumerate(node):
-            cells[0, i] = _struct(v)
+            cells[0, i] = _convert_struct(v)
         return cells
     if isinstance(node, int) and not isinstance(node, bool):
         return float(node)

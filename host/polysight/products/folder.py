@@ -95,7 +95,7 @@ def check_products_folder(out: Path, scan_id: str) -> None:
     except FileNotFoundError:
         return
     except OSError as e:
-        raise _no_folder(out, e) from None
+        raise _no_folder_error(out, e) from None
     if foreign:
         raise ConfigError(
             f"{out} is not empty: it contains {foreign[0]}",
@@ -148,7 +148,7 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
     keep = False
     try:
         yield new
-        for name, content in _hand_labels(place, scan_id).items():
+        for name, content in _read_hand_labels(place, scan_id).items():
             write_atomically(new / name, content)
         try:
             _replace(new, place, old)
@@ -191,10 +191,10 @@ def _lock(out: Path, new: Path) -> FolderLock:
             code=ErrorCode.BUSY,
         ) from None
     except OSError as e:
-        raise _no_folder(out, e) from None
+        raise _no_folder_error(out, e) from None
 
 
-def _no_folder(out: Path, e: OSError) -> ConfigError:
+def _no_folder_error(out: Path, e: OSError) -> ConfigError:
     return ConfigError(
         f"{out}: cannot create the folder for products: {e.strerror}",
         "a file has that name, or you have no permission to write there",
@@ -298,7 +298,7 @@ def find_labels(folder: Path) -> tuple[Path, Labels] | None:
     return None
 
 
-def _hand_labels(products: Path, scan_id: str) -> dict[str, bytes]:
+def _read_hand_labels(products: Path, scan_id: str) -> dict[str, bytes]:
     """Return the label file by hand among products of this scan and its picture, name to content."""
     path = products / LABELS
     try:

@@ -101,7 +101,7 @@ def map_images(
     level = level_db(values)
     if channel == "p":
         opacity = signal_opacity(images, channel)
-        return MapValues(level, opacity, _ratio_limits_db(level, opacity > 0.5, patches_db))
+        return MapValues(level, opacity, _find_ratio_limits_db(level, opacity > 0.5, patches_db))
     if top_db is None:
         top_db = percentile(level, images.usable, BRIGHT_PERCENTILE)
     return MapValues(level, images.usable.astype(np.float64), (top_db - AMPLITUDE_RANGE_DB, top_db))
@@ -115,7 +115,7 @@ def map_scan(scan: ProcessedScan, channel: str, quantity: str) -> MapValues:
     return map_images(scan.images, channel, quantity, top_db, patches_db)
 
 
-def _ratio_limits_db(level: Real, is_opaque: Mask, patches_db: Sequence[float]) -> Limits:
+def _find_ratio_limits_db(level: Real, is_opaque: Mask, patches_db: Sequence[float]) -> Limits:
     """Return the range of |P|, dB: that of the patches if there are any, else of the opaque pixels."""
     if patches_db:
         low = min(patches_db)

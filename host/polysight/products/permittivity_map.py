@@ -66,13 +66,13 @@ def map_permittivity(scan: ProcessedScan) -> PermittivityMap:
     Without an incidence angle nothing is known.
     """
     budget = (scan.materials and scan.materials.error_budget) or None
-    angle_rad = _estimated_angle(nominal_incidence_rad(scan), budget)
+    angle_rad = _estimate_angle(nominal_incidence_rad(scan), budget)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         measured = 1 / np.where(scan.valid, scan.p, np.nan).astype(np.complex128)
         inverse = measured
         if budget is not None and budget.leakage is not None:
-            inverse = _without_leakage(measured, budget.leakage)
-        inverse, least_real_std, least_loss_std = _as_patches(scan, inverse, angle_rad)
+            inverse = _remove_leakage(measured, budget.leakage)
+        inverse, least_real_std, least_loss_std = _match_patches(scan, inverse, angle_rad)
         value = permittivity_from_ratio(1 / inverse, angle_rad)
         value = np.where(np.isfinite(value), value, complex(np.nan, np.nan))
         by_ratio = np.abs(permittivity_slope(inverse, angle_rad))
@@ -100,22 +100,22 @@ def nominal_incidence_rad(scan: ProcessedScan) -> Real:
     return np.asarray(specular_incidence_rad(scan.rig))
 
 
-def _estimated_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:
+def _estimate_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:
     """Return the angle of incidence with the error that the scene tells, radians; the nominal one if it tells none."""
     if budget is None or budget.incidence is None or budget.incidence.deg is None:
         return theta_rad
     return theta_rad + (np.radians(budget.incidence.deg) - theta_rad.mean())
 
 
-def _without_leakage(inverse: Complex, leakage: LeakageError) -> Complex:
+def _remove_leakage(inverse: Complex, leakage: LeakageError) -> Complex:
     """Return V / H without the estimated leakage, instead of without that which the pixels are free of.
 
     Unchanged if the products do not say what was removed.
     """
-    removed_h = _as_complex(leakage.removed_h)
-    removed_v = _as_complex(leakage.removed_v)
-    estimated_h = _as_complex(leakage.h)
-    estimated_v = _as_complex(leakage.v)
+    removed_h = _join_parts(leakage.removed_h)
+    removed_v = _join_parts(leakage.removed_v)
+    estimated_h = _join_parts(leakage.h)
+    estimated_v = _join_parts(leakage.v)
     if removed_h is None or removed_v is None or estimated_h is None or estimated_v is None:
         return inverse
     # The channels as received, see `correct_leakage`.
@@ -125,13 +125,13 @@ def _without_leakage(inverse: Complex, leakage: LeakageError) -> Complex:
     return v / h
 
 
-def _as_complex(pair: Pair | UnsetType | None) -> complex | None:
+def _join_parts(pair: Pair | UnsetType | None) -> complex | None:
     if not pair or pair[0] is None or pair[1] is None:
         return None
     return complex(pair[0], pair[1])
 
 
-def _as_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tuple[Complex, Real, Real]:
+def _match_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tuple[Complex, Real, Real]:
     """Move V / H of the pixels of each patch, so that their median has the patch's permittivity.
 
     Return it with the standard errors of the patch in each pixel, real part and loss; not a number outside of patches.

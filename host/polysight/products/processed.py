@@ -421,7 +421,7 @@ class ProcessedScan:
             labels[inside] = patch.label
         if self._has_pixels:
             for pixels in self.patches.patches:
-                labels[self._pixels(pixels.places_mm)] = pixels.label
+                labels[self._find_pixels(pixels.places_mm)] = pixels.label
         return labels
 
     @cached_property
@@ -433,7 +433,7 @@ class ProcessedScan:
                 interior |= patch.interior
         elif self._has_pixels:
             for pixels in self.patches.patches:
-                interior[self._pixels(pixels.places_mm)] = True
+                interior[self._find_pixels(pixels.places_mm)] = True
         else:
             return None
         return interior
@@ -442,13 +442,13 @@ class ProcessedScan:
     def _has_pixels(self) -> bool:
         return self.materials is not None and (self.folder / PATCHES).exists()
 
-    def _pixels(self, places_mm: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    def _find_pixels(self, places_mm: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
         """Return rows and columns of the pixels at places x, y [n, 2]."""
-        rows = _nearest(axis_mm(self.images.y_m), places_mm[:, 1])
-        return rows, _nearest(axis_mm(self.images.x_m), places_mm[:, 0])
+        rows = _find_nearest(axis_mm(self.images.y_m), places_mm[:, 1])
+        return rows, _find_nearest(axis_mm(self.images.x_m), places_mm[:, 0])
 
 
-def _nearest(axis: npt.NDArray[np.float64], places: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
+def _find_nearest(axis: npt.NDArray[np.float64], places: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
     """Return the indices of the nearest values of an evenly spaced axis."""
     return np.rint((places - axis[0]) / (axis[1] - axis[0])).astype(np.intp)
 

@@ -115,12 +115,12 @@ class BringUp:
                 "RF power-up",
                 "the RF core's power-up event",
                 "reset; power-cycle the board",
-                self._rf_up,
+                self._power_up_rf,
                 State.POWERED,
             ),
             Step("versions", "both cores with a patch", _FIRMWARE, self._check_versions, State.POWERED),
             Step("settings", basic, "compare with `plan`", partial(self._send, program.basic), State.POWERED),
-            Step("RF init", calibrated, "clock, RF supplies; power-cycle it", self._rf_init, State.RF_READY),
+            Step("RF init", calibrated, "clock, RF supplies; power-cycle it", self._calibrate_rf, State.RF_READY),
             Step("chirp", waveform, "compare with `plan`", partial(self._send, program.waveform), State.RF_READY),
             Step("die id", "the board of the rig file", exchange, self._check_die, State.CONFIGURED),
         ]
@@ -138,7 +138,7 @@ class BringUp:
         Raises DeviceError or ConfigError if a part is refused, or the board does not start from its flash afterwards.
         """
         self._reset()
-        patch_before = self._same_rom(image)
+        patch_before = self._find_patch(image)
         send_image(self._link, self._board.name, image, TO_FLASH, progress)
         self._ignored.clear()
         self._reset()
@@ -154,7 +154,7 @@ class BringUp:
         self._refuse_damaged()
         # The die id is only readable after the RF power-up.
         if self._board.die_id:
-            self._rf_up()
+            self._power_up_rf()
             self._read_die()
         return f"main core's patch {patch_after} from flash (before: {patch_before})"
 
@@ -172,10 +172,10 @@ class BringUp:
                 f"check the 5 V supply of the radar board, the jumpers, then the reset; {error.remedy}",
                 code=error.code,
             ) from None
-        self._boot_status(up)
+        self._read_boot_status(up)
         return str(up)
 
-    def _boot_status(self, event: e.Event) -> None:
+    def _read_boot_status(self, event: e.Event) -> None:
         self._board.facts.boot = dict(event.values)
         self._cure = str(event.values.get("cure", ""))
         if event.detail:
@@ -201,7 +201,7 @@ class BringUp:
         return outcome
 
     def _load_into_ram(self, image: Image) -> str:
-        self._flash_patch = patch = self._same_rom(image)
+        self._flash_patch = patch = self._find_patch(image)
         if patch == image.patches[0] and self._cure != "firmware":
             self._from_flash = True
             return f"the flash already contains the main core's patch {patch}; nothing is sent"
@@ -217,7 +217,7 @@ class BringUp:
             self._board.log_event(error.what)
             return
         self._ignored.clear()
-        self._boot_status(booted)
+        self._read_boot_status(booted)
         if self._cure == "firmware":
             raise DeviceError(
                 f"{self._board.name}: refuses {image.name}: {booted}",
@@ -238,7 +238,7 @@ class BringUp:
         except NotReportedError:
             raise UnexpectedRestartError(self._board.name) from None
 
-    def _same_rom(self, image: Image) -> str:
+    def _find_patch(self, image: Image) -> str:
         """Return the main core's patch. Raises ConfigError if the image is for another ROM."""
         answer = self._board.ask(c.GET_MAIN_VERSION, 16)
         require_rom(self._board.name, answer, image)
@@ -275,7 +275,7 @@ class BringUp:
                 warning += f": it runs from the flash; {update}"
             self._link.warnings.append(warning)
 
-    def _rf_up(self) -> str:
+    def _power_up_rf(self) -> str:
         self._link.call(c.DEVICE_CONFIGURATION)
         self._link.call(c.RF_POWER_UP)
         up = self._link.wait_for((e.RF_POWER_UP_DONE,), POWER_UP_TIMEOUT_S, self.note)
@@ -320,7 +320,7 @@ class BringUp:
             self._link.call(command)
         return "acknowledged"
 
-    def _rf_init(self) -> str:
+    def _calibrate_rf(self) -> str:
         die = ""
         saved = None
         restored = ""

@@ -112,7 +112,7 @@ class CalibrationFiles:
     def save(self, die_id: str, data: bytes) -> None:
         """Write a die's file atomically. Raises ConfigError if it cannot be written."""
         path = self.path(die_id)
-        temperature = _temperature_c(data)
+        temperature = _read_temperature_c(data)
         content = {"die_id": die_id, "temperature_c": temperature, "crc32": zlib.crc32(data), "data": data.hex()}
         part = path.with_suffix(".part")
         try:
@@ -128,7 +128,7 @@ class CalibrationFiles:
             ) from None
 
 
-def _temperature_c(data: bytes) -> int:
+def _read_temperature_c(data: bytes) -> int:
     """Temperature of the board at its calibration."""
     return struct.unpack_from("<h", data, _TEMPERATURE_BYTE)[0]
 
@@ -175,4 +175,4 @@ def restore_calibration(link: Link, name: str, data: bytes, timeout_s: float, no
             code=ErrorCode.REFUSED_BY_PEER,
         )
     link.call(InitCalibrations(ALL & ~RESTORED))
-    return f"calibration restored, made at {_temperature_c(data)} C"
+    return f"calibration restored, made at {_read_temperature_c(data)} C"

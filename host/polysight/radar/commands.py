@@ -582,10 +582,10 @@ def _list_constraints_of_board(rig: Instrument, board: Board) -> Iterator[Constr
             high=0,
         )
     if board.role != "transmit":
-        yield _if_budget(rig, board)
+        yield _limit_if(rig, board)
 
 
-def _if_budget(rig: Instrument, board: Board) -> Constraint:
+def _limit_if(rig: Instrument, board: Board) -> Constraint:
     """Return the rule that the direct path lies in the IF band, also with the trigger's uncertainty."""
     c = rig.chirp
     direct_hz = direct_if_hz(rig, board)

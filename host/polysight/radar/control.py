@@ -421,7 +421,7 @@ class LineServers(RadarControl):
         try:
             connection = socket.create_connection((address, int(port)), self._timeout_s)
         except OSError as e:
-            raise self._unreachable(board, e) from None
+            raise self._unreachable_error(board, e) from None
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         connection.setblocking(False)
@@ -456,7 +456,7 @@ class LineServers(RadarControl):
                     code=ErrorCode.NO_ANSWER,
                 )
 
-    def _unreachable(self, board: str, e: OSError) -> DeviceError:
+    def _unreachable_error(self, board: str, e: OSError) -> DeviceError:
         if isinstance(e, ConnectionRefusedError):
             reason = ": connection refused"
             cause = "that machine is running, but no server listens"

@@ -88,13 +88,13 @@ def check_board(
         failed_step = None
         if len(done) < len(board.steps):
             failed_step = board.steps[len(done)]
-        on_row(_row_of_failure(failed_step, error))
+        on_row(_describe_failure(failed_step, error))
         return board
-    _frame_and_read_back(board, transmits, on_row)
+    _check_frame(board, transmits, on_row)
     return board
 
 
-def _frame_and_read_back(board: RadarBoard, transmits: bool, on_row: Callable[[Row], None]) -> None:
+def _check_frame(board: RadarBoard, transmits: bool, on_row: Callable[[Row], None]) -> None:
     expected = "frame end, 1 frame"
     if transmits:
         expected += " (this board transmits)"
@@ -115,7 +115,7 @@ def _frame_and_read_back(board: RadarBoard, transmits: bool, on_row: Callable[[R
         on_row(Row("read back", False, expected, error.what, f"{error.why}; {error.remedy}"))
 
 
-def _row_of_failure(step: Step | None, error: PolysightError) -> Row:
+def _describe_failure(step: Step | None, error: PolysightError) -> Row:
     if step is None:
         return Row("bring-up", False, "", error.what, f"{error.why}; {error.remedy}")
     picture = ""
@@ -175,7 +175,7 @@ class TracedWords:
 
     def write(self, words: Sequence[int]) -> None:
         """Shift words out. Raises DeviceError."""
-        self._put(out=_hex(words))
+        self._put(out=_format_hex(words))
         with self._log_errors():
             self._words.write(words)
 
@@ -183,7 +183,7 @@ class TracedWords:
         """Shift words in. Raises DeviceError."""
         with self._log_errors():
             words = self._words.read(count)
-        self._put(**{"in": _hex(words)})
+        self._put(**{"in": _format_hex(words)})
         return words
 
     def interrupt(self) -> bool:
@@ -306,7 +306,7 @@ class ReplayedWords:
 
     def write(self, words: Sequence[int]) -> None:
         """Compare the words with those of the trace. Raises DeviceError."""
-        written = _hex(words)
+        written = _format_hex(words)
         self._take(f"out {written}", lambda line: line.out == written)
 
     def read(self, count: int) -> list[int]:
@@ -314,7 +314,7 @@ class ReplayedWords:
         action = f"reads {count} words"
         words = self._take(action, lambda line: line.read is not None).read or ""
         if len(words) != 4 * count:
-            raise self._differs(action, f"{len(words) // 4} words")
+            raise self._difference_error(action, f"{len(words) // 4} words")
         return list(struct.unpack(f"<{count}H", bytes.fromhex(words)))
 
     def interrupt(self) -> bool:
@@ -369,12 +369,12 @@ class ReplayedWords:
         if self.done:
             raise DeviceError("the trace ends here", "the traced run ended or was killed", "")
         if not agrees(self._lines[self._at]):
-            raise self._differs(action, msgspec.json.encode(self._lines[self._at]).decode())
+            raise self._difference_error(action, msgspec.json.encode(self._lines[self._at]).decode())
         line = self._step()
         self._raise_error()
         return line
 
-    def _differs(self, now: str, then: str) -> DeviceError:
+    def _difference_error(self, now: str, then: str) -> DeviceError:
         return DeviceError(
             f"line {self._at + 2} of the trace: the host does {now}, the trace has {then}",
             "another version of this program, another rig file or board, or another trace",
@@ -395,18 +395,18 @@ def read_trace(file: Path) -> tuple[dict[str, Any], list[TraceLine]]:
         except (ValueError, RecursionError):
             # The last line of a killed program is incomplete.
             if number < len(lines):
-                raise _invalid(file, f"line {number} is not JSON") from None
+                raise _invalid_error(file, f"line {number} is not JSON") from None
             continue
         if facts is None:
             if not isinstance(value, dict) or value.get("trace") != TRACE_VERSION:
-                raise _invalid(file, f"its first line is not that of a trace, version {TRACE_VERSION}")
+                raise _invalid_error(file, f"its first line is not that of a trace, version {TRACE_VERSION}")
             facts = value
         elif value is not None:
             records.append(_trace_line(file, number, value))
             if len(records) > 1 and records[-1].t < records[-2].t:
-                raise _invalid(file, f"line {number} has an earlier time than the one before")
+                raise _invalid_error(file, f"line {number} has an earlier time than the one before")
     if facts is None:
-        raise _invalid(file, f"its first line is not that of a trace, version {TRACE_VERSION}")
+        raise _invalid_error(file, f"its first line is not that of a trace, version {TRACE_VERSION}")
     return facts, records
 
 
@@ -414,10 +414,10 @@ def _trace_line(file: Path, number: int, value: object) -> TraceLine:
     try:
         return msgspec.convert(value, TraceLine)
     except ValueError:
-        raise _invalid(file, f"line {number} is not a line of a trace") from None
+        raise _invalid_error(file, f"line {number} is not a line of a trace") from None
 
 
-def _invalid(file: Path, what: str) -> ConfigError:
+def _invalid_error(file: Path, what: str) -> ConfigError:
     return ConfigError(
         f"{file}: {what}",
         "another file",
@@ -426,5 +426,5 @@ def _invalid(file: Path, what: str) -> ConfigError:
     )
 
 
-def _hex(words: Sequence[int]) -> str:
+def _format_hex(words: Sequence[int]) -> str:
     return struct.pack(f"<{len(words)}H", *words).hex()

@@ -118,7 +118,7 @@ class Link:
                 continue
             self.sequence = (self.sequence + 1) % 16
             if answer.kind is messages.Kind.NACK:
-                problems.append(_lost_message("the device received a damaged message", _DISTURBED))
+                problems.append(_report_lost_message("the device received a damaged message", _DISTURBED))
                 retry = False
                 continue
             if problems:
@@ -201,7 +201,7 @@ class Link:
     def _await_answer(self, request: messages.Message, timeout_s: float) -> tuple[messages.Message | None, Finding]:
         """Return the answer to the last message, or None and the reason; keep events that arrive before it."""
         deadline = self._clock.now() + timeout_s
-        problem = _lost_message(f"no answer within {timeout_s:g} s", _SILENT)
+        problem = _report_lost_message(f"no answer within {timeout_s:g} s", _SILENT)
         parts: list[messages.Message] = []
         while self._clock.now() <= deadline:
             if not self._words.interrupt():
@@ -212,16 +212,16 @@ class Link:
                 problem = reason
             elif message.kind is messages.Kind.EVENT:
                 self._keep(message)
-            elif not _answers(message, request):
+            elif not _is_answer(message, request):
                 self._warn(f"late answer to an earlier message (sequence {message.sequence})")
             elif parts and message.remaining_chunks != parts[-1].remaining_chunks - 1:
-                return None, _lost_message("parts of the answer are missing", _DISTURBED)
+                return None, _report_lost_message("parts of the answer are missing", _DISTURBED)
             else:
                 parts.append(message)
                 if message.remaining_chunks == 0:
                     return _join_chunks(parts), problem
         if parts:
-            problem = _lost_message("parts of the answer are missing", _DISTURBED)
+            problem = _report_lost_message("parts of the answer are missing", _DISTURBED)
         return None, problem
 
     def _receive(self) -> tuple[messages.Message | None, Finding]:
@@ -231,7 +231,7 @@ class Link:
         if not self._wait_for_low():
             self._write(messages.READY_TO_READ)
             if not self._wait_for_low():
-                return None, _lost_message("the host interrupt stays high", _NOT_CLOCKED)
+                return None, _report_lost_message("the host interrupt stays high", _NOT_CLOCKED)
         self._clock.sleep(DATA_DELAY_S)
         head = self._read(messages.SYNC_BYTES)
         searched = 0
@@ -240,7 +240,7 @@ class Link:
                 # The same byte again and again comes from a line that nothing drives.
                 is_constant = len(set(head)) == 1
                 cause = _NO_MISO if is_constant else _DISTURBED
-                return None, _lost_message(f"no sync word in {searched} bytes", cause)
+                return None, _report_lost_message(f"no sync word in {searched} bytes", cause)
             head += self._read(2)
             searched += 2
         head = head[-messages.SYNC_BYTES :] + self._read(messages.HEADER_BYTES)
@@ -248,12 +248,12 @@ class Link:
             header = messages.decode_header(head)
         except ProtocolError as e:
             self._read(_FLUSH_BYTES)
-            return None, _lost_message(e.what, _DISTURBED)
+            return None, _report_lost_message(e.what, _DISTURBED)
         body = self._read(header.body_bytes)
         try:
-            return messages.decode(head + body), _lost_message("", "")
+            return messages.decode(head + body), _report_lost_message("", "")
         except ProtocolError as e:
-            return None, _lost_message(e.what, _DISTURBED)
+            return None, _report_lost_message(e.what, _DISTURBED)
 
     def _wait_for_low(self) -> bool:
         deadline = self._clock.now() + _INTERRUPT_TIMEOUT_S
@@ -289,11 +289,11 @@ class Link:
             self.warnings.append(f"{self._name}: {what}")
 
 
-def _lost_message(what: str, why: str) -> Finding:
+def _report_lost_message(what: str, why: str) -> Finding:
     return Finding("warning", what, why)
 
 
-def _answers(message: messages.Message, request: messages.Message) -> bool:
+def _is_answer(message: messages.Message, request: messages.Message) -> bool:
     """Return True if a response or NACK belongs to a command, by its message id and sequence number.
 
     A refusal has message id 0 (ICD 4.4). The only known refusal without a body had sequence number 0; it is not known

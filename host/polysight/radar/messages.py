@@ -255,7 +255,7 @@ def decode(raw: bytes) -> Message:
         direction=direction,
         kind=header.kind,
         message_id=header.message_id,
-        blocks=_blocks(inner[HEADER_BYTES:end], block_count),
+        blocks=_split_blocks(inner[HEADER_BYTES:end], block_count),
         sequence=header.sequence,
         retry=header.flags & _RETRY == _RETRY,
         remaining_chunks=header.remaining_chunks,
@@ -273,7 +273,7 @@ def crc(data: bytes, size: int) -> bytes:
     return value.to_bytes(size, "little")
 
 
-def _blocks(body: bytes, count: int) -> tuple[SubBlock, ...]:
+def _split_blocks(body: bytes, count: int) -> tuple[SubBlock, ...]:
     blocks = []
     start = 0
     for _ in range(count):
@@ -491,31 +491,31 @@ def _read_nothing(data: bytes) -> _Read:
     return "", False, {}
 
 
-def _word(words: Mapping[int, str] | tuple[str, ...], number: int, kind: str = "code") -> str:
+def _format_word(words: Mapping[int, str] | tuple[str, ...], number: int, kind: str = "code") -> str:
     try:
         return words[number]
     except (KeyError, IndexError):
         return f"{kind} {number}"
 
 
-def _bits(names: Mapping[int, str], mask: int, kind: str = "code") -> str:
-    return ", ".join(dict.fromkeys(_word(names, b, kind) for b in range(mask.bit_length()) if mask >> b & 1))
+def _name_bits(names: Mapping[int, str], mask: int, kind: str = "code") -> str:
+    return ", ".join(dict.fromkeys(_format_word(names, b, kind) for b in range(mask.bit_length()) if mask >> b & 1))
 
 
-def _cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
+def _read_cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
     def read(data: bytes) -> _Read:
         kind, code, line = struct.unpack_from("<BBH", data)
         if kind == 0xFF:
             return "no fault", False, {}
         detail = ""
         if kind == 3 and codes:
-            detail = f", {_word(codes, code)}, firmware line {line}"
-        return _word(_CPU_FAULTS, kind) + detail, True, {"type": kind, "code": code, "line": line}
+            detail = f", {_format_word(codes, code)}, firmware line {line}"
+        return _format_word(_CPU_FAULTS, kind) + detail, True, {"type": kind, "code": code, "line": line}
 
     return read
 
 
-def _esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
+def _read_esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
     def read(data: bytes) -> _Read:
         group1, group2 = struct.unpack_from("<II", data)
         fatal = bool(group2 or group1 & fatal_in_group1)
@@ -524,22 +524,22 @@ def _esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
     return read
 
 
-def _init_done(data: bytes) -> _Read:
+def _read_init_done(data: bytes) -> _Read:
     status, updated, temperature, _, stamp = struct.unpack_from("<IIhHI", data)
     failed = sum(1 << b for b in INIT_BITS if not status >> b & 1)
     values = {"passed": status, "updated": updated, "temperature_c": temperature, "device_ms": stamp}
     text = f"{temperature} C"
     if failed:
-        text += f"; failed: {_bits(_INIT_NAMES, failed)}"
+        text += f"; failed: {_name_bits(_INIT_NAMES, failed)}"
     return text, False, values
 
 
-def _analog(data: bytes) -> _Read:
+def _read_analog(data: bytes) -> _Read:
     kind, _, _, signals = struct.unpack_from("<BBHI", data)
-    return _bits(_ANALOG, signals) or "no signal reported", bool(kind), {"signals": signals}
+    return _name_bits(_ANALOG, signals) or "no signal reported", bool(kind), {"signals": signals}
 
 
-def _boot(data: bytes) -> _Read:
+def _read_boot(data: bytes) -> _Read:
     """Decode power-up time and status: 20 bytes, or 16 from the ROM of a first-generation device with empty flash.
 
     The short form has status, time, tests, as in a message that was received (tests/radar/test_received.py).
@@ -550,7 +550,7 @@ def _boot(data: bytes) -> _Read:
         ticks, boot, tests = struct.unpack_from("<IQQ", data)
     parts = []
     if boot:
-        parts = [_bits(_BOOT_BITS, boot, "bit")]
+        parts = [_name_bits(_BOOT_BITS, boot, "bit")]
     if tests:
         parts.append(f"self-tests failed 0x{tests:X}")
     if any(boot >> bit & 1 for bit in _HARDWARE_BITS):
@@ -563,7 +563,7 @@ def _boot(data: bytes) -> _Read:
     return "; ".join(parts), False, values
 
 
-def _rf_power_up(data: bytes) -> _Read:
+def _read_rf_power_up(data: bytes) -> _Read:
     passed, ticks = struct.unpack_from("<II", data)
     failed = _RF_TESTS & ~passed
     text = ""
@@ -574,25 +574,25 @@ def _rf_power_up(data: bytes) -> _Read:
     return text, False, {"tests_passed": passed, "power_up_us": ticks * 0.005}
 
 
-def _rf_error(data: bytes) -> _Read:
+def _read_rf_error(data: bytes) -> _Read:
     (flag,) = struct.unpack_from("<I", data)
-    return _word(_RF_ERRORS, flag), flag in (1, 2, 4), {"flag": flag}
+    return _format_word(_RF_ERRORS, flag), flag in (1, 2, 4), {"flag": flag}
 
 
 _FATAL_IF_TRUNCATED = (RF_CPU_FAULT, RF_ESM_FAULT, ANALOG_FAULT, MAIN_CPU_FAULT, MAIN_ESM_FAULT, RF_ERROR)
 _EVENTS: dict[int, tuple[str, Callable[[bytes], _Read]]] = {
-    RF_CPU_FAULT: ("RF core fault", _cpu(_RF_CODES)),
-    RF_ESM_FAULT: ("RF core error signal", _esm(_RF_GROUP1_FATAL)),
-    RF_INIT_DONE: ("RF calibrated", _init_done),
+    RF_CPU_FAULT: ("RF core fault", _read_cpu(_RF_CODES)),
+    RF_ESM_FAULT: ("RF core error signal", _read_esm(_RF_GROUP1_FATAL)),
+    RF_INIT_DONE: ("RF calibrated", _read_init_done),
     TRIGGER_READY: ("ready for triggers", _read_nothing),
     FRAME_END: ("frames ended", _read_nothing),
-    ANALOG_FAULT: ("analog supply fault", _analog),
+    ANALOG_FAULT: ("analog supply fault", _read_analog),
     TIMING_FAILURE: ("calibrations do not fit the frame", _read_nothing),
     CALIBRATION_REPORT: ("run-time calibration", _read_nothing),
-    MAIN_POWER_UP: ("main core is up", _boot),
-    RF_POWER_UP_DONE: ("RF core is up", _rf_power_up),
-    MAIN_CPU_FAULT: ("main core fault", _cpu(())),
-    MAIN_ESM_FAULT: ("main core error signal", _esm(_MAIN_GROUP1_FATAL)),
-    BOOT_STATUS: ("booted over SPI", _boot),
-    RF_ERROR: ("RF core error", _rf_error),
+    MAIN_POWER_UP: ("main core is up", _read_boot),
+    RF_POWER_UP_DONE: ("RF core is up", _read_rf_power_up),
+    MAIN_CPU_FAULT: ("main core fault", _read_cpu(())),
+    MAIN_ESM_FAULT: ("main core error signal", _read_esm(_MAIN_GROUP1_FATAL)),
+    BOOT_STATUS: ("booted over SPI", _read_boot),
+    RF_ERROR: ("RF core error", _read_rf_error),
 }

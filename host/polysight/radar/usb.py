@@ -366,7 +366,7 @@ class _Library(NamedTuple):
             if by_path:
                 matching = [path for path in paths if path == name]
             else:
-                matching = [path for path, chip in paths.items() if self._serial(chip) == name]
+                matching = [path for path, chip in paths.items() if self._read_serial(chip) == name]
         except self.errors as e:
             raise _usb_error(f"{place}: {e}", e, "libusb is missing, or the chip was unplugged") from None
         on_the_bus = "no chip on the bus"
@@ -389,7 +389,7 @@ class _Library(NamedTuple):
             )
         return paths[matching[0]]
 
-    def _serial(self, chip: Any) -> str | None:
+    def _read_serial(self, chip: Any) -> str | None:
         """Return a chip's serial number; None if it has none or cannot be read."""
         try:
             if chip.iSerialNumber:
@@ -452,7 +452,7 @@ class _TcpPort:
         try:
             self._connection.sendall(data)
         except OSError as e:
-            raise self._lost(e.strerror or str(e)) from None
+            raise self._lost_error(e.strerror or str(e)) from None
 
     def _receive(self, size: int) -> bytes:
         data = b""
@@ -460,13 +460,13 @@ class _TcpPort:
             while len(data) < size:
                 part = self._connection.recv(size - len(data))
                 if not part:
-                    raise self._lost("closed by the other side")
+                    raise self._lost_error("closed by the other side")
                 data += part
         except OSError as e:
-            raise self._lost(e.strerror or str(e)) from None
+            raise self._lost_error(e.strerror or str(e)) from None
         return data
 
-    def _lost(self, what: str) -> DeviceError:
+    def _lost_error(self, what: str) -> DeviceError:
         return DeviceError(
             f"radar at {self._address}: {what}",
             "its USB cable was pulled, or its program ended",

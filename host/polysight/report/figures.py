@@ -106,7 +106,7 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     return None
 
 
-def _amplitude_unit(scan: ProcessedScan) -> str:
+def _name_amplitude_unit(scan: ProcessedScan) -> str:
     if not scan.metal_referenced:
         return "dB"
     return "dB (metal = 0)" if scan.judged else "dB (reference = 0)"
@@ -121,7 +121,7 @@ def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | No
     values = map_scan(scan, channel, quantity)
     numbers = values.numbers
     limits = values.limits
-    unit = _amplitude_unit(scan)
+    unit = _name_amplitude_unit(scan)
     colours = "cividis"
     if quantity == "phase":
         unit = "degrees"

@@ -111,7 +111,7 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
     size_in = (7.8, max(4.4, 1.5 + 0.19 * len(estimates)))
     fig = new_figure(*size_in, RIGHT_IN)
     ax = fig.add_subplot()
-    truths = [t for patch, _ in estimates if (t := _truth(patch))]
+    truths = [t for patch, _ in estimates if (t := _find_truth(patch))]
     title = "Permittivity"
     if truths:
         title += ", estimate and truth"
@@ -123,7 +123,7 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
     ax.set_xlabel("real part ε′", fontsize=9, color=MUTED)
     ax.set_ylabel("loss ε″", fontsize=9, color=MUTED)
     for patch, e in estimates:
-        _draw_estimate(ax, e, _truth(patch), patch_colour(patch, colours))
+        _draw_estimate(ax, e, _find_truth(patch), patch_colour(patch, colours))
     _set_limits(ax, [e for _, e in estimates], truths)
     low = ax.get_ylim()[0]
     ax.axhspan(low, 0, color="#f0e7e6", zorder=0)
@@ -131,13 +131,13 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
         "ε″ < 0: gain", (0, 0), xycoords="axes fraction", xytext=(4, 3), textcoords="offset points", fontsize=7,
         color=MUTED, zorder=1,
     )  # fmt: skip
-    legend = _legend(fig, estimates, colours, bool(truths))
+    legend = _draw_legend(fig, estimates, colours, bool(truths))
     set_margins(fig, legend.get_window_extent().width / fig.dpi + RIGHT_IN)
     _write_numbers(fig, ax, estimates, truths)
     return png(fig)
 
 
-def _truth(patch: PatchFigures) -> Point | None:
+def _find_truth(patch: PatchFigures) -> Point | None:
     truth = patch.true_permittivity
     if truth is None:
         return None
@@ -175,7 +175,7 @@ def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequ
     """Set limits around estimates, truths and ellipses; one very uncertain patch must not shrink all others."""
     centres = np.array([(e.real, e.loss) for e in estimates])
     always_shown = np.concatenate([centres, np.array(truths, float).reshape(-1, 2)])
-    half_sizes = np.array([_half_size(e) for e in estimates])
+    half_sizes = np.array([_measure_half_size(e) for e in estimates])
     low = always_shown.min(axis=0)
     high = always_shown.max(axis=0)
     span = np.maximum(high - low, _SMALLEST_SPAN)
@@ -188,7 +188,7 @@ def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequ
     ax.set_ylim(min(low[1], -0.1), high[1])
 
 
-def _half_size(e: PermittivityFigures) -> Point:
+def _measure_half_size(e: PermittivityFigures) -> Point:
     """Return how far the drawing of an estimate reaches: its 95 % ellipse, or its bars."""
     if e.spread is not None:
         radius = math.sqrt(SHARES[0.95])
@@ -197,7 +197,7 @@ def _half_size(e: PermittivityFigures) -> Point:
     return real, max(abs(end - e.imag) for end in e.imag_p30_p70 or (e.imag,))
 
 
-def _legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str], with_truth: bool) -> Legend:
+def _draw_legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str], with_truth: bool) -> Legend:
     dot: dict[str, Any] = {
         "marker": "o",
         "linestyle": "",

@@ -124,7 +124,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         verdict=scan.verdict,
         remedies=_list_remedies(rows),
         rows=rows,
-        headings=[figure.column.title for figure in _shown_figures(scan)],
+        headings=[figure.column.title for figure in _select_shown_figures(scan)],
         with_errors=any(patch.permittivity and patch.permittivity.spread for patch in scan.segments),
         budget=budget,
         replaced=_list_replaced_names(scan),
@@ -177,7 +177,7 @@ def _list_provenance(scan: ProcessedScan) -> list[tuple[str, str]]:
     return [("scan", scan.scan_id), ("processed", moment), *(scan.facts.versions or {}).items()]
 
 
-def _shown_figures(scan: ProcessedScan) -> list[Figure]:
+def _select_shown_figures(scan: ProcessedScan) -> list[Figure]:
     """Return the declared figures of patches that have a heading in tables for people."""
     kind = type(scan.segments[0]) if scan.segments else PatchFigures
     return [figure for figure in declared_figures(kind) if figure.column.title]
@@ -312,7 +312,7 @@ def imaging_table(imaging: Any) -> Table | None:
     for key, heading in _IMAGING_ROWS:
         if any(key in board for board in boards.values()):
             between = " × " if key.endswith("_mm") else ", "
-            rows.append(_cells(heading, *(_format_number(board.get(key), between) for board in boards.values())))
+            rows.append(_format_cells(heading, *(_format_number(board.get(key), between) for board in boards.values())))
     caption = "Imaging. The point response is computed for the middle of the image, with taper and mask as they are."
     for notice in imaging.get("notices", ()):
         caption += f" {notice}."
@@ -438,7 +438,7 @@ def quality_tables(quality: dict[str, Any]) -> list[Table]:
     out = [part for part in parts if part]
     if rest := {k: v for k, v in quality.items() if k not in shown_elsewhere}:
         flat = _flatten(rest, nested=False)
-        rows = [_cells(format_heading(k), format_value(v)) for k, v in flat.items()]
+        rows = [_format_cells(format_heading(k), format_value(v)) for k, v in flat.items()]
         out.append({"caption": "Rows, masked data and other figures.", "head": [], "rows": rows})
     return out
 
@@ -452,23 +452,23 @@ _SOURCES = {
 
 def budget_table(budget: ErrorBudget) -> Table | None:
     """Return the table of the error budget: leakage, plane, angle, evidence for metal; None without any of them."""
-    rows = [*_leakage_rows(budget.leakage), *_incidence_rows(budget.incidence), *_plane_rows(budget.plane)]
+    rows = [*_tabulate_leakage(budget.leakage), *_tabulate_incidence(budget.incidence), *_tabulate_plane(budget.plane)]
     metal = budget.metal
     if metal is not None and metal.score is not None:
         evidence = f"score {_format_with_sign(metal.score, 1)} from {metal.others} other patches"
         if metal.channel_ratio_db is not None:
             evidence += f"; V over H {_format_with_sign(metal.channel_ratio_db, 1)} dB relative to the direct path"
-        rows.append(_cells("Evidence that the reference is metal", evidence))
+        rows.append(_format_cells("Evidence that the reference is metal", evidence))
     if not rows:
         return None
     caption = "What the errors of the permittivities were computed with. ± is a standard deviation."
     return {"caption": caption, "head": [], "rows": rows}
 
 
-def _leakage_rows(leakage: LeakageError | None) -> list[dict[str, Any]]:
+def _tabulate_leakage(leakage: LeakageError | None) -> list[dict[str, Any]]:
     if leakage is None:
         return []
-    rows = [_cells("Leakage", _SOURCES.get(leakage.source, leakage.source))]
+    rows = [_format_cells("Leakage", _SOURCES.get(leakage.source, leakage.source))]
     std_h, std_v = leakage.std or (None, None)
     for channel, value, std in (("H", leakage.h, std_h), ("V", leakage.v, std_v)):
         if value is not None and value[0] is not None and value[1] is not None:
@@ -476,35 +476,35 @@ def _leakage_rows(leakage: LeakageError | None) -> list[dict[str, Any]]:
             number = f"{_format_with_sign(value[0], 3)} {sign} {abs(value[1]):.3f}i"
             if std is not None:
                 number += f" ± {std:.3f}"
-            rows.append(_cells(f"Leakage of {channel}, relative to its own channel", number))
+            rows.append(_format_cells(f"Leakage of {channel}, relative to its own channel", number))
     return rows
 
 
-def _incidence_rows(incidence: IncidenceError | None) -> list[dict[str, Any]]:
+def _tabulate_incidence(incidence: IncidenceError | None) -> list[dict[str, Any]]:
     if incidence is None or incidence.deg is None:
         return []
     angle = f"{incidence.deg:.2f}°"
     if incidence.std_deg is not None:
         angle += f" ± {incidence.std_deg:.2f}°"
-    return [_cells("Incidence angle", angle)]
+    return [_format_cells("Incidence angle", angle)]
 
 
-def _plane_rows(plane: PlaneError | None) -> list[dict[str, Any]]:
+def _tabulate_plane(plane: PlaneError | None) -> list[dict[str, Any]]:
     if plane is None:
         return []
     if not plane.known:
-        return [_cells("Plane of the plates", "not found; that of the rig file is used")]
+        return [_format_cells("Plane of the plates", "not found; that of the rig file is used")]
     offset = f"{_format_with_sign(plane.offset_mm or 0.0, 1)} mm"
     if plane.offset_std_mm:
         offset += f" ± {plane.offset_std_mm:.1f} mm"
-    rows = [_cells("Plane of the plates, relative to the rig file", offset)]
+    rows = [_format_cells("Plane of the plates, relative to the rig file", offset)]
     if plane.tilt_deg and plane.tilt_deg[0] is not None and plane.tilt_deg[1] is not None:
         tilt = f"{_format_with_sign(plane.tilt_deg[0], 2)}° in x, {_format_with_sign(plane.tilt_deg[1], 2)}° in y"
-        rows.append(_cells("Tilt of the plane", tilt))
+        rows.append(_format_cells("Tilt of the plane", tilt))
     if plane.by and plane.plates:
-        rows.append(_cells("Plane found by", f"{plane.by} of {plane.plates} plates"))
+        rows.append(_format_cells("Plane found by", f"{plane.by} of {plane.plates} plates"))
     elif plane.by:
-        rows.append(_cells("Plane found by", plane.by))
+        rows.append(_format_cells("Plane found by", plane.by))
     return rows
 
 
@@ -513,7 +513,7 @@ def _format_with_sign(value: float, digits: int) -> str:
     return f"{round(float(value), digits) + 0.0:+.{digits}f}".replace("-", "−")
 
 
-def _cells(*cells: str, share: float | None = None) -> dict[str, Any]:
+def _format_cells(*cells: str, share: float | None = None) -> dict[str, Any]:
     return {"cells": list(cells), "share": share}
 
 
@@ -523,7 +523,7 @@ def _tabulate_boards(boards: Any) -> Table | None:
         return None
     flat = {name: _flatten_board(board) for name, board in boards.items()}
     keys = dict.fromkeys(k for board in flat.values() for k in board)
-    rows = [_cells(format_heading(k), *(format_value(board.get(k)) for board in flat.values())) for k in keys]
+    rows = [_format_cells(format_heading(k), *(format_value(board.get(k)) for board in flat.values())) for k in keys]
     caption = "Frames by board, of the recorded rows. Missing data are masked, never interpolated."
     return {"caption": caption, "head": ["Board", *map(str, boards)], "rows": rows}
 
@@ -557,7 +557,7 @@ def _tabulate_residuals(boards: Any) -> Table | None:
     if not flat:
         return None
     keys = list(dict.fromkeys(k for v in flat.values() for k in v))
-    rows = [_cells(format_heading(stage), *(format_value(v.get(k)) for k in keys)) for stage, v in flat.items()]
+    rows = [_format_cells(format_heading(stage), *(format_value(v.get(k)) for k in keys)) for stage, v in flat.items()]
     head = ["After stage", *map(format_heading, keys)]
     caption = (
         "Residual (standard deviation) after each stage of synchronisation: of one chirp as received and aligned, of"
@@ -582,5 +582,7 @@ def _tabulate_seconds(seconds: Mapping[str, float] | None) -> Table | None:
     if not seconds:
         return None
     longest = max([*seconds.values(), 1e-9])
-    rows = [_cells(format_heading(k), f"{v:.2f} s", share=round(100 * v / longest, 1)) for k, v in seconds.items()]
+    rows = [
+        _format_cells(format_heading(k), f"{v:.2f} s", share=round(100 * v / longest, 1)) for k, v in seconds.items()
+    ]
     return {"caption": "Time by stage.", "head": [], "rows": rows}

@@ -80,7 +80,7 @@ def font_families() -> tuple[str, ...]:
 
 
 @cache
-def _glyphs() -> frozenset[int]:
+def _list_glyphs() -> frozenset[int]:
     return frozenset(code for family in font_families() for code in get_font(findfont(family)).get_charmap())
 
 
@@ -91,7 +91,7 @@ def is_drawable(text: str) -> bool:
     """
     if any(unicodedata.bidirectional(character) in ("R", "AL") for character in text):
         return False
-    return all(character == "\n" or ord(character) in _glyphs() for character in text)
+    return all(character == "\n" or ord(character) in _list_glyphs() for character in text)
 
 
 def figure_label(name: str, number: str) -> str:

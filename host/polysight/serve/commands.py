@@ -190,21 +190,21 @@ def command_routes(site: Site) -> list[Route]:
     return [
         Route("/api/request", show_request),
         make_route("plan", PlanRequest, _plan),
-        make_route("doctor", Body, _doctor),
+        make_route("doctor", Body, _start_doctor),
         make_route("start", StartRequest, start_scan),
-        make_route("queue", StartRequest, _enqueue),
+        make_route("queue", StartRequest, _enqueue_scan),
         make_route("unqueue", ScanName, lambda site, body: site.queue.remove(body.name)),
         make_route("release", Body, lambda site, _: site.queue.release()),
         make_route("train", TrainRequest, _train),
-        make_route("concentration", LibraryRequest, _concentration),
-        make_scan_route("again", Body, _again),
-        make_scan_route("archive", ScanName, _archive),
+        make_route("concentration", LibraryRequest, _fit_concentration),
+        make_scan_route("again", Body, _start_again),
+        make_scan_route("archive", ScanName, _archive_scan),
         make_scan_route("delete", ScanName, _delete),
         make_scan_route("resume", ResumeRequest, _resume),
         make_scan_route("process", ProcessRequest, _process),
-        make_scan_route("layers", LayersRequest, _layers),
-        make_scan_route("labels", LabelRequest, _labels),
-        make_scan_route("notes", NotesRequest, _notes),
+        make_scan_route("layers", LayersRequest, _fit_layers),
+        make_scan_route("labels", LabelRequest, _save_labels),
+        make_scan_route("notes", NotesRequest, _save_notes),
         make_scan_route("export", ExportRequest, _export),
     ]
 
@@ -227,7 +227,7 @@ def _plan(site: Site, body: PlanRequest) -> dict[str, Any]:
     return plan | {"rig": rig.name, "config": str(site.config), "begun_with": to_builtins(rig)["grid"]}
 
 
-def _doctor(site: Site, body: Body) -> None:
+def _start_doctor(site: Site, body: Body) -> None:
     del body
     with site.rig:
         _check_free(site)
@@ -239,7 +239,7 @@ def start_scan(site: Site, body: StartRequest) -> None:
     """Start a scan as a request says. Raises PolysightError."""
     rig = check_request(site, body)
     folder = site.scans.folder(body.name, new=True)
-    words: Words = ["scan", "--out", folder, *_processing_words(site, body.library, body.metal)]
+    words: Words = ["scan", "--out", folder, *_list_processing_options(site, body.library, body.metal)]
     if body.keep_incomplete:
         words.append("--keep-incomplete")
     with site.rig:
@@ -264,7 +264,7 @@ def check_request(site: Site, body: StartRequest) -> Instrument:
     if not body.name:
         raise ConfigError("the scan has no name", "`name` is empty", "give it one", code=ErrorCode.KEY_MISSING)
     rig = body.plan.apply(site.config)
-    _processing_words(site, body.library, body.metal)
+    _list_processing_options(site, body.library, body.metal)
     folder = site.scans.folder(body.name, new=True)
     if folder.exists() and any(p.name not in (PROGRAM, NOTES) for p in folder.iterdir()):
         raise ConfigError(
@@ -274,7 +274,7 @@ def check_request(site: Site, body: StartRequest) -> Instrument:
     return rig
 
 
-def _again(site: Site, scan: Named, body: Body) -> None:
+def _start_again(site: Site, scan: Named, body: Body) -> None:
     """Start a scan once more that could not start; its request is checked as at first, wherever its file is from."""
     del body
     start_scan(site, read_request(scan.folder, scan.name))
@@ -298,12 +298,12 @@ def read_request(folder: Path, name: str) -> StartRequest:
     return StartRequest(name=name, plan=plan)
 
 
-def _enqueue(site: Site, body: StartRequest) -> None:
+def _enqueue_scan(site: Site, body: StartRequest) -> None:
     check_request(site, body)
     site.queue.add(body.name, msgspec.json.encode(body))
 
 
-def _archive(site: Site, scan: Named, body: ScanName) -> None:
+def _archive_scan(site: Site, scan: Named, body: ScanName) -> None:
     _put_away(site, scan, body.name)
 
 
@@ -370,7 +370,7 @@ def _write_files(folder: Path, rig: Instrument, request: StartRequest) -> Path:
 
 
 def _resume(site: Site, scan: Named, body: ResumeRequest) -> None:
-    words: Words = ["resume", scan.folder.absolute(), *_processing_words(site, body.library, None)]
+    words: Words = ["resume", scan.folder.absolute(), *_list_processing_options(site, body.library, None)]
     if body.keep_incomplete:
         words.append("--keep-incomplete")
     with site.rig:
@@ -381,7 +381,7 @@ def _resume(site: Site, scan: Named, body: ResumeRequest) -> None:
 def _process(site: Site, scan: Named, body: ProcessRequest) -> None:
     folder = scan.folder.absolute()
     words: Words = ["process", folder, "--out", folder / "products"]
-    words += _processing_words(site, body.library, body.metal)
+    words += _list_processing_options(site, body.library, body.metal)
     if body.labels:
         labels = find_labels(folder)
         if labels is None:
@@ -395,7 +395,7 @@ def _process(site: Site, scan: Named, body: ProcessRequest) -> None:
     site.programs.start(folder, "process", words)
 
 
-def _layers(site: Site, scan: Named, body: LayersRequest) -> None:
+def _fit_layers(site: Site, scan: Named, body: LayersRequest) -> None:
     for text in body.layers:
         try:
             parse_layer(text)
@@ -416,7 +416,7 @@ class SavedLabels(msgspec.Struct, frozen=True):
     notes: list[str] = []
 
 
-def _labels(site: Site, scan: Named, body: LabelRequest) -> SavedLabels:
+def _save_labels(site: Site, scan: Named, body: LabelRequest) -> SavedLabels:
     del site
     labels = Labels(body.boxes, "mm", body.metal or None, body.specimens, by_hand=True)
     if not labels.boxes:
@@ -428,7 +428,7 @@ def _labels(site: Site, scan: Named, body: LabelRequest) -> SavedLabels:
     return SavedLabels(str(place / "labels.json"), notes)
 
 
-def _notes(site: Site, scan: Named, body: NotesRequest) -> Notes:
+def _save_notes(site: Site, scan: Named, body: NotesRequest) -> Notes:
     del site
     return write_notes(scan.folder, Notes(body.notes, body.tags), body.base)
 
@@ -441,7 +441,7 @@ def _train(site: Site, body: TrainRequest) -> None:
     site.programs.start(site.logs, "train", ["train", *folders, "--out", out / f"{body.name}.npz"])
 
 
-def _concentration(site: Site, body: LibraryRequest) -> None:
+def _fit_concentration(site: Site, body: LibraryRequest) -> None:
     site.programs.start(site.logs, "concentration", ["concentration", _find_library(site, body.library)])
 
 
@@ -457,7 +457,7 @@ def _export(site: Site, scan: Named, body: ExportRequest) -> None:
     site.programs.start(folder, "export", ["export", folder, *options, "--out", out])
 
 
-def _processing_words(site: Site, library: str, metal: Box | None) -> Words:
+def _list_processing_options(site: Site, library: str, metal: Box | None) -> Words:
     """Options of the library and the metal reference. Raises ConfigError."""
     words: Words = []
     if library:

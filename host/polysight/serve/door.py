@@ -105,10 +105,10 @@ class Door:
             self._serve(client)
         else:
             self._waiting.append(client)
-            self._hand_on()
+            self._pass_connections()
         return True
 
-    def _hand_on(self) -> None:
+    def _pass_connections(self) -> None:
         """Hand connections to the pages' process, as many as it can take."""
         try:
             while self._waiting:
@@ -116,7 +116,7 @@ class Door:
                 self._waiting.popleft().close()
             self._loop.remove_writer(self._pages)
         except BlockingIOError:
-            self._loop.add_writer(self._pages, self._hand_on)
+            self._loop.add_writer(self._pages, self._pass_connections)
         except OSError:
             self.ended.set()
         if len(self._waiting) > MOST_WAITING:

@@ -113,15 +113,15 @@ def make_app(front: Front) -> Starlette:
     if front.stage is not None:
         routes += stage_routes(front.stage)
     routes.append(Route("/api/{path:path}", front.reader))
-    return _guarded(routes, front.access)
+    return _guard_application(routes, front.access)
 
 
 def make_command_app(front: Front) -> Starlette:
     """Build the application of the door: commands to scans."""
-    return _guarded([command_route(front)], front.access)
+    return _guard_application([command_route(front)], front.access)
 
 
-def _guarded(routes: list[Route], access: Access) -> Starlette:
+def _guard_application(routes: list[Route], access: Access) -> Starlette:
     return Starlette(routes=routes, middleware=[Middleware(Guard, access=access)], exception_handlers=HANDLERS)
 
 

@@ -53,12 +53,12 @@ class Queue:
 
     def waiting(self) -> Waiting:
         """The queue as it is."""
-        return Waiting([name for name, _ in self._requests()], self._held)
+        return Waiting([name for name, _ in self._list_requests()], self._held)
 
     def add(self, name: str, request: bytes) -> None:
         """Add a request at the end. Raises ConfigError if its name waits already, or the queue is full."""
         with self._lock:
-            names = [waiting for waiting, _ in self._requests()]
+            names = [waiting for waiting, _ in self._list_requests()]
             if name in names or len(names) >= MAX_WAITING:
                 raise ConfigError(
                     f"{name} cannot be queued", f"it is queued already, or {MAX_WAITING} scans are",
@@ -70,7 +70,7 @@ class Queue:
     def remove(self, name: str) -> None:
         """Take a request out; one that is not there is out already."""
         with self._lock:
-            for waiting, path in self._requests():
+            for waiting, path in self._list_requests():
                 if waiting == name:
                     path.unlink(missing_ok=True)
 
@@ -79,7 +79,7 @@ class Queue:
         self._held = ""
         self._last = ""
 
-    def _requests(self) -> list[tuple[str, Path]]:
+    def _list_requests(self) -> list[tuple[str, Path]]:
         """Names and files of the requests, in the order in which they came; files that are no requests are left out."""
         requests = []
         for path in sorted(self._folder.glob("*.json")):
@@ -96,7 +96,7 @@ class Queue:
 
     def _start_next(self) -> None:
         """Start the first request if the rig is free; hold the queue if the last scan, or this start, failed."""
-        requests = self._requests()
+        requests = self._list_requests()
         if not requests or self._held:
             return
         name, path = requests[0]

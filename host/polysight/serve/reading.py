@@ -43,16 +43,16 @@ Endpoint = Callable[[Site, Request], Awaitable[Response]]
 def reading_routes(site: Site) -> list[Route]:
     """Routes of everything that GET answers."""
     endpoints: dict[str, Endpoint] = {
-        "scans": _scans,
+        "scans": _list_scans,
         "scan": _scan,
         "queue": _queue,
-        "thumbnail": _thumbnail,
-        "program/{kind}": _program,
+        "thumbnail": _send_thumbnail,
+        "program/{kind}": _start_program,
         "state": _state,
-        "events": _events,
-        "picture/{name}": _live_picture,
-        "bar/{kind}": _bar,
-        "result": _result,
+        "events": _stream_events,
+        "picture/{name}": _send_live_picture,
+        "bar/{kind}": _send_colour_bar,
+        "result": _send_result,
         "map/{name}": _map,
         "probe": _probe,
         "file/{name}": _file,
@@ -93,7 +93,7 @@ class ScanDetails(ListedScan, frozen=True, kw_only=True):
     programs: list[catalogue.Program]
 
 
-async def _scans(site: Site, request: Request) -> Response:
+async def _list_scans(site: Site, request: Request) -> Response:
     root = site.scans.root
     stamp = request.query_params.get("since", "")
 
@@ -131,7 +131,7 @@ async def _queue(site: Site, request: Request) -> Response:
     return json_answer(await site.read("", site.queue.waiting))
 
 
-async def _thumbnail(site: Site, request: Request) -> Response:
+async def _send_thumbnail(site: Site, request: Request) -> Response:
     def draw(folder: Path) -> bytes:
         try:
             return draw_map(folder, THUMBNAIL).png
@@ -145,7 +145,7 @@ async def _thumbnail(site: Site, request: Request) -> Response:
     return Response(png, media_type="image/png", headers={"Cache-Control": "private, max-age=5"})
 
 
-async def _program(site: Site, request: Request) -> Response:
+async def _start_program(site: Site, request: Request) -> Response:
     kind = request.path_params["kind"]
     if kind not in ("doctor", "train", "concentration"):
         return json_answer(None)
@@ -164,13 +164,13 @@ async def _state(site: Site, request: Request) -> Response:
     return Response((await _open_watch(site, request)).state.data, media_type="application/json")
 
 
-async def _events(site: Site, request: Request) -> Response:
+async def _stream_events(site: Site, request: Request) -> Response:
     watch = await _open_watch(site, request)
     events = site.watches.events(site.name(request), watch, site.is_ending)
     return StreamingResponse(events, media_type="text/event-stream")
 
 
-async def _live_picture(site: Site, request: Request) -> Response:
+async def _send_live_picture(site: Site, request: Request) -> Response:
     picture = (await _open_watch(site, request)).shown.pictures.get(request.path_params["name"])
     if picture is None:
         problem = "This picture is not there yet"
@@ -178,7 +178,7 @@ async def _live_picture(site: Site, request: Request) -> Response:
     return Response(picture.png, media_type="image/png")
 
 
-async def _bar(site: Site, request: Request) -> Response:
+async def _send_colour_bar(site: Site, request: Request) -> Response:
     del site
     kind = request.path_params["kind"]
     colours = {"phase": catalogue.PHASE, "amplitude": catalogue.AMPLITUDE}.get(kind, str(kind))
@@ -190,7 +190,7 @@ async def _bar(site: Site, request: Request) -> Response:
 # --- results ---
 
 
-async def _result(site: Site, request: Request) -> Response:
+async def _send_result(site: Site, request: Request) -> Response:
     return json_answer(await _read_products(site, request, catalogue.read_result))
 
 
@@ -231,7 +231,7 @@ async def _map(site: Site, request: Request) -> Response:
         high = _number(request, "high")
         if low < high:
             limits = (low, high)
-    return _picture_answer(await _read_products(site, request, lambda folder: draw_map(folder, name, limits)))
+    return _answer_picture(await _read_products(site, request, lambda folder: draw_map(folder, name, limits)))
 
 
 async def _probe(site: Site, request: Request) -> Response:
@@ -268,7 +268,7 @@ class Download(StreamingResponse):
     """A file as an answer, closed also when the answer is aborted: starlette's FileResponse leaves it open then."""
 
     def __init__(self, path: Path, media_type: str, headers: dict[str, str]) -> None:
-        super().__init__(self._chunks(), media_type=media_type, headers=headers)
+        super().__init__(self._read_chunks(), media_type=media_type, headers=headers)
         self._path = path
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -277,12 +277,12 @@ class Download(StreamingResponse):
             self.headers["Content-Length"] = str(os.fstat(self._file.fileno()).st_size)
             await super().__call__(scope, receive, send)
 
-    async def _chunks(self) -> AsyncIterator[bytes]:
+    async def _read_chunks(self) -> AsyncIterator[bytes]:
         while chunk := await anyio.to_thread.run_sync(self._file.read, CHUNK_BYTES):
             yield chunk
 
 
-def _picture_answer(picture: catalogue.Picture) -> Response:
+def _answer_picture(picture: catalogue.Picture) -> Response:
     """A map, with the values at the ends of its colours as headers."""
     unit = "deg" if picture.unit == "°" else picture.unit
     headers = {"X-Low": f"{picture.low:g}", "X-High": f"{picture.high:g}", "X-Unit": unit}
@@ -366,6 +366,6 @@ async def _compare(site: Site, request: Request) -> Response:
 
 async def _compare_map(site: Site, request: Request) -> Response:
     name = request.path_params["name"]
-    return _picture_answer(
+    return _answer_picture(
         await _use_comparison(site, request, lambda comparison: catalogue.draw_comparison(comparison, name))
     )

@@ -143,7 +143,7 @@ def _run(shown: Shown, place: Place, what: str) -> int:
     place.check()
     listener = _bind(place)
     try:
-        access = _access(place, listener, shown.control)
+        access = _make_access(place, listener, shown.control)
         with contextlib.ExitStack() as stack:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="polysight-"))
             stage = None
@@ -157,7 +157,7 @@ def _run(shown: Shown, place: Place, what: str) -> int:
             if access.control and not access.secure:
                 commands = close_after_each(make_command_app(front))
                 door = stack.enter_context(open_door(listener, access.token, _configure(commands)))
-            stack.enter_context(_reading(reading, shown, Path(folder) / "reader"))
+            stack.enter_context(_keep_reading_process(reading, shown, Path(folder) / "reader"))
             sys.stderr.write(describe_server(access, what, listener.getsockname()[:2]))
             sys.stderr.flush()
             make_server(front, place, door).run(sockets=[listener])
@@ -166,7 +166,7 @@ def _run(shown: Shown, place: Place, what: str) -> int:
     return 0
 
 
-def _access(place: Place, listener: socket.socket, control: bool) -> Access:
+def _make_access(place: Place, listener: socket.socket, control: bool) -> Access:
     token = ""
     if control or not place.loopback:
         token = load_token()
@@ -225,7 +225,7 @@ def _bind(place: Place) -> socket.socket:
 
 
 @contextlib.contextmanager
-def _reading(first: BaseProcess, shown: Shown, path: Path) -> Iterator[None]:
+def _keep_reading_process(first: BaseProcess, shown: Shown, path: Path) -> Iterator[None]:
     """Keep the reading process running for the block: the `first` one, which runs already, and others after it."""
     ended = threading.Event()
     # Threads do not survive a fork, and there are some by now.

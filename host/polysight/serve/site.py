@@ -254,17 +254,17 @@ class Readers:
             one_thread = anyio.CapacityLimiter(1)
             return await anyio.to_thread.run_sync(work_and_return, abandon_on_cancel=True, limiter=one_thread)
         self._hanging.setdefault(folder, []).append(returned)
-        raise _no_answer(folder)
+        raise _no_answer_error(folder)
 
     def _check(self, folder: str) -> None:
         """Refuse a folder of which a read hangs."""
         hanging = [returned for returned in self._hanging.pop(folder, []) if not returned.is_set()]
         if hanging:
             self._hanging[folder] = hanging
-            raise _no_answer(folder)
+            raise _no_answer_error(folder)
 
 
-def _no_answer(folder: str) -> DeviceError:
+def _no_answer_error(folder: str) -> DeviceError:
     return DeviceError(
         f"{folder or 'the folder of scans'} did not answer within {READ_S:g} s", "its drive is gone, or very busy",
         "check the network drive, then load the page again", code=ErrorCode.NO_ANSWER,
@@ -289,10 +289,10 @@ class Sizes:
                 if folder not in self._counting_since:
                     self._waiting[folder] = None
                 if all(now - since > SIZE_S for since in self._counting_since.values()):
-                    self._next()
+                    self._begin_next()
         return size
 
-    def _next(self) -> None:
+    def _begin_next(self) -> None:
         """Begin with the next folder, with the lock held."""
         if self._waiting:
             folder, _ = self._waiting.popitem(last=False)
@@ -303,7 +303,7 @@ class Sizes:
         self._counted[folder] = (catalogue.folder_bytes(folder), time.monotonic())
         with self._lock:
             del self._counting_since[folder]
-            self._next()
+            self._begin_next()
 
 
 class OpenWatch:

@@ -114,7 +114,7 @@ def read_events(path: Path) -> EventLog:
     raw = _read_bytes(path)
     log = EventLog([], 0)
     try:
-        for end in _ends(raw):
+        for end in _find_ends(raw):
             log.events.append(unpack_with_crc(raw[log.length : end]))
             log.length = end
     except ProtocolError as e:
@@ -132,7 +132,7 @@ def read_events(path: Path) -> EventLog:
 def _is_beginning(raw: bytes) -> bool:
     """True if this may be the incomplete beginning of an event."""
     try:
-        return not any(True for _ in _ends(raw))
+        return not any(True for _ in _find_ends(raw))
     except (ValueError, msgpack.UnpackException):
         return False
 
@@ -151,7 +151,7 @@ def _read_bytes(path: Path) -> bytes:
         ) from None
 
 
-def _ends(raw: bytes) -> Iterator[int]:
+def _find_ends(raw: bytes) -> Iterator[int]:
     """Yield the end of each complete msgpack object."""
     unpacker = msgpack.Unpacker(raw=True, max_buffer_size=max(len(raw), 1))
     unpacker.feed(raw)

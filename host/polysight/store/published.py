@@ -135,10 +135,12 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
     if log is None:
         silent = np.zeros(0, bool)
         if zero_filled:
-            silent = _silent(raw, PACKET_BYTES)
-        return Stream(raw, _ranges(silent, PACKET_BYTES, raw.size), int(silent.sum()), none, np.zeros(0), PACKET_BYTES)
+            silent = _find_silent(raw, PACKET_BYTES)
+        return Stream(
+            raw, _find_ranges(silent, PACKET_BYTES, raw.size), int(silent.sum()), none, np.zeros(0), PACKET_BYTES
+        )
     full = int(log.size.max())
-    first = _first_sequence(log, shape, full, raw if zero_filled else None)
+    first = _find_first_sequence(log, shape, full, raw if zero_filled else None)
     start = (log.sequence - first) * full
     end = int(start[-1] + log.size[-1])
     if end > _MAX_ROWS * (shape.bytes + raw.size):
@@ -170,10 +172,10 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
     arrived_packets = np.zeros(count, bool)
     arrived_packets[start // full] = True
     if zero_filled:
-        arrived_packets &= ~_silent(data, full)
+        arrived_packets &= ~_find_silent(data, full)
         arrived_packets[-(-raw.size // full) :] = False
     arrived = arrived_packets[start // full]
-    lost_ranges = _ranges(~arrived_packets, full, end)
+    lost_ranges = _find_ranges(~arrived_packets, full, end)
     return Stream(data, lost_ranges, int(count - arrived_packets.sum()), start[arrived], log.at_s[arrived], full)
 
 
@@ -188,7 +190,7 @@ def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.i
     return data
 
 
-def _silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
+def _find_silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
     """Packets that are all zero, bool [packet]."""
     whole_packets = data.size // packet
     rows = data[: whole_packets * packet].reshape(whole_packets, packet)
@@ -202,7 +204,7 @@ def _silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
     return np.append(~np.any(wide, axis=1), np.array(tail, bool))
 
 
-def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDArray[np.uint8] | None) -> int:
+def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDArray[np.uint8] | None) -> int:
     """Return the sequence number of the row's first packet, which may be lost.
 
     With zero filling: the first packet that arrived, minus the packets of zeros at the file's beginning. Without:
@@ -214,8 +216,8 @@ def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDA
     last = int(log.sequence[-1])
     begin = first
     if zero_filled is not None:
-        begin -= int(np.argmin(np.append(_silent(zero_filled, full), False)))
-    elif log.size[-1] < full and _pauses(log.at_s, shape.positions - 1).size == shape.positions - 1:
+        begin -= int(np.argmin(np.append(_find_silent(zero_filled, full), False)))
+    elif log.size[-1] < full and _find_pauses(log.at_s, shape.positions - 1).size == shape.positions - 1:
         begin = min(first, last - expected + 1)
     fits_from_1 = last <= expected
     if begin not in (0, 1) and fits_from_1:
@@ -223,7 +225,7 @@ def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDA
     return begin
 
 
-def _pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+def _find_pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """Return the indices of the packets behind a pause between bursts, of which about `count` are expected.
 
     Most of the `count` longest pauses are those between neighbouring positions; the threshold is half of their first
@@ -242,7 +244,7 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
         return None
     frame = shape.frame_bytes
     end = stream.data.size
-    first_packets = _pauses(stream.at_s, -(-end // shape.burst_bytes) - 1)
+    first_packets = _find_pauses(stream.at_s, -(-end // shape.burst_bytes) - 1)
     ends = np.zeros(first_packets.size, np.int64)
     before_end = np.minimum(stream.start[first_packets - 1] + stream.packet_bytes, end)
     for i, (low, high) in enumerate(zip(before_end, stream.start[first_packets] + stream.packet_bytes, strict=True)):
@@ -286,7 +288,7 @@ def find_positions(own: Bursts, others: list[Bursts], positions: int, period: fl
     return None
 
 
-def _ranges(missing: NDArray[np.bool_], unit: int, end: int) -> Gaps:
+def _find_ranges(missing: NDArray[np.bool_], unit: int, end: int) -> Gaps:
     """Runs of True, each `unit` bytes, as (start, stop) up to `end`."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
     return [(int(a) * unit, min(int(b) * unit, end)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -356,9 +358,9 @@ class PublishedScan(_Published):
         burst = self._instrument.burst
         self._shape = RowShape(self._plan.columns, burst.pulses, self._instrument.frame_bytes)
         self._losses: dict[str, dict[int, RowLosses]] = {b.name: {} for b in base.receivers}
-        self._files: dict[str, dict[int, Path]] = {b.name: self._row_files(b.name) for b in base.boards}
+        self._files: dict[str, dict[int, Path]] = {b.name: self._list_row_files(b.name) for b in base.boards}
 
-    def _row_files(self, board_name: str) -> dict[int, Path]:
+    def _list_row_files(self, board_name: str) -> dict[int, Path]:
         files = {}
         for file in (self.path / board_name).glob("*.bin"):
             match = _ROW_FILE.fullmatch(file.name)
@@ -403,7 +405,7 @@ class PublishedScan(_Published):
         DataError
             if the row is missing, or file and log contradict each other.
         """
-        stream = self._stream(board_name, row)
+        stream = self._open_stream(board_name, row)
         if stream is None:
             problem = f"{self.path}: no row {row} of board {board_name}"
             raise DataError(problem, "the download is not complete", "download it again", code=ErrorCode.NO_DATA)
@@ -418,7 +420,7 @@ class PublishedScan(_Published):
         bursts = find_bursts(stream, shape)
         positions = None
         if bursts is not None:
-            other_bursts = self._others(board_name, row)
+            other_bursts = self._list_other_bursts(board_name, row)
             periods = [p for p in (self._period_s, *map(period_s, (bursts, *other_bursts))) if p]
             positions = find_positions(bursts, other_bursts, shape.positions, min(periods, default=None))
         if bursts is None or positions is None:
@@ -430,16 +432,16 @@ class PublishedScan(_Published):
         gaps = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
         return RowData(split_pieces(payload), gaps, frames)
 
-    def _stream(self, board_name: str, row: int) -> Stream | None:
+    def _open_stream(self, board_name: str, row: int) -> Stream | None:
         file = self._files.get(board_name, {}).get(row)
         if file is None:
             return None
         log = read_log(file.with_name(file.stem + "_log.csv"))
         return read_stream(file, log, self._shape, self._settings.packet_zero_filling)
 
-    def _others(self, board_name: str, row: int) -> list[Bursts]:
+    def _list_other_bursts(self, board_name: str, row: int) -> list[Bursts]:
         """Return the bursts of the same row from the other boards."""
-        streams = [self._stream(name, row) for name in self._files if name != board_name]
+        streams = [self._open_stream(name, row) for name in self._files if name != board_name]
         return [b for s in streams if s is not None and (b := find_bursts(s, self._shape)) is not None]
 
     @cached_property
@@ -447,7 +449,7 @@ class PublishedScan(_Published):
         """Time from one position to the next in the first complete row; None if there is none."""
         for board in self._instrument.receivers:
             for row in sorted(self._files[board.name]):
-                stream = self._stream(board.name, row)
+                stream = self._open_stream(board.name, row)
                 if stream is not None and stream.data.size >= self._shape.bytes and stream.at_s.size:
                     bursts = find_bursts(stream, self._shape)
                     if bursts is None:

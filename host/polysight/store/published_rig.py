@@ -151,7 +151,7 @@ def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tupl
     facing_deg = getattr(settings, key)
     # The transmitter stands at negative x and faces +x, receivers the other way round.
     side = -1 if transmits else 1
-    if facing_deg is not None and (turns := _turns(steps, "y")):
+    if facing_deg is not None and (turns := _list_turns(steps, "y")):
         # Its normal, (sin a, 0, cos a), would point away from the other boards.
         if facing_deg * side > 0:
             notices.append(
@@ -161,12 +161,12 @@ def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tupl
             facing_deg = -facing_deg
         steps[turns[-1]] = MountStep(turn_deg=facing_deg, about="y")
     if not transmits:
-        if settings.rxboard_angle_z is not None and (turns := _turns(steps, "z")):
+        if settings.rxboard_angle_z is not None and (turns := _list_turns(steps, "z")):
             steps[turns[-1]] = MountStep(turn_deg=settings.rxboard_angle_z, about="z")
-        turns_y = _turns(steps, "y")
+        turns_y = _list_turns(steps, "y")
         if board.role == "receive_v" and settings.rxboard_v_angle_y is not None and len(turns_y) > 1:
             steps[turns_y[0]] = MountStep(turn_deg=settings.rxboard_v_angle_y, about="y")
-        shifts = _shifts(steps)
+        shifts = _list_shifts(steps)
         if settings.rxboard_tilt_offset is not None and len(shifts) > 1:
             steps[shifts[-2]] = MountStep(shift_mm=settings.rxboard_tilt_offset)
     last_shift_mm = None
@@ -177,11 +177,11 @@ def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tupl
     return tuple(steps)
 
 
-def _turns(steps: list[MountStep], axis: str) -> list[int]:
+def _list_turns(steps: list[MountStep], axis: str) -> list[int]:
     return [i for i, step in enumerate(steps) if step.about == axis]
 
 
-def _shifts(steps: list[MountStep]) -> list[int]:
+def _list_shifts(steps: list[MountStep]) -> list[int]:
     return [i for i, step in enumerate(steps) if step.shift_mm is not None]
 
 

@@ -103,7 +103,7 @@ def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
     given_table = _replace_connection(to_builtins(given), extract_connection(begun))
     given_table["stage"] = {**given_table["stage"], **{key: table["stage"][key] for key in SERIAL}}
     given_table["calibration"] = table["calibration"]
-    differences = list(_differences(table, given_table, ""))
+    differences = list(_list_differences(table, given_table, ""))
     if differences:
         raise ConfigError(
             f"{name} is not the rig file of this scan: {'; '.join(differences)}",
@@ -119,14 +119,14 @@ def _replace_connection(table: dict[str, Any], connection: Mapping[str, Any]) ->
     return {**table, **{section: connection[section] for section in SECTIONS}, "boards": boards, "radar": radar}
 
 
-def _differences(begun: Any, given: Any, key: str) -> Iterator[str]:
+def _list_differences(begun: Any, given: Any, key: str) -> Iterator[str]:
     """Yield `key is A in the scan and B there` for every value that differs."""
     if isinstance(begun, dict) and isinstance(given, dict):
         for name in dict.fromkeys([*begun, *given]):
-            yield from _differences(begun.get(name), given.get(name), f"{key}.{name}".lstrip("."))
+            yield from _list_differences(begun.get(name), given.get(name), f"{key}.{name}".lstrip("."))
     elif isinstance(begun, list) and isinstance(given, list) and len(begun) == len(given):
         for k, pair in enumerate(zip(begun, given, strict=True)):
-            yield from _differences(*pair, f"{key}[{k}]")
+            yield from _list_differences(*pair, f"{key}[{k}]")
     elif begun != given:
         yield f"{key} is {_describe_value(begun)} in the scan and {_describe_value(given)} there"
 
@@ -169,7 +169,7 @@ class ScanFolder:
         self._rows: tuple[Manifest, int, dict[int, RowCommitted]] | None = None
         for number, fact in content.problems:
             if fact.kind == "scan_started":
-                raise self._unreadable(number, fact)
+                raise self._unreadable_error(number, fact)
         if content.started is None:
             raise DataError(
                 f"{path / MANIFEST}: no scan_started",
@@ -184,9 +184,9 @@ class ScanFolder:
         self.plan: RasterPlan = self.started.plan
         self.scan_id = self.started.scan_id
         self.simulated = self.started.simulated
-        self.instrument = self._latest_rig()
+        self.instrument = self._read_latest_rig()
 
-    def _unreadable(self, number: int, fact: OtherFact) -> ConfigError:
+    def _unreadable_error(self, number: int, fact: OtherFact) -> ConfigError:
         return ConfigError(
             f"{self.path / MANIFEST} line {number} ({fact.kind}): {fact.problem}",
             "written by another program or release",
@@ -194,7 +194,7 @@ class ScanFolder:
             code=ErrorCode.VALUE_INVALID,
         )
 
-    def _latest_rig(self) -> Instrument:
+    def _read_latest_rig(self) -> Instrument:
         """Return the scan's rig with the connection settings of the last resume. Raises ConfigError."""
         connections = [fact.rig for fact in self.facts(ScanResumed) if fact.rig]
         if connections:
@@ -248,7 +248,7 @@ class ScanFolder:
     def reload(self) -> None:
         """Read the manifest again."""
         self.content = manifest.read(self.path / MANIFEST)
-        self.instrument = self._latest_rig()
+        self.instrument = self._read_latest_rig()
 
     def writer(self) -> ManifestWriter:
         """Open the scan for appending and cut off a torn last line. Raises DeviceError if the scan is in use."""
@@ -270,14 +270,14 @@ class ScanFolder:
 
         Raises DataError if the manifest names a file outside `raw`, ConfigError for a row of another form.
         """
-        return dict(self._cached_rows())
+        return dict(self._read_cached_rows())
 
-    def _cached_rows(self) -> dict[int, RowCommitted]:
+    def _read_cached_rows(self) -> dict[int, RowCommitted]:
         """Return the committed rows from a cache, which is valid until facts are added."""
         if self._rows is None or self._rows[0] is not self.content or self._rows[1] != len(self.content.facts):
             for number, fact in self.content.problems:
                 if fact.kind in ("row_committed", "row_withdrawn"):
-                    raise self._unreadable(number, fact)
+                    raise self._unreadable_error(number, fact)
             for fact in self.facts(RowCommitted):
                 for board in fact.boards.values():
                     check_inside(self.path, board.file, "raw")
@@ -294,10 +294,12 @@ class ScanFolder:
             return faults
         last = ends[-1]
         counted = self.facts(ScanEnded)[-1].rows_committed
-        if counted is None or counted <= len(self._cached_rows()):
+        if counted is None or counted <= len(self._read_cached_rows()):
             return faults
         # Rows that were later withdrawn, or taken again, were committed then.
-        rows = {fact.row for fact in content.facts[:last] if isinstance(fact, RowCommitted)} | {*self._cached_rows()}
+        rows = {fact.row for fact in content.facts[:last] if isinstance(fact, RowCommitted)} | {
+            *self._read_cached_rows()
+        }
         lost_rows = counted - len(rows)
         if lost_rows <= sum(fault.facts["lost"] for fault in faults):
             return faults
@@ -307,13 +309,13 @@ class ScanFolder:
     @property
     def rows_absent(self) -> list[int]:
         """Rows of the plan that are not committed."""
-        return [row for row in range(self.plan.rows) if row not in self._cached_rows()]
+        return [row for row in range(self.plan.rows) if row not in self._read_cached_rows()]
 
     def recording_facts(self) -> dict[str, Any]:
         """Return `rows_retaken` (rejected takes of all runs) and `rows_incomplete` for quality.json."""
         return {
             "rows_retaken": len(self.content.rejected),
-            "rows_incomplete": [row for row, fact in self._cached_rows().items() if fact.kept_incomplete],
+            "rows_incomplete": [row for row, fact in self._read_cached_rows().items() if fact.kept_incomplete],
         }
 
     def rows(self) -> Iterator[int]:
@@ -337,7 +339,7 @@ class ScanFolder:
         DataError
             if the row is not committed or its index is damaged; when the payload is used: if it is missing or damaged.
         """
-        committed = self._cached_rows().get(row)
+        committed = self._read_cached_rows().get(row)
         board = None
         if committed is not None:
             board = committed.boards.get(board_name)
@@ -371,12 +373,14 @@ class ScanFolder:
                     yield piece
         except OSError as e:
             problem = f"{path}: cannot be read: {e.strerror}"
-            raise DataError(problem, "the file was removed", self._remedy(), code=ErrorCode.FILE_MISSING) from None
+            raise DataError(
+                problem, "the file was removed", self._suggest_remedy(), code=ErrorCode.FILE_MISSING
+            ) from None
         if size_on_disk != board.bytes or f"{digest:08x}" != board.crc32:
             raise DataError(
                 f"{path}: differs from the committed data ({size_on_disk} bytes, {board.bytes} expected)",
                 "the file was changed, truncated or damaged after the scan",
-                self._remedy(),
+                self._suggest_remedy(),
                 code=ErrorCode.FILE_DAMAGED,
             )
 
@@ -388,10 +392,10 @@ class ScanFolder:
         damaged = board.index_crc32 and f"{crc32(path.read_bytes()):08x}" != board.index_crc32
         if damaged or sum(b - a for a, b in missing) != board.missing_bytes:
             problem = f"{path}: differs from the committed index"
-            raise DataError(problem, "the file was changed", self._remedy(), code=ErrorCode.FILE_DAMAGED)
+            raise DataError(problem, "the file was changed", self._suggest_remedy(), code=ErrorCode.FILE_DAMAGED)
         return missing
 
-    def _remedy(self) -> str:
+    def _suggest_remedy(self) -> str:
         return (
             f"restore it from a copy, or `polysight resume {quote(self.path)}` takes its row again;"
             f" `polysight validate {quote(self.path)}` names every damaged file"

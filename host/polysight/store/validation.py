@@ -48,7 +48,7 @@ def to_json(findings: list[Finding]) -> str:
     return json.dumps(entries, indent=2)
 
 
-def _error(where: str, what: str, do: str = "", code: ErrorCode = ErrorCode.FILE_DAMAGED) -> Finding:
+def _make_error(where: str, what: str, do: str = "", code: ErrorCode = ErrorCode.FILE_DAMAGED) -> Finding:
     return Finding("error", what, do=do, where=where, code=code)
 
 
@@ -68,10 +68,10 @@ def validate(path: Path) -> list[Finding]:
         rows = scan.committed_rows()
     except PolysightError as e:
         lost_lines = [_add_lost_rows(fault, "its facts are lost") for fault in content.faults]
-        return [*findings, *lost_lines, _error(MANIFEST, e.what, e.remedy)]
-    findings += [_add_lost_rows(fault, _what_is_lost(scan)) for fault in scan.manifest_faults]
+        return [*findings, *lost_lines, _make_error(MANIFEST, e.what, e.remedy)]
+    findings += [_add_lost_rows(fault, _describe_loss(scan)) for fault in scan.manifest_faults]
     if scan.plan != plan_raster(scan.instrument.grid):
-        findings.append(_error(MANIFEST, "the plan is not that of the rig file's grid"))
+        findings.append(_make_error(MANIFEST, "the plan is not that of the rig file's grid"))
     for row in rows.values():
         findings += _check_row(scan, row)
     if being_written:
@@ -126,7 +126,7 @@ def _add_lost_rows(fault: Finding, lost: str) -> Finding:
     return msgspec.structs.replace(fault, level="note", do=_ALL_THERE)
 
 
-def _what_is_lost(scan: scan_folder.ScanFolder) -> str:
+def _describe_loss(scan: scan_folder.ScanFolder) -> str:
     """Describe the rows that are not committed; "" if every row is, so that lost lines do not matter."""
     absent = scan.rows_absent
     if not absent:
@@ -141,17 +141,17 @@ def _what_is_lost(scan: scan_folder.ScanFolder) -> str:
 def _check_row(scan: scan_folder.ScanFolder, row: RowCommitted) -> list[Finding]:
     place = f"row {row.row}"
     if not 0 <= row.row < scan.plan.rows:
-        return [_error(place, f"outside the plan's {scan.plan.rows} rows")]
+        return [_make_error(place, f"outside the plan's {scan.plan.rows} rows")]
     findings = []
     planned = scan.plan.row(row.row)
     pulses = planned.points * scan.instrument.burst.pulses
     if row.direction != planned.direction:
-        findings.append(_error(place, f"direction {row.direction}, planned {planned.direction}"))
+        findings.append(_make_error(place, f"direction {row.direction}, planned {planned.direction}"))
     if row.pulses != pulses:
-        findings.append(_error(place, f"{row.pulses} pulses, {pulses} planned"))
+        findings.append(_make_error(place, f"{row.pulses} pulses, {pulses} planned"))
     boards = {board.name for board in scan.instrument.recorded}
     if set(row.boards) != boards:
-        findings.append(_error(place, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
+        findings.append(_make_error(place, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
     for board in row.boards.values():
         findings += board_faults(scan, board, pulses)
     return findings
@@ -164,7 +164,9 @@ def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> 
     findings = []
     expected = frames * scan.instrument.frame_bytes
     if (board.bytes, board.frames_expected) != (expected, frames):
-        findings.append(_error(place, f"{board.bytes} bytes of {board.frames_expected} frames, planned {expected}"))
+        findings.append(
+            _make_error(place, f"{board.bytes} bytes of {board.frames_expected} frames, planned {expected}")
+        )
     is_kept = board.file not in scan_folder.dropped_files(scan) or path.exists()
     try:
         # Only the committed digest is left of a dropped payload.
@@ -176,32 +178,32 @@ def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> 
     except OSError as e:
         return [*findings, _error_of_reading(place, e)]
     if size != board.bytes:
-        findings.append(_error(place, f"{size} bytes, {board.bytes} were committed", _COPY))
+        findings.append(_make_error(place, f"{size} bytes, {board.bytes} were committed", _COPY))
     elif f"{crc:08x}" != board.crc32:
-        findings.append(_error(place, "differs from the committed data (CRC)", _COPY))
+        findings.append(_make_error(place, "differs from the committed data (CRC)", _COPY))
     index = path.with_suffix(".idx")
     findings += _check_packets(scan, board, path.with_suffix(PACKETS))
     place = str(index.relative_to(scan.path))
     if not index.exists():
         is_needed = board.missing_bytes > 0 or board.index_crc32 != ""
         if is_needed:
-            return [*findings, _error(place, "absent", _COPY)]
+            return [*findings, _make_error(place, "absent", _COPY)]
         return findings
     try:
         index_crc = crc32(index.read_bytes())
     except OSError as e:
         return [*findings, _error_of_reading(place, e)]
     if board.index_crc32 and f"{index_crc:08x}" != board.index_crc32:
-        return [*findings, _error(place, "differs from the committed data (CRC)", _COPY)]
+        return [*findings, _make_error(place, "differs from the committed data (CRC)", _COPY)]
     try:
         facts, _ = read_index(index)
         gaps = [(int(a), int(b)) for a, b in facts.get("missing", [])]
     except (PolysightError, TypeError, ValueError) as e:
-        return [*findings, _error(place, str(e))]
+        return [*findings, _make_error(place, str(e))]
     ordered = all(a < b for a, b in gaps) and all(x[1] < y[0] for x, y in pairwise(gaps))
     inside = all(a >= 0 and b <= board.bytes for a, b in gaps)
     if not ordered or not inside or sum(b - a for a, b in gaps) != board.missing_bytes:
-        findings.append(_error(place, f"its gaps do not make the {board.missing_bytes} missing bytes"))
+        findings.append(_make_error(place, f"its gaps do not make the {board.missing_bytes} missing bytes"))
     return findings
 
 
@@ -213,13 +215,13 @@ def _check_packets(scan: scan_folder.ScanFolder, board: BoardRow, path: Path) ->
     try:
         _, crc = _compute_digest(path)
     except FileNotFoundError:
-        return [_error(place, "absent", _COPY)]
+        return [_make_error(place, "absent", _COPY)]
     except OSError as e:
         return [_error_of_reading(place, e)]
     right = f"{crc:08x}" == board.packets_crc32
     if right:
         return []
-    return [_error(place, "differs from the committed data (CRC)", _COPY)]
+    return [_make_error(place, "differs from the committed data (CRC)", _COPY)]
 
 
 def _error_of_reading(where: str, e: OSError) -> Finding:
@@ -227,7 +229,7 @@ def _error_of_reading(where: str, e: OSError) -> Finding:
         code = ErrorCode.FILE_MISSING
     else:
         code = ErrorCode.FILE_UNREADABLE
-    return _error(where, f"cannot be read: {e.strerror}", _COPY, code)
+    return _make_error(where, f"cannot be read: {e.strerror}", _COPY, code)
 
 
 def _compute_digest(path: Path) -> tuple[int, int]:
@@ -251,7 +253,7 @@ def _check_dropped(scan: scan_folder.ScanFolder) -> list[Finding]:
         remedy_of_samples = "its raw data was dropped: restore the file from a copy, or images leave it out"
         for row, names in scan_folder.damaged_samples(scan).items():
             problem = f"row {row} is damaged or missing (CRC)"
-            findings += [_error(name, problem, remedy_of_samples) for name in names if row in rows_without_raw]
+            findings += [_make_error(name, problem, remedy_of_samples) for name in names if row in rows_without_raw]
     else:
         findings.append(_note(scan_folder.SAMPLES, "absent: no image can be made again"))
     leftover_files = [file for file in files if (scan.path / file).exists()]
@@ -276,7 +278,7 @@ def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
     try:
         log = read_events(path)
     except PolysightError as e:
-        return [_error(scan_folder.EVENTS, e.what, e.remedy)]
+        return [_make_error(scan_folder.EVENTS, e.what, e.remedy)]
     findings = []
     if log.torn:
         findings.append(_note(scan_folder.EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
@@ -291,13 +293,13 @@ def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
     is_known = bool(commits) or not scan.facts(RowCommitted)
     is_committed_damage = bool(log.damage) and not (is_known and log.length >= committed.bytes)
     if is_committed_damage:
-        findings.append(_error(scan_folder.EVENTS, log.damage, _FETCHED))
+        findings.append(_make_error(scan_folder.EVENTS, log.damage, _FETCHED))
     elif log.damage:
         findings.append(_note(scan_folder.EVENTS, log.damage, _FETCHED))
     if {e.scan_id for e in log.events} - {scan.scan_id}:
-        findings.append(_error(scan_folder.EVENTS, "holds events of another scan"))
+        findings.append(_make_error(scan_folder.EVENTS, "holds events of another scan"))
     if [e.seq for e in log.events] != list(range(1, len(log.events) + 1)):
-        findings.append(_error(scan_folder.EVENTS, "the sequence of the events has gaps"))
+        findings.append(_make_error(scan_folder.EVENTS, "the sequence of the events has gaps"))
     if commits and not is_committed_damage:
         findings += _check_committed_events(path, log.length, row, committed)
     return findings
@@ -308,10 +310,10 @@ def _check_committed_events(path: Path, length: int, row: int, committed: LogDig
     size = committed.bytes
     when = f"row {row} was committed"
     if length < size:
-        return [_error(scan_folder.EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
+        return [_make_error(scan_folder.EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
     with path.open("rb") as f:
         is_whole = f"{crc32(f.read(size)):08x}" == committed.crc32
     problem = f"not the events that were there when {when} (CRC)"
     if is_whole:
         return []
-    return [_error(scan_folder.EVENTS, problem, "restore it from a copy")]
+    return [_make_error(scan_folder.EVENTS, problem, "restore it from a copy")]

@@ -88,16 +88,16 @@ def make_optics(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) ->
     receivers = [np.array(rx_positions_m(rig, board)).mean(axis=0) for board in rig.receivers]
     tx_m = np.array(tx_position_m(rig))
     half = np.sqrt(0.5)
-    tx = aim_antenna(tx_m, _boresight(rig.transmitter), receivers[0], plane_m, (half, half))
-    h = aim_antenna(receivers[0], _boresight(rig.receivers[0]), tx_m, plane_m, (1.0, 0.0))
-    v = aim_antenna(receivers[1], _boresight(rig.receivers[1]), tx_m, plane_m, (0.0, 1.0))
+    tx = aim_antenna(tx_m, _compute_boresight(rig.transmitter), receivers[0], plane_m, (half, half))
+    h = aim_antenna(receivers[0], _compute_boresight(rig.receivers[0]), tx_m, plane_m, (1.0, 0.0))
+    v = aim_antenna(receivers[1], _compute_boresight(rig.receivers[1]), tx_m, plane_m, (0.0, 1.0))
     sweep = rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2
     return Optics(
         tx, replace(h, leakage=leakage[0]), replace(v, leakage=leakage[1]), 2 * np.pi * sweep / SPEED_OF_LIGHT_M_S
     )
 
 
-def _boresight(board: Board) -> Array:
+def _compute_boresight(board: Board) -> Array:
     ahead = np.array(place((0.0, 0.0, 1000.0), board.mount)) - np.array(place((0.0, 0.0, 0.0), board.mount))
     return ahead / np.linalg.norm(ahead)
 

@@ -200,11 +200,11 @@ class Gains:
 
     def ratio(self, arrival: Array) -> Complex:
         """Gain of H over that of V, [n]."""
-        return np.exp(self._basis(arrival) @ self.ratio_terms)
+        return np.exp(self._make_basis(arrival) @ self.ratio_terms)
 
     def level(self, arrival: Array) -> Array:
         """ln|gain of H|, [n]."""
-        return self._basis(arrival) @ self.level_terms
+        return self._make_basis(arrival) @ self.level_terms
 
     def estimate_unknown_std(self, arrival: Array) -> Array:
         """Standard deviation of ln(H / V) by directions that the reference does not cover, [n]."""
@@ -213,11 +213,11 @@ class Gains:
         slope = UNKNOWN_SLOPE if self.degree == 0 else UNKNOWN_SLOPE / 4
         return np.hypot(self.std, slope * beyond)
 
-    def _basis(self, arrival: Array) -> Array:
-        return _polynomials(arrival - self.middle, self.degree)
+    def _make_basis(self, arrival: Array) -> Array:
+        return _evaluate_polynomials(arrival - self.middle, self.degree)
 
 
-def _polynomials(d: Array, degree: int) -> Array:
+def _evaluate_polynomials(d: Array, degree: int) -> Array:
     terms = [d[:, 0] ** i * d[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)]
     return np.stack(terms, axis=1)
 
@@ -247,7 +247,7 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     middle = np.average(metal.arrival, axis=0, weights=weight)
     low, high = np.percentile(metal.arrival, [3, 97], axis=0)
     degree = DEGREE if float(np.min(high - low)) > 0.1 else 0
-    basis = _polynomials(metal.arrival - middle, degree)
+    basis = _evaluate_polynomials(metal.arrival - middle, degree)
     # Phases are taken about their mean, so that none wraps.
     centre = np.angle(np.sum(weight * ratio / np.abs(ratio)))
     log_ratio = np.log(np.abs(ratio)) + 1j * (np.angle(ratio * np.exp(-1j * centre)) + centre)
@@ -262,12 +262,12 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
         band_rise=np.median(metal.band_rise, axis=0),
         middle=middle,
         degree=degree,
-        std=float(np.hypot(_misfit_std(rest, metal.at_m), next_order)),
+        std=float(np.hypot(_compute_misfit_std(rest, metal.at_m), next_order)),
         covered=(low, high),
     )
 
 
-def _misfit_std(rest: Complex, at_m: Array) -> float:
+def _compute_misfit_std(rest: Complex, at_m: Array) -> float:
     """Standard deviation of each part of a fitted function: the root mean square of what is left over blocks."""
     clipped = rest / np.maximum(1, np.abs(rest) / (5 * np.median(np.abs(rest)) + 1e-12))
     block = number_blocks(at_m, (0.0, 0.0))
@@ -345,7 +345,7 @@ def find_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Complex:
     return v.b[:, 0] / gains.ratio(v.arrival) * expected[:, 1] - v.b[:, 1] * expected[:, 0]
 
 
-def _noise_of_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Array:
+def _compute_noise_of_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Array:
     """Standard deviation of each part of the misses by the noise of both voltages."""
     expected = np.abs(receive(v, coefficients))
     std_h = v.std[:, 0] / np.abs(gains.ratio(v.arrival))
@@ -372,7 +372,7 @@ def _linearise(eps: complex, v: Voltages, gains: Gains, ripple: Array, wave_numb
         moved = reflect_points(eps + step, v, wave_number)
         rates.append((find_misses(v, gains, moved) - miss) / EPS_STEP)
     jacobian = np.stack(rates, axis=1)
-    noise = _noise_of_misses(v, gains, coefficients)
+    noise = _compute_noise_of_misses(v, gains, coefficients)
     scale = np.hypot(noise, ripple)
     size = np.abs(miss) / scale
     usual = float(np.median(size)) + 1e-12
@@ -402,7 +402,7 @@ def fit_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Permittiv
             break
     return PermittivityFit(
         eps=eps,
-        covariance=_covariance_of_scatter(step.answer, step.miss, expect_ripple(step, ripple), v.at_m),
+        covariance=_compute_covariance_of_scatter(step.answer, step.miss, expect_ripple(step, ripple), v.at_m),
         used=step.used,
         excess2=(np.abs(step.miss) / np.maximum(step.noise, 1e-30)) ** 2 / 2,
         answer=step.answer,
@@ -418,7 +418,7 @@ def expect_ripple(step: _Step, least: Array) -> Array:
     return np.hypot(least, step.noise * np.sqrt(max(0.0, excess2)))
 
 
-def _covariance_of_scatter(answer: Complex, miss: Complex, ripple: Array, at_m: Array) -> Array:
+def _compute_covariance_of_scatter(answer: Complex, miss: Complex, ripple: Array, at_m: Array) -> Array:
     """Covariance of (real, imaginary) from the sums of the misses over blocks, with the expected ripple.
 
     The 95 % region of few blocks is wider than that of a known covariance, by Fisher's distribution.

@@ -79,7 +79,7 @@ def tangents(normals: Array) -> Array:
     return np.stack([first, np.cross(normals, first)], axis=-1).astype(np.float64)
 
 
-def _second_derivatives(
+def _compute_second_derivatives(
     points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Return H in the stage's plane, X, E' H E and 2 cos(theta) of the module's formulas."""
@@ -93,7 +93,7 @@ def _second_derivatives(
 
 def find_curvature(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
     """Curvature K [n, 2, 2] in the basis of `tangents`, 1 / m, of echoes whose path has the curvature `bend`."""
-    plane, cross, along, twice_cosine = _second_derivatives(points, normals, at_m, tx_m, rx_m)
+    plane, cross, along, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     difference = plane - bend
     # The small part keeps the matrix solvable where the path bends as that of a point.
     surface_part = cross @ np.linalg.solve(difference + 1e-9 * np.eye(2), np.swapaxes(cross, 1, 2))
@@ -102,14 +102,14 @@ def find_curvature(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m
 
 def find_motion(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
     """P^-1 [n, 2, 2], metres, of echoes whose path has the curvature `bend`."""
-    plane, cross, _, _ = _second_derivatives(points, normals, at_m, tx_m, rx_m)
+    plane, cross, _, _ = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     inverse = np.linalg.inv(cross)
     return np.swapaxes(inverse, 1, 2) @ (plane - bend) @ inverse
 
 
 def find_bend(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, motion: Array) -> Array:
     """Curvature [n, 2, 2] of the paths of echoes with a P^-1 of `motion`."""
-    plane, cross, _, _ = _second_derivatives(points, normals, at_m, tx_m, rx_m)
+    plane, cross, _, _ = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     return plane - np.swapaxes(cross, 1, 2) @ motion @ cross
 
 
@@ -118,7 +118,7 @@ def predict_echo(
 ) -> tuple[Array, Array, Array]:
     """Path [n], slope [n, 2] and curvature [n, 2, 2] of the echo of a surface seen from stage offsets [n, 3]."""
     t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
-    plane, cross, along, twice_cosine = _second_derivatives(points, normals, at_m, tx_m, rx_m)
+    plane, cross, along, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     second = along + twice_cosine[:, None, None] * curvature
     bend = plane - np.swapaxes(cross, 1, 2) @ np.linalg.solve(second, cross)
     return out_m + back_m, -(t + r)[:, :2], bend
@@ -130,7 +130,7 @@ def spreading(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m
     A mirror gives 1 / path.
     """
     _, _, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
-    _, _, along, twice_cosine = _second_derivatives(points, normals, at_m, tx_m, rx_m)
+    _, _, along, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     second = along + twice_cosine[:, None, None] * curvature
     root = np.sqrt(np.abs(np.linalg.det(second)))
     return twice_cosine / (2 * out_m * back_m * np.maximum(root, 1e-9))

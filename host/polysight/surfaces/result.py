@@ -211,8 +211,8 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
             moved = replace(
                 segment,
                 number=segment.number + first,
-                centre_m=_triple(back @ (np.array(segment.centre_m) - axis) + axis),
-                normal=_triple(back @ np.array(segment.normal)),
+                centre_m=_convert_triple(back @ (np.array(segment.centre_m) - axis) + axis),
+                normal=_convert_triple(back @ np.array(segment.normal)),
                 turned_deg=float(angle_deg),
             )
             segments.append(moved)
@@ -342,14 +342,14 @@ def describe_segment(number: int, shape: Shape) -> Segment:
     return Segment(
         number=number,
         points=len(shape.points),
-        centre_m=_triple(shape.points.mean(axis=0)),
-        normal=_triple(normal),
+        centre_m=_convert_triple(shape.points.mean(axis=0)),
+        normal=_convert_triple(normal),
         radius_mm=1e3 / bend if bend > 0.5 else None,
         incidence_deg=float(np.degrees(np.arccos(np.clip(shape.cos, 0, 1)).mean())),
     )
 
 
-def _triple(vector: Array) -> tuple[float, float, float]:
+def _convert_triple(vector: Array) -> tuple[float, float, float]:
     x, y, z = map(float, vector)
     return x, y, z
 

@@ -73,7 +73,7 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
 
     def spectrum(r: int, shift_mm: float) -> NDArray[np.complex128]:
         direction = plan.row(r).direction
-        return _spectrum(rows[r][:, ::direction], k, direction * travel + (shift_mm if r % 2 else 0.0))
+        return _compute_spectrum(rows[r][:, ::direction], k, direction * travel + (shift_mm if r % 2 else 0.0))
 
     def sums(shift_mm: float) -> NDArray[np.float64]:
         """Return sums over groups of rows: slope times difference, slope squared, power, power at the highest k."""
@@ -104,7 +104,7 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     return Backlash(shift, std) if std < plan.step_x_mm / 4 else None
 
 
-def _spectrum(row: NDArray[np.complex64], k: NDArray[np.floating], off_mm: float) -> NDArray[np.complex128]:
+def _compute_spectrum(row: NDArray[np.complex64], k: NDArray[np.floating], off_mm: float) -> NDArray[np.complex128]:
     """Return the spectrum of a row along x, [rx, 2 position], shifted back by `off_mm` to the planned positions.
 
     The row is continued by its mirror image to avoid a jump at its ends. `k` is in radians per millimetre.

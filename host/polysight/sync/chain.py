@@ -191,10 +191,10 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
 def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bool_], setup: BoardSetup) -> SyncedRow:
     """As :func:`synchronise_row`, for a row that comes in pieces of whole bursts; they may share their memory."""
     if valid.size % setup.pulses:
-        raise _mismatch(valid.size, setup.path.steering.shape, setup)
+        raise _mismatch_error(valid.size, setup.path.steering.shape, setup)
     received = valid.reshape(-1, setup.pulses)
     aligned = align_pieces(
-        _bursts(pieces, valid.size, setup),
+        _group_bursts(pieces, valid.size, setup),
         received,
         setup.chirp.linear_samples,
         setup.equaliser,
@@ -218,13 +218,13 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
     )
 
 
-def _bursts(pieces: Iterable[NDArray[np.int16]], frames: int, setup: BoardSetup) -> Iterator[NDArray[np.int16]]:
+def _group_bursts(pieces: Iterable[NDArray[np.int16]], frames: int, setup: BoardSetup) -> Iterator[NDArray[np.int16]]:
     """Return pieces [frame, sample, 2, rx] as bursts [position, chirp, sample, 2, rx]; check that they are whole."""
     for words in pieces:
         chirps, samples, _, rx = words.shape
         frames -= chirps
         if (rx, samples) != setup.path.steering.shape or chirps % setup.pulses or frames < 0:
-            raise _mismatch(chirps, (rx, samples), setup)
+            raise _mismatch_error(chirps, (rx, samples), setup)
         yield words.reshape(-1, setup.pulses, samples, 2, rx)
     if frames:
         raise DataError(
@@ -235,7 +235,7 @@ def _bursts(pieces: Iterable[NDArray[np.int16]], frames: int, setup: BoardSetup)
         )
 
 
-def _mismatch(frames: int, shape: tuple[int, ...], setup: BoardSetup) -> DataError:
+def _mismatch_error(frames: int, shape: tuple[int, ...], setup: BoardSetup) -> DataError:
     rx, samples = setup.path.steering.shape
     return DataError(
         f"{frames} frames of {shape[0]} RX x {shape[1]} samples are not bursts of {setup.pulses} frames"
@@ -343,8 +343,10 @@ def errors(
         out = {
             "received": received,
             "aligned": chirp_errors,
-            "averaged": _direct_path_errors(done.samples[:, examined], path),
-            "referenced": _object_errors(_reference_halves(aligned, done, two), path) if two.size else np.zeros((3, 0)),
+            "averaged": _estimate_direct_path_errors(done.samples[:, examined], path),
+            "referenced": _estimate_object_errors(_reference_halves(aligned, done, two), path)
+            if two.size
+            else np.zeros((3, 0)),
         }
     for values in out.values():
         values[0] *= sample_rate_hz
@@ -366,7 +368,7 @@ def _reference_halves(aligned: AlignedRow, done: Referenced, some: NDArray[np.in
     return complex64(aligned.halves[some] * (scale * (done.steering * turn[:, None])[:, None]))
 
 
-def _direct_path_errors(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
+def _estimate_direct_path_errors(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
     """Return the errors of the direct path [3, n] in averages [rx, position, block], from two halves of the RX."""
     halves = [_estimate(mean[h::2].swapaxes(0, 1), path.half_estimators[h]) for h in (0, 1)]
     amplitude = np.array([amplitude for amplitude, _ in halves])
@@ -384,7 +386,7 @@ def _estimate(signal: NDArray[np.complex64], estimator: NDArray[np.complex128]) 
     return estimate[..., 0].astype(complex), np.real(estimate[..., 1] / estimate[..., 0])
 
 
-def _object_errors(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
+def _estimate_object_errors(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
     """Return the errors of the object [3, n] from two averages [position, 2, rx, block], for positions with an echo."""
     rx, n = halves.shape[2:]
     # Reference each half to its own direct path and subtract it; the object remains.
@@ -443,7 +445,7 @@ class CubeForm:
 
         The receiver's filter is not compensated.
         """
-        valid = _positions_with_data(cube)
+        valid = _find_positions_with_data(cube)
         if not valid.all():
             cube = np.where(valid[:, None], cube, np.complex64(0))
         samples = (cube.conj() if self.conjugate else cube) * self.turn[:, None]
@@ -464,7 +466,7 @@ class CubeForm:
         )
 
 
-def _positions_with_data(cube: NDArray[np.complex64]) -> NDArray[np.bool_]:
+def _find_positions_with_data(cube: NDArray[np.complex64]) -> NDArray[np.bool_]:
     """Return the positions of a row [rx, position, sample] that are finite and not all zero, [position]."""
     numbers = np.ascontiguousarray(cube, np.complex64).view(np.float32)
     # The largest and the smallest of numbers with a NaN are NaN.
@@ -488,7 +490,7 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     DataError
         if the rows have no data.
     """
-    cube = np.concatenate([r[:, _positions_with_data(r)] for r in rows], axis=1)
+    cube = np.concatenate([r[:, _find_positions_with_data(r)] for r in rows], axis=1)
     cube = cube[:, :: max(1, cube.shape[1] // _FORM_POSITIONS)]
     if cube.shape[1] == 0:
         raise DataError(
@@ -511,7 +513,7 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
 
     constant = np.zeros(len(rx))
     path = None
-    mean, coherent = _mean_direct_path(cube[..., a:b], gate)
+    mean, coherent = _average_direct_path(cube[..., a:b], gate)
     if coherent > _COHERENT:
         lag = np.exp(2j * np.pi * np.outer(direct_m - direct_m[0], sweep) / SPEED_OF_LIGHT_M_S)
         phasors = mean / np.abs(mean)
@@ -555,7 +557,7 @@ def _sign_and_origin(
     return readings[0 if power[0] >= _PREFER_SIMPLE * max(power) else int(np.argmax(power))]
 
 
-def _mean_direct_path(
+def _average_direct_path(
     part: NDArray[np.complexfloating], gate: NDArray[np.complex128]
 ) -> tuple[NDArray[np.complexfloating], float]:
     """Return the mean direct path [rx] in samples [rx, position, sample], and its share of power.

@@ -60,7 +60,7 @@ class Decimator(NamedTuple):
 @lru_cache(maxsize=1)
 def decimator() -> Decimator:
     """Return the taps of both filters."""
-    inner = _low_pass()
+    inner = _design_low_pass()
     first = np.zeros(TAPS)
     first[_BESIDE:-_BESIDE] = 1 / FOLD
     cycles = np.linspace(-_PASS, _PASS, 121)
@@ -85,7 +85,7 @@ def decimator() -> Decimator:
     return Decimator(taps, np.stack(flat).astype(np.float32), float((combined_taps**2).sum()))
 
 
-def _low_pass() -> NDArray[np.float64]:
+def _design_low_pass() -> NDArray[np.float64]:
     """Return symmetric taps of sum 1 with the least response where decimation would move echoes into the passband."""
     images = [np.linspace(0.25 - _PASS, 0.25 + _PASS, 61), np.linspace(0.5 - _PASS, 0.5, 31)]
     cycles = np.concatenate(images)
@@ -116,11 +116,11 @@ def fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
 def flatten(folded: NDArray[np.complex64]) -> NDArray[np.complex64]:
     """Undo the attenuation by :func:`fold` in averages [..., block]; fewer blocks than `FLAT` stay as they are."""
     blocks = folded.shape[-1]
-    return folded if blocks < FLAT else (folded @ _flat_matrix(blocks)).astype(np.complex64)
+    return folded if blocks < FLAT else (folded @ _make_flat_matrix(blocks)).astype(np.complex64)
 
 
 @lru_cache(maxsize=8)
-def _flat_matrix(blocks: int) -> NDArray[np.float32]:
+def _make_flat_matrix(blocks: int) -> NDArray[np.float32]:
     """Return `flatten` as a matrix [block in, block out]."""
     flat = decimator().flat
     out = np.zeros((blocks, blocks), np.float32)

@@ -211,7 +211,7 @@ def match(
     energy
         float32 [position, chirp], over RX and linear samples.
     """
-    inside = _complex(words[:, :, slice(*linear)])
+    inside = _convert_to_complex(words[:, :, slice(*linear)])
     positions, chirps, _, n = inside.shape
     size = search_size(n)
     chosen = inside[np.arange(positions), reference]
@@ -269,7 +269,7 @@ def reduce_chirps(
     """
     a, b = linear
     turn = phasor(-frequency, np.zeros(frequency.shape), b - a, (b - a - 1) / 2)
-    return hpf.apply_filter(fold(_complex(words[:, :, a:b]) * turn[:, :, None]), taps)
+    return hpf.apply_filter(fold(_convert_to_complex(words[:, :, a:b]) * turn[:, :, None]), taps)
 
 
 def against_others(
@@ -349,7 +349,7 @@ def average(
     return flatten(complex64(halves.reshape(positions, 2, rx, blocks)))
 
 
-def _complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
+def _convert_to_complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
     """Return raw words as complex64 [position, chirp, rx, sample]."""
     positions, chirps, samples, _, rx = words.shape
     out = np.empty((positions, chirps, rx, samples), np.complex64)
@@ -359,7 +359,7 @@ def _complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
 
 
 @lru_cache(maxsize=4)
-def _preference(size: int) -> NDArray[np.float32]:
+def _weigh_bins(size: int) -> NDArray[np.float32]:
     """Return factors of a spectrum's bins: of equal peaks, as of a cupboard, that nearer the band's middle counts."""
     return np.sinc(np.fft.fftfreq(size)).astype(np.float32)
 
@@ -467,7 +467,7 @@ class NumpyLoops:
         beamed = np.einsum("rn,prn->pn", weights, halves[:, 0] + halves[:, 1])
         spectrum = np.abs(np.asarray(scipy.fft.fft(beamed, size, axis=-1)))
         median = np.sort(spectrum, axis=-1)[:, size // 2].astype(np.float64)
-        spectrum *= _preference(size)
+        spectrum *= _weigh_bins(size)
         rows = np.arange(len(beamed))
         top = np.argmax(spectrum, axis=-1)
         below = top[:, None] - np.arange(object_bins[0], object_bins[1] + 1)
@@ -632,7 +632,7 @@ class Library:
             frequency=np.empty(positions),
             estimate=np.empty((positions, len(estimator)), complex),
         )
-        spectra = _take_apart(weights), _preference(size), positions, blocks, size, *object_bins, np.array([comparable])
+        spectra = _take_apart(weights), _weigh_bins(size), positions, blocks, size, *object_bins, np.array([comparable])
         estimates = _take_apart(steering), _take_apart(estimator, axis=1), steps
         self._call("find", (halves, *spectra, *estimates, *out))
         return out
@@ -662,7 +662,7 @@ class Library:
     def _call(self, name: str, arguments: Sequence[NDArray[Any] | float]) -> None:
         """Call a loop with arrays as pointers and numbers as int. Raises MemoryError."""
         arrays = [np.ascontiguousarray(x) if isinstance(x, np.ndarray) else x for x in arguments]
-        c_arguments = [_c_argument(x) for x in arrays]
+        c_arguments = [_convert_argument(x) for x in arrays]
         if getattr(self._loaded, f"{name}_{self.bits}")(*c_arguments):
             raise MemoryError(f"no memory for {name}")
 
@@ -672,7 +672,7 @@ def _take_apart(values: NDArray[np.complex64], axis: int = 0) -> NDArray[np.floa
     return np.stack([values.real, values.imag], axis=axis)
 
 
-def _c_argument(value: NDArray[Any] | float) -> Any:
+def _convert_argument(value: NDArray[Any] | float) -> Any:
     """Return a contiguous array as a pointer, a number as int."""
     if not isinstance(value, np.ndarray):
         return ctypes.c_int(int(value))

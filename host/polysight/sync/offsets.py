@@ -289,10 +289,10 @@ def _align_round(
     equaliser: hpf.Equaliser | None,
 ) -> tuple[AlignedRow, NDArray[np.bool_]]:
     """Align and average the whole chirps of a few positions; return which of them are disturbed, too."""
-    first, centre, coherence, usable = _against_one(words, whole, linear)
-    good = _coherent(coherence, usable)
+    first, centre, coherence, usable = _refer_to_one(words, whole, linear)
+    good = _find_coherent(coherence, usable)
     frequency = centre[:, None] + first.frequency
-    taps = _taps(equaliser, frequency)
+    taps = _find_taps(equaliser, frequency)
     start = np.angle(first.amplitude * taps.sum(axis=-1))
 
     # Second pass: each chirp against the sum of the others.
@@ -309,7 +309,7 @@ def _align_round(
     correction = part * tone.frequency
     shift = part * np.angle(tone.amplitude)
     coherence = amplitude * np.sqrt(level / np.maximum(own_energy, 1e-30))
-    good = _coherent(coherence, usable)
+    good = _find_coherent(coherence, usable)
 
     second_half = np.cumsum(good, axis=1) % 2 == 0
     weights = good / np.maximum(good.sum(axis=1), 1)[:, None]
@@ -338,7 +338,7 @@ def _find_disturbed(
     of the average. It is compared with the median, and with the least of the two chirps on either side: the stage's
     motion leaves more in some chirps, but equally much in those beside.
     """
-    median = _median(left, usable[..., None], axis=1)[:, None]
+    median = _take_lower_median(left, usable[..., None], axis=1)[:, None]
     padded = np.pad(np.where(usable[..., None], left, np.inf), ((0, 0), (2, 2), (0, 0)), constant_values=np.inf)
     chirps = left.shape[1]
     beside = np.minimum.reduce([padded[:, k : k + chirps] for k in (0, 1, 3, 4)])
@@ -347,7 +347,7 @@ def _find_disturbed(
     return usable & enough[:, None] & (left > _UNEXPLAINED * usual + _NEGLIGIBLE * level[:, None]).any(axis=2)
 
 
-def _median(values: NDArray[np.float64], usable: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
+def _take_lower_median(values: NDArray[np.float64], usable: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
     """Return the lower median of the usable values along an axis; 0 without any."""
     rising = np.sort(np.where(usable, values, np.inf), axis=axis)
     middle = np.maximum(usable.sum(axis=axis, keepdims=True) - 1, 0) // 2
@@ -361,7 +361,7 @@ def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
     return a, b - (b - a) % FOLD
 
 
-def _against_one(
+def _refer_to_one(
     words: NDArray[np.int16], whole: NDArray[np.bool_], linear: tuple[int, int]
 ) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Estimate offsets relative to one usable chirp per position; try another one if it matches few others.
@@ -408,16 +408,16 @@ def _against_one(
     return Tone(frequency, amplitude), centre, coherence, usable
 
 
-def _taps(equaliser: hpf.Equaliser | None, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+def _find_taps(equaliser: hpf.Equaliser | None, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
     """Return the filter taps of every chirp, [position, chirp, 3]; without an equaliser those of no filter."""
     if equaliser is None:
         return np.broadcast_to(np.array([0, 1, 0], complex), (*frequency.shape, 3))
     return equaliser.taps(frequency)
 
 
-def _coherent(coherence: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _find_coherent(coherence: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the usable chirps with at least `_GOOD` of the median coherence of their position."""
-    return usable & (coherence >= _GOOD * _median(coherence, usable, axis=1)[:, None])
+    return usable & (coherence >= _GOOD * _take_lower_median(coherence, usable, axis=1)[:, None])
 
 
 def _subtract_mean(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -552,22 +552,22 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     return DirectPath(
         steering=cis(-2 * np.pi * sweep * lag_s),
         folded_steering=folded_steering,
-        estimator=_least_squares(model[:, :2], covariance),
-        drift_estimator=_least_squares(model, covariance),
-        half_estimators=np.stack([_least_squares(model[c, :2], covariance[np.ix_(c, c)]) for c in channels_of_half]),
+        estimator=_invert_model(model[:, :2], covariance),
+        drift_estimator=_invert_model(model, covariance),
+        half_estimators=np.stack([_invert_model(model[c, :2], covariance[np.ix_(c, c)]) for c in channels_of_half]),
         beam=beam,
-        search_weights=complex64(beam[:, None] * folded_steering * _window(n)),
+        search_weights=complex64(beam[:, None] * folded_steering * _make_window(n)),
         object_bins=(float(excess.min() * bins), float(excess.max() * bins)),
         sweep_hz=middles,
     )
 
 
-def _window(blocks: int) -> NDArray[np.float32]:
+def _make_window(blocks: int) -> NDArray[np.float32]:
     """Return the window of the search, a Hann window without zeros at its ends."""
     return np.hanning(blocks + 2)[1:-1].astype(np.float32)
 
 
-def _least_squares(model: NDArray[np.complex128], covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:
+def _invert_model(model: NDArray[np.complex128], covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Return `(G^H R^-1 G)^-1 G^H R^-1` for a model G [sample, parameter] and a covariance R."""
     whitened = np.asarray(scipy.linalg.solve(covariance, model, assume_a="pos"), np.complex128)
     return np.linalg.solve(model.conj().T @ whitened, whitened.conj().T).astype(np.complex128)
@@ -606,8 +606,8 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
         estimator=complex64(path.drift_estimator),
         steps=_STEPS,
     )
-    floor = first.median**2 / np.log(2) / (_window(n) ** 2).sum()  # from the median bin, for tones fill few bins
-    drifts = _ratio(first.estimate[:, 2], first.estimate[:, 0])[usable]
+    floor = first.median**2 / np.log(2) / (_make_window(n) ** 2).sum()  # from the median bin, for tones fill few bins
+    drifts = _divide(first.estimate[:, 2], first.estimate[:, 0])[usable]
     drift = _find_middle(drifts) if usable.any() else 0.0
     flat = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
     scale = half_scale(good_chirps)
@@ -694,7 +694,7 @@ def _find_middle(values: NDArray[np.floating]) -> float:
     return float(rising[(rising.size - 1) // 2] + rising[rising.size // 2]) / 2
 
 
-def _ratio(moment: NDArray[np.complex128], amplitude: NDArray[np.complex128]) -> NDArray[np.float64]:
+def _divide(moment: NDArray[np.complex128], amplitude: NDArray[np.complex128]) -> NDArray[np.float64]:
     ratio = np.zeros(amplitude.shape, complex)
     np.divide(moment, amplitude, out=ratio, where=amplitude != 0)
     return np.real(ratio)

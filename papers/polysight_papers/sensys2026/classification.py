@@ -80,7 +80,7 @@ def noise_text(tasks: Iterable[str], quick: bool) -> str:
     )
 
 
-def _angles(task: str) -> tuple[float, ...]:
+def _parse_angles(task: str) -> tuple[float, ...]:
     name, _, two = task.partition(", ")
     if two:
         return (groups()[name].angle_deg, SECOND_ANGLE_DEG)
@@ -98,7 +98,7 @@ def chance(quick: bool) -> Table:
         scores = [score(task_samples(task, seed, quick), DISCRIMINANT) for seed in seeds]
         errors = calibrated_errors(name, count_draws(quick))
         limits = [
-            pixel_bound(groups()[name].materials, _angles(task), errors, reference, pixels)
+            pixel_bound(groups()[name].materials, _parse_angles(task), errors, reference, pixels)
             for reference, pixels in ((True, 1), (False, 1), (False, 12))
         ]
         cells = []
@@ -199,7 +199,7 @@ class TaskScores:
             (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT}"),
             (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT}"),
         )
-        angle = " and ".join(f"{a:.0f}°" for a in _angles(task))
+        angle = " and ".join(f"{a:.0f}°" for a in _parse_angles(task))
         return Picture(
             confusion_figure(groups()[task.partition(", ")[0]].materials, panels),
             f"{task[0].upper()}{task[1:]} at {angle}, whole scans left out. Rows are the truth and add up to 100 %; the"

@@ -112,17 +112,17 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
     notices = []
     libraries = {}
     if pickles := sorted((folder / "materials").glob("*.pkl")):
-        libraries[MATERIALS] = _readable(materials.read_material, pickles, notices)
-    scans = _readable(materials.read_labelled_scan, materials.label_folders(folder / "labels"), notices)
+        libraries[MATERIALS] = _read_all(materials.read_material, pickles, notices)
+    scans = _read_all(materials.read_labelled_scan, materials.label_folders(folder / "labels"), notices)
     if scans:
         orientation = materials.image_orientation(scans)
         notices.append(f"boxes of labels/ are read with {orientation}: so they explain the images' brightness best")
         turned = [s.orient(orientation) for s in scans]
-        angles = {s.scan: _angle(folder, s, base, notices) for s in scans}
-        libraries[LABELS] = _entries(turned, angles, notices)
+        angles = {s.scan: _find_angle(folder, s, base, notices) for s in scans}
+        libraries[LABELS] = _make_entries(turned, angles, notices)
         if images is not None:
-            ours = [s for scan in turned if (s := _imaged_here(scan, images, notices)) is not None]
-            libraries[IMAGES] = _entries(ours, angles, notices)
+            ours = [s for scan in turned if (s := _image_here(scan, images, notices)) is not None]
+            libraries[IMAGES] = _make_entries(ours, angles, notices)
     elif images is not None:
         notices.append("images made here are left out: labels/ holds no boxes to look at them with")
     renames = {}
@@ -139,7 +139,7 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
     return AuthorsData(folder, base, sources, meaning, tuple(dict.fromkeys(notices)))
 
 
-def _readable(read: Callable[[Path], T], paths: Sequence[Path], notices: list[str]) -> list[T]:
+def _read_all(read: Callable[[Path], T], paths: Sequence[Path], notices: list[str]) -> list[T]:
     """Read the files at these paths; damaged or refused files are listed in the notices and skipped."""
     out = []
     for path in paths:
@@ -153,7 +153,7 @@ def _readable(read: Callable[[Path], T], paths: Sequence[Path], notices: list[st
     return out
 
 
-def _entries(
+def _make_entries(
     scans: list[materials.LabelledScan], angles: Mapping[str, float], notices: list[str]
 ) -> list[materials.Entry]:
     entries = []
@@ -165,7 +165,7 @@ def _entries(
     return entries
 
 
-def _angle(folder: Path, scan: materials.LabelledScan, base: Instrument, notices: list[str]) -> float:
+def _find_angle(folder: Path, scan: materials.LabelledScan, base: Instrument, notices: list[str]) -> float:
     """Return the incidence angle of a labelled scan: from its raw data, else from its text, else the rig's."""
     for form in ("unsynced", "raw"):
         path = folder / form / scan.scan
@@ -180,7 +180,7 @@ def _angle(folder: Path, scan: materials.LabelledScan, base: Instrument, notices
     return angle
 
 
-def _imaged_here(scan: materials.LabelledScan, images: Path, notices: list[str]) -> materials.LabelledScan | None:
+def _image_here(scan: materials.LabelledScan, images: Path, notices: list[str]) -> materials.LabelledScan | None:
     """Return the scan's boxes with our own images, in the orientation of the authors' images."""
     file = images / scan.scan / "image.npz"
     try:
@@ -199,7 +199,7 @@ def _imaged_here(scan: materials.LabelledScan, images: Path, notices: list[str])
     def turn(image: np.ndarray, way: tuple[int, bool]) -> np.ndarray:
         return np.rot90(image[::-1] if way[1] else image, way[0])
 
-    correlations = {w: _correlation(np.abs(turn(h, w)), theirs) for w in ways if turn(h, w).shape == theirs.shape}
+    correlations = {w: _correlate(np.abs(turn(h, w)), theirs) for w in ways if turn(h, w).shape == theirs.shape}
     best = max(correlations, key=lambda w: correlations[w], default=None)
     if best is None or not correlations[best] >= _ALIKE:
         notices.append(f"{scan.scan}: the image made here does not show what sar_h.npy shows; left out")
@@ -207,7 +207,7 @@ def _imaged_here(scan: materials.LabelledScan, images: Path, notices: list[str])
     return replace(scan, h=turn(h, best), v=turn(v, best))
 
 
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+def _correlate(a: np.ndarray, b: np.ndarray) -> float:
     a = a - a.mean()
     b = b - b.mean()
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-30))
@@ -364,7 +364,7 @@ def authors_library(data: AuthorsData) -> materials.Library:
             continue
         entries_of_source: dict[tuple[str, str, int], list[materials.Entry]] = {}
         for e in library.entries:
-            entries_of_source.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(_without_leakage(e, a, b))
+            entries_of_source.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(_remove_leakage(e, a, b))
         merged = {**merged, **entries_of_source}
     entries = tuple(e for group in merged.values() for e in group)
     kind = "files"
@@ -373,7 +373,7 @@ def authors_library(data: AuthorsData) -> materials.Library:
     return materials.Library(entries, {}, f"{kind} of {data.folder.name}")
 
 
-def _without_leakage(entry: materials.Entry, leak_hv: complex, leak_vh: complex) -> materials.Entry:
+def _remove_leakage(entry: materials.Entry, leak_hv: complex, leak_vh: complex) -> materials.Entry:
     """Return an entry with at most `PIXELS` pixels, with the cross-polar leakage removed."""
     picked = np.unique(np.linspace(0, entry.p.size - 1, min(PIXELS, entry.p.size)).round().astype(int))
     # A common phase of H and V has no effect

@@ -319,12 +319,12 @@ def authors_fig20(judge: Judgements) -> Item:
             " paper does not say how its mean was taken.",
         ),
         (Table("Share of pixels named right by the paper's KNN", head, tuple(rows)),),
-        {"channels": Picture(_channel_figure(bars), "Accuracy of each channel, published and from the files.")},
+        {"channels": Picture(_draw_channels(bars), "Accuracy of each channel, published and from the files.")},
         content,
     )
 
 
-def _channel_figure(bars: list[tuple[str, list[float]]]) -> Any:
+def _draw_channels(bars: list[tuple[str, list[float]]]) -> Any:
     """Bars of accuracies in per cent: for each label one of each channel."""
     fig = new_figure(8.4, 4.2)
     ax = fig.subplots()
@@ -505,7 +505,7 @@ def authors_recipe(p: Complex, angle_deg: float) -> complex:
     return complex(np.mean(eps[np.isfinite(eps)]))
 
 
-def _pixels_of_material(data: AuthorsData, source: str, m: Published) -> tuple[Complex, float, int] | None:
+def _collect_pixels(data: AuthorsData, source: str, m: Published) -> tuple[Complex, float, int] | None:
     """Ratios of a material's pixels, their angle, and how many scans: at the paper's angle, or else the first."""
     paper = next(g.angle_deg for g in groups().values() if m in g.materials)
     entries = list(data.select(source, range(m.number, m.number + 1), paper).entries)
@@ -546,7 +546,9 @@ def authors_table2(data: AuthorsData) -> Item:
         when no material of the table is in the data.
     """
     leakage = float(np.mean([data.base.polarimetry.leakage_h[0], data.base.polarimetry.leakage_v[0]]))
-    estimates = {source: _estimates(data, source, 0.0 if source == IMAGES else leakage) for source in data.sources}
+    estimates = {
+        source: _estimate_materials(data, source, 0.0 if source == IMAGES else leakage) for source in data.sources
+    }
     if not any(estimates.values()):
         raise DataError(
             "no material of Table 2 is in the data", "its names are others, see the notices on them",
@@ -565,21 +567,29 @@ def authors_table2(data: AuthorsData) -> Item:
             "The recipe's factor makes up for something in the published measurements that is not explained; on data"
             " without it, simulated data for one, the recipe is off by it.",
         ),
-        tuple(Table(f"Permittivity from {source}", HEAD, tuple(map(_row, e))) for source, e in estimates.items()),
-        {"permittivity": Picture(_figure(estimates), "From the files against published; the dotted line is equality.")},
+        tuple(
+            Table(f"Permittivity from {source}", HEAD, tuple(map(_format_row, e))) for source, e in estimates.items()
+        ),
+        {
+            "permittivity": Picture(
+                _draw_figure(estimates), "From the files against published; the dotted line is equality."
+            )
+        },
         {
             "materials": [
-                _to_json(source, e) for source, estimates_of_source in estimates.items() for e in estimates_of_source
+                _convert_to_json(source, e)
+                for source, estimates_of_source in estimates.items()
+                for e in estimates_of_source
             ]
         },
     )
 
 
-def _estimates(data: AuthorsData, source: str, leakage: float) -> list[Estimate]:
+def _estimate_materials(data: AuthorsData, source: str, leakage: float) -> list[Estimate]:
     """Estimate all materials of Table 2 in a source; `leakage` is still in its ratios."""
     source_estimates = []
     for m in table2():
-        pixels = _pixels_of_material(data, source, m)
+        pixels = _collect_pixels(data, source, m)
         if pixels is None or not pixels[0].size:
             continue
         p, angle, scans = pixels
@@ -600,7 +610,7 @@ def _estimates(data: AuthorsData, source: str, leakage: float) -> list[Estimate]
     return source_estimates
 
 
-def _row(e: Estimate) -> tuple[str, ...]:
+def _format_row(e: Estimate) -> tuple[str, ...]:
     m = e.material
     std = e.clean.real_std
     return (
@@ -611,20 +621,20 @@ def _row(e: Estimate) -> tuple[str, ...]:
         str(e.pixels),
         f"{m.permittivity.real:.4g}",
         "–" if m.number == 23 else f"{-m.permittivity.imag:.4g}",
-        *_cells(e.as_is.value),
-        *_cells(e.clean.value),
+        *_format_cells(e.as_is.value),
+        *_format_cells(e.clean.value),
         "" if std is None or e.metal_like else f"± {std:.2f}",
-        *_cells(None if e.metal_like else e.recipe),
+        *_format_cells(None if e.metal_like else e.recipe),
     )
 
 
-def _cells(value: complex | None) -> tuple[str, str]:
+def _format_cells(value: complex | None) -> tuple[str, str]:
     if value is None:
         return ("metal-like", "")
     return (f"{value.real:.2f}", f"{-value.imag:.2f}")
 
 
-def _to_json(source: str, e: Estimate) -> dict[str, Any]:
+def _convert_to_json(source: str, e: Estimate) -> dict[str, Any]:
     """Return the content of the JSON file."""
     return {
         "source": source,
@@ -643,7 +653,7 @@ def _to_json(source: str, e: Estimate) -> dict[str, Any]:
     }
 
 
-def _figure(estimates: Mapping[str, Sequence[Estimate]]) -> Figure:
+def _draw_figure(estimates: Mapping[str, Sequence[Estimate]]) -> Figure:
     """Draw real part and loss of each source, without leakage, against the published values."""
     fig = new_figure(10.5, 4.6)
     axes = fig.subplots(1, 2)

@@ -35,8 +35,8 @@ def authors_fig21(data: AuthorsData) -> Item:
         angles = [e.incidence_deg for e in library.entries if e.name in concentration_of_name]
         if not angles:
             continue
-        best = max(set(angles), key=lambda angle: len({e.name for e in _entries_near(library, angle)}))
-        near = Library(tuple(e for e in _entries_near(library, best) if e.name in concentration_of_name))
+        best = max(set(angles), key=lambda angle: len({e.name for e in _select_entries_near(library, angle)}))
+        near = Library(tuple(e for e in _select_entries_near(library, best) if e.name in concentration_of_name))
         try:
             result = fit_concentration(near, {WATER_IN_GLASS: 0.0})
         except DataError as e:
@@ -49,7 +49,7 @@ def authors_fig21(data: AuthorsData) -> Item:
         count = str(len(result.left_out))
         left_out = ("median error, each concentration left out", f"published {printed:g} %", median, count, "")
         optimistic = ("median error, line has seen them (optimistic)", "", f"{median_error:.3f} %", "", "")
-        rows = [*_solution_rows(result, concentration_of_name), left_out, optimistic]
+        rows = [*_tabulate_solutions(result, concentration_of_name), left_out, optimistic]
         tables.append(
             Table(
                 f"Concentration estimated from the others, {source}, {best:.0f} degrees",
@@ -78,17 +78,17 @@ def authors_fig21(data: AuthorsData) -> Item:
         "Fig. 21: concentration of sugar in water",
         (FIG21_NOTE,),
         tuple(tables),
-        {"sugar": Picture(_sugar_figure(plots, printed), "The lines, and the distribution of errors.")},
+        {"sugar": Picture(_draw_sugar(plots, printed), "The lines, and the distribution of errors.")},
         content,
     )
 
 
-def _entries_near(library: Library, angle_deg: float) -> list[Entry]:
+def _select_entries_near(library: Library, angle_deg: float) -> list[Entry]:
     """Entries within a degree of an incidence angle."""
     return [e for e in library.entries if abs(e.incidence_deg - angle_deg) < 1]
 
 
-def _solution_rows(result: Any, concentration_of_name: Mapping[str, float]) -> list[tuple[str, ...]]:
+def _tabulate_solutions(result: Any, concentration_of_name: Mapping[str, float]) -> list[tuple[str, ...]]:
     """A row for each solution: name, true and mean estimated concentration, patches, median error."""
     rows = []
     names = {r.name for r in result.left_out}
@@ -107,7 +107,7 @@ def _solution_rows(result: Any, concentration_of_name: Mapping[str, float]) -> l
     return rows
 
 
-def _sugar_figure(plots: list[tuple[str, Any, Any, Any]], printed: float) -> Any:
+def _draw_sugar(plots: list[tuple[str, Any, Any, Any]], printed: float) -> Any:
     fig = new_figure(11.0, 4.3)
     left_axes, right = fig.subplots(1, 2)
     for k, (source, x, y, result) in enumerate(plots):

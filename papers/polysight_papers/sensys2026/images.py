@@ -176,7 +176,7 @@ def _label_plates(ax: Any, scan: ProcessedScan, size: float = 7.5) -> None:
     ax.set_ylim(max(bottom, -110), min(top, 110))
 
 
-def _reflects(scan: ProcessedScan) -> npt.NDArray[np.float64]:
+def _compute_opacity(scan: ProcessedScan) -> npt.NDArray[np.float64]:
     """Return the opacity of P: pixels 20 dB below metal or less are noise."""
     power = (np.abs(scan.h).astype(np.float64) ** 2 + np.abs(scan.v).astype(np.float64) ** 2) / 2
     power = np.nan_to_num(power)
@@ -189,7 +189,7 @@ def draw_row(fig: Any, axes: Any, view: ScanView, keys: tuple[str, ...], name: s
     for ax, key in zip(axes, keys, strict=True):
         image, unit = draw_channel(ax, view.scan, key)
         if key.endswith("_p"):
-            image.set_alpha(_reflects(view.scan))
+            image.set_alpha(_compute_opacity(view.scan))
         kind, _, channel = key.partition("_")
         dress(ax, f"{name}: {kind} {channel.upper()}", "x (mm)", "y (mm)" if ax is axes[0] else "")
         ax.set_aspect("equal")

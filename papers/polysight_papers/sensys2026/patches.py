@@ -270,7 +270,7 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
     weights = np.outer(weight, weight).ravel() / weight.sum() ** 2
     std = np.tile([errors.amplitude, errors.amplitude, errors.phase_rad * np.sqrt(2)], len(angles_deg))
     std = std * np.sqrt(errors.shared + (1 - errors.shared) / 12)
-    mean = _features(
+    mean = _compute_features(
         specimens(materials, errors.spread, np.broadcast_to(nodes, (2, z.size**2, len(materials)))), angles_deg
     )
     rng = np.random.default_rng(0)
@@ -280,7 +280,7 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
         trials = 40
     for k in range(len(materials)):
         eps = specimens(materials, errors.spread, rng.standard_normal((2, trials, len(materials))))[:, k]
-        measured = _features(eps, angles_deg) + std * rng.standard_normal((trials, std.size))
+        measured = _compute_features(eps, angles_deg) + std * rng.standard_normal((trials, std.size))
         difference = measured[:, None, None] - mean[None]
         difference[..., 2::3] = (difference[..., 2::3] + np.pi) % (2 * np.pi) - np.pi
         q = np.sum((difference / std) ** 2, axis=-1)
@@ -289,7 +289,7 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
     return float(np.mean(right))
 
 
-def _features(eps: npt.NDArray[np.complex128], angles_deg: tuple[float, ...]) -> Real:
+def _compute_features(eps: npt.NDArray[np.complex128], angles_deg: tuple[float, ...]) -> Real:
     columns = []
     for angle in angles_deg:
         r_s, r_p = fresnel(eps, np.radians(angle))
@@ -316,12 +316,12 @@ def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, i
             classifications = model.by_scan(scan_samples.x, scan_samples.patches)
             strange = np.unique(scan_samples.patches[scan_samples.names == name])
             named += (classifications.distance[np.searchsorted(classifications.patches, strange)] <= 1).tolist()
-            outside += _outside(scan_samples.take(np.isin(scan_samples.patches, strange)), taught_others).tolist()
+            outside += _find_outside(scan_samples.take(np.isin(scan_samples.patches, strange)), taught_others).tolist()
     far = np.array(outside)
     return int(np.sum(named)), len(named), int(np.array(named)[far].sum()), int(far.sum())
 
 
-def _outside(seen: Samples, known: Samples) -> npt.NDArray[np.bool_]:
+def _find_outside(seen: Samples, known: Samples) -> npt.NDArray[np.bool_]:
     """Return true for patches outside the regions of 95 % of each known material's patches, [patch].
 
     Of ln|H|, ln|V| and arg P of patches, normal with mean and covariance from so many patches (Hotelling's law).

@@ -45,14 +45,14 @@ MATERIALS = {"PET": 6, "ceramic": 12}
 """Rows of Table 2."""
 
 
-def _rows(numbers: tuple[int, ...]) -> tuple[item.Published, ...]:
+def _list_published(numbers: tuple[int, ...]) -> tuple[item.Published, ...]:
     return tuple(item.table2()[n - 1] for n in numbers)
 
 
 def fig3(run: item.Run) -> item.Item:
     """Reflectances |r_s|^2 and |r_p|^2 and their ratio over the incidence angle (no random errors)."""
     del run
-    materials = (*_rows(COMMON), WATER)
+    materials = (*_list_published(COMMON), WATER)
     angle = np.arange(0.0, 90.0, 0.25)
     fig = item.new_figure(11.5, 4.4)
     axes = fig.subplots(1, 3)
@@ -99,14 +99,14 @@ def fig3(run: item.Run) -> item.Item:
     )
 
 
-def _d_prime(a: np.ndarray, b: np.ndarray) -> float:
+def _compute_d_prime(a: np.ndarray, b: np.ndarray) -> float:
     """Return the distance of two means in pooled standard deviations."""
     return float(abs(a.mean() - b.mean()) / np.sqrt((a.var() + b.var()) / 2))
 
 
 def fig16(run: item.Run) -> item.Item:
     """Level of |H| at 0 degrees and of |P| at 55 and 60, pixels of eight scans each."""
-    materials = _rows(CONTRAST)
+    materials = _list_published(CONTRAST)
     errors = calibrated_errors("solids", count_draws(run.quick))
     fig = item.new_figure(11.5, 4.6)
     axes = fig.subplots(1, 3, sharex=True)
@@ -126,7 +126,7 @@ def fig16(run: item.Run) -> item.Item:
         item.dress(ax, f"incidence {angle:.0f}°: {quantity}", "", f"{quantity} relative to metal (dB)")
         ax.set_xticks(range(len(materials)), [m.name for m in materials], rotation=35, ha="right", fontsize=8)
     rows = [
-        (f"{a} / {b}", *(f"{_d_prime(level[a], level[b]):.1f}" for level in levels.values()))
+        (f"{a} / {b}", *(f"{_compute_d_prime(level[a], level[b]):.1f}" for level in levels.values()))
         for a, b in combinations(CLUTTERED, 2)
     ]
     table = item.Table(
@@ -256,10 +256,10 @@ def fig17(run: item.Run) -> item.Item:
                 theta = np.broadcast_to(result.theta_rad, result.p.shape)[inside]
                 pixels[patch.truth.name].append(permittivity_from_ratio(result.p[inside], theta))
         centres.append(dict(zip(("copper", *true), box_places, strict=True)))
-    return _item(true, pixels, centres)
+    return _make_item(true, pixels, centres)
 
 
-def _item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: list[dict[str, Any]]) -> item.Item:
+def _make_item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: list[dict[str, Any]]) -> item.Item:
     fig = item.new_figure(11.5, 4.6)
     rows = []
     data = {}
@@ -343,7 +343,7 @@ def fig21(run: item.Run) -> item.Item:
             item.Table(
                 "Each concentration estimated from the others, mean over eight scans",
                 ("Solution", "true", "simulated", "90 % interval", "median error"),
-                _concentration_rows(value, result),
+                _tabulate_concentrations(value, result),
             ),
         ),
         {
@@ -401,7 +401,7 @@ def _draw_errors(ax: Axes, result: ConcentrationResult, printed: float) -> None:
     ax.legend(fontsize=8, facecolor="white", framealpha=1.0, edgecolor="none", loc="lower right")
 
 
-def _concentration_rows(value: Mapping[str, float], result: ConcentrationResult) -> tuple[tuple[str, ...], ...]:
+def _tabulate_concentrations(value: Mapping[str, float], result: ConcentrationResult) -> tuple[tuple[str, ...], ...]:
     """Return a table line for each solution, by concentration."""
     rows = []
     for name in sorted(value, key=lambda n: value[n]):

@@ -179,7 +179,7 @@ def fig15(run: Run) -> Item:
             f" {chirps}. Its stages are not quite these; its two published numbers stand beside the last one, which is"
             " measured on the echo of the object.",
         ),
-        (Table("Standard deviation after each stage", head, _stage_rows(summary, limits)),),
+        (Table("Standard deviation after each stage", head, _tabulate_stages(summary, limits)),),
         {"stages": Picture(fig, "Errors after each stage, on a logarithmic axis, with the bounds of one tone.")},
         summary,
     )
@@ -207,7 +207,7 @@ def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: flo
     ax.margins(y=0.25)
 
 
-def _stage_rows(summary: Mapping[str, Any], limits: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
+def _tabulate_stages(summary: Mapping[str, Any], limits: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
     """Return table lines for each board and stage, with the published values beside the last stage."""
     rows = []
     for board, content in summary.items():
@@ -246,7 +246,7 @@ def skirt_db(
     return (np.arange(_PADDED) / _PADDED - 0.5) * rate_hz, 10 * np.log10(laid)
 
 
-def _sweep(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
+def _sweep_start_frequencies(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
     """IF (Hz) and amplitude of the direct path over all start frequencies, and the chirps of the usual one."""
     swept = []
     example = np.zeros((1, 1, chirp.samples), np.complex64)
@@ -309,7 +309,7 @@ def _draw_filter(ax: Axes, if_hz: npt.NDArray, amplitude: npt.NDArray, fitted: H
 def fig9(run: Run) -> Item:
     """The direct path alone, received at ten start frequencies of the receiver."""
     chirp = load_instrument(run.config).chirp
-    if_hz, amplitude, example = _sweep(run, chirp)
+    if_hz, amplitude, example = _sweep_start_frequencies(run, chirp)
     fitted = fit_high_pass(if_hz, amplitude)
     programmed = high_pass(chirp)
     amplitude = amplitude / np.exp(np.mean(np.log(amplitude / np.abs(fitted.response(if_hz)))))

@@ -37,7 +37,7 @@ from polysight_simulators.scene import (
 )
 
 
-def _parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     parser = command_line(
         "polysight_simulators.cards",
         "Radars and capture cards of a simulated rig; `python -m polysight_simulators.rig` starts them.",
@@ -80,7 +80,9 @@ def _check_arguments(args: argparse.Namespace, board_names: tuple[str, ...]) -> 
     return names
 
 
-def _source(args: argparse.Namespace, rig: Instrument, scene: Scene | None, names: tuple[str, ...]) -> SignalSource:
+def _make_source(
+    args: argparse.Namespace, rig: Instrument, scene: Scene | None, names: tuple[str, ...]
+) -> SignalSource:
     if scene is None or args.pattern:
         return PatternSource(rig)
     radars = SimulatedRig(rig, scene, args.seed, args.cache)
@@ -109,7 +111,7 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     if args.seed is not None:
         seed = args.seed
     faults = read_faults(args.faults, args.fault, board_names, base, rig.radar.control)
-    source = _source(args, rig, scene, names)
+    source = _make_source(args, rig, scene, names)
     power_cycle = Event()
     signal.signal(signal.SIGUSR1, lambda _signal, _frame: power_cycle.set())
     cards: list[SimulatedCard] = []
@@ -175,7 +177,7 @@ def _report(cards: list[SimulatedCard], path: Path | None) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the cards until SIGTERM or SIGINT."""
-    args = _parser().parse_args(argv)
+    args = _make_parser().parse_args(argv)
     stop = stop_requested()
     die_with_parent()
     try:

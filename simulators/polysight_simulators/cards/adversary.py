@@ -181,15 +181,15 @@ class Adversary:
         if edges_ns is not None:
             pulse_ns = edges_ns[0] - 1_000_000
         sent = Sent(self._number, data, pulse_ns, troubles=troubles)
-        packets, last_bytes = self._packets(sent, data)
+        packets, last_bytes = self._make_packets(sent, data)
         made_ns = [pulse_ns + (k + 1) * _GAP_NS for k in range(len(packets))]
         if edges_ns is not None:
-            made_ns = [self._made_ns(byte, edges_ns) for byte in last_bytes]
+            made_ns = [self._find_time_made_ns(byte, edges_ns) for byte in last_bytes]
         # A card that was reset may send nothing
         made_ns = made_ns or [pulse_ns]
         packets_before = self.take_late(0.5)
         in_between = self.take_late(0.7)
-        arriving = self._network(packets, made_ns, sent)
+        arriving = self._transmit(packets, made_ns, sent)
         if "twin" in troubles or "twin_alone" in troubles:
             sent.whole = False
             twin_data = np.random.default_rng(chance.getrandbits(32)).integers(1, 256, len(data), np.uint8)
@@ -210,7 +210,7 @@ class Adversary:
         self._now_ns = max([pulse_ns, *(a.t_ns for a in arriving)]) + 10_000_000
         return sent
 
-    def _packets(self, sent: Sent, data: bytes) -> tuple[list[bytes], list[int]]:
+    def _make_packets(self, sent: Sent, data: bytes) -> tuple[list[bytes], list[int]]:
         """Return the packets of one record as the card sends them, and the last byte of the data in each."""
         self._bytes = np.frombuffer(data, dtype=np.uint8)
         self._waiting = np.zeros(0, np.int64)
@@ -252,18 +252,18 @@ class Adversary:
             sent.whole = False
             cut = chance.randint(1, frames - 2) * frame
             lost_bytes = chance.randint(0, 1) * frame
-            out += self._stream(data[:cut]) + self._end()
+            out += self._make_stream(data[:cut]) + self._end()
             data = data[cut + lost_bytes :]
         if "reset" in troubles or "reset_early" in troubles:
             sent.whole = False
             cut = chance.randrange(len(data) + 1)
             if "reset_early" in troubles:
                 cut = min(cut, 3 * self._payload)
-            out += self._stream(data[:cut])
+            out += self._make_stream(data[:cut])
             lost_bytes = chance.choice([0, 0, chance.randint(1, 4000)])
             self._reset()
             data = data[cut + lost_bytes :]
-        return out + self._stream(data) + self._end()
+        return out + self._make_stream(data) + self._end()
 
     def forget_late(self) -> None:
         """Drop delayed packets: the host's program was restarted."""
@@ -274,7 +274,7 @@ class Adversary:
         self.resets += 1
         self._waiting = np.zeros(0, np.int64)
 
-    def _stream(self, data: NDArray[np.int64]) -> list[bytes]:
+    def _make_stream(self, data: NDArray[np.int64]) -> list[bytes]:
         self._waiting = np.concatenate([self._waiting, data])
         return self._note_last_bytes(self._card.feed(self._bytes[data]))
 
@@ -292,11 +292,11 @@ class Adversary:
             self._waiting = self._waiting[size:]
         return [bytes(row) for row in rows]
 
-    def _made_ns(self, byte: int, edges_ns: list[int]) -> int:
+    def _find_time_made_ns(self, byte: int, edges_ns: list[int]) -> int:
         """Time at which a byte of the data leaves the radar."""
         return edges_ns[byte // self._frame] + _FRAME_NS * (byte % self._frame) // self._frame + 100_000
 
-    def _network(self, packets: list[bytes], made_ns: list[int], sent: Sent) -> list[Arrival]:
+    def _transmit(self, packets: list[bytes], made_ns: list[int], sent: Sent) -> list[Arrival]:
         """Return the packets that arrive in time, in the order of arrival; keep the delayed ones.
 
         Packets overtake others by the time that these wait, at most 0.6 ms; only what is "held" waits for pulses.

@@ -434,7 +434,7 @@ class CardEndpoint:
         self.sender.close()
 
 
-def _runs(pulses: list[Pulse]) -> Iterator[list[Pulse]]:
+def _group_pulses(pulses: list[Pulse]) -> Iterator[list[Pulse]]:
     """Yield runs of consecutive pulse numbers, at most FRAMES_PER_CALL long."""
     first = 0
     for i in range(1, len(pulses) + 1):
@@ -499,14 +499,14 @@ class SimulatedCard:
         """Process rising edges of SYNC_IN at these wire times."""
         pulses = [Pulse(self._pulses + i, t) for i, t in enumerate(rising_ns)]
         self._pulses += len(pulses)
-        self._frames(self._sync.frames(self._pulse_faults.select_seen(pulses)), track)
+        self._send_frames(self._sync.frames(self._pulse_faults.select_seen(pulses)), track)
         self.last_data_wall_s = self._clock_s()
 
-    def _frames(self, started: list[Pulse], track: StageTrack) -> None:
+    def _send_frames(self, started: list[Pulse], track: StageTrack) -> None:
         if not self.card.recording:
             self.endpoint.counts["frames_not_recorded"] += len(started)
             return
-        for run in _runs(track.places(started)):
+        for run in _group_pulses(track.places(started)):
             self._run(run, track)
 
     def _run(self, run: list[Pulse], track: StageTrack) -> None:

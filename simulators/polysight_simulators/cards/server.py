@@ -114,14 +114,14 @@ class CardServer:
             if isinstance(message, WireMotion):
                 self._track.add(message)
             elif message.value:
-                self._edge(message, rising)
+                self._take_edge(message, rising)
         for card in self._cards:
             if rising[card.line]:
                 card.pulses(rising[card.line], self._track)
                 self._next_read_s = self._clock_s() + GATHER_S
         return any(rising.values())
 
-    def _edge(self, edge: WireEdge, rising: dict[int, list[int]]) -> None:
+    def _take_edge(self, edge: WireEdge, rising: dict[int, list[int]]) -> None:
         if edge.line == self._trigger:
             self._trigger_ns = edge.t_ns
             self._track.trigger(edge.t_ns)

@@ -52,7 +52,7 @@ class SyncInput:
     def frames(self, pulses: list[Pulse]) -> list[Pulse]:
         """Return the pulses that start a frame; count the others as `too_soon` (a real radar faults) or `unarmed`."""
         if self._radar is not None:
-            return self._native(self._radar, pulses)
+            return self._read_native(self._radar, pulses)
         started = []
         for pulse in pulses:
             if self._frames_left == 0:
@@ -68,7 +68,7 @@ class SyncInput:
             started.append(pulse)
         return started
 
-    def _native(self, radar: RadarBoard, pulses: list[Pulse]) -> list[Pulse]:
+    def _read_native(self, radar: RadarBoard, pulses: list[Pulse]) -> list[Pulse]:
         started = []
         for pulse in pulses:
             armed = radar.ready_for_triggers
@@ -138,14 +138,14 @@ class StageTrack:
             trigger_count = bisect_right(self._triggers, pulse.t_ns)
             if trigger_count and self._triggers[trigger_count - 1] != edge_ns:
                 edge_ns = self._triggers[trigger_count - 1]
-                first = self._first_pulse(edge_ns)
+                first = self._find_first_pulse(edge_ns)
             pulse_of_burst = (pulse.t_ns - edge_ns) // us_to_ns(self._burst.period_us)
             if trigger_count and first is not None and pulse_of_burst < self._burst.pulses:
                 pulse = pulse._replace(number=first + pulse_of_burst)
             renumbered.append(pulse)
         return renumbered
 
-    def _first_pulse(self, edge_ns: int) -> int | None:
+    def _find_first_pulse(self, edge_ns: int) -> int | None:
         """Return the number of the first pulse of the point with this trigger; None outside the plan."""
         plan = self._plan
         x, y, _ = self._read_reported_mm([edge_ns])

@@ -53,17 +53,17 @@ def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> li
             if not board.interrupt:
                 differences.append(f"line {number}: the simulated board sends nothing here")
         elif "out" in record:
-            for word in _words(record["out"]):
+            for word in _list_words(record["out"]):
                 board.write_word(word)
         elif "in" in record:
-            sent = [board.read_word() for _ in _words(record["in"])]
-            if sent != _words(record["in"]):
+            sent = [board.read_word() for _ in _list_words(record["in"])]
+            if sent != _list_words(record["in"]):
                 sent_hex = b"".join(w.to_bytes(2, "little") for w in sent).hex()
                 differences.append(f"line {number}: the traced board sent {record['in']}, the simulated one {sent_hex}")
     return differences
 
 
-def _words(text: str) -> list[int]:
+def _list_words(text: str) -> list[int]:
     raw = bytes.fromhex(text)
     return [int.from_bytes(raw[offset : offset + 2], "little") for offset in range(0, len(raw), 2)]
 

@@ -104,7 +104,7 @@ class RadarBoard:
         self.functional_jumpers = functional_jumpers
         self._answers_32_bit = answers_32_bit
         self.cores = Cores(
-            now, self._event, flash, die=die, supply_v=supply_v, erase_s=erase_s, fault_at=fault_at,
+            now, self._send_event, flash, die=die, supply_v=supply_v, erase_s=erase_s, fault_at=fault_at,
             first_generation=first_generation,
         )  # fmt: skip
         self.plugged = True
@@ -208,19 +208,19 @@ class RadarBoard:
         too_soon = abs(time_s - self._pulse_s) < (period if self._dead_s is None else self._dead_s) - 1e-9
         if too_soon or self._pulses_seen - 1 in self._fault_pulses:
             cores.armed = False
-            self._event(RF_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), 0.0)
+            self._send_event(RF_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), 0.0)
             return False
         self._pulse_s = time_s
         cores.frame_ends = self.now() + period
         cores.frames_left -= 1
         if cores.frames_left == 0:
             cores.armed = False
-            self._event(FRAME_END, b"", period)
+            self._send_event(FRAME_END, b"", period)
         return True
 
     def say(self, number: int, data: bytes = b"") -> None:
         """Send an event now."""
-        self._event(number, data, 0.0)
+        self._send_event(number, data, 0.0)
 
     # words
 
@@ -245,7 +245,7 @@ class RadarBoard:
             elif len(self._in) >= 4 + length:
                 raw = bytes(self._in[4 : 4 + length])
                 del self._in[: 4 + length]
-                self._message(raw)
+                self._send_message(raw)
 
     def read_word(self) -> int:
         """Send a word to the host; all ones if there is none yet. Raises DeviceError if unplugged."""
@@ -276,7 +276,7 @@ class RadarBoard:
     def _send(self, raw: bytes, delay_s: float) -> None:
         self._later.append((self.now() + delay_s, raw))
 
-    def _event(self, number: int, data: bytes, delay_s: float) -> None:
+    def _send_event(self, number: int, data: bytes, delay_s: float) -> None:
         main = number >= 0x4000
         if main:
             wide = self.cores.crc32_events
@@ -290,7 +290,7 @@ class RadarBoard:
             delay_s,
         )
 
-    def _message(self, raw: bytes) -> None:
+    def _send_message(self, raw: bytes) -> None:
         opcode, length, flags, remaining, count = struct.unpack_from("<5H", raw)
         fault = None
         if self._faults:
@@ -355,7 +355,7 @@ class RadarBoard:
 
     def _answer(self, answer: bytes, fault: Fault | None, delay_s: float) -> None:
         if fault is Fault.EVENT_BETWEEN:
-            self._event(0x1012, bytes(20), 0.0)
+            self._send_event(0x1012, bytes(20), 0.0)
         elif fault is Fault.BAD_CRC:
             answer = answer[:-1] + bytes((answer[-1] ^ 1,))
         elif fault is Fault.BAD_CHECKSUM:

@@ -78,7 +78,7 @@ class UsbChip:
             if name == "A" and self._pins & _SELECT:
                 self._high_s = float("inf")
             self._pending[name] += data
-            commands: dict[str, Callable[[bytearray], int]] = {"A": self._spi, "B": self._gpio}
+            commands: dict[str, Callable[[bytearray], int]] = {"A": self._transfer_spi, "B": self._set_gpio}
             while self._pending[name]:
                 used = commands[name](self._pending[name])
                 if used == 0:
@@ -97,7 +97,7 @@ class UsbChip:
         if not self._board.plugged:
             raise DeviceError("no such USB device", "it was unplugged", "plug it in", code=ErrorCode.NO_ANSWER)
 
-    def _spi(self, data: bytearray) -> int:
+    def _transfer_spi(self, data: bytearray) -> int:
         code = data[0]
         if code in _BARE:
             self._fast = self._fast or code == 0x8A
@@ -157,7 +157,7 @@ class UsbChip:
         self._pins = pins
         return 3
 
-    def _gpio(self, data: bytearray) -> int:
+    def _set_gpio(self, data: bytearray) -> int:
         code = data[0]
         if code in _BARE:
             return 1

@@ -109,12 +109,12 @@ def synced_cube(
     direct_m = direct_of_all_m[channels]
     gains = power_on(rig, scene, board, seed).gains[channels]
     cube = _sample_field(field, rig, f, field.centre_path_m - direct_m, gains, d.backlash_mm)
-    cube *= _drift_of_positions(rig, scene, board)[:, :, None]
+    cube *= _compute_drift(rig, scene, board)[:, :, None]
     if direct:
         level = direct_factor(board, scene) * d.direct_gain * direct_of_all_m[0] / direct_m
         cube += (gains * level).astype(np.complex64)[:, None, None, None]
     if noise is None:
-        noise = _burst_noise(rig, scene, board, seed, field.centre_path_m)
+        noise = _compute_burst_noise(rig, scene, board, seed, field.centre_path_m)
     if noise > 0:
         cube += _draw_noise(cube.shape, noise * np.abs(gains), stream_key(seed, "synced noise", board.name))
     return cube
@@ -127,7 +127,7 @@ def _draw_noise(shape: tuple[int, ...], rms_of_channel: Real, key: int) -> NDArr
     return noise * (np.sqrt(0.5) * rms_of_channel).astype(np.float32)[:, None, None, None]
 
 
-def _drift_of_positions(rig: Instrument, scene: Scene, board: Board) -> NDArray[np.complex64]:
+def _compute_drift(rig: Instrument, scene: Scene, board: Board) -> NDArray[np.complex64]:
     """Return the drift of a board's echo at every position, [row, column], in the order of the scan."""
     plan = plan_raster(rig.grid)
     factors = np.empty((plan.rows, plan.columns), np.complex64)
@@ -140,7 +140,7 @@ def _drift_of_positions(rig: Instrument, scene: Scene, board: Board) -> NDArray[
     return factors
 
 
-def _burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m: float) -> float:
+def _compute_burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m: float) -> float:
     """Return the RMS noise of an averaged sample; compensating the high-pass filter divides by its gain at the IF."""
     d = scene.disturbances
     chirp = rig.chirp

@@ -59,7 +59,7 @@ def cheb_nodes(q: int) -> optics.Real:
     return np.cos(np.pi * (np.arange(q) + 0.5) / q)
 
 
-def _angle_series(
+def _fit_angle_series(
     scene: Scene, reflect: optics.Reflectivity, nodes_hz: optics.Real, theta: tuple[float, float]
 ) -> NDArray[np.complexfloating]:
     """Return the Chebyshev coefficients of r(theta) for each plate and node, [plate, node, order]."""
@@ -77,7 +77,9 @@ def _angle_series(
     return series[:, :, :orders]
 
 
-def _spectra(axis: Axis, centres: optics.Real, sizes: optics.Real, shifts: optics.Real | float = 0.0) -> optics.Complex:
+def _transform_intervals(
+    axis: Axis, centres: optics.Real, sizes: optics.Real, shifts: optics.Real | float = 0.0
+) -> optics.Complex:
     """Return the Fourier transforms of intervals (or points, size 0) along an axis, [item, kappa], on the grid.
 
     `shifts` [item] are linear phases over each interval, rad/m, zero at its centre.
@@ -89,7 +91,7 @@ def _spectra(axis: Axis, centres: optics.Real, sizes: optics.Real, shifts: optic
     return envelope.astype(np.complex128) * np.exp(1j * np.outer(shift, k))
 
 
-def _outer(
+def _sum_outer_products(
     y: NDArray[np.complexfloating], weight: NDArray[np.complexfloating], x: NDArray[np.complexfloating]
 ) -> NDArray[np.complex64]:
     """Return the weighted sum of outer products over items, [kappa_y, kappa_x]; without BLAS threads."""
@@ -229,30 +231,30 @@ class _Plane:
         weights = series[level.plates] * optics.plate_scale(ant, self.scene, f)
         weights = weights * np.reshape(level.lift_phase(level.lift_m, wave, m), (-1, 1))
         is_smooth = np.array([self.surfaces[i].height_m.size == 1 for i in level.plates])
-        x = _spectra(self.x, ant.centre_m[0] + table[:, 0], table[:, 2], turn[:, 0])
-        y = _spectra(self.y, ant.centre_m[1] + table[:, 1], table[:, 3], turn[:, 1])
+        x = _transform_intervals(self.x, ant.centre_m[0] + table[:, 0], table[:, 2], turn[:, 0])
+        y = _transform_intervals(self.y, ant.centre_m[1] + table[:, 1], table[:, 3], turn[:, 1])
         orders = weights.shape[1]
         if len(plates) < orders:
             shares, kernel_series = np.eye(len(plates), dtype=np.complex128), weights
         else:
             shares, kernel_series = weights.T, np.eye(orders, dtype=np.complex128)
-        maps = [_outer(y[is_smooth], share[is_smooth], x[is_smooth]) for share in shares]
+        maps = [_sum_outer_products(y[is_smooth], share[is_smooth], x[is_smooth]) for share in shares]
         for n in np.flatnonzero(~is_smooth):
-            plate_map = self._rough_map(
+            plate_map = self._transform_rough_plate(
                 self.surfaces[level.plates[n]], table[n, :2], turn[n], wave * level.steepness[m]
             )
             for share, target_map in zip(shares, maps, strict=True):
                 target_map += np.complex64(share[n]) * plate_map
         return list(zip(maps, kernel_series, strict=True))
 
-    def _rough_map(
+    def _transform_rough_plate(
         self, parts: Facets, centre_m: optics.Real, turn: optics.Real, per_metre: float
     ) -> NDArray[np.complex64]:
         """Return the spectrum of a plate of facets: `turn` is the phase of its tilt in rad/m, `per_metre` of height."""
-        x = _spectra(
+        x = _transform_intervals(
             self.x, self.ant.centre_m[0] + centre_m[0] + parts.x_m, np.full(parts.x_m.shape, parts.size_m[0]), turn[0]
         )
-        y = _spectra(
+        y = _transform_intervals(
             self.y, self.ant.centre_m[1] + centre_m[1] + parts.y_m, np.full(parts.y_m.shape, parts.size_m[1]), turn[1]
         )
         phase = per_metre * parts.height_m + turn[0] * parts.x_m + turn[1] * parts.y_m[:, None]
@@ -265,10 +267,10 @@ class _Plane:
             return None
         table = np.array([self.scene.points[i].position_mm for i in level.points]) / 1e3
         none = np.zeros(len(table))
-        x = _spectra(self.x, self.ant.centre_m[0] + table[:, 0], none)
-        y = _spectra(self.y, self.ant.centre_m[1] + table[:, 1], none)
+        x = _transform_intervals(self.x, self.ant.centre_m[0] + table[:, 0], none)
+        y = _transform_intervals(self.y, self.ant.centre_m[1] + table[:, 1], none)
         lifted = level.lift_phase(level.point_lift_m, 2 * np.pi * f / SPEED_OF_LIGHT_M_S, m)
-        return _outer(y, self.amplitudes[level.points] * lifted, x)
+        return _sum_outer_products(y, self.amplitudes[level.points] * lifted, x)
 
 
 def _range(legs: list[tuple[optics.Real, optics.Real, optics.Real, optics.Real]]) -> tuple[float, float]:
@@ -281,14 +283,14 @@ def compute(
 ) -> tuple[NDArray[np.complex64], tuple[float, float], tuple[float, float], optics.Real, float]:
     """Return the fields of :class:`polysight_simulators.scene.field.ObjectField` for a scene of drawn specimens."""
     top_hz = float(samples_hz[-1])
-    planes = _planes(rig, scene, board, top_hz)
+    planes = _group_planes(rig, scene, board, top_hz)
     levels = [(plane, level) for plane in planes for level in plane.levels(rx, top_hz)]
-    nodes_hz, centre = _frequencies(scene, levels, samples_hz)
+    nodes_hz, centre = _choose_nodes(scene, levels, samples_hz)
     legs = [leg for _, level in levels for leg in level.legs]
     low = min(leg[2].min() for leg in legs)
     high = max(leg[2].max() for leg in legs)
     reflect = optics.board_reflectivity(board, scene)
-    series = [_angle_series(plane.scene, reflect, nodes_hz, (low, high)) for plane in planes]
+    series = [_fit_angle_series(plane.scene, reflect, nodes_hz, (low, high)) for plane in planes]
     ax = planes[0].x
     ay = planes[0].y
     by_channel = np.zeros((len(rx), len(nodes_hz), ay.outputs, ax.outputs), dtype=np.complex64)
@@ -314,7 +316,7 @@ def compute(
     return values, (ax.first_u, ay.first_u), steps, nodes_hz, centre
 
 
-def _planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) -> list[_Plane]:
+def _group_planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) -> list[_Plane]:
     """Return the scene's parts: a wide background has a grid of its own, so that small plates keep small kernels.
 
     All parts have the same step and the same range of offsets, so that their fields add up.
@@ -349,7 +351,7 @@ def _planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) -> list[
     return [replace(p, x=replace(p.x, step=step_x), y=replace(p.y, step=step_y)) for p in planes]
 
 
-def _frequencies(
+def _choose_nodes(
     scene: Scene, levels: list[tuple[_Plane, _Level]], samples_hz: optics.Real
 ) -> tuple[optics.Real, float]:
     """Return the nodes in the samples' band (the samples if they are fewer), and the path whose phase is removed."""
@@ -420,7 +422,7 @@ class _Kernels:
 
     def add_spectra(self, total: NDArray[np.complex64], plane: _Plane, series: optics.Complex, f: float) -> None:
         """Add the level's spectra at one frequency to `total` [rx, kappa_y, kappa_x]; series [plate, order]."""
-        waves = [_unit_phasors(f / SPEED_OF_LIGHT_M_S * path_m) for path_m in self.paths_m]
+        waves = [_compute_phasors(f / SPEED_OF_LIGHT_M_S * path_m) for path_m in self.paths_m]
         for m in range(len(self.level.steepness)):
             maps = plane.plate_maps(self.level, series, f, m)
             point_map = plane.point_map(self.level, f, m)
@@ -445,7 +447,7 @@ def _add_orders(
     return summed
 
 
-def _unit_phasors(cycles: optics.Real) -> NDArray[np.complex64]:
+def _compute_phasors(cycles: optics.Real) -> NDArray[np.complex64]:
     """Return exp(2 pi j cycles): the fraction of a cycle, which single precision holds to 4e-7 rad, is left."""
     phase = (2 * np.pi * (cycles - np.rint(cycles))).astype(np.float32)
     phasors = np.empty(phase.shape, np.complex64)
@@ -496,10 +498,10 @@ class ObjectField:
             if an offset lies outside the field's aperture.
         """
         x_m, y_m = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
-        ix, wx = self._taps(x_m, 0)
+        ix, wx = self._compute_taps(x_m, 0)
         out = np.empty((len(x_m), *self.values.shape[2:]), dtype=np.complex64)
         for y in np.unique(y_m):
-            iy, wy = self._taps(np.array([y]), 1)
+            iy, wy = self._compute_taps(np.array([y]), 1)
             on = np.flatnonzero(y_m == y)
             low = ix[on].min()
             high = ix[on].max() + 1
@@ -523,7 +525,7 @@ class ObjectField:
         n = self.values.shape[1 - axis]
         return first + (half - 1) * step, first + (n - half - 1) * step
 
-    def _taps(self, u: optics.Real, axis: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    def _compute_taps(self, u: optics.Real, axis: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
         """Return grid indices [n, taps] and weights of the Kaiser-windowed sinc at offsets u."""
         low, high = self._reach(axis)
         if u.min() < low or u.max() > high:

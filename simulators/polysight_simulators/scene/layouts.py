@@ -134,7 +134,7 @@ class OwnLayout:
     def start(self) -> None:
         """Create the folder, start manifest and events. Raises DataError if it is not empty."""
         new_folder(self.folder)
-        self._fact(
+        self._write_fact(
             "scan_started",
             format=1,
             scan_id=self._scan_id,
@@ -145,7 +145,7 @@ class OwnLayout:
             versions=versions(),
             **_copy_calibration(self._rig, self.folder),
         )
-        self._event(RunStarted(plan=self._plan, **self._stamp()))
+        self._write_event(RunStarted(plan=self._plan, **self._stamp()))
 
     def write_row(self, row: Row, payloads: dict[str, NDArray[np.int16]], gaps: dict[str, Gaps]) -> None:
         """Write a committed row and the events of the Pi."""
@@ -177,18 +177,18 @@ class OwnLayout:
                 "crc32": f"{crc32(raw):08x}",
                 "index_crc32": f"{crc32(index):08x}",
             }
-        self._row_events(row)
-        self._fact(
+        self._write_row_events(row)
+        self._write_fact(
             "row_committed", row=row.index, take=1, direction=row.direction, boards=boards, pulses=row.points * pulses
         )
         self._rows += 1
 
     def end(self) -> None:
         """Write the end of the scan to manifest and events."""
-        self._event(RunStopped(exit_status="success", **self._stamp()))
-        self._fact("scan_ended", exit_status="success", reason="", rows_committed=self._rows)
+        self._write_event(RunStopped(exit_status="success", **self._stamp()))
+        self._write_fact("scan_ended", exit_status="success", reason="", rows_committed=self._rows)
 
-    def _fact(self, fact: str, **content: Any) -> None:
+    def _write_fact(self, fact: str, **content: Any) -> None:
         record = {"fact": fact, **content, "count": self._lines, "previous": self._digest}
         plain = json.dumps(record, sort_keys=True, separators=(",", ":"))
         record["crc"] = f"{crc32(plain.encode()):08x}"
@@ -199,7 +199,7 @@ class OwnLayout:
         self._lines = self._lines + 1
         self._digest = sha256(line.encode()).hexdigest()[:16]
 
-    def _event(self, *events: AnyEvent) -> None:
+    def _write_event(self, *events: AnyEvent) -> None:
         path = self.folder / "events.msgpack"
         with name_in_errors(path), path.open("ab") as f:
             f.write(b"".join(map(pack_with_crc, events)))
@@ -208,7 +208,7 @@ class OwnLayout:
         self._seq += 1
         return {"scan_id": self._scan_id, "seq": self._seq, "t_mono_ns": self._now_ns}
 
-    def _row_events(self, row: Row) -> None:
+    def _write_row_events(self, row: Row) -> None:
         burst = self._rig.burst
         stage = self._rig.stage
         events: list[AnyEvent] = [RowStarted(row=row, take=1, **self._stamp())]
@@ -246,7 +246,7 @@ class OwnLayout:
                 **self._stamp(),
             )
         )
-        self._event(*events)
+        self._write_event(*events)
 
 
 def _index(facts: dict[str, Any]) -> bytes:
@@ -352,14 +352,14 @@ class AuthorsLayout:
 def write_settings(folder: Path, rig: Instrument, zero_filling: bool, by_columns: bool) -> None:
     """Write the three JSON files of a scan."""
     for name, content in (
-        ("data_collection_cfg", _collection(rig, folder.name, zero_filling, by_columns)),
-        ("devices_comm_cfg", _devices(rig)),
-        ("radar_id", _radars(rig)),
+        ("data_collection_cfg", _describe_collection(rig, folder.name, zero_filling, by_columns)),
+        ("devices_comm_cfg", _describe_devices(rig)),
+        ("radar_id", _describe_radars(rig)),
     ):
         (folder / f"{name}.json").write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
 
 
-def _collection(rig: Instrument, scan: str, zero_filling: bool, by_columns: bool) -> dict[str, Any]:
+def _describe_collection(rig: Instrument, scan: str, zero_filling: bool, by_columns: bool) -> dict[str, Any]:
     h, v = rig.receivers
     tilt = [s.shift_mm for s in h.mount if s.shift_mm is not None][-2]
     return {
@@ -377,7 +377,7 @@ def _collection(rig: Instrument, scan: str, zero_filling: bool, by_columns: bool
         "num_ch": len(rig.antennas.rx_mm),
         "packet_zero_filling": zero_filling,
         "object_distance": rig.geometry.object_distance_mm,
-        "board_dist": (_last_shift(h) - _last_shift(rig.transmitter)) / 1e3,
+        "board_dist": (_find_last_shift(h) - _find_last_shift(rig.transmitter)) / 1e3,
         "txboard_angle_y": _turn(rig.transmitter, "y", -1),
         "rxboard_v_angle_y": _turn(v, "y", 0),
         "rxboard_angle_y": _turn(h, "y", -1),
@@ -387,7 +387,7 @@ def _collection(rig: Instrument, scan: str, zero_filling: bool, by_columns: bool
     }
 
 
-def _devices(rig: Instrument) -> dict[str, Any]:
+def _describe_devices(rig: Instrument) -> dict[str, Any]:
     c = rig.chirp
     chirp = {
         "f0": c.start_hz,
@@ -401,7 +401,7 @@ def _devices(rig: Instrument) -> dict[str, Any]:
     return {"activated_radar": list(range(len(rig.boards))), "chirp_configs": [chirp]}
 
 
-def _radars(rig: Instrument) -> dict[str, Any]:
+def _describe_radars(rig: Instrument) -> dict[str, Any]:
     return {
         str(i): {
             "idx": i,
@@ -422,7 +422,7 @@ def _turn(board: Board, axis: str, which: int) -> float:
     return turns[which]
 
 
-def _last_shift(board: Board) -> float:
+def _find_last_shift(board: Board) -> float:
     """Return the last shift of a mount along x, mm: the origin of the board."""
     shifts = [s.shift_mm[0] for s in board.mount if s.shift_mm is not None]
     if not shifts:

@@ -282,7 +282,7 @@ def field_exact(
         cx, cy = ant.centre_m[:2] + np.array(plate.centre_mm) / 1e3
         slope = slopes(plate)
         parts = facets(plate, i, scene.seed)
-        x, y, area = _quadrature(parts.size_m, float(np.max(frequencies_hz)))
+        x, y, area = _place_quadrature(parts.size_m, float(np.max(frequencies_hz)))
         for row, column in np.ndindex(parts.height_m.shape):
             px = x + parts.x_m[column]
             py = y + parts.y_m[row]
@@ -303,7 +303,7 @@ def field_exact(
     return out
 
 
-def _quadrature(size_m: tuple[float, float], top_hz: float) -> tuple[Real, Real, Real]:
+def _place_quadrature(size_m: tuple[float, float], top_hz: float) -> tuple[Real, Real, Real]:
     """Return quadrature points x, y relative to the centre of a rectangle, and their areas."""
     # The phase changes at most by 2 k per metre; Gauss-Legendre needs about half a point per radian, plus a few.
     wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S

@@ -231,7 +231,7 @@ class SimulatedRig:
         """Compute the object fields of these boards (default: both receivers) now instead of at the first chirp."""
         for name in board_names or [b.name for b in self.rig.receivers]:
             if self.rig.by_name(name).role != "transmit":
-                self._receiving(name)
+                self._make_receiving_board(name)
 
     def chirps(
         self,
@@ -296,9 +296,9 @@ class SimulatedRig:
         for start in range(0, len(x_mm), _BATCH):
             batch = slice(start, min(start + _BATCH, len(x_mm)))
             pulses = np.arange(first + batch.start, first + batch.stop, dtype=np.int64)
-            self._noise(board, pulses, out[batch])
+            self._add_noise(board, pulses, out[batch])
             if board.role == "transmit":
-                out[batch] += self._own_leakage()
+                out[batch] += self._simulate_own_leakage()
             else:
                 self._add_received(board, x_mm[batch] / 1e3, y_mm[batch] / 1e3, pulses, out[batch])
         return out
@@ -318,7 +318,7 @@ class SimulatedRig:
         after_s = FIRST_PULSE_DELAY_S + np.array(burst.chirp_times_s)
         return direction * stage.speed_mm_s * after_s + backlash_mm
 
-    def _receiving(self, name: str) -> _ReceivingBoard:
+    def _make_receiving_board(self, name: str) -> _ReceivingBoard:
         if name not in self._boards:
             board = self.rig.by_name(name)
             self._boards[name] = _ReceivingBoard(self.rig, self.scene, board, self.seed, self._cache_dir)
@@ -333,7 +333,7 @@ class SimulatedRig:
         out: NDArray[np.complex64],
     ) -> None:
         d = self.scene.disturbances
-        receiver = self._receiving(board.name)
+        receiver = self._make_receiving_board(board.name)
         chirp = self.rig.chirp
         # All chirps of a frame start with one pulse
         frames = pulses // self.rig.burst.chirps
@@ -362,7 +362,7 @@ class SimulatedRig:
         out += ideal[:, 0]
         out += ideal[:, 1]
 
-    def _noise(self, board: Board, pulses: NDArray[np.int64], out: NDArray[np.complex64]) -> None:
+    def _add_noise(self, board: Board, pulses: NDArray[np.int64], out: NDArray[np.complex64]) -> None:
         """Fill `out` with receiver noise: each channel has the same signal-to-noise ratio for any gain."""
         snr_db = self.scene.disturbances.direct_snr_db
         if snr_db is None:
@@ -373,10 +373,10 @@ class SimulatedRig:
         if board.role == "transmit":
             out *= np.float32(sigma)
         else:
-            gains = self._receiving(board.name).receiver.gains
+            gains = self._make_receiving_board(board.name).receiver.gains
             out *= (sigma * np.abs(gains)).astype(np.float32)[:, None]
 
-    def _own_leakage(self) -> NDArray[np.complex64]:
+    def _simulate_own_leakage(self) -> NDArray[np.complex64]:
         """Return the signal of the transmitting board: its own leakage, a tone near zero IF through the filter."""
         chirp = self.rig.chirp
         t = np.arange(chirp.samples) / chirp.sample_rate_hz

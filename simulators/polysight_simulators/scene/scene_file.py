@@ -55,11 +55,11 @@ def pulse_normal(key: int, first: int, out: NDArray[np.float32]) -> None:
     bits = np.random.Philox(key=key, counter=first * blocks).random_raw(len(out) * blocks * 4).view("<u2")
     chosen = bits.reshape(len(out), -1)[:, :values].reshape(out.shape)
     # "clip": no copy of `out` in case of a wrong index
-    np.take(_normal_values(), chosen, out=out, mode="clip")
+    np.take(_tabulate_normal(), chosen, out=out, mode="clip")
 
 
 @cache
-def _normal_values() -> NDArray[np.float32]:
+def _tabulate_normal() -> NDArray[np.float32]:
     """Return the middles of 65536 equally likely intervals of the normal distribution, variance 1."""
     middles = scipy.special.ndtri((np.arange(1 << 16) + 0.5) / (1 << 16))
     return (middles / middles.std()).astype(np.float32)
@@ -447,12 +447,12 @@ def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
         table["geometry"] = {**table["geometry"], "object_distance_mm": scene.object_distance_mm}
     if not scene.disturbances.hpf:
         table["chirp"] = {**table["chirp"], "hpf1_khz": 0.0, "hpf2_khz": 0.0}
-    table["polarimetry"] = {**table["polarimetry"], **_known_leakage(scene)}
+    table["polarimetry"] = {**table["polarimetry"], **_describe_leakage(scene)}
     remedy = f"its {', '.join(_OVERRIDES)} override the rig file's; docs/spec/scene-file.md lists all keys"
     return decode(table, Instrument, f"scene {scene.name}", remedy)
 
 
-def _known_leakage(scene: Scene) -> dict[str, Any]:
+def _describe_leakage(scene: Scene) -> dict[str, Any]:
     """Return the keys of the rig file's [polarimetry] that a scene sets: measured leakage, or zero."""
     d = scene.disturbances
     parts = ("leakage_h", "leakage_v")
@@ -499,7 +499,8 @@ def draw_specimens(scene: Scene) -> Scene:
     """
     plates = tuple(_move_with_plane(_draw_permittivities(p, i, scene), scene) for i, p in enumerate(scene.plates))
     points = tuple(
-        msgspec.structs.replace(p, height_mm=p.height_mm + _plane_height_mm(scene, p.position_mm)) for p in scene.points
+        msgspec.structs.replace(p, height_mm=p.height_mm + _find_plane_height_mm(scene, p.position_mm))
+        for p in scene.points
     )
     return msgspec.structs.replace(
         scene,
@@ -531,7 +532,7 @@ def slopes(plate: Plate) -> tuple[float, float]:
     return math.tan(math.radians(plate.tilt_deg[0])), math.tan(math.radians(plate.tilt_deg[1]))
 
 
-def _plane_height_mm(scene: Scene, at_mm: Pair) -> float:
+def _find_plane_height_mm(scene: Scene, at_mm: Pair) -> float:
     along = [math.tan(math.radians(a)) * x for a, x in zip(scene.plane_tilt_deg, at_mm, strict=True)]
     return scene.plane_shift_mm + sum(along)
 
@@ -545,7 +546,7 @@ def _move_with_plane(plate: Plate, scene: Scene) -> Plate:
             for a, b in zip(tilt, scene.plane_tilt_deg, strict=True)
         ]
         tilt = (math.degrees(math.atan(corners[0])), math.degrees(math.atan(corners[1])))
-    height_mm = plate.height_mm + _plane_height_mm(scene, plate.centre_mm)
+    height_mm = plate.height_mm + _find_plane_height_mm(scene, plate.centre_mm)
     return msgspec.structs.replace(plate, tilt_deg=tilt, height_mm=height_mm)
 
 

@@ -38,7 +38,7 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
     """
     centre = specular_midpoint_m(rig, rig.by_role("receive_h"))
     actual = draw_specimens(scene)
-    plates = [_plate_truth(p, n, centre) for p, n in zip(actual.plates, scene.plates, strict=True)]
+    plates = [_describe_plate(p, n, centre) for p, n in zip(actual.plates, scene.plates, strict=True)]
     points = [
         {
             "name": p.name,
@@ -67,7 +67,7 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
     }
 
 
-def _plate_truth(plate: Plate, nominal: Plate, centre_m: Vector) -> dict[str, Any]:
+def _describe_plate(plate: Plate, nominal: Plate, centre_m: Vector) -> dict[str, Any]:
     """Return the entry of a drawn plate, with the nominal values of the scene file."""
     return {
         "name": plate.name,
@@ -161,7 +161,7 @@ def simulate(
     DataError
         if the folder is not empty.
     """
-    radar = SimulatedRig(rig, _wider(scene, rig) if by_columns else scene, seed, cache_dir)
+    radar = SimulatedRig(rig, _widen_scene(scene, rig) if by_columns else scene, seed, cache_dir)
     rig = apply_scene(rig, scene)
     plan = _plan(rig, by_columns)
     if started_s is None:
@@ -267,7 +267,7 @@ def _transpose_grid(grid: Grid) -> Grid:
     return Grid(columns=grid.rows, rows=grid.columns, step_x_mm=grid.step_y_mm, step_y_mm=grid.step_x_mm)
 
 
-def _wider(scene: Scene, rig: Instrument) -> Scene:
+def _widen_scene(scene: Scene, rig: Instrument) -> Scene:
     """Return the scene with one more row above and below, for bursts that travel along y."""
     grid = to_builtins(apply_scene(rig, scene).grid)
     return msgspec.structs.replace(scene, grid={**grid, "rows": grid["rows"] + 2})

@@ -142,7 +142,7 @@ class StageLogic:
             "CLEAR": self._clear,
             "HOME": self._home,
             "MOVE": self._move,
-            "ROW": self._row,
+            "ROW": self._start_row,
             "BUZZ": self._buzz,
         }
         handlers[verb](*args)
@@ -180,7 +180,7 @@ class StageLogic:
         self._buzz_x = axis == 0
         self._phase = 0
 
-    def _next_buzz_leg(self) -> Event:
+    def _plan_buzz_leg(self) -> Event:
         if self._phase == 3:
             self._engine.set_accel(self.parameters[Parameter.ACCEL])
             return self._end()
@@ -198,16 +198,16 @@ class StageLogic:
     def _move(self, x: int, y: int, rate: int) -> None:
         _require(rate >= MIN_RATE, StageError.OUT_OF_RANGE)
         _require(rate <= MAX_RATE, StageError.TOO_FAST)
-        _require(self._within(x, y), StageError.SOFT_LIMIT)
+        _require(self._is_within(x, y), StageError.SOFT_LIMIT)
         self._begin("move")
         self._go(x, y, rate)
 
-    def _row(self, x0: int, pitch: int, points: int, y: int, rate: int) -> None:
+    def _start_row(self, x0: int, pitch: int, points: int, y: int, rate: int) -> None:
         _require(1 <= points <= MAX_POINTS and pitch != 0 and rate >= MIN_RATE, StageError.OUT_OF_RANGE)
         _require(rate <= MAX_RATE, StageError.TOO_FAST)
         last = x0 + pitch * (points - 1)
         spacing = abs(pitch)
-        _require(self._within(x0, y) and self._within(last, y) and spacing <= MAX_TRAVEL, StageError.SOFT_LIMIT)
+        _require(self._is_within(x0, y) and self._is_within(last, y) and spacing <= MAX_TRAVEL, StageError.SOFT_LIMIT)
         width_us = self.parameters[Parameter.TRIGGER]
         _require(width_us * rate < min(spacing, 4000) * 1_000_000, StageError.OUT_OF_RANGE)
         backlash = self.parameters[Parameter.BACKLASH]
@@ -216,7 +216,7 @@ class StageLogic:
             run_up = lead
         else:
             run_up = -lead
-        _require(self._within(x0 - run_up, y) and self._within(last + run_up, y), StageError.NO_RUN_UP)
+        _require(self._is_within(x0 - run_up, y) and self._is_within(last + run_up, y), StageError.NO_RUN_UP)
         _require(y >= backlash, StageError.NO_RUN_UP)
         self._row_leg = Leg(last - x0 + 2 * run_up, 0, rate, lead, spacing, points)
         self._begin("travel")
@@ -227,7 +227,7 @@ class StageLogic:
             from_below = y
         self._go(x0 - run_up, from_below, self.parameters[Parameter.TRAVEL_SPEED])
 
-    def _within(self, x: int, y: int) -> bool:
+    def _is_within(self, x: int, y: int) -> bool:
         return 0 <= x <= self.parameters[Parameter.TRAVEL_X] and 0 <= y <= self.parameters[Parameter.TRAVEL_Y]
 
     def _begin(self, activity: str) -> None:
@@ -318,10 +318,10 @@ class StageLogic:
         if engine.hold and self.activity == "row":
             self.held = True
         if engine.finished:
-            return self._next_leg()
+            return self._plan_leg()
         return Event.NONE
 
-    def _next_leg(self) -> Event:
+    def _plan_leg(self) -> Event:
         if self.activity == "travel" and self._engine.y != self._row_y:
             self._go(self._engine.x, self._row_y, self.parameters[Parameter.TRAVEL_SPEED])
             return Event.NONE
@@ -330,9 +330,9 @@ class StageLogic:
             self._arm(self._engine.start(self._row_leg))
             return Event.NONE
         if self.activity == "home":
-            return self._next_homing_leg()
+            return self._plan_homing_leg()
         if self.activity == "buzz":
-            return self._next_buzz_leg()
+            return self._plan_buzz_leg()
         return self._end()
 
     def _end(self) -> Event:
@@ -340,7 +340,7 @@ class StageLogic:
         self._engine.abandon()
         return Event.DONE
 
-    def _next_homing_leg(self) -> Event:
+    def _plan_homing_leg(self) -> Event:
         along_x = self._phase < 3
         step = self._phase % 3
         its_switch = SWITCH_X if along_x else SWITCH_Y
@@ -367,7 +367,7 @@ class StageLogic:
             self._phase += 1
             self._searched = 0
             self._homing_leg_made = False
-            return self._next_homing_leg()
+            return self._plan_homing_leg()
         if self._phase == 6:
             self._engine.set_accel(self.parameters[Parameter.ACCEL])
             self.homed = True

@@ -53,7 +53,7 @@ class PythonStage:
 
     def _power_on(self) -> None:
         self._engine = StepEngine()
-        self._logic = StageLogic(self._engine, self._arm, self._inputs)
+        self._logic = StageLogic(self._engine, self._arm, self._read_inputs)
         self._armed = self._was_homed = False
         self._line = bytearray()
         self._greeted = self._fresh = False
@@ -89,7 +89,7 @@ class PythonStage:
         moved = self._armed
         self._power_on()
         if self._fall is not None:
-            self._edge(self.tick, 0)
+            self._send_edge(self.tick, 0)
         if moved:
             self._report_motion()
         self._send(Reply("banner", fields={"fw": FIRMWARE, "proto": str(PROTOCOL_VERSION)}).encode())
@@ -108,19 +108,19 @@ class PythonStage:
         while self._armed and self._next <= tick:
             self._end_trigger(self._next)
             self.tick = self._next
-            self._steps(tick)
+            self._take_steps(tick)
         self._end_trigger(tick)
         self.tick = tick
         self._settle()
 
-    def _steps(self, until: int) -> None:
+    def _take_steps(self, until: int) -> None:
         engine = self._engine
         if self._fall is None:
             end = until
         else:
             end = min(until, self._fall - 1)
         n = dx = dy = ticks = 0
-        if end > self.tick and not self._inputs():
+        if end > self.tick and not self._read_inputs():
             n, dx, dy, ticks = engine.skip(end - self.tick, abs(self._x) - 1, abs(self._y) - 1)
         if n:
             self._x += dx
@@ -129,13 +129,13 @@ class PythonStage:
             self.tick = self._next - engine.ticks
             return
         cruised = engine.cruise
-        dx, dy, trigger = engine.step(self._inputs())
+        dx, dy, trigger = engine.step(self._read_inputs())
         self._x += dx
         self._y += dy
         if trigger:
             self._report_motion()
             if self._fall is None:
-                self._edge(self.tick, 1)
+                self._send_edge(self.tick, 1)
                 self._fall = self.tick + 2 * self._logic.parameters[Parameter.TRIGGER]
                 engine.pulses += 1
         ticks = engine.interval()
@@ -152,7 +152,7 @@ class PythonStage:
         while True:
             event = self._logic.service(self._now_ms)
             if event is Event.DONE:
-                self._outcome = self._done()
+                self._outcome = self._finish_motion()
                 self._send(self._outcome)
             elif event is Event.ALARM:
                 alarm = Reply("alarm", number=int(self._logic.alarm or 0)).encode()
@@ -160,7 +160,7 @@ class PythonStage:
                 self._send(alarm)
             if self._logic.status_requested:
                 self._logic.status_requested = False
-                self._send(self._status())
+                self._send(self._format_status())
             if not (self._logic.busy and self._engine.finished):
                 break
         if self._logic.homed and not self._was_homed:
@@ -177,7 +177,7 @@ class PythonStage:
             if self._engine.cruise:
                 self._report_motion()
 
-    def _inputs(self) -> int:
+    def _read_inputs(self) -> int:
         inputs = self._pressed
         if self._x <= 0:
             inputs |= SWITCH_X
@@ -185,13 +185,13 @@ class PythonStage:
             inputs |= SWITCH_Y
         return inputs
 
-    def _edge(self, tick: int, value: int) -> None:
+    def _send_edge(self, tick: int, value: int) -> None:
         self._fall = self._fall if value else None
         self.wires.append(WireEdge(tick * NS_PER_TICK, self._rig.trigger_line, value))
 
     def _end_trigger(self, until: int) -> None:
         if self._fall is not None and self._fall <= until:
-            self._edge(self._fall, 0)
+            self._send_edge(self._fall, 0)
 
     def _report_motion(self) -> None:
         self._told = self.tick
@@ -262,7 +262,7 @@ class PythonStage:
         self._last_answer = answer.encode()
         self._send(self._last_answer)
 
-    def _done(self) -> bytes:
+    def _finish_motion(self) -> bytes:
         engine = self._engine
         logic = self._logic
         fields = {}
@@ -275,10 +275,10 @@ class PythonStage:
             fields |= {"lostx": logic.lost_x, "losty": logic.lost_y}
         return Reply("done", self._motion_sequence, fields={k: str(v) for k, v in fields.items()}).encode()
 
-    def _status(self) -> bytes:
+    def _format_status(self) -> bytes:
         engine = self._engine
         logic = self._logic
         fields: dict[str, object] = {"state": logic.state, "x": engine.x, "y": engine.y}
         fields |= {"points": engine.points, "pulses": engine.pulses, "alarm": int(logic.alarm or 0)}
-        fields |= {"limits": self._inputs(), "homed": int(logic.homed)}
+        fields |= {"limits": self._read_inputs(), "homed": int(logic.homed)}
         return Reply("status", fields={k: str(v) for k, v in fields.items()}).encode()

@@ -115,7 +115,7 @@ class EmulatedUno:
                 self.troubles.append(" ".join(rest[1:]))
         raise DeviceError("the UNO emulator ended", "it crashed; its last words are on standard error", "report it")
 
-    def _do(self, line: str) -> None:
+    def _apply_action(self, line: str) -> None:
         if self._process.stdin is None:
             raise DeviceError("the UNO emulator has no input", "a bug", "report it")
         self._process.stdin.write(line + "\n")
@@ -124,11 +124,11 @@ class EmulatedUno:
 
     def feed(self, data: bytes) -> None:
         """Put bytes on the serial line; they arrive as time advances."""
-        self._do(f"feed {data.hex()}")
+        self._apply_action(f"feed {data.hex()}")
 
     def run(self, cycles: int) -> None:
         """Advance the time by CPU cycles."""
-        self._do(f"run {max(1, cycles)}")
+        self._apply_action(f"run {max(1, cycles)}")
 
     def run_ms(self, ms: float) -> None:
         """Advance the time by milliseconds."""
@@ -136,36 +136,36 @@ class EmulatedUno:
 
     def settle(self, pty_bytes: int = 0) -> None:
         """Run until the serial line is idle; `pty_bytes`: total number written to the pseudo terminal."""
-        self._do(f"settle {pty_bytes}")
+        self._apply_action(f"settle {pty_bytes}")
 
     def rest(self, limit_s: float = 600.0) -> None:
         """Run until no motor has stepped for 50 ms."""
-        self._do(f"rest {round(limit_s * HZ)}")
+        self._apply_action(f"rest {round(limit_s * HZ)}")
 
     def press(self, mask: int) -> None:
         """Press switches: 1 x, 2 y, 4 emergency stop."""
-        self._do(f"inputs {mask}")
+        self._apply_action(f"inputs {mask}")
 
     def slip(self, dx: int, dy: int) -> None:
         """Let the motors lose steps."""
-        self._do(f"slip {dx} {dy}")
+        self._apply_action(f"slip {dx} {dy}")
 
     def reset(self) -> None:
         """Press the reset button."""
-        self._do("reset")
+        self._apply_action("reset")
 
     def hang(self) -> None:
         """Stop the main program until the next reset; interrupts go on."""
-        self._do("hang")
+        self._apply_action("hang")
 
     def watch(self, *pins: int) -> None:
         """Store the edges of these pins from now on."""
-        self._do("watch " + ",".join(map(str, pins)))
+        self._apply_action("watch " + ",".join(map(str, pins)))
 
     def cost(self) -> Cost:
         """Return the worst cases since the last call."""
         self._counted = {}
-        self._do("cost")
+        self._apply_action("cost")
         return Cost(self._counted, *self._cost_pins)
 
     def close(self) -> None:

@@ -99,7 +99,7 @@ class CardClient:
         requests = 0
         while not versions:
             if requests == ATTEMPTS:
-                raise self._silent(Code.VERSION, ATTEMPTS)
+                raise self._no_answer_error(Code.VERSION, ATTEMPTS)
             requests += 1
             reply = self._try(Code.VERSION, b"", self._timeout_s / ATTEMPTS)
             if reply is not None:

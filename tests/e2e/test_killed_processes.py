@@ -223,12 +223,16 @@ def safe(folder: Path, truth: dict[str, str]) -> dict[str, str]:
 
 
 def retaken(folder: Path) -> set[int]:
-    """Rows that the last resume has taken again, by the manifest."""
+    """Rows that the last resume has taken again, by the manifest; not those that it rejected itself."""
     if not begun(folder):
         return set()
     facts = facts_of(folder)
     since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
-    return {f["row"] for f in facts[since:] if f["fact"] in ("row_committed", "row_rejected") and f["take"] > 1}
+    first_takes: dict[int, int] = {}
+    for fact in facts[since:]:
+        if fact["fact"] in ("row_committed", "row_rejected"):
+            first_takes.setdefault(fact["row"], fact["take"])
+    return {row for row, take in first_takes.items() if take > 1}
 
 
 def image(folder: Path) -> bytes:

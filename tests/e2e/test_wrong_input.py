@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
+from tests.support.processes import HANG_S
 from tests.support.scenes import small_scene
 
 from polysight_shared.tables import to_builtins
@@ -234,7 +235,7 @@ def silent_pty():
 def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
     """The Pi's port takes the connection and never answers: Ctrl-C ends the wait."""
     table = to_builtins(lonely_instrument)
-    table["limits"]["command_timeout_s"] = 60.0
+    table["limits"]["command_timeout_s"] = HANG_S
     lonely.write_text(tomli_w.dumps(table))
     with listening(lonely_instrument.pi.command_address):
         scan = bench.start("polysight", "scan", "--config", lonely, "--out", "s")

@@ -106,7 +106,7 @@ class Loop:
         return self
 
     def __exit__(self, *_):
-        assert self.loop.stop(5)
+        assert self.loop.stop(HANG_S)
         assert self.lines.closed
         assert not self.lines.level
 

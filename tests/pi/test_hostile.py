@@ -87,7 +87,7 @@ class Stranger:
             self.socket.setsockopt(option, 1)
         self.socket.connect(address)
 
-    def ask(self, raw: bytes, limit_s: float = 60.0) -> m.AnyReply | None:
+    def ask(self, raw: bytes, limit_s: float = HANG_S) -> m.AnyReply | None:
         self.socket.send(raw)
         if self.socket.poll(round(limit_s * 1e3)):
             return m.unpack_reply(self.socket.recv())

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.paths import REPO, RIG_FILE
+from tests.support.processes import HANG_S
 from tests.support.rigs import published_rig
 
 PI = REPO / "pi_controller"
@@ -46,7 +47,7 @@ def analyze(tmp_path):
     path = tmp_path / "polysight-pi.service"
     path.write_text(text.replace(PROGRAM, "/bin/true"))
     return lambda *words: subprocess.run(
-        ["systemd-analyze", *words, str(path)], capture_output=True, text=True, timeout=60, check=False
+        ["systemd-analyze", *words, str(path)], capture_output=True, text=True, timeout=HANG_S, check=False
     )
 
 

@@ -18,7 +18,7 @@ from urllib.request import urlopen
 import pytest
 from tests.support.page.asking import TOKEN, ask, compute_digest, get, post, raw
 from tests.support.page.live_view import served_folder
-from tests.support.processes import LIMIT_S
+from tests.support.processes import HANG_S
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 
@@ -137,9 +137,9 @@ def test_open_connections_and_unread_answers_lock_nobody_out(scans):
     """300 clients send half a head, and 100 ask for pages and read none, while the operator's keeps its connection."""
     pages = b"GET /common.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 300
     with served_folder(scans, TOKEN) as view, ExitStack() as clients:
-        operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
+        operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
         for k in range(400):
-            client = clients.enter_context(socket.create_connection(("127.0.0.1", view.port), LIMIT_S))
+            client = clients.enter_context(socket.create_connection(("127.0.0.1", view.port), HANG_S))
             client.setblocking(False)
             client.send(pages if k % 4 == 0 else b"GET / HTTP/1.1\r\nHo"[: k % 18])
             if k % 50 == 0:
@@ -154,15 +154,15 @@ def test_of_too_many_connections_those_without_a_request_are_closed(scans, monke
     """Neither one that is answered, nor one whose request lies unread; who comes anew finds room."""
     monkeypatch.setattr(server, "MAX_CONNECTIONS", 20)
     with served_folder(scans, TOKEN) as view, ExitStack() as clients:
-        operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
+        operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
         operator.request("GET", "/api/scans")
         assert operator.getresponse().read()
-        stream = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
+        stream = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
         stream.request("GET", "/api/events?scan=one")
         events = stream.getresponse()
         assert events.readline().startswith(b"event: ")
         for _ in range(200):
-            clients.enter_context(socket.create_connection(("127.0.0.1", view.port), LIMIT_S))
+            clients.enter_context(socket.create_connection(("127.0.0.1", view.port), HANG_S))
         operator.request("GET", "/api/scans")
         assert operator.getresponse().status == 200
         assert post(view, "/api/notes?scan=one", {"notes": "n"})[0] == 200
@@ -207,7 +207,7 @@ def test_a_download_that_is_aborted_leaves_no_file_open(scans):
 
     with served_folder(scans, TOKEN) as view, ExitStack() as clients:
         for _ in range(3):
-            client = clients.enter_context(socket.create_connection(("127.0.0.1", view.port), LIMIT_S))
+            client = clients.enter_context(socket.create_connection(("127.0.0.1", view.port), HANG_S))
             client.sendall(b"GET /api/file/report.html?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             assert client.recv(100)
         assert is_open()
@@ -320,7 +320,7 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, t
 
         def send(part: list[bytes]) -> None:
             for data in part:
-                s = socket.create_connection(("127.0.0.1", view.port), LIMIT_S)
+                s = socket.create_connection(("127.0.0.1", view.port), HANG_S)
                 s.sendall(data)
                 # Left open: nobody reads the answer, nobody closes
                 open_sockets.append(s)
@@ -358,6 +358,6 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
     place = Place("127.0.0.1", 0, (), tmp_path / "certificate.pem", tmp_path / "key.pem")
     with served_place(scans, place, Access(TOKEN, control=True, secure=True)) as view:
         trusted = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))
-        with urlopen(f"https://127.0.0.1:{view.port}/api/scans", timeout=LIMIT_S, context=trusted) as reply:
+        with urlopen(f"https://127.0.0.1:{view.port}/api/scans", timeout=HANG_S, context=trusted) as reply:
             assert json.load(reply)["scans"]
         assert b"HTTP" not in raw(view, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")

@@ -17,7 +17,7 @@ from tests.support.page.asking import TOKEN
 from tests.support.page.chromium import DESK, PHONE, Browser, find_axe
 from tests.support.page.live_view import Served, open_control, served_folder
 from tests.support.paths import RIG_FILE
-from tests.support.processes import LIMIT_S, wait_for
+from tests.support.processes import HANG_S, wait_for
 from tests.support.products import REASON, judged_products, name_check_plate
 from tests.support.scenes import COPPER, PET
 
@@ -262,7 +262,7 @@ def test_an_abort_goes_before_pictures_that_hang(page, scans, monkeypatch):
     released = threading.Event()
 
     def hang(*_: object) -> None:
-        released.wait(LIMIT_S)
+        released.wait(HANG_S)
         raise DataError("no picture", "the drive is gone", "none")
 
     monkeypatch.setattr(reading, "draw_map", hang)

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from tests.support.page.asking import ask, get, post
 from tests.support.page.live_view import open_control
-from tests.support.processes import LIMIT_S, wait_for
+from tests.support.processes import HANG_S, wait_for
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 
@@ -113,10 +113,10 @@ def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_no
         os.kill(door, signal.SIGINT)
         os.kill(server.program.pid, signal.SIGSTOP)
         try:
-            reading = clients.enter_context(socket.create_connection(("127.0.0.1", server.port), LIMIT_S))
+            reading = clients.enter_context(socket.create_connection(("127.0.0.1", server.port), HANG_S))
             reading.sendall(b"GET /api/page HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             for _ in range(MOST_SILENT + 100):
-                clients.enter_context(socket.create_connection(("127.0.0.1", server.port), LIMIT_S))
+                clients.enter_context(socket.create_connection(("127.0.0.1", server.port), HANG_S))
             assert post(server, "/api/control/abort?scan=one", token=server.token)[0] == 200
             assert stop.now
         finally:

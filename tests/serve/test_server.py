@@ -16,7 +16,7 @@ import segno
 import uvicorn
 from tests.support.page.asking import TOKEN, ask
 from tests.support.page.live_view import open_control, served
-from tests.support.processes import LIMIT_S, wait_for
+from tests.support.processes import HANG_S, wait_for
 
 from polysight.acquisition.control import ScanCommand
 from polysight.cli.main import build_parser
@@ -128,7 +128,7 @@ def test_connections_end_with_their_server(request_head):
         deaf_client.sendall(request_head)
         wait_for(lambda: len(server.server_state.connections) == 1, "the server has the connection")
         server.should_exit = True
-        thread.join(LIMIT_S)
+        thread.join(HANG_S)
         # Whatever is still open is told as a ResourceWarning, which fails the test.
         gc.collect()
         assert not server.server_state.connections

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.support.paths import REPO
+from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 
 from polysight_shared.error_codes import ErrorCode
@@ -58,9 +59,9 @@ def test_a_client_receives_all_edges_in_order_and_detects_the_end_of_the_hub(tmp
     thread = threading.Thread(target=serve)
     thread.start()
     client = WireClient(path, listen=(26,))
-    assert [client.receive(5.0) for _ in sent] == sent
+    assert [client.receive(HANG_S) for _ in sent] == sent
     with pytest.raises(DeviceError):
-        client.receive(5.0)
+        client.receive(HANG_S)
     client.close()
     thread.join()
     hub.close()

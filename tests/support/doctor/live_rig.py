@@ -24,7 +24,7 @@ from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.findings import Finding
 from polysight_shared.tables import to_builtins
 from tests.support.doctor.case import QUICK
-from tests.support.processes import LIMIT_S, processes_naming, wait_for
+from tests.support.processes import HANG_S, processes_naming, wait_for
 from tests.support.rigs import programmed_rig
 
 SCENE = """name = "doctor"
@@ -102,7 +102,7 @@ class LiveRig:
         """Cut a GPIO wire."""
         with socket.socket(socket.AF_UNIX) as wires:
             wires.connect(str(self.folder / "rig" / "wires.sock"))
-            wires.settimeout(LIMIT_S)
+            wires.settimeout(HANG_S)
             wires.sendall(f"X {line} 1\n".encode())
             assert wires.recv(8) == b"K\n"
             try:

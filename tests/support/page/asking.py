@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from polysight.serve.guard import TOKEN_HEADER
-from tests.support.processes import LIMIT_S
+from tests.support.processes import HANG_S
 
 TOKEN = "the-right-token"
 
@@ -19,7 +19,7 @@ def ask(
     view: Any, path: str, method: str = "GET", body: Any = None, **headers: str
 ) -> tuple[int, bytes, dict[str, str]]:
     """Status, body and headers (lower case) of one request; header names with `_` for `-`."""
-    connection = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
+    connection = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
     raw = body if isinstance(body, bytes | None) else json.dumps(body).encode()
     try:
         connection.request(method, path, raw, {k.replace("_", "-"): v for k, v in headers.items()})
@@ -42,7 +42,7 @@ def post(view: Any, path: str, body: Any = None, token: str = TOKEN, **headers: 
     return status, json.loads(raw)
 
 
-def raw(view: Any, data: bytes, limit_s: float = LIMIT_S) -> bytes:
+def raw(view: Any, data: bytes, limit_s: float = HANG_S) -> bytes:
     """Send bytes; return everything received until the server closes the connection."""
     with socket.create_connection(("127.0.0.1", view.port), limit_s) as s:
         s.sendall(data)

@@ -19,7 +19,7 @@ from polysight.serve.server import Place, make_reader_app, make_server
 from polysight.serve.site import Programs, Site, Watches
 from polysight.serve.stage import StageControl
 from polysight.store import EVENTS, MANIFEST, manifest, utc_now
-from tests.support.processes import LIMIT_S, wait_for
+from tests.support.processes import HANG_S, wait_for
 from tests.support.store.facts import facts_of
 
 
@@ -107,7 +107,7 @@ class Served:
     def close(self) -> None:
         """End it."""
         self._server.should_exit = True
-        self._thread.join(LIMIT_S)
+        self._thread.join(HANG_S)
         assert not self._thread.is_alive(), "the server does not end"
 
 

@@ -135,6 +135,27 @@ def test_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
     assert len(commands(sent)) == 1
 
 
+def test_what_comes_while_the_program_is_held_is_read_though_the_time_is_over(words, clock, sent, monkeypatch):
+    """The host looks, finds nothing, and is held for 100 s: after the RF power-up's request, and before its event."""
+    link = Link("RH", words, clock, sent.append)
+    words.reset(held=True)
+    words.reset(held=False)
+    link.wait_for((MAIN_POWER_UP,), 1.0, ignore)
+    link.call(DEVICE_CONFIGURATION)
+    interrupt = words.interrupt
+
+    def hold_once() -> bool:
+        clock.sleep(100.0)
+        monkeypatch.setattr(words, "interrupt", interrupt)
+        return False
+
+    monkeypatch.setattr(words, "interrupt", hold_once)
+    link.call(RF_POWER_UP)
+    monkeypatch.setattr(words, "interrupt", hold_once)
+    link.wait_for((RF_POWER_UP_DONE,), 1.0, ignore)
+    assert link.warnings == []
+
+
 def test_an_unplugged_link_is_an_error_at_once(link, board):
     board.plugged = False
     with refused(ErrorCode.NO_ANSWER, "unplugged"):

@@ -164,6 +164,8 @@ class Link:
         deadline = self._clock.now() + timeout_s
         lost_message: Finding | None = None
         while True:
+            # Before reading: what came while this program was held is read though the time is over.
+            is_over = self._clock.now() > deadline
             lost_message = self._read_messages() or lost_message
             events = list(self._events)
             self._events.clear()
@@ -172,7 +174,7 @@ class Link:
             for event in events:
                 if event.id in ids:
                     return event
-            if self._clock.now() > deadline:
+            if is_over:
                 names = ", ".join(f"0x{i:04X}" for i in ids)
                 problem = f"{self._name}: the radar did not report {names} within {timeout_s:g} s"
                 cause = f"it was reset, or: {_SILENT}"
@@ -203,7 +205,10 @@ class Link:
         deadline = self._clock.now() + timeout_s
         problem = _report_lost_message(f"no answer within {timeout_s:g} s", _SILENT)
         parts: list[messages.Message] = []
-        while self._clock.now() <= deadline:
+        is_over = False
+        while not is_over:
+            # As in `wait_for`.
+            is_over = self._clock.now() > deadline
             if not self._words.interrupt():
                 self._clock.sleep(_INTERVAL_S)
                 continue

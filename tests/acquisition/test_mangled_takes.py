@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from tests.support.acquisition.arrival_model import MS, PAYLOAD, pulse_times
-from tests.support.capture.records import make_mask
+from tests.support.capture.records import log_packets, make_mask
 
 from polysight.acquisition.pulse_times import PlacedFrames, frames_to_move, move_frames, place_frames
-from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Past, Placed, place_record
 from polysight_simulators.cards import KINDS, RADAR, Adversary, Sent
 
@@ -47,17 +46,9 @@ class Kept:
     placed_out: np.ndarray  # as the packets' counters say
 
 
-def log_packets(sent: Sent, expected: int) -> PacketLog:
-    """The packets as a receiver that is always awake logs them."""
-    log = PacketLog(expected)
-    for a in sent.arrivals:
-        log.add(np.frombuffer(a.packet, dtype=np.uint8)[None, :], np.array([len(a.packet)]), a.t_ns)
-    return log
-
-
 def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
     """Place a take and decide what is kept of it, as acquisition does."""
-    log = log_packets(sent, pulses.size * frame)
+    log = log_packets(sent, pulses.size * frame, 64)
     placed, out = place_record(log, frame, past, int(pulses[0, 0]) - 5 * MS)
     frames = None
     if placed.located or placed.slipped:

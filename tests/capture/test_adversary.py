@@ -13,10 +13,9 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
-from tests.support.capture.records import FULL, make_mask
+from tests.support.capture.records import FULL, log_packets, make_mask
 
 from polysight.capture.dca1000 import Counters
-from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Past, Placed, place_record
 from polysight_simulators.cards import KINDS, Adversary, Sent
 
@@ -36,18 +35,6 @@ GRIDS = [
 ]
 # Perfect records in a row, after anything that may have happened
 MAX_REFUSED = 1
-
-
-def log_packets(sent: Sent, expected: int, batch: int) -> PacketLog:
-    """The arrivals as a receiver logs them, some at a time."""
-    log = PacketLog(expected)
-    for k in range(0, len(sent.arrivals), batch):
-        some = sent.arrivals[k : k + batch]
-        block = np.zeros((len(some), max(10, *(len(a.packet) for a in some))), dtype=np.uint8)
-        for row, a in zip(block, some, strict=True):
-            row[: len(a.packet)] = np.frombuffer(a.packet, dtype=np.uint8)
-        log.add(block, np.array([len(a.packet) for a in some]), some[-1].t_ns)
-    return log
 
 
 def wrong_bytes(sent: Sent, placed: Placed, out: np.ndarray) -> int:

@@ -43,7 +43,7 @@ near_sequence_wrap = st.one_of(st.integers(0, SEQUENCE - 1), st.integers(SEQUENC
     count=near_wrap,
     sequence=near_sequence_wrap,
     batch=st.integers(1, 40),
-    chance=st.randoms(use_true_random=False),
+    chance=st.randoms(use_true_random=True),
     rate=st.sampled_from([0.0, 0.02, 0.05, 0.3]),
 )
 def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, chance: random.Random, rate):
@@ -104,7 +104,7 @@ class Oracle:
     count=near_wrap,
     sequence=near_sequence_wrap,
     batch=st.integers(1, 64),
-    chance=st.randoms(use_true_random=False),
+    chance=st.randoms(use_true_random=True),
     loss=st.floats(0, 0.05),
     double=st.floats(0, 0.05),
     shuffle=st.floats(0, 0.05),
@@ -168,7 +168,7 @@ def test_every_disorder_at_once(
     count=near_wrap,
     sequence=near_sequence_wrap,
     skip=st.integers(0, 3),
-    chance=st.randoms(use_true_random=False),
+    chance=st.randoms(use_true_random=True),
 )
 def test_counters_go_on_and_are_not_proportional(frames, frame, records, count, sequence, skip, chance: random.Random):
     """Each record ends with a short packet: sequence and byte count drift apart, and every record is found."""

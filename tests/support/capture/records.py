@@ -9,6 +9,7 @@ import numpy as np
 from polysight.capture.dca1000 import Counters
 from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Past, Placed, place_record
+from polysight_simulators.cards import Sent
 
 # Bytes of samples in a full packet
 FULL = 1456
@@ -103,3 +104,15 @@ def make_mask(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
 def is_original_or_masked(record: Record, placed: Placed, out: np.ndarray) -> bool:
     is_kept = ~make_mask(out.size, placed.missing)
     return bool((out[is_kept] == np.frombuffer(record.data, dtype=np.uint8)[is_kept]).all())
+
+
+def log_packets(sent: Sent, expected: int, batch: int) -> PacketLog:
+    """The arrivals as a receiver logs them, some at a time, each with the time of its arrival."""
+    log = PacketLog(expected)
+    for k in range(0, len(sent.arrivals), batch):
+        some = sent.arrivals[k : k + batch]
+        block = np.zeros((len(some), max(10, *(len(a.packet) for a in some))), dtype=np.uint8)
+        for row, a in zip(block, some, strict=True):
+            row[: len(a.packet)] = np.frombuffer(a.packet, dtype=np.uint8)
+        log.add(block, np.array([len(a.packet) for a in some]), np.array([a.t_ns for a in some]))
+    return log

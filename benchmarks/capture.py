@@ -22,7 +22,8 @@ from polysight.capture.receiver import ReceiverProcess, receiver_cores
 from polysight_shared.config import Board, Instrument, load_instrument
 
 RIG = ROOT / "instrument.toml"
-ROW_BLOCKS = 48  # of one board: 286 MB, twelve published rows
+# Blocks of one board: 286 MB, twelve published rows.
+ROW_BLOCKS = 48
 KEEPS_PACE = 0.98
 MBIT_A_PACKET = MAX_PAYLOAD_BYTES * 8 / 1e6
 

@@ -25,7 +25,8 @@ from polysight_shared.raster import plan_raster
 
 __all__ = ["add_arguments", "run"]
 REPEATS = 5
-ROUNDS = 3  # of methods that take seconds
+# Rounds of methods that take seconds.
+ROUNDS = 3
 # Of the rows, one in so many is timed with the time-domain sum.
 EVERY = 10
 
@@ -202,7 +203,8 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
     lines = []
     for placement, rows, batch, limits in (
         ("the cube on disk", "rows from disk", "batch from disk", (5.0, 3.0)),
-        ("reduced samples", "rows", "batch", (None, None)),  # without the steps both share: for information
+        # For information: without the steps that both share.
+        ("reduced samples", "rows", "batch", (None, None)),
     ):
         ours = took[rows].median
         theirs = took[batch].median

@@ -125,7 +125,8 @@ def measure(
     every: int = 1,
 ) -> None:
     """Print figures of one scan; `every` n-th row was scanned."""
-    scanned = Changes(step_y_mm=every * rig.grid.step_y_mm).apply(rig)  # its minutes are those of the rows scanned
+    # Only the rows that are scanned take time.
+    scanned = Changes(step_y_mm=every * rig.grid.step_y_mm).apply(rig)
     result = name_patches(rig, images, plates)
     pairs = [(r, r.truth) for r in result.patches if r.truth is not None]
     right = sum(r.verdict is not None and r.verdict.name == t.name for r, t in pairs)

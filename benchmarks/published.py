@@ -24,7 +24,8 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 Complex = NDArray[np.complexfloating]
 # Alignment transforms are so many times longer than a chirp
 UPSCALE = 64
-RANGE_BINS = 1024  # of the spectra in which the direct path is looked for
+# Bins of the spectra in which the direct path is searched.
+RANGE_BINS = 1024
 # Points of the closer look, over two bins
 ZOOM = 100
 # Alignment looks at this channel alone

@@ -20,7 +20,8 @@ from polysight_shared.config import Instrument
 
 __all__ = ["add_arguments", "run"]
 REPEATS = 5
-POSITIONS = 70  # of a row's 350, evenly spaced: the published method is timed on these
+# The published method is timed on so many of a row's 350 positions, evenly spaced.
+POSITIONS = 70
 STAGES = ("decode and align", "direct path")
 LIMITS = {"decode and align": (80.0, 120.0), "direct path": (60.0, 80.0)}
 

@@ -22,7 +22,8 @@ from polysight.store import MANIFEST, ScanFolder
 
 __all__ = ["add_arguments", "run"]
 REPEATS = 3
-COMMANDS = {  # at most so many CPU seconds; {made} is a folder of products
+# CPU seconds that each command may take; {made} is a folder of products.
+COMMANDS = {
     "--help": 0.2,
     "materials {made}": 0.6,
     "report {made}": 0.6,
@@ -39,7 +40,8 @@ def rows_then_products(scan: Path, out: Path) -> dict[str, float]:
     for row in rows[:-1]:
         pipeline.add_row(row)
     began = time.perf_counter()
-    pipeline.synchronise_row(rows[-1])  # from raw data, also where its samples are there
+    # From raw data, even where the samples are kept.
+    pipeline.synchronise_row(rows[-1])
     pipeline.samples.save(rows[-1])
     publish_images(pipeline, out)
     image_s = time.perf_counter() - began

@@ -21,6 +21,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, os_error
 from polysight_shared.sockets import Socket, requester, subscriber
 
+# A program that does not take a connection in this time is not there.
 CONNECT_TIMEOUT_S = 2.0
 # Sends a command and returns the service's reply.
 Ask = Callable[..., Any]
@@ -46,7 +47,8 @@ def _open_service(instrument: Instrument) -> Iterator[Ask]:
         def ask(command: m.AnyCommand) -> m.AnyReply:
             try:
                 client.send(m.pack(command))
-            except zmq.Again:  # not connected
+            # Not connected.
+            except zmq.Again:
                 raise _no_answer_error(address) from None
             if not client.poll(round(instrument.limits.command_timeout_s * 1e3)):
                 raise _no_answer_error(address)

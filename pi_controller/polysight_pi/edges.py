@@ -112,7 +112,8 @@ class _Leg(NamedTuple):
     distance: int
     # Time of each step while the stage speeds up
     up_s: list[float]
-    cruise_s: float  # of each step at constant speed
+    # Time of each step at constant speed.
+    cruise_s: float
     # Time from full speed to each step while it slows down
     down_s: list[float]
 

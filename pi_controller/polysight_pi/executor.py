@@ -346,7 +346,8 @@ class Executor:
         limit = min(command.limit, REPLAYED_AT_REST)
         if self._machine.row is not None:
             scan_id = self.journal.position[0]
-            if command.scan_id != scan_id:  # its whole file would be read
+            # The whole file of another scan would be read.
+            if command.scan_id != scan_id:
                 raise RefusedError(
                     PiFault.NOT_READY,
                     f"a row of scan {scan_id} runs",

@@ -116,7 +116,8 @@ class JournalFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.damage = ""
-        self.last_seq = 0  # of the newest record, or of the host's newest event if that is later
+        # Number of the newest record, or of the host's newest event if that is later.
+        self.last_seq = 0
         # The newest one of each row
         self.takes: dict[int, int] = {}
         # Sequence number and offset of each record
@@ -431,7 +432,8 @@ class JournalThread:
         self._journal = journal
         self._events: list[NewEvent] = []
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-        self._busy_since_s: float | None = None  # when the job in work was asked for
+        # Time when the current job was requested.
+        self._busy_since_s: float | None = None
         self._thread = threading.Thread(target=self._work, name="journal", daemon=True)
         self._closed = False
 

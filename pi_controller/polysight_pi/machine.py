@@ -25,6 +25,7 @@ from polysight_shared.faults import PiFault, StageError, explain
 from polysight_shared.raster import Row
 from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 
+# Time between two published statuses of a moving stage: about four a second are enough to draw it.
 STATUS_EVENT_S = 0.24
 # Consecutive statuses at rest after which the reply to the end of a motion counts as lost.
 RESTS = 3
@@ -76,7 +77,8 @@ class Machine:
         self.homed = self.in_run = False
         # The first one
         self.fault = 0
-        self.reason = ""  # of that fault
+        # Reason of the fault.
+        self.reason = ""
         # Steps lost before the last homing, which found them
         self.lost_mm = (0.0, 0.0)
         self.row_timeout_s = math.inf
@@ -85,7 +87,8 @@ class Machine:
         self._homing = -1
         # True once the stage has accepted it
         self._homing_underway = False
-        self._homing_is_watched = False  # its host sends heartbeats
+        # True while the host of a homing sends heartbeats.
+        self._homing_is_watched = False
         self._rests_in_hold = False
         self._resumes_at_rest = False
         self._lines_dead = self._terminating = False

@@ -16,7 +16,8 @@ from polysight_shared.stage_line import END_OF_TIME_NS
 class _Motion:
     """A motion that the stage has started with this line. Its result is decided once, perhaps before it ends."""
 
-    sequence: int  # of the line and its `done`
+    # Number of the line and of its `done`.
+    sequence: int
     status: m.RowStatus | None = None
     fault: int = 0
     reason: str = ""
@@ -37,7 +38,8 @@ class RunningJog(_Motion):
 
     command: m.Jog
     target: tuple[int, int]
-    timeout_s: float  # of its heartbeat
+    # Timeout of the heartbeat.
+    timeout_s: float
     alive_s: float
 
 
@@ -58,7 +60,8 @@ class RunningRow(_Motion):
     points: int = 0
     # Reported to the host
     bursts: int = 0
-    was_held: bool = False  # within the row; the stage says so
+    # True if the stage reported a hold within the row.
+    was_held: bool = False
     # Latest time at which its `done` was written
     done_ns: int = END_OF_TIME_NS
 

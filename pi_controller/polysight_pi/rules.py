@@ -75,8 +75,10 @@ RULES = (
 TIMEOUTS_S: dict[State, float] = {
     "homing": HOMING_TIMEOUT_S,
     "jogging": m.MAX_JOG_S + 5.0,
-    "stopping": 3.0,  # from STOP to standstill
-    "done": 1.0,  # from the stage's `done` to the last burst
+    # From STOP to standstill.
+    "stopping": 3.0,
+    # From the stage's `done` to the last burst.
+    "done": 1.0,
 }  # running: set for each row; all others: no limit
 # From STOP to standstill when the program is being ended.
 END_TIMEOUT_S = 0.5

@@ -98,7 +98,8 @@ class MemoryWatch(threading.Thread):
             held_bytes = self.resident_bytes()
             if held_bytes <= self._most_bytes:
                 continue
-            with suppress(OSError):  # no descriptor left: retried at the next check
+            # Without a free descriptor it is tried again at the next check.
+            with suppress(OSError):
                 cut = self._cut_connections()
                 # A client that connects again and floods on would fill the memory before the next check.
                 for _ in range(round(SETTLE_S / LOOK_S)):

@@ -44,7 +44,8 @@ MIN_PART = 0.98
 class Edge(NamedTuple):
     """A rising edge of the trigger line; a gap in `seqno` means lost edges."""
 
-    t_ns: int  # on the clock of the lines
+    # On the clock of the lines.
+    t_ns: int
     seqno: int
 
 

@@ -109,7 +109,8 @@ class Pi(Section, frozen=True):
     heartbeat_ms: Count = 500
     trigger_bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
     trigger_debounce_us: Annotated[int, msgspec.Meta(ge=0)] = 0
-    gpiomem: str = "/dev/gpiomem"  # of old files, not used
+    # In old rig files; not used.
+    gpiomem: str = "/dev/gpiomem"
     spi_device: str = "/dev/spidev0.0"
     # Period of the host's heartbeat; 0: none
     host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100

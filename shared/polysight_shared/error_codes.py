@@ -18,7 +18,8 @@ class ErrorCode(StrEnum):
     FILE_UNREADABLE = "file-unreadable"
     FILE_UNWRITABLE = "file-unwritable"
     FILE_DAMAGED = "file-damaged"
-    FILE_FOREIGN = "file-foreign"  # of another format, or another program's
+    # The file has another format, or belongs to another program.
+    FILE_FOREIGN = "file-foreign"
     FILE_TOO_LARGE = "file-too-large"
     FILE_EXISTS = "file-exists"
     # Leads out of the folder it belongs to
@@ -60,7 +61,8 @@ class ErrorCode(StrEnum):
     # host/polysight/acquisition
     # All retakes of a row are used up
     ROW_INCOMPLETE = "row-incomplete"
-    STAGE_NOT_READY = "stage-not-ready"  # not homed, in a fault, or another host's
+    # The stage is not homed, has a fault, or belongs to another host.
+    STAGE_NOT_READY = "stage-not-ready"
     # The Pi's [stage] places rows elsewhere
     STAGE_DIFFERS = "stage-differs"
 

@@ -18,7 +18,8 @@ from polysight_shared.units import us_to_ns
 
 FIRST_PULSE_DELAY_S = 200e-6
 """Fixed delay from a trigger edge to its first SYNC_IN pulse, longer than the usual wake-up time of the Pi."""
-MIN_PERIOD_US = 300.0  # between rising edges; a shorter period causes a fatal fault of the RF core
+# Shortest period between rising edges: a shorter one causes a fatal fault of the RF core.
+MIN_PERIOD_US = 300.0
 WIDTH_US = (0.025, 4.0)
 WIDTH_TEXT = f"{WIDTH_US[0]:g}..{WIDTH_US[1]:g} us"
 MIN_PERIOD_NS = us_to_ns(MIN_PERIOD_US)

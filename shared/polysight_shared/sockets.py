@@ -20,7 +20,8 @@ PI_KEYS = ("pi.key_secret",)
 EVENT_TOPIC = b"event"
 MAX_SUBSCRIPTION_BYTES = 1024
 SEND_TIMEOUT_MS = 200
-HANDSHAKE_TIMEOUT_MS = 5000  # then a connection without a handshake is closed
+# A connection without a handshake is closed after this time.
+HANDSHAKE_TIMEOUT_MS = 5000
 # Bits of ZMQ_AFFINITY: which of a context's I/O threads reads and writes the connections of a socket.
 COMMAND_IO_THREAD = 0b01
 EVENT_IO_THREAD = 0b10

@@ -13,6 +13,7 @@ import msgspec
 
 from polysight_shared.errors import ProtocolError
 
+# docs/spec/stage-line.md: the version that the greeting names, and the longest line with its end, bytes.
 PROTOCOL_VERSION = 2
 MAX_LINE_BYTES = 96
 MAX_SEQUENCE = 65535

@@ -15,6 +15,7 @@ from polysight_shared.errors import DeviceError
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.cards import SOURCE_PORT, bound_udp
 
+# Subnets that are tried: other programs may hold ports of some.
 _TRIES = 50
 _COMMAND_PORT = 5601
 _EVENT_PORT = 5602

@@ -35,6 +35,7 @@ _ALIVE_INTERVAL_S = 1.0
 _TIMEOUT_S = 5.0
 LAPSE_S = 15.0
 """Without a sign of life for so long, a scan's program hangs, or runs on a machine that is gone."""
+# Characters of the name of who gave a command; more of it is cut off.
 MAX_ASKER = 60
 Doing = Literal["rows", "materials"]
 

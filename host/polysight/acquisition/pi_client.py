@@ -36,6 +36,7 @@ _SILENT_BEATS = 10
 _ALIVE_TIMEOUT_S = 1.0
 # States that change without a command.
 MOVING: tuple[m.State, ...] = ("homing", "jogging", "running", "held", "done")
+# Time for the stage to come to rest.
 _REST_TIMEOUT_S = 10.0
 # Period of the heartbeat during a jog where the rig file has none for rows.
 _JOG_HEARTBEAT_MS = 100

@@ -19,6 +19,7 @@ from polysight.store import ScanFolder
 from polysight_shared.messages import ExitStatus
 
 OnRow = Callable[[int], None]
+# Added to the nice value of the program: the receivers get three times as much processor time.
 NICE = 5
 # Enough for a steady median, few enough to follow a faster rig.
 _RECENT_ROWS = 25

@@ -75,6 +75,7 @@ from polysight_shared.program import delay_interrupts
 from polysight_shared.raster import Row, check_burst_fits, plan_raster
 from polysight_shared.tables import to_builtins
 
+# Time between two readings of the Pi's events while a scan waits.
 _POLL_S = 0.05
 # 9 degrees of phase at 77 GHz.
 _LOST_STEPS_WARNING_MM = 0.05

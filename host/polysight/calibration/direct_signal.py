@@ -36,6 +36,7 @@ from polysight_shared.errors import DataError
 
 Real = NDArray[np.float64]
 
+# Largest value of a 16-bit word of the card.
 FULL_SCALE = 32767
 # Share of the sample rate that the receiver's filter passes.
 PASSBAND = 0.9

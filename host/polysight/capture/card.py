@@ -508,7 +508,8 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
     try:
         with tempfile.TemporaryDirectory(prefix="polysight-card-") as folder:
             card.record_stop()
-            card.reset_fpga()  # its counters begin again; where its last record ended is not known
+            # The reset begins the counters again: where the last record ended is not known.
+            card.reset_fpga()
             card.configure(instrument.card)
             listened = Path(folder) / "listened.bin"
             receiver.begin_row(0, 1, instrument.row_bytes, instrument.frame_bytes, listened, after_reset=True)

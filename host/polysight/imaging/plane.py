@@ -35,6 +35,7 @@ from polysight.imaging.samples import BoardSamples
 from polysight_shared.config import Instrument
 from polysight_shared.geometry import incidence_deg
 
+# Largest tilt of the plates that is searched; a plane near this limit is not believed.
 _MAX_TILT_DEG = 3.0
 
 PLANE_REACH_M = 0.015

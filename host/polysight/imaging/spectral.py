@@ -107,7 +107,8 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     last = grid.x_m[-1] - x.min() + slack_m
     step = column_step_m(offsets) or grid.pixel_m
     spans = (last - first) / step + 1
-    columns = _find_fast_length(math.ceil(spans + max(_FADE * spans, _FADE_COLUMNS)))  # of one period
+    # Columns of one period.
+    columns = _find_fast_length(math.ceil(spans + max(_FADE * spans, _FADE_COLUMNS)))
     band = _find_band(aperture, first, last, step, columns)
     stride_x = -(-band.size // columns)
     pitch = step / stride_x

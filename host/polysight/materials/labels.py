@@ -295,6 +295,7 @@ def patches_from_labels(
     return Segmentation(labels, tuple(patches)), names
 
 
+# Characters of a material's name: one line of a report.
 LONGEST_NAME = 80
 RESERVED = ("unknown", "none of these", "possible layer")
 """Words that the classifier uses."""

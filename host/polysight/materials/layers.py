@@ -34,7 +34,8 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
-_FREQUENCIES = 24  # of a sub-band
+# Frequencies of a sub-band at which a layer is modelled.
+_FREQUENCIES = 24
 METAL = complex(np.inf, 0.0)
 """Permittivity of a layer of metal: a perfect conductor."""
 
@@ -248,6 +249,7 @@ UNLIKELY = 1e-3
 """Probability of a larger chi-square below which the stack does not explain the data."""
 DETERMINED = 0.05
 """Largest relative half width of 95 % regions of a fit that is not ambiguous."""
+# Draws of the posterior for its second moments.
 _DRAWS = 1500
 # Standard deviations
 _REACH = 4.0
@@ -459,7 +461,8 @@ class _Model:
         self.data = (2 if bands.amplitude_h is None else 3) * bands.inverse_ratio.size
         self.freedom = self.data - self.unknowns
         self.whiten = np.linalg.inv(np.linalg.cholesky(bands.data_covariance))
-        self.wavenumber = 2 * np.pi * float(np.mean(bands.spectrum.frequency_hz)) / SPEED_OF_LIGHT_M_S * 1e-3  # per mm
+        # Radians per millimetre.
+        self.wavenumber = 2 * np.pi * float(np.mean(bands.spectrum.frequency_hz)) / SPEED_OF_LIGHT_M_S * 1e-3
 
     def residuals(self, x: npt.ArrayLike, thin: int = 1) -> Real:
         """Return normalised residuals, [..., data (+ 1)], of unknowns [..., n]; with every `thin`-th frequency."""
@@ -527,7 +530,8 @@ class _Model:
             np.clip(start, self.lower + 1e-9 * width, self.upper - 1e-9 * width),
             bounds=(self.lower, self.upper),
             x_scale="jac",
-            jac=cast("Any", self._differentiate),  # scipy-stubs accept only a name
+            # The cast: scipy-stubs accept only the name of a method.
+            jac=cast("Any", self._differentiate),
             xtol=precision,
             ftol=precision,
             gtol=precision,

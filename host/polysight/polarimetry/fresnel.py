@@ -54,7 +54,8 @@ def _broadcast_media(
 ) -> tuple[Complex, Real, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Broadcast permittivity and angle; return them made finite, and masks of metal (infinite) and of NaN."""
     eps, theta = np.broadcast_arrays(np.asarray(eps, np.complex128), np.asarray(theta_rad, np.float64))
-    unknown = np.isnan(eps) | ~np.isfinite(theta)  # of a complex number: either part
+    # `isnan` of a complex number is true if either part is.
+    unknown = np.isnan(eps) | ~np.isfinite(theta)
     metal = np.isinf(eps) & ~unknown
     return np.where(metal | unknown, 1.0, eps), np.where(unknown, 0.5, theta), metal, unknown
 

@@ -95,6 +95,7 @@ class RadarControl(ABC):
         self.close()
 
 
+# Time between two queries of the boards.
 _POLL_S = 0.005
 # USB needs some time to find a chip again that was reset or replugged.
 _REOPEN_TIMEOUT_S = 5.0

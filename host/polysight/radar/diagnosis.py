@@ -134,6 +134,7 @@ def _judge_supplies(board: RadarBoard) -> Row:
     return Row("power rails", True, expected, "the main core runs; no error reported")
 
 
+# Version of the file format of traces.
 TRACE_VERSION = 1
 INTERRUPT = "HOST_INTR"
 RESET = "NRST"

@@ -18,9 +18,12 @@ from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_po
 from polysight_shared.raster import mean_burst_travel_mm, plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-_GROUPS = 10  # groups of rows for the jackknife
-_STEPS = 3  # Gauss-Newton
-_ALIASED = 0.02  # largest share of power in the upper fifth of the spectrum; more means aliasing
+# Groups of rows for the jackknife.
+_GROUPS = 10
+# Steps of Gauss-Newton.
+_STEPS = 3
+# Largest share of power in the upper fifth of the spectrum; more means aliasing.
+_ALIASED = 0.02
 
 
 def object_filter(rig: Instrument, board: Board, sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
@@ -95,7 +98,8 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     shift, without = 0.0, np.zeros(_GROUPS)
     for _ in range(_STEPS):
         s = sums(shift)
-        sums_without_one = s.sum(axis=0) - s  # sums without one group: jackknife, Efron 1982
+        # Jackknife (Efron 1982): sums without one group.
+        sums_without_one = s.sum(axis=0) - s
         if s[:, 1].sum() == 0 or sums_without_one[:, 1].min() <= 0 or s[:, 3].sum() > _ALIASED * s[:, 2].sum():
             return None
         without = shift + sums_without_one[:, 0] / sums_without_one[:, 1]

@@ -248,7 +248,8 @@ def _mismatch_error(frames: int, shape: tuple[int, ...], setup: BoardSetup) -> D
 
 def _turn_along(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
     """Return `SyncedRow.turn` of samples [rx, position, block], from the valid neighbours; 0 without any."""
-    step = np.vecdot(samples[:, :-1], samples[:, 1:]).sum(axis=0)  # from each position to the next
+    # From each position to the next.
+    step = np.vecdot(samples[:, :-1], samples[:, 1:]).sum(axis=0)
     return np.angle(np.pad(step, (1, 0)) + np.pad(step, (0, 1)))
 
 
@@ -339,7 +340,8 @@ def errors(
     chirp_errors = np.array([*aligned.error[examined].swapaxes(0, 1)[:, good], amplitude_error[good]])
 
     two = examined[good.sum(axis=1) > 1]
-    with np.errstate(divide="ignore", invalid="ignore"):  # dead RX have no direct path: their figures are not finite
+    # A dead RX has no direct path: its figures are not finite.
+    with np.errstate(divide="ignore", invalid="ignore"):
         out = {
             "received": received,
             "aligned": chirp_errors,
@@ -567,7 +569,8 @@ def _average_direct_path(
     samples = part.shape[-1]
     covariance = gate.T @ gate.conj() / len(gate) + _NOISE * np.eye(samples)
     weights = scipy.linalg.solve(covariance, np.ones(samples), assume_a="pos").conj()
-    direct = part @ (weights / weights.sum())  # [rx, position]
+    # Complex [rx, position].
+    direct = part @ (weights / weights.sum())
     mean = direct.mean(axis=1)
     return mean, float(np.mean(np.abs(mean) ** 2 / np.mean(np.abs(direct) ** 2, axis=1)))
 
@@ -620,7 +623,8 @@ def _reference_cube(
         coherence=none + 1,
         clipped=~first_chirp,
     )
-    near_zero = bool(abs(np.median(centre)) < 0.4)  # mixed down already, so any IF is within the band
+    # A signal that is mixed down already has an IF of zero: any IF is within the band.
+    near_zero = bool(abs(np.median(centre)) < 0.4)
     done = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x") if near_zero else chirp)
     time = np.arange(samples) - middle
     steering = path.steering * np.exp(-0.5j * done.drift * time**2)

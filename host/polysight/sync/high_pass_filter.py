@@ -158,7 +158,8 @@ def fit_high_pass(
         return np.concatenate([out, np.angle(turn * np.conj(turn.mean()))])
 
     limits = np.log(if_hz.min() / 10), np.log(if_hz.max() * 3)
-    starts = itertools.combinations(np.linspace(*limits, 6)[1:-1], sections)  # the corners may be in any two octaves
+    # The corners may lie in any two octaves.
+    starts = itertools.combinations(np.linspace(*limits, 6)[1:-1], sections)
     fits = [scipy.optimize.least_squares(misfit, start, bounds=limits, loss="soft_l1", f_scale=0.1) for start in starts]
     corners = np.exp(np.sort(min(fits, key=lambda fit: fit.cost).x))
     if corners[0] < 1.1 * np.exp(limits[0]) or corners[-1] > 0.9 * np.exp(limits[1]):

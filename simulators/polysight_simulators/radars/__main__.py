@@ -15,6 +15,7 @@ from pathlib import Path
 from polysight_simulators.radars.board import FUNCTIONAL, RadarBoard
 from polysight_simulators.radars.cores import make_image
 
+# Step of the simulated clock.
 _STEP_S = 1e-4
 _TIMEOUT_S = 15.0
 

@@ -464,6 +464,7 @@ def _transform_back(kernel: NDArray[np.complex64]) -> NDArray[np.complex64]:
 # Version of the content of cached fields
 _PHYSICS = 3
 
+# Shape of the Kaiser window of the interpolation.
 _KAISER_BETA = 8.0
 
 

@@ -51,7 +51,8 @@ class SerialPort:
             self._master, slave = os.openpty()
             tty.setraw(slave, termios.TCSANOW)
             settings = termios.tcgetattr(slave)
-            settings[2] |= termios.HUPCL  # as a serial port has, and a pseudo terminal not
+            # A serial port has this flag set, a pseudo terminal has not.
+            settings[2] |= termios.HUPCL
             termios.tcsetattr(slave, termios.TCSANOW, settings)
             os.set_blocking(self._master, False)
             name = os.ttyname(slave)

@@ -196,7 +196,7 @@ class ControlFolder:
         self._doing = "materials"
 
     def _serve(self) -> None:
-        written: Life | None = None
+        written_life: Life | None = None
         next_alive_s = 0.0
         cleared = False
         ticks = read_start_ticks(os.getpid()) or 0
@@ -215,9 +215,9 @@ class ControlFolder:
                 if pending:
                     asker = self._stop.asker
                 life = Life(os.getpid(), ticks, socket.gethostname(), self._doing, pending, asker)
-                if life != written or time.monotonic() >= next_alive_s:
+                if life != written_life or time.monotonic() >= next_alive_s:
                     self._write(life)
-                    written = life
+                    written_life = life
                     next_alive_s = time.monotonic() + _ALIVE_INTERVAL_S
         with suppress(OSError):
             self._clear()

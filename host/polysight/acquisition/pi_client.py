@@ -334,9 +334,9 @@ class PiClient:
         if time.monotonic() - self._last_heard_s > self._silence_s:
             # Heartbeats are missing: check that the Pi answers commands.
             self._catch_up(self.status().last_seq)
-        out = list(self._pending)
+        events = list(self._pending)
         self._pending.clear()
-        return out
+        return events
 
     def _take(self, event: m.AnyEvent) -> None:
         self._last_seq = event.seq

@@ -147,8 +147,8 @@ def place_frames(
             raise _UndeterminedError("a packet holds several frames: only the one that fills it has a time")
         trains = _find_trains(pulses_ns, received_ns, arrivals, frame_bytes, payload_bytes, frame_ns)
     except _UndeterminedError as e:
-        none = np.full(received, -1, dtype=np.int64)
-        return PlacedFrames(none, [], pulses, contradicted=isinstance(e, _DisturbedError), reason=str(e))
+        no_frame = np.full(received, -1, dtype=np.int64)
+        return PlacedFrames(no_frame, [], pulses, contradicted=isinstance(e, _DisturbedError), reason=str(e))
     if received < pulses:
         return _place_short_row(trains, received, pulses, frame_bytes)
     return _check_whole_row(trains, pulses, frame_bytes)
@@ -271,10 +271,10 @@ def _select_seen(trains: _Trains, frame_bytes: int, frames: int) -> Flags:
 
 def _select_frames(trains: _Trains, selected: Flags, frame_bytes: int, frames: int) -> Flags:
     """Select the frames in which a packet of the selected trains ends, bool [frame]."""
-    out = np.zeros(frames, dtype=np.bool_)
-    out[(trains.first_stop[selected] - 1) // frame_bytes] = True
-    out[(trains.last_stop[selected] - 1) // frame_bytes] = True
-    return out
+    is_selected = np.zeros(frames, dtype=np.bool_)
+    is_selected[(trains.first_stop[selected] - 1) // frame_bytes] = True
+    is_selected[(trains.last_stop[selected] - 1) // frame_bytes] = True
+    return is_selected
 
 
 def _find_missed(slots: Times, pulses: int) -> list[int]:
@@ -282,11 +282,11 @@ def _find_missed(slots: Times, pulses: int) -> list[int]:
     number = np.concatenate([[-1], np.arange(slots.size), [slots.size]])
     slot = np.concatenate([[-1], slots, [pulses]])
     sure = np.flatnonzero((slot >= 0) | (number < 0))
-    out: list[int] = []
+    missed: list[int] = []
     for a, b in zip(sure[:-1].tolist(), sure[1:].tolist(), strict=True):
         if b == a + 1:
-            out += range(int(slot[a]) + 1, int(slot[b]))
-    return out
+            missed += range(int(slot[a]) + 1, int(slot[b]))
+    return missed
 
 
 def _find_period_ns(pulses_ns: Times) -> int:
@@ -353,15 +353,15 @@ def _predict_arrivals(
     sent_at = np.array(sent, dtype=np.float64) - start_ns
     delay = np.array(delays, dtype=np.float64) - delays[0]
     drift = _estimate_drift(sent_at, delay, pulses_ns)
-    rest = np.sort(delay - drift * sent_at)
+    residual = np.sort(delay - drift * sent_at)
     # The shortest range of delays that half of the bursts share: others are delayed, or have a spurious edge.
-    sharing = max(_AGREEING, (rest.size + 1) // 2)
-    widths = rest[sharing - 1 :] - rest[: rest.size - sharing + 1]
+    sharing = max(_AGREEING, (residual.size + 1) // 2)
+    widths = residual[sharing - 1 :] - residual[: residual.size - sharing + 1]
     narrowest = int(np.argmin(widths))
     if widths[narrowest] > min(_AGREE * _find_period_ns(pulses_ns), _AGREE_NS):
         raise _DisturbedError("the delays of the bursts differ by more than a pulse period")
     pulses = pulses_ns.reshape(-1)
-    return pulses + float(delays[0]) + drift * (pulses - start_ns) + rest[narrowest]
+    return pulses + float(delays[0]) + drift * (pulses - start_ns) + residual[narrowest]
 
 
 def _estimate_drift(at: NDArray[np.float64], delay: NDArray[np.float64], pulses_ns: Times) -> float:
@@ -400,8 +400,8 @@ def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instru
     """
     events = sorted((e for e in events if e.event.pulses == rig.burst.pulses), key=lambda e: e.event.point)
     if [e.event.point for e in events] != list(range(row.points)):
-        none = np.full(0, -1, dtype=np.int64)
-        return PlacedFrames(none, [], row.points * rig.burst.pulses, reason="capture events of the row are missing")
+        no_slots = np.full(0, -1, dtype=np.int64)
+        return PlacedFrames(no_slots, [], row.points * rig.burst.pulses, reason="capture events of the row are missing")
     arrivals = read_index(path.with_suffix(".idx"))[1]
     frame_us = (rig.burst.chirps - 1) * rig.burst.chirp_us + rig.chirp.ramp_end_us
     return place_frames(
@@ -428,8 +428,8 @@ def _collect_pulse_times(events: list[ReceivedCapture]) -> tuple[NDArray[np.int6
     """Return the time of each pulse (Pi's clock), int64 [burst, pulse], and of each event's receipt, int64 [burst]."""
     first = [e.event.first_pulse_ns for e in events]
     last = [e.event.last_pulse_ns for e in events]
-    sent = np.linspace(first, last, events[0].event.pulses, axis=1, dtype=np.int64)
-    return sent, np.array([e.received_ns for e in events], dtype=np.int64)
+    sent_ns = np.linspace(first, last, events[0].event.pulses, axis=1, dtype=np.int64)
+    return sent_ns, np.array([e.received_ns for e in events], dtype=np.int64)
 
 
 def describe(placed: PlacedFrames, pulses: int) -> str:
@@ -457,10 +457,10 @@ def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_byt
     facts, arrivals = read_index(path.with_suffix(".idx"))
     received = np.fromfile(path, dtype=np.uint8)
     packets_crc = _keep_payload(path.with_suffix(PACKETS), received)
-    out, missing = move_frames(received, capture.holes, int(arrivals[-1, 1]), placed.slots, frame_bytes)
+    payload, missing = move_frames(received, capture.holes, int(arrivals[-1, 1]), placed.slots, frame_bytes)
     try:
         with path.open("r+b") as f:
-            f.write(out.data)
+            f.write(payload.data)
             f.flush()
             os.fsync(f.fileno())
     except OSError as e:
@@ -479,7 +479,7 @@ def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_byt
         bytes=capture.expected - sum(b - a for a, b in missing),
         located=True,
         reason="",
-        crc32=zlib.crc32(out.data),
+        crc32=zlib.crc32(payload.data),
         index_crc32=index_crc,
         packets_crc32=packets_crc,
     )
@@ -492,18 +492,18 @@ def move_frames(
 
     `received` has `extent` bytes in the card's order, without those in `holes`.
     """
-    out = np.zeros_like(received)
+    moved = np.zeros_like(received)
     present: list[Gap] = []
     for first, slot, count in _find_runs(slots):
         start = first * frame_bytes
         stop = min((first + count) * frame_bytes, extent)
         move = (slot - first) * frame_bytes
-        out[start + move : stop + move] = received[start:stop]
+        moved[start + move : stop + move] = received[start:stop]
         present += [(a + move, b + move) for a, b in _subtract_ranges(holes, start, stop)]
     missing = _subtract_ranges(present, 0, received.size)
     for start, stop in missing:
-        out[start:stop] = 0
-    return out, missing
+        moved[start:stop] = 0
+    return moved, missing
 
 
 def frames_to_move(capture: RowCapture | Placed, frames: PlacedFrames | None) -> PlacedFrames | None:
@@ -540,12 +540,12 @@ def _find_runs(slots: NDArray[np.int64]) -> list[tuple[int, int, int]]:
 
 def _subtract_ranges(ranges: list[Gap], start: int, stop: int) -> list[Gap]:
     """Return the parts of [start, stop) outside the ranges, which are sorted and may touch."""
-    out = []
+    gaps = []
     for a, b in ranges:
         if b > start and a < stop:
             if a > start:
-                out.append((start, a))
+                gaps.append((start, a))
             start = b
     if start < stop:
-        return [*out, (start, stop)]
-    return out
+        return [*gaps, (start, stop)]
+    return gaps

@@ -197,7 +197,7 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
         if isinstance(scan, Scan):
             checked.append((scan.scan_id, check_scan(scan.read_or_process())))
         else:
-            checked += [(below.scan_id, result) for below, result in check_scans([Path(scan)])]
+            checked += [(nested.scan_id, result) for nested, result in check_scans([Path(scan)])]
     results = [result for _, result in checked]
     unknown = (np.nan, np.nan)
     measured = np.array([result.measured or unknown for result in results])

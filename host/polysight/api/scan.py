@@ -234,8 +234,8 @@ class Scan:
 
         Processes recorded rows where there are no products. Raises as :meth:`image`.
         """
-        done = self._saved or self.read_or_process()
-        return done.verdict
+        processed = self._saved or self.read_or_process()
+        return processed.verdict
 
     @property
     def rig(self) -> Instrument:
@@ -363,13 +363,13 @@ class Scan:
         DataError
             as :meth:`image`; when the products do not say which pixels are inside.
         """
-        done = self.read_or_process()
-        if done.interior is None:
+        processed = self.read_or_process()
+        if processed.interior is None:
             raise self._make_unknown_error("pixels inside the patches")
-        inside = done.interior & (done.labels > 0) & np.isfinite(done.p)
-        p = done.p[inside]
-        X = np.stack([np.abs(done.h[inside]), np.abs(done.v[inside]), p.real, p.imag], axis=1)
-        return X.astype(np.float64), done.labels[inside]
+        is_patch_pixel = processed.interior & (processed.labels > 0) & np.isfinite(processed.p)
+        p = processed.p[is_patch_pixel]
+        X = np.stack([np.abs(processed.h[is_patch_pixel]), np.abs(processed.v[is_patch_pixel]), p.real, p.imag], axis=1)
+        return X.astype(np.float64), processed.labels[is_patch_pixel]
 
     def label(
         self, boxes: Mapping[str, Box], *, metal: str | None = None, specimens: Mapping[str, str] | None = None
@@ -490,13 +490,15 @@ class Scan:
     def _repr_html_(self) -> str:
         """Table of the scan, and of its patches where they are known without processing rows."""
         lines = {"rows": self._row_count, "read from": f"{self._kind} in {self.folder}"}
-        done = self._result_at_hand
+        processed = self._result_at_hand
         patches = ""
-        if done is not None:
-            if done.verdict is not None:
-                lines["verdict"] = "; ".join([done.verdict.text, *(reason.what for reason in done.verdict.reasons)])
-            if done.metal_referenced and done.segments:
-                patches = patch_table(done)
+        if processed is not None:
+            if processed.verdict is not None:
+                lines["verdict"] = "; ".join(
+                    [processed.verdict.text, *(reason.what for reason in processed.verdict.reasons)]
+                )
+            if processed.metal_referenced and processed.segments:
+                patches = patch_table(processed)
         cells = "".join(f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in lines.items())
         stamp = " <b>SIMULATED</b>" if self.simulated else ""
         return f"<div><h4>Scan {escape(self._title)}{stamp}</h4><table>{cells}</table>{patches}</div>"
@@ -576,8 +578,8 @@ class Scan:
     def _select_columns(self, names: Sequence[str]) -> xarray.Dataset:
         """These variables of the patches, where they exist, with the coordinates of their dimension."""
         patches = self.patches()
-        chosen = patches[[name for name in names if name in patches]]
-        return chosen.drop_vars(["x_mm", "y_mm", "x_m", "y_m"], errors="ignore")
+        columns = patches[[name for name in names if name in patches]]
+        return columns.drop_vars(["x_mm", "y_mm", "x_m", "y_m"], errors="ignore")
 
 
 class Processing:

@@ -185,8 +185,10 @@ def _measure_power(
     time = np.arange(n) - (n - 1) / 2
     # [chirp, sample, rx]
     raw = words[:, first:end, 0] + 1j * words[:, first:end, 1].astype(np.float32)
-    still = raw * sync.cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
-    folded = still.reshape(len(words), n // sync.FOLD, sync.FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
+    derotated = raw * sync.cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
+    folded = (
+        derotated.reshape(len(words), n // sync.FOLD, sync.FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
+    )
     return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2
 
 
@@ -312,15 +314,15 @@ def _estimate_corner_errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple
     """Return the standard errors of the corners (Hz), and the residual of the log levels (dB, RMS)."""
 
     def residual(logs: Real) -> Real:
-        out = np.log(level) - np.log(np.abs(sync.HighPass(tuple(np.exp(logs))).response(if_hz)))
-        return out - out.mean()
+        log_misfit = np.log(level) - np.log(np.abs(sync.HighPass(tuple(np.exp(logs))).response(if_hz)))
+        return log_misfit - log_misfit.mean()
 
     logs = np.log(corners_hz)
     step = 1e-4
     slopes = np.stack(
         [(residual(logs + d) - residual(logs - d)) / (2 * step) for d in step * np.eye(logs.size)], axis=1
     )
-    rest = residual(logs)
-    variance = float(rest @ rest) / max(1, rest.size - logs.size - 1)
+    misfit = residual(logs)
+    variance = float(misfit @ misfit) / max(1, misfit.size - logs.size - 1)
     errors = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)) * variance)
-    return errors * corners_hz, float(np.sqrt(np.mean(rest**2)) * 20 / np.log(10))
+    return errors * corners_hz, float(np.sqrt(np.mean(misfit**2)) * 20 / np.log(10))

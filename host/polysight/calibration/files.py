@@ -498,8 +498,8 @@ def calibration_of_scan(scan: Source) -> Calibration:
         return calibration_of_rig(scan.instrument)
     recorded = scan.started.calibration
     if recorded is None:
-        named = {kind: name for kind, name in to_builtins(scan.instrument.calibration).items() if name}
-        return load_calibration({kind: check_inside(scan.path, name) for kind, name in named.items()})
+        names_by_kind = {kind: name for kind, name in to_builtins(scan.instrument.calibration).items() if name}
+        return load_calibration({kind: check_inside(scan.path, name) for kind, name in names_by_kind.items()})
     paths: dict[str, Path] = {}
     for kind, fact in _read_manifest_entries(scan, recorded).items():
         path = paths[kind] = check_inside(scan.path, fact["file"])

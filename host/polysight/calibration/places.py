@@ -237,13 +237,13 @@ def _model_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray
     rx = board.antennas.rx_m + np.asarray(shift_mm) / 1e3
     # [position, point, 3]
     difference = places_m[None] - board.offsets_m[:, None]
-    out = np.linalg.norm(difference - tx, axis=-1)
+    out_m = np.linalg.norm(difference - tx, axis=-1)
     back = np.linalg.norm(difference[None] - rx[:, None, None], axis=-1)
-    path = out + back - np.linalg.norm(rx - tx, axis=-1)[:, None, None]
+    path = out_m + back - np.linalg.norm(rx - tx, axis=-1)[:, None, None]
     f = board.frequencies_hz / SPEED_OF_LIGHT_M_S
     step = _rotate_phase(path * (f[-1] - f[0]) / (f.size - 1))
     tones = np.empty((*path.shape, f.size), np.complex128)
-    tones[..., 0] = _rotate_phase(path * f[0]) / (out * back)
+    tones[..., 0] = _rotate_phase(path * f[0]) / (out_m * back)
     # Evenly spaced
     for k in range(1, f.size):
         np.multiply(tones[..., k - 1], step, out=tones[..., k])

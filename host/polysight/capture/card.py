@@ -263,10 +263,10 @@ class CardClient:
 
     def _no_answer_error(self, code: Code, attempts: int) -> DeviceError:
         """Return the error for a card that does not answer, with the hop that does not work, if known."""
-        tried = "1 attempt"
+        attempts_text = "1 attempt"
         if attempts > 1:
-            tried = f"{attempts} attempts"
-        problem = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({tried})"
+            attempts_text = f"{attempts} attempts"
+        problem = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({attempts_text})"
         return silent_card(self.board, problem, self._kernel_root)
 
 
@@ -433,8 +433,8 @@ def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: f
                 findings += _receive(card, instrument, core, listen_s)
     except DeviceError as e:
         findings.append(_wrong("host", e))
-    tried = {hop.where for hop in findings}
-    findings += [Finding("note", "", where=hop) for hop in HOPS if hop not in tried]
+    hops = {hop.where for hop in findings}
+    findings += [Finding("note", "", where=hop) for hop in HOPS if hop not in hops]
     return survey
 
 
@@ -520,12 +520,12 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
                 card.take_status()
                 time.sleep(_POLL_S)
             card.record_stop()
-            got = receiver.end_row(card.take_status())
+            row_capture = receiver.end_row(card.take_status())
     except DeviceError as e:
         return _wrong("radar", e)
-    if got.packets == 0:
-        return _wrong("radar", silent_radar(card.board, got))
-    return _report_stream(got)
+    if row_capture.packets == 0:
+        return _wrong("radar", silent_radar(card.board, row_capture))
+    return _report_stream(row_capture)
 
 
 def _report_stream(got: RowCapture) -> Finding:

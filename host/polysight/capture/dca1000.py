@@ -177,10 +177,10 @@ def row_words(
 def raw_words(frames: NDArray[np.complex64]) -> NDArray[np.int16]:
     """Encode complex frames [rx, frame, sample] in ADC counts as words: int16 [frame, sample, 2, rx]."""
     rx, count, samples = frames.shape
-    out = np.empty((count, samples, 2, rx), np.int16)
+    words = np.empty((count, samples, 2, rx), np.int16)
     for part, values in enumerate((frames.real, frames.imag)):
-        np.rint(values.transpose(1, 2, 0), out=out[:, :, part], casting="unsafe")
-    return out
+        np.rint(values.transpose(1, 2, 0), out=words[:, :, part], casting="unsafe")
+    return words
 
 
 def decode_row(
@@ -239,12 +239,12 @@ def decode_two_lane(
 
 def _join_iq(parts: NDArray[np.int16], swap_iq: bool = False) -> NDArray[np.complex64]:
     """Join I and Q, int16 [2, rx, chirp, sample] (with `swap_iq` Q and I)."""
-    out = np.empty(parts.shape[1:], dtype=np.complex64)
+    joined = np.empty(parts.shape[1:], dtype=np.complex64)
     if swap_iq:
-        out.real, out.imag = parts[::-1]
+        joined.real, joined.imag = parts[::-1]
     else:
-        out.real, out.imag = parts
-    return out
+        joined.real, joined.imag = parts
+    return joined
 
 
 def valid_frames(missing: Gaps, frames: int, frame_bytes: int) -> NDArray[np.bool_]:

@@ -132,8 +132,8 @@ def packets_in_file(payload: NDArray[np.uint8]) -> list[bytes]:
     count = min(_HEADERS_READ, payload.size // MAX_PACKET_BYTES)
     if count < 2:
         return []
-    some = payload[: count * MAX_PACKET_BYTES].reshape(count, MAX_PACKET_BYTES)
-    heads = [dca1000.decode_packet_header(row.tobytes()) for row in some]
+    packets = payload[: count * MAX_PACKET_BYTES].reshape(count, MAX_PACKET_BYTES)
+    heads = [dca1000.decode_packet_header(row.tobytes()) for row in packets]
     (sequence, byte_count) = heads[0]
     k = range(count)
     if heads != [(sequence + i, byte_count + i * MAX_PAYLOAD_BYTES) for i in k]:

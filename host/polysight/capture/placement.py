@@ -262,45 +262,50 @@ class _Record:
 
 def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     """Select the packets with counters of the record that was predicted."""
-    full = find_full_payload(log)
-    early = log.arrivals_ns < not_before_ns
+    full_payload = find_full_payload(log)
+    is_early = log.arrivals_ns < not_before_ns
     start = past.start or SWITCHED_ON
     sizes = log.sizes
     expected = log.expected
     offsets = counter_differences(log.byte_counts, start.byte_count, BYTE_COUNT_BITS)
     steps = counter_differences(log.sequences, start.sequence, SEQUENCE_BITS)
     # All packets before it were full, as they are up to the last one of a record.
-    counters_agree = (offsets == full * steps) & (offsets >= 0)
-    is_of_row = counters_agree & (offsets < expected) & ~early
+    counters_agree = (offsets == full_payload * steps) & (offsets >= 0)
+    is_of_row = counters_agree & (offsets < expected) & ~is_early
     length = 0
     ended = False
     if is_of_row.any():
         stops = (offsets + sizes)[is_of_row]
         length = int(stops.max())
-        ended = bool((sizes[is_of_row][stops == length] < full).all())
-    is_near = (offsets < 2 * expected + 2 * full) & (steps > 0) & (steps * full < 4 * expected + 4 * full) & ~early
-    beyond = is_near & counters_agree & (offsets >= expected)
-    later = is_near & ~counters_agree & (offsets >= max(length, full))
-    ends_in_short = expected % full > 0
+        ended = bool((sizes[is_of_row][stops == length] < full_payload).all())
+    is_near = (
+        (offsets < 2 * expected + 2 * full_payload)
+        & (steps > 0)
+        & (steps * full_payload < 4 * expected + 4 * full_payload)
+        & ~is_early
+    )
+    is_beyond = is_near & counters_agree & (offsets >= expected)
+    later = is_near & ~counters_agree & (offsets >= max(length, full_payload))
+    ends_in_short = expected % full_payload > 0
     counts_on_anew = np.zeros_like(is_of_row)
     if start.byte_count > 2 * expected and is_of_row.any():
-        counts_anew = (log.byte_counts == full * (log.sequences - 1)) & (log.byte_counts < expected)
+        counts_anew = (log.byte_counts == full_payload * (log.sequences - 1)) & (log.byte_counts < expected)
         is_behind = np.arange(log.count) > int(np.argmax(is_of_row))
-        counts_on_anew = counts_anew & is_behind & ~early & ~is_of_row
+        counts_on_anew = counts_anew & is_behind & ~is_early & ~is_of_row
     return _Record(
         start=start,
         offsets=offsets,
         steps=steps,
         of_row=is_of_row,
-        beyond=beyond,
+        beyond=is_beyond,
         later=later & ~counts_on_anew,
-        early=early,
-        too_early=early & counters_agree & (offsets < expected),
+        early=is_early,
+        too_early=is_early & counters_agree & (offsets < expected),
         after_restart=counts_on_anew,
-        full=full,
+        full=full_payload,
         length=length,
         ended=ended,
-        ends_as_planned=length == expected and ended is ends_in_short and not beyond.any(),
+        ends_as_planned=length == expected and ended is ends_in_short and not is_beyond.any(),
     )
 
 
@@ -385,20 +390,20 @@ def _count_packets(
     log: PacketLog, record: _Record, placed: Flags, duplicate: Flags, conflicting: Flags
 ) -> PacketCounts:
     """Count a row's packets. `placed`, `duplicate`, `conflicting`: bool [packet], disjoint."""
-    rest = ~(placed | duplicate | conflicting)
-    leftover = rest & (record.early | ((record.offsets < 0) & (record.steps < 0) & ~record.after_restart))
-    restarted = rest & record.after_restart & ~leftover
-    rest &= ~(leftover | restarted)
+    is_unplaced = ~(placed | duplicate | conflicting)
+    leftover = is_unplaced & (record.early | ((record.offsets < 0) & (record.steps < 0) & ~record.after_restart))
+    restarted = is_unplaced & record.after_restart & ~leftover
+    is_unplaced &= ~(leftover | restarted)
     behind_the_row = (record.offsets >= log.expected) & (record.steps > 0) & (record.offsets < 2 * log.expected)
-    outside = rest & (record.of_row | record.beyond | behind_the_row)
+    is_outside = is_unplaced & (record.of_row | record.beyond | behind_the_row)
     return PacketCounts(
         placed=int(placed.sum()),
         duplicates=int(duplicate.sum()),
         conflicting=int(conflicting.sum()),
         leftover=int(leftover.sum()),
         restarted=int(restarted.sum()),
-        outside=int(outside.sum()),
-        disagreeing=int((rest & ~outside).sum()),
+        outside=int(is_outside.sum()),
+        disagreeing=int((is_unplaced & ~is_outside).sum()),
         malformed=log.malformed,
         before_pulses=int((record.early & leftover).sum()),
     )
@@ -443,9 +448,9 @@ class _Row:
         self.extent = int(b[-1])
         self.received = sum(stop - start for start, stop in self.covered)
         reached = np.maximum.accumulate(np.append(0, stops))[:-1]
-        behind = reached - starts
-        self.counts.late = int((behind > 0).sum())
-        self.counts.late_by_bytes = max(0, int(behind.max()))
+        bytes_behind = reached - starts
+        self.counts.late = int((bytes_behind > 0).sum())
+        self.counts.late_by_bytes = max(0, int(bytes_behind.max()))
         self.counts.short = int((self._sizes[placed] < self._record.full).sum())
 
     def _place(self) -> None:
@@ -469,9 +474,9 @@ class _Row:
         longest = packets[0]
         for k in packets[1:]:
             offset = int(self._record.offsets[k])
-            common = min(int(self._stops[k]), int(self._stops[longest])) - offset
-            if not np.array_equal(self._slice_payload(k)[:common], self._slice_payload(longest)[:common]):
-                self.conflicts.append((offset, offset + common))
+            overlap = min(int(self._stops[k]), int(self._stops[longest])) - offset
+            if not np.array_equal(self._slice_payload(k)[:overlap], self._slice_payload(longest)[:overlap]):
+                self.conflicts.append((offset, offset + overlap))
                 self._placed[k] = False
                 self._conflicting[k] = True
                 self.offsets[k] = -1
@@ -501,15 +506,15 @@ class _Row:
         """
         log = self._log
         placed = np.flatnonzero(self._placed)
-        out = log.payload[: log.expected]
+        payload = log.payload[: log.expected]
         is_whole = not holes and self.extent == log.expected
         if not is_whole or (self.offsets[placed] != self._starts[placed]).any():
-            out = np.zeros(log.expected, dtype=np.uint8)
-            self._copy(placed, out)
-        out[self.extent :] = 0
+            payload = np.zeros(log.expected, dtype=np.uint8)
+            self._copy(placed, payload)
+        payload[self.extent :] = 0
         for start, stop in holes:
-            out[start:stop] = 0
-        return out
+            payload[start:stop] = 0
+        return payload
 
     def _copy(self, placed: Counts, out: Bytes) -> None:
         """Copy runs of packets that are consecutive in the log and in the row."""
@@ -519,8 +524,8 @@ class _Row:
         sizes = self._sizes[placed]
         starts = self._starts[placed]
         stops = self._stops[placed]
-        joined = (starts[1:] == starts[:-1] + sizes[:-1]) & (offsets[1:] == offsets[:-1] + sizes[:-1])
-        firsts = np.flatnonzero(np.append(True, ~joined))
+        is_joined = (starts[1:] == starts[:-1] + sizes[:-1]) & (offsets[1:] == offsets[:-1] + sizes[:-1])
+        firsts = np.flatnonzero(np.append(True, ~is_joined))
         lasts = np.append(firsts[1:] - 1, len(placed) - 1)
         for i, j in zip(firsts.tolist(), lasts.tolist(), strict=True):
             a = int(offsets[i])
@@ -544,10 +549,10 @@ def _find_gaps(covered: list[Gap], extent: int) -> list[Gap]:
 
 def _merge(gaps: list[Gap]) -> list[Gap]:
     """Return the same bytes as sorted ranges that do not touch."""
-    out: list[Gap] = []
+    merged: list[Gap] = []
     for start, stop in sorted(gap for gap in gaps if gap[0] < gap[1]):
-        if out and start <= out[-1][1]:
-            out[-1] = (out[-1][0], max(out[-1][1], stop))
+        if merged and start <= merged[-1][1]:
+            merged[-1] = (merged[-1][0], max(merged[-1][1], stop))
         else:
-            out.append((start, stop))
-    return out
+            merged.append((start, stop))
+    return merged

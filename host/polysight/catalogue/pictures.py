@@ -77,8 +77,8 @@ class Pixels(products.ProcessedScan):
     @cached_property
     def permittivity(self) -> products.PermittivityMap:
         """Permittivity and its errors; masked where it is not known, and where the image is too dark."""
-        known = products.map_permittivity(self)
-        return replace(known, mask=known.mask & self.clear)
+        permittivity_map = products.map_permittivity(self)
+        return replace(permittivity_map, mask=permittivity_map.mask & self.clear)
 
     def nearest(self, x_mm: float, y_mm: float) -> tuple[int, int]:
         """Row and column of the pixel at a place. Raises DataError outside the image."""
@@ -202,8 +202,8 @@ def draw_values(values: products.MapValues, unit: str = "", colours: str = AMPLI
     import matplotlib
 
     low, high = values.limits
-    shown = np.where(values.opacity > 0, values.numbers, low)
-    rgba = matplotlib.colormaps[colours](np.clip((shown - low) / (high - low), 0.0, 1.0))
+    numbers = np.where(values.opacity > 0, values.numbers, low)
+    rgba = matplotlib.colormaps[colours](np.clip((numbers - low) / (high - low), 0.0, 1.0))
     rgba[..., 3] = values.opacity
     digits = 1 if unit else 3
     return Picture(_encode_png(rgba, "lower"), round(float(low), digits), round(float(high), digits), unit, colours)

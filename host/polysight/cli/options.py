@@ -38,10 +38,10 @@ class CommandParser(argparse.ArgumentParser):
 
     def format_usage(self) -> str:
         """One line: required options and arguments, and `[options]` for all others."""
-        named = [a for a in self._actions if a.option_strings]
+        options = [a for a in self._actions if a.option_strings]
         formatter = self._get_formatter()
         formatter.add_usage(None, [a for a in self._actions if a.required or not a.option_strings], [])
-        optional = " [options]" if any(not a.required for a in named) else ""
+        optional = " [options]" if any(not a.required for a in options) else ""
         return formatter.format_help().rstrip() + f"{optional}\n"
 
     def format_help(self) -> str:
@@ -49,19 +49,19 @@ class CommandParser(argparse.ArgumentParser):
         # The first two are argparse's own
         groups = self._action_groups[2:]
         grouped = [a for group in groups for a in group._group_actions]
-        named = [a for a in self._actions if a.option_strings and a not in grouped]
-        named.sort(key=lambda a: (not a.required, not set(self.most_used) & set(a.option_strings), a.dest == "help"))
+        options = [a for a in self._actions if a.option_strings and a not in grouped]
+        options.sort(key=lambda a: (not a.required, not set(self.most_used) & set(a.option_strings), a.dest == "help"))
         # No section for --help alone.
         first = _FIRST
-        if len(named) <= _FIRST + 1:
-            first = len(named)
+        if len(options) <= _FIRST + 1:
+            first = len(options)
         formatter = self._get_formatter()
         formatter.add_text(self.description)
         formatter.add_text(self.epilog)
         for title, text, actions in (
             ("arguments", None, [a for a in self._actions if not a.option_strings and a not in grouped]),
-            ("options", None, named[:first]),
-            ("more options", None, named[first:]),
+            ("options", None, options[:first]),
+            ("more options", None, options[first:]),
             *((group.title, group.description, group._group_actions) for group in groups),
         ):
             formatter.start_section(title)

@@ -493,19 +493,19 @@ def check_pulses(context: CheckContext) -> Finding:
             f"`polysight scan` can use it; the limit here is {MAX_PULSES_AT_REST} pulses or {MAX_PULSES_AT_REST_S:g} s",
         )
     try:
-        context.captured, sent = capture_frames(rig, context.pi, bursts)
+        context.captured, sent_pulses = capture_frames(rig, context.pi, bursts)
     except RefusedError as e:
         if e.number != PiFault.BAD_REQUEST:
             raise
         return error(e.what, "the Pi's release does not know this command", "install the same release on both")
-    counted = "seen" if sent.pulses_seen else "sent, not seen,"
+    counted = "seen" if sent_pulses.pulses_seen else "sent, not seen,"
     observed = (
-        f"{sent.pulses} {counted} at rest, at most {sent.width_max_ns / 1e3:.2f} us long,"
-        f" at most {sent.jitter_ns / 1e3:.2f} us late"
+        f"{sent_pulses.pulses} {counted} at rest, at most {sent_pulses.width_max_ns / 1e3:.2f} us long,"
+        f" at most {sent_pulses.jitter_ns / 1e3:.2f} us late"
     )
-    facts = {k: getattr(sent, k) for k in ("pulses", "pulses_seen", "width_max_ns", "jitter_ns", "fault")}
-    if sent.fault:
-        e = explain(sent.fault)
+    facts = {k: getattr(sent_pulses, k) for k in ("pulses", "pulses_seen", "width_max_ns", "jitter_ns", "fault")}
+    if sent_pulses.fault:
+        e = explain(sent_pulses.fault)
         return error(f"{observed}: {e.problem}", e.cause, e.remedy, **facts)
     return ok(f"{observed} ({context.rig.pi.pulse_source})", **facts)
 
@@ -600,13 +600,13 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
     """Judge a board's direct path."""
     low, high = band_hz(rig)
     expected = signal.expected_hz
-    outside = not low <= expected <= high
+    is_outside = not low <= expected <= high
     predicted = f"{expected / 1e3:.0f} kHz expected from the rig file"
     facts = {"expected_hz": expected, "band_hz": [low, high], "chirps": signal.chirps, "heard": signal.if_hz.size}
     if not signal.found:
         missed = signal.chirps - signal.if_hz.size
         observed = f"no direct path in {missed} of {signal.chirps} chirps; {predicted}"
-        if outside:
+        if is_outside:
             cause = "its IF is outside the receiver's band, so it is filtered out or aliased"
             return error(observed, cause, _suggest_start_offset(rig, board, expected), **facts)
         return error(
@@ -618,12 +618,12 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
             **facts,
         )
     if_hz = unwrap_if(signal.if_hz, rig)
-    spread = jitter_hz(rig)
+    jitter = jitter_hz(rig)
     median = float(np.median(if_hz))
     std = float(if_hz.std())
     observed = f"at {median / 1e3:.0f} kHz, std {std / 1e3:.0f} kHz, {signal.if_hz.size} of {signal.chirps} chirps"
     facts |= {"if_hz": median, "std_hz": std, "amplitude": float(np.sqrt(np.median(signal.power)))}
-    if outside:
+    if is_outside:
         return error(
             f"{observed}; {predicted}, outside {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
             "this is an alias: the anti-aliasing filter attenuates it, and the high-pass filter is inverted at the"
@@ -631,10 +631,10 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
             _suggest_start_offset(rig, board, expected),
             **facts,
         )
-    if median - spread < low or median + spread > high or signal.if_hz.size < _MIN_DETECTED * signal.chirps:
+    if median - jitter < low or median + jitter > high or signal.if_hz.size < _MIN_DETECTED * signal.chirps:
         return error(
             f"{observed}: too near the edge of {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
-            f"5 ns of trigger jitter move it by {spread / 1e3:.0f} kHz, so that some chirps are lost",
+            f"5 ns of trigger jitter move it by {jitter / 1e3:.0f} kHz, so that some chirps are lost",
             _suggest_start_offset(rig, board, median),
             **facts,
         )

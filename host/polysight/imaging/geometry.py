@@ -152,12 +152,12 @@ def row_offsets_m(rig: Instrument, row: Row) -> NDArray[np.float64]:
 def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
     """Return the mean stage offsets of all rows, metres [row, column, 3], columns from the smallest x."""
     plan = plan_raster(rig.grid)
-    out = np.zeros((plan.rows, plan.columns, 3))
+    offsets = np.zeros((plan.rows, plan.columns, 3))
     along = {row.direction: row_offsets_m(rig, row)[:: row.direction, 0] for row in itertools.islice(plan, 2)}
     for row in plan:
-        out[row.index, :, 0] = along[row.direction]
-        out[row.index, :, 1] = row.y_mm / 1e3
-    return out
+        offsets[row.index, :, 0] = along[row.direction]
+        offsets[row.index, :, 1] = row.y_mm / 1e3
+    return offsets
 
 
 @dataclass(frozen=True)
@@ -299,10 +299,10 @@ class StageWindow:
         """
         from_specular = (ends_px[:, None] - self.places_px) * np.sqrt(2 * self.bend_px / np.pi)
         sine, cosine = scipy.special.fresnel(from_specular)
-        seen = (cosine[1] - cosine[0]) + 1j * (sine[1] - sine[0])
+        phase_difference = (cosine[1] - cosine[0]) + 1j * (sine[1] - sine[0])
         distance = columns_px[:, None] - self.places_px
         kernel = self.weights * np.exp(-1j * self.bend_px * distance**2)
-        return np.asarray(kernel @ seen / kernel.sum(axis=1) / (1 + 1j), np.complex128)
+        return np.asarray(kernel @ phase_difference / kernel.sum(axis=1) / (1 + 1j), np.complex128)
 
     def correct_slope(
         self,
@@ -344,8 +344,8 @@ class StageWindow:
             # A plate that rises is seen like a level one at another place; the image of its end is not where it ends.
             at_level = moved_px * slope
             image = self.level_image(ends_px + at_level, columns_px + at_level)
-            turned = np.vdot(image[inside_px[:-1]], image[inside_px[1:]])
-            slope = slope_per_rad * (step_rad - float(np.angle(turned)))
+            product = np.vdot(image[inside_px[:-1]], image[inside_px[1:]])
+            slope = slope_per_rad * (step_rad - float(np.angle(product)))
             seen_of_level = find_ends(np.abs(image), lit, inside_px)
             both_end = ~touching & np.isfinite(seen_of_level) & np.isfinite(ends_px)
             off_px = seen_of_level[both_end] - ends_px[both_end]
@@ -359,9 +359,9 @@ def find_ends(profile: NDArray[np.float64], lit: NDArray[np.bool_], inside_px: N
     ends = []
     for outwards, start in ((-1, int(inside_px[0])), (1, int(inside_px[-1]))):
         end = outwards * np.inf
-        beyond = np.flatnonzero((profile < half)[start::outwards])
-        if beyond.size and beyond[0] > 0 and lit[start + outwards * beyond[0]]:
-            dark = start + outwards * int(beyond[0])
+        below_half = np.flatnonzero((profile < half)[start::outwards])
+        if below_half.size and below_half[0] > 0 and lit[start + outwards * below_half[0]]:
+            dark = start + outwards * int(below_half[0])
             bright = dark - outwards
             end = bright + outwards * (profile[bright] - half) / (profile[bright] - profile[dark])
         ends.append(float(end))

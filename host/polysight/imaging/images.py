@@ -116,10 +116,10 @@ class Illumination:
 
     def transpose(self) -> Illumination:
         """Return the illumination with x and y swapped."""
-        turned = np.ascontiguousarray(self.footprints.transpose(0, 2, 1))
+        transposed = np.ascontiguousarray(self.footprints.transpose(0, 2, 1))
         return replace(
             self,
-            footprints=turned,
+            footprints=transposed,
             moved_m=self.moved_m[:, ::-1, ::-1],
             pixel_m=self.pixel_m[::-1],
             windows=None if self.windows is None else self.windows[::-1],
@@ -135,13 +135,13 @@ class Illumination:
         """
         level_h, level_v = (float(np.nanmedian(np.abs(channel[mask]))) if mask.any() else 0.0 for channel in (h, v))
         channels = [h] if level_v < _FEEBLE * level_h else [h, v]
-        out = []
+        slopes = []
         for along in (0, 1):
             # The phase of the conjugate falls where the plate rises.
             step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in channels) / len(channels)
             slope = self._estimate_slope(float(np.angle(step)), h, along, mask, plate) if abs(step) > _COHERENT else 0.0
-            out.append(slope)
-        return out[0], out[1]
+            slopes.append(slope)
+        return slopes[0], slopes[1]
 
     def _estimate_slope(self, step_rad: float, h: Image, along: int, mask: Mask, plate: Mask | None) -> float:
         """Return the rise of a plate along x (0) or y (1) from its phase step."""
@@ -150,8 +150,8 @@ class Illumination:
         inside_px = np.flatnonzero(mask.any(axis=along))
         if self.windows is None or plate is None or inside_px.size < 2:
             return slope
-        lit = np.abs(self.footprints).min(axis=0) >= _VISIBLE * np.abs(self.footprints).max()
-        level = np.where(lit & np.isfinite(h), np.abs(h), np.nan)
+        is_lit = np.abs(self.footprints).min(axis=0) >= _VISIBLE * np.abs(self.footprints).max()
+        level = np.where(is_lit & np.isfinite(h), np.abs(h), np.nan)
         if along == 1:
             level, mask, plate = level.T, mask.T, plate.T
         lines = level[mask.any(axis=1)]
@@ -180,9 +180,9 @@ class Illumination:
             ahead = slice(1, None)
             following = slice(None, -1)
             first, second = ((slice(None), part) if axis == 1 else (part, slice(None)) for part in (following, ahead))
-            inside = mask[first] & mask[second]
-            steps = np.sum(np.where(inside, channel[second] * np.conj(channel[first]), 0), axis=1 - axis)
-            enough_pixels = inside.sum(axis=1 - axis) > 2
+            is_pair = mask[first] & mask[second]
+            steps = np.sum(np.where(is_pair, channel[second] * np.conj(channel[first]), 0), axis=1 - axis)
+            enough_pixels = is_pair.sum(axis=1 - axis) > 2
             if enough_pixels.sum() < _LEAST_LINES:
                 bends.append(0.0)
                 continue
@@ -361,8 +361,8 @@ def correct_tilt(images: Images, masks: Sequence[Mask], rises: Sequence[Rise]) -
 
 def _step(image: Image, mask: Mask, axis: int) -> complex:
     """Return exp(j mean phase step between pixels of a patch) times the coherence of the steps."""
-    inside = np.where(mask & np.isfinite(image), image, 0).astype(np.complex128)
-    ahead, behind = (np.take(inside, range(k, inside.shape[axis] - 1 + k), axis) for k in (1, 0))
+    masked_image = np.where(mask & np.isfinite(image), image, 0).astype(np.complex128)
+    ahead, behind = (np.take(masked_image, range(k, masked_image.shape[axis] - 1 + k), axis) for k in (1, 0))
     product = ahead * np.conj(behind)
     return complex(product.sum()) / max(float(np.abs(product).sum()), 1e-300)
 
@@ -508,9 +508,9 @@ class ImageBuilder:
 
     def _compute_illumination(self, footprints: NDArray[np.complex64], z_m: float) -> Illumination:
         """Return the illumination of the plane at `z_m` by both channels."""
-        moved, steep = zip(*(illumination_geometry(a, z_m, self._middle_hz) for a in self._antennas), strict=True)
+        shifts, steep = zip(*(illumination_geometry(a, z_m, self._middle_hz) for a in self._antennas), strict=True)
         pitch = self.grid.pixel_m
-        moved_m = np.stack(moved)
+        moved_m = np.stack(shifts)
         steepness_rad_m = np.array(steep)
         # Half of the second derivative of the phase by the distance from the specular point.
         bend_rad_m2 = steepness_rad_m.mean() * np.diagonal(np.linalg.inv(moved_m.mean(axis=0))) / 2
@@ -557,13 +557,13 @@ def sub_bands(chirp: Chirp, count: int) -> tuple[SubBand, ...]:
             f"use 1 to {most}",
             code=ErrorCode.VALUE_INVALID,
         )
-    out = []
+    bands = []
     for k in range(count):
         a = first + round(k * length / 2)
         b = min(last, a + round(length))
         edges = (chirp.first_sample_hz + chirp.hz_per_sample * n for n in (a, b - 1))
-        out.append(SubBand((a, b), *edges))
-    return tuple(out)
+        bands.append(SubBand((a, b), *edges))
+    return tuple(bands)
 
 
 class SubBandImages:
@@ -661,9 +661,9 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
             if len(place_before) != len(place_after):
                 yield f"{name} has {len(place_after) - 2} antennas in use, not {len(place_before) - 2}"
                 continue
-            moved = max(math.dist(a, b) for a, b in zip(place_before, place_after, strict=True))
-            if moved > SAME_MM:
-                yield f"{name} or its antennas moved or turned, by up to {moved:.2g} mm"
+            distance_m = max(math.dist(a, b) for a, b in zip(place_before, place_after, strict=True))
+            if distance_m > SAME_MM:
+                yield f"{name} or its antennas moved or turned, by up to {distance_m:.2g} mm"
         if abs(self.object_distance_mm - now.object_distance_mm) > SAME_MM:
             yield f"the object plane is at {now.object_distance_mm:.2f} mm, not {self.object_distance_mm:.2f} mm"
         difference_hz = max(abs(a - b) for a, b in zip(self.band_hz, now.band_hz, strict=True))
@@ -672,11 +672,11 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
         if self.apodisation != now.apodisation:
             yield f"image.apodisation is {now.apodisation!r}, not {self.apodisation!r}"
         for name in self.high_pass_khz.keys() & now.high_pass_khz.keys():
-            was = self.high_pass_khz[name]
+            old_khz = self.high_pass_khz[name]
             corners = now.high_pass_khz[name]
-            same = len(was) == len(corners)
-            if not same or any(abs(a - b) > SAME_CORNER_KHZ for a, b in zip(was, corners, strict=True)):
-                yield f"{name}'s high-pass corners are {_describe_corners(corners)}, not {_describe_corners(was)}"
+            same = len(old_khz) == len(corners)
+            if not same or any(abs(a - b) > SAME_CORNER_KHZ for a, b in zip(old_khz, corners, strict=True)):
+                yield f"{name}'s high-pass corners are {_describe_corners(corners)}, not {_describe_corners(old_khz)}"
 
 
 def _list_places_mm(rig: Instrument, board: Board) -> Iterator[Vector]:

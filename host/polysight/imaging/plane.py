@@ -89,8 +89,10 @@ class Focus:
     @property
     def certain(self) -> bool:
         """True if the sharpness falls by more than 2 % towards both ends of the sweep."""
-        inside = abs(self.depth_mm) < 0.95 * self.depths_mm[-1] and max(map(abs, self.tilt_deg)) < 0.95 * _MAX_TILT_DEG
-        return inside and float(max(self.sharpness[0], self.sharpness[-1])) < 0.98
+        is_inside = (
+            abs(self.depth_mm) < 0.95 * self.depths_mm[-1] and max(map(abs, self.tilt_deg)) < 0.95 * _MAX_TILT_DEG
+        )
+        return is_inside and float(max(self.sharpness[0], self.sharpness[-1])) < 0.98
 
     def transpose(self) -> Focus:
         """Return the result with x and y swapped."""
@@ -372,7 +374,7 @@ def _estimate_heights_by_range(
     """Return the height of each patch from the range of its echo, and its standard deviation, metres."""
     image, footprint, _ = board.image()
     slope, mirror_slope = board.range_slope()
-    moved = board.mirror_image(_STEP_M)
+    moved_image = board.mirror_image(_STEP_M)
     moved_slope = board.mirror_slope(_STEP_M)
     heights = np.full(len(masks), np.nan)
     stds = np.full(len(masks), np.inf)
@@ -383,15 +385,15 @@ def _estimate_heights_by_range(
         weight = power / power.sum()
         with np.errstate(invalid="ignore", divide="ignore"):
             path_slope = np.real(slope[mask] / image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
-            by_height = (np.real(moved_slope[mask] / moved[mask]) - np.real(mirror_slope[mask] / footprint[mask])) / (
-                _STEP_M
-            )
+            by_height = (
+                np.real(moved_slope[mask] / moved_image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
+            ) / (_STEP_M)
         per_metre = float(np.nansum(weight * by_height))
         path_slope = np.where(np.isfinite(path_slope), path_slope, 0.0)
         mean = float(np.sum(weight * path_slope))
-        spread = float(np.sqrt(np.sum(weight * (path_slope - mean) ** 2)))
+        path_std = float(np.sqrt(np.sum(weight * (path_slope - mean) ** 2)))
         height = mean / per_metre
-        std = spread / abs(per_metre)
+        std = path_std / abs(per_metre)
         if std < 0.05 and np.isfinite(height):
             heights[i] = height
             stds[i] = max(std, _MIN_STD_M)
@@ -406,7 +408,7 @@ def _estimate_heights_by_phase(
 ) -> tuple[NDArray[np.float64], float]:
     """Return the height of each patch from its phase, unwrapped with a plane near `plane`; and radians per metre."""
     image, footprint, _ = board.image()
-    moved = board.mirror_image(_STEP_M)
+    moved_image = board.mirror_image(_STEP_M)
     phases = np.full(len(masks), np.nan)
     rates = []
     for i, mask in enumerate(masks):
@@ -415,7 +417,7 @@ def _estimate_heights_by_phase(
         coherent = abs(flat.sum()) / max(float(np.abs(flat).sum()), 1e-300)
         if mask.any() and coherent > _COHERENT:
             phases[i] = np.angle(flat.sum())
-            rates.append(float(np.angle(np.vdot(footprint[mask], moved[mask]))) / _STEP_M)
+            rates.append(float(np.angle(np.vdot(footprint[mask], moved_image[mask]))) / _STEP_M)
     if not rates:
         return phases, 1.0
     rate = float(np.median(rates))
@@ -424,18 +426,18 @@ def _estimate_heights_by_phase(
     design = np.column_stack([np.ones(with_phase.size), places[with_phase]])
     # The range leaves an ambiguity of some turns, common to all plates except for the tilt: try several tilts.
     tilts = np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD
-    tried = plane + np.array([(0.0, tilt_x, tilt_y) for tilt_x in tilts for tilt_y in tilts])
-    guesses = tried @ design.T
+    trial_planes = plane + np.array([(0.0, tilt_x, tilt_y) for tilt_x in tilts for tilt_y in tilts])
+    guesses = trial_planes @ design.T
     heights = phases[with_phase] / rate
-    common = np.angle(np.mean(np.exp(2j * np.pi * (heights - guesses) / turn), axis=1)) / (2 * np.pi) * turn
-    lifted = heights + turn * np.round((guesses + common[:, None] - heights) / turn)
+    common_height = np.angle(np.mean(np.exp(2j * np.pi * (heights - guesses) / turn), axis=1)) / (2 * np.pi) * turn
+    lifted = heights + turn * np.round((guesses + common_height[:, None] - heights) / turn)
     lifted += turn * np.round((np.median(guesses, axis=1) - np.median(lifted, axis=1)) / turn)[:, None]
     # All tilts have the same places, so one inverse fits them all.
     prior = np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
     weighted = design / _PHASE_STD_M**2
-    fitted = np.linalg.solve(design.T @ weighted + prior, (lifted @ weighted).T).T
-    misses = ((lifted - fitted @ design.T) ** 2).sum(axis=1) / _PHASE_STD_M**2
-    misses += ((fitted[:, 1:] / _TILT_PRIOR_RAD) ** 2).sum(axis=1)
+    planes = np.linalg.solve(design.T @ weighted + prior, (lifted @ weighted).T).T
+    misses = ((lifted - planes @ design.T) ** 2).sum(axis=1) / _PHASE_STD_M**2
+    misses += ((planes[:, 1:] / _TILT_PRIOR_RAD) ** 2).sum(axis=1)
     best = np.full(len(masks), np.nan)
     best[with_phase] = lifted[int(np.argmin(misses))]
     return best, rate

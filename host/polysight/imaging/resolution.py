@@ -106,8 +106,8 @@ def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
     for place in (aperture.antennas.tx_m, aperture.antennas.rx_m[0]):
         difference = point - line - place
         slope += difference[:, axis] / np.linalg.norm(difference, axis=1)
-    spread = np.ptp(slope) * aperture.frequencies_hz.mean() / SPEED_OF_LIGHT_M_S
-    return float(0.886 / spread) if spread > 0 else float("inf")
+    path_range = np.ptp(slope) * aperture.frequencies_hz.mean() / SPEED_OF_LIGHT_M_S
+    return float(0.886 / path_range) if path_range > 0 else float("inf")
 
 
 def _cut(
@@ -136,10 +136,10 @@ def _measure_width(cut: NDArray[np.float64]) -> float:
     middle = cut.size // 2
     sides = []
     for side in (cut[middle:], cut[middle::-1]):
-        below = np.flatnonzero(side < _HALF_POWER)
-        if not below.size:
+        below_half_power = np.flatnonzero(side < _HALF_POWER)
+        if not below_half_power.size:
             return float("inf")
-        i = below[0]
+        i = below_half_power[0]
         sides.append(i - 1 + (side[i - 1] - _HALF_POWER) / (side[i - 1] - side[i]))
     return float(sum(sides))
 
@@ -156,10 +156,10 @@ def _measure_sidelobe_db(cut: NDArray[np.float64]) -> float:
 
 def imaging_facts(builder: ImageBuilder, images: Images) -> dict[str, BoardImaging | list[str]]:
     """Return the entry `imaging` of quality.json, by board."""
-    out: dict[str, BoardImaging | list[str]] = {name: board_facts(board) for name, board in builder.boards.items()}
+    facts: dict[str, BoardImaging | list[str]] = {name: board_facts(board) for name, board in builder.boards.items()}
     if images.notices:
-        out["notices"] = list(images.notices)
-    return out
+        facts["notices"] = list(images.notices)
+    return facts
 
 
 def board_facts(board: BoardSamples) -> BoardImaging:
@@ -243,7 +243,7 @@ def field_limits(rig: Instrument) -> FieldLimits:
     chirp = rig.chirp
     grid = rig.grid
     low, high = (chirp.first_sample_hz + n * chirp.hz_per_sample for n in chirp.linear_samples)
-    free = []
+    ghost_free = []
     zone = []
     for axis, (count, step_mm) in enumerate(((grid.columns, grid.step_x_mm), (grid.rows, grid.step_y_mm))):
         slope = PhaseSlope(rig, axis)
@@ -251,8 +251,8 @@ def field_limits(rig: Instrument) -> FieldLimits:
         zone.append(1e3 * float(np.sqrt(2 * np.pi / change)))
         size_m = (count - 1) * step_mm / 1e3
         places = np.linspace(-size_m / 4, size_m / 4, _PLACES)
-        free.append(1e3 * min(_find_nearest_ghost_m(slope, high, 2e3 * np.pi / step_mm, p) for p in places))
-    return FieldLimits((free[0], free[1]), (zone[0], zone[1]))
+        ghost_free.append(1e3 * min(_find_nearest_ghost_m(slope, high, 2e3 * np.pi / step_mm, p) for p in places))
+    return FieldLimits((ghost_free[0], ghost_free[1]), (zone[0], zone[1]))
 
 
 def _find_nearest_ghost_m(

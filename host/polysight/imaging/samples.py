@@ -164,8 +164,8 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     spectrum = np.zeros(chirp.samples, complex)
     spectrum[a:b] = direct
     # Echoes at the samples' frequencies are combinations of echoes at the few frequencies.
-    few = np.exp(2j * np.pi * np.outer(d, frequencies))
-    from_few = np.linalg.lstsq(few, np.exp(2j * np.pi * np.outer(d, sweep)), rcond=1e-9)[0].T
+    wave = np.exp(2j * np.pi * np.outer(d, frequencies))
+    from_few = np.linalg.lstsq(wave, np.exp(2j * np.pi * np.outer(d, sweep)), rcond=1e-9)[0].T
     model = (matrix[:, a:b] @ from_few).astype(np.complex128)
     return Reduction(frequencies, matrix, spectrum, model, gate_m, sample_frequencies_hz(chirp))
 
@@ -177,18 +177,18 @@ def burst_filters(rig: Instrument) -> NDArray[np.float32]:
     """
     times_s = np.array(rig.burst.chirp_times_s)
     # Motion of each chirp, in positions
-    moved = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm
+    shift_positions = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm
     turns = np.linspace(0, _BAND, 91)
-    loss = np.cos(2 * np.pi * np.outer(turns, moved)).mean(axis=1)
-    out = np.zeros((REACH + 1, REACH + 1))
-    out[0, 0] = 1
+    loss = np.cos(2 * np.pi * np.outer(turns, shift_positions)).mean(axis=1)
+    filters = np.zeros((REACH + 1, REACH + 1))
+    filters[0, 0] = 1
     for reach in range(1, REACH + 1):
         # The sum of the taps is one, so that constants keep their amplitude.
         basis = 2 * np.cos(2 * np.pi * np.outer(turns, np.arange(1, reach + 1))) - 2
         side = np.linalg.lstsq(basis, 1 / loss - 1, rcond=None)[0]
-        out[reach, 0] = 1 - 2 * side.sum()
-        out[reach, 1 : reach + 1] = side
-    return out.astype(np.float32)
+        filters[reach, 0] = 1 - 2 * side.sum()
+        filters[reach, 1 : reach + 1] = side
+    return filters.astype(np.float32)
 
 
 def undo_burst_motion(
@@ -210,16 +210,16 @@ def undo_burst_motion(
     count = valid.size
     reach = np.zeros(valid.size, int)
     for i in range(1, min(REACH, (count - 1) // 2) + 1):
-        near = np.zeros(count, bool)
-        near[i : count - i] = valid[: count - 2 * i] & valid[2 * i :] & valid[i : count - i]
-        reach += near & (reach == i - 1)
+        is_near_gap = np.zeros(count, bool)
+        is_near_gap[i : count - i] = valid[: count - 2 * i] & valid[2 * i :] & valid[i : count - i]
+        reach += is_near_gap & (reach == i - 1)
     taps = filters[reach]
-    out = samples * taps[:, 0]
+    filtered = samples * taps[:, 0]
     for i in range(1, int(reach.max(initial=0)) + 1):
         side = (taps[:, i] * np.exp(1j * i * turn)).astype(np.complex64)
-        out[..., :-i] += side[:-i].conj() * samples[..., i:]
-        out[..., i:] += side[i:] * samples[..., :-i]
-    return out
+        filtered[..., :-i] += side[:-i].conj() * samples[..., i:]
+        filtered[..., i:] += side[i:] * samples[..., :-i]
+    return filtered
 
 
 class Imager(Protocol):
@@ -421,8 +421,8 @@ class BoardSamples:
             self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
             self._final = None
             self._moved = True
-            moved = abs(geometry.row_starts_m(self._offsets)[index] - self._planned[index])
-            if moved > SLACK_M or geometry.irregular(self.aperture) is not None:
+            deviation = abs(geometry.row_starts_m(self._offsets)[index] - self._planned[index])
+            if deviation > SLACK_M or geometry.irregular(self.aperture) is not None:
                 self._live = None
         self._stale.add(index)
         self._image = None
@@ -438,12 +438,12 @@ class BoardSamples:
             self._maps[sweep_hz.size] = _pair_maps(self._reduction.maps(sweep_hz))
         used, maps = self._maps[sweep_hz.size]
         pairs = np.asarray(samples, np.complex64).view(np.float32)[..., used]
-        out = np.empty((*pairs.shape[:2], maps.shape[1]), np.float32)
+        gated = np.empty((*pairs.shape[:2], maps.shape[1]), np.float32)
         for first in range(0, pairs.shape[1], _CHUNK):
             part = slice(first, first + _CHUNK)
-            np.matmul(pairs[:, part], maps, out=out[:, part])
+            np.matmul(pairs[:, part], maps, out=gated[:, part])
         count = self._reduction.frequencies_hz.size + 1
-        return out.view(np.complex64)[..., :count].mT
+        return gated.view(np.complex64)[..., :count].mT
 
     def _prepare(self) -> None:
         """Create the spectral imager of all rows if the aperture is regular; keep it while positions do not change."""
@@ -576,8 +576,8 @@ class BoardSamples:
         f = self._reduction.frequencies_hz
         gains = 1 / self.rx_calibration()
         cube = self._cube.reshape(*self._cube.shape[:2], -1) * weights
-        turned = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * f[None, :, None] * excess[:, None, :])
-        focused = (gains[:, None] * (cube * turned).sum(axis=-1)).sum(axis=0)
+        phasor = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * f[None, :, None] * excess[:, None, :])
+        focused = (gains[:, None] * (cube * phasor).sum(axis=-1)).sum(axis=0)
         return (np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(shifts_m, f)) @ focused).astype(np.complex64)
 
     def range_slope(self, grid: geometry.ImageGrid | None = None) -> tuple[Image, Image]:
@@ -664,13 +664,13 @@ def _pair_maps(maps: NDArray[np.complex128]) -> tuple[slice, NDArray[np.float32]
     """
     used = np.flatnonzero(maps.any(axis=0))[[0, -1]]
     maps = np.pad(maps[:, used[0] : used[1] + 1], ((0, -len(maps) % (_COLUMNS // 2)), (0, 0)))
-    out = np.empty((maps.shape[1], 2, maps.shape[0], 2), np.float32)
+    paired = np.empty((maps.shape[1], 2, maps.shape[0], 2), np.float32)
     # contributions to the real part
-    out[:, 0, :, 0] = maps.real.T
-    out[:, 1, :, 0] = -maps.imag.T
-    out[:, 0, :, 1] = maps.imag.T
-    out[:, 1, :, 1] = maps.real.T
-    return slice(2 * used[0], 2 * used[1] + 2), out.reshape(2 * maps.shape[1], -1)
+    paired[:, 0, :, 0] = maps.real.T
+    paired[:, 1, :, 0] = -maps.imag.T
+    paired[:, 0, :, 1] = maps.imag.T
+    paired[:, 1, :, 1] = maps.real.T
+    return slice(2 * used[0], 2 * used[1] + 2), paired.reshape(2 * maps.shape[1], -1)
 
 
 def _wrong_row_error(what: str) -> DataError:

@@ -240,15 +240,15 @@ def spectra_along_x(aperture: Aperture, lattice: Lattice, xp: Any = np, device: 
     step = float(f[-1] - f[0]) / max(1, f.size - 1)
     band = xp.asarray(lattice.band % n, device=device)
     size = (len(aperture.antennas.rx_m) * f.size, lattice.lags_y, lattice.band.size)
-    out = xp.empty(size, dtype=xp.complex64, device=device)
+    spectra = xp.empty(size, dtype=xp.complex64, device=device)
     for rx, delay in enumerate(delays_s(aperture, x, y, xp, device)):
         kernel = turn(xp, delay * float(f[0]), xp.float32, xp.complex64)
-        turned = turn(xp, delay * step, xp.float32, xp.complex64)
+        phase_step = turn(xp, delay * step, xp.float32, xp.complex64)
         for m in range(f.size):
             spectrum = fft.fft(cross_fade(xp, kernel, n), axis=1)
-            out[rx * f.size + m, :, :] = xp.take(spectrum, band, axis=1)
-            kernel = kernel * turned
-    return out
+            spectra[rx * f.size + m, :, :] = xp.take(spectrum, band, axis=1)
+            kernel = kernel * phase_step
+    return spectra
 
 
 class RowSpectra:
@@ -304,8 +304,8 @@ class RowSpectra:
         xp = self.xp
         count = self.lattice.band.size
         columns = self.aperture.offsets_m.shape[1]
-        rest = xp.zeros((*spectra.shape[:-1], self.lattice.size_x - count), dtype=xp.complex64, device=self.device)
-        spectrum = xp.roll(xp.concat([spectra * xp.conj(ramps), rest], axis=-1), int(self.lattice.band[0]), axis=-1)
+        padding = xp.zeros((*spectra.shape[:-1], self.lattice.size_x - count), dtype=xp.complex64, device=self.device)
+        spectrum = xp.roll(xp.concat([spectra * xp.conj(ramps), padding], axis=-1), int(self.lattice.band[0]), axis=-1)
         folded = xp.sum(xp.reshape(spectrum, (*spectra.shape[:-1], self.lattice.stride_x, self.period)), axis=-2)
         return self._fft.ifft(folded, axis=-1)[..., :columns] * self.period
 
@@ -381,15 +381,15 @@ class SpectralImager(RowSpectra):
         xp = self.xp
         sizes = self.lattice
         lines = self.evaluate_pixels_adjoint(image)
-        spread = xp.zeros((sizes.size_y, lines.shape[-1]), dtype=xp.complex64, device=self.device)
+        padded = xp.zeros((sizes.size_y, lines.shape[-1]), dtype=xp.complex64, device=self.device)
         end = self._last + sizes.pixel_stride * lines.shape[0]
-        spread[self._last : end : sizes.pixel_stride, :] = lines
-        spectrum = self._fft.fft(spread, axis=0)
-        out = []
+        padded[self._last : end : sizes.pixel_stride, :] = lines
+        spectrum = self._fft.fft(padded, axis=0)
+        rows = []
         for c in range(self._kernels.shape[0]):
             product = self._fft.ifft(xp.conj(self._kernels[c, :, :]) * spectrum, axis=0)
-            out.append(self.transform_rows_adjoint(xp.take(product, self._rows, axis=0), self._ramps))
-        return xp.reshape(xp.stack(out), self.aperture.shape)
+            rows.append(self.transform_rows_adjoint(xp.take(product, self._rows, axis=0), self._ramps))
+        return xp.reshape(xp.stack(rows), self.aperture.shape)
 
     def _transform_along_y(self, lines: Any) -> Any:
         """Return the 2-D spectrum on the lattice [ky, k] of the rows' spectra [row, k]."""

@@ -95,14 +95,14 @@ class Outcome:
 
 def find_scans(paths: Sequence[Path]) -> list[Path]:
     """Return the scans at paths: scan folders themselves, and the scans in other folders."""
-    out: list[Path] = []
+    folders: list[Path] = []
     for path in paths:
         if path.is_dir() and not _is_data(path):
             scans_inside = sorted(p for p in path.iterdir() if _is_data(p))
         else:
             scans_inside = []
-        out += scans_inside or [path]
-    return out
+        folders += scans_inside or [path]
+    return folders
 
 
 def _is_data(path: Path) -> bool:
@@ -272,8 +272,8 @@ def run_here(jobs: Sequence[Job], at_once: int) -> Iterator[Outcome]:
     with ThreadPoolExecutor(at_once) as pool:
         try:
             pending = [pool.submit(run_scan, job, stop) for job in jobs]
-            for done in as_completed(pending):
-                yield done.result()
+            for future in as_completed(pending):
+                yield future.result()
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)
@@ -307,15 +307,15 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
         ) from None
     with client:
         jobs_by_name = {job.name: job for job in jobs}
-        named = {client.submit(run_scan, job, pure=False): job.name for job in jobs}
-        for future in as_completed(list(named)):
+        name_of_future = {client.submit(run_scan, job, pure=False): job.name for job in jobs}
+        for future in as_completed(list(name_of_future)):
             if future.status == "finished":
                 yield future.result()
-            elif is_finished(jobs_by_name[named[future]]):
+            elif is_finished(jobs_by_name[name_of_future[future]]):
                 # The worker was lost after it wrote the mark.
-                yield _end_outcome(jobs_by_name[named[future]])
+                yield _end_outcome(jobs_by_name[name_of_future[future]])
             else:
-                yield Outcome(named[future], "failed", message=f"its workers were lost: {future.exception()}")
+                yield Outcome(name_of_future[future], "failed", message=f"its workers were lost: {future.exception()}")
 
 
 def memory_bytes(positions: int) -> int:

@@ -61,10 +61,10 @@ def simulate_scene(scene: Path, config: Path, out: Path, seed: int | None = None
     command += ["--out", str(out), "--json"]
     if seed is not None:
         command += ["--seed", str(seed)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise _simulator_error(done.returncode, done.stderr)
-    sys.stderr.write(done.stderr)
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    if process.returncode != 0:
+        raise _simulator_error(process.returncode, process.stderr)
+    sys.stderr.write(process.stderr)
 
 
 def check_scenes(scenes: Iterable[Path], config: Path) -> None:

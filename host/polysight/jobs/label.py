@@ -170,8 +170,10 @@ def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[L
     write_together({place / LABELS_PICTURE: picture, place / LABELS: pack_labels(checked)})
     masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
     notes = []
-    if few := [name for name, mask in masks.items() if (mask & products.valid).sum() < MIN_PIXELS]:
-        notes.append(f"fewer than {MIN_PIXELS} pixels: {', '.join(few)}; a library would learn speckle from so few")
+    if small_boxes := [name for name, mask in masks.items() if (mask & products.valid).sum() < MIN_PIXELS]:
+        notes.append(
+            f"fewer than {MIN_PIXELS} pixels: {', '.join(small_boxes)}; a library would learn speckle from so few"
+        )
     if dark := _find_dark_boxes(products, masks):
         notes.append(f"as dark as empty background: {', '.join(dark)}; look at the picture")
     if checked.metal is None:
@@ -202,14 +204,14 @@ def _find_dark_boxes(products: ProcessedScan, masks: Mapping[str, npt.NDArray[np
     if not np.isfinite(power).any():
         return []
     least = np.nanpercentile(power, 99) * 10 ** (SegmentSettings().dimmest_db / 10)
-    inside = {name: power[mask & products.valid] for name, mask in masks.items()}
-    return [name for name, p in inside.items() if p.size and np.nanmedian(p) < least]
+    power_in_box = {name: power[mask & products.valid] for name, mask in masks.items()}
+    return [name for name, p in power_in_box.items() if p.size and np.nanmedian(p) < least]
 
 
 def list_patches(products: ProcessedScan) -> list[FoundPatch]:
     """Patches of materials.json, each with a box inside it that avoids its edges if it is wide enough."""
     margin_mm = SegmentSettings().margin_mm
-    out = []
+    lines = []
     for patch in products.segments:
         x0, y0, x1, y1 = patch.box_mm
         margin_x_mm = min(margin_mm, _LARGEST_MARGIN * (x1 - x0))
@@ -226,8 +228,8 @@ def list_patches(products: ProcessedScan) -> list[FoundPatch]:
             text = f"named {patch.name}"
             if patch.confidence is not None:
                 text += f" {100 * patch.confidence:.0f} %"
-        out.append(FoundPatch(patch.label, inner_box, text))
-    return out
+        lines.append(FoundPatch(patch.label, inner_box, text))
+    return lines
 
 
 def _require_patches(patches: Sequence[FoundPatch]) -> None:

@@ -296,12 +296,12 @@ def catalogue(as_json: bool) -> int:
 def _format_catalogue_line(material: CatalogueMaterial, number: Mapping[str, int]) -> str:
     """Name, permittivity and spreads, frequency and numbers of the sources."""
     value = format_permittivity(material.permittivity, 4, 8)
-    real, loss = (100 * spread for spread in material.spread)
+    real, loss = (100 * spread_text for spread_text in material.spread)
     star = "*" if material.spread_is_default else " "
     cited = "".join(f"[{number[source.key]}]" for source in material.sources)
-    spread = f"+-{real:3.0f} %, {loss:3.0f} %{star}"
+    spread_text = f"+-{real:3.0f} %, {loss:3.0f} %{star}"
     frequency = f"{material.frequency_hz / 1e9:5.4g} GHz"
-    return f"{_pad_name(material.name, 30)} {value:19s} {spread} {frequency}  {material.kind:10s} {cited}"
+    return f"{_pad_name(material.name, 30)} {value:19s} {spread_text} {frequency}  {material.kind:10s} {cited}"
 
 
 def _patch_line(patch: PatchFigures) -> str:
@@ -522,20 +522,20 @@ def _describe_contradictions(
     """Describe patches without a name that match different materials at different angles, one line each."""
     if len(angles_deg) < 2 or all(n.verdict.source == "library" for n in named):
         return []
-    alone = []
+    names_by_angle = []
     for i, angle_deg in enumerate(angles_deg):
         # Features of the angles stand side by side; evidence has a row for each.
         features = [np.split(m.features, len(angles_deg), 1)[i] for m in matched]
         evidence = [m.evidence if m.evidence is None else m.evidence[i : i + 1] for m in matched]
-        alone.append(Classifier(library, model=model, angles_deg=[angle_deg]).scan(features, evidence))
-    out = []
-    for m, together, *single_scans in zip(matched, named, *alone, strict=True):
+        names_by_angle.append(Classifier(library, model=model, angles_deg=[angle_deg]).scan(features, evidence))
+    lines = []
+    for m, together, *single_scans in zip(matched, named, *names_by_angle, strict=True):
         names = [n.verdict.name for n in single_scans]
         materials_alone = {n.verdict.name for n in single_scans if n.verdict.source == "library"}
         if together.verdict.source != "library" and len(materials_alone) > 1:
             answers = ", ".join(f"{name} at {a:g} degrees" for name, a in zip(names, angles_deg, strict=True))
-            out.append(f"patch {m.label} contradicts itself: {answers}; was it moved or exchanged between the scans?")
-    return out
+            lines.append(f"patch {m.label} contradicts itself: {answers}; was it moved or exchanged between the scans?")
+    return lines
 
 
 def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:

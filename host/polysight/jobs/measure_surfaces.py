@@ -131,8 +131,8 @@ def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
 
 def thin_out(metal: surfaces.Seen) -> surfaces.Seen:
     """Return `KEPT_POINTS` points of metal, evenly taken: neighbours overlap."""
-    chosen = np.linspace(0, len(metal) - 1, min(KEPT_POINTS, len(metal))).round().astype(int)
-    return metal[chosen]
+    index = np.linspace(0, len(metal) - 1, min(KEPT_POINTS, len(metal))).round().astype(int)
+    return metal[index]
 
 
 def analyse_points(

@@ -230,13 +230,13 @@ def inspect_placement(file: Path, as_json: bool) -> int:
                 "the scan was simulated without cards, or recorded by an older release",
                 "`polysight validate SCAN` says whether it is whole",
             )
-    again = place_again(row)
+    placed = place_again(row)
     # A row whose frames were moved to their pulses cannot be compared range by range.
-    same = again.by_pulses or again.missing_before == again.placed.missing
+    same = placed.by_pulses or placed.missing_before == placed.placed.missing
     if as_json:
-        print_json({**again.placed.facts(), "committed_missing": again.missing_before, "same": same})
+        print_json({**placed.placed.facts(), "committed_missing": placed.missing_before, "same": same})
     else:
-        sys.stdout.write("\n".join(_format_placement(file, again, same)) + "\n")
+        sys.stdout.write("\n".join(_format_placement(file, placed, same)) + "\n")
     return exit_status(same)
 
 

@@ -75,20 +75,20 @@ def surface(
     """
     check_turns(len(scans), turned_deg)
     surfaces = [make_surface(scan, config, reference) for scan in scans]
-    joined = surfaces[0]
+    surface = surfaces[0]
     if len(surfaces) > 1:
         rig = open_source(scans[0], config, dropped=True).instrument
-        joined = join_turned(surfaces, turned_deg, find_axis(rig, axis_mm or (0.0, 0.0)))
-    measure_surfaces.save_surface(out, joined)
+        surface = join_turned(surfaces, turned_deg, find_axis(rig, axis_mm or (0.0, 0.0)))
+    measure_surfaces.save_surface(out, surface)
     if as_json:
         row = {
-            "scan_id": joined.scan_id,
-            "simulated": joined.simulated,
-            "segments": [plain_segment(segment) for segment in joined.segments],
+            "scan_id": surface.scan_id,
+            "simulated": surface.simulated,
+            "segments": [plain_segment(segment) for segment in surface.segments],
         }
         print_json(row)
     else:
-        print_lines([*summary_lines(joined), f"surface: {out / 'surface.npz'}, surface.ply, surface.png"])
+        print_lines([*summary_lines(surface), f"surface: {out / 'surface.npz'}, surface.ply, surface.png"])
     return 0
 
 

@@ -265,9 +265,9 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
     scans = [training_scan(folder, config) for folder in steps(data, [str(folder) for folder in data])]
     if files:
         with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:
-            drawn = list(product(files, range(times)))
-            called = [f"simulating and imaging {file.name}, specimens {again}" for file, again in drawn]
-            for file, again in steps(drawn, called):
+            scenes_drawn = list(product(files, range(times)))
+            called = [f"simulating and imaging {file.name}, specimens {again}" for file, again in scenes_drawn]
+            for file, again in steps(scenes_drawn, called):
                 folder = Path(temporary) / f"{file.stem}-{again}"
                 command = ["simulate", str(file), "--config", str(config), "--out", str(folder)]
                 if run_simulator([*command, "--specimens", str(again)]):
@@ -291,9 +291,9 @@ def number_equal_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
     DataError
         if a scan is given twice: cross-validation would test it on itself.
     """
-    out: list[TrainingScan] = []
+    numbered: list[TrainingScan] = []
     for scan in scans:
-        namesakes = [s for s in scans[: len(out)] if s.scan == scan.scan]
+        namesakes = [s for s in scans[: len(numbered)] if s.scan == scan.scan]
         if any(np.array_equal(s.result.h, scan.result.h, equal_nan=True) for s in namesakes):
             raise DataError(
                 f"scan {scan.scan} is given twice",
@@ -302,8 +302,8 @@ def number_equal_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
             )
         if namesakes:
             scan = replace(scan, scan=f"{scan.scan} ({len(namesakes) + 1})")
-        out.append(scan)
-    return out
+        numbered.append(scan)
+    return numbered
 
 
 def _count(number: int, singular: str, plural: str) -> str:

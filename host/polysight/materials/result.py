@@ -213,10 +213,10 @@ class MaterialsResult:
     def incidence_deg(self, patch: Patch) -> float:
         """Return the mean incidence angle over a patch's interior, degrees."""
         if self.theta_rad.ndim and patch.interior.any():
-            inside = self.theta_rad[patch.interior]
+            angles = self.theta_rad[patch.interior]
         else:
-            inside = self.theta_rad
-        return float(np.degrees(np.mean(inside)))
+            angles = self.theta_rad
+        return float(np.degrees(np.mean(angles)))
 
     def _describe_patch(self, r: PatchResult) -> PatchFigures:
         label = r.patch.label
@@ -360,7 +360,7 @@ def pixel_features(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real
 
 def make_labels(result: MaterialsResult, description: str = "") -> Labels:
     """Return boxes around the interiors of a result's patches, in pixels, with unique names as drawn or classified."""
-    out: dict[str, Box] = {}
+    boxes: dict[str, Box] = {}
     for r in result.patches:
         name = "patch"
         if result.boxes.get(r.patch.label):
@@ -371,9 +371,9 @@ def make_labels(result: MaterialsResult, description: str = "") -> Labels:
             name = r.verdict.name
         inside = r.patch.interior if r.patch.interior.any() else r.patch.mask
         rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-        key = name if name not in out else f"{name} ({r.patch.label})"
-        out[key] = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
-    return Labels(out, description=description)
+        key = name if name not in boxes else f"{name} ({r.patch.label})"
+        boxes[key] = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
+    return Labels(boxes, description=description)
 
 
 def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike, simulated: bool) -> bytes:
@@ -394,9 +394,9 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
     judged = list(result.evidence)
     meta = {"format": PATCHES_FORMAT, "angle_deg": angle, "simulated": simulated, "patches": rows, "judged": judged}
     evidence = result.evidence.values()
-    out = io.BytesIO()
+    buffer = io.BytesIO()
     np.savez_compressed(
-        out,
+        buffer,
         meta=np.frombuffer(json.dumps(meta).encode("utf-8"), np.uint8),
         places_mm=np.concatenate(places).astype(np.float32),
         features=np.concatenate(features).astype(np.float32),
@@ -409,7 +409,7 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
         ),
         evidence_dispersion=np.array([_pack_dispersion(e.dispersion) for e in evidence], np.float64).reshape(-1, 8),
     )
-    return out.getvalue()
+    return buffer.getvalue()
 
 
 def _pack_dispersion(dispersion: PatchDispersion | None) -> Real:
@@ -490,7 +490,7 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
     Two patches match if their centres are each other's nearest. Pixels match by their position in the patch, so that
     the scans' image centres may differ by up to half a patch.
     """
-    out = []
+    matched = []
     for patch in scans[0].patches:
         partners = [p for other_scan in scans[1:] if (p := _find_partner(patch, scans[0], other_scan)) is not None]
         if len(partners) < len(scans) - 1:
@@ -510,8 +510,8 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
             near_enough &= distance_mm <= NEAR_MM
             columns.append(partner.features[np.minimum(nearest_index, len(partner_places) - 1)])
         complete = evidence if len(evidence) == len(scans) else None
-        out.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[near_enough], complete))
-    return out
+        matched.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[near_enough], complete))
+    return matched
 
 
 def _find_partner(patch: ScanPatch, own_scan: ScanPatches, other_scan: ScanPatches) -> ScanPatch | None:

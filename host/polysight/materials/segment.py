@@ -279,9 +279,9 @@ def find_patches_at_border(patches: Sequence[Patch], lit: Mask | None) -> frozen
 
 def _reaches_end(mask: Mask, lit: Mask) -> bool:
     """Return true if a mask comes within two pixels of the end of what is lit, and does not fill it."""
-    inside = np.asarray(scipy.ndimage.binary_erosion(lit, iterations=2), bool)
+    is_inside = np.asarray(scipy.ndimage.binary_erosion(lit, iterations=2), bool)
     fills = not (lit & ~mask).any()
-    return bool((mask & ~inside).any()) and not fills
+    return bool((mask & ~is_inside).any()) and not fills
 
 
 def _is_cut(mask: Mask, smallest_px: float) -> bool:
@@ -302,8 +302,8 @@ def _find_least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_
     bright = level > skimage.filters.threshold_otsu(level)
     background = float(np.median(level[~bright]))
     # Plates over a noisy background: the classes overlap, but noise is rarely as bright over a plate's width.
-    plain = _open_mask((image > background + PLAIN_DB) & usable, cfg.smallest_mm / pixel_mm / 2)
-    if not plain.any() and not _separate(level, bright, cfg.least_contrast_db):
+    plain_mask = _open_mask((image > background + PLAIN_DB) & usable, cfg.smallest_mm / pixel_mm / 2)
+    if not plain_mask.any() and not _separate(level, bright, cfg.least_contrast_db):
         return float("inf")
     scatter = min(1.4826 * float(np.median(np.abs(level[~bright] - background))), MOST_SCATTER_DB)
     return max(background + max(cfg.least_contrast_db, cfg.least_scatter * scatter), cfg.dimmest_db)
@@ -331,10 +331,10 @@ def whole_plane(usable: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm:
 def _remove_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> Real:
     """Return the level after total variation, dB, with the weight for the speckle of the bright plates."""
     strongest = reduce_variation(level, cfg.speckle_db)
-    inside = strongest[usable]
-    if np.ptp(inside) == 0:
+    levels = strongest[usable]
+    if np.ptp(levels) == 0:
         return strongest
-    bright = (strongest > skimage.filters.threshold_otsu(inside)) & usable
+    bright = (strongest > skimage.filters.threshold_otsu(levels)) & usable
     middle = np.asarray(scipy.ndimage.distance_transform_edt(bright)) > cfg.margin_mm / pixel_mm
     if not middle.any():
         return strongest
@@ -351,8 +351,8 @@ def _separate(level: Real, bright: Mask, least_contrast_db: float) -> bool:
     """
     w = float(bright.mean())
     gap = float(level[bright].mean() - level[~bright].mean())
-    two = w * (1 - w) * gap**2 >= 0.70 * float(level.var()) or gap >= 4 * float(level[~bright].std())
-    return gap >= least_contrast_db and two
+    is_bimodal = w * (1 - w) * gap**2 >= 0.70 * float(level.var()) or gap >= 4 * float(level[~bright].std())
+    return gap >= least_contrast_db and is_bimodal
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,18 +382,18 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
     """
     opening_px = (cfg.smallest_mm / pixel_mm - 1) / 2
     skirt_px = max(1.0, cfg.margin_mm / pixel_mm)
-    rest = usable.copy()
-    taken: list[Mask] = []
+    remaining = usable.copy()
+    regions: list[Mask] = []
     growing: list[_Growing] = []
 
     def take(mask: Mask) -> None:
-        taken.append(_smooth_outline(mask))
+        regions.append(_smooth_outline(mask))
         window = _find_window(mask, int(skirt_px) + 1)
-        rest[window][np.asarray(scipy.ndimage.distance_transform_edt(~mask[window])) <= skirt_px] = False
+        remaining[window][np.asarray(scipy.ndimage.distance_transform_edt(~mask[window])) <= skirt_px] = False
 
     for threshold in np.arange(float(level[usable].max()), cfg.floor_db, -STEP_DB) - STEP_DB:
         grown: list[_Growing] = []
-        for region in _find_components(_open_mask((level > threshold) & rest, opening_px)):
+        for region in _find_components(_open_mask((level > threshold) & remaining, opening_px)):
             inside = [node for node in growing if (node.mask & region).any()]
             complete = [node for node in inside if node.level_db - threshold >= cfg.least_contrast_db]
             overflows = any(region.sum() > OVERFLOW * node.mask.sum() for node in complete)
@@ -408,7 +408,7 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
                 earlier = max(inside, key=lambda node: int(node.mask.sum())).masks if inside else ()
                 grown.append(_Growing((*earlier, (float(threshold), region)), own_db))
         growing = grown
-    return taken
+    return regions
 
 
 def _smooth_outline(mask: Mask) -> Mask:
@@ -468,8 +468,8 @@ def align(images: Images) -> tuple[Images, tuple[float, float]]:
     back_px = np.asarray(registration[0], np.float64)
     pixel_mm = abs(float(images.x_m[1] - images.x_m[0])) * 1e3
     apart_mm = -back_px[::-1] * pixel_mm
-    moved = np.asarray(scipy.ndimage.shift(edges_v, back_px, order=1))
-    correlation = float(np.corrcoef(edges_h.ravel(), moved.ravel())[0, 1])
+    moved_edges = np.asarray(scipy.ndimage.shift(edges_v, back_px, order=1))
+    correlation = float(np.corrcoef(edges_h.ravel(), moved_edges.ravel())[0, 1])
     if not LEAST_APART_MM <= float(np.hypot(*apart_mm)) <= MOST_APART_MM or correlation < ALIKE:
         return images, (0.0, 0.0)
     usable_v = np.where(images.usable, images.v, 0).astype(np.complex128)
@@ -575,8 +575,8 @@ def match_truth(patches: Iterable[Patch], plates: Iterable[TruthPlate]) -> dict[
             if x0 <= x <= x1 and y0 <= y <= y1:
                 distance = float(np.hypot(x - plate.centre_mm[0], y - plate.centre_mm[1]))
                 pairs.append((distance, patch.label, plate))
-    out: dict[int, TruthPlate] = {}
+    plate_of_patch: dict[int, TruthPlate] = {}
     for _, label, plate in sorted(pairs, key=lambda p: p[0]):
-        if label not in out and all(p is not plate for p in out.values()):
-            out[label] = plate
-    return out
+        if label not in plate_of_patch and all(p is not plate for p in plate_of_patch.values()):
+            plate_of_patch[label] = plate
+    return plate_of_patch

@@ -165,13 +165,13 @@ def average_channels(covariance: Real) -> Real:
 
     A specimen's deviation changes mostly V, so that the gain error of V cannot be separated from it; that of H can.
     """
-    out = np.zeros_like(covariance)
+    averaged = np.zeros_like(covariance)
     for i in range(0, len(covariance), 3):
         h, v, phase = range(i, i + 3)
-        out[h, h] = out[v, v] = (covariance[h, h] + covariance[v, v]) / 2
-        out[h, v] = out[v, h] = covariance[h, v]
-        out[phase, phase] = covariance[phase, phase]
-    return out
+        averaged[h, h] = averaged[v, v] = (covariance[h, h] + covariance[v, v]) / 2
+        averaged[h, v] = averaged[v, h] = covariance[h, v]
+        averaged[phase, phase] = covariance[phase, phase]
+    return averaged
 
 
 def _compute_floor(covariance: Real) -> Real:

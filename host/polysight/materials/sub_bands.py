@@ -350,8 +350,8 @@ def fit_row(
     if row.metal_reference or (row.refused is not None and row.refused.what not in NOT_PASSIVE):
         return None
     if bands is None:
-        sized = any(layer.thickness_range_m for layer in stack)
-        bands = max(1, len(row.bands or ())) if sized else 1
+        has_thickness = any(layer.thickness_range_m for layer in stack)
+        bands = max(1, len(row.bands or ())) if has_thickness else 1
     data = bands_of_row(row, chirp, bands, amplitude_error, theta_std_rad)
     if data is None:
         return None
@@ -367,8 +367,8 @@ def incidence_std_rad(materials: ScanMaterials | None) -> float:
 
 def layer_content(fit: LayerFit) -> dict[str, Any]:
     """Return a fit as plain values for JSON; permittivities as [eps', eps''], lengths in millimetres."""
-    sized = fit.std_thickness_m > 0
-    units = np.array([1.0, 1.0, 1e3])[: 3 if sized else 2]
+    has_thickness = fit.std_thickness_m > 0
+    units = np.array([1.0, 1.0, 1e3])[: 3 if has_thickness else 2]
     if fit.covariance is None:
         covariance = None
     else:
@@ -377,7 +377,7 @@ def layer_content(fit: LayerFit) -> dict[str, Any]:
         **_read_solution(fit),
         "std_real": fit.std_real,
         "std_loss": fit.std_loss,
-        "thickness_std_mm": 1e3 * fit.std_thickness_m if sized else None,
+        "thickness_std_mm": 1e3 * fit.std_thickness_m if has_thickness else None,
         "covariance": covariance,
         "freedom": fit.freedom,
         "ambiguous": fit.ambiguous,
@@ -438,8 +438,8 @@ class Line:
         slope, intercept = (float(c) for c in np.polyfit(x, y, 1))
         residual = y - (intercept + slope * x)
         std = float(np.sqrt((residual**2).sum() / (x.size - 2)))
-        spread = float(((x - x.mean()) ** 2).sum())
-        return cls(slope, intercept, float(x.mean()), spread, std, int(x.size))
+        sum_of_squares = float(((x - x.mean()) ** 2).sum())
+        return cls(slope, intercept, float(x.mean()), sum_of_squares, std, int(x.size))
 
     def percent(self, angle_rad: npt.ArrayLike) -> Real:
         """Return the concentrations, percent by weight, in the shape of the angles."""
@@ -492,14 +492,14 @@ def concentrations(names: Iterable[str], given: Mapping[str, float] | None = Non
 
     Names without either are omitted.
     """
-    out: dict[str, float] = {}
+    concentration_of_name: dict[str, float] = {}
     for name in names:
         percent = _PERCENT.search(name)
         if given and name in given:
-            out[name] = given[name]
+            concentration_of_name[name] = given[name]
         elif percent:
-            out[name] = float(percent[1])
-    return out
+            concentration_of_name[name] = float(percent[1])
+    return concentration_of_name
 
 
 def fit_concentration(

@@ -213,15 +213,16 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
     metal_h, metal_v = metal_gains(scan.h, scan.v, scan.mask(scan.metal) & (scan.h != 0) & (scan.v != 0))
     h = scan.h / np.asarray(metal_h, scan.h.dtype)
     v = scan.v / np.asarray(metal_v, scan.v.dtype)
-    out = []
+    entries = []
     for name in scan.boxes:
         hs = h[scan.mask(name)]
         vs = v[scan.mask(name)]
-        good = np.flatnonzero(np.isfinite(hs) & np.isfinite(vs) & (hs != 0) & (vs != 0))
-        if good.size == 0:
+        usable = np.flatnonzero(np.isfinite(hs) & np.isfinite(vs) & (hs != 0) & (vs != 0))
+        if usable.size == 0:
             continue
-        picked = good[np.unique(np.linspace(0, good.size - 1, min(PUBLISHED_PIXELS, good.size)).round().astype(int))]
-        out.append(
+        spaced = np.linspace(0, usable.size - 1, min(PUBLISHED_PIXELS, usable.size)).round().astype(int)
+        picked = usable[np.unique(spaced)]
+        entries.append(
             Entry(
                 name=name,
                 scan=scan.scan,
@@ -233,7 +234,7 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
                 reference=scan.metal,
             )
         )
-    return out
+    return entries
 
 
 def label_folders(folder: Path) -> list[Path]:
@@ -357,10 +358,10 @@ def read_materials(folder: Path) -> Library:
 
 def _read_pixels(values: Any, most: int) -> npt.NDArray[np.complex128]:
     """Return the numbers of a file of `most` bytes. Raises ValueError: nested references can expand to any size."""
-    plain = isinstance(values, list | tuple) and all(isinstance(v, int | float | complex) for v in values)
+    is_plain = isinstance(values, list | tuple) and all(isinstance(v, int | float | complex) for v in values)
     if isinstance(values, np.ndarray):
         size = values.nbytes
-    elif plain:
+    elif is_plain:
         size = len(values)
     else:
         size = most + 1
@@ -499,17 +500,17 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     sure = np.zeros(samples.names.size)
     for train, test in splits(samples, by_pixel, folds):
         learnt[test] = np.isin(samples.names[test], samples.names[train])
-        fitted = MODELS[model](channels)
-        fitted.fit(samples.take(train))
-        alone[test], far = fitted.by_pixel(samples.x[test])
+        model_of_fold = MODELS[model](channels)
+        model_of_fold.fit(samples.take(train))
+        alone[test], distance = model_of_fold.by_pixel(samples.x[test])
         test_sets = [test]
-        if fitted.knows_scans:
+        if model_of_fold.knows_scans:
             test_sets = [test[samples.groups[test] == group] for group in np.unique(samples.groups[test])]
         for test_set in test_sets:
-            if fitted.knows_scans:
-                predicted = fitted.by_scan(samples.x[test_set], samples.patches[test_set])
+            if model_of_fold.knows_scans:
+                predicted = model_of_fold.by_scan(samples.x[test_set], samples.patches[test_set])
             else:
-                predicted = majority(alone[test_set], far, samples.patches[test_set])
+                predicted = majority(alone[test_set], distance, samples.patches[test_set])
             row = np.searchsorted(predicted.patches, samples.patches[test_set])
             in_scan[test_set] = predicted.pixel_names
             of_patch[test_set] = predicted.names[row]
@@ -551,7 +552,7 @@ def score_unseen_materials(samples: Samples, model: str) -> dict[str, float]:
 
     The other materials are learnt from other scans than the judged one, as always.
     """
-    out = {}
+    scores = {}
     for name in np.unique(samples.names):
         missed = []
         for train, test in splits(samples):
@@ -563,8 +564,8 @@ def score_unseen_materials(samples: Samples, model: str) -> dict[str, float]:
                 naming = fitted.by_scan(samples.x[test_set], samples.patches[test_set])
                 own_patches = np.unique(samples.patches[test_set][samples.names[test_set] == name])
                 missed += list(naming.distance[np.searchsorted(naming.patches, own_patches)] > 1)
-        out[str(name)] = float(np.mean(missed))
-    return out
+        scores[str(name)] = float(np.mean(missed))
+    return scores
 
 
 def fit_library(library: Library) -> Library:
@@ -653,7 +654,7 @@ def make_entries(scan: TrainingScan) -> list[Entry]:
 
     Pixels are taken at even intervals, so that the same scan always gives the same entries.
     """
-    out = []
+    entries = []
     r = scan.result
     for patch in r.patches:
         name = (scan.names or {}).get(patch.patch.label) or (patch.truth.name if patch.truth else None)
@@ -664,7 +665,7 @@ def make_entries(scan: TrainingScan) -> list[Entry]:
         picked = (rows[pick], cols[pick])
         eps = patch.truth.permittivity if patch.truth else None
         theta = r.theta_rad[picked] if r.theta_rad.ndim else r.theta_rad
-        out.append(
+        entries.append(
             Entry(
                 name=name,
                 scan=scan.scan,
@@ -680,7 +681,7 @@ def make_entries(scan: TrainingScan) -> list[Entry]:
                 specimen=(scan.specimens or {}).get(patch.patch.label),
             )
         )
-    return out
+    return entries
 
 
 def make_library(scans: Iterable[TrainingScan], note: str = "") -> Library:

@@ -228,19 +228,21 @@ class Motion(msgspec.Struct, frozen=True, kw_only=True):
 def make_snapshot(inputs: Inputs) -> Snapshot:
     """Describe the whole state of a scan."""
     history = inputs.history
-    shown = inputs.shown
+    row_shown = inputs.shown
     if history is None:
         return Snapshot(status=judge(inputs), notices=_collect_notices(inputs), control=inputs.control)
     plan = history.plan
     marks = history.marks
     boards = history.boards
     for board in boards:
-        board.masked = sum(row.masked for row in shown.sync.get(board.name, {}).values())
+        board.masked = sum(row.masked for row in row_shown.sync.get(board.name, {}).values())
     sync = {
         name: {number: round(math.degrees(row.object_rad), 3) for number, row in rows.items()}
-        for name, rows in shown.sync.items()
+        for name, rows in row_shown.sync.items()
     }
-    snr_db = {name: {number: round(row.snr_db, 1) for number, row in rows.items()} for name, rows in shown.sync.items()}
+    snr_db = {
+        name: {number: round(row.snr_db, 1) for number, row in rows.items()} for name, rows in row_shown.sync.items()
+    }
     verdict = None
     if _may_have_result(inputs, history):
         verdict = inputs.verdict
@@ -266,8 +268,8 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
         ),
         boards=boards,
         trigger=history.trigger,
-        pictures=_describe_pictures(history, shown),
-        profile=shown.profile,
+        pictures=_describe_pictures(history, row_shown),
+        profile=row_shown.profile,
         sync=sync,
         snr_db=snr_db,
         lost=history.lost_shares,

@@ -552,18 +552,18 @@ class Watch:
             patience_s = GRACE_S
             if self._history is not None and self._history.row_seconds is not None:
                 patience_s = max(GRACE_S, UNATTENDED_ROWS * self._history.row_seconds[0])
-            alive = now - self._grown_at < patience_s
+            is_alive = now - self._grown_at < patience_s
         else:
-            alive = not killed and now - self._life_at < self._lapse_s
+            is_alive = not killed and now - self._life_at < self._lapse_s
         alive_s = 0
-        if not alive:
+        if not is_alive:
             alive_s = round(life_s or self._manifest.file.modified_s)
         pi_silent_s = None
         if pi.heard_s:
             pi_silent_s = now - pi.heard_s
         return LifeSigns(
             life=life,
-            alive=alive,
+            alive=is_alive,
             killed=killed,
             alive_s=alive_s,
             pi_silent_s=pi_silent_s,

@@ -454,9 +454,9 @@ def _check_field(rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple
                 f" in an image of {image_mm[i]:.0f} mm needs {need:.0f} mm: use steps of at most"
                 f" {step * free / need:.2g} mm, a smaller image, or `polysight process --sparse`",
             )
-        if (good := max(0.0, size - 2 * zone)) < scene:
+        if (good_mm := max(0.0, size - 2 * zone)) < scene:
             yield _note(
                 "aperture",
-                f"flat plates are mirrors: an aperture of {size:.0f} mm in {axis} images {good:.0f} mm of them well"
+                f"flat plates are mirrors: an aperture of {size:.0f} mm in {axis} images {good_mm:.0f} mm of them well"
                 f" ({zone:.0f} mm of margin on either side); the scene has {scene:.0f} mm",
             )

@@ -309,11 +309,11 @@ def describe(f: Forecast) -> str:
         ("", f"a point as strong as the direct path is {f.noise.image_db:.1f} dB above the noise in the image"),
         ("", f"source: {f.noise_source}"),
     ]
-    out = [f"{name:11s}{text}" for name, text in lines]
+    text_lines = [f"{name:11s}{text}" for name, text in lines]
     for warning in f.warnings:
         kind = "REFUSED" if warning.level == "error" else "note"
-        out += textwrap.wrap(f"{kind}, {warning.where}: {warning.what}", _WIDTH, subsequent_indent="  ")
-    return "\n".join(out) + "\n"
+        text_lines += textwrap.wrap(f"{kind}, {warning.where}: {warning.what}", _WIDTH, subsequent_indent="  ")
+    return "\n".join(text_lines) + "\n"
 
 
 def _describe_normals(seen: VisibleNormals) -> str:
@@ -404,12 +404,12 @@ def measure_noise(source: RawSource) -> Noise:
 
     rig = source.instrument
     rows = list(source.rows())
-    spread = np.linspace(0, len(rows) - 1, min(_NOISE_ROWS, len(rows))).astype(int)
+    spaced = np.linspace(0, len(rows) - 1, min(_NOISE_ROWS, len(rows))).astype(int)
     ratios = []
     for board in rig.receivers:
         setup = BoardSetup.from_rig(rig, board)
         report = SyncReport(rig.chirp.sample_rate_hz, rig.chirp.linear_samples, len(rig.antennas.rx_mm))
-        for row in (rows[i] for i in spread):
+        for row in (rows[i] for i in spaced):
             data = source.read_row(board.name, row)
             words, valid = row_words(data.payload, data.missing, data.frames_expected, rig.chirp.samples)
             report.add(synchronise_row(words, valid, setup))

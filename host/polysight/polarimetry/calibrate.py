@@ -52,17 +52,17 @@ from polysight_shared.errors import DataError, PolysightError
 def ratio(h: Image, v: Image) -> Image:
     """Return the polarisation ratio h / v, complex; NaN where v is zero or either is not finite."""
     is_usable = (v != 0) & np.isfinite(v) & np.isfinite(h)
-    out = np.full(np.broadcast_shapes(h.shape, v.shape), complex(np.nan, np.nan), np.result_type(h, v))
-    np.divide(h, v, out=out, where=is_usable)
-    return out
+    quotient = np.full(np.broadcast_shapes(h.shape, v.shape), complex(np.nan, np.nan), np.result_type(h, v))
+    np.divide(h, v, out=quotient, where=is_usable)
+    return quotient
 
 
 def inverse_spread(h: Image, v: Image) -> float:
     """Return the standard deviation of V / H over pixels, of the real part and of the imaginary part (1.48 MAD)."""
-    good = np.isfinite(h) & np.isfinite(v) & (h != 0)
-    if not good.any():
+    is_usable = np.isfinite(h) & np.isfinite(v) & (h != 0)
+    if not is_usable.any():
         return float("nan")
-    inverse = v[good].astype(np.complex128) / h[good]
+    inverse = v[is_usable].astype(np.complex128) / h[is_usable]
     parts = np.concatenate([inverse.real - np.median(inverse.real), inverse.imag - np.median(inverse.imag)])
     return float(1.4826 * np.median(np.abs(parts)))
 
@@ -89,9 +89,9 @@ def metal_gains(h: Image, v: Image, metal_mask: Mask) -> tuple[complex, complex]
         )  # fmt: skip
     mh = h[metal_mask].astype(np.complex128)
     mv = v[metal_mask].astype(np.complex128)
-    good = np.isfinite(mh) & np.isfinite(mv)
-    mh = mh[good]
-    mv = mv[good]
+    is_finite = np.isfinite(mh) & np.isfinite(mv)
+    mh = mh[is_finite]
+    mv = mv[is_finite]
     cross = complex(np.vdot(mv, mh)) if mh.size else 0j
     if mh.size == 0 or abs(cross) == 0:
         raise DataError(
@@ -166,13 +166,13 @@ def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
     """
     if sigma_px <= 0:
         return image
-    good = np.isfinite(image)
-    filled = np.where(good, image, 0)
-    out = np.asarray(scipy.ndimage.gaussian_filter(filled, sigma_px, mode="nearest"))
-    if not good.all():
-        weight = scipy.ndimage.gaussian_filter(good.astype(np.float64), sigma_px, mode="nearest")
-        out = np.where(good, out / np.where(good, weight, 1.0), image)
-    return out.astype(image.dtype)
+    is_finite = np.isfinite(image)
+    filled = np.where(is_finite, image, 0)
+    smoothed = np.asarray(scipy.ndimage.gaussian_filter(filled, sigma_px, mode="nearest"))
+    if not is_finite.all():
+        weight = scipy.ndimage.gaussian_filter(is_finite.astype(np.float64), sigma_px, mode="nearest")
+        smoothed = np.where(is_finite, smoothed / np.where(is_finite, weight, 1.0), image)
+    return smoothed.astype(image.dtype)
 
 
 # Defaults of `plane_reference`: width of the Gaussian window, lowest level relative to the plate's 90th percentile.
@@ -331,8 +331,8 @@ def plane_reference(
         top = float(np.percentile(power[usable], 90)) if usable.any() else 0.0
         strong &= power >= max(top * 10 ** (floor_db / 10), np.finfo(np.float32).tiny)
     # The border of the image does not count as an edge of the plate.
-    inside = np.asarray(scipy.ndimage.binary_erosion(strong, _make_disk(round(2 * smooth_px)), border_value=1), bool)
-    if int(inside.sum()) < MIN_PIXELS:
+    is_plate = np.asarray(scipy.ndimage.binary_erosion(strong, _make_disk(round(2 * smooth_px)), border_value=1), bool)
+    if int(is_plate.sum()) < MIN_PIXELS:
         raise DataError(
             "the reference scan shows no metal plate",
             "no area wider than the smoothing window is bright in both channels",
@@ -342,15 +342,15 @@ def plane_reference(
     cut_h, cut_v = (np.where(strong, z, complex(np.nan, np.nan)) for z in (h, v))
     level_h, level_v = (np.sqrt(np.abs(smooth(np.abs(z) ** 2, smooth_px))) for z in (cut_h, cut_v))
     cross = smooth(cut_h * np.conj(cut_v), smooth_px)
-    metal_h = np.where(inside, level_h * np.exp(1j * np.angle(cross)), np.nan).astype(np.result_type(h, np.complex64))
-    metal_v = np.where(inside, level_v, np.nan).astype(metal_h.dtype)
-    spread = inverse_spread(h[inside] / metal_h[inside], v[inside] / metal_v[inside])
-    share = 100 * float(inside.mean())
+    metal_h = np.where(is_plate, level_h * np.exp(1j * np.angle(cross)), np.nan).astype(np.result_type(h, np.complex64))
+    metal_v = np.where(is_plate, level_v, np.nan).astype(metal_h.dtype)
+    relative_std = inverse_spread(h[is_plate] / metal_h[is_plate], v[is_plate] / metal_v[is_plate])
+    share = 100 * float(is_plate.mean())
     description = (
         f"a metal plate scanned on its own{f' ({name})' if name else ''}, by position on {share:.0f} % of the image"
     )
     return PlaneReference(
-        h=metal_h, v=metal_v, valid=inside, x_m=images.x_m, y_m=images.y_m, spread=spread, how=description
+        h=metal_h, v=metal_v, valid=is_plate, x_m=images.x_m, y_m=images.y_m, spread=relative_std, how=description
     )
 
 
@@ -478,8 +478,8 @@ def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
             code=ErrorCode.VALUES_CONFLICT,
         )
     g_h, g_ha, g_vb, g_v = vh[3].conj() * np.array([scale[0], scale[0], scale[1], scale[1]])
-    fitted = (np.array([[g_h, g_ha], [g_vb, g_v]]) / scale[:, None] @ e.T).T
-    sine = np.abs(m[:, 1] * fitted[:, 0] - m[:, 0] * fitted[:, 1]) / np.linalg.norm(fitted, axis=1)
+    matrix = (np.array([[g_h, g_ha], [g_vb, g_v]]) / scale[:, None] @ e.T).T
+    sine = np.abs(m[:, 1] * matrix[:, 0] - m[:, 0] * matrix[:, 1]) / np.linalg.norm(matrix, axis=1)
     if len(standards) > 3:
         residual = float(np.sqrt(np.mean(np.minimum(sine, 1.0) ** 2)))
     else:

@@ -292,8 +292,8 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         grid = np.meshgrid(row, column, indexing="ij")
         num = scipy.ndimage.map_coordinates(deviation, grid, order=1, mode="constant")
         den = scipy.ndimage.map_coordinates(mass, grid, order=1, mode="constant")
-        lit = den > 1e-3 * float(weight.sum())
-        total += float(specular) + np.where(lit, num / np.where(lit, den, 1.0), 0.0)
+        is_lit = den > 1e-3 * float(weight.sum())
+        total += float(specular) + np.where(is_lit, num / np.where(is_lit, den, 1.0), 0.0)
     return total / len(rig.receivers)
 
 

@@ -103,11 +103,11 @@ def keep_labels(*results: str) -> Callable[[Function], Function]:
                 return function(*filled[: len(arguments)], **keywords)
 
             cores: list[list[str]] = [[] for _ in results]
-            out = xarray.apply_ufunc(compute, *entries, output_core_dims=cores, keep_attrs="override")
-            for array, name in zip(out if len(results) > 1 else (out,), results, strict=True):
+            labelled = xarray.apply_ufunc(compute, *entries, output_core_dims=cores, keep_attrs="override")
+            for array, name in zip(labelled if len(results) > 1 else (labelled,), results, strict=True):
                 array.attrs |= {"units": "1", "long_name": name}
                 array.name = None
-            return out
+            return labelled
 
         return call  # type: ignore[return-value]
 

@@ -261,10 +261,10 @@ def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArr
             f"{path}: valid is {valid.dtype} {_shape(valid)}", f"expected bool {_shape(h)}",
             "save it as bool with the shape of h, or leave it out", code=ErrorCode.MISMATCH,
         )  # fmt: skip
-    bad = valid & ~(np.isfinite(h) & np.isfinite(v))
-    if bad.any():
+    not_finite = valid & ~(np.isfinite(h) & np.isfinite(v))
+    if not_finite.any():
         raise DataError(
-            f"{path}: {int(bad.sum())} of {bad.size} pixels are not finite",
+            f"{path}: {int(not_finite.sum())} of {not_finite.size} pixels are not finite",
             "a pixel without data cannot be told from a wrong one",
             "save valid (bool, [ny, nx]), false where there is no data", code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
@@ -280,13 +280,13 @@ def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArr
                 f"{path}: {name} is zero everywhere", "materials are told by the ratio of both channels",
                 "look at the program that made the images", code=ErrorCode.NO_DATA,
             )  # fmt: skip
-    lit = valid & ((h != 0) | (v != 0))
-    if not lit.any():
+    is_lit = valid & ((h != 0) | (v != 0))
+    if not is_lit.any():
         raise DataError(
             f"{path}: no pixel holds data", "both channels are zero, or valid is false everywhere",
             "look at the program that made the images", code=ErrorCode.NO_DATA,
         )  # fmt: skip
-    return lit
+    return is_lit
 
 
 def _number(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str) -> float | None:
@@ -415,23 +415,23 @@ def describe_illumination(images: Images, rig: Instrument) -> Illumination:
 
 def given_reasons(pair: GivenPair, angle: Angle) -> list[Finding]:
     """Return what limits the verdict on given images: no direct path, an assumed geometry, an assumed angle."""
-    out = [reason(
+    reasons = [reason(
         "care", "the images were given: there is no direct path beside them",
         "gains of H against V, the recording and the plane of the plates cannot be checked",
         "process the recorded scan where there is one", 2.4,
     )]  # fmt: skip
     if pair.assumed:
-        out.append(reason(
+        reasons.append(reason(
             "care", f"assumed, not in the file: {'; '.join(pair.assumed)}",
             "sizes and places of patches depend on it", "save x_m and y_m (metres) with the images", 1.1,
         ))  # fmt: skip
     if angle.source == "rig file":
-        out.append(reason(
+        reasons.append(reason(
             "care", f"the incidence angle is not known: {angle.deg:.1f} degrees of the rig file were used",
             "|P| of a dielectric changes by a tenth in a degree",
             "give --incidence DEGREES, or save incidence_deg", 2.3,
         ))  # fmt: skip
-    return out
+    return reasons
 
 
 TOLD_TILT_DEG = 0.5
@@ -468,15 +468,15 @@ def sign_reasons(other_sign: float, conjugated: bool, painted: float = 0.0) -> l
     """
     if other_sign < TOLD_SIGN and not conjugated:
         return []
-    taken = "as they are"
+    treatment = "as they are"
     if conjugated:
-        taken = "the other way round"
+        treatment = "the other way round"
     cause = "with the wrong sign losses are wrong; the error bars hold both signs"
     if conjugated and painted > TOLD_PAINT:
         cause += "; or the sign is as given, and the metal reference is painted"
     return [reason(
         "care",
-        f"the sign of the phases is not known: taken {taken}, right with a probability of {1 - other_sign:.2f}",
+        f"the sign of the phases is not known: taken {treatment}, right with a probability of {1 - other_sign:.2f}",
         cause,
         "save `conjugate` (true or false) with the images: docs/spec/given-images.md", 2.2,
     )]  # fmt: skip

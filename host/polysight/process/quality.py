@@ -238,11 +238,11 @@ def _compute_direct_snr(row: SyncedRow) -> NDArray[np.float64]:
 
     NaN at invalid positions and where the noise is unknown.
     """
-    out = np.full(row.valid.size, np.nan)
+    snr = np.full(row.valid.size, np.nan)
     if row.noise is not None:
-        good = row.valid & np.isfinite(row.noise) & (row.noise > 0)
-        out[good] = row.direct_amplitude[good] ** 2 / row.noise[good]
-    return out
+        is_measured = row.valid & np.isfinite(row.noise) & (row.noise > 0)
+        snr[is_measured] = row.direct_amplitude[is_measured] ** 2 / row.noise[is_measured]
+    return snr
 
 
 def _collect_finite_values(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -486,9 +486,9 @@ def _find_brightest(result: MaterialsResult) -> tuple[int, float]:
     levels_db = {}
     for r in result.patches:
         h = np.abs(result.h[r.patch.interior])
-        lit = h[np.isfinite(h) & (h > 0)]
-        if lit.size and r.patch.label != result.metal.label:
-            levels_db[r.patch.label] = 20 * float(np.log10(np.median(lit)))
+        levels = h[np.isfinite(h) & (h > 0)]
+        if levels.size and r.patch.label != result.metal.label:
+            levels_db[r.patch.label] = 20 * float(np.log10(np.median(levels)))
     brightest = max(levels_db, key=lambda label: levels_db[label], default=0)
     return brightest, levels_db.get(brightest, 0.0)
 

@@ -372,15 +372,15 @@ class KeptSamples:
 
     def _record(self, board: str, row: int) -> tuple[NDArray[Any], RowFigures]:
         """Return the record of a row, and its quality figures for rows.jsonl."""
-        out = np.zeros((), self._type(board))
+        record = np.zeros((), self._type(board))
         forward = slice(None, None, self._plan.row(row).direction)
         for name, builder in self._builders.items():
-            out[name], out[f"{name}_direct"], out["valid"] = builder.boards[board].read_reduced(row)
+            record[name], record[f"{name}_direct"], record["valid"] = builder.boards[board].read_reduced(row)
         quality = self._quality.boards[board].rows[row]
-        out["echo"] = quality.echo[:, forward]
-        out["direct_hz"] = quality.direct_hz[forward]
-        out["direct_snr"] = quality.direct_snr[forward]
-        return out, quality.figures
+        record["echo"] = quality.echo[:, forward]
+        record["direct_hz"] = quality.direct_hz[forward]
+        record["direct_snr"] = quality.direct_snr[forward]
+        return record, quality.figures
 
     def _put(self, board: str, row: int, record: Any, figures: RowFigures) -> None:
         """Add a record to the images and its figures to the quality; the inverse of `_record`."""
@@ -452,8 +452,8 @@ def _is_valid_head(head: Mapping[str, Any]) -> bool:
     if not (isinstance(gate, list) and isinstance(frequencies, dict) and "samples" in frequencies):
         return False
     numbers = [gate, *frequencies.values()]
-    good = all(isinstance(part, list) and part and all(_is_finite(v) for v in part) for part in numbers)
-    return good and len(gate) == 2
+    has_numbers = all(isinstance(part, list) and part and all(_is_finite(v) for v in part) for part in numbers)
+    return has_numbers and len(gate) == 2
 
 
 def _has_frequencies(head: Mapping[str, Any], rig: Instrument, gate: Gate, usual: Gate) -> bool:

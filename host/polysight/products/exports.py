@@ -452,14 +452,14 @@ def _check_hdf5(path: Path) -> None:
     with h5py.File(path, "r") as file:
         # HDF5 calls this function from C: it must not raise.
         def check(name: str) -> None:
-            outside = isinstance(file.get(name, getlink=True), h5py.ExternalLink)
+            is_external = isinstance(file.get(name, getlink=True), h5py.ExternalLink)
             content = None
-            if not outside:
+            if not is_external:
                 content = file.get(name)
             if isinstance(content, h5py.Dataset):
-                outside = bool(content.external) or content.is_virtual
+                is_external = bool(content.external) or content.is_virtual
                 sizes.append((content.size or 0) * content.dtype.itemsize)
-            if outside:
+            if is_external:
                 external.append(name)
 
         file.visit_links(check)

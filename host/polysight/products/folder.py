@@ -267,13 +267,13 @@ def find_scan_folder(folder: Path) -> Path | None:
     """Return the scan folder of a scan or of its products; None for products outside a scan folder."""
     if is_source(folder):
         return folder
-    above = folder.resolve().parent
-    if not is_source(above):
+    parent = folder.resolve().parent
+    if not is_source(parent):
         return None
     # The path is kept as the user wrote it, except where its parent is no other folder: that of `.` is `.`.
-    if folder.parent.resolve() == above:
+    if folder.parent.resolve() == parent:
         return folder.parent
-    return above
+    return parent
 
 
 def label_folder(folder: Path) -> Path:

@@ -136,7 +136,7 @@ def _match_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tu
 
     Return it with the standard errors of the patch in each pixel, real part and loss; not a number outside of patches.
     """
-    moved = inverse.copy()
+    matched = inverse.copy()
     real_std = np.full(inverse.shape, np.nan)
     loss_std = np.full(inverse.shape, np.nan)
     for patch in scan.segments:
@@ -144,18 +144,18 @@ def _match_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tu
         if value is None:
             continue
         of_patch = scan.labels == patch.label
-        inside = of_patch & np.isfinite(inverse)
+        pixels = of_patch & np.isfinite(inverse)
         if scan.interior is not None:
-            inside &= scan.interior
-        if not inside.any():
+            pixels &= scan.interior
+        if not pixels.any():
             continue
-        patch_angle = float(np.broadcast_to(angle_rad, inverse.shape)[inside].mean())
+        patch_angle = float(np.broadcast_to(angle_rad, inverse.shape)[pixels].mean())
         r_s, r_p = fresnel(value, patch_angle)
-        median = complex(np.median(inverse[inside].real), np.median(inverse[inside].imag))
-        moved[of_patch] += complex(r_p / r_s) - median
+        median = complex(np.median(inverse[pixels].real), np.median(inverse[pixels].imag))
+        matched[of_patch] += complex(r_p / r_s) - median
         real_std[of_patch] = np.nan if patch.permittivity_real_std is None else patch.permittivity_real_std
         loss_std[of_patch] = np.nan if patch.permittivity_loss_std is None else patch.permittivity_loss_std
-    return moved, real_std, loss_std
+    return matched, real_std, loss_std
 
 
 def _is_known_half_space(value: Complex, real_std: Real, loss_std: Real) -> npt.NDArray[np.bool_]:

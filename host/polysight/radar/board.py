@@ -547,15 +547,15 @@ class RadarBoard:
     def read_back(self) -> list[str]:
         """Read back profile, chirp and frame of a board that was armed; return the differences. Raises DeviceError."""
         commands = (*self.program.waveform, *self._sent_frames)
-        sent = {command.ID: command.block().data for command in commands}
+        sent_blocks = {command.ID: command.block().data for command in commands}
         differences = []
         for question, setting in ((c.READ_PROFILE, 0x0100), (c.READ_CHIRP, 0x0101), (c.READ_FRAME, 0x0102)):
             blocks = self.link.call(question).blocks
             read = b""
             if blocks:
                 read = blocks[0].data
-            if read != sent[setting]:
-                differences.append(f"0x{setting:04X}: sent {sent[setting].hex()}, read back {read.hex()}")
+            if read != sent_blocks[setting]:
+                differences.append(f"0x{setting:04X}: sent {sent_blocks[setting].hex()}, read back {read.hex()}")
         return differences
 
     def reconnect(self, words: WordLink) -> None:

@@ -513,8 +513,8 @@ def _list_timing_constraints(rig: Instrument, frames: int) -> Iterator[Constrain
             "chirp spacing", "idle + ramp - chirp_us", excess, "us", spacing_remedy, low=-0.006, high=0.006
         )
     # ICD 91
-    rest = period - burst.chirps * chirp
-    yield Constraint("inter-frame time", "frame period - chirps", rest, "us", period_remedy, low=INTER_FRAME_US)
+    idle_us = period - burst.chirps * chirp
+    yield Constraint("inter-frame time", "frame period - chirps", idle_us, "us", period_remedy, low=INTER_FRAME_US)
     # ICD 93
     gap = burst.period_us - period
     yield Constraint("pulse gap", "pulse period - frame period", gap, "us", period_remedy, low=AFTER_FRAME_US)

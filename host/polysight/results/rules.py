@@ -71,7 +71,7 @@ pictures)."""
 
 def judge_recording(coverage: Coverage, masked_share: float = 0.0) -> list[Finding]:
     """Judge rows, frames and manifest against the plan; `masked_share` of the recorded positions is masked."""
-    out = []
+    reasons = []
     if coverage.rows_planned:
         absent = 1 - coverage.rows_recorded / coverage.rows_planned
     else:
@@ -79,12 +79,12 @@ def judge_recording(coverage: Coverage, masked_share: float = 0.0) -> list[Findi
     if coverage.rows_recorded < coverage.rows_planned:
         level = "none" if absent > FEW_POSITIONS else "care"
         missing = coverage.rows_planned - coverage.rows_recorded
-        out.append(reason(
+        reasons.append(reason(
             level, f"{missing} of {coverage.rows_planned} rows are absent ({100 * absent:.1f} % of the positions)",
             "the scan was stopped, or rows were lost; plates there are missing or distorted",
             "`polysight resume SCAN` records the missing rows", 5 + absent,
         ))  # fmt: skip
-    out += [
+    reasons += [
         reason("care", fault, "a recorded row is missing in the images", "run `polysight validate SCAN`", 6.0)
         for fault in coverage.manifest
     ]
@@ -94,18 +94,18 @@ def judge_recording(coverage: Coverage, masked_share: float = 0.0) -> list[Findi
         frames = 1.0
     lost_share = max(masked_share, frames - absent)
     if lost_share > SOME_POSITIONS:
-        out.append(reason(
+        reasons.append(reason(
             "none" if lost_share > FEW_POSITIONS else "care",
             f"{100 * lost_share:.1f} % of the recorded positions or frames are masked",
             "packets were lost, or the direct path was not found there",
             "look at each board's frames in the report; `polysight doctor` checks the network", 4 + lost_share,
         ))  # fmt: skip
-    return out
+    return reasons
 
 
 def judge_reconstruction(boards: Iterable[tuple[str, float, float | None]]) -> list[Finding]:
     """Judge reconstructed positions by board: its name, their share, and the expected error of its image."""
-    out = []
+    reasons = []
     for board, missing_share, image_error in boards:
         if missing_share <= SOME_POSITIONS:
             continue
@@ -115,31 +115,31 @@ def judge_reconstruction(boards: Iterable[tuple[str, float, float | None]]) -> l
         else:
             level = "none" if image_error > RECONSTRUCTION_NONE else "care"
             error = f"its image is expected to be wrong by {100 * image_error:.1f} %"
-        out.append(reason(
+        reasons.append(reason(
             level, f"{100 * missing_share:.1f} % of the positions of {board} were reconstructed: {error}",
             "a reconstruction is right only where the scene is mostly empty, such as separate plates",
             "record the missing rows, or scan with a smaller step (`polysight plan`)", 3 + missing_share,
         ))  # fmt: skip
-    return out
+    return reasons
 
 
 def judge_left_out_chirps(board: str, clipped: float, disturbed: float, positions_clipped: float) -> list[Finding]:
     """Judge one board's shares of chirps that were left out, and of positions without data because all were clipped."""
-    out = []
+    reasons = []
     if clipped > SOME_CHIRPS or positions_clipped > SOME_POSITIONS:
-        out.append(reason(
+        reasons.append(reason(
             "care", f"{board}: {100 * clipped:.1f} % of the chirps are clipped, {100 * positions_clipped:.1f} % of the"
             " positions have no others",
             "the echo or the direct path overdrives the receiver; bright plates lose their strongest positions",
             "lower `rx_gain_db` and scan again", 4 + clipped,
         ))  # fmt: skip
     if disturbed > SOME_CHIRPS:
-        out.append(reason(
+        reasons.append(reason(
             "care", f"{board}: {100 * disturbed:.1f} % of the chirps are left out, unlike the others of their burst",
             "another radar transmits in the same band, a cable is loose, or the direct path is very weak",
             "switch other radars off; scan again", 3 + disturbed,
         ))  # fmt: skip
-    return out
+    return reasons
 
 
 def judge_direct_path(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Finding]:
@@ -150,24 +150,24 @@ def judge_direct_path(board: str, snr_db: float | None, phase_rad: float | None,
             "without it no position is synchronised, and the images are meaningless",
             "clear the line of sight from transmitter to receiver; check that the transmitter is on", 10.0,
         )]  # fmt: skip
-    out = []
+    reasons = []
     if is_known(snr_db) and snr_db < DIRECT_SNR_CARE_DB:
-        out.append(reason(
+        reasons.append(reason(
             "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise in one chirp (5 dB are usual)",
             "it is partly blocked, or the antennas point elsewhere; it is the reference of all phases",
             "clear the line of sight; check the antennas' direction", 3.0,
         ))  # fmt: skip
     if is_known(phase_rad) and phase_rad > DIRECT_PHASE_CARE_RAD:
-        out.append(reason(
+        reasons.append(reason(
             "care", f"{board}: residual phase {phase_rad:.3f} rad from position to position (0.004 is usual)",
             "a weak direct path, or a strong reflector near it", "look at the synchronisation table of the report", 2.5,
         ))  # fmt: skip
-    return out
+    return reasons
 
 
 def judge_levels(levels: Mapping[str, float | None]) -> list[Finding]:
     """Judge metal's brightness relative to the direct path in each channel (None: not known)."""
-    out = []
+    reasons = []
     for channel, level in levels.items():
         if is_known(level) and level > 0 and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
             weak = level > DIRECT_LEVELS[1]
@@ -180,8 +180,8 @@ def judge_levels(levels: Mapping[str, float | None]) -> list[Finding]:
                     "the object is far weaker than the direct path: the antennas point elsewhere, or it is not metal"
                 )
             do = "clear the line of sight from transmitter to receivers, and check the antennas' direction"
-            out.append(reason("care", problem, cause, do, 3.5))
-    return out
+            reasons.append(reason("care", problem, cause, do, 3.5))
+    return reasons
 
 
 def judge_patches(refused: Mapping[int, str], patches: int, left_out: int = 0) -> list[Finding]:
@@ -326,21 +326,21 @@ def judge_plane(known: bool, offset_mm: float, tilt_deg: tuple[float, float], th
             "they are at the edge of the range gate",
             "measure geometry.object_distance_mm and correct the rig file", 7.0,
         )]  # fmt: skip
-    out = []
+    reasons = []
     tilt = max(abs(t) for t in tilt_deg)
     if abs(offset_mm) > PLANE_FAR_MM:
-        out.append(reason(
+        reasons.append(reason(
             "care", f"the plates lie {offset_mm:+.1f} mm off the rig file's plane; the angle was corrected for it",
             "the object is at another distance, or object_distance_mm is wrong",
             "correct geometry.object_distance_mm in the rig file", 1.6,
         ))  # fmt: skip
     if tilt > PLANE_TILT_DEG:
-        out.append(reason(
+        reasons.append(reason(
             "care", f"the plates' plane is tilted by {tilt:.1f} degrees",
             "tilted plates reflect past the scanned positions",
             "lay the plates parallel to the stage", 1.4,
         ))  # fmt: skip
-    return out
+    return reasons
 
 
 def judge_copies(labels: Sequence[int], shift_mm: tuple[float, float], level_db: float) -> list[Finding]:
@@ -478,29 +478,29 @@ def judge_passivity(refused: Mapping[int, Finding]) -> list[Finding]:
     labels: dict[str, list[int]] = {}
     for label, fault in refused.items():
         labels.setdefault(fault.what, []).append(label)
-    out = []
+    reasons = []
     for patches in labels.values():
         fault = refused[patches[0]]
-        named = f"patch {patches[0]} has"
+        subject = f"patch {patches[0]} has"
         if len(patches) > 1:
-            named = f"patches {', '.join(map(str, patches))} have"
-        out.append(reason("care", f"{named} no permittivity: {fault.what}", fault.why, fault.do, 2.2))
-    return out
+            subject = f"patches {', '.join(map(str, patches))} have"
+        reasons.append(reason("care", f"{subject} no permittivity: {fault.what}", fault.why, fault.do, 2.2))
+    return reasons
 
 
 def judge_brightness(off: Mapping[int, float]) -> list[Finding]:
     """Judge brightness: patch number to ln of |H| over that of a half space of its permittivity."""
-    out = []
+    reasons = []
     for label, ln in off.items():
         if is_known(ln) and abs(ln) > BRIGHTNESS_CARE:
             share = 100 * abs(float(np.expm1(ln)))
             than = "brighter" if ln > 0 else "darker"
-            out.append(reason(
+            reasons.append(reason(
                 "care", f"patch {label} is {share:.0f} % {than} than a half space of its permittivity",
                 "it may be thin, layered, rough, or partly in a shadow; the permittivity of a thin plate is then wrong",
                 "fit it as a layer (polysight permittivity --layer), or lay it flat and free", 1.7,
             ))  # fmt: skip
-    return out
+    return reasons
 
 
 def judge_incidence(angle_deg: float, library_deg: float | None) -> list[Finding]:

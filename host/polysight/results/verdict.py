@@ -65,17 +65,17 @@ class Verdict(msgspec.Struct, frozen=True):
     def lines(self, most: int | None = None) -> list[str]:
         """Return text for a terminal: the level, then each reason and remedy; at most `most` reasons."""
         shown_reasons = self.reasons[:most]
-        out = [f"verdict:  {self.text}"]
+        lines = [f"verdict:  {self.text}"]
         for r in shown_reasons:
             cause = ""
             if r.why:
                 cause = f": {r.why}"
-            out.append(f"  - {r.what}{cause}")
+            lines.append(f"  - {r.what}{cause}")
             if r.do:
-                out.append(f"    do: {r.do}")
+                lines.append(f"    do: {r.do}")
         if len(shown_reasons) < len(self.reasons):
-            out.append(f"  - and {len(self.reasons) - len(shown_reasons)} more, see the report")
-        return out
+            lines.append(f"  - and {len(self.reasons) - len(shown_reasons)} more, see the report")
+        return lines
 
     def error(self, kept: str = "") -> NoResult:
         """Return the error that ends a command without a result; `kept` says where the images are."""

@@ -166,8 +166,8 @@ def page_routes(front: Front) -> list[Route]:
         )
         return Response(msgspec.json.encode(facts), media_type="application/json")
 
-    shown = [Route(path, show_page) for path in PAGES]
-    return [*shown, Route("/{name}", send_file), Route("/api/page", describe_page)]
+    routes = [Route(path, show_page) for path in PAGES]
+    return [*routes, Route("/{name}", send_file), Route("/api/page", describe_page)]
 
 
 def frame_page(name: str, title: str, style: str) -> str:

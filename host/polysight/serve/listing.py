@@ -54,18 +54,18 @@ class ChangingList:
             if shown_state is None:
                 return ListChanges(stamp=reached, whole=True, scans=list(self._scans.values()), gone=[])
             changed = [scan for name, scan in self._scans.items() if self._changed_in[name] > shown_state]
-            gone = [name for name, number in self._gone_in.items() if number > shown_state]
-        return ListChanges(stamp=reached, whole=False, scans=changed, gone=gone)
+            removed = [name for name, number in self._gone_in.items() if number > shown_state]
+        return ListChanges(stamp=reached, whole=False, scans=changed, gone=removed)
 
     def _take_over(self, scans: dict[str, ListedScan]) -> None:
         changed = [name for name, scan in scans.items() if self._scans.get(name) != scan]
-        gone = [name for name in self._scans if name not in scans]
-        if changed or gone:
+        removed = [name for name in self._scans if name not in scans]
+        if changed or removed:
             self._number += 1
         for name in changed:
             self._changed_in[name] = self._number
             self._gone_in.pop(name, None)
-        for name in gone:
+        for name in removed:
             del self._changed_in[name]
             self._gone_in[name] = self._number
         self._scans = scans

@@ -383,13 +383,13 @@ class Watches:
 
         Nothing is queued: a slow page gets fewer events, since `yield` waits for its socket.
         """
-        sent = {"state": -1, "motion": -1}
+        sent_numbers = {"state": -1, "motion": -1}
         silent_s = 0.0
         with self._count_stream(name):
             while not is_ending():
                 for kind, newest in (("state", watch.state), ("motion", watch.motion)):
-                    if newest.version != sent[kind]:
-                        sent[kind] = newest.version
+                    if newest.version != sent_numbers[kind]:
+                        sent_numbers[kind] = newest.version
                         silent_s = 0.0
                         yield b"event: %s\nid: %d\ndata: %s\n\n" % (kind.encode(), newest.version, newest.data)
                 if silent_s >= ALIVE_INTERVAL_S:

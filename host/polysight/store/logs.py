@@ -76,9 +76,9 @@ class AppendFile:
         end = self.length
         try:
             while remaining:
-                written = os.pwrite(self._file.fileno(), remaining, end)
-                remaining = remaining[written:]
-                end = end + written
+                written_bytes = os.pwrite(self._file.fileno(), remaining, end)
+                remaining = remaining[written_bytes:]
+                end = end + written_bytes
             os.fsync(self._file.fileno())
         except OSError as e:
             with suppress(OSError):

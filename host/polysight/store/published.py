@@ -131,17 +131,17 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
         if file and log are not of one recording.
     """
     raw = np.fromfile(file, np.uint8)
-    none = np.zeros(0, np.int64)
+    no_packets = np.zeros(0, np.int64)
     if log is None:
         silent = np.zeros(0, bool)
         if zero_filled:
             silent = _find_silent(raw, PACKET_BYTES)
         return Stream(
-            raw, _find_ranges(silent, PACKET_BYTES, raw.size), int(silent.sum()), none, np.zeros(0), PACKET_BYTES
+            raw, _find_ranges(silent, PACKET_BYTES, raw.size), int(silent.sum()), no_packets, np.zeros(0), PACKET_BYTES
         )
-    full = int(log.size.max())
-    first = _find_first_sequence(log, shape, full, raw if zero_filled else None)
-    start = (log.sequence - first) * full
+    full_size = int(log.size.max())
+    first = _find_first_sequence(log, shape, full_size, raw if zero_filled else None)
+    start = (log.sequence - first) * full_size
     end = int(start[-1] + log.size[-1])
     if end > _MAX_ROWS * (shape.bytes + raw.size):
         raise DataError(
@@ -168,15 +168,15 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
             data = raw
         else:
             data = _spread(raw, start, log.size, end)
-    count = -(-end // full)
+    count = -(-end // full_size)
     arrived_packets = np.zeros(count, bool)
-    arrived_packets[start // full] = True
+    arrived_packets[start // full_size] = True
     if zero_filled:
-        arrived_packets &= ~_find_silent(data, full)
-        arrived_packets[-(-raw.size // full) :] = False
-    arrived = arrived_packets[start // full]
-    lost_ranges = _find_ranges(~arrived_packets, full, end)
-    return Stream(data, lost_ranges, int(count - arrived_packets.sum()), start[arrived], log.at_s[arrived], full)
+        arrived_packets &= ~_find_silent(data, full_size)
+        arrived_packets[-(-raw.size // full_size) :] = False
+    arrived = arrived_packets[start // full_size]
+    lost_ranges = _find_ranges(~arrived_packets, full_size, end)
+    return Stream(data, lost_ranges, int(count - arrived_packets.sum()), start[arrived], log.at_s[arrived], full_size)
 
 
 def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64], end: int) -> NDArray[np.uint8]:
@@ -195,13 +195,13 @@ def _find_silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
     whole_packets = data.size // packet
     rows = data[: whole_packets * packet].reshape(whole_packets, packet)
     if packet % 8 == 0 and data.ctypes.data % 8 == 0:
-        wide = rows.view(np.uint64)
+        words = rows.view(np.uint64)
     else:
-        wide = rows
+        words = rows
     tail = []
     if data.size % packet:
         tail = [not data[whole_packets * packet :].any()]
-    return np.append(~np.any(wide, axis=1), np.array(tail, bool))
+    return np.append(~np.any(words, axis=1), np.array(tail, bool))
 
 
 def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDArray[np.uint8] | None) -> int:
@@ -426,8 +426,8 @@ class PublishedScan(_Published):
         if bursts is None or positions is None:
             self._note(board_name, row, RowLosses(packets_lost, rows_not_placed=1))
             return RowData(split_pieces(np.zeros(shape.bytes, np.uint8)), [(0, shape.bytes)], frames)
-        payload, arrived, short = _place(stream, bursts, positions, shape)
-        self._note(board_name, row, RowLosses(packets_lost, shape.positions - positions.size, short))
+        payload, arrived, missing = _place(stream, bursts, positions, shape)
+        self._note(board_name, row, RowLosses(packets_lost, shape.positions - positions.size, missing))
         edges = np.flatnonzero(np.diff(np.concatenate([[1], arrived, [1]]).astype(np.int8)))
         gaps = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
         return RowData(split_pieces(payload), gaps, frames)
@@ -480,7 +480,7 @@ def _place(
     """Return the row's payload, a mask of bytes that arrived, and the number of positions with a wrong frame count."""
     size = stream.data.size
     burst = shape.burst_bytes
-    short = 0
+    missing = 0
     payload = np.zeros(shape.bytes, np.uint8)
     is_received = np.zeros(shape.bytes, bool)
     arrived = np.ones(size, bool)
@@ -488,13 +488,13 @@ def _place(
         arrived[a:b] = False
     for (a, b), target in zip(bursts.ranges, positions * burst, strict=True):
         if b - a != burst:
-            short += 1
+            missing += 1
             continue
         stop = min(b, size)
         payload[target : target + stop - a] = stream.data[a:stop]
         is_received[target : target + stop - a] = arrived[a:stop]
     payload[~is_received] = 0
-    return payload, is_received, short
+    return payload, is_received, missing
 
 
 class PublishedCubes(_Published):

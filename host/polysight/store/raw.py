@@ -235,16 +235,16 @@ def _place_row_again(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tu
     try:
         if faults := board_faults(scan, board, row.pulses):
             return replace(unchanged, why_unchanged="; ".join(map(to_text, faults)), damaged=True), None
-        again = place_again(path)
+        placed = place_again(path)
     except DataError as e:
         return replace(unchanged, why_unchanged=str(e), damaged=True), None
-    if again.by_pulses:
+    if placed.by_pulses:
         return replace(unchanged, why_unchanged="its frames were placed by their pulses"), None
-    missing_now = sum(stop - start for start, stop in again.placed.missing)
-    same_gaps = again.missing_before == again.placed.missing
-    same_payload = f"{crc32(again.payload.tobytes()):08x}" == board.crc32
+    missing_now = sum(stop - start for start, stop in placed.placed.missing)
+    same_gaps = placed.missing_before == placed.placed.missing
+    same_payload = f"{crc32(placed.payload.tobytes()):08x}" == board.crc32
     changed = not (same_gaps and same_payload)
-    return replace(unchanged, missing_after=missing_now, changed=changed), again
+    return replace(unchanged, missing_after=missing_now, changed=changed), placed
 
 
 def _commit_changed_boards(
@@ -253,10 +253,10 @@ def _commit_changed_boards(
     """Write the new files, then the line, then delete the old files."""
     boards = dict(row.boards)
     old_files: list[Path] = []
-    for name, again in changed.items():
+    for name, placed in changed.items():
         path = scan.path / boards[name].file
         old_files += [path.with_suffix(suffix) for suffix in (".bin", ".idx", capture.PACKETS)]
-        boards[name] = _write_new_files(scan, boards[name], again)
+        boards[name] = _write_new_files(scan, boards[name], placed)
     kept_incomplete = row.kept_incomplete
     faults = row.faults
     if all(board.missing_bytes == 0 for board in boards.values()):

@@ -201,8 +201,8 @@ def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> 
     except (PolysightError, TypeError, ValueError) as e:
         return [*findings, _make_error(place, str(e))]
     ordered = all(a < b for a, b in gaps) and all(x[1] < y[0] for x, y in pairwise(gaps))
-    inside = all(a >= 0 and b <= board.bytes for a, b in gaps)
-    if not ordered or not inside or sum(b - a for a, b in gaps) != board.missing_bytes:
+    is_inside = all(a >= 0 and b <= board.bytes for a, b in gaps)
+    if not ordered or not is_inside or sum(b - a for a, b in gaps) != board.missing_bytes:
         findings.append(_make_error(place, f"its gaps do not make the {board.missing_bytes} missing bytes"))
     return findings
 

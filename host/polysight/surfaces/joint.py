@@ -113,15 +113,15 @@ class JointFit:
 
     def _subtract(self, members: NDArray, values: Array, amplitude: NDArray) -> tuple[NDArray, NDArray[np.complex64]]:
         """Waves of echoes of given values [window, echo, 6] and amplitudes, and the samples of windows less these."""
-        rest = self.windows.samples[members]
+        residual = self.windows.samples[members]
         valid = self.windows.valid[members]
         waves = np.empty((*amplitude.shape, *self.waves.shape[2:]), np.complex64)
         for index in range(values.shape[1]):
             paths = np.einsum("wnp,wp->wn", self.basis[members], values[:, index])
             waves[:, index] = make_waves(self.fit, paths)
             steering = self.steering[members, index]
-            rest -= synthesise(self.fit, valid, waves[:, index], amplitude[:, index], steering)
-        return waves, rest
+            residual -= synthesise(self.fit, valid, waves[:, index], amplitude[:, index], steering)
+        return waves, residual
 
     def _descend(self, members: NDArray) -> None:
         echoes = self.amplitude.shape[1]
@@ -138,15 +138,15 @@ class JointFit:
             values = self.values[running] + path_step
             turn = np.exp(-1j * np.einsum("wep,wp->we", path_step, self.mean_rate[running]))
             amplitude = (self.amplitude[running] + step[..., 0] + 1j * step[..., 1]) * turn
-            waves, rest = self._subtract(running, values, amplitude)
-            new_energy = find_energy(rest)
+            waves, residual = self._subtract(running, values, amplitude)
+            new_energy = find_energy(residual)
             gain = energy[running] - new_energy
             better = gain > 0
             accepted = running[better]
             self.values[accepted] = values[better]
             self.amplitude[accepted] = amplitude[better]
             self.waves[accepted] = waves[better]
-            self.rest[accepted] = rest[better]
+            self.rest[accepted] = residual[better]
             has_converged = better & (gain < JOINT_GAIN * energy[running])
             energy[accepted] = new_energy[better]
             damping[running] *= np.where(better, 0.2, 8)

@@ -250,9 +250,9 @@ def correlate_windows(d: Array) -> tuple[Array, Array]:
     slope, hence 1 - 3 s + 2 s^3 at the share s of a window there, and 1 - s across it. Ripple is as long as a window or
     longer: normals of simulated plates had correlations of 0.77, 0.49 and 0.13 at 8, 16 and 24 mm, about 1 - s.
     """
-    apart = np.minimum(1, np.abs(d[:, None] - d[None]) / WINDOW_M)
-    across = np.moveaxis(1 - apart, -1, 0)
-    along = np.moveaxis(1 - 3 * apart + 2 * apart**3, -1, 0)
+    distance = np.minimum(1, np.abs(d[:, None] - d[None]) / WINDOW_M)
+    across = np.moveaxis(1 - distance, -1, 0)
+    along = np.moveaxis(1 - 3 * distance + 2 * distance**3, -1, 0)
     ripple = across[0] * across[1]
     return along * across[::-1], np.stack([ripple, ripple])
 

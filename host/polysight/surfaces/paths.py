@@ -145,11 +145,11 @@ def _measure_strongest(board: Samples) -> float:
 def _separate(fit: BoardFit, search: _Search, windows: Windows) -> list[Echoes]:
     """Echoes of windows, one list entry per rank; the strongest are subtracted before the next are searched."""
     echoes: list[tuple[NDArray, Maximum]] = []
-    rest = windows.samples.copy()
+    residual = windows.samples.copy()
     active = np.arange(len(windows.valid))
-    energy = np.sum(np.abs(rest) ** 2, axis=(1, 2, 3))
+    energy = np.sum(np.abs(residual) ** 2, axis=(1, 2, 3))
     for rank in range(MAX_ECHOES):
-        part = select_windows(replace_samples(windows, rest), active)
+        part = select_windows(replace_samples(windows, residual), active)
         first = _fit_echo(fit, part, search.find(part))
         share = _power_share(fit, part, first, energy[active])
         keep = share > (MIN_LEFT if rank else MIN_SHARE)
@@ -159,12 +159,12 @@ def _separate(fit: BoardFit, search: _Search, windows: Windows) -> list[Echoes]:
         first = select_maxima(first, keep)
         echoes.append((active, first))
         if rank:
-            active = _refine(fit, windows, echoes, rest)
+            active = _refine(fit, windows, echoes, residual)
         else:
             joint = JointFit(fit, select_windows(windows, active), first.values[:, None], first.amplitude[:, None])
             joint.subtract(np.arange(active.size))
-            rest[active] = joint.rest
-        energy_left = np.sum(np.abs(rest[active]) ** 2, axis=(1, 2, 3)) / energy[active]
+            residual[active] = joint.rest
+        energy_left = np.sum(np.abs(residual[active]) ** 2, axis=(1, 2, 3)) / energy[active]
         active = active[energy_left > MIN_LEFT]
         if not active.size:
             break

@@ -80,20 +80,20 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
 
     def sums(shift_mm: float) -> NDArray[np.float64]:
         """Return sums over groups of rows: slope times difference, slope squared, power, power at the highest k."""
-        out = np.zeros((_GROUPS, 4))
+        sums_of_groups = np.zeros((_GROUPS, 4))
         recent = {r: spectrum(r, shift_mm) for r in (inner[0] - 1, inner[0])}
         for i, r in enumerate(inner):
             recent = {q: recent[q] if q in recent else spectrum(q, shift_mm) for q in (r - 1, r, r + 1)}
             mean = (recent[r - 1] + recent[r + 1]) / 2
             slope, rest = np.fft.ifft(1j * k * mean, axis=-1), np.fft.ifft(recent[r] - mean, axis=-1)
             power = np.abs(mean) ** 2
-            out[i * _GROUPS // len(inner)] += (
+            sums_of_groups[i * _GROUPS // len(inner)] += (
                 (1 if r % 2 else -1) * (window * slope.conj() * rest).real.sum(),
                 (window * np.abs(slope) ** 2).sum(),
                 power.sum(),
                 power[:, np.abs(k) > 0.8 * np.abs(k).max()].sum(),
             )
-        return out
+        return sums_of_groups
 
     shift, without = 0.0, np.zeros(_GROUPS)
     for _ in range(_STEPS):

@@ -307,8 +307,8 @@ class RowSynchroniser:
         if board not in self._forms:
             rig = self._source.instrument
             rows = self._source.plan.rows
-            some = sorted({int(r) for r in np.linspace(0, rows - 1, _CUBE_ROWS)})
-            cubes = [row.cube for r in some if isinstance(row := self._source.read_row(board, r), CubeRow)]
+            row_numbers = sorted({int(r) for r in np.linspace(0, rows - 1, _CUBE_ROWS)})
+            cubes = [row.cube for r in row_numbers if isinstance(row := self._source.read_row(board, r), CubeRow)]
             self._forms[board] = detect_form(cubes, rig, rig.by_name(board))
         return self._forms[board]
 
@@ -401,8 +401,8 @@ def _estimate_object_errors(halves: NDArray[np.complex64], path: DirectPath) -> 
     tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
     # Amplitudes relative to the mean of both halves.
     energy = signal_energy(echo.reshape(-1, rx, n)).reshape(-1, 2)
-    common = product.sum(axis=1)
-    size = np.abs(energy + np.array([common, common.conj()]).T)
+    mean_product = product.sum(axis=1)
+    size = np.abs(energy + np.array([mean_product, mean_product.conj()]).T)
     contrast = (size[:, 0] - size[:, 1]) / np.maximum(size.sum(axis=1), 1e-30)
     # Keep positions whose halves are more coherent than noise would be by chance.
     echoing = np.abs(tone.amplitude) > 4 / np.sqrt(rx * n) * np.sqrt(energy.prod(axis=1))
@@ -606,21 +606,21 @@ def _reference_cube(
     power = (np.abs(np.fft.fft(cube[..., a:b], axis=-1)) ** 2).sum(axis=0)
     centre = np.fft.fftfreq(b - a)[np.argmax(power, axis=-1)].astype(np.float64)
     middle = (a + b - 1) / 2
-    still = np.zeros(centre.size)
-    mixed = cube * phasor(-centre, still, samples, middle)
+    zero_drift = np.zeros(centre.size)
+    mixed = cube * phasor(-centre, zero_drift, samples, middle)
     halves = flatten(fold(mixed[..., a:b])).swapaxes(0, 1) / 2
     first_chirp = valid[:, None]
-    none = np.zeros((centre.size, 1))
+    zeros = np.zeros((centre.size, 1))
     aligned = AlignedRow(
         halves=np.ascontiguousarray(np.stack([halves, halves], axis=1), np.complex64),
         centre=centre,
         good=first_chirp,
-        frequency=none,
-        phase=none,
-        amplitude=none + 1,
-        gain=none + 1,
+        frequency=zeros,
+        phase=zeros,
+        amplitude=zeros + 1,
+        gain=zeros + 1,
         error=np.zeros((2, centre.size, 1)),
-        coherence=none + 1,
+        coherence=zeros + 1,
         clipped=~first_chirp,
     )
     # A signal that is mixed down already has an IF of zero: any IF is within the band.

@@ -105,12 +105,12 @@ def fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
     padded = np.zeros((*signal.shape[:-1], signal.shape[-1] + 2 * _BESIDE), np.complex64)
     padded[..., _BESIDE:-_BESIDE] = signal
     blocks = signal.shape[-1] // FOLD
-    out = np.zeros((*signal.shape[:-1], blocks), np.complex64)
+    folded = np.zeros((*signal.shape[:-1], blocks), np.complex64)
     weights = np.repeat(taps[1][:, None], blocks, axis=1)
     weights[:, 0], weights[:, -1] = taps[0], taps[2]
     for q in range(TAPS):
-        out += weights[q] * padded[..., q : q + FOLD * (blocks - 1) + 1 : FOLD]
-    return out
+        folded += weights[q] * padded[..., q : q + FOLD * (blocks - 1) + 1 : FOLD]
+    return folded
 
 
 def flatten(folded: NDArray[np.complex64]) -> NDArray[np.complex64]:
@@ -123,13 +123,13 @@ def flatten(folded: NDArray[np.complex64]) -> NDArray[np.complex64]:
 def _make_flat_matrix(blocks: int) -> NDArray[np.float32]:
     """Return `flatten` as a matrix [block in, block out]."""
     flat = decimator().flat
-    out = np.zeros((blocks, blocks), np.float32)
+    matrix = np.zeros((blocks, blocks), np.float32)
     for block in range(_EDGE):
-        out[:FLAT, block] = flat[block]
-        out[-FLAT:, -1 - block] = flat[block][::-1]
+        matrix[:FLAT, block] = flat[block]
+        matrix[-FLAT:, -1 - block] = flat[block][::-1]
     for block in range(_EDGE, blocks - _EDGE):
-        out[block - _EDGE : block + _EDGE + 1, block] = flat[_EDGE]
-    return out
+        matrix[block - _EDGE : block + _EDGE + 1, block] = flat[_EDGE]
+    return matrix
 
 
 def decimation(samples: int, middle: float) -> NDArray[np.complex128]:

@@ -104,8 +104,8 @@ def apply_filter(signal: NDArray[np.complex64], taps: NDArray[np.complex64]) -> 
     block_after = 3 * (signal[..., -1:] - signal[..., -2:-1]) + signal[..., -3:-2]
     extended = np.concatenate([block_before, signal, block_after], axis=-1)
     t = taps[..., None, None, :]
-    out = t[..., 0] * extended[..., :-2] + t[..., 1] * extended[..., 1:-1] + t[..., 2] * extended[..., 2:]
-    return out.astype(np.complex64, copy=False)
+    filtered = t[..., 0] * extended[..., :-2] + t[..., 1] * extended[..., 1:-1] + t[..., 2] * extended[..., 2:]
+    return filtered.astype(np.complex64, copy=False)
 
 
 def high_pass(chirp: Chirp) -> HighPass:
@@ -151,11 +151,11 @@ def fit_high_pass(
     def misfit(log_corners: NDArray[np.float64]) -> NDArray[np.float64]:
         h = HighPass(tuple(np.exp(log_corners))).response(if_hz)
         gain = measured - np.log(np.abs(h))
-        out = gain - gain.mean()
+        deviation = gain - gain.mean()
         if turns is None:
-            return out
+            return deviation
         turn = turns * np.conj(h) / np.abs(h)
-        return np.concatenate([out, np.angle(turn * np.conj(turn.mean()))])
+        return np.concatenate([deviation, np.angle(turn * np.conj(turn.mean()))])
 
     limits = np.log(if_hz.min() / 10), np.log(if_hz.max() * 3)
     # The corners may lie in any two octaves.

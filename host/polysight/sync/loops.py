@@ -59,10 +59,10 @@ def cis(angle: Real) -> NDArray[np.complex64]:
     turns = np.asarray(angle) / (2 * np.pi)
     turns -= np.rint(turns)
     small = (2 * np.pi * turns).astype(np.float32)
-    out = np.empty(small.shape, np.complex64)
-    np.cos(small, out=out.real)
-    np.sin(small, out=out.imag)
-    return out
+    phasors = np.empty(small.shape, np.complex64)
+    np.cos(small, out=phasors.real)
+    np.sin(small, out=phasors.imag)
+    return phasors
 
 
 def complex64(values: Complex) -> NDArray[np.complex64]:
@@ -211,15 +211,15 @@ def match(
     energy
         float32 [position, chirp], over RX and linear samples.
     """
-    inside = _convert_to_complex(words[:, :, slice(*linear)])
-    positions, chirps, _, n = inside.shape
+    linear_part = _convert_to_complex(words[:, :, slice(*linear)])
+    positions, chirps, _, n = linear_part.shape
     size = search_size(n)
-    chosen = inside[np.arange(positions), reference]
+    reference_chirp = linear_part[np.arange(positions), reference]
     products = np.zeros((positions, chirps, size), np.complex64)
-    products[..., :n] = (inside * chosen[:, None].conj()).sum(axis=2)
+    products[..., :n] = (linear_part * reference_chirp[:, None].conj()).sum(axis=2)
     tone = strongest(products, n)
-    energy = (inside.real**2 + inside.imag**2).sum(axis=(2, 3))
-    return tone.frequency, tone.amplitude.astype(complex), find_band(chosen), energy
+    energy = (linear_part.real**2 + linear_part.imag**2).sum(axis=(2, 3))
+    return tone.frequency, tone.amplitude.astype(complex), find_band(reference_chirp), energy
 
 
 def find_band(chirps: NDArray[np.complex64]) -> NDArray[np.float64]:
@@ -344,18 +344,18 @@ def average(
     complex64 [position, 2, rx, block].
     """
     positions, chirps, rx, blocks = reduced.shape
-    turned = reduced * phasor(-FOLD * frequency, -phase, blocks, (blocks - 1) / 2)[:, :, None]
-    halves = weights.astype(np.complex64) @ turned.reshape(positions, chirps, rx * blocks)
+    derotated = reduced * phasor(-FOLD * frequency, -phase, blocks, (blocks - 1) / 2)[:, :, None]
+    halves = weights.astype(np.complex64) @ derotated.reshape(positions, chirps, rx * blocks)
     return flatten(complex64(halves.reshape(positions, 2, rx, blocks)))
 
 
 def _convert_to_complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
     """Return raw words as complex64 [position, chirp, rx, sample]."""
     positions, chirps, samples, _, rx = words.shape
-    out = np.empty((positions, chirps, rx, samples), np.complex64)
-    out.real = words[..., 0, :].swapaxes(2, 3)
-    out.imag = words[..., 1, :].swapaxes(2, 3)
-    return out
+    complex_words = np.empty((positions, chirps, rx, samples), np.complex64)
+    complex_words.real = words[..., 0, :].swapaxes(2, 3)
+    complex_words.imag = words[..., 1, :].swapaxes(2, 3)
+    return complex_words
 
 
 @lru_cache(maxsize=4)

@@ -341,10 +341,10 @@ def _find_disturbed(
     median = _take_lower_median(left, usable[..., None], axis=1)[:, None]
     padded = np.pad(np.where(usable[..., None], left, np.inf), ((0, 0), (2, 2), (0, 0)), constant_values=np.inf)
     chirps = left.shape[1]
-    beside = np.minimum.reduce([padded[:, k : k + chirps] for k in (0, 1, 3, 4)])
-    usual = np.maximum(median, np.where(np.isfinite(beside), beside, 0.0))
+    neighbour = np.minimum.reduce([padded[:, k : k + chirps] for k in (0, 1, 3, 4)])
+    usual_level = np.maximum(median, np.where(np.isfinite(neighbour), neighbour, 0.0))
     enough = usable.sum(axis=1) >= 4
-    return usable & enough[:, None] & (left > _UNEXPLAINED * usual + _NEGLIGIBLE * level[:, None]).any(axis=2)
+    return usable & enough[:, None] & (left > _UNEXPLAINED * usual_level + _NEGLIGIBLE * level[:, None]).any(axis=2)
 
 
 def _take_lower_median(values: NDArray[np.float64], usable: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
@@ -497,8 +497,8 @@ def excess_path_m(
     tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], points_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return `|v - tx| + |v - rx| - |tx - rx|`, metres, [rx, point], for rx [rx, 3] and points [point, 3]."""
-    out = np.linalg.norm(points_m - tx_m, axis=-1) + np.linalg.norm(points_m[None] - rx_m[:, None], axis=-1)
-    return out - np.linalg.norm(rx_m - tx_m, axis=-1)[:, None]
+    path = np.linalg.norm(points_m - tx_m, axis=-1) + np.linalg.norm(points_m[None] - rx_m[:, None], axis=-1)
+    return path - np.linalg.norm(rx_m - tx_m, axis=-1)[:, None]
 
 
 def sample_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:

@@ -183,25 +183,44 @@ def test_a_report_that_comes_as_the_time_is_up_ends_the_row(rig, monkeypatch):
     assert take.finished == "the Pi's report"
 
 
+def test_a_report_that_comes_while_the_program_is_held_ends_the_row(rig, monkeypatch):
+    """The loop finds nothing, and is held until long after the row's time limit."""
+    reports = [None, "the Pi's report"]
+    monkeypatch.setattr(row, "time", SimpleNamespace(monotonic=lambda: 0.0 if len(reports) == 2 else 1e6))
+    monkeypatch.setattr(row, "row_limit_s", lambda *_: 60.0)
+    take = SimpleNamespace(finished=None, aborted=None, row=None)
+    taker = SimpleNamespace(
+        _instrument=rig.instrument,
+        _rig=None,
+        _poll=lambda taken: setattr(taken, "finished", reports.pop(0)),
+        _stop=SimpleNamespace(now=False),
+        _find_fatal_fault=lambda *_: None,
+        _pi=SimpleNamespace(state="running"),
+    )
+    row.RowTaker._wait_for_row(taker, take, transaction=None)
+    assert take.finished == "the Pi's report"
+
+
 def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
-    monkeypatch.setattr(row, "row_limit_s", lambda _, held: 0.5 if held.index == 1 else 60.0)
+    """Its limit passes at every reading of the clock, which stands still before it is held and after its end."""
     rig.pi.hang_at = {1}
+    rig.pi.hang_held = True
+    readings_s = []
     answer = []
 
-    def progress(p) -> None:
-        if p.state == "running" and (p.row, p.take) == (1, 1) and p.phase == "state":
-            rig.pi.state = "held"
-        if p.phase == "held":
-            answer.append(time.monotonic())
-            threading.Timer(1.0, end).start()
+    def monotonic() -> float:
+        if answer and len(readings_s) < 20:
+            readings_s.append(60.0 * len(readings_s))
+        elif answer:
+            rig.pi.hang_at = set()
+            rig.pi.wanted_end = True
+        return readings_s[-1] if readings_s else 0.0
 
-    def end() -> None:
-        rig.pi.hang_at = set()
-        rig.pi.wanted_end = True
-
-    result = run_scan(rig.instrument, tmp_path / "s", progress=progress)
+    monkeypatch.setattr(row, "time", SimpleNamespace(monotonic=monotonic, monotonic_ns=time.monotonic_ns))
+    monkeypatch.setattr(row, "row_limit_s", lambda *_: 0.5)
+    result = run_scan(rig.instrument, tmp_path / "s", progress=lambda p: p.phase == "held" and answer.append(p.row))
     assert result.exit_status == "success"
-    assert len(answer) == 1
+    assert answer == [1]
 
 
 def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):

@@ -502,6 +502,8 @@ class RowTaker:
         silence = _SilenceCheck(self._instrument, self._rig)
         is_held = False
         while take.finished is None:
+            # Before reading: what came while this program was held is read though the time is over.
+            is_late = time.monotonic() > deadline
             self._poll(take)
             if take.finished is not None:
                 return
@@ -514,6 +516,7 @@ class RowTaker:
             if fault is not None:
                 take.aborted = fault
                 deadline = time.monotonic() + _ABORT_TIMEOUT_S
+                is_late = False
                 transaction.change_state(RowState.ABORTING)
                 self._pi.abort(fault.text)
             if self._pi.state in ("fault", "idle"):
@@ -521,10 +524,11 @@ class RowTaker:
             if self._pi.state == "held" and not take.aborted:
                 # A held row has no timeout.
                 deadline = time.monotonic() + limit_s
+                is_late = False
                 if not is_held:
                     self._notify("held", f"row {take.row.index} is held; send `Resume` from where `Hold` was sent")
                 is_held = True
-            if time.monotonic() > deadline:
+            if is_late:
                 if take.aborted:
                     return
                 raise ScanError(

@@ -49,6 +49,7 @@ class FakePi:
         # Frames are sent one by one, and the times of their pulses are those of a real row
         self.timed = False
         self.hang_after_captures = False  # such rows send their bursts before they hang
+        self.hang_held = False  # such rows are held
         # Reason in RowFinished of a completed row
         self.notes: dict[tuple[int, int], str] = {}
         # The hanging row must end
@@ -173,6 +174,8 @@ class FakePi:
         row = self.run.plan.row(c.row_index)
         self._emit(m.RowStarted, row=row, take=c.take)
         if c.row_index in self.hang_at:
+            if self.hang_held:
+                self.state = "held"
             self.hanging = (row, c.take)
             for card in self.cards:
                 card.short[row.index, c.take] = card.row_bytes // 2

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.worlds import CHI2_95, analyse_world, judge_world, pixel_boxes
+from benchmarks.worlds import CHI2_95, analyse_world, draw_calibration, draw_pair, judge_world, pixel_boxes
 
 from polysight.materials import UNKNOWN
+from polysight.process.quality import scene_reasons
 from polysight_worlds import METAL, Plate, Stack, World, published_rig, simulate
 from polysight_worlds.world import nine_places
 
@@ -98,3 +99,14 @@ def test_the_reference_is_bare_metal_though_coated_metal_beside_it_is_brighter(c
     }
     assert level["plate 3"] > level["copper"]
     assert plates[analysis.metal.label].name == "copper"
+
+
+@pytest.mark.slow
+def test_a_plate_near_the_brewster_angle_is_not_called_disturbed():
+    """Its V is nearly zero, so that the sidelobes of its neighbours change most of it, and nothing of its value."""
+    pair = draw_pair("none", 990015, mixed=True)  # PTFE among eight others
+    analysis, plates = analyse_world(pair, leakage=draw_calibration("none", 990015)[0])
+    label = next(label for label, plate in plates.items() if "PTFE" in plate.name)
+    assert analysis.disturbed[label] > 0.05
+    assert analysis.errors_by_disturbance()[label] < 0.01
+    assert not any("changes within" in reason.what for reason in scene_reasons(analysis, None, None))

@@ -23,7 +23,7 @@ from msgspec import UNSET, structs
 from polysight.imaging import Image, Images, Rise
 from polysight.materials.common_change import CommonChange
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
-from polysight.materials.kinds import PatchDispersion, RatioEvidence
+from polysight.materials.kinds import PatchDispersion, RatioEvidence, permittivity_slope
 from polysight.materials.labels import Labels
 from polysight.materials.library import Real, feature_matrix
 from polysight.materials.measure import Permittivity, background, ratio_sigma
@@ -209,6 +209,21 @@ class MaterialsResult:
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = np.where(usable, v / h, np.nan)
         return ratio_sigma(h, v, dark, ratio_error(self.inversion, self.prior, inverse))
+
+    def errors_by_disturbance(self) -> dict[int, float]:
+        """Return patch number to the relative error of its permittivity by `disturbed`; of V / H without one.
+
+        Near the Brewster angle V is nearly zero, and half of it means little.
+        """
+        out = {}
+        for r in self.patches:
+            error = self.disturbed.get(r.patch.label, 0.0)
+            e = r.permittivity
+            if e.value and e.ratio:
+                slope = permittivity_slope(1 / e.ratio, np.radians(self.incidence_deg(r.patch)))
+                error *= min(1.0, float(abs(slope / e.ratio / e.value)))
+            out[r.patch.label] = error
+        return out
 
     def incidence_deg(self, patch: Patch) -> float:
         """Return the mean incidence angle over a patch's interior, degrees."""

@@ -213,10 +213,12 @@ class MaterialsResult:
     def errors_by_disturbance(self) -> dict[int, float]:
         """Return patch number to the relative error of its permittivity by `disturbed`; of V / H without one.
 
-        Near the Brewster angle V is nearly zero, and half of it means little.
+        Refused patches are left out. Near the Brewster angle V is nearly zero, and half of it means little.
         """
         out = {}
         for r in self.patches:
+            if r.refused is not None:
+                continue
             error = self.disturbed.get(r.patch.label, 0.0)
             e = r.permittivity
             if e.value and e.ratio:

@@ -440,8 +440,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     reasons += rules.judge_halo(result.halo)
     reasons += rules.judge_background(result.behind)
     reasons += rules.judge_flatness(result.ripple, result.relief_rad)
-    disturbed = result.errors_by_disturbance()
-    reasons += rules.judge_disturbed_plates({k: error for k, error in disturbed.items() if k not in refused})
+    reasons += rules.judge_disturbed_plates(result.errors_by_disturbance())
     reasons += rules.judge_passivity(gaining)
     metal = result.metal
     if result.patches and metal.evidence is not None:

@@ -51,6 +51,7 @@ static int transfer(const struct spi_ioc_transfer *t, unsigned n) {
     if (t[i].bits_per_word != 0 && t[i].bits_per_word != 8) return -EINVAL;
     if (bytes > bufsiz) return -EMSGSIZE;
   }
+  if (wire_clock && !thread_ns) thread_ns = now_ns(CLOCK_MONOTONIC);
   for (unsigned i = 0; i < n; i++) {
     const uint8_t *sent = (const uint8_t *)(uintptr_t)t[i].tx_buf;
     const double bit = bit_ns(t[i].speed_hz);

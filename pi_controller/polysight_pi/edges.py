@@ -1,11 +1,12 @@
-"""Judges the trigger edges of a row: a lost and a spurious edge keep the count, but not the times.
+"""Check the trigger edges of a row: a lost edge and a spurious one keep the count right, only their times tell.
 
-Three reports of the stage are compared with the edges:
+The edges are compared with three reports of the stage:
 
-* the row's motion: at constant speed each interval is step / speed; a hold slows the stage down to the place that its
-  status names, and from there speeds it up again, so those intervals are known as well, but for the wait;
-* the points in each status: as many edges came before it was asked for or later, and as many until it was written;
-* the end: behind the last point the stage runs on and slows down, so its `done` comes that much later.
+* the row's motion: at constant speed each interval is step / speed. A hold slows the stage down to the place that its
+  status names, and from there it speeds up again, so those intervals are known too, except for the time at rest;
+* the number of points in each status: at most as many edges before the status was requested, and at least as many by
+  the time when it was written;
+* the end: behind the last point the stage runs on and slows down, so its `done` follows after a known time.
 """
 
 from __future__ import annotations
@@ -166,11 +167,11 @@ class EdgeTimes:
         self._motion = motion
         self._interval_s = abs(motion.step) / motion.feed
         self._edges_ns: list[int] = []
-        # Points, and the latest time at which they were written
+        # Number of points of each status, and the latest time at which it was written.
         self._statuses: list[tuple[int, int]] = []
-        # Distances at which the stage rested, in a hold
+        # Distances at which the stage rested in a hold.
         self._stops: list[int] = []
-        # Those before the first point: of the row, or of the travel to it
+        # Distances of holds before the first point: in the row, or in the travel to it.
         self._early_stops: list[int] = []
         self._is_held = False
 
@@ -214,12 +215,13 @@ class EdgeTimes:
             return self._judge_motion([], done_ns)
         stops = sorted(self._stops)
         # A hold during the travel to the row has no effect on it.
-        wrong = self._judge_motion(stops, done_ns)
-        if wrong and self._early_stops:
-            wrong = self._judge_motion(sorted(self._early_stops) + stops, done_ns)
-        return wrong
+        fault = self._judge_motion(stops, done_ns)
+        if fault and self._early_stops:
+            fault = self._judge_motion(sorted(self._early_stops) + stops, done_ns)
+        return fault
 
     def _judge_motion(self, stops: list[int], done_ns: int) -> str:
+        """Compare all intervals with a motion that rests at these distances; return what is wrong, or ""."""
         points_s, end_s = self._motion.time_points(stops)
         for point in range(1, self._motion.points):
             interval_s = (self._edges_ns[point] - self._edges_ns[point - 1]) * 1e-9
@@ -228,8 +230,9 @@ class EdgeTimes:
             expected_s = points_s[point] - points_s[point - 1]
             if waited and interval_s > expected_s:
                 continue
-            if wrong := self._compare(point, interval_s, expected_s):
-                return wrong
+            fault = self._compare(point, interval_s, expected_s)
+            if fault:
+                return fault
         run_out_s = (done_ns - self._edges_ns[-1]) * 1e-9
         expected_s = end_s - points_s[-1]
         if run_out_s < (1 - TOLERANCE) * expected_s:

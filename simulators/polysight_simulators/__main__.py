@@ -75,10 +75,14 @@ def _simulate(args: argparse.Namespace) -> None:
     if args.json:
         sys.stdout.write(json.dumps({"folder": str(folder), "seconds": round(seconds, 2), "simulated": True}) + "\n")
     else:
-        sys.stdout.write(f"{'' if quiet else chr(10)}simulated scan in {folder}, {seconds:.1f} s\n")
+        if not quiet:
+            # The progress line has no end yet.
+            sys.stdout.write("\n")
+        sys.stdout.write(f"simulated scan in {folder}, {seconds:.1f} s\n")
 
 
 def _check(args: argparse.Namespace) -> None:
+    """Run `check`. Raises PolysightError."""
     rig = load_instrument(args.config)
     for path in args.scenes:
         scanned = apply_scene(rig, load_scene(path))

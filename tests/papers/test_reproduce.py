@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from polysight.cli.main import main
 from polysight_papers.sensys2026 import run as report
-from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, published_values
+from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figure, published_values, style_axes
 from polysight_shared.errors import DataError
 
 
@@ -17,7 +17,7 @@ def item(key="fig3", value=1.0):
     figure = new_figure(3, 2)
     ax = figure.subplots()
     ax.plot([0, value])
-    dress(ax, "a line", "x (mm)", "y (mm)")
+    style_axes(ax, "a line", "x (mm)", "y (mm)")
     table = Table("numbers", ("what", "published", "simulated"), (("one, two", "1", f"{value}"),))
     return Item(key, f"Fig. 3: {key}", ("text & more",), (table,), {"line": Picture(figure, "a line")}, {"n": value})
 

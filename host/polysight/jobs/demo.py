@@ -22,6 +22,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError
 
 # An empty file that tells a folder of an earlier demo, which may be overwritten, from any other.
+# An empty file that marks a folder as a demo, which another demo may overwrite.
 _MARK = ".polysight-demo"
 # Starting is mostly imports, of some seconds; the limit is far above them, for an overloaded machine.
 _START_LIMIT_S = 60.0

@@ -153,17 +153,17 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
             "two cards share one address",
             "give each its own card_address",
         )
-    now = _set_address(board, at)
-    with CardClient(now, rig.limits.command_timeout_s) as card:
+    present = _set_address(board, at)
+    with CardClient(present, rig.limits.command_timeout_s) as card:
         message = (
-            f"{name}: a card, FPGA {card.version()}, answers at {now.card_address}:{now.command_port}; its EEPROM is"
-            f" written anew, and cannot be read back.\n{name}: {settings.text()}"
+            f"{name}: a card, FPGA {card.version()}, answers at {present.card_address}:{present.command_port}; its"
+            f" EEPROM is written anew, and cannot be read back.\n{name}: {settings.text()}"
         )
         program_eeprom(card, settings, confirm(message, settings.confirmation, yes))
     sys.stdout.write(f"{name}: written, and the card reports no failure. Now switch the card off and on.\n")
     sys.stdout.flush()
     if wait_s > 0:
-        version = _wait_for_card(board, wait_s, same_place=now == board)
+        version = _wait_for_card(board, wait_s, same_place=present == board)
         sys.stdout.write(f"{name}: it answers at {board.card_address}:{board.command_port}, FPGA {version}.\n")
         sys.stdout.write("Whether it sends data to the right port is seen with `polysight card --listen 10`.\n")
     else:
@@ -272,6 +272,7 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
 
 
 def _run_check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], WordLink], as_json: bool) -> int:
+    """Check a board on the link that `open_words` opens; print each step as it ends, or all of them as JSON."""
     rows: list[Row] = []
 
     def tell(row: Row) -> None:

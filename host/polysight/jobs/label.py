@@ -99,13 +99,11 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     products = find_products(folder)
     if products is None:
         is_scan = (folder / "manifest.jsonl").exists()
-        out = "OUT"
-        if is_scan:
-            out = folder / "products"
+        products_folder = folder / "products" if is_scan else "OUT"
         raise DataError(
             f"{folder}: no {IMAGE} to draw on",
             "the scan was not processed yet, its products lie elsewhere, or the path is wrong",
-            f"polysight process {quote(folder)} --out {quote(out)}; or give the folder of its products",
+            f"polysight process {quote(folder)} --out {quote(products_folder)}; or give the folder of its products",
             code=ErrorCode.FILE_MISSING,
         )
     saved_labels = find_labels(folder)
@@ -211,7 +209,7 @@ def _find_dark_boxes(products: ProcessedScan, masks: Mapping[str, npt.NDArray[np
 def list_patches(products: ProcessedScan) -> list[FoundPatch]:
     """Patches of materials.json, each with a box inside it that avoids its edges if it is wide enough."""
     margin_mm = SegmentSettings().margin_mm
-    lines = []
+    patches = []
     for patch in products.segments:
         x0, y0, x1, y1 = patch.box_mm
         margin_x_mm = min(margin_mm, _LARGEST_MARGIN * (x1 - x0))
@@ -228,8 +226,8 @@ def list_patches(products: ProcessedScan) -> list[FoundPatch]:
             text = f"named {patch.name}"
             if patch.confidence is not None:
                 text += f" {100 * patch.confidence:.0f} %"
-        lines.append(FoundPatch(patch.label, inner_box, text))
-    return lines
+        patches.append(FoundPatch(patch.label, inner_box, text))
+    return patches
 
 
 def _require_patches(patches: Sequence[FoundPatch]) -> None:
@@ -338,8 +336,8 @@ def _split_at_equals(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
         name = "=".join(parts[:count])
         if name in boxes:
             return name, "=".join(parts[count:])
-    name, _, rest = text.partition("=")
-    return _find_box(name, boxes), rest
+    name, _, value = text.partition("=")
+    return _find_box(name, boxes), value
 
 
 def ask_for_names(found: Sequence[FoundPatch], ask: Ask) -> Labels:
@@ -389,7 +387,7 @@ def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missi
 
 
 def _ask_for_metal(boxes: Mapping[str, Box], ask: Ask) -> str | None:
-    """Return the metal box; None if no option names it."""
+    """Ask which box is the metal reference; None without an answer, so that a name of a metal decides."""
     while answer := ask("which of them is the metal reference (Enter: the one with a metal's name): ").strip():
         try:
             return _find_box(answer, boxes)

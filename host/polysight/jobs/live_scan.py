@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 # A web address that does not answer must not hold up the end of a command.
 NOTIFY_TIMEOUT_S = 20.0
-_BESIDE = ("program", "operator.json")
+_ALLOWED_ENTRIES = ("program", "operator.json")
 """Entries allowed in a folder before its scan begins: a program's log, notes."""
 RunScan = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
@@ -116,7 +116,7 @@ class ScanBar:
 
 
 def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, notifier: Notify) -> int:
-    """Run a scan, and tell whom the rig file names how it has ended."""
+    """Run a scan, and notify the people that the rig file names of its end."""
     stop = StopRequest()
     try:
         status = _run_rows(folder, processing, run_rows, stop)
@@ -136,6 +136,7 @@ def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, not
 
 @ignore_hangup()
 def _run_rows(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, stop: StopRequest) -> int:
+    """Run the rows, obey commands to the scan meanwhile, and finish the products; return the exit status."""
     with ScanBar() as bar, ControlFolder(folder, stop) as control:
 
         def show(progress: ScanProgress) -> None:
@@ -204,7 +205,7 @@ def _check_new(folder: Path) -> None:
             "scans are never overwritten",
             f"`polysight resume {quote(folder)}` goes on with it; or give another --out",
         )
-    if not folder.is_dir() or any(p.name not in (MANIFEST, *_BESIDE) for p in folder.iterdir()):
+    if not folder.is_dir() or any(p.name not in (MANIFEST, *_ALLOWED_ENTRIES) for p in folder.iterdir()):
         raise ConfigError(f"{folder} is not an empty folder", "a scan has a folder of its own", "give another --out")
 
 
@@ -267,9 +268,9 @@ def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: boo
 
 
 def notify(settings: Notify, folder: Path, state: str, text: str) -> None:
-    """Tell that a scan has ended, as `[notify]` of the rig file says: what goes wrong with it is only a note.
+    """Report the end of a scan as `[notify]` of the rig file says; a failure to do so is only noted.
 
-    Run the command with the text as its last argument, and send `{"scan", "state", "text"}` to the address.
+    Runs the command with the text as its last argument, and sends `{"scan", "state", "text"}` to the address.
     `state` is `finished`, `stopped` or `failed`.
     """
     message = f"{folder.name}: {text}"

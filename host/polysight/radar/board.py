@@ -31,8 +31,10 @@ from polysight_shared.errors import DeviceError, PolysightError
 POWER_UP_TIMEOUT_S = 5.0
 _CALIBRATION_TIMEOUT_S = 5.0
 _BOOT_TIMEOUT_S = 5.0
+# For how long the reset line is held.
 _RESET_S = 0.1
 _READY_TIMEOUT_S = 1.0
+# Events that are kept of a board; a faulty one could report without end.
 _MAX_EVENTS = 1000
 _SENSORS = ("rx1", "rx2", "rx3", "rx4", "tx1", "tx2", "tx3", "pm", "digital")
 _FIRMWARE = (
@@ -149,7 +151,7 @@ class BringUp:
                 "download it again; until then radar.firmware starts the board from RAM",
                 code=ErrorCode.RADAR_NO_FIRMWARE,
             )
-        patch_after = self._main_patch()
+        patch_after = self._read_main_patch()
         self._verify(patch_after, patch_before, image)
         self._refuse_damaged()
         # The die id is only readable after the RF power-up.
@@ -244,7 +246,7 @@ class BringUp:
         require_rom(self._board.name, answer, image)
         return _patch(answer)
 
-    def _main_patch(self) -> str:
+    def _read_main_patch(self) -> str:
         return _patch(self._board.ask(c.GET_MAIN_VERSION, 16))
 
     def _verify(self, patch: str, before: str, image: Image) -> None:

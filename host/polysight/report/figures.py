@@ -143,7 +143,7 @@ def channel_figure(scan: ProcessedScan, key: str) -> bytes:
     ax = fig.add_subplot()
     limits = phase_limits_deg(scan) if key == "phase_p" else None
     image, unit = draw_channel(ax, scan, key, limits)
-    style.dress(ax, FIGURES[key], scan.stamped)
+    style.style_axes(ax, FIGURES[key], scan.stamped)
     if key.endswith("_p"):
         _write_ratios(ax, scan, key)
     if limits is None:
@@ -271,7 +271,7 @@ def map_figure(scan: ProcessedScan, draw: Callable[[Axes, ProcessedScan], list[s
     fig = style.new_figure(4.6, 4.6, style.RIGHT_IN)
     ax = fig.add_subplot()
     labels = draw(ax, scan)
-    style.dress(ax, title, scan.stamped)
+    style.style_axes(ax, title, scan.stamped)
     ax.set_facecolor("#f3f5f8")
     style.fit_labels(fig, labels, style.RIGHT_IN)
     return style.png(fig)
@@ -307,8 +307,8 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
     _fill_patches(
         fig, error_axes, scan, errors, percents, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|")
     )
-    style.dress(value_axes, "Permittivity ε′ ± standard error", simulated=False)
-    style.dress(error_axes, "Relative error of ε", scan.stamped)
+    style.style_axes(value_axes, "Permittivity ε′ ± standard error", simulated=False)
+    style.style_axes(error_axes, "Relative error of ε", scan.stamped)
     for ax in (value_axes, error_axes):
         ax.set_facecolor("#f3f5f8")
     error_axes.set_ylabel("")
@@ -397,7 +397,7 @@ def coverage_figure(scan: ProcessedScan, masks: dict[str, npt.NDArray[np.bool_]]
     for ax, (name, mask) in zip(fig.subplots(1, len(masks), squeeze=False)[0], masks.items(), strict=True):
         colours = ListedColormap(_POSITION_COLOURS)
         ax.imshow(mask, origin="lower", extent=extent, cmap=colours, vmin=0, vmax=1, interpolation="nearest")
-        style.dress(ax, f"{name}: {mask.mean():.2%} masked", scan.stamped)
+        style.style_axes(ax, f"{name}: {mask.mean():.2%} masked", scan.stamped)
         ax.set_xlabel("stage offset x (mm)", fontsize=9, color=style.MUTED)
         ax.set_ylabel("stage offset y (mm)", fontsize=9, color=style.MUTED)
     return fig
@@ -412,7 +412,7 @@ def draw_overview(fig: Figure, axes: Sequence[Axes], scan: ProcessedScan, bar_la
         strict=True,
     ):
         image, unit = draw_channel(ax, scan, key)
-        style.dress(ax, title, scan.stamped)
+        style.style_axes(ax, title, scan.stamped)
         label = ""
         if bar_labels:
             label = unit
@@ -420,7 +420,7 @@ def draw_overview(fig: Figure, axes: Sequence[Axes], scan: ProcessedScan, bar_la
     labels = []
     for ax in axes[3:]:
         labels += draw_materials(ax, scan, size=6.5)
-        style.dress(ax, _map_title(scan), scan.stamped)
+        style.style_axes(ax, _map_title(scan), scan.stamped)
     style.shorten_labels(fig, labels)
 
 
@@ -475,7 +475,7 @@ def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | 
             ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=edge, linewidth=width))
         middle = style.write_label(ax, (x0 + x1) / 2, (y0 + y1) / 2, written, 8.5, on_dark=True)
         labels.append(style.MapLabel(middle, str(number), text, colour, below))
-    style.dress(ax, "Amplitude H, and the boxes", scan.stamped)
+    style.style_axes(ax, "Amplitude H, and the boxes", scan.stamped)
     style.colour_bar(fig, ax, image, unit)
     style.fit_labels(fig, labels, style.BAR_IN)
     return style.png(fig)
@@ -552,7 +552,7 @@ def surface_figure(surface: Surface) -> bytes:
         ax.plot(
             [start[:, across], ends[:, across]], [start[:, up], ends[:, up]], color=style.INK, linewidth=0.5, alpha=0.6
         )
-        style.dress(ax, title, surface.simulated)
+        style.style_axes(ax, title, surface.simulated)
         ax.set_xlabel(label_x, fontsize=9, color=style.MUTED)
         ax.set_ylabel(label_y, fontsize=9, color=style.MUTED)
         ax.set_aspect("equal", adjustable="datalim")

@@ -21,13 +21,13 @@ from polysight.report.style import (
     MUTED,
     RIGHT_IN,
     assign_colours,
-    dress,
     new_figure,
     patch_colour,
     patch_label,
     png,
     set_margins,
     short_label,
+    style_axes,
     style_legend,
 )
 from polysight.results import PatchFigures, PermittivityFigures
@@ -115,7 +115,7 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
     title = "Permittivity"
     if truths:
         title += ", estimate and truth"
-    dress(ax, title, scan.stamped)
+    style_axes(ax, title, scan.stamped)
     ax.set_aspect("auto")
     ax.set_facecolor("white")
     ax.grid(color="#e6e9ee", linewidth=0.8)

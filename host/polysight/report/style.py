@@ -45,6 +45,7 @@ UNKNOWN_COLOUR = "#BBBBBB"
 # Colours of the metal reference and of patches that were not judged.
 METAL_COLOUR = "#C9D3DE"
 REFUSED_COLOUR = "#8d949e"
+# Hatching of patches that were not judged.
 HATCH = "////"
 # Two names side by side need this gap, otherwise they read as one.
 _GAP_PT = 8.0
@@ -61,7 +62,7 @@ _LEGEND_LINE_IN = 0.17
 # Characters of a name in a legend: two names fit side by side below a map.
 _LONGEST_NAME = 26
 
-OWN = "DejaVu Sans"
+MATPLOTLIB_FONT = "DejaVu Sans"
 """The font that comes with matplotlib."""
 FALLBACKS = (
     "Noto Sans CJK JP", "Noto Sans CJK SC", "Noto Sans CJK TC", "Noto Sans CJK KR", "Noto Sans JP", "Noto Sans SC",
@@ -77,7 +78,7 @@ FALLBACKS = (
 def font_families() -> tuple[str, ...]:
     """Return the fonts for texts that hold names: matplotlib's own, then the installed ones of FALLBACKS."""
     installed = {entry.name for entry in fontManager.ttflist}
-    return (OWN, *(family for family in FALLBACKS if family in installed))
+    return (MATPLOTLIB_FONT, *(family for family in FALLBACKS if family in installed))
 
 
 @cache
@@ -138,7 +139,7 @@ def set_margins(fig: Figure, right_in: float, below_in: float = 0.0) -> None:
     )
 
 
-def dress(ax: Axes, title: str, simulated: bool) -> None:
+def style_axes(ax: Axes, title: str, simulated: bool) -> None:
     """Draw the title, axis labels in millimetres, grey ticks, and the word SIMULATED for simulated data."""
     ax.set_title(title, loc="left", fontsize=11, color=INK, fontweight="bold")
     if simulated:

@@ -51,7 +51,11 @@ MIN_POWER = 10 ** (-3.2)
 
 
 class _Search:
-    """Coarse search of path and slope: tables for windows whose positions form a lattice."""
+    """Coarse search of path and slope: phase tables for windows whose positions form a lattice.
+
+    A window is multiplied by the conjugate phases of its frequencies (`along_f`), rows (`along_y`) and columns
+    (`along_x`); `lead` is the phase of each RX relative to the board's middle.
+    """
 
     def __init__(self, fit: BoardFit, gate_m: tuple[float, float]) -> None:
         board = fit.board
@@ -172,12 +176,12 @@ def _separate(fit: BoardFit, search: _Search, windows: Windows) -> list[Echoes]:
 
 
 def _refine(
-    fit: BoardFit, windows: Windows, echoes: list[tuple[NDArray, Maximum]], rest: NDArray[np.complex64]
+    fit: BoardFit, windows: Windows, echoes: list[tuple[NDArray, Maximum]], residual: NDArray[np.complex64]
 ) -> NDArray[np.int_]:
-    """Fit all echoes of the windows that hold the weakest one together, and update what they leave.
+    """Fit the newest echo together with all others of its windows, and update `echoes` and `residual`.
 
-    Return the windows that hold it still: one that only splits another echo in two is no echo, but what the edge of a
-    surface makes of it.
+    Returns the windows that keep the newest echo. It is dropped where it only splits another echo in two: the edge of a
+    surface does that.
     """
     members, weakest = echoes[-1]
     part = select_windows(windows, members)
@@ -199,12 +203,13 @@ def _refine(
         kept = np.flatnonzero(place)[is_separate]
         for field in fields(Maximum):
             getattr(maximum, field.name)[kept] = getattr(better, field.name)[is_separate]
-    rest[members[is_separate]] = joint.rest[is_separate]
+    residual[members[is_separate]] = joint.rest[is_separate]
     echoes[-1] = (members[is_separate], select_maxima(weakest, is_separate))
     return members[is_separate]
 
 
 def _power_share(fit: BoardFit, windows: Windows, found: Maximum, energy: Array) -> Array:
+    """Share [window] of the energy of a window's samples, `energy`, that an echo explains."""
     count = windows.valid.sum(axis=1) * len(fit.lever)
     return count * np.abs(found.amplitude) ** 2 * fit.gain**2 / fit.omega.size / np.maximum(energy, 1e-30)
 
@@ -221,8 +226,10 @@ def measure_echoes(
 ) -> tuple[Echoes, NDArray]:
     """Measure the amplitudes of echoes of known path, slope and curvature, in the windows around `at_m` [n, 3].
 
-    The path is not fitted: a maximum over paths is too high by the noise, by most where V nearly vanishes. Echoes of
-    the same number `window` [n] are told apart by their paths; without it, each is measured as if alone.
+    `path_m` [n] are the paths there, `slope` [n, 2] and `bend` [n, 2, 2] their first and second derivatives by the
+    stage's place. The path is not fitted: a maximum over paths is too high by the noise, by most where V nearly
+    vanishes. Echoes of the same number `window` [n] are told apart by their paths; without it, each is measured as if
+    alone.
     Returns the echoes and which of them lie inside the scan and are to be measured (others are not).
     """
     fit = BoardFit(board)

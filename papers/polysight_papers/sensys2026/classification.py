@@ -33,10 +33,10 @@ from polysight_papers.sensys2026.item import (
     Published,
     Run,
     Table,
-    dress,
     new_figure,
     percent,
     published_values,
+    style_axes,
 )
 from polysight_papers.sensys2026.patches import Errors, calibrated_errors, count_draws, draw, groups, spread_table
 
@@ -284,7 +284,7 @@ def fig20(run: Run) -> Item:
         heights = [b[k] for b in bars]
         drawn = ax.bar(np.arange(4) + 0.27 * (k - 1), heights, 0.25, label=label, color=colour, hatch=hatch)
         ax.bar_label(drawn, fmt="%.1f", fontsize=7)
-    dress(ax, "Accuracy by channel, weighted KNN of the paper", "", "pixels named right (%)")
+    style_axes(ax, "Accuracy by channel, weighted KNN of the paper", "", "pixels named right (%)")
     ax.set_xticks(range(4), list(CHANNELS))
     ax.set_ylim(0, 118)
     ax.legend(fontsize=8, frameon=False, loc="upper left", ncols=3)
@@ -341,7 +341,7 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
             y_title = "true"
             y_labels = [f"{m.name}  {m.number}" for m in materials]
         lines = [fill(line, letters_a_line) for line in title.splitlines()]
-        dress(ax, "\n".join(lines), "named", y_title)
+        style_axes(ax, "\n".join(lines), "named", y_title)
         ax.title.set_fontsize(9.5)
         ax.grid(visible=False)
         ax.set_xticks(range(n), [str(m.number) for m in materials], fontsize=size)

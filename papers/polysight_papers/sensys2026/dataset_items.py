@@ -39,10 +39,10 @@ from polysight_papers.sensys2026.item import (
     Picture,
     Published,
     Table,
-    dress,
     new_figure,
     percent,
     published_values,
+    style_axes,
     table2,
 )
 from polysight_papers.sensys2026.patches import groups
@@ -336,7 +336,7 @@ def _draw_channels(bars: list[tuple[str, list[float]]]) -> Any:
             hatch = "//"
         drawn = ax.bar(positions, heights, 0.92 * width, label=label, color=PALETTE[k], hatch=hatch)
         ax.bar_label(drawn, fmt="%.0f", fontsize=7)
-    dress(ax, "Accuracy by channel, weighted KNN of the paper", "", "pixels named right (%)")
+    style_axes(ax, "Accuracy by channel, weighted KNN of the paper", "", "pixels named right (%)")
     ax.set_xticks(range(len(CHANNELS)), list(CHANNELS))
     ax.set_ylim(0, 135)
     ax.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
@@ -668,7 +668,7 @@ def _draw_figure(estimates: Mapping[str, Sequence[Estimate]]) -> Figure:
         axes[0].errorbar([t.real for t in true], [v.real for v in values], yerr=std, **bars)
         axes[1].errorbar([-t.imag for t in true], [-v.imag for v in values], yerr=std, **bars)
     for ax, part in zip(axes, ("real part ε′", "loss ε″"), strict=True):
-        dress(ax, part, f"published {part}", f"{part} without leakage")
+        style_axes(ax, part, f"published {part}", f"{part} without leakage")
         ax.axline((1, 1), slope=1, color=INK, lw=0.8, ls=":")
         ax.legend(fontsize=8, frameon=False)
     return fig

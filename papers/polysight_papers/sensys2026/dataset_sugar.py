@@ -11,7 +11,7 @@ import numpy as np
 from polysight.materials import Entry, Library, concentrations, fit_concentration, polarisation_angle_rad
 from polysight.report import INK, PALETTE
 from polysight_papers.sensys2026.dataset import AuthorsData
-from polysight_papers.sensys2026.item import Item, Picture, Table, dress, new_figure, published_values
+from polysight_papers.sensys2026.item import Item, Picture, Table, new_figure, published_values, style_axes
 from polysight_papers.sensys2026.permittivities import WATER_IN_GLASS
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -121,13 +121,13 @@ def _draw_sugar(plots: list[tuple[str, Any, Any, Any]], printed: float) -> Any:
         label = f"{source}: median {result.median_error:.3f} %"
         right.step(np.concatenate([[0], error]), share, where="post", color=colour, label=label)
     right.axvline(printed, color=INK, ls="--", lw=1.2, label=f"published median {printed:g} %")
-    dress(
+    style_axes(
         left_axes,
         "Concentration by polarisation angle",
         "polarisation angle arctan |P| (degrees)",
         "sugar (% by weight)",
     )
-    dress(right, "Error, each concentration left out", "error (% by weight)", "share of patches")
+    style_axes(right, "Error, each concentration left out", "error (% by weight)", "share of patches")
     left_axes.legend(fontsize=8, frameon=False)
     right.legend(fontsize=8, frameon=False)
     return fig

@@ -36,7 +36,7 @@ from polysight.products import ProcessedScan
 from polysight.report import INK, draw_channel
 from polysight.results import ScanFacts, ScanMaterials, ScanQuality
 from polysight.store import TRUTH, RawSource, ScanFolder
-from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, table2
+from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figure, style_axes, table2
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError
 
@@ -191,7 +191,7 @@ def draw_row(fig: Any, axes: Any, view: ScanView, keys: tuple[str, ...], name: s
         if key.endswith("_p"):
             image.set_alpha(_compute_opacity(view.scan))
         kind, _, channel = key.partition("_")
-        dress(ax, f"{name}: {kind} {channel.upper()}", "x (mm)", "y (mm)" if ax is axes[0] else "")
+        style_axes(ax, f"{name}: {kind} {channel.upper()}", "x (mm)", "y (mm)" if ax is axes[0] else "")
         ax.set_aspect("equal")
         ax.grid(visible=False)
         ax.set_facecolor("#3a404a")
@@ -310,7 +310,7 @@ def fig14(run: Run) -> Item:
             vmax=PHASE_DEG,
             interpolation="nearest",
         )
-        dress(ax, f"phase of {channel}", "x (mm)", "y (mm)")
+        style_axes(ax, f"phase of {channel}", "x (mm)", "y (mm)")
         ax.grid(visible=False)
         ax.set_facecolor("#b9c0ca")
         ax.set_xlim(-95, 95)

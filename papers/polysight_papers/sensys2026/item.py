@@ -74,7 +74,7 @@ def new_figure(width: float, height: float) -> Figure:
     return fig
 
 
-def dress(ax: Axes, title: str, x: str, y: str) -> None:
+def style_axes(ax: Axes, title: str, x: str, y: str) -> None:
     """Set the title, the axis labels and a light grid."""
     ax.set_title(title, loc="left", fontsize=10.5, color=INK, fontweight="bold")
     ax.set_xlabel(x, fontsize=9, color=MUTED)

@@ -75,7 +75,7 @@ def fig3(run: item.Run) -> item.Item:
         ("reflectance |r_s|²", "reflectance |r_p|²", "|P| (dB)"),
         strict=True,
     ):
-        item.dress(ax, title, "incidence angle (degrees)", unit)
+        item.style_axes(ax, title, "incidence angle (degrees)", unit)
         ax.set_xlim(0, 90)
     axes[2].axvspan(55, 65, color="#DDCC77", alpha=0.35, lw=0)
     axes[2].set_ylim(-2, 42)
@@ -123,7 +123,7 @@ def fig16(run: item.Run) -> item.Item:
             x = j + np.random.default_rng(j).uniform(-0.28, 0.28, level[:, j].size)
             ax.plot(x, level[:, j].ravel(), item.MARKERS[j], ms=2.6, color=PALETTE[j], alpha=0.6)
             ax.plot([j - 0.35, j + 0.35], 2 * [float(np.median(level[:, j]))], color=INK, lw=1.4)
-        item.dress(ax, f"incidence {angle:.0f}°: {quantity}", "", f"{quantity} relative to metal (dB)")
+        item.style_axes(ax, f"incidence {angle:.0f}°: {quantity}", "", f"{quantity} relative to metal (dB)")
         ax.set_xticks(range(len(materials)), [m.name for m in materials], rotation=35, ha="right", fontsize=8)
     rows = [
         (f"{a} / {b}", *(f"{_compute_d_prime(level[a], level[b]):.1f}" for level in levels.values()))
@@ -196,7 +196,7 @@ def table2_item(run: item.Run) -> item.Item:
             estimated.append((true, e.value, e.real_std))
         _draw_estimates(axes, estimated, colour, f"{name}, {group.angle_deg:.0f}°")
     for ax, part in zip(axes, ("real part ε′", "loss ε″"), strict=True):
-        item.dress(ax, part, f"published {part}", f"recovered {part}")
+        item.style_axes(ax, part, f"published {part}", f"recovered {part}")
         ax.axline((1, 1), slope=1, color=INK, lw=0.8, ls=":")
         ax.legend(fontsize=8, frameon=False)
     worst = max((d for d in data if "relative_error" in d), key=lambda d: d["relative_error"])
@@ -267,7 +267,7 @@ def _make_item(true: dict[str, complex], pixels: dict[str, list[Complex]], centr
         for i, values in enumerate(pixels[name]):
             ax.plot(values.real, -values.imag, item.MARKERS[i % 10], ms=3, color=PALETTE[i], label=f"placement {i + 1}")
         ax.plot(eps.real, -eps.imag, "x", color=INK, ms=11, mew=2.2, label="truth", zorder=5)
-        item.dress(ax, name, "real part ε′", "loss ε″")
+        item.style_axes(ax, name, "real part ε′", "loss ε″")
         all_pixels = np.concatenate(pixels[name])
         medians = np.array([np.median(v.real) - 1j * np.median(-v.imag) for v in pixels[name]])
         printed = item.published_values()["location_variance"][name]
@@ -370,7 +370,7 @@ def _draw_line(ax: Axes, library: Library, value: Mapping[str, float], result: C
     low, high = result.line.interval(np.radians(line_angles))
     ax.plot(line_angles, result.line.percent(np.radians(line_angles)), color=INK, lw=1.4, label="line")
     ax.fill_between(line_angles, low, high, color=PALETTE[1], alpha=0.35, lw=0, label="90 % of new patches")
-    item.dress(
+    item.style_axes(
         ax, "Concentration by polarisation angle", "polarisation angle arctan |P| (degrees)", "sugar (% by weight)"
     )
     ax.legend(fontsize=8, frameon=False)
@@ -387,7 +387,7 @@ def _draw_permittivity(
     ax.plot([value[e.name] for e in library.entries], eps, "o", ms=4, color=PALETTE[0], label="patches, simulated")
     printed = zip(*sorted(published_eps.items()), strict=True)
     ax.plot(*printed, "x-", color=PALETTE[6], ms=7, lw=1.0, label="published, Table 2")
-    item.dress(ax, "Apparent permittivity", "sugar (% by weight)", "real part ε′")
+    item.style_axes(ax, "Apparent permittivity", "sugar (% by weight)", "real part ε′")
     ax.legend(fontsize=8, frameon=False)
 
 
@@ -397,7 +397,7 @@ def _draw_errors(ax: Axes, result: ConcentrationResult, printed: float) -> None:
     ax.step(np.concatenate([[0], error]), np.arange(error.size + 1) / error.size, where="post", color=PALETTE[0])
     ax.axvline(printed, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {printed:g} %")
     ax.axvline(result.median_error, color=INK, ls=":", lw=1.2, label=f"simulated median {result.median_error:.3f} %")
-    item.dress(ax, "Error, each concentration left out", "error (% by weight)", "share of patches")
+    item.style_axes(ax, "Error, each concentration left out", "error (% by weight)", "share of patches")
     ax.legend(fontsize=8, facecolor="white", framealpha=1.0, edgecolor="none", loc="lower right")
 
 

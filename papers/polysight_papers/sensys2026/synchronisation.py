@@ -22,7 +22,7 @@ from polysight.imaging import ImageBuilder
 from polysight.report import INK, PALETTE, QUANTITIES, SyncReport
 from polysight.sync import STAGES, BoardSetup, HighPass, fit_high_pass, high_pass, synchronise_row
 from polysight_papers.sensys2026.images import plate, simulate_scan
-from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, published_values
+from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figure, published_values, style_axes
 from polysight_shared.config import Chirp, load_instrument
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
@@ -132,13 +132,13 @@ def fig12(run: Run) -> Item:
             vmax=0,
             interpolation="nearest",
         )
-        dress(line[0], f"{when}: range profiles", "path beyond the direct path (m)", "position in the middle row")
+        style_axes(line[0], f"{when}: range profiles", "path beyond the direct path (m)", "position in the middle row")
         fig.colorbar(picture, ax=line[0], fraction=0.046, pad=0.02).set_label("dB", fontsize=8)
         level = 20 * np.log10(np.maximum(image / image.max(), 1e-4))
         picture = line[1].imshow(
             level, extent=scan.extent_mm, origin="lower", cmap="cividis", vmin=-30, vmax=0, interpolation="nearest"
         )
-        dress(line[1], f"{when}: image of H", "x (mm)", "y (mm)")
+        style_axes(line[1], f"{when}: image of H", "x (mm)", "y (mm)")
         fig.colorbar(picture, ax=line[1], fraction=0.046, pad=0.02).set_label("dB, 0 = its maximum", fontsize=8)
         for ax in line:
             ax.grid(visible=False)
@@ -166,7 +166,7 @@ def fig15(run: Run) -> Item:
     chirps = " and ".join(f"{c['chirps']} chirps of {b}" for b, c in summary.items())
     for ax, quantity, unit in zip(fig.subplots(1, 3), QUANTITIES, UNITS, strict=True):
         _draw_stages(ax, summary, quantity, limits.get(quantity))
-        dress(ax, unit, "", f"standard deviation of {unit}")
+        style_axes(ax, unit, "", f"standard deviation of {unit}")
         ax.set_xticks(range(len(STAGES)), list(STAGES), fontsize=8)
         ax.legend(fontsize=7.5, frameon=False)
     head = ("Board, stage", *(f"{unit}, {w}" for unit in ("Hz", "rad") for w in ("simulated", "published")))
@@ -274,7 +274,7 @@ def _draw_spectrogram(ax: Axes, one: Complex, chirp: Chirp) -> None:
     level = 10 * np.log10(power[order] / power.max())
     picture = ax.pcolormesh(t * 1e6, f[order] / 1e6, level, cmap="cividis", vmin=-35, vmax=0, rasterized=True)
     ax.axvline(chirp.linear_samples[1] / chirp.sample_rate_hz * 1e6, color="w", ls="--", lw=1)
-    dress(ax, "Spectrogram of one chirp", "time in the ADC window (µs)", "IF (MHz)")
+    style_axes(ax, "Spectrogram of one chirp", "time in the ADC window (µs)", "IF (MHz)")
     ax.grid(visible=False)
     ax.figure.colorbar(picture, ax=ax, fraction=0.046, pad=0.02).set_label("dB", fontsize=8)
 
@@ -288,7 +288,7 @@ def _draw_skirts(ax: Axes, chirps: Complex, chirp: Chirp) -> dict[str, float]:
         near = (np.abs(distance_bins) > SKIRT_HZ[0]) & (np.abs(distance_bins) < SKIRT_HZ[1])
         smear[part] = float(10 * np.log10(np.mean(10 ** (level[near] / 10))))
         ax.plot(distance_bins / 1e6, level, color=colour, lw=1.2, label=part)
-    dress(ax, "Spectrum about the tone", "IF from the tone (MHz)", "dB, 0 = peak")
+    style_axes(ax, "Spectrum about the tone", "IF from the tone (MHz)", "dB, 0 = peak")
     ax.set_xlim(-0.6, 0.6)
     ax.legend(fontsize=8, frameon=False, loc="upper right")
     return smear
@@ -302,7 +302,7 @@ def _draw_filter(ax: Axes, if_hz: npt.NDArray, amplitude: npt.NDArray, fitted: H
         corners = ", ".join(f"{c / 1e3:.0f}" for c in model.corners_hz)
         response = 20 * np.log10(np.abs(model.response(grid_hz)))
         ax.plot(grid_hz / 1e6, response, color=colour, ls=style, lw=1.5, label=f"{name}: {corners} kHz")
-    dress(ax, "High-pass filter", "IF (MHz)", "gain (dB)")
+    style_axes(ax, "High-pass filter", "IF (MHz)", "gain (dB)")
     ax.legend(fontsize=8, frameon=False, loc="lower right")
 
 

@@ -188,7 +188,7 @@ def test_the_doctor_is_shown_as_it_looks(lab):
 
 def test_a_scan_that_cannot_begin_says_why(lab):
     lab.rig.pi.end()
-    folder = lab.start("sixth", rows=3)
+    folder = lab.start("sixth", rows=ROWS)
     lab.browser.wait("document.getElementById('program-log').innerText.includes('did not answer')", "why")
     assert not (folder / "manifest.jsonl").exists()
     lab.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
@@ -200,5 +200,9 @@ def test_a_scan_that_cannot_begin_says_why(lab):
     lab.browser.wait("/failed[^]*did not answer/.test(document.getElementById('list').innerText)", "state and reason")
     lab.open("/watch?scan=sixth", PHONE)
     lab.click("again")
-    lab.browser.wait("document.getElementById('count')?.innerText == '3 of 3 rows'", "all rows")
+    lab.wait_rows(folder, 1)
+    lab.click("pause")
+    lab.wait_headline("Paused")
+    lab.click("stop")
+    lab.wait_headline("Stopped on request")
     lab.wait_end(folder)

@@ -378,10 +378,9 @@ def find_metals(h: Image, v: Image, segmentation: Segmentation) -> tuple[MetalRe
     for i in order[1:MOST_METALS]:
         alike = size_v[i] * size_h[best] > size_v[best] * size_h[i] * 10 ** (-ALIKE_DB / 20)
         if alike and product[i] > LEAST_METAL_LEVEL * product[best]:
-            described = (
-                f"chosen as bare metal by the other patches (|H||V| {product[i] / product[best]:.1f} times that of "
-            )
-            described += f"patch {seen[best].label}, which is brighter and fits them less)"
+            level = product[i] / product[best]
+            described = "chosen as the patch that the others show best to be bare metal "
+            described += f"(|H||V| {level:.1f} times that of patch {seen[best].label}, which fits them less)"
             metals.append(MetalReference(seen[i].interior, seen[i].label, described))
     return tuple(metals)
 

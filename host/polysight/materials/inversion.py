@@ -365,7 +365,8 @@ class SceneLikelihood:
     def hypotheses(self) -> list[tuple[SceneLikelihood, float]]:
         """Return the same scene with each certainty on what the prior leaves open, and the probability of each."""
         out: list[tuple[SceneLikelihood, float]] = []
-        for moved, painted in itertools.product(_certainties(self.prior.moved), _certainties(self._painted())):
+        is_painted = _certainties(self._estimate_paint_probability())
+        for moved, painted in itertools.product(_certainties(self.prior.moved), is_painted):
             hypothesis = copy.copy(self)
             hypothesis.prior = replace(self.prior, moved=moved[0], painted=painted[0])
             out.append((hypothesis, moved[1] * painted[1]))
@@ -378,7 +379,7 @@ class SceneLikelihood:
         out[:, PAINT] = _place(z[:, PAINT], self.prior.painted, prior.painted)
         return out
 
-    def _painted(self) -> float:
+    def _estimate_paint_probability(self) -> float:
         """Return the probability of paint: without kinds of materials nothing could tell it, there is none."""
         return self.prior.painted if self.kinds is not None else 0.0
 
@@ -431,7 +432,7 @@ class SceneLikelihood:
 
     def paint(self, z: Real) -> Real:
         """Return the phase of 1 / P by the metal's paint, [..., 1], radians: 0 of bare metal, else uniform."""
-        painted = self._painted()
+        painted = self._estimate_paint_probability()
         if painted <= 0:
             return np.zeros((*z.shape[:-1], 1))
         beyond_bare = scipy.special.ndtr(z[..., PAINT, None]) - (1 - painted)

@@ -128,3 +128,19 @@ def test_the_phase_is_that_of_the_path_beyond_the_direct_one():
     rx_m = rx.position[:, None]
     path = follow_path(SHAPES[0].evaluate(*find_specular(SHAPES[0], tx_m, rx_m)), tx_m, rx_m)
     assert slope_m == pytest.approx(path.length_m[0] - direct_m, abs=2e-4)
+
+
+def test_a_cone_ends_before_its_tip_at_which_the_path_is_stationary_too():
+    """The shoulder of a bottle, seen from positions from which the search for its specular point ends at the tip."""
+    shoulder = worlds.draw_shapes(83902, "bottle").shapes[1]
+    x, y = np.meshgrid(np.linspace(0.32, 0.35, 4), [0.169, 0.184])
+    far_offsets_m = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    rx = ONE_RX.h[0]
+    tx_m, rx_m = (antenna.position[:, None] + far_offsets_m.T for antenna in (ONE_RX.tx, rx))
+    places = find_specular(shoulder, tx_m, rx_m)
+    echoes = worlds.record_shapes([shoulder], ONE_RX, FREQUENCIES_HZ, far_offsets_m)["h"][0]
+
+    is_tip = shoulder.evaluate(*places).area < 1e-12
+    assert is_tip.any()
+    assert not echoes[:, is_tip].any()
+    assert np.isfinite(echoes).all()

@@ -40,6 +40,8 @@ INSIDE_LEVEL = 1e-3
 PADDING = 4
 # Facets of a flat plate: the path bends by 3 / m, so its phase leaves the facet's plane by 0.04 rad.
 PLATE_FACET_M = 0.008
+# Area over both parameters below which a cone has come to its tip: its radius there, metres.
+LEAST_AREA_M = 1e-9
 
 
 def record_shapes(
@@ -216,10 +218,16 @@ def sum_bent(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
     """Physical optics with what it misses to first order in the curvature, where the medium has no layers."""
+    # The path is stationary at the tip of a cone, too: beyond the piece's edges, without any surface.
+    has_surface = shape.evaluate(*places).area > LEAST_AREA_M
+    offsets = offsets[has_surface]
+    places = tuple(place[has_surface] for place in places)
     sums = sum_window(shape, tx, rx, frequencies_hz, offsets, places)
     if shape.is_bent and not shape.stack.layers:
         sums += _add_bends(shape, tx, rx, frequencies_hz, offsets, places)
-    return sums
+    waves = np.zeros((len(frequencies_hz), len(has_surface)), complex)
+    waves[:, has_surface] = sums
+    return waves
 
 
 def _add_bends(

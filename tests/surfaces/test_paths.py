@@ -135,3 +135,15 @@ def test_a_known_path_is_measured_without_the_gain_of_a_search():
     expected = 2 / (len(scan.rx_m) * FREQUENCIES_HZ.size * height * width)
     assert inside.all()
     assert np.mean(np.abs(echoes.amplitude) ** 2) / expected == pytest.approx(1, abs=0.6)
+
+
+def test_an_amplitude_is_that_of_the_place_asked_not_of_the_window():
+    """Places between stage positions: |V| changes by a per cent a millimetre near Brewster's angle."""
+    level = 2 + 40 * empty_scan().offsets_m[..., 0] - 30 * empty_scan().offsets_m[..., 1]
+    mirror = with_mirror(empty_scan(), 0.5, 1.0)
+    scan = replace(mirror, cube=mirror.cube * level)
+    at_m = np.array([[0.0, 0.0, 0.0], [0.0009, -0.0007, 0.0], [-0.0004, 0.0008, 0.0]])
+    path = np.full(3, find_mirror_path(scan, 0.5))
+    echoes, inside = measure_echoes(scan, at_m, path, np.zeros((3, 2)), np.zeros((3, 2, 2)))
+    assert inside.all()
+    assert np.abs(echoes.amplitude) == pytest.approx(2 + 40 * at_m[:, 0] - 30 * at_m[:, 1], rel=1e-4)

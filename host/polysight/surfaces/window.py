@@ -248,14 +248,16 @@ def maximise(
         slope = np.einsum("wnp,wn->wp", weighted, rates) / np.where(total == 0, 1, total)[:, None]
         move = np.linalg.solve(scaled, (slope.real / scale)[..., None])[..., 0] / scale
         values += np.clip(move, -STEP_LIMITS, STEP_LIMITS)
-    amplitude = total / count / fit.gain
-    # The amplitude may change linearly over the window: a plane is taken out before the rest counts as noise.
+    # The amplitude may change linearly over the window: a plane is taken out before the rest counts as noise. Its value
+    # at the offset zero is the amplitude there, which the mean is not where a window lies beside its place.
     plane = weighted[:, :, :3]
     matrix = np.einsum("wnp,wnq->wpq", plane, basis[:, :, :3]) + 1e-12 * np.eye(3)
-    flat = np.linalg.solve(matrix, np.einsum("wnp,wn->wp", plane, sums)[..., None])[..., 0]
+    plane_inverse = np.linalg.inv(matrix)
+    flat = np.einsum("wpq,wnq,wn->wp", plane_inverse, plane, sums, optimize=True)
     rest = (sums - np.einsum("wnp,wp->wn", basis[:, :, :3], flat)) * valid
     power = (np.abs(rest) ** 2).sum(axis=1) / np.maximum(count - 9, 1) / fit.gain**2
     noise = power / count / 2
+    amplitude = flat[:, 0] / fit.gain
     inverse = np.linalg.inv(scaled)
     spread = np.einsum("wpp->wp", inverse) / scale**2
     std = np.sqrt(spread * (noise / np.maximum(np.abs(amplitude) ** 2, 1e-30))[:, None])
@@ -267,7 +269,7 @@ def maximise(
     return Maximum(
         values=values,
         amplitude=amplitude,
-        rest=np.sqrt(noise),
+        rest=np.sqrt(noise * np.maximum(1, count * plane_inverse[:, 0, 0])),
         std=std,
         share=share,
         band_rise=band_rise,

@@ -5,7 +5,7 @@ import pytest
 
 from polysight.materials.inversion import RigPrior
 from polysight.materials.kinds import Kinds, PatchMeasurement, literature
-from polysight.materials.metal import metal_evidence
+from polysight.materials.metal import log_evidence_of_dielectric, metal_evidence
 
 THETA = np.radians(55.0)
 KINDS = Kinds(literature(), float(THETA))
@@ -52,6 +52,13 @@ def test_no_dielectric_is_taken_for_metal(plates, scenes):
     for seed in range(scenes):
         patches, _, channel = scene(np.random.default_rng([plates, seed]), plates, False)
         assert not metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough
+
+
+def test_evidence_of_a_dielectric_reference_does_not_depend_on_the_paint_of_metal():
+    patches, _, _ = scene(np.random.default_rng(0), 3, False)
+    priors = [RigPrior(3e-3, painted=probability) for probability in (0.0, 0.5)]
+    evidence = [log_evidence_of_dielectric(patches, prior, KINDS, 0.0) for prior in priors]
+    assert evidence[0] == evidence[1]
 
 
 @pytest.mark.parametrize("plates", [7])

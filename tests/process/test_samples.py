@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 from tests.support.pipelines import make_pipeline
+from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 
 from polysight.imaging import PLANE_REACH_M, Images
@@ -70,16 +73,26 @@ def test_rows_on_several_threads_make_the_same_products(two_plates: Path, scan: 
     assert same(process_scan(without_raw(scan)).form_images(), serial.form_images())
 
 
-def test_the_first_error_stops_all_threads() -> None:
+def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other rows that have begun go on only once the rest was cancelled, however slow the main thread is."""
     begun: list[int] = []
+    stopped = threading.Event()
+    shutdown = ThreadPoolExecutor.shutdown
+
+    def stop(pool: ThreadPoolExecutor, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        shutdown(pool, wait=False, cancel_futures=cancel_futures)
+        stopped.set()
+        shutdown(pool, wait=wait)
 
     def add(row: int) -> None:
         begun.append(row)
+        assert row == 0 or stopped.wait(HANG_S)
         raise DataError(f"row {row}", code=ErrorCode.NO_DATA)
 
+    monkeypatch.setattr(ThreadPoolExecutor, "shutdown", stop)
     with refused(ErrorCode.NO_DATA, "row 0"):
         list(map_rows(add, range(1000), threads=2))
-    assert len(begun) < 1000
+    assert len(begun) <= 3
 
 
 def test_samples_with_sub_bands_can_be_used_without_them(two_plates: Path, scan: Path) -> None:

@@ -114,14 +114,14 @@ def test_a_small_body_says_whether_one_medium_explains_it(metal, gains, optics):
 
 def receive_wall(voltages, wave_numbers, medium, wall_m):
     """Voltages [n, 2] of a wall in ray optics, its echo taken where the matched filter finds it, and their rise."""
-    sine = np.sin(voltages.theta)[:, None]
-    cos = np.cos(voltages.theta)[:, None]
+    sine = np.sin(voltages.theta)[..., None]
+    cos = np.cos(voltages.theta)[..., None]
     inner = np.sqrt(medium - sine**2)
     through = np.exp(-2j * wave_numbers * wall_m * inner)
-    faces = np.stack([(cos - inner) / (cos + inner), (medium * cos - inner) / (medium * cos + inner)], axis=1)
-    r_s, r_p = np.moveaxis(faces * (1 - through[:, None]) / (1 - faces**2 * through[:, None]), 1, 0)
+    faces = np.stack([(cos - inner) / (cos + inner), (medium * cos - inner) / (medium * cos + inner)])
+    r_s, r_p = faces * (1 - through) / (1 - faces**2 * through)
     # The host's p is that of metal, -1, as s is.
-    echoes = voltages.m[..., :2] @ np.stack([r_s, -r_p], axis=1)
+    echoes = voltages.m[..., :1] * r_s - voltages.m[..., 1:2] * r_p
     paths_m = np.linspace(-0.02, 0.06, 161)
     matched = np.exp(1j * np.outer(paths_m, wave_numbers - wave_numbers.mean()))
     echoes = echoes * matched[np.abs(echoes[:, 0] @ matched.T).mean(axis=0).argmax()]
@@ -134,7 +134,7 @@ def test_no_drawn_wall_gets_a_permittivity_that_is_not_its_own(metal, gains, opt
     """Walls whose back face hardly shows: with limits of 10 and 2 % some had one, 7 to 15 % off."""
     learnt = gains(optics)
     voltages = find_voltages(metal[np.arange(0, len(metal), 4)], optics)
-    flat = 0 * voltages.theta
+    flat = 0 * voltages.bend_inside
     voltages = replace(voltages, bend_inside=flat, bend_across=flat, twist=flat)
     gain = np.exp(learnt.level(voltages.arrival))
     gain = np.stack([gain, gain / learnt.ratio(voltages.arrival)], axis=1)

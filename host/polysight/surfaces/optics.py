@@ -12,6 +12,7 @@ At a curved surface they differ from Fresnel's to first order in K / k (`reflect
   enters, and the same across it, where the angle grows by its square and the plane of incidence turns: s and p mix.
 * curvature may be twisted between both directions: then a cylinder's wave and the sum over directions couple s and p
   (`mix_twisted`).
+* a spherical wave of a finite path holds directions, too (`reflect_spherical`), at a plane as well.
 The first is Snyder and Love (IEEE Trans. MTT 23, 134, 1975) and, for metal, the second term of Luneberg and Kline; the
 second is the next order of the stationary phase (Felsen and Marcuvitz, section 4.2). All are linear in K.
 """
@@ -66,7 +67,10 @@ def _carry(start: Array, ends: Array, vector: NDArray) -> NDArray:
 
 @dataclass(frozen=True)
 class Optics:
-    """The antennas of a rig as H and V use them: TX, and the middle of the RX of each receiver."""
+    """The antennas of a rig as H and V use them: TX, and the middle of the RX of each receiver.
+
+    `wave_number`: at the middle of the band, where echoes have their phases; 1 / m.
+    """
 
     tx: Antenna
     h: Antenna
@@ -91,10 +95,13 @@ def make_optics(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) ->
     tx = aim_antenna(tx_m, _compute_boresight(rig.transmitter), receivers[0], plane_m, (half, half))
     h = aim_antenna(receivers[0], _compute_boresight(rig.receivers[0]), tx_m, plane_m, (1.0, 0.0))
     v = aim_antenna(receivers[1], _compute_boresight(rig.receivers[1]), tx_m, plane_m, (0.0, 1.0))
-    sweep = rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2
-    return Optics(
-        tx, replace(h, leakage=leakage[0]), replace(v, leakage=leakage[1]), 2 * np.pi * sweep / SPEED_OF_LIGHT_M_S
-    )
+    # Echoes have the phase at the middle of the linear samples. At another wave number H / V would turn by the
+    # difference of their paths, 0.7 mm at the metal sphere.
+    chirp = rig.chirp
+    first, end = chirp.linear_samples
+    middle_hz = chirp.first_sample_hz + chirp.hz_per_sample * (first + end - 1) / 2
+    wave_number = 2 * np.pi * middle_hz / SPEED_OF_LIGHT_M_S
+    return Optics(tx, replace(h, leakage=leakage[0]), replace(v, leakage=leakage[1]), wave_number)
 
 
 def _compute_boresight(board: Board) -> Array:
@@ -228,6 +235,25 @@ def reflect_curved(
         beside = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other_flat - r) / sin**2)
         coefficients.append(local + inside + beside)
     return coefficients[0], coefficients[1]
+
+
+def reflect_spherical(
+    eps: NDArray | complex, theta: Array, path_m: Array, wave_number: float
+) -> tuple[Complex, Complex]:
+    """Additions to (r_s, r_p) [n] for a spherical wave of a finite path, to first order in 1 / (k path).
+
+    The sum over directions of a plane: <d theta^2> = j / (k path), in the plane of incidence and across it.
+    """
+    flat = reflect_flat(eps, theta)
+    above = reflect_flat(eps, theta + ANGLE_STEP)
+    below = reflect_flat(eps, theta - ANGLE_STEP)
+    spread = 1j / (2 * wave_number * path_m)
+    additions = []
+    for r, up, down in zip(flat, above, below, strict=True):
+        first = (up - down) / (2 * ANGLE_STEP)
+        second = (up - 2 * r + down) / ANGLE_STEP**2
+        additions.append(spread * (second + first / np.tan(theta)))
+    return additions[0], additions[1]
 
 
 def mix_twisted(eps: NDArray | complex, theta: Array, twist: Array, wave_number: float) -> Complex:

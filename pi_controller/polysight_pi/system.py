@@ -37,7 +37,7 @@ def prepare_process() -> list[str]:
     """
     gc.freeze()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    refused = _list_schedule(OTHERS_PRIORITY)
+    refused = _request_real_time(OTHERS_PRIORITY)
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(_MCL_CURRENT_FUTURE_ONFAULT) != 0:
         refused.append(
@@ -51,11 +51,12 @@ def prepare_thread(priority: int = PRIORITY) -> list[str]:
     """Set the trigger thread's priority and the shortest timer slack. Returns as :func:`prepare_process`."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) != 0:
-        return ["timer slack stays at 50 us: pulses may be that late", *_list_schedule(priority)]
-    return _list_schedule(priority)
+        return ["timer slack stays at 50 us: pulses may be that late", *_request_real_time(priority)]
+    return _request_real_time(priority)
 
 
-def _list_schedule(priority: int) -> list[str]:
+def _request_real_time(priority: int) -> list[str]:
+    """Give this thread a real-time priority; return a sentence with the remedy if that is not allowed."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as e:
@@ -69,7 +70,10 @@ def notify_systemd(state: str) -> None:
     address = os.environ.get("NOTIFY_SOCKET", "")
     if address:
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as s:
-            s.sendto(state.encode("ascii"), "\0" + address[1:] if address.startswith("@") else address)
+            # "@" stands for the zero byte that begins the name of an abstract socket.
+            if address.startswith("@"):
+                address = "\0" + address[1:]
+            s.sendto(state.encode("ascii"), address)
 
 
 class MemoryWatch(threading.Thread):
@@ -115,7 +119,7 @@ class MemoryWatch(threading.Thread):
         """Shut down the TCP connections at the ports (ZeroMQ closes them). Return their number."""
         cut = 0
         for link in Path("/proc/self/fd").iterdir():
-            # Closed meanwhile, or not connected
+            # OSError: the socket was closed meanwhile, or is not connected.
             with suppress(OSError):
                 if not str(link.readlink()).startswith("socket:"):
                     continue

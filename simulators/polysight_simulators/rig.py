@@ -110,7 +110,7 @@ class Child:
     @property
     def ready(self) -> bool:
         """True if it has printed `ready`."""
-        return any(line.startswith("ready") for line in self._format_lines())
+        return any(line.startswith("ready") for line in self._read_log())
 
     def check(self) -> None:
         """Raise DeviceError with the last lines of its log if the process has ended."""
@@ -124,9 +124,9 @@ class Child:
 
     def last_lines(self) -> str:
         """Return the end of its log."""
-        return "\n".join(f"    {line}" for line in self._format_lines()[-_LOG_LINES:])
+        return "\n".join(f"    {line}" for line in self._read_log()[-_LOG_LINES:])
 
-    def _format_lines(self) -> list[str]:
+    def _read_log(self) -> list[str]:
         return self.log.read_text(encoding="utf-8", errors="replace").splitlines()
 
     def send_signal(self, number: signal.Signals) -> None:

@@ -60,10 +60,10 @@ class HostHeartbeat:
         self._alive = m.pack(m.Alive(scan_id=scan_id, owner=owner))
         self._interval_s = interval_s
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._take_heartbeat, name="heartbeat", daemon=True)
+        self._thread = threading.Thread(target=self._send_heartbeats, name="heartbeat", daemon=True)
         self._thread.start()
 
-    def _take_heartbeat(self) -> None:
+    def _send_heartbeats(self) -> None:
         # Without permission for real time, a busy machine may delay a heartbeat and so cause a retake.
         take_priority(REAL_TIME)
         try:

@@ -40,6 +40,7 @@ Not included: raw data, images, labels, keys. Words from files in pi.key_dir, an
 this computer.
 """
 HIDDEN = "[removed]"
+# Limits of the archive: lines of a manifest, numbers of scans, logs and traces, and bytes of a file.
 _LINES = 60
 _SCANS = 3
 _LOGS = 20
@@ -50,12 +51,15 @@ _KEY_BYTES = 64 << 10
 _MANIFEST_BYTES = 64 << 20
 _KERNEL = ("proc/version", "proc/sys/net/core/rmem_max", "proc/sys/net/core/rmem_default", "proc/loadavg",
            "proc/meminfo", "proc/net/udp", "proc/net/snmp")  # fmt: skip
+# Values that a name like `token` or `password`, or the word "bearer", announces.
 _NAMED = re.compile(
     r"""(?ix)((?:[\w-]*(?:secret|token|password|passwd|passphrase|psk)[\w-]*|(?:private|public|curve|api)[_-]?key
     |authorization)["']?\s*[=:]\s*["']?(?:bearer\s+|basic\s+)?|\bbearer\s+)
     ((?<=")[^"\n]+|(?<=')[^'\n]+|[^\s"',}]{2,})"""
 )
+# The password of `https://user:password@host`.
 _IN_URL = re.compile(r"(://[^\s/:@]+:)[^\s/@]+(?=@)")
+# Access tokens of GitHub, GitLab, OpenAI, Slack and AWS have these beginnings.
 _TOKENS = re.compile(r"\b(?:gh[opsu]_|github_pat_|glpat-|sk-|xox[abp]-|AKIA)[A-Za-z0-9_-]{10,}")
 _PEM = re.compile(r"-----BEGIN [^-]*KEY-----.*?(?:-----END [^-]*KEY-----|\Z)", re.DOTALL)
 
@@ -70,6 +74,7 @@ class Redactor:
                 for path in sorted(p for p in folder.iterdir() if p.is_file()):
                     with suppress(OSError, DataError):
                         text = read_bounded(path, _KEY_BYTES).decode("utf-8", "replace")
+                        # Shorter words are no keys: removing them would make the files unreadable.
                         words |= {w for w in re.split(r"[\s\"'=]+", text) if len(w) >= 16}
         self._words = sorted(words, key=len, reverse=True)
 
@@ -119,7 +124,7 @@ def _collect_contents(
     yield "findings.txt", text
     yield "findings.json", json.dumps([finding_facts(f) for f in findings], indent=1)
     yield "versions.json", json.dumps(_list_versions(), indent=1)
-    yield "kernel.txt", _read_kernel_log(root)
+    yield "kernel.txt", _describe_kernel(root)
     yield "network.json", json.dumps(_describe_network(root), indent=1)
     if (config := _read_tail(options.config, _TAIL_BYTES)) is not None:
         # Comments are for who wrote them, and whoever is told of a scan's end may be reached by a secret address.
@@ -168,7 +173,7 @@ def _list_versions() -> dict[str, object]:
     return {**versions(), **system, "cores": os.cpu_count(), "packages": dict(sorted(installed.items()))}
 
 
-def _read_kernel_log(root: Path) -> str:
+def _describe_kernel(root: Path) -> str:
     limits = ("RLIMIT_RTPRIO", "RLIMIT_MEMLOCK", "RLIMIT_NOFILE", "RLIMIT_NICE")
     parts = [f"{platform.uname()}", *(f"{name} {resource.getrlimit(getattr(resource, name))}" for name in limits)]
     for name in _KERNEL:

@@ -230,19 +230,19 @@ def inspect_placement(file: Path, as_json: bool) -> int:
                 "the scan was simulated without cards, or recorded by an older release",
                 "`polysight validate SCAN` says whether it is whole",
             )
-    placed = place_again(row)
+    result = place_again(row)
     # A row whose frames were moved to their pulses cannot be compared range by range.
-    same = placed.by_pulses or placed.missing_before == placed.placed.missing
+    same = result.by_pulses or result.missing_before == result.placed.missing
     if as_json:
-        print_json({**placed.placed.facts(), "committed_missing": placed.missing_before, "same": same})
+        print_json({**result.placed.facts(), "committed_missing": result.missing_before, "same": same})
     else:
-        sys.stdout.write("\n".join(_format_placement(file, placed, same)) + "\n")
+        sys.stdout.write("\n".join(_format_placement(file, result, same)) + "\n")
     return exit_status(same)
 
 
-def _format_placement(file: Path, again: PlacedAgain, same: bool) -> list[str]:
-    placed = again.placed
-    evidence = again.evidence
+def _format_placement(file: Path, result: PlacedAgain, same: bool) -> list[str]:
+    placed = result.placed
+    evidence = result.evidence
     counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(placed.counts).items() if n)
     start = "known from the record before, or from a reset"
     if evidence.past.start is None:
@@ -263,7 +263,7 @@ def _format_placement(file: Path, again: PlacedAgain, same: bool) -> list[str]:
     ]
     if evidence.dropped_by_card:
         lines.append(f"card       dropped data before numbering it ({evidence.dropped_by_card})")
-    if again.by_pulses:
+    if result.by_pulses:
         lines.append("committed  with its frames at their pulses")
     elif same:
         lines.append("committed  the same")

@@ -236,7 +236,7 @@ class _Fields:
 
     def explain(self, slopes: Real, noise: Real) -> _Explained:
         """Return what the slopes [2, plate] of one part and their errors tell, for each of `shared`."""
-        parts = [_stack_arrays(self._explain(slopes, noise, *shared)) for shared in self.shared]
+        parts = [_list_arrays(self._explain(slopes, noise, *shared)) for shared in self.shared]
         return _Explained(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _explain(
@@ -316,7 +316,7 @@ class _Explained:
     @classmethod
     def average_over(cls, parts: Sequence[_Explained]) -> _Explained:
         """Return one case for all cases of `parts`, weighed by their evidence."""
-        together = cls(*(np.concatenate(arrays) for arrays in zip(*map(_stack_arrays, parts), strict=True)))
+        together = cls(*(np.concatenate(arrays) for arrays in zip(*map(_list_arrays, parts), strict=True)))
         largest = float(together.log_evidence.max())
         weight = np.exp(together.log_evidence - largest)
         average = together.average(weight / weight.sum())
@@ -324,7 +324,7 @@ class _Explained:
 
     def average(self, weight: Real) -> _Explained:
         """Return one case, the average with weights [case]."""
-        return _Explained(*(np.tensordot(weight, array, 1)[None] for array in _stack_arrays(self)))
+        return _Explained(*(np.tensordot(weight, array, 1)[None] for array in _list_arrays(self)))
 
     @property
     def std(self) -> Real:
@@ -337,5 +337,5 @@ class _Explained:
         return np.sqrt(np.maximum(self.drift_square - self.drift**2, 0.0))
 
 
-def _stack_arrays(explained: _Explained) -> tuple[Real, ...]:
+def _list_arrays(explained: _Explained) -> tuple[Real, ...]:
     return tuple(getattr(explained, field.name) for field in fields(explained))

@@ -374,20 +374,20 @@ def layer_content(fit: LayerFit) -> dict[str, Any]:
     else:
         covariance = (fit.covariance * np.outer(units, units)).tolist()
     return {
-        **_read_solution(fit),
+        **_describe_solution(fit),
         "std_real": fit.std_real,
         "std_loss": fit.std_loss,
         "thickness_std_mm": 1e3 * fit.std_thickness_m if has_thickness else None,
         "covariance": covariance,
         "freedom": fit.freedom,
         "ambiguous": fit.ambiguous,
-        "rivals": [_read_solution(r) for r in fit.rivals],
+        "rivals": [_describe_solution(r) for r in fit.rivals],
         "at_limit": list(fit.at_limit),
         "warnings": fit.warnings(),
     }
 
 
-def _read_solution(fit: LayerFit) -> dict[str, Any]:
+def _describe_solution(fit: LayerFit) -> dict[str, Any]:
     return {
         "permittivity": [fit.permittivity.real, -fit.permittivity.imag],
         "thickness_mm": None if fit.thickness_m is None else 1e3 * fit.thickness_m,

@@ -58,11 +58,11 @@ def read_scene(path: Path, rig: Instrument) -> tuple[Instrument, list[Plate]]:
         table[name] = {**table[name], **scene.get(name, {})}
     if "object_distance_mm" in scene:
         table["geometry"] = {**table["geometry"], "object_distance_mm": scene["object_distance_mm"]}
-    plates = [_place_plate(raw, path) for raw in scene.get("plates", [])]
+    plates = [_decode_plate(raw, path) for raw in scene.get("plates", [])]
     return decode(table, Instrument, str(path)), [plate for plate in plates if not plate.background]
 
 
-def _place_plate(raw: Mapping[str, Any], path: Path) -> Plate:
+def _decode_plate(raw: Mapping[str, Any], path: Path) -> Plate:
     known_keys = {key: value for key, value in raw.items() if key in Plate.__struct_fields__}
     return decode(known_keys, Plate, f"{path}: plates")
 

@@ -216,13 +216,13 @@ def _summarise_result(scan: products.ProcessedScan, result: MaterialsResult) -> 
     count = scan.plates_named
     if count is None:
         return (head,)
-    names = f"{count.right} of {count.plates} plates named right{_count_right_pixels(result)}"
+    names = f"{count.right} of {count.plates} plates named right{_describe_accuracy(result)}"
     if count.strange:
         names += f"; {count.strange} not in the library, and called unknown"
     return (head, names)
 
 
-def _count_right_pixels(result: MaterialsResult) -> str:
+def _describe_accuracy(result: MaterialsResult) -> str:
     accuracy = pixel_accuracy(result)
     expected = predict_pixel_accuracy(result)
     if accuracy is None:

@@ -185,13 +185,13 @@ def write_item(out: Path, item: Item, origin: Origin = SIMULATED) -> dict[str, b
             name = f"{item.key}.csv"
         else:
             name = f"{item.key}-{i + 1}.csv"
-        write_atomically(out / name, _write_csv(table, origin).encode("utf-8"))
+        write_atomically(out / name, _format_csv(table, origin).encode("utf-8"))
     head = {"item": item.key, "title": item.title, "simulated": origin.simulated}
     write_json(out / f"{item.key}.json", {**head, **item.data})
     return pictures
 
 
-def _write_csv(table: Table, origin: Origin) -> str:
+def _format_csv(table: Table, origin: Origin) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerows([[f"{origin.word}: {table.caption}"], table.head, *table.rows])

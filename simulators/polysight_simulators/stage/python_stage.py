@@ -152,7 +152,7 @@ class PythonStage:
         while True:
             event = self._logic.service(self._now_ms)
             if event is Event.DONE:
-                self._outcome = self._finish_motion()
+                self._outcome = self._format_done()
                 self._send(self._outcome)
             elif event is Event.ALARM:
                 alarm = Reply("alarm", number=int(self._logic.alarm or 0)).encode()
@@ -262,7 +262,7 @@ class PythonStage:
         self._last_answer = answer.encode()
         self._send(self._last_answer)
 
-    def _finish_motion(self) -> bytes:
+    def _format_done(self) -> bytes:
         engine = self._engine
         logic = self._logic
         fields = {}

@@ -303,7 +303,7 @@ def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_
     """With the line low all the time."""
 
     def findings(rig, **settings):
-        environment = gpio.environment(rig.pi.gpio_chip, hub, wire_time=True, spi=rig.pi.spi_device, **settings)
+        environment = gpio.environment(rig.pi.gpio_chip, hub, spi=rig.pi.spi_device, exact="1", **settings)
         printed = run("check", "--json", "--config", write_config(rig), **environment).stdout
         return {f["name"]: f for f in json.loads(printed)}
 

@@ -7,8 +7,7 @@
  *   GPIOSHIM_LABEL, GPIOSHIM_LINES                                    label and size of the chip
  *   GPIOSHIM_FAULTS=denied,no-edges,busy:LINE,slow:US,stuck           faults from the start
  *   GPIOSHIM_SPI=PATH      a spidev device beside it: spidev.c
- *   GPIOSHIM_CLOCK=wires   edges carry their wire time, which the thread that reads them uses, as does one that only makes
- *                          transfers of SPI, from the first on: a sleep returns at once and
+ *   GPIOSHIM_CLOCK=wires   edges carry their wire time, which the thread that reads them uses: a sleep returns at once and
  *                          takes exactly its duration. So a burst is exact even on a busy machine. The chip reports a
  *                          hardware timestamp engine: its clock is not the program's
  *   SIGUSR1                                                           the chip vanishes, as when a driver is unloaded

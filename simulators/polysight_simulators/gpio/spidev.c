@@ -5,6 +5,7 @@
  *   GPIOSHIM_MISO=0        the return wire from MOSI to MISO is off; it is there where nothing is said
  *   GPIOSHIM_BUFSIZ=BYTES  of spidev's buffer, 4096 where nothing is said
  *   GPIOSHIM_CORE_HZ=A,B   the core clock as the driver believes it to be, and as it is; 250 MHz
+ *   GPIOSHIM_EXACT=1       a thread lives in wire time from its first transfer on, in which each takes exactly its duration
  *
  * From Linux: what spidev refuses (drivers/spi/spidev.c), the even divisor of the core clock that is never faster than
  * asked for (spi-bcm2835.c). The most significant bit goes first, MOSI stays as the last bit left it, and a transfer that
@@ -25,6 +26,7 @@
 static unsigned mosi = 10, bufsiz = 4096;
 static int returned = 1;
 static double believed_hz = 250e6, core_hz = 250e6;
+static int exact;
 
 void read_spi_settings(void) {
   const char *line = getenv("GPIOSHIM_MOSI"), *bytes = getenv("GPIOSHIM_BUFSIZ"), *clock = getenv("GPIOSHIM_CORE_HZ");
@@ -33,6 +35,7 @@ void read_spi_settings(void) {
   if (miso) returned = atoi(miso);
   if (bytes) bufsiz = atoi(bytes);
   if (clock) sscanf(clock, "%lf,%lf", &believed_hz, &core_hz);
+  exact = getenv("GPIOSHIM_EXACT") != 0;
 }
 
 static double bit_ns(uint32_t asked_hz) {
@@ -51,7 +54,7 @@ static int transfer(const struct spi_ioc_transfer *t, unsigned n) {
     if (t[i].bits_per_word != 0 && t[i].bits_per_word != 8) return -EINVAL;
     if (bytes > bufsiz) return -EMSGSIZE;
   }
-  if (wire_clock && !thread_ns) thread_ns = now_ns(CLOCK_MONOTONIC);
+  if (exact && !thread_ns) thread_ns = now_ns(CLOCK_MONOTONIC);
   for (unsigned i = 0; i < n; i++) {
     const uint8_t *sent = (const uint8_t *)(uintptr_t)t[i].tx_buf;
     const double bit = bit_ns(t[i].speed_hz);

@@ -343,7 +343,7 @@ class ReceiverProcess:
     def poll(self) -> Progress:
         """Return the latest progress that the process has sent, without waiting."""
         while self._connection.poll():
-            self._take(self._receive_answer())
+            self._note_answer(self._receive_answer())
         return self._progress
 
     def report(self, not_before_ns: int = 0) -> Progress:
@@ -373,7 +373,7 @@ class ReceiverProcess:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _take(self, answer: Answer) -> None:
+    def _note_answer(self, answer: Answer) -> None:
         if isinstance(answer, Progress):
             self._progress = answer
         elif isinstance(answer, Failed):
@@ -401,7 +401,7 @@ class ReceiverProcess:
         deadline = time.monotonic() + timeout_s
         while self._connection.poll(max(0.0, deadline - time.monotonic())):
             answer = self._receive_answer()
-            self._take(answer)
+            self._note_answer(answer)
             if isinstance(answer, kind):
                 return answer
         raise DeviceError(

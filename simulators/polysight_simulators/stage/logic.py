@@ -12,7 +12,7 @@ from polysight_simulators.stage.motion import EMERGENCY, LOOKS, MAX_RATE, MIN_RA
 MAX_TRAVEL = 999_999
 MAX_POINTS = 9_999
 MAX_BACKLASH = 20_000
-# Homing: rates in steps/s, the first leg in steps.
+# Homing: rates in steps/s, distances in steps.
 HOME_RATE = 4000
 CREEP_RATE = 400
 FIRST_RATE = 2000
@@ -20,8 +20,9 @@ FIRST_LEG = 2000
 STEPS_PER_MM = 200
 PULL_OFF = 400
 MAX_RELEASE = 4000
-# Steps/s^2
+# Acceleration of homing, steps/s^2.
 HOME_ACCEL = 40_000
+# A byte that comes this long after the one before stands alone: a heartbeat, no part of a noisy line.
 QUIET_MS = 4
 _RANGES = {
     Parameter.ACCEL: (100, 1_000_000),
@@ -96,18 +97,38 @@ class StageLogic:
             Parameter.BACKLASH: 0,
             Parameter.PINS: 0,
         }
-        # Idle, move, travel, row, home
+        # "idle", "move", "travel" (to the start of a row), "row", "home" or "buzz".
         self.activity = "idle"
         self.alarm: StageError | None = None
-        self.homed = self.held = self.row_command = self.heard = self.status_requested = False
+        self.homed = False
+        self.held = False
+        self.row_command = False
+        self.homing_command = False
+        self.status_requested = False
+        # A byte that counts as a heartbeat came; cleared when its time is noted.
+        self.heard = False
+        # Why the motion is to end once the stage rests.
         self._stopping: StageError | None = None
-        self._enabled = self._stop = self._resume = self._homing_leg_made = False
-        self._byte_seen = self._resume_begun = self._knew = self.homing_command = False
+        self._enabled = False
+        self._stop = False
+        self._resume = False
+        # RESUME counts only when it comes twice in a row; True after the first.
+        self._resume_begun = False
+        self._byte_seen = False
         self._quiet = True
-        self._found = self._searched = 0
+        # Homing: whether the stage was homed before, the switches found so far, and the steps of the present search.
+        self._was_homed = False
+        self._found_switches = 0
+        self._searched_steps = 0
+        self._homing_leg_made = False
         self._buzz_x = True
-        self._phase = self._heard_ms = self._byte_ms = self._looked_ms = 0
-        self.lost_x = self.lost_y = 0
+        # Leg of a homing or a buzz.
+        self._phase = 0
+        self._heard_ms = 0
+        self._byte_ms = 0
+        self._looked_ms = 0
+        self.lost_x = 0
+        self.lost_y = 0
         self._row_leg = Leg(0, 0, MIN_RATE)
         self._row_y = 0
 
@@ -169,9 +190,10 @@ class StageLogic:
     def _home(self) -> None:
         self._begin("home")
         self._engine.set_accel(HOME_ACCEL)
-        self._knew = self.homed
+        self._was_homed = self.homed
         self.homed = False
-        self._phase = self._searched = 0
+        self._phase = 0
+        self._searched_steps = 0
 
     def _buzz(self, axis: int) -> None:
         _require(axis in (0, 1), StageError.OUT_OF_RANGE)
@@ -347,25 +369,25 @@ class StageLogic:
         travel = self.parameters[Parameter.TRAVEL_X if along_x else Parameter.TRAVEL_Y]
         farthest = travel + travel // 10 + PULL_OFF
         if self._homing_leg_made and step == 0 and self._engine.reached:
-            self._found |= its_switch
-        searches_on = step == 0 and not self._found & its_switch and self._searched < farthest
+            self._found_switches |= its_switch
+        searches_on = step == 0 and not self._found_switches & its_switch and self._searched_steps < farthest
         if self._homing_leg_made and not searches_on:
             if self._engine.reached != (self._phase % 3 != 2):
                 return self._raise(StageError.HOMING_FAILED, True)
             if self._phase == 2:
-                if self._knew:
+                if self._was_homed:
                     self.lost_x = -self._engine.x
                 else:
                     self.lost_x = 0
                 self._engine.x = 0
             if self._phase == 5:
-                if self._knew:
+                if self._was_homed:
                     self.lost_y = -self._engine.y
                 else:
                     self.lost_y = 0
                 self._engine.y = 0
             self._phase += 1
-            self._searched = 0
+            self._searched_steps = 0
             self._homing_leg_made = False
             return self._plan_homing_leg()
         if self._phase == 6:
@@ -378,7 +400,7 @@ class StageLogic:
         if searches_on:
             distance = -FIRST_LEG
             rate = FIRST_RATE
-            self._searched += FIRST_LEG
+            self._searched_steps += FIRST_LEG
         if along_x:
             leg = Leg(distance, 0, rate, until=SWITCH_X, until_open=step == 1)
         else:

@@ -30,6 +30,8 @@ UNIT_GAINS = Gains(
     degree=0,
     std=0.0,
     covered=(np.full(2, -1.0), np.full(2, 1.0)),
+    terms_root=np.zeros((1, 1)),
+    cell=np.full(2, np.inf),
 )
 
 
@@ -97,3 +99,17 @@ def test_a_level_that_a_badly_known_rig_explains_does_not_refuse_a_segment():
     badly_known, _ = judge_medium(fit, loud, UNIT_GAINS, [moved], WAVE_NUMBER)
     assert well_known > 0.2
     assert badly_known == 0
+
+
+def test_a_wide_object_averages_over_what_a_reference_leaves_and_a_flat_one_does_not():
+    known = replace(UNIT_GAINS, degree=2, std=0.004, terms_root=np.zeros((6, 1)), cell=np.full(2, 0.05))
+    x, y = np.meshgrid(np.arange(8) * 0.05 + 0.01, np.arange(8) * 0.05 + 0.01)
+    directions = np.stack([x.ravel(), y.ravel()], axis=1)
+
+    def find_std_of_mean(arrival: np.ndarray) -> float:
+        return float(np.linalg.norm(known.list_errors(arrival).mean(axis=1)))
+
+    assert find_std_of_mean(directions[:1]) == pytest.approx(0.004)
+    assert find_std_of_mean(directions) == pytest.approx(0.004 / 8)
+    # Beyond the directions that the reference covers all points are wrong together.
+    assert find_std_of_mean(directions + 1.5) > 0.05

@@ -203,6 +203,8 @@ class Gains:
         Standard deviation of each part of ln(H / V) within the directions covered.
     covered
         Smallest and largest direction, [2] each.
+    terms_root, cell
+        Root of the covariance of each part of `ratio_terms`, [terms, blocks]; directions so close [2] have one misfit.
     """
 
     ratio_terms: Complex
@@ -212,6 +214,8 @@ class Gains:
     degree: int
     std: float
     covered: tuple[Array, Array]
+    terms_root: Array
+    cell: Array
 
     def ratio(self, arrival: Array) -> Complex:
         """Gain of H over that of V, [n]."""
@@ -223,10 +227,25 @@ class Gains:
 
     def estimate_unknown_std(self, arrival: Array) -> Array:
         """Standard deviation of ln(H / V) by directions that the reference does not cover, [n]."""
+        return np.hypot(self.std, self._extrapolate_std(arrival))
+
+    def _extrapolate_std(self, arrival: Array) -> Array:
         low, high = self.covered
         beyond = np.linalg.norm(np.maximum(0, np.maximum(low - arrival, arrival - high)), axis=1)
         slope = UNKNOWN_SLOPE if self.degree == 0 else UNKNOWN_SLOPE / 4
-        return np.hypot(self.std, slope * beyond)
+        return slope * beyond
+
+    def list_errors(self, arrival: Array) -> Array:
+        """Independent errors of each part of ln(H / V), one standard deviation each, [errors, n].
+
+        What the polynomials do not follow differs from cell to cell of the directions; a wide object averages over it.
+        Errors of the polynomials' terms are common to all directions, and so is what lies beyond those covered.
+        """
+        of_terms = self._make_basis(arrival) @ self.terms_root
+        cells = np.floor((arrival - self.middle) / self.cell)
+        number = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+        of_cells = self.std * (number == np.arange(number.max() + 1)[:, None])
+        return np.concatenate([of_terms.T, of_cells, self._extrapolate_std(arrival)[None]])
 
     def _make_basis(self, arrival: Array) -> Array:
         return _evaluate_polynomials(arrival - self.middle, self.degree)
@@ -271,14 +290,22 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     # The next order of metal's own correction, r_p / r_s = 1 + first order.
     first_order = np.abs(coefficients[sound, 0, 1] / coefficients[sound, 0, 0] - 1)
     next_order = float(np.median(first_order * expansion_parameter(metal, wave_number)))
+    std = float(np.hypot(_compute_misfit_std(rest, metal.at_m), next_order))
+    # How the direction changes with the stage; a plate has one direction.
+    rate = np.linalg.lstsq(metal.at_m - metal.at_m.mean(axis=0), metal.arrival - middle, rcond=None)[0]
+    cell = BLOCK_M * np.linalg.norm(rate, axis=0) if degree else np.full(2, np.inf)
+    block = number_blocks(metal.at_m, (0.0, 0.0))
+    of_blocks = np.stack([np.bincount(block, term) / np.bincount(block) for term in basis.T], axis=1)
     return Gains(
         ratio_terms=ratio_terms,
         level_terms=level_terms,
         band_rise=np.median(metal.band_rise, axis=0),
         middle=middle,
         degree=degree,
-        std=float(np.hypot(_compute_misfit_std(rest, metal.at_m), next_order)),
+        std=std,
         covered=(low, high),
+        terms_root=np.asarray(std * np.linalg.pinv(of_blocks), np.float64),
+        cell=np.asarray(cell, np.float64),
     )
 
 
@@ -534,14 +561,14 @@ def add_common_errors(
 
     # An error of ln(H / V) of the reference turns and scales b_H.
     of_h = miss + v.b[:, 1] * receive(v, coefficients)[:, 0]
-    reference_change = of_h * gains.estimate_unknown_std(v.arrival)
+    reference_changes = (fit.answer * of_h) @ gains.list_errors(v.arrival).T
     flat_s, flat_p = reflect_flat(fit.eps, v.theta)
     flat = np.stack([flat_s, flat_p, 0 * flat_s, 0 * flat_s], axis=2)
     first_order = find_misses(v, gains, flat) - miss
     model_change = first_order * (expansion_parameter(v, wave_number) + CURVATURE_ERROR)
-    # Their phases are not known.
+    # Their phases are not known: both parts of each count.
+    sources["reference"] = (reference_changes @ reference_changes.conj().T).real
     for phase in (1, 1j):
-        add("reference", (fit.answer @ (phase * reference_change)).real)
         add("model", (fit.answer @ (phase * model_change)).real)
     return sources
 

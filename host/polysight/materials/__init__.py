@@ -17,7 +17,6 @@ from polysight.materials.analyse import (
     KnownScene,
     Optics,
     analyse,
-    image_centre_mm,
     name_permittivity,
     permittivity_change,
 )
@@ -90,7 +89,16 @@ from polysight.materials.result import (
     predict_pixel_accuracy,
     read_patches,
 )
-from polysight.materials.segment import Box, SegmentSettings, TruthPlate, axis_mm, box_mask, insides, match_truth
+from polysight.materials.segment import (
+    Box,
+    SegmentSettings,
+    TruthPlate,
+    axis_mm,
+    box_mask,
+    image_centre_mm,
+    insides,
+    match_truth,
+)
 from polysight.materials.sub_bands import (
     AMPLITUDE_ERROR,
     LAYER_FORMS,

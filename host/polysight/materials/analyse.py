@@ -66,7 +66,6 @@ from polysight.materials.segment import (
     SegmentSettings,
     TruthPlate,
     align,
-    axis_mm,
     find_patches_at_border,
     match_truth,
     segment,
@@ -247,7 +246,9 @@ def analyse(
     images, tilts = level(images, segmentation)
     theta = np.asarray(optics.theta_rad, np.float64)
     kinds = _list_kinds(classifier, float(np.mean(theta)))
-    scene = _Scene(images, segmentation, tilts, float(np.hypot(*apart_mm)), plane, optics, kinds)
+    scene = _Scene(
+        images=images, found=segmentation, tilts=tilts, apart_mm=apart_mm, plane=plane, optics=optics, kinds=kinds
+    )  # fmt: skip
     relative = _most_like_metal([scene.relative_to(metal) for metal in _references(images, known_scene, segmentation)])
     reference, raw, judged, solution = relative.metal, relative.raw, relative.judged, relative.solution
     labels = [p.label for p in judged]
@@ -503,9 +504,9 @@ class _Scene:
     """A scene before anything is divided by metal: images, patches, and what is known of the rig and of materials."""
 
     images: Images
-    segmentation: Segmentation
+    found: Segmentation
     tilts: Tilts
-    apart_mm: float
+    apart_mm: tuple[float, float]
     plane: PlaneReference | None
     optics: Optics
     kinds: Kinds
@@ -513,7 +514,7 @@ class _Scene:
     def relative_to(self, reference: MetalReference) -> _Relative:
         """Measure and solve the scene relative to this reference, and weigh whether it is metal."""
         images = self.images
-        found = self.segmentation
+        found = self.found
         theta = np.asarray(self.optics.theta_rad, np.float64)
         raw = to_metal(images, reference, self.plane)
         rh, rv = (smooth_inside(c, found, self.optics.smooth_px) for c in (raw.h, raw.v))
@@ -530,7 +531,7 @@ class _Scene:
             images=images,
             tilts=self.tilts,
         )
-        prior = seen.prior(self.optics.prior, self.apart_mm)
+        prior = seen.prior(self.optics.prior, float(np.hypot(*self.apart_mm)))
         dispersions = measure_dispersions(images, found, judged, reference.mask, self.plane)
         measured = [
             seen.measure(p, (rh, rv), _mean_angle(theta, p), d) for p, d in zip(judged, dispersions, strict=True)
@@ -539,7 +540,10 @@ class _Scene:
         if self.plane is None:
             labels = [p.label for p in judged]
             reference = _weigh_metal(images, reference, labels, solution, self.kinds)
-        return _Relative(reference, raw, refused, judged, seen, prior, measured, solution)
+        return _Relative(
+            metal=reference, raw=raw, refused=refused, judged=judged, seen=seen, prior=prior, measured=measured,
+            solution=solution,
+        )  # fmt: skip
 
 
 def _most_like_metal(relatives: Sequence[_Relative]) -> _Relative:
@@ -672,13 +676,6 @@ def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
             smoothed = smooth(np.where(inside, image[near], complex(np.nan, np.nan)).astype(image.dtype), sigma_px)
             out[near] = np.where(inside, smoothed, out[near])
     return out
-
-
-def image_centre_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[float, float]:
-    """Return the image centre in the rig frame, millimetres: the origin of boxes and outlines."""
-    x = np.asarray(x_m, np.float64)
-    y = np.asarray(y_m, np.float64)
-    return float(x[0] * 1e3 - axis_mm(x)[0]), float(y[0] * 1e3 - axis_mm(y)[0])
 
 
 def permittivity_change(found: MaterialsResult, angles: IncidenceChoice) -> dict[str, Any]:

@@ -146,6 +146,13 @@ def axis_mm(axis_m: npt.ArrayLike) -> Real:
     return (a - (a[0] + a[-1]) / 2) * 1e3
 
 
+def image_centre_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[float, float]:
+    """Return the image centre in the rig frame, millimetres: the origin of boxes and outlines."""
+    x = np.asarray(x_m, np.float64)
+    y = np.asarray(y_m, np.float64)
+    return float(x[0] * 1e3 - axis_mm(x)[0]), float(y[0] * 1e3 - axis_mm(y)[0])
+
+
 def box_mask(box_mm: Box, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Mask:
     """Return the pixels whose centres lie in a box (x0, y0, x1, y1), mm from the image centre; bool [ny, nx]."""
     x = axis_mm(x_m)

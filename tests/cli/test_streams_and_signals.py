@@ -69,7 +69,7 @@ def load(args):
     import slow_module
     while True:
         pass
-polysight.cli.materials._materials = load
+polysight.cli.materials._run_materials = load
 sys.exit(main(["materials", "x"]))
 """
 
@@ -116,7 +116,7 @@ INTERRUPT_THE_PI = """
 import signal, sys
 from polysight_pi import cli
 assert "msgspec" not in sys.modules
-cli._parser = lambda: signal.raise_signal(signal.SIGINT)
+cli._make_parser = lambda: signal.raise_signal(signal.SIGINT)
 sys.exit(cli.main([]))
 """
 

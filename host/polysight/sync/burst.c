@@ -107,7 +107,7 @@ static double median(const double *values, const uint8_t *usable, int chirps, do
     return count ? sorted[(count - 1) / 2] : 0;
 }
 
-/* `offsets._coherent`: usable chirps with at least GOOD of the median coherence of their position; returns their number. */
+/* `offsets._find_coherent`: usable chirps with at least GOOD of the median coherence of their position; returns their number. */
 static int choose_coherent(const double *coherence, const uint8_t *usable, int chirps, double *sorted, uint8_t *good)
 {
     double least = GOOD * median(coherence, usable, chirps, sorted);
@@ -148,7 +148,7 @@ static int drop_disturbed(const Work *w, Chirps *c, int count)
     return dropped;
 }
 
-/* `offsets._against_one`: offsets relative to one usable chirp; try another if it matches few of the others. Returns the
+/* `offsets._refer_to_one`: offsets relative to one usable chirp; try another if it matches few of the others. Returns the
    middle of the signal's band. */
 static double against_one(Work *w, Chirps *c, const int16_t *words)
 {

@@ -90,6 +90,7 @@ def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
     out = tmp_path / "out"
     make_products(process_rows(ScanFolder.load(scan), scan, Settings(model="none")), out, ())
     assert (out / "surface.npz").exists() == is_steep
+    assert ("surfaces" in read_products(out).quality.seconds_per_stage) == is_steep
     assert (b"Surfaces from three sides" in (out / "report.html").read_bytes()) == is_steep
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from polysight import surfaces
@@ -16,7 +17,7 @@ from polysight.imaging import BoardSamples
 from polysight.materials import STEEP, Classifier, name_permittivity
 from polysight.pipeline import Pipeline
 from polysight.process import load_classifier
-from polysight.products import read_products
+from polysight.products import QUALITY, read_products, write_json
 from polysight_shared.config import Instrument
 from polysight_shared.files import write_atomically
 
@@ -181,12 +182,17 @@ def has_steep_patch(products: Path) -> bool:
 def add_surfaces(pipeline: Pipeline, products: Path) -> None:
     """Measure the surfaces of a processed scan, write them beside its products, and write the report again with them.
 
-    The range gate is that of the images, so that only what lies near the object plane is seen.
+    The range gate is that of the images, so that only what lies near the object plane is seen. quality.json counts the
+    time.
     """
     from polysight.report import write_report
 
-    optics = make_rig_optics(pipeline.rig)
-    seen_rows = see_rows(pipeline, optics)
-    if len(seen_rows):
-        save_surface(products, analyse_points(pipeline, optics, seen_rows))
-        write_report(products, read_products(products))
+    with pipeline.quality.measure_time("surfaces"):
+        optics = make_rig_optics(pipeline.rig)
+        seen_rows = see_rows(pipeline, optics)
+        if len(seen_rows):
+            save_surface(products, analyse_points(pipeline, optics, seen_rows))
+    quality = read_products(products).quality
+    timed = msgspec.structs.replace(quality, seconds_per_stage=pipeline.quality.seconds_per_stage)
+    write_json(products / QUALITY, timed)
+    write_report(products, read_products(products))

@@ -336,6 +336,11 @@ class Quality:
             with self._lock:
                 self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
 
+    @property
+    def seconds_per_stage(self) -> dict[str, float]:
+        """Wall time of each stage, s, as quality.json holds it."""
+        return {stage: round(s, 4) for stage, s in self.seconds.items()}
+
     def result(
         self, verdict: Verdict | None = None, pixel_accuracy: float | None = None, backlash: bool = True
     ) -> ScanQuality:
@@ -344,7 +349,7 @@ class Quality:
             **self.notes,
             boards={name: board.summary(backlash) for name, board in self.boards.items()},
             coverage=self.coverage(),
-            seconds_per_stage={stage: round(s, 4) for stage, s in self.seconds.items()},
+            seconds_per_stage=self.seconds_per_stage,
             verdict=verdict or UNSET,
             pixel_accuracy=pixel_accuracy,
         )

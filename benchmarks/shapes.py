@@ -49,8 +49,8 @@ DISTURBANCES: dict[str, dict[str, float]] = {
     "all": {"misplaced_mm": 1.0, "axes_deg": 2.0, "leakage": 0.05},
 }
 # Standard errors that the host is told: those of the disturbance (each axis of a place, each part of a leakage), and
-# what a rig that stands as its file says is known to.
-EXACT = surfaces.Uncertainty(leakage=0.001, axis_rad=0.001, place_m=0.00001)
+# none of a rig that stands as its file says.
+EXACT = surfaces.Uncertainty(leakage=0.0, axis_rad=0.0, place_m=0.0)
 PLACES = {"place_m": 0.001 / np.sqrt(3)}
 AXES = {"axis_rad": float(np.radians(2.0))}
 LEAKAGE = {"leakage": 0.05 / np.sqrt(2)}

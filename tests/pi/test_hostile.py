@@ -176,7 +176,8 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
         if host.subscriber.poll(0):
             event = m.unpack_event(host.subscriber.recv_multipart()[-1])
             if isinstance(event, m.RowFinished):
-                assert (event.status, event.pulses) == ("done", instrument.grid.columns * instrument.burst.pulses)
+                pulses = instrument.grid.columns * instrument.burst.pulses
+                assert (event.status, event.pulses) == ("done", pulses), event
                 taken += 1
                 # A Pi in fault would refuse every row.
                 host.until_state("ready", "fault")

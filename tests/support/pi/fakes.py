@@ -21,6 +21,7 @@ from polysight_shared.faults import StageError
 from polysight_shared.raster import Stage
 from polysight_shared.stage_line import Command, Immediate, Reply
 from polysight_shared.wires import WireClient, WireEdge
+from tests.support.processes import HANG_S
 
 
 class FakeDriver:
@@ -122,6 +123,8 @@ def gone() -> DeviceError:
 
 
 STEPS_PER_MM = 200
+# Two lines of the hub, joined: the stage hears itself
+MARK_LINE, ECHO_LINE = 1000, 1001
 # Steps/s^2
 ACCEL = 40000
 
@@ -147,7 +150,7 @@ class FakeStage:
         tty.setraw(slave, termios.TCSANOW)
         self.port = os.ttyname(slave)
         os.close(slave)
-        self.wire = WireClient(hub) if hub else None
+        self.wire = WireClient(hub, listen=(ECHO_LINE,), join=(MARK_LINE, ECHO_LINE)) if hub else None
         self.trigger = trigger
         self.banner = True
         self.deaf = False
@@ -359,4 +362,7 @@ class FakeStage:
 
     def _edge(self, t_ns: int) -> None:
         if self.wire:
-            self.wire.send(WireEdge(t_ns, self.trigger, 1), WireEdge(t_ns + 20_000, self.trigger, 0))
+            edges = WireEdge(t_ns, self.trigger, 1), WireEdge(t_ns + 20_000, self.trigger, 0)
+            self.wire.send(*edges, WireEdge(t_ns, MARK_LINE, 1))
+            # A wire has no delay: the edge has left the hub before the stage says another word.
+            self.wire.receive(HANG_S)

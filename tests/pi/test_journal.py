@@ -244,9 +244,11 @@ def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     host = host_in_row
     good = host.list_events(m.Capture)[0].seq
     monkeypatch.setattr(journal_module.os, "pwrite", full)
-    stage.stays_after = None
+    # The row would be done before a slow disk says that it is full.
+    stage.stays_after = 4
     fault = host.wait(m.Fault)
     done = host.wait(m.RowFinished)
+    stage.stays_after = None
     monkeypatch.undo()
     assert fault.number == done.fault == PiFault.JOURNAL_FULL
     assert done.status == "fault"

@@ -1,11 +1,14 @@
 """Metal is shown by the rest of the scene: random scenes of known and unknown materials, with and without metal."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from polysight.materials.analyse import most_like_metal
 from polysight.materials.inversion import RigPrior
 from polysight.materials.kinds import Kinds, PatchMeasurement, literature
-from polysight.materials.metal import log_evidence_of_dielectric, metal_evidence
+from polysight.materials.metal import MetalEvidence, log_evidence_of_dielectric, metal_evidence
 
 THETA = np.radians(55.0)
 KINDS = Kinds(literature(), float(THETA))
@@ -98,3 +101,20 @@ def test_a_patch_that_looks_the_same_is_no_witness():
     evidence = metal_evidence(dict(enumerate(equal_patches)), RigPrior(3e-3), 1.0 + 0j, KINDS)
     assert evidence.others == 0
     assert not evidence.enough
+
+
+def relative_to(label, bare, channel_ratio_db=-1.0, refused=()):
+    evidence = MetalEvidence(bare, bare, 8, channel_ratio_db)
+    return SimpleNamespace(metal=SimpleNamespace(label=label, evidence=evidence), refused=dict.fromkeys(refused))
+
+
+def test_the_reference_is_the_best_shown_metal_of_those_that_may_be_one():
+    brightest = relative_to(1, 5.0)
+    bare = relative_to(2, 9.0)
+    assert most_like_metal([brightest, bare]).metal.label == 2
+    assert most_like_metal([bare, brightest]).metal.label == 2
+    assert most_like_metal([brightest, relative_to(2, 9.0, channel_ratio_db=-9.0)]).metal.label == 1
+    assert most_like_metal([brightest, relative_to(2, 9.0, refused=[2])]).metal.label == 1
+    assert most_like_metal([brightest, relative_to(2, 9.0, refused=[1])]).metal.label == 2
+    nothing_like_metal = [relative_to(1, 5.0, refused=[1, 2]), relative_to(2, 9.0, refused=[1, 2])]
+    assert most_like_metal(nothing_like_metal).metal.label == 1

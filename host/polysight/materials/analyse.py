@@ -249,7 +249,7 @@ def analyse(
     scene = _Scene(
         images=images, found=segmentation, tilts=tilts, apart_mm=apart_mm, plane=plane, optics=optics, kinds=kinds
     )  # fmt: skip
-    relative = _most_like_metal([scene.relative_to(metal) for metal in _references(images, known_scene, segmentation)])
+    relative = most_like_metal([scene.relative_to(metal) for metal in _references(images, known_scene, segmentation)])
     reference, raw, judged, solution = relative.metal, relative.raw, relative.judged, relative.solution
     labels = [p.label for p in judged]
     inversion = solution.inversion
@@ -474,7 +474,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class _Relative:
+class RelativeScene:
     """A scene relative to a metal reference, which has the evidence of the other patches if it is in the scene.
 
     Attributes
@@ -511,7 +511,7 @@ class _Scene:
     optics: Optics
     kinds: Kinds
 
-    def relative_to(self, reference: MetalReference) -> _Relative:
+    def relative_to(self, reference: MetalReference) -> RelativeScene:
         """Measure and solve the scene relative to this reference, and weigh whether it is metal."""
         images = self.images
         found = self.found
@@ -540,21 +540,23 @@ class _Scene:
         if self.plane is None:
             labels = [p.label for p in judged]
             reference = _weigh_metal(images, reference, labels, solution, self.kinds)
-        return _Relative(
+        return RelativeScene(
             metal=reference, raw=raw, refused=refused, judged=judged, seen=seen, prior=prior, measured=measured,
             solution=solution,
         )  # fmt: skip
 
 
-def _most_like_metal(relatives: Sequence[_Relative]) -> _Relative:
+def most_like_metal(relatives: Sequence[RelativeScene]) -> RelativeScene:
     """Return the scene relative to the reference that the other patches show best to be bare metal: the first in doubt.
 
-    What contradicts itself by its own V / H is none.
+    What contradicts itself by its own V / H, or is no flat plate, is none.
     """
 
-    def bare(relative: _Relative) -> float:
+    def bare(relative: RelativeScene) -> float:
         evidence = relative.metal.evidence
-        return -np.inf if evidence is None or evidence.against else evidence.bare
+        if evidence is None or evidence.against or relative.metal.label in relative.refused:
+            return -np.inf
+        return evidence.bare
 
     return max(relatives, key=bare)
 

@@ -357,8 +357,8 @@ def metal_unevenness(images: Images, metal_mask: Mask) -> float:
 def find_metals(h: Image, v: Image, segmentation: Segmentation) -> tuple[MetalReference, ...]:
     """Return the patch that is brightest in both channels, then others that may be the metal; empty without patches.
 
-    The measure is median |H||V| over the interior. Metal reflects both polarisations fully (|r_s| = |r_p| = 1), every
-    dielectric loses most of p at these angles; the product does not depend on the unknown gains of H and V. The
+    The measure is the median of |H| times that of |V|. Metal reflects both polarisations fully (|r_s| = |r_p| = 1),
+    every dielectric loses most of p at these angles; the product does not depend on the unknown gains of H and V. The
     brightest patch of a scene without metal is a dielectric: whether it is metal is another question
     (:func:`metal_evidence`), as is which of several is bare.
     """

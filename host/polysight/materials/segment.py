@@ -260,7 +260,7 @@ def segment(
             left_out += 1
     labels = np.zeros(h.shape, np.int32)
     patches = []
-    for mask in sorted(masks, key=lambda mask: _sort_by_position(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
+    for mask in sorted(masks, key=lambda mask: _find_reading_place(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
         labels[mask] = len(patches) + 1
         patch = make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable)
         patches.append(replace(patch, cut=_is_cut(mask, cfg.smallest_mm / pixel_mm)))
@@ -316,7 +316,7 @@ def _find_least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_
     return max(background + max(cfg.least_contrast_db, cfg.least_scatter * scatter), cfg.dimmest_db)
 
 
-def _sort_by_position(mask: Mask, y_mm: Real, row_pitch_mm: float) -> tuple[float, float]:
+def _find_reading_place(mask: Mask, y_mm: Real, row_pitch_mm: float) -> tuple[float, float]:
     """Sort key of a patch: top row first, then from left to right."""
     rows, cols = np.nonzero(mask)
     return -round(float(y_mm[rows].mean()) / row_pitch_mm), float(cols.mean())

@@ -517,9 +517,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
             unknown[test_set] = (predicted.distance > 1)[row]
             sure[test_set] = predicted.confidence[row]
     names = np.unique(samples.names)
-    tables = [
-        _count_confusions(samples.names[learnt], predicted[learnt], names) for predicted in (alone, in_scan, of_patch)
-    ]
+    tables = [_confusions(samples.names[learnt], predicted[learnt], names) for predicted in (alone, in_scan, of_patch)]
     judged = np.isin(names, samples.names[learnt])
     first = np.unique(samples.patches, return_index=True)[1]
     first = first[learnt[first]]
@@ -543,7 +541,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     )
 
 
-def _count_confusions(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Real:
+def _confusions(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Real:
     table = np.zeros((names.size, names.size))
     np.add.at(table, (np.searchsorted(names, true), np.searchsorted(names, found)), 1)
     return table / np.maximum(table.sum(axis=1, keepdims=True), 1)

@@ -20,6 +20,8 @@ from polysight.sync import BoardSetup, synchronise_row
 from polysight_shared.config import load_instrument
 from polysight_simulators.scene import SimulatedRig, decode_scene
 
+# Positions of a row of the published scans.
+ROW_POSITIONS = 350
 SNR_DB = 7.2
 SCENE = {
     "name": "metal reflector at rest",
@@ -32,25 +34,29 @@ SCENE = {
 def run(out: Path, positions: int, board_name: str, snr_db: float = SNR_DB) -> str:
     """Simulate, synchronise and report; returns the text."""
     rig = load_instrument(Path(__file__).parents[1] / "instrument.toml")
-    radar = SimulatedRig(rig, decode_scene(SCENE, "static_chirps").with_disturbances(direct_snr_db=snr_db))
+    scene = decode_scene(SCENE, "static_chirps").with_disturbances(direct_snr_db=snr_db)
+    radar = SimulatedRig(rig, scene)
     board = radar.rig.by_name(board_name)
     chirp = radar.rig.chirp
-    row = 350
-    setup = replace(BoardSetup.from_rig(radar.rig, board), examined=row)
+    pulses = radar.rig.burst.pulses
+    setup = replace(BoardSetup.from_rig(radar.rig, board), examined=ROW_POSITIONS)
     report = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))
-    for row_start in range(0, positions, row):
-        still = np.zeros(min(row, positions - row_start) * radar.rig.burst.pulses)
-        words = radar.chirps(board_name, still, still).reshape(len(still), chirp.samples, 2, -1)
-        report.add(synchronise_row(words, np.ones(len(still), bool), setup))
-    return write_sync_report(out, {board_name: report}, f"{positions * radar.rig.burst.pulses:,} chirps at rest", True)
+    for row_start in range(0, positions, ROW_POSITIONS):
+        chirp_count = min(ROW_POSITIONS, positions - row_start) * pulses
+        x_mm = np.zeros(chirp_count)
+        y_mm = np.zeros(chirp_count)
+        words = radar.chirps(board_name, x_mm, y_mm).reshape(chirp_count, chirp.samples, 2, -1)
+        is_valid = np.ones(chirp_count, bool)
+        report.add(synchronise_row(words, is_valid, setup))
+    return write_sync_report(out, {board_name: report}, f"{positions * pulses:,} chirps at rest", True)
 
 
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.static_chirps", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
-    parser.add_argument("--positions", type=int, default=40_000, help="of 16 chirps each")
+    parser.add_argument("--positions", type=int, default=40_000, help="number of positions, of 16 chirps each")
     parser.add_argument("--board", default="RH", help="receiving board")
-    parser.add_argument("--snr-db", type=float, default=SNR_DB, help="direct path over noise, a channel of a chirp")
+    parser.add_argument("--snr-db", type=float, default=SNR_DB, help="direct path over noise in one chirp")
     args = parser.parse_args(argv)
     sys.stdout.write(run(args.out, args.positions, args.board, args.snr_db))
     return 0

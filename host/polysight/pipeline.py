@@ -30,7 +30,7 @@ class Pipeline:
         filters = self.calibration.high_passes(rig)
         self.plane = imaging.UNKNOWN_PLANE
         self.synchroniser = sync.RowSynchroniser(source, rig, filters)
-        self.quality = process.Quality(rig, source, self.calibration.facts())
+        self.quality = process.Quality(rig, source, self.calibration.list_sources())
         self.samples = process.KeptSamples(source, rig, filters, self.quality, settings, live=live, samples=samples)
         self.images = self.samples.images
         self.sub_bands = self.samples.sub_bands

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 from polysight_pi.edges import EdgeTimes, RowMotion
 from polysight_pi.journal import JournalThread
-from polysight_pi.motions import RunningJog, RunningRow, row_duration_s
+from polysight_pi.motions import RunningJog, RunningRow, estimate_row_duration_s
 from polysight_pi.rules import END_TIMEOUT_S, MOVING, RULES, TIMEOUTS_S, WIRE_STATE, State
 from polysight_pi.stage import MAX_MM, StageDriver, StageLostError, StageRefusedError
 from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop, TriggerWatch
@@ -466,7 +466,7 @@ class Machine:
             raise
         edges = EdgeTimes(motion)
         self.row = RunningRow(sequence=sequence, row=row, take=take, job=job, motion=motion, edges=edges)
-        self.row_timeout_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
+        self.row_timeout_s = 30.0 + 3 * estimate_row_duration_s(row, self.stage.config, speed_mm_s)
         self._watch = TriggerWatch()
         self._journal.add(m.RowStarted, row=row, take=take)
 

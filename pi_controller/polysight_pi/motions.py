@@ -1,4 +1,4 @@
-"""What the stage does for a command: a jog, or a row with its counts and result."""
+"""Motions of the stage that are under way: a jog, or a row with its counts and result."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from polysight_shared.stage_line import END_OF_TIME_NS
 
 @dataclass(kw_only=True)
 class _Motion:
-    """A motion that the stage has started with this line. Its result is decided once, perhaps before it ends."""
+    """A motion that the stage has started. Its result is decided once, perhaps before it ends."""
 
-    # Number of the line and of its `done`.
+    # Number of the line that started it; the stage's `done` line repeats it.
     sequence: int
+    # The result: None until it is decided.
     status: m.RowStatus | None = None
     fault: int = 0
     reason: str = ""
 
-    def decide(self, status: m.RowStatus, number: int = 0, reason: str = "") -> bool:
+    def decide(self, status: m.RowStatus, fault: int = 0, reason: str = "") -> bool:
         """Set the result; return False if it is set already."""
         if self.status is not None:
             return False
         self.status = status
-        self.fault = int(number)
+        self.fault = int(fault)
         self.reason = reason
         return True
 
@@ -38,8 +39,9 @@ class RunningJog(_Motion):
 
     command: m.Jog
     target: tuple[int, int]
-    # Timeout of the heartbeat.
+    # The jog is stopped this long after the host's latest heartbeat.
     timeout_s: float
+    # Time of that heartbeat, on the monotonic clock.
     alive_s: float
 
 
@@ -52,17 +54,17 @@ class RunningRow(_Motion):
     job: Job
     motion: RowMotion
     edges: EdgeTimes
-    # True once the stage's `ok` was read: earlier statuses belong to the motion before
+    # True once the stage has accepted the row: statuses before that belong to the motion before.
     is_underway: bool = False
-    # The next state is fault
+    # True if the machine stays in the fault state after the row.
     lasting: bool = False
-    # Passed, counted by the stage
+    # Points that the stage has passed, by its own count.
     points: int = 0
-    # Reported to the host
+    # Bursts that were reported to the host.
     bursts: int = 0
     # True if the stage reported a hold within the row.
     was_held: bool = False
-    # Latest time at which its `done` was written
+    # Latest time at which the stage can have written the row's `done` line.
     done_ns: int = END_OF_TIME_NS
 
     def judge(self, counts: Counts) -> None:
@@ -70,12 +72,13 @@ class RunningRow(_Motion):
         points = self.row.points
         pulses = points * self.job.spec.pulses
         if self.points == points and counts == Counts(points, points, pulses):
-            wrong = self.edges.judge(self.was_held, self.done_ns)
-            if wrong:
-                self.decide("fault", PiFault.EDGE_TIME, wrong)
+            time_problem = self.edges.judge(self.was_held, self.done_ns)
+            if time_problem:
+                self.decide("fault", PiFault.EDGE_TIME, time_problem)
+            elif self.was_held:
+                self.decide("done", reason="held during the row: some positions were passed below full speed")
             else:
-                held = "held during the row: some positions were passed below full speed"
-                self.decide("done", reason=held if self.was_held else "")
+                self.decide("done")
             return
         reason = (
             f"{points} points requested, {self.points} passed by the stage, {counts.edges} edges received, "
@@ -84,7 +87,10 @@ class RunningRow(_Motion):
         self.decide("fault", PiFault.POINTS_MISMATCH, reason)
 
 
-def row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:
+def estimate_row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:
     """Estimate the duration of a row, including the longest travel to its first point."""
     travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
-    return travel_s + abs(row.step_mm) * row.points / speed_mm_s + 4 * speed_mm_s / stage.accel_mm_s2
+    points_s = abs(row.step_mm) * row.points / speed_mm_s
+    # Two ramps each of the travel and of the row.
+    ramps_s = 4 * speed_mm_s / stage.accel_mm_s2
+    return travel_s + points_s + ramps_s

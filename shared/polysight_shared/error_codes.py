@@ -22,7 +22,7 @@ class ErrorCode(StrEnum):
     FILE_FOREIGN = "file-foreign"
     FILE_TOO_LARGE = "file-too-large"
     FILE_EXISTS = "file-exists"
-    # Leads out of the folder it belongs to
+    # The path leads out of the folder that it must stay in.
     PATH_OUTSIDE = "path-outside"
     DISK_FULL = "disk-full"
     VERSION_UNSUPPORTED = "version-unsupported"
@@ -31,9 +31,9 @@ class ErrorCode(StrEnum):
     KEY_UNKNOWN = "key-unknown"
     KEY_MISSING = "key-missing"
     TYPE_WRONG = "type-wrong"
-    # Breaks a rule of its own: range, form, finite
+    # The value alone is invalid: out of range, of wrong form, or not finite.
     VALUE_INVALID = "value-invalid"
-    # Two values that cannot stand together
+    # Two values that exclude each other.
     VALUES_CONFLICT = "values-conflict"
     NAME_TAKEN = "name-taken"
 
@@ -47,27 +47,27 @@ class ErrorCode(StrEnum):
     # Data
     NO_DATA = "no-data"
     NOT_ENOUGH_DATA = "not-enough-data"
-    # Two pieces of data that do not belong together
+    # Two pieces of data that do not belong together.
     MISMATCH = "mismatch"
 
     # host/polysight/serve
-    # The request's Host is no name of this server
+    # The Host header of the request is no name of this server.
     HOST_UNKNOWN = "host-unknown"
-    # The request comes from a page of another site
+    # The request comes from a page of another site.
     ORIGIN_FOREIGN = "origin-foreign"
     READ_ONLY = "read-only"
     TOKEN_WRONG = "token-wrong"
 
     # host/polysight/acquisition
-    # All retakes of a row are used up
+    # A row is still incomplete after its last retake.
     ROW_INCOMPLETE = "row-incomplete"
     # The stage is not homed, has a fault, or belongs to another host.
     STAGE_NOT_READY = "stage-not-ready"
-    # The Pi's [stage] places rows elsewhere
+    # The Pi's configuration of the stage would put rows at other positions than the host's.
     STAGE_DIFFERS = "stage-differs"
 
     # Radar
     RADAR_RESTARTED = "radar-restarted"
     RADAR_NO_FIRMWARE = "radar-no-firmware"
-    # A fatal event, or a failed self-test
+    # The radar reported a fatal event, or failed its self-test.
     RADAR_FAULT = "radar-fault"

@@ -9,7 +9,7 @@ from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import EVERYWHERE, scene_of
 from tests.support.store.facts import facts_of
 
-from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
+from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, make_header, write_calibration
 from polysight.store import manifest
 from polysight_shared.files import read_json
 
@@ -34,7 +34,7 @@ def scan(scan_of, tmp_path_factory):
         chirps=640,
         residual_db=0.05,
     )
-    head = header("hpf", [SourceScan("sweep", "sweep", True, 3)])
+    head = make_header("hpf", [SourceScan("sweep", "sweep", True, 3)])
     path = write_calibration(FilterFile(**head, boards={"RH": true_filter, "RV": true_filter}), folder / "calibration")
     true = rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
     scene_changes = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}

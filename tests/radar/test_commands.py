@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from polysight.radar import commands as c
 from polysight.radar.calibration_data import InitCalibrations, RestoreCalibration, SaveCalibration
-from polysight.radar.firmware import file_chunks
+from polysight.radar.firmware import split_into_chunks
 from polysight.radar.messages import command, decode, encode
 
 PUBLISHED = c.Profile(
@@ -144,7 +144,7 @@ def test_bytes_are_those_of_ti_s_library(sent: c.Command, expected: str):
 def test_parts_of_an_image_are_those_of_the_reference_encoder():
     """The same image of 1000 bytes, in the reference's messages: the first (by its digest) and the last."""
     image = bytes(range(8, 232)) + bytes(1000 - 224 - 80) + bytes(200 - n for n in range(80))
-    parts = file_chunks(image)
+    parts = split_into_chunks(image)
     first, last = (
         encode(command((chunk.block(),), sequence=sequence, remaining=remaining))
         for (chunk, remaining), sequence in ((parts[0], 14), (parts[-1], 15))

@@ -12,7 +12,7 @@ from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.commands import program
-from polysight.radar.firmware import CHUNK_TIMEOUT_S, TO_RAM, check_image, file_chunks, read_image
+from polysight.radar.firmware import CHUNK_TIMEOUT_S, TO_RAM, check_image, read_image, split_into_chunks
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_simulators.radars import Fault, make_image
@@ -77,7 +77,7 @@ def test_an_image_has_the_versions_of_rom_and_patches(tmp_path):
 @pytest.mark.parametrize("size", [1, 223, 224, 225, 456, 457, 1000])
 def test_the_parts_of_an_image_are_the_whole_image(size):
     image = bytes(n % 251 for n in range(size))
-    parts = file_chunks(image)
+    parts = split_into_chunks(image)
     joined = b"".join(chunk.part for chunk, _ in parts)
     assert joined == bytes((4, 0, 0, 0)) + size.to_bytes(4, "little") + image
     assert all(len(chunk.part) <= 232 for chunk, _ in parts)
@@ -86,7 +86,7 @@ def test_the_parts_of_an_image_are_the_whole_image(size):
 
 def test_the_first_part_is_that_of_a_user_s_log():
     """TI E2E 1267477: 35 parts, the first with type 0, length 7940 and the magic."""
-    first, remaining = file_chunks(DATA, TO_RAM)[0]
+    first, remaining = split_into_chunks(DATA, TO_RAM)[0]
     assert remaining == 0x22
     assert first.part[:12].hex() == "00000000041f00004d535452"
 
@@ -131,7 +131,7 @@ def test_a_new_board_runs_from_ram_and_its_flash_stays_empty(clock, fault_at):
     radar.fail("asked to")
     # A reset empties the RAM
     radar.arm(4)
-    assert board.executed.count(0x4080) == 2 * len(file_chunks(DATA))
+    assert board.executed.count(0x4080) == 2 * len(split_into_chunks(DATA))
 
 
 def test_without_an_image_a_new_board_is_refused(new, clock):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header
+from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, make_header
 from polysight.imaging import ImagedWith, Images, image_grid
 from polysight.polarimetry import Leakage, PlaneReference, plane_reference
 from polysight_shared.config import Instrument
@@ -30,7 +30,7 @@ def board_filter(first_khz: float = 180.5, second_khz: float = 355.25) -> BoardF
 def filter_file(first_khz: float = 180.5, rv: BoardFilter | None = None) -> FilterFile:
     """Both receivers with the same corners, or the second one with its own."""
     rh = board_filter(first_khz)
-    return FilterFile(**header("hpf", SOURCES), boards={"RH": rh, "RV": rv or rh})
+    return FilterFile(**make_header("hpf", SOURCES), boards={"RH": rh, "RV": rv or rh})
 
 
 def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:

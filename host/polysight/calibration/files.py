@@ -48,6 +48,8 @@ FORMAT = 1
 IMAGES = ("h", "v", "valid")
 MIN_METAL_LEVEL = 0.02
 """Smallest echo of a mirror relative to the direct path; antenna patterns may take some 20 dB."""
+FOLDER = "calibration"
+"""Folder of the copies in a scan's folder."""
 Vector = tuple[float, float, float]
 F = TypeVar("F", bound="CalibrationFile")
 
@@ -62,7 +64,7 @@ class SourceScan(msgspec.Struct, frozen=True):
 
 
 class CalibrationFile(msgspec.Struct, frozen=True, kw_only=True):
-    """Common fields. `kind` is the key in the rig file's [calibration] that names the file."""
+    """Fields that all files have. `kind` is the key in the rig file's [calibration] that names the file."""
 
     kind: str
     made_utc: str
@@ -78,20 +80,24 @@ class CalibrationFile(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BoardPlace(msgspec.Struct, frozen=True):
-    """Position of a receiving board: `shift_mm` in the rig frame, added after its mount; direct path to its RX1."""
+    """Position of a receiving board, relative to that in the rig file."""
 
     shift_mm: Vector
+    """In the rig frame, added after the board's mount."""
     standard_error_mm: Vector
     direct_path_mm: float
+    """Length of the direct path from the transmitter to the board's RX1."""
     direct_path_was_mm: float
+    """That length by the rig file."""
     direct_path_standard_error_mm: float
 
 
 class PlacesFile(CalibrationFile, frozen=True, kw_only=True):
     """`direct_path`: receiving boards and object plane relative to the transmitter, which stays as in the rig file.
 
-    `target_mm` [x, y] from the image centre and `target_turn_deg` are the position and rotation of the target
-    (by-products). `rig_crc32` is the digest of the rig file's positions, which the shifts are relative to.
+    Fields with `was` are the rig file's values. `target_mm` [x, y] from the image centre and `target_turn_deg` are the
+    position and rotation of the target (by-products). `rig_crc32` is the digest of the rig file's positions, which the
+    shifts are relative to. `explained` is the share of the measured power that the fit explains, at `points` points.
     """
 
     rig_crc32: str
@@ -187,7 +193,7 @@ class StartFile(CalibrationFile, frozen=True, kw_only=True):
     boards: dict[str, BoardStart]
 
 
-def header(kind: str, sources: list[SourceScan]) -> dict[str, Any]:
+def make_header(kind: str, sources: list[SourceScan]) -> dict[str, Any]:
     """Return the common fields of a new file, dated now."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
     return {"kind": kind, "made_utc": now, "sources": sources, "versions": versions()}
@@ -208,7 +214,7 @@ def write_calibration(file: CalibrationFile, out: Path) -> Path:
     name = f"{file.kind.replace('_', '-')}-{stamp}"
     try:
         out.mkdir(parents=True, exist_ok=True)
-        # Several of one second are numbered.
+        # Files of the same second get a number.
         for ending in ("", *(f"-{number}" for number in range(1, 100))):
             path = out / f"{name}{ending}.toml"
             try:
@@ -273,7 +279,7 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
                 code=ErrorCode.NO_DATA,
             )
     file = MetalFile(
-        **header("metal", sources),
+        **make_header("metal", sources),
         images="",
         images_crc32="",
         share_of_plane=facts["share_of_plane"],
@@ -286,7 +292,7 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
             for band, part in zip(bands, reference.bands, strict=True)
         ],
     )
-    # Reserves the name
+    # The file without images reserves the name; it is written again when the images are complete.
     path = write_calibration(file, out)
     images = path.with_suffix(".npz")
     try:
@@ -296,7 +302,7 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
         if reference.dispersion is not None:
             arrays["dispersion"] = np.array(reference.dispersion)
         np.savez_compressed(images, x_m=reference.x_m, y_m=reference.y_m, **arrays)
-        digest = f"{zlib.crc32(images.read_bytes()):08x}"
+        digest = _compute_crc32(images)
         path.unlink()
     except OSError as e:
         path.unlink(missing_ok=True)
@@ -307,12 +313,16 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
     return write_calibration(msgspec.structs.replace(file, images=images.name, images_crc32=digest), out)
 
 
+def _compute_crc32(path: Path) -> str:
+    return f"{zlib.crc32(path.read_bytes()):08x}"
+
+
 def read_metal(file: MetalFile, images: Path) -> PlaneReference:
     """Read the metal reference from a calibration file and its images, with sub-bands.
 
     Raises DataError if the images are missing or do not belong to the file.
     """
-    if not images.is_file() or f"{zlib.crc32(images.read_bytes()):08x}" != file.images_crc32:
+    if not images.is_file() or _compute_crc32(images) != file.images_crc32:
         raise DataError(
             f"{images}: missing, or other images than those of the calibration file",
             "one of the two files was moved or replaced",
@@ -322,10 +332,10 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
     with open_npz(images) as f:
         arrays: dict[str, NDArray[Any]] = dict(f)
     dispersion = None
-    # Files of earlier states hold none.
+    # Files of earlier releases have no dispersion.
     if "dispersion" in arrays:
-        h, v = arrays["dispersion"].tolist()
-        dispersion = (h, v)
+        dispersion_h, dispersion_v = arrays["dispersion"].tolist()
+        dispersion = (dispersion_h, dispersion_v)
     reference = PlaneReference(
         *(arrays[name] for name in IMAGES),
         x_m=arrays["x_m"],
@@ -335,19 +345,16 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
         made_with=file.imaged_with,
         dispersion=dispersion,
     )
-    parts = (
+    band_references = (
         replace(reference, spread=band.spread, how=band.how, **{n: arrays[f"band_{n}"][k] for n in IMAGES})
         for k, band in enumerate(file.bands)
     )
-    return replace(reference, bands=tuple(parts))
-
-
-FOLDER = "calibration"
+    return replace(reference, bands=tuple(band_references))
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Measured properties of the rig, by kind; None: not calibrated. `paths` are the files by kind."""
+    """Calibration files of a rig; None for what is not calibrated. `paths` are their paths by kind."""
 
     places: PlacesFile | None = None
     filters: FilterFile | None = None
@@ -424,9 +431,8 @@ class Calibration:
     ) -> PlaneReference | None:
         """Return the metal plate that images are referenced to; None: use metal in the scene.
 
-        Order of precedence: `chosen`, metal in the scene, the calibrated metal reference.
-
-        `rig` is the calibrated rig of the images; `in_scene`: the user gave the position of metal in the scene.
+        Order of precedence: `chosen` by the user, metal in the scene (`in_scene`: the user gave its position), the
+        calibrated metal reference. `rig` is the calibrated rig of the images, `bands` the number of sub-bands needed.
 
         Raises DataError if the metal plate was imaged with another rig, or without these sub-bands.
         """
@@ -444,7 +450,7 @@ class Calibration:
         """Return the settings that the gains of images depend on; `placed` is a rig that :meth:`rig` returned."""
         return ImagedWith.from_rig(placed, self.high_passes(placed))
 
-    def facts(self) -> dict[str, CalibrationSource]:
+    def list_sources(self) -> dict[str, CalibrationSource]:
         """Return path, date and origin of the active files, by kind, for quality.json."""
         return {
             kind: CalibrationSource(str(self.path(kind)), file.made_utc, file.simulated)
@@ -490,7 +496,7 @@ def calibration_of_rig(rig: Instrument) -> Calibration:
 
 
 def calibration_of_scan(scan: Source) -> Calibration:
-    """Load the calibration of a scan: its own copies, or without copies the files that its rig file names.
+    """Load the calibration of a scan: the copies in its folder, or without copies the files that its rig file names.
 
     Raises ConfigError or DataError if a file is invalid, or a copy is missing or was changed.
     """
@@ -501,13 +507,14 @@ def calibration_of_scan(scan: Source) -> Calibration:
         names_by_kind = {kind: name for kind, name in to_builtins(scan.instrument.calibration).items() if name}
         return load_calibration({kind: check_inside(scan.path, name) for kind, name in names_by_kind.items()})
     paths: dict[str, Path] = {}
-    for kind, fact in _read_manifest_entries(scan, recorded).items():
-        path = paths[kind] = check_inside(scan.path, fact["file"])
-        if not path.is_file() or f"{zlib.crc32(path.read_bytes()):08x}" != fact["crc32"]:
+    for kind, entry in _read_manifest_entries(scan, recorded).items():
+        path = check_inside(scan.path, entry["file"])
+        paths[kind] = path
+        if not path.is_file() or _compute_crc32(path) != entry["crc32"]:
             raise DataError(
                 f"{path}: missing, or changed since the scan was recorded",
                 "the calibration file was removed or edited",
-                f"restore it from a copy, or from {fact['copied_from']}",
+                f"restore it from a copy, or from {entry['copied_from']}",
                 code=ErrorCode.FILE_DAMAGED,
             )
     return load_calibration(paths)
@@ -557,24 +564,24 @@ def copy_into_scan(rig: Instrument, folder: Path, simulated: bool) -> dict[str, 
     :func:`load_checked_calibration`, before anything is copied.
     """
     calibration = load_checked_calibration(rig, simulated)
-    existing = (folder / MANIFEST).exists() and manifest.read(folder / MANIFEST).length > 0
+    holds_scan = (folder / MANIFEST).exists() and manifest.read(folder / MANIFEST).length > 0
     paths = calibration.paths or {}
     names = [path.name for path in paths.values()]
-    facts = {}
+    entries = {}
     for kind, path in paths.items():
         name = path.name if names.count(path.name) == 1 else f"{kind}-{path.name}"
         copy = folder / FOLDER / name
-        if not existing:
+        if not holds_scan:
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, copy)
             if kind == "metal" and calibration.metal is not None:
                 shutil.copyfile(path.parent / calibration.metal.images, copy.parent / calibration.metal.images)
-        facts[kind] = {
+        entries[kind] = {
             "file": f"{FOLDER}/{name}",
-            "crc32": f"{zlib.crc32(path.read_bytes()):08x}",
+            "crc32": _compute_crc32(path),
             "copied_from": str(path),
         }
-    return facts
+    return entries
 
 
 def open_raw(folder: Path, rig: Instrument | None = None) -> RawSource:
@@ -598,10 +605,14 @@ def source_scan(source: RawSource, folder: Path) -> SourceScan:
 def board_rows(
     source: RawSource, board: str, limit: int | None = None
 ) -> Iterator[tuple[int, NDArray[np.int16], NDArray[np.bool_]]]:
-    """Yield index, words int16 [frame, sample, 2, rx] and valid bool [frame] of rows; `limit` evenly spaced rows."""
+    """Yield index, words int16 [frame, sample, 2, rx] and valid bool [frame] of a board's rows.
+
+    With a `limit`, only as many rows, evenly spaced.
+    """
     rows = list(source.rows())
     if limit is not None and len(rows) > limit:
-        rows = [rows[i] for i in np.linspace(0, len(rows) - 1, limit).round().astype(int)]
+        evenly_spaced = np.linspace(0, len(rows) - 1, limit).round().astype(int)
+        rows = [rows[i] for i in evenly_spaced]
     for row in rows:
         recorded = source.read_row(board, row)
         samples = source.instrument.chirp.samples

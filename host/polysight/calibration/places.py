@@ -317,7 +317,7 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[file
         )
     depth, x, y, turn = (float(v) for v in fit.values[-4:])
     return files.PlacesFile(
-        **files.header("direct_path", sources),
+        **files.make_header("direct_path", sources),
         rig_crc32=files.places_crc32(rig),
         boards=boards,
         object_distance_mm=rig.geometry.object_distance_mm + depth,

@@ -128,7 +128,7 @@ def check_pi_clock(context: CheckContext) -> Finding:
 def check_calibration(context: CheckContext) -> Finding:
     """Check the calibration files that a scan would copy into its folder."""
     simulated = context.hello is not None and is_simulated(context.hello.backend)
-    facts = load_checked_calibration(context.rig, simulated).facts()
+    facts = load_checked_calibration(context.rig, simulated).list_sources()
     if not facts:
         return ok("no calibration file is configured: geometry, filters and metal as in the rig file and the scene")
     observed = "; ".join(f"{kind} of {file.made_utc[:10]}" for kind, file in facts.items())

@@ -18,7 +18,7 @@ from polysight.calibration import (
     CalibrationFile,
     FilterFile,
     StartFile,
-    header,
+    make_header,
     open_raw,
     source_scan,
     write_calibration,
@@ -128,7 +128,7 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
     names = [b.name for b in sources[0].instrument.receivers]
     boards = {name: fit_filter(sources, name) for name in steps(names, [f"filters of {name}" for name in names])}
     source_scans = [source_scan(source, folder) for source, folder in zip(sources, scans, strict=True)]
-    file = FilterFile(**header("hpf", source_scans), boards=boards)
+    file = FilterFile(**make_header("hpf", source_scans), boards=boards)
     path = write_calibration(file, out)
     lines = [
         f"{name}: corners "
@@ -175,7 +175,7 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
     source = open_raw(scan, load_rig_file(config))
     names = [b.name for b in source.instrument.receivers]
     boards = {name: fit_start(source, name) for name in steps(names, [f"direct path of {name}" for name in names])}
-    file = StartFile(**header("start_frequency", [source_scan(source, scan)]), boards=boards)
+    file = StartFile(**make_header("start_frequency", [source_scan(source, scan)]), boards=boards)
     path = write_calibration(file, out)
     lines = []
     what_to_set = []

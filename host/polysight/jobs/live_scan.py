@@ -44,13 +44,14 @@ if TYPE_CHECKING:
 
 # A web address that does not answer must not hold up the end of a command.
 NOTIFY_TIMEOUT_S = 20.0
+# A new scan's folder may hold the log of the program that starts it, and notes, and nothing else.
 _ALLOWED_ENTRIES = ("program", "operator.json")
-"""Entries allowed in a folder before its scan begins: a program's log, notes."""
+# Run or resume a scan: gets functions for committed rows and for progress, and the request to stop.
 RunScan = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
 
 def _format_clock(seconds: float | None) -> str:
-    """`1:02:03` or `2:03` left; empty when unknown."""
+    """Return a remaining time as `1:02:03 left` or `2:03 left`; empty if it is unknown."""
     if seconds is None:
         return ""
     minutes, second = divmod(round(seconds), 60)
@@ -96,16 +97,16 @@ class ScanBar:
             self._bars.stop()
 
     def update(self, p: ScanProgress) -> None:
-        """Show the progress of the scan."""
+        """Show the progress `p` of the scan."""
         self._bars.update(self._rows, total=p.rows, completed=p.committed, left=_format_clock(p.remaining_s))
         if p.row_points:
-            text = f"row {p.row}"
+            row_text = f"row {p.row}"
             if p.take > 1:
-                text += f" take {p.take}"
-            self._bars.update(self._points, description=text, total=p.row_points, completed=p.points, visible=True)
+                row_text += f" take {p.take}"
+            self._bars.update(self._points, description=row_text, total=p.row_points, completed=p.points, visible=True)
         if p.phase in ("warning", "retake", "home", "check", "connect", "stop", "held", "wait"):
             self._console.print(f"{p.phase}: {p.message}", highlight=False)
-        # Processing may still take a while, and the error is only printed after it: say now why the rows ended.
+        # Print now why the rows ended early: the error message itself follows only after the processing.
         if p.phase == "end" and p.committed < p.rows:
             self._console.print(f"{p.phase}: {p.message}", highlight=False)
         if not self._console.is_terminal and p.phase == "committed":
@@ -115,11 +116,11 @@ class ScanBar:
                 self._console.print(f"{p.committed} of {p.rows} rows, {_format_clock(p.remaining_s)}", highlight=False)
 
 
-def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, notifier: Notify) -> int:
-    """Run a scan, and notify the people that the rig file names of its end."""
+def _run_and_notify(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, notifier: Notify) -> int:
+    """Run and process a scan, and report its end as [notify] of the rig file says; return the exit status."""
     stop = StopRequest()
     try:
-        status = _run_rows(folder, processing, run_rows, stop)
+        status = _run_and_process(folder, processing, run_rows, stop)
     except PolysightError as e:
         state = "stopped" if stop.pending else "failed"
         notify(notifier, folder, state, str(e).splitlines()[0])
@@ -135,11 +136,11 @@ def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, not
 
 
 @ignore_hangup()
-def _run_rows(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, stop: StopRequest) -> int:
+def _run_and_process(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, stop: StopRequest) -> int:
     """Run the rows, obey commands to the scan meanwhile, and finish the products; return the exit status."""
     with ScanBar() as bar, ControlFolder(folder, stop) as control:
 
-        def show(progress: ScanProgress) -> None:
+        def show_progress(progress: ScanProgress) -> None:
             if progress.phase != "connect":
                 # From here on the scan folder exists and is locked by this program.
                 control.open()
@@ -148,17 +149,17 @@ def _run_rows(folder: Path, processing: LiveProcessing | None, run_rows: RunScan
         on_row = None
         if processing is not None:
             on_row = processing.add_row
-        result = run_rows(on_row, show, stop)
+        result = run_rows(on_row, show_progress, stop)
         control.end_rows()
         if result.exit_status == "success":
             _print(f"{folder}: every row is committed\n")
         if result.processing_error is not None:
             raise _add_advice(folder, result, result.processing_error)
         if result.exit_status != "success":
-            asker = ""
+            reason = result.reason
             if stop.asker:
-                asker = f" (asked by {stop.asker})"
-            raise ScanError(f"{folder}: {result.reason}{asker}", "", f"polysight resume {quote(folder)}")
+                reason = f"{reason} (asked by {stop.asker})"
+            raise ScanError(f"{folder}: {reason}", "", f"polysight resume {quote(folder)}")
         if processing is None:
             return 0
         return processing.finish()
@@ -212,10 +213,13 @@ def _check_new(folder: Path) -> None:
 def scan(
     config: Path, folder: Path, settings: Settings, truth: Path | None, keep_incomplete: bool, process: bool
 ) -> int:
-    """Run a new scan into `folder`, and process it; returns the exit status. Raises PolysightError."""
+    """Run a new scan into `folder`, and process it; returns the exit status. Raises PolysightError.
+
+    `truth` is the truth.json of a simulated rig, copied into the folder.
+    """
     rig = load_instrument(config)
     notifier = rig.notify
-    # A web address may hold a secret, and manifests are passed on.
+    # The web address of [notify] may hold a secret, and people pass manifests on: keep it out of the scan's rig file.
     rig = replace(rig, notify=Notify())
     _check_new(folder)
     if truth is not None and not truth.is_file():
@@ -226,25 +230,27 @@ def scan(
         processing.check_new(rig, truth)
 
     def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
-        def show(progress: ScanProgress) -> None:
+        def copy_truth_and_show(progress: ScanProgress) -> None:
             if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
-                # A copy that fails must not cost a row; it is noted below.
+                # A failed copy must not end the scan; it is reported after the last row.
                 with suppress(OSError):
                     shutil.copyfile(truth, folder / TRUTH)
             on_progress(progress)
 
-        result = run_scan(rig, folder, on_row=on_row, progress=show, keep_incomplete=keep_incomplete, stop=stop)
+        result = run_scan(
+            rig, folder, on_row=on_row, progress=copy_truth_and_show, keep_incomplete=keep_incomplete, stop=stop
+        )
         if truth is not None and not (folder / TRUTH).exists():
-            sys.stderr.write(f"note: {truth} was not copied into {folder}; a report does without\n")
+            sys.stderr.write(f"note: {truth} was not copied into {folder}; the report will not compare with it\n")
         return result
 
-    return _run(folder, processing, run_rows, notifier)
+    return _run_and_notify(folder, processing, run_rows, notifier)
 
 
 def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
     """Resume a scan at its first uncommitted row; return the exit status. Raises PolysightError.
 
-    `config` is a rig file that says how the rig is reached from now on; the scan's own, where it is None.
+    `config` is a rig file with the addresses to use from now on; None: those of the scan's own rig file.
     """
     source = ScanFolder.load(folder)
     require_raw(source)
@@ -264,11 +270,11 @@ def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: boo
             folder, on_row=on_row, progress=on_progress, keep_incomplete=keep_incomplete, stop=stop, rig_now=rig_now
         )
 
-    return _run(folder, processing, run_rows, notifier)
+    return _run_and_notify(folder, processing, run_rows, notifier)
 
 
 def notify(settings: Notify, folder: Path, state: str, text: str) -> None:
-    """Report the end of a scan as `[notify]` of the rig file says; a failure to do so is only noted.
+    """Report the end of a scan as `[notify]` of the rig file says; a failure is only noted on stderr.
 
     Runs the command with the text as its last argument, and sends `{"scan", "state", "text"}` to the address.
     `state` is `finished`, `stopped` or `failed`.
@@ -291,6 +297,7 @@ def _post(url: str, content: bytes) -> None:
 
 
 def _report_failure(send: Callable[[], None], name: str) -> None:
+    """Call `send`; write a note with `name` to stderr if it fails."""
     try:
         send()
     except (OSError, ValueError, subprocess.SubprocessError) as e:

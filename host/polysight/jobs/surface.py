@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.calibration import SphereFile, header, open_raw, source_scan, write_calibration
+from polysight.calibration import SphereFile, make_header, open_raw, source_scan, write_calibration
 from polysight.jobs import measure_surfaces
 from polysight.jobs.output import load_rig_file, print_json, print_lines, say
 from polysight.jobs.process import process_rows
@@ -161,7 +161,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
     chosen_metal = measure_surfaces.thin_out(metal)
     gains = learn_gains(find_voltages(chosen_metal, optics), optics.wave_number)
     file = SphereFile(
-        **header("sphere", [source_scan(raw, scan)]),
+        **make_header("sphere", [source_scan(raw, scan)]),
         radius_mm=radius_mm,
         radius_found_mm=1e3 * radius_m,
         centre_mm=(1e3 * float(centre[0]), 1e3 * float(centre[1]), 1e3 * float(centre[2])),

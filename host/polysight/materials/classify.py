@@ -43,10 +43,10 @@ from polysight.materials.names import (
     UNKNOWN,
     NamedPatch,
     PatchName,
-    evidence_of_pixels,
+    compute_name_shares,
+    derive_evidence_from_pixels,
+    make_patch_without_pixels,
     name_patch,
-    nothing_named,
-    share_of_pixels,
 )
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -395,7 +395,9 @@ class Classifier:
         for x, of_patch in zip(patches, evidence or [None] * len(patches), strict=True):
             ratios = split_by_angle(x)[2]
             if of_patch is None:
-                of_patch = [evidence_of_pixels(t, pixels) for t, pixels in zip(ratios.T, self.kinds, strict=True)]
+                of_patch = [
+                    derive_evidence_from_pixels(t, pixels) for t, pixels in zip(ratios.T, self.kinds, strict=True)
+                ]
             named.append(name_patch(self.kinds, of_patch, ratios))
         return named
 
@@ -403,7 +405,7 @@ class Classifier:
         """Name a patch by the votes of its pixels' nearest neighbours."""
         good = usable(x)
         if not good.any():
-            return nothing_named(good.size)
+            return make_patch_without_pixels(good.size)
         voted = self._model.by_scan(x[good], np.zeros(int(good.sum()), np.intp))
         pixel_names = np.full(good.size, UNKNOWN, f"<U{max(len(UNKNOWN), *map(len, self.names))}")
         pixel_names[good] = np.where(voted.pixel_distance <= 1, voted.pixel_names, UNKNOWN)
@@ -414,7 +416,7 @@ class Classifier:
         verdict = PatchName(
             name=nearest if distance <= 1 else UNKNOWN,
             confidence=float(voted.confidence[0]),
-            votes=share_of_pixels(pixel_names),
+            votes=compute_name_shares(pixel_names),
             distance=distance,
             pixels=int(good.sum()),
             nearest=nearest,

@@ -468,7 +468,7 @@ class SceneLikelihood:
 
     def library_share(self, z: Real) -> Real:
         """Return the share of the library's materials in this scene, [...]; uniform."""
-        if self.kinds is None or not self.kinds.ours.any():
+        if self.kinds is None or not self.kinds.in_library.any():
             return np.full(z.shape[:-1], 1e-12)
         low, high = LIBRARY_SHARE
         return low + (high - low) * scipy.special.ndtr(z[..., SHARE_OF_LIBRARY])
@@ -663,7 +663,7 @@ def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvi
     t = model.ratios_of_kinds(z, kinds)[:, i]
     covariance = np.cov(split_complex(t).T) + model.own[i]
     library_share = USUAL_LIBRARY_SHARE
-    if kinds.ours.any():
+    if kinds.in_library.any():
         library_share = float(model.library_share(z).mean())
     brightness_off = np.nan
     if model.bright[i]:

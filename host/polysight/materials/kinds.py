@@ -241,8 +241,8 @@ class Kinds:
     ----------
     kinds
         The library's and the literature's.
-    ours
-        bool [kind]: those of the library.
+    in_library
+        bool [kind]: True for materials of the library.
     t, effects, covariance, share
         complex [kind], float64 [kind, 2, 2] twice, float64 [kind]: each kind's mean of t, the effect of the specimens'
         two deviations on real and imaginary part, the covariance by them, and its share in the library, or in what is
@@ -257,7 +257,7 @@ class Kinds:
     def __init__(self, kinds: Sequence[Kind], theta_rad: float, sheets: bool = False) -> None:
         self.kinds = (*kinds, Kind("metal", None, source="literature", family="metal"))
         self.theta_rad = theta_rad
-        self.ours = np.array([kind.source == "library" for kind in self.kinds])
+        self.in_library = np.array([kind.source == "library" for kind in self.kinds])
         self.t = np.array([_average_ratio(kind, theta_rad) for kind in self.kinds], np.complex128)
         self.effects = np.stack([_compute_effects(kind, theta_rad) for kind in self.kinds])
         self.covariance = self.effects @ self.effects.mT + 1e-10 * np.eye(2)
@@ -290,7 +290,7 @@ class Kinds:
             x = real[window[1]] - self.t[k].real
             y = (imag[window[0]] - self.t[k].imag)[:, None]
             distance2 = inverse[k, 0, 0] * x**2 + 2 * inverse[k, 0, 1] * x * y + inverse[k, 1, 1] * y**2
-            density[0 if self.ours[k] else 1][window] += scale[k] * np.exp(-0.5 * distance2)
+            density[0 if self.in_library[k] else 1][window] += scale[k] * np.exp(-0.5 * distance2)
         density[1:] *= 1 - STACK_SHARE
         density[2] += STACK_SHARE / np.pi
         return DensityMap(low, high, np.log(density + 1e-12))
@@ -527,8 +527,8 @@ def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
     difference = split_complex(t - np.stack([kind.t for kind in kinds], axis=1)).reshape(-1, size)
     distance2 = np.einsum("ki,kij,kj->k", difference, inverse, difference)
     weight = first.share * np.sqrt(np.linalg.det(inverse / (2 * np.pi))) * np.exp(-0.5 * distance2)
-    ours = float(np.mean([evidence.library_share for evidence in seen])) if first.ours.any() else 0.0
-    weight = weight * np.where(first.ours, ours, 1 - ours)
+    ours = float(np.mean([evidence.library_share for evidence in seen])) if first.in_library.any() else 0.0
+    weight = weight * np.where(first.in_library, ours, 1 - ours)
     drawn = np.stack([kind.sheets for kind in kinds], axis=1)
     by_dispersion = _weigh_dispersion(kinds, seen)
     density = (

@@ -1,4 +1,7 @@
-"""Names of patches and of their pixels, by what one scan or several say of a patch's ratio.
+"""Names of patches and of their pixels, from the ratio t = V / H that one scan or several measured.
+
+A *kind* is a material that a patch may be of: of the user's library, or of the literature. `Kinds` holds them for one
+incidence angle, `Odds` their probabilities for one patch.
 
 A name is a material of the library, materials of the literature together ("like PTFE or paraffin wax (literature)"), a
 possible layer, or unknown. The probabilities of a patch's names sum to one.
@@ -38,9 +41,9 @@ LIKELY = 0.005
 LAYER = "possible layer"
 """Name of a patch that is rather a thin plate than a half space."""
 MOST_NAMES = 3
-"""Largest number of names in a statement about the literature."""
+"""Largest number of names in "like ... (literature)"."""
 MOST_OF_IT = 0.8
-"""Share of the literature's probability that such a statement holds at least."""
+"""Least share of the literature's probability that these names hold together."""
 
 
 @dataclass(frozen=True)
@@ -103,34 +106,39 @@ class NamedPatch:
     confidence: Real | None = None
 
 
-def name_of_literature(kinds: Kinds, odds: Odds) -> tuple[str, npt.NDArray[np.bool_]]:
-    """Return what the literature's materials are called together, and which of them the name means, bool [kind].
+def summarise_literature(kinds: Kinds, odds: Odds) -> tuple[str, npt.NDArray[np.bool_]]:
+    """Return one name for the likely materials of the literature, and a mask of those it stands for, bool [kind].
 
-    Few materials that hold most of the literature's probability are named; otherwise their families, a family of one
-    likely material by that material. The name is empty if more than `MOST_NAMES` would be needed.
+    If at most `MOST_NAMES` materials hold most of the literature's probability, the name lists them; otherwise it lists
+    their families ("polymer"), or the one material that dominates a family. It is empty if even that takes more names.
     """
-    foreign = np.where(kinds.ours, 0.0, odds.kinds)
+    probability = np.where(kinds.in_library, 0.0, odds.kinds)
     names = np.array(kinds.names)
     families = np.array([kind.family or kind.name for kind in kinds.kinds])
-    for groups in (names, families):
-        labels, member = np.unique(groups, return_inverse=True)
-        share = np.bincount(member, foreign)
-        order = np.argsort(-share, kind="stable")[:MOST_NAMES]
-        material_count = 1 + int(np.searchsorted(np.cumsum(share[order]), MOST_OF_IT * foreign.sum()))
-        if material_count > MOST_NAMES or not foreign.any():
+    for group_of_kind in (names, families):
+        group_names, group_index = np.unique(group_of_kind, return_inverse=True)
+        group_probability = np.bincount(group_index, probability)
+        likeliest_groups = np.argsort(-group_probability, kind="stable")[:MOST_NAMES]
+        cumulative = np.cumsum(group_probability[likeliest_groups])
+        group_count = 1 + int(np.searchsorted(cumulative, MOST_OF_IT * probability.sum()))
+        if group_count > MOST_NAMES or not probability.any():
             continue
-        meant = np.isin(member, order[:material_count]) & ~kinds.ours
-        group_names = []
-        for group in order[:material_count]:
-            of_group = np.where(member == group, foreign, 0.0)
-            likeliest = int(of_group.argmax())
-            one_holds_most = of_group[likeliest] >= MOST_OF_IT * share[group]
-            group_names.append(str(names[likeliest]) if one_holds_most else str(labels[group]))
-        return f"like {_join_with_or(group_names)} (literature)", meant
+        named_groups = likeliest_groups[:group_count]
+        listed_names = []
+        for group in named_groups:
+            in_group = np.where(group_index == group, probability, 0.0)
+            likeliest = int(in_group.argmax())
+            if in_group[likeliest] >= MOST_OF_IT * group_probability[group]:
+                listed_names.append(str(names[likeliest]))
+            else:
+                listed_names.append(str(group_names[group]))
+        is_listed = np.isin(group_index, named_groups) & ~kinds.in_library
+        return f"like {_join_with_or(listed_names)} (literature)", is_listed
     return "", np.zeros(len(names), np.bool_)
 
 
 def _join_with_or(names: Sequence[str]) -> str:
+    """Return `A, B or C`."""
     *first, last = names
     return f"{', '.join(first)} or {last}" if first else last
 
@@ -138,61 +146,66 @@ def _join_with_or(names: Sequence[str]) -> str:
 def name_patch(
     kinds: Sequence[Kinds], kind_evidence: Sequence[RatioEvidence], inverse_ratios: npt.NDArray[np.complex128]
 ) -> NamedPatch:
-    """Name a patch and its pixels by what one scan, or several under different angles, say of its ratio.
+    """Name a patch and its pixels by its ratio in one scan, or in several at different incidence angles.
 
-    The patch's name is what has the largest probability: a material of the library, those of the literature together, a
-    thin plate, or none of these. A material whose value lies outside of the patch's own 99 % region (errors and
-    specimens together) is never the name. A pixel is, but for `INCLUSIONS`, of its patch's material.
+    The name is the likeliest of: each material of the library, those of the literature together, a thin plate, and none
+    of these. A material whose value lies outside of the patch's own 99 % region (errors and specimens together) is
+    never the name. Pixels are assumed to be of their patch's material, except for the share `INCLUSIONS`.
 
     Parameters
     ----------
     kinds
-        What patches may be, at each scan's angle.
+        The possible materials at each scan's angle.
     kind_evidence
-        What the scans say of the patch, in their order.
+        The patch's ratio in each scan, in the same order.
     inverse_ratios
         complex [n, scan]: V / H of the pixels, NaN where not usable.
     """
-    good = np.isfinite(inverse_ratios).all(axis=1)
-    if not good.any():
-        return nothing_named(good.size)
+    usable = np.isfinite(inverse_ratios).all(axis=1)
+    if not usable.any():
+        return make_patch_without_pixels(usable.size)
     kind_evidence = [
         move_to_angle_of_kinds(evidence, kind) for evidence, kind in zip(kind_evidence, kinds, strict=True)
     ]
     odds = weigh_kinds(kinds, kind_evidence)
-    at_first = kinds[0]
-    names = np.array(at_first.names)
-    foreign_name, in_foreign_name = name_of_literature(at_first, odds)
-    verdict = replace(_find_verdict(at_first, odds, foreign_name, in_foreign_name), pixels=int(good.sum()))
+    # The kinds are the same at every angle; only their ratios differ.
+    first_kinds = kinds[0]
+    names = np.array(first_kinds.names)
+    literature_name, in_literature_name = summarise_literature(first_kinds, odds)
+    verdict = _find_verdict(first_kinds, odds, literature_name, in_literature_name)
+    verdict = replace(verdict, pixels=int(usable.sum()))
 
     # Pixels get the corrections of their patch: leakage, tilt, and the common change over the plane.
-    middle = np.median(inverse_ratios[good].real, axis=0) + 1j * np.median(inverse_ratios[good].imag, axis=0)
+    pixel_ratios = inverse_ratios[usable]
+    middle = np.median(pixel_ratios.real, axis=0) + 1j * np.median(pixel_ratios.imag, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         correction = np.array([evidence.inverse_ratio for evidence in kind_evidence]) / middle
     corrected = inverse_ratios * np.where(np.isfinite(correction), correction, 1.0)
-    called = np.where(at_first.ours, names, np.where(in_foreign_name, foreign_name, UNKNOWN))
-    pixel_names, pixel_distance, confidence = _name_pixels(kinds, kind_evidence, corrected, odds.kinds, called)
-    return NamedPatch(pixel_names, pixel_distance, replace(verdict, votes=share_of_pixels(pixel_names)), confidence)
+    name_of_kind = np.where(first_kinds.in_library, names, np.where(in_literature_name, literature_name, UNKNOWN))
+    pixel_names, pixel_distance, confidence = _name_pixels(kinds, kind_evidence, corrected, odds.kinds, name_of_kind)
+    return NamedPatch(pixel_names, pixel_distance, replace(verdict, votes=compute_name_shares(pixel_names)), confidence)
 
 
-def _find_verdict(kinds: Kinds, odds: Odds, foreign_name: str, in_foreign_name: npt.NDArray[np.bool_]) -> PatchName:
+def _find_verdict(
+    kinds: Kinds, odds: Odds, literature_name: str, in_literature_name: npt.NDArray[np.bool_]
+) -> PatchName:
     """Return the patch's name and its probabilities, without votes of pixels.
 
-    `foreign_name` is what the literature's materials are called together, `in_foreign_name` bool [kind] those meant.
+    `literature_name` and `in_literature_name` are those of :func:`summarise_literature`.
     """
     probability = {}
     distances = {}
     literature = {}
     for k, name in enumerate(kinds.names):
         distances[name] = float(odds.distance[k])
-        if kinds.ours[k]:
+        if kinds.in_library[k]:
             probability[name] = float(odds.kinds[k])
         else:
             literature[name] = float(odds.kinds[k])
     nearest = min(probability, key=lambda name: distances[name], default=None)
-    if foreign_name:
-        probability[foreign_name] = float(odds.kinds[in_foreign_name].sum())
-        distances[foreign_name] = float(odds.distance[in_foreign_name].min())
+    if literature_name:
+        probability[literature_name] = float(odds.kinds[in_literature_name].sum())
+        distances[literature_name] = float(odds.distance[in_literature_name].min())
     if kinds.sheet_share:
         probability[LAYER] = odds.sheet
     likely = _sort_likeliest_first(probability)
@@ -213,7 +226,7 @@ def _find_verdict(kinds: Kinds, odds: Odds, foreign_name: str, in_foreign_name: 
         probabilities=likely,
         nearest=nearest,
         literature=_sort_likeliest_first(literature),
-        from_literature=name == foreign_name,
+        from_literature=name == literature_name,
     )
 
 
@@ -223,28 +236,28 @@ def _sort_likeliest_first(probability: Mapping[str, float], least: float = LIKEL
     return {name: round(p, 4) for name, p in ordered if p >= least}
 
 
-def share_of_pixels(pixel_names: npt.NDArray[np.str_]) -> dict[str, float]:
+def compute_name_shares(pixel_names: npt.NDArray[np.str_]) -> dict[str, float]:
     """Return the share of the pixels with each name, largest first."""
     names, count = np.unique(pixel_names, return_counts=True)
     by_share = sorted(zip(names.tolist(), count.tolist(), strict=True), key=lambda row: (-row[1], row[0]))
     return {name: number / pixel_names.size for name, number in by_share}
 
 
-def evidence_of_pixels(inverse_ratios: npt.NDArray[np.complex128], kinds: Kinds) -> RatioEvidence:
-    """Return what pixels alone say of a patch whose scan's error budget is not known.
+def derive_evidence_from_pixels(inverse_ratios: npt.NDArray[np.complex128], kinds: Kinds) -> RatioEvidence:
+    """Return a patch's ratio and its covariance from its pixels alone, if the error budget of its scan is not known.
 
-    Their spread is not divided by the root of their number: errors inside a patch are as wide as the patch.
+    The spread of the pixels is not divided by the root of their number: errors inside a patch are as wide as the patch.
     `inverse_ratios` complex [n] is V / H of the pixels, NaN where not usable.
     """
-    good = inverse_ratios[np.isfinite(inverse_ratios)]
-    if not good.size:
+    usable_ratios = inverse_ratios[np.isfinite(inverse_ratios)]
+    if not usable_ratios.size:
         return RatioEvidence(kinds.theta_rad, 0j, np.eye(2), USUAL_LIBRARY_SHARE)
-    middle = complex(np.median(good.real), np.median(good.imag))
-    std = float(np.hypot(np.std(good), UNKNOWN_BUDGET * abs(middle)))
+    middle = complex(np.median(usable_ratios.real), np.median(usable_ratios.imag))
+    std = float(np.hypot(np.std(usable_ratios), UNKNOWN_BUDGET * abs(middle)))
     return RatioEvidence(kinds.theta_rad, middle, std**2 / 2 * np.eye(2), USUAL_LIBRARY_SHARE)
 
 
-def nothing_named(pixels: int) -> NamedPatch:
+def make_patch_without_pixels(pixels: int) -> NamedPatch:
     """Return a patch without any usable pixel."""
     verdict = PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
     return NamedPatch(np.full(pixels, UNKNOWN), np.full(pixels, np.inf), verdict)
@@ -255,88 +268,101 @@ def _name_pixels(
     kind_evidence: Sequence[RatioEvidence],
     inverse_ratios: npt.NDArray[np.complex128],
     patch_odds: Real,
-    called: npt.NDArray[np.str_],
+    name_of_kind: npt.NDArray[np.str_],
 ) -> tuple[npt.NDArray, Real, Real]:
     """Return name, distance over the threshold, and probability of the name of each pixel, [n] each.
 
     `inverse_ratios` complex [n, scan] are V / H of the pixels with the corrections of their patch, `patch_odds` [kind]
-    the probabilities of the patch's kinds, and `called` [kind] the name that each kind gets.
+    the probabilities of the patch's kinds, and `name_of_kind` [kind] the name that each kind gets.
     """
-    good = np.isfinite(inverse_ratios).all(axis=1)
-    first = kinds[0]
-    has_name = called != UNKNOWN
+    pixel_count = inverse_ratios.shape[0]
+    usable = np.isfinite(inverse_ratios).all(axis=1)
+    has_name = name_of_kind != UNKNOWN
+    # Real and imaginary part of each scan's ratio.
     parts = 2 * len(kind_evidence)
-    values = split_complex(inverse_ratios[good]).reshape(-1, parts)
+
+    # Gaussian of each named kind: its specimens differ, the scans have errors, and the pixels scatter.
+    values = split_complex(inverse_ratios[usable]).reshape(-1, parts)
     pixel_covariance = np.cov(values.T) if len(values) > 2 else np.zeros((parts, parts))
+    scan_covariance = scipy.linalg.block_diag(*(evidence.covariance for evidence in kind_evidence))
+    errors = scan_covariance + pixel_covariance + 1e-10 * np.eye(parts)
     effects = np.concatenate([kind.effects[has_name] for kind in kinds], axis=1)
-    errors = (
-        scipy.linalg.block_diag(*(evidence.covariance for evidence in kind_evidence))
-        + pixel_covariance
-        + 1e-10 * np.eye(parts)
-    )
     inverse = np.linalg.inv(effects @ effects.mT + errors)
-    middles = np.stack([kind.t[has_name] for kind in kinds], axis=1)
-    usable: npt.NDArray[np.complex128] = np.where(good.reshape(-1, 1), inverse_ratios, 0)
-    difference = split_complex(usable[:, None, :] - middles).reshape(inverse_ratios.shape[0], -1, parts)
+
+    # Squared Mahalanobis distance of each pixel to each kind, [n, kind].
+    means = np.stack([kind.t[has_name] for kind in kinds], axis=1)
+    ratios: npt.NDArray[np.complex128] = np.where(usable.reshape(-1, 1), inverse_ratios, 0)
+    difference = split_complex(ratios[:, None, :] - means).reshape(pixel_count, -1, parts)
     distance2 = np.einsum("nki,kij,nkj->nk", difference, inverse, difference)
-    ours = np.take(first.ours, np.flatnonzero(has_name))
-    prior = (1 - INCLUSIONS) * patch_odds[has_name] + INCLUSIONS * ours / max(ours.sum(), 1)
+
+    # Bayes: the prior is the patch's result, and for inclusions any material of the library. exp(-700) is not zero.
+    in_library = np.take(kinds[0].in_library, np.flatnonzero(has_name))
+    prior = (1 - INCLUSIONS) * patch_odds[has_name] + INCLUSIONS * in_library / max(in_library.sum(), 1)
     likelihood = prior * np.sqrt(np.linalg.det(inverse)) * np.exp(-0.5 * np.minimum(distance2, 1400))
-    labels, member = np.unique(called[has_name], return_inverse=True)
-    label_odds = likelihood @ np.equal.outer(member, np.arange(labels.size))
-    label = label_odds.argmax(axis=1)
-    row = np.arange(inverse_ratios.shape[0])
-    least_distance2 = np.where(np.equal.outer(label, member), distance2, np.inf).min(axis=1)
-    distance = np.where(good, np.sqrt(least_distance2 / scipy.special.chdtri(parts, 0.01)), np.inf)
-    share = label_odds[row, label] / np.maximum(label_odds.sum(axis=1), 1e-300)
-    names = np.where(distance <= 1, labels[label], UNKNOWN)
-    return names, distance, np.where(good, share * min(1.0, float(patch_odds[has_name].sum()) + INCLUSIONS), 0.0)
+
+    # Kinds of the same name are added up; the name of the largest sum is the pixel's.
+    names, name_index = np.unique(name_of_kind[has_name], return_inverse=True)
+    name_likelihood = likelihood @ np.equal.outer(name_index, np.arange(names.size))
+    best_name = name_likelihood.argmax(axis=1)
+    best_likelihood = name_likelihood[np.arange(pixel_count), best_name]
+    share = best_likelihood / np.maximum(name_likelihood.sum(axis=1), 1e-300)
+    probability_of_named = min(1.0, float(patch_odds[has_name].sum()) + INCLUSIONS)
+    confidence = np.where(usable, share * probability_of_named, 0.0)
+
+    # A pixel outside of the 99 % region of every kind of that name is unknown.
+    least_distance2 = np.where(np.equal.outer(best_name, name_index), distance2, np.inf).min(axis=1)
+    distance = np.where(usable, np.sqrt(least_distance2 / scipy.special.chdtri(parts, 0.01)), np.inf)
+    return np.where(distance <= 1, names[best_name], UNKNOWN), distance, confidence
 
 
 def add_explanation(
     named: NamedPatch,
     permittivity: complex | None,
     covariance: npt.NDArray[np.float64] | None,
-    known: Mapping[str, complex],
+    library: Mapping[str, complex],
 ) -> NamedPatch:
     """Return the patch with the reason of its name, one sentence for a reader who knows materials.
 
     `permittivity` is eps' - j eps'' of the patch, `covariance` [2, 2] that of its real and imaginary part; None if it
-    has none. `known` are the library's permittivities.
+    has none. `library` are the permittivities of the library's materials.
     """
-    name = named.verdict
+    verdict = named.verdict
     estimate = _format_estimate(permittivity, covariance)
-    nearest = name.nearest
-    if name.name in known:
-        nearest = name.name
-    nearest_text = ""
-    near = ""
+    nearest = verdict.nearest
+    if verdict.name in library:
+        nearest = verdict.name
+    nearest_material = ""
+    nearest_clause = ""
     if nearest is not None:
-        nearest_text = _add_permittivity(nearest, known.get(nearest))
-        near = f"; nearest: {nearest_text}"
-    if name.name == UNKNOWN:
-        explanation = f"not in the library: {estimate}{near}" if estimate else f"not in the library{near}"
-    elif name.name == LAYER:
-        if estimate:
-            explanation = f"{estimate} as a half space, but rather a thin plate{near}"
-        else:
-            explanation = f"rather a thin plate{near}"
-    elif name.from_literature:
-        values = _list_values(name.literature)
-        explanation = f"{estimate} is like {values} of the literature; not measured by this library{near}"
+        nearest_material = _add_permittivity(nearest, library.get(nearest))
+        nearest_clause = f"; nearest: {nearest_material}"
+
+    if verdict.name == UNKNOWN and estimate:
+        explanation = f"not in the library: {estimate}{nearest_clause}"
+    elif verdict.name == UNKNOWN:
+        explanation = f"not in the library{nearest_clause}"
+    elif verdict.name == LAYER and estimate:
+        explanation = f"{estimate} as a half space, but rather a thin plate{nearest_clause}"
+    elif verdict.name == LAYER:
+        explanation = f"rather a thin plate{nearest_clause}"
+    elif verdict.from_literature:
+        values = _list_values(verdict.literature)
+        explanation = f"{estimate} is like {values} of the literature; not measured by this library{nearest_clause}"
+    elif estimate:
+        explanation = f"{estimate} matches the library's {nearest_material}{_list_rivals(verdict)}"
     else:
-        explanation = f"{estimate} matches the library's {nearest_text}{_list_rivals(name)}"
-        if not estimate:
-            explanation = f"it looks like the library's {nearest_text}{_list_rivals(name)}"
-    return replace(named, verdict=replace(name, why=explanation))
+        explanation = f"it looks like the library's {nearest_material}{_list_rivals(verdict)}"
+    return replace(named, verdict=replace(verdict, why=explanation))
 
 
-def _list_rivals(name: PatchName) -> str:
-    """Say which other names are likely; nothing of the KNN, which has no probabilities."""
-    other_names = [f"{n} {100 * p:.0f} %" for n, p in name.probabilities.items() if n not in (name.name, UNKNOWN)]
-    if other_names:
-        return f"; it could also be {' or '.join(other_names[:2])}"
-    if name.probabilities:
+def _list_rivals(verdict: PatchName) -> str:
+    """Return a clause on the other likely names; empty for the KNN, which has no probabilities."""
+    rivals = [
+        f"{name} {100 * p:.0f} %" for name, p in verdict.probabilities.items() if name not in (verdict.name, UNKNOWN)
+    ]
+    if rivals:
+        return f"; it could also be {' or '.join(rivals[:2])}"
+    if verdict.probabilities:
         return "; no other material is likely"
     return ""
 
@@ -352,7 +378,7 @@ def _format_estimate(permittivity: complex | None, covariance: npt.NDArray[np.fl
 
 
 def _list_values(literature: Mapping[str, float]) -> str:
-    """The likeliest materials of the literature with their permittivities."""
+    """Return the likeliest materials of the literature with their permittivities, as text."""
     values = {material.name: material.permittivity for material in load_catalogue()}
     return ", ".join(_add_permittivity(name, values.get(name)) for name in list(literature)[:MOST_NAMES])
 

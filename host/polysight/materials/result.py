@@ -190,7 +190,7 @@ class MaterialsResult:
         """Return the figures of each patch, for materials.json."""
         figures = [self._describe_patch(r) for r in self.patches]
         if self.withheld:
-            return [patch.withheld() for patch in figures]
+            return [patch.without_results() for patch in figures]
         return figures
 
     def without_result(self) -> MaterialsResult:

@@ -20,9 +20,8 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.files import read_bounded
 
-# Lost at the next reset (ICD 302)
+# File types of a download (ICD 302): the RAM, which the next reset clears, and the first of four flash areas.
 TO_RAM = 0
-# The first of four areas in the board's serial flash
 TO_FLASH = 4
 # TI's limit for each part; the first one is acknowledged after erasing the flash
 CHUNK_TIMEOUT_S = 10.0
@@ -36,17 +35,22 @@ FAMILIES = {
     GENERATION: "AWR2243",
     6: "xWR6243, 57..64 GHz",
 }
-# An image has a part for each
+# An image has one program part for each core, in this order.
 _CORES = ("main", "RF")
 
+# An image is a header of 128 bytes, the program parts, and a CRC-32 of all before it. The header begins with a magic
+# word, has the length without the CRC at byte 20, and a closing word; each part begins with its own magic word.
 _MAGIC = b"MSTR"
 _END = b"MEND"
 _PART = b"RPRC"
 _LENGTH_AT = 20
 _HEADER_BYTES = 128
-# Offsets in a part: version, then year, month, day
+# Offsets in a program part of two versions, each of four bytes (followed by a date): ROM and patch.
 _ROM_AT = 0x38
 _PATCH_AT = 0x48
+_VERSION_BYTES = 4
+# Offset of the ROM's version in the answer to a version request.
+_ROM_IN_ANSWER = 3
 _REMEDY = "copy xwr22xx_metaImage.bin from TI's mmWave DFP 2.2 again, and compare its size with TI's"
 
 
@@ -85,11 +89,11 @@ def read_image(path: Path) -> Image:
 def check_image(data: bytes, name: str) -> Image:
     """Check the bytes of a file. Raises ConfigError if they are not a complete, undamaged image for an AWR2243."""
     if data[:4] != _MAGIC:
-        begin = "nothing"
+        beginning = "nothing"
         if data:
-            begin = data[:12].decode("latin-1")
+            beginning = data[:12].decode("latin-1")
         raise _file_error(
-            name, f"begins with {begin!r} instead of {_MAGIC.decode()!r}", "another file, or an empty one"
+            name, f"begins with {beginning!r} instead of {_MAGIC.decode()!r}", "another file, or an empty one"
         )
     if len(data) < _HEADER_BYTES:
         raise _file_error(name, f"{len(data)} bytes are too few for its header", "an interrupted copy")
@@ -104,23 +108,28 @@ def check_image(data: bytes, name: str) -> Image:
     expected = int.from_bytes(data[-4:], "little")
     if actual != expected:
         raise _file_error(name, f"CRC-32 {actual:08x} instead of {expected:08x}", "damaged during the copy")
-    begins = [
-        offset for offset in range(_HEADER_BYTES, len(data) - _PATCH_AT - 8, 4) if data[offset : offset + 4] == _PART
+    # Parts are aligned to four bytes; one that begins too late to hold its versions and the CRC is none.
+    last_offset = len(data) - 4 - _VERSION_BYTES - _PATCH_AT
+    part_offsets = [
+        offset for offset in range(_HEADER_BYTES, last_offset, 4) if data[offset : offset + len(_PART)] == _PART
     ]
-    if _END not in data[:_HEADER_BYTES] or not begins or begins[0] != _HEADER_BYTES:
+    if _END not in data[:_HEADER_BYTES] or not part_offsets or part_offsets[0] != _HEADER_BYTES:
         raise _file_error(name, "no program part after its header", "an image of another kind")
-    if len(begins) != len(_CORES):
-        raise _file_error(name, f"{len(begins)} program parts, an AWR2243 has two cores", "an image of another kind")
-    roms = [tuple(data[offset + _ROM_AT : offset + _ROM_AT + 4]) for offset in begins]
+    if len(part_offsets) != len(_CORES):
+        raise _file_error(
+            name, f"{len(part_offsets)} program parts, an AWR2243 has two cores", "an image of another kind"
+        )
+    roms = [_read_version(data, offset + _ROM_AT) for offset in part_offsets]
     foreign_generations = [rom[0] for rom in roms if rom[0] != GENERATION]
     if foreign_generations:
         generation = foreign_generations[0]
         raise _file_error(
             name,
-            f"for devices of generation {generation} ({_family(generation)}); an AWR2243 has generation {GENERATION}",
+            f"for devices of generation {generation} ({_name_family(generation)});"
+            f" an AWR2243 has generation {GENERATION}",
             "an image for another device",
         )
-    patches = tuple(describe_patch(*data[offset + _PATCH_AT : offset + _PATCH_AT + 4]) for offset in begins)
+    patches = tuple(describe_patch(*_read_version(data, offset + _PATCH_AT)) for offset in part_offsets)
     foreign_patches = [p for p in patches if not p.startswith(f"{GENERATION}.")]
     if foreign_patches:
         raise _file_error(
@@ -129,24 +138,37 @@ def check_image(data: bytes, name: str) -> Image:
     return Image(name, data, roms[0], patches)
 
 
-def _family(generation: int) -> str:
+def _read_version(data: bytes, offset: int) -> tuple[int, ...]:
+    """Return the four numbers of a version: major, minor, build, debug."""
+    return tuple(data[offset : offset + _VERSION_BYTES])
+
+
+def _name_family(generation: int) -> str:
     return FAMILIES.get(generation, "an unknown device")
 
 
-def require_family(name: str, core: str, version: bytes) -> None:
-    """Raise ConfigError if the version answer is not that of an AWR2243; the settings would not apply to it."""
-    release = version[3:7]
-    if release[0] == GENERATION:
+def _format_rom(rom: tuple[int, ...]) -> str:
+    return ".".join(map(str, rom))
+
+
+def require_family(board_name: str, core: str, answer: bytes) -> None:
+    """Raise ConfigError if a core's answer to a version request is not that of an AWR2243.
+
+    `core` is "main" or "RF". The settings would not apply to another device.
+    """
+    rom = _read_version(answer, _ROM_IN_ANSWER)
+    generation = rom[0]
+    if generation == GENERATION:
         return
-    rom = ".".join(map(str, release))
     cause = "the board has another device"
     remedy = "use an AWR2243 board; docs/spec/mmwavelink.md, Other boards"
     # All zeros or all ones come from a line that nothing drives.
-    if set(release) in ({0x00}, {0xFF}):
+    if set(rom) in ({0x00}, {0xFF}):
         cause = "the board's data line is stuck"
         remedy = "check the 60-pin connector"
     raise ConfigError(
-        f"{name}: its {core} core's ROM is {rom}, generation {release[0]} ({_family(release[0])});"
+        f"{board_name}: its {core} core's ROM is {_format_rom(rom)}, generation {generation}"
+        f" ({_name_family(generation)});"
         " only AWR2243 is supported",
         cause,
         remedy,
@@ -154,20 +176,21 @@ def require_family(name: str, core: str, version: bytes) -> None:
     )
 
 
-def require_rom(name: str, version: bytes, image: Image) -> None:
-    """Raise ConfigError if the image is for another ROM than that of the version answer."""
-    require_family(name, _CORES[0], version)
-    if tuple(version[3:7]) != image.rom:
-        actual, expected = (".".join(map(str, rom)) for rom in (version[3:7], image.rom))
+def require_rom(board_name: str, answer: bytes, image: Image) -> None:
+    """Raise ConfigError if the image is for another ROM than the main core's answer to a version request names."""
+    require_family(board_name, "main", answer)
+    rom = _read_version(answer, _ROM_IN_ANSWER)
+    if rom != image.rom:
         raise ConfigError(
-            f"{name}: its main core's ROM is {actual}, {image.name} is for ROM {expected}; nothing was sent",
+            f"{board_name}: its main core's ROM is {_format_rom(rom)}, {image.name} is for ROM"
+            f" {_format_rom(image.rom)}; nothing was sent",
             "another version of the device, or an image for another one",
             "use the image of this device's DFP",
             code=ErrorCode.MISMATCH,
         )
 
 
-def file_chunks(image: bytes, file_type: int = TO_FLASH) -> list[tuple[FileChunk, int]]:
+def split_into_chunks(image: bytes, file_type: int = TO_FLASH) -> list[tuple[FileChunk, int]]:
     """Return the commands that download an image, each with the number of commands after it.
 
     Raises ValueError if the image is empty.
@@ -180,26 +203,32 @@ def file_chunks(image: bytes, file_type: int = TO_FLASH) -> list[tuple[FileChunk
 
 
 def send_image(
-    link: Link, name: str, image: Image, to: int, progress: Callable[[int, int], None] = lambda _sent, _total: None
+    link: Link,
+    board_name: str,
+    image: Image,
+    file_type: int,
+    progress: Callable[[int, int], None] = lambda _sent, _total: None,
 ) -> None:
-    """Send every part of an image; call `progress` with the parts sent and their total.
+    """Download an image to the RAM or the flash; call `progress` with the chunks sent and their total.
 
-    Raises DeviceError for the part that failed. The flash is then incomplete; the board still accepts a download.
+    Raises DeviceError for the chunk that failed. The flash is then incomplete; the board still accepts a download.
     """
-    parts = file_chunks(image.data, to)
-    progress(0, len(parts))
-    for n, (part, remaining) in enumerate(parts):
+    chunks = split_into_chunks(image.data, file_type)
+    progress(0, len(chunks))
+    for number, (chunk, remaining) in enumerate(chunks, start=1):
         try:
-            link.call(part, timeout_s=CHUNK_TIMEOUT_S, remaining=remaining)
+            link.call(chunk, timeout_s=CHUNK_TIMEOUT_S, remaining=remaining)
         except DeviceError as e:
-            rest = "its flash has no complete image now; " if to == TO_FLASH else ""
+            cause = e.why
+            if file_type == TO_FLASH:
+                cause = f"its flash has no complete image now; {cause}"
             raise DeviceError(
-                f"{name}: part {n + 1} of {len(parts)} of {image.name} was not accepted: {e.what}",
-                f"{rest}{e.why}",
+                f"{board_name}: part {number} of {len(chunks)} of {image.name} was not accepted: {e.what}",
+                cause,
                 "remove the cause and download it again: a board without firmware still accepts a download",
                 code=e.code,
             ) from None
-        progress(n + 1, len(parts))
+        progress(number, len(chunks))
 
 
 def _file_error(name: str, what: str, why: str) -> ConfigError:

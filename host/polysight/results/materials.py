@@ -43,6 +43,7 @@ Pair = tuple[float | None, float | None]
 Number = float | None
 Text = str | None
 V = TypeVar("V")
+# Numbers the columns in the order of their declarations.
 _positions = count()
 
 
@@ -55,15 +56,15 @@ class Column:
     name
         Column of the CSV and MATLAB table; "" leaves it out.
     about
-        What it is, in a few words.
+        Description in a few words.
     unit
-        Of the value; "1" for a pure number, "" for text.
+        Unit of the value; "1" for a pure number, "" for text.
     variable
-        Variable of datasets; "" leaves it out. None: `name`.
+        Name of the variable in datasets; "" leaves it out. None: the same as `name`.
     title, digits
-        Heading in tables for people ("": not shown there), and digits behind the point.
+        Heading in tables for people ("": not shown there), and digits after the decimal point.
     optional
-        Left out of datasets where no patch has a value.
+        True if datasets omit the figure when no patch has a value.
     """
 
     name: str
@@ -103,12 +104,13 @@ class Figure:
             return np.array([value or "" for value in values], np.str_)
         if self.kind is bool:
             return np.array(values, np.bool_)
-        number = np.complex128 if self.kind is complex else np.float64
         if self.kind is complex:
+            dtype = np.complex128
             unknown = complex(np.nan, np.nan)
         else:
+            dtype = np.float64
             unknown = np.nan
-        return np.array([unknown if value is None else value for value in values], number)
+        return np.array([unknown if value is None else value for value in values], dtype)
 
     def format(self, patch: "PatchFigures") -> str:
         """Return the value for people, with its unit; a dash if it is not known."""
@@ -149,13 +151,17 @@ def derive(kind: type[V], compute: "Callable[[PatchFigures], V]", column: Column
 def derive_if_known(
     kind: type[V], source: "str | Callable[[PatchFigures], V | None]", column: Column
 ) -> Derived[V | None]:
-    """Declare a figure that some patches lack: a function, or a path of attributes, None where one of them is."""
+    """Declare a figure that some patches lack.
+
+    `source` computes it, or is a path of attributes ("permittivity.real"); it is None if an attribute on the path is.
+    """
     if isinstance(source, str):
         return Derived(kind, partial(_follow, source.split(".")), column)
     return Derived(kind, source, column)
 
 
 def _follow(path: Sequence[str], value: Any) -> Any:
+    """Return the attribute of an attribute ... of `value`; None if one of them is None or UNSET."""
     for name in path:
         value = getattr(value, name)
         if value is None or value is UNSET:
@@ -174,13 +180,10 @@ def declared_figures(kind: type["PatchFigures"]) -> tuple[Figure, ...]:
     ]
     for name, hint in get_type_hints(kind, include_extras=True).items():
         if get_origin(hint) is Annotated:
-            bare, *extras = get_args(hint)
-            kinds = [part for part in get_args(bare) if part not in (NoneType, UnsetType)]
-            if kinds:
-                value_kind = kinds[0]
-            else:
-                value_kind = bare
-            figures += [Figure(name, value_kind, column) for column in extras if isinstance(column, Column)]
+            field_type, *extras = get_args(hint)
+            value_types = [part for part in get_args(field_type) if part not in (NoneType, UnsetType)]
+            value_type = value_types[0] if value_types else field_type
+            figures += [Figure(name, value_type, column) for column in extras if isinstance(column, Column)]
     return tuple(sorted(figures, key=lambda figure: figure.column.position))
 
 
@@ -234,7 +237,7 @@ class PermittivityFigures(msgspec.Struct, frozen=True, kw_only=True):
     shares, dominated_by
         Share of each source in the variance, and the largest source.
     do
-        Measurement that would shrink the error.
+        Measurement that would reduce the error most.
     """
 
     real: float
@@ -289,7 +292,7 @@ class PermittivitySpread:
 
 
 class BandFigures(msgspec.Struct, frozen=True, kw_only=True):
-    """Ratio of a patch in one sub-band of the sweep; None where the sub-band shows no pixel of it.
+    """Ratio of a patch in one sub-band of the sweep; None if no pixel of the patch is usable in it.
 
     Attributes
     ----------
@@ -330,23 +333,27 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     name
         Material of the library, "like ... (literature)", "possible layer" or "unknown".
     name_source
-        "library" or "literature"; None without a name, or where it is no material's.
+        "library" or "literature"; None without a name, or if the name is not a material.
     votes, probabilities
-        Share of the pixels, and probability, of names and `unknown`; likeliest first.
+        Share of the pixels with each name, and probability of each name, `unknown` among them; likeliest first.
     literature
         Probability of each likely material of the literature.
     why
         Reason for the name in one sentence.
+    distance
+        Distance to the named material, in units of its threshold: above 1 is unknown.
+    box_mm
+        Bounding box: least x and y, largest x and y.
     outline_mm, pixels
         Outline and size before edges are left out.
     amplitude_h
         Median of abs(H) relative to metal.
     refused
-        Why it has neither name nor permittivity.
+        Reason why the patch has neither name nor permittivity.
     truth
-        Of a simulated scene.
+        The plate of a simulated scene.
     tilt_across_deg
-        Rise across the plane of incidence, which was taken out of H and V.
+        Tilt of the patch across the plane of incidence; its effect was removed from H and V.
     bands
         Ratios in the sub-bands of the sweep.
     """
@@ -466,12 +473,12 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def _second(self) -> "_NameShare":
-        """The name with the second largest probability; of the pixels in products without probabilities."""
+        """The likeliest name beside `name`, by probability, or by votes in products without probabilities."""
         shares = self.probabilities or self.votes
         other_shares = [_NameShare(name, share) for name, share in shares.items() if name != self.name]
         return max(other_shares, key=lambda other: other.share or 0.0, default=_NameShare())
 
-    def withheld(self) -> Self:
+    def without_results(self) -> Self:
         """Return only place and size: without name, measured values and truth."""
         return msgspec.structs.replace(
             self, name=None, name_source=None, confidence=None, votes={}, probabilities={}, literature={}, why="",
@@ -483,8 +490,8 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
 class LeakageError(msgspec.Struct, frozen=True, kw_only=True):
     """Leakage of H and V into each other, relative to their own channel, with its standard deviations.
 
-    `source` is "measured", "scene", or "prior and scene" (hardly known). `removed_h` and `removed_v` are what the
-    pixels of image.npz are free of.
+    `source` is "measured", "scene", or "prior and scene" (hardly known). `removed_h` and `removed_v` are the leakage
+    that was removed from the pixels of image.npz.
     """
 
     h: Pair | None = None
@@ -503,7 +510,7 @@ class IncidenceError(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlaneError(msgspec.Struct, frozen=True, kw_only=True):
-    """Plane of the plates relative to the rig file's; only `known` if it was not found."""
+    """Plane of the plates relative to the plane of the rig file; without values if `known` is False."""
 
     known: bool = False
     offset_mm: float | UnsetType = UNSET
@@ -515,9 +522,10 @@ class PlaneError(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MetalScore(msgspec.Struct, frozen=True, kw_only=True):
-    """Evidence that the reference is metal: score from the other patches, V over H beside the direct path.
+    """Evidence that the reference is metal.
 
-    `painted` is the probability that the metal is painted, `paint_mm` the thickness of the paint then.
+    `score` comes from the `others`, the number of other patches; `channel_ratio_db` is V / H relative to the direct
+    path. `painted` is the probability that the metal is painted, `paint_mm` the thickness of the paint in that case.
     """
 
     score: float | None = None
@@ -528,7 +536,7 @@ class MetalScore(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ErrorBudget(msgspec.Struct, frozen=True, kw_only=True):
-    """What the errors of the permittivities were computed with."""
+    """Errors of the scan that the errors of the permittivities were computed from."""
 
     leakage: LeakageError | None = None
     incidence: IncidenceError | None = None
@@ -549,12 +557,12 @@ class ScanMaterials(msgspec.Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     verdict
-        None in products of earlier releases. With the level `none` the patches keep only place and size: no reader and
-        no writer of the results can show names or permittivities.
+        None in products of earlier releases. With the level `none` the patches keep only place and size, so that no
+        reader or writer of the results can show names or permittivities.
     library, model
-        What named the patches, in words, and the classifier.
+        Description of the library that named the patches, and the name of the classifier.
     pixel_accuracy
-        Share of interior pixels named right, of a simulated scene.
+        Share of interior pixels with the correct name, in a simulated scene.
     """
 
     scan_id: str | UnsetType = UNSET
@@ -570,11 +578,11 @@ class ScanMaterials(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if self.verdict and not self.verdict.usable:
             msgspec.structs.force_setattr(self, "pixel_accuracy", None)
-            msgspec.structs.force_setattr(self, "segments", [patch.withheld() for patch in self.segments])
+            msgspec.structs.force_setattr(self, "segments", [patch.without_results() for patch in self.segments])
 
     @classmethod
     def read(cls, path: Path) -> "ScanMaterials | None":
-        """Read a file; None if there is none, as where only images were made. Raises DataError if it is damaged."""
+        """Read a file; None if it does not exist (only images were made). Raises DataError if it is damaged."""
         content = read_object(path)
         if content is None:
             return None
@@ -590,7 +598,7 @@ class ScanMaterials(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _decode_finding(segment: Any) -> Any:
-    """Return an entry with its reason for refusal as a finding; files hold what, why and do."""
+    """Return an entry with `refused` as a :class:`Finding`; files have its parts as what, why and do."""
     if not isinstance(segment, dict) or not isinstance(segment.get("refused"), dict):
         return segment
     refused = segment["refused"]

@@ -1,7 +1,8 @@
 """The step engine of the Python stand-in of the stage: the firmware's integer arithmetic (arduino_stage/motion.cpp).
 
-Same numbers on purpose: both make the same steps at the same ticks, which the tests compare. Here runs of steps at
-constant speed between two events are taken at once, because Python is too slow to make each.
+Names and numbers are those of the firmware on purpose: both make the same steps at the same ticks, which the tests
+compare; arduino_stage/motion.h explains the arithmetic. Here the steps at constant speed between two events are taken
+at once (:meth:`StepEngine.skip`), because Python is too slow to make each.
 """
 
 from __future__ import annotations
@@ -13,49 +14,84 @@ from polysight_shared.faults import StageError
 
 TICK_HZ = 2_000_000
 NS_PER_TICK = 1_000_000_000 // TICK_HZ
+# Slowest and fastest step rate, steps/s.
 MIN_RATE = 31
 MAX_RATE = 20_000
+# Bits of the switch inputs.
 SWITCH_X = 1
 SWITCH_Y = 2
 EMERGENCY = 4
 SWITCHES = SWITCH_X | SWITCH_Y
-# Equal readings after which a switch changes (debouncing)
+# A switch counts as changed after this many equal readings (debouncing).
 LOOKS = 5
 
 
 class Leg(NamedTuple):
-    """One straight line: signed steps, steps/s of the longer axis, triggers, and inputs that end it (homing)."""
+    """One straight line of the stage."""
 
     dx: int
+    """Signed steps of x; `dy` those of y."""
     dy: int
     rate: int
+    """Steps/s of the axis with more steps."""
     lead: int = 0
+    """Steps before the first trigger."""
     pitch: int = 0
+    """Steps from trigger to trigger."""
     points: int = 0
+    """Number of triggers; 0: none."""
     until: int = 0
+    """Switch inputs that end the leg (homing); 0: a pressed switch is a fault."""
     until_open: bool = False
+    """End the leg when the switch opens instead of when it closes."""
 
 
 class StepEngine:
     """One leg at a time with trapezoidal speed. Positions are steps, times are ticks of 500 ns."""
 
     def __init__(self) -> None:
-        self.x = self.y = self.points = self.pulses = 0
-        self.hold = self.stepping = self.cruise = self.reached = False
+        # Position, steps; trigger points passed and trigger pulses given in this row.
+        self.x = 0
+        self.y = 0
+        self.points = 0
+        self.pulses = 0
+        # A hold is requested; steps are due; constant speed; `Leg.until` has ended the leg.
+        self.hold = False
+        self.stepping = False
+        self.cruise = False
+        self.reached = False
+        # The switch that ended the leg.
         self.fault: StageError | None = None
-        self.left = self.ramp = self.ramp_full = self.major = self.minor = self.error = 0
+        # Steps left in the leg, steps to a stop from the present speed, and from the leg's rate.
+        self.left = 0
+        self.ramp = 0
+        self.ramp_full = 0
+        # Bresenham's line: steps of the axis with more steps, of the other one, and the error term.
+        self.major = 0
+        self.minor = 0
+        self.error = 0
         self.x_major = True
-        self.x_direction = self.y_direction = 0
-        self.to_trigger = self.carry = self.ticks = self.speed_q16 = 0
+        self.x_direction = 0
+        self.y_direction = 0
+        # Steps to the next trigger, triggers left.
+        self.to_trigger = 0
         self.points_left = 0
-        self.stable = self._looks = 0
+        # Speed in steps/s x 2^16, ticks of the present step, and the remainder carried to the next at constant speed.
+        self.speed_q16 = 0
+        self.ticks = 0
+        self.carry = 0
+        # The debounced inputs, and the readings that differed from them.
+        self.stable = 0
+        self._looks = 0
         self.leg = Leg(0, 0, MIN_RATE)
         self.set_accel(40_000)
 
     def set_accel(self, steps_s2: int) -> None:
         """Set the acceleration, steps/s^2."""
         self.accel = steps_s2
+        # Steps/s gained per tick, x 2^20: 2^20 / TICK_HZ = 8192 / 15625.
         self._accel_q20 = steps_s2 * 8192 // 15625
+        # Speed of the first step: its mean from rest, sqrt(2 a) / 2.
         self._slowest = max(MIN_RATE, math.isqrt(steps_s2 // 2))
 
     def ramp_steps(self, rate: int) -> int:
@@ -93,7 +129,8 @@ class StepEngine:
         self.ramp_full = self.ramp_steps(leg.rate)
         self.to_trigger = leg.lead
         self.points_left = leg.points
-        self.reached = self.cruise = False
+        self.reached = False
+        self.cruise = False
         return self._start_from_rest()
 
     def resume(self) -> int:
@@ -111,12 +148,16 @@ class StepEngine:
 
     def abandon(self) -> None:
         """Drop the rest of the leg."""
-        self.stepping = self.hold = self.cruise = False
-        self.left = self.ramp = self.points_left = 0
+        self.stepping = False
+        self.hold = False
+        self.cruise = False
+        self.left = 0
+        self.ramp = 0
+        self.points_left = 0
         self.fault = None
 
     def look(self, inputs: int) -> None:
-        """Read and debounce the switches: a change counts after :data:`LOOKS` equal readings."""
+        """Debounce the switches: a change counts after :data:`LOOKS` equal readings."""
         if inputs == self.stable:
             self._looks = 0
         else:
@@ -140,6 +181,7 @@ class StepEngine:
             self.left = 0
             return 0, 0, False
         if leg.until and not self.reached and bool(inputs & leg.until) != leg.until_open:
+            # The homing switch has changed: brake to a stop.
             self.reached = True
             self.left = self.ramp
             if self.left == 0:
@@ -152,7 +194,7 @@ class StepEngine:
         Parameters
         ----------
         wait_ticks
-            Ticks from the next step's due time to the end of what may be done.
+            Ticks from the next step's due time to the end of the time that may be simulated.
         clear_x, clear_y
             Steps each axis may make before its switch changes.
 
@@ -171,7 +213,9 @@ class StepEngine:
         else:
             clear_major = clear_y
             clear_minor = clear_x
-        n = min(self.left - self.ramp - 1, ((wait_ticks + 1) * rate - 1 - self.carry) // TICK_HZ + 1, clear_major)
+        steps_before_braking = self.left - self.ramp - 1
+        steps_in_time = ((wait_ticks + 1) * rate - 1 - self.carry) // TICK_HZ + 1
+        n = min(steps_before_braking, steps_in_time, clear_major)
         if self.points_left:
             n = min(n, self.to_trigger - 1)
         if self.minor:
@@ -187,6 +231,7 @@ class StepEngine:
         return n, dx, dy, ticks
 
     def _advance(self, n: int) -> tuple[int, int, bool]:
+        """Move by `n` steps of the longer axis; return the steps of x and y, and True if the trigger is raised."""
         self.left -= n
         minor_steps, self.error = divmod(self.error + n * self.minor, self.major)
         if self.x_major:
@@ -212,15 +257,20 @@ class StepEngine:
     def interval(self) -> int:
         """Return the ticks until the next step; 0: the stage is at rest."""
         rate = self.leg.rate
-        if not self.stepping or self.left == 0 or (self.hold and self.ramp == 0):
-            self.stepping = self.cruise = False
+        held_at_rest = self.hold and self.ramp == 0
+        must_brake = self.ramp > 0 and self.left <= self.ramp
+        if not self.stepping or self.left == 0 or held_at_rest:
+            self.stepping = False
+            self.cruise = False
             return 0
-        if self.hold or (self.ramp and self.left <= self.ramp):
+        if self.hold or must_brake:
+            # Brake.
             self.cruise = False
             self.ramp -= 1
             slowest = self._slowest << 16
             self.speed_q16 = max(slowest, self.speed_q16 - (self.ticks * self._accel_q20 >> 4))
         elif self.cruise or self.ramp == self.ramp_full:
+            # Constant speed: the remainder of the division is carried over, so that the mean rate is exact.
             if not self.cruise:
                 self.cruise = True
                 self.carry = 0
@@ -228,6 +278,7 @@ class StepEngine:
             self.ticks, self.carry = divmod(TICK_HZ + self.carry, rate)
             return self.ticks
         elif self.left > self.ramp + 1:
+            # Accelerate.
             if self.ramp == 0:
                 self.speed_q16 = self._slowest << 16
             else:
@@ -235,6 +286,7 @@ class StepEngine:
             self.ramp += 1
             self.speed_q16 = min(self.speed_q16, rate << 16)
         elif self.ramp == 0:
+            # The only step of a leg.
             self.speed_q16 = self._slowest << 16
         self.ticks = TICK_HZ // (self.speed_q16 >> 16)
         return self.ticks

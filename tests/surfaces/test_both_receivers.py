@@ -12,8 +12,8 @@ from polysight.data import find_packaged
 from polysight.imaging.samples import reduction
 from polysight.surfaces import Echoes, Optics, Seen, find_voltages, make_optics
 from polysight.surfaces.measure import Shape
-from polysight.surfaces.permittivity import receive, reflect_points
 from polysight.surfaces.points import find_normals, find_offset_that_sees, predict_echo
+from polysight.surfaces.voltages import receive, reflect_points
 from polysight.surfaces.window import BoardFit, Samples, no_echoes
 from polysight_shared.config import load_instrument
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -83,6 +83,20 @@ def test_a_large_ball_gives_both_receivers_what_the_series_says(medium, optics):
     # The antennas' patterns are those of metal. V is small near Brewster's angle: its error counts over H.
     miss = ratios["medium"] / ratios["metal"] - 1
     assert np.abs(miss * share_of_v).max() < 0.0004
+
+
+@pytest.mark.parametrize(("behind_m", "most_std"), [(0.0, 0.03), (0.18, 0.1)], ids=["same distance", "180 mm behind"])
+def test_the_level_of_metal_is_known_as_well_as_both_its_directions_are(behind_m, most_std, gains, optics):
+    """Away from the distance of the reference an arrival goes with another departure: 15 degrees at 180 mm, 7 %."""
+    learnt = gains(optics)
+    x, y, z = CENTRE_M
+    seen, shape = see_exactly(sphere("ball", METAL, (x, y, z + behind_m), RADIUS_M), optics)
+    voltages = find_voltages(seen, optics, shape)
+    expected = receive(voltages, reflect_points(np.inf, voltages, optics.wave_number))
+    miss = np.log(np.abs(voltages.b[:, 0] / expected[:, 0])) - learnt.level(voltages)
+    std = learnt.estimate_level_std(voltages)
+    assert np.all(np.abs(miss) < 2 * std + 0.02)
+    assert np.all(std < most_std)
 
 
 def test_echoes_have_their_phases_at_the_wave_number_of_the_rig():

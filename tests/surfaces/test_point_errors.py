@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from polysight.surfaces.gains import Gains
 from polysight.surfaces.optics import reflect_flat
 from polysight.surfaces.permittivity import (
     DisturbedScan,
-    Gains,
-    Voltages,
     fit_permittivity,
     judge_medium,
     point_covariance,
     point_permittivity,
 )
+from polysight.surfaces.voltages import Voltages
 
 WAVE_NUMBER = 1634.0
 EPS = 4.0 - 0.5j
@@ -24,9 +24,10 @@ CHI2_95 = 5.991
 # Metal of known gain, the same in all directions.
 UNIT_GAINS = Gains(
     ratio_terms=np.zeros(1, complex),
-    level_terms=np.zeros(1),
+    level_terms=np.zeros((2, 1)),
     band_rise=np.zeros(2),
     middle=np.zeros(2),
+    departure_middle=np.zeros(2),
     degree=0,
     std=0.0,
     covered=(np.full(2, -1.0), np.full(2, 1.0)),
@@ -58,6 +59,7 @@ def make_voltages(ripple: np.ndarray, at_m: np.ndarray, stated_noise: float) -> 
         bend_across=zero,
         twist=zero,
         arrival=np.zeros((count, 2)),
+        departure=np.zeros((count, 2)),
         band_rise=np.zeros((count, 2)),
         at_m=at_m,
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from polysight.surfaces import Seen, Uncertainty, analyse_surface, find_shape, find_voltages
-from polysight.surfaces.permittivity import find_interior, find_reflecting, receive, reflect_points
+from polysight.surfaces.permittivity import find_interior, find_reflecting
 from polysight.surfaces.result import (
     NO_SINGLE_MEDIUM,
     describe_segment,
@@ -16,6 +16,7 @@ from polysight.surfaces.result import (
     find_depth_behind,
     judge_segment,
 )
+from polysight.surfaces.voltages import receive, reflect_points
 from polysight_worlds.media import Stack
 from polysight_worlds.shapes import cylinder, plate
 
@@ -94,7 +95,7 @@ def test_a_small_body_says_whether_one_medium_explains_it(metal, gains, optics):
     """Below 40 mm nothing has a permittivity; the points of a wall lie off all the same, and its reason says so."""
     learnt = gains(optics)
     voltages = find_voltages(metal, optics)
-    gain = np.exp(learnt.level(voltages.arrival))[:, None]
+    gain = np.exp(learnt.level(voltages))[:, None]
     gain = gain * np.stack([np.ones(len(metal)), 1 / learnt.ratio(voltages.arrival)], axis=1)
     received = gain * receive(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
     ball = replace(describe_segment(0, find_shape(metal.h, optics)), radius_mm=30.0)
@@ -136,7 +137,7 @@ def test_no_drawn_wall_gets_a_permittivity_that_is_not_its_own(metal, gains, opt
     voltages = find_voltages(metal[np.arange(0, len(metal), 4)], optics)
     flat = 0 * voltages.bend_inside
     voltages = replace(voltages, bend_inside=flat, bend_across=flat, twist=flat)
-    gain = np.exp(learnt.level(voltages.arrival))
+    gain = np.exp(learnt.level(voltages))
     gain = np.stack([gain, gain / learnt.ratio(voltages.arrival)], axis=1)
     wave_numbers = 2 * np.pi * np.linspace(76.282e9, 79.749e9, 24) / 299792458
     plane = replace(describe_segment(0, find_shape(metal.h, optics)), radius_mm=None)

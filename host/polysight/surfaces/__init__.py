@@ -4,9 +4,10 @@
 measures the same points in V; `analyse_surface` gives points, normals, curvature and permittivity with covariance, with
 the gains that `learn_gains` takes from points of a metal sphere or plate. `write_surface` and `read_surface` are the
 files. In order: `window` (fit of one echo), `joint` (of several), `paths` (search), `points` (geometry), `measure`
-(both receivers, segments), `optics` (polarisation, curved reflection), `permittivity`, `result`.
+(both receivers, segments), `optics` (polarisation, curved reflection), `voltages`, `gains`, `permittivity`, `result`.
 """
 
+from polysight.surfaces.gains import Gains, learn_gains
 from polysight.surfaces.measure import Seen, find_shape, see_points
 from polysight.surfaces.optics import (
     Optics,
@@ -19,7 +20,7 @@ from polysight.surfaces.optics import (
     reflect_flat,
     visible_normals,
 )
-from polysight.surfaces.permittivity import Gains, Reference, Uncertainty, find_voltages, learn_gains
+from polysight.surfaces.permittivity import Reference, Uncertainty
 from polysight.surfaces.result import (
     POINTS,
     SURFACE,
@@ -34,4 +35,5 @@ from polysight.surfaces.result import (
     summary_lines,
     write_surface,
 )
+from polysight.surfaces.voltages import find_voltages
 from polysight.surfaces.window import Echoes, Samples

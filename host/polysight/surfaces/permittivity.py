@@ -1,8 +1,7 @@
 """Permittivity of surface segments from the voltages of H and V, referenced to metal of known shape.
 
-Voltages of a point are divided by spreading and path. Gains over the direction of arrival come from a metal sphere
-(`learn_gains`), or from a flat metal plate, for one direction alone. A segment has one permittivity: least squares of
-b_H (M r)_V = b_V (M r)_H over its points (`fit_permittivity`), with r the coefficients of a curved surface.
+A segment has one permittivity: least squares of b_H (M r)_V = b_V (M r)_H over its points (`fit_permittivity`), with r
+the coefficients of a curved surface, and b_H, b_V the voltages (`voltages`) over the gains (`gains`).
 
 The covariance is derived, source by source (`add_common_errors`): the scatter of the points over blocks of windows;
 leakage, axes and places of the antennas, each moved by one standard error for object and reference together; the
@@ -16,7 +15,7 @@ level of H over that of metal, and how both levels change over the band.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,33 +23,23 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.polarimetry import permittivity_from_ratio
-from polysight.surfaces.measure import Seen, Shape, find_shape
-from polysight.surfaces.optics import (
-    Antenna,
-    Optics,
-    bends_by_incidence,
-    mix_twisted,
-    polarisation_row,
-    reflect_curved,
-    reflect_flat,
-    reflect_spherical,
-)
+from polysight.surfaces.gains import Gains
+from polysight.surfaces.measure import Seen
+from polysight.surfaces.optics import Antenna, Optics, reflect_flat
 from polysight.surfaces.paths import STRIDE_M
-from polysight.surfaces.points import find_normals, find_offset_that_sees, predict_echo, spreading, unit_legs
-from polysight.surfaces.window import WINDOW_M
+from polysight.surfaces.voltages import (
+    Voltages,
+    expansion_parameter,
+    find_voltages,
+    number_blocks,
+    receive,
+    reflect_points,
+)
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-# Degree of the gains' polynomial in the direction of arrival, by the angle that the reference covers.
-DEGREE = 2
-# Change of ln(H / V) per radian of direction that a flat plate cannot exclude: two boards 20 degrees apart with the
-# pattern cos^2 differ by 0.7.
-UNKNOWN_SLOPE = 0.7
 # A point whose ratio lies so many usual misses from the segment's does not belong to it.
 OUTLIER = 4.0
-# Blocks of stage positions whose errors count as independent: windows overlap, and ripples of edges and of other echoes
-# are as long as a Fresnel zone (40 to 70 mm).
-BLOCK_M = 2 * WINDOW_M
 # Ripples of edges and of other echoes change over such a distance: points within it have the same scatter.
 RIPPLE_M = 0.04
 # Ripple of V / H that is expected before it is seen, and the number of blocks that this expectation is worth: a small
@@ -78,252 +67,6 @@ SAME_COLUMN_M = 1.5e-3
 # Median of the square of a complex normal variable, over twice that of each part: 2 ln 2.
 MEDIAN_OF_SQUARE = 1.386
 EPS_STEP = 1e-4
-
-
-@dataclass(frozen=True)
-class Voltages:
-    """What points [n] give.
-
-    Attributes
-    ----------
-    b, std
-        Voltages of H and V without path and spreading, complex [n, 2], and their standard deviations [n, 2].
-    m
-        Rows of the coefficients of r_s, r_p, s to p and p to s, complex [n, 2 receivers, 4 coefficients].
-    theta
-        Incidence at H and V, [n, 2]: V sees a point from elsewhere. Near Brewster's angle 0.06 degrees change r_p by
-        a per cent.
-    path_m
-        Path from TX to H and V, [n, 2].
-    bend_inside, bend_across, twist
-        Curvatures in and across the plane of incidence, and twist between both, [n].
-    arrival
-        Direction of arrival at V, its x and y, [n, 2].
-    band_rise
-        ln of the amplitude in the upper half of the band over that in the lower half, of H and V [n, 2].
-    at_m
-        Stage offsets, [n, 2].
-    """
-
-    b: Complex
-    std: Array
-    m: Complex
-    theta: Array
-    path_m: Array
-    bend_inside: Array
-    bend_across: Array
-    twist: Array
-    arrival: Array
-    band_rise: Array
-    at_m: Array
-
-    def __len__(self) -> int:
-        return len(self.theta)
-
-    def __getitem__(self, keep: NDArray) -> Voltages:
-        return Voltages(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
-
-
-def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Voltages:
-    """Return the voltages of points; `shape` is that of H's echoes unless given."""
-    if shape is None:
-        shape = find_shape(seen.h, optics)
-    tx_m = optics.tx.at_m
-    k = optics.wave_number
-    solid = (shape.points, shape.normals, shape.curvature)
-    seen_from = {"h": seen.h.at_m, "v": find_offset_that_sees(*solid[:2], seen.v.at_m, tx_m, optics.v.at_m)}
-    b = []
-    std = []
-    rows = []
-    theta = []
-    paths = []
-    for channel, echoes in (("h", seen.h), ("v", seen.v)):
-        receiver = optics.receiver(channel)
-        at_m = seen_from[channel]
-        path, _, _ = predict_echo(*solid, at_m, tx_m, receiver.at_m)
-        spread = spreading(*solid, at_m, tx_m, receiver.at_m)
-        b.append(echoes.move(at_m, k).amplitude * np.exp(1j * k * path) / spread)
-        std.append(echoes.amplitude_std / spread)
-        rows.append(polarisation_row(shape.points, shape.normals, at_m, optics.tx, receiver))
-        _, cos = find_normals(shape.points, at_m, tx_m, receiver.at_m)
-        theta.append(np.arccos(np.clip(cos, 0, 1)))
-        paths.append(path)
-    _, back, *_ = unit_legs(shape.points, seen_from["v"], tx_m, optics.v.at_m)
-    inside, across, twist = bends_by_incidence(*solid, seen.h.at_m, tx_m)
-    return Voltages(
-        b=np.stack(b, axis=1),
-        std=np.stack(std, axis=1),
-        m=np.stack(rows, axis=1),
-        theta=np.stack(theta, axis=1),
-        path_m=np.stack(paths, axis=1),
-        bend_inside=inside,
-        bend_across=across,
-        twist=twist,
-        arrival=back[:, :2],
-        band_rise=np.stack([seen.h.band_rise, seen.v.band_rise], axis=1),
-        at_m=seen.h.at_m[:, :2],
-    )
-
-
-def reflect_points(eps: NDArray | complex, v: Voltages, wave_number: float) -> Complex:
-    """Coefficients (r_s, r_p, s to p, p to s) of the curved surface at each point for H and V, [n, 2, 4]."""
-    of_receivers = np.asarray(eps)[..., None]
-    r_s, r_p = reflect_curved(of_receivers, v.theta, v.bend_inside[:, None], v.bend_across[:, None], wave_number)
-    mixed = mix_twisted(of_receivers, v.theta, v.twist[:, None], wave_number)
-    more_s, more_p = reflect_spherical(of_receivers, v.theta, v.path_m, wave_number)
-    return np.stack([r_s + more_s, r_p + more_p, mixed, mixed], axis=2)
-
-
-def receive(v: Voltages, coefficients: Complex) -> Complex:
-    """Voltages of H and V [n, 2] that coefficients [n, 2, 4] give with gains of 1."""
-    return np.sum(v.m * coefficients, axis=2)
-
-
-def expansion_parameter(v: Voltages, wave_number: float) -> Array:
-    """K / (k cos^3 theta) of each point: the ratio of successive orders of the reflection at a curved surface."""
-    bend = (np.abs(v.bend_inside) + np.abs(v.bend_across)) / 2
-    return bend / (wave_number * np.cos(v.theta[:, 0]) ** 3)
-
-
-@dataclass(frozen=True)
-class Gains:
-    """Gains of H and V as polynomials of the direction of arrival, learnt from metal.
-
-    Attributes
-    ----------
-    ratio_terms
-        Coefficients of ln(gain of H / gain of V), complex.
-    level_terms
-        Coefficients of ln|gain of H|.
-    band_rise
-        ln of the level in the upper half of the band over that in the lower half, of H and V.
-    middle, degree
-        Middle of the directions, and the degree of the polynomials.
-    std
-        Standard deviation of each part of ln(H / V) within the directions covered.
-    covered
-        Smallest and largest direction, [2] each.
-    terms_root, cell
-        Root of the covariance of each part of `ratio_terms`, [terms, blocks]; directions so close [2] have one misfit.
-    """
-
-    ratio_terms: Complex
-    level_terms: Array
-    band_rise: Array
-    middle: Array
-    degree: int
-    std: float
-    covered: tuple[Array, Array]
-    terms_root: Array
-    cell: Array
-
-    def ratio(self, arrival: Array) -> Complex:
-        """Gain of H over that of V, [n]."""
-        return np.exp(self._make_basis(arrival) @ self.ratio_terms)
-
-    def level(self, arrival: Array) -> Array:
-        """ln|gain of H|, [n]."""
-        return self._make_basis(arrival) @ self.level_terms
-
-    def estimate_unknown_std(self, arrival: Array) -> Array:
-        """Standard deviation of ln(H / V) by directions that the reference does not cover, [n]."""
-        return np.hypot(self.std, self._extrapolate_std(arrival))
-
-    def _extrapolate_std(self, arrival: Array) -> Array:
-        low, high = self.covered
-        beyond = np.linalg.norm(np.maximum(0, np.maximum(low - arrival, arrival - high)), axis=1)
-        slope = UNKNOWN_SLOPE if self.degree == 0 else UNKNOWN_SLOPE / 4
-        return slope * beyond
-
-    def list_errors(self, arrival: Array) -> Array:
-        """Independent errors of each part of ln(H / V), one standard deviation each, [errors, n].
-
-        What the polynomials do not follow differs from cell to cell of the directions; a wide object averages over it.
-        Errors of the polynomials' terms are common to all directions, and so is what lies beyond those covered.
-        """
-        of_terms = self._make_basis(arrival) @ self.terms_root
-        cells = np.floor((arrival - self.middle) / self.cell)
-        number = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
-        of_cells = self.std * (number == np.arange(number.max() + 1)[:, None])
-        return np.concatenate([of_terms.T, of_cells, self._extrapolate_std(arrival)[None]])
-
-    def _make_basis(self, arrival: Array) -> Array:
-        return _evaluate_polynomials(arrival - self.middle, self.degree)
-
-
-def _evaluate_polynomials(d: Array, degree: int) -> Array:
-    terms = [d[:, 0] ** i * d[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)]
-    return np.stack(terms, axis=1)
-
-
-def _fit_robustly(basis: Array, values: NDArray, weight: Array) -> tuple[NDArray, NDArray]:
-    """Coefficients of `values` [n] in `basis` [n, terms], and what is left; outliers lose their weight."""
-    coefficients = np.zeros(basis.shape[1], values.dtype)
-    rest = values
-    for _ in range(5):
-        root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq(basis * root[:, None], values * root, rcond=None)[0]
-        rest = values - basis @ coefficients
-        spread = 1.48 * np.median(np.abs(rest))
-        weight = weight / (1 + (np.abs(rest) / (2 * spread + 1e-9)) ** 2)
-    return coefficients, rest
-
-
-def learn_gains(metal: Voltages, wave_number: float) -> Gains:
-    """Fit the gains to points of metal; directions closer than 6 degrees together give one value for all."""
-    coefficients = reflect_points(np.inf, metal, wave_number)
-    gain = metal.b / receive(metal, coefficients)
-    sound = np.asarray(np.isfinite(gain).all(axis=1) & (np.abs(gain) > 0).all(axis=1))
-    metal = metal[sound]
-    gain = gain[sound]
-    ratio = gain[:, 0] / gain[:, 1]
-    weight = 1 / (np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1) + 1e-4)
-    middle = np.average(metal.arrival, axis=0, weights=weight)
-    low, high = np.percentile(metal.arrival, [3, 97], axis=0)
-    degree = DEGREE if float(np.min(high - low)) > 0.1 else 0
-    basis = _evaluate_polynomials(metal.arrival - middle, degree)
-    # Phases are taken about their mean, so that none wraps.
-    centre = np.angle(np.sum(weight * ratio / np.abs(ratio)))
-    log_ratio = np.log(np.abs(ratio)) + 1j * (np.angle(ratio * np.exp(-1j * centre)) + centre)
-    ratio_terms, rest = _fit_robustly(basis, log_ratio, weight)
-    level_terms, _ = _fit_robustly(basis, np.log(np.abs(gain[:, 0])), weight)
-    # The next order of metal's own correction, r_p / r_s = 1 + first order.
-    first_order = np.abs(coefficients[sound, 0, 1] / coefficients[sound, 0, 0] - 1)
-    next_order = float(np.median(first_order * expansion_parameter(metal, wave_number)))
-    std = float(np.hypot(_compute_misfit_std(rest, metal.at_m), next_order))
-    # How the direction changes with the stage; a plate has one direction.
-    rate = np.linalg.lstsq(metal.at_m - metal.at_m.mean(axis=0), metal.arrival - middle, rcond=None)[0]
-    cell = BLOCK_M * np.linalg.norm(rate, axis=0) if degree else np.full(2, np.inf)
-    block = number_blocks(metal.at_m, (0.0, 0.0))
-    of_blocks = np.stack([np.bincount(block, term) / np.bincount(block) for term in basis.T], axis=1)
-    return Gains(
-        ratio_terms=ratio_terms,
-        level_terms=level_terms,
-        band_rise=np.median(metal.band_rise, axis=0),
-        middle=middle,
-        degree=degree,
-        std=std,
-        covered=(low, high),
-        terms_root=np.asarray(std * np.linalg.pinv(of_blocks), np.float64),
-        cell=np.asarray(cell, np.float64),
-    )
-
-
-def _compute_misfit_std(rest: Complex, at_m: Array) -> float:
-    """Standard deviation of each part of a fitted function: the root mean square of what is left over blocks."""
-    clipped = rest / np.maximum(1, np.abs(rest) / (5 * np.median(np.abs(rest)) + 1e-12))
-    block = number_blocks(at_m, (0.0, 0.0))
-    count = np.bincount(block)
-    sums = np.bincount(block, clipped.real) + 1j * np.bincount(block, clipped.imag)
-    means = sums[count > 0] / count[count > 0]
-    return float(np.sqrt(np.average(np.abs(means) ** 2, weights=count[count > 0]) / 2))
-
-
-def number_blocks(at_m: Array, shift: tuple[float, float]) -> NDArray[np.int_]:
-    """Number of the block of each stage offset [n, 2]; `shift`: of the blocks' borders, in blocks."""
-    cell = np.floor(at_m / BLOCK_M + np.array(shift)).astype(int)
-    _, number = np.unique(cell, axis=0, return_inverse=True)
-    return number.reshape(-1)
 
 
 @dataclass(frozen=True)
@@ -583,7 +326,7 @@ def find_common_error(fit: PermittivityFit, miss: Complex, scan: DisturbedScan, 
 def find_reflection(v: Voltages, gains: Gains) -> Array:
     """Level of H over that of flat metal, [n]."""
     metal = np.array([-1.0, -1.0, 0.0, 0.0])
-    return np.abs(v.b[:, 0]) / np.exp(gains.level(v.arrival)) / np.maximum(np.abs(receive(v, metal)[:, 0]), 1e-30)
+    return np.abs(v.b[:, 0]) / np.exp(gains.level(v)) / np.maximum(np.abs(receive(v, metal)[:, 0]), 1e-30)
 
 
 def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.int_], gains: Gains | None) -> NDArray:
@@ -598,7 +341,7 @@ def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.in
     tolerance = LEVEL_TOLERANCE_WITHOUT_GAINS
     reflection = np.ones(len(level))
     if gains is not None:
-        level = level - gains.level(voltages.arrival)
+        level = level - gains.level(voltages)
         tolerance = LEVEL_TOLERANCE
         reflection = find_reflection(voltages, gains)
     reflecting = np.zeros(len(level), bool)
@@ -658,13 +401,13 @@ def judge_medium(
 
     def find_levels(eps: complex, voltages: Voltages, gains: Gains) -> Array:
         expected = receive(voltages, reflect_points(eps, voltages, wave_number))
-        levels = np.log(np.abs(voltages.b[:, 0])) - gains.level(voltages.arrival) - np.log(np.abs(expected[:, 0]))
+        levels = np.log(np.abs(voltages.b[:, 0])) - gains.level(voltages) - np.log(np.abs(expected[:, 0]))
         return levels[fit.used]
 
     levels = find_levels(fit.eps, v, gains)
     level = float(np.median(levels))
     # Where the reference does not tell the ratio of the gains, it does not tell their level either.
-    unknown_std = float(np.median(gains.estimate_unknown_std(v.arrival)))
+    unknown_std = float(np.median(gains.estimate_level_std(v)))
     variance = _spread(levels) ** 2 / blocks + unknown_std**2
     # A rig that is known badly gives a wrong permittivity, and with it a wrong level.
     miss = find_misses(v, gains, reflect_points(fit.eps, v, wave_number))

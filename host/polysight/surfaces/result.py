@@ -16,23 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.store import open_npz
+from polysight.surfaces.gains import Gains
 from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS
 from polysight.surfaces.measure import SAME_WINDOW_M, Seen, Shape, find_shape
 from polysight.surfaces.optics import Optics
 from polysight.surfaces.permittivity import (
     DisturbedScan,
-    Gains,
     PermittivityFit,
     Reference,
     Uncertainty,
-    Voltages,
     add_common_errors,
     disturb_optics,
     disturb_scan,
     find_interior,
     find_reflecting,
     find_reflection,
-    find_voltages,
     fit_permittivity,
     judge_medium,
     point_covariance,
@@ -40,6 +38,7 @@ from polysight.surfaces.permittivity import (
     point_ratio,
 )
 from polysight.surfaces.points import tangents
+from polysight.surfaces.voltages import Voltages, find_voltages
 from polysight.surfaces.window import Echoes
 from polysight_shared.files import write_atomically
 

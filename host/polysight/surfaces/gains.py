@@ -1,0 +1,179 @@
+"""Gains of both receivers over direction, learnt from metal of known shape: what a permittivity is referenced to.
+
+A metal sphere covers directions; a flat plate gives one. What TX sends depends on the direction of departure, and what
+a receiver takes on that of arrival. At the distance of the reference either gives the other; farther away or nearer
+not, and the level is known as well as both agree. H over V needs the direction of arrival alone: TX cancels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.surfaces.voltages import (
+    BLOCK_M,
+    Array,
+    Complex,
+    Voltages,
+    expansion_parameter,
+    number_blocks,
+    receive,
+    reflect_points,
+)
+
+# Degree of the gains' polynomial in the direction of arrival, by the angle that the reference covers.
+DEGREE = 2
+# Change of ln(H / V) per radian of direction that a flat plate cannot exclude: two boards 20 degrees apart with the
+# pattern cos^2 differ by 0.7.
+UNKNOWN_SLOPE = 0.7
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Gains of H and V as polynomials of the direction of arrival, learnt from metal.
+
+    Attributes
+    ----------
+    ratio_terms
+        Coefficients of ln(gain of H / gain of V), complex.
+    level_terms
+        Coefficients of ln|gain of H| in the direction of arrival, and in that of departure, [2, terms].
+    band_rise
+        ln of the level in the upper half of the band over that in the lower half, of H and V.
+    middle, departure_middle, degree
+        Middles of the directions of arrival and of departure, and the degree of the polynomials.
+    std
+        Standard deviation of each part of ln(H / V) within the directions covered.
+    covered
+        Smallest and largest direction, [2] each.
+    terms_root, cell
+        Root of the covariance of each part of `ratio_terms`, [terms, blocks]; directions so close [2] have one misfit.
+    """
+
+    ratio_terms: Complex
+    level_terms: Array
+    band_rise: Array
+    middle: Array
+    departure_middle: Array
+    degree: int
+    std: float
+    covered: tuple[Array, Array]
+    terms_root: Array
+    cell: Array
+
+    def ratio(self, arrival: Array) -> Complex:
+        """Gain of H over that of V, [n]."""
+        return np.exp(self._make_basis(arrival) @ self.ratio_terms)
+
+    def level(self, v: Voltages) -> Array:
+        """ln|gain of H|, [n]: the mean of what arrival and departure say."""
+        return np.mean(self._find_levels(v), axis=0)
+
+    def estimate_level_std(self, v: Voltages) -> Array:
+        """Standard deviation of the level [n] where arrival and departure do not go together as at the reference."""
+        by_arrival, by_departure = self._find_levels(v)
+        return np.hypot(np.abs(by_arrival - by_departure) / 2, self.estimate_unknown_std(v.arrival))
+
+    def _find_levels(self, v: Voltages) -> tuple[Array, Array]:
+        arrival_terms, departure_terms = self.level_terms
+        departure = _evaluate_polynomials(v.departure - self.departure_middle, self.degree)
+        return self._make_basis(v.arrival) @ arrival_terms, departure @ departure_terms
+
+    def estimate_unknown_std(self, arrival: Array) -> Array:
+        """Standard deviation of ln(H / V) by directions that the reference does not cover, [n]."""
+        return np.hypot(self.std, self._extrapolate_std(arrival))
+
+    def _extrapolate_std(self, arrival: Array) -> Array:
+        low, high = self.covered
+        beyond = np.linalg.norm(np.maximum(0, np.maximum(low - arrival, arrival - high)), axis=1)
+        slope = UNKNOWN_SLOPE if self.degree == 0 else UNKNOWN_SLOPE / 4
+        return slope * beyond
+
+    def list_errors(self, arrival: Array) -> Array:
+        """Independent errors of each part of ln(H / V), one standard deviation each, [errors, n].
+
+        What the polynomials do not follow differs from cell to cell of the directions; a wide object averages over it.
+        Errors of the polynomials' terms are common to all directions, and so is what lies beyond those covered.
+        """
+        of_terms = self._make_basis(arrival) @ self.terms_root
+        cells = np.floor((arrival - self.middle) / self.cell)
+        number = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+        of_cells = self.std * (number == np.arange(number.max() + 1)[:, None])
+        return np.concatenate([of_terms.T, of_cells, self._extrapolate_std(arrival)[None]])
+
+    def _make_basis(self, arrival: Array) -> Array:
+        return _evaluate_polynomials(arrival - self.middle, self.degree)
+
+
+def _evaluate_polynomials(d: Array, degree: int) -> Array:
+    terms = [d[:, 0] ** i * d[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)]
+    return np.stack(terms, axis=1)
+
+
+def _fit_robustly(basis: Array, values: NDArray, weight: Array) -> tuple[NDArray, NDArray]:
+    """Coefficients of `values` [n] in `basis` [n, terms], and what is left; outliers lose their weight."""
+    coefficients = np.zeros(basis.shape[1], values.dtype)
+    rest = values
+    for _ in range(5):
+        root = np.sqrt(weight)
+        coefficients = np.linalg.lstsq(basis * root[:, None], values * root, rcond=None)[0]
+        rest = values - basis @ coefficients
+        spread = 1.48 * np.median(np.abs(rest))
+        weight = weight / (1 + (np.abs(rest) / (2 * spread + 1e-9)) ** 2)
+    return coefficients, rest
+
+
+def learn_gains(metal: Voltages, wave_number: float) -> Gains:
+    """Fit the gains to points of metal; directions closer than 6 degrees together give one value for all."""
+    coefficients = reflect_points(np.inf, metal, wave_number)
+    gain = metal.b / receive(metal, coefficients)
+    sound = np.asarray(np.isfinite(gain).all(axis=1) & (np.abs(gain) > 0).all(axis=1))
+    metal = metal[sound]
+    gain = gain[sound]
+    ratio = gain[:, 0] / gain[:, 1]
+    weight = 1 / (np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1) + 1e-4)
+    middle = np.average(metal.arrival, axis=0, weights=weight)
+    departure_middle = np.average(metal.departure, axis=0, weights=weight)
+    low, high = np.percentile(metal.arrival, [3, 97], axis=0)
+    degree = DEGREE if float(np.min(high - low)) > 0.1 else 0
+    basis = _evaluate_polynomials(metal.arrival - middle, degree)
+    # Phases are taken about their mean, so that none wraps.
+    centre = np.angle(np.sum(weight * ratio / np.abs(ratio)))
+    log_ratio = np.log(np.abs(ratio)) + 1j * (np.angle(ratio * np.exp(-1j * centre)) + centre)
+    ratio_terms, rest = _fit_robustly(basis, log_ratio, weight)
+    of_departure = _evaluate_polynomials(metal.departure - departure_middle, degree)
+    level = np.log(np.abs(gain[:, 0]))
+    level_terms = np.stack([_fit_robustly(terms, level, weight)[0] for terms in (basis, of_departure)])
+    # The next order of metal's own correction, r_p / r_s = 1 + first order.
+    first_order = np.abs(coefficients[sound, 0, 1] / coefficients[sound, 0, 0] - 1)
+    next_order = float(np.median(first_order * expansion_parameter(metal, wave_number)))
+    std = float(np.hypot(_compute_misfit_std(rest, metal.at_m), next_order))
+    # How the direction changes with the stage; a plate has one direction.
+    rate = np.linalg.lstsq(metal.at_m - metal.at_m.mean(axis=0), metal.arrival - middle, rcond=None)[0]
+    cell = BLOCK_M * np.linalg.norm(rate, axis=0) if degree else np.full(2, np.inf)
+    block = number_blocks(metal.at_m, (0.0, 0.0))
+    of_blocks = np.stack([np.bincount(block, term) / np.bincount(block) for term in basis.T], axis=1)
+    return Gains(
+        ratio_terms=ratio_terms,
+        level_terms=level_terms,
+        band_rise=np.median(metal.band_rise, axis=0),
+        middle=middle,
+        departure_middle=departure_middle,
+        degree=degree,
+        std=std,
+        covered=(low, high),
+        terms_root=np.asarray(std * np.linalg.pinv(of_blocks), np.float64),
+        cell=np.asarray(cell, np.float64),
+    )
+
+
+def _compute_misfit_std(rest: Complex, at_m: Array) -> float:
+    """Standard deviation of each part of a fitted function: the root mean square of what is left over blocks."""
+    clipped = rest / np.maximum(1, np.abs(rest) / (5 * np.median(np.abs(rest)) + 1e-12))
+    block = number_blocks(at_m, (0.0, 0.0))
+    count = np.bincount(block)
+    sums = np.bincount(block, clipped.real) + 1j * np.bincount(block, clipped.imag)
+    means = sums[count > 0] / count[count > 0]
+    return float(np.sqrt(np.average(np.abs(means) ** 2, weights=count[count > 0]) / 2))

@@ -121,7 +121,7 @@ def one_tone(snr_db: float, trials: int = 4000, samples: int = 192) -> tuple[flo
 
 
 def at_bins(rig: Instrument, board: Board, bins: float) -> Instrument:
-    """The rig with its object plane where the mirror point's echo is so many bins of the linear samples away."""
+    """Return the rig with its object plane moved so that the mirror point's echo is `bins` linear samples away."""
     samples = rig.chirp.linear_samples[1] - rig.chirp.linear_samples[0]
 
     def move_plane(z_mm: float) -> Instrument:

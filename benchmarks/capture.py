@@ -53,7 +53,7 @@ class Cards:
             sender.hear()
 
     def start_sending(self, packets: int, rate: float) -> None:
-        """Every sender sends this many packets at its share of the rate."""
+        """Let every sender send this many packets at its share of the rate."""
         for sender in self.senders:
             sender.say(packets, rate / len(self.senders))
 
@@ -74,7 +74,7 @@ class Cards:
 
 
 def replace_addresses(board: Board, card: str, host: str) -> Board:
-    """The board on another subnet."""
+    """Return the board with addresses on another subnet."""
     return msgspec.structs.replace(board, card_address=card, host_address=host)
 
 
@@ -146,7 +146,7 @@ class Receivers:
         self._crc: dict[int, list[int]] = {}
 
     def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
-        """Rows, one after another, until the time is sent; making them durable in between is not in the time."""
+        """Receive rows one after another until the time is over; making them durable in between is not in the time."""
         cards = self._cards
         in_all = max(1, round(rate / len(cards.boards) * seconds / PACKETS))
         rows = -(-in_all // ROW_BLOCKS)
@@ -208,7 +208,7 @@ class Receivers:
             trial.queue = max(trial.queue, max(self._cards.queues()) / (2 * self._cards.buffer_bytes))
 
     def _drain(self) -> None:
-        """Until the receivers have taken what waits; what is lost never comes."""
+        """Wait until the receivers have taken the waiting packets; lost ones never come."""
         limit = time.perf_counter() + 5.0
         while any(self._cards.queues()) and time.perf_counter() < limit:
             time.sleep(0.01)

@@ -42,7 +42,7 @@ PACKETS = 4096
 
 
 def make_block(rig: Instrument, seed: int) -> bytes:
-    """The block, `PACKETS` full payloads: int16 I0..I3 Q0..Q3 a sample."""
+    """Return a block of `PACKETS` full payloads: int16 I0..I3 Q0..Q3 a sample."""
     rng = np.random.default_rng(seed)
     samples = rig.chirp.samples
     frames = PACKETS * MAX_PAYLOAD_BYTES // rig.frame_bytes

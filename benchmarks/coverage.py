@@ -120,11 +120,11 @@ class Cubes:
         self._cubes = {b.name: synced_cube(rig, scene, b.name, seed=seed) for b in self.instrument.receivers}
 
     def rows(self) -> Iterator[int]:
-        """All rows of the plan."""
+        """Return all rows of the plan."""
         yield from range(self.plan.rows)
 
     def read_row(self, board_name: str, row: int) -> CubeRow:
-        """One row, positions as they were met."""
+        """Return one row, positions in the order of the stage."""
         cube = self._cubes[board_name][:, row]
         return CubeRow(np.ascontiguousarray(cube[:, :: self.plan.row(row).direction]))
 
@@ -193,14 +193,14 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
 
 
 def _draw_materials(rng: np.random.Generator) -> dict[str, tuple[float, float]]:
-    """A material for each place: real part evenly, loss tangent evenly in its logarithm."""
+    """Draw a material for each place: real part uniform, loss tangent uniform in its logarithm."""
     real = rng.uniform(*WIDE_REAL, len(PLACES))
     tangent = np.exp(rng.uniform(*np.log(WIDE_LOSS_TANGENT), len(PLACES)))
     return {f"drawn {i}": (float(real[i]), float(real[i] * tangent[i])) for i in range(len(PLACES))}
 
 
 def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
-    """A metal plate over the plane, on the rig file's plane, with the scene's rig: the same leakage and gains."""
+    """Simulate a metal plate on the rig file's plane with the scene's rig: the same leakage and gains."""
     plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
     plates = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
     alone = msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0, plane_tilt_deg=(0.0, 0.0))
@@ -218,7 +218,7 @@ def _image_scan(source: Any, model: str | None = "none", inputs: Inputs = NO_INP
 
 
 def judge_scan(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Instrument, Findings, PlaneEstimate]:
-    """One scene, drawn, simulated and judged."""
+    """Draw, simulate and judge one scene."""
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     scene = draw_scene(seed, kind)
     model = "none"
@@ -344,7 +344,7 @@ def _read_names(seed: int) -> list[tuple[float, bool]]:
 
 
 def _print_reliability(pairs: list[tuple[float, bool]]) -> list[dict[str, float]]:
-    """How often names are right beside the probability they were given; printed and returned by bin."""
+    """Print how often names are correct beside their probability, by bin; return the same."""
     out = []
     for low, high in itertools.pairwise(SURE):
         inside = [(p, right) for p, right in pairs if low <= p < high]

@@ -49,7 +49,7 @@ def published_scene(quick: bool = False, **grid: Any) -> tuple[Instrument, Scene
 
 @contextmanager
 def temporary(parent: Path | None) -> Iterator[Path]:
-    """A folder for the data, removed afterwards."""
+    """Yield a folder for the data, removed afterwards."""
     folder = Path(tempfile.mkdtemp(prefix="polysight-bench-", dir=parent))
     try:
         yield folder
@@ -58,7 +58,7 @@ def temporary(parent: Path | None) -> Iterator[Path]:
 
 
 def recorded_rows(rig: Instrument, scene: Scene, count: int = DISTINCT) -> dict[str, list[NDArray[np.int16]]]:
-    """Rows about the middle of the grid as both receivers record them: int16 [frame, sample, 8] for each board."""
+    """Return rows about the middle of the grid as both receivers record them: int16 [frame, sample, 8] by board."""
     radar = SimulatedRig(rig, scene)
     plan = plan_raster(rig.grid)
     first = (plan.rows - count) // 4 * 2
@@ -71,7 +71,7 @@ def recorded_rows(rig: Instrument, scene: Scene, count: int = DISTINCT) -> dict[
 
 
 def write_scan(folder: Path, rig: Instrument, rows: dict[str, list[NDArray[np.int16]]], count: int) -> None:
-    """A scan folder of `count` rows, the given ones again and again."""
+    """Write a scan folder of `count` rows, the given ones again and again."""
     plan = plan_raster(rig.grid)
     layout = OwnLayout(folder, rig, plan, "benchmark", "2000-01-01T00:00:00+00:00")
     layout.start()
@@ -175,7 +175,7 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
 
 
 def as_synced(rig: Instrument, samples: NDArray[np.complex64], valid: NDArray[np.bool_] | None = None) -> SyncedRow:
-    """The part of a synchronised row that the imagers read: samples [rx, position, sample] and valid [position]."""
+    """Return the part of a synchronised row that imagers read: samples [rx, position, sample], valid [position]."""
     if valid is None:
         valid = np.ones(samples.shape[1], bool)
     else:

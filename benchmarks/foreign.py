@@ -131,7 +131,7 @@ def format_line(title: str, pieces: Sequence[Piece]) -> str:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the benchmark."""
+    """Add the options of the benchmark."""
     parser.add_argument("--scenes", type=int, default=4, help="scenes of each kind; four hold each material once")
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--nuisances", default="none,all", help="separated by commas")

@@ -159,7 +159,7 @@ def authors_settings(rig: Instrument, board: Board, folder: Path, bins: int) -> 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of this benchmark."""
+    """Add the options of the benchmark."""
     add_common(parser)
     parser.add_argument("--authors", type=Path, default=None, help="a checkout of the authors' code, to run it beside")
 

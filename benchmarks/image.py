@@ -42,7 +42,7 @@ class Bench:
         self.path = path
 
     def ours(self, live: bool = False) -> Image:
-        """From disk to pixels: all rows, then the image; or an image that every row updates."""
+        """Image from disk to pixels: all rows, then the image; or an image that every row updates."""
         samples = ImageBuilder(self.rig, live=live).boards[self.board.name]
         for row, met in self._map_rows():
             samples.add_row(row, as_synced(self.rig, met))
@@ -51,13 +51,13 @@ class Bench:
         return samples.image()[0]
 
     def _map_rows(self) -> Iterator[tuple[int, NDArray[np.complex64]]]:
-        """Rows [rx, position, sample] as met, mapped from the file like the published method's."""
+        """Return rows [rx, position, sample] in the order of the stage, mapped from the published method's file."""
         cube = np.load(self.path, mmap_mode="r")
         for row in range(cube.shape[1]):
             yield row, cube[:, row, :: 1 - 2 * (row % 2)]
 
     def reduce_cube(self, window: str) -> tuple[Aperture, NDArray[np.complex64]]:
-        """The cube through the range gate alone, complex64 [rx, frequency, row, column], and its aperture."""
+        """Return the cube after the range gate alone, complex64 [rx, frequency, row, column], and its aperture."""
         plan = plan_raster(self.rig.grid)
         grid = image_grid(self.rig)
         antennas = Antennas.from_rig(self.rig, self.board)
@@ -68,18 +68,18 @@ class Bench:
         return Aperture(antennas, scan_offsets_m(self.rig), gate.frequencies_hz, grid), samples
 
     def ours_cold(self) -> Image:
-        """The same without any kernel kept from before."""
+        """Image as :func:`ours`, without any stored kernel."""
         kernels.forget()
         return self.ours()
 
     def theirs(self, points: int = SETTINGS[0], tuned: bool = False) -> Image:
-        """The published method, from disk."""
+        """Image by the published method, from disk."""
         cube = np.load(self.path, mmap_mode="r")
         return form_image(cube, self.rig, self.board, image_grid(self.rig), points, tuned)
 
 
 def in_turn(jobs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Seconds]:
-    """Every job once a round."""
+    """Run every job once a round."""
     took = {name: Seconds() for name in jobs}
     for _ in range(rounds):
         for name, job in jobs.items():
@@ -100,7 +100,7 @@ def rms(image: Image, true: Image) -> float:
 
 
 def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
-    """From the cube on disk."""
+    """Compare with the published method, from the cube on disk."""
     bench.ours()
     jobs = {
         "cold": bench.ours_cold,
@@ -140,7 +140,7 @@ def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, 
 
 
 def against_time_domain(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
-    """From reduced samples; without numba no line."""
+    """Compare with the time-domain sum, from reduced samples; without numba print nothing."""
     if importlib.util.find_spec("numba") is None:
         print("numba is not here, so there is no time-domain sum: `pip install --group bench` adds it")
         return [], {}
@@ -172,7 +172,7 @@ def against_time_domain(bench: Bench, rounds: int) -> tuple[list[Line], dict[str
 
 
 def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
-    """Row by row, with the footprint that both image along."""
+    """Compare imaging row by row with imaging at once, both with the footprint."""
     aperture, samples = bench.reduce_cube("hann")
     weights = np.ones(samples.shape[2:], np.float32)
     mirror = np.ones(samples.shape[:2], np.complex64)

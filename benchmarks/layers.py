@@ -138,7 +138,7 @@ def _image_scan(rig: Instrument, scene: Scene) -> Pipeline:
 
 
 def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
-    """A metal plate over the plane, scanned by the same rig, on the rig file's plane, in the same sub-bands."""
+    """Simulate a metal plate over the rig file's plane with the same rig, in the same sub-bands."""
     plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
     plates = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
     pipeline = _image_scan(rig, msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0))
@@ -149,7 +149,7 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
 def process_scene(
     seed: int, rig: Instrument, scene: Scene, metal: PlaneReference
 ) -> tuple[dict[str, PatchFigures], float]:
-    """One scene, simulated and processed: a row of materials.json for each plate found; the angle's deviation, rad."""
+    """Simulate and process one scene; return a row of materials.json for each plate found, and the angle error, rad."""
     pipeline = _image_scan(rig, scene)
     pipeline.inputs = Inputs(reference=metal)
     findings = pipeline.examine(pipeline.form_images())
@@ -160,7 +160,7 @@ def process_scene(
 
 
 def given_stack(plate: Plate, within: float | None = None) -> list[Layer]:
-    """The stack as a user would give it, the thickness of a sheet free or within a share of the truth."""
+    """Return the stack as a user would give it, the thickness of a sheet free or within a share of the truth."""
     if plate.name.startswith(KINDS[2]):
         wall = plate.layers[0]
         return [Layer("glass", wall.epsilon, (wall.thickness_mm or 0.0) / 1e3), Layer("liquid")]
@@ -175,7 +175,7 @@ def given_stack(plate: Plate, within: float | None = None) -> list[Layer]:
 
 
 def judge_fit(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -> Case:
-    """The fit of one plate beside its truth."""
+    """Compare the fit of one plate with its truth."""
     kind = next(k for k in KINDS if plate.name.startswith(k))
     if kind == KINDS[2]:
         layer = plate.layers[1]
@@ -206,7 +206,7 @@ def judge_fit(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -
 
 
 def cases(seeds: Sequence[int]) -> list[Case]:
-    """All stacks of the scenes of one rig."""
+    """Return all stacks of the scenes of one rig."""
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     out = list[Case]()
     metal = metal_scan(rig, draw_scene(seeds[0]))

@@ -71,7 +71,7 @@ class Seconds:
 
 
 def count_repeats(quick: bool, usual: int) -> int:
-    """Number of repeats of a measurement: a quick trial only shows that it runs."""
+    """Return the number of repeats of a measurement: a quick trial only shows that it runs."""
     if quick:
         return 1
     return usual
@@ -105,7 +105,7 @@ class AnonymousMemory:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
+    """Return the facts of the machine on which the figures were measured."""
     info = Path("/proc/cpuinfo")
     models = [row.split(":")[1] for row in info.read_text().splitlines() if row.startswith("model name")]
     packages = {p: version(p) for p in ("numpy", "scipy", "numba") if importlib.util.find_spec(p)}
@@ -243,7 +243,7 @@ def show(title: str, lines: list[Line], quick: bool = False) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of every benchmark that prints such a table."""
+    """Add the options of every benchmark that prints such a table."""
     parser.add_argument("--folder", type=Path, default=None, help="where data is made (default: a temporary folder)")
     parser.add_argument("--quick", action="store_true", help="a tiny grid, once: shows that it runs, nothing else")
     parser.add_argument("--json", type=Path, default=None, help="also write the figures and the machine to this file")

@@ -32,7 +32,7 @@ TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 CPU_AT_MOST = 0.15
 MEMORY_AT_MOST_MB = 60.0
 LIMIT_S = 60.0
-# Short rows: a machine that is busy with other things ends some of them with a fault
+# Rows are short, because a busy machine ends some of them with a fault.
 ROW_POINTS = 35
 
 
@@ -68,7 +68,7 @@ def _make_rig(folder: Path, points: int) -> Instrument:
 
 
 def _start(stack: ExitStack, module: str, *args: object, **environment: str) -> tuple[subprocess.Popen[str], str]:
-    """A process that says `ready`, ended with the stack; and the rest of that line."""
+    """Start a process and wait for its line `ready`; return it with the rest of that line. The stack ends it."""
     command = [sys.executable, "-m", module, *map(str, args)]
     process = stack.enter_context(
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, **environment})
@@ -130,7 +130,7 @@ class _Rows:
         self.cpu_s = 0.0
         self.wall_s = 0.0
         self.faults: list[int] = []
-        # Whole ones, with their edges on SYNC_IN
+        # Complete bursts, each with its edges on SYNC_IN.
         self.bursts: list[tuple[Capture, list[WireEdge]]] = []
         client.follow("benchmark", 0, lambda _: None)
         client.begin_run(
@@ -142,7 +142,7 @@ class _Rows:
         )  # fmt: skip
 
     def take_row(self) -> None:
-        """One row, to its end; the processor's time counts from its first capture on."""
+        """Run one row to its end; processor time counts from its first capture on."""
         self.rows += 1
         while (state := self._client.status().state) != "ready":
             if state in ("idle", "fault"):
@@ -151,38 +151,40 @@ class _Rows:
         self._client.run_row("benchmark", 0, self.rows)
         edges: list[WireEdge] = []
         captures: list[Capture] = []
-        cpu = began = 0.0
+        cpu_at_start_s = 0.0
+        start_s = 0.0
         finished = None
         deadline = time.monotonic() + LIMIT_S
         while finished is None:
             if time.monotonic() > deadline:
                 raise SystemExit("a row does not end")
             message = self._wires.receive(0.05)
-            edges += [message] if isinstance(message, WireEdge) else []
+            if isinstance(message, WireEdge):
+                edges.append(message)
             for event in self._client.events():
                 if isinstance(event, Capture):
                     if not captures:
-                        cpu = _read_cpu_s(self._pid)
-                        began = time.monotonic()
+                        cpu_at_start_s = _read_cpu_s(self._pid)
+                        start_s = time.monotonic()
                     captures.append(event)
                 if isinstance(event, RowFinished):
                     finished = event
-                else:
-                    finished = finished
         if captures:
-            self.cpu_s += _read_cpu_s(self._pid) - cpu
-            self.wall_s += time.monotonic() - began
+            self.cpu_s += _read_cpu_s(self._pid) - cpu_at_start_s
+            self.wall_s += time.monotonic() - start_s
         while isinstance(message := self._wires.receive(0.5), WireEdge):
             edges.append(message)
         if finished.fault:
             self.faults.append(finished.fault)
         if len(edges) != 2 * finished.pulses:
             raise SystemExit(f"{len(edges)} edges on the wires, {finished.pulses} pulses reported")
-        start = 0
-        for c in captures:
-            if not (finished.fault and c is captures[-1]):
-                self.bursts.append((c, edges[start : start + 2 * c.pulses]))
-            start += 2 * c.pulses
+        first_edge = 0
+        for capture in captures:
+            next_edge = first_edge + 2 * capture.pulses
+            # A fault may have cut the last burst short.
+            if not finished.fault or capture is not captures[-1]:
+                self.bursts.append((capture, edges[first_edge:next_edge]))
+            first_edge = next_edge
 
 
 def _read_cpu_s(pid: int) -> float:

@@ -77,7 +77,7 @@ def tell(text: str) -> None:
 
 
 def image_every_nth(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
-    """The images from every n-th row, by matched filter or by reconstruction; the builder is left as it was."""
+    """Image every n-th row, by matched filter or by reconstruction; the builder is not changed."""
     valid = {name: board.valid.copy() for name, board in builder.boards.items()}
     weights = {name: board.weights for name, board in builder.boards.items()}
     all_images = builder.finish()
@@ -101,7 +101,7 @@ def image_every_nth(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
 
 
 def image_error(images: Images, ideal: Images) -> float:
-    """Of both channels' whole images, relative, after the complex factor that fits best."""
+    """Return the relative error of both channels' images after the complex factor that fits best."""
     errors = []
     for image, ideal_image in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
         factor = np.vdot(image, ideal_image) / np.vdot(image, image)
@@ -110,7 +110,7 @@ def image_error(images: Images, ideal: Images) -> float:
 
 
 def name_patches(rig: Instrument, images: Images, plates: tuple[TruthPlate, ...]) -> MaterialsResult:
-    """Patches, permittivities and names."""
+    """Analyse the image: patches, permittivities and names."""
     angles = incidence_choice(rig, images.x_m, images.y_m, "one")
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
     return analyse(images, Optics.from_rig(rig, angles), known=KnownScene(plates=plates), classifier=classifier)
@@ -153,12 +153,12 @@ Made = tuple[str, Instrument, Images, int]
 
 
 def published_plan(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """The rig file's plan."""
+    """Return the rig file's plan."""
     yield "published", rig, as_scanned(rig, scene)[0].finish(), 1
 
 
 def fast(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """At 100 mm/s with shorter bursts that make whole packets of a row; then with rows left out of it."""
+    """Plan 100 mm/s with shorter bursts that make whole packets of a row; then with rows left out of it."""
     rig = Changes(speed_mm_s=100.0, pulses=13, period_us=750.0).apply(rig)
     builder, uncompensated = as_scanned(rig, scene)
     yield "fast", rig, builder.finish(), 1
@@ -170,19 +170,19 @@ def fast(rig: Instrument, scene: Scene) -> Iterator[Made]:
 
 
 def short(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """The same with fewer chirps."""
+    """Plan the same with fewer chirps."""
     rig = Changes(speed_mm_s=100.0, period_us=750.0, pulses=6).apply(rig)
     yield "fast, 6 chirps", rig, as_scanned(rig, scene)[0].finish(), 1
 
 
 def wide(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """The published burst, rows twice as far apart."""
+    """Plan the published burst with rows twice as far apart."""
     rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm).apply(rig)
     yield "half the rows, published burst", rig, as_scanned(rig, scene)[0].finish(), 1
 
 
 def first_proposal(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """The first proposal of `polysight plan --minutes 30` for the published rig."""
+    """Return the first proposal of `polysight plan --minutes 30` for the published rig."""
     rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm, pulses=55, period_us=730.0).apply(rig)
     yield "first proposal for 30 minutes", rig, as_scanned(rig, scene)[0].finish(), 1
 

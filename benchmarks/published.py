@@ -62,7 +62,7 @@ class Synchroniser:
         self._fine = np.exp(-2j * np.pi * np.outer(np.arange(self._b - self._a), fine)).astype(np.complex64)
 
     def decode(self, payload: NDArray[np.uint8], chirps: int) -> Complex:
-        """One position's bytes to complex64 [rx, chirp, sample]: I of RX1..RX4, then Q, for every sample."""
+        """Convert one position's bytes to complex64 [rx, chirp, sample]: I of RX1..RX4, then Q, for every sample."""
         words = payload.view("<i2").reshape(chirps, self._samples, 2, -1)
         if not self._tuned:
             return (words[:, :, 0] + 1j * words[:, :, 1]).astype(np.complex64).transpose(2, 0, 1)
@@ -71,7 +71,7 @@ class Synchroniser:
         return out
 
     def align(self, chirps: Complex) -> Complex:
-        """Every chirp turned into the strongest one's frequency and phase, then the mean, complex64 [rx, sample].
+        """Align every chirp with the strongest one in frequency and phase; return the mean, complex64 [rx, sample].
 
         The quotient of two chirps is a tone (paper, equation 4): its frequency and phase are read off the largest
         point of a transform of one RX, and hold for all of them, which share a clock.
@@ -111,7 +111,7 @@ class Synchroniser:
         return frequency, np.angle(spectra[np.arange(len(peaks)), peaks])
 
     def reference(self, mean: Complex) -> tuple[Complex, float]:
-        """A position's samples with the direct path's frequency and phase taken out of every RX.
+        """Remove the frequency and phase of the direct path from a position's samples of every RX.
 
         The RX's spectra are steered to the direct path and summed; the first peak of 1,024 points is looked at
         more closely, and the phase is read off a spectrum of the result.
@@ -150,7 +150,7 @@ class Synchroniser:
         return moved * (self._beam * np.exp(-1j * phase)).astype(np.complex64)[:, None], phase
 
     def row(self, payload: NDArray[np.uint8], positions: int) -> Complex:
-        """All steps for the positions of a row: bytes to complex [rx, position, sample]."""
+        """Process the positions of a row in all steps: bytes to complex [rx, position, sample]."""
         size = payload.size // positions
         chirps = size // (self._samples * 4 * len(self._beam))
         bursts = (self.decode(payload[i * size : (i + 1) * size], chirps) for i in range(positions))
@@ -228,7 +228,7 @@ def form_image(
 
 
 def _make_lattice(axis_m: NDArray[np.float64], positions: int) -> NDArray[np.float64]:
-    """Every pixel minus every position along one axis, ascending, metres."""
+    """Return every pixel minus every position along one axis, ascending, metres."""
     pixel = axis_m[1] - axis_m[0]
     first = axis_m[0] - (positions - 1) / 2 * pixel
     return first + pixel * np.arange(axis_m.size + positions - 1)

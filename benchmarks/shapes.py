@@ -381,7 +381,7 @@ def print_tables(figures: Sequence[ObjectFigures]) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the benchmark."""
+    """Add the options of the benchmark."""
     parser.add_argument("--objects", type=int, default=1, help="objects of each kind and disturbance")
     parser.add_argument("--first", type=int, default=100, help="seed of the first object")
     parser.add_argument("--kinds", default=",".join(worlds.KINDS), help="separated by commas")

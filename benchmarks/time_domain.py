@@ -145,7 +145,7 @@ def form_image(
 
 
 def single(a: NDArray[np.floating]) -> NDArray[np.float32]:
-    """The array in single precision, contiguous."""
+    """Return the array in single precision, contiguous."""
     return np.ascontiguousarray(a, np.float32)
 
 

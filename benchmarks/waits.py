@@ -50,7 +50,7 @@ def rows_then_products(scan: Path, out: Path) -> dict[str, float]:
 
 
 def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
-    """All rows read back and both images made: of the rig file's plane, and of another, each in a new pipeline."""
+    """Read all rows back and make both images, of the rig file's plane and of another, each in a new pipeline."""
     same = Seconds()
     other_seconds = Seconds()
     for _ in range(repeats + 1):
@@ -71,7 +71,7 @@ def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
 
 
 def time_list(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Seconds]:
-    """A list of so many scans, each with the manifest of `scan` and the products `made`: the first look, and later."""
+    """Time a list of `count` copies of a scan and its products: the first look, and later ones."""
     for n in range(count):
         shutil.copytree(made, root / f"scan-{n}" / "products", ignore=shutil.ignore_patterns("report.html", "figures"))
         shutil.copy(scan / MANIFEST, root / f"scan-{n}")

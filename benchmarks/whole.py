@@ -104,7 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def rows_that_fit(rig: Instrument, rows: int, folder: Path) -> int:
-    """As many of the rows as the disk has room for."""
+    """Return as many of the rows as the disk has room for."""
     row_bytes = rig.grid.columns * rig.burst.pulses * rig.frame_bytes * len(rig.receivers)
     return max(2, min(rows, (shutil.disk_usage(folder).free - SPARE_BYTES) // row_bytes))
 

@@ -526,7 +526,7 @@ def print_tables(scenes: Sequence[SceneFigures]) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the benchmark."""
+    """Add the options of the benchmark."""
     parser.add_argument("--scenes", type=int, default=1, help="scenes for each nuisance")
     parser.add_argument("--first", type=int, default=100, help="seed of the first scene")
     parser.add_argument(

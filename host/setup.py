@@ -41,7 +41,7 @@ class BuildWithKernels(build_py):
     """Copies the package and its data, and compiles the kernels into it, or into sources used in place."""
 
     def run(self):
-        """Without a compiler that works the same runs in NumPy, more slowly: say so, and go on."""
+        """Build the compiled loops; if no compiler works, say so and continue: the same runs in NumPy, more slowly."""
         super().run()
         sources = Path("polysight", "sync")
         folder = sources if self.editable_mode else Path(self.build_lib) / sources

@@ -72,5 +72,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Names of the module, the public ones included."""
+    """Return the names of the module, the public ones included."""
     return sorted({*globals(), *__all__})

@@ -70,10 +70,10 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
     lines = open_lines(instrument, args.wires)
     try:
         if args.wires is None:
-            # Each once
+            # Print each sentence once.
             for sentence in dict.fromkeys(system.prepare_process() + system.prepare_thread()):
                 log(sentence)
-        # The width is printed below
+        # The width is printed below, so it need not be checked here.
         lines.check_width = False
         spec = BurstSpec.from_burst(instrument.burst)
         end_ns = lines.now_ns()

@@ -176,11 +176,11 @@ class EdgeTimes:
         self._is_held = False
 
     def note_hold(self) -> None:
-        """A hold is commanded: intervals may be longer from now on, until they are judged at the end."""
+        """Note that a hold is commanded: intervals may be longer from now on, until they are judged at the end."""
         self._is_held = True
 
     def note_stop(self, x: int, points: int) -> None:
-        """The stage rests at `x` in a hold, after this many points."""
+        """Note that the stage rests at `x` in a hold, after this many points."""
         distance = self._motion.distance(x)
         stops = self._stops if points else self._early_stops
         if 0 < distance < self._motion.length and distance not in stops:

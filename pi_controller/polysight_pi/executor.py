@@ -295,7 +295,7 @@ class Executor:
         except Exception as e:  # noqa: BLE001 - reported to the client and in the log
             traceback.print_exc()
             reply = make_refusal(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
-        # Before the deadlines are checked: it may have taken long
+        # The command may have taken long: count it as a heartbeat before the deadlines are checked.
         self._count_as_heartbeat(request.command)
         if reply is not None:
             self._replies.append((request, reply))
@@ -455,7 +455,7 @@ class Executor:
         self._machine.require("EndRun")
 
         def write(journal: Journal) -> None:
-            # There may be space again
+            # Try to write again: the full disk may have space by now.
             journal.broken = False
             journal.write([NewEvent.now(m.RunStopped, exit_status=command.exit_status, reason=command.reason)])
 

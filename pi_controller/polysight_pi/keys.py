@@ -28,18 +28,20 @@ class AllowedKeys:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._names: dict[str, str] = {}
-        self._seen = (-1, -1)
+        # Time and size of the file when it was last read.
+        self._stamp = (-1, -1)
         with suppress(OSError, ValueError):
             self._names = read_allowed(folder)
 
     def client_name(self, key: bytes) -> str:
         """Return the name of the client with this public key (32 bytes), or "" if it is not allowed."""
-        # Missing or unreadable: keep the last list
+        # Keep the last list if the file is missing or unreadable.
         with suppress(OSError, ValueError):
             stat = (self._folder / ALLOWED).stat()
-            if self._seen != (stat.st_mtime_ns, stat.st_size):
+            stamp = (stat.st_mtime_ns, stat.st_size)
+            if self._stamp != stamp:
                 self._names = read_allowed(self._folder)
-                self._seen = (stat.st_mtime_ns, stat.st_size)
+                self._stamp = stamp
         if len(key) == 32:
             return self._names.get(zmq.utils.z85.encode(key).decode("ascii"), "")
         return ""
@@ -108,6 +110,7 @@ def _derive_public(folder: Path, name: str) -> str:
 
 
 def _create(folder: Path, name: str) -> list[Path]:
+    """Create the public and the secret key file of a party; the secret one is readable by the owner only."""
     public, secret = map(Path, create_certificates(folder, name))
     secret.chmod(0o600)
     return [public, secret]

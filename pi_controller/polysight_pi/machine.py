@@ -121,7 +121,7 @@ class Machine:
             timeout_s = self.row_timeout_s
         self.state = state
         self._deadline_s = self._clock() + timeout_s
-        # After the bursts that are still in the queue
+        # The run ends after the bursts that are still in the queue.
         if state == "ending":
             self._post(partial(self.happen, "settled"))
 

@@ -88,7 +88,7 @@ class MemoryWatch(threading.Thread):
         self._ports = ports
         self._warn = warn
         self._ended = threading.Event()
-        # Kept open: descriptors may run out
+        # The file stays open: later there may be no free descriptor to open it.
         self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
         self._most_bytes = max(MAX_BYTES, self.resident_bytes() + SPARE_BYTES)
 
@@ -102,7 +102,7 @@ class MemoryWatch(threading.Thread):
             held_bytes = self.resident_bytes()
             if held_bytes <= self._most_bytes:
                 continue
-            # Without a free descriptor it is tried again at the next check.
+            # If there is no free descriptor, the next check tries again.
             with suppress(OSError):
                 cut = self._cut_connections()
                 # A client that connects again and floods on would fill the memory before the next check.

@@ -207,8 +207,13 @@ def send_burst(
     if isinstance(lines, BitLines):
         return _send_bits(lines, spec, start_ns, previous_rise_ns, stop)
     start_ns = max(start_ns, lines.now_ns())
-    first = last = end = start_ns
-    sent = width_max = jitter = fault = 0
+    first = start_ns
+    last = start_ns
+    end = start_ns
+    sent = 0
+    width_max = 0
+    jitter = 0
+    fault = 0
     while sent < spec.pulses and not fault and not stop():
         deadline = start_ns + sent * spec.period_ns
         lines.sleep_until(deadline)
@@ -437,7 +442,7 @@ class TriggerLoop:
             self._fail(None, PiFault.TRIGGER_LINE_LOST, f"internal error: {e!r}")
             raise
         finally:
-            # Lost already: the fault was posted above, or the process ends
+            # An error in closing tells nothing new: the lines are lost already, or the process ends.
             with contextlib.suppress(DeviceError):
                 self._lines.close()
 

@@ -109,7 +109,7 @@ class Pi(Section, frozen=True):
     heartbeat_ms: Count = 500
     trigger_bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
     trigger_debounce_us: Annotated[int, msgspec.Meta(ge=0)] = 0
-    # In old rig files; not used.
+    # Not used; old rig files have it.
     gpiomem: str = "/dev/gpiomem"
     spi_device: str = "/dev/spidev0.0"
     # Period of the host's heartbeat; 0: none
@@ -239,7 +239,7 @@ class Radar(Section, frozen=True):
         default_factory=dict
     )
     native: dict[str, NativeRadar] = msgspec.field(default_factory=dict)
-    # Before each chirp
+    # Pause before each chirp.
     idle_us: Positive = 100.0
     rx_gain_db: int = 32
     rf_gain_target_db: Literal[30, 33, 36] = 30

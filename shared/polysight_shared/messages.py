@@ -27,7 +27,8 @@ MAX_HEARTBEAT_MS = 10_000
 # Limits of `Jog`: a person who watches the stage presses again.
 MAX_JOG_MM = 100.0
 MAX_JOG_S = 60.0
-# Every field has a finite and bounded type; a message outside the limits is refused.
+# Every field has a finite and bounded type; others are refused. `Number` is a fault number, `Owner`
+# the secret of a host, `Place` a coordinate in mm.
 Natural = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Seq = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 Index = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
@@ -165,7 +166,7 @@ class Heartbeat(Event, frozen=True, kw_only=True):
 
 
 class Jogged(Event, frozen=True, kw_only=True):
-    """A jog ended. `from_mm` and `distance_mm` as in `Jog`; `end_mm`: where the axis rests, if `status` is `done`."""
+    """A jog ended. `from_mm` and `distance_mm` as in `Jog`; `end_mm`: position at the end, if `status` is `done`."""
 
     axis: Axis
     from_mm: Place
@@ -206,7 +207,8 @@ class BeginRun(Command, frozen=True, kw_only=True):
 
     `last_seq` is the run's last event that the host has; the Pi continues the sequence after it, even if its journal
     was lost. `heartbeat_ms`: period of the host's `Alive` messages; 0: none. `owner`: a secret chosen by the host,
-    required in all commands of this run. `owns_home`: in `Home`, too; False from hosts that send none there.
+    required in all commands of this run. `owns_home`: `Home` requires it, too; False from old hosts, whose `Home` has
+    no owner.
     """
 
     scan_id: ScanId
@@ -233,7 +235,7 @@ class EndRun(Command, frozen=True, kw_only=True):
 class Alive(Command, frozen=True, kw_only=True):
     """Heartbeat of the host. A row or a jog ends with fault 108 if four heartbeats in a row are missing.
 
-    `scan_id` "": of a jog outside of a run.
+    `scan_id` is "" for a jog outside of a run.
     """
 
     scan_id: ScanIdOrNone
@@ -243,7 +245,7 @@ class Alive(Command, frozen=True, kw_only=True):
 class Home(Command, frozen=True, kw_only=True):
     """Home the stage. Accepted at once; the state is `homing`, then `ready`.
 
-    `owner`: that of the run, while one is begun whose host is alive.
+    `owner`: the owner of the current run, if there is one and its host is alive.
     """
 
     owner: Owner = ""
@@ -252,9 +254,9 @@ class Home(Command, frozen=True, kw_only=True):
 class Jog(Command, frozen=True, kw_only=True):
     """Move one axis of the homed stage by a distance. Accepted at once; `Jogged` has the result.
 
-    `from_mm`: where the sender saw the axis; the stage does not move if it is elsewhere, so that a repeated command
-    moves it once. `heartbeat_ms`: period of the sender's `Alive`, without which the stage stops. `owner`: that of the
-    run, while one is begun whose host is alive.
+    `from_mm`: the axis' position by the sender's knowledge; the stage does not move if it is elsewhere, so that a
+    repeated command moves it once. `heartbeat_ms`: period of the sender's `Alive`, without which the stage stops.
+    `owner`: as in `Home`.
     """
 
     axis: Axis

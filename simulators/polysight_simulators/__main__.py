@@ -30,7 +30,7 @@ def _count_from_zero(text: str) -> int:
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `simulate`."""
+    """Add the options of `simulate`."""
     parser.add_argument("scene", type=Path, help="scene file (docs/spec/scene-file.md)")
     parser.add_argument("--config", type=Path, default=Path("instrument.toml"), help="rig file")
     parser.add_argument("--out", type=Path, required=True, help="folder to write")

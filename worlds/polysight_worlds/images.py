@@ -66,7 +66,7 @@ class ImagePair:
         return {"unit": "mm", "by_hand": True, "labels": boxes, "metal": metal[0] if metal else None}
 
     def truth(self) -> dict:
-        """What is true, for JSON; complex numbers as [real, imaginary]. Also a label file for the instrument."""
+        """Return the truth for JSON, complex numbers as [real, imaginary]; a label file of the instrument, too."""
         plates = []
         for plate in self.world.plates:
             written: dict[str, Any] = asdict(plate)
@@ -140,7 +140,7 @@ def simulate(
 
 
 def disturb_rig(rig: Rig, nuisances: Nuisances) -> Rig:
-    """The rig as it really stands: boards turned and misplaced, other polarisation leaking in, longer stage steps."""
+    """Return the rig as it really stands: boards turned and misplaced, polarisations leaking, longer stage steps."""
     rng = np.random.default_rng([nuisances.seed, 4])
 
     def disturb(antenna: Antenna, turn_deg: float, leakage: float) -> Antenna:
@@ -183,7 +183,7 @@ def _shift_world(world: World, nuisances: Nuisances, width_m: float) -> World:
 
 
 def _draw_bad_positions(rng: Generator, rig: Rig, nuisances: Nuisances) -> NDArray:
-    """Positions without signal, bool [rows, columns]: runs of 1 to 20 in a row, the same for both receivers."""
+    """Draw positions without signal, bool [rows, columns]: runs of 1 to 20 in a row, the same for both receivers."""
     bad = np.zeros((rig.rows, rig.columns), bool)
     return _add_runs(rng, bad, nuisances.dark)
 

@@ -39,12 +39,12 @@ class Antenna:
     def aim(
         position: NDArray, boresight: NDArray, direction: NDArray, polarisation: NDArray, exponent: float = 2.0
     ) -> Antenna:
-        """The antenna whose field in `direction` has the given polarisation (a vector across `direction`)."""
+        """Return the antenna whose field in `direction` has the given polarisation (a vector across `direction`)."""
         at_boresight = _carry(direction, boresight, polarisation)
         return Antenna(position, boresight, at_boresight, exponent)
 
     def rotate(self, rotation: NDArray, shift_m: NDArray) -> Antenna:
-        """The antenna after a turn about its own place and a shift."""
+        """Return the antenna after a turn about its own place and a shift."""
         return replace(
             self,
             position=self.position + shift_m,
@@ -53,7 +53,7 @@ class Antenna:
         )
 
     def with_leakage(self, leakage: complex) -> Antenna:
-        """The antenna that also takes `leakage` times the other polarisation."""
+        """Return the antenna that also receives `leakage` times the other polarisation."""
         cross_axis = np.cross(self.boresight, self.polarisation)
         return replace(self, polarisation=self.polarisation + leakage * cross_axis)
 
@@ -167,7 +167,7 @@ def integrate_phase(response: Response, edge_u: NDArray, edge_v: NDArray, freque
 
 
 def integrate_steps(steps_m: tuple[NDArray, NDArray], frequency_hz: float) -> NDArray:
-    """The same, from the path's change along both edges, see `Response.path_steps`."""
+    """Integrate as above, from the path's change along both edges, see `Response.path_steps`."""
     over_u, over_v = (np.sinc((frequency_hz / LIGHT_M_PER_S * step_m).astype(np.float32)) for step_m in steps_m)
     return over_u * over_v
 

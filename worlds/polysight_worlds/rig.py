@@ -67,7 +67,7 @@ def find_mirror_point(tx: NDArray, rx: NDArray, plane_m: float) -> NDArray:
 
 
 def place(steps: list[dict], antenna_mm: NDArray) -> tuple[NDArray, NDArray]:
-    """Position (metres) and boresight of an antenna of a board after the steps of its mount, in their order."""
+    """Return position (metres) and boresight of a board's antenna after the steps of its mount, in their order."""
     position = np.asarray(antenna_mm, float)
     boresight = np.array([0.0, 0.0, 1.0])
     for step in steps:
@@ -81,12 +81,12 @@ def place(steps: list[dict], antenna_mm: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def load_rig(file: Path) -> Rig:
-    """The rig of an `instrument.toml`: mounts, antennas, object distance, grid. A board's four RX become their mean."""
+    """Load the rig of an `instrument.toml`: mounts, antennas, object distance, grid; a board's four RX become one."""
     return read_rig(tomllib.loads(file.read_text(encoding="utf-8")))
 
 
 def read_rig(content: dict, leakage: tuple[complex, complex] = (0j, 0j)) -> Rig:
-    """The rig of an instrument file's content; `leakage` of p into H and of s into V, towards their mirror points."""
+    """Return the rig of an instrument file's content; `leakage`: p into H and s into V, towards their mirror points."""
     boards = {board["role"]: board for board in content["boards"]}
     antennas = content["antennas"]
     sender = boards["transmit"]
@@ -109,7 +109,7 @@ def build_rig(
     rows: int = 200,
     leakage: tuple[complex, complex] = (0j, 0j),
 ) -> Rig:
-    """The rig of (position, boresight) of three boards, polarised as s, p and both towards their mirror points."""
+    """Return the rig of (position, boresight) of three boards, polarised as s, p and both at their mirror points."""
 
     def aim(
         board: tuple[NDArray, NDArray], receiver: tuple[NDArray, NDArray], s_share: complex, p_share: complex
@@ -128,7 +128,7 @@ def build_rig(
 
 
 def published_rig() -> Rig:
-    """The published rig, 55 degrees of incidence: numbers of `place` with the mounts of instrument.toml."""
+    """Return the published rig, 55 degrees of incidence: numbers of `place` with the mounts of instrument.toml."""
     tx = np.array([-0.705544, 0.097419, 0.013030]), np.array([0.694658, 0.0, 0.719340])
     h = np.array([0.685843, 0.104606, 0.011526]), np.array([-0.819152, 0.0, 0.573576])
     v = np.array([0.683008, 0.136290, 0.009475]), np.array([-0.950993, -0.130885, 0.280145])

@@ -146,7 +146,7 @@ class PlateEchoes:
         return np.array([step, 0, slope_x * step]), np.array([0, step, slope_y * step])
 
     def _reflect(self, index: int) -> list[NDArray]:
-        """What cells of each slope reflect at frequency `index`."""
+        """Return the reflection of cells of each slope at frequency `index`."""
         if not self._terms or len(self._tables) > 1:
             self._terms = []
             for response in self._responses:
@@ -186,7 +186,7 @@ def fast_length(length: int) -> int:
 
 
 def fft2(values: NDArray, shape: tuple[int, int] | None = None) -> NDArray:
-    """Two-dimensional spectrum, padded to `shape`, in the precision of `values`."""
+    """Return the two-dimensional spectrum, padded to `shape`, in the precision of `values`."""
     return np.asarray(fft.fft2(values, shape))
 
 

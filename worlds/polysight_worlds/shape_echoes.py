@@ -160,7 +160,7 @@ def solve_cylinder(
 
 
 def _end_factors(shape: Shape, hessian: NDArray, along: NDArray, frequencies_hz: NDArray) -> NDArray:
-    """What a cylinder's ends leave of the endless one's echo, [frequencies, offsets]: a Fresnel integral along it."""
+    """Return the echo of a cylinder relative to an endless one, [frequencies, offsets]: a Fresnel integral along it."""
     bend = hessian[0, 0] - hessian[0, 1] ** 2 / hessian[1, 1]
     units = window_units()
     weights = window(units) * np.exp(-0.5j * units**2)
@@ -233,7 +233,7 @@ def sum_bent(
 def _add_bends(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
-    """What physical optics misses at the specular points, [frequencies, offsets], see `bends`."""
+    """Add the parts that physical optics misses at the specular points, [frequencies, offsets], see `bends`."""
     tx_m, rx_m = place_antennas(tx, rx, offsets)
     patch = shape.evaluate(*places)
     spread = spread_of_ray(patch, follow_path(patch, tx_m, rx_m), tx_m, rx_m) * shape.cover(*places)
@@ -265,7 +265,7 @@ def _add_bends(
 def _sum_facets(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, direct_m: float
 ) -> NDArray:
-    """A flat plate with sharp edges, facet by facet at each position."""
+    """Sum a flat plate with sharp edges, facet by facet at each position."""
     edges = shape.axes[:, :2] * np.asarray(shape.size_m)
     facets = rectangle(np.asarray(shape.place_m), edges[:, 1], edges[:, 0], PLATE_FACET_M)
     area_m2 = float(np.linalg.norm(np.cross(facets.edge_u[:, 0], facets.edge_v[:, 0])))

@@ -84,13 +84,13 @@ class World:
 
 
 def table(stack: Stack, *, behind_mm: float, centre_m: tuple[float, float], tilt_deg: float = 0.0) -> Plate:
-    """A table of 0.7 m by 0.5 m at `behind_mm` behind the object plane."""
+    """Return a table of 0.7 m by 0.5 m at `behind_mm` behind the object plane."""
     size_m = (0.7, 0.5)
     return Plate("table", centre_m, size_m, stack, height_mm=-behind_mm, tilt_x_deg=tilt_deg, tilt_y_deg=-tilt_deg)
 
 
 def dish(name: str, centre_m: tuple[float, float], diameter_m: float, liquid: complex, *, wall_m: float) -> Plate:
-    """A round glass dish that shows its bottom: glass of `wall_m` before a deep liquid."""
+    """Return a round glass dish that shows its bottom: glass of `wall_m` before a deep liquid."""
     glass = 6.9 - 0.5j
     return Plate(name, centre_m, (diameter_m, diameter_m), Stack(((glass, wall_m),), liquid), round_=True)
 
@@ -144,7 +144,7 @@ class Nuisances:
     dark: float = 0.0
 
     def active(self) -> tuple[str, ...]:
-        """Names of the fields that are not 0."""
+        """Return the names of the fields that are not 0."""
         return tuple(f.name for f in fields(self) if f.name != "seed" and getattr(self, f.name))
 
 
@@ -199,7 +199,7 @@ def draw_nuisances(rng: Generator, names: str | Sequence[str] = "none", *, stren
 
 
 def draw_stack(rng: Generator, permittivity: complex) -> Stack:
-    """A half space or, as often, a plate of 0.4 to 6 mm on a lossy holder."""
+    """Draw a half space or, as often, a plate of 0.4 to 6 mm on a lossy holder."""
     if rng.random() < 0.5:
         return Stack(below=permittivity)
     holder = rng.uniform(1.05, 2.5) - 1j * rng.uniform(0.01, 0.4)
@@ -252,7 +252,7 @@ def draw_world(
 
 
 def disturb_plates(world: World, nuisances: Nuisances) -> World:
-    """The world with heights, tilts, roughness and waviness that `nuisances` add to plates in front of the table."""
+    """Return the world with heights, tilts, roughness and waviness that `nuisances` add to plates before the table."""
     rng = np.random.default_rng([nuisances.seed, 1])
     disturbed = []
     for plate in world.plates:

@@ -26,7 +26,7 @@ from polysight_shared.errors import PolysightError
 
 GRACE_NS = 200_000_000
 """Silence after which a record that the card reported as completed has ended: status and data use different ports."""
-# From a record's stop to its last packet and its status.
+# Timeout from a record's stop to its last packet and its status.
 _COMPLETED_TIMEOUT_S = 0.2
 
 
@@ -56,7 +56,7 @@ class CaptureRig:
         self.cards: dict[str, CardClient] = {}
         self.receivers: dict[str, ReceiverProcess] = {}
         self._recording = False
-        # It is unknown where their cards count.
+        # Boards whose card has an unknown packet count: it is reset before the next row.
         self._start_lost = {board.name for board in instrument.recorded}
         with ExitStack() as stack:
             for board in instrument.recorded:
@@ -108,7 +108,7 @@ class CaptureRig:
         for name, receiver in self.receivers.items():
             path = folder / "raw" / name / f"{row:04d}{PART}"
             receiver.begin_row(row, take, expected, frame_bytes, path, after_reset=name in reset)
-            # Lost track of again, unless the row comes to its end.
+            # If the row is interrupted, the card's count stays unknown; `end_row` removes the name otherwise.
             self._start_lost.add(name)
         self._recording = True
         for card in self.cards.values():

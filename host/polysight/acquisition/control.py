@@ -192,7 +192,7 @@ class ControlFolder:
             self._thread.start()
 
     def end_rows(self) -> None:
-        """The rows have ended, and materials are computed: commands are not taken any more."""
+        """Accept no more commands: the rows have ended, and only materials are still computed."""
         self._doing = "materials"
 
     def _serve(self) -> None:
@@ -273,12 +273,12 @@ class ControlFolder:
 
 
 def _accepted_path(path: Path) -> Path:
-    """Path of a command's file while the command is being obeyed."""
+    """Return the path that a command's file has while the command is executed."""
     return path.with_name(f".{path.name}.accepted")
 
 
 def _read_asker(path: Path) -> str:
-    """Who sent a command: the text of its file, which a shell's `touch` leaves empty."""
+    """Return the sender of a command: the text of its file, which a shell's `touch` leaves empty."""
     with path.open("rb") as f:
         text = f.read(4 * MAX_ASKER).decode("utf-8", errors="replace")
     printable = "".join(character for character in text if character.isprintable())
@@ -337,7 +337,7 @@ def _write_command(path: Path, asker: str) -> None:
 
 
 def read_life(folder: Path) -> Life | None:
-    """The scan program's last sign of life, with the file system's time of it; None if there is none.
+    """Return the scan program's last sign of life, with the file system's time of it; None if there is none.
 
     A file that another program or an earlier release touched is a sign of life without content.
     """

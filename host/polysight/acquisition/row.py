@@ -502,7 +502,7 @@ class RowTaker:
         silence = _SilenceCheck(self._instrument, self._rig)
         is_held = False
         while take.finished is None:
-            # Before reading: what came while this program was held is read though the time is over.
+            # Check the time before reading: a message that came while this program was paused still counts.
             is_late = time.monotonic() > deadline
             self._poll(take)
             if take.finished is not None:

@@ -115,9 +115,9 @@ class RunningScan:
         self._current = (-1, 0, 0)
         self._state = ""
         self._stop_announced = False
-        # The stage, in this run.
+        # True once the stage was ready in this run.
         self._was_ready = False
-        # That ended the scan.
+        # The error that ended the scan.
         self._error: PolysightError | None = None
         self._lost_mm: tuple[float, float] | None = None
         self.result = ScanResult(scan, "fail", "ended unexpectedly")

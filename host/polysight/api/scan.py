@@ -342,7 +342,7 @@ class Scan:
         return permittivity_dataset(self.read_or_process())
 
     def probe(self, x_mm: float, y_mm: float) -> xarray.Dataset:
-        """All results at the pixel nearest to a place, mm from the image's centre. Raises as :meth:`image`."""
+        """Return all results at the pixel nearest to a place, mm from the image's centre. Raises as :meth:`image`."""
         import xarray
 
         maps = [self.image(), self.permittivity_map(), self.patches()[["label"]]]
@@ -458,7 +458,7 @@ class Scan:
         return surface_dataset(surface)
 
     def plot(self, *, metal_referenced: bool = True) -> Figure:
-        """Figure of |H|, |V|, |P| (dB), and of the materials' names if metal-referenced; axes in mm.
+        """Draw |H|, |V|, |P| (dB), and the materials' names if metal-referenced; axes in mm. Return the figure.
 
         Notebooks show the figure when it is the last line of a cell; `plot().savefig("scan.png")` saves it.
 

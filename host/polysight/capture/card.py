@@ -158,7 +158,7 @@ class CardClient:
             # Errors that the previous record left do not belong to this one.
             self._status = Status(0)
             reply = self._try(Code.RECORD_START, b"", self._timeout_s / ATTEMPTS)
-            # Before the reply: of the previous record.
+            # A completion that was reported before the reply belongs to the previous record.
             self._status &= ~Status.RECORD_COMPLETED
             if reply is not None:
                 self._check(reply, Code.RECORD_START)
@@ -172,7 +172,7 @@ class CardClient:
         self._exchange(Code.RECORD_STOP, b"", ATTEMPTS)
 
     def wait_completed(self, limit_s: float) -> None:
-        """After a stop, wait until the card reports the record as completed, or for the limit.
+        """Wait, after a stop, until the card reports the record as completed, or until the timeout.
 
         Before that status, but after the reply to the stop, the card sends the rest of the record as a short packet,
         which must not be taken for the next record's.
@@ -515,7 +515,7 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
             receiver.begin_row(0, 1, instrument.row_bytes, instrument.frame_bytes, listened, after_reset=True)
             card.record_start()
             deadline = time.monotonic() + listen_s
-            # Not until it is complete: a radar that goes on sends more than a row, which then is never.
+            # Do not wait for a complete row: a radar that does not stop sends more, and such a row never completes.
             while time.monotonic() < deadline and receiver.report().received < instrument.row_bytes:
                 card.take_status()
                 time.sleep(_POLL_S)

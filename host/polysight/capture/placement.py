@@ -79,7 +79,7 @@ class PacketCounts:
     late_by_bytes: int = 0
     # Placed packets that are not full: normally only the last one of a record.
     short: int = 0
-    # Those of `leftover` that came before the row's first pulse.
+    # Number of packets in `leftover` that came before the row's first pulse.
     before_pulses: int = 0
 
 
@@ -102,20 +102,20 @@ class Placed:
     received: int
     # Byte ranges (start, stop) that are missing or uncertain: sorted, not touching
     missing: list[Gap]
-    # The place of every byte is certain; if not, `missing` is the whole record
+    # True if the place of every byte is certain; otherwise `missing` is the whole record.
     located: bool
-    # Why it is not located
+    # Reason why it is not located.
     reason: str
     counts: PacketCounts
-    # Missing bytes by kind; for a record that is not located, by its counters only
+    # Missing bytes by kind; for a record that is not located, by its counters only.
     losses: Losses
-    # Knowledge for the next record
+    # Knowledge for placing the next record.
     past: Past
-    # int64 [packet]: offset of its payload in the row, -1 outside the row
+    # int64 [packet]: offset of the packet's payload in the row, -1 outside the row.
     offsets: Counts
-    # int64 [n, 2]: time (monotonic, ns), bytes received by then
+    # int64 [n, 2]: time (monotonic, ns), bytes received by then.
     arrivals: Counts
-    # Missing ranges below the furthest byte, in the card's order
+    # Missing ranges below the furthest byte, in the card's order.
     holes: list[Gap] = field(default_factory=list)
     # The row is not located only because whole frames are missing: triggers were missed.
     slipped: bool = False
@@ -454,7 +454,7 @@ class _Row:
         self.counts.short = int((self._sizes[placed] < self._record.full).sum())
 
     def _place(self) -> None:
-        """Of packets at the same place, select the first and any with more bytes."""
+        """Select, of the packets at the same place, the first one and any with more bytes."""
         packets = np.flatnonzero(self._of_row)
         offsets = self._record.offsets[packets]
         order = np.argsort(offsets, kind="stable")

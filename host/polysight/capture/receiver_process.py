@@ -69,7 +69,7 @@ class _Row:
         return self._reported != last_reported and any(self._reported)
 
     def progress(self) -> messages.Progress:
-        """How far the row is, by the packets so far."""
+        """Return the progress of the row by the packets so far."""
         self._update()
         return messages.Progress(
             row=self.request.row,

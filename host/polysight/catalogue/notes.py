@@ -34,7 +34,7 @@ class Notes(msgspec.Struct, frozen=True):
     tags: tuple[str, ...] = ()
 
 
-# Held from the comparison with the present notes until they are replaced.
+# Held while notes are compared with the stored ones and replaced, so that no change is overwritten unseen.
 _notes_lock = threading.Lock()
 
 

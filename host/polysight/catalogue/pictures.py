@@ -81,7 +81,7 @@ class Pixels(products.ProcessedScan):
         return replace(permittivity_map, mask=permittivity_map.mask & self.clear)
 
     def nearest(self, x_mm: float, y_mm: float) -> tuple[int, int]:
-        """Row and column of the pixel at a place. Raises DataError outside the image."""
+        """Return the row and column of the pixel at a place. Raises DataError outside the image."""
         x_min, right, low, high = self.extent_mm
         if not (x_min <= x_mm <= right and low <= y_mm <= high):
             raise DataError(
@@ -168,7 +168,7 @@ def draw_products(pixels: Pixels, name: str, limits: products.Limits | None = No
 
 
 def thumbnail(pixels: Pixels) -> Picture:
-    """A small picture of the amplitude of H."""
+    """Return a small picture of the amplitude of H."""
     step = max(1, -(-max(pixels.h.shape) // THUMBNAIL_PIXELS))
     values = products.map_scan(pixels, "h", "amplitude")
     small = (slice(None, None, step), slice(None, None, step))

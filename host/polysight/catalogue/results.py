@@ -257,7 +257,7 @@ def _explain_no_permittivity(pixels: Pixels, row: int, column: int) -> str:
 
 
 def _find_patch(patches: list[PatchFigures], place_mm: tuple[float, float]) -> PatchFigures | None:
-    """The patch whose outline holds a place."""
+    """Return the patch whose outline holds a place."""
     for patch in patches:
         outline = patch.outline_mm
         if len(outline) > 2 and skimage.measure.points_in_poly([place_mm], outline)[0]:
@@ -284,7 +284,7 @@ def _average_library(path: Path, changed_ns: int, angle_deg: float) -> dict[str,
 
 
 def _rank_materials(pixels: Pixels, row: int, column: int, library: Path | None) -> list[NearMaterial]:
-    """Materials of the library by the distance of their ratio, in standard deviations of pixel and material."""
+    """Return the library's materials by the distance of their ratio, in standard deviations of pixel and material."""
     path = library or SIMULATED_LIBRARY
     try:
         ratios = _average_library(path, path.stat().st_mtime_ns, float(np.degrees(pixels.theta_rad)))
@@ -344,7 +344,7 @@ def _focus_profile(folder: Path, x_m: float, y_m: float) -> tuple[FocusedProfile
 
 @lru_cache(maxsize=2)
 def _restore_rows(scan: Path, changed_ns: int) -> Pipeline | None:
-    """A pipeline that holds the kept samples of every row; None where some are not kept.
+    """Return a pipeline with the stored samples of every row; None if some rows have none.
 
     `changed_ns` is a part of the cache's key: changed samples are read again.
     """
@@ -506,7 +506,7 @@ def measure_scatter(differences: Real) -> float:
 
 
 def _match_axes(first: Real, second: Real) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Index of the nearest of `second` for each of `first` (mm), and True where it is within half a pixel."""
+    """Return the index of the nearest of `second` for each of `first` (mm), and True if it is within half a pixel."""
     nearest = np.abs(first[:, None] - second[None, :]).argmin(axis=1)
     pixel = max(abs(second[1] - second[0]), abs(first[1] - first[0]))
     return nearest, np.abs(first - second[nearest]) <= pixel * 0.51
@@ -579,7 +579,7 @@ def _read_covariance(permittivity: PermittivityFigures) -> Real:
 
 
 def draw_comparison(comparison: Comparison, name: str) -> Picture:
-    """A map of the differences: `p` (|difference of P|), `sigmas`, `permittivity` or `loss` (first minus second).
+    """Draw a map of differences: `p` (|difference of P|), `sigmas`, `permittivity` or `loss` (first minus second).
 
     Raises DataError where there is no such map.
     """

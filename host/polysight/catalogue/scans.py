@@ -240,13 +240,13 @@ class _Record(msgspec.Struct, frozen=True):
 
 
 def find_programs(folder: Path) -> list[Program]:
-    """All programs started for a folder, the newest first."""
+    """Return all programs started for a folder, the newest first."""
     programs = [find_program(folder, kind) for kind in KINDS]
     return sorted((p for p in programs if p is not None), key=lambda p: p.started_utc, reverse=True)
 
 
 def find_program(folder: Path, kind: str) -> Program | None:
-    """The program of a kind that was started last for a folder; None if there is none."""
+    """Return the program of a kind that was started last for a folder; None if there is none."""
     base = folder / PROGRAM / kind
     path = base.with_suffix(".json")
     if (folder / PROGRAM).is_symlink() or not is_plain(path):
@@ -297,7 +297,7 @@ def explain_failure(program: Program | None) -> Finding | None:
 
 
 def log_tail(path: Path) -> str:
-    """The end of a program's log since its last start, without control sequences; "" if there is none."""
+    """Return the end of a program's log since its last start, without control sequences; "" if there is none."""
     if not is_plain(path):
         return ""
     try:
@@ -312,7 +312,7 @@ def log_tail(path: Path) -> str:
 
 
 def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
-    """The summary with the present state: `running` or `paused` if the scan's program lives."""
+    """Return the summary with its present state: `running` or `paused` if the scan's program is alive."""
     if summary.state == "begun":
         # A killed program changes no file.
         failure = explain_failure(find_program(folder, "scan"))
@@ -420,7 +420,7 @@ class Scans:
         self._summaries: dict[str, StampedSummary] = {}
         if index is not None:
             self._summaries = read_index(index)
-        # Those that were there when the index was read or written.
+        # The summaries that the index file had when it was last read or written.
         self._indexed = dict(self._summaries)
         self._indexed_at = float("-inf")
         # Scans below each entry of the root, and entries that are being read.
@@ -429,7 +429,7 @@ class Scans:
         self._lock = threading.Lock()
 
     def list(self) -> Sequence[Summary]:
-        """Every scan, the newest first; what has changed since the last call is read again.
+        """Return every scan, the newest first; what has changed since the last call is read again.
 
         A folder that takes longer than `READ_S` is listed as `silent`. Its thread cannot be ended: the folder is read
         again when that has returned.
@@ -482,7 +482,7 @@ class Scans:
                     self._reading.discard(entry)
 
     def _find_names_below(self, entry: str) -> Iterator[str]:
-        """The scan that an entry of the root is, or those below it."""
+        """Return the names of the scans at or below an entry of the root folder."""
         if self.only is not None or is_scan(self.root / entry):
             return iter([entry])
         return _find_scan_names(self.root / entry, f"{entry}/", 2)
@@ -498,7 +498,7 @@ class Scans:
                 yield name, life
 
     def left_out(self) -> Sequence[str]:
-        """Names in the folder that hold a scan and are not listed: links, and names that cannot be shown; in ASCII."""
+        """Return the names (ASCII) of scans that are not listed: links, and names that cannot be shown."""
         if self.only is not None:
             return []
         with suppress(OSError), os.scandir(self.root) as entries:
@@ -507,12 +507,12 @@ class Scans:
         return []
 
     def summary(self, name: str) -> Summary:
-        """One of them. Raises DataError as :meth:`folder`."""
+        """Return the summary of one scan. Raises DataError as :meth:`folder`."""
         self.folder(name)
         return self._summarise(name)
 
     def folder(self, name: str, new: bool = False) -> Path:
-        """The folder of a scan.
+        """Return the folder of a scan.
 
         Parameters
         ----------
@@ -582,13 +582,13 @@ def folder_bytes(folder: Path) -> int:
 
 
 def _find_scan_names(root: Path, prefix: str, depth: int) -> Iterator[str]:
-    """Names of the scans below a folder."""
+    """Return the names of the scans below a folder."""
     names = (name for name, _ in _find_scans(root, prefix, depth))
     yield from islice(names, MAX_SCANS)
 
 
 def _find_scans(root: Path, prefix: str, depth: int) -> Iterator[tuple[str, Path]]:
-    """Names and paths of the scans below a folder; links, hidden folders and insides of scans are left out."""
+    """Return names and paths of the scans below a folder, without links, hidden folders and the insides of scans."""
     for entry, path in _list_folders(root):
         name = f"{prefix}{entry}"
         if is_scan(path):
@@ -598,7 +598,7 @@ def _find_scans(root: Path, prefix: str, depth: int) -> Iterator[tuple[str, Path
 
 
 def _list_folders(root: Path) -> list[tuple[str, Path]]:
-    """Names and paths of the folders in a folder, sorted; links and names that cannot be shown are left out."""
+    """Return names and paths of the folders in a folder, sorted, without links and names that cannot be shown."""
     with suppress(OSError), os.scandir(root) as entries:
         folders = [e for e in entries if _is_name(e.name) and e.is_dir(follow_symlinks=False)]
         return sorted((e.name, Path(e.path)) for e in folders)

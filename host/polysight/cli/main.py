@@ -39,7 +39,7 @@ FAMILIES = {
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
-    """The command line: of one command's family, or of all of them when it is not known."""
+    """Build the parser of one command's family, or of all families if the command is not known."""
     import argparse
     from importlib import import_module
 

@@ -37,7 +37,7 @@ class CommandParser(argparse.ArgumentParser):
     most_used: tuple[str, ...] = ()
 
     def format_usage(self) -> str:
-        """One line: required options and arguments, and `[options]` for all others."""
+        """Return the usage in one line: required options and arguments, and `[options]` for all others."""
         options = [a for a in self._actions if a.option_strings]
         formatter = self._get_formatter()
         formatter.add_usage(None, [a for a in self._actions if a.required or not a.option_strings], [])
@@ -45,7 +45,7 @@ class CommandParser(argparse.ArgumentParser):
         return formatter.format_help().rstrip() + f"{optional}\n"
 
     def format_help(self) -> str:
-        """The help text."""
+        """Return the help text."""
         # The first two are argparse's own
         groups = self._action_groups[2:]
         grouped = [a for group in groups for a in group._group_actions]
@@ -108,7 +108,7 @@ class Add(Protocol):
         example: str,
         most_used: tuple[str, ...] = (),
     ) -> CommandParser:
-        """A parser for the options of the command; `most_used` are shown first in its help."""
+        """Return a parser for the options of the command; `most_used` are shown first in its help."""
         ...
 
 
@@ -159,7 +159,7 @@ def material_settings(args: argparse.Namespace) -> Settings:
 
 
 def rig_file(config: Path | None, data: Path) -> Path | None:
-    """The rig file that is given, or the one in the folder of the data, or in the current folder."""
+    """Return the given rig file, or the one in the folder of the data, or in the current folder."""
     return config or next((rig for rig in (data / RIG, RIG) if rig.exists()), None)
 
 
@@ -253,7 +253,7 @@ Number = TypeVar("Number", int, float)
 
 
 def number(kind: Callable[[str], Number], rule: str, holds: Callable[[Number], bool]) -> Callable[[str], Number]:
-    """A `type` for argparse: a number for which `holds` is true; else the error is "... is not `rule`"."""
+    """Return a `type` for argparse: a number for which `holds` is true; else the error is "... is not `rule`"."""
 
     def convert(text: str) -> Number:
         try:

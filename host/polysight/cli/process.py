@@ -38,7 +38,7 @@ def _parse_angles(text: str) -> tuple[float, ...]:
 
 
 def _parse_axis(text: str) -> tuple[float, float]:
-    """Two lengths in millimetres, separated by a comma."""
+    """Parse two lengths in millimetres, separated by a comma."""
     x, _, z = text.partition(",")
     return _shift(x), _shift(z)
 
@@ -51,7 +51,7 @@ def _parse_incidence(text: str) -> str | float:
 
 
 def process_settings(args: argparse.Namespace, data: Path) -> Settings:
-    """The settings of `polysight process` for one scan. Raises ConfigError."""
+    """Return the settings of `polysight process` for one scan. Raises ConfigError."""
     # `--incidence` takes the word of a method, or the degrees of given images.
     method = args.incidence
     degrees = None

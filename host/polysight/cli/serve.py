@@ -69,7 +69,7 @@ def _place(args: argparse.Namespace) -> Place:
 
 
 def _parse_port(text: str) -> int:
-    """A TCP port, 0 for any that is free."""
+    """Parse a TCP port; 0 is any free port."""
     if not text.isdecimal() or int(text) > 65535:
         raise argparse.ArgumentTypeError(f"{text!r} is not a port, 0..65535")
     return int(text)
@@ -108,7 +108,7 @@ def _add_folder(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_place(sub: argparse.ArgumentParser) -> None:
-    """Options of the address."""
+    """Add the options of the server's address."""
     sub.add_argument("--port", type=_parse_port, default=8080, help="TCP port (default: 8080; 0: any free one)")
     sub.add_argument(
         "--host", default="127.0.0.1", metavar="ADDRESS", help="address (default: this machine; 0.0.0.0: the network)"

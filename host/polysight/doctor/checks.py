@@ -154,7 +154,7 @@ def run_doctor(
 
 
 def _format_finding(finding: Finding) -> str:
-    """The lines of a finding: verdict, check and what was found; below them why, and what to do."""
+    """Format a finding as lines: verdict, check and problem; below them cause and remedy."""
     lines = f"{verdict(finding):{_VERDICT_WIDTH}}{finding.where:{_NAME_WIDTH}} {finding.what}".rstrip() + "\n"
     for word, text in (("why", finding.why), ("do", finding.do)):
         if text:

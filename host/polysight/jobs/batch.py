@@ -213,7 +213,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     log = job.out.with_name(job.name + ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    # Nothing is written: the child sees its end when this program is gone
+    # Nothing is written to the pipe: its end tells the child that this program is gone.
     alive, promise = os.pipe()
     try:
         environment[ALIVE] = str(alive)
@@ -255,7 +255,7 @@ def _end_outcome(job: Job, seconds: float = 0.0) -> Outcome:
 
 
 def _read_failure(log: Path, status: int, on_dask: bool) -> str:
-    """The last message in a program's log, or the signal that killed it."""
+    """Return the last message in a program's log, or the signal that killed it."""
     if status < 0:
         what_to_do = "start fewer workers on one machine" if on_dask else "give --jobs 1"
         return f"killed by signal {-status}; signal 9 is usually the system running out of memory: {what_to_do}"
@@ -324,7 +324,7 @@ def memory_bytes(positions: int) -> int:
 
 
 def fit_scans(positions: int, cores: int, free_bytes: int) -> int:
-    """Number of scans that fit cores and free memory; at least one."""
+    """Return the number of scans that fit cores and free memory; at least one."""
     return max(1, min(cores, int(SHARE_OF_FREE_MEMORY * free_bytes / memory_bytes(positions))))
 
 
@@ -362,7 +362,7 @@ def process_many(
     sys.stderr.write(f"{len(jobs)} scans: {len(skipped)} finished before, {len(todo)} to process, {workers_text}\n")
     out.mkdir(parents=True, exist_ok=True)
     for job in todo:
-        # From now on a mark is one of this run.
+        # A mark that is found later was then written by this run.
         (job.out / FINISHED).unlink(missing_ok=True)
     if not todo:
         results = iter(())
@@ -404,7 +404,7 @@ def process_several(
 
 
 def _count_positions(data: Path) -> int:
-    """Number of positions of a scan; of the published grid if it cannot be read quickly."""
+    """Return the number of positions of a scan; of the published grid if it cannot be read quickly."""
     try:
         if (data / COLLECTION).exists():
             settings = read_json(data / COLLECTION)

@@ -70,7 +70,7 @@ def take_antenna_places(scanned: Instrument, other: Instrument) -> Instrument:
 
 
 def rig_file_keys(kind: str, path: Path) -> list[str]:
-    """Lines of the rig file that name a calibration file."""
+    """Return the lines of the rig file that name a calibration file."""
     return ["[calibration]", f'{kind} = "{path.resolve()}"']
 
 

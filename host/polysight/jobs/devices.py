@@ -71,7 +71,7 @@ def _describe_survey(survey: CardSurvey) -> dict[str, object]:
 
 
 def _describe_hop(finding: Finding) -> dict[str, str]:
-    """One hop as plain data; a note says that the hop was not checked."""
+    """Return one network hop as plain data; a note says if the hop was not checked."""
     verdict = finding.level
     if verdict == "note":
         verdict = "not checked"

@@ -46,29 +46,29 @@ from polysight_shared.errors import ConfigError, DataError, quote
 from polysight_shared.files import write_together
 
 METAL = "metal"
-REFERENCE = "the metal reference"
 MIN_PIXELS = 16
-"""Number of pixels below which a box is told as small: a library would learn speckle from fewer."""
+"""A box of fewer pixels gets a note: a library would learn speckle from it."""
 # Largest margin, as a share of a patch's side.
 _LARGEST_MARGIN = 0.3
 Ask = Callable[[str], str]
 
 
 @dataclass(frozen=True)
-class FoundPatch:
-    """A patch of the products: its number, a box inside it in millimetres, and its name."""
+class PatchToName:
+    """A patch of the products that may get a box: its number, a box inside it (mm), and its present name as text."""
 
     number: int
     box: Box
     description: str
+    is_metal_reference: bool = False
 
 
 @dataclass(frozen=True)
 class Edits:
     """Changes to labels, applied in this order.
 
-    `from_patches` begins with a box inside each patch that was found, called by its number; `renames` are `OLD=NEW`,
-    `specimens` `NAME=WHICH`; corners of `boxes` are millimetres from the image centre.
+    `from_patches` replaces the boxes by one inside each patch of the products, named by the patch's number. `renames`
+    are `OLD=NEW`, `specimens` `NAME=SPECIMEN`; corners of `boxes` are millimetres from the image centre.
     """
 
     from_patches: bool = False
@@ -79,16 +79,16 @@ class Edits:
     metal: str | None = None
 
     @property
-    def given(self) -> bool:
-        """True if there is any change."""
-        several = (self.removed, self.renames, self.boxes, self.specimens)
-        return self.from_patches or self.metal is not None or any(several)
+    def has_changes(self) -> bool:
+        """True if any option is given."""
+        changes = (self.removed, self.renames, self.boxes, self.specimens)
+        return self.from_patches or self.metal is not None or any(changes)
 
 
 def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None = None) -> int:
     """Draw, name and save the boxes of a scan or of its products; return the exit status.
 
-    Without `edits` the person is asked for the name of each patch; where nobody can be asked (`ask` is None), and with
+    Without `edits` the person is asked for the name of each patch. If nobody can be asked (`ask` is None), or with
     `list_only`, boxes and patches are printed and nothing is written.
 
     Raises
@@ -108,7 +108,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
         )
     saved_labels = find_labels(folder)
     patches = list_patches(products)
-    if edits.given and list_only:
+    if edits.has_changes and list_only:
         raise ConfigError(
             "--list cannot be combined with options that change boxes", "--list writes nothing", "leave --list out",
             code=ErrorCode.VALUES_CONFLICT,
@@ -116,7 +116,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     labels = Labels({}, "mm")
     if saved_labels:
         labels = saved_labels[1].in_mm(products.x_m, products.y_m)
-    if edits.given:
+    if edits.has_changes:
         labels, left_out = apply_edits(labels, patches, edits)
     elif list_only or ask is None:
         sys.stdout.write(_describe_boxes(folder, products, saved_labels, patches))
@@ -131,18 +131,18 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
             )  # fmt: skip
         labels = ask_for_names(patches, ask)
         left_out = []
-    place = label_folder(products.folder)
-    checked, notes = save_labels(place, products, labels)
+    labels_folder = label_folder(products.folder)
+    checked, notes = save_labels(labels_folder, products, labels)
     print_lines(_format_table(checked))
     if left_out:
         sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
     sys.stdout.write("".join(f"note: {note}\n" for note in notes))
-    sys.stdout.write(f"labels:   {place / LABELS}\npicture:  {place / LABELS_PICTURE}\n")
+    sys.stdout.write(f"labels:   {labels_folder / LABELS}\npicture:  {labels_folder / LABELS_PICTURE}\n")
     return 0
 
 
-def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[Labels, list[str]]:
-    """Check boxes drawn on products, and write them with their picture into `place`; return them with notes on them.
+def save_labels(folder: Path, products: ProcessedScan, labels: Labels) -> tuple[Labels, list[str]]:
+    """Check boxes drawn on products, and write them with their picture into a folder; return them with notes on them.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[L
         raise DataError(
             "no box is left",
             "every patch was left out, or every box removed",
-            f"to have none, delete {place / LABELS}",
+            f"to have none, delete {folder / LABELS}",
             code=ErrorCode.NO_DATA,
         )
     checked = check_labels(labels, products.x_m, products.y_m, products.valid)
@@ -165,7 +165,7 @@ def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[L
 
     picture = label_figure(products, checked.boxes, checked.metal)
     # The boxes are written last, so that saved boxes always have a picture.
-    write_together({place / LABELS_PICTURE: picture, place / LABELS: pack_labels(checked)})
+    write_together({folder / LABELS_PICTURE: picture, folder / LABELS: pack_labels(checked)})
     masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
     notes = []
     if small_boxes := [name for name, mask in masks.items() if (mask & products.valid).sum() < MIN_PIXELS]:
@@ -197,17 +197,17 @@ def remove_labels(folder: Path) -> Path:
 
 
 def _find_dark_boxes(products: ProcessedScan, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
-    """Names of boxes too dark in both channels to be detected as plates automatically."""
+    """Return the names of boxes too dark in both channels to be detected as plates automatically."""
     power = np.where(products.valid, np.abs(products.h) ** 2 + np.abs(products.v) ** 2, np.nan)
     if not np.isfinite(power).any():
         return []
-    least = np.nanpercentile(power, 99) * 10 ** (SegmentSettings().dimmest_db / 10)
+    least_power = np.nanpercentile(power, 99) * 10 ** (SegmentSettings().dimmest_db / 10)
     power_in_box = {name: power[mask & products.valid] for name, mask in masks.items()}
-    return [name for name, p in power_in_box.items() if p.size and np.nanmedian(p) < least]
+    return [name for name, values in power_in_box.items() if values.size and np.nanmedian(values) < least_power]
 
 
-def list_patches(products: ProcessedScan) -> list[FoundPatch]:
-    """Patches of materials.json, each with a box inside it that avoids its edges if it is wide enough."""
+def list_patches(products: ProcessedScan) -> list[PatchToName]:
+    """Return the patches of materials.json, each with a box inside it that avoids its edges if it is wide enough."""
     margin_mm = SegmentSettings().margin_mm
     patches = []
     for patch in products.segments:
@@ -215,22 +215,24 @@ def list_patches(products: ProcessedScan) -> list[FoundPatch]:
         margin_x_mm = min(margin_mm, _LARGEST_MARGIN * (x1 - x0))
         margin_y_mm = min(margin_mm, _LARGEST_MARGIN * (y1 - y0))
         inner_box = (x0 + margin_x_mm, y0 + margin_y_mm, x1 - margin_x_mm, y1 - margin_y_mm)
-        text = "not named"
+        description = "not named"
+        is_metal_reference = False
         if patch.box:
-            text = patch.box
+            description = patch.box
         elif patch.refused is not None:
-            text = "not judged"
+            description = "not judged"
         elif patch.metal_reference:
-            text = REFERENCE
+            description = "the metal reference"
+            is_metal_reference = True
         elif patch.name:
-            text = f"named {patch.name}"
+            description = f"named {patch.name}"
             if patch.confidence is not None:
-                text += f" {100 * patch.confidence:.0f} %"
-        patches.append(FoundPatch(patch.label, inner_box, text))
+                description += f" {100 * patch.confidence:.0f} %"
+        patches.append(PatchToName(patch.label, inner_box, description, is_metal_reference))
     return patches
 
 
-def _require_patches(patches: Sequence[FoundPatch]) -> None:
+def _require_patches(patches: Sequence[PatchToName]) -> None:
     """Raise DataError if there are none."""
     if not patches:
         raise DataError(
@@ -238,20 +240,20 @@ def _require_patches(patches: Sequence[FoundPatch]) -> None:
         )
 
 
-def apply_edits(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tuple[Labels, list[str]]:
+def apply_edits(labels: Labels, patches: Sequence[PatchToName], edits: Edits) -> tuple[Labels, list[str]]:
     """Return boxes after the edits, and the numbers of unnamed patches.
 
     Raises
     ------
     DataError
-        when a name is not there, is there twice, or cannot be used.
+        when a name does not exist, exists twice, or is invalid.
     """
     boxes = dict(labels.boxes)
     specimens = dict(labels.specimens)
     metal = labels.metal
     if edits.from_patches:
-        _require_patches(found)
-        boxes = {str(patch.number): patch.box for patch in found}
+        _require_patches(patches)
+        boxes = {str(patch.number): patch.box for patch in patches}
         specimens = {}
         metal = None
 
@@ -340,14 +342,14 @@ def _split_at_equals(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
     return _find_box(name, boxes), value
 
 
-def ask_for_names(found: Sequence[FoundPatch], ask: Ask) -> Labels:
+def ask_for_names(patches: Sequence[PatchToName], ask: Ask) -> Labels:
     """Ask for the names of patches. Raises DataError without patches, ConfigError when the input ends."""
-    _require_patches(found)
+    _require_patches(patches)
     boxes: dict[str, Box] = {}
     metal = None
     sys.stdout.write(f"name each patch; Enter leaves it out, m is the metal reference (named {METAL})\n")
     try:
-        for patch in found:
+        for patch in patches:
             question = f"patch {patch.number}, {format_box(patch.box)}, {patch.description}: "
             name, is_metal = _ask_for_name(question, boxes, ask, metal is None)
             if name:
@@ -397,19 +399,24 @@ def _ask_for_metal(boxes: Mapping[str, Box], ask: Ask) -> str | None:
 
 
 def _format_table(labels: Labels) -> list[str]:
-    """The boxes as lines of a table."""
+    """Format the boxes as lines of a table."""
     rows = [("name", "specimen", "box", "")]
     for name, box in labels.boxes.items():
         text = "metal reference" if name == labels.metal else ""
         rows.append((material_name(name), labels.specimen(name) or "-", format_box(box), text))
-    widths = [max(cell_len(row[i]) for row in rows) for i in range(3)]
-    return ["  ".join(c + " " * (w - cell_len(c)) for c, w in zip(r, (*widths, 0), strict=True)).rstrip() for r in rows]
+    # The last column needs no padding.
+    widths = [*(max(cell_len(row[column]) for row in rows) for column in range(3)), 0]
+    lines = []
+    for row in rows:
+        cells = [cell + " " * (width - cell_len(cell)) for cell, width in zip(row, widths, strict=True)]
+        lines.append("  ".join(cells).rstrip())
+    return lines
 
 
 def _describe_boxes(
-    folder: Path, products: ProcessedScan, saved_labels: tuple[Path, Labels] | None, patches: Sequence[FoundPatch]
+    folder: Path, products: ProcessedScan, saved_labels: tuple[Path, Labels] | None, patches: Sequence[PatchToName]
 ) -> str:
-    """Text of the boxes drawn, the patches found, and how to name them."""
+    """Describe the drawn boxes, the detected patches, and how to name them."""
     lines = [f"{products.folder}: {name_scan(products.scan_id, bool(products.simulated))}"]
     lines.append(f"image: {format_box(image_extent_mm(products.x_m, products.y_m))} from its centre")
     if saved_labels:
@@ -417,8 +424,8 @@ def _describe_boxes(
         lines += [f"drawn by hand: {saved_labels[0]}", *(f"  {line}" for line in _format_table(boxes))]
     if patches:
         lines += ["patches that were found, a box inside each:"]
-        lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.description}" for f in patches]
-        metal = next((f.number for f in patches if f.description == REFERENCE), "NUMBER")
+        lines += [f"  {patch.number:>3}  {format_box(patch.box)}  {patch.description}" for patch in patches]
+        metal = next((patch.number for patch in patches if patch.is_metal_reference), "NUMBER")
         lines.append(
             f"to name them: polysight label {quote(folder)} --from-patches --metal {metal} --rename NUMBER=NAME ..."
         )

@@ -75,7 +75,7 @@ def print_verdict(products: ProcessedScan, to_terminal: bool = True) -> int:
 
 
 def _find_chirp(products: ProcessedScan, config: Path | None) -> Chirp:
-    """The chirp of the products, or that of `config` if given. Raises DataError, ConfigError."""
+    """Return the chirp of the products, or that of `config` if given. Raises DataError, ConfigError."""
     rig = products.rig
     if config is not None:
         rig = load_instrument(config)
@@ -178,7 +178,7 @@ def _line(patch: PatchFigures, layer: Mapping[str, Any] | None) -> str:
 
 
 def _format_layer(layer: Mapping[str, Any] | None) -> str:
-    """The fit of a layer as text, with a line for each note."""
+    """Format the fit of a layer, with a line for each note."""
     if layer is None:
         return ""
     real, loss = layer["permittivity"]
@@ -190,7 +190,7 @@ def _format_layer(layer: Mapping[str, Any] | None) -> str:
 
 
 def _estimate(e: PermittivityFigures) -> str:
-    """A permittivity with the errors of both parts and their main source."""
+    """Format a permittivity with the errors of both parts and their main source."""
     text = f"{format_permittivity(e.value, width=6):15s}"
     if e.spread is not None:
         text += f"  +- {e.spread.real_std:.2f}, {e.spread.loss_std:.2f}"
@@ -328,7 +328,7 @@ def _patch_line(patch: PatchFigures) -> str:
 
 
 def _pad_name(name: str, width: int = 24) -> str:
-    """A name as wide as a column of a terminal; Chinese characters take two places each."""
+    """Pad a name to the width of a column of a terminal; Chinese characters take two places each."""
     return name + " " * max(0, width - cell_len(name))
 
 
@@ -481,7 +481,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
 
 
 def _select_classifiable(products: ProcessedScan) -> ScanPatches:
-    """Patches of a scan without the refused ones and the metal reference, which is never judged by itself."""
+    """Return the patches of a scan that are classified: not refused, and not the metal reference."""
     left_out = {patch.label for patch in products.segments if patch.refused is not None or patch.metal_reference}
     scan = products.patches
     return replace(scan, patches=tuple(p for p in scan.patches if p.label not in left_out))

@@ -390,7 +390,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
 
 
 def _format_focus(head: str, distance_mm: float, sharpest: Focus, plates: PlaneEstimate) -> list[str]:
-    """Text of `focus`: the plane by the plates, if there are any, and by sharpness."""
+    """Format the result of `focus`: the plane by the plates, if there are any, and by sharpness."""
     lines = []
     if plates.known:
         offset_mm = 1e3 * plates.offset_m

@@ -118,7 +118,7 @@ def _is_pcap(file: Path) -> bool:
 
 
 def find_scan(file: Path) -> ScanFolder | None:
-    """The scan of a row's file, if its manifest can be read."""
+    """Return the scan that a row's file belongs to, if its manifest can be read."""
     folders = file.resolve().parents
     if len(folders) < 3 or folders[1].name != "raw" or not (folders[2] / MANIFEST).is_file():
         return None

@@ -166,7 +166,7 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
 
 
 def _format_name(name: str | None) -> str:
-    """A material's name as people read it."""
+    """Return a material's name in the form for people."""
     if name == UNKNOWN:
         return "not in the library"
     return name or "not named"

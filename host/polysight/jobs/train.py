@@ -284,7 +284,7 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
 
 
 def number_equal_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
-    """Number the scans of equal names.
+    """Append numbers to scans of equal names.
 
     Raises
     ------

@@ -113,7 +113,7 @@ def read_catalogue(path: Path) -> tuple[CatalogueMaterial, ...]:
 
 
 def _read_material_line(row: _Row, file: _File) -> CatalogueMaterial:
-    """The material of a line. Raises KeyError if its kind or a source is not listed."""
+    """Parse a line of the catalogue. Raises KeyError if its kind or a source is not listed."""
     kind = file.kinds[row.kind]
     return CatalogueMaterial(
         name=row.name,
@@ -130,24 +130,24 @@ def _read_material_line(row: _Row, file: _File) -> CatalogueMaterial:
 
 @cache
 def load_catalogue() -> tuple[CatalogueMaterial, ...]:
-    """The catalogue of the package, read once. Raises ConfigError as `read_catalogue`."""
+    """Load the catalogue of the package, once. Raises ConfigError as `read_catalogue`."""
     return read_catalogue(CATALOGUE)
 
 
 def normalise_name(name: str) -> str:
-    """A name without case, punctuation, bracketed remarks and thickness: "PET (0.5 mm)" and "pet 1 mm" are "pet"."""
+    """Remove case, punctuation, bracketed remarks and thickness: "PET (0.5 mm)" and "pet 1 mm" become "pet"."""
     bare = re.sub(r"\([^)]*\)|\b\d+(\.\d+)?\s*mm\b", " ", name.casefold())
     return " ".join(re.findall(r"\w+", bare))
 
 
 @cache
 def _index_names() -> dict[str, CatalogueMaterial]:
-    """Materials by each of their normalised names."""
+    """Return the materials by each of their normalised names."""
     return {normalise_name(name): m for m in load_catalogue() for name in (m.name, *m.aliases)}
 
 
 def find_material(name: str) -> CatalogueMaterial | None:
-    """The material of the catalogue that has this name or alias; None if it has none."""
+    """Return the material of the catalogue that has this name or alias; None if it has none."""
     return _index_names().get(normalise_name(name))
 
 
@@ -160,7 +160,7 @@ def same_material(name: str, other: str) -> bool:
 
 @cache
 def _collect_all_names(name: str) -> frozenset[str]:
-    """A normalised name with its aliases and generic names, normalised."""
+    """Return a normalised name with its aliases and generic names, normalised."""
     material = _index_names().get(name)
     if material is None:
         return frozenset((name,))

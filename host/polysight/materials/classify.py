@@ -364,7 +364,7 @@ class Classifier:
         # Permittivities of the library's patches as half spaces; metals have none.
         self.permittivities: dict[str, complex] = self.distributions.permittivities
         kinds = (*self._make_library_kinds(), *literature(library.names))
-        # What a patch may be, at each angle.
+        # The materials that a patch may be of, at each angle.
         self.kinds = tuple(Kinds(kinds, float(np.radians(angle)), sheets=True) for angle in self.angles_deg)
 
     def _make_library_kinds(self) -> tuple[Kind, ...]:

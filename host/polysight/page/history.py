@@ -188,7 +188,7 @@ class PiState:
 
 
 def seconds(utc: str) -> float:
-    """An ISO time as seconds since 1970."""
+    """Return an ISO time in seconds since 1970."""
     return datetime.fromisoformat(utc).timestamp()
 
 
@@ -318,7 +318,7 @@ class ScanHistory:
             )
             self.notices.append(notice)
         if not fact.committed_utc:
-            # Made in one step, by `polysight simulate`.
+            # `polysight simulate` writes all rows at once, without times.
             return
         committed_s = seconds(fact.committed_utc)
         self.last_row_utc = fact.committed_utc

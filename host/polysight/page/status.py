@@ -318,7 +318,7 @@ def _describe_pictures(history: ScanHistory, shown: Shown) -> PicturesState:
 
 
 def _collect_notices(inputs: Inputs) -> list[Finding]:
-    """All notices, the newest first, each once."""
+    """Return all notices without duplicates, the newest first."""
     notices = []
     if inputs.problem:
         cause = "It was written by another release, or is damaged"
@@ -363,7 +363,7 @@ def sync_notices(shown: Shown, columns: int) -> list[Finding]:
 
 
 def say(key: str, **words: str | int) -> Status:
-    """The status of a state of the table, with its words filled in."""
+    """Return the status of a state of the table, with its texts filled in."""
     state = STATES[key]
     filled = {"since": SINCE, **words}
     # A line that can be pasted into a shell.
@@ -380,19 +380,19 @@ def say(key: str, **words: str | int) -> Status:
 
 
 def say_since(key: str, since_s: float, **words: str) -> Status:
-    """The status of a state that has lasted since a time."""
+    """Return the status of a state that has lasted since a time."""
     return msgspec.structs.replace(say(key, **words), since_s=since_s)
 
 
 def say_finding(key: str, finding: Finding | None, **words: str | int) -> Status:
-    """The status of a state that is about something that was found."""
+    """Return the status of a state that reports a finding."""
     if finding is None:
         return say(key, what="", why="", do="", **words)
     return say(key, what=f"{finding.what}.", why=finding.why, do=finding.do, **words)
 
 
 def judge(inputs: Inputs) -> Status:
-    """The status of a scan; the worst condition wins."""
+    """Return the status of a scan: that of its worst condition."""
     history = inputs.history
     folder = str(inputs.folder)
     if inputs.gone:
@@ -416,7 +416,7 @@ def _describe_safe_rows(history: ScanHistory) -> str:
 
 
 def _judge_start(inputs: Inputs) -> Status:
-    """A folder without a manifest."""
+    """Return the status of a folder without a manifest."""
     folder = str(inputs.folder)
     if inputs.problem:
         return say("unreadable", what=inputs.problem, folder=folder)
@@ -435,7 +435,7 @@ def _may_have_result(inputs: Inputs, history: ScanHistory) -> bool:
 
 
 def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status:
-    """A scan whose last run has ended."""
+    """Return the status of a scan whose last run has ended."""
     folder = str(inputs.folder)
     safe = _describe_safe_rows(history)
     words = "Every row is safe."
@@ -468,7 +468,7 @@ def cut_fraction(iso_time: str) -> str:
 
 
 def _judge_result(inputs: Inputs, gaps: str) -> Status:
-    """A scan of which every row is recorded."""
+    """Return the status of a scan whose rows are all recorded."""
     if inputs.verdict is not None:
         return say(f"result_{inputs.verdict.level}", gaps=gaps)
     if inputs.signs.killed:
@@ -480,7 +480,7 @@ def _judge_result(inputs: Inputs, gaps: str) -> Status:
 
 
 def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
-    """A program or Pi that does not answer, and what the scan was asked."""
+    """Return the status if a program or the Pi does not answer, or a request is pending."""
     signs = inputs.signs
     folder = str(inputs.folder)
     safe = _describe_safe_rows(history)
@@ -497,7 +497,7 @@ def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
 
 
 def _judge_request(life: Life, history: ScanHistory, folder: str) -> Status | None:
-    """A scan that was asked to pause, stop or abort, whoever did."""
+    """Return the status of a scan that was requested to pause, stop or abort, by anyone."""
     asker = life.asker or "somebody"
     if life.asked == "abort":
         return say("aborting", asker=asker)
@@ -511,7 +511,7 @@ def _judge_request(life: Life, history: ScanHistory, folder: str) -> Status | No
 
 
 def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
-    """A rig that has stopped, is held, or homes."""
+    """Return the status of a rig that has stopped, is held, or homes."""
     pi = inputs.pi
     all_rows_are_safe = len(history.takes) == history.plan.rows
     if pi.state == "fault" and pi.faults:
@@ -531,7 +531,7 @@ def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
 
 
 def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
-    """Rows that are retaken, late, or poor."""
+    """Return the status if rows are retaken, late, or of poor quality."""
     pi = inputs.pi
     newest_warning = next((notice for notice in reversed(history.notices) if notice.level == "warning"), None)
     if pi.row >= 0 and history.marks.get(pi.row) == "rejected":

@@ -74,7 +74,7 @@ HEAD_BYTES = 256
 TURN_S = 0.2
 LISTEN_MS = 200
 MAX_FAULTS = 20
-# From a manifest's first line to the first sign of life.
+# Longest time from a manifest's first line to the first sign of life of its program.
 GRACE_S = 6.0
 # Timeout of the Pi's heartbeat.
 PI_LIMIT_S = 6.0
@@ -141,7 +141,7 @@ class RowViewer:
             self._thread.join()
 
     def _list_waiting(self) -> list[tuple[int, int]]:
-        """Rows and takes that are not processed."""
+        """Return the rows and takes that are not processed yet."""
         with self._lock:
             takes = self._to_show.items()
             return [(row, take) for row, take in takes if take not in (self._done.get(row), self._failed.get(row))]
@@ -182,7 +182,7 @@ class RowViewer:
             self._drawn_at = time.monotonic()
 
     def _compute_profile(self, pipeline: Pipeline, row: int) -> Profile:
-        """The profile of a row, synchronised anew: kept samples hold the scene, but not the direct path."""
+        """Return the profile of a row, synchronised anew: kept samples hold the scene, but not the direct path."""
         rig = pipeline.source.instrument
         nearest, farthest = scene_m(rig)
         excess = np.linspace(-BEFORE_M, farthest + BEYOND_M, PROFILE_POINTS)
@@ -223,7 +223,7 @@ class GrowingFile:
         self._stamp = (0, -1, -1)
 
     def look(self) -> bytes:
-        """Bytes after those taken so far; empty if nothing has changed or the file cannot be read."""
+        """Return the verdict of products that were made after the last row; None if there are none."""
         self.replaced = False
         try:
             with self.path.open("rb") as f:
@@ -257,7 +257,7 @@ class ManifestTail:
         self.content = Manifest()
 
     def look(self) -> list[Fact]:
-        """Facts since the last look."""
+        """Return the verdict of products that were made after the last row; None if there are none."""
         raw = self.file.look()
         if self.file.replaced:
             self.content = Manifest()
@@ -274,7 +274,7 @@ class EventTail:
         self.file = GrowingFile(path)
 
     def look(self) -> list[m.AnyEvent]:
-        """Events since the last look."""
+        """Return the verdict of products that were made after the last row; None if there are none."""
         raw = self.file.look()
         unpacker = msgpack.Unpacker(raw=True, max_buffer_size=max(len(raw), 1))
         unpacker.feed(raw)
@@ -304,7 +304,7 @@ class ProductsTail:
         self._processed_utc = ""
 
     def look(self, last_row_utc: str) -> Verdict | None:
-        """The verdict of products that were made after the last row; None where there are none."""
+        """Return the verdict of products that were made after the last row; None if there are none."""
         products = find_products(self._folder, QUALITY)
         if products is None:
             return None
@@ -329,7 +329,7 @@ class ProductsTail:
 
 
 def find_newest_program(folder: Path) -> Program | None:
-    """The program that a page started last for a scan, `scan` or `process`."""
+    """Return the program of a scan (`scan` or `process`) that a page started last."""
     programs = [find_program(folder, kind) for kind in ("scan", "process")]
     return max((p for p in programs if p is not None), key=lambda p: p.started_utc, default=None)
 
@@ -384,7 +384,7 @@ class PiListener:
 
 
 def _follow_row(state: PiState, event: m.AnyEvent) -> PiState:
-    """The state after an event of the scan's rows."""
+    """Return the state after an event of the scan's rows."""
     if isinstance(event, m.RowStarted):
         return replace(state, row=event.row.index, take=event.take, point=0, state="running")
     if isinstance(event, m.Capture):
@@ -406,7 +406,7 @@ class Versioned(NamedTuple):
     data: bytes
 
     def publish(self, content: Snapshot | Motion) -> Versioned:
-        """The next version, if the content differs."""
+        """Publish the next version if the content differs."""
         data = msgspec.json.encode(content)
         if data == self.data:
             return self
@@ -500,7 +500,7 @@ class Watch:
             self._begin()
             self.shown = Shown()
             facts = self._manifest.look()
-        # At the first look nothing is known to be new.
+        # Content that is read at the first look may be old.
         if facts and self._looked:
             self._grown_at = time.monotonic()
         self._looked = True

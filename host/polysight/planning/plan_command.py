@@ -317,7 +317,7 @@ def describe(f: Forecast) -> str:
 
 
 def _describe_normals(seen: VisibleNormals) -> str:
-    """Text of the tilts at which curved and tilted surfaces are seen."""
+    """Describe the tilts at which curved and tilted surfaces are seen."""
     text = f"surfaces tilted by up to {seen.x_deg:.0f} degrees in x, {seen.y_deg:.0f} in y are seen"
     limits = zip(seen.alias_deg, (seen.x_deg, seen.y_deg), strict=True)
     aliases_deg = [alias for alias, tilt in limits if alias < tilt]

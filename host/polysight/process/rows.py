@@ -215,7 +215,7 @@ class KeptSamples:
         return needed
 
     def processable(self, source: Source, folder: Path) -> list[int]:
-        """Rows of a source with raw data or whole samples; `folder` is for messages. Logs which rows have neither.
+        """Return the rows of a source with raw data or whole samples; log those with neither. `folder` is for messages.
 
         Raises
         ------

@@ -164,7 +164,7 @@ class Link:
         deadline = self._clock.now() + timeout_s
         lost_message: Finding | None = None
         while True:
-            # Before reading: what came while this program was held is read though the time is over.
+            # Check the time before reading: a message that came while this program was paused still counts.
             is_over = self._clock.now() > deadline
             lost_message = self._read_messages() or lost_message
             events = list(self._events)
@@ -207,7 +207,7 @@ class Link:
         parts: list[messages.Message] = []
         is_over = False
         while not is_over:
-            # As in `wait_for`.
+            # Check the time before reading, as in `wait_for`.
             is_over = self._clock.now() > deadline
             if not self._words.interrupt():
                 self._clock.sleep(_INTERVAL_S)

@@ -582,6 +582,6 @@ def colour_range(surface: Surface) -> tuple[float, float]:
 
 
 def segment_text(segment: Segment) -> str:
-    """One line about a segment: form, permittivity with standard errors, or why it has none."""
+    """Describe a segment in one line: form, permittivity with standard errors, or why it has none."""
     head = f"{segment.number}: {segment.points} points, {describe_form(segment)}"
     return f"{head}, incidence {segment.incidence_deg:.0f}°: {describe_material(segment)}"

@@ -25,7 +25,7 @@ PAPER = {"frequency_hz": 138.0, "phase_rad": 0.022}
 
 QUANTITIES = ("frequency_hz", "phase_rad", "amplitude")
 _LABELS = ("frequency (Hz)", "phase (rad)", "amplitude / mean - 1")
-# Of a histogram; an odd number has a bin about zero.
+# Bins of a histogram: an odd number, so that one is centred at zero.
 _BINS = 121
 # Histograms reach this many standard deviations of the first row to either side.
 _REACH = 5.0

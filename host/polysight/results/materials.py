@@ -215,7 +215,7 @@ class _NameShare(NamedTuple):
 
 
 def level_db(ratio: complex | None) -> float | None:
-    """Level of a ratio, dB; None for zero, and where it is not known."""
+    """Return the level of a ratio, dB; None for zero and for an unknown ratio."""
     if not ratio:
         return None
     return 20 * math.log10(abs(ratio))

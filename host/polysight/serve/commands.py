@@ -63,11 +63,11 @@ class PlanRequest(Body, frozen=True):
     pulses: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None
 
     def changes(self) -> Changes:
-        """The same as changes of a plan."""
+        """Return the same numbers as changes of a plan."""
         return Changes(**msgspec.structs.asdict(self))
 
     def apply(self, config: Path) -> Instrument:
-        """The rig file with these numbers. Raises ConfigError."""
+        """Return the rig file with these numbers. Raises ConfigError."""
         rig = self.changes().apply(load_instrument(config))
         if max(rig.grid.columns, rig.grid.rows) > MAX_POSITIONS:
             raise ConfigError(
@@ -260,7 +260,7 @@ def start_waiting(site: Site, request: bytes) -> None:
 
 
 def check_request(site: Site, body: StartRequest) -> Instrument:
-    """The rig file with a request's plan. Raises PolysightError if the scan cannot be started with it."""
+    """Return the rig file with a request's plan. Raises PolysightError if no scan can be started with it."""
     if not body.name:
         raise ConfigError("the scan has no name", "`name` is empty", "give it one", code=ErrorCode.KEY_MISSING)
     rig = body.plan.apply(site.config)
@@ -281,7 +281,7 @@ def _start_again(site: Site, scan: Named, body: Body) -> None:
 
 
 def read_request(folder: Path, name: str) -> StartRequest:
-    """The request that a scan was started with, or one with its plan. Raises PolysightError if it has neither."""
+    """Return the request that started a scan, or one made from its plan. Raises PolysightError if it has neither."""
     path = folder / PROGRAM / REQUEST
     if is_plain(path) and not path.parent.is_symlink():
         request = decode_body(path.read_bytes()[:MAX_REQUEST_BYTES], StartRequest)
@@ -458,7 +458,7 @@ def _export(site: Site, scan: Named, body: ExportRequest) -> None:
 
 
 def _list_processing_options(site: Site, library: str, metal: Box | None) -> Words:
-    """Options of the library and the metal reference. Raises ConfigError."""
+    """Return the options of the library and the metal reference. Raises ConfigError."""
     words: Words = []
     if library:
         words += ["--library", _find_library(site, library)]

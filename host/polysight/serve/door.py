@@ -80,7 +80,7 @@ class Door:
                     self._drop_silent()
 
     def _wake(self, client: socket.socket) -> None:
-        """A silent connection has sent something, or was closed."""
+        """Handle a silent connection that has sent something or was closed."""
         del self._silent[client]
         self._loop.remove_reader(client)
         if not self._look(client):
@@ -144,7 +144,7 @@ def _refuse(client: socket.socket) -> None:
 
 
 def close_after_each(app: ASGIApp) -> ASGIApp:
-    """The same application with one request a connection."""
+    """Return the application such that it serves one request per connection."""
 
     async def answer(scope: Scope, receive: Receive, send: Send) -> None:
         async def send_on(message: Message) -> None:

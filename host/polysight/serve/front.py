@@ -171,7 +171,7 @@ def page_routes(front: Front) -> list[Route]:
 
 
 def frame_page(name: str, title: str, style: str) -> str:
-    """A page's content in the frame of all pages."""
+    """Return a page's content in the frame of all pages."""
     frame = (STATIC / "frame.html").read_text(encoding="utf-8")
     content = (STATIC / f"{name}.html").read_text(encoding="utf-8")
     return frame.format(name=name, title=title, style=style, content=content)
@@ -252,7 +252,7 @@ class RunningScans:
         self._lock = threading.Lock()
 
     def list(self) -> Sequence[RunningScan]:
-        """All of them, and those that were killed a short while ago; the last ones while their drive is waited for."""
+        """Return all scans, and those of programs killed shortly before; the previous list while the drive is slow."""
         if time.monotonic() - self._listed_at < RUNNING_AGE_S or not self._lock.acquire(blocking=False):
             return self._running
         try:
@@ -385,7 +385,7 @@ class ConnectionLimit:
         self._idle: OrderedDict[CountedConnection, None] = OrderedDict()
 
     def add(self, connection: CountedConnection) -> None:
-        """A connection was opened; another one is closed if there are too many."""
+        """Note that a connection was opened; close another one if there are too many."""
         self._open += 1
         self._silent[connection] = None
         if self._open > self._most:
@@ -402,12 +402,12 @@ class ConnectionLimit:
             self._silent.move_to_end(connection)
 
     def note_answered(self, connection: CountedConnection) -> None:
-        """A request was answered, and no other one is at work."""
+        """Note that a request was answered and no other one is being processed."""
         if not connection.is_working:
             self._idle[connection] = None
 
     def remove(self, connection: CountedConnection) -> None:
-        """A connection was closed."""
+        """Note that a connection was closed."""
         self._open -= 1
         self._forget(connection)
 

@@ -98,7 +98,7 @@ class Access:
 
 
 def read_host_name(host: str) -> str:
-    """The name or address in a `Host` header, without its port."""
+    """Return the name or address in a `Host` header, without its port."""
     if host.startswith("["):
         return host[1:].partition("]")[0]
     if ":" in host:
@@ -136,7 +136,7 @@ class Guard:
         await application(scope, receive, _add_headers(send))
 
     def _check_head(self, scope: Scope, headers: Headers) -> Response | None:
-        """The refusal of a request for its size, host, method or origin; None if these are allowed."""
+        """Return the refusal of a request for its size, host, method or origin; None if these are allowed."""
         method = scope["method"]
         line_bytes = len(scope.get("raw_path") or scope["path"]) + len(scope.get("query_string", b""))
         if line_bytes + sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_BYTES:
@@ -165,7 +165,7 @@ class Guard:
         return None
 
     def _check_token(self, scope: Scope, headers: Headers) -> Response | None:
-        """The refusal of a request without the token or session that it needs; None if it is allowed."""
+        """Return the refusal of a request without the token or session that it needs; None if it is allowed."""
         access = self._access
         path = scope["path"]
         if scope["method"] != "POST":
@@ -184,7 +184,7 @@ class Guard:
 
 
 async def _read_body(receive: Receive) -> bytes | None:
-    """The whole body of a request; None for one that is too large. Half of one if the client is gone."""
+    """Return the body of a request; None if it is too large. It is incomplete if the client disconnected."""
     body = bytearray()
     while True:
         message = await receive()
@@ -208,13 +208,13 @@ def _replay(body: bytes, receive: Receive) -> Receive:
 
 
 def refuse_body() -> Response:
-    """The refusal of a body that is too large."""
+    """Return the refusal of a body that is too large."""
     problem = f"More than {BODY_BYTES} bytes"
     return _close_after(refuse(413, ErrorCode.MESSAGE_INVALID, problem, "no page sends so much", "send less"))
 
 
 def _close_after(answer: Response) -> Response:
-    """The same answer, after which the connection is closed: the rest of the request is not read."""
+    """Return the same answer, after which the connection is closed: the rest of the request is not read."""
     answer.headers["Connection"] = "close"
     return answer
 
@@ -254,12 +254,12 @@ def _add_headers(send: Send) -> Send:
 
 
 def refuse(status: int, code: ErrorCode, problem: str, why: str, do: str) -> Response:
-    """An error as JSON: its code, and the three parts that people read."""
+    """Return an error as JSON: its code, and the three parts for people."""
     return JSONResponse({"code": code, "what": problem, "why": why, "do": do}, status)
 
 
 async def tell_error(request: Request, e: Exception) -> Response:
-    """An error that was raised. A file that cannot be written or read is no defect of this program."""
+    """Answer with an error that was raised. A file that cannot be written or read is no defect of this program."""
     if isinstance(e, OSError):
         error = os_error(e)
     else:
@@ -279,13 +279,13 @@ async def tell_error(request: Request, e: Exception) -> Response:
 
 
 async def tell_no_page(request: Request, e: Exception) -> Response:
-    """An address that leads nowhere."""
+    """Answer for an address that does not exist."""
     del request, e
     return refuse(404, ErrorCode.OTHER, "There is no such page", "the address is wrong", "begin at the list of scans")
 
 
 async def _tell_nobody(request: Request, e: Exception) -> Response:
-    """The client disconnected in the middle of its request."""
+    """Answer a client that disconnected in the middle of its request."""
     del request, e
     return Response(status_code=400)
 

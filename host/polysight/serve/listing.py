@@ -71,7 +71,7 @@ class ChangingList:
         self._scans = scans
 
     def _find_state(self, stamp: str) -> int | None:
-        """Number of the state that a stamp names; None if it is not one of this list."""
+        """Return the number of the state that a stamp names; None if the stamp is not of this list."""
         origin, _, number = stamp.partition("-")
         is_number = number.isascii() and number.isdecimal() and len(number) <= len(str(self._number))
         if origin != self._origin or not is_number:

@@ -52,7 +52,7 @@ class Queue:
         self._thread.start()
 
     def waiting(self) -> Waiting:
-        """The queue as it is."""
+        """Return the requests in the queue."""
         return Waiting([name for name, _ in self._list_requests()], self._held)
 
     def add(self, name: str, request: bytes) -> None:
@@ -80,7 +80,7 @@ class Queue:
         self._last = ""
 
     def _list_requests(self) -> list[tuple[str, Path]]:
-        """Names and files of the requests, in the order in which they came; files that are no requests are left out."""
+        """Return the names and files of the requests, oldest first; files that are no requests are left out."""
         requests = []
         for path in sorted(self._folder.glob("*.json")):
             try:

@@ -243,7 +243,7 @@ async def _probe(site: Site, request: Request) -> Response:
 
 
 async def _file(site: Site, request: Request) -> Response:
-    """One of the files that the result lists; nothing in it may act as a page of this server."""
+    """Return one of the files that the result lists, in a form that cannot act as a page of this server."""
     name = request.path_params["name"]
     kind = request.query_params.get("of", "products")
 
@@ -283,7 +283,7 @@ class Download(StreamingResponse):
 
 
 def _answer_picture(picture: catalogue.Picture) -> Response:
-    """A map, with the values at the ends of its colours as headers."""
+    """Answer with a map; headers have the values at the ends of its colours."""
     unit = "deg" if picture.unit == "°" else picture.unit
     headers = {"X-Low": f"{picture.low:g}", "X-High": f"{picture.high:g}", "X-Unit": unit}
     return Response(picture.png, media_type="image/png", headers=headers)

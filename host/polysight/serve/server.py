@@ -1,8 +1,8 @@
 """`polysight serve` and `polysight preview`: the address, the token, and the processes until Ctrl-C.
 
-This process shows the pages (`front`). It starts the one that accepts connections (`door`), and the reading process,
-which it starts again should that end. All are uvicorn; the reading process listens on a socket in a folder that only
-this user may enter.
+Three processes, all uvicorn: this one answers requests for pages (`front`), a second one accepts connections (`door`),
+and the reading process reads scans, behind a socket in a folder that only this user may enter. This process starts the
+other two, and restarts the reading process if it ends.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ from polysight_shared.program import delay_interrupts, ignore_interrupts
 
 # Priority of the reading process, below capture and scan.
 NICE = 10
-# A page holds up to six.
+# A browser opens up to six connections for a page.
 MAX_CONNECTIONS = 2048
-# Connections that may be accepted before the next one that has sent something is read; and in the kernel's queue: a
-# client whose connection finds no room there tries again after 1 s, and then after 2 more.
+# Connections that may be accepted before the next one that has sent something is read.
 ACCEPTED_AT_ONCE = 128
+# Connections in the kernel's queue. A client that finds the queue full tries again after 1 s, and after 2 s more.
 BACKLOG = 4096
 # Idle connections are closed when there are too many, never for their age.
 KEEP_ALIVE_S = 10**6
@@ -179,9 +179,9 @@ def _make_access(place: Place, listener: socket.socket, control: bool) -> Access
 
 
 def load_token() -> str:
-    """The token of this user's servers, made at the first call; open pages keep control when a server is restarted.
+    """Return the token of this user's servers, made at the first call: open pages keep control when a server restarts.
 
-    Raises ConfigError if its file can be read by others. Who removes it makes the next server print a new one.
+    Raises ConfigError if its file can be read by others. If it is removed, the next server makes and prints a new one.
     """
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     path = Path(state) / "polysight" / "token"
@@ -241,7 +241,7 @@ def _keep_reading_process(first: BaseProcess, shown: Shown, path: Path) -> Itera
                 process.join()
                 return
             process = context.Process(target=run_reader, args=(shown, path), name="reading", daemon=True)
-            # Else `start` begins it, and unblocks Ctrl-C.
+            # Start the tracker here: started by `start`, it would unblock Ctrl-C.
             resource_tracker.ensure_running()
             with delay_interrupts():
                 process.start()
@@ -273,7 +273,7 @@ def start_first_reader(shown: Shown, path: Path, listener: socket.socket) -> Bas
 
 def run_reader(shown: Shown, path: Path) -> None:
     """Run the reading process until it is ended, or the process that started it is gone."""
-    # Else it may end in a traceback before the server does.
+    # Ctrl-C ends the server, which ends this process; without this line it would end first, with a traceback.
     ignore_interrupts(signal.SIGINT)
     programs = None
     if shown.control and shown.only is None:
@@ -322,7 +322,7 @@ def lower_priority() -> None:
 
 
 def _configure(app: ASGIApp, **more: object) -> uvicorn.Config:
-    """Options of both servers: without logging, and stopping within a second."""
+    """Return the settings of both servers: without logging, and stopping within a second."""
     logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
     return uvicorn.Config(
         app,

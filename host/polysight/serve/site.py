@@ -74,7 +74,7 @@ class Site:
         self.scans = scans
         self.watches = watches
         self.is_ending: Callable[[], bool] = lambda: False
-        # Held from the check that the rig is free until a program has it.
+        # Held from the check that no program uses the rig until a program is started on it.
         self.rig = threading.Lock()
         self.listed = ChangingList()
         self._programs = programs
@@ -168,12 +168,12 @@ class Site:
 
 
 def draw_map(folder: Path, name: str, limits: tuple[float, float] | None = None) -> catalogue.Picture:
-    """A map of a scan's products, or its `thumbnail`; drawn again only when these have changed. Raises DataError."""
+    """Draw a map of a scan's products, or its `thumbnail`; cached until these change. Raises DataError."""
     return _draw(*_stamp_products(folder), name, limits)
 
 
 def compare_products(first: Path, second: Path) -> catalogue.Comparison:
-    """Two processed scans compared, computed again only when their products have changed. Raises DataError."""
+    """Compare two processed scans; cached until their products change. Raises DataError."""
     return _compare(first, second, _stamp_products(first), _stamp_products(second))
 
 
@@ -183,7 +183,7 @@ def check_products(folder: Path) -> CheckResult | None:
 
 
 def _stamp_products(folder: Path) -> tuple[Path, str]:
-    """The folder of a scan's products, and what changes when these do."""
+    """Return the folder of a scan's products, and a stamp that changes with them."""
     products = read_products(folder).folder
     return products, catalogue.read_generation(products)
 
@@ -328,7 +328,7 @@ class Watches:
         self._lock = threading.Lock()
 
     def open(self, name: str, folder: Path) -> Watch:
-        """The live view of a scan, opened if it is not. Raises DeviceError when too many are open."""
+        """Return the live view of a scan; open it first if necessary. Raises DeviceError if too many are open."""
         watch = self._find(name)
         if watch is not None:
             return watch

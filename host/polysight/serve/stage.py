@@ -52,7 +52,7 @@ class StageControl:
         self._jogging = threading.Lock()
 
     def look(self) -> StagePlace:
-        """Where it is. Raises PolysightError, as all of these."""
+        """Return the position of the stage. Raises PolysightError, as all of these."""
         return self._ask(lambda _pi, _rig: None)
 
     def home(self) -> StagePlace:

@@ -72,7 +72,7 @@ def find_addresses() -> list[str]:
 
 
 def draw_code(address: str) -> str:
-    """The address as a QR code, two rows of modules a line; "" without the library."""
+    """Draw the address as a QR code, two rows of modules a line; "" without the library."""
     try:
         import segno
     except ImportError:

@@ -393,7 +393,7 @@ class PublishedScan(_Published):
             )
 
     def rows(self) -> Iterator[int]:
-        """Rows of which both receiving boards have data, ascending."""
+        """Return the rows of which both receiving boards have data, ascending."""
         h, v = (set(self._files[b.name]) for b in self._instrument.receivers)
         yield from sorted(h & v)
 
@@ -412,7 +412,7 @@ class PublishedScan(_Published):
         shape = self._shape
         frames = self._shape.positions * self._shape.pulses
         packets_lost = stream.packets_lost
-        # Nothing slipped.
+        # All bytes are there, so none was shifted by a loss.
         if stream.data.size >= shape.bytes:
             self._note(board_name, row, RowLosses(packets_lost))
             gaps = [(a, min(b, shape.bytes)) for a, b in stream.lost if a < shape.bytes]
@@ -503,7 +503,7 @@ class PublishedCubes(_Published):
     synchronised = True
 
     def rows(self) -> Iterator[int]:
-        """All rows of the plan."""
+        """Return all rows of the plan."""
         yield from range(self._plan.rows)
 
     def read_row(self, board_name: str, row: int) -> CubeRow:
@@ -522,7 +522,7 @@ class PublishedCubes(_Published):
         if cube.shape != shape:
             problem = f"{file}: shape {cube.shape}, {shape} in its settings"
             raise DataError(problem, "not the settings of this scan", "download both again", code=ErrorCode.MISMATCH)
-        # From the smallest x (y) on.
+        # Positions in the order of ascending x (or y).
         if self.mirrored:
             ascending = cube[:, :, row]
         else:

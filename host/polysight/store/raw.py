@@ -161,14 +161,13 @@ class Replaced:
 
     row: int
     board: str
-    # Missing bytes as committed
+    # Missing bytes when the row was committed, and now.
     missing_before: int
-    # Missing bytes now
     missing_after: int
-    # Why the row was left unchanged
+    # Reason why the row was left unchanged.
     why_unchanged: str = ""
     changed: bool = False
-    # Left unchanged because its files differ from the commit or are unreadable
+    # True if the row was left unchanged because its files differ from the commit or are unreadable.
     damaged: bool = False
 
 
@@ -178,9 +177,9 @@ class PlacedAgain:
 
     evidence: capture.Evidence
     placed: capture.Placed
-    # uint8, the payload as placed now
+    # uint8: the payload as placed now.
     payload: np.ndarray
-    # Missing bytes as committed, [start, stop)
+    # Missing byte ranges [start, stop) when the row was committed.
     missing_before: list[tuple[int, int]]
     # True if the committed row has its frames at the times of their pulses. Placement by byte count would undo that.
     by_pulses: bool

@@ -232,7 +232,7 @@ class ScanFolder:
         )
         _make_folder(path)
         if (path / MANIFEST).exists() and not manifest.read(path / MANIFEST).length:
-            # Left by a start that ended before its first line.
+            # A start that was interrupted before its first line left an empty manifest.
             (path / MANIFEST).unlink()
         with ManifestWriter(path / MANIFEST, create=True) as writer:
             writer.append(fact)
@@ -319,7 +319,7 @@ class ScanFolder:
         }
 
     def rows(self) -> Iterator[int]:
-        """Indices of the committed rows, ascending."""
+        """Return the indices of the committed rows, ascending."""
         return iter(self.committed_rows())
 
     @property
@@ -406,7 +406,7 @@ def dropped_files(scan: ScanFolder) -> dict[str, RawDropped]:
     """Return the payload files (relative to the scan folder) that were dropped, each with its fact."""
     files: dict[str, RawDropped] = {}
     for fact in scan.content.facts:
-        # Taken again, with new files.
+        # The row was recorded again or withdrawn: its dropped files no longer count.
         if isinstance(fact, RowCommitted | RowWithdrawn):
             files = {file: dropped for file, dropped in files.items() if dropped.row != fact.row}
         elif isinstance(fact, RawDropped):

@@ -72,7 +72,7 @@ class RowData:
     @cached_property
     def payload(self) -> NDArray[np.uint8]:
         """The whole payload."""
-        # To the end: damage is told after the last piece.
+        # Read to the end: damage is raised only after the last piece.
         pieces = list(self.pieces(0))
         if not pieces:
             return np.empty(0, np.uint8)
@@ -152,7 +152,7 @@ class Source(Scan, Protocol):
         ...
 
     def rows(self) -> Iterator[int]:
-        """Indices of the rows with data, ascending."""
+        """Return the indices of the rows with data, ascending."""
         ...
 
     def read_row(self, board_name: str, row: int) -> RowData | CubeRow:

@@ -269,7 +269,7 @@ def measure_echoes(
 
 
 def _move_starts(values: Array, offsets_m: Array) -> Array:
-    """Values [..., 6] of paths at other stage offsets near by."""
+    """Return the values [..., 6] of paths at other stage offsets near by."""
     x = offsets_m[..., 0]
     y = offsets_m[..., 1]
     path, slope_x, slope_y, xx, xy, yy = np.moveaxis(values, -1, 0)

@@ -116,7 +116,7 @@ def find_bend(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Arr
 def predict_echo(
     points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array, rx_m: Array
 ) -> tuple[Array, Array, Array]:
-    """Path [n], slope [n, 2] and curvature [n, 2, 2] of the echo of a surface seen from stage offsets [n, 3]."""
+    """Return path [n], slope [n, 2] and curvature [n, 2, 2] of the echo of a surface seen from stage offsets [n, 3]."""
     t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
     plane, cross, along, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     second = along + twice_cosine[:, None, None] * curvature

@@ -437,7 +437,7 @@ def point_cloud(surface: Surface) -> bytes:
 
 
 def summary_lines(surface: Surface) -> list[str]:
-    """Text for people: a line for each segment."""
+    """Describe the surface for people: a line for each segment."""
     kind = "simulated " if surface.simulated else ""
     lines = [f"{kind}scan {surface.scan_id}: {len(surface.segment)} points on {len(surface.segments)} surfaces"]
     for segment in surface.segments:

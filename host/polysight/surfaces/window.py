@@ -64,7 +64,7 @@ class Samples:
         return np.linalg.norm(self.rx_m - self.tx_m, axis=1)
 
     def window_shape(self) -> tuple[int, int]:
-        """Rows and columns of a window."""
+        """Return the rows and columns of a window."""
         y = self.offsets_m[:, 0, 1]
         x = self.offsets_m[0, :, 0]
         steps = [abs(axis[-1] - axis[0]) / max(1, axis.size - 1) for axis in (y, x)]
@@ -169,7 +169,7 @@ def _find_gate(board: Samples) -> tuple[float, float]:
 
 
 def find_mirror_path(board: Samples, z_m: float) -> float:
-    """Path over a mirror at `z_m`."""
+    """Return the path over a mirror at `z_m`."""
     image = board.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
     return float(np.linalg.norm(board.middle_m - image))
 
@@ -182,7 +182,7 @@ def find_basis(offsets: Array) -> Array:
 
 
 def pack_values(path_m: Array, slope: Array, bend: Array) -> Array:
-    """Values [n, 6] of paths [n], slopes [n, 2] and curvatures [n, 2, 2]."""
+    """Stack paths [n], slopes [n, 2] and curvatures [n, 2, 2] as values [n, 6]."""
     return np.stack([path_m, *slope.T, bend[:, 0, 0], bend[:, 0, 1], bend[:, 1, 1]], axis=1)
 
 

@@ -189,7 +189,7 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
 
 
 def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bool_], setup: BoardSetup) -> SyncedRow:
-    """As :func:`synchronise_row`, for a row that comes in pieces of whole bursts; they may share their memory."""
+    """Synchronise a row given in pieces of whole bursts, as :func:`synchronise_row`; pieces may share memory."""
     if valid.size % setup.pulses:
         raise _mismatch_error(valid.size, setup.path.steering.shape, setup)
     received = valid.reshape(-1, setup.pulses)
@@ -248,7 +248,7 @@ def _mismatch_error(frames: int, shape: tuple[int, ...], setup: BoardSetup) -> D
 
 def _turn_along(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
     """Return `SyncedRow.turn` of samples [rx, position, block], from the valid neighbours; 0 without any."""
-    # From each position to the next.
+    # Phase step from each position to the next.
     step = np.vecdot(samples[:, :-1], samples[:, 1:]).sum(axis=0)
     return np.angle(np.pad(step, (1, 0)) + np.pad(step, (0, 1)))
 
@@ -376,7 +376,7 @@ def _estimate_direct_path_errors(mean: NDArray[np.complex64], path: DirectPath) 
     amplitude = np.array([amplitude for amplitude, _ in halves])
     w = [w for _, w in halves]
     amplitude_size = np.abs(amplitude)
-    # Without the constant difference of the RX.
+    # Remove the constant phase difference between the RX.
     phase = np.angle(amplitude * amplitude.mean(axis=1, keepdims=True).conj())
     size = amplitude_size / amplitude_size.mean(axis=1, keepdims=True)
     return np.array([(w[0] - w[1]) / (2 * np.pi), phase[0] - phase[1], size[0] - size[1]]) / 2

@@ -313,7 +313,7 @@ def fig20(run: Run) -> Item:
 
 
 def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) -> Figure:
-    """One panel for each score and matrix, with its title."""
+    """Draw one panel for each score and matrix, with its title."""
     n = len(materials)
     if n > 12:
         # Large matrices stand two by two, and leave room for a list of confusions.
@@ -360,7 +360,7 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
 
 
 def _list_confusions(panels: Sequence[Panel], shown: int = 5) -> str:
-    """The largest confusions of each panel."""
+    """List the largest confusions of each panel."""
     lines = []
     for scored, table, title in panels:
         confusions = table * (1 - np.eye(len(table)))

@@ -106,7 +106,7 @@ def pair_scans(first: Library, second: Library) -> tuple[Library, Library]:
 
 
 def select_repeated(samples: Samples) -> Samples | None:
-    """The materials that at least two scans hold; None when these are fewer than two, or the scans fewer than three.
+    """Return the materials of at least two scans; None if these are fewer than two, or the scans fewer than three.
 
     The classifiers fit their weights with scans kept apart: two must remain when one is left out.
     """
@@ -538,7 +538,7 @@ class Estimate:
 
 
 def authors_table2(data: AuthorsData) -> Item:
-    """Each source's permittivities by Eq. 3 as it is, without leakage, and by the authors' recipe.
+    """Tabulate each source's permittivities by Eq. 3 as it is, without leakage, and by the authors' recipe.
 
     Raises
     ------

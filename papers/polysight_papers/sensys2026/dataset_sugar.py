@@ -89,7 +89,7 @@ def _select_entries_near(library: Library, angle_deg: float) -> list[Entry]:
 
 
 def _tabulate_solutions(result: Any, concentration_of_name: Mapping[str, float]) -> list[tuple[str, ...]]:
-    """A row for each solution: name, true and mean estimated concentration, patches, median error."""
+    """Return a row for each solution: name, true and mean estimated concentration, patches, median error."""
     rows = []
     names = {r.name for r in result.left_out}
     for name in sorted(names, key=lambda n: concentration_of_name[n]):

@@ -140,7 +140,7 @@ def view_scan(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 4
 def _scan(
     name: str, rows: Sequence[int], at: Sequence[tuple[float, float]], config: Path, seed: int, **more: object
 ) -> ScanView:
-    """A copper plate in the middle and plates with the permittivities of these rows of Table 2 around it, mm."""
+    """Return a scene of a copper plate, and plates with the permittivities of these rows of Table 2 around it."""
     plates = [plate("copper", None, 0.0, 0.0)]
     plates += [plate(table2()[n - 1].name, table2()[n - 1].permittivity, *xy) for n, xy in zip(rows, at, strict=True)]
     with simulate_scan(name, plates, config, seed=seed, **more) as (source, truth):

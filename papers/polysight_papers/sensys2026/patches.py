@@ -170,7 +170,7 @@ def h_accuracy(group: Group, errors: Errors, seeds: tuple[int, ...]) -> float:
 
 
 def count_draws(quick: bool) -> int:
-    """Number of draws on which errors are calibrated."""
+    """Return the number of draws on which errors are calibrated."""
     if quick:
         return 1
     return 3

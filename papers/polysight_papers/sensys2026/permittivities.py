@@ -105,7 +105,7 @@ def _compute_d_prime(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def fig16(run: item.Run) -> item.Item:
-    """Level of |H| at 0 degrees and of |P| at 55 and 60, pixels of eight scans each."""
+    """Draw the level of |H| at 0 degrees and of |P| at 55 and 60, pixels of eight scans each."""
     materials = _list_published(CONTRAST)
     errors = calibrated_errors("solids", count_draws(run.quick))
     fig = item.new_figure(11.5, 4.6)

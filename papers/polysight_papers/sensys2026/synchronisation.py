@@ -307,7 +307,7 @@ def _draw_filter(ax: Axes, if_hz: npt.NDArray, amplitude: npt.NDArray, fitted: H
 
 
 def fig9(run: Run) -> Item:
-    """The direct path alone, received at ten start frequencies of the receiver."""
+    """Draw the direct path alone, received at ten start frequencies of the receiver."""
     chirp = load_instrument(run.config).chirp
     if_hz, amplitude, example = _sweep_start_frequencies(run, chirp)
     fitted = fit_high_pass(if_hz, amplitude)

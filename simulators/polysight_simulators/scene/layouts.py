@@ -7,6 +7,7 @@ follow docs/spec/scan-folder.md and the description of the data set, implemented
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Collection, Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -52,7 +53,7 @@ class Layout(Protocol):
 
 
 def versions() -> dict[str, str]:
-    """Return the release that makes the data."""
+    """Return the release of this program, for the manifest."""
     return {"polysight": __version__}
 
 
@@ -89,7 +90,7 @@ def new_folder(path: Path) -> None:
 
 def _copy_calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, str]]]:
     """Copy the files that `[calibration]` names into the scan; return the entry for the manifest."""
-    facts = {}
+    entries = {}
     for kind, name in to_builtins(rig.calibration).items():
         if not name:
             continue
@@ -106,14 +107,14 @@ def _copy_calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[s
             raise DataError(
                 f"{source}: cannot be copied: {e.strerror}", f"calibration.{kind} names it", "correct or empty that key"
             ) from None
-        facts[kind] = {
+        entries[kind] = {
             "file": str(copy),
             "crc32": f"{crc32(source.read_bytes()):08x}",
             "copied_from": str(source),
         }
-    if not facts:
+    if not entries:
         return {}
-    return {"calibration": facts}
+    return {"calibration": entries}
 
 
 class OwnLayout:
@@ -150,6 +151,7 @@ class OwnLayout:
     def write_row(self, row: Row, payloads: dict[str, NDArray[np.int16]], gaps: dict[str, Gaps]) -> None:
         """Write a committed row and the events of the Pi."""
         pulses = self._rig.burst.pulses
+        frame_bytes = self._rig.frame_bytes
         boards = {}
         for name, payload in payloads.items():
             raw = blank_gaps(payload, gaps[name])
@@ -157,23 +159,23 @@ class OwnLayout:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             with name_in_errors(self.folder / file):
                 (self.folder / file).write_bytes(raw)
-            missing = sum(stop - start for start, stop in gaps[name])
-            partial = {
-                f for a, b in gaps[name] for f in range(a // self._rig.frame_bytes, -(-b // self._rig.frame_bytes))
-            }
+            missing_bytes = sum(stop - start for start, stop in gaps[name])
+            incomplete_frames: set[int] = set()
+            for start, stop in gaps[name]:
+                incomplete_frames.update(range(start // frame_bytes, math.ceil(stop / frame_bytes)))
             facts = {
                 "frames_expected": row.points * pulses,
                 "bytes": len(raw),
                 "missing": gaps[name],
             }
-            index = _index(facts)
+            index = _make_index(facts)
             (self.folder / file.with_suffix(".idx")).write_bytes(index)
             boards[name] = {
                 "file": str(file),
                 "bytes": len(raw),
                 "frames_expected": row.points * pulses,
-                "frames_received": row.points * pulses - len(partial),
-                "missing_bytes": missing,
+                "frames_received": row.points * pulses - len(incomplete_frames),
+                "missing_bytes": missing_bytes,
                 "crc32": f"{crc32(raw):08x}",
                 "index_crc32": f"{crc32(index):08x}",
             }
@@ -205,6 +207,7 @@ class OwnLayout:
             f.write(b"".join(map(pack_with_crc, events)))
 
     def _stamp(self) -> dict[str, Any]:
+        """Return the common fields of the next event."""
         self._seq += 1
         return {"scan_id": self._scan_id, "seq": self._seq, "t_mono_ns": self._now_ns}
 
@@ -249,8 +252,8 @@ class OwnLayout:
         self._write_event(*events)
 
 
-def _index(facts: dict[str, Any]) -> bytes:
-    """Return the index of a row: one JSON line, followed by no packet arrivals."""
+def _make_index(facts: dict[str, Any]) -> bytes:
+    """Return the index of a row: one JSON line, without packet arrivals after it."""
     return json.dumps({**facts, "arrivals": 0}, sort_keys=True, separators=(",", ":")).encode() + b"\n"
 
 
@@ -314,38 +317,45 @@ class AuthorsLayout:
             folder.mkdir(exist_ok=True)
             raw = blank_gaps(sent, lost_ranges)
             if not self._zero_filling:
-                ends = [0, *(e for gap in lost_ranges for e in gap), len(raw)]
-                pieces = [raw[a:b] for a, b in zip(ends[::2], ends[1::2], strict=True)]
+                # The received pieces lie between the end of one lost range and the start of the next.
+                starts = [0, *(stop for _, stop in lost_ranges)]
+                stops = [*(start for start, _ in lost_ranges), len(raw)]
+                pieces = [raw[start:stop] for start, stop in zip(starts, stops, strict=True)]
             else:
                 pieces = [raw]
             with name_in_errors(folder / f"{stem}.bin"):
                 (folder / f"{stem}.bin").write_bytes(b"".join(pieces))
-            (folder / f"{stem}_log.csv").write_text(self._log(len(raw), lost_ranges, points, step_s), encoding="ascii")
+            packet_log = self._format_packet_log(len(raw), lost_ranges, points, step_s)
+            (folder / f"{stem}_log.csv").write_text(packet_log, encoding="ascii")
+        # The next row begins two seconds after the late packet.
         self._now_s += row.points * step_s + LATE_S + 2.0
 
     def end(self) -> None:
         """Write nothing more."""
 
-    def _log(self, size: int, lost: Gaps, points: list[int], step_s: float) -> str:
+    def _format_packet_log(self, size: int, lost: Gaps, points: list[int], step_s: float) -> str:
         """Return a line for each packet received: sequence number, payload bytes, Unix time.
 
         The last, incomplete packet is late, for the card sends it after a timeout; the authors' decoder needs that.
         """
-        full = packet_payload_bytes(self._rig)
-        frame = self._rig.frame_bytes
+        full_bytes = packet_payload_bytes(self._rig)
+        frame_bytes = self._rig.frame_bytes
         pulses = self._rig.burst.pulses
         period_s = self._rig.burst.period_us * 1e-6
-        lost_packets = {start // full for a, b in lost for start in range(a - a % full, b, full)}
+        lost_packets: set[int] = set()
+        for lost_start, lost_stop in lost:
+            lost_packets.update(range(lost_start // full_bytes, math.ceil(lost_stop / full_bytes)))
         lines = []
-        for k, start in enumerate(range(0, size, full)):
-            if k in lost_packets:
+        for packet, start in enumerate(range(0, size, full_bytes)):
+            if packet in lost_packets:
                 continue
-            stop = min(start + full, size)
-            position, chirp = divmod((stop - 1) // frame, pulses)
-            at_s = self._now_s + points[position] * step_s + chirp * period_s + 2e-4
-            if stop - start < full:
-                at_s += LATE_S
-            lines.append(f"{k + 1},{stop - start},{at_s:.6f}\n")
+            stop = min(start + full_bytes, size)
+            # The packet is received 0.2 ms after the trigger of the chirp that its last byte is of.
+            position, chirp = divmod((stop - 1) // frame_bytes, pulses)
+            received_s = self._now_s + points[position] * step_s + chirp * period_s + 2e-4
+            if stop - start < full_bytes:
+                received_s += LATE_S
+            lines.append(f"{packet + 1},{stop - start},{received_s:.6f}\n")
         return "".join(lines)
 
 
@@ -360,8 +370,10 @@ def write_settings(folder: Path, rig: Instrument, zero_filling: bool, by_columns
 
 
 def _describe_collection(rig: Instrument, scan: str, zero_filling: bool, by_columns: bool) -> dict[str, Any]:
+    """Return the scan's settings with the keys of the published data set."""
     h, v = rig.receivers
-    tilt = [s.shift_mm for s in h.mount if s.shift_mm is not None][-2]
+    # The last shift of a mount is its board's origin; the one before it is the offset of the tilted board.
+    tilt_offset_mm = [step.shift_mm for step in h.mount if step.shift_mm is not None][-2]
     return {
         "dx": rig.grid.step_x_mm,
         "dy": rig.grid.step_y_mm,
@@ -378,11 +390,11 @@ def _describe_collection(rig: Instrument, scan: str, zero_filling: bool, by_colu
         "packet_zero_filling": zero_filling,
         "object_distance": rig.geometry.object_distance_mm,
         "board_dist": (_find_last_shift(h) - _find_last_shift(rig.transmitter)) / 1e3,
-        "txboard_angle_y": _turn(rig.transmitter, "y", -1),
-        "rxboard_v_angle_y": _turn(v, "y", 0),
-        "rxboard_angle_y": _turn(h, "y", -1),
-        "rxboard_angle_z": _turn(h, "z", -1),
-        "rxboard_tilt_offset": list(tilt),
+        "txboard_angle_y": _find_turn_deg(rig.transmitter, "y", -1),
+        "rxboard_v_angle_y": _find_turn_deg(v, "y", 0),
+        "rxboard_angle_y": _find_turn_deg(h, "y", -1),
+        "rxboard_angle_z": _find_turn_deg(h, "z", -1),
+        "rxboard_tilt_offset": list(tilt_offset_mm),
         "description": f"simulated: {scan}",
     }
 
@@ -414,20 +426,20 @@ def _describe_radars(rig: Instrument) -> dict[str, Any]:
     }
 
 
-def _turn(board: Board, axis: str, which: int) -> float:
-    """Return a mount's rotation about an axis, degrees; 0 without one."""
-    turns = [s.turn_deg for s in board.mount if s.about == axis and s.turn_deg is not None]
-    if not turns:
+def _find_turn_deg(board: Board, axis: str, which: int) -> float:
+    """Return one of a mount's rotations about an axis (0: the first, -1: the last), degrees; 0 without any."""
+    turns_deg = [step.turn_deg for step in board.mount if step.about == axis and step.turn_deg is not None]
+    if not turns_deg:
         return 0.0
-    return turns[which]
+    return turns_deg[which]
 
 
 def _find_last_shift(board: Board) -> float:
     """Return the last shift of a mount along x, mm: the origin of the board."""
-    shifts = [s.shift_mm[0] for s in board.mount if s.shift_mm is not None]
-    if not shifts:
+    shifts_mm = [step.shift_mm[0] for step in board.mount if step.shift_mm is not None]
+    if not shifts_mm:
         return 0.0
-    return shifts[-1]
+    return shifts_mm[-1]
 
 
 def write_cube(
@@ -455,7 +467,7 @@ def write_cube(
     conjugate
         Phases have the opposite sign.
     by_columns
-        Write this into the settings; the travel in a burst is still along x.
+        Write this into the settings; the stage still moves along x during a burst.
     """
     name = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
     folder = out / "raw" / name

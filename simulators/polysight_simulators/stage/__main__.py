@@ -180,7 +180,7 @@ def serve(
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Build the parser of the command line."""
     p = command_line("polysight_simulators.stage", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
     p.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
     p.add_argument("--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires; without it no edges")

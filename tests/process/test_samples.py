@@ -39,15 +39,34 @@ def same(one: Images, other: Images) -> bool:
     return same_pixels and np.array_equal(one.illumination.footprints, other.illumination.footprints)
 
 
+@pytest.fixture(scope="module")
+def from_raw(two_plates: Path) -> Pipeline:
+    """The scan, processed without samples."""
+    return process_scan(two_plates, "none")
+
+
+@pytest.fixture(scope="module")
+def expected(from_raw: Pipeline) -> Images:
+    """Its images."""
+    return from_raw.form_images()
+
+
 @pytest.fixture
 def scan(two_plates: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(two_plates, tmp_path / "scan"))
 
 
+@pytest.fixture(scope="module")
+def _processed(two_plates: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = Path(shutil.copytree(two_plates, tmp_path_factory.mktemp("kept") / "scan"))
+    process_scan(folder)
+    return folder
+
+
 @pytest.fixture
-def kept(scan: Path) -> Path:
-    process_scan(scan)
-    return scan
+def kept(_processed: Path, tmp_path: Path) -> Path:
+    """A copy of the scan with its samples."""
+    return Path(shutil.copytree(_processed, tmp_path / "scan"))
 
 
 def without_raw(folder: Path) -> Path:
@@ -55,22 +74,20 @@ def without_raw(folder: Path) -> Path:
     return folder
 
 
-def test_images_and_quality_from_samples_are_bit_exact(two_plates: Path, kept: Path) -> None:
-    expected = process_scan(two_plates, "none")
+def test_images_and_quality_from_samples_are_bit_exact(from_raw: Pipeline, expected: Images, kept: Path) -> None:
     reprocessed = process_scan(without_raw(kept))
-    assert same(reprocessed.form_images(), expected.form_images())
+    assert same(reprocessed.form_images(), expected)
     for key in ("boards", "coverage"):
-        assert getattr(reprocessed.quality.result(), key) == getattr(expected.quality.result(), key)
+        assert getattr(reprocessed.quality.result(), key) == getattr(from_raw.quality.result(), key)
 
 
-def test_rows_on_several_threads_make_the_same_products(two_plates: Path, scan: Path) -> None:
-    serial = process_scan(two_plates, "none")
+def test_rows_on_several_threads_make_the_same_products(from_raw: Pipeline, expected: Images, scan: Path) -> None:
     threaded = Pipeline(ScanFolder.load(scan), samples="keep")
     rows = list(threaded.source.rows())
     assert list(map_rows(threaded.add_row, rows, threads=4)) == rows
-    assert same(threaded.form_images(), serial.form_images())
-    assert threaded.quality.result().boards == serial.quality.result().boards
-    assert same(process_scan(without_raw(scan)).form_images(), serial.form_images())
+    assert same(threaded.form_images(), expected)
+    assert threaded.quality.result().boards == from_raw.quality.result().boards
+    assert same(process_scan(without_raw(scan)).form_images(), expected)
 
 
 def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,13 +112,12 @@ def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(begun) <= 3
 
 
-def test_samples_with_sub_bands_can_be_used_without_them(two_plates: Path, scan: Path) -> None:
-    process_scan(scan, bands=3)
-    expected = process_scan(two_plates, "none", bands=3)
+def test_samples_with_sub_bands_can_be_used_without_them(expected: Images, scan: Path) -> None:
+    first = process_scan(scan, bands=3)
     reprocessed = process_scan(without_raw(scan), bands=3)
-    for first_item, second_item in zip(reprocessed.sub_bands.finish(), expected.sub_bands.finish(), strict=True):
+    for first_item, second_item in zip(reprocessed.sub_bands.finish(), first.sub_bands.finish(), strict=True):
         assert same(first_item, second_item)
-    assert same(process_scan(scan).form_images(), process_scan(two_plates, "none").form_images())
+    assert same(process_scan(scan).form_images(), expected)
 
 
 def test_samples_without_the_sub_bands_asked_for_are_not_used(kept: Path) -> None:
@@ -139,7 +155,7 @@ def test_other_planes_do_not_change_the_kept_samples(kept: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["record", "torn line", "line", "head", "array gone", "array short"])
-def test_damaged_samples_are_made_again(two_plates: Path, kept: Path, what: str) -> None:
+def test_damaged_samples_are_made_again(expected: Images, kept: Path, what: str) -> None:
     folder = kept / "samples"
     rows = folder / "rows.jsonl"
     array = folder / "RH.npy"
@@ -157,7 +173,6 @@ def test_damaged_samples_are_made_again(two_plates: Path, kept: Path, what: str)
         array.unlink()
     else:
         array.write_bytes(array.read_bytes()[:-3000])
-    expected = process_scan(two_plates, "none").form_images()
     assert same(process_scan(kept).form_images(), expected)
     assert same(process_scan(without_raw(kept)).form_images(), expected)
 
@@ -185,15 +200,14 @@ def test_samples_of_another_calibration_are_not_used(kept: Path) -> None:
 
 
 def test_a_scan_is_processed_even_if_samples_cannot_be_written(
-    two_plates: Path, scan: Path, caplog: pytest.LogCaptureFixture
+    expected: Images, scan: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (scan / "samples").write_text("a file is in the way")
-    reprocessed = process_scan(scan).form_images()
-    assert same(reprocessed, process_scan(two_plates, "none").form_images())
+    assert same(process_scan(scan).form_images(), expected)
     assert str(scan / "samples") in caplog.text
 
 
-def test_samples_can_be_read_as_the_specification_says(kept: Path) -> None:
+def test_samples_can_be_read_as_the_specification_says(from_raw: Pipeline, kept: Path) -> None:
     """The lines of docs/spec/samples.md."""
     folder = kept / "samples"
     head = json.loads((folder / "samples.json").read_text())
@@ -203,8 +217,7 @@ def test_samples_can_be_read_as_the_specification_says(kept: Path) -> None:
     assert cube.shape[:2] == (17, 4)
     assert cube.shape[2] == len(head["frequencies_hz"]["samples"])
     assert [line["row"] for line in lines] == list(range(17))
-    expected = process_scan(kept, "none").images.boards["RH"]._cube
-    np.testing.assert_array_equal(np.moveaxis(cube, 0, 2), expected)
+    np.testing.assert_array_equal(np.moveaxis(cube, 0, 2), from_raw.images.boards["RH"]._cube)
 
 
 @pytest.mark.parametrize(
@@ -221,12 +234,10 @@ def test_samples_can_be_read_as_the_specification_says(kept: Path) -> None:
         lambda h: [h],
     ],
 )
-def test_an_invalid_head_is_ignored(two_plates: Path, kept: Path, head) -> None:
+def test_an_invalid_head_is_ignored(expected: Images, kept: Path, head) -> None:
     path = kept / "samples" / "samples.json"
     path.write_text(json.dumps(head(json.loads(path.read_text()))))
-    expected = process_scan(two_plates, "none")
-    reprocessed = process_scan(kept, "read")
-    assert same(reprocessed.form_images(), expected.form_images())
+    assert same(process_scan(kept, "read").form_images(), expected)
 
 
 @pytest.mark.parametrize(
@@ -239,13 +250,12 @@ def test_an_invalid_head_is_ignored(two_plates: Path, kept: Path, head) -> None:
         {"positions_masked": -5},
     ],
 )
-def test_a_row_with_invalid_figures_is_made_again(two_plates: Path, kept: Path, change: dict | None) -> None:
+def test_a_row_with_invalid_figures_is_made_again(expected: Images, kept: Path, change: dict | None) -> None:
     path = kept / "samples" / "rows.jsonl"
     facts = [json.loads(line) for line in path.read_text().splitlines()]
     entry = facts[4]["boards"]["RH"]
     entry["figures"] = change if change is None else {**entry["figures"], **change}
     path.write_bytes(b"".join(encode_line({k: v for k, v in f.items() if k != "crc"}) for f in facts))
-    expected = process_scan(two_plates, "none").form_images()
     assert same(process_scan(kept).form_images(), expected)
     assert same(process_scan(without_raw(kept)).form_images(), expected)
 

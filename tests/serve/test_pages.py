@@ -30,7 +30,6 @@ from polysight.serve import reading
 from polysight_shared.config import CheckPlate
 from polysight_shared.errors import DataError
 
-SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
 PAGES = {
     "/": "document.querySelectorAll('#list li').length == 2",
     "/scan?scan=one": "document.querySelector('#scale img')?.naturalWidth > 1",
@@ -171,38 +170,41 @@ def test_axe_is_here():
         pytest.skip("no axe-core here: npm install --no-save axe-core")
 
 
-@SIZES
 @pytest.mark.parametrize("path", PAGES)
-def test_every_page_fits_can_be_read_and_has_the_abort_of_the_running_scan(page, scans, path, size, request):
-    """In both schemes, with all that a page unfolds; axe: https://github.com/dequelabs/axe-core."""
+def test_every_page_fits_can_be_read_and_has_the_abort_of_the_running_scan(page, scans, path, request):
+    """At both sizes and in both schemes, with all that a page unfolds; axe: https://github.com/dequelabs/axe-core."""
     axe = find_axe()
-    request.addfinalizer(lambda: page.browser.set_scheme("light"))
+    browser = page.browser
+    request.addfinalizer(lambda: browser.set_scheme("light"))
     with open_control(scans / "two"):
-        page.open(path, size)
-        page.browser.wait("document.querySelector('#running button.danger')?.checkVisibility()", "the abort")
-        page.check_whole()
-        # A table's last columns, too.
-        assert page.browser.value(
-            "[...document.querySelectorAll('.wide')].every((t) => t.scrollWidth <= t.clientWidth)"
-        )
-        assert page.browser.value("document.querySelectorAll('h1').length") == 1
-        for button in ("#label-open", "#process-open", "#layers-open"):
-            page.browser.value(f"document.querySelector('{button}')?.click()")
-        page.browser.value("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-        # WCAG AA. A scheme changes colours alone, so that axe reads the page in one of them.
-        assert page.browser.value(NAMELESS) == []
-        assert axe is None or page.browser.find_violations(axe) == []
-        for scheme in ("light", "dark"):
-            page.browser.set_scheme(scheme)
-            assert page.browser.value(CONTRAST) == []
+        page.open(path, PHONE)
+        for size in (PHONE, DESK):
+            browser.size(*size)
+            browser.wait(f"innerWidth == {size[0]}", "the other size")
+            browser.wait("document.querySelector('#running button.danger')?.checkVisibility()", "the abort")
+            page.check_whole()
+            # A table's last columns, too.
+            assert browser.value("[...document.querySelectorAll('.wide')].every((t) => t.scrollWidth <= t.clientWidth)")
+            assert browser.value("document.querySelectorAll('h1').length") == 1
+            if size == PHONE:
+                for button in ("#label-open", "#process-open", "#layers-open"):
+                    browser.value(f"document.querySelector('{button}')?.click()")
+            browser.value("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+            # WCAG AA. A scheme changes colours alone, so that axe reads the page in one of them.
+            assert browser.value(NAMELESS) == []
+            assert axe is None or browser.find_violations(axe) == []
+            for scheme in ("light", "dark"):
+                browser.set_scheme(scheme)
+                assert browser.value(CONTRAST) == []
 
 
-@SIZES
-def test_axe_finds_nothing_in_a_report(page, scans, size):
+def test_axe_finds_nothing_in_a_report(page, scans):
     axe = find_axe()
-    page.browser.visit((scans / "one" / "products" / "report.html").as_uri(), size)
+    page.browser.visit((scans / "one" / "products" / "report.html").as_uri(), DESK)
     page.browser.wait("document.querySelector('details')", "the report")
-    assert axe is None or page.browser.find_violations(axe) == []
+    for size in (DESK, PHONE):
+        page.browser.size(*size)
+        assert axe is None or page.browser.find_violations(axe) == []
 
 
 def test_the_points_of_surfaces_turn_and_are_coloured(page):

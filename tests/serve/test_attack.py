@@ -21,6 +21,7 @@ from tests.serve.test_processes import Server, serving
 from tests.support.page.asking import post
 from tests.support.page.live_view import open_control
 from tests.support.paths import REPO
+from tests.support.processes import wait_for
 
 
 class Attack(NamedTuple):
@@ -37,7 +38,6 @@ BRIEF = Attack(streams=4, readers=10, wrong_tokens=4, connections=50, aborts=3)
 LONG = Attack(streams=48, readers=250, wrong_tokens=90, connections=1000, aborts=100)
 # Each of these scans has a live view.
 VIEWS = 4
-WARM_UP_S = 3.0
 
 
 @contextmanager
@@ -72,7 +72,8 @@ def test_an_abort_gets_through_whoever_else_asks(processed: Path, tmp_path: Path
     (tmp_path / "state").mkdir()
     took_s = []
     with serving(tmp_path / "scans", tmp_path / "state") as server, attacking(server.port, attack, tmp_path):
-        time.sleep(WARM_UP_S)
+        # They say once a second what they have done: by then all are at it.
+        wait_for(lambda: "answers" in (tmp_path / "attackers.txt").read_text(), "the attack")
         for _ in range(attack.aborts):
             took_s.append(abort_once(server, tmp_path / "scans" / f"s{VIEWS}"))
             time.sleep(random.uniform(0, 0.2))

@@ -7,7 +7,8 @@ starts, is started as always.
 
 The program is the child of the process that asked, as if that had started it: the server forks twice, the middle one
 ends, and the asking process adopts its orphans meanwhile. Exit status, `getppid` and signals at a parent's end work. So
-each program that starts others itself has a server of its own, forked before the program begins.
+each program that starts others itself has a server of its own, forked before the program begins. So are the workers of
+pytest-xdist: they fork their programs from the same server, and import nothing of ours again.
 """
 
 from __future__ import annotations
@@ -28,10 +29,14 @@ import subprocess
 import sys
 import threading
 import time
+import types
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from execnet.gateway_io import popen_bootstrapline
 
 REPO = Path(__file__).resolve().parents[2]
 BIN = Path(sys.executable).parent
@@ -42,7 +47,9 @@ LIBRARIES = (
     "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.signal", "scipy.stats", "skimage.measure",
     "sklearn.discriminant_analysis", "sklearn.model_selection", "sklearn.neighbors", "uvicorn", "xarray",
 )  # fmt: skip
-STARTING_OTHERS = ("polysight", "polysight_simulators.rig", "polysight_simulators")
+# Of pytest-xdist, which has execnet start it by `python -u -c CODE`.
+WORKER = "worker"
+STARTING_OTHERS = ("polysight", "polysight_simulators.rig", "polysight_simulators", WORKER)
 # Variables that only a new process takes notice of.
 READ_AT_START = ("PYTHON", "LD_", "LC_", "LANG", "OMP_", "OPENBLAS_", "MPL", "MALLOC_")
 # Descriptors below are the program's; above are those on their way to it.
@@ -63,12 +70,14 @@ class Request(NamedTuple):
 
 
 def program_name(words: list[str]) -> str:
-    """The module or script of a command of ours, or an empty string."""
+    """The module or script of a command of ours, WORKER, or an empty string."""
     program = Path(words[0])
     if program.parent != BIN:
         return ""
     if program.name in ("polysight", "polysight-pi"):
         return program.name
+    if words[1:] == ["-u", "-c", popen_bootstrapline]:
+        return WORKER
     is_module = program.name.startswith("python") and len(words) > 2 and words[1] == "-m"
     if is_module and words[2].partition(".")[0] in PACKAGES:
         return words[2]
@@ -158,9 +167,19 @@ class Server:
 
 
 def install(server: Server) -> None:
-    """Have this process's commands of ours forked. A server without a connection starts with the first of them."""
+    """Have this process's commands of ours forked. A server without a connection starts with the first of them.
+
+    A program that was forked has its server already.
+    """
+    if hasattr(subprocess.Popen, "server"):
+        return
     Popen.server = server
     subprocess.Popen = Popen  # type: ignore[misc]
+
+
+def close() -> None:
+    """End the server of this process's commands."""
+    subprocess.Popen.server.close()  # type: ignore[attr-defined]
 
 
 def adopt_orphans(wanted: bool) -> None:
@@ -184,10 +203,13 @@ def preload() -> None:
         for package in PACKAGES
         for module in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}.")
     ]
-    for name in (*modules, *LIBRARIES):
-        if not name.endswith("__main__"):
-            with suppress(ImportError):
-                importlib.import_module(name)
+    with warnings.catch_warnings():
+        # As pytest, which imports nothing of this in its workers
+        warnings.simplefilter("error")
+        for name in (*modules, *LIBRARIES):
+            if not name.endswith("__main__"):
+                with suppress(ImportError):
+                    importlib.import_module(name)
 
 
 def serve(connection: socket.socket) -> list[str]:
@@ -272,7 +294,11 @@ def show_in_process_list(words: list[str]) -> None:
 def run(words: list[str]) -> int:
     """Run a command as Python does; return its exit status."""
     try:
-        if words[1:2] == ["-m"]:
+        if program_name(words) == WORKER:
+            sys.path[0] = ""
+            sys.modules["__main__"] = types.ModuleType("__main__")
+            exec(words[3], vars(sys.modules["__main__"]))
+        elif words[1:2] == ["-m"]:
             sys.path[0] = str(Path.cwd())
             sys.argv = words[2:]
             # A module that runs as the program is not yet imported; a package is.

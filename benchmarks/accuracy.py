@@ -93,8 +93,8 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
     divided = np.array([method.offsets(np.swapaxes(burst, 0, 1))[0] for burst in bursts])
     half_bin = 0.5 / (b - a)
 
-    def errors(found: NDArray[np.float64]) -> tuple[float, int]:
-        e = found - truth
+    def errors(estimated: NDArray[np.float64]) -> tuple[float, int]:
+        e = estimated - truth
         e -= np.median(e, axis=1, keepdims=True)
         gross = np.abs(e) > half_bin
         rest = np.where(gross, np.nan, e)

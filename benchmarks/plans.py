@@ -113,7 +113,7 @@ def name_patches(rig: Instrument, images: Images, plates: tuple[TruthPlate, ...]
     """Analyse the image: patches, permittivities and names."""
     angles = incidence_choice(rig, images.x_m, images.y_m, "one")
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
-    return analyse(images, Optics.from_rig(rig, angles), known=KnownScene(plates=plates), classifier=classifier)
+    return analyse(images, Optics.from_rig(rig, angles), given_scene=KnownScene(plates=plates), classifier=classifier)
 
 
 def measure(

@@ -177,7 +177,7 @@ def see_reference(nuisances: worlds.ShapeNuisances, scan: ScanKind) -> surfaces.
 
 
 def analyse_shapes(
-    scene: worlds.ShapeScene, nuisances: worlds.ShapeNuisances, known: surfaces.Uncertainty, scan: ScanKind
+    scene: worlds.ShapeScene, nuisances: worlds.ShapeNuisances, uncertainty: surfaces.Uncertainty, scan: ScanKind
 ) -> tuple[surfaces.Surface, float]:
     """Scan a scene and its reference; return what the host finds, and the seconds of CPU that its analysis took."""
     metal = see_reference(nuisances, scan)
@@ -187,7 +187,7 @@ def analyse_shapes(
 
     points = see_shapes((*scene.shapes, *scene.background), nuisances, scan, number=2)
     started = time.process_time()
-    surface = surfaces.analyse_surface(points, scan.optics, reference, uncertainty=known, simulated=True)
+    surface = surfaces.analyse_surface(points, scan.optics, reference, uncertainty=uncertainty, simulated=True)
     return surface, time.process_time() - started
 
 

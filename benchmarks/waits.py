@@ -70,10 +70,12 @@ def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
     return same, other_seconds
 
 
-def time_list(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Seconds]:
+def time_list(scan: Path, products: Path, root: Path, count: int) -> tuple[Seconds, Seconds]:
     """Time a list of `count` copies of a scan and its products: the first look, and later ones."""
     for n in range(count):
-        shutil.copytree(made, root / f"scan-{n}" / "products", ignore=shutil.ignore_patterns("report.html", "figures"))
+        shutil.copytree(
+            products, root / f"scan-{n}" / "products", ignore=shutil.ignore_patterns("report.html", "figures")
+        )
         shutil.copy(scan / MANIFEST, root / f"scan-{n}")
     first = Seconds()
     again = Seconds()

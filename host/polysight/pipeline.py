@@ -84,7 +84,7 @@ class Pipeline:
     def find_materials(
         self,
         images: imaging.Images,
-        known: materials.KnownScene | None = None,
+        known_scene: materials.KnownScene | None = None,
         classifier: materials.Classifier | None = None,
     ) -> materials.MaterialsResult:
         """Find patches (unless known), metal reference, permittivities and names; in sub-bands too, if imaged."""
@@ -93,8 +93,8 @@ class Pipeline:
             angle_std = self.plane.incidence_std_rad(self.rig)
             incidence = polarimetry.incidence_choice(rig, images.x_m, images.y_m, self.settings.incidence)
             optics = materials.Optics.from_rig(self.rig, incidence, angle_std, self.synchroniser.direct_path_known)
-            result = materials.analyse(images, optics, known, classifier)
-            metal_plane = None if known is None else known.plane
+            result = materials.analyse(images, optics, known_scene, classifier)
+            metal_plane = None if known_scene is None else known_scene.plane
             self.quality.note_materials(result, incidence, images.valid, metal_plane)
         with self.quality.measure_time("sub-bands"):
             band_images = self.sub_bands.finish(self.source.mirrored, self.plane.moved_m)

@@ -135,12 +135,12 @@ def _home(args: argparse.Namespace, instrument: Instrument) -> int:
     return _print_position(args, status)
 
 
-def _print_position(args: argparse.Namespace, at: Any) -> int:
-    position_mm = {"x_mm": at.x_mm, "y_mm": at.y_mm}
+def _print_position(args: argparse.Namespace, status: Any) -> int:
+    position_mm = {"x_mm": status.x_mm, "y_mm": status.y_mm}
     if args.json:
         _write(json.dumps(position_mm))
     else:
-        _write(f"stage at x {at.x_mm:.3f} mm, y {at.y_mm:.3f} mm")
+        _write(f"stage at x {status.x_mm:.3f} mm, y {status.y_mm:.3f} mm")
     return 0
 
 

@@ -561,13 +561,13 @@ class Executor:
 # --- limits of this rig and the radars --------------------------------------------------------------------------------
 
 
-def read_burst(asked: m.BeginRun | m.Pulse) -> BurstSpec:
+def read_burst(command: m.BeginRun | m.Pulse) -> BurstSpec:
     """Return the requested burst. Raises RefusedError (PERIOD_TOO_SHORT, PULSE_TOO_LONG) if radars cannot accept it."""
-    spec = BurstSpec(asked.pulses, us_to_ns(asked.period_us), us_to_ns(asked.width_us))
+    spec = BurstSpec(command.pulses, us_to_ns(command.period_us), us_to_ns(command.width_us))
     if spec.period_ns < MIN_PERIOD_NS:
-        raise RefusedError(PiFault.PERIOD_TOO_SHORT, f"period of {asked.period_us} us is below {MIN_PERIOD_US} us")
+        raise RefusedError(PiFault.PERIOD_TOO_SHORT, f"period of {command.period_us} us is below {MIN_PERIOD_US} us")
     if not MIN_WIDTH_NS <= spec.width_ns <= MAX_WIDTH_NS:
-        raise RefusedError(PiFault.PULSE_TOO_LONG, f"pulse width of {asked.width_us} us is outside {WIDTH_TEXT}")
+        raise RefusedError(PiFault.PULSE_TOO_LONG, f"pulse width of {command.width_us} us is outside {WIDTH_TEXT}")
     return spec
 
 

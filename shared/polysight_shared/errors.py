@@ -76,12 +76,12 @@ def advice(*parts: str) -> str:
     return "; ".join(part for part in parts if part)
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
+def did_you_mean(word: str, known_words: Iterable[str]) -> str:
     """Return `did you mean 'step_mm'?` with the most similar known word; "" if none is similar."""
-    near = get_close_matches(word, list(known), n=1, cutoff=0.7)
-    if not near:
+    similar = get_close_matches(word, list(known_words), n=1, cutoff=0.7)
+    if not similar:
         return ""
-    return f"did you mean {near[0]!r}?"
+    return f"did you mean {similar[0]!r}?"
 
 
 class ConfigError(PolysightError):

@@ -120,8 +120,8 @@ def read_faults(
     return faults
 
 
-def _merge(table: dict[str, Any], more: dict[str, Any]) -> None:
-    for key, value in more.items():
+def _merge(table: dict[str, Any], changes: dict[str, Any]) -> None:
+    for key, value in changes.items():
         if isinstance(value, dict):
             table[key] = {**table.get(key, {}), **value}
         else:

@@ -17,7 +17,7 @@ from polysight.settings import DEFAULT
 def drawn_result(image_scene):
     scan = image_scene("nine-materials")
     return scan.pipeline.find_materials(
-        scan.images, known=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
+        scan.images, known_scene=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
     )
 
 

@@ -17,7 +17,7 @@ def plate_mask(scan, name, rim_mm=11.0):
 
 def named_materials(scan):
     return scan.pipeline.find_materials(
-        scan.images, known=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
+        scan.images, known_scene=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
     )
 
 
@@ -82,7 +82,7 @@ def test_the_set_leakage_is_recovered_from_a_known_material(image_scene, disturb
     scan = image_scene("nine-materials", **disturbances)
     leakage = complex(*disturbances.get("leakage_h", [0.05, 0.0]))
     c = calibrate(scan.images, plate_mask(scan, "copper"))
-    theta = scan.pipeline.find_materials(scan.images, known=KnownScene(plates=scan.plates)).theta_rad[0, 0]
+    theta = scan.pipeline.find_materials(scan.images, known_scene=KnownScene(plates=scan.plates)).theta_rad[0, 0]
     true = complex(ratio_from_permittivity(4.75 - 2.43j, theta))
     plate_pixels = plate_mask(scan, "ceramic")
     measured = np.sum(c.h[plate_pixels]) / np.sum(c.v[plate_pixels])

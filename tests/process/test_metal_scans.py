@@ -231,7 +231,7 @@ def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytes
     scene = decode_scene(raw, "test")
     folder = simulate(rig, scene, tmp_path / "scan")
     pipeline, images = form_scan_images(folder, Settings(bands=BANDS))
-    analysis = pipeline.find_materials(images, known=KnownScene(plates=read_truth(folder / "truth.json")))
+    analysis = pipeline.find_materials(images, known_scene=KnownScene(plates=read_truth(folder / "truth.json")))
     assert len(analysis.patches) == 6
     for row in analysis.rows():
         name = row.truth.name

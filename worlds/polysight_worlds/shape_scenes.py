@@ -162,71 +162,71 @@ class _Draw:
 
 
 def _draw_sphere(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[Shape, ...], float]]:
-    def draw(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
-        radius_m = drawn.rng.uniform(low_m, high_m)
-        return (sphere("sphere", drawn.stack, drawn.point_behind(radius_m), radius_m),), radius_m
+    def draw(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+        radius_m = draws.rng.uniform(low_m, high_m)
+        return (sphere("sphere", draws.stack, draws.point_behind(radius_m), radius_m),), radius_m
 
     return draw
 
 
 def _draw_cylinder(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[Shape, ...], float]]:
-    def draw(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
-        radius_m = drawn.rng.uniform(low_m, high_m)
+    def draw(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+        radius_m = draws.rng.uniform(low_m, high_m)
         return (
-            cylinder("cylinder", drawn.stack, drawn.point_behind(radius_m), radius_m, 0.4, axis=drawn.axis),
+            cylinder("cylinder", draws.stack, draws.point_behind(radius_m), radius_m, 0.4, axis=draws.axis),
         ), radius_m
 
     return draw
 
 
-def _draw_plate(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
-    tilt_deg = drawn.rng.uniform(-15, 15, 2)
-    size_m = drawn.rng.uniform(0.14, 0.22, 2)
+def _draw_plate(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    tilt_deg = draws.rng.uniform(-15, 15, 2)
+    size_m = draws.rng.uniform(0.14, 0.22, 2)
     tilts = float(tilt_deg[0]), float(tilt_deg[1])
-    return (plate("plate", drawn.stack, drawn.front_m, (float(size_m[0]), float(size_m[1])), tilt_deg=tilts),), np.inf
+    return (plate("plate", draws.stack, draws.front_m, (float(size_m[0]), float(size_m[1])), tilt_deg=tilts),), np.inf
 
 
-def _draw_cone(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
-    radius_m = drawn.rng.uniform(0.1, 0.16)
-    slope = float(np.tan(np.radians(drawn.rng.uniform(3, 12))))
-    piece = cylinder("cone", drawn.stack, drawn.point_behind(radius_m), radius_m, 0.3, axis=drawn.axis, slope=slope)
+def _draw_cone(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radius_m = draws.rng.uniform(0.1, 0.16)
+    slope = float(np.tan(np.radians(draws.rng.uniform(3, 12))))
+    piece = cylinder("cone", draws.stack, draws.point_behind(radius_m), radius_m, 0.3, axis=draws.axis, slope=slope)
     return (piece,), radius_m
 
 
-def _draw_barrel(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
-    radius_m = drawn.rng.uniform(0.1, 0.16)
-    bulge = float(drawn.rng.uniform(1, 6))
-    piece = cylinder("barrel", drawn.stack, drawn.point_behind(radius_m), radius_m, 0.2, axis=drawn.axis, bulge=bulge)
+def _draw_barrel(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radius_m = draws.rng.uniform(0.1, 0.16)
+    bulge = float(draws.rng.uniform(1, 6))
+    piece = cylinder("barrel", draws.stack, draws.point_behind(radius_m), radius_m, 0.2, axis=draws.axis, bulge=bulge)
     return (piece,), radius_m
 
 
-def _draw_saddle(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
-    radii_m = drawn.rng.uniform(0.1, 0.2, 2)
+def _draw_saddle(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radii_m = draws.rng.uniform(0.1, 0.2, 2)
     bends = float(1 / radii_m[0]), float(-1 / radii_m[1]), 0.0
-    turn_deg = float(drawn.rng.uniform(0, 180))
-    return (plate("saddle", drawn.stack, drawn.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radii_m.min()
+    turn_deg = float(draws.rng.uniform(0, 180))
+    return (plate("saddle", draws.stack, draws.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radii_m.min()
 
 
-def _draw_sheet(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
-    radius_m = drawn.rng.uniform(0.15, 0.6)
-    turn_deg = float(drawn.rng.uniform(0, 180))
+def _draw_sheet(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radius_m = draws.rng.uniform(0.15, 0.6)
+    turn_deg = float(draws.rng.uniform(0, 180))
     bends = (1 / radius_m, 0.0, 0.0)
-    return (plate("sheet", drawn.stack, drawn.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radius_m
+    return (plate("sheet", draws.stack, draws.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radius_m
 
 
-def _draw_bottle(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
-    radius_m = drawn.rng.uniform(0.03, 0.05)
-    wall_m = drawn.rng.uniform(0.5e-3, 3e-3)
-    wall = Stack(((drawn.stack.below, wall_m),), 1.0)
-    return bottle("bottle", wall, drawn.point_behind(radius_m), radius_m, 0.16, axis=drawn.axis), radius_m
+def _draw_bottle(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radius_m = draws.rng.uniform(0.03, 0.05)
+    wall_m = draws.rng.uniform(0.5e-3, 3e-3)
+    wall = Stack(((draws.stack.below, wall_m),), 1.0)
+    return bottle("bottle", wall, draws.point_behind(radius_m), radius_m, 0.16, axis=draws.axis), radius_m
 
 
-def _draw_thin_sheet(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
-    radius_m = drawn.rng.uniform(0.15, 0.6)
-    turn_deg = float(drawn.rng.uniform(0, 180))
-    wall = Stack(((drawn.stack.below, drawn.rng.uniform(0.5e-3, 3e-3)),), 1.0)
+def _draw_thin_sheet(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radius_m = draws.rng.uniform(0.15, 0.6)
+    turn_deg = float(draws.rng.uniform(0, 180))
+    wall = Stack(((draws.stack.below, draws.rng.uniform(0.5e-3, 3e-3)),), 1.0)
     bends = (1 / radius_m, 0.0, 0.0)
-    return (plate("thin sheet", wall, drawn.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radius_m
+    return (plate("thin sheet", wall, draws.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radius_m
 
 
 # What draws the pieces of each kind of object, and the smaller radius of its front in metres.

@@ -364,13 +364,13 @@ def _predict_arrivals(
     return pulses + float(delays[0]) + drift * (pulses - start_ns) + residual[narrowest]
 
 
-def _estimate_drift(at: NDArray[np.float64], delay: NDArray[np.float64], pulses_ns: Times) -> float:
+def _estimate_drift(times: NDArray[np.float64], delay: NDArray[np.float64], pulses_ns: Times) -> float:
     """Relative drift of the clocks from the delay (ns) of bursts at these times (ns): the least that fits."""
-    if at.size >= _DRIFT_BURSTS:
-        low, high = scipy.stats.theilslopes(delay, at)[2:]
+    if times.size >= _DRIFT_BURSTS:
+        low, high = scipy.stats.theilslopes(delay, times)[2:]
         return float(np.clip(np.clip(0.0, low, high), -_MAX_DRIFT, _MAX_DRIFT))
     if _USUAL_DRIFT * float(np.ptp(pulses_ns)) > _EARLY * _find_period_ns(pulses_ns):
-        raise _UndeterminedError(f"{at.size} bursts came in time: too few for the drift between the clocks")
+        raise _UndeterminedError(f"{times.size} bursts came in time: too few for the drift between the clocks")
     return 0.0
 
 

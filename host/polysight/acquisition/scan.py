@@ -297,20 +297,20 @@ class RunningScan:
         finally:
             self._write_radar_report({"row": row.index, "take": number})
 
-    def _write_radar_report(self, of: dict[str, int]) -> None:
+    def _write_radar_report(self, row_and_take: dict[str, int]) -> None:
         """Add the radars' report since the last one to the manifest, if there is one."""
         if report := self._radars.report():
-            self._writer.append({"fact": "radars", **of, **report})
+            self._writer.append({"fact": "radars", **row_and_take, **report})
 
     @contextmanager
     def _exclude_time(self) -> Iterator[None]:
         """Exclude the block from the row's duration, unlike waiting for processing."""
-        began = time.monotonic()
+        started_s = time.monotonic()
         try:
             yield
         finally:
             if self._row_began is not None:
-                self._row_began += time.monotonic() - began
+                self._row_began += time.monotonic() - started_s
 
     def _wait_while_paused(self) -> bool:
         """Wait for the end of a pause and record it in the manifest; return False if asked to stop."""

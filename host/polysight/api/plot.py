@@ -27,22 +27,22 @@ class NotebookFigure(Figure):
         return buffer.getvalue()
 
 
-def plot_scan(done: ProcessedScan) -> Figure:
+def plot_scan(scan: ProcessedScan) -> Figure:
     """Amplitude of H, V, P in dB, and the materials where the images are relative to metal; axes in mm."""
     rows = 1
     columns = 3
-    if done.metal_referenced:
+    if scan.metal_referenced:
         # The materials are the fourth picture.
         rows = 2
         columns = 2
     # A long narrow image is cut neither to a line nor to a tower.
-    height_over_width = done.labels.shape[0] / done.labels.shape[1]
+    height_over_width = scan.labels.shape[0] / scan.labels.shape[1]
     height_in = _PANEL_IN * min(2.0, max(0.4, height_over_width))
     size = (columns * (_PANEL_IN + _BETWEEN_IN), rows * (height_in + _TITLE_IN) + _HEAD_IN)
     fig = NotebookFigure(figsize=size, dpi=100, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
-    draw_overview(fig, list(fig.subplots(rows, columns).flat), done, bar_labels=True)
-    stamp = {True: " (simulated)", False: "", None: " (not known whether simulated)"}[done.simulated]
-    title = figure_label(f"Scan {done.scan_id}{stamp}", "title")
+    draw_overview(fig, list(fig.subplots(rows, columns).flat), scan, bar_labels=True)
+    stamp = {True: " (simulated)", False: "", None: " (not known whether simulated)"}[scan.simulated]
+    title = figure_label(f"Scan {scan.scan_id}{stamp}", "title")
     fig.suptitle(title, fontsize=12, family=list(font_families()), parse_math=False)
     return fig

@@ -633,12 +633,12 @@ class Processing:
         )
 
 
-def patch_table(done: ProcessedScan) -> str:
+def patch_table(scan: ProcessedScan) -> str:
     """Return the patches as an HTML table: the figures that reports show."""
     figures = [figure for figure in declared_figures(PatchFigures) if figure.column.title]
     lines = ["<tr><th>patch</th><th>name</th><th>permittivity</th>"]
     lines += [f"<th>{escape(figure.column.title)}</th>" for figure in figures]
-    for patch in done.segments:
+    for patch in scan.segments:
         name = "metal reference" if patch.metal_reference else patch.name or "not named"
         value = patch.permittivity
         text = "–"
@@ -650,16 +650,16 @@ def patch_table(done: ProcessedScan) -> str:
 
 
 def layer_dataset(
-    done: ProcessedScan, chirp: Chirp, stack: Sequence[str | Layer], bands: int | None, amplitude_percent: float
+    scan: ProcessedScan, chirp: Chirp, stack: Sequence[str | Layer], bands: int | None, amplitude_percent: float
 ) -> xarray.Dataset:
     """Fit the unknown layer of a stack at each patch; parameters and errors as `Scan.layers`."""
     import xarray
 
-    if done.verdict is not None and not done.verdict.usable:
-        raise done.verdict.error("the images are kept")
+    if scan.verdict is not None and not scan.verdict.usable:
+        raise scan.verdict.error("the images are kept")
     layers = [_parse_layer(layer) for layer in stack]
-    angle_std_rad = incidence_std_rad(done.materials)
-    fits = [fit_row(row, chirp, layers, bands, amplitude_percent / 100, angle_std_rad) for row in done.segments]
+    angle_std_rad = incidence_std_rad(scan.materials)
+    fits = [fit_row(row, chirp, layers, bands, amplitude_percent / 100, angle_std_rad) for row in scan.segments]
 
     def describe(values: Sequence[object], units: str, about: str) -> tuple[str, np.ndarray, dict[str, str]]:
         return "patch", np.asarray(values), {"units": units, "long_name": about}
@@ -682,7 +682,7 @@ def layer_dataset(
         "ambiguous": describe(ambiguous, "1", "another solution fits, or it is open by 5 %"),
         "notes": describe(notes, "", "rivals and other warnings"),
     }
-    return xarray.Dataset(table, patch_coordinates(done))
+    return xarray.Dataset(table, patch_coordinates(scan))
 
 
 def _parse_layer(layer: str | Layer) -> Layer:

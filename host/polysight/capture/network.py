@@ -257,14 +257,16 @@ def usable_packets(buffer_bytes: int) -> int:
     return 2 * buffer_bytes // KERNEL_BYTES_A_PACKET
 
 
-def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int, rmem_max: Path = _RMEM_MAX) -> str:
+def check_receive_buffer(
+    name: str, granted: int, needed_bytes: int, burst_bytes: int, rmem_max: Path = _RMEM_MAX
+) -> str:
     """Return a warning if the kernel granted less than requested, otherwise "".
 
     Parameters
     ----------
     name
         Board, for the message.
-    granted, wanted
+    granted, needed_bytes
         Granted and requested bytes of the receive buffer.
     burst_bytes
         Data of one burst; the buffer must hold two, to bridge a pause of the receiver.
@@ -276,7 +278,7 @@ def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int,
     DeviceError
         if the buffer holds less than two bursts; the remedy is the command that raises the limit.
     """
-    enough = max(wanted, (2 * burst_bytes // MAX_PAYLOAD_BYTES + 2) * KERNEL_BYTES_A_PACKET // 2)
+    enough = max(needed_bytes, (2 * burst_bytes // MAX_PAYLOAD_BYTES + 2) * KERNEL_BYTES_A_PACKET // 2)
     remedy = f"`sysctl -w net.core.rmem_max={enough}`, and the same in /etc/sysctl.d/ to keep it"
     try:
         limit = f"net.core.rmem_max is {int(rmem_max.read_text(encoding='ascii'))}"
@@ -287,12 +289,12 @@ def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int,
             f"{name}: the kernel grants a receive buffer of {granted} bytes, less than two bursts of {burst_bytes}"
         )
         cause = limit
-        if granted >= wanted:
+        if granted >= needed_bytes:
             cause = "card.receive_buffer_bytes asks for no more"
             remedy = f"card.receive_buffer_bytes = {enough} in instrument.toml; {remedy}"
         raise DeviceError(problem, cause, remedy, code=ErrorCode.VALUE_INVALID)
-    if granted < wanted:
-        return f"{name}: receive buffer of {granted} bytes granted, {wanted} requested ({limit}); {remedy}"
+    if granted < needed_bytes:
+        return f"{name}: receive buffer of {granted} bytes granted, {needed_bytes} requested ({limit}); {remedy}"
     return ""
 
 

@@ -132,14 +132,14 @@ def write_speed(folder: Path) -> float:
     """
     block = os.urandom(1 << 20)
     with tempfile.TemporaryFile(dir=folder) as file:
-        began = time.perf_counter()
+        started_s = time.perf_counter()
         written_bytes = 0
-        while written_bytes < _PROBE_BYTES and time.perf_counter() - began < _PROBE_S:
+        while written_bytes < _PROBE_BYTES and time.perf_counter() - started_s < _PROBE_S:
             file.write(block)
             file.flush()
             os.fsync(file.fileno())
             written_bytes += len(block)
-        return written_bytes / (time.perf_counter() - began)
+        return written_bytes / (time.perf_counter() - started_s)
 
 
 # Time of a packet beyond its configured delay: delays of 5, 10, 25, 50 us give 706, 545, 325, 193 Mbit/s (TI).

@@ -484,8 +484,8 @@ class ImageBuilder:
         """Return the images from running sums, within 1e-6 of the peak; fast if the builder is `live`."""
         return self._make_channels({name: board.current() for name, board in self.boards.items()})
 
-    def _make_channels(self, made: dict[str, tuple[Image, Image, str | None]], offset_m: float = 0.0) -> Images:
-        h, v = made.values()
+    def _make_channels(self, channels: dict[str, tuple[Image, Image, str | None]], offset_m: float = 0.0) -> Images:
+        h, v = channels.values()
         visible = np.ones(self.grid.shape, bool)
         for _, weight, _ in (h, v):
             strong = np.abs(weight) >= _VISIBLE * np.abs(weight).max()
@@ -503,7 +503,7 @@ class ImageBuilder:
             v_raw=v[0],
             illumination=self._compute_illumination(np.stack([h[1], v[1]]), float(np.mean(self.grid.z_m)) + offset_m),
             rx_gains={name: board.rx_calibration() for name, board in self.boards.items()},
-            notices=tuple(f"{name}: {notice}" for name, (_, _, notice) in made.items() if notice),
+            notices=tuple(f"{name}: {notice}" for name, (_, _, notice) in channels.items() if notice),
         )
 
     def _compute_illumination(self, footprints: NDArray[np.complex64], z_m: float) -> Illumination:
@@ -682,15 +682,15 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
 def _list_places_mm(rig: Instrument, board: Board) -> Iterator[Vector]:
     """Yield antennas in use and two points along a board's x and y, rig frame, rounded to a nanometre."""
     antennas = rig.antennas
-    used = (antennas.tx_mm[board.tx_antenna],) if board.role == "transmit" else antennas.rx_mm
-    for point in (*used, (ARM_MM, 0.0, 0.0), (0.0, ARM_MM, 0.0)):
+    antennas_mm = (antennas.tx_mm[board.tx_antenna],) if board.role == "transmit" else antennas.rx_mm
+    for point in (*antennas_mm, (ARM_MM, 0.0, 0.0), (0.0, ARM_MM, 0.0)):
         x, y, z = (round(1e3 * v, 6) for v in place(point, board.mount))
         yield (x, y, z)
 
 
-def _describe_band(made: ImagedWith) -> str:
-    first, last = made.band_hz
-    return f"{made.samples} of {first / 1e9:.4f}..{last / 1e9:.4f} GHz"
+def _describe_band(settings: ImagedWith) -> str:
+    first, last = settings.band_hz
+    return f"{settings.samples} of {first / 1e9:.4f}..{last / 1e9:.4f} GHz"
 
 
 def _describe_corners(khz: list[float]) -> str:

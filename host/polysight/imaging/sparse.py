@@ -79,7 +79,7 @@ def reconstruct(
     board: BoardSamples,
     iterations: int = 60,
     strength: float = STRENGTH,
-    used: Mask | None = None,
+    selected: Mask | None = None,
     start: NDArray[np.complex64] | None = None,
 ) -> Reconstruction:
     """Reconstruct the image of a board from its valid positions.
@@ -93,13 +93,13 @@ def reconstruct(
     strength
         Weight of sparsity relative to the strongest pixel of the matched filter: pixels below about this level become
         0, and the others weaker by as much. For a few points with many random omissions 0.01 converges faster.
-    used
+    selected
         bool [row, column]: positions to use; None: all that are valid.
     start
         complex64 [ny, nx]: image to start from; None: empty.
     """
     model = _Model(board)
-    weights = np.sqrt(board.weights if used is None else board.weights * used)
+    weights = np.sqrt(board.weights if selected is None else board.weights * selected)
     data = board.calibrate_samples() * weights
 
     def forward(x: NDArray[np.complex64]) -> NDArray[np.complex64]:
@@ -222,7 +222,7 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
     recorded = board.valid.copy()
     samples = board.calibrate_samples()
     tested = _choose_test_positions(recorded)
-    first = reconstruct(board, iterations, used=~tested)
+    first = reconstruct(board, iterations, selected=~tested)
     error = None
     if tested.any():
         misfit = model.samples(first.image) - samples

@@ -209,7 +209,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     """
     if is_finished(job):
         return _end_outcome(job)
-    began = time.monotonic()
+    started_s = time.monotonic()
     log = job.out.with_name(job.name + ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -225,7 +225,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     finally:
         os.close(alive)
         os.close(promise)
-    seconds = time.monotonic() - began
+    seconds = time.monotonic() - started_s
     # The child may have been killed after it wrote the mark.
     if child.returncode == 0 or is_finished(job):
         return _end_outcome(job, seconds)

@@ -166,7 +166,7 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
     KeyboardInterrupt
         after the scan and the rig have been ended.
     """
-    began = time.monotonic()
+    started_s = time.monotonic()
     load_instrument(config)
     _check_folder(out)
     check_scenes([scene], config)
@@ -177,7 +177,7 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
         command += ["--truth", str(rig_file.parent / "truth.json")]
         status = _run_to_its_end(command)
     if status in (0, NoResult.exit_status):
-        sys.stdout.write(f"simulated demo: {time.monotonic() - began:.0f} s in all\n")
+        sys.stdout.write(f"simulated demo: {time.monotonic() - started_s:.0f} s in all\n")
     else:
         sys.stderr.write(f"the logs of the simulated rig are in {out / 'rig' / 'logs'}\n")
     return abs(status)

@@ -61,9 +61,9 @@ def steps(things: Sequence[T], names: Sequence[str]) -> Iterator[T]:
     for k, (thing, name) in enumerate(zip(things, names, strict=True), 1):
         sys.stderr.write(f"[{k}/{len(things)}] {name} ...")
         sys.stderr.flush()
-        began = monotonic()
+        started_s = monotonic()
         yield thing
-        sys.stderr.write(f" {monotonic() - began:.0f} s\n")
+        sys.stderr.write(f" {monotonic() - started_s:.0f} s\n")
 
 
 def count_steps(things: Iterable[T], total: int, name: str) -> Iterator[T]:

@@ -164,7 +164,7 @@ class KnownScene:
         return self.metal if isinstance(self.metal, PlaneReference) else None
 
 
-def level(images: Images, found: Segmentation, tilts: Tilts | None = None) -> tuple[Images, Tilts]:
+def level(images: Images, segmentation: Segmentation, tilts: Tilts | None = None) -> tuple[Images, Tilts]:
     """Correct the illumination of each patch for its tilt; return the images and the tilts, as given or estimated.
 
     Without the illumination of the plane the images are returned unchanged, and no tilt is known.
@@ -172,17 +172,17 @@ def level(images: Images, found: Segmentation, tilts: Tilts | None = None) -> tu
     if images.illumination is None:
         return images, Tilts({}, 1)
     if tilts is None:
-        tilts = _estimate_tilts(images, images.illumination, found)
-    risen_patches = [p for p in found.patches if p.label in tilts.rises]
+        tilts = _estimate_tilts(images, images.illumination, segmentation)
+    risen_patches = [p for p in segmentation.patches if p.label in tilts.rises]
     masks = [p.mask for p in risen_patches]
     rises = [tilts.rises[p.label] for p in risen_patches]
     return correct_tilt(images, masks, rises), tilts
 
 
-def _estimate_tilts(images: Images, illumination: Illumination, found: Segmentation) -> Tilts:
+def _estimate_tilts(images: Images, illumination: Illumination, segmentation: Segmentation) -> Tilts:
     """Estimate the rise of each patch from its phase; patches that are steeper than what is modelled are marked."""
-    rises = {p.label: illumination.rise(images.h, images.v, p.interior, p.mask) for p in found.patches}
-    bends = {p.label: illumination.bend(images.h, images.v, p.interior) for p in found.patches}
+    rises = {p.label: illumination.rise(images.h, images.v, p.interior, p.mask) for p in segmentation.patches}
+    bends = {p.label: illumination.bend(images.h, images.v, p.interior) for p in segmentation.patches}
     steep = frozenset(
         label
         for label, rise in rises.items()
@@ -229,14 +229,14 @@ POSSIBLE_SIGN = 0.05
 
 
 def analyse(
-    images: Images, optics: Optics, known: KnownScene | None = None, classifier: Classifier | None = None
+    images: Images, optics: Optics, given_scene: KnownScene | None = None, classifier: Classifier | None = None
 ) -> MaterialsResult:
     """Find the patches of the images, estimate their permittivities, and name them if there is a classifier.
 
     A scene without patches, metal or a valid pixel is no error; see `metal` and `refused` of the result.
     Raises DataError if the given metal box or patch number does not exist.
     """
-    known_scene = known or KnownScene()
+    known_scene = given_scene or KnownScene()
     plane = known_scene.plane
     if plane is not None:
         plane.check_axes(images.x_m, images.y_m)
@@ -247,7 +247,8 @@ def analyse(
     theta = np.asarray(optics.theta_rad, np.float64)
     kinds = _list_kinds(classifier, float(np.mean(theta)))
     scene = _Scene(
-        images=images, found=segmentation, tilts=tilts, apart_mm=apart_mm, plane=plane, optics=optics, kinds=kinds
+        images=images, segmentation=segmentation, tilts=tilts, apart_mm=apart_mm, plane=plane, optics=optics,
+        kinds=kinds,
     )  # fmt: skip
     relative = most_like_metal([scene.relative_to(metal) for metal in _references(images, known_scene, segmentation)])
     reference, raw, judged, solution = relative.metal, relative.raw, relative.judged, relative.solution
@@ -273,9 +274,9 @@ def analyse(
         boxes=dict(known_scene.names), library=() if classifier is None else classifier.names,
         brightness_off={label: ln for label, ln in brightness_off.items() if np.isfinite(ln)},
         evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
-        apart_mm=apart_mm, drift=relative.seen.change, halo=relative.seen.halo.level,
-        behind=relative.seen.usual_background(relative.measured), ripple=relative.seen.usual,
-        disturbed=relative.seen.disturbed, relief_rad=relative.seen.relief_rad, other_sign=solution.other_sign,
+        apart_mm=apart_mm, drift=relative.scatter.change, halo=relative.scatter.halo.level,
+        behind=relative.scatter.usual_background(relative.measured), ripple=relative.scatter.usual,
+        disturbed=relative.scatter.disturbed, relief_rad=relative.scatter.relief_rad, other_sign=solution.other_sign,
     )  # fmt: skip
 
 
@@ -313,7 +314,7 @@ def _solve(measured: list[PatchMeasurement], prior: RigPrior, kinds: Kinds, othe
 
 
 @dataclass(frozen=True)
-class Seen:
+class SceneScatter:
     """How V / H scatters over the plates of a scene, the metal among them, and what the scene says of its own errors.
 
     Attributes
@@ -364,12 +365,12 @@ class Seen:
         channels: tuple[Image, Image],
         raw: Images,
         judged: Sequence[Patch],
-        found: Segmentation,
+        segmentation: Segmentation,
         reference: MetalReference,
         plane: PlaneReference | None,
         images: Images,
         tilts: Tilts,
-    ) -> Seen:
+    ) -> SceneScatter:
         """Measure the scatter of the judged patches and of the metal, and the background.
 
         `channels` are relative to metal and smoothed inside patches, `raw` is relative to metal.
@@ -386,9 +387,9 @@ class Seen:
         at_border = find_patches_at_border(judged, None if plane is None else images.usable & plane.valid)
         border_flags = [*(label in at_border for label in scatter), False]
         change = None if metal is None else common_change(scatters, metal.centre_m, border_flags)
-        halo = NO_HALO if metal is None else find_halo(reference.mask, found.patches, images)
+        halo = NO_HALO if metal is None else find_halo(reference.mask, segmentation.patches, images)
         uneven = 0.0 if metal is None else metal_unevenness(raw, reference.mask)
-        behind = background_mean(raw.h, raw.v, found, images.usable)
+        behind = background_mean(raw.h, raw.v, segmentation, images.usable)
         return cls(
             scatter=scatter,
             usual=usual_scatter(scatters),
@@ -457,14 +458,14 @@ class Seen:
         behind = abs(patch_measurement.inverse_ratio) * self.background_in(patch_measurement)
         return replace(patch_measurement, std=float(np.sqrt(patch_measurement.std**2 + around**2 + behind**2)))
 
-    def background_in(self, seen: PatchMeasurement) -> float:
+    def background_in(self, measurement: PatchMeasurement) -> float:
         """Return the standard deviation of each part of a patch's ln(V / H) by what lies behind it."""
-        if not seen.brightness or not seen.inverse_ratio:
+        if not measurement.brightness or not measurement.inverse_ratio:
             return 0.0
         behind_h, behind_v = self.behind
         # The background has any phase: half of its power is in each part.
-        relative = np.hypot(behind_h, behind_v / abs(seen.inverse_ratio)) / np.sqrt(2)
-        return float(BEHIND_PATCH * relative / seen.brightness)
+        relative = np.hypot(behind_h, behind_v / abs(measurement.inverse_ratio)) / np.sqrt(2)
+        return float(BEHIND_PATCH * relative / measurement.brightness)
 
     def usual_background(self, measured: Sequence[PatchMeasurement]) -> float:
         """Return the median of :meth:`background_in` over patches; 0 without any."""
@@ -483,7 +484,7 @@ class RelativeScene:
         Images relative to it.
     refused
         Patch number to why the patch is no flat plate; the others but for the reference are `judged`.
-    seen, prior
+    scatter, prior
         What the plates show of the scene's errors, and the prior of the rig's errors with it.
     measured
         The judged patches as the joint inversion takes them.
@@ -493,7 +494,7 @@ class RelativeScene:
     raw: Images
     refused: dict[int, Finding]
     judged: list[Patch]
-    seen: Seen
+    scatter: SceneScatter
     prior: RigPrior
     measured: list[PatchMeasurement]
     solution: _Solution
@@ -504,7 +505,7 @@ class _Scene:
     """A scene before anything is divided by metal: images, patches, and what is known of the rig and of materials."""
 
     images: Images
-    found: Segmentation
+    segmentation: Segmentation
     tilts: Tilts
     apart_mm: tuple[float, float]
     plane: PlaneReference | None
@@ -514,34 +515,35 @@ class _Scene:
     def relative_to(self, reference: MetalReference) -> RelativeScene:
         """Measure and solve the scene relative to this reference, and weigh whether it is metal."""
         images = self.images
-        found = self.found
+        segmentation = self.segmentation
         theta = np.asarray(self.optics.theta_rad, np.float64)
         raw = to_metal(images, reference, self.plane)
-        rh, rv = (smooth_inside(c, found, self.optics.smooth_px) for c in (raw.h, raw.v))
-        refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
-        refused |= {p.label: STEEP for p in found.patches if p.label in self.tilts.steep}
-        judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
-        seen = Seen.collect(
+        rh, rv = (smooth_inside(c, segmentation, self.optics.smooth_px) for c in (raw.h, raw.v))
+        dark = background(raw.h, raw.v, segmentation, images.usable)
+        refused = check_patches(segmentation, rh, rv, dark, reference.mask)
+        refused |= {p.label: STEEP for p in segmentation.patches if p.label in self.tilts.steep}
+        judged = [p for p in segmentation.patches if p.label not in refused and p.label != reference.label]
+        scatter = SceneScatter.collect(
             channels=(rh, rv),
             raw=raw,
             judged=judged,
-            found=found,
+            segmentation=segmentation,
             reference=reference,
             plane=self.plane,
             images=images,
             tilts=self.tilts,
         )
-        prior = seen.prior(self.optics.prior, float(np.hypot(*self.apart_mm)))
-        dispersions = measure_dispersions(images, found, judged, reference.mask, self.plane)
+        prior = scatter.prior(self.optics.prior, float(np.hypot(*self.apart_mm)))
+        dispersions = measure_dispersions(images, segmentation, judged, reference.mask, self.plane)
         measured = [
-            seen.measure(p, (rh, rv), _mean_angle(theta, p), d) for p, d in zip(judged, dispersions, strict=True)
+            scatter.measure(p, (rh, rv), _mean_angle(theta, p), d) for p, d in zip(judged, dispersions, strict=True)
         ]
         solution = _solve(measured, prior, self.kinds, self.optics.other_sign)
         if self.plane is None:
             labels = [p.label for p in judged]
             reference = _weigh_metal(images, reference, labels, solution, self.kinds)
         return RelativeScene(
-            metal=reference, raw=raw, refused=refused, judged=judged, seen=seen, prior=prior, measured=measured,
+            metal=reference, raw=raw, refused=refused, judged=judged, scatter=scatter, prior=prior, measured=measured,
             solution=solution,
         )  # fmt: skip
 
@@ -639,38 +641,38 @@ def _weigh_metal(
     return replace(metal, evidence=min(evidence, key=lambda of_sign: of_sign.score))
 
 
-def _select_patches(images: Images, known: KnownScene) -> Segmentation:
+def _select_patches(images: Images, known_scene: KnownScene) -> Segmentation:
     """Return the known patches, cut to the valid pixels, or else find them."""
-    if known.segmentation is not None:
-        cut = tuple(replace(p, interior=p.interior & images.valid) for p in known.segmentation.patches)
-        return replace(known.segmentation, patches=cut)
+    if known_scene.segmentation is not None:
+        cut = tuple(replace(p, interior=p.interior & images.valid) for p in known_scene.segmentation.patches)
+        return replace(known_scene.segmentation, patches=cut)
     if not images.usable.any():
         # A scan without a direct path in any position has no signal: there is nothing to search, the verdict says why.
         return Segmentation(np.zeros(images.h.shape, np.int32), ())
-    even = images if known.plane is None else known.plane.apply(images)
+    even = images if known_scene.plane is None else known_scene.plane.apply(images)
     segmentation = segment(even.h, even.v, images.x_m, images.y_m, images.valid)
-    filled = known.plane is not None and float(np.median(np.abs(even.h[images.valid]))) > FILLED
+    filled = known_scene.plane is not None and float(np.median(np.abs(even.h[images.valid]))) > FILLED
     if not segmentation.patches and filled:
         return whole_plane(images.valid, images.x_m, images.y_m, SegmentSettings().margin_mm)
     return segmentation
 
 
-def _references(images: Images, known: KnownScene, found: Segmentation) -> tuple[MetalReference, ...]:
+def _references(images: Images, known_scene: KnownScene, segmentation: Segmentation) -> tuple[MetalReference, ...]:
     """Return the given metal reference, or else the brightest patch and others like it; none without patches."""
-    if isinstance(known.metal, PlaneReference):
-        return (MetalReference(known.metal.valid, None, known.metal.how, given=True),)
-    if isinstance(known.metal, int):
-        return (metal_by_label(known.metal, found),)
-    if known.metal is not None:
-        return (metal_in_box(known.metal, found, images.x_m, images.y_m, images.valid),)
-    return find_metals(images.h, images.v, found) or (no_metal(images.usable),)
+    if isinstance(known_scene.metal, PlaneReference):
+        return (MetalReference(known_scene.metal.valid, None, known_scene.metal.how, given=True),)
+    if isinstance(known_scene.metal, int):
+        return (metal_by_label(known_scene.metal, segmentation),)
+    if known_scene.metal is not None:
+        return (metal_in_box(known_scene.metal, segmentation, images.x_m, images.y_m, images.valid),)
+    return find_metals(images.h, images.v, segmentation) or (no_metal(images.usable),)
 
 
-def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
+def smooth_inside(image: Image, segmentation: Segmentation, sigma_px: float) -> Image:
     """Apply a Gaussian filter inside each patch separately; NaN elsewhere."""
     out = np.full(image.shape, complex(np.nan, np.nan), image.dtype)
     reach = int(np.ceil(4 * sigma_px))
-    for patch in found.patches:
+    for patch in segmentation.patches:
         if patch.interior.any():
             lines, columns = (np.flatnonzero(patch.interior.any(axis=axis)) for axis in (1, 0))
             near = tuple(slice(max(0, indices[0] - reach), indices[-1] + reach + 1) for indices in (lines, columns))
@@ -680,17 +682,17 @@ def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
     return out
 
 
-def permittivity_change(found: MaterialsResult, angles: IncidenceChoice) -> dict[str, Any]:
+def permittivity_change(result: MaterialsResult, angles: IncidenceChoice) -> dict[str, Any]:
     """Return the largest relative change of a patch's permittivity (Eq. 3) with the other angle, for quality.json.
 
     `largest_permittivity_change` is |eps_other / eps - 1|, `of_patch` its number; empty without any permittivity.
     """
     changes = []
-    for r in found.patches:
+    for r in result.patches:
         pixels = r.patch.interior
         if r.permittivity.value is not None and pixels.any():
-            used, other_angle = (float(np.mean(a[pixels])) for a in (angles.used_rad, angles.other_rad))
-            eps = permittivity_from_ratio(r.permittivity.ratio, np.array([used, other_angle]))
+            used_angle, other_angle = (float(np.mean(a[pixels])) for a in (angles.used_rad, angles.other_rad))
+            eps = permittivity_from_ratio(r.permittivity.ratio, np.array([used_angle, other_angle]))
             changes.append((float(abs(eps[1] / eps[0] - 1)), r.patch.label))
     if not changes:
         return {}

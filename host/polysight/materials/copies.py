@@ -60,8 +60,10 @@ def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pix
     the same shift and level.
     """
     brightest = max(float(np.median(other[p.mask])) for p in patches)
-    seen = [p for p in patches if p.label in copies.labels and float(np.median(other[p.mask])) > VISIBLE * brightest]
-    if len(seen) < len(copies.labels):
+    visible_patches = [
+        p for p in patches if p.label in copies.labels and float(np.median(other[p.mask])) > VISIBLE * brightest
+    ]
+    if len(visible_patches) < len(copies.labels):
         return False
     again = _find_copies_in_channel(patches, other, pixel_mm)
     return again is None or not set(copies.labels) & set(again.labels)

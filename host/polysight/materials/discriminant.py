@@ -63,10 +63,10 @@ def shares_of_materials(cost: Real) -> Real:
     return weight / weight.sum(axis=1, keepdims=True)
 
 
-def estimate_common_error(mean: Real, own: Real, prior: Real, level: float) -> tuple[Real, Real]:
+def estimate_common_error(mean: Real, own_errors: Real, prior: Real, level: float) -> tuple[Real, Real]:
     """Estimate the error that all patches of a scan share; return its mean [d] and covariance [d, d].
 
-    `mean` [patch, materials, d] are the deviations of patches from the materials, `own` [materials, d, d] the
+    `mean` [patch, materials, d] are the deviations of patches from the materials, `own_errors` [materials, d, d] the
     covariances of these, `prior` [d, d] that of the error. Patches whose squared distance to every material is above
     `level` have little weight. Expectation maximisation: a patch of uncertain material counts with the moments of the
     mixture. A single patch tells nothing of it.
@@ -76,12 +76,12 @@ def estimate_common_error(mean: Real, own: Real, prior: Real, level: float) -> t
     if len(mean) < 2:
         return value, covariance
     for _ in range(COMMON_ERROR_ROUNDS):
-        distance2, cost = costs(mean - value, own + covariance)
+        distance2, cost = costs(mean - value, own_errors + covariance)
         share = shares_of_materials(cost)
         weight = scipy.special.expit(level - distance2.min(axis=1))
         middle = np.einsum("pk,pkd->pd", share, mean)
         difference = mean - middle[:, None]
-        spread = np.einsum("pk,pkde->pde", share, own + difference[..., :, None] * difference[..., None, :])
+        spread = np.einsum("pk,pkde->pde", share, own_errors + difference[..., :, None] * difference[..., None, :])
         information = weight[:, None, None] * np.linalg.inv(spread)
         covariance = np.linalg.inv(np.linalg.inv(prior) + information.sum(axis=0))
         last_value = value

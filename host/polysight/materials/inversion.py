@@ -268,23 +268,23 @@ def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: 
     return np.asarray((without_reference - b) / (1 - a * without_reference), np.complex128)
 
 
-def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None = None) -> Inversion:
+def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None = None) -> Inversion:
     """Solve for all patches of a scene together.
 
-    `seen` are the patches without the metal reference. With `kinds` the patches get probabilities of them.
+    `measurements` are the patches without the metal reference. With `kinds` the patches get probabilities of them.
     """
-    model = SceneLikelihood(seen, prior, kinds)
+    model = SceneLikelihood(measurements, prior, kinds)
     rng = np.random.default_rng(0)
-    drawn = sample_posterior(model, rng)
+    posterior = sample_posterior(model, rng)
     all_evidence = np.ones(model.patch_count + 1)
     patches = []
     for i in range(model.patch_count):
         # A patch is measured without the belief that it must be some material itself.
         without_patch = all_evidence.copy()
         without_patch[i + 1] = 0.0
-        particles, _ = _anneal(model, drawn[0], all_evidence, without_patch, rng)
+        particles, _ = _anneal(model, posterior[0], all_evidence, without_patch, rng)
         patches.append(_estimate(model, particles, i, rng))
-    return _solution(model, drawn, tuple(patches))
+    return _solution(model, posterior, tuple(patches))
 
 
 def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[Real, float, float]:
@@ -318,41 +318,41 @@ class SceneLikelihood:
 
     width = WIDTH
 
-    def __init__(self, seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None) -> None:
+    def __init__(self, measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None) -> None:
         self.prior = prior
         self.kinds = kinds
-        self.patch_count = len(seen)
-        self.measured = np.array([s.inverse_ratio for s in seen], np.complex128)
-        self.rise = np.array([s.rise for s in seen], np.float64).reshape(-1, 2)
-        self.theta = np.array([s.theta_rad for s in seen], np.float64)
-        level = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)
+        self.patch_count = len(measurements)
+        self.measured = np.array([s.inverse_ratio for s in measurements], np.complex128)
+        self.rise = np.array([s.rise for s in measurements], np.float64).reshape(-1, 2)
+        self.theta = np.array([s.theta_rad for s in measurements], np.float64)
+        level = np.array([np.nan if s.brightness is None else s.brightness for s in measurements], np.float64)
         # Metal-like patches have |H| = 1 with any leakage: they give no information on it.
         unlike_metal = np.abs(self.measured - 1) > METAL_WITHOUT_BRIGHTNESS
         self.bright = np.isfinite(level) & (level > 0) & unlike_metal
         self.log_level = np.log(np.where(self.bright, level, 1.0))
-        self.own = self._own_covariances(seen)
+        self.own = self._own_covariances(measurements)
         # Of one part of the measured ratio
-        self.own_variance = np.array([np.trace(s.covariance) / 2 for s in seen], np.float64)
-        self.densities = None if kinds is None or not seen else self._densities(kinds)
-        self.dispersions = tuple(s.dispersion for s in seen)
+        self.own_variance = np.array([np.trace(s.covariance) / 2 for s in measurements], np.float64)
+        self.densities = None if kinds is None or not measurements else self._densities(kinds)
+        self.dispersions = tuple(s.dispersion for s in measurements)
         self.log_layer_odds = np.array([log_layer_odds(d, kinds) for d in self.dispersions])
 
-    def _own_covariances(self, seen: Sequence[PatchMeasurement]) -> Real:
+    def _own_covariances(self, measurements: Sequence[PatchMeasurement]) -> Real:
         """Return the covariance of each patch's t by its own errors, [patch, 2, 2]: those of V / H, to first order."""
-        if not seen:
+        if not measurements:
             return np.zeros((0, 2, 2))
         nominal = np.zeros((1, self.width))
         step = 1e-4 * np.maximum(np.abs(self.measured), 1e-3)
         at_measured = self._correct_ratios(self.measured, nominal)[0]
-        beside = self._correct_ratios(self.measured + step, nominal)[0]
-        return turn_covariance((beside - at_measured) / step, np.stack([s.covariance for s in seen]))
+        at_next = self._correct_ratios(self.measured + step, nominal)[0]
+        return turn_covariance((at_next - at_measured) / step, np.stack([s.covariance for s in measurements]))
 
     def _densities(self, kinds: Kinds) -> DensityMaps:
         """Return the density of each patch's ratio over its possible values."""
-        drawn = self.ratios(np.random.default_rng(1).standard_normal((PARTICLES, self.width)))
+        drawn_ratios = self.ratios(np.random.default_rng(1).standard_normal((PARTICLES, self.width)))
         maps = []
         for i in range(self.patch_count):
-            t = drawn[np.isfinite(drawn[:, i]) & (np.abs(drawn[:, i]) < 3.0), i]
+            t = drawn_ratios[np.isfinite(drawn_ratios[:, i]) & (np.abs(drawn_ratios[:, i]) < 3.0), i]
             if not t.size:
                 t = np.zeros(1, np.complex128)
             # The particles may wander a little beyond the first ones.
@@ -486,8 +486,8 @@ class SceneLikelihood:
             return np.concatenate([brightness_log, no_evidence], axis=-1)
         if self.densities is None:
             return brightness_log
-        moved = move_to_angle(t, self.angle(z), self.kinds.theta_rad)
-        of_library, of_half_spaces, of_layers = self.densities.log_densities(moved)
+        ratios_of_kinds = move_to_angle(t, self.angle(z), self.kinds.theta_rad)
+        of_library, of_half_spaces, of_layers = self.densities.log_densities(ratios_of_kinds)
         of_others = np.logaddexp(of_half_spaces, of_layers + self.log_layer_odds)
         library_share = self.library_share(z)[..., None]
         of_some_kind = np.logaddexp(np.log(library_share) + of_library, np.log1p(-library_share) + of_others)
@@ -523,13 +523,13 @@ def _anneal(model: SceneLikelihood, z: Real, before: Real, after: Real, rng: np.
     """
     parts = model.log_likelihoods(z)
     change = after - before
-    done = 0.0
+    temperature = 0.0
     log_evidence = 0.0
-    while done < 1:
+    while temperature < 1:
         gain = parts @ change
-        step = _choose_step(gain, 1 - done)
-        done = 1.0 if step >= 1 - done else done + step
-        weight = before + done * change
+        step = _choose_step(gain, 1 - temperature)
+        temperature = 1.0 if step >= 1 - temperature else temperature + step
+        weight = before + temperature * change
         log_evidence += step * float(gain.max()) + float(np.log(np.mean(np.exp(step * (gain - gain.max())))))
         chosen = _resample(np.exp(step * (gain - gain.max())), rng)
         z = z[chosen]
@@ -573,10 +573,10 @@ def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:
 
 
 def _solution(
-    model: SceneLikelihood, drawn: tuple[Real, float, float], patches: tuple[PatchEstimate, ...]
+    model: SceneLikelihood, posterior: tuple[Real, float, float], patches: tuple[PatchEstimate, ...]
 ) -> Inversion:
     """Collect the solution from what `sample_posterior` returns."""
-    z, log_evidence, log_bare = drawn
+    z, log_evidence, log_bare = posterior
     prior = model.prior
     paint = model.paint(z)
     painted = paint > 0
@@ -627,11 +627,11 @@ def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator)
     value = complex(permittivity_from_ratio(middle, float(angles.mean())))
     noise = rng.multivariate_normal(np.zeros(2), model.own[i], (DRAWS, len(z)), method="cholesky")
     drawn_t = t + noise[..., 0] + 1j * noise[..., 1]
-    drawn = np.asarray(permittivity_from_ratio(drawn_t, angles), np.complex128)
+    drawn_values = np.asarray(permittivity_from_ratio(drawn_t, angles), np.complex128)
     # Near metal the moments of the far tail do not exist: three standard deviations of the ratio are kept.
     difference = split_complex(drawn_t - middle)
     inside = np.einsum("...i,ij,...j->...", difference, np.linalg.inv(ratio_covariance), difference) < CHI2_997
-    parts = split_complex(drawn[inside] - value)
+    parts = split_complex(drawn_values[inside] - value)
     covariance = np.asarray(parts.T @ parts / len(parts), np.float64)
     # A tail (the mount may have moved) widens a covariance more than the region that holds 95 %.
     distance2 = np.einsum("...i,ij,...j->...", parts, np.linalg.inv(covariance), parts)

@@ -365,15 +365,15 @@ class DensityMaps:
         y = np.fmin(np.fmax((t.imag - self.low.imag) * self.cells_per_unit.imag, 0.0), rows - 1)
         column = np.minimum(x.astype(np.intp), columns - 2)
         row = np.minimum(y.astype(np.intp), rows - 2)
-        beside = x - column
-        beyond = y - row
+        fraction_x = x - column
+        fraction_y = y - row
         corner = (np.arange(patches) * rows + row) * columns + column
-        at, right, up, across = (
+        at_corner, at_right, at_upper, at_upper_right = (
             self.log_density.reshape(3, -1).take(corner + step, axis=1) for step in (0, 1, columns, columns + 1)
         )
-        near = at + beside * (right - at)
-        far = up + beside * (across - up)
-        return near + beyond * (far - near)
+        lower_edge = at_corner + fraction_x * (at_right - at_corner)
+        upper_edge = at_upper + fraction_x * (at_upper_right - at_upper)
+        return lower_edge + fraction_y * (upper_edge - lower_edge)
 
 
 def literature(library: Collection[str] = ()) -> list[Kind]:
@@ -487,8 +487,8 @@ def _draw_sheet_properties() -> tuple[Complex, Complex, Real]:
         low * (high / low) ** part
         for (low, high), part in zip((SHEET_REAL, SHEET_LOSS_TANGENT, SHEET_MM), unit.T[:3], strict=True)
     )
-    behind = np.where(unit[:, 3] < 0.5, 1.0, HOLDER_REAL[0] + (HOLDER_REAL[1] - HOLDER_REAL[0]) * unit[:, 4])
-    return real * (1 - 1j * tangent), behind.astype(np.complex128), size_mm / 1e3
+    eps_behind = np.where(unit[:, 3] < 0.5, 1.0, HOLDER_REAL[0] + (HOLDER_REAL[1] - HOLDER_REAL[0]) * unit[:, 4])
+    return real * (1 - 1j * tangent), eps_behind.astype(np.complex128), size_mm / 1e3
 
 
 def _compute_histogram(draws: Complex, real: Real, imag: Real, covariance: Real) -> Real:
@@ -513,40 +513,42 @@ class Odds:
     distance: Real
 
 
-def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
+def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Odds:
     """Return the probabilities of what a patch may be, from one scan or from several under different angles.
 
     The specimen is the same in all scans, the errors are each scan's own. `kinds` are the same at each scan's angle.
     """
     first = kinds[0]
-    size = 2 * len(seen)
-    errors = scipy.linalg.block_diag(*(evidence.covariance for evidence in seen))
-    t = np.array([evidence.inverse_ratio for evidence in seen])
+    size = 2 * len(scan_evidence)
+    errors = scipy.linalg.block_diag(*(evidence.covariance for evidence in scan_evidence))
+    t = np.array([evidence.inverse_ratio for evidence in scan_evidence])
     effects = np.concatenate([kind.effects for kind in kinds], axis=1)
     inverse = np.linalg.inv(effects @ effects.mT + 1e-10 * np.eye(size) + errors)
     difference = split_complex(t - np.stack([kind.t for kind in kinds], axis=1)).reshape(-1, size)
     distance2 = np.einsum("ki,kij,kj->k", difference, inverse, difference)
     weight = first.share * np.sqrt(np.linalg.det(inverse / (2 * np.pi))) * np.exp(-0.5 * distance2)
-    ours = float(np.mean([evidence.library_share for evidence in seen])) if first.in_library.any() else 0.0
-    weight = weight * np.where(first.in_library, ours, 1 - ours)
-    drawn = np.stack([kind.sheets for kind in kinds], axis=1)
-    by_dispersion = _weigh_dispersion(kinds, seen)
+    library_share = (
+        float(np.mean([evidence.library_share for evidence in scan_evidence])) if first.in_library.any() else 0.0
+    )
+    weight = weight * np.where(first.in_library, library_share, 1 - library_share)
+    drawn_sheets = np.stack([kind.sheets for kind in kinds], axis=1)
+    by_dispersion = _weigh_dispersion(kinds, scan_evidence)
     density = (
-        _evaluate_normal(drawn, t, errors + SHEET_KERNEL**2 * np.eye(size))
-        * _weigh_brightness(kinds, seen)
+        _evaluate_normal(drawn_sheets, t, errors + SHEET_KERNEL**2 * np.eye(size))
+        * _weigh_brightness(kinds, scan_evidence)
         * by_dispersion
     )
-    sheet = (1 - ours) * first.sheet_share * float(np.mean(density))
-    if any(evidence.dispersion is not None for evidence in seen):
-        sheet += (1 - ours) * STACK_SHARE / np.pi ** len(seen) * float(np.mean(by_dispersion))
-    other_weight = (1 - ours) * first.other * _evaluate_other_density(kinds, seen)
+    sheet = (1 - library_share) * first.sheet_share * float(np.mean(density))
+    if any(evidence.dispersion is not None for evidence in scan_evidence):
+        sheet += (1 - library_share) * STACK_SHARE / np.pi ** len(scan_evidence) * float(np.mean(by_dispersion))
+    other_weight = (1 - library_share) * first.other * _evaluate_other_density(kinds, scan_evidence)
     distance = np.sqrt(distance2 / scipy.special.chdtri(size, 0.01))
     total = float(weight.sum()) + sheet + other_weight
     if not total > 0:
         return Odds(np.zeros(len(weight)), 0.0, 1.0, distance)
-    inside = np.where(distance <= 1, weight, 0.0) / total
+    probability = np.where(distance <= 1, weight, 0.0) / total
     sheet = sheet / total
-    return Odds(inside, sheet, 1 - sheet - float(inside.sum()), distance)
+    return Odds(probability, sheet, 1 - sheet - float(probability.sum()), distance)
 
 
 def may_be_thin(evidence: RatioEvidence, kinds: Kinds) -> bool:
@@ -554,19 +556,19 @@ def may_be_thin(evidence: RatioEvidence, kinds: Kinds) -> bool:
     return weigh_kinds((kinds,), (evidence,)).sheet > POSSIBLY_THIN
 
 
-def _weigh_dispersion(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Real:
+def _weigh_dispersion(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Real:
     """Return how much likelier the change over the sweep is for each drawn thin plate than for a half space, [draw]."""
     odds = np.ones(kinds[0].sheets.size)
-    for kind, evidence in zip(kinds, seen, strict=True):
+    for kind, evidence in zip(kinds, scan_evidence, strict=True):
         if evidence.dispersion is not None:
             odds = odds * layer_odds(evidence.dispersion, kind.theta_rad)
     return odds
 
 
-def _weigh_brightness(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Real:
+def _weigh_brightness(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Real:
     """Return how much likelier the brightness of a patch is for each drawn thin plate than for a half space, [draw]."""
     odds = np.ones(kinds[0].sheets.size)
-    for kind, evidence in zip(kinds, seen, strict=True):
+    for kind, evidence in zip(kinds, scan_evidence, strict=True):
         if np.isfinite(evidence.brightness_off):
             of_sheets = evidence.brightness_off - kind.sheet_brightness_off
             density = brightness_density(of_sheets, evidence.brightness_std)
@@ -582,21 +584,21 @@ def _evaluate_normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
     return scale * np.exp(-0.5 * np.einsum("ni,ij,nj->n", difference, inverse, difference))
 
 
-def _evaluate_other_density(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> float:
+def _evaluate_other_density(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> float:
     """Return the density of the measured ratios as any half space.
 
     With several angles by half spaces that are drawn from the measurement that is known best.
     """
-    best = min(range(len(seen)), key=lambda i: float(np.linalg.det(seen[i].covariance)))
-    mean = seen[best].inverse_ratio
-    covariance = seen[best].covariance
-    if len(seen) == 1:
+    best = min(range(len(scan_evidence)), key=lambda i: float(np.linalg.det(scan_evidence[i].covariance)))
+    mean = scan_evidence[best].inverse_ratio
+    covariance = scan_evidence[best].covariance
+    if len(scan_evidence) == 1:
         return float(kinds[best].compute_half_space_density(np.array(mean), covariance))
     noise = np.random.default_rng(0).multivariate_normal(np.zeros(2), covariance, _HALF_SPACES, method="cholesky")
     t = mean + noise[:, 0] + 1j * noise[:, 1]
     density = kinds[best].compute_half_space_density(t, 1e-8 * np.eye(2))
     eps = permittivity_from_ratio(t, kinds[best].theta_rad)
-    for i, evidence in enumerate(seen):
+    for i, evidence in enumerate(scan_evidence):
         if i != best:
             ratio = inverse_ratio(eps, evidence.theta_rad)
             density = density * _evaluate_normal(

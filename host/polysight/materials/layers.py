@@ -375,10 +375,10 @@ def fit_layer(
         )
     by_fit = operator.attrgetter("chi2")
     rough = sorted((model.solve(start, precision=1e-3) for start in model.starts()), key=by_fit)
-    level = rough[0].chi2 + 3 * RIVAL * model.fit(rough[0], drawn=False).stretch
+    level = rough[0].chi2 + 3 * RIVAL * model.fit(rough[0], by_sampling=False).stretch
     solutions = sorted((model.solve(solution.x) for solution in _drop_repetitions(rough, level, 0.01)), key=by_fit)
-    level = solutions[0].chi2 + RIVAL * model.fit(solutions[0], drawn=False).stretch
-    near = [model.fit(solution, drawn=True) for solution in _drop_repetitions(solutions, level, 1e-3)]
+    level = solutions[0].chi2 + RIVAL * model.fit(solutions[0], by_sampling=False).stretch
+    near = [model.fit(solution, by_sampling=True) for solution in _drop_repetitions(solutions, level, 1e-3)]
     best = near[0]
     rivals = list[LayerFit]()
     for rival in near[1:]:
@@ -420,15 +420,15 @@ class _Solution:
     active: npt.NDArray[np.intp]
 
 
-def _drop_repetitions(found: Sequence[_Solution], level: float, relative: float) -> list[_Solution]:
+def _drop_repetitions(solutions: Sequence[_Solution], level: float, relative: float) -> list[_Solution]:
     """Return solutions up to a chi-square `level`, without repetitions (closer than `relative`), best first."""
-    out: list[_Solution] = []
-    for solution in found:
+    distinct: list[_Solution] = []
+    for solution in solutions:
         if solution.chi2 <= level and all(
-            np.any(np.abs(solution.x - o.x) > relative * np.maximum(np.abs(o.x), 0.1)) for o in out
+            np.any(np.abs(solution.x - o.x) > relative * np.maximum(np.abs(o.x), 0.1)) for o in distinct
         ):
-            out.append(solution)
-    return out
+            distinct.append(solution)
+    return distinct
 
 
 class _Model:
@@ -441,17 +441,20 @@ class _Model:
         self,
         bands: Bands,
         stack: tuple[Layer, ...],
-        at: int,
+        layer_index: int,
         theta_rad: float,
         thickness_range_m: tuple[float, float] | None,
     ) -> None:
         self.sized = thickness_range_m is not None
         check_stack(
-            [replace(layer, thickness_m=1.0) if self.sized and i == at else layer for i, layer in enumerate(stack)]
+            [
+                replace(layer, thickness_m=1.0) if self.sized and i == layer_index else layer
+                for i, layer in enumerate(stack)
+            ]
         )
         self.bands = bands
         self.stack = stack
-        self.at = at
+        self.at = layer_index
         self.theta_rad = theta_rad
         self.range_mm = tuple(1e3 * d for d in thickness_range_m or (0.0, 0.0))
         self.turned = bands.theta_std_rad > 0
@@ -525,7 +528,7 @@ class _Model:
     def solve(self, start: Real, precision: float = 1e-10) -> _Solution:
         """Solve by least squares from one start."""
         width = self.upper - self.lower
-        done = scipy.optimize.least_squares(
+        optimum = scipy.optimize.least_squares(
             self.residuals,
             np.clip(start, self.lower + 1e-9 * width, self.upper - 1e-9 * width),
             bounds=(self.lower, self.upper),
@@ -538,25 +541,25 @@ class _Model:
             max_nfev=200,
         )
         # At a bound (no loss) the solver's Jacobian still has the slope for the error bar.
-        return _Solution(done.x, float(2 * done.cost), done.jac, done.active_mask)
+        return _Solution(optimum.x, float(2 * optimum.cost), optimum.jac, optimum.active_mask)
 
-    def fit(self, one: _Solution, drawn: bool) -> LayerFit:
-        """Return a solution with its error bars; by samples of the posterior if `drawn` and the valley is bent."""
+    def fit(self, solution: _Solution, by_sampling: bool) -> LayerFit:
+        """Return a solution with its error bars; `by_sampling`: by samples of the posterior if the valley is bent."""
         n = self.unknowns
-        covariance = np.asarray(np.linalg.pinv(one.jacobian.T @ one.jacobian), np.float64)
-        own_covariance = self._draw_second_moments(one, covariance) if drawn else covariance[:n, :n]
-        wider = max(1.0, one.chi2 / self.freedom) if self.freedom > 0 else 1.0
+        covariance = np.asarray(np.linalg.pinv(solution.jacobian.T @ solution.jacobian), np.float64)
+        own_covariance = self._draw_second_moments(solution, covariance) if by_sampling else covariance[:n, :n]
+        wider = max(1.0, solution.chi2 / self.freedom) if self.freedom > 0 else 1.0
         units = np.array([1.0, 1.0, 1e-3])[:n]
         own_covariance = np.asarray(wider * own_covariance * np.outer(units, units), np.float64)
         std = np.sqrt(np.maximum(np.diag(own_covariance), 0.0))
-        ends = zip(("the real part", "the loss", "the thickness"), one.active, (True, False, True), strict=False)
+        ends = zip(("the real part", "the loss", "the thickness"), solution.active, (True, False, True), strict=False)
         return LayerFit(
-            permittivity=complex(one.x[0], -one.x[1]),
-            thickness_m=float(one.x[2]) * 1e-3 if self.sized else self.stack[self.at].thickness_m,
+            permittivity=complex(solution.x[0], -solution.x[1]),
+            thickness_m=float(solution.x[2]) * 1e-3 if self.sized else self.stack[self.at].thickness_m,
             std_real=float(std[0]),
             std_loss=float(std[1]),
             std_thickness_m=float(std[2]) if self.sized else 0.0,
-            chi2=one.chi2,
+            chi2=solution.chi2,
             freedom=self.freedom,
             at_limit=tuple(
                 name for name, end, two_sided in itertools.islice(ends, n) if end > 0 or (two_sided and end < 0)
@@ -564,13 +567,13 @@ class _Model:
             covariance=own_covariance,
         )
 
-    def _draw_second_moments(self, one: _Solution, covariance: Real) -> Real:
+    def _draw_second_moments(self, solution: _Solution, covariance: Real) -> Real:
         """Return second moments of the posterior about a solution, [unknowns, unknowns]; linear in straight valleys.
 
         By importance sampling along index and phase, where the valley is straighter than in thickness.
         """
         n = self.unknowns
-        x = one.x
+        x = solution.x
         to_z = self._differentiate_straight(x)
         spread = to_z @ covariance @ to_z.T
         spread = spread + np.diag(1e-12 * np.maximum(np.diag(spread), 1e-18))

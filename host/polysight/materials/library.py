@@ -411,10 +411,17 @@ class Samples:
         labels = np.array(names), np.array(groups), np.array(patches), np.array(specimens)
         return cls(np.concatenate(x), *labels, library.angles_deg)
 
-    def take(self, at: npt.NDArray) -> Samples:
+    def take(self, indices: npt.NDArray) -> Samples:
         """Return some of the pixels, by index or by mask."""
-        specimens = None if self.specimens is None else self.specimens[at]
-        return Samples(self.x[at], self.names[at], self.groups[at], self.patches[at], specimens, self.angles_deg)
+        specimens = None if self.specimens is None else self.specimens[indices]
+        return Samples(
+            self.x[indices],
+            self.names[indices],
+            self.groups[indices],
+            self.patches[indices],
+            specimens,
+            self.angles_deg,
+        )
 
     def join(self, other: Samples) -> Samples:
         """Join with samples of a second angle, patch by patch.

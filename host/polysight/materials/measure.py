@@ -92,23 +92,23 @@ ACTIVE = 2.0
 """Limit in standard deviations of gain, or of a real part below 1, for a permittivity to be impossible."""
 
 
-def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[float, float]:
+def background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> tuple[float, float]:
     """Return the rms of |H| and |V| away from all patches (noise and sidelobes); NaN without such pixels."""
-    background_mask = _select_background(h, v, found, usable)
+    background_mask = _select_background(h, v, segmentation, usable)
     if not background_mask.any():
         return float("nan"), float("nan")
     return _compute_rms(h[background_mask]), _compute_rms(v[background_mask])
 
 
-def background_mean(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[float, float]:
+def background_mean(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> tuple[float, float]:
     """Return the rms of the mean of H and of V over places of a plate's size away from all patches.
 
     What lies behind the plates, such as a table, adds to them as well, with a phase that nobody knows. It changes
     little over a plate, so that neither averaging nor the scatter of the plate's pixels tells of it: on the published
     picture the mean over a plate's size is only 6 dB below the background itself. 0 without such places.
     """
-    background_mask = _select_background(h, v, found, usable)
-    widths = [np.sqrt(patch.interior.sum()) for patch in found.patches if patch.interior.any()]
+    background_mask = _select_background(h, v, segmentation, usable)
+    widths = [np.sqrt(patch.interior.sum()) for patch in segmentation.patches if patch.interior.any()]
     if not widths:
         return 0.0, 0.0
     width_px = max(1, round(float(np.median(widths))))
@@ -121,10 +121,10 @@ def background_mean(h: Image, v: Image, found: Segmentation, usable: Mask) -> tu
     return _compute_rms(behind_h), _compute_rms(behind_v)
 
 
-def _select_background(h: Image, v: Image, found: Segmentation, usable: Mask) -> Mask:
+def _select_background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> Mask:
     """Return the usable pixels with some distance to every patch."""
     background_mask = usable & np.isfinite(h) & np.isfinite(v)
-    for patch in found.patches:
+    for patch in segmentation.patches:
         background_mask &= ~np.asarray(scipy.ndimage.binary_dilation(patch.mask, iterations=_AROUND_PX), bool)
     return background_mask
 
@@ -195,9 +195,9 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     return None
 
 
-def halves_apart(h: Image, v: Image, at: Mask) -> float:
+def halves_apart(h: Image, v: Image, mask: Mask) -> float:
     """Return the largest difference of the median V / H between opposite halves of a patch; 0 with too few pixels."""
-    rows, columns = np.nonzero(at & np.isfinite(h) & np.isfinite(v) & (h != 0))
+    rows, columns = np.nonzero(mask & np.isfinite(h) & np.isfinite(v) & (h != 0))
     values = v[rows, columns] / h[rows, columns]
     largest = 0.0
     for place in (rows, columns):
@@ -292,15 +292,15 @@ def usual_scatter(all_plates: Sequence[Scatter]) -> tuple[float, float]:
     return float(np.median([s.amplitude for s in all_plates])), float(np.median([s.phase for s in all_plates]))
 
 
-def relative_errors(own: Scatter | None, usual: tuple[float, float]) -> tuple[float, float]:
+def relative_errors(plate_scatter: Scatter | None, usual: tuple[float, float]) -> tuple[float, float]:
     """Return the standard errors of a plate's ln|V / H| and phase, from its own scatter and the scene's usual one."""
     amplitude, phase = usual
     blocks = 1.0
-    if own is not None:
-        blocks = own.blocks
+    if plate_scatter is not None:
+        blocks = plate_scatter.blocks
         weight = USUAL_BLOCKS + blocks
-        amplitude = float(np.sqrt((USUAL_BLOCKS * amplitude**2 + blocks * own.amplitude**2) / weight))
-        phase = float(np.sqrt((USUAL_BLOCKS * phase**2 + blocks * own.phase**2) / weight))
+        amplitude = float(np.sqrt((USUAL_BLOCKS * amplitude**2 + blocks * plate_scatter.amplitude**2) / weight))
+        phase = float(np.sqrt((USUAL_BLOCKS * phase**2 + blocks * plate_scatter.phase**2) / weight))
     return AMPLITUDE_OF_BLOCKS * amplitude / np.sqrt(blocks), PHASE_OF_BLOCKS * phase / np.sqrt(blocks)
 
 
@@ -354,7 +354,7 @@ def measure_patch(
 
 def measure_dispersions(
     images: Images,
-    found: Segmentation,
+    segmentation: Segmentation,
     judged: Sequence[Patch],
     metal: Mask,
     plane: PlaneReference | None,
@@ -376,7 +376,7 @@ def measure_dispersions(
     if dispersion is None or of_metal is None:
         return [None] * len(judged)
     metal_change, metal_spread = of_metal
-    behind = background_mean(images.h * dispersion.h, images.v * dispersion.v, found, images.usable)
+    behind = background_mean(images.h * dispersion.h, images.v * dispersion.v, segmentation, images.usable)
     floor = np.array([DISPERSION_STD[0], DISPERSION_STD[1], DISPERSION_STD[1]])
     out: list[PatchDispersion | None] = []
     for patch in judged:
@@ -414,11 +414,11 @@ def _measure_phase_spread(h: Image) -> float:
 
 
 def check_patches(
-    found: Segmentation, h: Image, v: Image, dark: tuple[float, float], metal: Mask
+    segmentation: Segmentation, h: Image, v: Image, dark: tuple[float, float], metal: Mask
 ) -> dict[int, Finding]:
     """Return patch number to reason for all patches that are no plates; `metal` is the metal reference's interior."""
     uneven = halves_apart(h, v, metal)
-    reasons = ((p.label, check_patch(p, h, v, dark, uneven)) for p in found.patches)
+    reasons = ((p.label, check_patch(p, h, v, dark, uneven)) for p in segmentation.patches)
     return {label: reason for label, reason in reasons if reason is not None}
 
 
@@ -517,10 +517,10 @@ def median_ratio(h: Image, v: Image) -> complex:
     additive and symmetric even where V nearly vanishes; H / V itself has no mean there. Medians are taken of real and
     imaginary part separately.
     """
-    good = np.isfinite(h) & np.isfinite(v) & (h != 0)
-    if not good.any():
+    usable = np.isfinite(h) & np.isfinite(v) & (h != 0)
+    if not usable.any():
         return complex(np.nan, np.nan)
-    inverse = v[good].astype(np.complex128) / h[good]
+    inverse = v[usable].astype(np.complex128) / h[usable]
     middle = complex(np.median(inverse.real), np.median(inverse.imag))
     return 1 / middle if middle != 0 else complex(np.inf, 0.0)
 
@@ -545,17 +545,17 @@ def estimate_permittivity(
     incidence angle, one number or [n].
     """
     ratio = median_ratio(h, v)
-    good = np.isfinite(h) & np.isfinite(v) & (h != 0)
+    usable = np.isfinite(h) & np.isfinite(v) & (h != 0)
     distance = min(abs(ratio - 1), abs(1 / ratio - 1) if ratio != 0 else np.inf)
-    n = int(good.sum())
+    n = int(usable.sum())
     inverse = 1 / ratio if ratio != 0 else complex(np.inf, 0.0)
     inverse_std = inverse_spread(h, v)
     # Written with `not`, so that a distance that is not a number gets no permittivity either.
     if not distance >= METAL_WITHOUT_PERMITTIVITY:
         return Permittivity.not_estimated(ratio, inverse_std, float(distance), n)
-    theta = np.broadcast_to(np.asarray(theta_rad, np.float64), h.shape)[good]
+    theta = np.broadcast_to(np.asarray(theta_rad, np.float64), h.shape)[usable]
     value = complex(permittivity_from_ratio(ratio, float(theta.mean())))
-    pixels = permittivity_from_ratio(v[good].astype(np.complex128) / h[good], theta)
+    pixels = permittivity_from_ratio(v[usable].astype(np.complex128) / h[usable], theta)
     pixels = pixels[np.isfinite(pixels)]
     re, im = (np.percentile(part, [30, 70]) for part in (pixels.real, pixels.imag))
     std = float(abs(permittivity_slope(inverse, float(theta.mean()))) * inverse_std)

@@ -133,13 +133,15 @@ class MetalEvidence:
 
 
 def log_evidence_of_dielectric(
-    seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None = None
+    measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None = None
 ) -> float:
     """Return the log evidence of the same measurements if the reference is a dielectric, as `Inversion.log_evidence`.
 
     `channel_ratio_db` is V / H of the reference relative to the direct path; None if it is not known.
     """
-    return sample_posterior(_DielectricReference(seen, prior, kinds, channel_ratio_db), np.random.default_rng(0))[1]
+    return sample_posterior(
+        _DielectricReference(measurements, prior, kinds, channel_ratio_db), np.random.default_rng(0)
+    )[1]
 
 
 class _DielectricReference(SceneLikelihood):
@@ -148,10 +150,10 @@ class _DielectricReference(SceneLikelihood):
     width = WIDTH + 2
 
     def __init__(
-        self, seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None
+        self, measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None
     ) -> None:
         self.channel_ratio_db = channel_ratio_db
-        super().__init__(seen, prior, kinds)
+        super().__init__(measurements, prior, kinds)
 
     def _estimate_paint_probability(self) -> float:
         return 0.0
@@ -362,26 +364,26 @@ def find_metals(h: Image, v: Image, segmentation: Segmentation) -> tuple[MetalRe
     brightest patch of a scene without metal is a dielectric: whether it is metal is another question
     (:func:`metal_evidence`), as is which of several is bare.
     """
-    seen = [p for p in segmentation.patches if p.interior.any()]
-    size_h, size_v = (np.array([np.median(np.abs(image[p.interior])) for p in seen]) for image in (h, v))
+    patches = [p for p in segmentation.patches if p.interior.any()]
+    size_h, size_v = (np.array([np.median(np.abs(image[p.interior])) for p in patches]) for image in (h, v))
     product = size_h * size_v
     order = np.argsort(-product, kind="stable")
-    if not seen:
+    if not patches:
         return ()
     best = order[0]
-    beside = "the only patch found"
-    if len(seen) > 1:
+    margin_text = "the only patch found"
+    if len(patches) > 1:
         margin = np.inf if product[order[1]] == 0 else product[best] / product[order[1]]
-        beside = f"|H||V| {margin:.1f} times the next"
-    described = f"chosen as the patch that is brightest in both channels ({beside})"
-    metals = [MetalReference(seen[best].interior, seen[best].label, described)]
+        margin_text = f"|H||V| {margin:.1f} times the next"
+    how = f"chosen as the patch that is brightest in both channels ({margin_text})"
+    metals = [MetalReference(patches[best].interior, patches[best].label, how)]
     for i in order[1:MOST_METALS]:
         alike = size_v[i] * size_h[best] > size_v[best] * size_h[i] * 10 ** (-ALIKE_DB / 20)
         if alike and product[i] > LEAST_METAL_LEVEL * product[best]:
             level = product[i] / product[best]
-            described = "chosen as the patch that the others show best to be bare metal "
-            described += f"(|H||V| {level:.1f} times that of patch {seen[best].label}, which fits them less)"
-            metals.append(MetalReference(seen[i].interior, seen[i].label, described))
+            how = "chosen as the patch that the others show best to be bare metal "
+            how += f"(|H||V| {level:.1f} times that of patch {patches[best].label}, which fits them less)"
+            metals.append(MetalReference(patches[i].interior, patches[i].label, how))
     return tuple(metals)
 
 

@@ -534,9 +534,9 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
 def _find_partner(patch: ScanPatch, own_scan: ScanPatches, other_scan: ScanPatches) -> ScanPatch | None:
     """Return the other scan's patch nearest to this one, if this one is also the nearest to it."""
 
-    def nearest(to: ScanPatch, among: ScanPatches) -> ScanPatch | None:
+    def nearest(patch: ScanPatch, among: ScanPatches) -> ScanPatch | None:
         def distance_mm(p: ScanPatch) -> float:
-            return float(np.hypot(p.centre_mm[0] - to.centre_mm[0], p.centre_mm[1] - to.centre_mm[1]))
+            return float(np.hypot(p.centre_mm[0] - patch.centre_mm[0], p.centre_mm[1] - patch.centre_mm[1]))
 
         best = min(among.patches, key=distance_mm, default=None)
         return best if best is not None and distance_mm(best) <= APART_MM else None

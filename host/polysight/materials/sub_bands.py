@@ -66,7 +66,7 @@ _PERCENT = re.compile(r"(\d+(?:\.\d+)?)\s*%")
 
 
 def add_bands(
-    found: MaterialsResult,
+    result: MaterialsResult,
     bands: Sequence[SubBand],
     images: Sequence[Images],
     optics: Optics,
@@ -77,13 +77,13 @@ def add_bands(
     `plane` is metal scanned separately, imaged in the same sub-bands. Parameters and errors as :func:`band_rows`.
     """
     if not bands:
-        return found
+        return result
     parts = None if plane is None else plane.bands
-    return replace(found, bands=band_rows(found, bands, images, found.inversion.leakage, optics.smooth_px, parts))
+    return replace(result, bands=band_rows(result, bands, images, result.inversion.leakage, optics.smooth_px, parts))
 
 
 def band_rows(
-    found: MaterialsResult,
+    result: MaterialsResult,
     bands: Sequence[SubBand],
     images: Sequence[Images],
     leakage: tuple[complex, complex],
@@ -94,7 +94,7 @@ def band_rows(
 
     Parameters
     ----------
-    found
+    result
         Patches and metal reference, from the whole sweep.
     bands, images
         Sub-bands and their image pairs, [K].
@@ -120,35 +120,35 @@ def band_rows(
             f"give a reference with --bands {len(bands)}",
             code=ErrorCode.MISMATCH,
         )
-    parts: dict[int, list[BandFigures]] = {r.patch.label: [] for r in found.patches}
+    parts: dict[int, list[BandFigures]] = {r.patch.label: [] for r in result.patches}
     for k, (band, band_images) in enumerate(zip(bands, images, strict=True)):
         reference = references[k] if references is not None else None
-        h, v, error = _divide_by_metal(found, band_images, leakage, smooth_px, reference)
-        for r in found.patches:
+        h, v, error = _divide_by_metal(result, band_images, leakage, smooth_px, reference)
+        for r in result.patches:
             pixels = r.patch.interior & band_images.valid
-            full_band = (found.h[pixels], found.v[pixels])
+            full_band = (result.h[pixels], result.v[pixels])
             parts[r.patch.label].append(_measure_band(band, h[pixels], v[pixels], full_band, error))
-    std_by_label = {r.patch.label: _estimate_own_std(found, r.patch.interior) for r in found.patches}
-    return {label: _add_covariance(rows, found, std_by_label[label]) for label, rows in parts.items()}
+    std_by_label = {r.patch.label: _estimate_own_std(result, r.patch.interior) for r in result.patches}
+    return {label: _add_covariance(rows, result, std_by_label[label]) for label, rows in parts.items()}
 
 
-def _estimate_own_std(found: MaterialsResult, interior: Mask) -> float:
+def _estimate_own_std(result: MaterialsResult, interior: Mask) -> float:
     """Return the standard error of a patch's V / H, each part, by what scatters over the plate; NaN if not known."""
-    images = found.calibrated
-    scatter = measure_scatter(interior, found.h, found.v, images.x_m, images.y_m)
+    images = result.calibrated
+    scatter = measure_scatter(interior, result.h, result.v, images.x_m, images.y_m)
     if scatter is None:
         return float("nan")
-    inverse = 1 / median_ratio(found.h[interior], found.v[interior])
-    amplitude, phase = relative_errors(scatter, found.ripple)
+    inverse = 1 / median_ratio(result.h[interior], result.v[interior])
+    amplitude, phase = relative_errors(scatter, result.ripple)
     return float(np.hypot(abs(inverse) * np.hypot(amplitude, phase) / np.sqrt(2), LEAST_STD))
 
 
-def _add_covariance(rows: list[BandFigures], found: MaterialsResult, common: float) -> list[BandFigures]:
+def _add_covariance(rows: list[BandFigures], result: MaterialsResult, common: float) -> list[BandFigures]:
     """Add the covariance of the errors to one patch's sub-bands; `common` is the deviation common to all of them."""
     ratios = [row.ratio.value for row in rows if row.ratio is not None]
     if len(ratios) < len(rows) or not math.isfinite(common):
         return rows
-    slopes = ratio_slopes(found.inversion, found.prior, 1 / np.array(ratios, np.complex128)).reshape(2 * len(rows), 6)
+    slopes = ratio_slopes(result.inversion, result.prior, 1 / np.array(ratios, np.complex128)).reshape(2 * len(rows), 6)
     place = common * np.tile(np.eye(2), (len(rows), 1))
     variances = np.repeat([(row.own_std or 0.0) ** 2 for row in rows], 2)
     covariance = slopes @ slopes.T + place @ place.T + np.diag(variances)
@@ -160,8 +160,8 @@ def _add_covariance(rows: list[BandFigures], found: MaterialsResult, common: flo
 
 
 def _divide_by_metal(
-    found: MaterialsResult,
-    made: Images,
+    result: MaterialsResult,
+    images: Images,
     leakage: tuple[complex, complex],
     smooth_px: float,
     reference: PlaneReference | None,
@@ -170,28 +170,28 @@ def _divide_by_metal(
 
     All are NaN if the sub-band shows no metal.
     """
-    metal = replace(found.metal, mask=found.metal.mask & made.valid)
+    metal = replace(result.metal, mask=result.metal.mask & images.valid)
     if not metal.mask.any():
-        nothing = np.full(made.valid.shape, complex(np.nan, np.nan))
+        nothing = np.full(images.valid.shape, complex(np.nan, np.nan))
         return nothing, nothing, float("nan")
-    pair, _ = level(made, found.segmentation, found.tilts)
-    h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (pair.h, pair.v))
+    pair, _ = level(images, result.segmentation, result.tilts)
+    h, v = (np.where(images.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (pair.h, pair.v))
     relative = remove_leakage(to_metal(replace(pair, h=h, v=v), metal, reference), leakage)
-    h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
+    h, v = (smooth_inside(c, result.segmentation, smooth_px) for c in (relative.h, relative.v))
     return h, v, _measure_reference_spread(h, v, metal, reference)
 
 
-def _measure_band(band: SubBand, h: Image, v: Image, whole: tuple[Image, Image], error: float) -> BandFigures:
+def _measure_band(band: SubBand, h: Image, v: Image, sweep_channels: tuple[Image, Image], error: float) -> BandFigures:
     """Return ratio of a patch's pixels [n] in a sub-band, its standard deviations, and |H|; None without usable pixels.
 
-    `whole` are H and V of the same pixels of the whole sweep, `error` the relative error of the metal reference.
+    `sweep_channels` are H and V of the same pixels of the whole sweep, `error` the metal reference's relative error.
     """
     ratio = median_ratio(h, v)
     std = math.hypot(inverse_spread(h, v), error / abs(ratio)) if ratio else float("nan")
     if not (math.isfinite(abs(ratio)) and math.isfinite(std)):
         return BandFigures(first_hz=band.first_hz, last_hz=band.last_hz)
     with np.errstate(divide="ignore", invalid="ignore"):
-        spread = inverse_spread(np.ones_like(h), v / h - whole[1] / whole[0])
+        spread = inverse_spread(np.ones_like(h), v / h - sweep_channels[1] / sweep_channels[0])
     return BandFigures(
         first_hz=band.first_hz,
         last_hz=band.last_hz,
@@ -487,7 +487,7 @@ class ConcentrationResult:
         return float(np.mean([r.low <= r.true_percent <= r.high for r in self.left_out]))
 
 
-def concentrations(names: Iterable[str], given: Mapping[str, float] | None = None) -> dict[str, float]:
+def concentrations(names: Iterable[str], known_concentrations: Mapping[str, float] | None = None) -> dict[str, float]:
     """Return material name to percent by weight: as given, or the number before a percent sign in the name.
 
     Names without either are omitted.
@@ -495,24 +495,24 @@ def concentrations(names: Iterable[str], given: Mapping[str, float] | None = Non
     concentration_of_name: dict[str, float] = {}
     for name in names:
         percent = _PERCENT.search(name)
-        if given and name in given:
-            concentration_of_name[name] = given[name]
+        if known_concentrations and name in known_concentrations:
+            concentration_of_name[name] = known_concentrations[name]
         elif percent:
             concentration_of_name[name] = float(percent[1])
     return concentration_of_name
 
 
 def fit_concentration(
-    library: Library, given: Mapping[str, float] | None = None, confidence: float = 0.9
+    library: Library, known_concentrations: Mapping[str, float] | None = None, confidence: float = 0.9
 ) -> ConcentrationResult:
     """Fit a line through a library's patches of known concentration, and judge it with each one left out.
 
-    The concentration is in the names of the patches (``"sugar (3.8%)"``) or in `given`, name to percent by weight
+    The concentration is in the names of the patches (``"sugar (3.8%)"``) or in `known_concentrations`, percent
     (``{"water": 0.0}``). `confidence` is that of the intervals.
 
     Raises DataError with fewer than three known concentrations, or patches of several incidence angles.
     """
-    percent_by_name = concentrations(library.names, given)
+    percent_by_name = concentrations(library.names, known_concentrations)
     entries = [e for e in library.entries if e.name in percent_by_name]
     values = {percent_by_name[e.name] for e in entries}
     if len(values) < 3:

@@ -495,14 +495,14 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
 
     Raises DataError with fewer than two groups, or without a material in two groups.
     """
-    alone, in_scan, of_patch = (np.empty_like(samples.names) for _ in range(3))
+    of_pixel, in_scan, of_patch = (np.empty_like(samples.names) for _ in range(3))
     unknown, learnt = np.zeros((2, samples.names.size), bool)
     sure = np.zeros(samples.names.size)
     for train, test in splits(samples, by_pixel, folds):
         learnt[test] = np.isin(samples.names[test], samples.names[train])
         model_of_fold = MODELS[model](channels)
         model_of_fold.fit(samples.take(train))
-        alone[test], distance = model_of_fold.by_pixel(samples.x[test])
+        of_pixel[test], distance = model_of_fold.by_pixel(samples.x[test])
         test_sets = [test]
         if model_of_fold.knows_scans:
             test_sets = [test[samples.groups[test] == group] for group in np.unique(samples.groups[test])]
@@ -510,14 +510,14 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
             if model_of_fold.knows_scans:
                 predicted = model_of_fold.by_scan(samples.x[test_set], samples.patches[test_set])
             else:
-                predicted = majority(alone[test_set], distance, samples.patches[test_set])
+                predicted = majority(of_pixel[test_set], distance, samples.patches[test_set])
             row = np.searchsorted(predicted.patches, samples.patches[test_set])
             in_scan[test_set] = predicted.pixel_names
             of_patch[test_set] = predicted.names[row]
             unknown[test_set] = (predicted.distance > 1)[row]
             sure[test_set] = predicted.confidence[row]
     names = np.unique(samples.names)
-    tables = [_confusions(samples.names[learnt], predicted[learnt], names) for predicted in (alone, in_scan, of_patch)]
+    tables = [_confusions(samples.names[learnt], p[learnt], names) for p in (of_pixel, in_scan, of_patch)]
     judged = np.isin(names, samples.names[learnt])
     first = np.unique(samples.patches, return_index=True)[1]
     first = first[learnt[first]]
@@ -541,9 +541,9 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     )
 
 
-def _confusions(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Real:
+def _confusions(true_names: npt.NDArray, predicted: npt.NDArray, names: npt.NDArray) -> Real:
     table = np.zeros((names.size, names.size))
-    np.add.at(table, (np.searchsorted(names, true), np.searchsorted(names, found)), 1)
+    np.add.at(table, (np.searchsorted(names, true_names), np.searchsorted(names, predicted)), 1)
     return table / np.maximum(table.sum(axis=1, keepdims=True), 1)
 
 

@@ -316,10 +316,10 @@ def describe(f: Forecast) -> str:
     return "\n".join(text_lines) + "\n"
 
 
-def _describe_normals(seen: VisibleNormals) -> str:
+def _describe_normals(normals: VisibleNormals) -> str:
     """Describe the tilts at which curved and tilted surfaces are seen."""
-    text = f"surfaces tilted by up to {seen.x_deg:.0f} degrees in x, {seen.y_deg:.0f} in y are seen"
-    limits = zip(seen.alias_deg, (seen.x_deg, seen.y_deg), strict=True)
+    text = f"surfaces tilted by up to {normals.x_deg:.0f} degrees in x, {normals.y_deg:.0f} in y are seen"
+    limits = zip(normals.alias_deg, (normals.x_deg, normals.y_deg), strict=True)
     aliases_deg = [alias for alias, tilt in limits if alias < tilt]
     if aliases_deg:
         text += f"; beyond {min(aliases_deg):.0f} degrees their phases alias: take a smaller step"

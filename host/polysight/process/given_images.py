@@ -101,11 +101,11 @@ class GivenPair:
             return self.path.stem
         return self.path.name
 
-    def boxes(self, drawn: materials.Labels | None) -> materials.Labels | None:
+    def boxes(self, hand_labels: materials.Labels | None) -> materials.Labels | None:
         """Return drawn boxes, or else those that came with the images, in millimetres from the image centre."""
         labels = self.labels
-        if drawn is not None:
-            labels = drawn
+        if hand_labels is not None:
+            labels = hand_labels
         if labels is None:
             return None
         return labels.in_mm(self.x_m, self.y_m)
@@ -498,7 +498,7 @@ def analyse_given_images(
 
     Raises PolysightError as `Pipeline.examine` for a recorded scan.
     """
-    began = time.perf_counter()
+    started_s = time.perf_counter()
     angle = choose_angle(pair, settings, rig)
     rig = place_rig(rig, angle.deg)
     classifier = load_classifier(settings, rig)
@@ -528,7 +528,7 @@ def analyse_given_images(
         result = result.without_result()
     findings = Findings(images, result, verdict, UNKNOWN_PLANE, classifier, plates)
     quality = ScanQuality(
-        seconds_per_stage={"materials": round(time.perf_counter() - began, 4)},
+        seconds_per_stage={"materials": round(time.perf_counter() - started_s, 4)},
         verdict=verdict,
         pixel_accuracy=materials.pixel_accuracy(result),
         incidence=IncidenceAngles(used="one number for the image", one_deg=round(angle.deg, 4)),

@@ -329,12 +329,12 @@ class Quality:
     @contextmanager
     def measure_time(self, stage: str) -> Iterator[None]:
         """Add the wall time of a block to a stage; parallel rows add up."""
-        began = time.perf_counter()
+        started_s = time.perf_counter()
         try:
             yield
         finally:
             with self._lock:
-                self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
+                self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - started_s
 
     @property
     def seconds_per_stage(self) -> dict[str, float]:
@@ -456,7 +456,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
             patch,
             likely=enough,
             certain=enough and evidence.sure,
-            given=metal.given,
+            is_given=metal.given,
             contradicted=evidence.against,
             only_patch=evidence.others == 0,
             culprit=evidence.culprit,

@@ -483,7 +483,7 @@ def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | 
 
 def focus_figure(
     sweep: dict[str, Any],
-    before: npt.NDArray[np.complexfloating],
+    image_before: npt.NDArray[np.complexfloating],
     after: npt.NDArray[np.complexfloating],
     x_m: npt.NDArray[np.float64],
     y_m: npt.NDArray[np.float64],
@@ -507,11 +507,11 @@ def focus_figure(
         title = f"Tilt found: {tilt[0]:+.2f}° in x, {tilt[1]:+.2f}° in y"
     curve.set_title(title, loc="left", fontsize=10, color=style.INK)
     curve.legend(fontsize=8, frameon=False)
-    top = max(float(np.abs(before).max()), float(np.abs(after).max()), 1e-30)
+    top = max(float(np.abs(image_before).max()), float(np.abs(after).max()), 1e-30)
     x = axis_mm(x_m)
     y = axis_mm(y_m)
     for ax, image, title in zip(
-        pictures, (before, after), ("H on the rig file's plane", "H on the found plane"), strict=True
+        pictures, (image_before, after), ("H on the rig file's plane", "H on the found plane"), strict=True
     ):
         level = 20 * np.log10(np.maximum(np.abs(image) / top, 1e-6))
         mesh = ax.pcolormesh(

@@ -232,7 +232,7 @@ def judge_metal(
     patch: str,
     likely: bool,
     certain: bool,
-    given: bool,
+    is_given: bool,
     contradicted: bool,
     only_patch: bool,
     culprit: int | None = None,
@@ -243,23 +243,23 @@ def judge_metal(
 
     By the other patches it is `likely` or `certain` to be metal; `contradicted`: by its own V / H against the direct
     path; `only_patch`: there are no others; `culprit`: the other patch that fits it least, if they speak against it.
-    `given`: the user chose it. `painted` is the probability that it is metal with a coating, `paint_mm` thick.
+    `is_given`: the user chose it. `painted` is the probability that it is metal with a coating, `paint_mm` thick.
     """
     do = "lay a metal plate into the scene and name it (--metal-box X0,Y0,X1,Y1), or use `polysight calibrate metal`"
-    if given and contradicted:
+    if is_given and contradicted:
         return [reason(
             "care" if likely or only_patch else "none",
             f"the given metal reference ({patch}) does not look like metal",
             "relative to the direct path it reflects far less of V than of H, as no metal does", do, 8.0,
         )]  # fmt: skip
-    if given and painted > PAINT_TOLD:
+    if is_given and painted > PAINT_TOLD:
         return [reason(
             "care", f"the given metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
             "all patches have the same additional phase of V / H beside it, as a coating on metal makes it;"
             " permittivities are corrected for it, with its error",
             f"take the paint or film off {patch}, or use bare metal", 2.7,
         )]  # fmt: skip
-    if given and culprit is not None and not likely:
+    if is_given and culprit is not None and not likely:
         return [reason(
             "care",
             f"the given metal reference ({patch}) may be no metal: patch {culprit} and others look odd beside it",
@@ -267,7 +267,7 @@ def judge_metal(
             " places",
             f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 4.4,
         )]  # fmt: skip
-    if given or certain:
+    if is_given or certain:
         return []
     if likely:
         return [reason(

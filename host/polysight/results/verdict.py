@@ -77,13 +77,13 @@ class Verdict(msgspec.Struct, frozen=True):
             lines.append(f"  - and {len(self.reasons) - len(shown_reasons)} more, see the report")
         return lines
 
-    def error(self, kept: str = "") -> NoResult:
-        """Return the error that ends a command without a result; `kept` says where the images are."""
+    def error(self, kept_products: str = "") -> NoResult:
+        """Return the error that ends a command without a result; `kept_products` says where the images are."""
         if self.reasons:
             first = self.reasons[0]
         else:
             first = reason("none", "no result", "", "")
-        remedy = "; ".join(part for part in (first.do, kept) if part)
+        remedy = "; ".join(part for part in (first.do, kept_products) if part)
         return NoResult(f"no result: {first.what}", first.why, remedy)
 
 

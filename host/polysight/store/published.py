@@ -268,13 +268,15 @@ def period_s(bursts: Bursts) -> float | None:
     return None
 
 
-def find_positions(own: Bursts, others: list[Bursts], positions: int, period: float | None) -> NDArray[np.int64] | None:
+def find_positions(
+    bursts: Bursts, other_boards: list[Bursts], positions: int, period: float | None
+) -> NDArray[np.int64] | None:
     """Return the position of each burst; None if undetermined.
 
     Positions are evenly spaced in time, so a step of two periods is a position at which no radar started. The boards
     share triggers and clock: the first position is known only if all boards together span the row.
     """
-    times = np.sort(np.concatenate([b.at_s for b in (own, *others)]))
+    times = np.sort(np.concatenate([b.at_s for b in (bursts, *other_boards)]))
     if period is None or period <= 0 or positions < 2:
         return None
     events = times[np.concatenate([[True], np.diff(times) > period / 2])]
@@ -282,7 +284,7 @@ def find_positions(own: Bursts, others: list[Bursts], positions: int, period: fl
     if np.any(np.abs(steps - np.round(steps)) > _UNEVEN):
         return None
     index = np.concatenate([[0], np.cumsum(np.round(steps).astype(np.int64))])
-    position = index[np.searchsorted(events, own.at_s, side="right") - 1]
+    position = index[np.searchsorted(events, bursts.at_s, side="right") - 1]
     if index[-1] == positions - 1 and np.all(np.diff(position) > 0):
         return position
     return None

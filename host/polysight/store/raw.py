@@ -217,7 +217,11 @@ def replace_rows(scan: ScanFolder) -> list[Replaced]:
         for row in scan.committed_rows().values():
             boards = {name: _place_row_again(scan, row, board) for name, board in row.boards.items()}
             reports += [report for report, _ in boards.values()]
-            changed = {name: again for name, (report, again) in boards.items() if report.changed and again is not None}
+            changed = {
+                name: placed_again
+                for name, (report, placed_again) in boards.items()
+                if report.changed and placed_again is not None
+            }
             if changed:
                 _commit_changed_boards(scan, writer, row, changed)
     scan.reload()
@@ -271,17 +275,17 @@ def _commit_changed_boards(
         path.unlink(missing_ok=True)
 
 
-def _write_new_files(scan: ScanFolder, board: BoardRow, again: PlacedAgain) -> BoardRow:
+def _write_new_files(scan: ScanFolder, board: BoardRow, placed_again: PlacedAgain) -> BoardRow:
     """Write a row's new files durably; return their entry for the manifest."""
-    placed = again.placed
+    placed = placed_again.placed
     frame_bytes = scan.instrument.frame_bytes
     path = scan.path / board.file
     index, _ = capture.read_index(path.with_suffix(".idx"))
     _, log = capture.read_packets(path.with_suffix(capture.PACKETS), np.fromfile(path, dtype=np.uint8))
     new_path = _find_free_name(path)
-    crc = capture.write_durably(new_path, again.payload.tobytes())
+    crc = capture.write_durably(new_path, placed_again.payload.tobytes())
     index_crc = capture.write_index(new_path.with_suffix(".idx"), {**index, **placed.facts()}, placed.arrivals)
-    packets_crc = capture.write_packets(new_path.with_suffix(capture.PACKETS), log, again.evidence, placed)
+    packets_crc = capture.write_packets(new_path.with_suffix(capture.PACKETS), log, placed_again.evidence, placed)
     sync_folder(new_path.parent)
     frames = placed.expected // frame_bytes
     return msgspec.structs.replace(

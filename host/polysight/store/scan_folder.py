@@ -91,7 +91,7 @@ def with_connection(begun: Instrument, connection: Mapping[str, Any]) -> Instrum
     return decode(_replace_connection(to_builtins(begun), connection), Instrument, "scan_resumed")
 
 
-def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
+def check_same_scan(begun: Instrument, rig_file: Instrument, name: str) -> None:
     """Check that a rig file differs from the one a scan was begun with only in the connection settings.
 
     Raises
@@ -100,7 +100,7 @@ def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
         with every other key that differs; `name` is the rig file's in the message.
     """
     table = to_builtins(begun)
-    given_table = _replace_connection(to_builtins(given), extract_connection(begun))
+    given_table = _replace_connection(to_builtins(rig_file), extract_connection(begun))
     given_table["stage"] = {**given_table["stage"], **{key: table["stage"][key] for key in SERIAL}}
     given_table["calibration"] = table["calibration"]
     differences = list(_list_differences(table, given_table, ""))
@@ -119,16 +119,16 @@ def _replace_connection(table: dict[str, Any], connection: Mapping[str, Any]) ->
     return {**table, **{section: connection[section] for section in SECTIONS}, "boards": boards, "radar": radar}
 
 
-def _list_differences(begun: Any, given: Any, key: str) -> Iterator[str]:
+def _list_differences(begun: Any, rig_value: Any, key: str) -> Iterator[str]:
     """Yield `key is A in the scan and B there` for every value that differs."""
-    if isinstance(begun, dict) and isinstance(given, dict):
-        for name in dict.fromkeys([*begun, *given]):
-            yield from _list_differences(begun.get(name), given.get(name), f"{key}.{name}".lstrip("."))
-    elif isinstance(begun, list) and isinstance(given, list) and len(begun) == len(given):
-        for k, pair in enumerate(zip(begun, given, strict=True)):
+    if isinstance(begun, dict) and isinstance(rig_value, dict):
+        for name in dict.fromkeys([*begun, *rig_value]):
+            yield from _list_differences(begun.get(name), rig_value.get(name), f"{key}.{name}".lstrip("."))
+    elif isinstance(begun, list) and isinstance(rig_value, list) and len(begun) == len(rig_value):
+        for k, pair in enumerate(zip(begun, rig_value, strict=True)):
             yield from _list_differences(*pair, f"{key}[{k}]")
-    elif begun != given:
-        yield f"{key} is {_describe_value(begun)} in the scan and {_describe_value(given)} there"
+    elif begun != rig_value:
+        yield f"{key} is {_describe_value(begun)} in the scan and {_describe_value(rig_value)} there"
 
 
 def _describe_value(value: Any) -> str:

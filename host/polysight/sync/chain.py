@@ -200,18 +200,18 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
         setup.equaliser,
         _FULL_SCALE,
     )
-    done = reference(aligned, setup.path, setup.chirp)
+    synchronised = reference(aligned, setup.path, setup.chirp)
     rate = setup.chirp.sample_rate_hz
     return SyncedRow(
-        samples=done.samples,
+        samples=synchronised.samples,
         sweep_hz=setup.path.sweep_hz,
-        valid=done.found,
+        valid=synchronised.found,
         chirps=aligned.good.sum(axis=1),
-        direct_hz=done.frequency * rate,
-        direct_amplitude=np.abs(done.amplitude),
-        errors=errors(aligned, done, setup.path, rate, setup.examined),
-        noise=done.noise,
-        turn=_turn_along(done.samples),
+        direct_hz=synchronised.frequency * rate,
+        direct_amplitude=np.abs(synchronised.amplitude),
+        errors=errors(aligned, synchronised, setup.path, rate, setup.examined),
+        noise=synchronised.noise,
+        turn=_turn_along(synchronised.samples),
         chirps_clipped=int(aligned.clipped.sum()),
         chirps_disturbed=int((received & ~aligned.clipped & ~aligned.good).sum()),
         positions_clipped=int((aligned.clipped.any(axis=1) & (aligned.clipped == received).all(axis=1)).sum()),
@@ -314,22 +314,22 @@ class RowSynchroniser:
 
 
 def errors(
-    aligned: AlignedRow, done: Referenced, path: DirectPath, sample_rate_hz: float, most: int = EXAMINED
+    aligned: AlignedRow, referenced: Referenced, path: DirectPath, sample_rate_hz: float, most: int = EXAMINED
 ) -> Errors:
     """Return the errors after each stage, float64 [3, n]: Hz, rad, and amplitude relative to its mean.
 
     At most `most` valid positions are used, evenly spaced. Empty if no position is valid. `referenced` contains only
     positions with an echo.
     """
-    if not done.found.any():
+    if not referenced.found.any():
         return {}
-    found = np.flatnonzero(done.found)
-    examined = found[_spread_evenly(found.size, most)]
+    referenced_positions = np.flatnonzero(referenced.found)
+    examined = referenced_positions[_spread_evenly(referenced_positions.size, most)]
     good = aligned.good[examined]
-    amplitude = done.amplitude[examined, None]
+    amplitude = referenced.amplitude[examined, None]
     relative_amplitude = aligned.amplitude[examined]
 
-    frequency = (done.frequency[examined, None] + aligned.frequency[examined])[good]
+    frequency = (referenced.frequency[examined, None] + aligned.frequency[examined])[good]
     phase = (np.angle(amplitude) + aligned.phase[examined])[good]
     size = (np.abs(amplitude) * relative_amplitude / aligned.gain[examined])[good]
     turns = (phase - np.angle(cis(phase).mean())) / (2 * np.pi)
@@ -339,15 +339,15 @@ def errors(
     amplitude_error = relative_amplitude / mean_amplitude - 1
     chirp_errors = np.array([*aligned.error[examined].swapaxes(0, 1)[:, good], amplitude_error[good]])
 
-    two = examined[good.sum(axis=1) > 1]
+    with_several_chirps = examined[good.sum(axis=1) > 1]
     # A dead RX has no direct path: its figures are not finite.
     with np.errstate(divide="ignore", invalid="ignore"):
         out = {
             "received": received,
             "aligned": chirp_errors,
-            "averaged": _estimate_direct_path_errors(done.samples[:, examined], path),
-            "referenced": _estimate_object_errors(_reference_halves(aligned, done, two), path)
-            if two.size
+            "averaged": _estimate_direct_path_errors(referenced.samples[:, examined], path),
+            "referenced": _estimate_object_errors(_reference_halves(aligned, referenced, with_several_chirps), path)
+            if with_several_chirps.size
             else np.zeros((3, 0)),
         }
     for values in out.values():
@@ -361,13 +361,15 @@ def _spread_evenly(count: int, most: int) -> NDArray[np.intp]:
     return np.linspace(0, count - 1, min(most, count)).astype(np.intp)
 
 
-def _reference_halves(aligned: AlignedRow, done: Referenced, some: NDArray[np.intp]) -> NDArray[np.complex64]:
+def _reference_halves(
+    aligned: AlignedRow, referenced: Referenced, positions: NDArray[np.intp]
+) -> NDArray[np.complex64]:
     """Return the halves of some positions' bursts as averages, referenced like `samples`: [position, 2, rx, block]."""
     blocks = aligned.halves.shape[-1]
-    frequency = done.frequency[some] - aligned.centre[some]
-    turn = phasor(-frequency * FOLD, -np.angle(done.amplitude[some]), blocks, (blocks - 1) / 2)
-    scale = half_scale(aligned.good[some].sum(axis=1))[..., None, None]
-    return complex64(aligned.halves[some] * (scale * (done.steering * turn[:, None])[:, None]))
+    frequency = referenced.frequency[positions] - aligned.centre[positions]
+    turn = phasor(-frequency * FOLD, -np.angle(referenced.amplitude[positions]), blocks, (blocks - 1) / 2)
+    scale = half_scale(aligned.good[positions].sum(axis=1))[..., None, None]
+    return complex64(aligned.halves[positions] * (scale * (referenced.steering * turn[:, None])[:, None]))
 
 
 def _estimate_direct_path_errors(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
@@ -588,11 +590,11 @@ def _gate_echoes(sweep_hz: NDArray[np.floating], gate_m: tuple[float, float]) ->
     return np.exp(2j * np.pi * np.outer(paths, sweep_hz) / SPEED_OF_LIGHT_M_S)
 
 
-def _share(part: NDArray[np.complexfloating], gate: NDArray[np.complex128]) -> float:
+def _share(samples: NDArray[np.complexfloating], gate: NDArray[np.complex128]) -> float:
     """Return the share of the power of samples [..., sample] explained by echoes in the gate."""
     _, strength, basis = np.linalg.svd(gate, full_matrices=False)
-    inside = part @ basis[strength > 1e-2 * strength[0]].conj().T
-    return float((np.abs(inside) ** 2).sum() / (np.abs(part) ** 2).sum())
+    in_gate = samples @ basis[strength > 1e-2 * strength[0]].conj().T
+    return float((np.abs(in_gate) ** 2).sum() / (np.abs(samples) ** 2).sum())
 
 
 def _reference_cube(

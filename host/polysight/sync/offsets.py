@@ -189,18 +189,18 @@ def align_pieces(
     """
     linear = whole_blocks(linear)
     row = None
-    done = 0
+    next_position = 0
     for words in pieces:
         if row is None:
             row = _empty_row(valid.shape, words.shape, (linear[1] - linear[0]) // FOLD)
-        rows = slice(done, done + len(words))
+        rows = slice(next_position, next_position + len(words))
         if words.shape[:2] != valid[rows].shape:
-            raise ValueError(f"bursts {words.shape[:2]} at position {done} of {valid.shape}")
+            raise ValueError(f"bursts {words.shape[:2]} at position {next_position} of {valid.shape}")
         align = by or _choose_loop(words.shape[1], words.shape[-1])
         align(words, valid[rows], linear, equaliser, full_scale, row.part(rows))
-        done = rows.stop
-    if row is None or done != len(valid):
-        raise ValueError(f"{done} of {len(valid)} positions")
+        next_position = rows.stop
+    if row is None or next_position != len(valid):
+        raise ValueError(f"{next_position} of {len(valid)} positions")
     return row
 
 
@@ -255,15 +255,15 @@ def _align(
     usable = valid & ~clipped
     row, disturbed = _align_round(words, usable, clipped, linear, equaliser)
     for _ in range(_ROUNDS - 1):
-        again = np.flatnonzero(disturbed.any(axis=1))
-        if again.size == 0:
+        todo = np.flatnonzero(disturbed.any(axis=1))
+        if todo.size == 0:
             break
-        usable[again] &= ~disturbed[again]
-        redone, residual_energy = _align_round(words[again], usable[again], clipped[again], linear, equaliser)
+        usable[todo] &= ~disturbed[todo]
+        redone, residual_energy = _align_round(words[todo], usable[todo], clipped[todo], linear, equaliser)
         disturbed[:] = False
-        disturbed[again] = residual_energy
+        disturbed[todo] = residual_energy
         for field, values in zip(row, redone, strict=True):
-            field[again] = values
+            field[todo] = values
     return row
 
 
@@ -283,13 +283,13 @@ def find_clipped(words: NDArray[np.int16], valid: NDArray[np.bool_], full_scale:
 
 def _align_round(
     words: NDArray[np.int16],
-    whole: NDArray[np.bool_],
+    is_complete: NDArray[np.bool_],
     clipped: NDArray[np.bool_],
     linear: tuple[int, int],
     equaliser: hpf.Equaliser | None,
 ) -> tuple[AlignedRow, NDArray[np.bool_]]:
     """Align and average the whole chirps of a few positions; return which of them are disturbed, too."""
-    first, centre, coherence, usable = _refer_to_one(words, whole, linear)
+    first, centre, coherence, usable = _refer_to_one(words, is_complete, linear)
     good = _find_coherent(coherence, usable)
     frequency = centre[:, None] + first.frequency
     taps = _find_taps(equaliser, frequency)
@@ -299,7 +299,7 @@ def _align_round(
     reduced = loops.reduce_chirps(words, frequency, complex64(taps * cis(-start)[..., None]), linear)
     tone, own_energy, levels, half_difference, residual_energy = loops.against_others(reduced, good)
     n = good.sum(axis=1)
-    disturbed = whole & _find_disturbed(residual_energy, levels / np.maximum(n, 1)[:, None] ** 2, usable)
+    disturbed = is_complete & _find_disturbed(residual_energy, levels / np.maximum(n, 1)[:, None] ** 2, usable)
     level = np.maximum(levels.sum(axis=1) / np.maximum(n, 1) ** 2, 1e-30)[:, None]
     other_chirps = n[:, None] - good
     # A single chirp is the mean itself.
@@ -362,25 +362,25 @@ def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
 
 
 def _refer_to_one(
-    words: NDArray[np.int16], whole: NDArray[np.bool_], linear: tuple[int, int]
+    words: NDArray[np.int16], is_complete: NDArray[np.bool_], linear: tuple[int, int]
 ) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Estimate offsets relative to one usable chirp per position; try another one if it matches few others.
 
     Returns the offsets, the middle of the signal's band [position], and [position, chirp]: coherence with the reference
     chirp, and usable chirps (whole, not silent).
     """
-    positions, chirps = whole.shape
+    positions, chirps = is_complete.shape
     # Threshold for two records of noise: four times the RMS of a sum of random phases.
     noise = 4.0 / np.sqrt(words.shape[-1] * (linear[1] - linear[0]))
-    usable = whole & words.any(axis=(2, 3, 4))
+    usable = is_complete & words.any(axis=(2, 3, 4))
     count = usable.sum(axis=1)
     order = np.argsort(~usable, axis=1, kind="stable")  # the usable ones, first to last
     reference = order[:, 0].copy()
     all_positions = np.arange(positions)
-    frequency = np.zeros(whole.shape)
-    amplitude = np.zeros(whole.shape, complex)
+    frequency = np.zeros(is_complete.shape)
+    amplitude = np.zeros(is_complete.shape, complex)
     centre = np.zeros(positions)
-    coherence = np.zeros(whole.shape)
+    coherence = np.zeros(is_complete.shape)
     best_sum = np.full(positions, -1.0)
     todo = np.flatnonzero(count)
     for attempt in range(min(_REFERENCES, chirps)):

@@ -321,13 +321,13 @@ def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, i
     return int(np.sum(named)), len(named), int(np.array(named)[far].sum()), int(far.sum())
 
 
-def _find_outside(seen: Samples, known: Samples) -> npt.NDArray[np.bool_]:
+def _find_outside(test_samples: Samples, training_samples: Samples) -> npt.NDArray[np.bool_]:
     """Return true for patches outside the regions of 95 % of each known material's patches, [patch].
 
     Of ln|H|, ln|V| and arg P of patches, normal with mean and covariance from so many patches (Hotelling's law).
     """
-    features, _ = _patch_features(seen)
-    means, names = _patch_features(known)
+    features, _ = _patch_features(test_samples)
+    means, names = _patch_features(training_samples)
     out = np.ones(len(features), np.bool_)
     for name in np.unique(names):
         own_means = means[names == name]

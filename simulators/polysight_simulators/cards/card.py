@@ -208,10 +208,10 @@ class CardSender:
             self._send_datagram(row.data, self._data_to)
 
     def _send_datagram(
-        self, data: bytes | memoryview, address: tuple[str, int], how: list[tuple[int, int, bytes]] | None = None
+        self, data: bytes | memoryview, address: tuple[str, int], ancillary: list[tuple[int, int, bytes]] | None = None
     ) -> None:
         try:
-            self._socket.sendmsg([data], how or [], 0, address)
+            self._socket.sendmsg([data], ancillary or [], 0, address)
         except OSError as e:
             raise DeviceError(
                 f"simulated card: cannot send to {address[0]}:{address[1]}: {e.strerror}",

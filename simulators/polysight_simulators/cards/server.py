@@ -144,11 +144,11 @@ class CardServer:
             return IDLE_S
         return min(IDLE_S, max(0.001, 0.1 * TAIL_S / self._time_scale))
 
-    def _listen(self, wanted: bool) -> None:
+    def _listen(self, is_needed: bool) -> None:
         """Start or stop reading the wires; unread edges stay in the socket and the hub."""
-        if wanted is not self._listening:
-            self._listening = wanted
-            if wanted:
+        if is_needed is not self._listening:
+            self._listening = is_needed
+            if is_needed:
                 self._selector.register(self._wires, selectors.EVENT_READ)
             else:
                 self._selector.unregister(self._wires)

@@ -1,6 +1,7 @@
 """What pyproject.toml cannot say: how the loops are compiled; a wheel is for one platform and any Python.
 
-With POLYSIGHT_WHEEL set to a platform of `polysight/sync/build.py`, wheels are made for that one.
+With POLYSIGHT_WHEEL set to a platform of `polysight/sync/build.py`, wheels are made for that one. POLYSIGHT_KERNELS is
+a library that was compiled for this machine before: it is taken if it is one of these sources.
 """
 
 import importlib.util
@@ -18,6 +19,7 @@ kernels = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(kernels)
 TOP = Path("..")
 TARGET = os.environ.get("POLYSIGHT_WHEEL", "")
+COMPILED = Path(os.environ.get("POLYSIGHT_KERNELS", ""))
 
 
 def copy_data(folder):
@@ -47,6 +49,9 @@ class BuildWithKernels(build_py):
         folder = sources if self.editable_mode else Path(self.build_lib) / sources
         if not self.editable_mode:
             copy_data(Path(self.build_lib, "polysight", "data"))
+        if not TARGET and COMPILED.is_file() and COMPILED.read_bytes().endswith(kernels.source_digest().encode()):
+            shutil.copyfile(COMPILED, folder / kernels.LIBRARY)
+            return
         try:
             kernels.build(folder.resolve(), TARGET)
         except kernels.BuildError as error:

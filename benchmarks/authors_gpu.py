@@ -25,10 +25,10 @@ def main(checkout: str, settings_path: str, image_path: str) -> int:
     seconds = []
     image = np.empty(0)
     for _ in range(ROUNDS):
-        began = time.perf_counter()
+        started_s = time.perf_counter()
         # Images come back as NumPy arrays, so the time holds the GPU's work and the copy
         image = sar_eval(settings, "RH", sum_bins=True).mean(axis=0)
-        seconds.append(time.perf_counter() - began)
+        seconds.append(time.perf_counter() - started_s)
     np.save(image_path, image)
     print(json.dumps(seconds))
     return 0

@@ -76,7 +76,7 @@ class Pipeline:
     def place_plane(self, images: imaging.Images, move: bool = True) -> imaging.Images:
         """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
         with self.quality.measure_time("plane"):
-            masks = materials.insides(images)
+            masks = materials.find_interiors(images)
             swapped = self.source.mirrored
             self.plane, images = imaging.move_to_plane(self.samples.filled, images, masks, swapped, move)
         return images

@@ -39,13 +39,13 @@ MAGIC = b"PSJRNL1\n"
 MAX_RECORD_BYTES = 1 << 20
 # Upper limit of a position's record.
 CAPTURE_BYTES = 320
-# For faults and retakes.
+# Space on the disk for the records of faults and retakes.
 SPARE_BYTES = 4 << 20
-# Length of the search for a good record after damage.
+# Bytes after a damaged record that are searched for a good one.
 SEARCHED_BYTES = 1 << 20
 # Suffix of the copy of a damaged journal.
 DAMAGED = ".damaged"
-# Places in the thread's queue, for jobs and events. A row stops long before it is full (LATE_S).
+# Longest queue of jobs and largest batch of events. A row stops long before they are full (LATE_S).
 JOBS_WAITING = 256
 EVENTS_WAITING = 1000
 _HEAD = struct.Struct("<III")
@@ -76,7 +76,7 @@ def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
     magic = file.read(len(MAGIC))
     if magic != MAGIC:
         if MAGIC.startswith(magic.rstrip(b"\0")):
-            # The power was cut before the first bytes were on the disk
+            # The power was cut before the first bytes were on the disk.
             return
         summary = f"{getattr(file, 'name', 'journal')}: not a journal"
         remedy = "move it out of the journal folder"
@@ -118,10 +118,11 @@ class JournalFile:
         self.damage = ""
         # Number of the newest record, or of the host's newest event if that is later.
         self.last_seq = 0
-        # The newest one of each row
+        # The newest take of each row.
         self.takes: dict[int, int] = {}
-        # Sequence number and offset of each record
-        self._places: list[tuple[int, int]] = []
+        # Sequence number and offset in the file of each record.
+        self._index: list[tuple[int, int]] = []
+        # True if everything that was written is on the disk.
         self._synced = True
         try:
             self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -137,7 +138,8 @@ class JournalFile:
             raise
 
     def _note_take(self, payload: bytes) -> None:
-        # The type comes first; a record that is decoded costs a hundred times as much.
+        """Update `takes` if the event is the start of a row."""
+        # The type comes first in the packed event: this test is a hundred times faster than decoding.
         if b"RowStarted" not in payload[:32]:
             return
         with suppress(ProtocolError):
@@ -146,10 +148,11 @@ class JournalFile:
                 self.takes[event.row.index] = max(event.take, self.takes.get(event.row.index, 0))
 
     def _recover(self) -> None:
+        """Read the records, copy a damaged file, and cut the file after the last good record."""
         self._end = len(MAGIC)
         with self.path.open("rb") as file:
             for offset, self.last_seq, payload in records(file):
-                self._places.append((self.last_seq, offset))
+                self._index.append((self.last_seq, offset))
                 self._note_take(payload)
                 self._end = offset + _HEAD.size + len(payload)
             file.seek(self._end)
@@ -162,7 +165,7 @@ class JournalFile:
                 f"{self.path}: damaged after event {self.last_seq}, the following {len(tail)} bytes were cut off;"
                 f" the original is kept as {copy}; the disk or card fails: replace it"
             )
-        if not self._places:
+        if not self._index:
             os.pwrite(self._fd, MAGIC, 0)
         os.ftruncate(self._fd, self._end)
         os.fsync(self._fd)
@@ -183,34 +186,34 @@ class JournalFile:
 
         Raises JournalFullError if the disk is full or broken; the file is then unchanged.
         """
-        places = []
+        new_index = []
         data = bytearray()
         for seq, payload in enumerate(payloads, self.last_seq + 1):
-            places.append((seq, self._end + len(data)))
+            new_index.append((seq, self._end + len(data)))
             data += _HEAD.pack(len(payload), seq, _compute_crc(seq, payload)) + payload
-        done = 0
+        written = 0
         try:
-            while done < len(data):
-                done += os.pwrite(self._fd, memoryview(data)[done:], self._end + done)
+            while written < len(data):
+                written += os.pwrite(self._fd, memoryview(data)[written:], self._end + written)
             if sync and (data or not self._synced):
                 os.fsync(self._fd)
         except OSError as e:
-            # The rest is overwritten, or cut off when the file is next opened
+            # If this fails, too: the next write overwrites the incomplete records, or the next start cuts them off.
             with suppress(OSError):
                 os.ftruncate(self._fd, self._end)
             raise JournalFullError(self.path, e) from None
         self._end += len(data)
-        self._places += places
+        self._index += new_index
         for payload in payloads:
             self._note_take(payload)
-        self.last_seq += len(places)
+        self.last_seq += len(new_index)
         self._synced = sync or (self._synced and not data)
 
     def read(self, from_seq: int, limit: int) -> list[bytes]:
         """Return at most `limit` payloads, starting at `from_seq`. Raises DataError for a damaged record."""
-        first = bisect_left(self._places, (from_seq, 0))
+        first = bisect_left(self._index, (from_seq, 0))
         payloads = []
-        for seq, offset in self._places[first : first + limit]:
+        for seq, offset in self._index[first : first + limit]:
             length, _, crc = _HEAD.unpack(os.pread(self._fd, _HEAD.size, offset))
             payload = os.pread(self._fd, length, offset + _HEAD.size)
             if _compute_crc(seq, payload) != crc:
@@ -259,7 +262,7 @@ class Journal:
         self._file: JournalFile | None = None
         self.broken = False
         self.scan_id = ""
-        # Current scan and number of its newest published event; replaced as a whole
+        # Current scan and number of its newest published event. Other threads read it, so it is replaced as a whole.
         self.position = ("", 0)
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -364,7 +367,8 @@ class Journal:
         seq = self.last_seq
         numbered: list[m.AnyEvent] = []
         for event in events:
-            seq += file is not None
+            if file is not None:
+                seq += 1
             fields: dict[str, Any] = {
                 key: value[: m.MAX_TEXT] if isinstance(value, str) else value for key, value in event.fields.items()
             }
@@ -418,11 +422,11 @@ def _read_plan(file: JournalFile) -> RasterPlan | None:
 
 
 class Job(NamedTuple):
-    """Work on the journal, and the callback for its result or error; `asked_s`: when it was asked for."""
+    """Work on the journal, the callback for its result or error, and the time when it was requested."""
 
     work: Callable[[Journal], Any]
     then: Callable[[Any], object]
-    asked_s: float
+    requested_s: float
 
 
 class JournalThread:
@@ -461,9 +465,10 @@ class JournalThread:
             self._journal.publish_now(kind, **fields)
 
     def commit(self, then: Callable[[PolysightError | OSError | None], object]) -> bool:
-        """Have the batch written and published; then call `then` with None, or with the error.
+        """Queue the batch for writing and publishing; `then` is called with None, or with the error.
 
-        Return False while the queue is full: the batch waits for a later call. One that is too long is given up.
+        Return False if the queue is full: the batch then waits for a later call. A batch that is too long is dropped,
+        and `then` gets the error at once.
         """
         if self._jobs.qsize() >= JOBS_WAITING and len(self._events) < EVENTS_WAITING:
             return False
@@ -485,12 +490,12 @@ class JournalThread:
         self._jobs.put(Job(work, then, time.monotonic()))
 
     def retry(self) -> None:
-        """Write again from now on: there may be space."""
+        """Try to write again from now on: a full disk may have space again."""
 
-        def retry(journal: Journal) -> None:
+        def end_broken_state(journal: Journal) -> None:
             journal.broken = False
 
-        self.call(retry, lambda _: None)
+        self.call(end_broken_state, lambda _: None)
 
     def start(self) -> None:
         """Start the thread."""
@@ -499,7 +504,7 @@ class JournalThread:
     def _work(self) -> None:
         try:
             while (job := self._jobs.get()) is not None:
-                self._busy_since_s = job.asked_s
+                self._busy_since_s = job.requested_s
                 self.do(job)
                 self._busy_since_s = None
         except BaseException:
@@ -508,7 +513,7 @@ class JournalThread:
             raise
 
     def do(self, job: Job) -> None:
-        """Do a job and pass on its result."""
+        """Execute a job and pass its result to its callback."""
         try:
             result = job.work(self._journal)
         except (PolysightError, OSError) as e:
@@ -516,13 +521,13 @@ class JournalThread:
         job.then(result)
 
     def do_waiting(self) -> None:
-        """Do the jobs that wait, in this thread, instead of :meth:`start`."""
+        """Execute the queued jobs in the calling thread, instead of :meth:`start`."""
         while not self._jobs.empty():
             if (job := self._jobs.get()) is not None:
                 self.do(job)
 
     def stop(self, timeout_s: float) -> None:
-        """End the thread behind the jobs that wait, and close the journal; leave a hanging disk alone.
+        """End the thread after the queued jobs, and close the journal; give up after `timeout_s` if the disk hangs.
 
         Raises JournalFullError.
         """

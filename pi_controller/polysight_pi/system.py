@@ -47,12 +47,12 @@ def prepare_process() -> list[str]:
     return refused
 
 
-def prepare_thread(priority: int = PRIORITY) -> list[str]:
+def prepare_thread() -> list[str]:
     """Set the trigger thread's priority and the shortest timer slack. Returns as :func:`prepare_process`."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) != 0:
-        return ["timer slack stays at 50 us: pulses may be that late", *_request_real_time(priority)]
-    return _request_real_time(priority)
+        return ["timer slack stays at 50 us: pulses may be that late", *_request_real_time(PRIORITY)]
+    return _request_real_time(PRIORITY)
 
 
 def _request_real_time(priority: int) -> list[str]:

@@ -44,9 +44,9 @@ class Finding(msgspec.Struct, frozen=True):
     facts: dict[str, Any] = {}
 
     @classmethod
-    def of_error(cls, error: PolysightError, level: Level = "error", where: str = "") -> Finding:
-        """Return the finding that tells an error."""
-        return cls(level, error.what, error.why, error.remedy, where, error.code)
+    def of_error(cls, error: PolysightError, where: str = "") -> Finding:
+        """Return an error as a finding."""
+        return cls("error", error.what, error.why, error.remedy, where, error.code)
 
     def __str__(self) -> str:
         place = f"{self.where}: " if self.where else ""

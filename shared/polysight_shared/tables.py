@@ -69,7 +69,7 @@ def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T
         message, _, path = str(e).partition(" - at `")
         path = path.rstrip("`") or "$"
         key = path.removeprefix("$").lstrip(".")
-        rule, code = _plain_rule(message, kind)
+        rule, code = _rewrite_rule(message, kind)
         value = _lookup(raw, path)
         if value:
             rule = f"{key} = {value}: {rule}"
@@ -83,14 +83,14 @@ def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T
         ) from None
 
 
-# Names of the types of JSON and TOML for messages
+# Names of the types of JSON and TOML for messages.
 _TYPES = {
     "int": "a whole number", "float": "a number", "str": "text", "bool": "true or false",
     "array": "a list", "object": "a table", "null": "nothing",
 }  # fmt: skip
 
 
-def _plain_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
+def _rewrite_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
     """Rewrite a message of msgspec in plain words, with its code; keep a rule of `require` as it is."""
     if match := re.search(r"unknown field `(.*)`", rule):
         return f"unknown key {match[1]!r}: {_suggest_key(match[1], kind)}", ErrorCode.KEY_UNKNOWN
@@ -103,11 +103,11 @@ def _plain_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
         return rule, ErrorCode.VALUE_INVALID
     expected, limit, actual = match.groups()
     types = " or ".join(_TYPES.get(name, name) for name in expected.split(" | ") if name != "null")
-    plain = f"must be {types}" + (limit or "").replace("matching regex", "of the form")
+    text = f"must be {types}" + (limit or "").replace("matching regex", "of the form")
     if actual:
-        plain += f", not {_TYPES.get(actual, actual)}"
+        text += f", not {_TYPES.get(actual, actual)}"
     code = ErrorCode.TYPE_WRONG if actual and not limit else ErrorCode.VALUE_INVALID
-    return plain, code
+    return text, code
 
 
 def _suggest_key(key: str, kind: Any) -> str:

@@ -64,12 +64,12 @@ def is_free(rig: Instrument) -> bool:
     return True
 
 
-def move_to_free_subnet(rig: Instrument, chance: random.Random | None = None) -> Instrument:
+def move_to_free_subnet(rig: Instrument) -> Instrument:
     """Return the rig on a random loopback subnet with free addresses.
 
     Raises DeviceError if there is none in 50 attempts, because this machine's loopback is not 127.0.0.0/8.
     """
-    chance = chance or random.Random()
+    chance = random.Random()
     for _ in range(_TRIES):
         moved = move_to_subnet(rig, f"127.{chance.randint(1, 254)}.{chance.randint(0, 255)}")
         if is_free(moved):

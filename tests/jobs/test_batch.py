@@ -224,7 +224,7 @@ def test_the_table_names_every_scan_and_counts(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "quality.json").write_text('{"boards": {"RH": {"positions": 200, "positions_masked": 3}}}')
     (tmp_path / "a" / "materials.json").write_text('{"segments": [{"label": 1}, {"label": 2}]}')
-    text = batch.table(
+    text = batch.format_table(
         [batch.Outcome("a", "done", 61.0, 0.54), batch.Outcome("b", "failed", 2.0, 0.0, "broken")], tmp_path
     )
     head, a, b, end = text.splitlines()
@@ -289,7 +289,7 @@ import sys
 from pathlib import Path
 from polysight.jobs import batch
 child = "from polysight.jobs import batch; import os, sys, time;" \
-    "batch.end_with(os.environ[batch.ALIVE]); open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
+    "batch.exit_with_parent(os.environ[batch.ALIVE]); open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
 batch.PROGRAM = (sys.executable, "-c", child, sys.argv[2])
 batch.run_scan(batch.make_jobs([(Path(sys.argv[1]), batch.Settings())], Path(sys.argv[1] + "-out"))[0])
 """

@@ -242,7 +242,7 @@ def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int) -> PlacedFr
 
 
 def _measure_longest_run(flags: Flags) -> int:
-    """Length of the longest run of True."""
+    """Return the length of the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
@@ -278,7 +278,7 @@ def _select_frames(trains: _Trains, selected: Flags, frame_bytes: int, frames: i
 
 
 def _find_missed(slots: Times, pulses: int) -> list[int]:
-    """Numbers of the pulses between two neighbours that are certain."""
+    """Return the numbers of the pulses between two neighbours that are certain."""
     number = np.concatenate([[-1], np.arange(slots.size), [slots.size]])
     slot = np.concatenate([[-1], slots, [pulses]])
     sure = np.flatnonzero((slot >= 0) | (number < 0))
@@ -290,7 +290,7 @@ def _find_missed(slots: Times, pulses: int) -> list[int]:
 
 
 def _find_period_ns(pulses_ns: Times) -> int:
-    """Shortest time between two pulses."""
+    """Return the shortest time between two pulses."""
     return int(np.diff(pulses_ns.reshape(-1)).min(initial=_NO_BOUND))
 
 

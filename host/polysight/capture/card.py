@@ -58,8 +58,6 @@ class CardClient:
         Name, addresses and ports.
     timeout_s
         Timeout of a command, all attempts together.
-    kernel_root
-        Folder with `proc` and `sys`, for the diagnosis of a silent card.
 
     Raises
     ------
@@ -67,10 +65,9 @@ class CardClient:
         if the command port is in use or the host address is not this machine's.
     """
 
-    def __init__(self, board: Board, timeout_s: float, kernel_root: Path = Path("/")) -> None:
+    def __init__(self, board: Board, timeout_s: float) -> None:
         self.board = board
         self._timeout_s = timeout_s
-        self._kernel_root = kernel_root
         self._address = (board.card_address, board.command_port)
         self._socket = bind_udp(board.host_address, board.command_port, f"{board.name} commands")
         self._status = Status(0)
@@ -94,7 +91,7 @@ class CardClient:
 
         Raises DeviceError if there are two, or no answer. A second card sends whole rows that look like this one's.
         """
-        macs = {card_mac(self.board.card_address, self._kernel_root)}
+        macs = {card_mac(self.board.card_address)}
         versions: list[Version] = []
         requests = 0
         while not versions:
@@ -110,7 +107,7 @@ class CardClient:
             reply = self._receive(remaining_s)
             if reply is not None and reply.code == Code.VERSION:
                 versions.append(dca1000.decode_version(reply.status))
-        macs.add(card_mac(self.board.card_address, self._kernel_root))
+        macs.add(card_mac(self.board.card_address))
         macs.discard("")
         if len(versions) > requests or len(macs) > 1:
             asked = "one request" if requests == 1 else f"{requests} requests"
@@ -227,7 +224,7 @@ class CardClient:
             if e.errno in (errno.ENETUNREACH, errno.EHOSTUNREACH):
                 raise no_route(self.board, f"no way to {self._name()} from {self.board.host_address}") from None
             problem = f"sending to {self._name()} failed: {e.strerror}"
-            raise silent_card(self.board, problem, self._kernel_root) from e
+            raise silent_card(self.board, problem) from e
         deadline = time.monotonic() + limit_s
         # The replies that are there are read even if the time is over: this program may have been held meanwhile.
         while (reply := self._receive(max(0.0, deadline - time.monotonic()))) is not None:
@@ -267,7 +264,7 @@ class CardClient:
         if attempts > 1:
             attempts_text = f"{attempts} attempts"
         problem = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({attempts_text})"
-        return silent_card(self.board, problem, self._kernel_root)
+        return silent_card(self.board, problem)
 
 
 @dataclass(frozen=True)

@@ -122,12 +122,13 @@ def decode_reply(raw: bytes) -> Reply:
     raise ProtocolError(problem, code=ErrorCode.MESSAGE_INVALID)
 
 
-def configure_fpga_data(lanes: int = 4, timer: int = 30) -> bytes:
+def configure_fpga_data(lanes: int = 4) -> bytes:
     """Encode the body of 0x03: raw mode, LVDS lanes (4: AWR2243, 2: xWR16xx/18xx/68xx), Ethernet, 16 bit, timer."""
     if lanes not in (2, 4):
         raise ProtocolError(f"the card captures 2 or 4 LVDS lanes, not {lanes}", code=ErrorCode.VALUE_INVALID)
     lane_mode = 1 if lanes == 4 else 2
-    return bytes([1, lane_mode, 1, 2, 3, timer])
+    # The last byte, a timer, is TI's default.
+    return bytes([1, lane_mode, 1, 2, 3, 30])
 
 
 def configure_packet_data(packet_bytes: int, delay_us: float) -> bytes:

@@ -69,7 +69,7 @@ def take_core(core: int | None, exclusive: bool = True, urgent: bool = True) -> 
     return core, ""
 
 
-def take_priority(real_time: int = REAL_TIME, nice: int = NICE) -> tuple[str, str]:
+def take_priority(real_time: int = REAL_TIME) -> tuple[str, str]:
     """Give this process real-time priority, or else a lower nice value; return the priority and what was not permitted.
 
     Real time (round robin) and negative nice values need CAP_SYS_NICE. A receiver sleeps for a millisecond between
@@ -83,10 +83,10 @@ def take_priority(real_time: int = REAL_TIME, nice: int = NICE) -> tuple[str, st
     else:
         return f"real-time priority {real_time}", ""
     try:
-        os.setpriority(os.PRIO_PROCESS, 0, nice)
+        os.setpriority(os.PRIO_PROCESS, 0, NICE)
     except OSError as e:
-        return f"nice {os.getpriority(os.PRIO_PROCESS, 0)}", f"{refused}; nice {nice}: {e.strerror}"
-    return f"nice {nice}", refused
+        return f"nice {os.getpriority(os.PRIO_PROCESS, 0)}", f"{refused}; nice {NICE}: {e.strerror}"
+    return f"nice {NICE}", refused
 
 
 _START_TIMEOUT_S = 30.0

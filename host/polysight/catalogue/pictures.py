@@ -177,7 +177,7 @@ def thumbnail(pixels: Pixels) -> Picture:
 
 
 def _derive_values(pixels: Pixels, name: str) -> products.MapValues:
-    """Maps derived from P: its error, permittivity, loss."""
+    """Return the maps derived from P: its error, permittivity, loss."""
     if not pixels.referenced:
         raise DataError(
             "no permittivity is shown", "the images are not referenced to metal, or support no result",

@@ -132,7 +132,7 @@ def _load_labels(folder: Path, pixels: Pixels) -> DrawnLabels | None:
 
 
 def list_files(folder: Path) -> list[File]:
-    """Downloadable files of a scan's products and exports."""
+    """Return the downloadable files of a scan's products and exports."""
     products = read_products(folder).folder
     files = []
     for group, place in (("products", products), (EXPORT, folder / EXPORT)):
@@ -318,7 +318,7 @@ def _sort_by_sigmas(material: NearMaterial) -> float:
 
 
 def _focus_profile(folder: Path, x_m: float, y_m: float) -> tuple[FocusedProfile | None, str]:
-    """Focused range profile through a place, from the scan's kept samples, or why there is none."""
+    """Return the focused range profile through a place, from the scan's kept samples, or why there is none."""
     scan = find_scan_folder(folder)
     if scan is None or not (scan / MANIFEST).exists():
         return None, "the rows are not in this folder"
@@ -531,7 +531,7 @@ def _collect_notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
 
 
 def _pair_patches(first: list[PatchFigures], second: list[PatchFigures]) -> list[PatchPair]:
-    """Pairs of patches with their centres at one place."""
+    """Return the pairs of patches with their centres at one place."""
     pairs = []
     candidates = [patch for patch in second if not patch.metal_reference]
     for patch in first:
@@ -572,7 +572,7 @@ def _describe_pair(a: PatchFigures, b: PatchFigures) -> PatchPair:
 
 
 def _read_covariance(permittivity: PermittivityFigures) -> Real:
-    """Covariance of (real, imaginary); nan if an earlier release did not write it."""
+    """Return the covariance of (real, imaginary); nan if an earlier release did not write it."""
     if permittivity.covariance is None:
         return np.full((2, 2), np.nan)
     return np.array(permittivity.covariance, np.float64)

@@ -124,7 +124,7 @@ def read_generation(products: Path) -> str:
 
 
 def _read_stamp(folder: Path) -> Stamp:
-    """Times and sizes of the files that a summary is made from."""
+    """Return the times and sizes of the files that a summary is made from."""
     # As text: making paths takes as long as asking for the files.
     place = str(folder)
     stamps = []
@@ -275,7 +275,7 @@ def _read_status(path: Path) -> int | None:
 
 
 def explain_failure(program: Program | None) -> Finding | None:
-    """Why a program failed, from the last error in its log; None if it runs, or has ended well."""
+    """Return why a program failed, from the last error in its log; None if it runs, or has ended well."""
     if program is None or program.running or program.status in (0, NO_RESULT):
         return None
     if program.status is None:
@@ -571,7 +571,7 @@ class Scans:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Bytes of all files in a folder; links are not followed."""
+    """Return the bytes of all files in a folder; links are not followed."""
     total = 0
     for place, _, files in os.walk(folder):
         for name in files:

@@ -132,7 +132,7 @@ def add_json_option(sub: argparse.ArgumentParser) -> None:
 
 
 def material_settings(args: argparse.Namespace) -> Settings:
-    """Settings from the options of :func:`add_material_options`.
+    """Return the settings from the options of :func:`add_material_options`.
 
     Raises
     ------

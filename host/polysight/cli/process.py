@@ -33,7 +33,7 @@ _degrees = number(float, "`one`, `pixel` or an angle of 5 to 80 degrees", lambda
 
 
 def _parse_angles(text: str) -> tuple[float, ...]:
-    """Angles of a turntable, separated by commas."""
+    """Parse the angles of a turntable, separated by commas."""
     return tuple(_turn(part) for part in text.split(","))
 
 
@@ -44,7 +44,7 @@ def _parse_axis(text: str) -> tuple[float, float]:
 
 
 def _parse_incidence(text: str) -> str | float:
-    """`one`, `pixel`, or degrees."""
+    """Parse `one`, `pixel`, or degrees."""
     if text in ("one", "pixel"):
         return text
     return _degrees(text)
@@ -201,7 +201,7 @@ def add_commands(add: Add) -> None:
 
 
 def _add_data(sub: argparse.ArgumentParser, several: bool = False) -> None:
-    """Recorded data, the folder of results, and the rig file of published data."""
+    """Add the options for the recorded data, the folder of results, and the rig file of published data."""
     text = "scan folder, or published unsynced/<scan> or raw/<scan>"
     if several:
         text += "; or images: published labels/<scan>, or .npz with h and v; or several, or a folder of them"
@@ -234,7 +234,7 @@ def _add_several_options(sub: argparse.ArgumentParser) -> None:
 
 
 def grid(text: str) -> tuple[int, int, float]:
-    """`COLUMNSxROWS@MM`: pixels and their distance."""
+    """Parse `COLUMNSxROWS@MM`: pixels and their distance."""
     words = re.fullmatch(r"(\d{1,4})x(\d{1,4})@(\d+(?:\.\d+)?)", text)
     if words is None:
         raise argparse.ArgumentTypeError(f"{text!r}: a grid is COLUMNSxROWS@MM, for example 300x300@1")

@@ -199,7 +199,7 @@ def _add_board(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_own_config(sub: argparse.ArgumentParser) -> None:
-    """`--config` of an action, without a default, so that the one given before the action stays."""
+    """Add `--config` to an action, without a default, so that the one given before the action stays."""
     sub.add_argument("--config", type=Path, default=argparse.SUPPRESS, metavar="FILE", help="rig file")
 
 

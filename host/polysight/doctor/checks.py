@@ -88,7 +88,7 @@ def run_checks(context: CheckContext) -> Iterator[Finding]:
 
 
 def _find_failed_prerequisite(check: Check, board: Board | None, blocked: dict[tuple[str, str], str]) -> str:
-    """Title of the failed check because of which this one is skipped; "" if there is none.
+    """Return the title of the failed check because of which this one is skipped; "" if there is none.
 
     A check of one board depends on the same board's checks, and one of the whole rig on those of every board.
     """

@@ -653,7 +653,7 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
 
 
 def _suggest_start_offset(rig: Instrument, board: Board, if_hz: float) -> str:
-    """Remedy: the start offset that moves a direct path with this true IF to the middle of the band."""
+    """Return the remedy: the start offset that moves a direct path with this true IF to the middle of the band."""
     return f"start_offset_hz = {board.start_offset_hz + sum(band_hz(rig)) / 2 - if_hz:.0f} for {board.name}"
 
 

@@ -56,6 +56,10 @@ _MIN_STD_M = 3e-4
 """Smallest standard deviation of a plate's range, due to sidelobes of its neighbours."""
 _MAX_TILT = 0.035
 """Largest tilt that phases may show, rise per metre: two degrees."""
+_TILT_TOLERANCE = 3e-3
+"""Difference of the tilts by phase and by range that is accepted beside their errors, rise per metre."""
+_MAX_RANGE_STD_M = 0.05
+"""Largest standard deviation of a height by range that is used."""
 _PHASE_FITS_RAD = 0.5
 """Largest RMS phase error of plates on one plane; a fifth of the value for random phases."""
 _PHASE_STD_M = 5e-5
@@ -166,20 +170,13 @@ def _compute_cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> N
     grid = builder.grid
     z = float(np.mean(grid.z_m)) + depths
     axes = (z[[0, -1]], grid.y_m[[0, grid.y_m.size // 2, -1]], grid.x_m[[0, grid.x_m.size // 2, -1]])
-    area = np.array(
-        [
-            [
-                [
-                    limit_m(aperture, np.array([px, py, pz]), 0) * limit_m(aperture, np.array([px, py, pz]), 1)
-                    for px in axes[2]
-                ]
-                for py in axes[1]
-            ]
-            for pz in axes[0]
-        ]
-    )
-    between = scipy.interpolate.RegularGridInterpolator(axes, area, method="linear")
-    return between(tuple(np.meshgrid(z, grid.y_m, grid.x_m, indexing="ij")))
+    area = np.empty([axis.size for axis in axes])
+    for index in np.ndindex(area.shape):
+        pz, py, px = (axis[i] for axis, i in zip(axes, index, strict=True))
+        point = np.array([px, py, pz])
+        area[index] = limit_m(aperture, point, 0) * limit_m(aperture, point, 1)
+    interpolate = scipy.interpolate.RegularGridInterpolator(axes, area, method="linear")
+    return interpolate(tuple(np.meshgrid(z, grid.y_m, grid.x_m, indexing="ij")))
 
 
 def _interpolate_stack(
@@ -313,20 +310,23 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     if not determined.any():
         return replace(UNKNOWN_PLANE, heights_m=np.full(len(masks), np.nan))
     places = np.array([(x[m.any(axis=0)].mean(), y[m.any(axis=1)].mean()) if m.any() else (0.0, 0.0) for m in masks])
-    plane, covariance = _fit(places[determined], heights[determined], np.hypot(stds[determined], _MIN_STD_M))
-    phase = _estimate_heights_by_phase(next(iter(builder.boards.values())), masks, places, plane)
-    fine = determined & np.isfinite(phase[0])
+    plane, covariance = _fit_plane(places[determined], heights[determined], np.hypot(stds[determined], _MIN_STD_M))
+    first_board = next(iter(builder.boards.values()))
+    phase_heights, rad_per_m = _estimate_heights_by_phase(first_board, masks, places, plane)
+    with_phase = determined & np.isfinite(phase_heights)
     by_phase = False
-    if fine.sum() >= 2:
-        finer, fine_covariance = _fit(places[fine], phase[0][fine], np.full(int(fine.sum()), _PHASE_STD_M))
-        residual = phase[0][fine] - _evaluate_plane(finer, places[fine])
-        on_one_plane = float(np.sqrt(np.mean((residual * phase[1]) ** 2))) < _PHASE_FITS_RAD
+    if with_phase.sum() >= 4:
+        phase_stds = np.full(int(with_phase.sum()), _PHASE_STD_M)
+        phase_plane, phase_covariance = _fit_plane(places[with_phase], phase_heights[with_phase], phase_stds)
+        residual = phase_heights[with_phase] - _evaluate_plane(phase_plane, places[with_phase])
+        on_one_plane = float(np.sqrt(np.mean((residual * rad_per_m) ** 2))) < _PHASE_FITS_RAD
         # Thin sheets change the phase themselves: accept the plane only if the ranges agree.
-        like_ranges = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, 3e-3, 3e-3]
-        if on_one_plane and fine.sum() >= 4 and bool(like_ranges.all()) and float(np.hypot(*finer[1:])) < _MAX_TILT:
-            plane = finer
-            covariance = fine_covariance
-            heights = phase[0]
+        tolerance = 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, _TILT_TOLERANCE, _TILT_TOLERANCE]
+        agrees_with_ranges = bool((np.abs(phase_plane - plane) < tolerance).all())
+        if on_one_plane and agrees_with_ranges and float(np.hypot(*phase_plane[1:])) < _MAX_TILT:
+            plane = phase_plane
+            covariance = phase_covariance
+            heights = phase_heights
             by_phase = True
     std = np.sqrt(np.diag(covariance))
     return PlaneEstimate(
@@ -387,14 +387,14 @@ def _estimate_heights_by_range(
             path_slope = np.real(slope[mask] / image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
             by_height = (
                 np.real(moved_slope[mask] / moved_image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
-            ) / (_STEP_M)
+            ) / _STEP_M
         per_metre = float(np.nansum(weight * by_height))
         path_slope = np.where(np.isfinite(path_slope), path_slope, 0.0)
         mean = float(np.sum(weight * path_slope))
         path_std = float(np.sqrt(np.sum(weight * (path_slope - mean) ** 2)))
         height = mean / per_metre
         std = path_std / abs(per_metre)
-        if std < 0.05 and np.isfinite(height):
+        if std < _MAX_RANGE_STD_M and np.isfinite(height):
             heights[i] = height
             stds[i] = max(std, _MIN_STD_M)
     return heights, stds
@@ -420,30 +420,31 @@ def _estimate_heights_by_phase(
             rates.append(float(np.angle(np.vdot(footprint[mask], moved_image[mask]))) / _STEP_M)
     if not rates:
         return phases, 1.0
-    rate = float(np.median(rates))
-    turn = 2 * np.pi / abs(rate)
+    rad_per_m = float(np.median(rates))
+    ambiguity_m = 2 * np.pi / abs(rad_per_m)
     with_phase = np.flatnonzero(np.isfinite(phases))
     design = np.column_stack([np.ones(with_phase.size), places[with_phase]])
     # The range leaves an ambiguity of some turns, common to all plates except for the tilt: try several tilts.
     tilts = np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD
     trial_planes = plane + np.array([(0.0, tilt_x, tilt_y) for tilt_x in tilts for tilt_y in tilts])
     guesses = trial_planes @ design.T
-    heights = phases[with_phase] / rate
-    common_height = np.angle(np.mean(np.exp(2j * np.pi * (heights - guesses) / turn), axis=1)) / (2 * np.pi) * turn
-    lifted = heights + turn * np.round((guesses + common_height[:, None] - heights) / turn)
-    lifted += turn * np.round((np.median(guesses, axis=1) - np.median(lifted, axis=1)) / turn)[:, None]
+    heights = phases[with_phase] / rad_per_m
+    phasors = np.exp(2j * np.pi * (heights - guesses) / ambiguity_m)
+    common_height = np.angle(np.mean(phasors, axis=1)) / (2 * np.pi) * ambiguity_m
+    lifted = heights + ambiguity_m * np.round((guesses + common_height[:, None] - heights) / ambiguity_m)
+    lifted += ambiguity_m * np.round((np.median(guesses, axis=1) - np.median(lifted, axis=1)) / ambiguity_m)[:, None]
     # All tilts have the same places, so one inverse fits them all.
     prior = np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
     weighted = design / _PHASE_STD_M**2
     planes = np.linalg.solve(design.T @ weighted + prior, (lifted @ weighted).T).T
-    misses = ((lifted - planes @ design.T) ** 2).sum(axis=1) / _PHASE_STD_M**2
-    misses += ((planes[:, 1:] / _TILT_PRIOR_RAD) ** 2).sum(axis=1)
-    best = np.full(len(masks), np.nan)
-    best[with_phase] = lifted[int(np.argmin(misses))]
-    return best, rate
+    chi2 = ((lifted - planes @ design.T) ** 2).sum(axis=1) / _PHASE_STD_M**2
+    chi2 += ((planes[:, 1:] / _TILT_PRIOR_RAD) ** 2).sum(axis=1)
+    best_heights = np.full(len(masks), np.nan)
+    best_heights[with_phase] = lifted[int(np.argmin(chi2))]
+    return best_heights, rad_per_m
 
 
-def _fit(
+def _fit_plane(
     places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Fit a plane (height, rise along x, rise along y) with a prior on its tilt; return it and its covariance.

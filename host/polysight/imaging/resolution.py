@@ -258,7 +258,7 @@ def field_limits(rig: Instrument) -> FieldLimits:
 def _find_nearest_ghost_m(
     slope: PhaseSlope, frequency_hz: float, difference_rad_per_m: float, centre_m: float
 ) -> float:
-    """Distance between two places around `centre_m` whose slopes differ by `difference_rad_per_m`."""
+    """Return the distance between two places around `centre_m` whose slopes differ by `difference_rad_per_m`."""
 
     def too_far(distance_m: float) -> bool:
         far, near = (slope.slope(centre_m + side * distance_m / 2, frequency_hz) for side in (1, -1))

@@ -1,7 +1,7 @@
 """Many scans at once: one program each, as many at a time as cores and memory allow, here or on a Dask cluster.
 
-A scan that fails, or is killed for want of memory, takes no other with it. What is finished carries a mark that says
-what it was made with; a later run passes over it unless data, options, rig file or version have changed since.
+A scan that fails, or whose program is killed because memory runs out, does not stop the others. Finished products have
+a mark file with their dependencies; a later run skips them unless data, options, rig file or version have changed.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _PRODUCTS = ("image.npz", "quality.json")
 PROGRAM = (sys.executable, "-m", "polysight.jobs.batch")
 """Module that processes the job on its standard input."""
 ALIVE = "POLYSIGHT_PARENT_ALIVE"
-"""Environment of the program: number of a pipe that ends with the program that started it."""
+"""Environment variable of the program: number of a pipe that closes when the program that started it ends."""
 # Leave a fifth of the free memory to the system.
 SHARE_OF_FREE_MEMORY = 0.8
 _POLL_S = 0.2
@@ -136,8 +136,9 @@ def make_jobs(scans: Sequence[tuple[Path, Settings]], out: Path) -> list[Job]:
     return list(jobs.values())
 
 
-# Counts changes of what products of the same data hold
+# Increased by each release that makes other products from the same data.
 PRODUCTS_VERSION = 4
+# Files that the products of a scan folder, or of published data, are made from.
 _OWN_FILES = (MANIFEST, TRUTH, "raw/*/*.bin", "raw/*/*.idx")
 _PUBLISHED_FILES = ("*_cfg.json", TRUTH, "*/*.bin", "*/*_log.csv", "*_synced.npy")
 
@@ -160,7 +161,7 @@ def made_with(data: Path, settings: Settings) -> dict[str, Any]:
 
 
 def _digest_scan(folder: Path, config: Path | None) -> str:
-    """Digest of the sizes and times of a scan's :func:`data_files`."""
+    """Return a digest of the sizes and times of a scan's :func:`data_files`."""
     listing = []
     for path in data_files(folder, config):
         status = path.stat()
@@ -171,8 +172,8 @@ def _digest_scan(folder: Path, config: Path | None) -> str:
 def data_files(folder: Path, config: Path | None = None) -> list[Path]:
     """Return the files that products of a scan are made from: manifest, rows, calibration and truth.
 
-    `config` is the rig file of scans without one. Kept samples count where raw data was dropped: elsewhere they are
-    made again from it. Notes, labels, exports, programs and products in the folder are no data.
+    `config` is the rig file of scans without one. Stored samples count only if raw data was dropped: otherwise they are
+    made again from the raw data. Notes, labels, exports, programs and products in the folder are no data.
     """
     if is_given_images(folder) and folder.is_file():
         return [folder]
@@ -180,7 +181,7 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
         return sorted([*folder.glob("*.npy"), *folder.glob("*.json")])
     patterns = _OWN_FILES if (folder / MANIFEST).exists() else _PUBLISHED_FILES
     files: list[Path] = []
-    # The scan's own program will say what is wrong with it
+    # Errors are left to the program that processes the scan: its message is the result.
     with suppress(PolysightError):
         source = open_source(folder, config, dropped=True)
         if isinstance(source, ScanFolder) and dropped_rows(source):
@@ -204,8 +205,8 @@ def is_finished(job: Job) -> bool:
 def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     """Process one scan in a program of its own; its output goes to `<out>.log`. Failures are part of the result.
 
-    That program ends when this one does, however this one ends. A scan that carries its mark is done: a Dask worker
-    may have been killed between the mark and its answer.
+    That program ends when this one does, however this one ends. A scan with a mark is done: a Dask worker may have been
+    killed between writing the mark and reporting it.
     """
     if is_finished(job):
         return _end_outcome(job)
@@ -214,17 +215,17 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     # Nothing is written to the pipe: its end tells the child that this program is gone.
-    alive, promise = os.pipe()
+    child_end, parent_end = os.pipe()
     try:
-        environment[ALIVE] = str(alive)
+        environment[ALIVE] = str(child_end)
         with log.open("wb") as output:
             child = subprocess.Popen(
-                PROGRAM, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment, pass_fds=(alive,)
+                PROGRAM, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment, pass_fds=(child_end,)
             )
             _follow(child, job, stop)
     finally:
-        os.close(alive)
-        os.close(promise)
+        os.close(child_end)
+        os.close(parent_end)
     seconds = time.monotonic() - started_s
     # The child may have been killed after it wrote the mark.
     if child.returncode == 0 or is_finished(job):
@@ -235,7 +236,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
 
 
 def _follow(child: subprocess.Popen[bytes], job: Job, stop: Event | None) -> None:
-    """Send a program its job and wait for its end; terminate it when `stop` is set."""
+    """Send a program its job and wait for its end; terminate it if `stop` is set."""
     if child.stdin is not None:
         # The child may end before it reads; its log says why.
         with suppress(BrokenPipeError):
@@ -329,7 +330,7 @@ def fit_scans(positions: int, cores: int, free_bytes: int) -> int:
 
 
 def free_memory_bytes() -> int:
-    """Available memory without swapping."""
+    """Return the memory that is available without swapping."""
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -337,7 +338,7 @@ def free_memory_bytes() -> int:
     except OSError:
         pass
     if not hasattr(os, "sysconf"):
-        # Windows does not say: enough for one scan at a time.
+        # Windows does not tell. Zero makes one scan at a time.
         return 0
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
@@ -350,7 +351,7 @@ def process_many(
     Raises
     ------
     ConfigError
-        when there is no Dask, or no cluster, where it is asked for.
+        when `dask` is given and Dask is not installed, or nothing answers there.
     """
     skipped = [j for j in jobs if not again and is_finished(j)]
     todo = [j for j in jobs if j not in skipped]
@@ -362,7 +363,7 @@ def process_many(
     sys.stderr.write(f"{len(jobs)} scans: {len(skipped)} finished before, {len(todo)} to process, {workers_text}\n")
     out.mkdir(parents=True, exist_ok=True)
     for job in todo:
-        # A mark that is found later was then written by this run.
+        # Remove old marks, so that each mark found later was written by this run.
         (job.out / FINISHED).unlink(missing_ok=True)
     if not todo:
         results = iter(())
@@ -394,12 +395,13 @@ def process_several(
         raise ConfigError(f"{out} is a file", "several scans need a folder", "give another --out")
     jobs = make_jobs(scans, out)
     positions = max((_count_positions(folder) for folder, _ in scans), default=0)
-    n = at_a_time or fit_scans(positions, cores(), free_memory_bytes())
-    n = min(n, len(jobs))
+    jobs_at_once = at_a_time or fit_scans(positions, cores(), free_memory_bytes())
+    jobs_at_once = min(jobs_at_once, len(jobs))
     if dask is None:
-        jobs = [msgspec.structs.replace(job, threads=max(1, cores() // n)) for job in jobs]
-    outcomes = process_many(jobs, out, n, dask, again)
-    sys.stdout.write(table(outcomes, out))
+        threads = max(1, cores() // jobs_at_once)
+        jobs = [msgspec.structs.replace(job, threads=threads) for job in jobs]
+    outcomes = process_many(jobs, out, jobs_at_once, dask, again)
+    sys.stdout.write(format_table(outcomes, out))
     return exit_status(all(o.has_products for o in outcomes))
 
 
@@ -415,35 +417,40 @@ def _count_positions(data: Path) -> int:
         return 350 * 200
 
 
-def table(outcomes: Sequence[Outcome], out: Path) -> str:
-    """Table of the results of all scans, and their counts."""
+def format_table(outcomes: Sequence[Outcome], out: Path) -> str:
+    """Format a table of the results of all scans, and their counts."""
     rows = [("scan", "result", "seconds", "memory", "masked", "patches", "")]
-    for o in outcomes:
-        masked = patches = verdict = ""
-        if o.has_products:
-            masked, patches, verdict = _read_results(out / o.name)
-        if o.seconds:
-            seconds = f"{o.seconds:.0f}"
-        else:
-            seconds = ""
+    for outcome in outcomes:
+        masked = ""
+        patches = ""
+        verdict = ""
+        if outcome.has_products:
+            masked, patches, verdict = _read_results(out / outcome.name)
+        seconds = ""
+        if outcome.seconds:
+            seconds = f"{outcome.seconds:.0f}"
         memory = ""
-        if o.memory_gb:
-            memory = f"{o.memory_gb:.1f} GB"
-        rows.append((o.name, o.status, seconds, memory, masked, patches, o.message or verdict))
-    widths = [max(len(row[k]) for row in rows) for k in range(6)]
+        if outcome.memory_gb:
+            memory = f"{outcome.memory_gb:.1f} GB"
+        rows.append((outcome.name, outcome.status, seconds, memory, masked, patches, outcome.message or verdict))
+    # Two columns of words, four of numbers, and a last one without padding.
+    widths = [max(len(row[column]) for row in rows) for column in range(6)]
     lines = []
     for row in rows:
-        words = [cell.ljust(w) for cell, w in zip(row[:2], widths[:2], strict=True)]
-        numbers = [cell.rjust(w) for cell, w in zip(row[2:6], widths[2:], strict=True)]
+        words = [cell.ljust(width) for cell, width in zip(row[:2], widths[:2], strict=True)]
+        numbers = [cell.rjust(width) for cell, width in zip(row[2:6], widths[2:], strict=True)]
         lines.append("  ".join([*words, *numbers, row[6]]).rstrip())
-    count = {status: sum(o.status == status for o in outcomes) for status in ("done", "skipped", "failed", "stopped")}
-    counts = ", ".join(f"{n} {status}" for status, n in count.items() if n)
+    statuses = [outcome.status for outcome in outcomes]
+    counts = ", ".join(f"{statuses.count(s)} {s}" for s in ("done", "skipped", "failed", "stopped") if s in statuses)
     end = f"{len(outcomes)} scans: {counts}; products in {out}/<scan>/, all of this in {out / SUMMARY}"
     return "\n".join([*lines, end, ""])
 
 
 def _read_results(products: Path) -> tuple[str, str, str]:
-    """Share of masked or missing positions, number of patches, and the verdict unless it is `good`; "" if unknown."""
+    """Return the share of masked or missing positions, the number of patches, and the verdict unless it is `good`.
+
+    Values that are not known are "".
+    """
     saved = ProcessedScan(products)
     try:
         boards = saved.quality.boards.values()
@@ -471,8 +478,8 @@ def _read_results(products: Path) -> tuple[str, str, str]:
 # --- the program of one scan: `python -m polysight.jobs.batch` ---
 
 
-def end_with(pipe: str | None) -> None:
-    """Exit when the other end of a pipe closes, so that a killed worker leaves nothing running."""
+def exit_with_parent(pipe: str | None) -> None:
+    """Exit when the other end of a pipe closes, so that nothing goes on after the parent was killed."""
     if pipe is None:
         return
 
@@ -485,9 +492,9 @@ def end_with(pipe: str | None) -> None:
 
 def main() -> int:
     """Process one job; returns the exit status. Output goes to stdout and stderr."""
-    end_with(os.environ.get(ALIVE))
+    exit_with_parent(os.environ.get(ALIVE))
     job = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=Job)
-    began = time.monotonic()
+    started_s = time.monotonic()
     try:
         (job.out / FINISHED).unlink(missing_ok=True)
         status = process(Path(job.data), job.out, job.settings, job.threads)
@@ -501,22 +508,23 @@ def main() -> int:
         # The scan is processed: its products say that nothing can be named
         status = 0
     if status == 0:
-        seconds = round(time.monotonic() - began, 1)
+        seconds = round(time.monotonic() - started_s, 1)
         mark = {"made_with": job.made_with, "seconds": seconds, "memory_gb": peak_memory_bytes() / 1e9}
         write_json(job.out / FINISHED, mark)
     return status
 
 
 def peak_memory_bytes() -> int:
-    """Largest memory of this process until now; 0 where the system does not tell."""
+    """Return the largest memory of this process until now; 0 if the system does not tell."""
     try:
         import resource
     except ModuleNotFoundError:
         return 0
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # The unit is a byte on macOS, a kilobyte on Linux.
     if sys.platform == "darwin":
-        return used
-    return 1024 * used
+        return peak
+    return 1024 * peak
 
 
 if __name__ == "__main__":

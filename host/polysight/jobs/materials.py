@@ -119,8 +119,8 @@ def permittivity(
 
     `folder` holds the products, or is the scan folder that holds them. The chirp is the one they were made with, as
     their scan.json says; `config` replaces it. With `bands` above 1 the stack is fitted to so many sub-bands of the
-    sweep, which the products must hold; None takes those they hold where a thickness is fitted, else the whole sweep.
-    `amplitude_error` is how far |H| may be trusted, relative; 0 leaves it out.
+    sweep, which the products must hold; None takes those of the products if a thickness is fitted, else the whole
+    sweep. `amplitude_error` is the relative error of |H|; 0 leaves |H| out.
 
     Raises
     ------
@@ -162,18 +162,18 @@ def permittivity(
     status = print_verdict(products)
     if status == 0:
         for patch, row in zip(patches, rows, strict=True):
-            sys.stdout.write(_line(patch, row.get("layer")))
+            sys.stdout.write(_format_half_space_line(patch, row.get("layer")))
     return status
 
 
-def _line(patch: PatchFigures, layer: Mapping[str, Any] | None) -> str:
+def _format_half_space_line(patch: PatchFigures, layer: Mapping[str, Any] | None) -> str:
     head = f"{patch.label:>3}  {_pad_name(patch.name or '')}"
     if patch.refused is not None:
         text = f"{head} not judged: {patch.refused_text}"
     elif patch.permittivity is None:
         text = f"{head} metal-like: no permittivity"
     else:
-        text = f"{head} one interface {_estimate(patch.permittivity)}"
+        text = f"{head} one interface {_format_estimate(patch.permittivity)}"
     return (text + _format_layer(layer)).rstrip() + "\n"
 
 
@@ -189,7 +189,7 @@ def _format_layer(layer: Mapping[str, Any] | None) -> str:
     return text + "".join(f"\n     note: {w}" for w in layer["warnings"])
 
 
-def _estimate(e: PermittivityFigures) -> str:
+def _format_estimate(e: PermittivityFigures) -> str:
     """Format a permittivity with the errors of both parts and their main source."""
     text = f"{format_permittivity(e.value, width=6):15s}"
     if e.spread is not None:
@@ -224,14 +224,14 @@ def concentration(data: Path, values: Sequence[tuple[str, float]], confidence: f
             f"{data}: no material {unknown[0]!r}", f"it holds {', '.join(library.names)}", "correct --value"
         )
     result = fit_concentration(library, percent_by_name, confidence)
-    left_out = sorted(set(library.names) - set(concentrations(library.names, percent_by_name)))
+    without_concentration = sorted(set(library.names) - set(concentrations(library.names, percent_by_name)))
     source = _describe_origin(library.simulated)
     if as_json:
         content = {
             "source": source,
             "line": asdict(result.line),
             "left_out": [asdict(r) for r in result.left_out],
-            "without_concentration": left_out,
+            "without_concentration": without_concentration,
             "median_error_percent": result.median_error,
             "covered": result.covered,
         }
@@ -248,17 +248,16 @@ def concentration(data: Path, values: Sequence[tuple[str, float]], confidence: f
         f"median error {result.median_error:.3f} percent by weight; the {100 * confidence:.0f} % intervals hold the"
         f" truth in {100 * result.covered:.0f} % of the patches\n"
     )
-    if left_out:
-        print_lines(
-            [f"note: not used, no percentage in the name: {', '.join(left_out)} (--value NAME=PERCENT gives it)"]
-        )
+    if without_concentration:
+        names = ", ".join(without_concentration)
+        print_lines([f"note: not used, no percentage in the name: {names} (--value NAME=PERCENT gives it)"])
     return 0
 
 
 def materials(data: Sequence[Path], as_json: bool) -> int:
     """Print names and permittivities of the patches of processed scans; return the exit status.
 
-    That of NoResult if one of the scans has none (verdict `none`); its patches are not printed.
+    The status is that of NoResult if one of the scans has no result (verdict `none`); its patches are not printed.
 
     Raises
     ------
@@ -274,7 +273,7 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
         sys.stdout.write(f"{scan.folder}: {name_scan(scan.scan_id, bool(scan.simulated))}\n")
         status = print_verdict(scan)
         if status == 0:
-            sys.stdout.write("".join(map(_patch_line, scan.segments)))
+            sys.stdout.write("".join(map(_format_patch_line, scan.segments)))
         worst = max(worst, status)
     return worst
 
@@ -294,17 +293,17 @@ def catalogue(as_json: bool) -> int:
 
 
 def _format_catalogue_line(material: CatalogueMaterial, number: Mapping[str, int]) -> str:
-    """Name, permittivity and spreads, frequency and numbers of the sources."""
+    """Format a material: name, permittivity and spreads, frequency and numbers of the sources."""
     value = format_permittivity(material.permittivity, 4, 8)
-    real, loss = (100 * spread_text for spread_text in material.spread)
+    spread_real, spread_loss = material.spread
     star = "*" if material.spread_is_default else " "
     cited = "".join(f"[{number[source.key]}]" for source in material.sources)
-    spread_text = f"+-{real:3.0f} %, {loss:3.0f} %{star}"
+    spread_text = f"+-{100 * spread_real:3.0f} %, {100 * spread_loss:3.0f} %{star}"
     frequency = f"{material.frequency_hz / 1e9:5.4g} GHz"
     return f"{_pad_name(material.name, 30)} {value:19s} {spread_text} {frequency}  {material.kind:10s} {cited}"
 
 
-def _patch_line(patch: PatchFigures) -> str:
+def _format_patch_line(patch: PatchFigures) -> str:
     box = ""
     if patch.box:
         box = f"   drawn as {patch.box}"
@@ -318,7 +317,7 @@ def _patch_line(patch: PatchFigures) -> str:
         confidence = f"{100 * patch.confidence:.0f} %"
     value = "-"
     if patch.permittivity is not None:
-        value = _estimate(patch.permittivity)
+        value = _format_estimate(patch.permittivity)
     elif patch.metal_like:
         value = "metal-like"
     line = f"{patch.label:>3}  {_pad_name(name)} {confidence:>5s}  {value}{box}".rstrip() + "\n"
@@ -333,7 +332,7 @@ def _pad_name(name: str, width: int = 24) -> str:
 
 
 def report(folder: Path) -> int:
-    """Print where the report of a scan is; make it if it is missing. Return the exit status, also that of NoResult.
+    """Print the path of a scan's report, and make the report if it is missing; return the exit status.
 
     Raises
     ------
@@ -343,7 +342,7 @@ def report(folder: Path) -> int:
     saved = find_products(folder, REPORT)
     if saved is None:
         if not is_source(folder):
-            # There is nothing to make a report of: this raises, with the reason.
+            # There are neither products nor a scan: this raises the error with the reason.
             read_products(folder, REPORT)
         from polysight.jobs.process import process
 
@@ -402,7 +401,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
 
 
 def _score_models(data: Path, as_json: bool) -> int:
-    """Cross-validate every model on a library; print shares of right names."""
+    """Cross-validate every model on a library; print shares of correct names."""
     from polysight.materials import MODELS, Samples, score
 
     library = _load_library(data)
@@ -473,7 +472,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
         print_json(content)
     else:
         _print_names(content, several=len(scans) > 1)
-        _print_right(content["patches"], library.names)
+        _print_accuracy(content["patches"], library.names)
         if unmatched := content["patches_not_in_every_scan"]:
             sys.stdout.write(f"{unmatched} patches were not seen in every scan and are not named\n")
         sys.stdout.write(content["library"] + "\n")
@@ -524,7 +523,7 @@ def _describe_contradictions(
         return []
     names_by_angle = []
     for i, angle_deg in enumerate(angles_deg):
-        # Features of the angles stand side by side; evidence has a row for each.
+        # Features of the angles are side by side in columns; evidence has one row for each angle.
         features = [np.split(m.features, len(angles_deg), 1)[i] for m in matched]
         evidence = [m.evidence if m.evidence is None else m.evidence[i : i + 1] for m in matched]
         names_by_angle.append(Classifier(library, model=model, angles_deg=[angle_deg]).scan(features, evidence))
@@ -538,23 +537,23 @@ def _describe_contradictions(
     return lines
 
 
-def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
-    """Count right names; unknown patches of materials that the library lacks do not count."""
-    foreign = [r for r in rows if r["truth"] and r["truth"] not in names]
-    judged = [r for r in rows if r["truth"] and not (r in foreign and r["name"] == UNKNOWN)]
-    if foreign:
-        unknown = sum(r["name"] == UNKNOWN for r in foreign)
+def _print_accuracy(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
+    """Print the number of correct names; patches of materials that the library lacks do not count if unknown."""
+    not_in_library = [r for r in rows if r["truth"] and r["truth"] not in names]
+    judged = [r for r in rows if r["truth"] and not (r in not_in_library and r["name"] == UNKNOWN)]
+    if not_in_library:
+        unknown = sum(r["name"] == UNKNOWN for r in not_in_library)
         sys.stdout.write(
-            f"{len(foreign)} patches of materials that the library lacks, {unknown} of them named unknown\n"
+            f"{len(not_in_library)} patches of materials that the library lacks, {unknown} of them named unknown\n"
         )
     if judged:
-        right = sum(r["name"] == r["truth"] for r in judged)
+        correct = sum(r["name"] == r["truth"] for r in judged)
         share = np.mean([r["pixels_right"] for r in judged])
-        sys.stdout.write(f"{right} of {len(judged)} patches named right, {share:.1%} of their pixels\n")
+        sys.stdout.write(f"{correct} of {len(judged)} patches named right, {share:.1%} of their pixels\n")
 
 
 def _describe_unnamed(products: Sequence[ProcessedScan]) -> dict[str, Any]:
-    """JSON of `classify` if a scan has no result: its patches without names."""
+    """Return the JSON of `classify` if a scan has no result: its patches without names."""
     nothing = {"name": None, "confidence": None, "votes": {}, "probabilities": {}}
     for scan in products:
         if scan.verdict is not None and not scan.verdict.usable:

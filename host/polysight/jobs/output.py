@@ -33,7 +33,7 @@ def load_rig_file(config: Path | None) -> Instrument | None:
 
 
 def name_scan(scan_id: str, is_simulated: bool) -> str:
-    """`scan NAME`, or `simulated scan NAME`."""
+    """Return `scan NAME`, or `simulated scan NAME`."""
     if is_simulated:
         return f"simulated scan {scan_id}"
     return f"scan {scan_id}"

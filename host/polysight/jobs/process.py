@@ -71,7 +71,7 @@ def process_rows(source: Source, data: Path, settings: Settings = DEFAULT) -> Pi
 
 
 def pixel_axes(pipeline: Pipeline) -> Axes:
-    """Pixel centres of the images, x and y, ascending."""
+    """Return the pixel centres of the images, x and y, ascending."""
     grid = pipeline.images.grid
     if pipeline.source.mirrored:
         return grid.y_m, grid.x_m

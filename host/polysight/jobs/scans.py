@@ -55,7 +55,7 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
 
 
 def _count_bytes(root: Path, s: Summary) -> int:
-    """Size on the disk; 0 for a folder that does not answer."""
+    """Return the size on the disk; 0 for a folder that does not answer."""
     if s.state == "silent":
         return 0
     return folder_bytes(root / s.name)
@@ -173,7 +173,7 @@ def _format_name(name: str | None) -> str:
 
 
 def _format_error(std: float | None) -> str:
-    """Standard error of a complex number as text."""
+    """Format the standard error of a complex number."""
     if std is None:
         return "(its error is not known)"
     return f"+- {std:.3g} (real and imaginary part)"
@@ -186,7 +186,7 @@ def _format_value(value: float | None) -> str:
 
 
 def _format_complex(number: ComplexNumber | PermittivityDifference) -> str:
-    """`3.1 - 0.2j`."""
+    """Format a number as `3.1 - 0.2j`."""
     if number.real is None or number.imag is None:
         return "not known"
     sign = "-" if number.imag < 0 else "+"

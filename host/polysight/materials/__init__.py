@@ -95,8 +95,8 @@ from polysight.materials.segment import (
     TruthPlate,
     axis_mm,
     box_mask,
+    find_interiors,
     image_centre_mm,
-    insides,
     match_truth,
 )
 from polysight.materials.sub_bands import (
@@ -197,6 +197,7 @@ __all__ = [
     "estimate_permittivity",
     "feature_matrix",
     "find_copies",
+    "find_interiors",
     "find_material",
     "find_truth",
     "fit_concentration",
@@ -208,7 +209,6 @@ __all__ = [
     "image_extent_mm",
     "image_orientation",
     "incidence_std_rad",
-    "insides",
     "is_metal",
     "label_folders",
     "layer_content",

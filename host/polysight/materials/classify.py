@@ -75,7 +75,7 @@ class Weights:
 
     @staticmethod
     def from_dict(raw: dict[str, Any]) -> Weights:
-        """Inverse of :meth:`to_dict`. Raises DataError."""
+        """Rebuild the model from the result of :meth:`to_dict`. Raises DataError."""
         try:
             w = Weights(float(raw["h"]), float(raw["v"]), float(raw["p"]), raw["measure"], int(raw["neighbours"]))
         except (KeyError, TypeError, ValueError) as e:

@@ -245,18 +245,18 @@ def segment(
         )  # fmt: skip
     pixel_mm = abs(float(axis_mm(x_m)[1] - axis_mm(x_m)[0]))
     level = np.maximum(level_db(h, v, usable, cfg.smooth_px, cfg.smallest_mm / pixel_mm / 2), cfg.floor_db)
-    even = _remove_speckle(level, usable, cfg, pixel_mm)
-    least_db = _find_least_level_db(even, usable, cfg, pixel_mm)
+    smooth_level = _remove_speckle(level, usable, cfg, pixel_mm)
+    least_db = _find_least_level_db(smooth_level, usable, cfg, pixel_mm)
     masks: list[Mask] = []
     left_out = 0
-    for mask in _find_regions(even, usable, cfg, pixel_mm):
-        # Smoothing its outline may have left nothing of it.
+    for mask in _find_regions(smooth_level, usable, cfg, pixel_mm):
+        # Smoothing the outline may have left too little of the region.
         if float(mask.sum()) * pixel_mm**2 < SMALLEST_SHARE * cfg.smallest_mm**2:
             continue
-        own_db = float(np.median(even[mask]))
-        if own_db >= least_db:
+        region_db = float(np.median(smooth_level[mask]))
+        if region_db >= least_db:
             masks.append(mask)
-        elif own_db >= cfg.dimmest_db:
+        elif region_db >= cfg.dimmest_db:
             left_out += 1
     labels = np.zeros(h.shape, np.int32)
     patches = []
@@ -273,11 +273,11 @@ def touches_border(mask: Mask) -> bool:
 
 
 def find_patches_at_border(patches: Sequence[Patch], lit: Mask | None) -> frozenset[int]:
-    """Return the numbers of the patches that the end of the aperture lights.
+    """Return the numbers of the patches at the border of the illuminated area, where the illumination is uneven.
 
-    Metal in the scene (`lit` is None) was lit inside: these are the patches that reach the border of the image. Metal
-    that was scanned apart was lit by the same end, at the pixels `lit`, bool [ny, nx], alone: these are the patches
-    that the end of `lit` cuts, but for one that fills it as the metal did.
+    With metal in the scene (`lit` is None) these are the patches that reach the border of the image. If the metal was
+    scanned separately, `lit`, bool [ny, nx], are its illuminated pixels: these are the patches that the border of `lit`
+    cuts, except one that fills `lit` as the metal did.
     """
     if lit is None:
         return frozenset(patch.label for patch in patches if touches_border(patch.mask))
@@ -309,20 +309,20 @@ def _find_least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_
     bright = level > skimage.filters.threshold_otsu(level)
     background = float(np.median(level[~bright]))
     # Plates over a noisy background: the classes overlap, but noise is rarely as bright over a plate's width.
-    plain_mask = _open_mask((image > background + PLAIN_DB) & usable, cfg.smallest_mm / pixel_mm / 2)
-    if not plain_mask.any() and not _separate(level, bright, cfg.least_contrast_db):
+    plate_mask = _open_mask((image > background + PLAIN_DB) & usable, cfg.smallest_mm / pixel_mm / 2)
+    if not plate_mask.any() and not _separate(level, bright, cfg.least_contrast_db):
         return float("inf")
     scatter = min(1.4826 * float(np.median(np.abs(level[~bright] - background))), MOST_SCATTER_DB)
     return max(background + max(cfg.least_contrast_db, cfg.least_scatter * scatter), cfg.dimmest_db)
 
 
 def _find_reading_place(mask: Mask, y_mm: Real, row_pitch_mm: float) -> tuple[float, float]:
-    """Sort key of a patch: top row first, then from left to right."""
+    """Return the sort key of a patch: top row first, then from left to right."""
     rows, cols = np.nonzero(mask)
     return -round(float(y_mm[rows].mean()) / row_pitch_mm), float(cols.mean())
 
 
-def insides(images: Images) -> list[Mask]:
+def find_interiors(images: Images) -> list[Mask]:
     """Return the interiors of the patches of an image pair, bool [ny, nx] each; none without valid pixels."""
     if not images.usable.any():
         return []
@@ -393,7 +393,8 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
     regions: list[Mask] = []
     growing: list[_Growing] = []
 
-    def take(mask: Mask) -> None:
+    def take_region(mask: Mask) -> None:
+        """Add a region, and remove its pixels and its skirt from the remaining ones."""
         regions.append(_smooth_outline(mask))
         window = _find_window(mask, int(skirt_px) + 1)
         remaining[window][np.asarray(scipy.ndimage.distance_transform_edt(~mask[window])) <= skirt_px] = False
@@ -401,19 +402,20 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
     for threshold in np.arange(float(level[usable].max()), cfg.floor_db, -STEP_DB) - STEP_DB:
         grown: list[_Growing] = []
         for region in _find_components(_open_mask((level > threshold) & remaining, opening_px)):
-            inside = [node for node in growing if (node.mask & region).any()]
-            complete = [node for node in inside if node.level_db - threshold >= cfg.least_contrast_db]
+            # Regions at the threshold before that have grown into this one.
+            parts = [node for node in growing if (node.mask & region).any()]
+            complete = [node for node in parts if node.level_db - threshold >= cfg.least_contrast_db]
             overflows = any(region.sum() > OVERFLOW * node.mask.sum() for node in complete)
-            own_db = float(np.median(level[region]))
+            region_db = float(np.median(level[region]))
             if len(complete) > 1 or overflows:
                 for node in complete:
-                    take(node.cut(float(threshold)))
-                grown += [node for node in inside if node not in complete]
-            elif own_db - threshold >= EDGE_DB:
-                take(region)
+                    take_region(node.cut(float(threshold)))
+                grown += [node for node in parts if node not in complete]
+            elif region_db - threshold >= EDGE_DB:
+                take_region(region)
             else:
-                earlier = max(inside, key=lambda node: int(node.mask.sum())).masks if inside else ()
-                grown.append(_Growing((*earlier, (float(threshold), region)), own_db))
+                earlier_masks = max(parts, key=lambda node: int(node.mask.sum())).masks if parts else ()
+                grown.append(_Growing((*earlier_masks, (float(threshold), region)), region_db))
         growing = grown
     return regions
 
@@ -469,7 +471,7 @@ def align(images: Images) -> tuple[Images, tuple[float, float]]:
     edges_v = _measure_edges(images.v, images.usable)
     if not edges_h.any() or not edges_v.any():
         return images, (0.0, 0.0)
-    # None is documented; the stub takes the default's type.
+    # The type stub knows only the default's type, but None is documented.
     options: dict[str, Any] = {"upsample_factor": 20, "normalization": None}
     registration = skimage.registration.phase_cross_correlation(edges_h, edges_v, **options)
     back_px = np.asarray(registration[0], np.float64)
@@ -510,7 +512,8 @@ def reduce_variation(level: Real, weight: float) -> Real:
     field = np.zeros((2, *level.shape))
     gradient = np.zeros_like(field)
     change = np.zeros_like(level)
-    first_cost = last_cost = np.inf
+    first_cost = np.inf
+    last_cost = np.inf
     smooth = level
     for _ in range(_ITERATIONS):
         smooth = level + change
@@ -525,7 +528,7 @@ def reduce_variation(level: Real, weight: float) -> Real:
         last_cost = cost
         field -= _STEP * gradient
         field /= 1 + (_STEP / weight) * steepness
-        # The field's negative divergence
+        # `change` becomes the negative divergence of the field.
         np.negative(field[0] + field[1], out=change)
         change[1:] += field[0, :-1]
         change[:, 1:] += field[1, :, :-1]

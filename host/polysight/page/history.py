@@ -79,7 +79,7 @@ def sentence(text: str) -> str:
 
 
 def notice_of_error(error: PolysightError, level: Level = "warning") -> Finding:
-    """Notice of an error that was raised."""
+    """Return the notice of an error that was raised."""
     return Finding(level, sentence(error.what), sentence(error.why), sentence(error.remedy), code=error.code)
 
 
@@ -102,7 +102,7 @@ def notice_of_fault(event: Fault) -> Finding:
 
 
 def _find_cause(faults: Sequence[store.RowFault]) -> tuple[str, str]:
-    """Likely cause and remedy of a row's faults: those of the first known kind."""
+    """Return the likely cause and remedy of a row's faults: those of the first known kind."""
     for fault in faults:
         if fault.kind == K.PI_FAULT and fault.number:
             table = explain(fault.number)
@@ -115,7 +115,7 @@ def _find_cause(faults: Sequence[store.RowFault]) -> tuple[str, str]:
 def notice_of_rejection(
     row: int, take: int, reasons: Sequence[str], faults: Sequence[store.RowFault], utc: str
 ) -> Finding:
-    """Notice of a rejected take; one that somebody asked for is no fault."""
+    """Return the notice of a rejected take; one that somebody asked for is no fault."""
     cause, remedy = _find_cause(faults)
     remedy = remedy or "Nothing: the row is retaken automatically"
     if is_on_request(faults):
@@ -130,7 +130,7 @@ def is_on_request(faults: Sequence[store.RowFault]) -> bool:
 
 
 def _make_row_notice(row: int, problem: str, why_do: tuple[str, str], reasons: Sequence[str], utc: str) -> Finding:
-    """Notice of a row; the page shows the reasons in full on demand, and the time if it is known."""
+    """Return the notice of a row; the page shows the reasons in full on demand, and the time if it is known."""
     return Finding("warning", problem, *why_do, where=f"row {row}", facts={"detail": "; ".join(reasons), "utc": utc})
 
 

@@ -294,7 +294,7 @@ def make_motion(inputs: Inputs) -> Motion:
 
 
 def estimate_time_left(history: ScanHistory, now_s: float) -> tuple[int | None, str]:
-    """Seconds to the scan's end and their origin (`measured`, `first row`, `plan`); None: not known."""
+    """Return the seconds to the scan's end and their origin (`measured`, `first row`, `plan`); None: not known."""
     rows_left = history.plan.rows - len(history.takes)
     if history.ended is not None or history.row_seconds is None:
         if rows_left == 0:
@@ -338,7 +338,7 @@ def _collect_notices(inputs: Inputs) -> list[Finding]:
 
 
 def sync_notices(shown: Shown, columns: int) -> list[Finding]:
-    """Warnings about the synchronisation of the last row."""
+    """Return the warnings about the synchronisation of the last row."""
     notices = []
     for board, rows in shown.sync.items():
         if not rows:
@@ -428,7 +428,7 @@ def _judge_start(inputs: Inputs) -> Status:
 
 
 def _may_have_result(inputs: Inputs, history: ScanHistory) -> bool:
-    """False while the scan goes on or materials are computed: products of an earlier run may lie there."""
+    """Return false while the scan goes on or materials are computed: products of an earlier run may lie there."""
     life = inputs.signs.life
     computing = life is not None and life.doing == "materials" and inputs.signs.alive
     return history.ended is not None and not computing
@@ -548,7 +548,7 @@ def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
 
 
 def _find_late_since_s(history: ScanHistory, signs: LifeSigns) -> float:
-    """When the last row ended, if that is much longer ago than a row takes; otherwise 0."""
+    """Return when the last row ended, if that is much longer ago than a row takes; otherwise 0."""
     if history.row_seconds is None:
         return 0.0
     row_s, basis = history.row_seconds

@@ -83,13 +83,13 @@ UNATTENDED_ROWS = 3.0
 
 
 def scene_m(rig: Instrument) -> tuple[float, float]:
-    """Excess paths that the scene can have: nearest and farthest, metres."""
+    """Return the excess paths that the scene can have: nearest and farthest, metres."""
     antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
     return scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig))
 
 
 def range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean power over RX and positions against excess path, relative to the direct path at 0.
+    """Return the mean power over RX and positions against excess path, relative to the direct path at 0.
 
     An echo of excess path d is `exp(+j 2 pi f d / c)` (sync/chain.py), so a Fourier transform along the linear
     samples, Hann-windowed, has it at bin `d N df / c`. Returns dB, float64 [n] as `excess_m`; all at the floor when no
@@ -533,7 +533,7 @@ class Watch:
             self._listener = None
 
     def _read_life_signs(self, pi: PiState) -> LifeSigns:
-        """Signs of life of the scan program and the Pi."""
+        """Return the signs of life of the scan program and the Pi."""
         now = time.monotonic()
         wall_s = time.time()
         life = read_life(self.folder)

@@ -527,7 +527,7 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
 
 
 def _choose_assumptions(options: PlanOptions) -> tuple[Noise, float]:
-    """Noise and standstill: as given, else of the scan of --like, else the simulated rig's."""
+    """Return the noise and standstill: as given, else of the scan of --like, else the simulated rig's."""
     noise = Noise(source=_SIMULATED)
     overhead_s = ROW_OVERHEAD_S
     if options.like is not None:

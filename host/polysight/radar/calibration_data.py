@@ -129,7 +129,7 @@ class CalibrationFiles:
 
 
 def _read_temperature_c(data: bytes) -> int:
-    """Temperature of the board at its calibration."""
+    """Return the temperature of the board at its calibration."""
     return struct.unpack_from("<h", data, _TEMPERATURE_BYTE)[0]
 
 

@@ -35,7 +35,7 @@ MAX_MESSAGES = 64
 MAX_POLL_S = 0.25
 _MAX_WARNINGS = 100
 _SYNC_SEARCH_BYTES = 252
-# Read after an invalid header, to resynchronise with the device
+# Bytes that are read after an invalid header, to resynchronise with the device.
 _FLUSH_BYTES = 244
 _REMEDY = "check the board's power, the 60-pin connector and the USB cable, then `polysight resume SCAN`"
 
@@ -100,16 +100,18 @@ class Link:
         self._events.clear()
         self.may_start = True
 
-    def call(self, sent: Command, *, timeout_s: float = RESPONSE_TIMEOUT_S, remaining: int = 0) -> messages.Message:
-        """Send a command, with retries, and return the device's answer; RF power-up is never sent twice.
+    def call(self, command: Command, *, timeout_s: float = RESPONSE_TIMEOUT_S, remaining: int = 0) -> messages.Message:
+        """Send a command, with retries, and return the device's answer; `remaining` chunks follow it.
+
+        RF power-up is never sent twice.
 
         Raises DeviceError if the device does not answer or refuses the command.
         """
         problems: list[Finding] = []
         retry = False
-        attempts = 1 if sent is RF_POWER_UP else ATTEMPTS
+        attempts = 1 if command is RF_POWER_UP else ATTEMPTS
         for _ in range(attempts):
-            request = messages.command((sent.block(),), sequence=self.sequence, retry=retry, remaining=remaining)
+            request = messages.command((command.block(),), sequence=self.sequence, retry=retry, remaining=remaining)
             self._write(messages.encode(request))
             answer, problem = self._await_answer(request, timeout_s)
             if answer is None:
@@ -118,22 +120,22 @@ class Link:
                 continue
             self.sequence = (self.sequence + 1) % 16
             if answer.kind is messages.Kind.NACK:
-                problems.append(_report_lost_message("the device received a damaged message", _DISTURBED))
+                problems.append(_make_problem("the device received a damaged message", _DISTURBED))
                 retry = False
                 continue
             if problems:
-                self._warn(f"{sent.name} (0x{sent.ID:04X}) sent {len(problems) + 1} times: {problems[-1].what}")
+                self._warn(f"{command.name} (0x{command.ID:04X}) sent {len(problems) + 1} times: {problems[-1].what}")
             if answer.error is not None:
                 self._detect_restart()
                 raise DeviceError(
-                    f"{self._name}: the radar refuses {sent}: {messages.describe_refusal(*answer.error)}",
+                    f"{self._name}: the radar refuses {command}: {messages.describe_refusal(*answer.error)}",
                     "the device does not support a setting, or it is in an unexpected state",
                     "correct [chirp], [burst] or [radar]; docs/spec/mmwavelink.md",
                     code=ErrorCode.REFUSED_BY_PEER,
                 )
             return answer
         raise DeviceError(
-            f"{self._name}: no valid answer to {sent} after {len(problems)} attempts:"
+            f"{self._name}: no valid answer to {command} after {len(problems)} attempts:"
             f" {'; '.join(dict.fromkeys(p.what for p in problems))}",
             "; ".join(dict.fromkeys(p.why for p in problems)),
             _REMEDY,
@@ -142,8 +144,8 @@ class Link:
 
     def _detect_restart(self) -> None:
         """Raise UnexpectedRestartError if a power-up event follows the refusal of a command."""
-        until = self._clock.now() + _RESTART_EVENT_S
-        while self._clock.now() < until:
+        deadline = self._clock.now() + _RESTART_EVENT_S
+        while self._clock.now() < deadline:
             self._read_messages()
             self._clock.sleep(_INTERVAL_S)
 
@@ -203,7 +205,7 @@ class Link:
     def _await_answer(self, request: messages.Message, timeout_s: float) -> tuple[messages.Message | None, Finding]:
         """Return the answer to the last message, or None and the reason; keep events that arrive before it."""
         deadline = self._clock.now() + timeout_s
-        problem = _report_lost_message(f"no answer within {timeout_s:g} s", _SILENT)
+        problem = _make_problem(f"no answer within {timeout_s:g} s", _SILENT)
         parts: list[messages.Message] = []
         is_over = False
         while not is_over:
@@ -220,13 +222,13 @@ class Link:
             elif not _is_answer(message, request):
                 self._warn(f"late answer to an earlier message (sequence {message.sequence})")
             elif parts and message.remaining_chunks != parts[-1].remaining_chunks - 1:
-                return None, _report_lost_message("parts of the answer are missing", _DISTURBED)
+                return None, _make_problem("parts of the answer are missing", _DISTURBED)
             else:
                 parts.append(message)
                 if message.remaining_chunks == 0:
                     return _join_chunks(parts), problem
         if parts:
-            problem = _report_lost_message("parts of the answer are missing", _DISTURBED)
+            problem = _make_problem("parts of the answer are missing", _DISTURBED)
         return None, problem
 
     def _receive(self) -> tuple[messages.Message | None, Finding]:
@@ -236,16 +238,16 @@ class Link:
         if not self._wait_for_low():
             self._write(messages.READY_TO_READ)
             if not self._wait_for_low():
-                return None, _report_lost_message("the host interrupt stays high", _NOT_CLOCKED)
+                return None, _make_problem("the host interrupt stays high", _NOT_CLOCKED)
         self._clock.sleep(DATA_DELAY_S)
         head = self._read(messages.SYNC_BYTES)
         searched = 0
         while head[-messages.SYNC_BYTES :] != messages.DEVICE_SYNC:
             if searched >= _SYNC_SEARCH_BYTES:
-                # The same byte again and again comes from a line that nothing drives.
+                # A line that nothing drives gives the same byte again and again.
                 is_constant = len(set(head)) == 1
                 cause = _NO_MISO if is_constant else _DISTURBED
-                return None, _report_lost_message(f"no sync word in {searched} bytes", cause)
+                return None, _make_problem(f"no sync word in {searched} bytes", cause)
             head += self._read(2)
             searched += 2
         head = head[-messages.SYNC_BYTES :] + self._read(messages.HEADER_BYTES)
@@ -253,14 +255,15 @@ class Link:
             header = messages.decode_header(head)
         except ProtocolError as e:
             self._read(_FLUSH_BYTES)
-            return None, _report_lost_message(e.what, _DISTURBED)
+            return None, _make_problem(e.what, _DISTURBED)
         body = self._read(header.body_bytes)
         try:
-            return messages.decode(head + body), _report_lost_message("", "")
+            return messages.decode(head + body), _make_problem("", "")
         except ProtocolError as e:
-            return None, _report_lost_message(e.what, _DISTURBED)
+            return None, _make_problem(e.what, _DISTURBED)
 
     def _wait_for_low(self) -> bool:
+        """Wait until the interrupt line is low; return False after the timeout."""
         deadline = self._clock.now() + _INTERRUPT_TIMEOUT_S
         while self._words.interrupt():
             if self._clock.now() > deadline:
@@ -290,11 +293,13 @@ class Link:
         return struct.pack(f"<{len(words)}H", *words)[:size]
 
     def _warn(self, what: str) -> None:
+        """Add a warning; after `_MAX_WARNINGS` of them drop it."""
         if len(self.warnings) < _MAX_WARNINGS:
             self.warnings.append(f"{self._name}: {what}")
 
 
-def _report_lost_message(what: str, why: str) -> Finding:
+def _make_problem(what: str, why: str) -> Finding:
+    """Return the reason why a message was lost or unreadable."""
     return Finding("warning", what, why)
 
 
@@ -306,13 +311,13 @@ def _is_answer(message: messages.Message, request: messages.Message) -> bool:
     """
     if message.kind is messages.Kind.NACK:
         return True
-    back = {messages.Direction.HOST_TO_RF: messages.Direction.RF_TO_HOST}.get(
-        request.direction, messages.Direction.MAIN_TO_HOST
-    )
-    of_device = message.direction in (messages.Direction.RF_TO_HOST, messages.Direction.MAIN_TO_HOST)
-    if message.error == (None, None) and message.sequence == 0 and of_device:
+    reply_direction = messages.Direction.MAIN_TO_HOST
+    if request.direction is messages.Direction.HOST_TO_RF:
+        reply_direction = messages.Direction.RF_TO_HOST
+    is_from_device = message.direction in (messages.Direction.RF_TO_HOST, messages.Direction.MAIN_TO_HOST)
+    if message.error == (None, None) and message.sequence == 0 and is_from_device:
         return True
-    if message.kind is not messages.Kind.RESPONSE or message.direction is not back:
+    if message.kind is not messages.Kind.RESPONSE or message.direction is not reply_direction:
         return False
     same_command = message.message_id == request.message_id or message.error is not None
     return same_command and message.sequence == request.sequence

@@ -565,7 +565,7 @@ def surface_figure(surface: Surface) -> bytes:
 
 
 def surface_colours(surface: Surface) -> npt.NDArray[np.float64]:
-    """Real part of the permittivity of each point's segment, [n]; not a number without one."""
+    """Return the real part of the permittivity of each point's segment, [n]; not a number without one."""
     colours = np.full(len(surface.segment), np.nan)
     for segment in surface.segments:
         if segment.permittivity is not None:
@@ -574,7 +574,7 @@ def surface_colours(surface: Surface) -> npt.NDArray[np.float64]:
 
 
 def colour_range(surface: Surface) -> tuple[float, float]:
-    """Range of the colour bar: the permittivities, at least 1 wide."""
+    """Return the range of the colour bar: the permittivities, at least 1 wide."""
     values = [s.permittivity.real for s in surface.segments if s.permittivity is not None] or [1.0]
     middle = (min(values) + max(values)) / 2
     half = max(0.5, 0.55 * (max(values) - min(values)))

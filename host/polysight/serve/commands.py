@@ -166,7 +166,7 @@ class Named(NamedTuple):
 
 
 def command_routes(site: Site) -> list[Route]:
-    """Routes of everything that POST asks for."""
+    """Return the routes of all POST requests."""
 
     async def show_request(request: Request) -> Response:
         name = site.name(request)
@@ -469,7 +469,7 @@ def _list_processing_options(site: Site, library: str, metal: Box | None) -> Wor
 
 
 def _find_library(site: Site, name: str) -> Path:
-    """File of a library. Raises ConfigError."""
+    """Return the file of a library. Raises ConfigError."""
     libraries = site.libraries()
     if name not in libraries:
         raise ConfigError(

@@ -126,7 +126,7 @@ def _guard_application(routes: list[Route], access: Access) -> Starlette:
 
 
 def page_routes(front: Front) -> list[Route]:
-    """Routes of the static pages, and of what a page may show."""
+    """Return the routes of the static pages, and of what a page may show."""
     # They are small, and stay in memory.
     files = {
         path.name: Response(path.read_bytes(), media_type=MEDIA_TYPES[path.suffix])
@@ -178,7 +178,7 @@ def frame_page(name: str, title: str, style: str) -> str:
 
 
 def control_routes(front: Front) -> list[Route]:
-    """Routes of the running scans, and of the session of who has the token."""
+    """Return the routes of the running scans, and of the session of who has the token."""
     running = RunningScans(front.scans)
 
     async def open_session(request: Request) -> Response:
@@ -198,7 +198,7 @@ def control_routes(front: Front) -> list[Route]:
 
 
 def command_route(front: Front) -> Route:
-    """Route of pause, stop, abort and the other commands to a scan that runs."""
+    """Return the route of pause, stop, abort and the other commands to a running scan."""
 
     async def control(request: Request) -> Response:
         name = request.query_params.get("scan") or front.scans.only or ""
@@ -217,7 +217,7 @@ def command_route(front: Front) -> Route:
 
 
 def stage_routes(stage: StageControl) -> list[Route]:
-    """Routes of home and jog; all are POST, since even looking asks the Pi."""
+    """Return the routes of home and jog; all are POST, since even looking asks the Pi."""
     works: dict[str, Callable[[bytes], StagePlace]] = {
         "look": lambda _: stage.look(),
         "home": lambda _: stage.home(),
@@ -392,7 +392,7 @@ class ConnectionLimit:
             self._close_one()
 
     def note_read(self, connection: CountedConnection) -> None:
-        """Bytes of a connection were read."""
+        """Note that bytes of a connection were read."""
         if connection.is_working:
             self._forget(connection)
         elif connection in self._idle:

@@ -31,34 +31,34 @@ from polysight.serve.site import THUMBNAIL, Site, check_products, compare_produc
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError, ScanError
 
-# A report may come from anywhere: no script runs in it, and nothing is loaded.
+# A report may come from anywhere, so browsers run no script in it and load nothing for it.
 REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
 CHUNK_BYTES = 1 << 18
-# Products that are replaced while they are read are read again, so many times in all.
+# Number of attempts to read products, which may be replaced meanwhile.
 MAX_TRIES = 5
 T = TypeVar("T")
 Endpoint = Callable[[Site, Request], Awaitable[Response]]
 
 
 def reading_routes(site: Site) -> list[Route]:
-    """Routes of everything that GET answers."""
+    """Return the routes of all GET requests."""
     endpoints: dict[str, Endpoint] = {
-        "scans": _list_scans,
-        "scan": _scan,
-        "queue": _queue,
+        "scans": _send_scans,
+        "scan": _send_scan,
+        "queue": _send_queue,
         "thumbnail": _send_thumbnail,
-        "program/{kind}": _start_program,
-        "state": _state,
+        "program/{kind}": _send_program,
+        "state": _send_state,
         "events": _stream_events,
         "picture/{name}": _send_live_picture,
         "bar/{kind}": _send_colour_bar,
         "result": _send_result,
-        "map/{name}": _map,
-        "probe": _probe,
-        "file/{name}": _file,
-        "check": _check,
-        "compare": _compare,
-        "compare/{name}": _compare_map,
+        "map/{name}": _send_map,
+        "probe": _send_probe,
+        "file/{name}": _send_file,
+        "check": _send_control_chart,
+        "compare": _send_comparison,
+        "compare/{name}": _send_comparison_map,
     }
 
     def make_route(path: str, answer: Endpoint) -> Route:
@@ -71,7 +71,7 @@ def reading_routes(site: Site) -> list[Route]:
 
 
 def json_answer(content: object) -> Response:
-    """Structs, dataclasses or plain data as JSON; numbers that are not finite become null."""
+    """Return an answer in JSON from structs, dataclasses or plain data; numbers that are not finite become null."""
     return Response(msgspec.json.encode(content), media_type="application/json")
 
 
@@ -93,7 +93,7 @@ class ScanDetails(ListedScan, frozen=True, kw_only=True):
     programs: list[catalogue.Program]
 
 
-async def _list_scans(site: Site, request: Request) -> Response:
+async def _send_scans(site: Site, request: Request) -> Response:
     root = site.scans.root
     stamp = request.query_params.get("since", "")
 
@@ -113,7 +113,7 @@ async def _list_scans(site: Site, request: Request) -> Response:
     return json_answer(await site.read("", list_scans))
 
 
-async def _scan(site: Site, request: Request) -> Response:
+async def _send_scan(site: Site, request: Request) -> Response:
     name = site.name(request)
 
     def read_details(folder: Path) -> ScanDetails:
@@ -124,7 +124,7 @@ async def _scan(site: Site, request: Request) -> Response:
     return json_answer(await site.read_scan(request, read_details))
 
 
-async def _queue(site: Site, request: Request) -> Response:
+async def _send_queue(site: Site, request: Request) -> Response:
     del request
     if not site.starts:
         return json_answer(Waiting([]))
@@ -145,7 +145,7 @@ async def _send_thumbnail(site: Site, request: Request) -> Response:
     return Response(png, media_type="image/png", headers={"Cache-Control": "private, max-age=5"})
 
 
-async def _start_program(site: Site, request: Request) -> Response:
+async def _send_program(site: Site, request: Request) -> Response:
     kind = request.path_params["kind"]
     if kind not in ("doctor", "train", "concentration"):
         return json_answer(None)
@@ -160,7 +160,7 @@ async def _open_watch(site: Site, request: Request) -> Watch:
     return await site.read_scan(request, lambda folder: site.watches.open(name, folder))
 
 
-async def _state(site: Site, request: Request) -> Response:
+async def _send_state(site: Site, request: Request) -> Response:
     return Response((await _open_watch(site, request)).state.data, media_type="application/json")
 
 
@@ -209,7 +209,7 @@ async def _read_products(site: Site, request: Request, work: Callable[[Path], T]
             try:
                 result = work(folder)
             except (PolysightError, OSError):
-                # Half of it may be of the folder before, half of the one behind.
+                # The files may have been of two generations: an error counts only if there was one.
                 if catalogue.read_generation(read_products(folder).folder) == generation_before:
                     raise
                 continue
@@ -223,27 +223,27 @@ async def _read_products(site: Site, request: Request, work: Callable[[Path], T]
     return await site.read_scan(request, read)
 
 
-async def _map(site: Site, request: Request) -> Response:
+async def _send_map(site: Site, request: Request) -> Response:
     name = request.path_params["name"]
     limits = None
     if "low" in request.query_params and "high" in request.query_params:
-        low = _number(request, "low")
-        high = _number(request, "high")
+        low = _parse_number(request, "low")
+        high = _parse_number(request, "high")
         if low < high:
             limits = (low, high)
-    return _answer_picture(await _read_products(site, request, lambda folder: draw_map(folder, name, limits)))
+    return _make_picture_answer(await _read_products(site, request, lambda folder: draw_map(folder, name, limits)))
 
 
-async def _probe(site: Site, request: Request) -> Response:
-    x_mm = _number(request, "x")
-    y_mm = _number(request, "y")
+async def _send_probe(site: Site, request: Request) -> Response:
+    x_mm = _parse_number(request, "x")
+    y_mm = _parse_number(request, "y")
     name = request.query_params.get("library", "")
     library = site.libraries().get(name)
     return json_answer(await _read_products(site, request, lambda folder: catalogue.probe(folder, x_mm, y_mm, library)))
 
 
-async def _file(site: Site, request: Request) -> Response:
-    """Return one of the files that the result lists, in a form that cannot act as a page of this server."""
+async def _send_file(site: Site, request: Request) -> Response:
+    """Send one of the files that the result lists, in a form that cannot act as a page of this server."""
     name = request.path_params["name"]
     kind = request.query_params.get("of", "products")
 
@@ -282,14 +282,14 @@ class Download(StreamingResponse):
             yield chunk
 
 
-def _answer_picture(picture: catalogue.Picture) -> Response:
-    """Answer with a map; headers have the values at the ends of its colours."""
+def _make_picture_answer(picture: catalogue.Picture) -> Response:
+    """Return a map as an answer; its headers have the values at the ends of its colours."""
     unit = "deg" if picture.unit == "°" else picture.unit
     headers = {"X-Low": f"{picture.low:g}", "X-High": f"{picture.high:g}", "X-Unit": unit}
     return Response(picture.png, media_type="image/png", headers=headers)
 
 
-def _number(request: Request, key: str) -> float:
+def _parse_number(request: Request, key: str) -> float:
     text = request.query_params.get(key, "")
     try:
         value = float(text)
@@ -324,7 +324,7 @@ class ControlChart(msgspec.Struct, frozen=True, kw_only=True):
     action_sigmas: float = ACTION_SIGMAS
 
 
-async def _check(site: Site, request: Request) -> Response:
+async def _send_control_chart(site: Site, request: Request) -> Response:
     del request
 
     def read_checks() -> ControlChart:
@@ -351,21 +351,21 @@ async def _check(site: Site, request: Request) -> Response:
 
 
 async def _use_comparison(site: Site, request: Request, use: Callable[[catalogue.Comparison], T]) -> T:
-    """Compare the two scans that a request names, and return what `use` makes of the comparison; in a thread."""
+    """Compare the two scans of a request in a thread, and return the result of `use` on the comparison."""
     first = site.name(request, "a")
     second = site.name(request, "b")
-    # If one of them hangs, the other is still read alone.
+    # A name of its own: if reading one of them hangs, other requests for the other scan still work.
     both_scans = f"{first.partition('/')[0]} and {second.partition('/')[0]}"
     folder = site.scans.folder
     return await site.read(both_scans, lambda: use(compare_products(folder(first), folder(second))))
 
 
-async def _compare(site: Site, request: Request) -> Response:
+async def _send_comparison(site: Site, request: Request) -> Response:
     return json_answer(await _use_comparison(site, request, lambda comparison: comparison.figures))
 
 
-async def _compare_map(site: Site, request: Request) -> Response:
+async def _send_comparison_map(site: Site, request: Request) -> Response:
     name = request.path_params["name"]
-    return _answer_picture(
+    return _make_picture_answer(
         await _use_comparison(site, request, lambda comparison: catalogue.draw_comparison(comparison, name))
     )

@@ -142,7 +142,7 @@ class Site:
         return await anyio.to_thread.run_sync(work)
 
     def size(self, name: str) -> int | None:
-        """Bytes of a scan on the disk; None while they are being counted."""
+        """Return the bytes of a scan on the disk; None while they are being counted."""
         return self._sizes.read_size(self.scans.root / name)
 
     @property
@@ -151,7 +151,7 @@ class Site:
         return self.scans.root / HIDDEN
 
     def libraries(self) -> dict[str, Path]:
-        """Libraries trained here, by name."""
+        """Return the libraries trained here, by name."""
         folder = self.scans.root / LIBRARIES
         if not folder.is_dir() or folder.is_symlink():
             return {}
@@ -281,7 +281,7 @@ class Sizes:
         self._lock = threading.Lock()
 
     def read_size(self, folder: Path) -> int | None:
-        """Size in bytes at the last count; None before the first."""
+        """Return the size in bytes at the last count; None before the first."""
         size, counted_at = self._counted.get(folder, (None, float("-inf")))
         now = time.monotonic()
         if now - counted_at > SIZE_AGE_S:
@@ -379,7 +379,7 @@ class Watches:
             opened.used_at = time.monotonic()
 
     async def events(self, name: str, watch: Watch, is_ending: Callable[[], bool]) -> AsyncIterator[bytes]:
-        """Server-sent events of one page: always the newest state and motion.
+        """Return the server-sent events of one page: always the newest state and motion.
 
         Nothing is queued: a slow page gets fewer events, since `yield` waits for its socket.
         """

@@ -49,7 +49,7 @@ def describe_server(access: Access, what: str, bound: tuple[str, int]) -> str:
 
 
 def find_addresses() -> list[str]:
-    """IPv4 addresses of this machine in its networks, that of the default route first.
+    """Return the IPv4 addresses of this machine in its networks, that of the default route first.
 
     An interface with several addresses counts with its first; systems without these calls have none.
     """

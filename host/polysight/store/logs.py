@@ -213,7 +213,7 @@ class EventWriter:
             self._batch.clear()
 
     def digest(self) -> LogDigest:
-        """Length and CRC-32 of the file on disk, for the manifest."""
+        """Return the length and CRC-32 of the file on disk, for the manifest."""
         return LogDigest(self._file.length, f"{self._crc:08x}")
 
     def close(self) -> None:

@@ -250,7 +250,7 @@ _decoders = {name: msgspec.json.Decoder(kind) for name, kind in KINDS.items()}
 
 
 def compute_crc(fact: Mapping[str, Any]) -> str:
-    """CRC-32 (hex) of a fact without its `crc`: JSON, keys sorted, compact separators."""
+    """Return the CRC-32 (hex) of a fact without its `crc`: JSON, keys sorted, compact separators."""
     body = json.dumps(fact, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return f"{zlib.crc32(body.encode('ascii')):08x}"
 

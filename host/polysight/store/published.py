@@ -191,7 +191,7 @@ def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.i
 
 
 def _find_silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
-    """Packets that are all zero, bool [packet]."""
+    """Return the packets that are all zero, bool [packet]."""
     whole_packets = data.size // packet
     rows = data[: whole_packets * packet].reshape(whole_packets, packet)
     if packet % 8 == 0 and data.ctypes.data % 8 == 0:
@@ -291,7 +291,7 @@ def find_positions(
 
 
 def _find_ranges(missing: NDArray[np.bool_], unit: int, end: int) -> Gaps:
-    """Runs of True, each `unit` bytes, as (start, stop) up to `end`."""
+    """Return the runs of True, each `unit` bytes, as (start, stop) up to `end`."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
     return [(int(a) * unit, min(int(b) * unit, end)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 

@@ -303,7 +303,7 @@ def _write_new_files(scan: ScanFolder, board: BoardRow, placed_again: PlacedAgai
 
 
 def _find_free_name(path: Path) -> Path:
-    """`0003-1.bin` for `0003.bin`, or the next number that is free."""
+    """Return `0003-1.bin` for `0003.bin`, or the next number that is free."""
     stem = path.stem.split("-")[0]
     number = 1
     while (new := path.with_name(f"{stem}-{number}.bin")).exists():

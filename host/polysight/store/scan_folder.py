@@ -137,10 +137,9 @@ def _describe_value(value: Any) -> str:
     return repr(value)
 
 
-def new_scan_id(now: datetime | None = None) -> str:
+def new_scan_id() -> str:
     """Return a scan id: the start time and four random hex digits."""
-    now = now or datetime.now(UTC)
-    return f"{now:%Y%m%dT%H%M%SZ}-{secrets.token_hex(2)}"
+    return f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(2)}"
 
 
 def versions() -> dict[str, str]:

@@ -160,7 +160,7 @@ class Source(Scan, Protocol):
         ...
 
     def recording_facts(self) -> dict[str, Any]:
-        """Entries of quality.json about the recording: rows retaken, losses by board, notices."""
+        """Return the entries of quality.json about the recording: rows retaken, losses by board, notices."""
         ...
 
 

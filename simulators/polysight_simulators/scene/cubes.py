@@ -121,7 +121,7 @@ def synced_cube(
 
 
 def _draw_noise(shape: tuple[int, ...], rms_of_channel: Real, key: int) -> NDArray[np.complex64]:
-    """Complex noise of `shape`, whose first axis are the channels."""
+    """Return the complex noise of `shape`, whose first axis are the channels."""
     rng = np.random.default_rng(key)
     noise = rng.standard_normal((*shape[:-1], 2 * shape[-1]), dtype=np.float32).view(np.complex64)
     return noise * (np.sqrt(0.5) * rms_of_channel).astype(np.float32)[:, None, None, None]

@@ -107,7 +107,7 @@ class SerialPort:
         return rose
 
     def read(self) -> bytes:
-        """Received bytes; empty when there are none."""
+        """Return the received bytes; empty when there are none."""
         try:
             return os.read(self._master, 512)
         except OSError:

@@ -87,6 +87,7 @@ def test_the_command_says_and_draws_it(products_copy, tmp_path, capsys, permitti
     table = polysight.check(products_copy)
     assert table["level"].item() == check["level"]
     assert table["sigmas"].item() == check["sigmas"]
+    assert all({"units", "long_name"} <= set(variable.attrs) for variable in table.variables.values())
 
 
 def test_a_rig_file_without_a_plate_is_an_error(products_copy, capsys):

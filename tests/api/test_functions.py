@@ -15,6 +15,7 @@ import polysight
 from polysight import compare, fresnel, multilayer, open_scan, permittivity_from_ratio
 from polysight.products.processed import read_image
 from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
 
 from .conftest import COPPER, PET, simulate_plates
 
@@ -66,13 +67,23 @@ def test_an_array_with_labels_is_one_medium(which):
     xarray.testing.assert_identical(swept, multilayer([eps], [thickness_m], 78e9, np.radians(55))[0])
 
 
+@pytest.mark.parametrize("theta", [55.0, np.array([0.9, 55.0]), xarray.DataArray([55.0], dims="angle")])
+def test_degrees_are_no_radians(theta):
+    for call in (lambda: fresnel(3.8 - 0.7j, theta), lambda: permittivity_from_ratio(2.0, theta_rad=theta)):
+        with refused(ErrorCode.VALUE_INVALID, 55):
+            call()
+    with refused(ErrorCode.VALUE_INVALID, 55):
+        multilayer(2.9 - 0.03j, 1e-3, 78e9, theta)
+    assert np.isnan(fresnel(3.8 - 0.7j, np.nan)[0])
+
+
 def test_types_say_whether_labels_are_kept():
     """`assert_type` is judged by pyright: tests/api is among the files of `make check`."""
     plain = np.array([2.0, 3.0])
     labelled = xarray.DataArray(plain, dims="kind")
     assert_type(permittivity_from_ratio(plain, 0.9), Complex)
     assert_type(permittivity_from_ratio(labelled, 0.9), xarray.DataArray)
-    assert_type(fresnel(3.8 - 0.7j, labelled), tuple[xarray.DataArray, xarray.DataArray])
+    assert_type(fresnel(3.8 - 0.7j, labelled / 4), tuple[xarray.DataArray, xarray.DataArray])
     assert_type(multilayer([2.9, 3 - 0.1j], 1e-3, 78e9, 0.9), tuple[Complex, Complex])
     assert_type(multilayer(2.9, labelled * 1e-3, 78e9, 0.9), tuple[xarray.DataArray, xarray.DataArray])
     places = np.zeros((2, 3))
@@ -90,6 +101,8 @@ def test_two_scans_are_compared_on_labelled_pixels(folder, products):
     assert [same["pair_x_mm"].item(), same["pair_y_mm"].item()] == pytest.approx(PET["centre_mm"], abs=6)
     assert abs(same["pair_difference"].item()) < 1e-5
     assert set(same["p_difference"].dims) == {"y_mm", "x_mm"}
+    for variable in same.variables.values():
+        assert {"units", "long_name"} <= set(variable.attrs)
 
 
 # --- labels, libraries ------------------------------------------------------------------------------------------------
@@ -124,6 +137,21 @@ def test_a_box_outside_the_image_is_refused_and_nothing_is_written(products, tmp
     assert not (place / "labels.json").exists()
 
 
+@pytest.mark.parametrize("box", [[1, 2, 3], 7.0, "10,10,20,20", (20, 10, 10, 20)])
+def test_what_is_no_box_is_refused_by_name(products, tmp_path, box):
+    place = shutil.copytree(products, tmp_path / "one")
+    (place / "labels.json").unlink(missing_ok=True)
+    with refused(ErrorCode.VALUE_INVALID, "oak"):
+        open_scan(place).label({"oak": box})
+    assert not (place / "labels.json").exists()
+
+
+def test_one_path_is_one_scan(products):
+    """Not a scan for each letter of it."""
+    with pytest.raises(DataError, match=r"products|1 scan"):
+        polysight.train(str(products))
+
+
 # --- plan, simulate, show ---------------------------------------------------------------------------------------------
 
 
@@ -142,7 +170,8 @@ def test_a_scene_can_be_written_in_python(tmp_path):
         "burst": {"pulses": 2},
         "plates": [COPPER],
     }
-    simulated_scan = polysight.simulate(scene, tmp_path / "scan", seed=5)
+    with pytest.warns(UserWarning, match="COPPER|copper"):
+        simulated_scan = polysight.simulate(scene, tmp_path / "scan", seed=5)
     assert simulated_scan.simulated is True
     assert simulated_scan.rows.planned == 9
     with pytest.warns(UserWarning, match="grid"), refused(ErrorCode.OTHER):

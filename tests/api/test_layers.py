@@ -5,7 +5,7 @@ import pytest
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
-from polysight.api.scan import layer_dataset
+from polysight.api.layers import layer_dataset
 from polysight.materials.layers import Layer, Spectrum, predict
 from polysight.products import ProcessedScan, write_json
 from polysight_shared.error_codes import ErrorCode

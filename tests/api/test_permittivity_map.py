@@ -156,3 +156,5 @@ def test_a_place_has_the_figures_of_map_and_patch(scan):
     pixel = scan.probe(45, 0)
     assert complex(pixel["permittivity"]) == complex(eps["permittivity"].sel(x_mm=45, y_mm=0, method="nearest"))
     assert int(pixel["label"]) == 2
+    assert pixel["name"].item() == scan.materials()["name"].sel(patch=2).item()
+    assert scan.probe(0, 45)["name"].item() == ""

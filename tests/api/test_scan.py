@@ -330,7 +330,13 @@ def test_a_scan_without_metal_says_what_can_be_had(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"library": "absent.npz"}, {"model": "no such model"}, {"metal_box_mm": (900.0, 900.0, 910.0, 910.0)}]
+    "wrong",
+    [
+        {"library": "absent.npz"},
+        {"library": polysight.Library(())},
+        {"model": "no such model"},
+        {"metal_box_mm": (900.0, 900.0, 910.0, 910.0)},
+    ],
 )
 def test_parameters_that_cannot_be_used_are_errors(folder, wrong):
     with pytest.raises(PolysightError):

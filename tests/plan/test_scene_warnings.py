@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -69,3 +70,7 @@ def test_plan_and_simulate_say_it(tmp_path, capsys):
     assert main(["simulate", str(path), "--out", str(tmp_path / "scan")]) == 0
     assert "note, gap:" in capsys.readouterr().err
     assert any(text.startswith("gap: ") for text in polysight.plan(scene=path).warnings)
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always")
+        polysight.simulate(path, tmp_path / "again")
+    assert any(str(note.message).startswith("gap: ") for note in notes)

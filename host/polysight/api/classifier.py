@@ -66,6 +66,8 @@ def train(
     DataError
         if a scan has no labels, or fewer than two scans were given.
     """
+    if isinstance(scans, str | os.PathLike):
+        scans = [scans]
     folders = [scan if isinstance(scan, str | os.PathLike) else scan.folder for scan in scans]
     config = find_packaged(RIG) if rig is None else Path(rig)
     return train_from_scans([Path(folder) for folder in folders], config, note)

@@ -21,7 +21,7 @@ from polysight.catalogue import Pixels, compare_pixels
 from polysight.data import find_packaged
 from polysight.jobs.check import check_scan, check_scans
 from polysight.jobs.demo import simulate_scene
-from polysight.planning import Changes, Forecast, describe, forecast_scene
+from polysight.planning import Changes, Forecast, describe, find_scene_warnings, forecast_scene
 from polysight.products import PLANE, image_dataset
 from polysight.results import CheckResult
 from polysight_shared.config import Instrument, load_instrument
@@ -85,6 +85,8 @@ def plan(rig: PathText | Instrument | None = None, *, scene: Scene | None = None
 def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: int | None = None) -> Scan:
     """Simulate the scan of a scene with the simulated rig, and open it.
 
+    Warns of gaps, sizes, places and thicknesses that spoil the result of a plate, as :func:`plan`.
+
     Parameters
     ----------
     scene
@@ -109,8 +111,11 @@ def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: 
             raise ConfigError(
                 "no scene was given", "a scene says which objects lie where", "see help(polysight.simulate)"
             )
+        config = _find_rig(rig)
         _warn_of_whole_grid(path)
-        simulate_scene(path, _find_rig(rig), Path(out), seed)
+        for warning in find_scene_warnings(path, config):
+            warnings.warn(expand_paths(f"{warning.where}: {warning.what}"), stacklevel=2)
+        simulate_scene(path, config, Path(out), seed)
     return open_scan(out)
 
 
@@ -153,10 +158,22 @@ def compare(first: Scan | PathText, second: Scan | PathText) -> xarray.Dataset:
         "sigmas": (PLANE, comparison.sigmas, {"units": "1", "long_name": "difference of P in standard deviations"}),
         "pair_x_mm": ("pair", [pair.place_mm[0] for pair in pairs], {"units": "mm", "long_name": "x from the centre"}),
         "pair_y_mm": ("pair", [pair.place_mm[1] for pair in pairs], {"units": "mm", "long_name": "y from the centre"}),
-        "first_name": ("pair", [pair.names[0] or "" for pair in pairs]),
-        "second_name": ("pair", [pair.names[1] or "" for pair in pairs]),
+        "first_name": (
+            "pair",
+            [pair.names[0] or "" for pair in pairs],
+            {"units": "", "long_name": "name in the first"},
+        ),
+        "second_name": (
+            "pair",
+            [pair.names[1] or "" for pair in pairs],
+            {"units": "", "long_name": "name in the second"},
+        ),
         "pair_difference": ("pair", values, {"units": "1", "long_name": "difference of the permittivity"}),
-        "pair_sigmas": ("pair", [np.nan if pair.sigmas is None else pair.sigmas for pair in pairs]),
+        "pair_sigmas": (
+            "pair",
+            [np.nan if pair.sigmas is None else pair.sigmas for pair in pairs],
+            {"units": "1", "long_name": "difference of the permittivity in standard deviations"},
+        ),
     }
     image = image_dataset(scans[0].read_or_process())
     attributes: dict[str, object] = {
@@ -204,16 +221,17 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
     errors = np.array([result.measured_std or unknown for result in results])
     expected = np.array([result.expected for result in results])
     sigmas = [np.nan if result.sigmas is None else result.sigmas for result in results]
-    values: dict[str, Any] = {
-        "permittivity": measured[:, 0] - 1j * measured[:, 1],
-        "permittivity_real_standard_error": errors[:, 0],
-        "permittivity_loss_standard_error": errors[:, 1],
-        "expected_permittivity": expected[:, 0] - 1j * expected[:, 1],
-        "sigmas": sigmas,
-        "level": [result.level for result in results],
+    table: dict[str, Any] = {
+        "permittivity": (measured[:, 0] - 1j * measured[:, 1], "relative permittivity of the check plate"),
+        "permittivity_real_standard_error": (errors[:, 0], "standard error, real part"),
+        "permittivity_loss_standard_error": (errors[:, 1], "standard error, loss"),
+        "expected_permittivity": (expected[:, 0] - 1j * expected[:, 1], "permittivity in the rig file"),
+        "sigmas": (sigmas, "distance in standard deviations"),
+        "level": ([result.level for result in results], "level of the control chart"),
     }
-    table = {name: ("scan", value) for name, value in values.items()}
-    return xarray.Dataset(table, {"scan": [name for name, _ in checked]}, {"plate": results[-1].name})
+    variables = {name: ("scan", value, {"units": "1", "long_name": about}) for name, (value, about) in table.items()}
+    names = ("scan", [name for name, _ in checked], {"units": "", "long_name": "name of the scan"})
+    return xarray.Dataset(variables, {"scan": names}, {"plate": results[-1].name})
 
 
 def _find_rig(rig: PathText | None) -> Path:

@@ -15,20 +15,16 @@ import numpy.typing as npt
 from msgspec import UNSET
 
 from polysight import process
+from polysight.api.layers import layer_dataset
 from polysight.data import find_packaged
 from polysight.imaging import Images
 from polysight.jobs.label import save_labels
 from polysight.materials import (
-    LAYER_FORMS,
     MODELS,
     SHORT,
     Labels,
-    Layer,
     find_truth,
-    fit_row,
     format_permittivity,
-    incidence_std_rad,
-    parse_layer,
 )
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import Incidence
@@ -41,7 +37,6 @@ from polysight.products import (
     full_dataset,
     image_dataset,
     label_folder,
-    patch_coordinates,
     patch_dataset,
     permittivity_dataset,
     ranges_text,
@@ -51,7 +46,7 @@ from polysight.products import (
 from polysight.results import PatchFigures, Verdict, declared_figures
 from polysight.settings import Settings
 from polysight.store import MANIFEST, ScanFolder, Source, open_source
-from polysight_shared.config import Chirp, Instrument, load_instrument
+from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 
@@ -61,6 +56,7 @@ if TYPE_CHECKING:
 
 RIG = Path("instrument.toml")
 Box = tuple[float, float, float, float]
+_BOX = "a box is (x0, y0, x1, y1) in mm from the image's centre, x0 < x1 and y0 < y1"
 _PERMITTIVITY = (
     "permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error",
     "permittivity_real_loss_covariance", "dominated_by", "refused",
@@ -145,14 +141,24 @@ def _check_arguments(
         wrong = f"incidence is {incidence!r}: 'one' or 'pixel'"
     elif not isinstance(bands, int) or bands < 1:
         wrong = f"bands is {bands!r}: a whole number, 1 or more"
-    elif box is not None and (isinstance(box, str) or len(box) != 4 or not (box[0] < box[2] and box[1] < box[3])):
-        wrong = f"metal_box_mm is {box!r}: (x0, y0, x1, y1) in mm from the image centre, x0 < x1 and y0 < y1"
+    elif box is not None and not _is_box(box):
+        wrong = f"metal_box_mm is {box!r}: {_BOX}"
     elif model is not None and model not in (*MODELS, *SHORT, "none"):
         wrong = f"model is {model!r}: one of {', '.join((*SHORT, 'none'))}"
+    elif not isinstance(library, str | os.PathLike | None):
+        wrong = f"library is {library!r}: the path of a file that Library.save wrote"
     elif library is not None and not Path(library).is_file():
         wrong = f"library {library}: no such file"
     if wrong:
         raise ConfigError(wrong, "the argument is wrong", "see help(polysight.open_scan)", code=ErrorCode.VALUE_INVALID)
+
+
+def _is_box(box: object) -> bool:
+    """True for four corners in order."""
+    if not isinstance(box, tuple | list | np.ndarray) or len(box) != 4:
+        return False
+    x0, y0, x1, y1 = box
+    return bool(x0 < x1 and y0 < y1)
 
 
 def _analyse_images(path: Path, rig: str | os.PathLike[str] | Instrument | None, settings: Settings) -> ProcessedScan:
@@ -342,13 +348,28 @@ class Scan:
         return permittivity_dataset(self.read_or_process())
 
     def probe(self, x_mm: float, y_mm: float) -> xarray.Dataset:
-        """Return all results at the pixel nearest to a place, mm from the image's centre. Raises as :meth:`image`."""
+        """Results at the pixel nearest to a place, mm from the image's centre.
+
+        Returns
+        -------
+        xarray.Dataset
+            The variables of :meth:`image` and :meth:`permittivity_map`, `label` (the patch there, 0: none) and its
+            `name` ("": none).
+
+        Raises
+        ------
+        DataError
+            as :meth:`permittivity_map`.
+        """
         import xarray
 
-        maps = [self.image(), self.permittivity_map(), self.patches()[["label"]]]
-        return xarray.merge(maps, compat="override", join="exact", combine_attrs="override").sel(
-            x_mm=x_mm, y_mm=y_mm, method="nearest"
-        )
+        patches = self.patches()
+        maps = [self.image(), self.permittivity_map(), patches[["label"]]]
+        merged = xarray.merge(maps, compat="override", join="exact", combine_attrs="override")
+        place = merged.sel(x_mm=x_mm, y_mm=y_mm, method="nearest")
+        names = dict(zip(patches["patch"].values, patches["name"].values, strict=True))
+        name = str(names.get(place["label"].item(), ""))
+        return place.assign(name=((), name, patches["name"].attrs))
 
     def columns(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
         """Pixels inside the patches for a classifier, and the number of the patch of each.
@@ -393,9 +414,16 @@ class Scan:
 
         Raises
         ------
+        ConfigError
+            when a box is not four numbers in this order.
         DataError
             when a box or name cannot be used; nothing was written then.
         """
+        for name, box in boxes.items():
+            if not _is_box(box):
+                raise ConfigError(
+                    f"box of {name!r} is {box!r}", _BOX, "see help(polysight.Scan.label)", code=ErrorCode.VALUE_INVALID
+                )
         # Images of another program are one file: its folder takes the labels.
         place = label_folder(self.folder if self.folder.is_dir() else self.folder.parent)
         save_labels(place, self.read_or_process(), Labels(dict(boxes), "mm", metal, dict(specimens or {})))
@@ -647,50 +675,3 @@ def patch_table(scan: ProcessedScan) -> str:
         cells = [str(patch.label), name, text, *(figure.format(patch) for figure in figures)]
         lines.append("</tr><tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells))
     return f"<table>{''.join(lines)}</tr></table>"
-
-
-def layer_dataset(
-    scan: ProcessedScan, chirp: Chirp, stack: Sequence[str | Layer], bands: int | None, amplitude_percent: float
-) -> xarray.Dataset:
-    """Fit the unknown layer of a stack at each patch; parameters and errors as `Scan.layers`."""
-    import xarray
-
-    if scan.verdict is not None and not scan.verdict.usable:
-        raise scan.verdict.error("the images are kept")
-    layers = [_parse_layer(layer) for layer in stack]
-    angle_std_rad = incidence_std_rad(scan.materials)
-    fits = [fit_row(row, chirp, layers, bands, amplitude_percent / 100, angle_std_rad) for row in scan.segments]
-
-    def describe(values: Sequence[object], units: str, about: str) -> tuple[str, np.ndarray, dict[str, str]]:
-        return "patch", np.asarray(values), {"units": units, "long_name": about}
-
-    def read(attribute: str, factor: float = 1.0) -> list[float]:
-        values = [getattr(fit, attribute, None) for fit in fits]
-        return [np.nan if value is None else factor * value for value in values]
-
-    unknown = complex(np.nan, np.nan)
-    values = [unknown if fit is None else fit.permittivity for fit in fits]
-    notes = ["" if fit is None else "; ".join(map(str, fit.warnings())) for fit in fits]
-    ambiguous = [fit is not None and fit.ambiguous for fit in fits]
-    thickness = "thickness of the unknown layer; not a number: half space"
-    table = {
-        "permittivity": describe(values, "1", "relative permittivity of the unknown layer"),
-        "permittivity_real_standard_error": describe(read("std_real"), "1", "standard error, real part"),
-        "permittivity_loss_standard_error": describe(read("std_loss"), "1", "standard error, loss"),
-        "thickness_mm": describe(read("thickness_m", 1e3), "mm", thickness),
-        "thickness_standard_error_mm": describe(read("std_thickness_m", 1e3), "mm", "0 where it was given"),
-        "ambiguous": describe(ambiguous, "1", "another solution fits, or it is open by 5 %"),
-        "notes": describe(notes, "", "rivals and other warnings"),
-    }
-    return xarray.Dataset(table, patch_coordinates(scan))
-
-
-def _parse_layer(layer: str | Layer) -> Layer:
-    if isinstance(layer, Layer):
-        return layer
-    try:
-        return parse_layer(layer)
-    except ValueError:
-        problem = f"{layer!r} does not describe a layer"
-        why = "the text has another form"
-        raise ConfigError(problem, why, f"write {LAYER_FORMS}", code=ErrorCode.VALUE_INVALID) from None

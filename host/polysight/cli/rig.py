@@ -26,7 +26,7 @@ from polysight.cli.options import (
 from polysight.data import find_packaged
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, PolysightError
+from polysight_shared.errors import ConfigError
 
 _bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
 # Nearer than a few wavelengths (4 mm) no antenna sees a plane wave.
@@ -438,25 +438,15 @@ def _run_demo(args: argparse.Namespace) -> int:
 
 def _simulate(args: argparse.Namespace) -> int:
     from polysight.jobs.demo import run_simulator
+    from polysight.planning import find_scene_warnings
 
-    _warn_of_plates(find_packaged(args.scene), args.config)
+    for warning in find_scene_warnings(find_packaged(args.scene), args.config):
+        sys.stderr.write(f"note, {warning.where}: {warning.what}\n")
     command = ["simulate", str(find_packaged(args.scene)), "--config", str(args.config), "--out", str(args.out)]
     command += ["--layout", args.layout]
     if args.seed is not None:
         command += ["--seed", str(args.seed)]
     return run_simulator(command)
-
-
-def _warn_of_plates(scene: Path, config: Path) -> None:
-    """Print the warnings about the plates of a scene; what is wrong with the file, the simulator says."""
-    from polysight.planning import read_scene, warn_of_scene
-
-    try:
-        rig, plates = read_scene(scene, load_instrument(config))
-    except PolysightError:
-        return
-    for warning in warn_of_scene(rig, plates):
-        sys.stderr.write(f"note, {warning.where}: {warning.what}\n")
 
 
 def _run_reproduce(args: argparse.Namespace) -> int:

@@ -2,7 +2,8 @@
 
 `forecast` predicts the scan of a rig file to which `Changes` were applied; `propose` searches for the plans with the
 least noise within a time. `scan_time` estimates the duration. `run_plan`
-is the command; it can take noise and standstill from an earlier scan. `warn_of_scene` checks the plates of a scene.
+is the command; it can take noise and standstill from an earlier scan. `warn_of_scene` checks the plates of a scene,
+`find_scene_warnings` those of a scene file.
 """
 
 from polysight.planning.forecast import (
@@ -22,7 +23,7 @@ from polysight.planning.plan_command import (
     propose,
     run_plan,
 )
-from polysight.planning.scene_warnings import read_scene, warn_of_scene
+from polysight.planning.scene_warnings import find_scene_warnings, read_scene, warn_of_scene
 
 __all__ = [
     "Changes",
@@ -30,6 +31,7 @@ __all__ = [
     "Noise",
     "PlanOptions",
     "describe",
+    "find_scene_warnings",
     "forecast",
     "forecast_scene",
     "forecast_values",

@@ -15,7 +15,8 @@ from polysight.imaging import field_limits, point_response
 from polysight.materials import SegmentSettings
 from polysight.planning.forecast import describe_aperture
 from polysight.polarimetry import multilayer, specular_incidence_rad
-from polysight_shared.config import Instrument
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.errors import PolysightError
 from polysight_shared.findings import Finding
 from polysight_shared.tables import decode, read_toml, to_builtins
 
@@ -60,6 +61,15 @@ def read_scene(path: Path, rig: Instrument) -> tuple[Instrument, list[Plate]]:
         table["geometry"] = {**table["geometry"], "object_distance_mm": scene["object_distance_mm"]}
     plates = [_decode_plate(raw, path) for raw in scene.get("plates", [])]
     return decode(table, Instrument, str(path)), [plate for plate in plates if not plate.background]
+
+
+def find_scene_warnings(scene: Path, config: Path) -> list[Finding]:
+    """Return the notes about the plates of a scene file; none for a wrong file, which the simulator refuses."""
+    try:
+        rig, plates = read_scene(scene, load_instrument(config))
+    except PolysightError:
+        return []
+    return list(warn_of_scene(rig, plates))
 
 
 def _decode_plate(raw: Mapping[str, Any], path: Path) -> Plate:

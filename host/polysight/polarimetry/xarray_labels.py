@@ -1,10 +1,11 @@
-"""`fresnel`, `permittivity_from_ratio`, `multilayer` for people: they keep xarray's labels.
+"""`fresnel`, `permittivity_from_ratio`, `multilayer` for people: they keep xarray's labels and refuse degrees.
 
 Rooms use the plain functions of `fresnel.py`.
 """
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
@@ -17,6 +18,8 @@ from polysight.polarimetry.fresnel import Complex
 from polysight.polarimetry.fresnel import fresnel as plain_fresnel
 from polysight.polarimetry.fresnel import multilayer as plain_multilayer
 from polysight.polarimetry.fresnel import permittivity_from_ratio as plain_permittivity
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
 
 if TYPE_CHECKING:
     from xarray import DataArray
@@ -125,8 +128,27 @@ def _fill(value: Any, arrays: Iterator[Any]) -> Any:
     return next(arrays)
 
 
+def _refuse_degrees(function: Function) -> Function:
+    """Decorate a function of `theta_rad`: raise ConfigError for an angle beyond the plate's plane."""
+
+    @wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        theta_rad = inspect.signature(function).bind(*arguments, **named).arguments["theta_rad"]
+        largest = np.max(np.abs(np.asarray(theta_rad)), initial=0.0)
+        if largest > np.pi / 2:
+            raise ConfigError(
+                f"theta_rad reaches {largest:g}",
+                "an angle of incidence is at most pi / 2 (1.571) radians; this may be in degrees",
+                "convert it with numpy.radians, or take `incidence_rad` of an image",
+                code=ErrorCode.VALUE_INVALID,
+            )
+        return function(*arguments, **named)
+
+    return call  # type: ignore[return-value]
+
+
 _REFLECTION = ("s-polarised reflection coefficient", "p-polarised reflection coefficient")
-fresnel: _Fresnel = cast(_Fresnel, keep_labels(*_REFLECTION)(plain_fresnel))
+fresnel: _Fresnel = cast(_Fresnel, _refuse_degrees(keep_labels(*_REFLECTION)(plain_fresnel)))
 
 
 def _take_arrays_as_one_medium(function: Function) -> Function:
@@ -147,7 +169,9 @@ def _list_one_medium(value: Any) -> Any:
     return value
 
 
-multilayer: _Multilayer = cast(_Multilayer, _take_arrays_as_one_medium(keep_labels(*_REFLECTION)(plain_multilayer)))
+multilayer: _Multilayer = cast(
+    _Multilayer, _refuse_degrees(_take_arrays_as_one_medium(keep_labels(*_REFLECTION)(plain_multilayer)))
+)
 permittivity_from_ratio: _PermittivityFromRatio = cast(
-    _PermittivityFromRatio, keep_labels("relative permittivity")(plain_permittivity)
+    _PermittivityFromRatio, _refuse_degrees(keep_labels("relative permittivity")(plain_permittivity))
 )

@@ -141,6 +141,26 @@ def test_a_phone_shows_the_result_before_anything_is_opened(page, browser):
     assert browser.value("document.querySelectorAll('details[open]').length") == 0
 
 
+def test_a_phone_shows_nine_patches_and_many_reasons_in_as_much(scan, browser, tmp_path):
+    """As wordy as reports of disturbed scenes are; figures are of the scan of two plates."""
+    texts = {
+        "what": "plates are rough, wavy or bent: the phase of H scatters by 4 degrees, more than flat ones do",
+        "why": "an uneven surface is seen from other places by H and V; errors are larger, counted by the scatter",
+        "do": "fit it as a layer (polysight permittivity --layer), or lay plates and metal flat and free of others",
+    }
+    quality = QUALITY | {"verdict": {"level": "care", "reasons": [texts] * 7}}
+    plate = MATERIALS[1] | {"name": "cardboard (rough, in two lines)"}
+    patches = [MATERIALS[0], *(plate | {"label": number} for number in range(2, 10))]
+    content = {"segments": patches, "library": "a library of nine materials from 16 scans. " * 10, "model": "knn"}
+    busy = changed(scan, quality=ScanQuality.decode(quality), materials=ScanMaterials.decode(content))
+    assert busy.verdict is not None
+    write_report(tmp_path, busy)
+    browser.visit((tmp_path / "report.html").as_uri(), PHONE)
+    browser.wait("document.readyState == 'complete'", "the report")
+    assert browser.value("document.querySelectorAll('ol > li').length") == 7
+    assert browser.value("document.documentElement.scrollHeight") <= 4000
+
+
 def test_nothing_is_loaded_from_elsewhere(page):
     _, html = page
     assert not re.search(r"(?:https?:)?//[a-z0-9]", re.sub(r"base64,[A-Za-z0-9+/=]+", "", html), re.IGNORECASE)

@@ -12,6 +12,6 @@ connect) and creates the other parts, each with a thread of its own:
 scheduling, systemd notifications and the memory limit.
 """
 
-# Where install.sh puts it.
+# Path at which install.sh installs the program.
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
 AS_THE_SERVICE = f"as the service's user: `sudo -u polysight {PROGRAM} ...`"

@@ -34,9 +34,9 @@ JOURNAL_BYTES = 100 << 20
 TRANSFERS = 5
 # Longest duration relative to the nominal one: the system call adds some 100 us to 22 ms.
 MAX_PART = 1.05
-# Pairs of system calls to time.
+# Number of pairs of system calls that are timed.
 PAIRS = 500
-# Between them.
+# Pause between two pairs.
 PAUSE_NS = 300_000
 MODEL = Path("/proc/device-tree/model")
 MODULES = Path("/sys/module")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Commands import their modules when they are called: `--help` needs no other package, and Ctrl-C ends in no traceback.
 
-# Between the bursts of `pulse`.
+# Pause between two bursts of `pulse`.
 PAUSE_NS = 10_000_000
 
 
@@ -225,7 +225,7 @@ JOURNAL = _make_option(
 JSON = _make_option("--json", action="store_true", help="print JSON, for programs")
 COUNT = {"type": _parse_positive, "metavar": "N"}
 MM = {"type": float, "default": 0.0, "metavar": "MM"}
-# name, action, help, example, options
+# Name, action, help, example and options of each command.
 COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str, Any]], ...]], ...] = (
     ("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml", (
         WIRES, STAGE_PORT, JOURNAL,
@@ -307,7 +307,7 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except BrokenPipeError:
-        # Whoever read our output has enough.
+        # The reader of our output has closed the pipe.
         close_standard_output()
         return 0
     except Exception as e:

@@ -47,7 +47,7 @@ def _open_service(instrument: Instrument) -> Iterator[Ask]:
         def ask(command: m.AnyCommand) -> m.AnyReply:
             try:
                 client.send(m.pack(command))
-            # Not connected.
+            # There is no connection to the service.
             except zmq.Again:
                 raise _no_answer_error(address) from None
             if not client.poll(round(instrument.limits.command_timeout_s * 1e3)):

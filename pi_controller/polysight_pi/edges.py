@@ -20,7 +20,7 @@ from polysight_shared.raster import Row, Stage
 
 # Lowest speed of the sketch, steps/s (board.h, MIN_RATE).
 MIN_FEED = 31
-# Clock of the sketch's timer.
+# Clock of the timer in the stage's sketch.
 TICK_HZ = 2_000_000
 # Relative tolerance of the interval at constant speed. The resonator of an UNO is within 0.5 % of its frequency.
 TOLERANCE = 0.01

@@ -42,7 +42,7 @@ from polysight_shared.units import us_to_ns
 
 # The rest of the queue waits for the next turn, so that a queue that never empties is not a hang.
 TURN_TIMEOUT_S = 0.2
-# Longest turn without work.
+# Longest wait for work in one turn of the loop.
 TURN_S = 0.25
 # Silence of the executor, the journal or a socket after which motion stops and the watchdog is not fed. An answer of
 # the stage takes up to 2 s; writing to an SD card that tidies up takes about 1 s.
@@ -121,9 +121,9 @@ class Executor:
         self._last_row: tuple[int, int] | None = None
         # The newest one of each row of this scan
         self._takes: dict[int, int] = {}
-        # A run begins or ends
+        # True while a run begins or ends, which the journal must confirm.
         self._waits_for_journal = False
-        # Commands behind it
+        # Commands that wait until then.
         self._deferred: list[Request] = []
         self._after_row: Request | None = None
         self._replies: list[tuple[Request, m.AnyReply]] = []
@@ -339,7 +339,7 @@ class Executor:
             case m.Pulse():
                 return self._pulse(request, command)
             case _:
-                # Home, Hold, Resume
+                # The other commands are Home, Hold and Resume.
                 return self._accept(type(command).__name__)
 
     def _replay(self, request: Request, command: m.Replay) -> None:
@@ -449,7 +449,7 @@ class Executor:
 
     def _end_run(self, request: Request, command: m.EndRun) -> m.Accepted | None:
         if self._run is None and command.scan_id == self.journal.position[0]:
-            # A repeated request
+            # The host repeats a request that was already executed.
             return self._accept()
         self._require_run(command.scan_id)
         self._machine.require("EndRun")

@@ -37,7 +37,7 @@ from polysight_shared.raster import RasterPlan
 
 MAGIC = b"PSJRNL1\n"
 MAX_RECORD_BYTES = 1 << 20
-# Upper limit of a position's record.
+# Upper limit of the record of a position, bytes.
 CAPTURE_BYTES = 320
 # Space on the disk for the records of faults and retakes.
 SPARE_BYTES = 4 << 20

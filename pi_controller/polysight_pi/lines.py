@@ -423,12 +423,12 @@ class WireLines:
         self._return = pi.pulses_in
         listen = (pi.trigger_in,)
         join = None
-        # The simulated return wire
+        # The simulated wire that returns SYNC_IN, for counting pulses.
         if pi.pulses_in is not None:
             listen += (pi.pulses_in,)
             join = (self._output, pi.pulses_in)
         self._client = WireClient(path, listen=listen, join=join)
-        # Trigger edges received while looking back
+        # Trigger edges that were received while waiting for other edges.
         self._waiting: deque[WireEdge] = deque()
         self._now_ns = self._seqno = 0
         self._active = False

@@ -75,7 +75,7 @@ class Machine:
         # True while the position is that of a stage at rest; a status of before is none.
         self._is_placed = False
         self.homed = self.in_run = False
-        # The first one
+        # Number of the first fault; 0: none.
         self.fault = 0
         # Reason of the fault.
         self.reason = ""
@@ -83,7 +83,7 @@ class Machine:
         self.lost_mm = (0.0, 0.0)
         self.row_timeout_s = math.inf
         self._deadline_s = math.inf
-        # Sequence of HOME
+        # Sequence number of the HOME line.
         self._homing = -1
         # True once the stage has accepted it
         self._homing_underway = False
@@ -197,7 +197,7 @@ class Machine:
     def stop_motion(self, number: int, reason: str) -> None:
         """Stop a row, jog or homing, if there is one, with this fault."""
         if self.jog is not None and self.jog.status is not None:
-            # It was told to stop
+            # The stage was already told to stop.
             return
         if self.state in ("running", "held", "jogging"):
             self.happen("row fault", number, reason)
@@ -245,7 +245,7 @@ class Machine:
             if self.row is not None and reply.sequence == self.row.sequence:
                 self.row.is_underway = True
         elif homing and not self._homing_underway:
-            # Sent before HOME was accepted
+            # The status was sent before HOME was accepted.
             pass
         elif reply.kind == "banner":
             self.happen("stage lost", PiFault.STAGE_LOST, "the stage was reset: it sent its banner")

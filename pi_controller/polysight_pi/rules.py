@@ -75,14 +75,14 @@ RULES = (
 TIMEOUTS_S: dict[State, float] = {
     "homing": HOMING_TIMEOUT_S,
     "jogging": m.MAX_JOG_S + 5.0,
-    # From STOP to standstill.
+    # Time from STOP to standstill.
     "stopping": 3.0,
-    # From the stage's `done` to the last burst.
+    # Time from the stage's `done` to the last burst.
     "done": 1.0,
 }  # running: set for each row; all others: no limit
 # From STOP to standstill when the program is being ended.
 END_TIMEOUT_S = 0.5
-# The others have the same name
+# The other states have the same name on the wire.
 WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}
-# The stage moves
+# States in which the stage moves.
 MOVING = ("homing", "jogging", "running", "held", "stopping")

@@ -67,7 +67,7 @@ CLEAR_RETRY_S = 0.05
 CALLER_LATE_S = 3.0
 # Largest position in the messages; a reply with a larger one was damaged.
 MAX_MM = 1e6
-# No motion takes longer than homing.
+# Homing is the longest motion.
 MOTION_TIMEOUT_S = HOMING_TIMEOUT_S
 
 
@@ -194,7 +194,7 @@ class StageLink:
             settings[2] &= ~termios.HUPCL
             termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, settings)
         except (OSError, ValueError, termios.error) as e:
-            # SerialException is an OSError
+            # SerialException is an OSError, too, but may have no number.
             reason = os.strerror(e.errno) if isinstance(e, OSError) and e.errno else str(e)
             raise StageLostError(
                 f"stage port {port} cannot be opened: {reason}",
@@ -221,7 +221,7 @@ class StageLink:
 
     def _greet(self, banner_timeout_s: float) -> None:
         self._banner_seen.wait(banner_timeout_s)
-        # Ends a partial line sent earlier
+        # The line end completes a partial line that was sent earlier.
         self._write(b"\n")
         hello = self.request("HELLO")
         fields = {**(self._banner.fields if self._banner else {}), **hello.fields}
@@ -458,7 +458,7 @@ class StageDriver:
         try:
             self.clear(stop=True)
         except StageRefusedError as e:
-            # Homing is the remedy
+            # Homing is the remedy of this error.
             if e.number != StageError.NOT_HOMED:
                 raise
         config = self.config

@@ -44,7 +44,7 @@ MIN_PART = 0.98
 class Edge(NamedTuple):
     """A rising edge of the trigger line; a gap in `seqno` means lost edges."""
 
-    # On the clock of the lines.
+    # Time on the clock of the lines.
     t_ns: int
     seqno: int
 
@@ -65,10 +65,10 @@ class BurstSpec(NamedTuple):
 class SpiBurst(NamedTuple):
     """A burst as one SPI transfer on MOSI: each pulse is one set bit, within half a bit of its exact time."""
 
-    # Most significant bit first
+    # Bits of the SPI transfer, most significant bit first.
     data: bytes
     clock_hz: int
-    # Index of each set bit
+    # Index of each set bit.
     bits: tuple[int, ...]
 
     @property
@@ -89,13 +89,13 @@ class BurstRecord(NamedTuple):
     # Rising edge of the first pulse: the clock just before the line was set
     first_ns: int
     last_ns: int
-    # End of the last pulse
+    # Time of the end of the last pulse.
     end_ns: int
     # Upper bound: from before the line was set until after it was cleared
     width_max_ns: int = 0
     # Largest delay of a rising edge after its deadline
     jitter_ns: int = 0
-    # PiFault; 0: none
+    # Number of the PiFault; 0: none.
     fault: int = 0
 
 
@@ -103,7 +103,7 @@ class Seen(NamedTuple):
     """Pulses seen at the connector, by the return wire."""
 
     pulses: int
-    # 0: not measured
+    # Upper bound of the pulse widths; 0: not measured.
     width_max_ns: int = 0
 
 
@@ -113,13 +113,13 @@ class _Lines(Protocol):
     name: str
     # True without a hardware one-shot: a pulse that may have been too long is a fault
     check_width: bool
-    # True if their clock is CLOCK_MONOTONIC
+    # True if the lines' clock is CLOCK_MONOTONIC.
     is_real_time: bool
 
     # Time on the clock of edges and pulses.
     def now_ns(self) -> int: ...
 
-    # Returns at `t_ns`, never before it.
+    # Sleep until `t_ns`; never return before it.
     def sleep_until(self, t_ns: int) -> None: ...
 
     # The next rising edge of the trigger line, or None after `timeout_s` of wall time.

@@ -45,7 +45,7 @@ def die_with_parent(sig: signal.Signals = signal.SIGTERM) -> None:
     """Request the signal `sig` at the end of the parent process, so that a simulated rig leaves none behind (Linux)."""
     if not sys.platform.startswith("linux"):
         return
-    # Needed by few programs
+    # Imported here, because few programs need it.
     import ctypes
 
     parent = os.getppid()

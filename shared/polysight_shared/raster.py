@@ -110,7 +110,7 @@ class Stage(Section, frozen=True):
     centre_x_mm: NonNegative = 400.0
     centre_y_mm: NonNegative = 250.0
     backlash_mm: NonNegative = 0.0
-    # Measures lost steps; needs limit switches
+    # Home after the last row to measure lost steps; needs limit switches.
     home_after_scan: bool = False
     # Pins with the other level than in board.h, sent before the first motion
     inverted: tuple[_Invertible, ...] = ()

@@ -48,17 +48,17 @@ class Immediate(IntEnum):
 class Parameter(IntEnum):
     """First argument of `SET`: the setting of the stage; the comment has the unit of the second argument."""
 
-    # Steps/s^2
+    # Acceleration, steps/s^2.
     ACCEL = 0
     # Milliseconds of silence after which a moving stage stops
     HEARTBEAT = 1
-    # Microseconds, width of the trigger pulse
+    # Width of the trigger pulse, microseconds.
     TRIGGER = 2
-    # Steps, soft limit 0..TRAVEL_X
+    # Travel in x, steps: the stage moves within 0..TRAVEL_X.
     TRAVEL_X = 3
-    # Steps
+    # Travel in y, steps.
     TRAVEL_Y = 4
-    # Steps/s, between rows
+    # Speed between rows, steps/s.
     TRAVEL_SPEED = 5
     # Bits of the pins whose level is inverted, in the order of raster.INVERTIBLE
     PINS = 7

@@ -57,7 +57,7 @@ def compile_once(product: str, sources: Iterable[Path], command: Sequence[str], 
         return result
     with tempfile.TemporaryDirectory(prefix=".making-", dir=result.parent) as folder:
         _run([word.replace("{folder}", folder) for word in command], product, on_failure)
-        # Atomically
+        # The rename is atomic: other processes see a complete file or none.
         (Path(folder) / product).replace(result)
     return result
 
@@ -77,7 +77,7 @@ def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
 def _make_folder() -> Path:
     """Return a writable folder for compiled programs. Raises DeviceError if the last one belongs to another user."""
     places = [FOLDER]
-    # A user without a home
+    # The user may have no home folder.
     with suppress(RuntimeError):
         places.append(Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "polysight" / "build")
     for folder in places:

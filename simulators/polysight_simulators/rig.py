@@ -152,7 +152,7 @@ class RigOptions(NamedTuple):
     seed: int | None = None
     pattern: bool = False
     faults: Path | None = None
-    # Single ones, KEY=VALUE
+    # Single faults, KEY=VALUE.
     fault: Sequence[str] = ()
     cache: Path | None = None
     uno: bool = False
@@ -304,7 +304,7 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
         raise ConfigError("neither --scene nor --pattern", "the radars need a signal", "give one of them")
     rig = derive(load_instrument(config), scene, folder, options.native)
     boards = tuple(b.name for b in rig.boards)
-    # Raises before anything starts.
+    # Invalid faults raise an error before anything starts.
     read_faults(options.faults, list(options.fault), boards, control=rig.radar.control)
     folder.mkdir(parents=True, exist_ok=True)
     _write_files(rig, scene, folder, options)

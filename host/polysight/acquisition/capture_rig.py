@@ -142,7 +142,7 @@ class CaptureRig:
         self.stop_records()
         deadline = time.monotonic() + _COMPLETED_TIMEOUT_S
         for name, receiver in self.receivers.items():
-            # Nothing follows a complete row.
+            # A complete row gets no more data: only others need the wait.
             if not receiver.poll().complete:
                 self.cards[name].wait_completed(max(0.0, deadline - time.monotonic()))
         statuses = self.statuses()

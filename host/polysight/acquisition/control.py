@@ -317,7 +317,7 @@ def send_command(folder: Path, command: ScanCommand, asker: str = "a program", l
             try:
                 path.unlink()
             except FileNotFoundError:
-                # Accepted at the last moment.
+                # The command was accepted at the last moment.
                 return
             raise ScanError(
                 f"{folder}: the scan did not accept `{command}` within {limit_s:g} s; the command is withdrawn",

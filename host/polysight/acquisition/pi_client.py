@@ -34,7 +34,7 @@ REAL_TIME = 1
 _SILENT_BEATS = 10
 # Time to wait for a reply to `Alive` before it is sent again.
 _ALIVE_TIMEOUT_S = 1.0
-# States that change without a command.
+# States of the Pi that change without a command.
 MOVING: tuple[m.State, ...] = ("homing", "jogging", "running", "held", "done")
 # Time for the stage to come to rest.
 _REST_TIMEOUT_S = 10.0
@@ -285,7 +285,7 @@ class PiClient:
         try:
             self._commands.send(m.pack(command))
         except zmq.Again:
-            # There is no connection.
+            # There is no connection to the Pi.
             return None
         if not self._commands.poll(round(timeout_s * 1e3)):
             return None

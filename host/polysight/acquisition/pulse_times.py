@@ -73,7 +73,7 @@ _USUAL_DRIFT = 100e-6
 _DRIFT_BURSTS = 8
 # Host clock over pulse clock; outside, the pulses are in simulated time.
 _RATES = 0.8, 1.25
-# Missed pulses that a message names.
+# Number of missed pulses that a message names.
 _SHOWN = 4
 # Stands for no bound: beyond every time in nanoseconds, and every number of bytes.
 _NO_BOUND = 1 << 60

@@ -50,11 +50,11 @@ class FaultKind(StrEnum):
 
     # The scan was aborted on request.
     ON_REQUEST = "on_request"
-    # Reported by the radar.
+    # The radar reported that it has stopped.
     RADAR_STOPPED = "radar_stopped"
-    # Still armed after the last pulse.
+    # The radar is still armed after the last pulse.
     RADAR_WAITS = "radar_waits"
-    # The Pi ended the row; `number` is of shared/polysight_shared/faults.py.
+    # The Pi ended the row; `number` is the fault's in shared/polysight_shared/faults.py.
     PI_FAULT = "pi_fault"
     # The Pi did not report how the row ended.
     NO_END = "no_end"
@@ -71,13 +71,13 @@ class FaultKind(StrEnum):
     FRAMES_MISSING = "frames_missing"
     # The card reports that it dropped data before numbering packets.
     CARD_DROPPED = "card_dropped"
-    # Packets dropped by the kernel, possibly others too.
+    # Packets are missing, and the kernel dropped at least some of them.
     LOST_BY_HOST = "lost_by_host"
-    # Packets that never reached this machine.
+    # Packets are missing that never reached this machine.
     LOST_ON_THE_WAY = "lost_on_the_way"
-    # Packets with equal counters and different bytes.
+    # Packets have equal counters and different bytes.
     CONFLICTING = "conflicting"
-    # Data with an uncertain place in the row.
+    # The place of the data in the row is uncertain.
     UNLOCATED = "unlocated"
 
 
@@ -87,7 +87,7 @@ class TakeFault:
 
     kind: FaultKind
     text: str
-    # "" if the fault is the whole row's
+    # Name of the board; "" if the fault concerns the whole row.
     board: str = ""
     # The Pi's number of a `PI_FAULT`.
     number: int = 0
@@ -116,15 +116,15 @@ class Take:
 
     row: Row
     number: int
-    # None if the Pi did not report how the row ended
+    # The Pi's report on the end of the row; None if there was none.
     finished: RowFinished | None = None
     captures: dict[str, RowCapture] = field(default_factory=dict)
-    # Why the host aborted the row, or did not begin it
+    # Reason why the host aborted the row, or did not begin it.
     aborted: TakeFault | None = None
     events: list[pulse_times.ReceivedCapture] = field(default_factory=list)
-    # Latest states
+    # Latest state of each radar.
     radars: dict[str, BoardState] = field(default_factory=dict)
-    # Radars that did not confirm the end of all frames
+    # Radars that did not confirm the end of all frames.
     not_done: list[str] = field(default_factory=list)
     # Frames placed by their arrival times, for rows of a certain length.
     frames: dict[str, pulse_times.PlacedFrames] = field(default_factory=dict)
@@ -135,32 +135,32 @@ class Take:
             TakeFault(FaultKind.RADAR_STOPPED, f"the radar has stopped: {s.detail}", name)
             for name, s in self.stopped_radars.items()
         ]
-        if fault := self._read_fault_of_pi(self.row.points * pulses_per_point):
+        if fault := self._find_fault_of_pi(self.row.points * pulses_per_point):
             faults.append(fault)
         faults += [
             TakeFault(FaultKind.RADAR_WAITS, "the radar still waits for pulses, it missed some", name)
             for name in self.not_done
         ]
         if self.aborted and not self.events:
-            # No pulses, no data.
+            # Without pulses there is no data to judge.
             return faults
         board_faults = (
             self._find_board_fault(name, capture, pulses_per_point) for name, capture in self.captures.items()
         )
         return faults + [fault for fault in board_faults if fault is not None]
 
-    def _read_fault_of_pi(self, pulses: int) -> TakeFault | None:
+    def _find_fault_of_pi(self, pulses: int) -> TakeFault | None:
         """Return the fault that the Pi reported; None if the row was run as planned."""
-        f = self.finished
-        if f is None:
+        end = self.finished
+        if end is None:
             return self.aborted or TakeFault(FaultKind.NO_END, "the Pi did not report how the row ended")
-        if f.status != "done":
-            text = f"the row ended as {f.status}: {f.reason or explain(f.fault).problem}"
-            if self.aborted is not None and f.status == "aborted":
+        if end.status != "done":
+            text = f"the row ended as {end.status}: {end.reason or explain(end.fault).problem}"
+            if self.aborted is not None and end.status == "aborted":
                 return TakeFault(self.aborted.kind, text)
-            return TakeFault(FaultKind.PI_FAULT, text, number=f.fault)
-        if (f.points, f.pulses) != (self.row.points, pulses):
-            text = f"{f.points} points and {f.pulses} pulses, {self.row.points} and {pulses} planned"
+            return TakeFault(FaultKind.PI_FAULT, text, number=end.fault)
+        if (end.points, end.pulses) != (self.row.points, pulses):
+            text = f"{end.points} points and {end.pulses} pulses, {self.row.points} and {pulses} planned"
             return TakeFault(FaultKind.COUNTS_DIFFER, text)
         return None
 
@@ -197,7 +197,7 @@ class Take:
                 kind = FaultKind.SLIPPED
             return TakeFault(kind, pulse_times.describe(displaced, pulses_per_point) + held_text, name)
         if not capture.located:
-            # The kind with the clearest remedy goes first; the text lists all that is known.
+            # Of several possible kinds, the one with the clearest remedy is chosen; the text lists all that is known.
             frames = self.frames.get(name)
             if frames is not None:
                 unplaced = f"; missed pulses cannot be located: {frames.reason}"
@@ -269,9 +269,9 @@ def commit_row(
     for name, capture in take.captures.items():
         final = scan.row_path(name, take.row.index)
         frames = take.frames.get(name)
-        # Frames that were not seen at the pulse of their number; None if the record can stay as it came.
+        # Frames that must be moved to the pulse at which they arrived; None if the record is already in order.
         moved = pulse_times.frames_to_move(capture, frames)
-        # Without times to compare them with, the pulse of each frame follows from its number alone.
+        # Frames whose pulse is known only from their number, because their times could not be compared.
         untimed = 0
         if capture.located and (frames is None or not frames.is_timed):
             untimed = planned
@@ -340,7 +340,7 @@ def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
 
 
 def _describe_reception(capture: RowCapture) -> dict[str, Any]:
-    """Return the counts of `capture` under the names of the manifest; both types use the same names, but for bytes."""
+    """Return the counts of `capture` under the names of the manifest, which differ only for the bytes."""
     counts = {kind: getattr(capture, kind) for kind in Reception.__struct_fields__ if hasattr(capture, kind)}
     return {**counts, "received_bytes": capture.bytes}
 
@@ -574,8 +574,9 @@ class RowTaker:
             )
 
     def _poll(self, take: Take) -> None:
-        """Wait for messages and read all of them: cards and receivers are read by asking for their state."""
+        """Wait for messages of the Pi, the cards and the receivers, and read all of them."""
         self._poller.poll(_POLL_MS)
+        # Asking for the state reads the messages of cards and receivers.
         self._rig.statuses()
         _ = self._rig.complete
         self._collect(take)
@@ -603,11 +604,11 @@ class RowTaker:
 
     def _end_records(self, take: Take) -> None:
         """Stop the records and make the rows durable; notify while a slow disk delays this."""
-        began = time.monotonic()
+        started_s = time.monotonic()
         with ThreadPoolExecutor(1, thread_name_prefix="disk") as executor:
             ending = executor.submit(self._rig.end_row, pulse_times.first_pulse_ns(take.events) or 0)
             while not wait([ending], _DISK_NOTICE_S).done:
-                waited_s = time.monotonic() - began
+                waited_s = time.monotonic() - started_s
                 self._notify("wait", f"row {take.row.index} is not written after {waited_s:.0f} s: the disk is slow")
             take.captures = ending.result()
 
@@ -626,13 +627,13 @@ class _SilenceCheck:
         self._rig = rig
         self._limit_ns = int(instrument.limits.end_of_record_s * NS_PER_S)
         burst_bytes = instrument.burst.pulses * instrument.frame_bytes
-        # A card sends a packet when it is full: fewer bursts than fill two packets prove nothing.
+        # A card sends a packet only when it is full: silence counts only after bursts that fill two packets.
         self._bursts = -(-2 * instrument.card.packet_bytes // burst_bytes)
         self._checked_ns = 0
         self._all_heard = False
 
     def find_silent_boards(self, events: list[pulse_times.ReceivedCapture]) -> list[str]:
-        """Return the boards without a byte `end_of_record_s` after enough bursts. Asks the receivers no more often."""
+        """Return the boards without a byte `end_of_record_s` after enough bursts; checked once in that time."""
         now = time.monotonic_ns()
         if self._all_heard or len(events) < self._bursts or now - self._checked_ns < self._limit_ns:
             return []

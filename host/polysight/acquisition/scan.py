@@ -109,9 +109,9 @@ class RunningScan:
         self._queue = ProcessingQueue(on_row, scan.instrument.limits.rows_waiting)
         self._committed = set(scan.committed_rows())
         self._row_seconds: list[float] = []
-        # Monotonic, plus pauses; None between rows.
+        # Start of the current row on the monotonic clock, moved on by pauses; None between rows.
         self._row_began: float | None = None
-        # Row, take, points.
+        # Index, take number and points of the current row.
         self._current = (-1, 0, 0)
         self._state = ""
         self._stop_announced = False
@@ -134,9 +134,9 @@ class RunningScan:
         try:
             with stop_on_interrupt(self._stop):
                 self._pi.follow(self._scan.scan_id, events.last_seq, events.append)
-                self._pi.begin_run(self._begin_run(events.last_seq))
+                self._pi.begin_run(self._make_begin_run(events.last_seq))
                 begun = True
-                # Events of an earlier program's takes.
+                # Fetch the events of takes that an earlier program recorded.
                 self._pi.drain()
                 self._warn_of_lost_events(self._pi.events())
                 events.sync()
@@ -161,7 +161,7 @@ class RunningScan:
         safe = f"{len(self._committed)} of {self._plan.rows} rows are safe"
         resume = f"`polysight resume {quote(self._scan.path)}` continues from there"
         if isinstance(e, PolysightError):
-            # A remedy that names the command already is not told twice.
+            # Do not repeat the command if the remedy has it already.
             if f"polysight resume {quote(self._scan.path)}" in e.remedy:
                 resume = ""
             e.remedy = advice(e.remedy, safe, resume)
@@ -178,17 +178,18 @@ class RunningScan:
             with suppress(PolysightError):
                 self._end(begun)
 
-    def _begin_run(self, last_seq: int) -> BeginRun:
-        i = self._instrument
+    def _make_begin_run(self, last_seq: int) -> BeginRun:
+        """Return the command that begins or resumes the run; `last_seq` is the last event that this host has."""
+        burst = self._instrument.burst
         return BeginRun(
             scan_id=self._scan.scan_id,
             plan=self._plan,
-            pulses=i.burst.pulses,
-            period_us=i.burst.period_us,
-            width_us=i.burst.width_us,
-            speed_mm_s=i.stage.speed_mm_s,
+            pulses=burst.pulses,
+            period_us=burst.period_us,
+            width_us=burst.width_us,
+            speed_mm_s=self._instrument.stage.speed_mm_s,
             last_seq=last_seq,
-            heartbeat_ms=i.pi.host_heartbeat_ms,
+            heartbeat_ms=self._instrument.pi.host_heartbeat_ms,
         )
 
     def _warn_of_lost_events(self, events: list[AnyEvent]) -> None:
@@ -214,7 +215,7 @@ class RunningScan:
             scan_id=self._scan.scan_id,
             folder=self._scan.path,
             stop=self._stop,
-            on_point=self._point,
+            on_point=self._report_points,
             notify=self._notify,
         )
         for row in todo:
@@ -262,7 +263,7 @@ class RunningScan:
                     transaction.change_state(RowState.STOPPED)
                     return
                 events.sync()
-                if self._settle(take, number == last_take, transaction, events) or self._stop.now:
+                if self._commit_or_reject(take, number == last_take, transaction, events) or self._stop.now:
                     return
             except BaseException:
                 transaction.fail()
@@ -341,12 +342,12 @@ class RunningScan:
             self._pi.events()
         return not (self._stop.now or (waited and self._stop.after_row))
 
-    def _settle(self, take: Take, last: bool, transaction: RowTransaction, events: EventWriter) -> bool:
+    def _commit_or_reject(self, take: Take, is_last: bool, transaction: RowTransaction, events: EventWriter) -> bool:
         """Commit or reject the take; return True if it is committed."""
         row = take.row.index
         faults = take.faults(self._instrument.burst.pulses)
-        keep = last and self._keep_incomplete and take.all_pulses_sent and not self._stop.now
-        if faults and not keep:
+        may_keep_incomplete = is_last and self._keep_incomplete and take.all_pulses_sent and not self._stop.now
+        if faults and not may_keep_incomplete:
             if self._stop.now:
                 faults = [ON_REQUEST]
             reject_row(self._scan, self._writer, take, faults)
@@ -403,7 +404,8 @@ class RunningScan:
                 raise
             self.result.warnings.append(f"the Pi's run could not be ended: {e.what}")
 
-    def _point(self, points: int) -> None:
+    def _report_points(self, points: int) -> None:
+        """Report the points of the row so far, and once that a stop was requested."""
         if self._stop.after_row and not self._stop.now and not self._stop_announced:
             self._stop_announced = True
             self._notify("stop", "the scan ends after this row; Ctrl-C once more ends it now")
@@ -511,7 +513,7 @@ def run_scan(
         )
         writer = stack.enter_context(scan.writer())
         if progress is not None:
-            # The folder is this scan's from here on, and it can be stopped; the radars may take seconds.
+            # Report progress now, because the radars may take seconds: the caller can accept requests to stop.
             progress(ScanProgress("check", "making the radars ready", plan.rows, 0))
         radars = stack.enter_context(radars or radar_control(instrument))
         stop = stop or StopRequest()
@@ -563,7 +565,7 @@ def resume_scan(
         if not hello.stage or (scan.started.pi is not None and scan.started.pi.stage):
             warnings = check_same_stage(scan.instrument.stage, hello, f"{folder}")
         else:
-            # The earlier rows were placed by that Pi, not by the host's rig file
+            # The scan began without the Pi's stage settings, which placed its rows: a difference is only a warning.
             differences = stage_differences(scan.instrument.stage, hello)
             warnings = [f"not compared when the scan began: {d}" for d in differences]
         connection = None
@@ -610,7 +612,7 @@ def _copy_calibration(instrument: Instrument, folder: Path, simulated: bool) -> 
     """Copy the calibration files that the rig file names into the scan; return their entry for the manifest."""
     if not any(to_builtins(instrument.calibration).values()):
         return {}
-    # Here, because checking them loads imaging and polarimetry.
+    # Imported here, because it loads imaging and polarimetry.
     from polysight.calibration import copy_into_scan
 
     return copy_into_scan(instrument, folder, simulated)

@@ -136,21 +136,23 @@ def _check_arguments(
     model: str | None, library: str | os.PathLike[str] | None, box: Box | None, bands: int, incidence: str
 ) -> None:
     """Check the arguments before any row is read. Raises ConfigError."""
-    wrong = ""
+    problem = ""
     if incidence not in ("one", "pixel"):
-        wrong = f"incidence is {incidence!r}: 'one' or 'pixel'"
+        problem = f"incidence is {incidence!r}: 'one' or 'pixel'"
     elif not isinstance(bands, int) or bands < 1:
-        wrong = f"bands is {bands!r}: a whole number, 1 or more"
+        problem = f"bands is {bands!r}: a whole number, 1 or more"
     elif box is not None and not _is_box(box):
-        wrong = f"metal_box_mm is {box!r}: {_BOX}"
+        problem = f"metal_box_mm is {box!r}: {_BOX}"
     elif model is not None and model not in (*MODELS, *SHORT, "none"):
-        wrong = f"model is {model!r}: one of {', '.join((*SHORT, 'none'))}"
+        problem = f"model is {model!r}: one of {', '.join((*SHORT, 'none'))}"
     elif not isinstance(library, str | os.PathLike | None):
-        wrong = f"library is {library!r}: the path of a file that Library.save wrote"
+        problem = f"library is {library!r}: the path of a file that Library.save wrote"
     elif library is not None and not Path(library).is_file():
-        wrong = f"library {library}: no such file"
-    if wrong:
-        raise ConfigError(wrong, "the argument is wrong", "see help(polysight.open_scan)", code=ErrorCode.VALUE_INVALID)
+        problem = f"library {library}: no such file"
+    if problem:
+        raise ConfigError(
+            problem, "the argument is wrong", "see help(polysight.open_scan)", code=ErrorCode.VALUE_INVALID
+        )
 
 
 def _is_box(box: object) -> bool:
@@ -175,8 +177,8 @@ def _analyse_images(path: Path, rig: str | os.PathLike[str] | Instrument | None,
     return scan
 
 
-def _open_products_only(path: Path, settings: Settings, anew: bool) -> Scan:
-    if anew:
+def _open_products_only(path: Path, settings: Settings, process_again: bool) -> Scan:
+    if process_again:
         raise ConfigError(
             f"{path}: products cannot be processed again", "the recorded rows are not in this folder",
             "give the scan folder with these parameters, or leave them out to read the products",
@@ -516,7 +518,7 @@ class Scan:
         return f"<Scan {self._title}: {simulated}{self._row_count}, {self._kind} in {self.folder}>"
 
     def _repr_html_(self) -> str:
-        """Table of the scan, and of its patches where they are known without processing rows."""
+        """Return a table of the scan, and of its patches if they are known without processing rows."""
         lines = {"rows": self._row_count, "read from": f"{self._kind} in {self.folder}"}
         processed = self._result_at_hand
         patches = ""
@@ -553,6 +555,7 @@ class Scan:
         """The result if it is saved or was computed already."""
         if self._saved is not None:
             return self._saved
+        # Cached properties that were computed are in the instance's dict; asking for them would compute them.
         processing = vars(self).get("_processing", self)
         return vars(processing).get("referenced")
 
@@ -576,7 +579,7 @@ class Scan:
         return origin
 
     def read_or_process(self, metal_referenced: bool = True) -> ProcessedScan:
-        """Saved products of this kind, otherwise processed rows: what the datasets are made of. Raises as `image`."""
+        """Return saved products of this kind, or else process the rows. Raises as :meth:`image`."""
         if self._saved is not None and self._saved.metal_referenced == metal_referenced:
             return self._saved
         if self._source is None:
@@ -604,7 +607,7 @@ class Scan:
         )  # fmt: skip
 
     def _select_columns(self, names: Sequence[str]) -> xarray.Dataset:
-        """These variables of the patches, where they exist, with the coordinates of their dimension."""
+        """Return those of the named variables that the patches have, with the coordinates of their dimension."""
         patches = self.patches()
         columns = patches[[name for name in names if name in patches]]
         return columns.drop_vars(["x_mm", "y_mm", "x_m", "y_m"], errors="ignore")

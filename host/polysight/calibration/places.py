@@ -244,7 +244,7 @@ def _model_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray
     step = _rotate_phase(path * (f[-1] - f[0]) / (f.size - 1))
     tones = np.empty((*path.shape, f.size), np.complex128)
     tones[..., 0] = _rotate_phase(path * f[0]) / (out_m * back)
-    # Evenly spaced
+    # Frequencies are evenly spaced: each phasor follows from the one before.
     for k in range(1, f.size):
         np.multiply(tones[..., k - 1], step, out=tones[..., k])
     echoes = tones.reshape(-1, f.size) @ board.echo.T

@@ -216,7 +216,7 @@ class CardClient:
     def _try(self, code: Code, data: bytes, limit_s: float) -> Reply | None:
         """Send once and wait for the reply to this code."""
         while self._receive(0.0) is not None:
-            # Late replies to an earlier attempt.
+            # Late replies to an earlier attempt are ignored.
             pass
         try:
             self._socket.sendto(dca1000.encode_request(code, data), self._address)

@@ -36,15 +36,15 @@ from polysight_shared.files import read_bounded
 
 MAX_BYTES = 256 << 20
 """Part of a file that is read: eleven rows of the published scan."""
-# Enough for the statistics.
+# More chirps do not change the statistics noticeably.
 MAX_CHIRPS = 4096
 # To recognise a file of whole packets.
 _HEADERS_READ = 16
-# ADC counts.
+# Full scale of the ADC, counts.
 _FULL_SCALE = 32767
 _PCAP_HEADS = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\n\r\r\n")
 _UDP_HEADER_BYTES = 8
-# Half an hour of three boards.
+# Largest capture file: half an hour of three boards.
 _MAX_PCAP_BYTES = 4 << 30
 _CLEAR_PEAK_DB = 10.0
 _MUCH_DC = 0.05 * _FULL_SCALE

@@ -63,7 +63,7 @@ class PacketCounts:
     duplicates: int = 0
     # Their bytes differ from those of a packet with equal counters; both are masked where they overlap.
     conflicting: int = 0
-    # Packets of an earlier record.
+    # Number of packets that belong to an earlier record.
     leftover: int = 0
     # They came after the card restarted within the row and reset its counters.
     restarted: int = 0
@@ -75,7 +75,7 @@ class PacketCounts:
     malformed: int = 0
     # Placed packets that came after one that follows them.
     late: int = 0
-    # Largest delay of these, bytes
+    # Largest delay of late packets, bytes.
     late_by_bytes: int = 0
     # Placed packets that are not full: normally only the last one of a record.
     short: int = 0
@@ -232,11 +232,11 @@ def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
 class _Record:
     """The row's record among the packets; arrays are [packet]."""
 
-    # Counters of its first byte
+    # Counters of the first byte of the record.
     start: Counters
-    # int64, bytes behind the start
+    # int64: bytes from the start to each packet.
     offsets: Counts
-    # int64, packets behind the start
+    # int64: packets from the start to each packet.
     steps: Counts
     # Counters within the row, and came after the first pulse
     of_row: Flags
@@ -244,13 +244,13 @@ class _Record:
     beyond: Flags
     # Packets of a record behind this one.
     later: Flags
-    # Came before the row's first pulse
+    # True for packets that came before the row's first pulse.
     early: Flags
     # The early packets with counters of the row.
     too_early: Flags
     # Has counters of a card that restarted within the row
     after_restart: Flags
-    # Payload of a full packet, bytes
+    # Payload of a full packet, bytes.
     full: int
     # Bytes up to the end of the furthest packet
     length: int = 0
@@ -423,7 +423,7 @@ class _Row:
         is_kept = np.arange(log.count) < log.kept
         self._of_row = record.of_row & is_kept
         self.offsets: Counts = np.full(log.count, -1, dtype=np.int64)
-        # Sorted, joined.
+        # Byte ranges that are covered by packets: sorted and joined.
         self.covered: list[Gap] = []
         self.conflicts: list[Gap] = []
         self.received = self.extent = 0

@@ -94,7 +94,7 @@ class Receiver:
         self._socket: socket.socket | None = None
         self._batches: BatchReceiver | None = None
         self._row: _Row | None = None
-        # Knowledge from earlier records.
+        # Knowledge of the card from earlier records.
         self._past = Past()
         # Memory of the previous row, which the next one reuses.
         self._memory: NDArray[np.uint8] | None = None
@@ -257,7 +257,7 @@ def main(argv: list[str]) -> int:
         try:
             Receiver(connection).serve()
         except PolysightError as e:
-            # The host may have ended.
+            # The host program may have ended already.
             with contextlib.suppress(DeviceError):
                 messages.send(connection, messages.Failed(e.what, e.why, e.remedy, e.code))
             return e.exit_status

@@ -289,7 +289,7 @@ def _rank_materials(pixels: Pixels, row: int, column: int, library: Path | None)
     try:
         ratios = _average_library(path, path.stat().st_mtime_ns, float(np.degrees(pixels.theta_rad)))
     except (PolysightError, OSError):
-        # A library of another angle.
+        # The library was made at another angle.
         return []
     p = complex(pixels.p[row, column])
     p_std = float(pixels.p_std[row, column])

@@ -81,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"{name}: stopped\n")
         return 128 + signal.SIGINT
     except BrokenPipeError:
-        # Whoever read our output has enough.
+        # The reader of our output has closed the pipe.
         close_standard_output()
         return 0
     except Exception as e:

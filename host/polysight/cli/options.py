@@ -18,7 +18,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 
 RIG = Path("instrument.toml")
-# Options before "more options"
+# Number of options that help shows before "more options".
 _FIRST = 3
 _FARTHEST_MM = 10_000
 # Names in a parsed command line that are no options.
@@ -46,12 +46,12 @@ class CommandParser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         """Return the help text."""
-        # The first two are argparse's own
+        # The first two groups are argparse's own.
         groups = self._action_groups[2:]
         grouped = [a for group in groups for a in group._group_actions]
         options = [a for a in self._actions if a.option_strings and a not in grouped]
         options.sort(key=lambda a: (not a.required, not set(self.most_used) & set(a.option_strings), a.dest == "help"))
-        # No section for --help alone.
+        # A section with --help alone is left out.
         first = _FIRST
         if len(options) <= _FIRST + 1:
             first = len(options)
@@ -204,7 +204,7 @@ def join_negative_values(words: Sequence[str]) -> list[str]:
         elif out and out[-1].startswith("--") and "=" not in out[-1]:
             out[-1] += f"={word}"
         else:
-            # A blank in front: no option
+            # With a blank in front argparse does not take it for an option.
             out.append(f" {word}")
     return out
 

@@ -72,7 +72,7 @@ _MIN_SPEED_MBIT = 1000
 _MIN_RING = 512
 # Share of chirps that may be clipped.
 _MAX_CLIPPED = 0.01
-# Counts
+# Least rms of the samples, ADC counts.
 _MIN_RMS = 4.0
 # Share of chirps in which the direct path must be found.
 _MIN_DETECTED = 0.9
@@ -667,7 +667,7 @@ def check_skew(context: CheckContext) -> Finding:
 def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
     """Judge the receivers' start times. Relative to the transmitter they are as exact as the start frequencies."""
     h, v = rig.receivers
-    # Mean and standard error, s
+    # Mean and standard error of the delay of each board, s.
     delay = {b.name: signals[b.name].start_delay_s(rig) for b in (h, v)}
     skew = delay[v.name][0] - delay[h.name][0]
     uncertainty = float(np.hypot(delay[h.name][1], delay[v.name][1]))

@@ -77,7 +77,7 @@ ARM_MM = 100.0
 
 # Smallest footprint relative to the strongest; weaker pixels are mostly noise.
 _VISIBLE = 0.15
-# Pixels, width of the majority filter.
+# Width of the majority filter, pixels.
 _NEIGHBOURS = 15
 TAPERS: dict[str, Window] = {"none": "boxcar", "kaiser": ("kaiser", 4.0), "taylor": ("taylor", 4, 30)}
 """Windows over the aperture by their name in the rig file, as for scipy."""

@@ -23,9 +23,9 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Blocks of positions per axis: exact within 12 resolution cells to either side
 _BLOCKS = 24
-# Resolution cells evaluated to either side
+# Number of resolution cells that are evaluated to either side of the peak.
 _CELLS = 6.0
-# Points per resolution cell
+# Number of points per resolution cell.
 _POINTS = 20
 # Nearest ghosts: step of the numerical derivative, reach and precision of the search, places that are tried.
 _STEP_M = 1e-4

@@ -47,7 +47,7 @@ _PASSED_M = 1.0
 _ECHO = 30.0
 # Noise power of a sample relative to the gate, for the estimate of the direct path
 _NOISE = 1e-3
-# Positions to either side
+# Taps of the filter against the motion in a burst: positions to either side.
 REACH = 4
 # Largest frequency of the filter, cycles per position
 _BAND = 0.45
@@ -176,7 +176,7 @@ def burst_filters(rig: Instrument) -> NDArray[np.float32]:
     The first tap is the middle one, the others apply on both sides. Least squares up to 0.45 cycles per position.
     """
     times_s = np.array(rig.burst.chirp_times_s)
-    # Motion of each chirp, in positions
+    # Motion of the stage from the middle of the burst to each chirp, in positions.
     shift_positions = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm
     turns = np.linspace(0, _BAND, 91)
     loss = np.cos(2 * np.pi * np.outer(turns, shift_positions)).mean(axis=1)
@@ -431,7 +431,7 @@ class BoardSamples:
 
     def _apply_gate(self, samples: NDArray[np.complex64], sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Apply the range gate to a row; return samples and the direct path, [rx, frequency + 1, position]."""
-        # Reversed positions make the product slow
+        # A copy: the product of an array with reversed positions is slow.
         if samples.strides[1] < 0:
             return self._apply_gate(samples[:, ::-1], sweep_hz)[..., ::-1]
         if sweep_hz.size not in self._maps:
@@ -448,7 +448,7 @@ class BoardSamples:
     def _prepare(self) -> None:
         """Create the spectral imager of all rows if the aperture is regular; keep it while positions do not change."""
         if self._final is None and geometry.irregular(self.aperture) is None:
-            # Shares spectra with the live imager
+            # The same slack as the live imager, so that both share their spectra.
             self._final = SpectralImager(self.aperture, slack_m=SLACK_M)
             self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)
             self._padded = np.zeros((*self._cube.shape[:2], self._final.period), np.complex64)
@@ -665,7 +665,7 @@ def _pair_maps(maps: NDArray[np.complex128]) -> tuple[slice, NDArray[np.float32]
     used = np.flatnonzero(maps.any(axis=0))[[0, -1]]
     maps = np.pad(maps[:, used[0] : used[1] + 1], ((0, -len(maps) % (_COLUMNS // 2)), (0, 0)))
     paired = np.empty((maps.shape[1], 2, maps.shape[0], 2), np.float32)
-    # contributions to the real part
+    # Contributions to the real part.
     paired[:, 0, :, 0] = maps.real.T
     paired[:, 1, :, 0] = -maps.imag.T
     paired[:, 0, :, 1] = maps.imag.T

@@ -28,7 +28,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Length of the cross-fade relative to the kernel's length in x
 _FADE = 0.08
-# Smallest length of the cross-fade
+# Smallest length of the cross-fade, columns.
 _FADE_COLUMNS = 20
 # Relative to the kernel's strongest spectral bin: weaker ones are left out
 _FILLED = 1e-5
@@ -107,7 +107,7 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     last = grid.x_m[-1] - x.min() + slack_m
     step = column_step_m(offsets) or grid.pixel_m
     spans = (last - first) / step + 1
-    # Columns of one period.
+    # Number of columns of one period.
     columns = _find_fast_length(math.ceil(spans + max(_FADE * spans, _FADE_COLUMNS)))
     band = _find_band(aperture, first, last, step, columns)
     stride_x = -(-band.size // columns)
@@ -147,7 +147,7 @@ def cross_fade(xp: Any, kernel: Any, size: int) -> Any:
     spectrum, so that phase ramps shift it by any fraction.
     """
     fade = kernel.shape[-1] - size
-    # 1e-4 from its ends
+    # The curve is within 1e-4 of 0 and 1 at its ends.
     curve = (1 + scipy.special.erf(np.linspace(-1, 1, fade + 2)[1:-1] * 2.7)) / 2
     ramp = xp.asarray(curve, dtype=xp.float32, device=getattr(kernel, "device", None))
     period = xp.asarray(kernel[..., fade:], copy=True)
@@ -332,7 +332,7 @@ class SpectralImager(RowSpectra):
         # Lattice row of the first row of pixels
         self._last = sizes.row_stride * (rows - 1)
         count = sizes.size_y // sizes.row_stride
-        # Zeros below rows
+        # Rows are padded with zeros below.
         self._padded_lines = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)
         self._repeat = self.put(np.arange(sizes.size_y) % count)
         self._rows = self.put(np.arange(rows) * sizes.row_stride)
@@ -514,12 +514,12 @@ class IncrementalImager(RowSpectra):
         xp = self.xp
         kernels = self.kernels()
         by_k = xp.empty(kernels.shape[::-1], dtype=xp.complex64, device=self.device)
-        # Contiguous, so that products are fast
+        # The kernels are stored contiguously by k, so that products are fast.
         by_k[...] = xp.permute_dims(kernels, (2, 1, 0))
         squares = []
         for first in range(0, by_k.shape[0], _CHUNK):
             last = min(first + _CHUNK, by_k.shape[0])
-            # Weak components need the digits
+            # Weak components need double precision.
             exact = xp.astype(by_k[first:last, :, :], xp.complex128)
             squares.append(xp.matmul(xp.conj(exact).mT, exact))
         power, vectors = xp.linalg.eigh(xp.concat(squares))

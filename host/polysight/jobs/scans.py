@@ -193,7 +193,7 @@ def _format_complex(number: ComplexNumber | PermittivityDifference) -> str:
     return f"{number.real:.3g} {sign} {abs(number.imag):.3g}j"
 
 
-# Confirms the removal of raw rows
+# Word that a person types to confirm the removal of raw rows.
 WORD = "drop"
 
 
@@ -285,7 +285,7 @@ def _keep(products: Path, scan: store.ScanFolder) -> None:
 def find_processed_digests(folder: Path) -> store.Digests:
     """Return the CRCs of the processed rows, by board. Raises DataError."""
     products = read_products(folder)
-    # Raises when it cannot be read
+    # Reading the images raises an error if they are damaged.
     _ = products.images
     boards = products.quality.boards
     digests = {name: board.raw_crc32 for name, board in boards.items() if board.raw_crc32 is not UNSET}

@@ -253,7 +253,7 @@ class ErrorDiscriminant(Model):
     def _compute_deviations(self, x: Real) -> Real:
         """Return the deviations from every material's anchor, [n, materials, features]."""
         h, v, t = split_by_angle(x)
-        # Alone, by its own logarithm
+        # V alone is judged by its own logarithm.
         if self.channels == "V":
             return np.log(np.maximum(v, 1e-6))[:, None] - self._anchor_v
         log_h = np.log(np.maximum(h, 1e-6))[:, None] - self._anchor_h

@@ -86,7 +86,7 @@ CHI2_997 = 11.8
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
-# Columns of a particle.
+# Columns of a particle (see `SceneLikelihood`).
 LEAKAGE_H = (0, 1)
 LEAKAGE_V = (2, 3)
 REFERENCE = (4, 5)
@@ -687,7 +687,7 @@ def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real
     """
     t = np.asarray(t, np.complex128)
     scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
-    # Pixels without a ratio stay so.
+    # Pixels without a ratio have no error either.
     with np.errstate(invalid="ignore"):
         by_real_part = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
     by_error = np.stack([by_real_part, 1j * by_real_part], axis=-1).reshape(*t.shape, 6)

@@ -251,7 +251,7 @@ DETERMINED = 0.05
 """Largest relative half width of 95 % regions of a fit that is not ambiguous."""
 # Draws of the posterior for its second moments.
 _DRAWS = 1500
-# Standard deviations
+# Range of the integration, in standard deviations.
 _REACH = 4.0
 # Ratio of sampled to linear standard deviations above which the sampled ones are used
 _BENT = 1.15
@@ -464,7 +464,7 @@ class _Model:
         self.data = (2 if bands.amplitude_h is None else 3) * bands.inverse_ratio.size
         self.freedom = self.data - self.unknowns
         self.whiten = np.linalg.inv(np.linalg.cholesky(bands.data_covariance))
-        # Radians per millimetre.
+        # Wavenumber in vacuum, radians per millimetre.
         self.wavenumber = 2 * np.pi * float(np.mean(bands.spectrum.frequency_hz)) / SPEED_OF_LIGHT_M_S * 1e-3
 
     def residuals(self, x: npt.ArrayLike, thin: int = 1) -> Real:

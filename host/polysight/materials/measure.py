@@ -505,7 +505,7 @@ def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
 
     `digits` stand behind the point; `width` is the least width of the real part, for aligned columns.
     """
-    # + 0.0: no -0.00
+    # Adding zero after rounding removes the sign of a negative zero.
     real, imag = (round(float(part), digits) + 0.0 for part in (value.real, value.imag))
     return f"{real:{width}.{digits}f} {'+' if imag > 0 else '-'} j{abs(imag):.{digits}f}"
 

@@ -189,7 +189,7 @@ def image_orientation(scans: Sequence[LabelledScan]) -> str:
         try:
             shares[orientation] = float(np.mean([compute_explained_variance(s.orient(orientation)) for s in scans]))
         except DataError:
-            # A box outside the image
+            # The box lies outside the image in this orientation.
             shares[orientation] = -1.0
     first = next(iter(ORIENTATIONS))
     best = max(shares, key=lambda h: shares[h])
@@ -371,7 +371,7 @@ def _read_pixels(values: Any, most: int) -> npt.NDArray[np.complex128]:
 
 
 def _number(value: Any) -> float | None:
-    # "3 mm"
+    # The thickness may be a text such as "3 mm".
     if isinstance(value, str):
         value = value.lower().removesuffix("mm").strip()
     return None if value is None or value == "" else float(value)

@@ -263,7 +263,7 @@ class ScanHistory:
                 if rejected.faults:
                     total.retaken += any(fault.board == name for fault in rejected.faults)
                 else:
-                    # Older scans.
+                    # Older scans have no faults by kind, only texts.
                     total.retaken += any(reason.startswith(f"{name}:") for reason in rejected.reasons)
         for row in self.content.rows.values():
             for name, part in row.boards.items():
@@ -305,7 +305,7 @@ class ScanHistory:
         elif isinstance(fact, store.ScanPaused):
             self._paused_at = seconds(fact.paused_utc)
         elif isinstance(fact, store.ScanContinued) and self.last_commit_s:
-            # A pause does not count.
+            # The time of a pause does not count as time of the row.
             self.last_commit_s += seconds(fact.continued_utc) - self._paused_at
 
     def _add_committed_row(self, fact: store.RowCommitted) -> None:

@@ -60,25 +60,30 @@ from polysight_shared.raster import plan_raster
 from polysight_shared.sockets import observer
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
+# Range profiles: points of the Fourier transform, points that are shown, and the lowest level.
 FFT_POINTS = 2048
 PROFILE_POINTS = 240
 PROFILE_FLOOR_DB = -70.0
-# Shown on either side of direct path and scene.
+# Excess path that a profile shows before the direct path and beyond the scene.
 BEFORE_M = 0.25
 BEYOND_M = 0.35
 # Shortest time between two pictures, while many rows are caught up with.
 PICTURE_INTERVAL_S = 0.5
 POLL_S = 0.1
 
+# Bytes at the beginning of a file by which a replaced file is recognised.
 HEAD_BYTES = 256
+# Time between two readings of the files.
 TURN_S = 0.2
+# Timeout of waiting for an event of the Pi.
 LISTEN_MS = 200
+# Faults of the current row that are kept for the page.
 MAX_FAULTS = 20
 # Longest time from a manifest's first line to the first sign of life of its program.
 GRACE_S = 6.0
 # Timeout of the Pi's heartbeat.
 PI_LIMIT_S = 6.0
-# A scan without signs of life lives while rows come, and for so many rows' time.
+# A scan whose program gives no signs of life counts as alive until no row has come for the time of this many rows.
 UNATTENDED_ROWS = 3.0
 
 
@@ -164,7 +169,7 @@ class RowViewer:
                 self._fail(row, take, Finding("warning", row_problem, "A defect of the live view", "Report it"))
 
     def _add(self, pipeline: Pipeline, row: int, take: int, draws: bool) -> None:
-        """Process a row; publish if it `draws`, or the last pictures are old."""
+        """Process a row; draw and publish pictures if `draws`, or if the last ones are old."""
         pipeline.add_row(row)
         self._done[row] = take
         for name, board in pipeline.quality.boards.items():
@@ -223,7 +228,7 @@ class GrowingFile:
         self._stamp = (0, -1, -1)
 
     def look(self) -> bytes:
-        """Return the verdict of products that were made after the last row; None if there are none."""
+        """Return the bytes after those taken so far; empty if nothing has changed or the file cannot be read."""
         self.replaced = False
         try:
             with self.path.open("rb") as f:
@@ -233,7 +238,7 @@ class GrowingFile:
                     return b""
                 self._stamp = stamp
                 self.modified_s = status.st_mtime
-                # Another file may have the same number: a record's CRC at its beginning tells them apart.
+                # A new file may have the inode number of the old one; the CRC in its first record is different.
                 if status.st_size < self._position or f.read(len(self._head)) != self._head:
                     self.replaced = True
                     self._position = 0
@@ -257,7 +262,7 @@ class ManifestTail:
         self.content = Manifest()
 
     def look(self) -> list[Fact]:
-        """Return the verdict of products that were made after the last row; None if there are none."""
+        """Return the facts since the last look."""
         raw = self.file.look()
         if self.file.replaced:
             self.content = Manifest()
@@ -274,7 +279,7 @@ class EventTail:
         self.file = GrowingFile(path)
 
     def look(self) -> list[m.AnyEvent]:
-        """Return the verdict of products that were made after the last row; None if there are none."""
+        """Return the events since the last look."""
         raw = self.file.look()
         unpacker = msgpack.Unpacker(raw=True, max_buffer_size=max(len(raw), 1))
         unpacker.feed(raw)
@@ -312,17 +317,17 @@ class ProductsTail:
         if generation != self._generation:
             verdict = None
             processed_utc = ""
-            # They are damaged.
+            # Damaged products have no verdict.
             with suppress(PolysightError):
                 processed_utc = products.facts.processed_utc or ""
                 verdict = products.verdict if products.materials is not None else None
             if read_generation(products.folder) != generation:
-                # They were replaced meanwhile: the next look reads the new ones.
+                # The products were replaced meanwhile: the next look reads the new ones.
                 return None
             self._generation = generation
             self._verdict = verdict
             self._processed_utc = processed_utc
-        # Releases before this one did not say when.
+        # Products of earlier releases have no time.
         if self._processed_utc and cut_fraction(self._processed_utc) < cut_fraction(last_row_utc):
             return None
         return self._verdict
@@ -428,7 +433,7 @@ class Watch:
         self._lapse_s = lapse_s
         self._ended = threading.Event()
         self._looked = False
-        # The folder was there.
+        # True once the folder existed: if it is missing later, it was moved or deleted.
         self._existed = False
         self._begin()
         self._turn()

@@ -399,7 +399,7 @@ def measure_noise(source: RawSource) -> Noise:
 
     Raises DataError if the scan has no rows, or bursts of a single chirp.
     """
-    # Here: importing matplotlib takes a second
+    # Imported here, because importing matplotlib takes a second.
     from polysight.report import SyncReport
 
     rig = source.instrument

@@ -274,7 +274,7 @@ class Quality:
         self.notes: dict[str, Any] = {}
         if calibration:
             self.notes["calibration"] = dict(calibration)
-        # Boards with reconstructed positions.
+        # Reconstructed positions of each board that has any.
         self.filled: Mapping[str, ReconstructedPositions] = {}
         # Rows are processed in several threads, which all add to `seconds`.
         self._lock = threading.Lock()

@@ -135,7 +135,7 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
     DeviceError
         if the new folder cannot replace `out`; the error names the new folder, which is kept.
     """
-    # The target of a link
+    # If the folder is a link, its target is replaced.
     place = out.resolve()
     new = place.with_name(f".{place.name}.new")
     old = place.with_name(f".{place.name}.old")

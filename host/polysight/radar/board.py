@@ -90,7 +90,7 @@ class BringUp:
     def __init__(self, board: RadarBoard) -> None:
         self._board = board
         self._link = board.link
-        # Errors that healthy boards report, too.
+        # Reported errors that are ignored, because healthy boards report them, too.
         self._ignored: list[str] = []
         # What the last boot status calls for: "firmware" (none in the flash), "hardware" (replace the board), or "".
         self._cure = ""

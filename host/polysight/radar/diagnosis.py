@@ -284,7 +284,7 @@ class ReplayedWords:
 
     def __init__(self, file: Path) -> None:
         self.facts, self._lines = read_trace(file)
-        # Index of the next line.
+        # Index of the next line of the trace.
         self._at = 0
         self._time = 0.0
         self._level = False

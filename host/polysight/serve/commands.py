@@ -36,9 +36,9 @@ REQUEST = "request.json"
 MAX_REQUEST_BYTES = 1 << 16
 Format = Literal["csv", "mat", "netcdf"]
 """Formats of exports, which are written into `<scan>/export`."""
-# Positions of a row, and rows.
+# Largest number of positions of a row, and of rows.
 MAX_POSITIONS = 2000
-# Sub-bands that images are made in.
+# Largest number of sub-bands.
 MAX_BANDS = 16
 Text = Annotated[str, msgspec.Meta(max_length=200)]
 LongText = Annotated[str, msgspec.Meta(max_length=1000)]

@@ -67,7 +67,7 @@ def main() -> int:
     with selectors.DefaultSelector() as selector:
         selector.register(0, selectors.EVENT_READ)
         while True:
-            # `poll` reaps those that have ended.
+            # `poll` also reaps the programs that have ended.
             running = [program for program in running if program.poll() is None]
             if not selector.select(POLL_S):
                 continue

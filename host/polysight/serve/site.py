@@ -356,7 +356,7 @@ class Watches:
         too_many = len(self._open) >= MAX_WATCHES
         for name, opened in list(self._open.items()):
             if not opened.streams and (too_many or time.monotonic() - opened.used_at > LINGER_S):
-                # Its folder may hang.
+                # Closed in a thread, because its folder may hang.
                 threading.Thread(target=opened.watch.close, name="close", daemon=True).start()
                 del self._open[name]
         if len(self._open) >= MAX_WATCHES:

@@ -101,11 +101,11 @@ class EventLog:
 
     # Up to the first that is torn or damaged
     events: list[AnyEvent]
-    # Their bytes
+    # Length of the good records, bytes.
     length: int
     # The beginning of an event or zeros follow, as after a kill or power cut
     torn: bool = False
-    # Description of anything else that follows
+    # Description of damage after the good records; "" if there is none.
     damage: str = ""
 
 

@@ -368,7 +368,7 @@ class Manifest:
     def feed(self, raw: bytes) -> list[Fact]:
         """Add what follows the first `length` bytes of the file; return the facts that are new."""
         lines = raw.split(b"\n")
-        # An incomplete last line.
+        # The last line is incomplete.
         tail = lines.pop()
         self.torn = bool(tail)
         old_facts = len(self.facts)

@@ -63,16 +63,16 @@ class RowShape:
 class Stream:
     """Data that the card sent in one row."""
 
-    # [n], zero where lost
+    # uint8 [n]: the payload, zero where bytes were lost.
     data: NDArray[np.uint8]
-    # Byte ranges that never arrived
+    # Byte ranges that never arrived.
     lost: Gaps
     packets_lost: int
     # Offset of each packet that arrived; empty without a log
     start: NDArray[np.int64]
     # Arrival time of each packet.
     at_s: NDArray[np.float64]
-    # Payload of a full packet
+    # Payload of a full packet, bytes.
     packet_bytes: int
 
 
@@ -97,7 +97,7 @@ def read_log(path: Path) -> PacketLog | None:
     if not path.exists():
         return None
     lines = [line for line in path.read_text("ascii", "replace").replace(";", ",").split("\n") if line.strip()]
-    # A header.
+    # The first line is a header if it does not begin with a digit.
     if lines and not lines[0].lstrip()[0].isdigit():
         del lines[0]
     if not lines:

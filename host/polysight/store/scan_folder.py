@@ -600,7 +600,7 @@ def _leads_into(link: Path, root: Path) -> bool:
     try:
         return link.resolve().is_relative_to(root)
     except (OSError, RuntimeError):
-        # Links in a circle
+        # The links form a circle.
         return False
 
 

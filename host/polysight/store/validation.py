@@ -19,7 +19,7 @@ from polysight_shared.raster import plan_raster
 
 # Bytes of a file that are in memory at a time.
 _CHUNK = 1 << 22
-# What can be done about a damaged file, a damaged manifest and a damaged event log.
+# Remedies of a damaged file, a damaged manifest and a damaged event log.
 _COPY = "restore it from a copy, or resume takes its row again"
 _ALL_THERE = "every row is committed"
 _FETCHED = "resume fetches the rest from the Pi's journal"
@@ -139,6 +139,7 @@ def _describe_loss(scan: scan_folder.ScanFolder) -> str:
 
 
 def _check_row(scan: scan_folder.ScanFolder, row: RowCommitted) -> list[Finding]:
+    """Compare a committed row with the plan, and its files with the manifest."""
     place = f"row {row.row}"
     if not 0 <= row.row < scan.plan.rows:
         return [_make_error(place, f"outside the plan's {scan.plan.rows} rows")]
@@ -176,7 +177,7 @@ def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> 
             size = board.bytes
             crc = int(board.crc32, 16)
     except OSError as e:
-        return [*findings, _error_of_reading(place, e)]
+        return [*findings, _make_read_error(place, e)]
     if size != board.bytes:
         findings.append(_make_error(place, f"{size} bytes, {board.bytes} were committed", _COPY))
     elif f"{crc:08x}" != board.crc32:
@@ -192,7 +193,7 @@ def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> 
     try:
         index_crc = crc32(index.read_bytes())
     except OSError as e:
-        return [*findings, _error_of_reading(place, e)]
+        return [*findings, _make_read_error(place, e)]
     if board.index_crc32 and f"{index_crc:08x}" != board.index_crc32:
         return [*findings, _make_error(place, "differs from the committed data (CRC)", _COPY)]
     try:
@@ -217,14 +218,13 @@ def _check_packets(scan: scan_folder.ScanFolder, board: BoardRow, path: Path) ->
     except FileNotFoundError:
         return [_make_error(place, "absent", _COPY)]
     except OSError as e:
-        return [_error_of_reading(place, e)]
-    right = f"{crc:08x}" == board.packets_crc32
-    if right:
+        return [_make_read_error(place, e)]
+    if f"{crc:08x}" == board.packets_crc32:
         return []
     return [_make_error(place, "differs from the committed data (CRC)", _COPY)]
 
 
-def _error_of_reading(where: str, e: OSError) -> Finding:
+def _make_read_error(where: str, e: OSError) -> Finding:
     if isinstance(e, FileNotFoundError):
         code = ErrorCode.FILE_MISSING
     else:
@@ -233,7 +233,9 @@ def _error_of_reading(where: str, e: OSError) -> Finding:
 
 
 def _compute_digest(path: Path) -> tuple[int, int]:
-    size = crc = 0
+    """Return the size and the CRC-32 of a file."""
+    size = 0
+    crc = 0
     with path.open("rb") as f:
         while chunk := f.read(_CHUNK):
             size += len(chunk)
@@ -242,6 +244,7 @@ def _compute_digest(path: Path) -> tuple[int, int]:
 
 
 def _check_dropped(scan: scan_folder.ScanFolder) -> list[Finding]:
+    """Check that the stored samples of rows without raw data are good, and that no file to be dropped is left."""
     files = scan_folder.dropped_files(scan)
     if not files:
         return []
@@ -264,6 +267,7 @@ def _check_dropped(scan: scan_folder.ScanFolder) -> list[Finding]:
 
 
 def _find_strays(scan: scan_folder.ScanFolder, rows: dict[int, RowCommitted]) -> list[Finding]:
+    """Return a note for each file in `raw` that belongs to no committed row."""
     committed_files = {scan.path / b.file for r in rows.values() for b in r.boards.values()}
     committed_files |= {p.with_suffix(suffix) for p in committed_files for suffix in (".idx", PACKETS)}
     return [
@@ -274,6 +278,7 @@ def _find_strays(scan: scan_folder.ScanFolder, rows: dict[int, RowCommitted]) ->
 
 
 def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
+    """Check the event log: its records, their sequence, and its digest at the last commit."""
     path = scan.path / scan_folder.EVENTS
     try:
         log = read_events(path)
@@ -288,8 +293,8 @@ def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
     else:
         row = 0
         committed = LogDigest(0, "")
-    # Behind the last commit nothing was synced for certain, and a power cut may leave any of it. Rows of earlier
-    # releases, and simulated ones, do not say how many events were committed.
+    # Damage after the last commit is only a note: those events were perhaps not on the disk before a power cut. The
+    # digest of committed events is missing in rows of earlier releases and in simulated ones.
     is_known = bool(commits) or not scan.facts(RowCommitted)
     is_committed_damage = bool(log.damage) and not (is_known and log.length >= committed.bytes)
     if is_committed_damage:

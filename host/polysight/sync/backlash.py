@@ -18,9 +18,9 @@ from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_po
 from polysight_shared.raster import mean_burst_travel_mm, plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Groups of rows for the jackknife.
+# Number of groups of rows for the jackknife.
 _GROUPS = 10
-# Steps of Gauss-Newton.
+# Number of Gauss-Newton steps.
 _STEPS = 3
 # Largest share of power in the upper fifth of the spectrum; more means aliasing.
 _ALIASED = 0.02

@@ -84,7 +84,7 @@ _STEPS = 3
 _COMPARABLE = 0.35
 # Smallest amplitude of a direct path, relative to the row's median.
 _LOST = 0.3
-# Standard deviations from the row's amplitude.
+# Positions whose amplitude is further from the row's, in standard deviations, are not used.
 _OUTLIER = 5.0
 # Smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions.
 _PRESENT = 30.0
@@ -673,7 +673,7 @@ def _try_others(
     if not usable.any():
         return
     middle = _find_middle(level[usable])
-    # 1.4826: of a normal distribution.
+    # 1.4826 turns the median deviation of a normal distribution into its standard deviation.
     spread = 1.4826 * _find_middle(np.abs(level[usable] - middle))
     odd = np.flatnonzero(usable & (np.abs(level - middle) > _OUTLIER * spread) & (peaks[0] != peaks[1]))
     if odd.size == 0:

@@ -32,17 +32,18 @@ from polysight_papers.sensys2026.patches import calibrated_errors, count_draws, 
 
 Complex = npt.NDArray[np.complex128]
 
+# Materials of Fig. 3 and of Fig. 16, by their numbers in Table 2, and those that Fig. 16 compares in pairs.
 COMMON = (1, 3, 6, 12, 13, 15, 21)
 CONTRAST = (1, 13, 16, 12, 18, 6, 3)
 CLUTTERED = ("Cardboard", "PET (1 mm)", "Acrylic (3 mm)")
 WATER = item.Published(0, "Water (without glass, 75 GHz)", 9.37 - 18.0j, None, "literature value quoted in section 9.2")
 LINES = ("-", "--", "-.", ":")
-# Fig. 17.
+# Fig. 17: number of scans, plate centres within this distance of the middle and this far apart, and materials by their
+# numbers in Table 2.
 PLACEMENTS = 8
 REACH_MM = 60.0
 APART_MM = 60.0
 MATERIALS = {"PET": 6, "ceramic": 12}
-"""Rows of Table 2."""
 
 
 def _list_published(numbers: tuple[int, ...]) -> tuple[item.Published, ...]:
@@ -231,13 +232,13 @@ def places(seed: int, count: int = 3) -> list[tuple[float, float]]:
         if all(max(abs(x - a), abs(y - b)) >= APART_MM for a, b in centres):
             centres.append((x, y))
         elif rng.random() < 0.05:
-            # Two plates may leave no room for a third
+            # Two plates may leave no room for a third: start again now and then.
             centres.clear()
     return centres
 
 
 def fig17(run: item.Run) -> item.Item:
-    """Return the permittivities of all pixels of PET and ceramic in scans with other placements."""
+    """Draw the permittivities of all pixels of PET and ceramic in scans with other placements."""
     count = PLACEMENTS
     if run.quick:
         count = 3
@@ -256,10 +257,12 @@ def fig17(run: item.Run) -> item.Item:
                 theta = np.broadcast_to(result.theta_rad, result.p.shape)[inside]
                 pixels[patch.truth.name].append(permittivity_from_ratio(result.p[inside], theta))
         centres.append(dict(zip(("copper", *true), box_places, strict=True)))
-    return _make_item(true, pixels, centres)
+    return _make_fig17_item(true, pixels, centres)
 
 
-def _make_item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: list[dict[str, Any]]) -> item.Item:
+def _make_fig17_item(
+    true: dict[str, complex], pixels: dict[str, list[Complex]], centres: list[dict[str, Any]]
+) -> item.Item:
     fig = item.new_figure(11.5, 4.6)
     rows = []
     data = {}
@@ -270,10 +273,10 @@ def _make_item(true: dict[str, complex], pixels: dict[str, list[Complex]], centr
         item.style_axes(ax, name, "real part ε′", "loss ε″")
         all_pixels = np.concatenate(pixels[name])
         medians = np.array([np.median(v.real) - 1j * np.median(-v.imag) for v in pixels[name]])
-        printed = item.published_values()["location_variance"][name]
+        published = item.published_values()["location_variance"][name]
         for part, take, key in (("ε′", np.real, "real"), ("ε″", np.imag, "loss")):
             within = float(np.mean([take(v).var() for v in pixels[name]]))
-            row = {"published": printed[key], "all": float(take(all_pixels).var()), "within": within}
+            row = {"published": published[key], "all": float(take(all_pixels).var()), "within": within}
             row["between"] = float(take(medians).var())
             data[f"{name} {key}"] = row
             rows.append((name, part, *(f"{x:.4f}" for x in row.values())))
@@ -316,34 +319,35 @@ WATER_IN_GLASS = "Water (with glass)"
 
 
 def fig21(run: item.Run) -> item.Item:
-    """Water and five solutions in eight scans; each concentration is estimated by a line through the others."""
+    """Estimate the concentrations of water and five solutions, each by a line through the others."""
     group = groups()["liquids"]
     errors = calibrated_errors("liquids", count_draws(run.quick))
     materials = tuple(m for m in item.table2() if m.name == WATER_IN_GLASS or m.name.startswith("Cane Sugar"))
     library = draw(materials, group.angle_deg, errors, seed=21).library()
     result = fit_concentration(library, {WATER_IN_GLASS: 0.0})
-    printed = item.published_values()["sugar_median_error_percent"]
-    value = concentrations(library.names, {WATER_IN_GLASS: 0.0})
+    published_error = item.published_values()["sugar_median_error_percent"]
+    percent_by_name = concentrations(library.names, {WATER_IN_GLASS: 0.0})
     fig = item.new_figure(11.5, 4.2)
     left_axes, centre, right = fig.subplots(1, 3)
-    _draw_line(left_axes, library, value, result)
-    _draw_permittivity(centre, library, value, {value[m.name]: m.permittivity.real for m in materials})
-    _draw_errors(right, result, printed)
+    _draw_line(left_axes, library, percent_by_name, result)
+    published_eps = {percent_by_name[m.name]: m.permittivity.real for m in materials}
+    _draw_permittivity(centre, library, percent_by_name, published_eps)
+    _draw_errors(right, result, published_error)
     return item.Item(
         "fig21",
         "Fig. 21: concentration of sugar in water",
         (
-            f"Published median error {printed:g} %; simulated {result.median_error:.3f} % by weight, each concentration"
-            f" estimated from the others. The 90 % intervals hold the truth in {100 * result.covered:.0f} % of"
-            " the patches. The paper does not say whether its percentage is by weight or of the concentration, nor"
-            " whether the line had seen the concentration it was asked for.",
+            f"Published median error {published_error:g} %; simulated {result.median_error:.3f} % by weight, each"
+            " concentration estimated from the others. The 90 % intervals hold the truth in"
+            f" {100 * result.covered:.0f} % of the patches. The paper does not say whether its percentage is by weight"
+            " or of the concentration, nor whether the line had seen the concentration it was asked for.",
             f"Water and five solutions at {group.angle_deg:.0f} degrees with the errors of the liquids.",
         ),
         (
             item.Table(
                 "Each concentration estimated from the others, mean over eight scans",
                 ("Solution", "true", "simulated", "90 % interval", "median error"),
-                _tabulate_concentrations(value, result),
+                _tabulate_concentrations(percent_by_name, result),
             ),
         ),
         {
@@ -353,7 +357,7 @@ def fig21(run: item.Run) -> item.Item:
             )
         },
         {
-            "published_median_error_percent": printed,
+            "published_median_error_percent": published_error,
             "median_error_percent": result.median_error,
             "covered": result.covered,
             "line": asdict(result.line),
@@ -362,10 +366,10 @@ def fig21(run: item.Run) -> item.Item:
     )
 
 
-def _draw_line(ax: Axes, library: Library, value: Mapping[str, float], result: ConcentrationResult) -> None:
+def _draw_line(ax: Axes, library: Library, percent_by_name: Mapping[str, float], result: ConcentrationResult) -> None:
     """Draw the calibration line with its interval, and the patches."""
     x = np.array([np.degrees(np.median(polarisation_angle_rad(e.p))) for e in library.entries])
-    ax.plot(x, [value[e.name] for e in library.entries], "o", ms=4, color=PALETTE[0], label="patches")
+    ax.plot(x, [percent_by_name[e.name] for e in library.entries], "o", ms=4, color=PALETTE[0], label="patches")
     line_angles = np.linspace(x.min() - 0.1, x.max() + 0.1, 100)
     low, high = result.line.interval(np.radians(line_angles))
     ax.plot(line_angles, result.line.percent(np.radians(line_angles)), color=INK, lw=1.4, label="line")
@@ -377,40 +381,44 @@ def _draw_line(ax: Axes, library: Library, value: Mapping[str, float], result: C
 
 
 def _draw_permittivity(
-    ax: Axes, library: Library, value: Mapping[str, float], published_eps: Mapping[float, float]
+    ax: Axes, library: Library, percent_by_name: Mapping[str, float], published_eps: Mapping[float, float]
 ) -> None:
     """Draw the real part by Eq. 3 against concentration, beside the published values."""
     eps = [
         np.median(permittivity_from_ratio(e.p.astype(np.complex128), np.radians(e.incidence_deg)).real)
         for e in library.entries
     ]
-    ax.plot([value[e.name] for e in library.entries], eps, "o", ms=4, color=PALETTE[0], label="patches, simulated")
+    ax.plot(
+        [percent_by_name[e.name] for e in library.entries], eps, "o", ms=4, color=PALETTE[0], label="patches, simulated"
+    )
     printed = zip(*sorted(published_eps.items()), strict=True)
     ax.plot(*printed, "x-", color=PALETTE[6], ms=7, lw=1.0, label="published, Table 2")
     item.style_axes(ax, "Apparent permittivity", "sugar (% by weight)", "real part ε′")
     ax.legend(fontsize=8, frameon=False)
 
 
-def _draw_errors(ax: Axes, result: ConcentrationResult, printed: float) -> None:
-    """Draw the distribution of the errors, each concentration left out; `printed` is the published median, percent."""
+def _draw_errors(ax: Axes, result: ConcentrationResult, published_error: float) -> None:
+    """Draw the distribution of the errors, each concentration left out; `published_error` is a median, percent."""
     error = np.sort([abs(r.percent - r.true_percent) for r in result.left_out])
     ax.step(np.concatenate([[0], error]), np.arange(error.size + 1) / error.size, where="post", color=PALETTE[0])
-    ax.axvline(printed, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {printed:g} %")
+    ax.axvline(published_error, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {published_error:g} %")
     ax.axvline(result.median_error, color=INK, ls=":", lw=1.2, label=f"simulated median {result.median_error:.3f} %")
     item.style_axes(ax, "Error, each concentration left out", "error (% by weight)", "share of patches")
     ax.legend(fontsize=8, facecolor="white", framealpha=1.0, edgecolor="none", loc="lower right")
 
 
-def _tabulate_concentrations(value: Mapping[str, float], result: ConcentrationResult) -> tuple[tuple[str, ...], ...]:
+def _tabulate_concentrations(
+    percent_by_name: Mapping[str, float], result: ConcentrationResult
+) -> tuple[tuple[str, ...], ...]:
     """Return a table line for each solution, by concentration."""
     rows = []
-    for name in sorted(value, key=lambda n: value[n]):
+    for name in sorted(percent_by_name, key=lambda n: percent_by_name[n]):
         errors_of_name = [r for r in result.left_out if r.name == name]
         spread = np.median([abs(r.percent - r.true_percent) for r in errors_of_name])
         rows.append(
             (
                 name,
-                f"{value[name]:.1f} %",
+                f"{percent_by_name[name]:.1f} %",
                 f"{np.mean([r.percent for r in errors_of_name]):.2f} %",
                 f"{np.mean([r.low for r in errors_of_name]):.2f} … {np.mean([r.high for r in errors_of_name]):.2f} %",
                 f"{spread:.2f} %",

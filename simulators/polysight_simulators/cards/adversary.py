@@ -68,7 +68,7 @@ RADAR = (
 _FRAME_NS = 128_000
 NEAREST_EDGE_NS = 350_000
 """An edge nearer to a missed pulse makes that pulse's frame: the stage has moved by a hundredth of a millimetre."""
-# Time between packets.
+# Time between two packets, ns.
 _GAP_NS = 20_000
 
 

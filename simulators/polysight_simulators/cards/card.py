@@ -30,7 +30,7 @@ from polysight_simulators.radars import RadarBoard
 Rows = NDArray[np.uint8]
 # Option of linux/udp.h: the kernel cuts one buffer into equal datagrams.
 _UDP_SEGMENT = 103
-# Below the largest UDP datagram
+# Bytes of one call, below the largest UDP datagram.
 _CALL_BYTES = 65_000
 _CALL_SEGMENTS = 44
 # Unread at the receiver, below which the next 44 packets (about 100 kB) are sent
@@ -255,7 +255,7 @@ NO_DATA_FLOOR_S = 10.0
 if TYPE_CHECKING:
     from polysight_simulators.scene import SignalSource
 
-# Bounds memory
+# Number of frames per call, which bounds the memory.
 FRAMES_PER_CALL = 64
 MAC = b"\x12\x34\x56\x78\x90\x12"
 Clock = Callable[[], float]

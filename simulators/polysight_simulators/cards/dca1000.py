@@ -19,7 +19,7 @@ REQUEST_HEADER = 0xA55A
 REQUEST_FOOTER = 0xEEAA
 # Port from which replies and data come, as seen on a card.
 SOURCE_PORT = 1024
-# U32 sequence, u48 byte count
+# Header of a data packet: u32 sequence number, u48 byte count.
 DATA_HEADER_BYTES = 10
 # "packet size 1470" carries 1456 bytes of payload
 PACKET_OVERHEAD_BYTES = 14

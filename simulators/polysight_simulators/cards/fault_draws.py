@@ -34,7 +34,7 @@ class NetworkFaults:
         self._counts = counts
         self._rng = fault_generator(seed, board_name, "network")
         self._corrupt_rng = fault_generator(seed, board_name, "corrupt")
-        # Packets that the next one overtakes
+        # Packets that the next packet overtakes.
         self._held: list[Rows] = []
 
     def carry(self, rows: Rows) -> list[Rows]:

@@ -105,7 +105,7 @@ class CardServer:
     def _take_edges(self) -> bool:
         """Read the wires; return True if there were pulses."""
         rising: dict[int, list[int]] = {card.line: [] for card in self._cards}
-        # The client may have buffered lines
+        # The client may have buffered lines that were not read.
         self._unread = True
         for _ in range(EDGES_PER_TURN):
             message = self._wires.receive(0.0)
@@ -134,7 +134,7 @@ class CardServer:
         """Send data and end the record in time; return the seconds until this card has more to do."""
         endpoint = card.endpoint
         wait = endpoint.flush()
-        # Pending data delays the end
+        # Pending data delays the end of the program.
         if wait is None and endpoint.due and not self._take_edges():
             card.tick(self.more_expected)
             wait = endpoint.flush()

@@ -29,7 +29,7 @@ from polysight_simulators.radars.cores import (
     ones_sum,
 )
 
-# Sense-on-power mode
+# Value of the sense-on-power pins: functional mode.
 FUNCTIONAL = 4
 ANSWER_S = 1e-4
 DATA_S = 1e-3

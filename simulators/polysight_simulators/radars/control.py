@@ -37,7 +37,7 @@ _PIN_S = 0.2e-6
 _CLOCKS_S = 0.2e-6
 _HEAD = struct.Struct("<ccH")
 LINE = b"Retrigger"
-# Closing sends a reset
+# With this option, closing a connection sends a reset.
 _NO_LINGER = struct.pack("ii", 1, 0)
 
 
@@ -74,7 +74,7 @@ class UsbChip:
             for pins in data:
                 self._board.reset(held=not (pins >> 6 & 1 and pins >> 7 & 1))
         else:
-            # USB is slow
+            # USB delays each request.
             if name == "A" and self._pins & _SELECT:
                 self._high_s = float("inf")
             self._pending[name] += data
@@ -82,7 +82,7 @@ class UsbChip:
             while self._pending[name]:
                 used = commands[name](self._pending[name])
                 if used == 0:
-                    # Incomplete command
+                    # The command is incomplete: wait for the rest.
                     return
                 del self._pending[name][:used]
 
@@ -237,7 +237,7 @@ class _Server:
                         self._clients[descriptor] = client, self._execute(client, rest + data)
                         continue
                 except (OSError, DeviceError):
-                    # Disconnected or unplugged: close the connection
+                    # The client has disconnected, or the board is unplugged: close the connection.
                     pass
                 self._drop(descriptor)
 

@@ -141,7 +141,7 @@ SAVE = 0x00AB
 RESTORE = 0x008B
 CHUNK_BYTES = 224
 CHUNKS = 3
-# Data bytes of each sub-block
+# Number of data bytes of each sub-block.
 SIZES = {
     0x0080: 8, 0x0082: 8, 0x0083: 4, 0x0085: 4, 0x0086: 12, 0x0089: 12, RESTORE: 228, 0x008D: 16, SAVE: 4, INIT_RF: 0,
     PROFILE: 44, CHIRP: 20, FRAME: 24, STREAM_SET: 20, STREAM: 4, READ_PROFILE: 4, READ_CHIRP: 4, READ_FRAME: 0,
@@ -151,7 +151,7 @@ SIZES = {
     0x4044: 4, 0x4045: 4, 0x4046: 4, SET_EVENT_CHECKSUM: 12, 0x40C0: 8, READ_MAIN_VERSION: 0,
 }  # fmt: skip
 _BEFORE_FRAMES = (0x0080, 0x0082, 0x0086, INIT_RF, PROFILE, CHIRP, 0x4041, 0x4042, 0x4043, 0x4044, 0x4045)
-# Commands before the RF power-up
+# Commands that are accepted before the RF power-up.
 _WITHOUT_RF = (DOWNLOAD, SET_EVENT_CHECKSUM, POWER_UP_RF, READ_MAIN_VERSION)
 
 
@@ -171,7 +171,7 @@ class Cores:
     hardware_bits: int = 0
     # Self-tests of the RF core that passed
     rf_tests: int = 0x07FFFFFF
-    # Calibrations of the RF init
+    # Bits of the RF calibrations that pass.
     passes: int = 0x1FFE
     main_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
     rf_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
@@ -192,7 +192,7 @@ class Cores:
         self.frames_left = 0
         self.armed = False
         self.frame_ends = -1.0
-        # File type, missing bytes
+        # File type and missing bytes of the download in progress; None: no download.
         self._file: tuple[int, int] | None = None
         self._restored: dict[int, bytes] = {}
         self._part = b""

@@ -48,7 +48,7 @@ from polysight_simulators.scene.spectral_grid import OVERSAMPLING, TAPS, Axis, o
 
 # Error of the Chebyshev series in the local angle
 _ANGLE_TOLERANCE = 1e-4
-# Error of the interpolation in dpath/dz
+# Largest error of the interpolation in dpath/dz.
 _RELIEF_TOLERANCE = 2e-4
 # Range of heights that share a kernel
 _LEVEL_MM = 2.0
@@ -364,7 +364,7 @@ def _choose_nodes(
     shortest_m = float(min(low for low, _ in ranges))
     longest_m = float(max(high for _, high in ranges))
     inside = 0.0
-    # Inner echoes extend the response
+    # Echoes inside plates extend the response.
     for p in scene.plates:
         depth = sum((layer.thickness_mm or 0.0) / 1e3 * abs(np.sqrt(layer.epsilon)) for layer in p.stack)
         inside = max(inside, 4 * depth)

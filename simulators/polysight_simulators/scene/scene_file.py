@@ -568,7 +568,7 @@ def _vary_layer(layer: Layer, scene: Scene, rng: np.random.Generator) -> Layer:
 
 
 def _vary(nominal: Pair, spread: Pair, rng: np.random.Generator) -> Pair:
-    # Plain numbers, which JSON can write
+    # Plain Python numbers, which can be written as JSON.
     real, loss = rng.standard_normal(2).tolist()
     # The log-normal factor has mean 1 and standard deviation spread[1]
     width = math.sqrt(math.log1p(spread[1] ** 2))

@@ -18,7 +18,7 @@ from polysight_simulators.scene.scene_file import Scene
 
 # Length of the kernel's fade-out beyond the scene
 FADE_M = 0.06
-# Taps of the windowed sinc
+# Number of taps of the windowed sinc.
 TAPS = 12
 # Offsets beyond the aperture, for the taps of the sinc
 MARGIN_M = 0.012

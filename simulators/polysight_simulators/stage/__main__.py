@@ -119,7 +119,7 @@ class SerialPort:
         try:
             os.write(self._master, data)
         except OSError:
-            # EAGAIN: full
+            # The buffer is full.
             return
 
     def flush(self) -> None:

@@ -173,7 +173,7 @@ class PythonStage:
         if ticks:
             self._next = self.tick + ticks
             self._armed = True
-            # A leg without a ramp
+            # The leg has no ramp.
             if self._engine.cruise:
                 self._report_motion()
 

@@ -29,7 +29,7 @@ class PinEdge(NamedTuple):
     """An edge of a watched pin, at an exact cycle of the 16 MHz clock."""
 
     cycle: int
-    # Arduino number; A0 is 14
+    # Number of the pin on the Arduino; A0 is 14.
     pin: int
     value: int
     # Motor steps, counted at the pins from where the stage stood when it was switched on
@@ -45,11 +45,11 @@ class Cost(NamedTuple):
 
     # Cycles from entry to the end of reti, by vector number.
     interrupts: dict[int, int]
-    # Shortest
+    # Shortest width of a step pulse.
     step_pulse: int
-    # Shortest time from DIR to PUL
+    # Shortest time from a change of DIR to PUL.
     direction_setup: int
-    # ... and from PUL to DIR
+    # Shortest time from PUL to a change of DIR.
     direction_hold: int
 
 
@@ -78,12 +78,12 @@ class EmulatedUno:
     ) -> None:
         self.edges: list[PinEdge] = []
         self.received = bytearray()
-        # Resets, lost bytes, crashes
+        # Descriptions of resets, lost bytes and crashes.
         self.troubles: list[str] = []
         self.cycle = 0
-        # X, left, right
+        # Positions of the motors: x, left y, right y.
         self.motors = (start[0], start[1], start[1])
-        # Bytes to the pseudo terminal
+        # Number of bytes sent to the pseudo terminal.
         self.sent = 0
         self._counted: dict[int, int] = {}
         self._cost_pins = (0, 0, 0)

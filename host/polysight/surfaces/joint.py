@@ -15,6 +15,7 @@ from polysight.surfaces.window import (
     Array,
     BoardFit,
     Windows,
+    add_rx,
     find_basis,
     make_waves,
     select_windows,
@@ -36,6 +37,8 @@ STEERING_GAIN = 0.9
 # wave that an edge cuts. Echoes 150 mm apart in x have 1.4, 50 mm apart in range 2.8. With 3 a plate of 200 mm keeps
 # 488 points and with 12 it keeps 120, for 524 with 2 (simulated).
 MERGED_WIDENING = 2
+# Pairs of the six values of a path, each once.
+PAIRS = np.triu_indices(6)
 # Square of a widening beyond any use.
 NO_INFORMATION = 1e12
 
@@ -65,26 +68,20 @@ class JointFit:
         # Rate of an echo's mean phase by its parameters.
         self.mean_rate = fit.middle * mean
         # An echo's wave and its derivatives are j (steady + nu changing) times the wave, nu the frequency's distance
-        # from the middle.
+        # from the middle; both are given in the basis, as [window, 7, 6] and [7, 6].
         self.nu = fit.omega - fit.middle
-        ones = np.ones((*self.basis.shape[:2], 1))
-        self.steady = np.concatenate([ones, fit.middle * (self.basis - mean[:, None])], axis=2)
-        self.changing = np.concatenate([0 * ones, self.basis], axis=2)
-        self.products = self._make_products()
+        self.steady = np.zeros((len(mean), 7, 6))
+        self.steady[:, 0, 0] = 1
+        self.steady[:, 1:] = fit.middle * np.eye(6)
+        self.steady[:, 1:, 0] -= self.mean_rate
+        self.changing = np.eye(7, 6, -1)
+        # Products of the basis, those with p <= q, [window, position, 21], and their sums over the positions.
+        first, second = PAIRS
+        self.products = windows.valid[..., None] * self.basis[..., first] * self.basis[..., second]
+        self.product_sums = self.products.sum(axis=1)
         self.steering = np.zeros((*self.amplitude.shape, len(fit.lever), fit.omega.size), complex)
         self.waves = np.zeros((*self.amplitude.shape, fit.omega.size, self.basis.shape[1]), np.complex64)
         self.rest = windows.samples.copy()
-
-    def _make_products(self) -> Array:
-        """Products of derivatives, by powers 0, 1, 2 of nu one after the other: [window, 3 positions, 49]."""
-        valid = self.windows.valid[..., None, None]
-        mixed = self.steady[..., :, None] * self.changing[..., None, :]
-        by_power = [
-            valid * self.steady[..., :, None] * self.steady[..., None, :],
-            valid * (mixed + np.swapaxes(mixed, 2, 3)),
-            valid * self.changing[..., :, None] * self.changing[..., None, :],
-        ]
-        return np.concatenate([products.reshape(*products.shape[:2], 49) for products in by_power], axis=1)
 
     def run(self) -> None:
         """Fit until the rest no longer shrinks; the RX are added up anew for the paths found."""
@@ -108,20 +105,15 @@ class JointFit:
 
     def synthesise(self, index: int) -> NDArray[np.complex64]:
         """Samples of one echo, [window, rx, frequency, position]."""
-        waves = self.waves[:, index]
-        return synthesise(self.fit, self.windows.valid, waves, self.amplitude[:, index], self.steering[:, index])
+        own = slice(index, index + 1)
+        waves = self.waves[:, own]
+        return synthesise(self.fit, self.windows.valid, waves, self.amplitude[:, own], self.steering[:, own])
 
     def _subtract(self, members: NDArray, values: Array, amplitude: NDArray) -> tuple[NDArray, NDArray[np.complex64]]:
         """Waves of echoes of given values [window, echo, 6] and amplitudes, and the samples of windows less these."""
-        residual = self.windows.samples[members]
-        valid = self.windows.valid[members]
-        waves = np.empty((*amplitude.shape, *self.waves.shape[2:]), np.complex64)
-        for index in range(values.shape[1]):
-            paths = np.einsum("wnp,wp->wn", self.basis[members], values[:, index])
-            waves[:, index] = make_waves(self.fit, paths)
-            steering = self.steering[members, index]
-            residual -= synthesise(self.fit, valid, waves[:, index], amplitude[:, index], steering)
-        return waves, residual
+        waves = make_waves(self.fit, values @ np.swapaxes(self.basis[members], 1, 2))
+        echoes = synthesise(self.fit, self.windows.valid[members], waves, amplitude, self.steering[members])
+        return waves, self.windows.samples[members] - echoes
 
     def _descend(self, members: NDArray) -> None:
         echoes = self.amplitude.shape[1]
@@ -211,13 +203,11 @@ class JointFit:
 
     def _project(self, members: NDArray, index: int) -> NDArray[np.complex128]:
         """Products of an echo's wave and its derivatives with the rest, [window, 7]."""
-        steering = (self.steering[members, index] / len(self.fit.lever)).astype(np.complex64)
-        added = np.einsum("wrf,wrfn->wfn", steering, self.rest[members])
+        added = add_rx(self.steering[members, index] / len(self.fit.lever), self.rest[members])
         turned = self.waves[members, index].conj() * added
         by_power = np.stack([np.ones_like(self.nu), self.nu]).astype(np.complex64) @ turned
-        steady, changing = np.moveaxis(by_power * self.windows.valid[members, None], 1, 0)
-        projected = np.einsum("wn,wnp->wp", steady, self.steady[members])
-        return projected + np.einsum("wn,wnp->wp", changing, self.changing[members])
+        sums = _multiply_parts(by_power * self.windows.valid[members, None], self.basis[members])
+        return np.einsum("wpb,wb->wp", self.steady[members], sums[:, 0]) + sums[:, 1] @ self.changing.T
 
     def _multiply(self, members: NDArray, first: int, second: int) -> NDArray[np.complex128]:
         """Products of the waves of two echoes, and of their derivatives: [window, 7, 7]."""
@@ -225,13 +215,18 @@ class JointFit:
         steering = np.mean(self.steering[members, first] * self.steering[members, second].conj(), axis=1)
         factors = (steering * fit.weights * fit.gain)[:, None] * self.nu ** np.arange(3)[:, None]
         if first == second:
-            sums = np.repeat(factors.sum(axis=2)[..., None], self.basis.shape[1], axis=2)
+            sums = factors.sum(axis=2)[..., None] * self.product_sums[members, None]
         else:
             turned = self.waves[members, first].conj() * self.waves[members, second]
-            sums = factors.astype(np.complex64) @ turned
-        sums = sums.reshape(len(members), -1)
-        parts = np.stack([np.real(sums), np.imag(sums)], axis=1) @ self.products[members]
-        return (parts[:, 0] + 1j * parts[:, 1]).reshape(-1, 7, 7)
+            sums = _multiply_parts(factors.astype(np.complex64) @ turned, self.products[members])
+        grams = np.empty((len(members), 3, 6, 6), complex)
+        rows, columns = PAIRS
+        grams[..., rows, columns] = sums
+        grams[..., columns, rows] = sums
+        steady = self.steady[members]
+        mixed = steady @ grams[:, 1] @ self.changing.T
+        products = steady @ grams[:, 0] @ np.swapaxes(steady, 1, 2) + self.changing @ grams[:, 2] @ self.changing.T
+        return (products + mixed + np.swapaxes(mixed, 1, 2)).astype(complex)
 
     def fit_amplitudes(self) -> Array:
         """Fit the amplitudes alone; return how much less certain the others make that of the first echo [window]."""
@@ -269,6 +264,14 @@ class JointFit:
         return np.maximum(widening, 1)
 
 
-def find_energy(samples: NDArray) -> Array:
-    """Energy of the samples of each window."""
-    return np.sum(np.real(samples) ** 2 + np.imag(samples) ** 2, axis=(1, 2, 3), dtype=float)
+def _multiply_parts(values: NDArray[np.complexfloating], matrices: Array) -> NDArray[np.complex128]:
+    """Products [window, row, column] of complex values [window, row, position] with real [window, position, column]."""
+    rows = values.shape[1]
+    parts = np.concatenate([np.real(values), np.imag(values)], axis=1) @ matrices
+    return parts[:, :rows] + 1j * parts[:, rows:]
+
+
+def find_energy(samples: NDArray[np.complexfloating]) -> Array:
+    """Energy of the samples [window, rx, frequency, position] of each window."""
+    parts = np.ascontiguousarray(samples).view(samples.real.dtype)
+    return (parts[..., None, :] @ parts[..., None]).sum(axis=(1, 2, 3, 4), dtype=float)

@@ -7,7 +7,6 @@ comes, and `maximise` fits values and complex amplitude by the matched filter ov
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -204,15 +203,6 @@ class Maximum:
     band_rise: Array
 
 
-def derotate(fit: BoardFit, added: NDArray, paths: Array) -> Iterator[tuple[float, NDArray]]:
-    """Yield each frequency's wave number and samples [window, position] turned back by the path."""
-    first = np.exp(-1j * fit.omega[0] * paths)
-    step = np.exp(-1j * (fit.omega[1] - fit.omega[0]) * paths) if fit.omega.size > 1 else first
-    for index, omega in enumerate(fit.omega):
-        yield float(omega), added[:, index] * first
-        first = first * step
-
-
 def maximise(
     fit: BoardFit, added: NDArray, valid: Array, offsets: Array, values: Array, *, iterations: int = ITERATIONS
 ) -> Maximum:
@@ -229,19 +219,15 @@ def maximise(
     scale = np.sqrt(np.einsum("wpp->wp", curvature) + 1e-12)
     scaled = curvature / scale[:, :, None] / scale[:, None, :] + 1e-9 * np.eye(6)
     values = values.copy()
+    # Sums over the frequencies: as they are, times the distance from the middle, and over the upper half of the band.
+    rows = np.stack([np.ones_like(fit.omega), fit.omega - fit.middle, fit.upper_half]).astype(np.complex64)
     sums = np.zeros(basis.shape[:2], complex)
     upper = np.zeros(basis.shape[:2], complex)
     total = np.zeros(len(values), complex)
     for step in range(iterations + 1):
-        paths = np.einsum("wnp,wp->wn", basis, values)
-        sums = np.zeros(paths.shape, complex)
-        upper = np.zeros(paths.shape, complex)
-        rates = np.zeros(paths.shape, complex)
-        for index, (omega, turned) in enumerate(derotate(fit, added, paths)):
-            sums += turned
-            rates -= 1j * omega * turned
-            if fit.upper_half[index]:
-                upper += turned
+        paths = (basis @ values[..., None])[..., 0]
+        sums, changing, upper = np.moveaxis(rows @ (make_waves(fit, paths).conj() * added), 1, 0)
+        rates = -1j * (fit.middle * sums + changing)
         total = (sums * valid).sum(axis=1)
         if step == iterations:
             break
@@ -310,17 +296,22 @@ def gather_windows(board: Samples, rows: NDArray, columns: NDArray, at_m: Array)
 def add_up(fit: BoardFit, windows: Windows, values: Array) -> NDArray:
     """Samples of all RX added up for echoes of the given values: [window, frequency, position]."""
     path, slope, _ = unpack_values(values)
-    factors = fit.steer(windows.at_m, path, slope) / len(fit.lever)
-    return np.einsum("wrf,wrfn->wfn", factors, windows.samples)
+    return add_rx(fit.steer(windows.at_m, path, slope) / len(fit.lever), windows.samples)
+
+
+def add_rx(factors: NDArray, samples: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """Sum over the RX of factors [window, rx, frequency] times samples [window, rx, frequency, position]."""
+    by_frequency = np.moveaxis(factors, 1, 2).astype(np.complex64)[:, :, None]
+    return (by_frequency @ np.moveaxis(samples, 1, 2))[:, :, 0]
 
 
 def make_waves(fit: BoardFit, paths: Array) -> NDArray[np.complex64]:
-    """exp(j omega path) of paths [window, position]: [window, frequency, position]."""
-    waves = np.empty((len(paths), fit.omega.size, paths.shape[1]), np.complex64)
-    wave = np.exp(1j * fit.omega[0] * paths)
-    turn = np.exp(1j * (fit.omega[1] - fit.omega[0]) * paths)
+    """exp(j omega path) of paths [..., position]: [..., frequency, position]."""
+    waves = np.empty((*paths.shape[:-1], fit.omega.size, paths.shape[-1]), np.complex64)
+    wave = np.exp(1j * fit.omega[0] * paths).astype(np.complex64)
+    turn = np.exp(1j * (fit.omega[1] - fit.omega[0]) * paths).astype(np.complex64)
     for index in range(fit.omega.size):
-        waves[:, index] = wave
+        waves[..., index, :] = wave
         wave = wave * turn
     return waves
 
@@ -328,12 +319,17 @@ def make_waves(fit: BoardFit, paths: Array) -> NDArray[np.complex64]:
 def synthesise(
     fit: BoardFit, valid: Array, waves: NDArray, amplitude: NDArray, steering: NDArray
 ) -> NDArray[np.complex64]:
-    """Samples of echoes, [window, rx, frequency, position]."""
-    factors = (amplitude[:, None, None] * steering.conj()).astype(np.complex64)
-    echo = factors[..., None] * (waves * valid[:, None].astype(np.float32))[:, None]
+    """Samples of all echoes together, [window, rx, frequency, position].
+
+    `waves` [window, echo, frequency, position], `amplitude` [window, echo], `steering` [window, echo, rx, frequency].
+    """
+    factors = (amplitude[..., None, None] * steering.conj()).astype(np.complex64)
+    echoes = np.moveaxis(factors.transpose(0, 3, 2, 1) @ np.swapaxes(waves, 1, 2), 1, 2)
+    if not valid.all():
+        echoes = echoes * valid[:, None, None].astype(np.float32)
     if fit.board.model is not None:
-        echo = fit.model.astype(np.complex64) @ echo
-    return echo.astype(np.complex64, copy=False)
+        echoes = fit.model.astype(np.complex64) @ echoes
+    return echoes.astype(np.complex64, copy=False)
 
 
 def no_echoes() -> Echoes:

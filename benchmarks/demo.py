@@ -16,9 +16,10 @@ from benchmarks.waits import command
 from polysight.store import MANIFEST
 
 __all__ = ["add_arguments", "run"]
-_LOOK_S = 0.05
+# Time between two readings of the manifest and of the processes.
+_POLL_S = 0.05
 REPEATS = 3
-# Kinds of process by a part of their command line; the first that fits.
+# Kind of a process by a part of its command line; the first part that occurs decides.
 KINDS = {
     "receiver_process": "receivers",
     "polysight_pi": "Pi",
@@ -29,8 +30,8 @@ QUICK = ROOT / "examples" / "own-scene.toml"
 
 
 def run(args: argparse.Namespace) -> int:
-    """Scan and process; print CPU seconds."""
-    # Never in `args.folder`: paths of the rig's sockets must be short.
+    """Scan and process the demo; print CPU seconds."""
+    # Not in `args.folder`: paths of the rig's sockets must be short.
     with temporary(None) as folder:
         scene = ROOT / "examples" / "demo.toml"
         if args.quick:
@@ -44,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
     total = sum(by_kind.values()) / rows
     process_s = statistics.median(processed)
     lines = [
-        _report_least("a row of the demo's scan, all processes, CPU s", total, 0.75, f"{rows} rows: {each}"),
-        _report_least(
+        _make_seconds_line("a row of the demo's scan, all processes, CPU s", total, 0.75, f"{rows} rows: {each}"),
+        _make_seconds_line(
             "process of that scan, CPU s", process_s, 6.0, ", ".join(f"{seconds:.1f}" for seconds in processed)
         ),
     ]
@@ -57,17 +58,20 @@ def run(args: argparse.Namespace) -> int:
 def scan_cpu_s(out: Path, scene: Path) -> tuple[int, dict[str, float]]:
     """Run the demo; return the rows between the first commit and the last, and CPU seconds of each kind meanwhile.
 
-    So the scene's field, computed before, and the products are not in it. Raises RuntimeError if the demo fails.
+    The scene's field, which is computed before, and the products are not counted. Raises RuntimeError if the demo
+    fails.
     """
     words = [sys.executable, "-m", "polysight", "demo", "--scene", str(scene), "--out", str(out)]
     demo = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL)
-    first = last = None
+    # Number of commits, and CPU seconds of each process then, at the first and at the newest commit.
+    first = None
+    last = None
     while demo.poll() is None:
         committed = _count_commits(out / "scan" / MANIFEST)
         if committed and (last is None or committed > last[0]):
             last = committed, _measure_cpu_of_tree(demo.pid)
             first = first or last
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
     if demo.returncode or first is None or last is None or first[0] == last[0]:
         raise RuntimeError(f"the demo ended with status {demo.returncode}")
     by_kind = dict.fromkeys(KINDS.values(), 0.0)
@@ -109,5 +113,5 @@ def _list_parents() -> Iterator[tuple[int, int]]:
             yield int(process.name), int(status.rsplit(")", 1)[1].split()[1])
 
 
-def _report_least(name: str, value: float, limit: float, note: str) -> Line:
+def _make_seconds_line(name: str, value: float, limit: float, note: str) -> Line:
     return Line(name, f"{value:.2f} s", "", value, limit, limit, higher_is_better=False, note=note)

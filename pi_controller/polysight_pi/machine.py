@@ -29,8 +29,9 @@ from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 STATUS_EVENT_S = 0.24
 # Consecutive statuses at rest after which the reply to the end of a motion counts as lost.
 RESTS = 3
-# Times that such a reply is asked for; a stage whose banner was lost never gives it.
-ASKED_AGAIN = 3
+# Number of requests to repeat such a reply; a stage that was reset, and whose banner was lost, never answers them.
+MAX_REPEAT_REQUESTS = 3
+# Errors of the stage after which its position is not known.
 POSITION_LOST = (
     StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
 )  # fmt: skip
@@ -70,28 +71,33 @@ class Machine:
         self.state: State = "idle"
         self.row: RunningRow | None = None
         self.jog: RunningJog | None = None
-        # The newest one, also after its end
+        # Command of the newest jog; it stays after the jog's end.
         self.last_jog: m.Jog | None = None
-        # True while the position is that of a stage at rest; a status of before is none.
+        # True if the known position is that of the stage at rest, not of an earlier status.
         self._is_placed = False
-        self.homed = self.in_run = False
+        self.homed = False
+        self.in_run = False
         # Number of the first fault; 0: none.
         self.fault = 0
         # Reason of the fault.
         self.reason = ""
-        # Steps lost before the last homing, which found them
+        # Lost steps, mm, that the last homing measured.
         self.lost_mm = (0.0, 0.0)
         self.row_timeout_s = math.inf
         self._deadline_s = math.inf
         # Sequence number of the HOME line.
         self._homing = -1
-        # True once the stage has accepted it
+        # True once the stage has accepted the homing.
         self._homing_underway = False
         # True while the host of a homing sends heartbeats.
         self._homing_is_watched = False
+        # True if the stage rests in a hold; True if the row is to be resumed once it does.
         self._rests_in_hold = False
         self._resumes_at_rest = False
-        self._lines_dead = self._terminating = False
+        # True if the lines to trigger and radar have failed; True while the program is being ended.
+        self._lines_dead = False
+        self._terminating = False
+        # Consecutive statuses at rest while the end of a motion is awaited.
         self._rests = 0
         self._watch = TriggerWatch()
         self._status_sent_s = 0.0
@@ -116,6 +122,7 @@ class Machine:
         return True
 
     def _enter(self, state: State) -> None:
+        """Set the state and its time limit."""
         timeout_s = TIMEOUTS_S.get(state, math.inf)
         if state == "running":
             timeout_s = self.row_timeout_s
@@ -212,9 +219,9 @@ class Machine:
         record = sent.record
         if row is None or sent.job is not row.job:
             return
-        wrong = row.edges.note_edge(sent.edge_ns)
-        if wrong:
-            self.happen("row fault", PiFault.EDGE_TIME, wrong)
+        time_problem = row.edges.note_edge(sent.edge_ns)
+        if time_problem:
+            self.happen("row fault", PiFault.EDGE_TIME, time_problem)
         if not record.pulses:
             return
         self._journal.add(
@@ -266,6 +273,7 @@ class Machine:
             self.happen("passed", reply)
 
     def _on_status(self, reply: Reply) -> None:
+        """Handle a status; request the end of a motion again if the stage rests without having reported it."""
         self.stage.note_position(reply)
         self._is_placed |= self.state in ("homed", "ready") and reply.fields.get("state") == "idle"
         self._publish_status(reply)
@@ -277,36 +285,39 @@ class Machine:
             self._rests += 1
         else:
             self._rests = 0
-        if self._rests > RESTS * ASKED_AGAIN:
+        if self._rests > RESTS * MAX_REPEAT_REQUESTS:
             self._rests = 0
             reason = "it rests, and does not say how its motion ended: it was reset"
             self.happen("stage lost", PiFault.STAGE_LOST, reason)
         elif self._rests and self._rests % RESTS == 0:
-            # The stage repeats the end of its motion. Looked up inside: there may be no link any more.
+            # Ask the stage to repeat the end of its motion. The lambda reads `link` inside `_tell_stage`, which handles
+            # a link that is lost.
             self._tell_stage(lambda: self.stage.link.repeat())
 
     def _note_row_status(self, row: RunningRow, reply: Reply) -> None:
-        row.points = max(0, _number(reply, "points"))
-        if wrong := row.edges.note_status(row.points, reply.asked_ns, reply.written_ns):
-            self.happen("row fault", PiFault.EDGE_TIME, wrong)
+        """Compare a status with the trigger edges of the row, and resume a held row once the stage rests."""
+        row.points = max(0, _read_integer(reply, "points"))
+        if time_problem := row.edges.note_status(row.points, reply.asked_ns, reply.written_ns):
+            self.happen("row fault", PiFault.EDGE_TIME, time_problem)
         edges = self._loop.counts.edges
         if self.state != "stopping" and self._watch.is_silent(row.points, edges):
             reason = f"the stage has passed {row.points} points, {edges} edges were received: wire off?"
             self.happen("lasting fault", PiFault.TRIGGER_LINE_LOST, reason)
         if self.state in ("running", "held") and reply.fields.get("state") == "hold":
-            row.edges.note_stop(_number(reply, "x"), row.points)
+            row.edges.note_stop(_read_integer(reply, "x"), row.points)
             self._rests_in_hold = True
             if self._resumes_at_rest:
                 self._tell_stage(self._send_resume)
 
     def _tell_stage(self, send: Callable[[], object]) -> None:
-        """Send something to the stage; if it is lost, that happens after the event that is being handled."""
+        """Send something to the stage; a lost stage becomes an event, after the one that is being handled."""
         try:
             send()
         except StageLostError as e:
             self._post(partial(self.happen, "stage lost", e.number, str(e)))
 
     def _publish_status(self, reply: Reply) -> None:
+        """Publish a status of the stage, but not more often than a page needs it."""
         now_s = self._clock()
         interval_s = STATUS_EVENT_S if self.state in MOVING else 1.0
         if now_s - self._status_sent_s < interval_s:
@@ -314,16 +325,18 @@ class Machine:
         self._status_sent_s = now_s
         self._journal.add(
             m.StageStatus, state=reply.fields.get("state", ""), x_mm=self.stage.x_mm, y_mm=self.stage.y_mm,
-            points=max(0, _number(reply, "points")), alarm=max(0, min(_number(reply, "alarm"), 999)),
+            points=max(0, _read_integer(reply, "points")), alarm=max(0, min(_read_integer(reply, "alarm"), 999)),
         )  # fmt: skip
 
     # --- actions: homing and rows -----------------------------------------------------------------------------------
 
     def _home(self) -> None:
+        """Prepare homing; :meth:`_home_now` starts it after the state has changed."""
         if self._lines_dead:
             remedy = "find out why, then start polysight-pi again"
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self.reason, remedy=remedy)
-        self.homed = self._homing_underway = False
+        self.homed = False
+        self._homing_underway = False
         self._is_placed = False
         self._homing_is_watched = self.host_lives
         self._journal.retry()
@@ -342,13 +355,14 @@ class Machine:
             self.happen("stage lost", e.number, str(e))
 
     def _note_homed(self, reply: Reply) -> str:
+        """Store the lost steps and return the next state; `fault` if homing did not end at the origin."""
         self.stage.slow_down_polling()
-        place = (_number(reply, "x"), _number(reply, "y"))
-        if place != (0, 0):
-            self._report_fault(PiFault.POSITION, f"homing ended at {place}, not at (0, 0) (x, y in steps)")
+        end = (_read_integer(reply, "x"), _read_integer(reply, "y"))
+        if end != (0, 0):
+            self._report_fault(PiFault.POSITION, f"homing ended at {end}, not at (0, 0) (x, y in steps)")
             return "fault"
         limit = MAX_MM * self.stage.config.steps_per_mm
-        lost_x, lost_y = (max(-limit, min(_number(reply, key), limit)) for key in ("lostx", "losty"))
+        lost_x, lost_y = (max(-limit, min(_read_integer(reply, key), limit)) for key in ("lostx", "losty"))
         self.lost_mm = (lost_x / self.stage.config.steps_per_mm, lost_y / self.stage.config.steps_per_mm)
         self.homed = True
         self._is_placed = True
@@ -365,7 +379,7 @@ class Machine:
     # --- actions: jog -----------------------------------------------------------------------------------------------
 
     def find_place_mm(self, axis: m.Axis) -> float:
-        """Return the place of an axis of a stage at rest. Raises RefusedError while it is not known."""
+        """Return the position of an axis of the stage at rest. Raises RefusedError while it is not known."""
         if not self._is_placed:
             remedy = "ask again in a second"
             raise RefusedError(PiFault.NOT_READY, "the stage has not said where it rests", "it just stopped", remedy)
@@ -379,8 +393,8 @@ class Machine:
         else:
             y_mm = command.from_mm + command.distance_mm
         sequence = self._start_motion(partial(self.stage.move, x_mm, y_mm, command.speed_mm_s))
-        k = self.stage.config.steps_per_mm
-        target = (round(x_mm * k), round(y_mm * k))
+        steps_per_mm = self.stage.config.steps_per_mm
+        target = (round(x_mm * steps_per_mm), round(y_mm * steps_per_mm))
         timeout_s = HOST_MISSES * command.heartbeat_ms / 1e3
         self.jog = RunningJog(
             sequence=sequence, command=command, target=target, timeout_s=timeout_s, alive_s=self._clock()
@@ -404,8 +418,9 @@ class Machine:
         return sequence
 
     def _note_moved(self, reply: Reply) -> str:
+        """Finish a jog and return the next state; `fault` if it did not end at its target."""
         self.stage.slow_down_polling()
-        end = (_number(reply, "x", -1), _number(reply, "y", -1))
+        end = (_read_integer(reply, "x", -1), _read_integer(reply, "y", -1))
         if self.jog is not None and end != self.jog.target:
             self.homed = False
             reason = f"the jog ended at {end}, not at {self.jog.target} (x, y in steps)"
@@ -422,7 +437,7 @@ class Machine:
         return self._at_rest_state
 
     def _stop_jog(self, status: m.RowStatus, number: int, reason: str) -> None:
-        """Send STOP; the jog ends with the stage's alarm, or as lost if that does not come."""
+        """Send STOP; the jog ends with the stage's alarm, or the stage counts as lost if that does not come."""
         if self.jog is None or not self.jog.decide(status, number, reason):
             return
         self._deadline_s = min(self._deadline_s, self._clock() + TIMEOUTS_S["stopping"])
@@ -436,7 +451,7 @@ class Machine:
         self._stop_jog("fault", number, reason)
 
     def _finish_jog(self, status: m.RowStatus = "done", number: int = 0, reason: str = "") -> None:
-        """Journal the end of the jog, if there is one; what was decided when it was stopped stays."""
+        """Journal the end of the jog, if there is one; a result that was decided before is kept."""
         jog = self.jog
         if jog is None:
             return
@@ -477,7 +492,7 @@ class Machine:
         self.stage.link.send_byte(Immediate.HOLD)
 
     def _resume(self) -> None:
-        # The row resumes only when the stage rests: its place then tells the times of the edges around it.
+        # Resume only when the stage rests: the times of the edges before and after are computed from its position.
         self._resumes_at_rest = True
         if self._rests_in_hold:
             self._send_resume()
@@ -553,12 +568,13 @@ class Machine:
             self._lose_stage(PiFault.STAGE_LOST, reasons[self.state])
 
     def _note_passed(self, reply: Reply) -> str | None:
+        """Note that the stage has reached the row's end; return `ending` if every burst was sent."""
         row = self._current
         self.stage.slow_down_polling()
-        row.points = max(0, _number(reply, "points", row.row.points))
+        row.points = max(0, _read_integer(reply, "points", row.row.points))
         row.done_ns = reply.written_ns
-        row.was_held = bool(_number(reply, "held"))
-        end = (_number(reply, "x", -1), _number(reply, "y", -1))
+        row.was_held = bool(_read_integer(reply, "held"))
+        end = (_read_integer(reply, "x", -1), _read_integer(reply, "y", -1))
         if end != row.motion.end and row.status is None:
             self.homed = False
             self._fail_row(PiFault.POSITION, f"the row ended at {end}, not at {row.motion.end} (x, y in steps)")
@@ -569,7 +585,7 @@ class Machine:
     def _note_stopped(self, reply: Reply | None = None) -> None:
         """Handle the stage at rest after STOP; it may have reached the row's end before."""
         if reply is not None:
-            self._current.points = max(0, _number(reply, "points", self._current.row.points))
+            self._current.points = max(0, _read_integer(reply, "points", self._current.row.points))
         self._decide("aborted", PiFault.ABORTED, "the stage was stopped")
         self._clear_alarm()
 
@@ -582,6 +598,7 @@ class Machine:
             self.homed = self.homed and e.number not in POSITION_LOST
 
     def _finish_row(self) -> str:
+        """Judge and journal the row; return the next state."""
         row = self._current
         counts = self._loop.disarm()
         if row.status is None:
@@ -616,7 +633,8 @@ class Machine:
         self._journal.add(m.Fault, number=int(number), problem=f"{e.problem}: {reason}", cause=e.cause, remedy=e.remedy)
 
 
-def _number(reply: Reply, key: str, absent: int = 0) -> int:
+def _read_integer(reply: Reply, key: str, absent: int = 0) -> int:
+    """Return an integer field of a reply; `absent` if the reply does not have it."""
     try:
         return reply.integer(key)
     except ProtocolError:

@@ -107,22 +107,24 @@ class PlateEchoes:
         if surface.local_slopes is not None:
             variations += [(slopes[0] + SLOPE_STEP, slopes[1]), (slopes[0], slopes[1] + SLOPE_STEP)]
         self._responses = [respond(rig.tx, rx, points, _compute_normal(varied)) for varied in variations]
-        # Without layers a medium reflects alike at all frequencies.
-        many = rig.frequencies_hz if plate.stack.layers else rig.frequencies_hz[:1]
-        self._tables = [ReflectionTable(plate.stack, f) for f in many]
+        # A medium without layers reflects equally at all frequencies: one table is enough.
+        table_frequencies_hz = rig.frequencies_hz if plate.stack.layers else rig.frequencies_hz[:1]
+        self._tables = [ReflectionTable(plate.stack, f) for f in table_frequencies_hz]
         self._terms: list[NDArray] = []
         main = self._responses[0]
         along_x, along_y = self._find_edges()
         self._steps_m = main.path_steps(along_x, along_y)
         self._phase = _PhaseSteps(main.path_m, rig.frequencies_hz)
+        # Height differences change the path by c delta, with c = d path / d z: the mean of c goes into the mask, the
+        # deviations from it into the Taylor series.
         weight = np.abs(main.s_weight) + np.abs(main.p_weight)
         weight /= np.sum(weight)
         self._rise_mean = float(np.sum(weight * main.gradient[2]))
-        self._rise_rest = main.gradient[2] - self._rise_mean
+        self._rise_deviation = main.gradient[2] - self._rise_mean
         bend_mean = float(np.sum(weight * main.curvature_z))
         self._path_mean = self._rise_mean * surface.height_m + bend_mean / 2 * surface.height_m**2
         k = 2 * np.pi * rig.frequencies_hz[-1] / LIGHT_M_PER_S
-        largest = k * np.abs(surface.height_m).max() * np.sqrt(np.sum(weight * self._rise_rest**2))
+        largest = k * np.abs(surface.height_m).max() * np.sqrt(np.sum(weight * self._rise_deviation**2))
         self._orders = 1
         term = 2 * largest
         while term > SERIES_ERROR and self._orders < 12:
@@ -172,11 +174,12 @@ class PlateEchoes:
                 spectrum += self._multiply(mask * slope, common * (varied - terms[0]) / SLOPE_STEP)
         for order in range(1, self._orders):
             mask = mask * surface.height_m
-            kernel = kernel * (-1j * k / order * self._rise_rest).astype(np.complex64)
+            kernel = kernel * (-1j * k / order * self._rise_deviation).astype(np.complex64)
             spectrum += self._multiply(mask, kernel)
         data += ifft2(spectrum)[: rig.rows, : rig.columns]
 
     def _multiply(self, mask: NDArray, kernel: NDArray) -> NDArray:
+        """Return the spectrum of the convolution of mask and kernel."""
         return fft2(mask.astype(np.complex64), self._shape) * fft2(kernel.astype(np.complex64))
 
 

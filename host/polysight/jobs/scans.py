@@ -39,9 +39,9 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
     if not root.is_dir():
         raise no_such(root)
     catalogue = Scans(root)
-    odd = ""
+    not_listed = ""
     if left_out := catalogue.left_out():
-        odd = f"; not listed, because they are links or have unprintable names: {', '.join(left_out)}"
+        not_listed = f"; not listed, because they are links or have unprintable names: {', '.join(left_out)}"
     matching = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _join_searchable_text(s)]
     if as_json:
         rows = [msgspec.to_builtins(s) | {"bytes": _count_bytes(root, s)} for s in matching]
@@ -49,8 +49,8 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
         return 0
     width = min(max((len(s.name) for s in matching), default=0), _NAME_WIDTH)
     for s in matching:
-        sys.stdout.write(f"{s.name:{width}}  {_count_bytes(root, s) / 1e6:8.1f} MB  {printable(_line(s))}\n")
-    sys.stdout.write(f"{len(matching)} scans under {root}{odd}\n")
+        sys.stdout.write(f"{s.name:{width}}  {_count_bytes(root, s) / 1e6:8.1f} MB  {printable(_format_summary(s))}\n")
+    sys.stdout.write(f"{len(matching)} scans under {root}{not_listed}\n")
     return 0
 
 
@@ -61,8 +61,8 @@ def _count_bytes(root: Path, s: Summary) -> int:
     return folder_bytes(root / s.name)
 
 
-def _line(s: Summary) -> str:
-    """State, rows, verdict, materials and tags of a scan."""
+def _format_summary(s: Summary) -> str:
+    """Format state, rows, verdict, materials and tags of a scan."""
     words, _ = BADGES[s.state]
     parts = [words]
     if s.rows:
@@ -218,10 +218,11 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
         return 0
     products = read_products(products or folder, REPORT).folder
     with products_locked(products), store.locked_samples(scan):
-        return _drop(scan, folder, products, yes)
+        return _confirm_and_drop(scan, folder, products, yes)
 
 
-def _drop(scan: store.ScanFolder, folder: Path, products: Path, yes: bool) -> int:
+def _confirm_and_drop(scan: store.ScanFolder, folder: Path, products: Path, yes: bool) -> int:
+    """List the files, ask for confirmation, and delete them; return the exit status."""
     processed = find_processed_digests(products)
     rows = store.find_droppable(scan, processed)
     for line in rows.kept_files:
@@ -250,7 +251,7 @@ def _drop(scan: store.ScanFolder, folder: Path, products: Path, yes: bool) -> in
         raise ConfigError(
             f"nothing dropped: answered {answer!r}", f"the answer was not {WORD!r}", f"type {WORD}, or --yes"
         )
-    _keep(products, scan)
+    _mark_as_only_data(products, scan)
     store.drop(scan, processed, products)
     sys.stdout.write(f"{folder}: dropped; its digests stay in the manifest\n")
     return 0
@@ -274,10 +275,10 @@ def _check_samples(scan: store.ScanFolder, rows: set[int]) -> None:
         )
 
 
-def _keep(products: Path, scan: store.ScanFolder) -> None:
+def _mark_as_only_data(products: Path, scan: store.ScanFolder) -> None:
     """Mark the products as the only remaining data of the scan, so that they are never overwritten."""
     mark = RawDropped(scan_id=scan.scan_id, scan=str(scan.path.resolve()), dropped_utc=store.utc_now())
-    # The object of the file, not its struct: keys of a later release stay.
+    # The file is changed as a plain object, not as a struct, so that keys of later releases are kept.
     content = read_object(products / QUALITY) or {}
     write_json(products / QUALITY, {**content, "raw_dropped": mark})
 

@@ -40,11 +40,12 @@ STRIDE_M = 0.008
 MAX_SLOPE = 0.47
 # Bins of the coarse search per resolution cell.
 SLOPE_BINS = 19
-# Most echoes of one window.
+# Largest number of echoes of one window.
 MAX_ECHOES = 5
 # Share of a window's power that a plane wave explains; noise alone gives 0.01.
 MIN_SHARE = 0.05
-# What is left after the stronger echoes: a sphere before a table that is 16 dB brighter has 0.025.
+# Least share of the power for the echoes after the strongest: a sphere in front of a table that is 16 dB brighter has
+# 0.025.
 MIN_LEFT = 0.012
 # An echo this far below the strongest of the scan is a side lobe or the echo of an edge.
 MIN_POWER = 10 ** (-3.2)
@@ -81,7 +82,7 @@ class _Search:
         self.lead = np.moveaxis(lead.reshape(*path.shape, -1), -1, 0).astype(np.complex64)
 
     def find(self, windows: Windows) -> Array:
-        """Start values [window, 6] of the strongest echo of each window."""
+        """Return start values [window, 6] of the strongest echo of each window."""
         y = windows.samples
         count, rx = y.shape[:2]
         total = np.zeros((count, *self.lead.shape[1:]), np.complex64)
@@ -131,7 +132,7 @@ def find_echoes(board: Samples, gate_m: tuple[float, float]) -> Echoes:
         power = (np.abs(windows.samples) ** 2).mean(axis=(1, 2, 3))
         worth = (windows.valid.mean(axis=1) > 0.5) & (power > MIN_POWER * strongest)
         if worth.any():
-            parts += _separate(fit, search, select_windows(windows, worth))
+            parts += _separate_echoes(fit, search, select_windows(windows, worth))
     if not parts:
         return no_echoes()
     echoes = Echoes.join(parts)
@@ -141,13 +142,13 @@ def find_echoes(board: Samples, gate_m: tuple[float, float]) -> Echoes:
 
 
 def _measure_strongest(board: Samples) -> float:
-    """Power of the strongest positions, without the one per cent that a glint may be."""
+    """Return the power of the strongest positions, without the strongest per cent, which may be a glint."""
     power = (np.abs(board.cube) ** 2).mean(axis=(0, 1))
     return float(np.percentile(power, 99)) if power.size else 0.0
 
 
-def _separate(fit: BoardFit, search: _Search, windows: Windows) -> list[Echoes]:
-    """Echoes of windows, one list entry per rank; the strongest are subtracted before the next are searched."""
+def _separate_echoes(fit: BoardFit, search: _Search, windows: Windows) -> list[Echoes]:
+    """Return the echoes of windows, one list entry per rank; the strongest are subtracted before the next search."""
     echoes: list[tuple[NDArray, Maximum]] = []
     residual = windows.samples.copy()
     active = np.arange(len(windows.valid))
@@ -155,7 +156,7 @@ def _separate(fit: BoardFit, search: _Search, windows: Windows) -> list[Echoes]:
     for rank in range(MAX_ECHOES):
         part = select_windows(replace_samples(windows, residual), active)
         first = _fit_echo(fit, part, search.find(part))
-        share = _power_share(fit, part, first, energy[active])
+        share = _compute_power_share(fit, part, first, energy[active])
         keep = share > (MIN_LEFT if rank else MIN_SHARE)
         if not keep.any():
             break
@@ -208,10 +209,10 @@ def _refine(
     return members[is_separate]
 
 
-def _power_share(fit: BoardFit, windows: Windows, found: Maximum, energy: Array) -> Array:
-    """Share [window] of the energy of a window's samples, `energy`, that an echo explains."""
+def _compute_power_share(fit: BoardFit, windows: Windows, maximum: Maximum, energy: Array) -> Array:
+    """Return the share [window] of a window's `energy` that an echo explains."""
     count = windows.valid.sum(axis=1) * len(fit.lever)
-    return count * np.abs(found.amplitude) ** 2 * fit.gain**2 / fit.omega.size / np.maximum(energy, 1e-30)
+    return count * np.abs(maximum.amplitude) ** 2 * fit.gain**2 / fit.omega.size / np.maximum(energy, 1e-30)
 
 
 def measure_echoes(
@@ -258,9 +259,9 @@ def measure_echoes(
         for first in range(0, of_count.size, 100):
             part = of_count[first : first + 100]
             group = np.array([members[index] for index in part])
-            own = group[:, 0]
-            windows = gather_windows(board, rows[own], columns[own], at_m[own])
-            values = _move_starts(starts[group], at_m[own][:, None] - at_m[group])
+            measured = group[:, 0]
+            windows = gather_windows(board, rows[measured], columns[measured], at_m[measured])
+            values = _move_starts(starts[group], at_m[measured][:, None] - at_m[group])
             parts.append(_measure_windows(fit, windows, values))
             order.append(part)
     if not parts:
@@ -279,13 +280,15 @@ def _move_starts(values: Array, offsets_m: Array) -> Array:
 
 def _measure_windows(fit: BoardFit, windows: Windows, values: Array) -> Echoes:
     """Measure the first echo of each window, of known values [window, echo, 6], beside the others."""
-    own = values[:, 0]
+    first_values = values[:, 0]
     if values.shape[1] > 1:
         joint = JointFit(fit, windows, values, np.zeros(values.shape[:2]))
         widening = joint.fit_amplitudes()
         windows = replace_samples(windows, joint.rest + joint.synthesise(0))
     else:
         widening = np.ones(len(values))
-    measured = maximise(fit, add_up(fit, windows, own), windows.valid, windows.offsets, own, iterations=0)
+    measured = maximise(
+        fit, add_up(fit, windows, first_values), windows.valid, windows.offsets, first_values, iterations=0
+    )
     measured.rest = measured.rest * widening
     return make_echoes(fit, windows, measured)

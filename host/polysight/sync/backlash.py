@@ -74,43 +74,50 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     travel = mean_burst_travel_mm(rig.burst, rig.stage)
     window = np.pad(np.hanning(plan.columns + 2)[1:-1], (0, plan.columns))
 
-    def spectrum(r: int, shift_mm: float) -> NDArray[np.complex128]:
+    def compute_row_spectrum(r: int, shift_mm: float) -> NDArray[np.complex128]:
+        """Return the spectrum of a row at its planned positions, odd rows shifted back by `shift_mm`."""
         direction = plan.row(r).direction
-        return _compute_spectrum(rows[r][:, ::direction], k, direction * travel + (shift_mm if r % 2 else 0.0))
+        backlash_mm = shift_mm if r % 2 else 0.0
+        return _compute_spectrum(rows[r][:, ::direction], k, direction * travel + backlash_mm)
 
-    def sums(shift_mm: float) -> NDArray[np.float64]:
+    def sum_groups(shift_mm: float) -> NDArray[np.float64]:
         """Return sums over groups of rows: slope times difference, slope squared, power, power at the highest k."""
-        sums_of_groups = np.zeros((_GROUPS, 4))
-        recent = {r: spectrum(r, shift_mm) for r in (inner[0] - 1, inner[0])}
+        sums = np.zeros((_GROUPS, 4))
+        # Spectra of the row and its neighbours; each is computed once.
+        recent = {r: compute_row_spectrum(r, shift_mm) for r in (inner[0] - 1, inner[0])}
         for i, r in enumerate(inner):
-            recent = {q: recent[q] if q in recent else spectrum(q, shift_mm) for q in (r - 1, r, r + 1)}
+            neighbours = (r - 1, r, r + 1)
+            recent = {q: recent[q] if q in recent else compute_row_spectrum(q, shift_mm) for q in neighbours}
             mean = (recent[r - 1] + recent[r + 1]) / 2
-            slope, rest = np.fft.ifft(1j * k * mean, axis=-1), np.fft.ifft(recent[r] - mean, axis=-1)
+            slope = np.fft.ifft(1j * k * mean, axis=-1)
+            difference = np.fft.ifft(recent[r] - mean, axis=-1)
             power = np.abs(mean) ** 2
-            sums_of_groups[i * _GROUPS // len(inner)] += (
-                (1 if r % 2 else -1) * (window * slope.conj() * rest).real.sum(),
+            sums[i * _GROUPS // len(inner)] += (
+                (1 if r % 2 else -1) * (window * slope.conj() * difference).real.sum(),
                 (window * np.abs(slope) ** 2).sum(),
                 power.sum(),
                 power[:, np.abs(k) > 0.8 * np.abs(k).max()].sum(),
             )
-        return sums_of_groups
+        return sums
 
-    shift, without = 0.0, np.zeros(_GROUPS)
+    shift = 0.0
+    shift_without_group = np.zeros(_GROUPS)
     for _ in range(_STEPS):
-        s = sums(shift)
+        sums = sum_groups(shift)
+        product, slope2, power, power_at_high_k = sums.sum(axis=0)
         # Jackknife (Efron 1982): sums without one group.
-        sums_without_one = s.sum(axis=0) - s
-        if s[:, 1].sum() == 0 or sums_without_one[:, 1].min() <= 0 or s[:, 3].sum() > _ALIASED * s[:, 2].sum():
+        product_without, slope2_without, _, _ = (sums.sum(axis=0) - sums).T
+        if slope2 == 0 or slope2_without.min() <= 0 or power_at_high_k > _ALIASED * power:
             return None
-        without = shift + sums_without_one[:, 0] / sums_without_one[:, 1]
-        shift += float(np.clip(s[:, 0].sum() / s[:, 1].sum(), -plan.step_x_mm / 2, plan.step_x_mm / 2))
-    std = float(np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((without - without.mean()) ** 2)))
+        shift_without_group = shift + product_without / slope2_without
+        shift += float(np.clip(product / slope2, -plan.step_x_mm / 2, plan.step_x_mm / 2))
+    std = float(np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((shift_without_group - shift_without_group.mean()) ** 2)))
     return Backlash(shift, std) if std < plan.step_x_mm / 4 else None
 
 
-def _compute_spectrum(row: NDArray[np.complex64], k: NDArray[np.floating], off_mm: float) -> NDArray[np.complex128]:
-    """Return the spectrum of a row along x, [rx, 2 position], shifted back by `off_mm` to the planned positions.
+def _compute_spectrum(row: NDArray[np.complex64], k: NDArray[np.floating], shift_mm: float) -> NDArray[np.complex128]:
+    """Return the spectrum of a row along x, [rx, 2 position], shifted back by `shift_mm` to the planned positions.
 
     The row is continued by its mirror image to avoid a jump at its ends. `k` is in radians per millimetre.
     """
-    return np.fft.fft(np.concatenate([row, row[:, ::-1]], axis=-1), axis=-1) * np.exp(-1j * k * off_mm)
+    return np.fft.fft(np.concatenate([row, row[:, ::-1]], axis=-1), axis=-1) * np.exp(-1j * k * shift_mm)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 import textwrap
+
+from tests.support.rigs import published_rig
+from tests.support.scenes import COPPER, PET, scene_of
+
+from polysight_simulators.scene import decode_scene, simulate
 
 HIDDEN = """
 import builtins, ctypes, io, os, subprocess, sys, types  # subprocess takes a msvcrt for Windows' own
@@ -59,12 +63,13 @@ def test_every_public_name_is_imported_without_posix():
     run_hidden("import polysight.jobs.process, polysight.jobs.batch, polysight.catalogue, polysight.serve")
 
 
-def test_a_scan_is_processed_read_and_exported_without_posix(folder, tmp_path):
-    scan = shutil.copytree(folder, tmp_path / "scan")
+def test_a_scan_is_processed_read_and_exported_without_posix(tmp_path):
+    scene = decode_scene(scene_of(COPPER, PET, columns=15, rows=17), "test")
+    scan = simulate(published_rig(), scene, tmp_path / "scan")
     program = """
     from polysight.cli.main import main
     scan, out = sys.argv[1:]
-    assert main(["process", scan, "--out", out]) == 0
+    assert main(["image", scan, "--out", out]) == 0
     assert main(["process", scan, "--out", out]) == 0
     assert (2, 1) in locked
     assert {"renameat2", "kernels"} <= asked

@@ -44,7 +44,7 @@ def test_the_sharp_edges_of_a_tilted_plate_are_no_surface(see, gains, optics):
 def test_edges_alone_give_no_permittivity(see, gains, optics):
     """So far tilted that no position of the grid sees the plate's mirror point."""
     board = plate("board", Stack(below=MEDIUM), CENTRE_M, (0.1, 0.1), tilt_deg=(12.0, 0.0))
-    surface = analyse_surface(see([board]), optics, gains, uncertainty=EXACT)
+    surface = analyse_surface(see([board], 64, 44), optics, gains, uncertainty=EXACT)
     assert [s.permittivity for s in surface.segments] == [None] * len(surface.segments)
     assert all(s.reason for s in surface.segments)
 

@@ -26,8 +26,17 @@ from xdist.scheduler import LoadScopeScheduling
 TOGETHER = {
     "tests/process/test_drawn_boxes.py": "tests/process/test_laws.py",
     "tests/process/test_products.py": "tests/process/test_samples.py",
+    **dict.fromkeys(
+        (
+            "tests/pi/test_stage_page.py",
+            "tests/report/test_report.py",
+            "tests/serve/test_states.py",
+            "tests/serve/test_watch_page.py",
+        ),
+        "tests/serve/test_pages.py",
+    ),
 }
-"""Files whose tests share an expensive fixture with another file's."""
+"""Files whose tests share an expensive fixture with another file's, such as a worker's browser."""
 
 ROOMS = ("tests/api", "tests/materials")
 """Folders with an expensive fixture for most of their files: one worker runs them."""
@@ -35,12 +44,14 @@ ROOMS = ("tests/api", "tests/materials")
 FIRST = (
     "tests/e2e/test_operator_page.py",
     "tests/materials",
+    "tests/serve/test_pages.py",
     "tests/e2e/test_killed_processes.py",
     "tests/doctor/test_live_rig.py",
-    "tests/serve/test_pages.py",
     "tests/api",
+    "tests/surfaces/test_what_is_no_surface.py",
     "tests/process/test_laws.py",
     "tests/process/test_samples.py",
+    "tests/process/test_given_images.py",
     "tests/papers/test_reproduce.py",
     "tests/store/test_cut_anywhere.py",
     "tests/stage/test_dialogues.py",
@@ -56,6 +67,13 @@ FIRST = (
     "tests/process/test_verdicts.py",
     "tests/stage/test_uno_safety.py",
     "tests/benchmarks/test_runs.py",
+    "tests/worlds/test_series.py",
+    "tests/worlds/test_shape_scenes.py",
+    "tests/surfaces/test_surface.py",
+    "tests/process/test_metal_scans.py",
+    "tests/jobs/test_train_on_labels.py",
+    "tests/jobs/test_batch.py",
+    "tests/serve/test_attack.py",
 )
 """Files and folders that take longest: begun first, so that no worker ends long after the others."""
 

@@ -73,6 +73,34 @@ def test_a_classifier_is_an_estimator(library, model):
         classifier.predict(X[:, :3])
 
 
+@pytest.mark.parametrize(
+    ("model", "others"),
+    [
+        ("knn", set()),
+        # Its clouds of points are anywhere in X, and no reflection of materials.
+        ("discriminant", {"check_classifiers_train"}),
+    ],
+)
+def test_both_models_pass_scikit_learn_s_checks(monkeypatch, model, others):
+    """The checks have 1 to 10 columns; the discriminant gets them with as many more as make whole angles."""
+
+    def fill_angle(X):
+        return ratio_columns(np.pad(X, ((0, 0), (0, -X.shape[1] % 4)), constant_values=1.0))
+
+    monkeypatch.setattr("polysight.api.classifier._to_features", fill_angle)
+    results = check_estimator(Classifier(model), on_skip=None, on_fail=None)
+    failed = {result["check_name"] for result in results if result["status"] == "failed"}
+    skipped = {result["check_name"] for result in results if result["status"] == "skipped"}
+    assert failed == others
+    assert skipped <= NOT_CHECKED
+
+
+def test_columns_that_are_no_angles_are_refused(library):
+    X, y, _ = library.columns()
+    with pytest.raises(ValueError, match="3 feature"):
+        Classifier("discriminant").fit(X[:, :3], y)
+
+
 def test_scans_left_out_are_judged_by_scikit_learn_and_by_us_alike(library):
     X, y, scans = library.columns()
     theirs = cross_val_score(Classifier("knn"), X[::9], y[::9], groups=scans[::9], cv=LeaveOneGroupOut())

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, cast
 import numpy as np
 import numpy.typing as npt
 from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from polysight.data import find_packaged
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 RIG = Path("instrument.toml")
 # Neighbours that vote, as in libraries (polysight.materials.classify.Weights).
 NEIGHBOURS = 15
+# |H|, |V|, real and imaginary part of P.
+CHANNELS = 4
 # scikit-learn declares X as text.
 _validate = cast(Any, validate_data)
 Columns = npt.NDArray[np.float64]
@@ -98,10 +101,16 @@ class Classifier(ClassifierMixin, BaseEstimator):
 
         `groups` [n] is the scan of each pixel: what the pixels of a scan share is no difference of materials. Without
         it all pixels are of one scan.
+
+        Raises
+        ------
+        ValueError
+            for other numbers of columns, too few pixels, or what names no classes.
         """
-        pixels, names = _validate(self, X, y)
+        pixels, names = _validate(self, X, y, ensure_min_samples=2)
         if self.model not in SHORT:
             raise ValueError(f"model is {self.model!r}: one of {', '.join(SHORT)}")
+        check_classification_targets(names)
         self.classes_ = np.unique(names)
         if self.model == "knn":
             count = min(NEIGHBOURS, len(pixels))
@@ -116,7 +125,7 @@ class Classifier(ClassifierMixin, BaseEstimator):
         pixels: Columns = _validate(self, X, reset=False)
         if self.model == "knn":
             return np.asarray(self._model.predict_proba(pixels))
-        return self._model.pixel_probabilities(ratio_columns(pixels))
+        return self._model.pixel_probabilities(_to_features(pixels))
 
     def predict(self, X: npt.ArrayLike) -> Names:
         """Return the likeliest material of each pixel, [n]."""
@@ -148,4 +157,13 @@ def _collect_samples(X: Columns, y: Names, groups: npt.ArrayLike | None) -> Samp
     material = np.unique(y, return_inverse=True)[1]
     scan = np.unique(scans, return_inverse=True)[1]
     patches = scan * (material.max() + 1) + material
-    return Samples(ratio_columns(X), np.asarray(y), scan, patches)
+    return Samples(_to_features(X), np.asarray(y), scan, patches)
+
+
+def _to_features(X: Columns) -> Columns:
+    """Return |H|, |V|, real and imaginary part of 1 / P of pixels. Raises ValueError for other numbers of columns."""
+    if X.shape[1] % CHANNELS:
+        raise ValueError(
+            f"X has {X.shape[1]} feature(s): {CHANNELS} for each incidence angle, |H|, |V|, real and imaginary P"
+        )
+    return ratio_columns(X)

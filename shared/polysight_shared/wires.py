@@ -54,9 +54,9 @@ def encode(message: WireMessage) -> bytes:
 
 def parse(line: str) -> WireMessage:
     """Parse an S or M line. Raises ProtocolError."""
-    tag, *rest = line.split() or [""]
+    tag, *fields = line.split() or [""]
     try:
-        values = [int(w) for w in rest]
+        values = [int(field) for field in fields]
         if tag == "S" and len(values) == 3 and values[2] in (0, 1):
             return WireEdge(*values)
         if tag == "M" and len(values) == 4:
@@ -99,17 +99,17 @@ class WireClient:
                 time.sleep(0.02)
         self._buffer = b""
         self._pending: list[str] = []
-        hello = b""
+        subscriptions = b""
         if listen:
-            hello += ("L " + " ".join(map(str, listen)) + "\n").encode("ascii")
+            subscriptions += ("L " + " ".join(map(str, listen)) + "\n").encode("ascii")
         if motion:
-            hello += b"W\n"
+            subscriptions += b"W\n"
         if join is not None:
-            hello += f"J {join[0]} {join[1]}\n".encode("ascii")
-        if hello:
-            self._socket.sendall(hello)
+            subscriptions += f"J {join[0]} {join[1]}\n".encode("ascii")
+        if subscriptions:
+            self._socket.sendall(subscriptions)
             deadline = time.monotonic() + timeout_s
-            for _ in range(hello.count(b"\n")):
+            for _ in range(subscriptions.count(b"\n")):
                 if self._read_line(max(0.0, deadline - time.monotonic())) != "K":
                     raise ProtocolError(f"simulated wires at {path}: no confirmation", code=ErrorCode.NO_ANSWER)
 

@@ -134,7 +134,7 @@ def test_a_card_that_stays_where_it_was_must_have_been_off(cards, card, rig, tmp
         """The card is off until a whole round of requests, three of them, is lost."""
         running_cards.power_cycle("RH")
         wait_for(lambda: endpoint.counts["requests_unheard"] > 3, "requests to a card that is off")
-        endpoint._deaf_until_s = 0.0
+        endpoint._boots_until_s = 0.0
 
     assert "it answers at" in program_card(power_cycle, tmp_path, rig.by_name("RH").card_address, "RH")
     assert endpoint.card.network.mac.hex(":") == NEW_MAC

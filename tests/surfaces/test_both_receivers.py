@@ -107,12 +107,12 @@ def test_echoes_have_their_phases_at_the_wave_number_of_the_rig():
     offsets = scan_offsets(21, 21)
     cube = np.zeros((1, reduced.frequencies_hz.size, 21, 21), np.complex64)
     board = Samples(
-        cube,
-        np.ones((21, 21), bool),
-        offsets,
-        reduced.frequencies_hz,
-        optics.tx.at_m,
-        optics.h.at_m[None],
-        reduced.model,
+        cube=cube,
+        valid=np.ones((21, 21), bool),
+        offsets_m=offsets,
+        frequencies_hz=reduced.frequencies_hz,
+        tx_m=optics.tx.at_m,
+        rx_m=optics.h.at_m[None],
+        model=reduced.model,
     )
     assert BoardFit(board).middle == pytest.approx(optics.wave_number, abs=0.05)

@@ -1,7 +1,8 @@
 """The rules of the verdict: each function turns one kind of evidence into findings, none if the evidence is good.
 
 A finding says what was found, why it matters and what to do; `join_reasons` joins them to a verdict. All limits are
-constants of this module.
+constants of this module. The last argument of `reason` is the finding's weight, which orders the findings of one level,
+largest first.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ below twice the expected ones (tests/imaging/test_sparse.py); of nine simulated 
 DIRECT_SNR_NONE_DB = -14.0
 """Direct path over noise in one sample of one chirp and channel, below which it counts as missing."""
 DIRECT_SNR_CARE_DB = 0.0
-"""Same, below which it counts as weak. The simulated rig has 5.5 dB, as the paper's phase errors suggest."""
+"""The same ratio, below which the direct path counts as weak. The simulated rig has 5.5 dB, as the paper's phase errors
+suggest."""
 DIRECT_LEVELS = (0.4, 3.0)
 """Range of metal's brightness relative to the direct path; in published data both are equal within a factor of 1.5."""
 DIRECT_PHASE_CARE_RAD = 0.05
@@ -65,7 +67,7 @@ LIBRARY_ANGLE_DEG = 0.3
 PAINT_TOLD = 0.2
 """Probability of a painted metal reference from which on the verdict tells it."""
 MOST_OUTSHINING_DB = 6.0
-"""How much brighter than metal a plate may be: a factor of two by thickness, tilt and illumination (published
+"""Largest level of a plate relative to metal: a factor of two by thickness, tilt and illumination (published
 pictures)."""
 
 
@@ -205,7 +207,7 @@ def judge_patches(refused: Mapping[int, str], patches: int, left_out: int = 0) -
     for label, fault in refused.items():
         by_reason.setdefault(fault, []).append(label)
     if left_out:
-        aside = [
+        left_out_notes = [
             reason(
                 "good",
                 f"{left_out} region{'s' * (left_out > 1)} of a plate's size within 25 dB of the brightest: no patch",
@@ -215,8 +217,8 @@ def judge_patches(refused: Mapping[int, str], patches: int, left_out: int = 0) -
             )
         ]
     else:
-        aside = []
-    return aside + [
+        left_out_notes = []
+    return left_out_notes + [
         reason(
             "care",
             f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {fault}",

@@ -25,7 +25,7 @@ SOURCES = ("burst.c", "direct_path.c")
 
 _FLAGS = "-std=c99 -Werror=implicit-function-declaration -O3 -fPIC"
 _FLAGS += " -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
-# Not -ffast-math, which changes rounding in other libraries, too.
+# -fassociative-math instead of -ffast-math, which would change rounding in other libraries, too.
 _FLAGS += " -fassociative-math"
 _WIDTHS = {
     128: "",
@@ -44,7 +44,7 @@ class BuildError(Exception):
 
 
 def source_digest() -> str:
-    """Return the digest of the C sources. A library ends with it: another, truncated or foreign file is not loaded."""
+    """Return the digest of the C sources. A library ends with it, so that no old or truncated one is loaded."""
     digest = hashlib.sha256()
     for path in sorted([*HERE.glob("*.c"), *HERE.glob("*.h")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
@@ -72,7 +72,7 @@ def build(folder: Path = HERE, target: str = "") -> Path:
     BuildError
         if there is no compiler, or it fails.
     """
-    # Here, because `loops.py` needs this module, but no threads.
+    # Imported here, because `loops.py` imports this module and needs no threads.
     from concurrent.futures import ThreadPoolExecutor
 
     compiler = _find_zig() if target else find_compiler()
@@ -99,7 +99,7 @@ def build(folder: Path = HERE, target: str = "") -> Path:
         _run([*compiler, "-O3", "-fno-sanitize=undefined", "-s", "-shared", "-o", library, *objects, "-lm"])
         new = folder / f".{LIBRARY}-{os.getpid()}"
         new.write_bytes(Path(library).read_bytes() + source_digest().encode())
-        # In one step: programs that use the old library keep it.
+        # Replaced by a rename: programs that have loaded the old library go on with it.
         new.replace(folder / LIBRARY)
     return folder / LIBRARY
 
@@ -113,11 +113,11 @@ def _find_zig() -> list[str] | None:
 
 def _run(command: Sequence[str]) -> None:
     try:
-        done = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
+        completed = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
     except OSError as e:
         raise BuildError(f"{shlex.join(command)}\n{e}") from None
-    if done.returncode != 0:
-        raise BuildError(f"{shlex.join(command)}\n{done.stderr.strip()}")
+    if completed.returncode != 0:
+        raise BuildError(f"{shlex.join(command)}\n{completed.stderr.strip()}")
 
 
 def main() -> int:

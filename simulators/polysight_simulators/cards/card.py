@@ -30,16 +30,17 @@ from polysight_simulators.radars import RadarBoard
 Rows = NDArray[np.uint8]
 # Option of linux/udp.h: the kernel cuts one buffer into equal datagrams.
 _UDP_SEGMENT = 103
-# Bytes of one call, below the largest UDP datagram.
+# Most bytes and packets of one call: below the largest UDP datagram.
 _CALL_BYTES = 65_000
 _CALL_SEGMENTS = 44
-# Unread at the receiver, below which the next 44 packets (about 100 kB) are sent
+# The next packets (about 100 kB) are sent while fewer bytes than these are unread at the receiver.
 _UNREAD_BYTES = 128 << 10
+# Time between two looks at the receiver's queue while it is full.
 _POLL_S = 0.001
 # Time to wait for a receiver that does not read; then its packets are lost, as with a real card.
 _WAIT_TIMEOUT_S = 2.0
 _MAX_QUEUED_BYTES = 64 << 20
-# Largest delay that is made up for when sending many packets per call
+# Largest delay of the packets that later calls make up for.
 _CATCH_UP_S = 0.01
 
 
@@ -185,6 +186,7 @@ class CardSender:
         self._queued_bytes = 0
 
     def _may_send(self, now_s: float) -> bool:
+        """Return True if the receiver has room, or has not read for too long."""
         if not self._wait_for_receiver:
             return True
         queue_state = self._receiver.look()
@@ -197,6 +199,7 @@ class CardSender:
         return now_s - self._waiting_since_s > _WAIT_TIMEOUT_S
 
     def _send(self, rows: Rows) -> None:
+        """Send data packets in one call if the kernel can cut them, otherwise one by one."""
         size = rows.shape[1]
         self.packets += len(rows)
         self.payload_bytes += len(rows) * max(0, size - dca1000.DATA_HEADER_BYTES)
@@ -250,7 +253,8 @@ def _can_segment(s: socket.socket) -> bool:
     return True
 
 
-# Wall time: with a large time scale the card's 30 s would end before the stage has moved
+# Least time without data before a record ends, wall time: with a large time scale the card's own 30 s of wire time
+# would end before the stage has moved.
 NO_DATA_FLOOR_S = 10.0
 if TYPE_CHECKING:
     from polysight_simulators.scene import SignalSource
@@ -271,7 +275,7 @@ class CardEndpoint:
     network
         Addresses in its EEPROM.
     time_scale
-        Wire time over wall time.
+        Wire time (that of the simulated card) over wall time.
     clock_s
         Wall clock.
 
@@ -303,11 +307,13 @@ class CardEndpoint:
         self._wait_for_receiver = wait_for_receiver
         self._network_faults = NetworkFaults(faults, seed, name, self.counts)
         self._status_rng = fault_generator(seed, name, "status")
+        # A second card at the same address, which sends the data in reverse under other counters.
         if faults.twin:
             self._twin = dca1000.Packetiser(sequence=700, byte_count=1 << 40)
         else:
             self._twin = None
-        self._deaf_until_s = float("-inf")
+        # Wall time until which the card boots and hears no request.
+        self._boots_until_s = float("-inf")
         self.bindings = 0
         self._bind(network)
 
@@ -342,7 +348,7 @@ class CardEndpoint:
         network_before = self.card.network
         self.card.power_cycle()
         self.counts["power_cycles"] += 1
-        self._deaf_until_s = self._clock_s() + self._faults.boot_s / self._time_scale
+        self._boots_until_s = self._clock_s() + self._faults.boot_s / self._time_scale
         if self.card.network != network_before:
             self.sender.send_now()
             self._keep_sender_counts()
@@ -359,12 +365,13 @@ class CardEndpoint:
             self._serve(datagram)
 
     def _serve(self, datagram: bytes) -> None:
+        """Execute one request and send its replies."""
         request = dca1000.parse_request(datagram)
         if request is None:
             self.counts["not_requests"] += 1
             return
         self.counts["requests"] += 1
-        if self._clock_s() < self._deaf_until_s:
+        if self._clock_s() < self._boots_until_s:
             self.counts["requests_unheard"] += 1
             return
         if self._faults.mute:
@@ -507,9 +514,10 @@ class SimulatedCard:
             self.endpoint.counts["frames_not_recorded"] += len(started)
             return
         for run in _group_pulses(track.places(started)):
-            self._run(run, track)
+            self._send_run(run, track)
 
-    def _run(self, run: list[Pulse], track: StageTrack) -> None:
+    def _send_run(self, run: list[Pulse], track: StageTrack) -> None:
+        """Simulate the frames of consecutive pulses and pass them to the card."""
         counts = self.endpoint.counts
         burst = self._burst
         x_mm, y_mm = track.offsets_mm(
@@ -526,11 +534,11 @@ class SimulatedCard:
                 self.endpoint.emit(self.card.overflow())
 
     def tick(self, more_expected: bool) -> None:
-        """End the record when its time has come.
+        """End the record if its deadline has passed.
 
-        At many times real time 2 s are over in an instant, and a process that gets no CPU for that instant must not end
-        the record: while the stage moves, or has raised triggers that no pulse has followed yet, 2 s of wall time are
-        waited for. In real time both are the same.
+        With `more_expected`, while the stage moves or pulses are still to follow, the record ends only after 2 s of
+        wall time without data: at many times real time 2 s of wire time pass in a moment, for which any process may get
+        no CPU. In real time both are the same.
         """
         if more_expected and self._clock_s() - self.last_data_wall_s < dca1000.TAIL_S:
             return

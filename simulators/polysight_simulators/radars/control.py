@@ -26,15 +26,27 @@ from polysight_shared.errors import DeviceError
 from polysight_simulators.faults import Faults
 from polysight_simulators.radars.board import RadarBoard
 
+# Pins of channel A: clock, data to the board, chip select.
 _CLOCK = 1 << 0
 _OUT = 1 << 1
 _SELECT = 1 << 3
-_BARE = (0x85, 0x87, 0x8A, 0x8C, 0x8D, 0x97)
+# MPSSE commands (FTDI AN_108): set and read the pins, set the clock divisor, write and read bytes, and commands without
+# arguments, of which one selects the clock of 60 MHz.
+_SET_PINS = 0x80
+_READ_PINS = 0x81
+_SET_DIVISOR = 0x86
+_WRITE_BYTES = 0x11
+_READ_BYTES = 0x20
+_FAST_CLOCK = 0x8A
+_BARE = (0x85, 0x87, _FAST_CLOCK, 0x8C, 0x8D, 0x97)
+# Bit of the host interrupt in the pins of channel B.
+_INTERRUPT_BIT = 5
 _CHANNELS = "ABCD"
-# Duration of a pin command (FTDI AN_114)
+# Duration of a pin command (FTDI AN_114).
 _PIN_S = 0.2e-6
-# Two clocks, the minimum before and between chip selects (ICD 3.2.4); required here: twice that
+# Two clocks, the minimum before and between chip selects (ICD 3.2.4). The simulation requires twice that.
 _CLOCKS_S = 0.2e-6
+# Channel, operation and size of a request.
 _HEAD = struct.Struct("<ccH")
 LINE = b"Retrigger"
 # With this option, closing a connection sends a reset.
@@ -51,8 +63,9 @@ class UsbChip:
         self.spi_hz = 0.0
         self._fast = False
         self._pins = 0
+        # Number of words since chip select became low.
         self._latched = 0
-        # Time since the last change of chip select
+        # Time for which chip select is high or low, by the duration of the pin commands.
         self._high_s = float("inf")
         self._low_s = 0.0
         self._answers = {name: bytearray() for name in _CHANNELS}
@@ -67,12 +80,14 @@ class UsbChip:
         """Receive bytes from the host for a channel. Raises DeviceError if unplugged."""
         self._check()
         if name == "D":
-            pins = data[-1]
-            self._sense = {0b100: 4}.get(pins >> 2 & 0b111, 0)
+            # Pins 2 to 4 are the sense-on-power pins: 0b100 is the functional mode, 4.
+            sense_pins = data[-1] >> 2 & 0b111
+            self._sense = 4 if sense_pins == 0b100 else 0
             self._board.sense(self._sense)
         elif name == "C":
+            # The board runs while pins 6 and 7, its reset lines, are both high.
             for pins in data:
-                self._board.reset(held=not (pins >> 6 & 1 and pins >> 7 & 1))
+                self._board.reset(held=pins >> 6 & 0b11 != 0b11)
         else:
             # USB delays each request.
             if name == "A" and self._pins & _SELECT:
@@ -98,23 +113,24 @@ class UsbChip:
             raise DeviceError("no such USB device", "it was unplugged", "plug it in", code=ErrorCode.NO_ANSWER)
 
     def _transfer_spi(self, data: bytearray) -> int:
+        """Execute the first command of channel A; return its bytes, or 0 if it is incomplete."""
         code = data[0]
         if code in _BARE:
-            self._fast = self._fast or code == 0x8A
+            self._fast = self._fast or code == _FAST_CLOCK
             return 1
-        if code == 0x86:
+        if code == _SET_DIVISOR:
             if len(data) < 3:
                 return 0
             self.spi_hz = (60e6 if self._fast else 12e6) / (2 * (1 + int.from_bytes(data[1:3], "little")))
             return 3
-        if code == 0x80:
+        if code == _SET_PINS:
             return self._set_pins(data)
-        if code not in (0x11, 0x20):
+        if code not in (_WRITE_BYTES, _READ_BYTES):
             return self._refuse_code("A", code)
         if len(data) < 3:
             return 0
         count = 1 + int.from_bytes(data[1:3], "little")
-        if code == 0x11 and len(data) < 3 + count:
+        if code == _WRITE_BYTES and len(data) < 3 + count:
             return 0
         if count != 2 or self._pins & _SELECT:
             self.errors.append(f"{count} bytes at once, chip select {'high' if self._pins & _SELECT else 'low'}")
@@ -123,7 +139,7 @@ class UsbChip:
         elif self._low_s < 2 * _CLOCKS_S - 1e-9:
             self.errors.append(f"the clock starts {self._low_s * 1e9:.0f} ns after chip select")
         self._latched = 1
-        if code == 0x20:
+        if code == _READ_BYTES:
             self._answers["A"] += self._board.read_word().to_bytes(2, "big")
             return 3
         word = int.from_bytes(data[3:5], "big")
@@ -132,6 +148,7 @@ class UsbChip:
         return 3 + count
 
     def _set_pins(self, data: bytearray) -> int:
+        """Set clock, data and chip select of channel A; return the command's bytes, or 0 if it is incomplete."""
         if len(data) < 3:
             return 0
         pins = data[1]
@@ -158,17 +175,18 @@ class UsbChip:
         return 3
 
     def _set_gpio(self, data: bytearray) -> int:
+        """Execute the first command of channel B; return its bytes, or 0 if it is incomplete."""
         code = data[0]
         if code in _BARE:
             return 1
-        if code == 0x80:
+        if code == _SET_PINS:
             if len(data) < 3:
                 return 0
-            if data[2] >> 5 & 1:
+            if data[2] >> _INTERRUPT_BIT & 1:
                 self.errors.append("the host drives the interrupt line")
             return 3
-        if code == 0x81:
-            self._answers["B"].append(self._board.interrupt << 5)
+        if code == _READ_PINS:
+            self._answers["B"].append(self._board.interrupt << _INTERRUPT_BIT)
             return 1
         return self._refuse_code("B", code)
 
@@ -270,7 +288,7 @@ class RadarSocket(_Server):
         self.chip = UsbChip(board)
 
     def _accept(self) -> None:
-        # The new client replaces the old one
+        # The new client replaces the old one.
         for descriptor in list(self._clients):
             self._drop(descriptor)
         super()._accept()

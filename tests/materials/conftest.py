@@ -123,7 +123,10 @@ def nine():
 
 @pytest.fixture(scope="session")
 def analyse_placement():
-    """`analysed(seed, angle_deg)`: the materials of a placement of the nine, found once."""
+    """`analyse_placement(seed, angle_deg)`: the materials of a placement of the nine, found once.
+
+    Seeds 1000 to 1005 are those of `library`: tests without a library take them.
+    """
 
     @functools.cache
     def find(seed: int, angle_deg: float = 55.0) -> MaterialsResult:

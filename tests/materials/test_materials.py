@@ -98,7 +98,7 @@ def test_at_least_eight_of_nine_named_right(name_placement):
 
 
 def test_without_truth_or_probabilities_no_share_of_right_pixels_is_expected(synthetic, library, analyse_placement):
-    assert materials.predict_pixel_accuracy(analyse_placement(4)) is None
+    assert materials.predict_pixel_accuracy(analyse_placement(1000)) is None
     assert (
         materials.predict_pixel_accuracy(synthetic(4).analyse(classifier=materials.Classifier(library, model="knn")))
         is None
@@ -213,7 +213,7 @@ def test_median_ratio_is_unbiased_where_v_nearly_vanishes():
 
 
 def test_permittivity_of_the_plates_within_ten_percent(analyse_placement):
-    result = analyse_placement(21)
+    result = analyse_placement(1001)
     for r in result.patches:
         if r.truth.metal:
             assert r.permittivity.value is None

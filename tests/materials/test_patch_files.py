@@ -77,7 +77,7 @@ def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, na
 def test_a_budget_of_other_patches_is_refused(synthetic, analyse_placement, tmp_path):
     scene = synthetic(3)
     path = tmp_path / "patches.npz"
-    path.write_bytes(pack_patches(analyse_placement(3), scene.x_m, scene.y_m, simulated=True))
+    path.write_bytes(pack_patches(analyse_placement(1000), scene.x_m, scene.y_m, simulated=True))
     with np.load(path) as z:
         arrays = {k: z[k] for k in z}
     out = io.BytesIO()

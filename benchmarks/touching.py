@@ -157,7 +157,9 @@ def count_separate(scene: PlateScene) -> tuple[int, int]:
 
 def judge_gap(gap_cells: float, same_material: bool, scenes: int, first_seed: int) -> GapFigures:
     """Segment drawn scenes of one gap."""
-    plates = separate = strays = 0
+    plates = 0
+    separate = 0
+    strays = 0
     for seed in range(first_seed, first_seed + scenes):
         scene = draw_scene(seed, gap_cells, same_material)
         separate_plates, extra = count_separate(scene)

@@ -60,7 +60,7 @@ class Pipeline:
         return synced
 
     def form_images(self, from_sums: bool = False) -> imaging.Images:
-        """Form both images on the rig's plane, divided by the footprint, not referenced; `from_sums`: a live scan's."""
+        """Form both images on the rig's plane, not relative to metal; `from_sums`: from a live scan's running sums."""
         if self.settings.sparse and not from_sums:
             self.sub_bands = self.samples.fill_missing()
         with self.quality.measure_time("image"):
@@ -110,7 +110,7 @@ class Pipeline:
         metal_plane = self.calibration.metal_plane(self.rig, self.inputs.reference, has_metal, self.settings.bands)
         images = self.place_plane(images)
         if metal_plane is not None:
-            # A pixel can be judged only where the scan of the metal plate tells its gain.
+            # Only pixels whose gain the scan of the metal plate has measured can be judged.
             images = images.within(metal_plane.valid_on(images.x_m, images.y_m))
             scene = replace(scene, metal=metal_plane)
         result = self.find_materials(images, replace(scene, plates=plates), classifier)

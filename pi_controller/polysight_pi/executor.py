@@ -128,7 +128,8 @@ class Executor:
         self._after_row: Request | None = None
         self._replies: list[tuple[Request, m.AnyReply]] = []
         self._pulsing: list[Request] = []
-        self._ending = self._ended = False
+        self._ending = False
+        self._ended = False
         self.crash: BaseException | None = None
         self._thread = threading.Thread(target=self._live, name="executor", daemon=True)
         self._refresh_replies()
@@ -443,7 +444,8 @@ class Executor:
         self._write_synced(request, write, accept_begin)
 
     def _forget_run(self) -> None:
-        self._run = self._last_row = None
+        self._run = None
+        self._last_row = None
         self._takes = {}
         self._machine.happen("EndRun")
 

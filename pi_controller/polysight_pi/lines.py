@@ -430,7 +430,8 @@ class WireLines:
         self._client = WireClient(path, listen=listen, join=join)
         # Trigger edges that were received while waiting for other edges.
         self._waiting: deque[WireEdge] = deque()
-        self._now_ns = self._seqno = 0
+        self._now_ns = 0
+        self._seqno = 0
         self._active = False
         self._unsent: list[WireEdge] = []
 

@@ -206,8 +206,10 @@ class StageLink:
         self._answers: queue.SimpleQueue[Reply | None] = queue.SimpleQueue()
         self._banner: Reply | None = None
         self._banner_seen = threading.Event()
-        self._greeted = self._closing = False
-        self._sequence = self.bad_lines = 0
+        self._greeted = False
+        self._closing = False
+        self._sequence = 0
+        self.bad_lines = 0
         self._last_line = b""
         # The reason, once the link is lost
         self.lost = ""
@@ -386,7 +388,8 @@ class StageDriver:
         self.port = config.port
         self._news = news
         self._open: StageLink | None = None
-        self.x_mm = self.y_mm = 0.0
+        self.x_mm = 0.0
+        self.y_mm = 0.0
         self.firmware = ""
 
     def connect(self) -> None:

@@ -369,7 +369,8 @@ class TriggerLoop:
         self._bench: BurstSpec | None = None
         self._last_seqno: int | None = None
         self._last_rise_ns: int | None = None
-        self._busy_until_ns = self.strays = 0
+        self._busy_until_ns = 0
+        self.strays = 0
         self.counts = Counts()
         self.backend = lines.name
         self.sees_pulses = False
@@ -530,7 +531,8 @@ class TriggerWatch:
 
     def __init__(self) -> None:
         self._edges = -1
-        self._points = self._statuses = 0
+        self._points = 0
+        self._statuses = 0
 
     def is_silent(self, points: int, edges: int) -> bool:
         """Update with a stage status (points passed, edges received); True if the wire is off."""

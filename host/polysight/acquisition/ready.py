@@ -23,9 +23,9 @@ from polysight_shared.messages import HelloReply, StatusReply
 from polysight_shared.raster import Stage
 from polysight_shared.stage_line import HOMING_TIMEOUT_S
 
-# Longer than the Pi's own, which reports the exact reason.
+# Timeout of homing: longer than the Pi's own, so that the Pi reports the exact reason first.
 _HOMING_TIMEOUT_S = HOMING_TIMEOUT_S + 30.0
-# A person must look and home: `polysight-pi home`.
+# Faults after which a person must look at the stage and home it: `polysight-pi home`.
 STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)
 STAGE_NOT_REPORTED = (
     "the Pi does not report its [stage], so it cannot be compared with the rig file's: install this release on the Pi"
@@ -113,11 +113,9 @@ def check_between_rows(status: StatusReply, scan_id: str, first: bool) -> None:
         cause = explained.cause
         remedy = explained.remedy
     elif not first and needs_homing:
+        problem = f"the stage is {status.state!r} between two rows"
         if status.reason:
-            reason = f": {status.reason}"
-        else:
-            reason = ""
-        problem = f"the stage is {status.state!r} between two rows{reason}"
+            problem += f": {status.reason}"
         cause = "its position was lost, homing was stopped, or somebody ended the run at the Pi"
         remedy = "check that nothing is in the way, then `polysight-pi home`"
     else:
@@ -127,13 +125,13 @@ def check_between_rows(status: StatusReply, scan_id: str, first: bool) -> None:
 
 def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
     """Check that the disk has space for this number of rows and the reserve. Raises ScanError."""
-    need = rows * instrument.recorded_row_bytes
-    reserve = instrument.limits.free_disk_bytes
-    free = shutil.disk_usage(folder).free
-    if free < need + reserve:
+    needed_bytes = rows * instrument.recorded_row_bytes
+    reserved_bytes = instrument.limits.free_disk_bytes
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < needed_bytes + reserved_bytes:
         raise ScanError(
-            f"{folder}: {free / 1e9:.2f} GB free, {need / 1e9:.2f} GB needed for {rows} rows and"
-            f" {reserve / 1e9:.2f} GB kept free",
+            f"{folder}: {free_bytes / 1e9:.2f} GB free, {needed_bytes / 1e9:.2f} GB needed for {rows} rows and"
+            f" {reserved_bytes / 1e9:.2f} GB kept free",
             "the disk is too full for this scan",
             f"free space, then `polysight resume {quote(folder)}`; or lower limits.free_disk_bytes in instrument.toml,"
             " and add --config instrument.toml",

@@ -426,7 +426,8 @@ class _Row:
         # Byte ranges that are covered by packets: sorted and joined.
         self.covered: list[Gap] = []
         self.conflicts: list[Gap] = []
-        self.received = self.extent = 0
+        self.received = 0
+        self.extent = 0
         self._stops = np.minimum(record.offsets + self._sizes, log.expected)
         self._placed, self._duplicate, self._conflicting = np.zeros((3, log.count), dtype=np.bool_)
         self._place()

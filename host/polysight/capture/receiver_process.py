@@ -46,7 +46,9 @@ class _Row:
         self.segment = segment
         self.log = log
         self.past = past
-        self.stale = self.strangers = self.drops = 0
+        self.stale = 0
+        self.strangers = 0
+        self.drops = 0
         self.not_before_ns = 0
         # What the last report said of the preview: all frames complete, the record ended.
         self._reported = (False, False)

@@ -105,7 +105,8 @@ def read_interface(name: str, root: Path = Path("/")) -> NetworkInterface:
             return None
         return value
 
-    ring = ring_max = None
+    ring = None
+    ring_max = None
     if root == Path("/"):
         ring, ring_max = _receive_ring(name)
     dropped = sum(number(f"statistics/{counter}") or 0 for counter in _DROP_COUNTERS)

@@ -1,6 +1,6 @@
-"""What `train` says of a library: how often its names are right, if they are said too surely, and what it needs.
+"""Advice on a trained library: how often its names are correct, whether it is overconfident, and which scans it needs.
 
-Scores are of scans left out of training (`train.py`).
+Scores are those of scans left out of training (`train.py`).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from polysight.materials.library import Library, Samples
 
 
 def accuracy_lines(library: Library) -> list[str]:
-    """Say for each angle how often names are right on scans left out of training, or why nobody can know."""
+    """Return for each angle how often names are correct on scans left out of training, or why this is not known."""
     lines: list[str] = []
     for angle, fit in library.fit["angles"].items():
-        alone = ", ".join(fit["not_judged"])
+        in_one_scan_only = ", ".join(fit["not_judged"])
         if not fit["judged"]:
             lines.append(
                 f"{angle} degrees: accuracy not known: it is measured on a second scan of a material, and there is none"
@@ -31,7 +31,7 @@ def accuracy_lines(library: Library) -> list[str]:
             f"{angle} degrees: on scans left out {100 * fit['pixel_accuracy']:.1f} % of the pixels and"
             f" {100 * fit['patch_accuracy']:.1f} % of the patches are named right ({fit['model']},"
             f" {fit['materials'] - len(fit['not_judged'])} materials)"
-            + (f"; not known for materials of one scan: {alone}" if alone else "")
+            + (f"; not known for materials of one scan: {in_one_scan_only}" if in_one_scan_only else "")
         )
     return lines
 
@@ -40,16 +40,16 @@ def accuracy_lines(library: Library) -> list[str]:
 FREEDOM_NEEDED = 8
 FEW_SCANS = 4
 LEAST_MISFIT = 0.05
-"""Difference between the mean confidence and the share of right names that is told, if it is no chance."""
+"""Difference between the mean confidence and the share of correct names that is reported, unless it may be chance."""
 ALIKE_STD = 2.0
-"""Distance of two materials in standard deviations of a patch below which names of one may be the other."""
+"""Distance of two materials, in standard deviations of a patch, below which one may be named as the other."""
 SHOWN_PAIRS = 3
 
 
 def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
-    """Say if the names' probabilities are too large or too small, why, and how many specimens the library needs."""
+    """Return lines on confidence: whether it is too large or too small, why, and how many specimens are needed."""
     if fit.get("named") is None:
-        # Libraries of earlier releases do not say.
+        # Libraries of earlier releases have no confidence.
         return []
     missing = max(FREEDOM_NEEDED - fit["specimen_freedom"], 0)
     # Scans of one and the same piece cannot show how names fare on another.

@@ -64,7 +64,8 @@ class SyncReport:
         self._samples = linear[1] - linear[0]
         self._rx = rx
         self.stages: dict[str, _Stage] = {}
-        self.positions = self.chirps = 0
+        self.positions = 0
+        self.chirps = 0
         self._snr: list[tuple[float, int]] = []
 
     def add(self, row: SyncedRow) -> None:

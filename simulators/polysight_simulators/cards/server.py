@@ -44,7 +44,8 @@ class CardServer:
         self._time_scale = time_scale
         self._clock_s = clock_s
         self._track = track
-        self._trigger_ns = self._pulse_ns = 0
+        self._trigger_ns = 0
+        self._pulse_ns = 0
         self._selector = selectors.DefaultSelector()
         # Number of the card's binding, its descriptor then
         self._bound: dict[SimulatedCard, tuple[int, int]] = {}

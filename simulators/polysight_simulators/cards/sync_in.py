@@ -38,7 +38,8 @@ class SyncInput:
         self._radar = radar
         self._row_frames = rig.grid.columns * rig.burst.pulses
         self._frames_left: int | None = 0 if rig.radar.control == "line_server" else None
-        self.rearmed = self.unarmed = 0
+        self.rearmed = 0
+        self.unarmed = 0
         last_chirp_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
         self._dead_ns = us_to_ns(last_chirp_us + rig.chirp.ramp_end_us + RECOVERY_US)
         self._last_ns: int | None = None

@@ -187,8 +187,12 @@ class Cores:
 
     def forget(self) -> None:
         """Reset: clear RAM and settings, keep the flash."""
-        self.ram = self._booted = b""
-        self.main_up = self.rf_up = self.calibrated = self.crc32_events = False
+        self.ram = b""
+        self._booted = b""
+        self.main_up = False
+        self.rf_up = False
+        self.calibrated = False
+        self.crc32_events = False
         self.frames_left = 0
         self.armed = False
         self.frame_ends = -1.0

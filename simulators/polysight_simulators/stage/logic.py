@@ -254,11 +254,13 @@ class StageLogic:
 
     def _begin(self, activity: str) -> None:
         self.activity = activity
-        self.held = self._homing_leg_made = False
+        self.held = False
+        self._homing_leg_made = False
         self.row_command = activity == "travel"
         self.homing_command = activity == "home"
         self._engine.abandon()
-        self._engine.points = self._engine.pulses = 0
+        self._engine.points = 0
+        self._engine.pulses = 0
         self.heard = True
 
     def _go(self, x: int, y: int, rate: int) -> None:
@@ -280,7 +282,8 @@ class StageLogic:
         elif byte == Immediate.STATUS:
             self.status_requested = True
         elif byte == Immediate.STOP:
-            self._engine.hold = self._stop = True
+            self._engine.hold = True
+            self._stop = True
         else:
             return False
         self.heard |= alone
@@ -304,7 +307,8 @@ class StageLogic:
         self._engine.set_accel(self.parameters[Parameter.ACCEL])
         self.activity = "idle"
         self._stopping = None
-        self._stop = self._resume = False
+        self._stop = False
+        self._resume = False
         self.alarm = alarm
         self.homed = self.homed and not position_lost
         self._enabled = self._enabled and alarm != StageError.EMERGENCY_STOP
@@ -321,7 +325,8 @@ class StageLogic:
         if not self.busy:
             if self._stop and self.alarm is None:
                 return self._raise(StageError.STOPPED, False)
-            self._stop = self._resume = False
+            self._stop = False
+            self._resume = False
             engine.abandon()
             return Event.NONE
         if self._stop and self._stopping is None:

@@ -42,7 +42,10 @@ class PythonStage:
         self.wires: list[WireMessage] = []
         self.replies = bytearray()
         self.tick = 0
-        self._now_ms = self._pressed = self._told = self._next = 0
+        self._now_ms = 0
+        self._pressed = 0
+        self._told = 0
+        self._next = 0
         self._armed = False
         self._fall: int | None = None
         self._x = rig.x
@@ -54,9 +57,11 @@ class PythonStage:
     def _power_on(self) -> None:
         self._engine = StepEngine()
         self._logic = StageLogic(self._engine, self._arm, self._read_inputs)
-        self._armed = self._was_homed = False
+        self._armed = False
+        self._was_homed = False
         self._line = bytearray()
-        self._greeted = self._fresh = False
+        self._greeted = False
+        self._fresh = False
         # The last answered line: its repetition gets the same answer
         self._last: Command | None = None
         self._last_answer = b""
@@ -119,7 +124,10 @@ class PythonStage:
             end = until
         else:
             end = min(until, self._fall - 1)
-        n = dx = dy = ticks = 0
+        n = 0
+        dx = 0
+        dy = 0
+        ticks = 0
         if end > self.tick and not self._read_inputs():
             n, dx, dy, ticks = engine.skip(end - self.tick, abs(self._x) - 1, abs(self._y) - 1)
         if n:

@@ -16,7 +16,7 @@ from polysight_shared import __version__
 if TYPE_CHECKING:
     from polysight.api import Scan, open_scan, read_netcdf, write_netcdf
     from polysight.api.classifier import Classifier, train
-    from polysight.api.functions import Plan, check, compare, plan, simulate
+    from polysight.api.functions import Plan, check, compare, plan, plot_check, simulate
     from polysight.imaging import backproject
     from polysight.materials import Library, PaperKNeighborsClassifier
     from polysight.polarimetry.xarray_labels import fresnel, multilayer, permittivity_from_ratio
@@ -35,6 +35,7 @@ _HOME = {
     "open_scan": "polysight.api",
     "permittivity_from_ratio": "polysight.polarimetry.xarray_labels",
     "plan": "polysight.api.functions",
+    "plot_check": "polysight.api.functions",
     "read_netcdf": "polysight.api",
     "simulate": "polysight.api.functions",
     "train": "polysight.api.classifier",
@@ -56,6 +57,7 @@ __all__ = [
     "open_scan",
     "permittivity_from_ratio",
     "plan",
+    "plot_check",
     "read_netcdf",
     "simulate",
     "train",

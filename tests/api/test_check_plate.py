@@ -8,11 +8,13 @@ import shutil
 import numpy as np
 import pytest
 from tests.support.products import name_check_plate
+from tests.support.refusals import refused
 
 import polysight
 from polysight.cli.main import main
 from polysight.results import PatchFigures, PermittivityFigures, check_plate, check_reasons
 from polysight_shared.config import CheckPlate
+from polysight_shared.error_codes import ErrorCode
 
 from .conftest import PET
 
@@ -88,6 +90,15 @@ def test_the_command_says_and_draws_it(products_copy, tmp_path, capsys, permitti
     assert table["level"].item() == check["level"]
     assert table["sigmas"].item() == check["sigmas"]
     assert all({"units", "long_name"} <= set(variable.attrs) for variable in table.variables.values())
+    chart_axes = polysight.plot_check(products_copy, polysight.open_scan(products_copy)).axes
+    assert [ax.get_ylabel() for ax in chart_axes] == ["real part", "loss"]
+    points = chart_axes[0].get_lines()[0].get_ydata()
+    assert points == pytest.approx([table["permittivity"].real.item()] * 2)
+
+
+def test_a_check_of_nothing_says_so():
+    with refused(ErrorCode.OTHER):
+        polysight.check()
 
 
 def test_a_rig_file_without_a_plate_is_an_error(products_copy, capsys):

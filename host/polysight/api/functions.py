@@ -6,7 +6,7 @@ import os
 import tempfile
 import tomllib
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from html import escape
@@ -22,13 +22,14 @@ from polysight.data import find_packaged
 from polysight.jobs.check import check_scan, check_scans
 from polysight.jobs.demo import simulate_scene
 from polysight.planning import Changes, Forecast, describe, find_scene_warnings, forecast_scene
-from polysight.products import PLANE, image_dataset
+from polysight.products import PLANE, ProcessedScan, image_dataset
 from polysight.results import CheckResult
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import ConfigError, expand_paths
 
 if TYPE_CHECKING:
     import xarray
+    from matplotlib.figure import Figure
 
 PathText = str | os.PathLike[str]
 Scene = PathText | Mapping[str, object]
@@ -205,16 +206,11 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
     Raises
     ------
     ConfigError
-        if a rig file names no check plate.
+        if no scan is given, or a rig file names no check plate.
     """
     import xarray
 
-    checked: list[tuple[str, CheckResult]] = []
-    for scan in scans:
-        if isinstance(scan, Scan):
-            checked.append((scan.scan_id, check_scan(scan.read_or_process())))
-        else:
-            checked += [(nested.scan_id, result) for nested, result in check_scans([Path(scan)])]
+    checked = _check_all(scans)
     results = [result for _, result in checked]
     unknown = (np.nan, np.nan)
     measured = np.array([result.measured or unknown for result in results])
@@ -230,8 +226,33 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
         "level": ([result.level for result in results], "level of the control chart"),
     }
     variables = {name: ("scan", value, {"units": "1", "long_name": about}) for name, (value, about) in table.items()}
-    names = ("scan", [name for name, _ in checked], {"units": "", "long_name": "name of the scan"})
+    names = ("scan", [scan.scan_id for scan, _ in checked], {"units": "", "long_name": "name of the scan"})
     return xarray.Dataset(variables, {"scan": names}, {"plate": results[-1].name})
+
+
+def plot_check(*scans: Scan | PathText) -> Figure:
+    """Draw the control chart of check plates: permittivities of scans, the known one, and its limits.
+
+    Takes scans and folders, and raises, as :func:`check`.
+    """
+    from polysight.api.plot import plot_control_chart
+
+    return plot_control_chart(_check_all(scans))
+
+
+def _check_all(scans: Sequence[Scan | PathText]) -> list[tuple[ProcessedScan, CheckResult]]:
+    checked: list[tuple[ProcessedScan, CheckResult]] = []
+    for scan in scans:
+        if isinstance(scan, Scan):
+            processed = scan.read_or_process()
+            checked.append((processed, check_scan(processed)))
+        else:
+            checked += check_scans([Path(scan)])
+    if not checked:
+        raise ConfigError(
+            "no scan was given", "nothing can be compared with the known value", "see help(polysight.check)"
+        )
+    return checked
 
 
 def _find_rig(rig: PathText | None) -> Path:

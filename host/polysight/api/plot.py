@@ -1,14 +1,17 @@
-"""One figure of a processed scan, for notebooks."""
+"""Figures for notebooks: a processed scan, the check plates of many."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from polysight.jobs.check import CHART_IN, DOTS_PER_INCH, draw_control_chart
 from polysight.products import ProcessedScan
 from polysight.report import draw_overview, figure_label, font_families
+from polysight.results import CheckResult
 
 # Width of one picture, and what its colour bar and the axis of the next one add; height of a title and axis.
 _PANEL_IN = 3.8
@@ -45,4 +48,12 @@ def plot_scan(scan: ProcessedScan) -> Figure:
     stamp = {True: " (simulated)", False: "", None: " (not known whether simulated)"}[scan.simulated]
     title = figure_label(f"Scan {scan.scan_id}{stamp}", "title")
     fig.suptitle(title, fontsize=12, family=list(font_families()), parse_math=False)
+    return fig
+
+
+def plot_control_chart(checked: Sequence[tuple[ProcessedScan, CheckResult]]) -> Figure:
+    """Control chart of the check plates of scans."""
+    fig = NotebookFigure(figsize=CHART_IN, dpi=DOTS_PER_INCH, layout="constrained")
+    FigureCanvasAgg(fig)
+    draw_control_chart(fig, checked)
     return fig

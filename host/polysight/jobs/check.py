@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from polysight.catalogue import Scans
 from polysight.jobs.output import print_json, print_lines
@@ -13,6 +14,9 @@ from polysight.results import WARNING_SIGMAS, CheckResult, check_plate, to_plain
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CHART_IN = (8.0, 5.0)
 DOTS_PER_INCH = 120
@@ -75,7 +79,13 @@ def check(folders: Sequence[Path], chart: Path | None, as_json: bool) -> int:
     """
     checked = check_scans(folders)
     if chart is not None:
-        write_atomically(chart, draw_control_chart(checked))
+        from matplotlib.figure import Figure
+
+        fig = Figure(figsize=CHART_IN, dpi=DOTS_PER_INCH, layout="constrained")
+        draw_control_chart(fig, checked)
+        buffer = io.BytesIO()
+        fig.savefig(buffer, format="png")
+        write_atomically(chart, buffer.getvalue())
     if as_json:
         print_json([{"scan_id": scan.scan_id, **to_plain(result)} for scan, result in checked])
     else:
@@ -96,13 +106,8 @@ def _describe(scan: ProcessedScan, result: CheckResult) -> str:
     )
 
 
-def draw_control_chart(checked: Sequence[tuple[ProcessedScan, CheckResult]]) -> bytes:
-    """Return a PNG: real part and loss of the check plate over the scans, with the known value and its limits."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=CHART_IN, dpi=DOTS_PER_INCH, layout="constrained")
-    FigureCanvasAgg(fig)
+def draw_control_chart(fig: Figure, checked: Sequence[tuple[ProcessedScan, CheckResult]]) -> None:
+    """Draw real part and loss of the check plate over the scans, with the known value and its limits."""
     axes = fig.subplots(2, 1, sharex=True)
     names = []
     measured = []
@@ -126,6 +131,3 @@ def draw_control_chart(checked: Sequence[tuple[ProcessedScan, CheckResult]]) -> 
     axes[-1].set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=8)
     stamp = " (simulated)" if any(scan.simulated is not False for scan, _ in checked) else ""
     fig.suptitle(f"Check plate {latest.name}{stamp}: bars and band hold 95 % of good scans", fontsize=11)
-    buffer = io.BytesIO()
-    fig.savefig(buffer, format="png")
-    return buffer.getvalue()

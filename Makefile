@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
-JOBS ?= $(shell expr 2 + $$(getconf _NPROCESSORS_ONLN))  # tests wait a good part of their time; each worker collects for 8 CPU s
+JOBS ?= $(shell expr 2 + $$(getconf _NPROCESSORS_ONLN))  # tests wait a good part of their time; each worker collects for 4 CPU s
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport PYTHONDONTWRITEBYTECODE  # modules are compiled once, not for each of a hundred programs
 

@@ -217,13 +217,13 @@ def _place_frequency_nodes(frequencies_hz: NDArray, count: int = 5) -> tuple[NDA
 def sum_bent(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
-    """Physical optics with what it misses to first order in the curvature, where the medium has no layers."""
+    """Physical optics with what it misses to first order in curvature and distance, where the medium has no layers."""
     # The path is stationary at the tip of a cone, too: beyond the piece's edges, without any surface.
     has_surface = shape.evaluate(*places).area > LEAST_AREA_M
     offsets = offsets[has_surface]
     places = tuple(place[has_surface] for place in places)
     sums = sum_window(shape, tx, rx, frequencies_hz, offsets, places)
-    if shape.is_bent and not shape.stack.layers:
+    if not shape.stack.layers:
         sums += _add_bends(shape, tx, rx, frequencies_hz, offsets, places)
     waves = np.zeros((len(frequencies_hz), len(has_surface)), complex)
     waves[:, has_surface] = sums

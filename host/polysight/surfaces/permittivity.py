@@ -23,9 +23,9 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.polarimetry import permittivity_from_ratio
-from polysight.surfaces.gains import Gains
+from polysight.surfaces.gains import UNKNOWN_SLOPE, Gains
 from polysight.surfaces.measure import Seen
-from polysight.surfaces.optics import Antenna, Optics, reflect_flat
+from polysight.surfaces.optics import ANGLE_STEP, Antenna, Optics, reflect_flat
 from polysight.surfaces.paths import STRIDE_M
 from polysight.surfaces.voltages import (
     Voltages,
@@ -42,9 +42,10 @@ Complex = NDArray[np.complex128]
 OUTLIER = 4.0
 # Ripples of edges and of other echoes change over such a distance: points within it have the same scatter.
 RIPPLE_M = 0.04
-# Ripple of V / H that is expected before it is seen, and the number of blocks that this expectation is worth: a small
-# segment has few blocks, which say little of their own scatter.
-EXPECTED_RIPPLE = 0.02
+# Ripple of V / H by which points are weighted, beside their noise.
+USUAL_RIPPLE = 0.02
+# Blocks that the scatter of the points is worth, if it were common to a block: the few blocks of a small segment say
+# little of their own scatter.
 EXPECTED_BLOCKS = 2.0
 # Error of the curvature, in proportion: that of a sphere of 113 mm is 5 % too large (windows are not small to it).
 CURVATURE_ERROR = 0.1
@@ -64,8 +65,6 @@ BORDER_DISC_M = 0.05
 MIN_FILLING = 0.75
 # Offsets closer than this are of one column of windows: rows start a little apart, as the stage moves within a burst.
 SAME_COLUMN_M = 1.5e-3
-# Median of the square of a complex normal variable, over twice that of each part: 2 ln 2.
-MEDIAN_OF_SQUARE = 1.386
 EPS_STEP = 1e-4
 
 
@@ -140,12 +139,16 @@ def _compute_noise_of_misses(v: Voltages, gains: Gains, coefficients: Complex) -
 
 @dataclass(frozen=True)
 class _Step:
-    """Misses at one permittivity, their noise and weights [n], which points count, and `answer` as of the fit."""
+    """Misses at one permittivity, their noise and weights [n], which points count, and `answer` as of the fit.
+
+    The step of Newton is the real part of `influence` times the misses, complex [2, n].
+    """
 
     miss: Complex
     noise: Array
     weights: Array
     used: NDArray[np.bool_]
+    influence: Complex
     answer: Complex
 
 
@@ -163,22 +166,26 @@ def _linearise(eps: complex, v: Voltages, gains: Gains, ripple: Array, wave_numb
     size = np.abs(miss) / scale
     usual = float(np.median(size)) + 1e-12
     used = size < OUTLIER * max(usual, 0.3)
-    weights = used / scale**2 / (1 + (size / (2 * usual)) ** 2)
-    information = np.einsum("np,nq,n->pq", jacobian.conj(), jacobian, weights).real
+    falloff = 1 / (1 + (size / (2 * usual)) ** 2)
+    weights = used / scale**2 * falloff
+    # A miss that grows loses weight: what it counts changes by the square of the falloff, over all phases.
+    rate_weights = weights * falloff
+    information = np.einsum("np,nq,n->pq", jacobian.conj(), jacobian, rate_weights).real
     inverse = np.linalg.inv(information + 1e-15 * np.eye(2))
-    answer = -np.einsum("pq,nq,n->pn", inverse, jacobian.conj(), weights)
-    return _Step(miss, noise, weights, used, answer)
+    influence, answer = (-np.einsum("pq,nq,n->pn", inverse, jacobian.conj(), w) for w in (weights, rate_weights))
+    return _Step(miss, noise, weights, used, influence, answer)
 
 
 def fit_permittivity(v: Voltages, gains: Gains, wave_number: float) -> PermittivityFit:
     """Weighted least squares of one permittivity over points, by Gauss and Newton; robust by iterated weights."""
     of_points = point_permittivity(v, gains, wave_number)
     eps = complex(np.median(of_points.real), min(np.median(of_points.imag), -0.01))
+    level = np.abs(v.b[:, 0] / gains.ratio(v.arrival) * v.m[:, 1, 1])
     # What is common to a point's surroundings: no point counts for more than its ripple allows.
-    ripple = EXPECTED_RIPPLE * np.abs(v.b[:, 0] / gains.ratio(v.arrival) * v.m[:, 1, 1])
+    ripple = USUAL_RIPPLE * level
     step = _linearise(eps, v, gains, ripple, wave_number)
     for _ in range(12):
-        move = (step.answer @ step.miss).real
+        move = (step.influence @ step.miss).real
         eps = complex(
             np.clip(eps.real + np.clip(move[0], -1, 1), 1.2, 40),
             np.clip(eps.imag + np.clip(move[1], -1, 1), -20, 0.5),
@@ -188,29 +195,29 @@ def fit_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Permittiv
             break
     return PermittivityFit(
         eps=eps,
-        covariance=_compute_covariance_of_scatter(step.answer, step.miss, expect_ripple(step, ripple), v.at_m),
+        covariance=_compute_covariance_of_scatter(step.influence, step.miss, measure_ripple(step, level), v.at_m),
         used=step.used,
         excess2=(np.abs(step.miss) / np.maximum(step.noise, 1e-30)) ** 2 / 2,
         answer=step.answer,
     )
 
 
-def expect_ripple(step: _Step, least: Array) -> Array:
-    """Ripple of the misses [n] that is expected to be common to a block: what noise does not explain, or `least`.
+def measure_ripple(step: _Step, level: Array) -> Array:
+    """Ripple of the misses [n], what noise does not explain of them, in proportion to the `level` [n] of H.
 
-    It is slow, so the few blocks of a small segment do not show how far it moves their mean.
+    It is slow: the few blocks of a small segment do not show how far it moves their mean. Points count as in the fit.
     """
-    excess2 = float(np.median(np.abs(step.miss) ** 2 / step.noise**2)) / MEDIAN_OF_SQUARE - 1
-    return np.hypot(least, step.noise * np.sqrt(max(0.0, excess2)))
+    excess = step.weights @ (np.abs(step.miss) ** 2 - 2 * step.noise**2) / (step.weights @ level**2)
+    return level * np.sqrt(max(0.0, float(excess)))
 
 
-def _compute_covariance_of_scatter(answer: Complex, miss: Complex, ripple: Array, at_m: Array) -> Array:
+def _compute_covariance_of_scatter(influence: Complex, miss: Complex, ripple: Array, at_m: Array) -> Array:
     """Covariance of (real, imaginary) from the sums of the misses over blocks, with the expected ripple.
 
     The 95 % region of few blocks is wider than that of a known covariance, by Fisher's distribution.
     """
-    measured_terms = (answer * miss).real.T
-    expected_terms = np.concatenate([answer.real * ripple, -answer.imag * ripple]).T / np.sqrt(2)
+    measured_terms = (influence * miss).real.T
+    expected_terms = np.concatenate([influence.real * ripple, -influence.imag * ripple]).T / np.sqrt(2)
     measured = np.zeros((2, 2))
     expected = np.zeros((2, 2))
     blocks = 0.0
@@ -223,7 +230,7 @@ def _compute_covariance_of_scatter(answer: Complex, miss: Complex, ripple: Array
         measured += measured_sums.T @ measured_sums / len(shifts)
         for part in (expected_sums[:, :2], expected_sums[:, 2:]):
             expected += part.T @ part / len(shifts)
-        weight = np.bincount(block, np.sum(np.abs(answer) ** 2, axis=0), count)
+        weight = np.bincount(block, np.sum(np.abs(influence) ** 2, axis=0), count)
         blocks += weight.sum() ** 2 / np.sum(weight**2) / len(shifts)
     # Each block gives two numbers, and two were fitted.
     freedom = max(0.0, 2 * blocks - 2)
@@ -309,11 +316,25 @@ def add_common_errors(
     flat = np.stack([flat_s, flat_p, 0 * flat_s, 0 * flat_s], axis=2)
     first_order = find_misses(v, gains, flat) - miss
     model_change = first_order * (expansion_parameter(v, wave_number) + CURVATURE_ERROR)
+    for change in find_pattern_changes(fit.eps, v, wave_number):
+        add("model", (fit.answer @ (find_misses(v, gains, coefficients + change) - miss)).real)
     # Their phases are not known: both parts of each count.
     sources["reference"] = (reference_changes @ reference_changes.conj().T).real
     for phase in (1, 1j):
         add("model", (fit.answer @ (phase * model_change)).real)
     return sources
+
+
+def find_pattern_changes(eps: complex, v: Voltages, wave_number: float) -> Complex:
+    """Changes [2, n, 2, 4] of the coefficients by the slope of H's pattern, and of V's, over a finite path's angles.
+
+    A pattern weights the directions that a path L holds: r gets j / (k L) r' times its slope. Metal does not show it.
+    """
+    above, below = (reflect_flat(eps, v.theta + step) for step in (ANGLE_STEP, -ANGLE_STEP))
+    slope_s, slope_p = ((up - down) / (2 * ANGLE_STEP) for up, down in zip(above, below, strict=True))
+    slopes = np.stack([slope_s, slope_p, 0 * slope_s, 0 * slope_s], axis=2)
+    change = 1j * UNKNOWN_SLOPE / (wave_number * v.path_m)[..., None] * slopes
+    return np.eye(2)[:, None, :, None] * change
 
 
 def find_common_error(fit: PermittivityFit, miss: Complex, scan: DisturbedScan, wave_number: float) -> Array:

@@ -127,10 +127,12 @@ def _collect_contents(
     yield "kernel.txt", _describe_kernel(root)
     yield "network.json", json.dumps(_describe_network(root), indent=1)
     if (config := _read_tail(options.config, _TAIL_BYTES)) is not None:
-        # Comments are for who wrote them, and whoever is told of a scan's end may be reached by a secret address.
+        # Comments are private, and the addresses that are notified of a scan's end may be secret.
         config = re.sub(r"(?m)(^|[ \t])#.*$", "", config)
         yield "rig.toml", re.sub(r"(?m)^(\s*(?:url|command)\s*=\s*).+$", rf'\1"{HIDDEN}"', config)
-    for folder in _find_newest_scans(options.out):
+    scan_folders = [options.out, *(path for path in options.out.glob("*") if path.is_dir())]
+    for newest_manifest in _find_newest(scan_folders, MANIFEST, _SCANS):
+        folder = newest_manifest.parent
         with suppress(OSError, DataError):
             lines = read_bounded(folder / MANIFEST, _MANIFEST_BYTES).decode("utf-8", "replace").splitlines()
             yield f"scans/{folder.resolve().name}.jsonl", "\n".join(lines[-_LINES:]) + "\n"
@@ -160,11 +162,6 @@ def _read_tail(path: Path, most: int) -> str | None:
 def _find_newest(folders: Sequence[Path], pattern: str, count: int) -> list[Path]:
     matches = {p.resolve() for folder in folders for p in folder.glob(pattern) if p.is_file() and not p.is_symlink()}
     return sorted(matches, key=lambda p: (p.stat().st_mtime, p), reverse=True)[:count]
-
-
-def _find_newest_scans(out: Path) -> list[Path]:
-    manifests = _find_newest([out, *(p for p in out.glob("*") if p.is_dir())], MANIFEST, _SCANS)
-    return [path.parent for path in manifests]
 
 
 def _list_versions() -> dict[str, object]:

@@ -193,7 +193,7 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
 
 
 def is_finished(job: Job) -> bool:
-    """True if the products exist and have exactly these dependencies."""
+    """Return true if the products exist and have exactly these dependencies."""
     try:
         mark = read_json(job.out / FINISHED)
     except (OSError, ValueError, PolysightError):

@@ -151,7 +151,7 @@ class BringUp:
                 "download it again; until then radar.firmware starts the board from RAM",
                 code=ErrorCode.RADAR_NO_FIRMWARE,
             )
-        patch_after = self._read_main_patch()
+        patch_after = _format_patch(self._board.ask(c.GET_MAIN_VERSION, 16))
         self._verify(patch_after, patch_before, image)
         self._refuse_damaged()
         # The die id is only readable after the RF power-up.
@@ -244,10 +244,7 @@ class BringUp:
         """Return the main core's patch. Raises ConfigError if the image is for another ROM."""
         answer = self._board.ask(c.GET_MAIN_VERSION, 16)
         require_rom(self._board.name, answer, image)
-        return _patch(answer)
-
-    def _read_main_patch(self) -> str:
-        return _patch(self._board.ask(c.GET_MAIN_VERSION, 16))
+        return _format_patch(answer)
 
     def _verify(self, patch: str, before: str, image: Image) -> None:
         """Raise DeviceError if the patch is still the old one; warn if it is not the file's.
@@ -309,9 +306,9 @@ class BringUp:
                     code=ErrorCode.RADAR_NO_FIRMWARE,
                 )
             if self._board.firmware is not None and core == "RF":
-                self._verify_rf(_patch(answer), self._board.firmware)
+                self._verify_rf(_format_patch(answer), self._board.firmware)
             elif self._board.firmware is not None:
-                self._verify(_patch(answer), self._flash_patch, self._board.firmware)
+                self._verify(_format_patch(answer), self._flash_patch, self._board.firmware)
         if self._board.die_id:
             # A wrong board is refused before its RF part is configured.
             self._read_die()
@@ -403,7 +400,7 @@ def fault_error(
 _NO_PATCH = describe_patch(0, 0, 0, 0)
 
 
-def _patch(version: bytes) -> str:
+def _format_patch(version: bytes) -> str:
     return describe_patch(version[10], version[11], version[15] >> 4, version[15] & 15)
 
 

@@ -166,7 +166,7 @@ def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tupl
         turns_y = _list_turns(steps, "y")
         if board.role == "receive_v" and settings.rxboard_v_angle_y is not None and len(turns_y) > 1:
             steps[turns_y[0]] = MountStep(turn_deg=settings.rxboard_v_angle_y, about="y")
-        shifts = _list_shifts(steps)
+        shifts = [i for i, step in enumerate(steps) if step.shift_mm is not None]
         if settings.rxboard_tilt_offset is not None and len(shifts) > 1:
             steps[shifts[-2]] = MountStep(shift_mm=settings.rxboard_tilt_offset)
     last_shift_mm = None
@@ -179,10 +179,6 @@ def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tupl
 
 def _list_turns(steps: list[MountStep], axis: str) -> list[int]:
     return [i for i, step in enumerate(steps) if step.about == axis]
-
-
-def _list_shifts(steps: list[MountStep]) -> list[int]:
-    return [i for i, step in enumerate(steps) if step.shift_mm is not None]
 
 
 def mirror_rig(rig: Instrument) -> Instrument:

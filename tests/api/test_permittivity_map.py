@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from tests.support.refusals import refused
 
 import polysight
 from polysight import fresnel, open_scan, permittivity_from_ratio
@@ -16,6 +17,7 @@ from polysight.polarimetry import correct_leakage, specular_incidence_rad
 from polysight.products import ProcessedScan, permittivity_dataset
 from polysight.results import ErrorBudget, IncidenceError, LeakageError, ScanFacts, ScanMaterials, ScanQuality, to_plain
 from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
 
 LEAKAGE_H = 0.05 - 0.02j
 LEAKAGE_V = -0.03 + 0.06j
@@ -158,3 +160,9 @@ def test_a_place_has_the_figures_of_map_and_patch(scan):
     assert int(pixel["label"]) == 2
     assert pixel["name"].item() == scan.materials()["name"].sel(patch=2).item()
     assert scan.probe(0, 45)["name"].item() == ""
+
+
+@pytest.mark.parametrize("place", [(900.0, 0.0), (0.0, -900.0)])
+def test_a_place_outside_the_image_is_no_border_pixel(scan, place):
+    with refused(ErrorCode.VALUE_INVALID):
+        scan.probe(*place)

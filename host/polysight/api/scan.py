@@ -16,6 +16,7 @@ from msgspec import UNSET
 
 from polysight import process
 from polysight.api.layers import layer_dataset
+from polysight.catalogue import Pixels
 from polysight.data import find_packaged
 from polysight.imaging import Images
 from polysight.jobs.label import save_labels
@@ -361,10 +362,12 @@ class Scan:
         Raises
         ------
         DataError
-            as :meth:`permittivity_map`.
+            as :meth:`permittivity_map`; when the place lies outside the image.
         """
         import xarray
 
+        # Raises for a place outside.
+        Pixels.from_scan(self.read_or_process()).nearest(x_mm, y_mm)
         patches = self.patches()
         maps = [self.image(), self.permittivity_map(), patches[["label"]]]
         merged = xarray.merge(maps, compat="override", join="exact", combine_attrs="override")

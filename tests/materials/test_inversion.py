@@ -267,3 +267,16 @@ def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evide
         assert sum(after.shares.values()) == pytest.approx(1.0)
     # Without any doubt nothing changes
     assert join_signs(right, wrong, 1e-6)[0] == right
+
+
+def test_what_plates_may_be_counts_less_on_leakage_that_was_never_measured():
+    patches = world(np.random.default_rng(4), (0.03, 0.02j))
+    measured = RigPrior(2e-3, (0.03 + 0j, 0.02j), 0.003, True)
+    unmeasured = RigPrior(2e-3)
+    found = [invert(patches, prior, KINDS) for prior in (unmeasured, measured)]
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("polysight.materials.inversion.WEIGHT_OF_KINDS", 1.0)
+        in_full = [invert(patches, prior, KINDS) for prior in (unmeasured, measured)]
+    errors, errors_in_full = ([np.trace(p.covariance) for p in solution.patches] for solution in (found[0], in_full[0]))
+    assert np.median(np.array(errors) / errors_in_full) > 1.05
+    assert found[1].leakage == in_full[1].leakage

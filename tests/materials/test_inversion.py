@@ -270,7 +270,7 @@ def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evide
 
 
 def test_what_plates_may_be_counts_less_on_leakage_that_was_never_measured():
-    patches = world(np.random.default_rng(4), (0.03, 0.02j))
+    patches = world(np.random.default_rng(4), (0.03, 0.02j), eps=EPS[:5])
     measured = RigPrior(2e-3, (0.03 + 0j, 0.02j), 0.003, True)
     unmeasured = RigPrior(2e-3)
     found = [invert(patches, prior, KINDS) for prior in (unmeasured, measured)]

@@ -166,7 +166,7 @@ def test_a_plan_is_a_text_and_its_numbers():
 def test_a_scene_can_be_written_in_python(tmp_path):
     scene = {
         "name": "one plate",
-        "grid": {"columns": 9, "rows": 9, "step_x_mm": 16.0, "step_y_mm": 16.0},
+        "grid": {"columns": 9, "rows": 9, "step_x_mm": 8.0, "step_y_mm": 8.0},
         "burst": {"pulses": 2},
         "plates": [COPPER],
     }

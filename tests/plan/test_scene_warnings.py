@@ -12,7 +12,8 @@ from tests.support.rigs import published_rig
 
 import polysight
 from polysight.cli.main import main
-from polysight.planning import read_scene, warn_of_scene
+from polysight.data import find_packaged
+from polysight.planning import find_scene_warnings, read_scene, warn_of_scene
 
 OWN_SCENE = Path(__file__).resolve().parents[2] / "examples" / "own-scene.toml"
 GRID = {"columns": 61, "rows": 61, "step_x_mm": 6.0, "step_y_mm": 6.0}
@@ -74,3 +75,20 @@ def test_plan_and_simulate_say_it(tmp_path, capsys):
         warnings.simplefilter("always")
         polysight.simulate(path, tmp_path / "again")
     assert any(str(note.message).startswith("gap: ") for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("step_mm", "plates", "expected"),
+    [
+        (5.0, [plate(-60), plate(60)], set()),
+        (12.0, [plate(-60), plate(60)], {"aliasing"}),
+        # A plate that is larger than the image fills it without its ghosts, too.
+        (12.0, [plate(0, side_mm=420.0)], set()),
+    ],
+)
+def test_ghosts_by_wide_steps_are_told_before_a_simulation(tmp_path, step_mm, plates, expected):
+    path = tmp_path / "scene.toml"
+    grid = {"columns": 31, "rows": 31, "step_x_mm": step_mm, "step_y_mm": step_mm}
+    path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "plates": plates}))
+    config = find_packaged(Path("instrument.toml"))
+    assert {warning.where for warning in find_scene_warnings(path, config)} & {"aliasing"} == expected

@@ -13,7 +13,7 @@ import numpy as np
 
 from polysight.imaging import field_limits, point_response
 from polysight.materials import SegmentSettings
-from polysight.planning.forecast import describe_aperture
+from polysight.planning.forecast import Noise, describe_aperture, find_warnings
 from polysight.polarimetry import multilayer, specular_incidence_rad
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import PolysightError
@@ -64,12 +64,23 @@ def read_scene(path: Path, rig: Instrument) -> tuple[Instrument, list[Plate]]:
 
 
 def find_scene_warnings(scene: Path, config: Path) -> list[Finding]:
-    """Return the notes about the plates of a scene file; none for a wrong file, which the simulator refuses."""
+    """Return the notes about the plates of a scene file and the ghosts of its steps.
+
+    There are none for a wrong file, which the simulator refuses.
+    """
     try:
         rig, plates = read_scene(scene, load_instrument(config))
     except PolysightError:
         return []
-    return list(warn_of_scene(rig, plates))
+    notes = list(warn_of_scene(rig, plates))
+    # A plate that is larger than the image fills it without its ghosts, too.
+    image_mm = rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm
+    smaller = [plate for plate in plates if plate.size_mm[0] < image_mm[0] or plate.size_mm[1] < image_mm[1]]
+    if smaller:
+        # Ghosts within the plates' own reach lie on other plates, or make patches of their own.
+        reach_x, reach_y = (2 * max(max(map(abs, plate.edges(axis))) for plate in smaller) for axis in (0, 1))
+        notes += [note for note in find_warnings(rig, Noise(), (reach_x, reach_y)) if note.where == "aliasing"]
+    return notes
 
 
 def _decode_plate(raw: Mapping[str, Any], path: Path) -> Plate:

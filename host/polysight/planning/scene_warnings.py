@@ -77,10 +77,15 @@ def find_scene_warnings(scene: Path, config: Path) -> list[Finding]:
     image_mm = rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm
     smaller = [plate for plate in plates if plate.size_mm[0] < image_mm[0] or plate.size_mm[1] < image_mm[1]]
     if smaller:
-        # Ghosts within the plates' own reach lie on other plates, or make patches of their own.
-        reach_x, reach_y = (2 * max(max(map(abs, plate.edges(axis))) for plate in smaller) for axis in (0, 1))
-        notes += [note for note in find_warnings(rig, Noise(), (reach_x, reach_y)) if note.where == "aliasing"]
+        # Ghosts lie on other plates, or make patches of their own: the scene reaches as far as its plates.
+        scene_mm = _measure_reach(smaller, axis=0), _measure_reach(smaller, axis=1)
+        notes += [note for note in find_warnings(rig, Noise(), scene_mm) if note.where == "aliasing"]
     return notes
+
+
+def _measure_reach(plates: Sequence[Plate], axis: int) -> float:
+    """Return the width of the smallest scene about the image's centre that holds the plates, mm."""
+    return 2 * max(abs(edge) for plate in plates for edge in plate.edges(axis))
 
 
 def _decode_plate(raw: Mapping[str, Any], path: Path) -> Plate:

@@ -47,7 +47,8 @@ def _simulate_paths(rig: Instrument, board: Board, cycles_away: float = 0.0) -> 
     f = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
     direct = np.linalg.norm(rx - tx, axis=1)
     echo = np.linalg.norm(point - tx) + np.linalg.norm(rx - point, axis=1)
-    first, second = (np.exp(2j * np.pi * np.outer(d, f) / SPEED_OF_LIGHT_M_S) for d in (direct, echo))
+    first = np.exp(2j * np.pi * np.outer(direct, f) / SPEED_OF_LIGHT_M_S)
+    second = np.exp(2j * np.pi * np.outer(echo, f) / SPEED_OF_LIGHT_M_S)
     return first, second * np.exp(2j * np.pi * cycles_away)
 
 

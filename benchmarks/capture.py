@@ -296,7 +296,8 @@ def run(args: argparse.Namespace) -> int:
                 show("plain recv_into loops that only count:")
                 plain = PlainLoops(cards, theirs).try_rate(args.rate, min(args.seconds, 3.0), beside)
                 show(plain.line())
-            ours_cpu, plain_cpu = (sum(trial.cpu) / trial.rate * 1e6 for trial in (fastest_trial, plain))
+            ours_cpu = sum(fastest_trial.cpu) / fastest_trial.rate * 1e6
+            plain_cpu = sum(plain.cpu) / plain.rate * 1e6
             show(
                 f"at {args.rate:.0f} packets/s: {ours_cpu:.1f} us of CPU a packet, plain loop {plain_cpu:.1f} us and"
                 f" {plain.lost} of {plain.packets} lost: ratio {plain_cpu / ours_cpu:.2f}"

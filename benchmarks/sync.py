@@ -122,7 +122,9 @@ def run(args: argparse.Namespace) -> int:
     medians = {method: np.median(t, axis=0) for method, t in times.items()}
     lines = []
     for k, stage in enumerate(STAGES):
-        ours, plain, tuned = (float(medians[m][k]) for m in ("ours", "published", "published, tuned"))
+        ours = float(medians["ours"][k])
+        plain = float(medians["published"][k])
+        tuned = float(medians["published, tuned"][k])
         note = f"against the published method in single precision ({1e6 * tuned:.0f} us): {tuned / ours:.1f}x"
         lines.append(
             Line(stage, f"{1e6 * ours:.0f} us", f"{1e6 * plain:.0f} us", plain / ours, *LIMITS[stage], note=note)

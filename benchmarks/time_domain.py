@@ -122,7 +122,8 @@ def form_image(
     k = np.arange(first_bin, first_bin + bins)
     turn = np.exp(-2j * np.pi * (frequencies_hz[0] - middle_hz) / step_hz * k / size)
     spectrum = np.asarray(scipy.fft.fft(samples, size))[..., k % size] * turn
-    real, imag = (single(part.reshape(len(samples), -1)) for part in (spectrum.real, spectrum.imag))
+    real = single(spectrum.real.reshape(len(samples), -1))
+    imag = single(spectrum.imag.reshape(len(samples), -1))
     image = np.zeros((2, *grid.shape), np.float32)
     _sum(
         real=real,

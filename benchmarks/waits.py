@@ -132,7 +132,8 @@ def run(args: argparse.Namespace) -> int:
             _report_least(f"list of 200 scans of the operator's page, {name}, CPU s", took.median, 1.0, 0.5, note)
         )
     for name, times in typed.items():
-        cpu, wall = (statistics.median(t[k] for t in times) for k in (0, 1))
+        cpu = statistics.median(t[0] for t in times)
+        wall = statistics.median(t[1] for t in times)
         note = f"{wall:.2f} s wall"
         lines.append(_report_least(f"polysight {name.split()[0]}, CPU s", cpu, COMMANDS[name], COMMANDS[name], note))
     show("waiting times, simulated rows", lines, args.quick)

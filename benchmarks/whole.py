@@ -141,8 +141,10 @@ def run(args: argparse.Namespace) -> int:
         write_scan(scan, rig, rows, count)
         files = {name: scan / "raw" / name / "0000.bin" for name in rows}
         del rows
-        plain, tuned = (Published(rig, files, t) for t in (False, True))
-        batch, live = (Chain(folder, mode, {"scan": str(scan)}) for mode in ("batch", "live"))
+        plain = Published(rig, files, False)
+        tuned = Published(rig, files, True)
+        batch = Chain(folder, "batch", {"scan": str(scan)})
+        live = Chain(folder, "live", {"scan": str(scan)})
         ours = []
         theirs = []
         theirs_tuned = []

@@ -212,9 +212,8 @@ def dispersion_of_worlds(pair: generator.ImagePair) -> Dispersion:
     """Return the change of the images over the sweep."""
     first_hz, last_hz = pair.rig.frequencies_hz[[0, -1]].tolist()
     with np.errstate(divide="ignore", invalid="ignore"):
-        h, v = (
-            (last_hz - first_hz) * slope / image for slope, image in ((pair.h_slope, pair.h), (pair.v_slope, pair.v))
-        )
+        h = (last_hz - first_hz) * pair.h_slope / pair.h
+        v = (last_hz - first_hz) * pair.v_slope / pair.v
     return Dispersion(h, v, (first_hz, last_hz))
 
 

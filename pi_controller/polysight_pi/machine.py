@@ -362,7 +362,8 @@ class Machine:
             self._report_fault(PiFault.POSITION, f"homing ended at {end}, not at (0, 0) (x, y in steps)")
             return "fault"
         limit = MAX_MM * self.stage.config.steps_per_mm
-        lost_x, lost_y = (max(-limit, min(_read_integer(reply, key), limit)) for key in ("lostx", "losty"))
+        lost_x = max(-limit, min(_read_integer(reply, "lostx"), limit))
+        lost_y = max(-limit, min(_read_integer(reply, "losty"), limit))
         self.lost_mm = (lost_x / self.stage.config.steps_per_mm, lost_y / self.stage.config.steps_per_mm)
         self.homed = True
         self._is_placed = True

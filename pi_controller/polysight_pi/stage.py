@@ -502,7 +502,8 @@ class StageDriver:
     def note_position(self, reply: Reply) -> None:
         """Store x and y of a status or done reply; a missing or impossible position is ignored."""
         try:
-            x_mm, y_mm = (reply.integer(axis) / self.config.steps_per_mm for axis in "xy")
+            x_mm = reply.integer("x") / self.config.steps_per_mm
+            y_mm = reply.integer("y") / self.config.steps_per_mm
         except ProtocolError:
             return
         if max(abs(x_mm), abs(y_mm)) <= MAX_MM:

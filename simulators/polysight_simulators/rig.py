@@ -347,7 +347,9 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--native", action="store_true", help="the host configures and arms the radars (simulated USB)")
     arguments = vars(parser.parse_args(argv))
-    config, scene, folder = (arguments.pop(name) for name in ("config", "scene", "dir"))
+    config = arguments.pop("config")
+    scene = arguments.pop("scene")
+    folder = arguments.pop("dir")
     options = RigOptions(**arguments)
     return run_until_stopped(lambda stop: run(config, scene, folder, options, stop))
 

@@ -94,7 +94,8 @@ def test_patches_are_where_the_plates_are(scan):
 
 
 def test_permittivity_is_near_the_truth_and_unknown_for_metal(scan):
-    copper, pet = (scan.permittivity().sel(patch=n) for n in (1, 2))
+    copper = scan.permittivity().sel(patch=1)
+    pet = scan.permittivity().sel(patch=2)
     for name in ("permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error"):
         assert np.isnan(copper[name])
         assert np.isfinite(pet[name])

@@ -120,7 +120,8 @@ def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, 
 
 def test_files_of_one_name_in_two_folders_are_both_kept(tmp_path, make_rig, rig_naming, hpf):
     metal = write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "b")
-    hpf, metal = (path.rename(path.with_name("latest.toml")) for path in (hpf, metal))
+    hpf = hpf.rename(hpf.with_name("latest.toml"))
+    metal = metal.rename(metal.with_name("latest.toml"))
     calibration = calibration_of_scan(create(tmp_path / "s", rig_naming(hpf=hpf, metal=metal)))
     assert set(calibration.files()) == {"hpf", "metal"}
 

@@ -94,7 +94,8 @@ def test_an_active_calibration_corrects_every_antenna(case, file):
     corrected = Calibration(places=file).rig(believed)
     assert corrected.geometry.object_distance_mm == pytest.approx(true.geometry.object_distance_mm, abs=0.5)
     for name in SHIFTS:
-        expected_m, thought = (Antennas.from_rig(r, r.by_name(name)).rx_m for r in (true, corrected))
+        expected_m = Antennas.from_rig(true, true.by_name(name)).rx_m
+        thought = Antennas.from_rig(corrected, corrected.by_name(name)).rx_m
         np.testing.assert_allclose(thought, expected_m, atol=0.6e-3)
     assert corrected.transmitter == believed.transmitter
 

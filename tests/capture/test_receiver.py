@@ -50,7 +50,9 @@ def send(card: socket.socket, board: Board, some: list[bytes]) -> None:
 
 def test_rows_are_bit_exact_and_counters_go_on(board, card, tmp_path):
     size = 300 * 4096
-    first, second, third = (noise(size, s) for s in (1, 2, 3))
+    first = noise(size, 1)
+    second = noise(size, 2)
+    third = noise(size, 3)
     count = 0
     sequence = 1
     n = -(-size // FULL)

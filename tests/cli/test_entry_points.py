@@ -32,10 +32,8 @@ REAL = ("env",)
 
 @pytest.mark.parametrize("command", PROGRAMS, ids=lambda command: " ".join(map(str, command[1:])))
 def test_a_fork_is_as_the_program_started_for_real(tmp_path: Path, command: tuple[str | Path, ...]):
-    forked, real = (
-        subprocess.run([*first, *command], cwd=tmp_path, input="", capture_output=True, text=True, check=False)
-        for first in ((), REAL)
-    )
+    forked = subprocess.run(command, cwd=tmp_path, input="", capture_output=True, text=True, check=False)
+    real = subprocess.run([*REAL, *command], cwd=tmp_path, input="", capture_output=True, text=True, check=False)
     assert (forked.returncode, forked.stdout) == (real.returncode, real.stdout)
     # Of a traceback the last line: the fork's has more.
     assert forked.stderr.splitlines()[-1:] == real.stderr.splitlines()[-1:]

@@ -40,7 +40,9 @@ def test_a_monostatic_radar_referenced_to_the_scene_centre_focuses_in_three_dime
 def test_evenly_spaced_frequencies_by_horner_equal_the_plain_sum():
     rng = np.random.default_rng(1)
     f = 76e9 + 1e8 * np.arange(9)
-    tx, rx, voxels = (rng.uniform(-0.5, 0.5, (7, 3)) for _ in range(3))
+    tx = rng.uniform(-0.5, 0.5, (7, 3))
+    rx = rng.uniform(-0.5, 0.5, (7, 3))
+    voxels = rng.uniform(-0.5, 0.5, (7, 3))
     reference = rng.uniform(0, 1, 7)
     s = rng.standard_normal((7, 9)) + 1j * rng.standard_normal((7, 9))
     order = rng.permutation(9)
@@ -60,7 +62,8 @@ def test_project_is_its_adjoint_for_any_antennas_and_voxels(even):
     rx = rng.uniform(-1, 1, (40, 3))
     reference = rng.uniform(0, 2, 40)
     voxels = rng.uniform(-1, 1, (30, 3))
-    y, x = (rng.standard_normal(n) + 1j * rng.standard_normal(n) for n in ((40, 9), 30))
+    y = rng.standard_normal((40, 9)) + 1j * rng.standard_normal((40, 9))
+    x = rng.standard_normal(30) + 1j * rng.standard_normal(30)
     forward = np.vdot(project(x, f, tx, rx, voxels, reference), y)
     back = np.vdot(x, backproject(y, f, tx, rx, voxels, reference))
     assert abs(forward - back) < 1e-10 * np.linalg.norm(x) * np.linalg.norm(y)
@@ -68,8 +71,11 @@ def test_project_is_its_adjoint_for_any_antennas_and_voxels(even):
 
 def test_backprojection_is_linear_and_works_with_one_frequency():
     rng = np.random.default_rng(2)
-    tx, rx, voxels = (rng.uniform(-0.5, 0.5, (5, 3)) for _ in range(3))
-    a, b = (rng.standard_normal((5, 1)) + 0j for _ in range(2))
+    tx = rng.uniform(-0.5, 0.5, (5, 3))
+    rx = rng.uniform(-0.5, 0.5, (5, 3))
+    voxels = rng.uniform(-0.5, 0.5, (5, 3))
+    a = rng.standard_normal((5, 1)) + 0j
+    b = rng.standard_normal((5, 1)) + 0j
     args = ([77e9], tx, rx, voxels, np.zeros(5))
     np.testing.assert_allclose(
         backproject(a + 2j * b, *args), backproject(a, *args) + 2j * backproject(b, *args), rtol=1e-9

@@ -94,7 +94,8 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
     assert f"drawn as {MINE}" in (out / "report.html").read_text(encoding="utf-8")
     assert main(["label", str(out), *drawn()]) == 0
     (scan / "labels.json").write_bytes((out / "labels.json").read_bytes())
-    rows, images = (make_entries(training_scan(folder, RIG_FILE)) for folder in (scan, out))
+    rows = make_entries(training_scan(scan, RIG_FILE))
+    images = make_entries(training_scan(out, RIG_FILE))
     assert [e.name for e in rows] == [e.name for e in images] == ["copper", MINE]
     for first_item, second_item in zip(rows, images, strict=True):
         assert first_item.incidence_deg == pytest.approx(second_item.incidence_deg, abs=0.05)

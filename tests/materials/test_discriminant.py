@@ -147,7 +147,8 @@ def test_metal_with_a_stray_pixel_tells_nothing_of_the_reference(stray):
     model = ErrorDiscriminant().fit(with_metal(drawn(8), 0))
     test = with_metal(drawn(9, scans=1), stray)
     without_metal = test.take(test.names != "metal")
-    alone, beside = (model.by_scan(s.x, s.patches) for s in (without_metal, test))
+    alone = model.by_scan(without_metal.x, without_metal.patches)
+    beside = model.by_scan(test.x, test.patches)
     np.testing.assert_allclose(beside.distance[: len(alone.distance)], alone.distance, rtol=1e-9)
     assert beside.names[-1] == "metal"
 

@@ -277,6 +277,7 @@ def test_what_plates_may_be_counts_less_on_leakage_that_was_never_measured():
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("polysight.materials.inversion.WEIGHT_OF_KINDS", 1.0)
         in_full = [invert(patches, prior, KINDS) for prior in (unmeasured, measured)]
-    errors, errors_in_full = ([np.trace(p.covariance) for p in solution.patches] for solution in (found[0], in_full[0]))
+    errors = [np.trace(p.covariance) for p in found[0].patches]
+    errors_in_full = [np.trace(p.covariance) for p in in_full[0].patches]
     assert np.median(np.array(errors) / errors_in_full) > 1.05
     assert found[1].leakage == in_full[1].leakage

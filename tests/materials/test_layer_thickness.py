@@ -85,10 +85,8 @@ def test_an_error_that_all_bands_share_is_no_misfit_and_moves_little():
 def test_differences_between_bands_are_known_better_than_each():
     """With the same error of each band, the thickness is known better where most of it is common to all."""
     alone = np.eye(8) * (OWN**2 + COMMON**2)
-    shared, independent = (
-        fit_layer(measure_bands([SHEET], covariance=c), [Layer("sheet")], THETA, NEAR)
-        for c in (shared_covariance(), alone)
-    )
+    shared = fit_layer(measure_bands([SHEET], covariance=shared_covariance()), [Layer("sheet")], THETA, NEAR)
+    independent = fit_layer(measure_bands([SHEET], covariance=alone), [Layer("sheet")], THETA, NEAR)
     assert shared.std_thickness_m < 0.7 * independent.std_thickness_m
 
 
@@ -107,9 +105,8 @@ def test_two_thicknesses_that_fit_are_both_told_in_millimetres():
 
 
 def test_an_uncertain_angle_widens_the_error_bars():
-    sure, unsure = (
-        fit_layer(measure_bands([SHEET], theta_std=std), [Layer("sheet")], THETA, NEAR) for std in (0, 0.01)
-    )
+    sure = fit_layer(measure_bands([SHEET], theta_std=0), [Layer("sheet")], THETA, NEAR)
+    unsure = fit_layer(measure_bands([SHEET], theta_std=0.01), [Layer("sheet")], THETA, NEAR)
     assert unsure.std_real > 1.1 * sure.std_real
 
 

@@ -153,7 +153,9 @@ def test_distances_are_distances():
     rng = np.random.default_rng(3)
     a, b, c = rng.standard_normal((3, 200)) + 1j * rng.standard_normal((3, 200))
     for measure in ("paper", "inverse", "log"):
-        ab, bc, ac = (ratio_distance(*pair, measure) for pair in ((a, b), (b, c), (a, c)))
+        ab = ratio_distance(a, b, measure)
+        bc = ratio_distance(b, c, measure)
+        ac = ratio_distance(a, c, measure)
         np.testing.assert_allclose(ab, ratio_distance(b, a, measure), rtol=1e-9)
         assert (ac <= ab + bc + 1e-9).all()
         np.testing.assert_allclose(ratio_distance(a, a, measure), 0, atol=1e-12)

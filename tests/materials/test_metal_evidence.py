@@ -30,7 +30,8 @@ def scene(rng, plates, metal, patterns_db=1.0):
     if metal:
         r_s = np.append(r_s, -1.0)
         r_p = np.append(r_p, -1.0)
-    a, b = (0.1 * rng.random() * np.exp(2j * np.pi * rng.random()) for _ in range(2))
+    a = 0.1 * rng.random() * np.exp(2j * np.pi * rng.random())
+    b = 0.1 * rng.random() * np.exp(2j * np.pi * rng.random())
     dull = np.exp(0.04 * rng.standard_normal(r_s.size))
     h = (r_s + a * r_p) / (1 + a) * dull
     v = (r_p + b * r_s) / (1 + b) * dull

@@ -23,7 +23,8 @@ INVERSE_STD = 0.01
 
 def channels(scene, valid) -> Images:
     """Images as an image builder makes them: 0 where not valid."""
-    h, v = (np.where(valid, c, 0).astype(np.complex64) for c in (scene.h, scene.v))
+    h = np.where(valid, scene.h, 0).astype(np.complex64)
+    v = np.where(valid, scene.v, 0).astype(np.complex64)
     return Images(h, v, scene.x_m, scene.y_m, valid)
 
 
@@ -48,9 +49,8 @@ def cut_left_half(mask):
 def test_metal_that_a_sub_band_does_not_show_is_no_part_of_its_reference(scene, analysis):
     everywhere = np.ones(scene.h.shape, bool)
     without = everywhere & ~cut_left_half(analysis.metal.mask)
-    full_rows, cut = (
-        band_rows(analysis, [BAND], [channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)
-    )
+    full_rows = band_rows(analysis, [BAND], [channels(scene, everywhere)], (0, 0), 1.5)
+    cut = band_rows(analysis, [BAND], [channels(scene, without)], (0, 0), 1.5)
     for patch in analysis.patches:
         (row_before,), (row_after,) = full_rows[patch.patch.label], cut[patch.patch.label]
         assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
@@ -81,10 +81,10 @@ def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, analys
     valid = ~cut_left_half(analysis.metal.mask)
     cut = replace(scene, h=np.where(valid, scene.h, 0), v=np.where(valid, scene.v, 0))
     label = analysis.metal.label
-    full_result, part = (
-        s.analyse(metal=label, segmentation=analysis.segmentation, pair=s.pair.within(is_valid))
-        for s, is_valid in ((scene, np.ones_like(valid)), (cut, valid))
+    full_result = scene.analyse(
+        metal=label, segmentation=analysis.segmentation, pair=scene.pair.within(np.ones_like(valid))
     )
+    part = cut.analyse(metal=label, segmentation=analysis.segmentation, pair=cut.pair.within(valid))
     for row_before, row_after in zip(full_result.rows(), part.rows(), strict=True):
         assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
 

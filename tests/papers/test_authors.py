@@ -212,7 +212,8 @@ def test_a_hostile_or_damaged_file_is_refused_and_named_and_stops_no_other(datas
 
 def test_pairs_of_scans_share_no_scan_and_both_angles_are_seen(dataset):
     data = read_authors(dataset, RIG_FILE)
-    first, second = (data.select(MATERIALS, range(1, 24), a) for a in (60.0, 55.0))
+    first = data.select(MATERIALS, range(1, 24), 60.0)
+    second = data.select(MATERIALS, range(1, 24), 55.0)
     a, b = pair_scans(first, second)
     assert a.scans == b.scans
     assert len(a.scans) == 3

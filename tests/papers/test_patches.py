@@ -72,7 +72,8 @@ def test_the_phase_error_is_the_published_residual_and_only_h_is_used(monkeypatc
 def test_v_and_p_add_to_what_h_tells():
     group = groups()["powders"]
     samples_drawn = draw(group.materials, group.angle_deg, calibrated_errors("powders", 1), seed=3).samples()
-    h, all_three = (score(samples_drawn, PAPER, c).pixels for c in ("H", "H+V+P"))
+    h = score(samples_drawn, PAPER, "H").pixels
+    all_three = score(samples_drawn, PAPER, "H+V+P").pixels
     assert all_three > h + 0.2
 
 
@@ -96,9 +97,8 @@ def test_the_bound_is_one_without_errors_and_falls_to_chance():
     assert bounds[0] == 1.0
     assert sorted(bounds, reverse=True) == bounds
     assert bounds[-1] == pytest.approx(0.25, abs=0.05)
-    bound_one_angle, two = (
-        pixel_bound(materials, angles, Errors(0.05, 0.05), True, 1) for angles in ((60.0,), (60.0, 55.0))
-    )
+    bound_one_angle = pixel_bound(materials, (60.0,), Errors(0.05, 0.05), True, 1)
+    two = pixel_bound(materials, (60.0, 55.0), Errors(0.05, 0.05), True, 1)
     assert two > bound_one_angle
 
 

@@ -151,7 +151,8 @@ def test_a_host_with_a_refused_key_gets_that_error_and_not_a_timeout(tmp_path, s
     (tmp_path / "mine").mkdir()
     shutil.copy(tmp_path / "keys" / "pi.key", tmp_path / "mine")
     shutil.copy(tmp_path / "other" / "host.key_secret", tmp_path / "mine")
-    port, events = (a.rpartition(":")[2] for a in (served_pi.command_address, served_pi.event_address))
+    port = served_pi.command_address.rpartition(":")[2]
+    events = served_pi.event_address.rpartition(":")[2]
     rig = published_rig()
     replace = msgspec.structs.replace
     pi = replace(

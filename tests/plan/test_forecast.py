@@ -33,7 +33,8 @@ def test_a_plan_whose_rows_exceed_the_travel_is_refused_by_the_rig_file_s_rule(r
 
 
 def test_noise_falls_with_chirps_and_positions(rig):
-    noise_of_one, four = (predict_noise(Changes(pulses=n).apply(rig), Noise(0.0, "")) for n in (4, 16))
+    noise_of_one = predict_noise(Changes(pulses=4).apply(rig), Noise(0.0, ""))
+    four = predict_noise(Changes(pulses=16).apply(rig), Noise(0.0, ""))
     assert four.position_db - noise_of_one.position_db == pytest.approx(10 * np.log10(4))
     assert four.image_db - noise_of_one.image_db == pytest.approx(10 * np.log10(4))
     assert noise_of_one.direct_phase_rad / four.direct_phase_rad == pytest.approx(2.0)

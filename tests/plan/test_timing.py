@@ -91,7 +91,8 @@ def test_the_estimate_is_the_time_of_the_simulated_stage(rig, speed, step_x, ste
 
 
 def test_one_more_row_adds_its_motion_turn_overhead_and_tail(rig):
-    ten, eleven = (scan_time(Changes(rows=n).apply(rig), 0.25) for n in (10, 11))
+    ten = scan_time(Changes(rows=10).apply(rig), 0.25)
+    eleven = scan_time(Changes(rows=11).apply(rig), 0.25)
     longer_duration = row_motion_s(rig.grid, rig.stage) + turn_s(rig.grid, rig.stage) + 0.25 + tail_s(rig)
     # The first row is half a step nearer to the corner.
     assert eleven.total_s - ten.total_s == pytest.approx(longer_duration + eleven.approach_s - ten.approach_s)

@@ -28,7 +28,8 @@ def by_tmm(eps, thickness_m, frequency_hz, theta):
     index = [1.0, *(np.conj(np.sqrt(complex(e))) for e in eps)]
     inside = [np.inf, *thickness_m, np.inf]
     wave = SPEED_OF_LIGHT_M_S / frequency_hz
-    s, p = (tmm.coh_tmm(pol, index, inside, theta, wave) for pol in "sp")
+    s = tmm.coh_tmm("s", index, inside, theta, wave)
+    p = tmm.coh_tmm("p", index, inside, theta, wave)
     return (np.conj(s["r"]), -np.conj(p["r"])), (s["T"], p["T"])
 
 

@@ -218,10 +218,8 @@ def test_the_tilt_of_a_plate_is_read_from_its_phase(save_images, pair, rig):
     ramp = np.exp(-2j * np.pi * np.add.outer(*2 * [np.arange(150) / 900.0]))
     pair = {name: image * ramp for name, image in pair.items()}
     tilted = {name: image * np.exp(-2j * wave * np.cos(np.radians(ANGLE)) * height_m) for name, image in pair.items()}
-    level, rising = (
-        analyse_file(save_images(name, x_m=axis, y_m=axis, **images), rig, incidence_deg=ANGLE)
-        for name, images in (("level", pair), ("rising", tilted))
-    )
+    level = analyse_file(save_images("level", x_m=axis, y_m=axis, **pair), rig, incidence_deg=ANGLE)
+    rising = analyse_file(save_images("rising", x_m=axis, y_m=axis, **tilted), rig, incidence_deg=ANGLE)
     changes = [
         b.tilt_across_deg - a.tilt_across_deg
         for a, b in zip(level.segments, rising.segments, strict=True)

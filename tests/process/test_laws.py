@@ -44,7 +44,8 @@ def test_synchronisation_undoes_every_disturbance(image_scene):
     ideal = image_scene("nine-materials", ideal=True)
     valid_in_both = disturbed.images.valid & ideal.images.valid
     for channel in ("h", "v"):
-        on, ideal_values = (getattr(s.images, channel)[valid_in_both] for s in (disturbed, ideal))
+        on = getattr(disturbed.images, channel)[valid_in_both]
+        ideal_values = getattr(ideal.images, channel)[valid_in_both]
         assert correlation(on, ideal_values) > 0.995, channel
 
 
@@ -55,7 +56,8 @@ def test_metal_gives_one_at_every_pixel_within_noise(image_scene):
     plate_pixels = plate_mask(scan, "copper", rim_mm=150.0)
     assert plate_pixels.sum() > 1000
     middle = box_mask((-20, -20, 20, 20), scan.images.x_m, scan.images.y_m)
-    first, second = (calibrate(s.images, middle).p[plate_pixels] for s in (scan, again))
+    first = calibrate(scan.images, middle).p[plate_pixels]
+    second = calibrate(again.images, middle).p[plate_pixels]
     noise = np.std(first - second) / np.sqrt(2)
     assert np.abs(first - 1).max() < 0.02 + 5 * noise
     assert np.abs(first.mean() - 1) < 0.01

@@ -77,10 +77,13 @@ def remaining_at_same_plate(found: Leakage, truth: Leakage) -> tuple[float, floa
 
 
 def test_leakage_of_both_boards_is_recovered_from_metal_at_two_orientations(scan, capsys):
-    plate, upright, lying = (scan(name, **LEAKAGE) for name in ("plate", "upright", "lying"))
+    plate = scan("plate", **LEAKAGE)
+    upright = scan("upright", **LEAKAGE)
+    lying = scan("lying", **LEAKAGE)
     assert main(["leakage", str(plate), "--strips", f"0={upright}", "--strips", f"90={lying}", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    leakage, truth = (Leakage(complex(*x["leakage_h"]), complex(*x["leakage_v"]), 1.0, 0.0) for x in (printed, LEAKAGE))
+    leakage = Leakage(complex(*printed["leakage_h"]), complex(*printed["leakage_v"]), 1.0, 0.0)
+    truth = Leakage(complex(*LEAKAGE["leakage_h"]), complex(*LEAKAGE["leakage_v"]), 1.0, 0.0)
     crosstalk, imbalance = remaining_at_same_plate(leakage, truth)
     assert crosstalk < 0.01
     assert imbalance < 0.025

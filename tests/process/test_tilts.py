@@ -84,9 +84,8 @@ def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(ti
     corrected = correct_tilt(images, masks, rises)
     h_turned, ratio_turned = _turn_polarisation()
     truth = _ratios(level.h, level.v, masks) * ratio_turned
-    state_before, state_after = (
-        np.abs(_ratios(*c, masks) / truth - 1) for c in ((images.h, images.v), (corrected.h, corrected.v))
-    )
+    state_before = np.abs(_ratios(images.h, images.v, masks) / truth - 1)
+    state_after = np.abs(_ratios(corrected.h, corrected.v, masks) / truth - 1)
     assert state_before.max() > 0.02
     assert state_after.max() < 0.02  # the turn is a first order in the rise
     brightness = [np.median(np.abs(corrected.h[m])) / np.median(np.abs(level.h[m])) for m in masks] / np.abs(h_turned)

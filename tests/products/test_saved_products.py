@@ -46,7 +46,8 @@ def write_part(inverse: complex) -> dict:
 def folder(tmp_path, monkeypatch):
     """Products of water behind glass, measured with USED; the current folder has the published rig file."""
     layers = [parse_layer(STACK[0]), Layer("water", WATER)]
-    whole_band, parts = (predict(layers, Spectrum.from_chirp(USED.chirp, n), np.radians(ANGLE_DEG))[0] for n in (1, 3))
+    whole_band = predict(layers, Spectrum.from_chirp(USED.chirp, 1), np.radians(ANGLE_DEG))[0]
+    parts = predict(layers, Spectrum.from_chirp(USED.chirp, 3), np.radians(ANGLE_DEG))[0]
     bands = [
         write_part(complex(q)) | {"first_hz": b.first_hz, "last_hz": b.last_hz}
         for q, b in zip(parts, sub_bands(USED.chirp, 3), strict=True)

@@ -47,7 +47,9 @@ PLAN = RasterPlan(1, 1, 1.0, 1.0)
 STAMP = {"scan_id": "a", "seq": 1, "t_mono_ns": 5}
 HEAD_OF_EVENT = {"version": "1.0", **STAMP}
 
-events, commands, replies = (draw_values(inspect.type_info(kind)) for kind in (m.AnyEvent, m.AnyCommand, m.AnyReply))
+events = draw_values(inspect.type_info(m.AnyEvent))
+commands = draw_values(inspect.type_info(m.AnyCommand))
+replies = draw_values(inspect.type_info(m.AnyReply))
 
 
 @given(events)

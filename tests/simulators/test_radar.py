@@ -151,7 +151,9 @@ def test_h_and_v_have_independent_timing_relative_to_the_transmitter() -> None:
     n = 2000
     d = rig.scene.disturbances
     pulses = np.arange(n)
-    tx, h, v = (sync_delay_s(d, 1, rig.rig.by_name(b), pulses) for b in ("LS", "RH", "RV"))
+    tx = sync_delay_s(d, 1, rig.rig.by_name("LS"), pulses)
+    h = sync_delay_s(d, 1, rig.rig.by_name("RH"), pulses)
+    v = sync_delay_s(d, 1, rig.rig.by_name("RV"), pulses)
     correlation = np.corrcoef(h - tx, v - tx)[0, 1]
     # The transmitter's share is common
     assert abs(correlation - 0.5) < 0.06
@@ -247,7 +249,8 @@ def test_gains_are_within_their_spread_fixed_for_a_power_cycle_and_new_in_the_ne
 
 def test_h_and_v_differ_by_the_set_gain() -> None:
     on = radar(hv_gain_db=1.5)
-    h, v = (np.abs(on.signals(b, ZERO, ZERO)[0, 0]).mean() for b in ("RH", "RV"))
+    h = np.abs(on.signals("RH", ZERO, ZERO)[0, 0]).mean()
+    v = np.abs(on.signals("RV", ZERO, ZERO)[0, 0]).mean()
     assert abs(20 * np.log10(h / v) - 1.5) < 1e-3
 
 

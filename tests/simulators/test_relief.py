@@ -81,10 +81,8 @@ def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
     board = rig.receivers[0]
     f = np.array([78.5e9])
     cos = np.cos(np.radians(incidence_deg(rig, board)))
-    flat, high = (
-        field_exact(rig, setup(plates=[{**PLATE, "height_mm": h}])[1], board, np.zeros((1, 2)), f)[0, 0]
-        for h in (0.0, 0.2)
-    )
+    flat = field_exact(rig, setup(plates=[{**PLATE, "height_mm": 0.0}])[1], board, np.zeros((1, 2)), f)[0, 0]
+    high = field_exact(rig, setup(plates=[{**PLATE, "height_mm": 0.2}])[1], board, np.zeros((1, 2)), f)[0, 0]
     # Positive is farther: later
     assert np.angle(high / flat) == pytest.approx(2 * WAVE * cos * 0.2e-3, abs=0.01)
 

@@ -65,7 +65,9 @@ def test_events_agree_with_the_rows_in_sequence(folder: Path) -> None:
 def test_the_same_seed_writes_the_same_bytes_also_of_drawn_specimens(tmp_path: Path) -> None:
     rough = {**RAW["plates"][1], "rough_mm": 0.2, "tilt_deg": [0.5, 0.1]}
     scene = decode_scene({**RAW, "plates": [RAW["plates"][0], rough], "specimen_spread": [0.03, 0.3]}, "t")
-    a, b, c = (simulate(RIG, scene, tmp_path / n, seed=s, started_s=0.0) for n, s in (("a", 9), ("b", None), ("c", 10)))
+    a = simulate(RIG, scene, tmp_path / "a", seed=9, started_s=0.0)
+    b = simulate(RIG, scene, tmp_path / "b", seed=None, started_s=0.0)
+    c = simulate(RIG, scene, tmp_path / "c", seed=10, started_s=0.0)
     names = sorted(p.relative_to(a) for p in a.rglob("*") if p.is_file())
     assert names == sorted(p.relative_to(b) for p in b.rglob("*") if p.is_file())
     assert all((a / n).read_bytes() == (b / n).read_bytes() for n in names)

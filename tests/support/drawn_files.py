@@ -71,7 +71,8 @@ def write_material(
 ) -> Path:
     """Write `folder`/<name>_<angle>.pkl with its own metal reference; further files are numbered."""
     rng = np.random.default_rng(seed)
-    gain_h, gain_v = (rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform()) for _ in range(2))
+    gain_h = rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform())
+    gain_v = rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform())
     values = []
     for medium in (material, Material(METAL, None)):
         h, v = draw_pixels(medium, angle_deg, pixels, errors, rng)

@@ -85,9 +85,8 @@ def test_scatter_that_noise_does_not_explain_may_be_common_to_a_block():
     x, y = np.meshgrid(np.arange(8) * 0.008, np.arange(20) * 0.008)
     at_m = np.stack([x.ravel(), y.ravel()], axis=1)
     ripple = np.full(len(at_m), 0.05)
-    noise, edges = (
-        fit_permittivity(make_voltages(ripple, at_m, stated), UNIT_GAINS, WAVE_NUMBER) for stated in (0.05, 0.005)
-    )
+    noise = fit_permittivity(make_voltages(ripple, at_m, 0.05), UNIT_GAINS, WAVE_NUMBER)
+    edges = fit_permittivity(make_voltages(ripple, at_m, 0.005), UNIT_GAINS, WAVE_NUMBER)
     assert np.trace(edges.covariance) > 1.1 * np.trace(noise.covariance)
 
 

@@ -66,10 +66,8 @@ def test_what_reflects_less_than_any_medium_is_no_surface(metal, gains, optics):
     voltages = find_voltages(metal, optics)
     amplitude = np.abs(metal.h.amplitude)
     number = np.zeros(len(metal), int)
-    of_foam, of_edge = (
-        find_reflecting(replace(voltages, b=level * voltages.b), level * amplitude, number, gains(optics))
-        for level in (0.05, 0.02)
-    )
+    of_foam = find_reflecting(replace(voltages, b=0.05 * voltages.b), 0.05 * amplitude, number, gains(optics))
+    of_edge = find_reflecting(replace(voltages, b=0.02 * voltages.b), 0.02 * amplitude, number, gains(optics))
     assert of_foam.mean() > 0.9
     assert not of_edge.any()
 
@@ -127,7 +125,8 @@ def receive_wall(voltages, wave_numbers, medium, wall_m):
     matched = np.exp(1j * np.outer(paths_m, wave_numbers - wave_numbers.mean()))
     echoes = echoes * matched[np.abs(echoes[:, 0] @ matched.T).mean(axis=0).argmax()]
     half = len(wave_numbers) // 2
-    upper, lower = (np.abs(part.mean(axis=2)) for part in (echoes[..., half:], echoes[..., :half]))
+    upper = np.abs(echoes[..., half:].mean(axis=2))
+    lower = np.abs(echoes[..., :half].mean(axis=2))
     return echoes.mean(axis=2), np.log(upper / lower)
 
 

@@ -125,9 +125,8 @@ def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, 
     turn = np.exp(2j * np.pi * rng.uniform(size=(1, 300, PULSES, 1)))
     frames = 800 * (signal.swapaxes(0, 1)[:, :, None] * turn)
     frames = (frames + 800 * noise(frames.shape, -12.0, rng)).reshape(4, -1, 256).astype(np.complex64)
-    some, all_positions = (
-        synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=n)) for n in (64, 300)
-    )
+    some = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=64))
+    all_positions = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=300))
     assert {name: values.shape[1] for name, values in some.errors.items() if name != "referenced"} == {
         "received": 64 * PULSES,
         "aligned": 64 * PULSES,

@@ -31,7 +31,8 @@ def test_a_drawn_object_is_seen_and_its_truth_is_where_its_rays_are(kind):
     assert 6e-4 < brightest < 2
     middle_m = np.zeros((3, 1))
     shape = scene.shapes[0]
-    tx_m, rx_m = (antenna.position[:, None] + middle_m for antenna in (BOARDS.tx, BOARDS.h[0]))
+    tx_m = BOARDS.tx.position[:, None] + middle_m
+    rx_m = BOARDS.h[0].position[:, None] + middle_m
     patch = shape.evaluate(*find_specular(shape, tx_m, rx_m))
     if kind != "bottle":
         distances, normals = scene.nearest_surface(patch.point.T)
@@ -102,6 +103,7 @@ def test_disturbances_are_normally_distributed_with_the_size_given(change, std):
 
 def test_noise_differs_between_scans_of_one_rig():
     quiet = scan(worlds.ShapeNuisances(noise=0))["h"]
-    first, second = (scan(worlds.ShapeNuisances(noise=1), number)["h"] - quiet for number in (0, 1))
+    first = scan(worlds.ShapeNuisances(noise=1), 0)["h"] - quiet
+    second = scan(worlds.ShapeNuisances(noise=1), 1)["h"] - quiet
     assert np.std(first) == pytest.approx(np.std(second), rel=0.3)
     assert not np.allclose(first, second)

@@ -136,7 +136,8 @@ def test_a_cone_ends_before_its_tip_at_which_the_path_is_stationary_too():
     x, y = np.meshgrid(np.linspace(0.32, 0.35, 4), [0.169, 0.184])
     far_offsets_m = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     rx = ONE_RX.h[0]
-    tx_m, rx_m = (antenna.position[:, None] + far_offsets_m.T for antenna in (ONE_RX.tx, rx))
+    tx_m = ONE_RX.tx.position[:, None] + far_offsets_m.T
+    rx_m = rx.position[:, None] + far_offsets_m.T
     places = find_specular(shoulder, tx_m, rx_m)
     echoes = worlds.record_shapes([shoulder], ONE_RX, FREQUENCIES_HZ, far_offsets_m)["h"][0]
 

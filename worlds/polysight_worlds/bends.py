@@ -88,7 +88,8 @@ def _compare(stack: Stack, axis: tuple[float, float, float], radius_m: float) ->
         tx_way = np.array([-sine, 0.0, -cosine])
         rx_way = np.array([sine, 0.0, -cosine])
         axes = (s_axis, np.cross(s_axis, -tx_way)), (s_axis, np.cross(rx_way, s_axis))
-        tx_m, rx_m = (DISTANCE_M * way[:, None] for way in (tx_way, rx_way))
+        tx_m = DISTANCE_M * tx_way[:, None]
+        rx_m = DISTANCE_M * rx_way[:, None]
         specular = find_specular(shape, tx_m, rx_m)
         patch = shape.evaluate(*specular)
         path = follow_path(patch, tx_m, rx_m)

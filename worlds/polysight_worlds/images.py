@@ -47,7 +47,8 @@ class ImagePair:
 
     def plate_ratio(self, plate: Plate) -> complex:
         """H / V of a plate over that of metal, without any disturbance, at the middle of the band."""
-        cos_h, cos_v = (np.cos(np.radians(self.rig.incidence_deg(channel))) for channel in ("h", "v"))
+        cos_h = np.cos(np.radians(self.rig.incidence_deg("h")))
+        cos_v = np.cos(np.radians(self.rig.incidence_deg("v")))
         r_s, _ = reflect(plate.stack, self.rig.frequencies_hz.mean(), cos_h)
         _, r_p = reflect(plate.stack, self.rig.frequencies_hz.mean(), cos_v)
         return complex(r_s / r_p)

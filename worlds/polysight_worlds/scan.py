@@ -44,7 +44,8 @@ class Surface:
 def make_surface(plate: Plate, step_m: float, rng: np.random.Generator) -> Surface:
     """Cut a plate into cells of one stage step; cells at the edges are covered in part."""
     columns, rows = (int(np.ceil(size / step_m - 1e-6)) for size in plate.size_m)
-    x, y = ((np.arange(n) - (n - 1) / 2) * step_m for n in (columns, rows))
+    x = (np.arange(columns) - (columns - 1) / 2) * step_m
+    y = (np.arange(rows) - (rows - 1) / 2) * step_m
     cover_x, cover_y = (
         np.clip((size / 2 - np.abs(places)) / step_m + 0.5, 0, 1)
         for size, places in zip(plate.size_m, (x, y), strict=True)

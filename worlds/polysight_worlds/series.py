@@ -225,7 +225,8 @@ class EndlessCylinder:
         x = eta * a
         j_below, j = _bessel(len(orders), x)
         h1_below, h1 = _hankel(len(orders), x)
-        j_rate, h1_rate = (eta * (below - n / x * value) for below, value in ((j_below, j), (h1_below, h1)))
+        j_rate = eta * (j_below - n / x * j)
+        h1_rate = eta * (h1_below - n / x * h1)
         # Orders that miss the body give nothing, with Hankel functions beyond all numbers.
         too_high = n > np.abs(x) + 4.05 * np.abs(x) ** (1 / 3) + MORE_TERMS
         j = np.where(too_high, 0, j)
@@ -238,8 +239,10 @@ class EndlessCylinder:
         eta_1 = np.sqrt(inside * k**2 - h**2 + 0j)
         rate = self._inner_rates(len(orders), eta_1 * a)
         coupling = h * n / (k * a) * (1 - eta**2 / eta_1**2)
-        u_j, u_h = (slope - eta**2 / eta_1 * rate * value for slope, value in ((j_rate, j), (h1_rate, h1)))
-        v_j, v_h = (slope - inside * eta**2 / eta_1 * rate * value for slope, value in ((j_rate, j), (h1_rate, h1)))
+        u_j = j_rate - eta**2 / eta_1 * rate * j
+        u_h = h1_rate - eta**2 / eta_1 * rate * h1
+        v_j = j_rate - inside * eta**2 / eta_1 * rate * j
+        v_h = h1_rate - inside * eta**2 / eta_1 * rate * h1
         # [[u_h, g h1], [g h1, v_h]] (M, N) = -[[u_j, g j], [g j, v_j]] (incident M, N)
         determinant = u_h * v_h - (coupling * h1) ** 2
         m_m = -(v_h * u_j - coupling**2 * h1 * j) / determinant

@@ -214,7 +214,8 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
     power = (np.abs(np.fft.fft(cube * np.hanning(layout.samples), axis=-1)) ** 2).mean(axis=1)
     mean = power.mean(axis=0)
     floor = max(float(np.median(mean)), 1e-12)
-    profile, profile_of_rx = (10 * np.log10(np.maximum(p, 1e-12) / floor) for p in (mean, power))
+    profile = 10 * np.log10(np.maximum(mean, 1e-12) / floor)
+    profile_of_rx = 10 * np.log10(np.maximum(power, 1e-12) / floor)
     # Without the bins that a constant offset fills, on both sides of zero.
     peak = 2 + int(np.argmax(profile[2:-1]))
     report = Report(

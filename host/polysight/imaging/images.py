@@ -133,7 +133,8 @@ class Illumination:
         neighbours' sidelobes. `plate` [ny, nx] is the whole patch: with it the rise that a level plate seems to have is
         taken off (:mod:`polysight.imaging.geometry`).
         """
-        level_h, level_v = (float(np.nanmedian(np.abs(channel[mask]))) if mask.any() else 0.0 for channel in (h, v))
+        level_h = float(np.nanmedian(np.abs(h[mask]))) if mask.any() else 0.0
+        level_v = float(np.nanmedian(np.abs(v[mask]))) if mask.any() else 0.0
         channels = [h] if level_v < _FEEBLE * level_h else [h, v]
         slopes = []
         for along in (0, 1):
@@ -179,7 +180,8 @@ class Illumination:
             pitch_m = self.pixel_m[1 - axis]
             ahead = slice(1, None)
             following = slice(None, -1)
-            first, second = ((slice(None), part) if axis == 1 else (part, slice(None)) for part in (following, ahead))
+            first = (slice(None), following) if axis == 1 else (following, slice(None))
+            second = (slice(None), ahead) if axis == 1 else (ahead, slice(None))
             is_pair = mask[first] & mask[second]
             steps = np.sum(np.where(is_pair, channel[second] * np.conj(channel[first]), 0), axis=1 - axis)
             enough_pixels = is_pair.sum(axis=1 - axis) > 2
@@ -362,7 +364,8 @@ def correct_tilt(images: Images, masks: Sequence[Mask], rises: Sequence[Rise]) -
 def _step(image: Image, mask: Mask, axis: int) -> complex:
     """Return exp(j mean phase step between pixels of a patch) times the coherence of the steps."""
     masked_image = np.where(mask & np.isfinite(image), image, 0).astype(np.complex128)
-    ahead, behind = (np.take(masked_image, range(k, masked_image.shape[axis] - 1 + k), axis) for k in (1, 0))
+    ahead = np.take(masked_image, range(1, masked_image.shape[axis]), axis)
+    behind = np.take(masked_image, range(masked_image.shape[axis] - 1), axis)
     product = ahead * np.conj(behind)
     return complex(product.sum()) / max(float(np.abs(product).sum()), 1e-300)
 

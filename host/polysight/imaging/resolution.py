@@ -88,7 +88,8 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
 def _combine_positions(aperture: Aperture, weights: NDArray[np.floating]) -> tuple[Aperture, NDArray[np.float64]]:
     """Return the aperture with neighbouring positions combined, and the sums of their weights."""
     rows, columns = weights.shape
-    at_rows, at_columns = (np.unique(np.linspace(0, n, _BLOCKS + 1).astype(int)[:-1]) for n in (rows, columns))
+    at_rows = np.unique(np.linspace(0, rows, _BLOCKS + 1).astype(int)[:-1])
+    at_columns = np.unique(np.linspace(0, columns, _BLOCKS + 1).astype(int)[:-1])
 
     def sum_blocks(values: NDArray[np.floating]) -> NDArray[np.float64]:
         return np.add.reduceat(np.add.reduceat(values.astype(float), at_rows, axis=0), at_columns, axis=1)
@@ -261,7 +262,8 @@ def _find_nearest_ghost_m(
     """Return the distance between two places around `centre_m` whose slopes differ by `difference_rad_per_m`."""
 
     def too_far(distance_m: float) -> bool:
-        far, near = (slope.slope(centre_m + side * distance_m / 2, frequency_hz) for side in (1, -1))
+        far = slope.slope(centre_m + distance_m / 2, frequency_hz)
+        near = slope.slope(centre_m - distance_m / 2, frequency_hz)
         return far - near >= difference_rad_per_m
 
     if not too_far(_MAX_DISTANCE_M):

@@ -100,7 +100,8 @@ def make_reference(metal: surfaces.Seen) -> surfaces.Reference:
 
 def load_sphere_points(file: SphereFile) -> surfaces.Seen:
     """Return the points of a metal sphere from its calibration file."""
-    h, v = (_parse_echoes(np.array(file.points[channel])) for channel in ("h", "v"))
+    h = _parse_echoes(np.array(file.points["h"]))
+    v = _parse_echoes(np.array(file.points["v"]))
     return surfaces.Seen(h, v, np.zeros(len(h), int))
 
 

@@ -255,7 +255,8 @@ def analyse(
     labels = [p.label for p in judged]
     inversion = solution.inversion
     calibrated = remove_leakage(raw, inversion.known_leakage(relative.prior))
-    sh, sv = (smooth_inside(c, segmentation, optics.smooth_px) for c in (calibrated.h, calibrated.v))
+    sh = smooth_inside(calibrated.h, segmentation, optics.smooth_px)
+    sv = smooth_inside(calibrated.v, segmentation, optics.smooth_px)
     sp = ratio(sh, sv)
     estimates = dict(zip(labels, inversion.patches, strict=True))
     brightness_off = dict(zip(labels, inversion.brightness_off.tolist(), strict=True))
@@ -518,21 +519,16 @@ class _Scene:
         segmentation = self.segmentation
         theta = np.asarray(self.optics.theta_rad, np.float64)
         raw = to_metal(images, reference, self.plane)
-        rh, rv = (smooth_inside(c, segmentation, self.optics.smooth_px) for c in (raw.h, raw.v))
+        rh = smooth_inside(raw.h, segmentation, self.optics.smooth_px)
+        rv = smooth_inside(raw.v, segmentation, self.optics.smooth_px)
         dark = background(raw.h, raw.v, segmentation, images.usable)
         refused = check_patches(segmentation, rh, rv, dark, reference.mask)
         refused |= {p.label: STEEP for p in segmentation.patches if p.label in self.tilts.steep}
         judged = [p for p in segmentation.patches if p.label not in refused and p.label != reference.label]
         scatter = SceneScatter.collect(
-            channels=(rh, rv),
-            raw=raw,
-            judged=judged,
-            segmentation=segmentation,
-            reference=reference,
-            plane=self.plane,
-            images=images,
-            tilts=self.tilts,
-        )
+            channels=(rh, rv), raw=raw, judged=judged, segmentation=segmentation, reference=reference,
+            plane=self.plane, images=images, tilts=self.tilts,
+        )  # fmt: skip
         prior = scatter.prior(self.optics.prior, float(np.hypot(*self.apart_mm)))
         dispersions = measure_dispersions(images, segmentation, judged, reference.mask, self.plane)
         measured = [
@@ -674,7 +670,8 @@ def smooth_inside(image: Image, segmentation: Segmentation, sigma_px: float) -> 
     reach = int(np.ceil(4 * sigma_px))
     for patch in segmentation.patches:
         if patch.interior.any():
-            lines, columns = (np.flatnonzero(patch.interior.any(axis=axis)) for axis in (1, 0))
+            lines = np.flatnonzero(patch.interior.any(axis=1))
+            columns = np.flatnonzero(patch.interior.any(axis=0))
             near = tuple(slice(max(0, indices[0] - reach), indices[-1] + reach + 1) for indices in (lines, columns))
             inside = patch.interior[near]
             smoothed = smooth(np.where(inside, image[near], complex(np.nan, np.nan)).astype(image.dtype), sigma_px)
@@ -691,8 +688,8 @@ def permittivity_change(result: MaterialsResult, angles: IncidenceChoice) -> dic
     for r in result.patches:
         pixels = r.patch.interior
         if r.permittivity.value is not None and pixels.any():
-            used_angle, other_angle = (float(np.mean(a[pixels])) for a in (angles.used_rad, angles.other_rad))
-            eps = permittivity_from_ratio(r.permittivity.ratio, np.array([used_angle, other_angle]))
+            mean_angles_rad = np.array([np.mean(angles.used_rad[pixels]), np.mean(angles.other_rad[pixels])])
+            eps = permittivity_from_ratio(r.permittivity.ratio, mean_angles_rad)
             changes.append((float(abs(eps[1] / eps[0] - 1)), r.patch.label))
     if not changes:
         return {}

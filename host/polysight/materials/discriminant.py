@@ -261,7 +261,9 @@ class ErrorDiscriminant(Model):
 
     def _select_channels(self, every: Real) -> Real:
         """Select the model's channels of ln|H|, ln|V|, arg P [..., angles, 3]; return [..., features]."""
-        h, v, angle = (every[..., i] for i in range(3))
+        h = every[..., 0]
+        v = every[..., 1]
+        angle = every[..., 2]
         columns = {"H": (h,), "V": (v,), "P": (v - h, angle), "H+V+P": (h, v, angle)}[self.channels]
         return np.stack(columns, axis=-1).reshape(*every.shape[:-2], -1)
 
@@ -318,9 +320,8 @@ def _fit_two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informati
     level = np.zeros((material.max() + 1, mean.shape[1]))
     of_material = np.arange(len(level))[:, None] == material
     of_scan = (np.arange(len(offset))[:, None] == scan) & informative
-    material_mean, scan_mean = (
-        members / np.maximum(members.sum(axis=1, keepdims=True), 1) for members in (of_material, of_scan)
-    )
+    material_mean = of_material / np.maximum(of_material.sum(axis=1, keepdims=True), 1)
+    scan_mean = of_scan / np.maximum(of_scan.sum(axis=1, keepdims=True), 1)
     informed = of_scan.any(axis=1)
     for _ in range(TWO_WAY_ROUNDS):
         level = material_mean @ (mean - offset[scan] * informative[:, None])

@@ -173,8 +173,10 @@ class Labels:
         dy = float(y[1] - y[0])
 
         def convert_box(box: Box) -> Box:
-            x0, x1 = (float(x[0]) + (edge - 0.5) * dx for edge in (box[0], box[2]))
-            y0, y1 = (float(y[0]) + (edge - 0.5) * dy for edge in (box[1], box[3]))
+            x0 = float(x[0]) + (box[0] - 0.5) * dx
+            x1 = float(x[0]) + (box[2] - 0.5) * dx
+            y0 = float(y[0]) + (box[1] - 0.5) * dy
+            y1 = float(y[0]) + (box[3] - 0.5) * dy
             return x0, y0, x1, y1
 
         return replace(self, boxes={n: convert_box(b) for n, b in self.boxes.items()}, unit="mm")

@@ -115,9 +115,8 @@ def background_mean(h: Image, v: Image, segmentation: Segmentation, usable: Mask
     window_is_whole = _average_window(background_mask.astype(np.complex128), width_px).real > 1 - 1e-6
     if not window_is_whole.any():
         return 0.0, 0.0
-    behind_h, behind_v = (
-        _average_window(np.where(background_mask, channel, 0), width_px)[window_is_whole] for channel in (h, v)
-    )
+    behind_h = _average_window(np.where(background_mask, h, 0), width_px)[window_is_whole]
+    behind_v = _average_window(np.where(background_mask, v, 0), width_px)[window_is_whole]
     return _compute_rms(behind_h), _compute_rms(behind_v)
 
 
@@ -174,7 +173,8 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     if np.isfinite(dark[0]) and float(np.median(level)) < LEAST_LEVEL * dark[0]:
         return Finding("error", "as dark as the background", "it does not stand out from noise and sidelobes", remedy)
     cross = abs(np.vdot(h[pixels].astype(np.complex128), v[pixels]))
-    power_h, power_v = (float(np.sum(np.abs(c[pixels].astype(np.complex128)) ** 2)) for c in (h, v))
+    power_h = float(np.sum(np.abs(h[pixels].astype(np.complex128)) ** 2))
+    power_v = float(np.sum(np.abs(v[pixels].astype(np.complex128)) ** 2))
     level_v = float(np.median(np.abs(v[pixels])))
     dim = level_v < 0.12 * float(np.median(level)) or level_v < IN_NOISE * dark[1]
     if not dim and cross < 0.7 * np.sqrt(power_h * power_v):
@@ -250,9 +250,8 @@ def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Sca
     if middle == 0:
         return None
     log_ratio = np.asarray(np.log(inverse / middle), np.complex128)
-    amplitude, phase = (
-        1.4826 * float(np.median(np.abs(part - np.median(part)))) for part in (log_ratio.real, log_ratio.imag)
-    )
+    amplitude = 1.4826 * float(np.median(np.abs(log_ratio.real - np.median(log_ratio.real))))
+    phase = 1.4826 * float(np.median(np.abs(log_ratio.imag - np.median(log_ratio.imag))))
     places = np.stack([x_m[columns], y_m[rows]], axis=1)
     centred = places - places.mean(axis=0)
     pixel_m2 = abs((x_m[1] - x_m[0]) * (y_m[1] - y_m[0]))
@@ -381,7 +380,8 @@ def measure_dispersions(
     out: list[PatchDispersion | None] = []
     for patch in judged:
         of_patch = _measure_median_change(dispersion, patch.interior)
-        level_h, level_v = (np.median(np.abs(channel[patch.interior])) for channel in (images.h, images.v))
+        level_h = np.median(np.abs(images.h[patch.interior]))
+        level_v = np.median(np.abs(images.v[patch.interior]))
         if of_patch is None or not min(level_h, level_v) > 0:
             out.append(None)
             continue
@@ -506,7 +506,8 @@ def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
     `digits` stand behind the point; `width` is the least width of the real part, for aligned columns.
     """
     # Adding zero after rounding removes the sign of a negative zero.
-    real, imag = (round(float(part), digits) + 0.0 for part in (value.real, value.imag))
+    real = round(float(value.real), digits) + 0.0
+    imag = round(float(value.imag), digits) + 0.0
     return f"{real:{width}.{digits}f} {'+' if imag > 0 else '-'} j{abs(imag):.{digits}f}"
 
 
@@ -557,7 +558,8 @@ def estimate_permittivity(
     value = complex(permittivity_from_ratio(ratio, float(theta.mean())))
     pixels = permittivity_from_ratio(v[usable].astype(np.complex128) / h[usable], theta)
     pixels = pixels[np.isfinite(pixels)]
-    re, im = (np.percentile(part, [30, 70]) for part in (pixels.real, pixels.imag))
+    re = np.percentile(pixels.real, [30, 70])
+    im = np.percentile(pixels.imag, [30, 70])
     std = float(abs(permittivity_slope(inverse, float(theta.mean()))) * inverse_std)
     return Permittivity(
         value=value,

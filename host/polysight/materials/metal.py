@@ -365,7 +365,8 @@ def find_metals(h: Image, v: Image, segmentation: Segmentation) -> tuple[MetalRe
     (:func:`metal_evidence`), as is which of several is bare.
     """
     patches = [p for p in segmentation.patches if p.interior.any()]
-    size_h, size_v = (np.array([np.median(np.abs(image[p.interior])) for p in patches]) for image in (h, v))
+    size_h = np.array([np.median(np.abs(h[p.interior])) for p in patches])
+    size_v = np.array([np.median(np.abs(v[p.interior])) for p in patches])
     product = size_h * size_v
     order = np.argsort(-product, kind="stable")
     if not patches:
@@ -444,7 +445,8 @@ def _measure_excess(
     h, v = (channel[ring] for channel in relative)
     if float(np.median(v / np.maximum(h, 1e-30))) < HALO_EXCESS:
         return 0.0
-    power_h, power_v = (float(np.median(channel)) ** 2 for channel in (h, v))
+    power_h = float(np.median(h)) ** 2
+    power_v = float(np.median(v)) ** 2
     return float(np.sqrt(max(0.0, power_v - USUAL_POWER * power_h)))
 
 

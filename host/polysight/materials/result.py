@@ -387,7 +387,8 @@ def make_labels(result: MaterialsResult, description: str = "") -> Labels:
         elif r.verdict is not None and r.verdict.source == "library":
             name = r.verdict.name
         inside = r.patch.interior if r.patch.interior.any() else r.patch.mask
-        rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+        rows = np.flatnonzero(inside.any(axis=1))
+        columns = np.flatnonzero(inside.any(axis=0))
         key = name if name not in boxes else f"{name} ({r.patch.label})"
         boxes[key] = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
     return Labels(boxes, description=description)

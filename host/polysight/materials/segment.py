@@ -448,7 +448,8 @@ def _open_mask(mask: Mask, radius_px: float) -> Mask:
 
 def _find_window(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
     """Return the rows and columns that hold a mask, and `margin` more around it within the image."""
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    rows = np.flatnonzero(mask.any(axis=1))
+    columns = np.flatnonzero(mask.any(axis=0))
     if not rows.size:
         return slice(0, 0), slice(0, 0)
     return (

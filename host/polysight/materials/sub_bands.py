@@ -175,9 +175,11 @@ def _divide_by_metal(
         nothing = np.full(images.valid.shape, complex(np.nan, np.nan))
         return nothing, nothing, float("nan")
     pair, _ = level(images, result.segmentation, result.tilts)
-    h, v = (np.where(images.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (pair.h, pair.v))
+    h = np.where(images.valid, pair.h, complex(np.nan, np.nan)).astype(pair.h.dtype)
+    v = np.where(images.valid, pair.v, complex(np.nan, np.nan)).astype(pair.v.dtype)
     relative = remove_leakage(to_metal(replace(pair, h=h, v=v), metal, reference), leakage)
-    h, v = (smooth_inside(c, result.segmentation, smooth_px) for c in (relative.h, relative.v))
+    h = smooth_inside(relative.h, result.segmentation, smooth_px)
+    v = smooth_inside(relative.v, result.segmentation, smooth_px)
     return h, v, _measure_reference_spread(h, v, metal, reference)
 
 

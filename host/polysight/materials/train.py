@@ -10,7 +10,7 @@ placement and metal reference, so that a split by pixel compares a patch with it
 the paper seems to use it; it is labelled optimistic. A material of a single scan cannot be judged: it stays among the
 candidates, counts neither as right nor as wrong, and is listed.
 
-Read the published data set's labels and material files into library entries.
+Two parts of the published data set are read:
 
 `labels/<scan>/{sar_h,sar_v}.npy` and `<scan>.json`: images with boxes [x0, y0, x1, y1] in pixels. The direction of y,
 and the order [y, x] or [x, y] of the images, is not documented. All scans share one convention, which is found from the
@@ -69,7 +69,6 @@ _ALLOWED = {
     ("numpy.core.numeric", "_frombuffer"),
     ("numpy._core.numeric", "_frombuffer"),
 }
-
 FOLDS = 8
 OPTIMISTIC = "by pixel (optimistic)"
 PIXELS = 16
@@ -428,16 +427,16 @@ class Score:
     right: float = float("nan")
 
 
-def calibration_error(confidence: npt.NDArray, right: npt.NDArray, bins: int = 10) -> float:
-    """Return the expected calibration error: |mean confidence - share right| in bins, weighted by their size.
+def calibration_error(confidence: npt.NDArray, right: npt.NDArray) -> float:
+    """Return the expected calibration error: |mean confidence - share right| in ten bins, weighted by their size.
 
-    Guo et al., On Calibration of Modern Neural Networks, ICML 2017. NaN without data.
+    Both arrays are [patch]. Guo et al., On Calibration of Modern Neural Networks, ICML 2017. NaN without data.
     """
     if not len(confidence):
         return float("nan")
-    bin_index = np.clip((np.asarray(confidence) * bins).astype(int), 0, bins - 1)
-    count = np.bincount(bin_index, minlength=bins)
-    difference = np.bincount(bin_index, confidence, bins) - np.bincount(bin_index, right, bins)
+    bin_index = np.clip((np.asarray(confidence) * 10).astype(int), 0, 9)
+    count = np.bincount(bin_index)
+    difference = np.bincount(bin_index, confidence) - np.bincount(bin_index, right)
     return float(np.abs(difference).sum() / count.sum())
 
 
@@ -491,11 +490,12 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     """Judge a model by cross-validation.
 
     `model` is a key of `MODELS`, `channels` one of `CHANNELS`. With `by_pixel` the split is by pixel instead of by
-    group: optimistic, see the module's docstring. `folds` is the largest number of folds.
-
-    Raises DataError with fewer than two groups, or without a material in two groups.
+    group: optimistic, see the module's docstring. `folds` is the largest number of folds. Raises DataError with fewer
+    than two groups, or without a material in two groups.
     """
-    of_pixel, in_scan, of_patch = (np.empty_like(samples.names) for _ in range(3))
+    of_pixel = np.empty_like(samples.names)
+    in_scan = np.empty_like(samples.names)
+    of_patch = np.empty_like(samples.names)
     unknown, learnt = np.zeros((2, samples.names.size), bool)
     sure = np.zeros(samples.names.size)
     for train, test in splits(samples, by_pixel, folds):

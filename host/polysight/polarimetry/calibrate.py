@@ -222,10 +222,8 @@ class PlaneReference:
         is_known = self.valid & np.isfinite(dispersion.h) & np.isfinite(dispersion.v)
         if not is_known.any():
             return self
-        h, v = (
-            complex(np.median(change[is_known].real), np.median(change[is_known].imag))
-            for change in (dispersion.h, dispersion.v)
-        )
+        h = complex(np.median(dispersion.h[is_known].real), np.median(dispersion.h[is_known].imag))
+        v = complex(np.median(dispersion.v[is_known].real), np.median(dispersion.v[is_known].imag))
         return replace(self, dispersion=(h, v))
 
     def apply(self, images: Images) -> Images:
@@ -325,7 +323,8 @@ def plane_reference(
     v = images.v
     usable = images.usable
     smooth_px = smooth_mm / 1e3 / abs(float(images.x_m[1] - images.x_m[0]))
-    power_h, power_v = (smooth(np.where(usable, np.abs(z) ** 2, 0.0).astype(np.float64), smooth_px) for z in (h, v))
+    power_h = smooth(np.where(usable, np.abs(h) ** 2, 0.0).astype(np.float64), smooth_px)
+    power_v = smooth(np.where(usable, np.abs(v) ** 2, 0.0).astype(np.float64), smooth_px)
     strong = usable.copy()
     for power in (power_h, power_v):
         top = float(np.percentile(power[usable], 90)) if usable.any() else 0.0
@@ -339,8 +338,10 @@ def plane_reference(
             "scan a flat metal plate that covers the plane, larger than the grid on every side",
             code=ErrorCode.NO_DATA,
         )
-    cut_h, cut_v = (np.where(strong, z, complex(np.nan, np.nan)) for z in (h, v))
-    level_h, level_v = (np.sqrt(np.abs(smooth(np.abs(z) ** 2, smooth_px))) for z in (cut_h, cut_v))
+    cut_h = np.where(strong, h, complex(np.nan, np.nan))
+    cut_v = np.where(strong, v, complex(np.nan, np.nan))
+    level_h = np.sqrt(np.abs(smooth(np.abs(cut_h) ** 2, smooth_px)))
+    level_v = np.sqrt(np.abs(smooth(np.abs(cut_v) ** 2, smooth_px)))
     cross = smooth(cut_h * np.conj(cut_v), smooth_px)
     metal_h = np.where(is_plate, level_h * np.exp(1j * np.angle(cross)), np.nan).astype(np.result_type(h, np.complex64))
     metal_v = np.where(is_plate, level_v, np.nan).astype(metal_h.dtype)

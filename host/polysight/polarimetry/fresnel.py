@@ -285,7 +285,8 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         angle, path = _compute_half_bistatic(rig, i, points)
         specular, shortest = _compute_half_bistatic(rig, i, middle)
         weight = np.exp(-((2 * np.pi / wavelength * (path - shortest)) ** 2) / 8)
-        deviation, mass = (_convolve(visited, map_part) for map_part in (weight * (angle - specular), weight))
+        deviation = _convolve(visited, weight * (angle - specular))
+        mass = _convolve(visited, weight)
         # Sample (row, column) of the full convolution is the pixel at offset + displacement from the midpoint.
         column = (x - middle[0]) / step[0] + (count[0] - 1) / 2 + reach[0]
         row = (y - middle[1]) / step[1] + (count[1] - 1) / 2 + reach[1]

@@ -245,7 +245,8 @@ class Frame(Command):
 
     def data(self) -> bytes:
         """Pack chirps, loops, frames, words, period, trigger, delay."""
-        period, delay = (round(t / FRAME_TICK_US) for t in (self.period_us, self.trigger_delay_us))
+        period = round(self.period_us / FRAME_TICK_US)
+        delay = round(self.trigger_delay_us / FRAME_TICK_US)
         words = 2 * self.samples
         return struct.pack("<6HIHHI", 0, 0, 0, self.loops, self.frames, words, period, self.trigger, 0, delay)
 
@@ -451,9 +452,8 @@ def direct_if_hz(rig: Instrument, board: Board) -> float:
     """
     paths = direct_path_m(rig, board)
     slope = slope_code(rig.chirp.slope_hz_per_s) * SLOPE_HZ_PER_S_PER_CODE
-    start, transmitted = (
-        start_code(rig.chirp.start_hz + b.start_offset_hz) * START_HZ_PER_CODE for b in (board, rig.transmitter)
-    )
+    start = start_code(rig.chirp.start_hz + board.start_offset_hz) * START_HZ_PER_CODE
+    transmitted = start_code(rig.chirp.start_hz + rig.transmitter.start_offset_hz) * START_HZ_PER_CODE
     return slope * sum(paths) / len(paths) / SPEED_OF_LIGHT_M_S + start - transmitted
 
 

@@ -172,7 +172,8 @@ def _linearise(eps: complex, v: Voltages, gains: Gains, ripple: Array, wave_numb
     rate_weights = weights * falloff
     information = np.einsum("np,nq,n->pq", jacobian.conj(), jacobian, rate_weights).real
     inverse = np.linalg.inv(information + 1e-15 * np.eye(2))
-    influence, answer = (-np.einsum("pq,nq,n->pn", inverse, jacobian.conj(), w) for w in (weights, rate_weights))
+    influence = -np.einsum("pq,nq,n->pn", inverse, jacobian.conj(), weights)
+    answer = -np.einsum("pq,nq,n->pn", inverse, jacobian.conj(), rate_weights)
     return _Step(miss, noise, weights, used, influence, answer)
 
 
@@ -330,7 +331,8 @@ def find_pattern_changes(eps: complex, v: Voltages, wave_number: float) -> Compl
 
     A pattern weights the directions that a path L holds: r gets j / (k L) r' times its slope. Metal does not show it.
     """
-    above, below = (reflect_flat(eps, v.theta + step) for step in (ANGLE_STEP, -ANGLE_STEP))
+    above = reflect_flat(eps, v.theta + ANGLE_STEP)
+    below = reflect_flat(eps, v.theta - ANGLE_STEP)
     slope_s, slope_p = ((up - down) / (2 * ANGLE_STEP) for up, down in zip(above, below, strict=True))
     slopes = np.stack([slope_s, slope_p, 0 * slope_s, 0 * slope_s], axis=2)
     change = 1j * UNKNOWN_SLOPE / (wave_number * v.path_m)[..., None] * slopes

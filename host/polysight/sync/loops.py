@@ -153,18 +153,15 @@ def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
     z
         complex64 [..., size], zero beyond the first `samples`; overwritten.
     samples
-        Length of the record.
-
-    Returns
-    -------
-    Tone
-        The amplitude is the sum over the record (not the mean), at its centre.
+        Length of the record. The tone's amplitude is the sum over it (not the mean), at its centre.
     """
     size = z.shape[-1]
     spectrum: NDArray[np.complex64] = np.asarray(scipy.fft.fft(z, axis=-1, overwrite_x=True)).reshape(-1, size)
     top = np.argmax(spectrum.real**2 + spectrum.imag**2, axis=-1)
     spectrum_rows = np.arange(len(spectrum))
-    bin_below, bin_value, bin_above = (spectrum[spectrum_rows, (top + d) % size] for d in (-1, 0, 1))
+    bin_below = spectrum[spectrum_rows, (top - 1) % size]
+    bin_value = spectrum[spectrum_rows, top]
+    bin_above = spectrum[spectrum_rows, (top + 1) % size]
     fraction = peak_between(np.abs(bin_below), np.abs(bin_value), np.abs(bin_above))
     bin_frequency = np.where(top < size // 2, top, top - size) / size
     # The transform of a symmetrical window is real, so the phase of the bin is that of the tone at the centre.
@@ -173,7 +170,7 @@ def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
     return Tone((bin_frequency + fraction / size).reshape(shape), amplitude.reshape(shape))
 
 
-def estimate_tone(z: NDArray[np.complex64], steps: int = 3) -> Tone:
+def estimate_tone(z: NDArray[np.complex64]) -> Tone:
     """Return the strongest tone of each record [..., sample]: FFT, then Newton. Amplitude as in :func:`strongest`."""
     n = z.shape[-1]
     padded = np.zeros((*z.shape[:-1], search_size(n)), np.complex64)
@@ -182,7 +179,7 @@ def estimate_tone(z: NDArray[np.complex64], steps: int = 3) -> Tone:
     demodulated = z * phasor(-coarse, np.zeros(coarse.shape), n, (n - 1) / 2)
     edges = block_edges(n)
     sums = np.add.reduceat(demodulated, edges[:-1], axis=-1).astype(complex)
-    fine = refine(sums, block_times(edges), steps)
+    fine = refine(sums, block_times(edges))
     return Tone(coarse + fine.frequency, fine.amplitude)
 
 
@@ -234,7 +231,9 @@ def find_band(chirps: NDArray[np.complex64]) -> NDArray[np.float64]:
     power = (spectra.real**2 + spectra.imag**2).sum(axis=(1, 2))
     smooth = np.roll(power, 1, axis=-1) + 2 * power + np.roll(power, -1, axis=-1)
     top = np.argmax(smooth, axis=-1)
-    below, middle, above = (smooth[np.arange(positions), (top + d) % size] for d in (-1, 0, 1))
+    below = smooth[np.arange(positions), (top - 1) % size]
+    middle = smooth[np.arange(positions), top]
+    above = smooth[np.arange(positions), (top + 1) % size]
     return (top + peak_between(below, middle, above)) / size % 1.0
 
 

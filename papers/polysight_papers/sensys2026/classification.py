@@ -269,9 +269,8 @@ def fig20(run: Run) -> Item:
     ax = fig.subplots()
     bars = []
     for channel in CHANNELS:
-        by_pixel, left_out = (
-            [score_simulated(t, PAPER, channel, p, run.quick).pixels for t in tasks] for p in (True, False)
-        )
+        by_pixel = [score_simulated(t, PAPER, channel, True, run.quick).pixels for t in tasks]
+        left_out = [score_simulated(t, PAPER, channel, False, run.quick).pixels for t in tasks]
         means = [float(np.average(x, weights=weight)) for x in (by_pixel, left_out)]
         rows.append((channel, f"{printed[channel]:.2f} %", *(percent(x) for x in (*means, *left_out))))
         bars.append((printed[channel], 100 * means[0], 100 * means[1]))

@@ -192,7 +192,8 @@ def _image_here(scan: materials.LabelledScan, images: Path, notices: list[str]) 
         notices.append(f"{scan.scan}: no image made here: {e}")
         return None
     imaged_mask = valid & np.isfinite(h) & np.isfinite(v)
-    h, v = (np.where(imaged_mask, x, 0) for x in (h, v))
+    h = np.where(imaged_mask, h, 0)
+    v = np.where(imaged_mask, v, 0)
     theirs = np.abs(scan.h)
     ways = [(k, flip) for k in range(4) for flip in (False, True)]
 

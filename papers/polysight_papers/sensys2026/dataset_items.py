@@ -595,7 +595,8 @@ def _estimate_materials(data: AuthorsData, source: str, leakage: float) -> list[
         p, angle, scans = pixels
         ones = np.ones(p.size, np.complex128)
         theta = np.radians(angle)
-        as_is, clean = (estimate_permittivity(x, ones, theta) for x in (p, without_leakage(p, leakage)))
+        as_is = estimate_permittivity(p, ones, theta)
+        clean = estimate_permittivity(without_leakage(p, leakage), ones, theta)
         source_estimates.append(
             Estimate(
                 material=m,

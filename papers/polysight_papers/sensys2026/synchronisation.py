@@ -102,7 +102,8 @@ def sync_scan(run: Run) -> SyncScan:
     profiles = [np.abs(np.fft.fft(example[k][:, a:b] * np.hanning(b - a), 1024)).astype(np.float32) for k in example]
     range_m = np.arange(1024) / 1024 * SPEED_OF_LIGHT_M_S / chirp.hz_per_sample
     near = range_m < 2.5
-    x, y = ((v[[0, -1]] - v[[0, -1]].mean()) * 1e3 for v in (grid.x_m, grid.y_m))
+    x = (grid.x_m[[0, -1]] - grid.x_m[[0, -1]].mean()) * 1e3
+    y = (grid.y_m[[0, -1]] - grid.y_m[[0, -1]].mean()) * 1e3
     return SyncScan(
         reports,
         (pairs[0], pairs[1]),

@@ -7,14 +7,16 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+from msgspec import convert
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
-from polysight_shared.messages import Capture, RowFinished, RunStarted, RunStopped, unpack_event
+from polysight_shared.messages import Capture, RowFinished, RunStarted, RunStopped, ScanId, unpack_event
 from polysight_shared.raster import FIRST_PULSE_DELAY_S, plan_raster
 from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm, simulate
+from polysight_simulators.scene.layouts import make_scan_id
 
 RIG = published_rig()
 RAW: dict[str, Any] = {
@@ -123,3 +125,8 @@ def test_a_scan_ends_when_its_truth_is_written(tmp_path: Path, monkeypatch: pyte
     facts = [json.loads(line)["fact"] for line in (tmp_path / "manifest.jsonl").read_text().splitlines()]
     assert "row_committed" in facts
     assert "scan_ended" not in facts
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "Übung 1", "木", "a/../b", "-" * 130 + "a", "two plates"])
+def test_any_name_of_a_scene_gives_the_id_of_a_scan(name):
+    convert(make_scan_id(name), ScanId)

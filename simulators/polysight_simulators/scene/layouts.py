@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Collection, Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -69,6 +70,11 @@ def blank_gaps(payload: NDArray[np.int16], gaps: Gaps) -> bytes:
     for start, stop in gaps:
         raw[start:stop] = bytes(stop - start)
     return bytes(raw)
+
+
+def make_scan_id(name: str) -> str:
+    """Return a scene's name as the id of a scan: letters A to z, digits and hyphens, at most 120 of them."""
+    return re.sub("[^A-Za-z0-9]", "-", name)[:120].strip("-") or "scene"
 
 
 def require_empty(path: Path) -> None:
@@ -469,7 +475,7 @@ def write_cube(
     by_columns
         Write this into the settings; the stage still moves along x during a burst.
     """
-    name = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
+    name = make_scan_id(scene.name)
     folder = out / "raw" / name
     new_folder(folder)
     rig = apply_scene(rig, scene)

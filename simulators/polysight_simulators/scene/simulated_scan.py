@@ -166,7 +166,7 @@ def simulate(
     plan = _plan(rig, by_columns)
     if started_s is None:
         started_s = time.time()
-    scan_id = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
+    scan_id = layouts.make_scan_id(scene.name)
     facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id}
     if layout == "own":
         stamp = datetime.fromtimestamp(started_s, UTC).isoformat(timespec="seconds")

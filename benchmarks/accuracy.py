@@ -105,9 +105,10 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
     return Alignment(snr_db, *errors(aligned.frequency), *errors(divided), truth.size)
 
 
-def one_tone(snr_db: float, trials: int = 4000, samples: int = 192) -> tuple[float, float]:
+def one_tone(snr_db: float, trials: int = 4000) -> tuple[float, float]:
     """Rms error over Cramer-Rao bound of frequency and of phase (at the record's centre), one tone in noise."""
     rng = np.random.default_rng([SEED, 1, round(10 * snr_db)])
+    samples = 192
     frequency = rng.uniform(-0.4, 0.4, trials)
     phase = rng.uniform(-np.pi, np.pi, trials)
     t = np.arange(samples) - (samples - 1) / 2

@@ -206,9 +206,9 @@ def draw_stack(rng: Generator, permittivity: complex) -> Stack:
     return Stack(((permittivity, rng.uniform(0.4e-3, 6e-3)),), holder)
 
 
-def nine_places(centre_m: tuple[float, float], pitch_m: float = 0.064) -> list[tuple[float, float]]:
-    """Centres of nine plates in three rows and columns, as of the published picture."""
-    steps = (-pitch_m, 0.0, pitch_m)
+def nine_places(centre_m: tuple[float, float]) -> list[tuple[float, float]]:
+    """Centres of nine plates in three rows and columns, 64 mm apart as in the published picture."""
+    steps = (-0.064, 0.0, 0.064)
     return [(centre_m[0] + dx, centre_m[1] + dy) for dy in steps for dx in steps]
 
 

@@ -44,6 +44,7 @@ SHEET_MM = (0.2, 6.0)
 HOLDER_REAL = (1.0, 2.5)
 """Permittivity behind a thin plate: air, foam, wood. Half of the plates have air."""
 SHEET_HZ = 78e9
+"""Frequency at which thin plates are drawn, about the middle of the sweep."""
 SHEET_KERNEL = 0.02
 """Smoothing of the distribution of thin plates, in t."""
 STACK_SHARE = 0.05
@@ -53,6 +54,8 @@ cups of sugar water moved the estimated leakage by three standard deviations, an
 ODD_BRIGHTNESS = 0.1
 ODD_BRIGHTNESS_STD = 1.2
 """Share of patches whose brightness is that of nothing known (shadows, edges), and the spread of its logarithm then."""
+# Cells of a map of densities along each side of its rectangle.
+_MAP_CELLS = 96
 DISPERSION_KERNEL = 0.05
 DISPERSION_MODEL = 0.2
 """Errors of a thin plate's change over the sweep: smoothing of the drawn plates, and a share of each change (edges, and
@@ -270,10 +273,13 @@ class Kinds:
         """Name of each kind."""
         return tuple(kind.name for kind in self.kinds)
 
-    def density_map(self, low: complex, high: complex, covariance: Real, cells: int = 96) -> DensityMap:
-        """Return the densities of what patches may be on a rectangle of t, for quick looking up."""
-        real = np.linspace(low.real, high.real, cells)
-        imag = np.linspace(low.imag, high.imag, cells)
+    def density_map(self, low: complex, high: complex, covariance: Real) -> DensityMap:
+        """Tabulate the density of each kind on the rectangle of t from `low` to `high`, for patches of one covariance.
+
+        `covariance`, float64 [2, 2], is of the real and the imaginary part of a patch's t.
+        """
+        real = np.linspace(low.real, high.real, _MAP_CELLS)
+        imag = np.linspace(low.imag, high.imag, _MAP_CELLS)
         other_density = self.other * self.compute_half_space_density(real[None, :] + 1j * imag[:, None], covariance)
         layers = np.zeros_like(other_density)
         if self.sheet_share:
@@ -417,13 +423,13 @@ def _compute_shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
 
 
 @cache
-def draw_sheets(theta_rad: float, frequency_hz: float = SHEET_HZ) -> tuple[Complex, Real]:
+def draw_sheets(theta_rad: float) -> tuple[Complex, Real]:
     """Return t of thin plates before air or a holder, complex128 [draw], and ln |r_s| over that of half spaces, [draw].
 
     The half spaces have the same t. The plates are the same at every angle.
     """
     eps, holder, thickness_m = _draw_sheet_properties()
-    r_s, r_p = multilayer([eps, holder], [thickness_m, np.inf], frequency_hz, theta_rad)
+    r_s, r_p = multilayer([eps, holder], [thickness_m, np.inf], SHEET_HZ, theta_rad)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = r_p / r_s
         brightness_off = np.log(np.abs(r_s)) - log_half_space_brightness(t, theta_rad)

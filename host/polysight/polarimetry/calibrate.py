@@ -175,7 +175,8 @@ def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
     return smoothed.astype(image.dtype)
 
 
-# Defaults of `plane_reference`: width of the Gaussian window, lowest level relative to the plate's 90th percentile.
+# Of `plane_reference`: default width of the Gaussian window, and lowest level relative to the plate's 90th percentile
+# in each channel.
 SMOOTH_MM = 8.0
 FLOOR_DB = -10.0
 # A smaller area of metal is no plate that covers the plane.
@@ -306,16 +307,14 @@ def _measure_variation_db(gain: Image) -> float:
     return round(float(np.std(20 * np.log10(np.abs(gain)))), 4)
 
 
-def plane_reference(
-    images: Images, smooth_mm: float = SMOOTH_MM, floor_db: float = FLOOR_DB, name: str = ""
-) -> PlaneReference:
+def plane_reference(images: Images, smooth_mm: float = SMOOTH_MM, name: str = "") -> PlaneReference:
     """Make a reference from the images of a metal plate over the plane.
 
     Amplitudes and H conj(V) are averaged over a Gaussian window, so a common phase of both channels (distance and tilt
-    of the plate) has no influence. A pixel is valid if both channels exceed `floor_db` within two widths of the window.
+    of the plate) has no influence. A pixel is valid if both channels exceed `FLOOR_DB` within two widths of the window.
 
-    The window has the width (standard deviation) `smooth_mm`: the gains vary slowly, speckle does not. `floor_db` is
-    the lowest level relative to the plate's 90th percentile, in each channel; `name` is the scan, for the report.
+    The window has the width (standard deviation) `smooth_mm`: the gains vary slowly, speckle does not.
+    `name` is the scan, for the report.
 
     Raises DataError if the image shows no metal.
     """
@@ -328,7 +327,7 @@ def plane_reference(
     strong = usable.copy()
     for power in (power_h, power_v):
         top = float(np.percentile(power[usable], 90)) if usable.any() else 0.0
-        strong &= power >= max(top * 10 ** (floor_db / 10), np.finfo(np.float32).tiny)
+        strong &= power >= max(top * 10 ** (FLOOR_DB / 10), np.finfo(np.float32).tiny)
     # The border of the image does not count as an edge of the plate.
     is_plate = np.asarray(scipy.ndimage.binary_erosion(strong, _make_disk(round(2 * smooth_px)), border_value=1), bool)
     if int(is_plate.sum()) < MIN_PIXELS:

@@ -117,9 +117,8 @@ def fit_high_pass(
     if_hz: NDArray[np.float64],
     amplitude: NDArray[np.float64],
     phase_rad: NDArray[np.float64] | None = None,
-    sections: int = 2,
 ) -> HighPass:
-    """Fit the filter to a sweep: one reflector, measured at several IF by changing the start frequency.
+    """Fit two first-order sections to one reflector, measured at several IF by changing the start frequency.
 
     Least squares of log amplitude, and of phase if known, over the corners and a common gain (paper, Fig. 9).
 
@@ -129,8 +128,6 @@ def fit_high_pass(
         float64 [point]: IF and linear amplitude, in any unit.
     phase_rad
         float64 [point], up to a constant; None if the phases of the measurements are unrelated.
-    sections
-        First-order sections to fit.
 
     Raises
     ------
@@ -138,9 +135,9 @@ def fit_high_pass(
         if there are too few points, or no points near a corner.
     """
     if_hz, amplitude = np.asarray(if_hz, np.float64), np.asarray(amplitude, np.float64)
-    if if_hz.size < 2 * (sections + 2) or np.any(amplitude <= 0) or np.any(if_hz <= 0):
+    if if_hz.size < 8 or np.any(amplitude <= 0) or np.any(if_hz <= 0):
         raise DataError(
-            f"{if_hz.size} points do not determine {sections} corners",
+            f"{if_hz.size} points do not determine two corners",
             "a sweep needs IF and amplitude above zero, at twice as many points as unknowns",
             "measure the same reflector at more start frequencies",
             code=ErrorCode.NOT_ENOUGH_DATA,
@@ -159,7 +156,7 @@ def fit_high_pass(
 
     limits = np.log(if_hz.min() / 10), np.log(if_hz.max() * 3)
     # The corners may lie in any two octaves.
-    starts = itertools.combinations(np.linspace(*limits, 6)[1:-1], sections)
+    starts = itertools.combinations(np.linspace(*limits, 6)[1:-1], 2)
     fits = [scipy.optimize.least_squares(misfit, start, bounds=limits, loss="soft_l1", f_scale=0.1) for start in starts]
     corners = np.exp(np.sort(min(fits, key=lambda fit: fit.cost).x))
     if corners[0] < 1.1 * np.exp(limits[0]) or corners[-1] > 0.9 * np.exp(limits[1]):

@@ -338,7 +338,7 @@ def _find_disturbed(
     of the average. It is compared with the median, and with the least of the two chirps on either side: the stage's
     motion leaves more in some chirps, but equally much in those beside.
     """
-    median = _take_lower_median(left, usable[..., None], axis=1)[:, None]
+    median = _take_lower_median(left, usable[..., None])[:, None]
     padded = np.pad(np.where(usable[..., None], left, np.inf), ((0, 0), (2, 2), (0, 0)), constant_values=np.inf)
     chirps = left.shape[1]
     neighbour = np.minimum.reduce([padded[:, k : k + chirps] for k in (0, 1, 3, 4)])
@@ -347,12 +347,12 @@ def _find_disturbed(
     return usable & enough[:, None] & (left > _UNEXPLAINED * usual_level + _NEGLIGIBLE * level[:, None]).any(axis=2)
 
 
-def _take_lower_median(values: NDArray[np.float64], usable: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
-    """Return the lower median of the usable values along an axis; 0 without any."""
-    rising = np.sort(np.where(usable, values, np.inf), axis=axis)
-    middle = np.maximum(usable.sum(axis=axis, keepdims=True) - 1, 0) // 2
-    median = np.take_along_axis(rising, np.broadcast_to(middle, (*middle.shape[:2], *values.shape[2:])), axis=axis)
-    return np.where(np.isfinite(median), median, 0.0).squeeze(axis).astype(np.float64)
+def _take_lower_median(values: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the lower median of the usable values along the second axis; 0 without any."""
+    rising = np.sort(np.where(usable, values, np.inf), axis=1)
+    middle = np.maximum(usable.sum(axis=1, keepdims=True) - 1, 0) // 2
+    median = np.take_along_axis(rising, np.broadcast_to(middle, (*middle.shape[:2], *values.shape[2:])), axis=1)
+    return np.where(np.isfinite(median), median, 0.0).squeeze(1).astype(np.float64)
 
 
 def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
@@ -417,7 +417,7 @@ def _find_taps(equaliser: hpf.Equaliser | None, frequency: NDArray[np.float64]) 
 
 def _find_coherent(coherence: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the usable chirps with at least `_GOOD` of the median coherence of their position."""
-    return usable & (coherence >= _GOOD * _take_lower_median(coherence, usable, axis=1)[:, None])
+    return usable & (coherence >= _GOOD * _take_lower_median(coherence, usable)[:, None])
 
 
 def _subtract_mean(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.float64]:

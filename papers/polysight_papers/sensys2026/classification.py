@@ -358,13 +358,13 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
     return fig
 
 
-def _list_confusions(panels: Sequence[Panel], shown: int = 5) -> str:
-    """List the largest confusions of each panel."""
+def _list_confusions(panels: Sequence[Panel]) -> str:
+    """List the five largest confusions of each panel."""
     lines = []
     for scored, table, title in panels:
         confusions = table * (1 - np.eye(len(table)))
         lines.append(f"Most confused, {title.splitlines()[0].rpartition(':')[0]}:")
-        for cell in np.argsort(confusions, axis=None)[::-1][:shown]:
+        for cell in np.argsort(confusions, axis=None)[::-1][:5]:
             i, j = np.unravel_index(cell, confusions.shape)
             if confusions[i, j] > 0:
                 lines.append(f"   {scored.names[i]} named {scored.names[j]}: {100 * confusions[i, j]:.0f} %")

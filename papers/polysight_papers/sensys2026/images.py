@@ -157,7 +157,8 @@ def _scan(
     return ScanView(imaged_scan.result, scan)
 
 
-def _label_plates(ax: Any, scan: ProcessedScan, size: float = 7.5) -> None:
+def _label_plates(ax: Any, scan: ProcessedScan) -> None:
+    """Write the plates' names on an image, and crop it to 110 mm about the middle."""
     for plate in scan.plates:
         x0, y0, x1, y1 = plate.box_mm
         name = plate.name.split(" (")[0]
@@ -167,7 +168,7 @@ def _label_plates(ax: Any, scan: ProcessedScan, size: float = 7.5) -> None:
             name.replace(" ", "\n"),
             ha="center",
             va="center",
-            fontsize=size,
+            fontsize=7.5,
             color="white",
             path_effects=[withStroke(linewidth=2.0, foreground=INK)],
         )
@@ -184,9 +185,9 @@ def _compute_opacity(scan: ProcessedScan) -> npt.NDArray[np.float64]:
     return np.clip((level + 20) / 6, 0.0, 1.0)
 
 
-def draw_row(fig: Any, axes: Any, view: ScanView, keys: tuple[str, ...], name: str) -> None:
-    """Draw images of a scan side by side, with colour bars and the plates' names."""
-    for ax, key in zip(axes, keys, strict=True):
+def draw_row(fig: Any, axes: Any, view: ScanView, name: str) -> None:
+    """Draw the amplitudes of a scan in H, V and P side by side, with colour bars and the plates' names."""
+    for ax, key in zip(axes, ("amplitude_h", "amplitude_v", "amplitude_p"), strict=True):
         image, unit = draw_channel(ax, view.scan, key)
         if key.endswith("_p"):
             image.set_alpha(_compute_opacity(view.scan))
@@ -239,7 +240,7 @@ def fig13(run: Run) -> Item:
     """Seven materials at 50 degrees."""
     view = view_scan("seven materials at 50 degrees", FIG13, run, FIG13_DISTANCE_MM)
     fig = new_figure(11.5, 3.7)
-    draw_row(fig, fig.subplots(1, 3), view, ("amplitude_h", "amplitude_v", "amplitude_p"), "50°")
+    draw_row(fig, fig.subplots(1, 3), view, "50°")
     views = {"50°": view}
     return Item(
         "fig13",
@@ -259,7 +260,7 @@ def fig19(run: Run) -> Item:
     views = {name: view_scan(name, rows, run) for name, rows in SETS.items()}
     fig = new_figure(11.5, 10.2)
     for line, (name, view) in zip(fig.subplots(3, 3), views.items(), strict=True):
-        draw_row(fig, line, view, ("amplitude_h", "amplitude_v", "amplitude_p"), name)
+        draw_row(fig, line, view, name)
     return Item(
         "fig19",
         "Fig. 19: images of solids, liquids and powders",
@@ -370,7 +371,7 @@ def fig4(run: Run) -> Item:
     views["steep"] = _scan("steep", ROWS, FRONT_ON_PLACES_MM, run.config, 400)
     fig = new_figure(11.5, 6.8)
     for line, (name, view) in zip(fig.subplots(2, 3), views.items(), strict=True):
-        draw_row(fig, line, view, ("amplitude_h", "amplitude_v", "amplitude_p"), name)
+        draw_row(fig, line, view, name)
     theta = {name: float(np.mean(view.result.theta_rad)) for name, view in views.items()}
     eps = [table2()[n - 1].permittivity for n in ROWS]
     spread = {k: float(np.ptp(20 * np.log10(np.abs(ratio_from_permittivity(eps, t))))) for k, t in theta.items()}

@@ -21,8 +21,7 @@ from tests.support.rigs import published_rig
 
 from polysight.catalogue import PROGRAM, find_program
 from polysight.jobs.live_scan import _check_new
-from polysight.serve import launcher
-from polysight.serve.site import Programs
+from polysight.serve.programs import Programs
 from polysight.store import validate
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
@@ -57,14 +56,14 @@ def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
 
 
 @pytest.fixture
-def sleeping(tmp_path: Path) -> Iterator[Path]:
+def sleeping(programs: Programs, tmp_path: Path) -> Iterator[Path]:
     """A folder for which a program runs, which is killed in the end."""
-    child = launcher.launch(["/bin/sleep", "60"], str(tmp_path), str(tmp_path / PROGRAM / "scan"))
+    pid = programs.launch(["/bin/sleep", "60"], tmp_path / PROGRAM / "scan")
     try:
         yield tmp_path
     finally:
-        os.killpg(child.pid, 9)
-        child.wait()
+        os.killpg(pid, 9)
+        os.waitpid(pid, 0)
     # Killed: it could not say
     assert find_program(tmp_path, "scan").status is None
 
@@ -180,7 +179,7 @@ def test_what_a_page_leaves_beside_a_scan_is_no_fault_of_it(finished, tmp_path):
     assert validate(tmp_path / "one") == state_before
 
 
-@pytest.mark.parametrize("name", ["", "scan.log", "scan.json", "scan.status", "scan.part"])
+@pytest.mark.parametrize("name", ["", "scan.log", "scan.json", "scan.status"])
 def test_nothing_is_written_through_a_link(programs, tmp_path, name):
     """A scan folder from elsewhere may hold links where logs go."""
     (tmp_path / "victim").mkdir()

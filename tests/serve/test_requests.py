@@ -25,7 +25,7 @@ from polysight.serve.commands import (
     StartRequest,
     TrainRequest,
 )
-from polysight.serve.site import Programs
+from polysight.serve.programs import Programs
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.tables import decode
 

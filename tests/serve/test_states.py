@@ -25,7 +25,8 @@ from polysight.results import Verdict
 from polysight.results.verdict import LEVELS, reason
 from polysight.serve import site as serve_site
 from polysight.serve.guard import Access
-from polysight.serve.site import Programs, Site, Watches
+from polysight.serve.programs import Programs
+from polysight.serve.site import Site, Watches
 
 WITHOUT_SCAN = ("empty", "starting", "start_failed", "unreadable", "folder_gone")
 OF_THE_PAGE = ("offline", "server_frozen")

@@ -31,6 +31,7 @@ from polysight.catalogue.results import (
 from polysight.catalogue.scans import (
     PROGRAM,
     Program,
+    ProgramRecord,
     Scans,
     Summary,
     explain_failure,

@@ -230,8 +230,8 @@ class Program(msgspec.Struct, frozen=True):
     log: str
 
 
-class _Record(msgspec.Struct, frozen=True):
-    """Content of `program/<kind>.json`, which `polysight.serve.launcher` writes."""
+class ProgramRecord(msgspec.Struct, frozen=True):
+    """Content of `program/<kind>.json`: process number and start time (:func:`read_start_ticks`), and the command."""
 
     pid: int
     ticks: int
@@ -252,7 +252,7 @@ def find_program(folder: Path, kind: str) -> Program | None:
     if (folder / PROGRAM).is_symlink() or not is_plain(path):
         return None
     try:
-        record = msgspec.json.decode(path.read_bytes()[:MAX_RECORD_BYTES], type=_Record)
+        record = msgspec.json.decode(path.read_bytes()[:MAX_RECORD_BYTES], type=ProgramRecord)
     except (OSError, ValueError):
         return None
     words = record.words

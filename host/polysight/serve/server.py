@@ -36,8 +36,9 @@ from polysight.serve.commands import command_routes, start_waiting
 from polysight.serve.door import PagesServer, close_after_each, open_door
 from polysight.serve.front import EndingServer, Front, Reader, make_app, make_command_app, make_counting_protocol
 from polysight.serve.guard import HANDLERS, HEAD_BYTES, Access
+from polysight.serve.programs import Programs
 from polysight.serve.reading import reading_routes
-from polysight.serve.site import HIDDEN, Programs, Site, Watches
+from polysight.serve.site import HIDDEN, Site, Watches
 from polysight.serve.stage import StageControl
 from polysight.serve.welcome import describe_server
 from polysight_shared.error_codes import ErrorCode

@@ -1,20 +1,12 @@
-"""State shared by requests of the reading process: scans, live views, threads for reads, caches, started programs.
-
-`Programs` are commands of `polysight` that the page starts, each a process that outlives page and server. A program's
-process number and log lie in `<folder>/program/`, where another server finds them. It is paused and stopped as from a
-terminal, by files in `<scan>/control/`; no signal is ever sent to a process number that a file names.
-"""
+"""State shared by requests of the reading process: scans, live views, threads for reads, caches, started programs."""
 
 from __future__ import annotations
 
 import asyncio
-import json
-import subprocess
-import sys
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -27,11 +19,11 @@ from polysight import catalogue
 from polysight.page import Watch
 from polysight.products import read_products
 from polysight.results import CheckResult, check_plate
-from polysight.serve import launcher
 from polysight.serve.listing import ChangingList
+from polysight.serve.programs import Programs
 from polysight.serve.queue import Queue
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError, ScanError
+from polysight_shared.errors import ConfigError, DeviceError
 
 READ_S = 30.0
 """Time limit of one read. Longer ones are refused, and so is their folder until they have returned."""
@@ -405,74 +397,3 @@ class Watches:
                 watch.close()
             self._open = {}
             self._lasting = {}
-
-
-class Programs:
-    """Starts programs; create it before the server lowers its priority (see `launcher`)."""
-
-    def __init__(self) -> None:
-        # Run as a file: run as a module it would load all of this server.
-        command = [sys.executable, "-I", str(Path(launcher.__file__))]
-        self._launcher = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-        )
-        self._lock = threading.Lock()
-
-    def start(self, folder: Path, kind: str, words: Sequence[str | Path]) -> None:
-        """Run `polysight WORDS`, with its log in `folder`.
-
-        Raises
-        ------
-        ScanError
-            if a program of this kind is running there.
-        DeviceError
-            if none can be started.
-        """
-        with self._lock:
-            earlier = catalogue.find_program(folder, kind)
-            if earlier is not None and earlier.running:
-                raise ScanError(
-                    f"{folder}: {kind} runs already", "it was started before", "wait for it, or stop it",
-                    code=ErrorCode.BUSY,
-                )  # fmt: skip
-            _check_place(folder / catalogue.PROGRAM, kind)
-            base = str((folder / catalogue.PROGRAM).absolute() / kind)
-            command = [sys.executable, "-m", "polysight", *map(str, words)]
-            answer = self._ask(json.dumps({"words": command, "cwd": str(Path.cwd()), "base": base}))
-        if answer:
-            raise DeviceError(
-                f"{folder}: {kind} cannot be started: {answer}", "no room, no permission, or no memory",
-                "remove the cause; or give the same command in a terminal",
-            )  # fmt: skip
-
-    def _ask(self, request: str) -> str:
-        """Send a request to the launcher; return its complaint, "" for none."""
-        if self._launcher.stdin is None or self._launcher.stdout is None:
-            return "the launcher has no pipes"
-        try:
-            self._launcher.stdin.write(f"{request}\n")
-            self._launcher.stdin.flush()
-            line = self._launcher.stdout.readline()
-        except OSError as e:
-            return str(e)
-        if not line:
-            return "the launcher has ended"
-        return str(json.loads(line))
-
-    def close(self) -> None:
-        """End the launcher; started programs go on."""
-        for pipe in (self._launcher.stdin, self._launcher.stdout):
-            if pipe is not None:
-                pipe.close()
-        self._launcher.wait(10)
-
-
-def _check_place(place: Path, kind: str) -> None:
-    """Refuse a folder of logs with links, through which other files would be overwritten. Raises DeviceError."""
-    files = [place / f"{kind}{suffix}" for suffix in (".json", ".log", ".status", ".part")]
-    for path in (place, *files):
-        if path.is_symlink() or (path != place and path.exists() and not catalogue.is_plain(path)):
-            raise DeviceError(
-                f"{path} is a link or not a regular file", "the folder was made by another program",
-                "remove it, and find out who made it", code=ErrorCode.PATH_OUTSIDE,
-            )  # fmt: skip

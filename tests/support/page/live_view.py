@@ -15,8 +15,9 @@ from polysight.page.history import ScanHistory
 from polysight.page.watch import Watch
 from polysight.serve.front import Front
 from polysight.serve.guard import Access
+from polysight.serve.programs import Programs
 from polysight.serve.server import Place, make_reader_app, make_server
-from polysight.serve.site import Programs, Site, Watches
+from polysight.serve.site import Site, Watches
 from polysight.serve.stage import StageControl
 from polysight.store import EVENTS, MANIFEST, manifest, utc_now
 from tests.support.processes import HANG_S, wait_for

@@ -1,0 +1,121 @@
+"""Programs that the page starts: commands of `polysight`, each a process that outlives page and server.
+
+A program runs in a session of its own, with its output in `<folder>/program/<kind>.log`, its process number in
+`<kind>.json` and finally its exit status in `<kind>.status`, where another server finds them (`find_program`). It is
+paused and stopped as from a terminal, by files in `<scan>/control/`; no signal is ever sent to a process number that a
+file names.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+
+from polysight.acquisition import read_start_ticks
+from polysight.catalogue import PROGRAM, ProgramRecord, find_program, is_plain
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError, ScanError
+from polysight_shared.files import write_atomically
+
+OOM_SCORE = Path("/proc/self/oom_score_adj")
+# $1 is the kernel's score of the memory killer; then come the words of the program.
+SHELL = (
+    '{ echo "$1" > /proc/self/oom_score_adj; } 2> /dev/null; shift;'
+    ' "$@" >> "$0.log" 2>&1 < /dev/null; echo $? > "$0.status"'
+)
+
+
+class Programs:
+    """Starts programs with the priority that this process has now: create it before the server lowers its own.
+
+    A scan must not inherit a low priority, or be killed first when memory runs out. Linux has a priority for each
+    thread, so one thread that keeps the old one starts all programs. They inherit the score of the memory killer from
+    the whole process, and get the old one back.
+    """
+
+    def __init__(self) -> None:
+        self._oom_score = "0"
+        with suppress(OSError):
+            self._oom_score = OOM_SCORE.read_text(encoding="ascii").strip()
+        self._running: list[int] = []
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="programs")
+        # The thread begins with its first work.
+        self._thread.submit(self._reap).result()
+
+    def start(self, folder: Path, kind: str, words: Sequence[str | Path]) -> None:
+        """Run `polysight WORDS`, with its log in `folder`.
+
+        Raises
+        ------
+        ScanError
+            if a program of this kind is running there.
+        DeviceError
+            if none can be started.
+        """
+        self._thread.submit(self._start, folder, kind, words).result()
+
+    def _start(self, folder: Path, kind: str, words: Sequence[str | Path]) -> None:
+        earlier = find_program(folder, kind)
+        if earlier is not None and earlier.running:
+            raise ScanError(
+                f"{folder}: {kind} runs already", "it was started before", "wait for it, or stop it",
+                code=ErrorCode.BUSY,
+            )  # fmt: skip
+        place = (folder / PROGRAM).absolute()
+        _check_place(place, kind)
+        try:
+            self.launch([sys.executable, "-m", "polysight", *map(str, words)], place / kind)
+        except OSError as e:
+            raise DeviceError(
+                # The error of a full disk has no file name.
+                f"{folder}: {kind} cannot be started: {e.filename or place}: {e.strerror or e}",
+                "no room, no permission, or no memory",
+                "remove the cause; or give the same command in a terminal",
+            ) from None
+
+    def launch(self, command: Sequence[str], base: Path) -> int:
+        """Start one program, and record its process number and start time; returns the number. Raises OSError."""
+        self._reap()
+        base.parent.mkdir(parents=True, exist_ok=True)
+        for suffix in (".status", ".json"):
+            base.with_suffix(suffix).unlink(missing_ok=True)
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        with base.with_suffix(".log").open("a", encoding="utf-8") as log:
+            log.write(f"--- {now} {' '.join(command)}\n")
+        shell = ["/bin/sh", "-c", SHELL, str(base), self._oom_score]
+        pid = os.posix_spawn(shell[0], [*shell, *command], os.environ, setsid=True)
+        self._running.append(pid)
+        record = ProgramRecord(pid, read_start_ticks(pid) or 0, list(command), now)
+        write_atomically(base.with_suffix(".json"), msgspec.json.encode(record) + b"\n")
+        return pid
+
+    def _reap(self) -> None:
+        """Let the system forget the programs that have ended."""
+        for pid in list(self._running):
+            ended = pid
+            with suppress(ChildProcessError):
+                ended, _ = os.waitpid(pid, os.WNOHANG)
+            if ended:
+                self._running.remove(pid)
+
+    def close(self) -> None:
+        """End the thread; started programs go on."""
+        self._thread.shutdown()
+
+
+def _check_place(place: Path, kind: str) -> None:
+    """Refuse a folder of logs with links, through which other files would be overwritten. Raises DeviceError."""
+    files = [place / f"{kind}{suffix}" for suffix in (".json", ".log", ".status")]
+    for path in (place, *files):
+        if path.is_symlink() or (path != place and path.exists() and not is_plain(path)):
+            raise DeviceError(
+                f"{path} is a link or not a regular file", "the folder was made by another program",
+                "remove it, and find out who made it", code=ErrorCode.PATH_OUTSIDE,
+            )  # fmt: skip

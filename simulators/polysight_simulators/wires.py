@@ -21,13 +21,17 @@ from polysight_simulators.process import announce_ready, command_line, run_until
 
 MAX_LINE_BYTES = 200
 MAX_PENDING_BYTES = 64 << 20
-# sun_path of Linux holds 108 bytes with its terminator
+# `sun_path` of Linux holds 108 bytes with its terminator.
 MAX_SOCKET_PATH = 107
 _READ_BYTES = 1 << 18
 
 
 class _Client:
-    """A connected process with its subscriptions and its unread lines."""
+    """A connected process.
+
+    `partial` is a line of which the end has not come yet, `lines` are the GPIO lines that it subscribed to, `motion`
+    is true if it gets M lines, `pending` are the bytes that it has not read.
+    """
 
     def __init__(self, connection: socket.socket, number: int) -> None:
         self.connection = connection
@@ -76,6 +80,7 @@ class WireHub:
         self._clients: dict[socket.socket, _Client] = {}
         self._accepted = 0
         self._last_motion = b""
+        # GPIO lines that a fault has cut, and for a line the other one that has the same changes.
         self._cut: set[bytes] = set()
         self._joined: dict[bytes, bytes] = {}
 
@@ -130,6 +135,7 @@ class WireHub:
             self._disconnect(client, str(e))
 
     def _relay(self, sender: _Client, lines: list[bytes]) -> None:
+        """Obey lines by their letter: S edge, M motion, L and W subscribe, X cut or repair a wire, J join two."""
         other_clients = [p for p in self._clients.values() if p is not sender]
         for line in lines:
             tag = line[:2]
@@ -162,7 +168,7 @@ class WireHub:
                 sender.pending += b"K\n"
             elif line == b"W":
                 sender.motion = True
-                # A late client needs the stage's position
+                # A client that subscribes late needs the stage's position.
                 sender.pending += b"K\n" + self._last_motion
             else:
                 raise ProtocolError(f"not a wire line: {line!r}")

@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from polysight.imaging import Images
 from polysight.materials.analyse import KnownScene, Optics, analyse
-from polysight.materials.common_change import common_change
+from polysight.materials.common_change import estimate_common_change
 from polysight.materials.measure import Scatter, median_ratio
 from polysight.materials.metal import find_halo, metal_by_label, metal_unevenness, to_metal
 from polysight.materials.segment import align, segment
@@ -100,13 +100,13 @@ def make_scatter(slope_of):
 
 
 def test_slopes_that_all_plates_have_alike_are_theirs():
-    change = common_change(make_scatter(lambda _x, _y: (0.7 + 0.5j, 0.4j)), ORIGIN_M)
+    change = estimate_common_change(make_scatter(lambda _x, _y: (0.7 + 0.5j, 0.4j)), ORIGIN_M)
     assert np.abs(change.value).max() < 0.01
 
 
 def test_a_drift_over_the_rows_is_followed_within_its_error():
     """ln(V / H) = 0.06 cos(20 y): both parts, slopes along y."""
-    change = common_change(make_scatter(lambda _x, y: (0j, -(1 + 1j) * 0.06 * 20 * np.sin(20 * y))), ORIGIN_M)
+    change = estimate_common_change(make_scatter(lambda _x, y: (0j, -(1 + 1j) * 0.06 * 20 * np.sin(20 * y))), ORIGIN_M)
     true = (1 + 1j) * 0.06 * (np.cos(20 * np.array(PLACES_M)[:, 1]) - 1)
     deviation = change.value - true
     assert (np.abs(deviation.real) <= 2 * change.std.real + 1e-6).all()
@@ -115,19 +115,19 @@ def test_a_drift_over_the_rows_is_followed_within_its_error():
 
 
 def test_a_slope_along_y_alone_is_rather_drift_than_one_that_plates_have_both_ways():
-    along_y_alone = common_change(make_scatter(lambda _x, _y: (0j, 0.8)), ORIGIN_M)
-    both_ways = common_change(make_scatter(lambda _x, _y: (0.8, 0.8)), ORIGIN_M)
+    along_y_alone = estimate_common_change(make_scatter(lambda _x, _y: (0j, 0.8)), ORIGIN_M)
+    both_ways = estimate_common_change(make_scatter(lambda _x, _y: (0.8, 0.8)), ORIGIN_M)
     assert np.abs(along_y_alone.value).max() > 2 * np.abs(both_ways.value).max()
 
 
 def test_slopes_along_a_row_are_no_drift():
-    change = common_change(make_scatter(lambda x, _y: (20 * x, 0j)), ORIGIN_M)
+    change = estimate_common_change(make_scatter(lambda x, _y: (20 * x, 0j)), ORIGIN_M)
     assert np.abs(change.value).max() < 0.005
 
 
 def test_plates_at_the_border_say_nothing_of_a_drift():
     steep = make_scatter(lambda _x, y: (0j, 8.0 if y > 0.05 else 0j))
-    change = common_change(steep, ORIGIN_M, [place[1] > 0.05 for place in PLACES_M])
+    change = estimate_common_change(steep, ORIGIN_M, [place[1] > 0.05 for place in PLACES_M])
     assert np.abs(change.value[:6]).max() < 0.01
 
 
@@ -142,7 +142,7 @@ def test_long_fringes_are_within_the_error():
         phase = rng.uniform(0, 2 * np.pi)
         fringes = 0.12 * np.exp(1j * (places @ wave_vector + phase))
         slopes = dict(zip(PLACES_M, 1j * fringes[:, None] * wave_vector, strict=True))
-        change = common_change(make_scatter(lambda x, y, slopes=slopes: slopes[x, y]), ORIGIN_M)
+        change = estimate_common_change(make_scatter(lambda x, y, slopes=slopes: slopes[x, y]), ORIGIN_M)
         true = fringes - fringes[PLACES_M.index(ORIGIN_M)]
         for place in range(len(PLACES_M)):
             if PLACES_M[place] == ORIGIN_M:
@@ -155,7 +155,7 @@ def test_long_fringes_are_within_the_error():
 
 def test_a_plate_that_a_copy_of_another_disturbs_is_doubted_alone():
     disturbed = make_scatter(lambda x, y: (8 + 6j, 5j) if (x, y) == PLACES_M[0] else (0j, 0j))
-    error = common_change(disturbed, ORIGIN_M).ripple
+    error = estimate_common_change(disturbed, ORIGIN_M).ripple
     assert error[0] > 0.05
     assert error[1:].max() < 0.01
 
@@ -164,7 +164,7 @@ def test_bent_plates_are_no_ripple():
     """Their brightness changes along y, in which direction H and V see different places."""
     rng = np.random.default_rng(3)
     bent = make_scatter(lambda _x, _y: (0j, complex(rng.normal(0, 4))))
-    assert common_change(bent, ORIGIN_M).ripple.max() < 0.01
+    assert estimate_common_change(bent, ORIGIN_M).ripple.max() < 0.01
 
 
 def test_an_overdriven_receiver_shows_as_a_halo_of_v_alone():

@@ -30,7 +30,7 @@ def print_figure(text: str) -> None:
 
 
 def rig_of_the_box() -> Instrument:
-    """The published rig, SYNC_IN on a GPIO line with a one-shot: QEMU has no SPI controller, nor a Pi's speed."""
+    """Return the published rig, with SYNC_IN by a GPIO line and a one-shot: QEMU has neither SPI nor a Pi's speed."""
     rig = timed_by_the_program(published_rig())
     replace = msgspec.structs.replace
     return replace(
@@ -52,8 +52,9 @@ class InstalledPi:
         self.keys = work / "keys"
 
     def install(self) -> str:
-        """`make pi-install`, as on a host; what it prints."""
-        (self.work / "installed").touch()  # for make: the environment of these tests is the one it would make
+        """Run `make pi-install`, as on a host; return what it prints."""
+        # For make: the environment of these tests is the one that it would make.
+        (self.work / "installed").touch()
         make = ["make", "pi-install", f"HOST=-F {self.box.ssh_config} box", f"OUT={self.work / 'out'}"]
         make += [f"VENV={self.work}", f"BIN={BIN}"]
         done = subprocess.run(make, cwd=REPO, capture_output=True, text=True, timeout=INSTALL_LIMIT_S, check=False)
@@ -78,13 +79,13 @@ class InstalledPi:
         self.fetch_keys(self.keys, "host")
 
     def fetch_keys(self, folder: Path, client: str) -> None:
-        """A client's keys, under the names that a host's have."""
+        """Copy a client's keys from the box, under the names that a host's have."""
         folder.mkdir(mode=0o700)
         for name_on_box, name_on_host in (("pi.key", "pi.key"), (f"{client}.key_secret", "host.key_secret")):
             (folder / name_on_host).write_text(self.box.run(f"sudo cat /etc/polysight/keys/{name_on_box}"))
 
     def systemctl(self, words: str) -> str:
-        """`sudo systemctl ...`."""
+        """Run `sudo systemctl` with these words; return what it prints."""
         return self.box.run(f"sudo systemctl {words}")
 
     def read_property(self, name: str) -> str:
@@ -108,11 +109,11 @@ class InstalledPi:
         assert done.returncode == 0, self.log()
 
     def addresses(self) -> tuple[str, str]:
-        """Where the host reaches it. 0.0.0.0 leads here too, and is none of the addresses that need no keys."""
+        """Return the addresses of commands and events. 0.0.0.0 leads here too, and needs keys, unlike 127.0.0.1."""
         return f"tcp://0.0.0.0:{self.box.command_port}", f"tcp://0.0.0.0:{self.box.event_port}"
 
     def on_host(self, *words: str) -> str:
-        """Run `polysight-pi` on the host, with a rig file that names the box and the host's keys; what it prints."""
+        """Run `polysight-pi` on the host with a rig file that names the box and the host's keys; return its output."""
         command, event = self.addresses()
         pi_settings = msgspec.structs.replace(
             self.rig.pi, command_address=command, event_address=event, key_dir=str(self.keys)
@@ -133,7 +134,7 @@ class InstalledPi:
         return self.box.run("readlink /opt/polysight/venv").strip()
 
     def check(self) -> dict[str, dict[str, Any]]:
-        """What `polysight-pi check` finds, by name, run as the service's user."""
+        """Return the findings of `polysight-pi check` by name, run as the service's user."""
         command = f"sudo -u polysight {PROGRAM} check --json --config /etc/polysight/instrument.toml"
         done = self.box.try_run(command)
         assert done.returncode in (0, 1), done.stderr

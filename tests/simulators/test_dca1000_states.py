@@ -20,7 +20,10 @@ def request(code: int, body: bytes = b"") -> bytes:
 
 
 class AnyUse(RuleBasedStateMachine):
-    """The card compared with a model of bytes given, bytes received, and recording or not."""
+    """The card compared with a model of bytes given, bytes received, and recording or not.
+
+    `suits` is false while the card is configured for another number of lanes than the LVDS data has.
+    """
 
     @initialize(
         sequence=st.sampled_from([1, 77, 2**32 - 2]),
@@ -39,8 +42,8 @@ class AnyUse(RuleBasedStateMachine):
         self.next_byte = 0
         self.sizes: list[int] = []
 
-    def take(self, outputs: list[Output], ends: bool) -> None:
-        """Check what came out against the model."""
+    def compare(self, outputs: list[Output], ends: bool) -> None:
+        """Compare what came out with the model; `ends`: the record ends with it."""
         packets = [row.tobytes() for o in outputs if isinstance(o, Packets) for row in o.rows]
         assert self.recording or not packets, "data outside a record"
         for packet in packets:
@@ -75,13 +78,13 @@ class AnyUse(RuleBasedStateMachine):
         outputs = self.card.command(request(0x05), self.now)
         if not self.recording:
             self.begin()
-        self.take(outputs, False)
+        self.compare(outputs, False)
 
     @rule()
     def stop(self) -> None:
         outputs = self.card.command(request(0x06), self.now)
         assert outputs[0] == message(0x06, 0)
-        self.take(outputs[1:], self.recording)
+        self.compare(outputs[1:], self.recording)
 
     @rule(n=st.integers(0, 9000))
     def data(self, n: int) -> None:
@@ -91,14 +94,14 @@ class AnyUse(RuleBasedStateMachine):
         if self.recording and self.suits:
             self.given += fresh.tobytes()
             self.last_data = self.now
-        self.take(outputs, False)
+        self.compare(outputs, False)
 
     @rule(seconds=st.sampled_from([0.001, 0.5, TAIL_S, 31.0]))
     def wait(self, seconds: float) -> None:
         self.now += seconds
         over = 30.0 if self.last_data is None else TAIL_S
         since = self.started if self.last_data is None else self.last_data
-        self.take(self.card.tick(self.now), self.recording and self.now >= since + over)
+        self.compare(self.card.tick(self.now), self.recording and self.now >= since + over)
 
     @rule(code=st.sampled_from([0x02, 0x09, 0x0A, 0x0E, 0x07, 0x77]), body=st.binary(max_size=8))
     def ask(self, code: int, body: bytes) -> None:

@@ -38,7 +38,7 @@ MAX_BYTES = 256 << 20
 """Part of a file that is read: eleven rows of the published scan."""
 # More chirps do not change the statistics noticeably.
 MAX_CHIRPS = 4096
-# To recognise a file of whole packets.
+# Packets at its beginning by which a file of whole packets is recognised.
 _HEADERS_READ = 16
 # Full scale of the ADC, counts.
 _FULL_SCALE = 32767
@@ -46,8 +46,13 @@ _PCAP_HEADS = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"
 _UDP_HEADER_BYTES = 8
 # Largest capture file: half an hour of three boards.
 _MAX_PCAP_BYTES = 4 << 30
+# Longest record that byte counts are believed to be of: more than a thousand rows of the published scan.
+_MAX_RECORD_BYTES = 1 << 34
+# Chosen: a peak over the median of the range profile that noise does not have, a constant offset that the radar's
+# high-pass filter does not let through, and the share of the loudest antenna's level below which one counts as off.
 _CLEAR_PEAK_DB = 10.0
 _MUCH_DC = 0.05 * _FULL_SCALE
+_SILENT_SHARE = 0.01
 MAGIC = {
     b"\x7fELF": "a program", b"\x89PNG": "a picture (PNG)", b"\xff\xd8\xff": "a picture (JPEG)", b"%PDF": "a PDF",
     b"PK\x03\x04": "an archive (zip)", b"\x1f\x8b": "compressed (gzip)", b"\x89HDF": "HDF5",
@@ -87,7 +92,12 @@ class Layout:
 
 @dataclass
 class CardReport:
-    """A card in a packet capture: replies (code, status), FPGA version, status, the record."""
+    """A card in a packet capture.
+
+    `replies` are pairs (command, status), `version` is that of the FPGA, `status` all status bits that the card sent.
+    `record` is None without data. The last packet holds `tail_bytes` and came `tail_after_s` after the one before it;
+    both are 0 if it is a full one.
+    """
 
     address: str
     replies: list[tuple[str, int]]
@@ -103,8 +113,9 @@ class Report:
     """Content of a recording.
 
     `profile_db` is the power range profile, Hann window, mean over chirps and antennas, in dB over its median;
-    float64 [samples]. `rx_profile_db` is the same for every antenna over the same median. `rx_rms` and `rx_dc` are one
-    value per antenna, ADC counts.
+    float64 [samples]; its highest bin is `peak_bin`, of `peak_db`. `rx_profile_db` is that of every antenna, over the
+    same median. `rx_rms` and `rx_dc` (constant offset) are one value per antenna, ADC counts. `clipped` counts values
+    at full scale, `left_over_bytes` the bytes behind the last complete chirp.
     """
 
     path: Path
@@ -124,19 +135,19 @@ class Report:
     simulated: bool = False
 
 
-def packets_in_file(payload: NDArray[np.uint8]) -> list[bytes]:
+def read_packets(payload: NDArray[np.uint8]) -> list[bytes]:
     """Return the packets of a file of consecutive full packets, the last perhaps short; [] for any other file.
 
-    Some programs write packets as they come: 1456 bytes of payload, each behind ten bytes of counters.
+    Some programs write packets as they come: 1456 bytes of payload, each behind ten bytes of counters. `payload` is the
+    file's content, uint8 [n].
     """
     count = min(_HEADERS_READ, payload.size // MAX_PACKET_BYTES)
     if count < 2:
         return []
     packets = payload[: count * MAX_PACKET_BYTES].reshape(count, MAX_PACKET_BYTES)
     heads = [dca1000.decode_packet_header(row.tobytes()) for row in packets]
-    (sequence, byte_count) = heads[0]
-    k = range(count)
-    if heads != [(sequence + i, byte_count + i * MAX_PAYLOAD_BYTES) for i in k]:
+    sequence, byte_count = heads[0]
+    if heads != [(sequence + k, byte_count + k * MAX_PAYLOAD_BYTES) for k in range(count)]:
         return []
     pieces = [payload[a : a + MAX_PACKET_BYTES].tobytes() for a in range(0, payload.size, MAX_PACKET_BYTES)]
     return [piece for piece in pieces if len(piece) > dca1000.PACKET_HEADER_BYTES]
@@ -151,7 +162,7 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
     ahead = counter_differences(counts, int(counts[0]), dca1000.BYTE_COUNT_BITS)
     sizes = np.array([len(p) for p in packets]) - dca1000.PACKET_HEADER_BYTES
     size = int((ahead + sizes).max() - ahead.min())
-    if size > 1 << 34:
+    if size > _MAX_RECORD_BYTES:
         problem = f"byte counts span {size} bytes"
         cause = "the file holds more than one record, or corrupted packets"
         raise DataError(problem, cause, "cut the capture to one record", code=ErrorCode.FILE_DAMAGED)
@@ -178,7 +189,7 @@ def inspect_bin(path: Path, layout: Layout = Layout()) -> Report:
         problem = f"{path}: not a capture: it begins as {kind}"
         remedy = "give a row (.bin) or a packet capture (.pcap)"
         raise DataError(problem, "a card records samples", remedy, code=ErrorCode.FILE_FOREIGN)
-    packets = packets_in_file(payload)
+    packets = read_packets(payload)
     if packets:
         payload, _ = place_packets(packets)
     report = inspect_payload(path, payload, layout)
@@ -261,7 +272,7 @@ def _collect_remarks(r: Report, mirrored: bool) -> list[str]:
         return ["every sample is zero: nothing was recorded"]
     if mirrored:
         remarks.append("most power is at negative frequencies: I and Q seem to be swapped (--q-first)")
-    if silent := [k for k, v in enumerate(r.rx_rms) if v < 0.01 * max(r.rx_rms)]:
+    if silent := [k for k, v in enumerate(r.rx_rms) if v < _SILENT_SHARE * max(r.rx_rms)]:
         remarks.append(f"RX {', '.join(map(str, silent))} have no signal: antennas off, or another lane layout")
     if r.clipped:
         remarks.append(f"{r.clipped} values are at full scale: the receiver clips, lower its gain")
@@ -370,7 +381,7 @@ def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") 
                 "record on the card's interface",
                 code=ErrorCode.NO_DATA,
             )
-        return _empty(path, layout, card)
+        return _report_without_data(path, layout, card)
     payload, card.record = place_packets([d.payload for d in data])
     if len(data) > 1 and len(data[-1].payload) < len(data[0].payload):
         card.tail_bytes = len(data[-1].payload) - dca1000.PACKET_HEADER_BYTES
@@ -414,7 +425,7 @@ def _select_from_card(path: Path, card_address: str) -> tuple[CardReport, list[D
     return card, packets
 
 
-def _empty(path: Path, layout: Layout, card: CardReport) -> Report:
+def _report_without_data(path: Path, layout: Layout, card: CardReport) -> Report:
     empty = np.zeros(0)
     return Report(
         path=path,

@@ -33,9 +33,10 @@ READ_S = 3.0
 """Time limit for reading one folder of the list; it is then listed as `silent` until the read returns."""
 PROGRAM = "program"
 """Folder of a scan in which programs that a page started keep their process number and log."""
-# Folders below the first, and scans, that are looked at.
+# The deepest level of folders that scans are searched in, and the number of scans at which the search ends.
 MAX_DEPTH = 4
 MAX_SCANS = 5000
+# End of a program's log that is read: its last messages.
 LOG_BYTES = 16384
 # Longest record of a started program that is read: its command line is short.
 MAX_RECORD_BYTES = 100_000
@@ -109,7 +110,7 @@ def read_generation(products: Path) -> str:
     To read several files that belong together, compare the text before and after.
     """
     stamps = []
-    for path in (products, *(products / name for name in (IMAGE, MATERIALS, QUALITY, SCAN))):
+    for path in (products, products / IMAGE, products / MATERIALS, products / QUALITY, products / SCAN):
         try:
             status = path.stat()
         except OSError:
@@ -262,7 +263,7 @@ def find_program(folder: Path, kind: str) -> Program | None:
     status = None
     if not running:
         status = _read_status(base.with_suffix(".status"))
-    return Program(kind, running, status, tuple(words), record.started_utc, log_tail(base.with_suffix(".log")))
+    return Program(kind, running, status, tuple(words), record.started_utc, read_log_tail(base.with_suffix(".log")))
 
 
 def _read_status(path: Path) -> int | None:
@@ -296,7 +297,7 @@ def explain_failure(program: Program | None) -> Finding | None:
     return Finding("error", problem[:MESSAGE_CHARACTERS], parts["why"], parts["do"])
 
 
-def log_tail(path: Path) -> str:
+def read_log_tail(path: Path) -> str:
     """Return the end of a program's log since its last start, without control sequences; "" if there is none."""
     if not is_plain(path):
         return ""
@@ -340,14 +341,16 @@ def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
     return replace(summary, state="running")
 
 
-def _read_modified_s(folder: Path) -> float:
+def _read_modified_s(path: Path) -> float:
+    """Return the time of the last change of a file or folder, since 1970; 0 if it cannot be read."""
     try:
-        return folder.stat().st_mtime
+        return path.stat().st_mtime
     except OSError:
         return 0.0
 
 
 def _parse_utc(utc: str) -> float:
+    """Return a time in seconds since 1970; 0 if the text is none."""
     try:
         return datetime.fromisoformat(utc).timestamp()
     except ValueError:
@@ -488,7 +491,7 @@ class Scans:
         return _find_scan_names(self.root / entry, f"{entry}/", 2)
 
     def lives(self) -> Iterator[tuple[str, Life]]:
-        """Name and last sign of life of each scan that runs, or was killed; no scan is read."""
+        """Yield name and last sign of life of each scan that runs, or was killed; no scan is read."""
         places = _find_scans(self.root, "", 1)
         if self.only is not None:
             places = iter([(self.only, self.root / self.only)])
@@ -527,7 +530,7 @@ class Scans:
             when the name leads out of the folder, also by a link, or there is no such scan.
         """
         parts = name.split("/")
-        valid = bool(name) and len(name) <= 1000 and len(parts) <= MAX_DEPTH and all(map(_is_name, parts))
+        valid = len(name) <= 1000 and len(parts) <= MAX_DEPTH and all(map(_is_name, parts))
         if self.only is not None:
             valid = valid and name == self.only
         if valid:
@@ -606,7 +609,10 @@ def _list_folders(root: Path) -> list[tuple[str, Path]]:
 
 
 def _is_name(part: str) -> bool:
-    return bool(part) and not part.startswith(".") and part.isprintable() and "\\" not in part and len(part) <= 200
+    """True if a folder of this name is listed: not empty, hidden or unprintable, and at most 200 characters."""
+    if not part or part.startswith("."):
+        return False
+    return part.isprintable() and "\\" not in part and len(part) <= 200
 
 
 def is_scan(path: Path) -> bool:

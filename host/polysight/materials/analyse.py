@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise, correct_tilt
 from polysight.materials.classify import PAPER, Classifier
-from polysight.materials.common_change import CommonChange, common_change
+from polysight.materials.common_change import CommonChange, estimate_common_change
 from polysight.materials.inversion import EVEN_LIGHT, MOVED, UNEVEN_LIGHT, Inversion, RigPrior, invert
 from polysight.materials.kinds import (
     Kinds,
@@ -387,7 +387,7 @@ class SceneScatter:
         evenly = images.illumination is not None and images.illumination.known
         at_border = find_patches_at_border(judged, None if plane is None else images.usable & plane.valid)
         border_flags = [*(label in at_border for label in scatter), False]
-        change = None if metal is None else common_change(scatters, metal.centre_m, border_flags)
+        change = None if metal is None else estimate_common_change(scatters, metal.centre_m, border_flags)
         halo = NO_HALO if metal is None else find_halo(reference.mask, segmentation.patches, images)
         uneven = 0.0 if metal is None else metal_unevenness(raw, reference.mask)
         behind = background_mean(raw.h, raw.v, segmentation, images.usable)

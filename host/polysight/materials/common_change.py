@@ -36,15 +36,17 @@ that drifts, as usual or by 15 % and 9 degrees."""
 DRIFT_LENGTHS_M = (0.07, 0.15)
 """Lengths over which a drift changes, along the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
 FRINGES = {0.0: 0.95, 0.05: 0.025, 0.15: 0.025}
-"""The same of fringes by a second path beside the direct path; the published rig shows 10 to 20 %."""
+"""Standard deviations of fringes in ln(V / H) by a second path beside the direct path, each part, with their prior
+probabilities; the published rig shows 10 to 20 %."""
 FRINGE_LENGTHS_M = (0.03, 0.05)
-"""Their lengths: fringes of 0.2 to 0.3 m. Shorter ones average out over a plate."""
+"""Correlation lengths of fringes whose period is 0.2 to 0.3 m. Shorter ones average out over a plate."""
 COMMON_SLOPES = {0.15: 0.5, 0.5: 0.25, 2.0: 0.25}
 """Standard deviations of the slope of ln(V / H) that all plates have by themselves, per metre, with their prior
 probabilities: H and V that see the same place (0.1 to 0.3 in scenes of the independent generator), images some
 millimetres apart (0.5), and a small aperture (1 to 3)."""
 OWN_SLOPES = (0.05, 1.0, 3.0)
-"""The same of the slope that each plate has of its own: flat plates, uneven or disturbed ones."""
+"""Standard deviations of the slope that each plate has of its own, per metre: flat plates, uneven or disturbed ones.
+All are equally probable."""
 ALIKE_BOTH_WAYS = 0.7
 """Probability that the plates' own slopes are as large along x as along y. Bent plates have them along y alone, in
 which direction H and V see different places."""
@@ -69,7 +71,7 @@ class CommonChange:
         complex [plate]: ln(V / H) at each plate relative to the origin by drift and fringes, and the standard
         deviations of its real and of its imaginary part.
     drift, drift_std
-        The same by drift alone.
+        complex [plate]: the part of them that drift makes.
     ripple
         float64 [plate]: error of each part of the plate's ln(V / H) by its own slopes.
     fringes
@@ -87,9 +89,9 @@ class CommonChange:
         """Return the largest root mean square of the drift at a plate, of its real and of its imaginary part."""
         if not self.drift.size:
             return 0.0, 0.0
-        parts = (np.hypot(part(self.drift), part(self.drift_std)) for part in (np.real, np.imag))
-        amplitude, phase = (float(part.max()) for part in parts)
-        return amplitude, phase
+        amplitude = np.hypot(self.drift.real, self.drift_std.real)
+        phase = np.hypot(self.drift.imag, self.drift_std.imag)
+        return float(amplitude.max()), float(phase.max())
 
     def log_ratio(self, plate: int) -> tuple[complex, tuple[float, float]]:
         """Return ln(V / H) of a plate relative to the origin, and the standard deviations of both of its parts."""
@@ -98,12 +100,13 @@ class CommonChange:
         return complex(self.value[plate]), (float(np.hypot(std.real, ripple)), float(np.hypot(std.imag, ripple)))
 
 
-def common_change(
+def estimate_common_change(
     plates: Sequence[Scatter], origin_m: tuple[float, float], at_border: Sequence[bool] = ()
 ) -> CommonChange:
-    """Return what the slopes of all plates of a scene tell of a change of ln(V / H) over the scan.
+    """Estimate the change of ln(V / H) over the scan from the slopes of all plates of a scene.
 
-    Plates `at_border` of the image say nothing of it.
+    It is zero at `origin_m`, (x, y) of the metal reference. Plates `at_border` of the image (one value for each plate;
+    none if empty) are left out.
     """
     border = np.array(at_border, bool) if at_border else np.zeros(len(plates), bool)
     places_m = np.array([plate.centre_m for plate in plates], np.float64).reshape(-1, 2)
@@ -119,7 +122,8 @@ def common_change(
     log_weight = parts[0].log_evidence + parts[1].log_evidence + smooth_fields.log_prior
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    real, imag = (part.average(weight) for part in parts)
+    real = parts[0].average(weight)
+    imag = parts[1].average(weight)
     return CommonChange(
         value=(real.mean + 1j * imag.mean)[0],
         std=(real.std + 1j * imag.std)[0],
@@ -180,7 +184,10 @@ class _Field:
 
     @classmethod
     def along(cls, axes: tuple[int, int], length_m: float, places_m: Real, origin_m: Real) -> _Field:
-        """Return a field that changes over `length_m` along the axes that are 1, at places [plate, 2]."""
+        """Return a field with a Gaussian covariance of length `length_m`, at places [plate, 2].
+
+        `axes` has 1 for each of x and y along which the field changes, and 0 for one along which it is constant.
+        """
         count = len(places_m)
         apart = (places_m[:, None] - places_m[None]) * np.array(axes)
         from_origin = (places_m - origin_m) * np.array(axes)
@@ -338,4 +345,5 @@ class _Explained:
 
 
 def _list_arrays(explained: _Explained) -> tuple[Real, ...]:
+    """Return the values of the fields, in the order in which the class declares them."""
     return tuple(getattr(explained, field.name) for field in fields(explained))

@@ -40,7 +40,7 @@ LABELS_PICTURE = "labels.png"
 SURFACES = (SURFACE, POINTS, "surface.png")
 PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, REPORT, "figures", *SURFACES)
 _BY_HAND = b'"by_hand": true'
-# AT_FDCWD of renameat2(2)
+# AT_FDCWD and RENAME_EXCHANGE of renameat2(2): paths start at the current folder, and the two are swapped.
 _HERE = -100
 _EXCHANGE = 2
 
@@ -140,9 +140,10 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
     new = place.with_name(f".{place.name}.new")
     old = place.with_name(f".{place.name}.old")
     if old.exists() and not place.exists():
-        # A program was killed between the two renames of _replace
+        # A program was killed between the first two renames of `_replace`.
         old.rename(place)
-    shutil.rmtree(old, ignore_errors=True)  # or after them
+    # It may also have been killed after them.
+    shutil.rmtree(old, ignore_errors=True)
     check_products_folder(out, scan_id)
     lock = _lock(out, new)
     keep = False
@@ -307,7 +308,7 @@ def _read_hand_labels(products: Path, scan_id: str) -> dict[str, bytes]:
         files = (path, products / LABELS_PICTURE)
         return {f.name: f.read_bytes() for f in files if f.exists()}
     except (OSError, DataError):
-        # Damaged: not known to belong to this scan
+        # Damaged files cannot be shown to belong to this scan.
         return {}
 
 

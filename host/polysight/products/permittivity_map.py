@@ -65,7 +65,9 @@ def map_permittivity(scan: ProcessedScan) -> PermittivityMap:
     `p_sigma` holds noise, metal reference, and what is left of the leakage.
     Without an incidence angle nothing is known.
     """
-    budget = (scan.materials and scan.materials.error_budget) or None
+    budget = None
+    if scan.materials is not None:
+        budget = scan.materials.error_budget or None
     angle_rad = _estimate_angle(nominal_incidence_rad(scan), budget)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         measured = 1 / np.where(scan.valid, scan.p, np.nan).astype(np.complex128)
@@ -101,7 +103,7 @@ def nominal_incidence_rad(scan: ProcessedScan) -> Real:
 
 
 def _estimate_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:
-    """Return the angle of incidence with the error that the scene tells, radians; the nominal one if it tells none."""
+    """Return the incidence angle that the scene tells, radians; the nominal one if the budget has no estimate."""
     if budget is None or budget.incidence is None or budget.incidence.deg is None:
         return theta_rad
     return theta_rad + (np.radians(budget.incidence.deg) - theta_rad.mean())

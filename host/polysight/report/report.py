@@ -54,7 +54,7 @@ _IMAGING_ROWS: tuple[tuple[str, str], ...] = (
     ("point_sidelobe_db", "Strongest sidelobe, x, y (dB)"),
 )
 Table = dict[str, Any]
-# Texts of the pictures for who does not see them, by file name.
+# Alternative texts of the pictures, for readers who cannot see them, by file name.
 ALTERNATIVE_TEXTS = {
     **FIGURES,
     "materials": "Material map",

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight.materials.kinds import Kinds, inverse_ratio, literature, log_half_space_brightness
+from polysight.materials.kinds import HalfSpaces, Kinds, inverse_ratio, literature
 from polysight.polarimetry import fresnel
 
 THETA = np.radians(55.0)
@@ -32,5 +32,5 @@ def test_brightness_of_a_half_space_is_that_of_eq_2():
     eps = np.array([1.5 - 0.1j, 2.3 - 0.22j, 4.0 - 0.4j, 7.3 - 0.9j, 9.0 - 17.0j])
     for theta_rad in np.radians([30.0, 55.0, 60.0]):
         r_s, _ = fresnel(eps, theta_rad)
-        brightness = log_half_space_brightness(inverse_ratio(eps, theta_rad), theta_rad)
+        brightness = HalfSpaces(inverse_ratio(eps, theta_rad), theta_rad).log_brightness()
         np.testing.assert_allclose(brightness, np.log(np.abs(r_s)), atol=1e-9)

@@ -10,9 +10,8 @@ relative to an ideal one (thickness, roughness, illumination). A plate that rise
 turns this plane about x, and both waves meet its s axis at d = w sin(theta): to first order H receives
 (1 - d) r_s - d r_p and V (1 + d) r_p + d r_s, as the image of the transmitter in a tilted mirror confirms. So a plate
 has a and b of its own, smaller and larger by d, and G is 4 sin(theta) across, up to the patterns of boards that see the
-plate from other points. r_s and r_p follow from t
-and the incidence angle by Eq. 2 and 3. Unknown are a, b, rho, c, G, the turn, the angle's error, the usual size of
-ln kappa, and t of every patch.
+plate from other points. r_s and r_p follow from t and the incidence angle by Eq. 2 and 3. Unknown are a, b, rho, c, G,
+the turn, the angle's error, the usual size of ln kappa, and t of every patch.
 
 The evidence is that of |V / H| and its phase; brightness is a nuisance of each plate, whose usual size the scene tells.
 Other evidence on the common errors is that every patch has to be some material (`Kinds`): the library's, the
@@ -36,13 +35,12 @@ import scipy
 from polysight.materials.kinds import (
     USUAL_LIBRARY_SHARE,
     DensityMaps,
+    HalfSpaces,
     Kinds,
     PatchMeasurement,
     RatioEvidence,
     brightness_density,
-    log_half_space_brightness,
     log_layer_odds,
-    move_to_angle,
     permittivity_slope,
     split_complex,
     turn_covariance,
@@ -282,11 +280,12 @@ def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kin
         evidence[1:] = WEIGHT_OF_KINDS
         z, _ = _anneal(model, z, np.ones_like(evidence), evidence, rng)
     patches = []
+    parts = model.log_likelihoods(z)
     for i in range(model.patch_count):
         # A patch is measured without the belief that it must be some material itself.
         without_patch = evidence.copy()
         without_patch[i + 1] = 0.0
-        particles, _ = _anneal(model, z, evidence, without_patch, rng)
+        particles, _ = _anneal(model, z, evidence, without_patch, rng, parts)
         patches.append(_estimate(model, particles, i, rng))
     return _solution(model, (z, log_evidence, log_bare), tuple(patches))
 
@@ -347,8 +346,8 @@ class SceneLikelihood:
             return np.zeros((0, 2, 2))
         nominal = np.zeros((1, self.width))
         step = 1e-4 * np.maximum(np.abs(self.measured), 1e-3)
-        at_measured = self._correct_ratios(self.measured, nominal)[0]
-        at_next = self._correct_ratios(self.measured + step, nominal)[0]
+        at_measured = self.ratios(nominal)[0]
+        at_next = self.ratios(nominal, step)[0]
         return turn_covariance((at_next - at_measured) / step, np.stack([s.covariance for s in measurements]))
 
     def _densities(self, kinds: Kinds) -> DensityMaps:
@@ -422,10 +421,6 @@ class SceneLikelihood:
         """Return the true angles, [..., patch]."""
         return self.theta + self.prior.theta_std_rad * z[..., ANGLE, None]
 
-    def ratios(self, z: Real) -> Complex:
-        """Return t of every patch, [..., patch]."""
-        return self._correct_ratios(self.measured, z)
-
     def reference_ratio(self, z: Real) -> Complex:
         """Return t of the reference, [..., 1]: paint delays p of metal more than s."""
         return np.exp(-1j * self.paint(z))
@@ -442,25 +437,26 @@ class SceneLikelihood:
         beyond_bare = scipy.special.ndtr(z[..., PAINT, None]) - (1 - painted)
         return MOST_PAINT_RAD * np.maximum(beyond_bare, 0.0) / painted
 
-    def _correct_ratios(self, measured: Complex, z: Real) -> Complex:
-        """Return t of measured V / H [patch], [..., patch]."""
+    def ratios(self, z: Real, change: Real | float = 0.0) -> Complex:
+        """Return t of every patch, [..., patch]; of the measured V / H plus a `change` [patch]."""
+        measured = self.measured + change
         a, b = self.leakage_of_patches(z)
         rho = self.prior.reference_std * _complex(z, REFERENCE)
         return true_ratio(measured * np.exp(-self.lighting(z)) * self.reference_ratio(z), a, b, rho)
-
-    def ratios_of_kinds(self, z: Real, kinds: Kinds) -> Complex:
-        """Return t that each patch would have at the angle of the kinds, [..., patch]."""
-        return move_to_angle(self.ratios(z), self.angle(z), kinds.theta_rad)
 
     def permittivities(self, z: Real) -> Complex:
         """Return the permittivity of every patch, [..., patch]."""
         return np.asarray(permittivity_from_ratio(self.ratios(z), self.angle(z)), np.complex128)
 
-    def brightness_off(self, z: Real, t: Complex) -> Real:
-        """Return ln |H| of every patch minus that of Eq. 2 and the metal's, [..., patch], given `ratios` of z."""
+    def half_spaces(self, z: Real) -> HalfSpaces:
+        """Return the patches' half spaces, [..., patch]."""
+        return HalfSpaces(self.ratios(z), self.angle(z))
+
+    def brightness_off(self, z: Real, half_spaces: HalfSpaces) -> Real:
+        """Return ln |H| of every patch minus that of Eq. 2 and the metal's, [..., patch], given `half_spaces` of z."""
         a, _ = self.leakage_of_patches(z)
         with np.errstate(divide="ignore", invalid="ignore"):
-            model = log_half_space_brightness(t, self.angle(z)) + np.log(np.abs((1 + a * t) / (1 + a)))
+            model = half_spaces.log_brightness() + np.log(np.abs((1 + a * half_spaces.t) / (1 + a)))
         difference = self.log_level - model - METAL_BRIGHTNESS_STD * z[..., METAL_BRIGHTNESS, None]
         difference = difference + self.log_reference_brightness(z)
         return np.where(np.isfinite(difference), np.clip(difference, -10, 10), 10.0)
@@ -479,22 +475,22 @@ class SceneLikelihood:
 
     def log_likelihoods(self, z: Real) -> Real:
         """Return log likelihoods [..., 1 + patch]: of all brightnesses, and of each patch to be some material."""
-        return self._log_likelihoods(z, self.ratios(z))
+        return self._log_likelihoods(z, self.half_spaces(z))
 
-    def _log_likelihoods(self, z: Real, t: Complex) -> Real:
-        """Return the same, given the ratios of these particles."""
-        density = brightness_density(self.brightness_off(z, t), self.brightness_std(z)[..., None])
+    def _log_likelihoods(self, z: Real, half_spaces: HalfSpaces) -> Real:
+        """Return the same, given the half spaces of these particles."""
+        density = brightness_density(self.brightness_off(z, half_spaces), self.brightness_std(z)[..., None])
         brightness_log = np.where(self.bright, np.log(density + 1e-300), 0.0).sum(axis=-1, keepdims=True)
         if self.kinds is None:
             no_evidence = np.zeros((*brightness_log.shape[:-1], self.patch_count))
             return np.concatenate([brightness_log, no_evidence], axis=-1)
         if self.densities is None:
             return brightness_log
-        ratios_of_kinds = move_to_angle(t, self.angle(z), self.kinds.theta_rad)
-        of_library, of_half_spaces, of_layers = self.densities.log_densities(ratios_of_kinds)
-        of_others = np.logaddexp(of_half_spaces, of_layers + self.log_layer_odds)
+        ratios_of_kinds = half_spaces.move_to_angle(self.kinds.theta_rad)
+        of_library, of_half_spaces, of_layers = np.exp(self.densities.log_densities(ratios_of_kinds))
+        of_others = of_half_spaces + of_layers * np.exp(self.log_layer_odds)
         library_share = self.library_share(z)[..., None]
-        of_some_kind = np.logaddexp(np.log(library_share) + of_library, np.log1p(-library_share) + of_others)
+        of_some_kind = np.log(library_share * of_library + (1 - library_share) * of_others)
         return np.concatenate([brightness_log, of_some_kind], axis=-1)
 
 
@@ -519,13 +515,15 @@ def _complex(z: Real, columns: tuple[int, int]) -> Complex:
     return z[..., columns[0], None] + 1j * z[..., columns[1], None]
 
 
-def _anneal(model: SceneLikelihood, z: Real, before: Real, after: Real, rng: np.random.Generator) -> tuple[Real, float]:
+def _anneal(
+    model: SceneLikelihood, z: Real, before: Real, after: Real, rng: np.random.Generator, parts: Real | None = None
+) -> tuple[Real, float]:
     """Move particles of one posterior to another.
 
-    `before`, `after` [1 + patch] weigh the log likelihoods. Return them with the logarithm of the ratio of both
-    evidences.
+    `before`, `after` [1 + patch] weigh the log likelihoods (`parts`, if they are known). Return the particles with the
+    logarithm of the ratio of both evidences.
     """
-    parts = model.log_likelihoods(z)
+    parts = model.log_likelihoods(z) if parts is None else parts
     change = after - before
     temperature = 0.0
     log_evidence = 0.0
@@ -600,7 +598,7 @@ def _solution(
         prior_std=prior.leakage_std,
         theta_error_rad=float(prior.theta_std_rad * z[:, ANGLE].mean()),
         theta_std_rad=float(prior.theta_std_rad * np.std(z[:, ANGLE])),
-        brightness_off=np.where(model.bright, np.median(model.brightness_off(z, model.ratios(z)), axis=0), np.nan),
+        brightness_off=np.where(model.bright, np.median(model.brightness_off(z, model.half_spaces(z)), axis=0), np.nan),
         brightness_std=float(np.exp(np.log(model.brightness_std(z)).mean())),
         nuisance_covariance=covariance,
         moved=float(model.has_moved(z).mean()),
@@ -662,12 +660,13 @@ def _shares_of_sources(model: SceneLikelihood, z: Real, i: int, value: complex) 
 
 def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
     """Return what the scene says of a patch's ratio at the angle of the kinds."""
-    t = model.ratios_of_kinds(z, kinds)[:, i]
+    half_spaces = model.half_spaces(z)
+    t = half_spaces.move_to_angle(kinds.theta_rad)[:, i]
     covariance = np.cov(split_complex(t).T) + model.own[i]
     library_share = USUAL_LIBRARY_SHARE
     if kinds.in_library.any():
         library_share = float(model.library_share(z).mean())
-    off = float(np.median(model.brightness_off(z, model.ratios(z))[:, i])) if model.bright[i] else np.nan
+    off = float(np.median(model.brightness_off(z, half_spaces)[:, i])) if model.bright[i] else np.nan
     return RatioEvidence(
         theta_rad=kinds.theta_rad,
         inverse_ratio=complex(t.mean()),

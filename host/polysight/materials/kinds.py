@@ -181,13 +181,36 @@ def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Comp
     return np.asarray(1 / ratio_from_permittivity(permittivity, theta_rad), np.complex128)
 
 
-def log_half_space_brightness(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Real:
-    """Return ln |r_s| of the half space of t = 1 / P (Eq. 2 with :func:`move_to_angle`'s root); NaN for metal."""
-    t = np.asarray(t, np.complex128)
-    cosine = np.cos(theta_rad)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        root = (1 + t) / (1 - t) * np.sin(theta_rad) ** 2 / cosine
-        return np.asarray(np.log(np.abs((cosine - root) / (cosine + root))), np.float64)
+class HalfSpaces:
+    """Half spaces of t = 1 / P at angles of incidence `theta_rad`, which broadcast.
+
+    With u = (1 + t) / (1 - t) Eq. 3 is q = sqrt(eps - sin^2) = u sin^2 / cos.
+    """
+
+    def __init__(self, t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> None:
+        self.t = np.asarray(t, np.complex128)
+        self._cosine = np.cos(theta_rad)
+        self._sine2 = 1 - np.square(self._cosine)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self._q = (1 + self.t) / (1 - self.t) * (self._sine2 / self._cosine)
+
+    def log_brightness(self) -> Real:
+        """Return ln |r_s| by Eq. 2, r_s = (cos - q) / (cos + q); NaN for metal."""
+        loss2 = np.square(self._q.imag)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            difference2 = np.square(self._cosine - self._q.real) + loss2
+            sum2 = np.square(self._cosine + self._q.real) + loss2
+            return np.asarray(0.5 * np.log(difference2 / sum2), np.float64)
+
+    def move_to_angle(self, other_rad: float) -> Complex:
+        """Return t of the same half spaces at another angle."""
+        other2 = np.sin(other_rad) ** 2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            root = np.sqrt(np.square(self._q) + (self._sine2 - other2))
+            along_q = root.real * self._q.real + root.imag * self._q.imag
+            root = root * np.copysign(np.cos(other_rad) / other2, along_q)
+            moved = (root - 1) / (root + 1)
+        return np.where(np.isfinite(moved), moved, self.t)
 
 
 def brightness_density(difference: Real | float, size: Real | float) -> Real:
@@ -203,24 +226,9 @@ def permittivity_slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
     return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * (1 + t) / (1 - t) ** 3
 
 
-def move_to_angle(t: Complex, theta_rad: npt.ArrayLike, other_rad: float) -> Complex:
-    """Return t of the same half space at another angle.
-
-    With u = (1 + t) / (1 - t) Eq. 3 is sqrt(eps - sin^2) = u sin^2 / cos.
-    """
-    sine2 = np.sin(theta_rad) ** 2
-    other2 = np.sin(other_rad) ** 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        q = (1 + t) / (1 - t) * sine2 / np.cos(theta_rad)
-        root = np.sqrt(q**2 + sine2 - other2)
-        root = np.where((root * np.conj(q)).real < 0, -root, root) * np.cos(other_rad) / other2
-        moved = (root - 1) / (root + 1)
-    return np.where(np.isfinite(moved), moved, t)
-
-
 def move_to_angle_of_kinds(evidence: RatioEvidence, kinds: Kinds) -> RatioEvidence:
     """Return what a scan says of a patch's ratio at the angle of the kinds."""
-    t = move_to_angle(np.array(evidence.inverse_ratio), evidence.theta_rad, kinds.theta_rad)
+    t = HalfSpaces(evidence.inverse_ratio, evidence.theta_rad).move_to_angle(kinds.theta_rad)
     return replace(evidence, theta_rad=kinds.theta_rad, inverse_ratio=complex(t))
 
 
@@ -291,12 +299,18 @@ class Kinds:
         rows = np.searchsorted(imag, self.t.imag + np.array([-1, 1])[:, None] * reach[:, 1])
         inverse = np.linalg.inv(summed)
         scale = self.share * np.sqrt(np.linalg.det(inverse)) / (2 * np.pi)
+        x = real - self.t.real[:, None]
+        y = imag - self.t.imag[:, None]
+        along_x = np.log(scale)[:, None] - 0.5 * inverse[:, 0, :1] * x**2
+        along_y = -0.5 * inverse[:, 1, 1:] * y**2
+        x *= -inverse[:, 0, 1:]
         for k in np.flatnonzero((columns[1] > columns[0]) & (rows[1] > rows[0])):
-            window = slice(rows[0, k], rows[1, k]), slice(columns[0, k], columns[1, k])
-            x = real[window[1]] - self.t[k].real
-            y = (imag[window[0]] - self.t[k].imag)[:, None]
-            distance2 = inverse[k, 0, 0] * x**2 + 2 * inverse[k, 0, 1] * x * y + inverse[k, 1, 1] * y**2
-            density[0 if self.in_library[k] else 1][window] += scale[k] * np.exp(-0.5 * distance2)
+            of_rows = slice(rows[0, k], rows[1, k])
+            of_columns = slice(columns[0, k], columns[1, k])
+            exponent = y[k, of_rows, None] * x[k, of_columns]
+            exponent += along_x[k, of_columns]
+            exponent += along_y[k, of_rows, None]
+            density[0 if self.in_library[k] else 1, of_rows, of_columns] += np.exp(exponent, out=exponent)
         density[1:] *= 1 - STACK_SHARE
         density[2] += STACK_SHARE / np.pi
         return DensityMap(low, high, np.log(density + 1e-12))
@@ -314,7 +328,9 @@ class Kinds:
         eps_loss = np.where(np.isfinite(parts[..., 1]), -parts[..., 1], 0.0)
         real = np.clip(eps_real, *REAL_RANGE)
         loss = np.clip(eps_loss, *LOSS_RANGE)
-        at_border = inverse_ratio(real - 1j * loss, self.theta_rad)
+        at_border = t.copy()
+        is_outside = (real != parts[..., 0]) | (loss != -parts[..., 1])
+        at_border[is_outside] = inverse_ratio(real[is_outside] - 1j * loss[is_outside], self.theta_rad)
         # At the border and not at t: near t = 1, which is metal, the slope has no bound.
         slope = np.abs(permittivity_slope(at_border, self.theta_rad))
         width = np.log(REAL_RANGE[1] / REAL_RANGE[0]) * np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS)
@@ -432,7 +448,7 @@ def draw_sheets(theta_rad: float) -> tuple[Complex, Real]:
     r_s, r_p = multilayer([eps, holder], [thickness_m, np.inf], SHEET_HZ, theta_rad)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = r_p / r_s
-        brightness_off = np.log(np.abs(r_s)) - log_half_space_brightness(t, theta_rad)
+        brightness_off = np.log(np.abs(r_s)) - HalfSpaces(t, theta_rad).log_brightness()
     sheets = np.where(np.isfinite(t), t, 1e3).astype(np.complex128)
     return sheets, np.where(np.isfinite(brightness_off), brightness_off, 0.0)
 

@@ -24,7 +24,7 @@ import scipy
 
 from polysight.imaging import Image, Images, Mask
 from polysight.materials.inversion import WIDTH, Inversion, RigPrior, SceneLikelihood, invert, sample_posterior
-from polysight.materials.kinds import METAL_SHARE, METAL_SPREAD, Kinds, PatchMeasurement, inverse_ratio
+from polysight.materials.kinds import METAL_SHARE, METAL_SPREAD, HalfSpaces, Kinds, PatchMeasurement, inverse_ratio
 from polysight.materials.measure import median_ratio
 from polysight.materials.segment import Box, Patch, Segmentation, box_mask
 from polysight.materials.specimens import METAL_UNLIKE
@@ -176,12 +176,12 @@ class _DielectricReference(SceneLikelihood):
         root = np.sqrt(self.reference_permittivity(z) - (1 - cosine**2))
         return np.log(np.abs((cosine - root) / (cosine + root)))
 
-    def _log_likelihoods(self, z: Real, t: Complex) -> Real:
+    def _log_likelihoods(self, z: Real, half_spaces: HalfSpaces) -> Real:
         """Return log likelihoods [..., 1 + patch] of the measured ratios, which are t over that of the reference."""
-        parts = super()._log_likelihoods(z, t)
+        parts = super()._log_likelihoods(z, half_spaces)
         reference = self.reference_ratio(z)
         size = np.abs(reference)
-        measured = t / reference
+        measured = half_spaces.t / reference
         # The density of a measured ratio is |t0|^2 that of t. Two plates may be of the same material, as metal is
         # beside metal.
         variance = METAL_SPREAD**2 + self.own_variance

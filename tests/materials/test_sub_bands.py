@@ -5,14 +5,15 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_fields
 from tests.support.rigs import published_rig
 
 from polysight.imaging import Images
 from polysight.imaging.images import SubBand
-from polysight.materials.layers import Bands, Layer, fit_layer
-from polysight.materials.sub_bands import band_rows, bands_of_row
+from polysight.materials.layers import Bands, Layer, Spectrum, fit_layer, predict
+from polysight.materials.sub_bands import BAND_AMPLITUDE_STD, band_rows, bands_of_row
 from polysight.polarimetry import fresnel, ratio_from_permittivity
-from polysight.results import PatchFigures, to_plain
+from polysight.results import ComplexNumber, PatchFigures, to_plain
 
 THETA = np.radians(55.0)
 BAND = SubBand((0, 96), 76.3e9, 78.0e9)
@@ -87,6 +88,46 @@ def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, analys
     part = cut.analyse(metal=label, segmentation=analysis.segmentation, pair=cut.pair.within(valid))
     for row_before, row_after in zip(full_result.rows(), part.rows(), strict=True):
         assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
+
+
+def test_brightness_that_a_sub_band_changes_over_a_plate_is_an_error_of_that_band(scene, analysis):
+    """Echoes of the surroundings that change both channels alike leave V / H and its error as they are."""
+    everywhere = np.ones(scene.h.shape, bool)
+    ripple = 1 + 0.05 * np.sin(2 * np.pi * scene.x_m / 0.025)
+    images = channels(scene, everywhere)
+    rippled = replace(images, h=(images.h * ripple).astype(np.complex64), v=(images.v * ripple).astype(np.complex64))
+    rows = band_rows(analysis, [BAND, BAND], [images, rippled], (0, 0), 1.5)
+    for patch in analysis.patches:
+        even, uneven = rows[patch.patch.label]
+        assert BAND_AMPLITUDE_STD <= even.own_amplitude_std < uneven.own_amplitude_std / 2
+        assert 0.01 < uneven.own_amplitude_std < 0.05
+        assert uneven.own_std == pytest.approx(even.own_std, rel=0.2)
+
+
+def test_a_told_error_of_brightness_keeps_the_loss_of_a_sheet_within_its_error():
+    sheet = Layer("sheet", 3.0 - 0.1j, 1.2e-3)
+    told_std = 0.01
+    rng = np.random.default_rng(1)
+    ratio, brightness = predict([sheet], Spectrum.from_chirp(CHIRP, 4), THETA)
+    row = make_row(1 / ratio[0], 4)
+    covariance = INVERSE_STD**2 * np.eye(8)
+    errors = []
+    for _ in range(40):
+        measured_h = brightness * (1 + told_std * rng.standard_normal(4))
+        parts = [
+            replace_fields(
+                part,
+                ratio=ComplexNumber.from_complex(1 / ratio[k]),
+                covariance=covariance[2 * k : 2 * k + 2].tolist(),
+                amplitude_h=measured_h[k],
+                own_amplitude_std=told_std,
+            )
+            for k, part in enumerate(row.bands)
+        ]
+        bands = bands_of_row(replace_fields(row, bands=parts), CHIRP, 4)
+        fit = fit_layer(bands, [replace(sheet, permittivity=None)], THETA)
+        errors.append((-fit.permittivity.imag - 0.1) / fit.std_loss)
+    assert np.mean(np.abs(errors) < 1.96) >= 0.85
 
 
 def make_row(ratio, parts):

@@ -302,6 +302,8 @@ class BandFigures(msgspec.Struct, frozen=True, kw_only=True):
         Median of P and of abs(H), relative to metal.
     inverse_ratio_std, own_std
         Standard error of 1 / P, and its part not shared with other sub-bands.
+    own_amplitude_std
+        Relative standard error of abs(H), the part not shared with other sub-bands.
     covariance
         [2][2 K]: this 1 / P (real, imaginary) with those of all K sub-bands; None if one has no ratio.
     """
@@ -312,6 +314,7 @@ class BandFigures(msgspec.Struct, frozen=True, kw_only=True):
     inverse_ratio_std: float | None = None
     own_std: float | None = None
     amplitude_h: float | None = None
+    own_amplitude_std: float | None = None
     covariance: list[list[float]] | None = None
 
 

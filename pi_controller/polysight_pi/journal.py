@@ -32,7 +32,7 @@ import msgspec
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError, ProtocolError
-from polysight_shared.faults import PiFault
+from polysight_shared.faults import PiFault, explain
 from polysight_shared.raster import RasterPlan
 
 MAGIC = b"PSJRNL1\n"
@@ -361,7 +361,8 @@ class Journal:
         """Number events, write them to the file, then publish them; long texts are cut to the limit of the messages.
 
         Raises JournalFullError if they cannot be written; of them only faults and the end of a row are then published.
-        Until the scan is opened again, events have the last good number and are not stored.
+        Until the scan is opened again, events have the last good number and are not stored, and a row that is done ends
+        with a fault: what is not journalled is not acknowledged.
         """
         file = None if self.broken else self._file
         seq = self.last_seq
@@ -373,13 +374,15 @@ class Journal:
                 key: value[: m.MAX_TEXT] if isinstance(value, str) else value for key, value in event.fields.items()
             }
             numbered.append(event.kind(scan_id=self.scan_id, seq=seq, t_mono_ns=event.t_mono_ns, **fields))
+        if self.broken:
+            numbered = [_end_with_fault(event) for event in numbered]
         packed = [m.pack(event) for event in numbered]
         if file is not None:
             try:
                 file.write(packed, sync=any(event.kind is not m.Capture for event in events))
             except JournalFullError:
                 self.broken = True
-                urgent = [event for event in numbered if isinstance(event, m.RowFinished | m.Fault)]
+                urgent = [_end_with_fault(event) for event in numbered if isinstance(event, m.RowFinished | m.Fault)]
                 self._publish([m.pack(msgspec.structs.replace(event, seq=self.last_seq)) for event in urgent])
                 raise
         self._publish(packed)
@@ -410,6 +413,14 @@ class Journal:
         finally:
             self._file = None
             os.close(self._lock)
+
+
+def _end_with_fault(event: m.AnyEvent) -> m.AnyEvent:
+    """Return the end of a row that is done as one with a fault, because it is not journalled; others as they are."""
+    if not isinstance(event, m.RowFinished) or event.status != "done":
+        return event
+    explanation = explain(PiFault.JOURNAL_FULL)
+    return msgspec.structs.replace(event, status="fault", fault=PiFault.JOURNAL_FULL, reason=explanation.problem)
 
 
 def _read_plan(file: JournalFile) -> RasterPlan | None:

@@ -98,6 +98,21 @@ def test_a_reply_that_waits_when_the_program_goes_on_is_no_lost_one(scripted_car
     assert [code for code, _ in sent_to.seen] == [Code.ALIVE]
 
 
+def test_a_flood_of_replies_of_another_code_ends_a_command_with_an_error(scripted_card, monkeypatch):
+    """The socket is never empty; the clock stands at the end of the time."""
+    client, _ = scripted_card(lambda code, _: [])
+    datagrams = itertools.repeat((reply(Code.VERSION), (client.board.card_address, 1024)))
+    flood = SimpleNamespace(
+        recvfrom=lambda _: next(datagrams), sendto=lambda *_: None, close=client.close, fileno=client.fileno
+    )
+    monkeypatch.setattr(client, "_socket", flood)
+    monkeypatch.setattr(card.select, "select", lambda readable, *_: (readable, [], []))
+    monkeypatch.setattr(card, "time", SimpleNamespace(monotonic=itertools.count(0.0, 1e3).__next__))
+    with refused(ErrorCode.NO_ANSWER, "ALIVE"):
+        client.alive()
+    assert client.take_status() == Status(0)
+
+
 def test_record_start_is_never_sent_twice_without_a_stop(scripted_card):
     client, card = scripted_card(lambda code, _: [reply(code)], unanswered=[(Code.RECORD_START, 1)])
     client.record_start()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import pytest
@@ -21,7 +22,9 @@ from polysight_pi.journal import (
     SPARE_BYTES,
     Journal,
     JournalFile,
+    JournalFullError,
     JournalThread,
+    NewEvent,
 )
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
@@ -238,6 +241,37 @@ def test_no_scan_begins_without_space_for_its_journal(tmp_path, monkeypatch):
 
 def full(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+ROW_DONE: dict[str, Any] = {
+    "row_index": 0,
+    "take": 1,
+    "status": "done",
+    "points": 3,
+    "edges": 3,
+    "bursts": 3,
+    "pulses": 6,
+}
+
+
+def test_a_row_that_is_not_journalled_is_not_done(tmp_path, monkeypatch):
+    """Neither the row whose end finds the disk full, nor one that ends before the full disk has stopped the run."""
+    published = []
+    folder = Journal(tmp_path, published.extend)
+    folder.open("scan", RasterPlan(2, 2, 1.0, 1.0), 0)
+    end = NewEvent.now(m.RowFinished, **ROW_DONE)
+    published.clear()
+    monkeypatch.setattr(journal_module.os, "pwrite", full)
+    with pytest.raises(JournalFullError):
+        folder.write([end])
+    folder.write([end])
+    ends = [unpack_event(packed) for packed in published]
+    assert [(e.status, e.fault) for e in ends] == [("fault", PiFault.JOURNAL_FULL)] * 2
+    monkeypatch.undo()
+    folder.broken = False
+    folder.write([end])
+    assert unpack_event(published[-1]).status == "done"
+    folder.close()
 
 
 def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):

@@ -41,6 +41,8 @@ from polysight_shared.findings import Finding
 ATTEMPTS = 3
 # How long a second answer to one request is awaited: a second card answers as soon as the first.
 _TWIN_S = 0.05
+# Datagrams that may wait in the command socket when the time is over: Linux's usual 212,992 bytes hold 280 short ones.
+SOCKET_DATAGRAMS = 1000
 # How long the card's report of a failed write is awaited after its reply.
 EEPROM_REPORT_S = 0.5
 # Command and data port, as the EEPROM holds them.
@@ -180,7 +182,7 @@ class CardClient:
 
     def take_status(self) -> Status:
         """Return the status bits that the card reported since the last record start, without waiting."""
-        while self._receive(0.0) is not None:
+        for _ in self._replies(0.0):
             pass
         return self._status
 
@@ -215,7 +217,7 @@ class CardClient:
 
     def _try(self, code: Code, data: bytes, limit_s: float) -> Reply | None:
         """Send once and wait for the reply to this code."""
-        while self._receive(0.0) is not None:
+        for _ in self._replies(0.0):
             # Late replies to an earlier attempt are ignored.
             pass
         try:
@@ -225,20 +227,25 @@ class CardClient:
                 raise no_route(self.board, f"no way to {self._name()} from {self.board.host_address}") from None
             problem = f"sending to {self._name()} failed: {e.strerror}"
             raise silent_card(self.board, problem) from e
-        deadline = time.monotonic() + limit_s
-        # The replies that are there are read even if the time is over: this program may have been held meanwhile.
-        while (reply := self._receive(max(0.0, deadline - time.monotonic()))) is not None:
-            if reply.code == code:
-                return reply
-        return None
+        return next((reply for reply in self._replies(limit_s) if reply.code == code), None)
 
     def _receive(self, limit_s: float) -> Reply | None:
-        """Return the next reply, None after the timeout; collect status bits and count foreign datagrams."""
+        """Return the next reply, None after the timeout."""
+        return next(self._replies(limit_s), None)
+
+    def _replies(self, limit_s: float) -> Iterator[Reply]:
+        """Yield replies until the timeout; collect status bits and count foreign datagrams.
+
+        Datagrams that are there are read even if the time is over, because this program may have been held meanwhile:
+        as many as a socket holds, for a flood of them has no end.
+        """
         deadline = time.monotonic() + limit_s
-        while True:
-            remaining_s = max(0.0, deadline - time.monotonic())
-            if not select.select([self._socket], [], [], remaining_s)[0]:
-                return None
+        late = 0
+        while late < SOCKET_DATAGRAMS:
+            remaining_s = deadline - time.monotonic()
+            late += remaining_s <= 0
+            if not select.select([self._socket], [], [], max(0.0, remaining_s))[0]:
+                return
             try:
                 raw, (address, _) = self._socket.recvfrom(2048)
             except (BlockingIOError, ConnectionError):
@@ -251,9 +258,10 @@ class CardClient:
             except ProtocolError:
                 self.strangers += 1
                 continue
-            if reply.code != Code.STATUS:
-                return reply
-            self._status |= Status(reply.status & 0x0FFF)
+            if reply.code == Code.STATUS:
+                self._status |= Status(reply.status & 0x0FFF)
+            else:
+                yield reply
 
     def _name(self) -> str:
         return f"capture card of {self.board.name} at {self.board.card_address}:{self.board.command_port}"

@@ -100,7 +100,7 @@ def test_a_reply_that_waits_when_the_program_goes_on_is_no_lost_one(scripted_car
 
 def test_a_flood_of_replies_of_another_code_ends_a_command_with_an_error(scripted_card, monkeypatch):
     """The socket is never empty; the clock stands at the end of the time."""
-    client, _ = scripted_card(lambda code, _: [])
+    client, _ = scripted_card(lambda *_: [])
     datagrams = itertools.repeat((reply(Code.VERSION), (client.board.card_address, 1024)))
     flood = SimpleNamespace(
         recvfrom=lambda _: next(datagrams), sendto=lambda *_: None, close=client.close, fileno=client.fileno

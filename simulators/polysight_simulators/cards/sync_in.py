@@ -105,14 +105,18 @@ class StageTrack:
         self._triggers: list[int] = []
         self._centre_mm = (rig.stage.centre_x_mm, rig.stage.centre_y_mm)
         self._lines: list[WireMotion] = []
+        self._line_times: list[int] = []
 
     def add(self, motion: WireMotion) -> None:
         """Add one motion line; a time before the last line's means that the stage's clock restarted."""
         if self._lines and motion.t_ns < self._lines[-1].t_ns:
             self._lines.clear()
+            self._line_times.clear()
         self._lines.append(motion)
+        self._line_times.append(motion.t_ns)
         if len(self._lines) > 2 * _KEEP:
             del self._lines[:_KEEP]
+            del self._line_times[:_KEEP]
 
     def trigger(self, t_ns: int) -> None:
         """Record a trigger of the stage."""
@@ -174,7 +178,7 @@ class StageTrack:
             t = pulse_ns
             if self._middle_ns is not None and (trigger_count := bisect_right(self._triggers, t)):
                 t = self._triggers[trigger_count - 1] + self._middle_ns
-            line = self._lines[max(0, bisect_right(self._lines, t, key=lambda m: m.t_ns) - 1)]
+            line = self._lines[max(0, bisect_right(self._line_times, t) - 1)]
             moved_um = line.vx_um_s * max(0, t - line.t_ns) * 1e-9
             x[i] = (line.x_um + moved_um) * 1e-3 - self._centre_mm[0]
             y[i] = line.y_um * 1e-3 - self._centre_mm[1]

@@ -91,12 +91,23 @@ def _transform_intervals(
     return envelope.astype(np.complex128) * np.exp(1j * np.outer(shift, k))
 
 
+# Products of matrices of at most this size (rows x terms x columns) stay in one thread with OpenBLAS: threads are slow
+# beside other processes.
+_PRODUCT_SIZE = 1 << 18
+
+
 def _sum_outer_products(
     y: NDArray[np.complexfloating], weight: NDArray[np.complexfloating], x: NDArray[np.complexfloating]
 ) -> NDArray[np.complex64]:
-    """Return the weighted sum of outer products over items, [kappa_y, kappa_x]; without BLAS threads."""
-    scaled = (y * weight[:, None]).astype(np.complex64)
-    return np.einsum("py,px->yx", scaled, x.astype(np.complex64))
+    """Return the weighted sum of outer products over items, [kappa_y, kappa_x]."""
+    scaled = np.ascontiguousarray((y * weight[:, None]).T, np.complex64)
+    columns = x.astype(np.complex64)
+    summed = np.empty((y.shape[1], x.shape[1]), np.complex64)
+    height = max(1, _PRODUCT_SIZE // max(1, x.size))
+    for first in range(0, len(summed), height):
+        rows = slice(first, first + height)
+        np.matmul(scaled[rows], columns, out=summed[rows])
+    return summed
 
 
 @dataclass(frozen=True)
@@ -230,27 +241,29 @@ class _Plane:
         turn = wave * level.steepness[m] * np.array([slopes(p) for p in plates])
         weights = series[level.plates] * optics.plate_scale(ant, self.scene, f)
         weights = weights * np.reshape(level.lift_phase(level.lift_m, wave, m), (-1, 1))
-        is_smooth = np.array([self.surfaces[i].height_m.size == 1 for i in level.plates])
-        x = _transform_intervals(self.x, ant.centre_m[0] + table[:, 0], table[:, 2], turn[:, 0])
-        y = _transform_intervals(self.y, ant.centre_m[1] + table[:, 1], table[:, 3], turn[:, 1])
+        strips = [
+            self._transform_plate(self.surfaces[i], table[n, :2], turn[n], wave * level.steepness[m])
+            for n, i in enumerate(level.plates)
+        ]
+        y = np.concatenate([of_plate for of_plate, _ in strips])
+        x = np.concatenate([of_plate for _, of_plate in strips])
+        strips_of_plate = [len(of_plate) for of_plate, _ in strips]
         orders = weights.shape[1]
         if len(plates) < orders:
             shares, kernel_series = np.eye(len(plates), dtype=np.complex128), weights
         else:
             shares, kernel_series = weights.T, np.eye(orders, dtype=np.complex128)
-        maps = [_sum_outer_products(y[is_smooth], share[is_smooth], x[is_smooth]) for share in shares]
-        for n in np.flatnonzero(~is_smooth):
-            plate_map = self._transform_rough_plate(
-                self.surfaces[level.plates[n]], table[n, :2], turn[n], wave * level.steepness[m]
-            )
-            for share, target_map in zip(shares, maps, strict=True):
-                target_map += np.complex64(share[n]) * plate_map
+        maps = [_sum_outer_products(y, np.repeat(share, strips_of_plate), x) for share in shares]
         return list(zip(maps, kernel_series, strict=True))
 
-    def _transform_rough_plate(
+    def _transform_plate(
         self, parts: Facets, centre_m: optics.Real, turn: optics.Real, per_metre: float
-    ) -> NDArray[np.complex64]:
-        """Return the spectrum of a plate of facets: `turn` is the phase of its tilt in rad/m, `per_metre` of height."""
+    ) -> tuple[optics.Complex, NDArray[np.complex64]]:
+        """Return the spectra of the rows of facets of a plate along y and x, [row, kappa_y] and [row, kappa_x].
+
+        The plate's spectrum is the sum of their outer products. `turn` is the phase of its tilt in rad/m, `per_metre`
+        that of height.
+        """
         x = _transform_intervals(
             self.x, self.ant.centre_m[0] + centre_m[0] + parts.x_m, np.full(parts.x_m.shape, parts.size_m[0]), turn[0]
         )
@@ -258,8 +271,7 @@ class _Plane:
             self.y, self.ant.centre_m[1] + centre_m[1] + parts.y_m, np.full(parts.y_m.shape, parts.size_m[1]), turn[1]
         )
         phase = per_metre * parts.height_m + turn[0] * parts.x_m + turn[1] * parts.y_m[:, None]
-        rows = np.einsum("rc,cx->rx", np.exp(1j * phase).astype(np.complex64), x.astype(np.complex64))
-        return np.einsum("ry,rx->yx", y.astype(np.complex64), rows)
+        return y, np.einsum("rc,cx->rx", np.exp(1j * phase).astype(np.complex64), x.astype(np.complex64))
 
     def point_map(self, level: _Level, f: float, m: int) -> NDArray[np.complex64] | None:
         """Return the spectrum of a level's points, with the phases of C_m."""

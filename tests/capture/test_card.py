@@ -17,7 +17,7 @@ from tests.support.refusals import refused
 from polysight.capture import card, dca1000
 from polysight.capture.card import CardClient, EepromSettings, program_eeprom, survey_cards
 from polysight.capture.dca1000 import Code, Status
-from polysight.capture.network import card_mac
+from polysight.capture.network import neighbour_mac
 from polysight_shared.config import Card
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.cards import Network
@@ -302,7 +302,7 @@ def test_mac_addresses_of_cards_are_read_from_the_kernel(tmp_path):
     table.parent.mkdir(parents=True)
     line = "192.168.33.180   0x1         {}         12:34:56:78:90:12     *        eth0"
     table.write_text("IP address HW type Flags HW address Mask Device\n" + line.format("0x2"))
-    assert card_mac("192.168.33.180", tmp_path) == "12:34:56:78:90:12"
-    assert card_mac("192.168.33.181", tmp_path) == ""
+    assert neighbour_mac("192.168.33.180", tmp_path) == "12:34:56:78:90:12"
+    assert neighbour_mac("192.168.33.181", tmp_path) is None
     table.write_text("IP address HW type Flags HW address Mask Device\n" + line.format("0x0"))
-    assert card_mac("192.168.33.180", tmp_path) == ""
+    assert neighbour_mac("192.168.33.180", tmp_path) == ""

@@ -15,7 +15,7 @@ from tests.support.paths import REPO
 from polysight.capture.dca1000 import Status
 from polysight.capture.network import (
     Hop,
-    neighbour_answers,
+    neighbour_mac,
     route_interface,
     silent_card,
     silent_hop,
@@ -77,7 +77,7 @@ def test_every_hop_reads_differently(tmp_path, given, hop, says):
 def test_unknown_hops_are_not_guessed(tmp_path):
     assert silent_hop(CARD, tmp_path) is Hop.UNKNOWN
     assert route_interface(CARD, tmp_path) is None
-    assert neighbour_answers(CARD, tmp_path) is None
+    assert neighbour_mac(CARD, tmp_path) is None
     assert silent_hop("127.0.0.5", kernel(tmp_path, routes="")) is Hop.UNKNOWN
 
 

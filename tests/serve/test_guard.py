@@ -22,7 +22,7 @@ from tests.support.processes import HANG_S
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 
-from polysight.serve import guard, server
+from polysight.serve import Place, guard, server
 from polysight.serve.front import ConnectionLimit
 from polysight.serve.guard import TOKEN_HEADER, Access
 from polysight_shared.error_codes import ErrorCode
@@ -347,16 +347,12 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
     subject = ["-subj", "/CN=127.0.0.1", "-addext", "subjectAltName=IP:127.0.0.1"]
     command = [program, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", *files, *subject]
     subprocess.run([str(w) for w in command], check=True, capture_output=True)
-    from tests.support.page.live_view import served_place
-
-    from polysight.serve import Place
-
     # Twice the same, and so neither belongs to the other
     for wrong in ("key.pem", "certificate.pem"):
         with refused(ErrorCode.FILE_FOREIGN, tmp_path / wrong):
             Place("127.0.0.1", 0, (), tmp_path / wrong, tmp_path / wrong).check()
     place = Place("127.0.0.1", 0, (), tmp_path / "certificate.pem", tmp_path / "key.pem")
-    with served_place(scans, place, Access(TOKEN, control=True, secure=True)) as view:
+    with served_folder(scans, access=Access(TOKEN, control=True, secure=True), place=place) as view:
         trusted = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))
         with urlopen(f"https://127.0.0.1:{view.port}/api/scans", timeout=HANG_S, context=trusted) as reply:
             assert json.load(reply)["scans"]

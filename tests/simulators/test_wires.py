@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
@@ -19,15 +20,8 @@ Join = Callable[..., WireClient]
 @pytest.fixture
 def join() -> Iterator[Join]:
     """Joins the wires; leaves them after the test."""
-    clients: list[WireClient] = []
-
-    def connect(path: Path, listen: tuple[int, ...] = (), motion: bool = False) -> WireClient:
-        clients.append(WireClient(path, listen, motion))
-        return clients[-1]
-
-    yield connect
-    for client in clients:
-        client.close()
+    with ExitStack() as joined:
+        yield lambda *arguments, **options: joined.enter_context(closing(WireClient(*arguments, **options)))
 
 
 @pytest.fixture

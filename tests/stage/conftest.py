@@ -67,15 +67,12 @@ def uno_programs() -> tuple[Path, Path]:
 @pytest.fixture
 def make_uno(uno_programs: tuple[Path, Path]) -> Iterator[Callable[..., EmulatedUno]]:
     """Makes emulated boards; takes the further arguments of EmulatedUno, and another image."""
-    unos: list[EmulatedUno] = []
+    with ExitStack() as unos:
 
-    def make(image: Path = uno_programs[1], **arguments: object) -> EmulatedUno:
-        unos.append(EmulatedUno(uno_programs[0], image, **arguments))
-        return unos[-1]
+        def make(image: Path = uno_programs[1], **arguments: object) -> EmulatedUno:
+            return unos.enter_context(closing(EmulatedUno(uno_programs[0], image, **arguments)))
 
-    yield make
-    for uno in unos:
-        uno.close()
+        yield make
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
@@ -44,15 +44,8 @@ def speed(kind: str) -> float:
 @pytest.fixture
 def start(kind: str, tmp_path: Path) -> Iterator[Start]:
     """Starts the process at a time scale."""
-    started: list[StageProcess] = []
-
-    def start(time_scale: float = 1.0) -> StageProcess:
-        started.append(StageProcess(tmp_path, kind, time_scale))
-        return started[-1]
-
-    yield start
-    for process in started:
-        process.close()
+    with ExitStack() as started:
+        yield lambda time_scale=1.0: started.enter_context(closing(StageProcess(tmp_path, kind, time_scale)))
 
 
 def test_rows_over_the_port(start: Start, speed: float):

@@ -24,8 +24,8 @@ from polysight.capture.dca1000 import Code, Reply, Status, Version
 from polysight.capture.network import (
     Hop,
     bind_udp,
-    card_mac,
     check_receive_buffer,
+    neighbour_mac,
     no_route,
     route_interface,
     silent_card,
@@ -93,7 +93,7 @@ class CardClient:
 
         Raises DeviceError if there are two, or no answer. A second card sends whole rows that look like this one's.
         """
-        macs = {card_mac(self.board.card_address)}
+        macs = {neighbour_mac(self.board.card_address)}
         versions: list[Version] = []
         requests = 0
         while not versions:
@@ -109,8 +109,8 @@ class CardClient:
             reply = self._receive(remaining_s)
             if reply is not None and reply.code == Code.VERSION:
                 versions.append(dca1000.decode_version(reply.status))
-        macs.add(card_mac(self.board.card_address))
-        macs.discard("")
+        macs.add(neighbour_mac(self.board.card_address))
+        macs = set(filter(None, macs))
         if len(versions) > requests or len(macs) > 1:
             asked = "one request" if requests == 1 else f"{requests} requests"
             answers = f"{len(versions)} answers to {asked} (FPGA {', '.join(map(str, versions))})"

@@ -239,19 +239,6 @@ def measure_clock_difference() -> int:
     return difference_ns
 
 
-def card_mac(address: str, root: Path = _ROOT) -> str:
-    """Return the MAC address that the kernel has for a card's address; "" if it has none."""
-    try:
-        lines = (root / "proc/net/arp").read_text(encoding="ascii").splitlines()[1:]
-    except OSError:
-        return ""
-    for line in lines:
-        fields = line.split()
-        if fields[0] == address and int(fields[2], 16) & _ARP_COMPLETE:
-            return fields[3]
-    return ""
-
-
 def usable_packets(buffer_bytes: int) -> int:
     """Return the number of full packets that a receive buffer holds."""
     return 2 * buffer_bytes // KERNEL_BYTES_A_PACKET
@@ -321,10 +308,10 @@ def silent_hop(card_address: str, root: Path = _ROOT) -> Hop:
         return Hop.ROUTE
     if interface is not None and has_link(interface, root) is False:
         return Hop.LINK
-    neighbour = neighbour_answers(card_address, root)
-    if neighbour is None:
+    mac = neighbour_mac(card_address, root)
+    if mac is None:
         return Hop.UNKNOWN
-    if neighbour:
+    if mac:
         return Hop.CARD
     return Hop.NEIGHBOUR
 
@@ -373,16 +360,19 @@ def has_link(interface: str, root: Path = _ROOT) -> bool | None:
         return None
 
 
-def neighbour_answers(address: str, root: Path = _ROOT) -> bool | None:
-    """True if a device answered for this address on the local network; None if the kernel does not know."""
+def neighbour_mac(address: str, root: Path = _ROOT) -> str | None:
+    """Return the MAC address that the kernel has for an address on the local network.
+
+    "" if no device answered there; None if the kernel does not know.
+    """
     try:
         lines = (root / "proc/net/arp").read_text(encoding="ascii").splitlines()[1:]
     except OSError:
         return None
     for line in lines:
         words = line.split()
-        if len(words) >= 3 and words[0] == address:
-            return bool(int(words[2], 16) & _ARP_COMPLETE)
+        if len(words) >= 4 and words[0] == address:
+            return words[3] if int(words[2], 16) & _ARP_COMPLETE else ""
     return None
 
 

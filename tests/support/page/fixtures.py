@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -51,16 +52,14 @@ class Watched(Watch):
 @pytest.fixture
 def watching() -> Iterator[Callable[..., Watched]]:
     """Makes watches, as `Watch`, that run until the test ends."""
-    watched: list[Watched] = []
+    with ExitStack() as watched:
 
-    def watch(*arguments: Any, **options: Any) -> Watched:
-        watched.append(Watched(*arguments, **options))
-        watched[-1].start()
-        return watched[-1]
+        def watch(*arguments: Any, **options: Any) -> Watched:
+            new_watch = watched.enter_context(closing(Watched(*arguments, **options)))
+            new_watch.start()
+            return new_watch
 
-    yield watch
-    for watched_scan in watched:
-        watched_scan.close()
+        yield watch
 
 
 @pytest.fixture(scope="session")

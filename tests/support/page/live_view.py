@@ -126,23 +126,16 @@ def served(watch: Watch, token: str = "", host: str = "127.0.0.1", port: int = 0
 
 @contextmanager
 def served_folder(
-    root: Path, token: str = "", access: Access | None = None, config: Path | None = None
+    root: Path,
+    token: str = "",
+    access: Access | None = None,
+    config: Path | None = None,
+    place: Place | None = None,
 ) -> Iterator[Served]:
     """A server of all scans under a folder for the block; with a rig file it starts programs."""
     access = access or Access(token, control=bool(token))
     programs = Programs() if config is not None else None
-    server = Served(Site(Scans(root), Watches(access.control), programs, config), access)
-    try:
-        yield server
-    finally:
-        server.close()
-        server.site.close()
-
-
-@contextmanager
-def served_place(root: Path, place: Place, access: Access) -> Iterator[Served]:
-    """The same at a place with a certificate."""
-    server = Served(Site(Scans(root), Watches(access.control)), access, place=place)
+    server = Served(Site(Scans(root), Watches(access.control), programs, config), access, place=place)
     try:
         yield server
     finally:

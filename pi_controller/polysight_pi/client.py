@@ -127,8 +127,11 @@ def take_over(instrument: Instrument, action: str) -> str:
         if action == "end":
             scan_id = ask(m.Status()).scan_id
             return ask(m.EndRun(scan_id=scan_id, exit_status="abort", reason=reason, owner=owner)).state
-        command = {"abort": m.Abort(reason=reason, owner=owner), "hold": m.Hold(owner=owner)}
-        return ask(command.get(action, m.Resume(owner=owner))).state
+        if action == "abort":
+            return ask(m.Abort(reason=reason, owner=owner)).state
+        if action == "hold":
+            return ask(m.Hold(owner=owner)).state
+        return ask(m.Resume(owner=owner)).state
 
 
 def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:
@@ -159,5 +162,5 @@ def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterat
             if not reply.events:
                 return
             yield from map(msgspec.to_builtins, reply.events)
-            # A lost journal leaves a gap in the numbers
+            # A lost journal leaves a gap in the numbers.
             from_seq = reply.events[-1].seq + 1

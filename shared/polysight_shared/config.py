@@ -1,6 +1,7 @@
 """Declaration of the rig file `instrument.toml`: every setting of the instrument with its type, limits and rules.
 
 `load_instrument` reads it. An unknown key, a wrong type or a broken rule is refused with file, key, value and rule.
+The comments of `instrument.toml` at the top of the repository explain each key.
 """
 
 from __future__ import annotations
@@ -17,16 +18,17 @@ from polysight_shared.tables import Count, NonNegative, Positive, Section, decod
 Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 GpioLine = Annotated[int, msgspec.Meta(ge=0, le=63)]
 Vector = tuple[float, float, float]
+# Corners of the two high-pass filters that an AWR2243 has (docs/spec/mmwavelink.md).
 HPF_FIRST_KHZ = (175.0, 235.0, 350.0, 700.0)
 HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
+# The kernel debounces by ticks of 4 ms: this much later it has read the level.
 DEBOUNCE_TICKS_US = 5_000
 # 2000 x 2000: imaging holds some 200 bytes a pixel, and an image of 9999 x 9999 took all memory of a PC.
 MAX_PIXELS = 4_000_000
 # The wavelength is 4 mm; the spectral imager's memory grows as one over the size.
 MIN_PIXEL_MM = 0.05
 MAX_PIXEL_MM = 100.0
-# What a scene may hold to both sides. The range gate's matrices grow as the square of an image's size: one of 400 m
-# took all memory of a PC.
+# The range gate's matrices grow as the square of an image's size: one of 400 m took all memory of a PC.
 MAX_IMAGE_MM = 4_000.0
 PixelSize = Annotated[float, msgspec.Meta(ge=MIN_PIXEL_MM, le=MAX_PIXEL_MM)]
 # Silence after which a card sends a packet that is not full (docs/spec/dca1000.md, observed).
@@ -34,7 +36,7 @@ CARD_TAIL_S = 2.0
 # GPIO lines of a Pi's header.
 _MOSI = {"/dev/spidev0": 10, "/dev/spidev1": 20}
 _MISO = {"/dev/spidev0": 9, "/dev/spidev1": 19}
-# A bit at 2 MHz and at 500 kHz.
+# Shortest and longest pulse by SPI, which is one bit: at 2 MHz and at 500 kHz.
 SPI_WIDTH_US = (0.5, 2.0)
 
 
@@ -459,9 +461,18 @@ def load_instrument(path: Path) -> Instrument:
     """
     rig = decode(read_toml(path), Instrument, str(path))
     folder = path.parent.resolve()
-    files = {kind: name and str(folder / name) for kind, name in to_builtins(rig.calibration).items()}
-    pi = msgspec.structs.replace(rig.pi, key_dir=str(folder / rig.pi.key_dir))
-    paths = ("firmware", "calibration_dir", "trace_dir")
-    places = {key: (name := getattr(rig.radar, key)) and str(folder / name) for key in paths}
-    radar = msgspec.structs.replace(rig.radar, **places)
-    return msgspec.structs.replace(rig, pi=pi, radar=radar, calibration=CalibrationFiles(**files))
+
+    def resolve(name: str) -> str:
+        if not name:
+            return ""
+        return str(folder / name)
+
+    calibration = CalibrationFiles(**{kind: resolve(name) for kind, name in to_builtins(rig.calibration).items()})
+    pi = msgspec.structs.replace(rig.pi, key_dir=resolve(rig.pi.key_dir))
+    radar = msgspec.structs.replace(
+        rig.radar,
+        firmware=resolve(rig.radar.firmware),
+        calibration_dir=resolve(rig.radar.calibration_dir),
+        trace_dir=resolve(rig.radar.trace_dir),
+    )
+    return msgspec.structs.replace(rig, pi=pi, radar=radar, calibration=calibration)

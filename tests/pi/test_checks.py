@@ -55,8 +55,10 @@ def on_chip(write_config, stage, tmp_path):
 
 
 def test_a_whole_rig_is_all_ok(on_chip, rig_with):
-    findings = on_chip(rig_with(one_shot=True), "slow:4")  # behind a one-shot, any width is good enough
-    rights = ["real time"]  # as this machine has it
+    # Behind a one-shot, any width is good enough.
+    findings = on_chip(rig_with(one_shot=True), "slow:4")
+    # Real time depends on this machine.
+    rights = ["real time"]
     lines = ["GPIO chip", "trigger line 26", "SYNC_IN line 22", "pulses", "pulse width"]
     rest = ["stage", "journal", "keys", "command address", "event address"]
     assert list(findings) == ["plan", *rights, *lines, *rest]
@@ -70,7 +72,8 @@ def test_a_whole_rig_is_all_ok(on_chip, rig_with):
         ({}, "busy:26", "trigger line 26", "another-program"),
         ({}, "busy:22", "SYNC_IN line 22", "another-program"),
         ({}, "no-edges", "trigger line 26", "reports no edges"),
-        ({}, "slow:4", "pulse width", "105"),  # each change of an output takes 4 us
+        # Each change of an output takes 4 us.
+        ({}, "slow:4", "pulse width", "105"),
         ({"trigger_in": 60}, "slow:0", "trigger line 60", "no such line"),
         ({"gpio_chip": "pinctrl-none"}, "slow:0", "GPIO chip", "'pinctrl-none'"),
     ],
@@ -94,7 +97,7 @@ def test_line_release(rig_with, tmp_path):
     assert levels_with(pi_4, wiring="spi", sync_out=(10,)) == [], (
         "the kernel ends a transfer, and its last bits are low"
     )
-    # An older kernel
+    # An older kernel has no such parameter.
     assert levels_with(pi_4) == ["warning"]
     parameters = tmp_path / "pinctrl_bcm2835" / "parameters"
     parameters.mkdir(parents=True)

@@ -38,7 +38,7 @@ PLACE_WEIGHTS = np.linalg.solve(np.vander(PLACES, increasing=True).T, [1, 0, -1j
 # phase turns over half of the paths: Chebyshev series of exp(i z x) converge from the degree z on. With 23 alone, a
 # cylinder of 173 mm along x had errors of 15 % and 0.2 rad.
 MORE_DEGREES = 24
-# So few positions are computed one by one.
+# Up to this many positions, coefficients are computed for each one instead of looked up in a table.
 FEW = 40
 
 
@@ -76,7 +76,7 @@ def _dot(a: NDArray, b: NDArray) -> NDArray:
 
 
 def needed_orders(x: float) -> NDArray:
-    """Orders 0, 1, .. that a body of size parameter x needs."""
+    """Return the orders 0, 1, .. that a body of size parameter x needs."""
     return np.arange(int(np.ceil(x + 4.05 * x ** (1 / 3) + MORE_TERMS)) + 1)
 
 
@@ -171,10 +171,9 @@ class _RadialWaves:
 
     def __init__(self, rho: NDArray) -> None:
         self._rho = rho
+        # h_{-1} = exp(i rho) / rho and h_0 = -i exp(i rho) / rho.
         self._last: NDArray = np.exp(1j * rho) / rho
         self._now: NDArray = -1j * self._last
-        # h_{-1} = cos + i sin over rho; h_0 = -i exp(i rho) / rho.
-        self._order = 0
 
     def step(self, n: int) -> tuple[NDArray, NDArray]:
         """Return h_n and (rho h_n)' / rho. To be called for n = 1, 2, .. in turn."""
@@ -189,9 +188,6 @@ class _Legendre:
         self._c = c
         ones = np.ones_like(c)
         zero = np.zeros_like(c)
-        self._values = ones, ones
-        self._firsts = zero, zero
-        self._seconds = zero, zero
         self._last = (zero, zero, zero)
         self._now = (ones, zero, zero)
 
@@ -317,7 +313,7 @@ def _tabulate(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Chebyshev series of `EndlessCylinder.coefficients` over the path in the cross-section, [degree + 1, orders].
 
-    `place`: beside the stationary axial wave number, see `_axial_wave_number`.
+    `place` is the distance from the stationary axial wave number, see `_axial_wave_number`.
     """
     low, high = path_range_m
     ends, _ = _axial_wave_number(k, along_m, np.array(path_range_m), place)
@@ -333,7 +329,7 @@ def _tabulate(
 
 
 def _axial_wave_number(k: float, along_m: NDArray | float, path_m: NDArray, place: float) -> tuple[NDArray, NDArray]:
-    """Axial wave number at `place` beside the stationary one, and the unit of places."""
+    """Return the axial wave number that lies `place` units from the stationary one, and that unit, rad / m."""
     distance_m = np.hypot(along_m, path_m)
     unit = np.sqrt(k * path_m**2 / distance_m**3)
     return k * along_m / distance_m + unit * place, unit
@@ -385,7 +381,10 @@ def sum_orders(
     """Integrand at axial wave numbers h [n] over exp(i h x + i sqrt(k^2 - h^2) path_m): sum over azimuthal orders."""
     eta = np.sqrt(k**2 - h**2)
     m_m = coefficients[0]
-    ends = [_AzimuthalWaves(*end, eta, h, k) for end in _ends(pair)]
+    ends = (
+        _AzimuthalWaves(pair.rx_m, pair.received, 1, eta, h, k),
+        _AzimuthalWaves(pair.tx_m, pair.sent, -1, eta, h, k),
+    )
     turn = np.exp(1j * (ends[0].angle - ends[1].angle))
     # Both ends' waves are scaled by exp(-i eta rho).
     scale = np.exp(1j * eta * (ends[0].rho + ends[1].rho - path_m)) / eta**2
@@ -406,10 +405,6 @@ def sum_orders(
         total += np.sum(wave * powers + wave_back * powers.conj(), axis=0)
         power = powers[-1] * turn
     return total * scale
-
-
-def _ends(pair: Pair) -> tuple[tuple[NDArray, NDArray, int], tuple[NDArray, NDArray, int]]:
-    return (pair.rx_m, pair.received, 1), (pair.tx_m, pair.sent, -1)
 
 
 class _AzimuthalWaves:

@@ -65,6 +65,8 @@ class Column:
         Heading in tables for people ("": not shown there), and digits after the decimal point.
     optional
         True if datasets omit the figure when no patch has a value.
+    position
+        Place in the order of the declarations, set by itself.
     """
 
     name: str
@@ -513,7 +515,10 @@ class IncidenceError(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlaneError(msgspec.Struct, frozen=True, kw_only=True):
-    """Plane of the plates relative to the plane of the rig file; without values if `known` is False."""
+    """Plane of the plates relative to the plane of the rig file; without values if `known` is False.
+
+    It was found `by` the "phase" or the "range" of so many `plates`.
+    """
 
     known: bool = False
     offset_mm: float | UnsetType = UNSET

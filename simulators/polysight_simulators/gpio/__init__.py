@@ -15,13 +15,14 @@ from polysight_simulators.builds import compile_once
 
 ENABLING_COMMAND = "sudo apt-get install gcc libc6-dev"
 VANISH = signal.SIGUSR1
+"""Signal to the program that makes the chip vanish, as if its driver were unloaded."""
 _SOURCES = sorted(p for p in Path(__file__).parent.iterdir() if p.suffix in (".c", ".h"))
 _CC = ("gcc", "-shared", "-fPIC", "-O2", "-Wall", "-Wextra", "-Werror")
 _LIBRARIES = ("-ldl", "-lpthread")
 
 
 def missing() -> list[str]:
-    """Return the missing Debian packages that compiling it needs."""
+    """Return the Debian packages that the stand-in chip is compiled with and that are missing."""
     lacking = {"gcc": shutil.which("gcc") is None, "libc6-dev": not Path("/usr/include/linux/gpio.h").is_file()}
     return [package for package, lacks in lacking.items() if lacks]
 

@@ -127,6 +127,29 @@ def test_what_was_written_a_moment_ago_is_read_again_after_a_restart(root):
     assert Scans(root, index=index).summary("done").notes == "dog"
 
 
+def test_a_list_whose_time_is_over_goes_on_with_the_next(root):
+    """What was changed last comes first, and nothing that was read is lost; an index is written of whole lists only."""
+    whole = Scans(root).list()
+    newest = max((s.name.partition("/")[0] for s in whole), key=lambda name: (root / name).stat().st_mtime)
+    index = root.parent / "index.json"
+    scans = Scans(root, index=index)
+    lists = [scans.list(within_s=0.0)]
+    assert {s.name.partition("/")[0] for s in lists[0]} <= {newest}
+    while scans.unread:
+        assert not index.exists()
+        unread_before = scans.unread
+        lists.append(scans.list(within_s=0.0))
+        assert scans.unread < unread_before
+        assert {s.name for s in lists[-2]} <= {s.name for s in lists[-1]}
+    assert len(lists) > 2
+    assert lists[-1] == whole
+    assert index.exists()
+    in_parts = Scans(root)
+    in_parts.read_in_parts()
+    assert in_parts.unread == 0
+    assert in_parts.list() == whole
+
+
 @pytest.mark.parametrize("kept", [0, 1, 0.5, 0.999])
 def test_a_damaged_or_foreign_index_changes_no_list(root, kept):
     index = root / ".polysight" / "list.json"

@@ -6,6 +6,7 @@ with the times and sizes of the files that it was made from, also over a restart
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import threading
@@ -31,6 +32,8 @@ from polysight_shared.findings import Finding
 
 READ_S = 3.0
 """Time limit for reading one folder of the list; it is then listed as `silent` until the read returns."""
+PART_S = 0.1
+"""Length of the parts in which a list is read before it is asked for, and of the pauses between them."""
 PROGRAM = "program"
 """Folder of a scan in which programs that a page started keep their process number and log."""
 # The deepest level of folders that scans are searched in, and the number of scans at which the search ends.
@@ -430,19 +433,28 @@ class Scans:
         self._listed: dict[str, list[Summary]] = {}
         self._reading: set[str] = set()
         self._lock = threading.Lock()
+        self.unread = 0
+        """Entries of the root that the last list lacks, because its time was over."""
 
-    def list(self) -> Sequence[Summary]:
+    def list(self, within_s: float = math.inf) -> Sequence[Summary]:
         """Return every scan, the newest first; what has changed since the last call is read again.
 
         A folder that takes longer than `READ_S` is listed as `silent`. Its thread cannot be ended: the folder is read
-        again when that has returned.
+        again when that has returned. After `within_s` the list is what was read so far; the next call goes on with what
+        was changed last.
         """
         with self._lock:
             if self.only is not None:
                 entries = [self.only]
             else:
                 entries = [name for name, _ in _list_folders(self.root)]
-            self._read_all(deque(entry for entry in entries if entry not in self._reading))
+            newest_first = sorted(
+                (entry for entry in entries if entry not in self._reading),
+                key=lambda entry: (entry in self._listed, -_read_modified_s(self.root / entry)),
+            )
+            self._read_all(deque(newest_first), time.monotonic() + within_s)
+            unread = {entry for entry in entries if entry not in self._listed and entry not in self._reading}
+            self.unread = len(unread)
             scans: list[Summary] = []
             for entry in entries:
                 listed = self._listed.get(entry, [])
@@ -450,9 +462,21 @@ class Scans:
                     listed = [replace(s, state="silent") for s in listed] or [Summary(entry, "silent")]
                 scans += listed
             names = {s.name for s in scans}
-            self._summaries = {name: stored for name, stored in list(self._summaries.items()) if name in names}
-            self._keep_index()
+            self._summaries = {
+                name: stored
+                for name, stored in list(self._summaries.items())
+                if name in names or name.partition("/")[0] in unread
+            }
+            if not unread:
+                self._keep_index()
         return sorted(scans, key=lambda s: (-s.seconds, s.name))
+
+    def read_in_parts(self) -> None:
+        """Read the whole list once, in parts between which other threads get what was read so far."""
+        self.list(PART_S)
+        while self.unread:
+            time.sleep(PART_S)
+            self.list(PART_S)
 
     def _keep_index(self) -> None:
         """Write the index if the list has changed since it was written, not too often."""
@@ -463,17 +487,20 @@ class Scans:
         self._indexed = dict(self._summaries)
         self._indexed_at = time.monotonic()
 
-    def _read_all(self, waiting: deque[str]) -> None:
-        """Read entries of the root in a thread; when it makes no progress for `READ_S`, another thread goes on."""
+    def _read_all(self, waiting: deque[str], until_s: float) -> None:
+        """Read entries of the root in a thread; when it makes no progress for `READ_S`, another thread goes on.
+
+        Behind `until_s` (monotonic clock) no further entry is read.
+        """
         while waiting:
-            worker = threading.Thread(target=self._read_entries, args=(waiting,), name="list", daemon=True)
+            worker = threading.Thread(target=self._read_entries, args=(waiting, until_s), name="list", daemon=True)
             worker.start()
             count_before = -1
             while worker.is_alive() and count_before != len(waiting):
                 count_before = len(waiting)
                 worker.join(READ_S)
 
-    def _read_entries(self, waiting: deque[str]) -> None:
+    def _read_entries(self, waiting: deque[str], until_s: float) -> None:
         # Two threads may read: the other one may take the last entry.
         with suppress(IndexError):
             while True:
@@ -483,6 +510,8 @@ class Scans:
                     self._listed[entry] = [self._summarise(name) for name in self._find_names_below(entry)]
                 finally:
                     self._reading.discard(entry)
+                if time.monotonic() >= until_s:
+                    waiting.clear()
 
     def _find_names_below(self, entry: str) -> Iterator[str]:
         """Return the names of the scans at or below an entry of the root folder."""

@@ -290,7 +290,7 @@ def run_reader(shown: Shown, path: Path) -> None:
         index = shown.root / HIDDEN / LIST_INDEX
     site = Site(Scans(shown.root, shown.only, index), watches, programs, shown.config)
     # The list is cached before the page asks for it.
-    threading.Thread(target=site.scans.list, name="first list", daemon=True).start()
+    threading.Thread(target=site.scans.read_in_parts, name="first list", daemon=True).start()
     path.unlink(missing_ok=True)
     server = EndingServer(_configure(make_reader_app(site), uds=str(path)))
     site.is_ending = lambda: server.should_exit

@@ -1,7 +1,7 @@
 // The list of scans: what there is, how it stands; search, order, and what several scans are chosen for.
 import { address, badge, begin, by, bytes, called, complain, day, get, make, nest, pageOf, post, rich, STATES, VERDICTS } from "./common.js";
 
-const LOOK_MS = 4000;
+const LOOK_MS = 4000, REST_MS = 100; // between two looks at the list, and before the rest of one that was too long
 const FIRST_CARDS = 40, MORE_CARDS = 400; // the first ones of a long list are seen before the rest is made
 const ORDER = { good: 0, care: 1, "": 2, none: 3, damaged: 4 };
 const cards = new Map(), chosen = new Set();
@@ -80,6 +80,7 @@ function show() {
   if (nodes.length !== now.length || nodes.some((node, i) => node !== now[i])) by("list").replaceChildren(...nodes);
   const all = told.scans.length;
   by("count").textContent = `${found.length === all ? "" : `${found.length} of `}${all} scan${all === 1 ? "" : "s"}`
+    + (told.unread ? ` · reading ${told.unread} more` : "")
     + (told.left_out?.length ? ` · not shown (links, odd names): ${told.left_out.slice(0, 3).join(", ")}${told.left_out.length > 3 ? ", …" : ""}` : "")
     + (told.free_bytes ? ` · ${bytes(told.free_bytes)} free` : "");
   if (!all) by("told").textContent = server.starts ? "No scans yet: start one with New scan." : "No scans yet.";
@@ -100,6 +101,7 @@ async function look(answer = get("scans", { since: told.stamp })) {
       options("tag", [...new Set(now.scans.flatMap((s) => s.tags))].sort());
     }
     show();
+    if (told.unread) setTimeout(look, REST_MS);
   } catch (error) { complain("told", error); }
 }
 

@@ -115,15 +115,47 @@ class Response:
         return _dot(self.gradient, edge_u), _dot(self.gradient, edge_v)
 
 
-def respond(tx: Antenna, rx: Antenna, points: NDArray, normals: NDArray) -> Response:
-    """Response of facets at `points` [3, ...] with unit `normals` [3, ...] or [3] towards the antennas."""
-    out = points - _make_column(tx.position, points)
-    back = _make_column(rx.position, points) - points
-    out_m = np.sqrt(_dot(out, out))
-    back_m = np.sqrt(_dot(back, back))
-    incident = out / out_m
-    scattered = back / back_m
-    normals = _make_column(normals, points)
+@dataclass(frozen=True)
+class Waves:
+    """Waves between the antennas and points, whatever lies there: unit directions and fields [3, ...], distances [...].
+
+    `received_magnetic` is the receive antenna's magnetic field times the impedance of free space.
+    """
+
+    out_m: NDArray
+    back_m: NDArray
+    incident: NDArray
+    scattered: NDArray
+    field: NDArray
+    received: NDArray
+    received_magnetic: NDArray
+
+    @staticmethod
+    def between(tx: Antenna, rx: Antenna, points: NDArray) -> Waves:
+        """Return the waves from `tx` by way of `points` [3, ...] to `rx`."""
+        out = points - _make_column(tx.position, points)
+        back = _make_column(rx.position, points) - points
+        out_m = np.sqrt(_dot(out, out))
+        back_m = np.sqrt(_dot(back, back))
+        incident = out / out_m
+        scattered = back / back_m
+        received = rx.field(-scattered)
+        return Waves(
+            out_m=out_m,
+            back_m=back_m,
+            incident=incident,
+            scattered=scattered,
+            field=tx.field(incident),
+            received=received,
+            received_magnetic=_cross(scattered, received),
+        )
+
+
+def respond(waves: Waves, normals: NDArray) -> Response:
+    """Response of facets with unit `normals` [3, ...] or [3] towards the antennas."""
+    incident = waves.incident
+    scattered = waves.scattered
+    normals = _make_column(normals, incident)
     cos_incidence = -_dot(incident, normals)
     lit = (cos_incidence > 0) & (_dot(scattered, normals) > 0)
 
@@ -139,22 +171,18 @@ def respond(tx: Antenna, rx: Antenna, points: NDArray, normals: NDArray) -> Resp
     p_axis_in = _cross(s_axis, incident)
     p_axis_out = _cross(reflected, s_axis)
 
-    field = tx.field(incident)
-    s_part = _dot(field, s_axis)
-    p_part = _dot(field, p_axis_in)
-    received = rx.field(-scattered)
-    # The receive antenna's magnetic field times the impedance of free space.
-    received_magnetic = _cross(scattered, received)
+    s_part = _dot(waves.field, s_axis)
+    p_part = _dot(waves.field, p_axis_in)
     n_cross_s = _cross(normals, s_axis)
     n_cross_p = _cross(normals, p_axis_out)
     # Reflected wave of unit s: E = s, eta H = p_out; of unit p: E = p_out, eta H = -s.
-    from_s = _dot(received, n_cross_p) - _dot(received_magnetic, n_cross_s)
-    from_p = -_dot(received, n_cross_s) - _dot(received_magnetic, n_cross_p)
-    spread = np.where(lit, -1 / (out_m * back_m), 0)
+    from_s = _dot(waves.received, n_cross_p) - _dot(waves.received_magnetic, n_cross_s)
+    from_p = -_dot(waves.received, n_cross_s) - _dot(waves.received_magnetic, n_cross_p)
+    spread = np.where(lit, -1 / (waves.out_m * waves.back_m), 0)
     return Response(
-        path_m=out_m + back_m,
+        path_m=waves.out_m + waves.back_m,
         gradient=incident - scattered,
-        curvature_z=(1 - incident[2] ** 2) / out_m + (1 - scattered[2] ** 2) / back_m,
+        curvature_z=(1 - incident[2] ** 2) / waves.out_m + (1 - scattered[2] ** 2) / waves.back_m,
         s_weight=spread * s_part * from_s,
         p_weight=spread * p_part * from_p,
         cos_incidence=cos_incidence,
@@ -217,7 +245,7 @@ def scatter(
     for first in range(0, len(offsets), positions_at_once):
         chunk = slice(first, first + positions_at_once)
         points = facets.centres[:, None] - offsets[chunk].T[:, :, None]
-        response = respond(tx, rx, points, np.broadcast_to(normals, points.shape))
+        response = respond(Waves.between(tx, rx, points), np.broadcast_to(normals, points.shape))
         for i, frequency_hz in enumerate(frequencies_hz):
             k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
             r_s, r_p = tables[i].look_up(response.cos_incidence)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable
-from polysight_worlds.optics import Antenna, integrate_steps, respond, scatter
+from polysight_worlds.optics import Antenna, Waves, integrate_steps, respond, scatter
 from polysight_worlds.rig import Rig
 from polysight_worlds.world import Plate, World
 
@@ -102,12 +102,12 @@ class PlateEchoes:
         self._brightness = plate.brightness
         rows, columns = surface.cover.shape
         self._shape = fast_length(rig.rows + rows - 1), fast_length(rig.columns + columns - 1)
-        points = self._list_points(plate)
+        waves = Waves.between(rig.tx, rx, self._list_points(plate))
         slopes = surface.mean_slopes
         variations = [slopes]
         if surface.local_slopes is not None:
             variations += [(slopes[0] + SLOPE_STEP, slopes[1]), (slopes[0], slopes[1] + SLOPE_STEP)]
-        self._responses = [respond(rig.tx, rx, points, _compute_normal(varied)) for varied in variations]
+        self._responses = [respond(waves, _compute_normal(varied)) for varied in variations]
         # A medium without layers reflects equally at all frequencies: one table is enough.
         table_frequencies_hz = rig.frequencies_hz if plate.stack.layers else rig.frequencies_hz[:1]
         self._tables = [ReflectionTable(plate.stack, f) for f in table_frequencies_hz]
@@ -191,7 +191,9 @@ def fast_length(length: int) -> int:
 
 def fft2(values: NDArray, shape: tuple[int, int] | None = None) -> NDArray:
     """Return the two-dimensional spectrum, padded to `shape`, in the precision of `values`."""
-    return np.asarray(fft.fft2(values, shape))
+    rows, columns = shape or values.shape[-2:]
+    # The columns of the padding are zero, also of the spectrum along y.
+    return np.asarray(fft.fft(fft.fft(values, rows, axis=-2), columns, axis=-1))
 
 
 def ifft2(spectrum: NDArray) -> NDArray:

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from polysight_worlds.bends import find_bend_terms
 from polysight_worlds.media import LIGHT_M_PER_S
-from polysight_worlds.optics import CHUNK, Antenna, integrate_steps, rectangle, respond, turn_back
+from polysight_worlds.optics import CHUNK, Antenna, Waves, integrate_steps, rectangle, respond, turn_back
 from polysight_worlds.rig import Boards
 from polysight_worlds.series import Pair, scatter_cylinder, scatter_sphere
 from polysight_worlds.shapes import Revolved, Shape, Sphere, find_specular, follow_path
@@ -282,7 +282,7 @@ def _sum_facets(
     for first in range(0, len(offsets), at_once):
         chunk = slice(first, first + at_once)
         points = facets.centres[:, None] - offsets[chunk].T[:, :, None]
-        response = respond(tx, rx, points, normal)
+        response = respond(Waves.between(tx, rx, points), normal)
         rest_m = response.path_m - middle_path_m[chunk, None]
         steps_m = response.path_steps(facets.edge_u[:, :1, None], facets.edge_v[:, :1, None])
         reflected = reflect_facets(tables, response)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight_worlds.media import LIGHT_M_PER_S, Stack, reflect
-from polysight_worlds.optics import CHUNK, Antenna, Response, respond, turn_back
+from polysight_worlds.optics import CHUNK, Antenna, Response, Waves, respond, turn_back
 from polysight_worlds.shapes import Patch, PathAt, Shape, follow_path
 
 # Window exp(-x) (1 + x + .. + x^4 / 24), x = (distance / WIDTH)^2 / 2, in units of the Fresnel zone, sqrt(1 / (k second
@@ -97,7 +97,7 @@ def sum_window(
         b = b0[:, None] + zones[0, 1, :, None] * xi + zones[1, 1, :, None] * eta
         patch = shape.evaluate(a, b)
         moved = patch.point - u.T[:, :, None]
-        response = respond(tx, rx, moved, patch.normal)
+        response = respond(Waves.between(tx, rx, moved), patch.normal)
         area = patch.area * zone_area[:, None] * weights * shape.cover(a, b) * _fade_shadow(patch.normal, response)
         rest_m = response.path_m - path.length_m[:, None]
         reflected = reflect_facets(tables, response)

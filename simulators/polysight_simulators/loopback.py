@@ -17,6 +17,7 @@ from polysight_simulators.cards import SOURCE_PORT, bound_udp
 
 # Subnets that are tried: other programs may hold ports of some.
 _TRIES = 50
+# Ports and last byte of the address of the simulated Pi, and port of the native connection of a simulated radar.
 _COMMAND_PORT = 5601
 _EVENT_PORT = 5602
 _PI_HOST_PART = "10"
@@ -56,7 +57,7 @@ def is_free(rig: Instrument) -> bool:
                 stack.enter_context(bound_udp(address, port))
             for address, port in tcp:
                 s = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
-                # Addresses of a rig that just ended are free
+                # Addresses of a rig that has just ended count as free.
                 s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 s.bind((address, int(port)))
         except (OSError, DeviceError):
@@ -69,9 +70,9 @@ def move_to_free_subnet(rig: Instrument) -> Instrument:
 
     Raises DeviceError if there is none in 50 attempts, because this machine's loopback is not 127.0.0.0/8.
     """
-    chance = random.Random()
+    generator = random.Random()
     for _ in range(_TRIES):
-        moved = move_to_subnet(rig, f"127.{chance.randint(1, 254)}.{chance.randint(0, 255)}")
+        moved = move_to_subnet(rig, f"127.{generator.randint(1, 254)}.{generator.randint(0, 255)}")
         if is_free(moved):
             return moved
     raise DeviceError(

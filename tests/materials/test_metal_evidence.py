@@ -82,12 +82,12 @@ def test_a_dielectric_that_is_declared_as_metal_is_doubted_and_metal_is_not(plat
 
 @pytest.mark.parametrize(("plates", "least"), [(2, 0.6), (4, 0.8), (8, 0.8)])
 def test_metal_among_dielectrics_is_mostly_recognised(plates, least, scenes):
-    is_recognised = []
+    recognised = []
     for seed in range(scenes):
         patches, metal, channel = scene(np.random.default_rng([plates, seed]), plates, True)
         assert metal
-        is_recognised.append(metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough)
-    assert np.mean(is_recognised) >= least
+        recognised.append(metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough)
+    assert np.mean(recognised) >= least
 
 
 def test_alone_nothing_is_shown():

@@ -21,17 +21,18 @@ from polysight_pi.journal import records
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.messages import RowStarted
 
-pytestmark = pytest.mark.timeout(3600)  # with --long
+# With --long each byte and bit is tried.
+pytestmark = pytest.mark.timeout(3600)
 PAGE = bytes(4096)
-# Bytes of a row's last record
+# Bytes of a full packet's payload.
 PACKET = 1456
 
 
-def lines(path: Path) -> list[bytes]:
+def read_lines(path: Path) -> list[bytes]:
     return path.read_bytes().splitlines(keepends=True)
 
 
-def read_journal(scan: SmallScan) -> Path:
+def find_journal(scan: SmallScan) -> Path:
     return next(scan.journals.glob("*.journal"))
 
 
@@ -64,12 +65,12 @@ def is_row(event: object) -> bool:
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [-2, -1], ids=["row_committed", "scan_ended"])
 def test_manifest(undisturbed_scan, tmp_path, sample, record, tail):
-    whole_lines = lines(undisturbed_scan.path / "manifest.jsonl")
-    state_before = b"".join(whole_lines[: len(whole_lines) + record])
+    whole_lines = read_lines(undisturbed_scan.path / "manifest.jsonl")
+    lines_before = b"".join(whole_lines[: len(whole_lines) + record])
     last = whole_lines[record]
     for cut in sample(range(len(last)), 8):
         scan = undisturbed_scan.copy(tmp_path / "s")
-        (scan.path / "manifest.jsonl").write_bytes(state_before + last[:cut] + tail)
+        (scan.path / "manifest.jsonl").write_bytes(lines_before + last[:cut] + tail)
         assert faults(scan) == []
         torn = [n for n in faults(scan, "note") if "torn" in n]
         assert len(torn) == bool(last[:cut] + tail)
@@ -78,7 +79,7 @@ def test_manifest(undisturbed_scan, tmp_path, sample, record, tail):
 
 @pytest.mark.parametrize("record", [1, -2, -1], ids=["row 0", "row 2, the last", "scan_ended"])
 def test_bit_of_the_manifest(undisturbed_scan, tmp_path, sample, record):
-    whole_lines = lines(undisturbed_scan.path / "manifest.jsonl")
+    whole_lines = read_lines(undisturbed_scan.path / "manifest.jsonl")
     offset = len(b"".join(whole_lines[:record]))
     for bit in sample(range(8 * len(whole_lines[record])), 8):
         scan = undisturbed_scan.copy(tmp_path / "s")
@@ -146,7 +147,7 @@ def test_bit_of_the_event_log(undisturbed_scan, tmp_path, sample):
 @pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
 def test_journal_of_the_pi(undisturbed_scan, tmp_path, sample, record, tail):
     """The journal is shorter than the host's event log: the sequence goes on behind what the host has."""
-    path = read_journal(undisturbed_scan)
+    path = find_journal(undisturbed_scan)
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
     raw = path.read_bytes()
@@ -154,43 +155,43 @@ def test_journal_of_the_pi(undisturbed_scan, tmp_path, sample, record, tail):
     stop = [*starts, len(raw)][len(starts) - record + 1]
     for cut in sample(range(start, stop), 8):
         scan = undisturbed_scan.copy(tmp_path / "s")
-        read_journal(scan).write_bytes(raw[:cut] + tail)
-        goes_on_behind(scan, undisturbed_scan, lost=record)
+        find_journal(scan).write_bytes(raw[:cut] + tail)
+        check_resumed_journal(scan, undisturbed_scan, lost=record)
 
 
 def test_bit_of_the_journal(undisturbed_scan, tmp_path, sample):
-    path = read_journal(undisturbed_scan)
+    path = find_journal(undisturbed_scan)
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
     for bit in sample(range(8 * starts[0], 8 * path.stat().st_size), 16):
         scan = undisturbed_scan.copy(tmp_path / "s")
-        turn(read_journal(scan), bit)
-        goes_on_behind(scan, undisturbed_scan, lost=sum(s > bit // 8 for s in starts[1:]) + 1)
+        turn(find_journal(scan), bit)
+        check_resumed_journal(scan, undisturbed_scan, lost=sum(s > bit // 8 for s in starts[1:]) + 1)
 
 
 @pytest.mark.parametrize("left", [b"", b"PSJR", PAGE, None], ids=["empty", "torn magic", "zeros", "removed"])
 def test_journal_that_is_lost_as_a_whole(undisturbed_scan, tmp_path, left):
     scan = undisturbed_scan.copy(tmp_path / "s")
     if left is None:
-        read_journal(scan).unlink()
+        find_journal(scan).unlink()
     else:
-        read_journal(scan).write_bytes(left)
+        find_journal(scan).write_bytes(left)
     manifest_path = scan.path / "manifest.jsonl"
     # Row 2 is to be taken yet
-    manifest_path.write_bytes(b"".join(lines(manifest_path)[:-2]))
+    manifest_path.write_bytes(b"".join(read_lines(manifest_path)[:-2]))
     events = len(read_events(scan.path / "events.msgpack").events)
-    goes_on_behind(scan, undisturbed_scan, lost=events, rows={2})
+    check_resumed_journal(scan, undisturbed_scan, lost=events, rows={2})
 
 
-def goes_on_behind(scan: SmallScan, undisturbed_scan, lost: int, rows: set[int] = frozenset()) -> None:
+def check_resumed_journal(scan: SmallScan, undisturbed_scan, lost: int, rows: set[int] = frozenset()) -> None:
     """Resume: the host is told how much the journal lost, and keeps all it had."""
-    state_before = (scan.path / "events.msgpack").read_bytes()
+    log_before = (scan.path / "events.msgpack").read_bytes()
     assert resume(scan, undisturbed_scan) == rows
     assert any(f"ends {lost} events before" in text for text in scan.messages)
-    state_after = (scan.path / "events.msgpack").read_bytes()
-    assert state_after.startswith(state_before)
-    assert len(state_after) > len(state_before)
-    with read_journal(scan).open("rb") as file:
+    log_after = (scan.path / "events.msgpack").read_bytes()
+    assert log_after.startswith(log_before)
+    assert len(log_after) > len(log_before)
+    with find_journal(scan).open("rb") as file:
         seqs = [seq for _, seq, _ in records(file)]
     assert seqs[-1] == read_events(scan.path / "events.msgpack").events[-1].seq
 
@@ -226,7 +227,7 @@ def test_bit_of_a_committed_row(undisturbed_scan, tmp_path, sample, suffix):
 
 @pytest.mark.parametrize("suffix", [".part", ".bin", ".idx"])
 def test_row_that_is_not_committed_may_be_anything(undisturbed_scan, tmp_path, sample, suffix):
-    whole_lines = lines(undisturbed_scan.path / "manifest.jsonl")
+    whole_lines = read_lines(undisturbed_scan.path / "manifest.jsonl")
     raw = (undisturbed_scan.path / f"raw/RV/0002{suffix.replace('part', 'bin')}").read_bytes()
     for cut in sample(range(len(raw)), 4):
         scan = undisturbed_scan.copy(tmp_path / "s")

@@ -25,7 +25,8 @@ def paths(rig: Instrument) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     def make(
         board: Board, positions: int, echo: float, rng: np.random.Generator, echoes: int = 1, spread_m: float = 0.1
     ) -> tuple[np.ndarray, np.ndarray]:
-        tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+        tx = np.array(tx_position_m(rig))
+        rx = np.array(rx_positions_m(rig, board))
         direct = np.linalg.norm(rx - tx, axis=1)
         f = sweep_hz(rig)
         out = np.zeros((positions, len(rx), f.size), complex)

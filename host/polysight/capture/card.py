@@ -48,7 +48,7 @@ EEPROM_REPORT_S = 0.5
 # Command and data port, as the EEPROM holds them.
 _PORTS = struct.Struct("<HH")
 DEFAULT_MAC = "12:34:56:78:90:12"
-_OTHER_MAC = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
+_MAC_REMEDY = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
 
 
 class CardClient:
@@ -243,7 +243,8 @@ class CardClient:
         late = 0
         while late < SOCKET_DATAGRAMS:
             remaining_s = deadline - time.monotonic()
-            late += remaining_s <= 0
+            if remaining_s <= 0:
+                late += 1
             if not select.select([self._socket], [], [], max(0.0, remaining_s))[0]:
                 return
             try:
@@ -304,9 +305,9 @@ class EepromSettings:
         try:
             mac = self._parse_mac()
         except ValueError:
-            raise self._wrong(f"{self.card_mac!r} is not a MAC address such as {DEFAULT_MAC}", _OTHER_MAC) from None
+            raise self._wrong(f"{self.card_mac!r} is not a MAC address such as {DEFAULT_MAC}", _MAC_REMEDY) from None
         if len(mac) != 6 or mac[0] & 1 or not any(mac):
-            raise self._wrong(f"{self.card_mac} is not the MAC address of one machine", _OTHER_MAC)
+            raise self._wrong(f"{self.card_mac} is not the MAC address of one machine", _MAC_REMEDY)
         for port in (self.command_port, self.data_port):
             if not 1024 < port <= 0xFFFF:
                 raise self._wrong(f"port {port} is outside 1025..65535")
@@ -391,6 +392,7 @@ HOPS = ("host", "route", "link", "card", "receiver", "buffer", "radar")
 """The host's address and ports, the interface, its cable, the card; then the receiver process, its buffer, data."""
 PULSES = "`polysight doctor`: it sends pulses with the stage at rest, and reports each one"
 _FAULTY_HOP = {Hop.ROUTE: "route", Hop.LINK: "link"}
+# Time between two looks at what has come from a radar.
 _POLL_S = 0.05
 
 

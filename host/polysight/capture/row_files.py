@@ -163,11 +163,10 @@ def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed
 
     Raises DeviceError if the disk fails.
     """
-    is_kept = log.kept
-    sizes = log.sizes[:is_kept]
+    sizes = log.sizes[: log.kept]
     # Payload that does not lie unchanged in the row's file is stored in this one.
     if placed is None:
-        offsets_in_row = np.full(is_kept, -1, dtype=np.int64)
+        offsets_in_row = np.full(log.kept, -1, dtype=np.int64)
     else:
         offsets_in_row = _find_offsets_in_row(placed, sizes)
     is_stored_here = offsets_in_row < 0
@@ -182,7 +181,7 @@ def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed
         "batches": len(batches),
         "runs": len(runs),
         "packets": log.count,
-        "kept": is_kept,
+        "kept": log.kept,
         "own_bytes": int(sizes[is_stored_here].sum()),
         "malformed": log.malformed,
         "evidence": msgspec.to_builtins(evidence),

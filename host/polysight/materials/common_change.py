@@ -308,7 +308,7 @@ class _Explained:
     mean, square
         [case, plate]: mean and mean square of drift and fringes at each plate.
     drift, drift_square
-        The same of the drift alone.
+        [case, plate]: mean and mean square of the drift alone.
     remaining
         [case, 2, plate]: slopes along x and y that are left.
     """

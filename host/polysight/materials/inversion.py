@@ -202,7 +202,7 @@ class Inversion:
     leakage_std
         Standard deviation of each: root mean variance of its two parts.
     prior_std
-        The same of the prior.
+        Standard deviation of each by the prior alone.
     theta_error_rad, theta_std_rad
         True minus nominal incidence angle, and its standard deviation.
     brightness_off
@@ -368,8 +368,8 @@ class SceneLikelihood:
     def hypotheses(self) -> list[tuple[SceneLikelihood, float]]:
         """Return the same scene with each certainty on what the prior leaves open, and the probability of each."""
         out: list[tuple[SceneLikelihood, float]] = []
-        is_painted = _certainties(self._estimate_paint_probability())
-        for moved, painted in itertools.product(_certainties(self.prior.moved), is_painted):
+        paint_cases = _certainties(self._estimate_paint_probability())
+        for moved, painted in itertools.product(_certainties(self.prior.moved), paint_cases):
             hypothesis = copy.copy(self)
             hypothesis.prior = replace(self.prior, moved=moved[0], painted=painted[0])
             out.append((hypothesis, moved[1] * painted[1]))
@@ -496,7 +496,7 @@ class SceneLikelihood:
 
 def _certainties(probability: float) -> list[tuple[float, float]]:
     """Return whether something is so, 0 or 1, with the probability of each that is possible."""
-    return [(0.0, 1 - probability)] * (probability < 1) + [(1.0, probability)] * (probability > 0)
+    return [(value, share) for value, share in ((0.0, 1 - probability), (1.0, probability)) if share > 0]
 
 
 def _place(z: Real, certainty: float, probability: float) -> Real:

@@ -100,7 +100,7 @@ def band_rows(
     bands, images
         Sub-bands and their image pairs, [K].
     leakage, smooth_px
-        Those of the whole sweep.
+        Leakage and width of the filter against speckle, as for the whole sweep.
     references
         Metal scanned separately, for each sub-band; None: the metal region of the scene.
 

@@ -68,6 +68,7 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
 }
 """Likely cause and remedy by kind of fault. Those of the Pi are in shared/polysight_shared/faults.py."""
 RowMark = Literal["committed", "kept", "rejected"]
+# Counts of a board's reception that the page adds up over the rows.
 RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
@@ -164,15 +165,15 @@ class PiState:
     heard_s, heard_utc_s
         Time of the last event, on the monotonic clock and in seconds since 1970; 0 before.
     state
-        The Pi's.
+        State that the event named; None before.
     x_mm, y_mm
         Stage offset in the rig frame; None while unknown.
     row, take, point
-        Of the running row; row -1 between rows.
+        The running row, its take and the last point that was passed; row -1 between rows.
     faults
         Faults since the last row that was done.
     deaf
-        Why no events can be received.
+        Reason why no events can be received; None if they can.
     """
 
     heard_s: float = 0.0
@@ -200,7 +201,7 @@ class ScanHistory:
     content
         The manifest, of which the first fact has been read.
     instrument, plan
-        Of the scan.
+        Rig file of the scan, and its rows and columns.
     notices
         Faults in the order of the facts and events.
     run_started_s, last_commit_s
@@ -210,7 +211,7 @@ class ScanHistory:
     rows_since_trouble
         Rows committed whole since one was rejected or kept with gaps.
     trigger
-        The worst of all bursts; None before the first.
+        Longest pulse and largest jitter of all bursts; None before the first.
     """
 
     def __init__(self, content: store.Manifest, started: store.ScanStarted) -> None:

@@ -75,9 +75,9 @@ class Shown:
     pictures
         See :func:`polysight.catalogue.draw`.
     profile
-        Of the last row.
+        Range profile of the last row.
     sync
-        By board and row, rows ascending.
+        Residuals of synchronisation by board and row, rows ascending.
     problem
         The last error of a row.
     """

@@ -224,7 +224,7 @@ def _set_burst(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float
 
 
 def _find_max_pulses(rig: Instrument) -> int:
-    """Largest number of pulses of a burst: by time, by travel during the burst, by the radar's frames in a row."""
+    """Return the most pulses that a burst may have by time, by its travel, and by the radar's frames in a row."""
     by_time = _MAX_DUTY * 1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us
     travel = predict_burst(rig).travel_wavelengths
     by_travel = 1 + _MAX_TRAVEL_WAVELENGTHS * (rig.burst.chirps_a_position - 1) / travel

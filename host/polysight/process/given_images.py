@@ -142,10 +142,10 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     angle = _number(path, arrays, "incidence_deg")
     images = _sort_axes(h, v, valid, x_m, y_m)
     simulated = bool(_number(path, arrays, "simulated") or False)
-    is_conjugate = _number(path, arrays, "conjugate")
+    conjugate_flag = _number(path, arrays, "conjugate")
     # Only our own images hold the error of P.
-    is_sign_known = is_conjugate is not None or OWN_ERROR in arrays
-    if is_conjugate:
+    is_sign_known = conjugate_flag is not None or OWN_ERROR in arrays
+    if conjugate_flag:
         images = conjugate(images)
     return GivenPair(
         path=path,

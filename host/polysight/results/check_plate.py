@@ -33,7 +33,7 @@ class CheckResult(msgspec.Struct, frozen=True, kw_only=True):
     expected, expected_std
         Permittivity [eps', loss] of the rig file and its standard errors.
     measured, measured_std
-        The same as measured on the patch; None if it is missing.
+        Permittivity as measured on the patch; None if it is missing.
     sigmas
         Distance in standard deviations, of both errors and their correlation.
     why

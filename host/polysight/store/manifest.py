@@ -346,7 +346,7 @@ class Manifest:
     torn
         True if an incomplete line follows.
     count, digest
-        Of the next line.
+        Number of the next line, and the digest of the line before it that it must hold.
     """
 
     facts: list[Fact] = field(default_factory=list)

@@ -27,6 +27,7 @@ _FLAGS = "-std=c99 -Werror=implicit-function-declaration -O3 -fPIC"
 _FLAGS += " -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
 # -fassociative-math instead of -ffast-math, which would change rounding in other libraries, too.
 _FLAGS += " -fassociative-math"
+# Flags by width of the vectors in bits: at run time the widest is used that the processor has.
 _WIDTHS = {
     128: "",
     256: "-mavx2 -mfma",

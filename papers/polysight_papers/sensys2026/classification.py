@@ -387,7 +387,7 @@ def pixel_bound(
     Parameters
     ----------
     materials, angles_deg, errors
-        As for drawing the pixels.
+        Materials, incidence angles and errors that the pixels are drawn with.
     reference
         True if the error of the scan's metal reference is in the pixels; False if it is known and removed.
     pixels

@@ -45,6 +45,8 @@ def main(argv: list[str]) -> int:
         chosen = {name: parser.parse_args([name]) for name in NAMES}
     else:
         chosen = {args.name: args}
+    if args.out is not None:
+        args.out.mkdir(parents=True, exist_ok=True)
     for name, options in chosen.items():
         if args.out is not None and getattr(options, "json", "") is None:
             options.json = args.out / f"{name}.json"

@@ -53,7 +53,9 @@ class Page:
         self.view = view
 
     def open(self, path: str, size: tuple[int, int, bool] = DESK, token: str = TOKEN) -> None:
-        """Go there, and wait until it shows something."""
+        """Go there, and wait until it shows something; without a token, as who was never here."""
+        if not token:
+            self.browser.forget(self.view.address)
         self.browser.visit(f"{self.view.address}{path}{f'#token={token}' if token else ''}", size)
         self.browser.wait(PAGES.get(path, "document.querySelector('.bar')"), path)
 
@@ -435,8 +437,7 @@ def test_the_page_follows_products_that_another_program_has_made(page, scans):
 
 
 def test_without_the_token_nothing_can_be_asked_and_the_page_asks_for_it(page, scans):
-    page.open("/scan?scan=one", token="")
-    page.browser.value("localStorage.clear()")
+    page.browser.forget(page.view.address)
     page.open("/scan?scan=one", token="wrong")
     page.browser.wait("document.getElementById('token-bar')", "that it asks")
     page.browser.fill("#notes-text", "not mine")
@@ -462,6 +463,16 @@ def test_a_view_that_is_read_only_has_no_buttons_that_ask(browser, scans):
             buttons = "[...document.querySelectorAll('button')].filter(b => b.checkVisibility()).map(b => b.innerText)"
             asking = {"Label", "Process again", "Resume", "Save", "Write", "Make a library", "Start the scan"}
             assert not asking & set(browser.value(buttons))
+
+
+def test_a_token_of_the_server_that_had_the_port_before_is_forgotten(browser, scans):
+    """Tests share one browser, and ports are given out again."""
+    with served_folder(scans) as view:
+        page = Page(browser, view)
+        page.open("/", token="of another server")
+        page.open("/", token="")
+        assert browser.value("localStorage.length") == 0
+        page.check_whole()
 
 
 def test_advice_for_a_terminal_is_in_the_words_of_the_page(page):

@@ -86,8 +86,7 @@ def _listens(port: int) -> bool:
 
 
 def test_behind_the_documented_proxy_everything_works_for_who_has_the_token(browser, address, scans):
-    browser.visit(f"{address}/watch?scan=one")
-    browser.value("localStorage.clear()")
+    browser.forget(address)
     browser.visit(f"{address}/watch?scan=one")
     browser.wait("document.getElementById('token-bar')", "that it asks for the token")
     browser.visit(f"{address}/watch?scan=one#token={TOKEN}")

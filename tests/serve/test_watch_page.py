@@ -18,7 +18,9 @@ PICTURES = "[...document.querySelectorAll('.view img')]"
 
 
 def open_page(browser: Browser, view, size=DESK, token: str = "") -> None:
-    """The page, told what there is."""
+    """The page, told what there is; without a token, for who was never there."""
+    if not token:
+        browser.forget(view.address)
     browser.visit(view.address + (f"/#token={token}" if token else "/"), size)
     browser.wait("document.title.length > 9", "the first state")
 

@@ -153,6 +153,10 @@ class Browser:
         self.requests.clear()
         self.open(url)
 
+    def forget(self, address: str) -> None:
+        """Forget tokens and cookies of an address: another server may have had its port before."""
+        self.call("Storage.clearDataForOrigin", origin=address, storageTypes="all")
+
     def fill(self, selector: str, text: str) -> None:
         """Type into a field, as a person does."""
         self.value(

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.planning import Changes, row_motion_s, scan_time, straight_move_s
-from polysight.planning.forecast import tail_s, turn_s, whole_packets
+from polysight.planning.forecast import fills_whole_packets, tail_s, turn_s
 from polysight_pi.edges import RowMotion
 from polysight_shared.config import CARD_TAIL_S, Instrument
 from polysight_shared.raster import plan_raster
@@ -111,8 +111,8 @@ def test_a_row_of_whole_packets_has_no_wait_for_the_last_packet(rig):
     # 350 columns x 13 frames x 4096 bytes = 12,800 packets of 1456 bytes.
     whole_rig = Changes(pulses=13).apply(rig)
     short = Changes(pulses=16).apply(rig)
-    assert whole_packets(whole_rig)
-    assert not whole_packets(short)
+    assert fills_whole_packets(whole_rig)
+    assert not fills_whole_packets(short)
     assert tail_s(whole_rig) == 0.0
     run_out = (row_motion_s(short.grid, short.stage) - 698 / 20) / 2
     assert tail_s(short) == pytest.approx(CARD_TAIL_S + 15 * 1.5e-3 - run_out)

@@ -44,9 +44,7 @@ async def read_pages(port: int, views: int) -> None:
                 may_ask = await ask(reader, writer, f"GET /api/{path} HTTP/1.1\r\nHost: localhost\r\n\r\n")
                 await asyncio.sleep(0.02 * random.random())
             writer.close()
-        except OSError:
-            counted["reads lost"] += 1
-        except asyncio.IncompleteReadError:
+        except (OSError, asyncio.IncompleteReadError):
             counted["reads lost"] += 1
         await asyncio.sleep(0.05)
 
@@ -101,6 +99,7 @@ async def report(opened: Synchronized[int]) -> None:
 
 async def main() -> None:
     """Run all of them until the process is ended."""
+    # The aborts of an attack are sent by the test, not from here.
     port, streams, readers, wrong_tokens, connections, _, views = map(int, sys.argv[1:])
     clients = [read_stream(port, k % views) for k in range(streams)]
     clients += [read_pages(port, views) for _ in range(readers)]

@@ -104,11 +104,11 @@ def write_bundle(
     keys = [options.config.resolve().parent / "keys"]
     if rig is not None and rig.pi.key_dir:
         keys.append(Path(rig.pi.key_dir))
-    redacted = Redactor(keys)
+    redact = Redactor(keys)
     try:
         with open_to_write(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, content in _collect_contents(options, rig, findings, text, root):
-                archive.writestr(name, redacted(content))
+                archive.writestr(name, redact(content))
     except OSError as e:
         raise DeviceError(
             f"{path}: cannot be written: {e.strerror}", "the disk is full, or the path is wrong", "give another FILE"
@@ -160,7 +160,9 @@ def _read_tail(path: Path, most: int) -> str | None:
 
 
 def _find_newest(folders: Sequence[Path], pattern: str, count: int) -> list[Path]:
-    matches = {p.resolve() for folder in folders for p in folder.glob(pattern) if p.is_file() and not p.is_symlink()}
+    """Return the `count` newest files of some folders whose names match a pattern, without links."""
+    paths = (path for folder in folders for path in folder.glob(pattern))
+    matches = {path.resolve() for path in paths if path.is_file() and not path.is_symlink()}
     return sorted(matches, key=lambda p: (p.stat().st_mtime, p), reverse=True)[:count]
 
 

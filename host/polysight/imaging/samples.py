@@ -91,9 +91,9 @@ class Reduction:
     def maps(self, sweep_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return matrix and direct for samples at `sweep_hz`, complex128 [m + 1, sample]: all, or one for each block.
 
-        Those for blocks give what the others give of all samples: of noise within 0.3 %, of echoes as far as decimation
-        passes them (1 m behind the direct path) within 3e-4, in the gate within 2e-4. By least squares, over noise and
-        such echoes.
+        Maps for blocks are fitted by least squares to noise and echoes. Their results differ from those of the maps for
+        all samples by 0.3 % in noise, by 3e-4 in echoes that decimation passes (up to 1 m behind the direct path), and
+        by 2e-4 in echoes within the gate.
         """
         maps = np.vstack([self.matrix, self.direct])
         if sweep_hz.shape == self.sweep_hz.shape:
@@ -210,9 +210,9 @@ def undo_burst_motion(
     count = valid.size
     reach = np.zeros(valid.size, int)
     for i in range(1, min(REACH, (count - 1) // 2) + 1):
-        is_near_gap = np.zeros(count, bool)
-        is_near_gap[i : count - i] = valid[: count - 2 * i] & valid[2 * i :] & valid[i : count - i]
-        reach += is_near_gap & (reach == i - 1)
+        has_valid_neighbours = np.zeros(count, bool)
+        has_valid_neighbours[i : count - i] = valid[: count - 2 * i] & valid[2 * i :] & valid[i : count - i]
+        reach += has_valid_neighbours & (reach == i - 1)
     taps = filters[reach]
     filtered = samples * taps[:, 0]
     for i in range(1, int(reach.max(initial=0)) + 1):
@@ -337,7 +337,7 @@ class BoardSamples:
         # Image of the rows so far, once it was formed
         self._image: tuple[Image, Image, str | None] | None = None
         self._slope: tuple[Image, Image] | None = None
-        # Rows differ from the lattice of the live image
+        # True if a row was recorded at other places than planned, so that the live image cannot use its spectra.
         self._moved = False
         self._live = None
         if live and regular:
@@ -352,7 +352,7 @@ class BoardSamples:
 
     @property
     def model(self) -> NDArray[np.complex128]:
-        """Effect of the range gate on an echo, [frequency, frequency], see `reduce.Reduction.model`."""
+        """Effect of the range gate on an echo, [frequency, frequency], see :attr:`Reduction.model`."""
         return self._reduction.model
 
     @property
@@ -659,13 +659,14 @@ class BoardSamples:
 def _pair_maps(maps: NDArray[np.complex128]) -> tuple[slice, NDArray[np.float32]]:
     """Return complex maps [map, sample] as real ones for pairs (re, im), float32 [2 sample, 2 map], and their slice.
 
-    `pairs[..., slice] @ out` are the pairs of `maps @ x`: a real product is 1.5 times as fast as such a narrow complex
-    one. The slice leaves out samples at the ends with weight 0. Columns of zeros fill the last group of `_COLUMNS`.
+    With x as pairs, `pairs[..., slice] @ real_maps` are the pairs of `maps @ x`: a real product is 1.5 times as fast as
+    such a narrow complex one. The slice leaves out samples at the ends with weight 0. Columns of zeros fill the last
+    group of `_COLUMNS`.
     """
     used = np.flatnonzero(maps.any(axis=0))[[0, -1]]
     maps = np.pad(maps[:, used[0] : used[1] + 1], ((0, -len(maps) % (_COLUMNS // 2)), (0, 0)))
     paired = np.empty((maps.shape[1], 2, maps.shape[0], 2), np.float32)
-    # Contributions to the real part.
+    # Real part of the result, then its imaginary part.
     paired[:, 0, :, 0] = maps.real.T
     paired[:, 1, :, 0] = -maps.imag.T
     paired[:, 0, :, 1] = maps.imag.T

@@ -69,11 +69,12 @@ def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
     if len(angles_rad) != len(t) or not np.isfinite(t).all() or bool((np.abs(t - 1) < METAL_SPECIMENS).any()):
         return np.zeros((3 * len(t), 2))
     eps = apparent_permittivity(t, angles_rad)
-    here_h, here_t = features(eps, angles_rad)
+    log_h, half_space_t = features(eps, angles_rad)
     columns = []
     for stretched in (complex(eps.real * np.exp(_STEP), eps.imag), complex(eps.real, eps.imag * np.exp(_STEP))):
-        there_h, there_t = features(stretched, angles_rad)
-        columns.append(relative(there_h - here_h, there_t - here_t, here_t).ravel() / _STEP)
+        stretched_log_h, stretched_t = features(stretched, angles_rad)
+        change = relative(stretched_log_h - log_h, stretched_t - half_space_t, half_space_t)
+        columns.append(change.ravel() / _STEP)
     return np.stack(columns, axis=1)
 
 
@@ -150,12 +151,18 @@ def fit_spread(
 
 
 def _spread_each_material(
-    pooled: Real, second: Real, kind: npt.NDArray[np.intp], telling: npt.NDArray[np.bool_]
+    pooled: Real,
+    second_moments: Real,
+    material_of_specimen: npt.NDArray[np.intp],
+    has_spread: npt.NDArray[np.bool_],
 ) -> Real:
-    """Return the spread of each material: the pooled one, corrected by its own specimens' squares [specimen, 2]."""
-    spreads = np.tile(pooled, (telling.size, 1))
-    for k in np.flatnonzero(telling):
-        moments = second[kind == k]
+    """Return the variances of each material, [material, 2]: the pooled ones, corrected by its own specimens' squares.
+
+    `second_moments` [specimen, 2] are these squares; `has_spread` [material] is true where a material has several.
+    """
+    spreads = np.tile(pooled, (has_spread.size, 1))
+    for k in np.flatnonzero(has_spread):
+        moments = second_moments[material_of_specimen == k]
         spreads[k] = (OWN_FREEDOM * pooled + moments.sum(axis=0)) / (OWN_FREEDOM + len(moments))
     return spreads
 
@@ -175,4 +182,5 @@ def average_channels(covariance: Real) -> Real:
 
 
 def _compute_floor(covariance: Real) -> Real:
+    """Return a small multiple of the identity, which keeps a singular covariance [d, d] invertible."""
     return (1e-9 * np.trace(covariance) + 1e-14) * np.eye(len(covariance))

@@ -40,10 +40,12 @@ Real = NDArray[np.float64]
 
 # Limit of the stage's firmware (docs/spec/stage-line.md, timing).
 MAX_STEPS_PER_S = 20_000
+# Default of the simulators' `direct_snr_db`, from recorded data (docs/spec/scene-file.md).
 SIMULATED_DIRECT_SNR_DB = 5.5
 _PUBLISHED_SPEED_MM_S = 20.0
-# Standard deviation of the phase of the object's peak, paper section 9.1
+# Standard deviation of the phase of the object's peak (paper, section 9.1).
 _PUBLISHED_PHASE_RAD = 0.022
+# Loss by the motion during a burst from which on the forecast warns (chosen).
 _MAX_BURST_LOSS_DB = 0.5
 # A full packet on Ethernet: headers, preamble, checksum, gap
 _WIRE_BYTES = 1470 + 42 + 24
@@ -121,14 +123,14 @@ def turn_s(grid: Grid, stage: Stage) -> float:
     return sum(straight_move_s(leg, stage.travel_speed_mm_s, stage.accel_mm_s2) for leg in legs)
 
 
-def whole_packets(rig: Instrument, pulses: int | None = None) -> bool:
+def fills_whole_packets(rig: Instrument, pulses: int | None = None) -> bool:
     """Return True if a row with `pulses` pulses a position fills whole packets, so that no short one is delayed."""
     return rig.row_bytes // rig.burst.pulses * (pulses or rig.burst.pulses) % rig.card.payload_bytes == 0
 
 
 def tail_s(rig: Instrument) -> float:
     """Return the wait for the cards' last packet at the end of each row, after the stage has stopped, seconds."""
-    if whole_packets(rig):
+    if fills_whole_packets(rig):
         return 0.0
     run_out = (row_motion_s(rig.grid, rig.stage) - measuring_s(rig)) / 2
     return max(0.0, burst_duration_s(rig.burst) + CARD_TAIL_S - run_out)
@@ -393,7 +395,7 @@ def _check_burst(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
 
 
 def _check_card(rig: Instrument) -> Iterator[Finding]:
-    if whole_packets(rig):
+    if fills_whole_packets(rig):
         yield _note(
             "card",
             f"a row of {rig.row_bytes} bytes fills whole packets of {rig.card.payload_bytes}: no short packet marks its"

@@ -26,6 +26,7 @@ from polysight.planning.forecast import (
     ROW_OVERHEAD_S,
     Forecast,
     Noise,
+    fills_whole_packets,
     find_warnings,
     forecast,
     measuring_s,
@@ -35,7 +36,6 @@ from polysight.planning.forecast import (
     scan_time,
     tail_s,
     turn_s,
-    whole_packets,
 )
 from polysight.planning.scene_warnings import Plate, read_scene, warn_of_scene
 from polysight.radar import INTER_FRAME_US, TRIGGER_MARGIN_US, chirp_us
@@ -206,7 +206,7 @@ def _vary_bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iter
         for speed in _list_speeds(rig, minutes):
             plan = _set_burst(rig, speed, 2, period)
             most = _find_max_pulses(plan)
-            with_short_last_packet = (n for n in range(most, 1, -1) if not whole_packets(plan, n))
+            with_short_last_packet = (n for n in range(most, 1, -1) if not fills_whole_packets(plan, n))
             pulses = next(with_short_last_packet, most)
             if pulses < 2:
                 break

@@ -2,7 +2,7 @@
 
 The files are image.npz, materials.json, quality.json and scan.json, written atomically. `find_products` finds a folder
 of products, `ProcessedScan` reads its files, without names and permittivities if the verdict is "no result"
-(`withhold`). Formats: docs/spec/products.md.
+(`ScanMaterials`). Formats: docs/spec/products.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The published data set as libraries: its `materials/`, its `labels/`, and our own images of its raw data.
 
-Each source is judged separately. Materials get the names of Table 2's rows, if `row_of` finds a row for their names.
+Each source is judged separately. Materials get the names of Table 2's rows, if `find_row` finds a row for their names.
 `train_authors` makes one library of the first two sources for `polysight train`.
 """
 

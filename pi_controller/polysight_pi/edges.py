@@ -30,7 +30,10 @@ STATUS_TOLERANCE = 0.2
 
 
 class RowMotion(NamedTuple):
-    """A row in motor steps, as the stage is told it, and the motion that follows (docs/spec/stage-line.md, "A row")."""
+    """A row as the stage is told it, and the motion that follows (docs/spec/stage-line.md, "A row").
+
+    Lengths are in motor steps; `feed` is a speed in steps/s, `accel` in steps/s^2. `step` is below zero towards -x.
+    """
 
     x_start: int
     step: int

@@ -33,14 +33,15 @@ from polysight_simulators.radars import make_image
 from polysight_simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight_simulators.wires import MAX_SOCKET_PATH
 
-# The processes share the cores of a busy machine
+# The processes share the cores of a busy machine, and may be late.
 MIN_HEARTBEAT_MS = 2000
 IMAGE_FILE = "firmware.bin"
 READY_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 5.0
+# Largest speed of the emulated UNO: its heartbeat clock is scaled, that of the Pi's program is not.
 UNO_TIME_SCALE = 2.0
 _POLL_S = 0.02
-# Puts the published rig's direct path in the middle of its IF window
+# It puts the published rig's direct path in the middle of its IF window.
 _NATIVE_OFFSET_HZ = 790e3
 _LOG_LINES = 15
 # One thread for linear algebra: several processes with more threads on few cores are ten times slower.
@@ -80,7 +81,7 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     elif table["radar"]["control"] != "native" and scene is not None:
         _apply_if_offset(table, scene.disturbances.if_offset_hz)
     if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
-        # The boards start with an empty flash
+        # The boards start with an empty flash.
         table["radar"]["firmware"] = str(folder / IMAGE_FILE)
     table["stage"]["port"] = str(folder / "ttySTAGE")
     table["pi"] |= {"journal_dir": str(folder / "journal"), "key_dir": str(folder / "keys")}

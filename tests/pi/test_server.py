@@ -37,7 +37,7 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     assert [type(e) for e in events] == [m.RunStarted, m.RowStarted] + n * [m.Capture] + [m.RowFinished]
     captures = host.list_events(m.Capture)
     assert [c.point for c in captures] == list(range(n))
-    # Odd rows run towards -x
+    # Odd rows run towards -x.
     assert [c.column for c in captures] == list(reversed(range(n)))
     for c in captures:
         assert c.last_pulse_ns - c.first_pulse_ns == (burst.pulses - 1) * round(burst.period_us * 1e3)
@@ -67,6 +67,7 @@ def test_stage_gets_the_row_in_steps_and_a_heartbeat(instrument, stage, hub):
         stage.stays_after = None
         pi.host.wait(m.RowFinished)
     row = next(c for c in stage.seen if c.verb == "ROW")
+    # 200 steps/mm; half of eight columns 2 mm apart, and the first of four rows.
     half = 3.5 * 2 * 200
     y = 250 * 200 - 1.5 * 2 * 200
     assert row.args == (400 * 200 - half, 400, 8, y, 4000)
@@ -106,7 +107,8 @@ def test_refusals_have_their_number(pi):
     host = pi.host
     plan = host.begin().plan
     replace = msgspec.structs.replace
-    assert host.must_refuse(RUN_0) == PiFault.NOT_READY  # no run
+    # No run has begun.
+    assert host.must_refuse(RUN_0) == PiFault.NOT_READY
     assert host.must_refuse(host.begin(period_us=299.0)) == PiFault.PERIOD_TOO_SHORT
     assert host.must_refuse(host.begin(width_us=4.5)) == PiFault.PULSE_TOO_LONG
     for wrong in (
@@ -117,7 +119,8 @@ def test_refusals_have_their_number(pi):
         assert host.must_refuse(host.begin(**wrong)) == PiFault.BAD_REQUEST
     host.must_accept(host.begin())
     assert host.must_refuse(host.begin(plan=replace(plan, rows=3))) == PiFault.BAD_REQUEST
-    assert host.must_refuse(RUN_0) == PiFault.NOT_READY  # not homed
+    # The stage is not homed.
+    assert host.must_refuse(RUN_0) == PiFault.NOT_READY
     host.home()
     assert host.must_refuse(m.RunRow(scan_id="scan", row_index=4, take=1)) == PiFault.BAD_REQUEST
     assert host.must_refuse(m.RunRow(scan_id="other", row_index=0, take=1)) == PiFault.NOT_READY

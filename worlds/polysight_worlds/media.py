@@ -95,7 +95,7 @@ class ReflectionTable:
         self._tables = [table.astype(np.complex64) for table in reflect(stack, frequency_hz, cosines)]
 
     def look_up(self, cos_incidence: NDArray) -> tuple[NDArray, NDArray]:
-        """(r_s, r_p) as complex64 by linear interpolation."""
+        """Return (r_s, r_p) by linear interpolation, complex64 of the shape of `cos_incidence`."""
         place = np.clip(cos_incidence, 0, 1) * (self.POINTS - 1)
         left_index = np.minimum(place.astype(np.int32), self.POINTS - 2)
         share = (place - left_index).astype(np.float32)

@@ -29,7 +29,9 @@ from polysight_shared.errors import ScanError, quote
 
 CONTROL = "control"
 ALIVE = "alive"
+# Time between two looks for command files.
 _POLL_S = 0.2
+# A sign of life that is unchanged is written again after this time, far below LAPSE_S.
 _ALIVE_INTERVAL_S = 1.0
 # Time in which a scan accepts a command.
 _TIMEOUT_S = 5.0
@@ -161,7 +163,10 @@ class Life(msgspec.Struct, frozen=True):
 
 
 def read_start_ticks(pid: int) -> int | None:
-    """Start time of a running process in clock ticks since boot, or None; it tells reused process numbers apart."""
+    """Return the start time of a running process in clock ticks since boot, or None.
+
+    It tells a process from a later one with the same number.
+    """
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:

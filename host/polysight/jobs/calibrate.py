@@ -130,15 +130,16 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
     source_scans = [source_scan(source, folder) for source, folder in zip(sources, scans, strict=True)]
     file = FilterFile(**make_header("hpf", source_scans), boards=boards)
     path = write_calibration(file, out)
-    lines = [
-        f"{name}: corners "
-        + ", ".join(
-            f"{was:.0f} -> {c:.1f} +- {e:.1f} kHz"
-            for was, c, e in zip(b.programmed_khz, b.corners_khz, b.standard_error_khz, strict=True)
+    lines = []
+    for name, b in boards.items():
+        corners = zip(b.programmed_khz, b.corners_khz, b.standard_error_khz, strict=True)
+        text = ", ".join(
+            f"{programmed:.0f} -> {corner:.1f} +- {error:.1f} kHz" for programmed, corner, error in corners
         )
-        + f"; IF {b.if_from_khz:.0f}..{b.if_to_khz:.0f} kHz, {b.chirps} chirps, the fit leaves {b.residual_db:.2f} dB"
-        for name, b in boards.items()
-    ]
+        lines.append(
+            f"{name}: corners {text}; IF {b.if_from_khz:.0f}..{b.if_to_khz:.0f} kHz, {b.chirps} chirps, the fit leaves"
+            f" {b.residual_db:.2f} dB"
+        )
     return print_result(path, file, lines, rig_file_keys("hpf", path), as_json)
 
 
@@ -213,7 +214,7 @@ def leakage_of_scans(
     Returns
     -------
     leakage, facts
-        facts are plain: simulated, scan ids, pixels, incidence_deg.
+        The facts are plain values: `scans` (their ids), `simulated`, `pixels`, `leakage_std`, `incidence_deg`.
 
     Raises
     ------

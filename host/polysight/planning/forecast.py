@@ -335,8 +335,8 @@ def find_warnings(rig: Instrument, noise: Noise, scene_mm: tuple[float, float] |
     if phase > _PUBLISHED_PHASE_RAD:
         text = f"standard deviation of the direct path's phase {phase:.3f} rad (published rig after all stages:"
         warnings.append(_note("noise", f"{text} {_PUBLISHED_PHASE_RAD}): use more pulses a position"))
-    if text := why_unnamed(DEFAULT, rig):
-        warnings.append(_note("library", text.replace("was named", "will be named", 1)))
+    if text := why_unnamed(DEFAULT, rig, will_be=True):
+        warnings.append(_note("library", text))
     return tuple(sorted(warnings, key=lambda w: w.level != "error"))
 
 

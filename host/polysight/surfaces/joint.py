@@ -104,13 +104,13 @@ class JointFit:
         self.waves[members], self.rest[members] = self._subtract(members, self.values[members], self.amplitude[members])
 
     def synthesise(self, index: int) -> NDArray[np.complex64]:
-        """Samples of one echo, [window, rx, frequency, position]."""
+        """Return the samples of one echo, [window, rx, frequency, position]."""
         own = slice(index, index + 1)
         waves = self.waves[:, own]
         return synthesise(self.fit, self.windows.valid, waves, self.amplitude[:, own], self.steering[:, own])
 
     def _subtract(self, members: NDArray, values: Array, amplitude: NDArray) -> tuple[NDArray, NDArray[np.complex64]]:
-        """Waves of echoes of given values [window, echo, 6] and amplitudes, and the samples of windows less these."""
+        """Return the waves of echoes of given values [window, echo, 6], and the samples of the windows less these."""
         waves = make_waves(self.fit, values @ np.swapaxes(self.basis[members], 1, 2))
         echoes = synthesise(self.fit, self.windows.valid[members], waves, amplitude, self.steering[members])
         return waves, self.windows.samples[members] - echoes
@@ -149,7 +149,7 @@ class JointFit:
     def part_merged_echoes(self) -> None:
         """Fit again, from starts apart, where two echoes have run into one another: large, and of opposite sign.
 
-        The start that leaves least counts.
+        Of the fits, the one that leaves the least energy is kept.
         """
         widening = self.find_widening()[..., 0]
         merged = np.flatnonzero(widening.max(axis=1) > MERGED_WIDENING)
@@ -177,7 +177,10 @@ class JointFit:
                 getattr(self, name)[merged[better]] = getattr(other, name)[better]
 
     def _find_normal_equations(self, members: NDArray) -> tuple[Array, Array]:
-        """Normal matrix [window, 8 echoes, 8 echoes] and its right side; an echo's amplitude comes first."""
+        """Return the normal matrix, [window, 8 echoes, 8 echoes], and its right side.
+
+        Of an echo's 8 unknowns the two parts of the amplitude come first.
+        """
         echoes = self.amplitude.shape[1]
         count = len(members)
         normal = np.zeros((count, echoes, 8, echoes, 8))
@@ -272,6 +275,6 @@ def _multiply_parts(values: NDArray[np.complexfloating], matrices: Array) -> NDA
 
 
 def find_energy(samples: NDArray[np.complexfloating]) -> Array:
-    """Energy of the samples [window, rx, frequency, position] of each window."""
+    """Return the energy of the samples [window, rx, frequency, position] of each window, [window]."""
     parts = np.ascontiguousarray(samples).view(samples.real.dtype)
     return (parts[..., None, :] @ parts[..., None]).sum(axis=(1, 2, 3, 4), dtype=float)

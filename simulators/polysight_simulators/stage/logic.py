@@ -9,10 +9,11 @@ from polysight_shared.faults import StageError
 from polysight_shared.stage_line import Immediate, Parameter
 from polysight_simulators.stage.motion import EMERGENCY, LOOKS, MAX_RATE, MIN_RATE, SWITCH_X, SWITCH_Y, Leg, StepEngine
 
+# Limits of arguments, and the sequence of homing, as in arduino_stage/board.h: lengths in steps.
 MAX_TRAVEL = 999_999
 MAX_POINTS = 9_999
 MAX_BACKLASH = 20_000
-# Homing: rates in steps/s, distances in steps.
+# Homing: rates in steps/s.
 HOME_RATE = 4000
 CREEP_RATE = 400
 FIRST_RATE = 2000

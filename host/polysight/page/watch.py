@@ -17,7 +17,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import msgpack
 import msgspec
 import numpy as np
 import zmq
@@ -50,6 +49,7 @@ from polysight.store import (
     OtherFact,
     ScanFolder,
     ScanStarted,
+    parse_events,
 )
 from polysight.sync import SyncedRow
 from polysight_shared import messages as m
@@ -280,19 +280,9 @@ class EventTail:
 
     def look(self) -> list[m.AnyEvent]:
         """Return the events since the last look."""
-        raw = self.file.look()
-        unpacker = msgpack.Unpacker(raw=True, max_buffer_size=max(len(raw), 1))
-        unpacker.feed(raw)
-        events: list[m.AnyEvent] = []
-        end = 0
-        try:
-            while True:
-                unpacker.skip()
-                events.append(m.unpack_with_crc(raw[end : unpacker.tell()]))
-                end = unpacker.tell()
-        except (msgpack.OutOfData, msgpack.UnpackException, ValueError, ProtocolError):
-            self.file.take(end)
-        return events
+        log = parse_events(self.file.look())
+        self.file.take(log.length)
+        return log.events
 
 
 class ProductsTail:

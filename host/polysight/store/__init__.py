@@ -8,7 +8,7 @@ chirps.
 """
 
 from polysight.store import manifest
-from polysight.store.logs import EventWriter, LogDigest, read_events
+from polysight.store.logs import EventWriter, LogDigest, parse_events, read_events
 from polysight.store.manifest import (
     MANIFEST,
     BoardRow,

@@ -30,7 +30,7 @@ try:
 except ImportError:
     from zlib import crc32
 
-__all__ = ["AppendFile", "EventLog", "EventWriter", "LogDigest", "crc32", "read_events"]
+__all__ = ["AppendFile", "EventLog", "EventWriter", "LogDigest", "crc32", "parse_events", "read_events"]
 
 
 class AppendFile:
@@ -111,7 +111,11 @@ class EventLog:
 
 def read_events(path: Path) -> EventLog:
     """Read an event file up to its first damage; a missing file is empty. Raises DataError if it is unreadable."""
-    raw = _read_bytes(path)
+    return parse_events(_read_bytes(path))
+
+
+def parse_events(raw: bytes) -> EventLog:
+    """Read the bytes of an event file, or of what was appended to one, up to the first damage."""
     log = EventLog([], 0)
     try:
         for end in _find_ends(raw):

@@ -70,6 +70,10 @@ def process_settings(args: argparse.Namespace, data: Path) -> Settings:
 
 
 def _process(args: argparse.Namespace) -> int:
+    from polysight.jobs.output import say
+
+    # Before the other modules are loaded, which takes most of a second.
+    say("checking data and settings")
     from polysight.jobs.batch import find_scans, process_several
     from polysight.jobs.process import process
 

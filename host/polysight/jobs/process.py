@@ -216,7 +216,6 @@ def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | 
 
     `data` is a scan, or a pair of images (see :func:`process_images`). Raises PolysightError.
     """
-    say("checking data and settings")
     inputs = load_inputs(settings)
     if is_given_images(data):
         return process_images(data, out, settings, inputs)

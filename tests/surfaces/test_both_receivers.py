@@ -7,18 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.surfaces.test_point_errors import UNIT_GAINS
 
 from polysight.data import find_packaged
 from polysight.imaging.samples import reduction
 from polysight.surfaces import Echoes, Optics, Seen, find_voltages, make_optics
 from polysight.surfaces.measure import Shape
+from polysight.surfaces.permittivity import add_common_errors, fit_permittivity
 from polysight.surfaces.points import find_normals, find_offset_that_sees, predict_echo
 from polysight.surfaces.voltages import receive, reflect_points
 from polysight.surfaces.window import BoardFit, Samples, no_echoes
 from polysight_shared.config import load_instrument
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_worlds.media import METAL, Stack
-from polysight_worlds.rig import Boards, published_boards
+from polysight_worlds.rig import Antenna, Boards, published_boards
 from polysight_worlds.shape_echoes import record_shapes
 from polysight_worlds.shape_scenes import scan_offsets
 from polysight_worlds.shapes import Sphere, find_specular, sphere
@@ -40,7 +42,7 @@ def see_exactly(ball: Sphere, optics: Optics) -> tuple[Seen, Shape]:
     patch = ball.evaluate(*find_specular(ball, *antennas))
     points = patch.point.T
     normals = patch.normal.T
-    curvature = np.tile(np.eye(2) / RADIUS_M, (len(points), 1, 1))
+    curvature = np.tile(np.eye(2) / ball.radius_m, (len(points), 1, 1))
     _, cos = find_normals(points, OFFSETS_M, optics.tx.at_m, optics.h.at_m)
     seen_from = {
         "h": OFFSETS_M,
@@ -83,6 +85,32 @@ def test_a_large_ball_gives_both_receivers_what_the_series_says(medium, optics):
     # The antennas' patterns are those of metal. V is small near Brewster's angle: its error counts over H.
     miss = ratios["medium"] / ratios["metal"] - 1
     assert np.abs(miss * share_of_v).max() < 0.0004
+
+
+def find_pattern(antenna: Antenna, points: np.ndarray, at_m: np.ndarray) -> np.ndarray:
+    """Gain of an antenna of the worlds in the directions of points [n, 3] from stage offsets [n, 3]."""
+    away = points - at_m - antenna.position
+    return (away @ antenna.boresight / np.linalg.norm(away, axis=1)) ** antenna.exponent
+
+
+@pytest.mark.parametrize("medium", [2.8 - 0.1j, 4.5 - 0.3j, 8 - 1j], ids=["2.8", "4.5", "8"])
+def test_the_error_of_the_model_is_what_the_series_of_a_sphere_shows(medium, optics):
+    """Beyond the first order, at 100 mm, gains known. It was stated twice as large, and in any direction."""
+    x, y, _ = CENTRE_M
+    seen, shape = see_exactly(sphere("ball", Stack(below=medium), (x, y, 0.6), 0.1), optics)
+    v = find_voltages(seen, optics, shape)
+    published = published_boards()
+    tx = published.tx
+    h = replace(published.h[0], position=optics.h.at_m)
+    v_rx = replace(published.v[0], position=optics.v.at_m)
+    at_v_m = find_offset_that_sees(shape.points, shape.normals, OFFSETS_M, tx.position, v_rx.position)
+    gain_h = find_pattern(tx, shape.points, OFFSETS_M) * find_pattern(h, shape.points, OFFSETS_M)
+    gain_v = find_pattern(tx, shape.points, at_v_m) * find_pattern(v_rx, shape.points, at_v_m)
+    v = replace(v, b=v.b / np.stack([gain_h, gain_v], axis=1), std=np.full(v.b.shape, 1e-4))
+    fit = fit_permittivity(v, UNIT_GAINS, optics.wave_number)
+    covariance = add_common_errors(fit, v, UNIT_GAINS, [], optics.wave_number)["model"]
+    std = np.sqrt(np.trace(covariance))
+    assert 0.3 * std < abs(fit.eps - medium) < 2 * std
 
 
 @pytest.mark.parametrize(("behind_m", "most_std"), [(0.0, 0.03), (0.18, 0.1)], ids=["same distance", "180 mm behind"])

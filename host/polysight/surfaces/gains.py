@@ -45,7 +45,8 @@ class Gains:
     middle, departure_middle, degree
         Middles of the directions of arrival and of departure, and the degree of the polynomials.
     std
-        Standard deviation of each part of ln(H / V) within the directions covered.
+        Standard deviation of each part of ln(H / V) within the directions covered: what the polynomial does not follow,
+        beyond the noise of the reference's points.
     covered
         Smallest and largest direction, [2] each.
     terms_root, cell
@@ -149,7 +150,9 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     # The next order of metal's own correction, r_p / r_s = 1 + first order.
     first_order = np.abs(coefficients[sound, 0, 1] / coefficients[sound, 0, 0] - 1)
     next_order = float(np.median(first_order * expansion_parameter(metal, wave_number)))
-    std = float(np.hypot(_compute_misfit_std(rest, metal.at_m), next_order))
+    noise2 = np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1)
+    misfit_std, noise_std = _compute_misfit_std(rest, noise2, metal.at_m)
+    std = float(np.hypot(np.sqrt(max(0.0, misfit_std**2 - noise_std**2)), next_order))
     # How the direction changes with the stage; a plate has one direction.
     rate = np.linalg.lstsq(metal.at_m - metal.at_m.mean(axis=0), metal.arrival - middle, rcond=None)[0]
     cell = BLOCK_M * np.linalg.norm(rate, axis=0) if degree else np.full(2, np.inf)
@@ -164,16 +167,20 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
         degree=degree,
         std=std,
         covered=(low, high),
-        terms_root=np.asarray(std * np.linalg.pinv(of_blocks), np.float64),
+        terms_root=np.asarray(np.hypot(misfit_std, next_order) * np.linalg.pinv(of_blocks), np.float64),
         cell=np.asarray(cell, np.float64),
     )
 
 
-def _compute_misfit_std(rest: Complex, at_m: Array) -> float:
-    """Standard deviation of each part of a fitted function: the root mean square of what is left over blocks."""
+def _compute_misfit_std(rest: Complex, noise2: Array, at_m: Array) -> tuple[float, float]:
+    """Standard deviation of each part of a fitted function, and that by noise of variance `noise2` [n] of each point.
+
+    The root mean square of what is left over blocks.
+    """
     clipped = rest / np.maximum(1, np.abs(rest) / (5 * np.median(np.abs(rest)) + 1e-12))
     block = number_blocks(at_m, (0.0, 0.0))
     count = np.bincount(block)
     sums = np.bincount(block, clipped.real) + 1j * np.bincount(block, clipped.imag)
-    means = sums[count > 0] / count[count > 0]
-    return float(np.sqrt(np.average(np.abs(means) ** 2, weights=count[count > 0]) / 2))
+    variance = np.average(np.abs(sums / count) ** 2, weights=count) / 2
+    noise_variance = np.average(np.bincount(block, noise2) / count**2, weights=count)
+    return float(np.sqrt(variance)), float(np.sqrt(noise_variance))

@@ -137,8 +137,8 @@ def expansion_parameter(v: Voltages, wave_number: float) -> Array:
     return bend / (wave_number * np.cos(v.theta[:, 0]) ** 3)
 
 
-def number_blocks(at_m: Array, shift: tuple[float, float]) -> NDArray[np.int_]:
+def number_blocks(at_m: Array, shift: tuple[float, float], block_m: float = BLOCK_M) -> NDArray[np.int_]:
     """Number of the block of each stage offset [n, 2]; `shift`: of the blocks' borders, in blocks."""
-    cell = np.floor(at_m / BLOCK_M + np.array(shift)).astype(int)
+    cell = np.floor(at_m / block_m + np.array(shift)).astype(int)
     _, number = np.unique(cell, axis=0, return_inverse=True)
     return number.reshape(-1)

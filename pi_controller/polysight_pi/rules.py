@@ -72,6 +72,7 @@ RULES = (
     Rule("timeout", "done", "ending", "disarm"),
     Rule("settled", "ending", "ready idle fault", "finish_row"),
 )
+# A row's own time limit is set when it begins; states that are not listed have none.
 TIMEOUTS_S: dict[State, float] = {
     "homing": HOMING_TIMEOUT_S,
     "jogging": m.MAX_JOG_S + 5.0,
@@ -79,8 +80,8 @@ TIMEOUTS_S: dict[State, float] = {
     "stopping": 3.0,
     # Time from the stage's `done` to the last burst.
     "done": 1.0,
-}  # running: set for each row; all others: no limit
-# From STOP to standstill when the program is being ended.
+}
+# Time from STOP to standstill when the program is being ended.
 END_TIMEOUT_S = 0.5
 # The other states have the same name on the wire.
 WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}

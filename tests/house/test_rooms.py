@@ -144,7 +144,7 @@ def test_no_module_is_taken_from_behind_a_front():
                 past.append(f"{file.relative_to(ROOT)}:{node.lineno} a relative import")
             elif parts[0] == "polysight" and len(parts) == 2 and parts[1] not in (find_room(file), *ENTERED_BY_MODULE):
                 room = HOST / parts[1]
-                # pipeline.py
+                # A module at the root, such as pipeline.py, is no room.
                 if not room.is_dir():
                     continue
                 front = (room / "__init__.py").read_text(encoding="utf-8")

@@ -97,7 +97,8 @@ def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
 def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path) -> None:
     scan_folder = tmp_path / "scan"
     shutil.copytree(scan, scan_folder)
-    shutil.rmtree(scan_folder / "raw")  # the samples are enough
+    # The samples are enough.
+    shutil.rmtree(scan_folder / "raw")
     options = ("--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
     read_output("image", scan_folder, *options)
     products = read_products(tmp_path / "out")
@@ -115,7 +116,8 @@ def test_an_invalid_grid_is_refused(grid: str) -> None:
         main(["image", "scan", "--out", "out", "--grid", grid])
 
 
-METAL = "-40,10,30,30"  # inside the copper
+# A box inside the copper.
+METAL = "-40,10,30,30"
 
 
 def rename_pet(scan: Path, name: str) -> None:

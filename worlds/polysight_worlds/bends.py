@@ -41,8 +41,9 @@ PAIRS = ((0, 0), (1, 1), (0, 1), (1, 0))
 class BendTerms:
     """Additions to the reflection coefficients over the cosine of incidence, at `FREQUENCY_HZ`.
 
-    Each row of `table` [4 rows, 4 coefficients] is of: a plane, curvature along, across, twist (the last three times
-    metres). Coefficients: s to s, p to p, s to p, p to s.
+    `spline` gives them over the angle in degrees, real [4 rows, 4 coefficients, 2 parts]. The rows are for a plane, a
+    curvature along, one across, and a twist (the last three times metres), the coefficients s to s, p to p, s to p and
+    p to s.
     """
 
     spline: CubicSpline
@@ -75,7 +76,7 @@ def find_bend_terms(stack: Stack) -> BendTerms:
 
 
 def _compare(stack: Stack, axis: tuple[float, float, float], radius_m: float) -> NDArray:
-    """Series minus physical optics over the ray's spreading, [angles, 4: s to s, p to p, s to p, p to s]."""
+    """Return series minus physical optics over the ray's spreading, [angle, 4: s to s, p to p, s to p, p to s]."""
     sines = np.sin(np.radians(ANGLES_DEG))
     cosines = np.cos(np.radians(ANGLES_DEG))
     shape = cylinder("solid", stack, (0.0, 0.0, radius_m), radius_m, 10.0, axis=axis)

@@ -30,7 +30,7 @@ SWITCHED_ON = Counters(0, 1)
 """Counters of the first packet of a card that was switched on or reset."""
 # Fewer packets with strange counters are damaged ones.
 MIN_PACKETS_OF_A_RECORD = 3
-# Packets by which a network does not delay one behind others.
+# A packet that comes so many packets late was not delayed by a network: the card has counted its bytes twice.
 _FAR_BEHIND = 64
 # A packet size seen in fewer packets may be that of last packets, which are short.
 _MIN_PACKETS_OF_A_SIZE = 3
@@ -85,7 +85,7 @@ class PacketCounts:
 
 @dataclass(frozen=True)
 class Losses:
-    """Missing bytes: before the first packet, in gaps between packets, after the last one."""
+    """Missing bytes: before the first packet, in `gaps` gaps between packets, after the last one."""
 
     head_bytes: int = 0
     gaps: int = 0
@@ -494,7 +494,7 @@ class _Row:
         return self._log.payload[self._starts[k] : self._starts[k] + self._sizes[k]]
 
     def arrivals(self) -> Counts:
-        """Return the arrival time of each packet behind all before it, and its end, int64 [n, 2]."""
+        """Return pairs (arrival time, ns; end of the packet) of packets that reach further than all before, [n, 2]."""
         stops = np.where(self._placed, self._stops, 0)
         reached = np.maximum.accumulate(stops)
         is_new = np.diff(reached, prepend=0) > 0

@@ -314,9 +314,13 @@ class Program:
     Attributes
     ----------
     basic
-        After the power-up of the RF core.
+        Commands that follow the power-up of the RF core.
     waveform
-        After the calibration of the RF core.
+        Commands that follow the calibration of the RF core.
+    samples, chirps, frame_period_us
+        Samples of a chirp, chirps of a frame, and the period of frames.
+    transmits
+        True for the board whose transmitter is on.
     """
 
     basic: tuple[Command, ...]
@@ -532,7 +536,7 @@ def _list_chirp_constraints(rig: Instrument) -> Iterator[Constraint]:
     memory = c.samples * len(rig.antennas.rx_mm) * 4
     samples_remedy = "lower chirp.samples"
     yield Constraint("sample memory", "samples x RX x 4", memory, "bytes", samples_remedy, high=SAMPLE_MEMORY_BYTES)
-    # Error 1023
+    # Limits of the radar's error 1023 (docs/spec/mmwavelink.md).
     yield Constraint("samples", "words a chirp", 2 * c.samples, "", "set chirp.samples", low=64, high=8192)
     limit = MAX_RATE_HZ[c.if_mode]
     yield Constraint("sample rate", "rate", c.sample_rate_hz, "Hz", "set chirp.sample_rate_hz", low=2e6, high=limit)

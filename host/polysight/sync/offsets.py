@@ -228,7 +228,8 @@ def align_in_numpy(
 
 def _empty_row(bursts: tuple[int, ...], words: tuple[int, ...], blocks: int) -> AlignedRow:
     """Return memory for the row: bursts [position, chirp], words [position, chirp, sample, 2, rx]."""
-    (positions, chirps), rx = bursts, words[-1]
+    positions, chirps = bursts
+    rx = words[-1]
     return AlignedRow(
         halves=np.empty((positions, 2, rx, blocks), np.complex64),
         centre=np.empty(positions),
@@ -259,9 +260,9 @@ def _align(
         if todo.size == 0:
             break
         usable[todo] &= ~disturbed[todo]
-        redone, residual_energy = _align_round(words[todo], usable[todo], clipped[todo], linear, equaliser)
+        redone, still_disturbed = _align_round(words[todo], usable[todo], clipped[todo], linear, equaliser)
         disturbed[:] = False
-        disturbed[todo] = residual_energy
+        disturbed[todo] = still_disturbed
         for field, values in zip(row, redone, strict=True):
             field[todo] = values
     return row
@@ -310,7 +311,6 @@ def _align_round(
     shift = part * np.angle(tone.amplitude)
     coherence = amplitude * np.sqrt(level / np.maximum(own_energy, 1e-30))
     good = _find_coherent(coherence, usable)
-
     second_half = np.cumsum(good, axis=1) % 2 == 0
     weights = good / np.maximum(good.sum(axis=1), 1)[:, None]
     split = np.stack([weights * ~second_half, weights * second_half], axis=1).astype(np.float32)
@@ -366,7 +366,7 @@ def _refer_to_one(
 ) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Estimate offsets relative to one usable chirp per position; try another one if it matches few others.
 
-    Returns the offsets, the middle of the signal's band [position], and [position, chirp]: coherence with the reference
+    Return the offsets, the middle of the signal's band [position], and [position, chirp]: coherence with the reference
     chirp, and usable chirps (whole, not silent).
     """
     positions, chirps = is_complete.shape
@@ -374,7 +374,7 @@ def _refer_to_one(
     noise = 4.0 / np.sqrt(words.shape[-1] * (linear[1] - linear[0]))
     usable = is_complete & words.any(axis=(2, 3, 4))
     count = usable.sum(axis=1)
-    order = np.argsort(~usable, axis=1, kind="stable")  # the usable ones, first to last
+    order = np.argsort(~usable, axis=1, kind="stable")
     reference = order[:, 0].copy()
     all_positions = np.arange(positions)
     frequency = np.zeros(is_complete.shape)
@@ -390,7 +390,8 @@ def _refer_to_one(
         offset, product, middle, energy = loops.match(words[todo], tried, linear)
         tried_pair = np.arange(todo.size), tried
         c = np.abs(product) / np.sqrt(np.maximum(energy * energy[tried_pair][:, None], 1e-30)) * usable[todo]
-        c[tried_pair] = 0  # a chirp always matches itself
+        # A chirp always matches itself.
+        c[tried_pair] = 0
         total = c.sum(axis=1)
         better = total > best_sum[todo]
         won = todo[better]
@@ -403,7 +404,7 @@ def _refer_to_one(
         matching = (c > noise).sum(axis=1)
         todo = todo[(2 * matching < count[todo] - 1) & (attempt + 1 < count[todo])]
     best = coherence.max(axis=1)
-    # A reference is as good as its best match
+    # A reference is as good as its best match.
     coherence[all_positions, reference] = np.where(usable[all_positions, reference], best, 0)
     return Tone(frequency, amplitude), centre, coherence, usable
 
@@ -585,7 +586,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     chirp
         The chirp the samples were taken with.
     by
-        Its loops, with equal results; None: compiled where that is possible.
+        Compiled loops or those in NumPy, with equal results; None: compiled ones where possible.
     """
     a, b = whole_blocks(chirp.linear_samples)
     n = (b - a) // FOLD
@@ -594,19 +595,18 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     run = by or (loops.library() if is_supported else None) or NumpyLoops
     good_chirps = aligned.good.sum(axis=1)
     usable = good_chirps > 0
-    nearest = int(path.object_bins[0] * 0.9)
-    farthest = int(path.object_bins[1] * 1.1)
     first = run.find(
         halves=aligned.halves,
         weights=path.search_weights,
         size=_FFT,
-        object_bins=(nearest, farthest),
+        object_bins=(int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)),
         comparable=_COMPARABLE,
         steering=path.folded_steering,
         estimator=complex64(path.drift_estimator),
         steps=_STEPS,
     )
-    floor = first.median**2 / np.log(2) / (_make_window(n) ** 2).sum()  # from the median bin, for tones fill few bins
+    # From the median bin, for tones fill few bins.
+    floor = first.median**2 / np.log(2) / (_make_window(n) ** 2).sum()
     drifts = _divide(first.estimate[:, 2], first.estimate[:, 0])[usable]
     drift = _find_middle(drifts) if usable.any() else 0.0
     flat = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
@@ -626,9 +626,9 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     band = if_frequency < 0.9 if chirp.if_mode == "complex1x" else np.abs(if_frequency) < 0.45
     strength = np.abs(amplitude)
     chirps = np.maximum(good_chirps, 1)
-    # All chirps of a row have the same noise.
+    # All chirps of a row have the same noise; `noise` is the power in an averaged sample of one RX.
     floor = _find_middle((floor * chirps)[usable]) / chirps if usable.any() else floor
-    noise = floor / (np.abs(path.beam) ** 2).sum()  # noise power of an averaged sample of one RX
+    noise = floor / (np.abs(path.beam) ** 2).sum()
     present = strength**2 > _PRESENT * noise * (np.abs(path.estimator[0]) ** 2).sum()
     is_found = usable & band & present & (np.abs(step) < 0.02 / (b - a))
     if is_found.any():

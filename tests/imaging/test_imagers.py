@@ -7,7 +7,7 @@ import pytest
 
 from polysight.imaging import image_grid
 from polysight.imaging.direct import DirectImager
-from polysight.imaging.geometry import Antennas, Aperture, irregular, scan_offsets_m
+from polysight.imaging.geometry import Antennas, Aperture, find_irregularity, scan_offsets_m
 from polysight.imaging.samples import choose_imager, reduction, scene_gate_m
 from polysight.imaging.spectral import IncrementalImager, SpectralImager, forget
 from polysight_shared.raster import plan_raster
@@ -175,7 +175,7 @@ def test_a_micrometre_of_jitter_is_imaged_spectrally(aperture):
     rng = np.random.default_rng(8)
     a = aperture(31, 12, 4.0, 4.0, (12, 10), 2.0)
     a.offsets_m[..., 0] += rng.uniform(-3e-7, 3e-7, a.offsets_m.shape[:2])
-    assert irregular(a) is None
+    assert find_irregularity(a) is None
     samples = DirectImager(a).samples(np.eye(10, 12))
     got = SpectralImager(a).image(samples)
     exact = DirectImager(a).image(samples)
@@ -199,4 +199,7 @@ def test_steps_without_a_common_divisor_are_irregular(make_rig):
     rig = make_rig(5, 5, step_y=2.137)
     grid = image_grid(rig)
     offsets = scan_offsets_m(rig)
-    assert irregular(Aperture(Antennas.from_rig(rig, rig.receivers[0]), offsets, np.array([77e9]), grid)) is not None
+    assert (
+        find_irregularity(Aperture(Antennas.from_rig(rig, rig.receivers[0]), offsets, np.array([77e9]), grid))
+        is not None
+    )

@@ -33,9 +33,9 @@ more of either, plates half in the dark run away (78 drawn plates, apertures of 
 
 SAME_END_PX = 5.0
 """Distance up to which a plate's end by |H| and by its segmentation are the same one: about a resolution cell."""
-# Tolerance of positions: 2e-3 rad at one position, far below the noise
+# Tolerance of positions: 2e-3 rad at one position, far below the noise.
 _SAME_M = 1e-6
-# The lattice in y may be this much finer than the pixels
+# The lattice in y may be finer than the pixels by this factor.
 _FINER = 4
 Window = str | tuple[Any, ...]
 """Window as for scipy.signal.get_window; "boxcar" for none."""
@@ -187,7 +187,7 @@ class Aperture:
         return (len(self.antennas.rx_m), self.frequencies_hz.size, *self.offsets_m.shape[:2])
 
 
-def irregular(aperture: Aperture) -> str | None:
+def find_irregularity(aperture: Aperture) -> str | None:
     """Return the reason why positions and pixels do not form a lattice; None if they do."""
     offsets = aperture.offsets_m
     grid = aperture.grid
@@ -347,9 +347,10 @@ class StageWindow:
             product = np.vdot(image[inside_px[:-1]], image[inside_px[1:]])
             slope = slope_per_rad * (step_rad - float(np.angle(product)))
             seen_of_level = find_ends(np.abs(image), lit, inside_px)
-            both_end = ~touching & np.isfinite(seen_of_level) & np.isfinite(ends_px)
-            off_px = seen_of_level[both_end] - ends_px[both_end]
-            ends_px[both_end] = seen_px[both_end] - END_STEP * off_px
+            # Ends that both the plate and the level one have within the light.
+            is_seen = ~touching & np.isfinite(seen_of_level) & np.isfinite(ends_px)
+            off_px = seen_of_level[is_seen] - ends_px[is_seen]
+            ends_px[is_seen] = seen_px[is_seen] - END_STEP * off_px
         return slope
 
 

@@ -248,7 +248,7 @@ class Imager(Protocol):
 
 def choose_imager(aperture: geometry.Aperture) -> tuple[Imager, str | None]:
     """Choose the imager: spectral if the aperture is regular, otherwise the slower direct sum (with a notice)."""
-    reason = geometry.irregular(aperture)
+    reason = geometry.find_irregularity(aperture)
     if reason is None:
         return SpectralImager(aperture), None
     rx, _, rows, columns = aperture.shape
@@ -326,7 +326,7 @@ class BoardSamples:
         self._cube = np.zeros((rx, reduction.frequencies_hz.size, *shape), np.complex64)
         self._direct = np.zeros((rx, *shape), np.complex64)
         self.valid = np.zeros(shape, bool)
-        regular = geometry.irregular(self.aperture) is None
+        regular = geometry.find_irregularity(self.aperture) is None
         self._final: SpectralImager | None = None
         # Spectra of the rows along x, for the final image
         self._spectra = np.zeros(0, np.complex64)
@@ -422,7 +422,7 @@ class BoardSamples:
             self._final = None
             self._moved = True
             deviation = abs(geometry.row_starts_m(self._offsets)[index] - self._planned[index])
-            if deviation > SLACK_M or geometry.irregular(self.aperture) is not None:
+            if deviation > SLACK_M or geometry.find_irregularity(self.aperture) is not None:
                 self._live = None
         self._stale.add(index)
         self._image = None
@@ -447,7 +447,7 @@ class BoardSamples:
 
     def _prepare(self) -> None:
         """Create the spectral imager of all rows if the aperture is regular; keep it while positions do not change."""
-        if self._final is None and geometry.irregular(self.aperture) is None:
+        if self._final is None and geometry.find_irregularity(self.aperture) is None:
             # The same slack as the live imager, so that both share their spectra.
             self._final = SpectralImager(self.aperture, slack_m=SLACK_M)
             self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)

@@ -85,7 +85,7 @@ class Lattice:
 
 
 def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
-    """Return the lattice of a regular aperture, see :func:`polysight.imaging.geometry.irregular`.
+    """Return the lattice of a regular aperture, see :func:`polysight.imaging.geometry.find_irregularity`.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ class RowSpectra:
     Parameters
     ----------
     aperture
-        A regular aperture, see :func:`polysight.imaging.geometry.irregular`.
+        A regular aperture, see :func:`polysight.imaging.geometry.find_irregularity`.
     xp, device
         Array API namespace and device.
     slack_m

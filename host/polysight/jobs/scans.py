@@ -241,10 +241,9 @@ def _confirm_and_drop(scan: store.ScanFolder, folder: Path, products: Path, yes:
         f"{folder}: the raw data of {len(rows.files)} rows, {rows.bytes / 1e6:.1f} MB, is removed. {products} and"
         " the kept samples stay: images and materials can be made again, but not synchronised again."
     )
-    for folder_of_board in sorted({path.parent for boards in rows.files.values() for path in boards.values()}):
-        names = sorted(
-            path.name for boards in rows.files.values() for path in boards.values() if path.parent == folder_of_board
-        )
+    paths = [path for boards in rows.files.values() for path in boards.values()]
+    for folder_of_board in sorted({path.parent for path in paths}):
+        names = sorted(path.name for path in paths if path.parent == folder_of_board)
         sys.stdout.write(f"to be removed: {folder_of_board.relative_to(folder)}: {', '.join(names)}\n")
     answer = confirm(text, WORD, yes)
     if answer != WORD:

@@ -1,8 +1,9 @@
 """Gains of both receivers over direction, learnt from metal of known shape: what a permittivity is referenced to.
 
 A metal sphere covers directions; a flat plate gives one. What TX sends depends on the direction of departure, and what
-a receiver takes on that of arrival. At the distance of the reference either gives the other; farther away or nearer
-not, and the level is known as well as both agree. H over V needs the direction of arrival alone: TX cancels.
+a receiver takes on that of arrival. At the distance of the reference, one of these directions gives the other; at
+other distances it does not, and the error of the level is half the difference of what both say. H over V needs the
+direction of arrival alone: TX cancels.
 """
 
 from __future__ import annotations
@@ -65,15 +66,15 @@ class Gains:
     cell: Array
 
     def ratio(self, arrival: Array) -> Complex:
-        """Gain of H over that of V, [n]."""
+        """Return the gain of H over that of V for directions of arrival [n, 2], [n]."""
         return np.exp(self._make_basis(arrival) @ self.ratio_terms)
 
     def level(self, v: Voltages) -> Array:
-        """ln|gain of H|, [n]: the mean of what arrival and departure say."""
+        """Return ln|gain of H|, [n]: the mean of what arrival and departure say."""
         return np.mean(self._find_levels(v), axis=0)
 
     def estimate_level_std(self, v: Voltages) -> Array:
-        """Standard deviation of the level [n] where arrival and departure do not go together as at the reference."""
+        """Return the standard deviation of the level, [n], also where arrival and departure disagree."""
         by_arrival, by_departure = self._find_levels(v)
         return np.hypot(np.abs(by_arrival - by_departure) / 2, self.estimate_unknown_std(v.arrival))
 
@@ -83,7 +84,7 @@ class Gains:
         return self._make_basis(v.arrival) @ arrival_terms, departure @ departure_terms
 
     def estimate_unknown_std(self, arrival: Array) -> Array:
-        """Standard deviation of ln(H / V) by directions that the reference does not cover, [n]."""
+        """Return the standard deviation of ln(H / V), [n], also of directions that the reference does not cover."""
         return np.hypot(self.std, self._extrapolate_std(arrival))
 
     def _extrapolate_std(self, arrival: Array) -> Array:
@@ -93,7 +94,7 @@ class Gains:
         return slope * beyond
 
     def list_errors(self, arrival: Array) -> Array:
-        """Independent errors of each part of ln(H / V), one standard deviation each, [errors, n].
+        """Return independent errors of each part of ln(H / V), one standard deviation each, [errors, n].
 
         What the polynomials do not follow differs from cell to cell of the directions; a wide object averages over it.
         Errors of the polynomials' terms are common to all directions, and so is what lies beyond those covered.
@@ -114,7 +115,7 @@ def _evaluate_polynomials(d: Array, degree: int) -> Array:
 
 
 def _fit_robustly(basis: Array, values: NDArray, weight: Array) -> tuple[NDArray, NDArray]:
-    """Coefficients of `values` [n] in `basis` [n, terms], and what is left; outliers lose their weight."""
+    """Return the coefficients of `values` [n] in `basis` [n, terms], and what is left; outliers lose their weight."""
     coefficients = np.zeros(basis.shape[1], values.dtype)
     rest = values
     for _ in range(5):
@@ -173,9 +174,9 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
 
 
 def _compute_misfit_std(rest: Complex, noise2: Array, at_m: Array) -> tuple[float, float]:
-    """Standard deviation of each part of a fitted function, and that by noise of variance `noise2` [n] of each point.
+    """Return the standard deviation of each part of what a fit leaves, and its part by noise of variance `noise2` [n].
 
-    The root mean square of what is left over blocks.
+    It is the root mean square over blocks of the mean of what is left, `rest` [n], in each block.
     """
     clipped = rest / np.maximum(1, np.abs(rest) / (5 * np.median(np.abs(rest)) + 1e-12))
     block = number_blocks(at_m, (0.0, 0.0))

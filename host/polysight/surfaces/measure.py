@@ -172,20 +172,20 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
         tree = scipy.spatial.KDTree(at_m)
         neighbours = tree.query_ball_point(at_m, NEIGHBOURHOOD_M)
         around = tree.query_ball_point(at_m, RIPPLE_REACH_M)
-        ripple = np.zeros((len(members), 2))
+        ripple_variance = np.zeros((len(members), 2))
         is_fitted = np.array([len(near) >= MIN_NEIGHBOURS for near in neighbours])
         for place in np.flatnonzero(is_fitted):
             near = neighbours[place]
             fit = _find_fit(fits, at_m[near] - at_m[place], may_change=False)
-            bend[members[place]], ripple[place] = fit.apply(echoes, members[near])
+            bend[members[place]], ripple_variance[place] = fit.apply(echoes, members[near])
             if len(around[place]) >= MIN_AROUND:
                 near = around[place]
                 fit = _find_fit(fits, at_m[near] - at_m[place], may_change=True)
-                _, ripple[place] = fit.apply(echoes, members[near])
+                _, ripple_variance[place] = fit.apply(echoes, members[near])
         for place in np.flatnonzero(is_fitted):
             near = [other for other in neighbours[place] if is_fitted[other]]
             slope_std[members[place]] = np.hypot(
-                slope_std[members[place]], np.sqrt(np.maximum(0, ripple[near].mean(axis=0)))
+                slope_std[members[place]], np.sqrt(np.maximum(0, ripple_variance[near].mean(axis=0)))
             )
     return replace(echoes, bend=bend, slope_std=slope_std)
 

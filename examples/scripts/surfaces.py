@@ -2,7 +2,7 @@
 
 Needs the package in worlds/ (pip install ./worlds), which simulates the scan: exact series for the pipe and the metal
 sphere, vector physical optics for the rest. One RX a board and every other position, with the noise that the whole
-scan's averages have: four minutes of CPU.
+scan's averages have: four to five minutes of CPU.
 """
 
 # %%

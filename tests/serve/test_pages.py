@@ -436,6 +436,20 @@ def test_the_page_follows_products_that_another_program_has_made(page, scans):
     page.browser.errors.clear()
 
 
+def test_a_list_that_takes_long_is_shown_as_it_is_read(browser, tmp_path, monkeypatch):
+    """Each answer of this server has one scan more; the page asks again until it has all, and says so meanwhile."""
+    monkeypatch.setattr(reading, "LIST_S", 0.0)
+    for k in range(6):
+        judged_products(tmp_path / "scans" / f"scan-{k}", "care")
+    with served_folder(tmp_path / "scans") as view:
+        page = Page(browser, view)
+        page.open("/?all", token="")
+        browser.wait("document.querySelectorAll('#list li').length == 6", "all of them")
+        browser.wait("!document.getElementById('count').innerText.includes('reading')", "that nothing is being read")
+        asked = [url for url in browser.requests if "/api/scans" in url]
+        assert len(asked) >= 6
+
+
 def test_without_the_token_nothing_can_be_asked_and_the_page_asks_for_it(page, scans):
     page.browser.forget(page.view.address)
     page.open("/scan?scan=one", token="wrong")

@@ -227,7 +227,9 @@ def serve(connection: socket.socket) -> list[str]:
             answer = near.recv(32)
             # From the end of the middle process on, the program's parent is the process that asked.
             os.waitpid(middle, 0)
-            connection.send(answer)
+            # Who asked may have been killed meanwhile: there is no further request then.
+            with suppress(BrokenPipeError):
+                connection.send(answer)
             near.close()
             continue
         if os.fork():

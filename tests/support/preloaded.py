@@ -215,7 +215,11 @@ def preload() -> None:
 def serve(connection: socket.socket) -> list[str]:
     """Fork a program for each request. Return in each program, which is prepared, with its words."""
     while True:
-        message, files, _, _ = socket.recv_fds(connection, 1 << 20, 64)
+        try:
+            message, files, _, _ = socket.recv_fds(connection, 1 << 20, 64)
+        except ConnectionResetError:
+            # Who asked was killed before it had read the last answer.
+            os._exit(0)
         if not message:
             os._exit(0)
         near, far = socket.socketpair()

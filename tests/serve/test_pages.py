@@ -184,6 +184,8 @@ def test_every_page_fits_can_be_read_and_has_the_abort_of_the_running_scan(page,
             browser.size(*size)
             browser.wait(f"innerWidth == {size[0]}", "the other size")
             browser.wait("document.querySelector('#running button.danger')?.checkVisibility()", "the abort")
+            # No Pi is there: the page says so, and the console has its refusal.
+            browser.errors[:] = [error for error in browser.errors if not error.endswith("/api/stage/look")]
             page.check_whole()
             # A table's last columns, too.
             assert browser.value("[...document.querySelectorAll('.wide')].every((t) => t.scrollWidth <= t.clientWidth)")

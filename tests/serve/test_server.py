@@ -136,7 +136,7 @@ def test_connections_end_with_their_server(request_head):
 
 def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
     """Rows of modules, True for dark, as a terminal shows them that has black text on white, or white on black."""
-    colours = {"0": (black_text, not black_text), "38;5;231;48;5;16": (False, True)}
+    colours = {"0": (black_text, not black_text), "38;5;16;48;5;231": (True, False)}
     blocks = {" ": (1, 1), "\u2580": (0, 1), "\u2584": (1, 0), "\u2588": (0, 0)}
     rows: list[list[bool]] = []
     dark = colours["0"]
@@ -157,9 +157,10 @@ def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
 @pytest.mark.parametrize("black_text", [True, False])
 def test_the_code_is_dark_on_light_whatever_the_terminal_s_colours_are(black_text):
     address = f"http://192.168.33.7:8080/#token={TOKEN}"
-    expected = [[bool(module) for module in row] for row in segno.make(address, error="l").matrix_iter(border=2)]
+    expected = [[bool(module) for module in row] for row in segno.make(address, error="l").matrix_iter()]
     shown = show_on_terminal(draw_code(address), black_text)
     assert shown[: len(expected)] == expected
+    assert not any(map(any, shown[len(expected) :]))
 
 
 def test_a_server_of_all_interfaces_names_each_address_of_this_machine():

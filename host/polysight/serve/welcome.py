@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import ipaddress
 import socket
 import struct
@@ -15,9 +14,10 @@ from polysight.serve.guard import Access
 SIOCGIFADDR = 0x8915
 # A documentation address (RFC 5737): it stands for every network that is reached by the default route.
 ELSEWHERE = ("203.0.113.1", 9)
-# The library draws light modules in the text's colour. Colours are given, since the terminal's own may be either way
-# round and a camera reads no inverted code.
-WHITE_ON_BLACK = "\033[38;5;231;48;5;16m"
+# One character shows two modules of the code, the keys say whether the upper and the lower one are dark. Colours are
+# given, black on white, since the terminal's own may be either way round and a camera reads no inverted code.
+HALF_BLOCKS = {(0, 0): " ", (1, 0): "\u2580", (0, 1): "\u2584", (1, 1): "\u2588"}
+BLACK_ON_WHITE = "\033[38;5;16;48;5;231m"
 RESET = "\033[0m"
 
 
@@ -77,6 +77,11 @@ def draw_code(address: str) -> str:
         import segno
     except ImportError:
         return ""
-    drawn = io.StringIO()
-    segno.make(address, error="l").terminal(drawn, border=2, compact=True)
-    return "\n".join(f"{WHITE_ON_BLACK}{line}{RESET}" for line in drawn.getvalue().splitlines())
+    rows = [*segno.make(address, error="l").matrix_iter()]
+    if len(rows) % 2:
+        rows.append(bytearray(len(rows)))
+    lines = []
+    for upper, lower in zip(rows[::2], rows[1::2], strict=True):
+        blocks = "".join(HALF_BLOCKS[pair] for pair in zip(upper, lower, strict=True))
+        lines.append(f"{BLACK_ON_WHITE}{blocks}{RESET}")
+    return "\n".join(lines)

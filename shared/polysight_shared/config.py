@@ -468,7 +468,7 @@ def load_instrument(path: Path) -> Instrument:
         return str(folder / name)
 
     calibration = CalibrationFiles(**{kind: resolve(name) for kind, name in to_builtins(rig.calibration).items()})
-    pi = msgspec.structs.replace(rig.pi, key_dir=resolve(rig.pi.key_dir))
+    pi = msgspec.structs.replace(rig.pi, key_dir=str(folder / rig.pi.key_dir))
     radar = msgspec.structs.replace(
         rig.radar,
         firmware=resolve(rig.radar.firmware),

@@ -21,6 +21,17 @@ def test_the_published_rig_survives_toml(rig: Instrument, tmp_path: Path):
     assert load_instrument(path) == rig
 
 
+def test_paths_are_beside_the_rig_file_and_no_path_stays_none(rig: Instrument, tmp_path: Path):
+    table = to_builtins(rig)
+    table["pi"]["key_dir"] = ""
+    table["radar"] |= {"firmware": "", "trace_dir": "traces"}
+    path = tmp_path / "rig.toml"
+    path.write_text(tomli_w.dumps(table))
+    loaded = load_instrument(path)
+    assert (loaded.pi.key_dir, loaded.radar.firmware) == (str(tmp_path), "")
+    assert loaded.radar.trace_dir == str(tmp_path / "traces")
+
+
 def test_no_section_of_the_rig_can_be_changed(rig: Instrument):
     sections = [getattr(rig, name) for name in rig.__struct_fields__]
     for section in (rig, *(s for s in sections if isinstance(s, Section))):

@@ -120,3 +120,18 @@ def test_the_size_of_a_dead_folder_is_not_waited_for(dead, root, monkeypatch):
     sizes = site.Sizes()
     assert sizes.read_size(root / "dead") is None
     wait_for(lambda: sizes.read_size(root / "alive") is not None, "the size of another folder")
+
+
+def test_only_threads_that_may_hang_ask_a_folder_of_the_list_for_its_time(root, monkeypatch):
+    """A drive that is gone hangs already then."""
+    real = scans._read_modified_s
+    asking: set[threading.Thread] = set()
+
+    def record(path: Path) -> float:
+        asking.add(threading.current_thread())
+        return real(path)
+
+    monkeypatch.setattr(scans, "_read_modified_s", record)
+    Scans(root).list()
+    assert asking
+    assert threading.current_thread() not in asking

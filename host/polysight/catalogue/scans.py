@@ -440,19 +440,18 @@ class Scans:
         """Return every scan, the newest first; what has changed since the last call is read again.
 
         A folder that takes longer than `READ_S` is listed as `silent`. Its thread cannot be ended: the folder is read
-        again when that has returned. After `within_s` the list is what was read so far; the next call goes on with what
-        was changed last.
+        again when that has returned. After `within_s` the list is what was read so far; the next call goes on.
         """
         with self._lock:
             if self.only is not None:
                 entries = [self.only]
             else:
                 entries = [name for name, _ in _list_folders(self.root)]
-            newest_first = sorted(
-                (entry for entry in entries if entry not in self._reading),
-                key=lambda entry: (entry in self._listed, -_read_modified_s(self.root / entry)),
-            )
-            self._read_all(deque(newest_first), time.monotonic() + within_s)
+            # What is not listed yet comes first, by falling names, of which many begin with a date. Only the threads
+            # that read may ask a folder for its time: its drive may be gone.
+            waiting = [entry for entry in reversed(entries) if entry not in self._reading]
+            waiting.sort(key=self._listed.__contains__)
+            self._read_all(deque(waiting), time.monotonic() + within_s)
             unread = {entry for entry in entries if entry not in self._listed and entry not in self._reading}
             self.unread = len(unread)
             scans: list[Summary] = []

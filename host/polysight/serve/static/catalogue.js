@@ -5,7 +5,7 @@ const LOOK_MS = 4000, REST_MS = 100; // between two looks at the list, and befor
 const FIRST_CARDS = 40, MORE_CARDS = 400; // the first ones of a long list are seen before the rest is made
 const ORDER = { good: 0, care: 1, "": 2, none: 3, damaged: 4 };
 const cards = new Map(), chosen = new Set();
-let server = {}, told = { scans: [] };
+let server = {}, told = { scans: [] }, rest = null;
 
 const words = (s) => [s.name, s.scan_id, s.rig, s.state, s.notes, s.started_utc, ...s.tags, ...s.materials, ...s.labelled].join(" ").toLowerCase();
 
@@ -101,7 +101,8 @@ async function look(answer = get("scans", { since: told.stamp })) {
       options("tag", [...new Set(now.scans.flatMap((s) => s.tags))].sort());
     }
     show();
-    if (told.unread) setTimeout(look, REST_MS);
+    clearTimeout(rest);
+    if (told.unread) rest = setTimeout(look, REST_MS);
   } catch (error) { complain("told", error); }
 }
 

@@ -190,7 +190,10 @@ class Receivers:
                 trial.exact &= capture.missing_bytes > 0 or capture.crc32 == self._expected_checksum(k, blocks)
             for r in self._receivers:
                 path = cards.folder / r.board.name / f"{self._row:04d}.part"
-                path.unlink() if self._row else path.rename(cards.folder / f"{r.board.name}.bin")
+                if self._row:
+                    path.unlink()
+                else:
+                    path.rename(cards.folder / f"{r.board.name}.bin")
             self._row += 1
         wall = time.perf_counter() - began
         state_after = ask(beside)

@@ -118,7 +118,7 @@ def change(scene: dict[str, Any], path: tuple[str | int, ...], value: Any) -> No
         else:
             return
     if isinstance(table, dict) or (isinstance(table, list) and isinstance(path[-1], int) and path[-1] < len(table)):
-        table[path[-1]] = value  # type: ignore[index]
+        table[path[-1]] = value
 
 
 def is_small(scene: Path) -> bool:

@@ -133,8 +133,10 @@ class Illumination:
         neighbours' sidelobes. `plate` [ny, nx] is the whole patch: with it the rise that a level plate seems to have is
         taken off (:mod:`polysight.imaging.geometry`).
         """
-        level_h = float(np.nanmedian(np.abs(h[mask]))) if mask.any() else 0.0
-        level_v = float(np.nanmedian(np.abs(v[mask]))) if mask.any() else 0.0
+        if not mask.any():
+            return 0.0, 0.0
+        level_h = float(np.nanmedian(np.abs(h[mask])))
+        level_v = float(np.nanmedian(np.abs(v[mask])))
         channels = [h] if level_v < _FEEBLE * level_h else [h, v]
         slopes = []
         for along in (0, 1):
@@ -176,15 +178,10 @@ class Illumination:
         """
         channel = h if np.nansum(np.abs(h[mask])) >= np.nansum(np.abs(v[mask])) else v
         bends = []
-        for axis in (1, 0):
-            pitch_m = self.pixel_m[1 - axis]
-            ahead = slice(1, None)
-            following = slice(None, -1)
-            first = (slice(None), following) if axis == 1 else (following, slice(None))
-            second = (slice(None), ahead) if axis == 1 else (ahead, slice(None))
-            is_pair = mask[first] & mask[second]
-            steps = np.sum(np.where(is_pair, channel[second] * np.conj(channel[first]), 0), axis=1 - axis)
-            enough_pixels = is_pair.sum(axis=1 - axis) > 2
+        for pitch_m, lines, is_inside in ((self.pixel_m[0], channel, mask), (self.pixel_m[1], channel.T, mask.T)):
+            is_pair = is_inside[:, :-1] & is_inside[:, 1:]
+            steps = np.sum(np.where(is_pair, lines[:, 1:] * np.conj(lines[:, :-1]), 0), axis=0)
+            enough_pixels = is_pair.sum(axis=0) > 2
             if enough_pixels.sum() < _LEAST_LINES:
                 bends.append(0.0)
                 continue

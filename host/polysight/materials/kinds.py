@@ -371,9 +371,9 @@ class DensityMaps:
     @classmethod
     def collect(cls, maps: Sequence[DensityMap]) -> DensityMaps:
         """Return the maps together."""
-        low = np.array([one.low for one in maps], np.complex128)
-        size = np.array([one.high for one in maps], np.complex128) - low
-        log_density = np.stack([one.log_density for one in maps], axis=1)
+        low = np.array([density_map.low for density_map in maps], np.complex128)
+        size = np.array([density_map.high for density_map in maps], np.complex128) - low
+        log_density = np.stack([density_map.log_density for density_map in maps], axis=1)
         _, _, rows, columns = log_density.shape
         return cls(low, (columns - 1) / size.real + 1j * (rows - 1) / size.imag, log_density)
 

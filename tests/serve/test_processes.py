@@ -125,8 +125,14 @@ def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_no
 
 
 INTERRUPT_AT_FORKS = """
-import os, signal, sys
+import multiprocessing, os, signal, sys, tempfile
 from polysight.cli.main import main
+remove = tempfile.TemporaryDirectory.cleanup
+def cleanup(folder):
+    remove(folder)
+    for process in multiprocessing.active_children():
+        sys.stderr.write(f"{process.name} outlives the folder of its socket\\n")
+tempfile.TemporaryDirectory.cleanup = cleanup
 forks = iter("123")
 def interrupt():
     if next(forks) in sys.argv[1]:

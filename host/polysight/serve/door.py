@@ -187,15 +187,17 @@ def open_door(listener: socket.socket, token: str, config: uvicorn.Config) -> It
         asyncio.run(_keep_door(listener, door_end, token, config))
 
     process = multiprocessing.get_context("fork").Process(target=run, name="door", daemon=True)
-    with delay_interrupts():
-        process.start()
-    door_end.close()
     pages_end.setblocking(False)
     try:
+        with delay_interrupts():
+            process.start()
+        door_end.close()
         yield pages_end
     finally:
+        door_end.close()
         pages_end.close()
-        process.join()
+        if process.pid is not None:
+            process.join()
 
 
 class PagesServer(EndingServer):

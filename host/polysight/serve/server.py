@@ -153,7 +153,7 @@ def _run(shown: Shown, place: Place, what: str) -> int:
             reader = Reader(Path(folder) / "reader")
             front = Front(Scans(shown.root, shown.only), access, shown.starts, reader, stage)
             _allow_files()
-            reading = start_first_reader(shown, Path(folder) / "reader", listener)
+            reading = stack.enter_context(fork_first_reader(shown, Path(folder) / "reader", listener))
             door = None
             if access.control and not access.secure:
                 commands = close_after_each(make_command_app(front))
@@ -256,10 +256,12 @@ def _keep_reading_process(first: BaseProcess, shown: Shown, path: Path) -> Itera
         keeper.join(10)
 
 
-def start_first_reader(shown: Shown, path: Path, listener: socket.socket) -> BaseProcess:
-    """Fork the reading process: it has what this process has loaded, and answers two seconds sooner than a new one.
+@contextlib.contextmanager
+def fork_first_reader(shown: Shown, path: Path, listener: socket.socket) -> Iterator[BaseProcess]:
+    """Fork the reading process for the block: it has what this process has loaded, and answers two seconds sooner.
 
-    To be called before there are threads. The server's address is not its own: it closes `listener`.
+    To be called before there are threads. The server's address is not its own: it closes `listener`. It ends before the
+    folder of its socket is removed, also when Ctrl-C comes while it starts.
     """
 
     def run() -> None:
@@ -267,9 +269,14 @@ def start_first_reader(shown: Shown, path: Path, listener: socket.socket) -> Bas
         run_reader(shown, path)
 
     process = multiprocessing.get_context("fork").Process(target=run, name="reading", daemon=True)
-    with delay_interrupts():
-        process.start()
-    return process
+    try:
+        with delay_interrupts():
+            process.start()
+        yield process
+    finally:
+        if process.pid is not None:
+            process.terminate()
+            process.join()
 
 
 def run_reader(shown: Shown, path: Path) -> None:

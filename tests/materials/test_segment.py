@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from benchmarks.touching import judge_gap
+from scipy.ndimage import gaussian_filter
 from tests.support.refusals import refused
 
 from polysight.materials import Labels, SegmentSettings, pack_labels, read_labels
@@ -202,3 +203,20 @@ def test_sheet_that_only_h_shows_is_a_patch(synthetic, seed):
     assert len(found.patches) == 1
     box = scene.plates[0].box_mm
     assert np.abs(np.subtract(found.patches[0].box_mm, box)).max() < 5.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plates_that_fill_the_image_are_all_found_beside_metal(seed):
+    """Six plates of 46 mm, 20 mm apart, as a small aperture sees them; all but the metal are 12 to 24 dB below it."""
+    rng = np.random.default_rng(seed)
+    levels_db = rng.permutation([0.0, -12.0, -15.0, -18.0, -21.0, -24.0]).reshape(2, 3)
+    x_m = (np.arange(93) - 46) * 2e-3
+    y_m = (np.arange(60) - 29.5) * 2e-3
+    amplitude = np.full((60, 93), 0.003)
+    for (row, column), level_db in np.ndenumerate(levels_db):
+        amplitude[2 + 33 * row : 25 + 33 * row, 2 + 33 * column : 25 + 33 * column] = 10 ** (level_db / 20)
+    noise = 0.003 * (rng.standard_normal((2, 60, 93)) + 1j * rng.standard_normal((2, 60, 93)))
+    h, v = (gaussian_filter(amplitude * gain, (2, 1)) + part for gain, part in zip((1.0, 0.6j), noise, strict=True))
+    segmentation = segment(h, v, x_m, y_m)
+    assert len(segmentation.patches) == levels_db.size
+    assert segmentation.left_out == ()

@@ -121,11 +121,12 @@ def background_mean(h: Image, v: Image, segmentation: Segmentation, usable: Mask
 
 
 def _select_background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> Mask:
-    """Return the usable pixels with some distance to every patch."""
-    background_mask = usable & np.isfinite(h) & np.isfinite(v)
-    for patch in segmentation.patches:
-        background_mask &= ~np.asarray(scipy.ndimage.binary_dilation(patch.mask, iterations=_AROUND_PX), bool)
-    return background_mask
+    """Return the usable pixels with some distance to every patch, and to bright regions that are none."""
+    in_region = segmentation.labels > 0
+    for mask in segmentation.left_out:
+        in_region |= mask
+    near_region = np.asarray(scipy.ndimage.binary_dilation(in_region, iterations=_AROUND_PX), bool)
+    return usable & np.isfinite(h) & np.isfinite(v) & ~near_region
 
 
 def _average_window(values: Image, width_px: int) -> Image:

@@ -5,7 +5,7 @@ additive noise and plates are constant with steps between them: total variation 
 Levels of plates differ by 25 dB (thin wood against metal), so a common threshold cannot give their edges. The threshold
 falls from the brightest level instead, and each region that grows with it is cut at half of its own amplitude, the
 position of the edge of a band-limited step. A region is a patch if it stands out from the background; bright ones that
-do not are counted (`Segmentation.left_out`). Where the true plates are known, `match_truth` finds each one's patch.
+do not are left out (`Segmentation.left_out`). Where the true plates are known, `match_truth` finds each one's patch.
 """
 
 from __future__ import annotations
@@ -133,11 +133,11 @@ class Patch:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """Label image int32 [ny, nx] (0: no patch), its patches, and the number of bright regions that are none."""
+    """Label image int32 [ny, nx] (0: no patch), its patches, and the masks of bright regions that are none."""
 
     labels: npt.NDArray[np.int32]
     patches: tuple[Patch, ...]
-    left_out: int = 0
+    left_out: tuple[Mask, ...] = ()
 
 
 def axis_mm(axis_m: npt.ArrayLike) -> Real:
@@ -244,27 +244,32 @@ def segment(
             code=ErrorCode.NO_DATA,
         )  # fmt: skip
     pixel_mm = abs(float(axis_mm(x_m)[1] - axis_mm(x_m)[0]))
-    level = np.maximum(level_db(h, v, usable, cfg.smooth_px, cfg.smallest_mm / pixel_mm / 2), cfg.floor_db)
-    smooth_level = _remove_speckle(level, usable, cfg, pixel_mm)
+    level = level_db(h, v, usable, cfg.smooth_px, cfg.smallest_mm / pixel_mm / 2)
+    smooth_level = _remove_speckle(np.maximum(level, cfg.floor_db), usable, cfg, pixel_mm)
+    # Smoothing the outline may have left too little of a region.
+    least_pixels = SMALLEST_SHARE * cfg.smallest_mm**2 / pixel_mm**2
+    regions = [mask for mask in _find_regions(smooth_level, usable, cfg, pixel_mm) if mask.sum() >= least_pixels]
     least_db = _find_least_level_db(smooth_level, usable, cfg, pixel_mm)
+    if np.isfinite(least_db):
+        # Where plates fill a small image, dim ones are among the dark pixels beside metal: the gaps are the background.
+        gaps = level[_select_gaps(usable, regions, cfg.margin_mm / pixel_mm)]
+        if gaps.size >= least_pixels:
+            least_db = min(least_db, max(float(np.median(gaps)) + PLAIN_DB, cfg.dimmest_db))
     masks: list[Mask] = []
-    left_out = 0
-    for mask in _find_regions(smooth_level, usable, cfg, pixel_mm):
-        # Smoothing the outline may have left too little of the region.
-        if float(mask.sum()) * pixel_mm**2 < SMALLEST_SHARE * cfg.smallest_mm**2:
-            continue
+    left_out: list[Mask] = []
+    for mask in regions:
         region_db = float(np.median(smooth_level[mask]))
         if region_db >= least_db:
             masks.append(mask)
         elif region_db >= cfg.dimmest_db:
-            left_out += 1
+            left_out.append(mask)
     labels = np.zeros(h.shape, np.int32)
     patches = []
     for mask in sorted(masks, key=lambda mask: _find_reading_place(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
         labels[mask] = len(patches) + 1
         patch = make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable)
         patches.append(replace(patch, cut=_is_cut(mask, cfg.smallest_mm / pixel_mm)))
-    return Segmentation(labels, tuple(patches), left_out)
+    return Segmentation(labels, tuple(patches), tuple(left_out))
 
 
 def touches_border(mask: Mask) -> bool:
@@ -314,6 +319,14 @@ def _find_least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_
         return float("inf")
     scatter = min(1.4826 * float(np.median(np.abs(level[~bright] - background))), MOST_SCATTER_DB)
     return max(background + max(cfg.least_contrast_db, cfg.least_scatter * scatter), cfg.dimmest_db)
+
+
+def _select_gaps(usable: Mask, regions: Sequence[Mask], margin_px: float) -> Mask:
+    """Return the usable pixels that are farther than the margin from every region."""
+    in_no_region = np.ones(usable.shape, bool)
+    for mask in regions:
+        in_no_region &= ~mask
+    return usable & (np.asarray(scipy.ndimage.distance_transform_edt(in_no_region)) > margin_px)
 
 
 def _find_reading_place(mask: Mask, y_mm: Real, row_pitch_mm: float) -> tuple[float, float]:

@@ -430,6 +430,7 @@ def survey_cards(instrument: Instrument, listen_s: float = 0.0) -> list[CardSurv
 
 
 def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: float) -> CardSurvey:
+    """Ask the card hop by hop; hops behind the first that fails become notes without text."""
     survey = CardSurvey(board)
     findings = survey.hops
     try:

@@ -258,6 +258,7 @@ def valid_frames(missing: Gaps, frames: int, frame_bytes: int) -> NDArray[np.boo
 
 
 def _split_words(payload: bytes | memoryview | NDArray[np.uint8], count: int) -> NDArray[np.int16]:
+    """Return the first `count` samples, int16 [count], without a copy. Raises DataError if there are fewer."""
     raw = np.frombuffer(payload, dtype=np.uint8)
     if raw.size < count * 2:
         raise DataError(

@@ -267,6 +267,7 @@ def is_mirrored(power: NDArray[np.float64]) -> bool:
 
 
 def _collect_remarks(r: Report, mirrored: bool) -> list[str]:
+    """List what is suspicious in a recording; `mirrored`: most power is at negative frequencies."""
     remarks = []
     if max(r.rx_rms) == 0:
         return ["every sample is zero: nothing was recorded"]

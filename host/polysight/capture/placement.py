@@ -85,7 +85,7 @@ class PacketCounts:
 
 @dataclass(frozen=True)
 class Losses:
-    """Missing bytes: before the first packet, in `gaps` gaps between packets, after the last one."""
+    """Missing bytes of a row: before its first packet, in `gaps` gaps between packets, after its last one."""
 
     head_bytes: int = 0
     gaps: int = 0
@@ -141,16 +141,20 @@ class Placed:
 
 @dataclass(frozen=True)
 class Preview:
-    """Progress of a running row: bytes in place, all bytes in place, the furthest packet is a short one."""
+    """Progress of a running row."""
 
+    # Bytes in place; each counts once.
     received: int
+    # True if all bytes are in place and the record ends where it should.
     complete: bool
+    # True if the furthest packet is a short one: the card ended the record.
     ended: bool
 
 
 class Evidence(msgspec.Struct, frozen=True):
     """Inputs for placing a row, beside its packets; as of :func:`place_record`."""
 
+    # Bytes of the whole row.
     expected: int
     frame_bytes: int
     not_before_ns: int = 0

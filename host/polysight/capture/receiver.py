@@ -394,6 +394,7 @@ class ReceiverProcess:
         )
 
     def _ask(self, request: Request, kind: type[A], timeout_s: float) -> A:
+        """Send a request and return its answer, a `kind`; note other answers. Raises DeviceError after `timeout_s`."""
         try:
             send(self._connection, request)
         except DeviceError:

@@ -86,7 +86,7 @@ class Segment:
             raise write_error(path, f"reserved ({size} bytes)", e) from None
 
     def finish(self, data: NDArray[np.uint8]) -> int:
-        """Write the bytes durably, close the file, and return their CRC-32. Raises DeviceError if the disk fails."""
+        """Write uint8 [byte] durably, close the file, and return the CRC-32. Raises DeviceError if the disk fails."""
         remaining = np.ascontiguousarray(data).data
         crc = zlib.crc32(remaining)
         try:

@@ -246,7 +246,7 @@ class PlaneReference:
             )
 
     def valid_on(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Return `valid` for a scan with these pixels. Raises DataError if its pixels differ."""
+        """Return `valid`, bool [ny, nx], for a scan with pixels at `x_m`, `y_m`. Raises DataError if they differ."""
         self.check_axes(x_m, y_m)
         return self.valid
 
@@ -402,7 +402,7 @@ class Leakage:
     residual: float
 
     def matrix(self) -> npt.NDArray[np.complex128]:
-        """Return the 2 x 2 matrix from (s, p) to (H, V), with g_v = 1."""
+        """Return the matrix from (s, p) to (H, V), complex128 [2, 2], with g_v = 1."""
         g = self.imbalance
         return np.array([[g, g * self.h], [self.v, 1.0]], np.complex128)
 

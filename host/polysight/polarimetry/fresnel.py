@@ -134,7 +134,7 @@ def permittivity_from_ratio(p: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Compl
 
 
 def brewster_angle_rad(eps: npt.ArrayLike) -> Real:
-    """Return the angle of smallest |r_p| of a half space, radians: arctan(sqrt|eps|), exact for lossless media.
+    """Return the angle of smallest |r_p| of half spaces, radians: arctan(sqrt|eps|), any shape, exact if lossless.
 
     The paper calls it the angle of lowest *s* reflectance; it is the p-polarised wave that vanishes there.
     """
@@ -310,22 +310,23 @@ def _convolve(a: Real, b: Real) -> Real:
 class IncidenceChoice:
     """Specular and effective incidence angle of every pixel, float64 [ny, nx] radians, and the one to use."""
 
+    # "one": one angle for the image; otherwise by pixel.
     choice: Incidence
     one_rad: Real
     pixel_rad: Real
 
     @property
     def used_rad(self) -> Real:
-        """The chosen angles."""
+        """The chosen angles, radians [ny, nx]."""
         return self.one_rad if self.choice == "one" else self.pixel_rad
 
     @property
     def other_rad(self) -> Real:
-        """The other angles."""
+        """The angles of the other kind, radians [ny, nx]."""
         return self.pixel_rad if self.choice == "one" else self.one_rad
 
     def facts(self, valid: npt.NDArray[np.bool_]) -> IncidenceAngles:
-        """Return both angles and their largest difference over valid pixels, for quality.json; degrees."""
+        """Return both angles and their largest difference over `valid`, bool [ny, nx], for quality.json; degrees."""
         if valid.any():
             pixel = np.degrees(self.pixel_rad[valid])
         else:

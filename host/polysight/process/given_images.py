@@ -166,6 +166,7 @@ def conjugate(images: Images) -> Images:
 
 
 def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """Read all arrays of an .npz file. Raises DataError if it is damaged or no such file."""
     try:
         with open_npz(path) as archive:
             return {name: archive[name] for name in archive}

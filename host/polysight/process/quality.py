@@ -321,7 +321,10 @@ class Quality:
     def note_materials(
         self, result: MaterialsResult, angles: IncidenceChoice, valid: NDArray[np.bool_], plane: PlaneReference | None
     ) -> None:
-        """Add the effect of the incidence angle and the use of the metal plate to quality.json."""
+        """Add the effect of the incidence angle and the use of the metal plate to quality.json.
+
+        `valid` as of :meth:`IncidenceChoice.facts`.
+        """
         self.note(incidence=msgspec.structs.replace(angles.facts(valid), **permittivity_change(result, angles)))
         if plane is not None:
             self.note(metal_reference=plane.facts())

@@ -223,6 +223,7 @@ def _summarise_result(scan: products.ProcessedScan, result: MaterialsResult) -> 
 
 
 def _describe_accuracy(result: MaterialsResult) -> str:
+    """Return the end of a sentence on the correct pixels of a simulated scene; "" if the truth is unknown."""
     accuracy = pixel_accuracy(result)
     expected = predict_pixel_accuracy(result)
     if accuracy is None:

@@ -493,14 +493,16 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LeakageError(msgspec.Struct, frozen=True, kw_only=True):
-    """Leakage of H and V into each other, relative to their own channel, with its standard deviations.
+    """Leakage of the other polarisation into H and V, relative to the wanted one, with its standard deviations.
 
     `source` is "measured", "scene", or "prior and scene" (hardly known). `removed_h` and `removed_v` are the leakage
     that was removed from the pixels of image.npz.
     """
 
+    # Real and imaginary part.
     h: Pair | None = None
     v: Pair | None = None
+    # Standard deviation of `h` and that of `v`.
     std: Pair | None = None
     source: str = ""
     removed_h: Pair | UnsetType = UNSET

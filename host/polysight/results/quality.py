@@ -59,17 +59,21 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
         Stage to its residuals.
     """
 
+    # Counted in chirps; most frames hold one. `frames_masked` were not received.
     frames_expected: int = 0
     frames_received: int = 0
     bytes_missing: int = 0
     positions: int | UnsetType = UNSET
+    # Positions without valid samples.
     positions_masked: int | UnsetType = UNSET
     frames_masked: int = 0
     chirps_clipped: int = 0
     chirps_disturbed: int = 0
     positions_clipped: int = 0
     direct_path_hz: FrequencyRange | UnsetType = UNSET
+    # In one sample of one chirp; None where the noise is unknown.
     direct_path_snr_db: float | None = None
+    # Shift of odd rows towards +x, from echoes; None if undetermined.
     stage_backlash_mm: Backlash | None = None
     masked_columns: dict[int, list[tuple[int, int]]] | UnsetType = UNSET
     rows_recorded: list[int] | UnsetType = UNSET
@@ -89,9 +93,13 @@ class BoardImaging(msgspec.Struct, frozen=True, kw_only=True):
     masked: float = 0.0
     frequencies: int = 0
     loss_db: float | UnsetType = UNSET
+    # Width of the response at half power.
     point_width_mm: Pair | UnsetType = UNSET
+    # The geometry's limit of the width, without taper.
     point_limit_mm: Pair | UnsetType = UNSET
+    # The paper's estimate r lambda / L of the width.
     point_paper_mm: Pair | UnsetType = UNSET
+    # Strongest sidelobe, relative to the peak.
     point_sidelobe_db: Pair | UnsetType = UNSET
 
 
@@ -125,9 +133,12 @@ class IncidenceAngles(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     used: str = ""
+    # The one angle for the whole image.
     one_deg: float | None = None
     pixel_deg: tuple[float | None, ...] = ()
+    # Between `one_deg` and the angle of a valid pixel.
     largest_difference_deg: float | None = None
+    # |eps_other / eps - 1| of the patch `of_patch`, which changes most with the other kind of angle.
     largest_permittivity_change: float | UnsetType = UNSET
     of_patch: int | UnsetType = UNSET
 
@@ -136,7 +147,9 @@ class MetalPlate(msgspec.Struct, frozen=True, kw_only=True):
     """Variation of the gains over a metal plate that was scanned separately."""
 
     how: str = ""
+    # Share of the pixels with valid gains.
     share_of_plane: float | None = None
+    # Standard deviations over the valid pixels: gains of H and V, then H / V.
     h_variation_db: float | None = None
     v_variation_db: float | None = None
     ratio_variation_db: float | None = None
@@ -188,14 +201,17 @@ class ScanQuality(msgspec.Struct, frozen=True, kw_only=True):
 
     boards: dict[str, BoardQuality] = {}
     coverage: Coverage | UnsetType = UNSET
+    # Wall time; stages that run in parallel add up.
     seconds_per_stage: dict[str, float] = {}
     verdict: Verdict | UnsetType | None = UNSET
+    # Share of interior pixels with the correct name, in a simulated scene.
     pixel_accuracy: float | UnsetType | None = UNSET
     calibration: dict[str, CalibrationSource] | UnsetType = UNSET
     recording: Recording | UnsetType = UNSET
     rows_retaken: int | UnsetType = UNSET
     rows_incomplete: list[int] | UnsetType = UNSET
     imaging: dict[str, BoardImaging | list[str]] | UnsetType = UNSET
+    # Reconstructed positions by board.
     sparse: dict[str, ReconstructedPositions] | UnsetType = UNSET
     incidence: IncidenceAngles | UnsetType = UNSET
     metal_reference: MetalPlate | UnsetType = UNSET

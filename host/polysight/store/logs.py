@@ -142,6 +142,7 @@ def _is_beginning(raw: bytes) -> bool:
 
 
 def _read_bytes(path: Path) -> bytes:
+    """Return the content of a file; empty if it does not exist. Raises DataError if it cannot be read."""
     try:
         return path.read_bytes()
     except FileNotFoundError:

@@ -78,7 +78,9 @@ class RowFault(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Reception(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Counts of one board's reception of a row; None where an earlier release, or a simulation, did not count."""
+    """Counts of one board's reception of a row (docs/spec/dca1000.md); None where an earlier release or a simulation
+    did not count.
+    """
 
     packets: int | None = None
     duplicates: int | None = None
@@ -240,8 +242,11 @@ class _Head(msgspec.Struct):
     """The keys of a line that make it valid."""
 
     fact: str
+    # CRC-32 of the other keys, hexadecimal.
     crc: str
+    # Number of lines before this one; None in a line that is not chained to the one before.
     count: int | None = None
+    # Digest of the line before.
     previous: str | None = None
 
 

@@ -271,7 +271,7 @@ def period_s(bursts: Bursts) -> float | None:
 def find_positions(
     bursts: Bursts, other_boards: list[Bursts], positions: int, period: float | None
 ) -> NDArray[np.int64] | None:
-    """Return the position of each burst; None if undetermined.
+    """Return the position of each burst in the row, int64 [burst]; None if undetermined. `period` in seconds.
 
     Positions are evenly spaced in time, so a step of two periods is a position at which no radar started. The boards
     share triggers and clock: the first position is known only if all boards together span the row.

@@ -33,7 +33,10 @@ class ChirpConfig(msgspec.Struct, frozen=True):
 
 
 class Collection(msgspec.Struct, frozen=True):
-    """The keys of the JSON files that are used. Lengths in mm, times in ms, angles in degrees, `board_dist` in m."""
+    """The keys of the JSON files that are used. Lengths in mm, times in ms, angles in degrees, `board_dist` in m.
+
+    `total_x`, `total_y` are positions `dx`, `dy` apart; `num_trigger` the pulses of a position.
+    """
 
     dx: float
     dy: float

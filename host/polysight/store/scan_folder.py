@@ -438,7 +438,7 @@ def read_sample_rows(folder: Path, start: int = 0) -> tuple[dict[int, dict[str, 
 
 
 def open_records(path: Path) -> NDArray[Any] | None:
-    """Return a board's records, memory-mapped, one per row; None if the file cannot be read."""
+    """Return a board's records, structured [row], memory-mapped; None if the file cannot be read."""
     try:
         with HEADER_LOCK:
             return np.load(path, mmap_mode="r", allow_pickle=False)

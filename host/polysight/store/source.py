@@ -34,7 +34,7 @@ _PAGE = 4096
 
 
 def allocate_pages(size: int) -> NDArray[np.uint8]:
-    """Return uninitialised memory of `size` bytes that starts at a page, to read a file into from its start.
+    """Return uninitialised memory, uint8 [size], that starts at a page, to read a file into from its start.
 
     Large arrays of NumPy start 16 bytes behind a page's start. There Zen 3 copies a file's pages at a sixth of the
     speed (64 KB: 34 us instead of 5.5): loads wait for the stores before them, which have nearly the same place in
@@ -46,7 +46,7 @@ def allocate_pages(size: int) -> NDArray[np.uint8]:
 
 
 def split_pieces(payload: NDArray[np.uint8]) -> Pieces:
-    """Return the pieces of a payload in memory."""
+    """Return a function that yields a payload in memory, uint8 [byte], in pieces of `size` bytes; 0: all at once."""
 
     def pieces(size: int) -> Iterator[NDArray[np.uint8]]:
         step = size or max(1, payload.size)
@@ -71,7 +71,7 @@ class RowData:
 
     @cached_property
     def payload(self) -> NDArray[np.uint8]:
-        """The whole payload."""
+        """The whole payload, uint8 [byte]; empty if nothing was recorded."""
         # Read to the end: damage is raised only after the last piece.
         pieces = list(self.pieces(0))
         if not pieces:

@@ -241,6 +241,7 @@ def plot_check(*scans: Scan | PathText) -> Figure:
 
 
 def _check_all(scans: Sequence[Scan | PathText]) -> list[tuple[ProcessedScan, CheckResult]]:
+    """Return each scan, processed if necessary, with the result of its check."""
     checked: list[tuple[ProcessedScan, CheckResult]] = []
     for scan in scans:
         if isinstance(scan, Scan):

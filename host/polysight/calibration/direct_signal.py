@@ -291,7 +291,9 @@ def _measure_power_of_scan(
 
 
 def average_in_bins(if_hz: Real, power: Real, noise_power: Real) -> tuple[Real, Real]:
-    """Return mean IF and level without noise, in bins of `BIN_HZ` with enough chirps and signal; IF ascending.
+    """Return mean IF (Hz) and amplitude without noise, [bin], in bins of `BIN_HZ` with enough chirps and signal.
+
+    `if_hz`, `power` and `noise_power` are of one chirp each, [chirp]; the IF ascends.
 
     The level comes from the median power, so that chirps with a wrong direct path do not count.
     """

@@ -118,7 +118,9 @@ class BoardFilter(msgspec.Struct, frozen=True):
 
     corners_khz: list[float]
     standard_error_khz: list[float]
+    # Corners set in the rig file.
     programmed_khz: list[float]
+    # Range of the direct path that the fit is based on.
     if_from_khz: float
     if_to_khz: float
     chirps: int
@@ -178,10 +180,13 @@ class BoardStart(msgspec.Struct, frozen=True):
     """Start frequency of a receiver: `start_offset_hz` moves its direct path to the middle of the IF band."""
 
     start_offset_hz: float
+    # Value of the rig file that the scan was made with.
     start_offset_was_hz: float
     direct_if_hz: float
     direct_if_standard_error_hz: float
+    # IF of the direct path by the rig file.
     expected_if_hz: float
+    # Middle of the IF band.
     middle_hz: float
     alias: int
     chirps: int

@@ -74,12 +74,15 @@ class Prior:
     """Prior standard deviations of the unknowns."""
 
     board_mm: float = 5.0
+    # Offset of the target's plane.
     plane_mm: float = 5.0
+    # Place of the target along x and along y.
     target_mm: float = 10.0
+    # Rotation of the target in its plane.
     turn_deg: float = 2.0
 
     def scale(self, boards: int) -> Real:
-        """Return the standard deviation of each unknown."""
+        """Return the standard deviation of each unknown, float64 [3 x boards + 4], millimetres and degrees."""
         return np.array([self.board_mm] * 3 * boards + [self.plane_mm, *2 * [self.target_mm], self.turn_deg])
 
 
@@ -119,7 +122,7 @@ class PlacesFit:
 
     @property
     def errors(self) -> Real:
-        """Standard errors of the unknowns."""
+        """Standard errors of the unknowns, millimetres and degrees."""
         return np.sqrt(np.diag(self.covariance))
 
 

@@ -49,12 +49,12 @@ class Pixels(products.ProcessedScan):
 
     @cached_property
     def clear(self) -> NDArray[np.bool_]:
-        """Pixels bright enough in both channels for a meaningful ratio."""
+        """Pixels bright enough in both channels for a meaningful ratio, bool [ny, nx]."""
         return products.signal_opacity(self.images, "p") > 0
 
     @cached_property
     def p_std(self) -> Real:
-        """Standard deviation of each part of P; nan where unknown."""
+        """Standard deviation of each part of P, float64 [ny, nx]; NaN where unknown."""
         if self.images.p_sigma is None:
             return np.full(self.valid.shape, np.nan)
         return np.asarray(self.images.p_sigma, np.float64)
@@ -97,7 +97,7 @@ class Pixels(products.ProcessedScan):
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG, the values at the ends of its colour map, and the name of that map."""
+    """A PNG, the values at the ends of its colour map in `unit`, and the name of that map."""
 
     png: bytes
     low: float

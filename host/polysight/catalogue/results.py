@@ -120,6 +120,7 @@ def read_result(folder: Path) -> Result:
 
 
 def _load_labels(folder: Path, pixels: Pixels) -> DrawnLabels | None:
+    """Return the boxes drawn by hand, or the problem of their file; None if there is no such file."""
     try:
         labelled = find_labels(folder)
         if labelled is None:
@@ -493,7 +494,7 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
 
 
 def measure_scatter(differences: Real) -> float:
-    """Estimate the scatter of unchanged pixels, 0.1 to 1, from |differences| in stated errors; nan without any.
+    """Estimate the scatter of unchanged pixels, 0.1 to 1, from |differences| [any] in stated errors; NaN without any.
 
     Stated errors include those that both scans share (leakage, metal reference, sidelobes), which cancel in a
     difference. Taken from the median, so that changes of less than half of the image hardly matter: the median of a
@@ -513,6 +514,7 @@ def _match_axes(first: Real, second: Real) -> tuple[NDArray[np.intp], NDArray[np
 
 
 def _collect_notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
+    """List what limits a comparison of two scans; `scatter` as of :func:`measure_scatter`."""
     notes = []
     if scatter < 1:
         notes.append(
@@ -548,6 +550,7 @@ def _measure_distance_mm(a: PatchFigures, b: PatchFigures) -> float:
 
 
 def _describe_pair(a: PatchFigures, b: PatchFigures) -> PatchPair:
+    """Compare two patches; without two invertible covariances the difference has no standard errors."""
     pair = PatchPair(
         place_mm=(round(a.centre_x_mm, 1), round(a.centre_y_mm, 1)),
         names=(a.name, b.name),

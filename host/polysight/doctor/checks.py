@@ -100,6 +100,7 @@ def _find_failed_prerequisite(check: Check, board: Board | None, blocked: dict[t
 
 
 def _run_check(check: Check, context: CheckContext, board: Board | None) -> Finding:
+    """Run a check; its error becomes its finding."""
     try:
         if board is None:
             return check.run(context)

@@ -527,6 +527,7 @@ def check_radar(context: CheckContext, board: Board) -> Finding:
 
 
 def _judge_frames(board: Board, row: RowCapture, observed: str) -> Finding:
+    """Judge whether the card received the frames of a row; the first fault is the finding."""
     if row.packets == 0:
         e = silent_radar(board, row)
         return error(e.what, e.why, e.remedy)

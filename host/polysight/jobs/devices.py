@@ -342,6 +342,7 @@ def _open_words(rig: Instrument, name: str, clock: SystemClock, trace: Path | No
 
 
 def _load_rig_of_native(config: Path) -> Instrument:
+    """Load a rig file. Raises ConfigError if its radars are not configured by this program."""
     rig = load_instrument(config)
     if not rig.radar.native:
         raise ConfigError(

@@ -508,6 +508,7 @@ class _Scene:
     images: Images
     segmentation: Segmentation
     tilts: Tilts
+    # Distance (x, y) of the images of H and V before they were laid on each other.
     apart_mm: tuple[float, float]
     plane: PlaneReference | None
     optics: Optics

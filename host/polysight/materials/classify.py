@@ -92,7 +92,7 @@ class Weights:
 
 
 def combine(channels: Distances, w: Weights) -> Real:
-    """Return the weighted sum of the three distances."""
+    """Return the weighted sum of the distances in H, V and P, float64 in their shape."""
     return w.h * channels[0] + w.v * channels[1] + w.p * channels[2]
 
 
@@ -141,7 +141,10 @@ class PaperKnn(Model):
         return self._distributions
 
     def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
-        """Name patches by the majority of their pixels; unknown if they are far from that material's distribution."""
+        """Name patches by the majority of their pixels; unknown if they are far from that material's distribution.
+
+        `x` features [n, columns], `patches` patch number [n].
+        """
         voted = majority(*self.by_pixel(x), patches)
         distances = self.distributions.by_scan(x, patches).distances
         if distances is None:
@@ -151,7 +154,7 @@ class PaperKnn(Model):
         return replace(voted, distance=np.maximum(voted.distance, to_material))
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
-        """Name each pixel; return name, and mean distance of its neighbours over the material's threshold."""
+        """Return each pixel's name [n], and its mean distance to its neighbours over the material's threshold [n]."""
         distance, nearest = self._knn.kneighbors(ratio_columns(x))
         votes = count_votes(self._material[nearest], self._materials.size)
         names = self._materials[votes.argmax(axis=1)]

@@ -171,7 +171,7 @@ class ErrorDiscriminant(Model):
         return np.sqrt(np.einsum("abd,abde,abe->ab", differences, inverse, differences))
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
-        """Classify each pixel independently: return its name, and its distance over the threshold."""
+        """Classify each pixel independently: return name, str [n], and distance over the threshold, float64 [n]."""
         q, cost = costs(self._compute_deviations(x) - self.level, self._compute_pixel_covariances())
         best = cost.argmin(axis=1)
         return self.names[best], np.sqrt(q[np.arange(len(x)), best] / self.pixel_level)
@@ -184,7 +184,7 @@ class ErrorDiscriminant(Model):
     def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
         """Name the patches and pixels of one scan, with an estimate of the error common to all patches.
 
-        Pixels are named independently of each other.
+        Pixels are named independently of each other. `patches` [n] is the patch number of each pixel.
         """
         ids, patch = np.unique(patches, return_inverse=True)
         deviations = self._compute_deviations(x) - self.level

@@ -260,7 +260,7 @@ class Inversion:
 
 
 def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: npt.ArrayLike = 0j) -> Complex:
-    """Return t of a measured V / H: the first formula of the module's docstring, solved for t, at the metal's place."""
+    """Return t of a measured V / H, broadcast: the first formula of the module's docstring, at the metal's place."""
     a = np.asarray(a, np.complex128)
     b = np.asarray(b, np.complex128)
     without_reference = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + np.asarray(rho)))
@@ -291,7 +291,8 @@ def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kin
 
 
 def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[Real, float, float]:
-    """Return particles of the posterior of the common errors, the log evidence, and the log probability of bare metal.
+    """Return particles [particle, unknown] of the posterior of the common errors, the log evidence, and the log
+    probability of bare metal.
 
     Whether the mount has moved and whether the metal is painted are sampled apart and weighed by their evidence: what
     fits of each is so small a part of its prior that among few particles of all none may lie there.
@@ -376,7 +377,7 @@ class SceneLikelihood:
         return out
 
     def within(self, prior: RigPrior, z: Real) -> Real:
-        """Return particles of this hypothesis as particles of a prior that leaves it open."""
+        """Return particles [particle, unknown] of this hypothesis as particles of a prior that leaves it open."""
         out = z.copy()
         out[:, HAS_MOVED] = _place(z[:, HAS_MOVED], self.prior.moved, prior.moved)
         out[:, PAINT] = _place(z[:, PAINT], self.prior.painted, prior.painted)
@@ -695,5 +696,5 @@ def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real
 
 
 def ratio_error(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
-    """Return the standard deviation of 1 / P at t by leakage and reference: root mean variance of both parts."""
+    """Return the standard deviation of 1 / P by leakage and reference, as `t`: root mean variance of both parts."""
     return np.sqrt(np.sum(ratio_slopes(estimate, prior, t) ** 2, axis=(-2, -1)) / 2)

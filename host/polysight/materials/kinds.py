@@ -177,7 +177,7 @@ class RatioEvidence:
 
 
 def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
-    """Return t = 1 / P of half spaces (Eq. 2)."""
+    """Return t = 1 / P of half spaces (Eq. 2), complex128, broadcast."""
     return np.asarray(1 / ratio_from_permittivity(permittivity, theta_rad), np.complex128)
 
 
@@ -195,7 +195,7 @@ class HalfSpaces:
             self._q = (1 + self.t) / (1 - self.t) * (self._sine2 / self._cosine)
 
     def log_brightness(self) -> Real:
-        """Return ln |r_s| by Eq. 2, r_s = (cos - q) / (cos + q); NaN for metal."""
+        """Return ln |r_s| by Eq. 2, r_s = (cos - q) / (cos + q), broadcast; NaN for metal."""
         loss2 = np.square(self._q.imag)
         with np.errstate(divide="ignore", invalid="ignore"):
             difference2 = np.square(self._cosine - self._q.real) + loss2
@@ -203,7 +203,7 @@ class HalfSpaces:
             return np.asarray(0.5 * np.log(difference2 / sum2), np.float64)
 
     def move_to_angle(self, other_rad: float) -> Complex:
-        """Return t of the same half spaces at another angle."""
+        """Return t of the same half spaces at another angle, complex128, broadcast."""
         other2 = np.sin(other_rad) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
             root = np.sqrt(np.square(self._q) + (self._sine2 - other2))
@@ -214,14 +214,14 @@ class HalfSpaces:
 
 
 def brightness_density(difference: Real | float, size: Real | float) -> Real:
-    """Return the density of ln |H| over its expectation, but for a factor: of the usual size, or odd."""
+    """Return the density of `difference` (ln |H| less its expectation), not normalised: error of `size`, or odd."""
     usual = (1 - ODD_BRIGHTNESS) / size * np.exp(-0.5 * (difference / size) ** 2)
     odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (difference / ODD_BRIGHTNESS_STD) ** 2)
     return np.asarray(usual + odd, np.float64)
 
 
 def permittivity_slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
-    """Return d eps / d t of Eq. 3 with t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
+    """Return d eps / d t of Eq. 3, broadcast, with t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
     t = np.asarray(t, np.complex128)
     return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * (1 + t) / (1 - t) ** 3
 
@@ -233,7 +233,7 @@ def move_to_angle_of_kinds(evidence: RatioEvidence, kinds: Kinds) -> RatioEviden
 
 
 def split_complex(value: npt.ArrayLike) -> Real:
-    """Return real and imaginary part on a last axis of two."""
+    """Return real and imaginary part, float64 [..., 2]."""
     value = np.asarray(value, np.complex128)
     return np.stack([value.real, value.imag], axis=-1)
 
@@ -317,6 +317,8 @@ class Kinds:
 
     def compute_half_space_density(self, t: Complex, covariance: Real) -> Real:
         """Return the density of t of any half space: ln eps' uniform, eps'' uniform on a scale that ends in a line.
+
+        Shape of `t`; `covariance` [2, 2] is that of the real and imaginary part of a measured t.
 
         Errors of the measurement soften the border of the passive half spaces: the density beyond is that of the
         passive one at the border, times the probability of an error as large.

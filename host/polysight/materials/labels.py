@@ -91,6 +91,7 @@ def find_truth(folder: Path) -> tuple[Plates, str]:
 
 
 def _read_plate(raw: Mapping[str, Any]) -> TruthPlate:
+    """Read a plate of a scene file. Raises KeyError, TypeError or ValueError for a malformed one."""
     cx, cy = (float(c) for c in raw["centre_mm"])
     w, h = (float(s) for s in raw["size_mm"])
     eps = None
@@ -409,6 +410,7 @@ def no_box(name: str, boxes: Mapping[str, Any]) -> DataError:
 
 
 def _check_box(name: str, box: Box, extent: Box) -> Box:
+    """Return the box. Raises DataError if it is empty or reaches outside the image."""
     if not all(math.isfinite(b) for b in box) or not (box[0] < box[2] and box[1] < box[3]):
         raise DataError(
             f"box of {name}, {', '.join(f'{b:g}' for b in box)}: it is empty",
@@ -428,6 +430,7 @@ def _check_box(name: str, box: Box, extent: Box) -> Box:
 
 
 def _check_apart(one: str, a: Box, other: str, b: Box) -> None:
+    """Raise DataError if two boxes overlap, beyond rounding."""
     across = min(a[2], b[2]) - max(a[0], b[0])
     up = min(a[3], b[3]) - max(a[1], b[1])
     if across > _TOLERANCE_MM and up > _TOLERANCE_MM:

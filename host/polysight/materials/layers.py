@@ -412,10 +412,12 @@ def _differ(a: LayerFit, b: LayerFit) -> bool:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Result of the solver: unknowns, chi-square, Jacobian of the residuals, and active bounds."""
+    """Result of the solver; `active` [n] is -1 or 1 where an unknown is at its lower or upper bound."""
 
+    # Unknowns [n], as of :class:`_Model`.
     x: Real
     chi2: float
+    # Of the residuals, [residual, n].
     jacobian: Real
     active: npt.NDArray[np.intp]
 
@@ -491,7 +493,7 @@ class _Model:
         return np.concatenate([out, x[..., -1:]], axis=-1) if self.turned else out
 
     def starts(self) -> list[Real]:
-        """Return local minima of chi-square on a grid of index, phase and loss, best first."""
+        """Return unknowns [n] at local minima of chi-square on a grid of index, phase and loss, best first."""
         sine2 = float(np.sin(self.theta_rad) ** 2)
         low, high = (float(np.sqrt(max(real - sine2, 1e-3))) for real in REAL_RANGE)
         known_mm = 1e3 * (self.stack[self.at].thickness_m or 0.0)
@@ -526,7 +528,7 @@ class _Model:
         return ((residuals[: x.size] - residuals[x.size :]) / (2 * np.diag(step)[:, None])).T
 
     def solve(self, start: Real, precision: float = 1e-10) -> _Solution:
-        """Solve by least squares from one start."""
+        """Solve by least squares from one start [n]."""
         width = self.upper - self.lower
         optimum = scipy.optimize.least_squares(
             self.residuals,

@@ -77,7 +77,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Library:
-    """Entries, and the model fitted to them (`polysight.materials.train`; may be empty)."""
+    """Entries, and the model fitted to them (`polysight.materials.train`; empty if none was fitted)."""
 
     entries: tuple[Entry, ...]
     fit: dict[str, Any] = field(default_factory=dict)
@@ -209,6 +209,7 @@ class Library:
 
 
 def _read_entries(rows: list[dict[str, Any]], h: npt.NDArray, v: npt.NDArray, p: npt.NDArray) -> tuple[Entry, ...]:
+    """Cut the arrays of all entries, [pixel] one entry after the other, into entries; `rows` are their other fields."""
     if not h.shape == v.shape == p.shape or h.ndim != 1 or sum(r["pixels"] for r in rows) != h.size:
         raise ValueError(f"arrays {h.shape}, {v.shape}, {p.shape}")
     out = []
@@ -270,7 +271,10 @@ _LARGEST_RATIO = 1e12
 
 
 def ratio_columns(features: Real) -> Real:
-    """Return columns |H|, |V|, Re P, Im P of features |H|, |V|, Re 1/P, Im 1/P; or the features of such columns."""
+    """Return columns |H|, |V|, Re P, Im P [n, 4] of features |H|, |V|, Re 1/P, Im 1/P; or the features of columns.
+
+    Sub-bands follow each other along the second axis, four columns each.
+    """
     table = features.reshape(len(features), -1, WIDTH).copy()
     inverse = table[..., 2] + 1j * table[..., 3]
     inverse = np.where(np.abs(inverse) < 1 / _LARGEST_RATIO, 1 / _LARGEST_RATIO, inverse)
@@ -280,7 +284,7 @@ def ratio_columns(features: Real) -> Real:
 
 
 def ratio_distance(a: npt.NDArray[np.complex128], b: npt.NDArray[np.complex128], measure: Measure) -> Real:
-    """Return the distance of ratios P, broadcast; the measures are described above."""
+    """Return the distance of ratios P, float64, broadcast; the measures are described above."""
     if measure == "paper":
         return np.abs(a - b)
     if measure == "inverse":
@@ -412,7 +416,7 @@ class Samples:
         return cls(np.concatenate(x), *labels, library.angles_deg)
 
     def take(self, indices: npt.NDArray) -> Samples:
-        """Return some of the pixels, by index or by mask."""
+        """Return some of the pixels, by index [k] or by bool mask [n]."""
         specimens = None if self.specimens is None else self.specimens[indices]
         return Samples(
             self.x[indices],
@@ -527,7 +531,7 @@ class Model(ABC):
 
 
 def majority(pixel_names: npt.NDArray, distance: Real, patches: npt.NDArray) -> NamedScan:
-    """Name each patch as most of its pixels; confidence is their share, distance the median over all pixels."""
+    """Name each patch as most of its pixels [n]; confidence is their share, distance the median over all pixels."""
     ids = np.unique(patches)
     rows = []
     for i in ids:

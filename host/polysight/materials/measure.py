@@ -241,7 +241,7 @@ class Scatter:
 
 
 def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Scatter | None:
-    """Return how V / H scatters over the pixels of a mask; None with fewer than `LEAST_PIXELS` usable ones."""
+    """Return how V / H scatters over the pixels of a mask [ny, nx]; None with fewer than `LEAST_PIXELS` usable ones."""
     pixels = mask & np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
     rows, columns = np.nonzero(pixels)
     if rows.size < LEAST_PIXELS:

@@ -237,7 +237,7 @@ def _sort_likeliest_first(probability: Mapping[str, float], least: float = LIKEL
 
 
 def compute_name_shares(pixel_names: npt.NDArray[np.str_]) -> dict[str, float]:
-    """Return the share of the pixels with each name, largest first."""
+    """Return the share of the pixels, str [n], with each name, largest first."""
     names, count = np.unique(pixel_names, return_counts=True)
     by_share = sorted(zip(names.tolist(), count.tolist(), strict=True), key=lambda row: (-row[1], row[0]))
     return {name: number / pixel_names.size for name, number in by_share}

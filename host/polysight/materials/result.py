@@ -101,7 +101,7 @@ class PatchResult:
 
     @property
     def names(self) -> npt.NDArray[np.str_] | None:
-        """Names of the interior's pixels, in image order; None as for `verdict`."""
+        """Names of the interior's pixels, str [n] in image order; None as for `verdict`."""
         if self.named is None or self.refused is not None:
             return None
         return self.named.names

@@ -141,7 +141,7 @@ class Segmentation:
 
 
 def axis_mm(axis_m: npt.ArrayLike) -> Real:
-    """Convert an image axis to millimetres from the image centre."""
+    """Convert an image axis [n] to millimetres from the image centre."""
     a = np.asarray(axis_m, np.float64)
     return (a - (a[0] + a[-1]) / 2) * 1e3
 
@@ -519,7 +519,7 @@ _STEP = 0.25
 
 
 def reduce_variation(level: Real, weight: float) -> Real:
-    """Return an image with less total variation, by Chambolle's dual projection (2004); a larger weight smooths more.
+    """Return an image [ny, nx] with less total variation, by Chambolle's dual projection (2004).
 
     It minimises half the squared distance from `level` plus `weight` times the sum of the gradient's magnitude.
     """

@@ -50,7 +50,7 @@ _LEAST_LOSS = 1e-3
 
 
 def soft_modulus(t: npt.ArrayLike) -> Real:
-    """Return the scale of errors of t = V / H, `sqrt(|t|^2 + SOFT^2)`: V may vanish (Brewster's angle)."""
+    """Return the scale of errors of t = V / H [any]: `sqrt(|t|^2 + SOFT^2)`, as V may vanish (Brewster's angle)."""
     return np.asarray(np.hypot(np.abs(t), SOFT), np.float64)
 
 

@@ -417,7 +417,7 @@ def _describe_solution(fit: LayerFit) -> dict[str, Any]:
 
 
 def polarisation_angle_rad(p: npt.ArrayLike) -> Real:
-    """Return the polarisation angle arctan |P| of metal-referenced ratios (Eq. 8), radians; 45 degrees for metal."""
+    """Return the polarisation angle arctan |P| of metal-referenced ratios [any] (Eq. 8), radians; pi / 4 for metal."""
     return np.arctan(np.abs(np.asarray(p)))
 
 
@@ -467,7 +467,7 @@ class Line:
         return self.intercept + self.slope * np.asarray(angle_rad, np.float64)
 
     def interval(self, angle_rad: npt.ArrayLike, confidence: float = 0.9) -> tuple[Real, Real]:
-        """Return the prediction interval of a new patch: lower and upper end, percent by weight.
+        """Return the prediction intervals of new patches: lower and upper ends, percent by weight, as `angle_rad`.
 
         Student's t over the residuals, wider away from the calibration's middle (Draper and Smith, Applied Regression
         Analysis, section 1.4).
@@ -484,6 +484,7 @@ class LeftOut:
     """Estimate of one patch by a line fitted without its concentration."""
 
     name: str
+    # Percent by weight: known, estimated, and the ends of the prediction interval.
     true_percent: float
     percent: float
     low: float

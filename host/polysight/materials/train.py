@@ -125,7 +125,7 @@ class LabelledScan:
 
 
 def restore_phase_sign(published: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.complexfloating]:
-    """Return published images or pixels with our sign of phase, where losses are -j eps'': the conjugate.
+    """Return published images or pixels (any shape) with our sign of phase, where losses are -j eps'': the conjugate.
 
     The published imaging code multiplies the samples by exp(-j k R) and adds them up. A wave that is delayed by R has
     exp(-j k R) in our sign: samples that add up are its conjugate, and the images are, too. No document says so; a
@@ -441,7 +441,7 @@ def calibration_error(confidence: npt.NDArray, right: npt.NDArray) -> float:
 
 
 def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iterator[tuple[npt.NDArray, npt.NDArray]]:
-    """Yield training and test pixels of each fold: whole groups, or single pixels.
+    """Yield indices [k] of the training and test pixels of each fold: whole groups, or single pixels.
 
     Every group is a fold of its own if `folds` could put all groups of a material into one fold.
 

@@ -108,6 +108,7 @@ def warn_of_scene(rig: Instrument, plates: Sequence[Plate]) -> Iterator[Finding]
 
 
 def _warn_of_gap(first: Plate, second: Plate, cell_mm: Pair) -> Iterator[Finding]:
+    """Warn of two plates closer than 1.5 resolution cells, which segmentation may join."""
     gaps_mm = []
     for axis in (0, 1):
         low, high = first.edges(axis)
@@ -127,6 +128,7 @@ def _warn_of_gap(first: Plate, second: Plate, cell_mm: Pair) -> Iterator[Finding
 
 
 def _warn_of_size(plate: Plate, cell_mm: Pair) -> Iterator[Finding]:
+    """Warn of a plate too small for a pixel without influence of its edges."""
     margin_mm = SegmentSettings().margin_mm
     for axis in (0, 1):
         least_mm = 2 * margin_mm + cell_mm[axis]
@@ -139,6 +141,7 @@ def _warn_of_size(plate: Plate, cell_mm: Pair) -> Iterator[Finding]:
 
 
 def _warn_of_aperture(plate: Plate, rig: Instrument) -> Iterator[Finding]:
+    """Warn of a plate that reaches beyond the area where this aperture images mirrors well."""
     zone_mm = field_limits(rig).mirror_zone_mm
     aperture_mm = ((rig.grid.columns - 1) * rig.grid.step_x_mm, (rig.grid.rows - 1) * rig.grid.step_y_mm)
     for axis in (0, 1):
@@ -154,6 +157,7 @@ def _warn_of_aperture(plate: Plate, rig: Instrument) -> Iterator[Finding]:
 
 
 def _warn_of_thickness(plate: Plate, rig: Instrument) -> Iterator[Finding]:
+    """Warn of a plate whose back changes V / H within the sweep: it is not a half space."""
     if plate.permittivity is None or plate.thickness_mm is None:
         return
     first, last = rig.chirp.linear_samples

@@ -49,20 +49,20 @@ class MapValues:
 
 
 def level_db(values: npt.NDArray[np.complexfloating]) -> Real:
-    """Return 20 log10 |values|; what is zero or not finite has the level of the least amplitude."""
+    """Return 20 log10 |values|, shape of `values`; zero and non-finite values get the level of the least amplitude."""
     amplitude = np.nan_to_num(np.abs(values).astype(np.float64), nan=0.0, posinf=0.0)
     return 20 * np.log10(np.maximum(amplitude, LEAST_AMPLITUDE))
 
 
 def percentile(values: Real, mask: Mask, percent: float, default: float = 0.0) -> float:
-    """Return a percentile of the values under a mask; `default` if it is empty."""
+    """Return a percentile of the values under a mask of their shape; `default` if it is empty."""
     if mask.any():
         return float(np.percentile(values[mask], percent))
     return default
 
 
 def level_below_brightest_db(images: Images, channel: str) -> Real:
-    """Return the level relative to the brightest pixels of a channel, dB; of P that of the fainter channel."""
+    """Return the level relative to the brightest pixels of a channel, dB [ny, nx]; of P that of the fainter channel."""
     if channel == "p":
         return np.minimum(level_below_brightest_db(images, "h"), level_below_brightest_db(images, "v"))
     level = level_db(images.h if channel == "h" else images.v)
@@ -70,7 +70,7 @@ def level_below_brightest_db(images: Images, channel: str) -> Real:
 
 
 def signal_opacity(images: Images, channel: str) -> Real:
-    """Return the opacity of a channel's phase, or of P: pixels that hold only noise are transparent."""
+    """Return the opacity of a channel's phase or of P, 0 to 1 [ny, nx]: pixels of only noise are transparent."""
     level = level_below_brightest_db(images, channel)
     return np.clip((level - FAINT_DB) / (CLEAR_DB - FAINT_DB), 0.0, 1.0) * images.usable
 

@@ -564,6 +564,7 @@ def _read_boot(data: bytes) -> _Read:
 
 
 def _read_rf_power_up(data: bytes) -> _Read:
+    """Read the event of the RF power-up: failed self-tests, and the time it took in ticks of 5 ns."""
     passed, ticks = struct.unpack_from("<II", data)
     failed = _RF_TESTS & ~passed
     text = ""

@@ -237,6 +237,7 @@ class UsbWords:
 
 
 def _read_exactly(port: Port, size: int) -> bytes:
+    """Read `size` bytes. Raises DeviceError after the timeout of the port."""
     data = port.read(size)
     if len(data) != size:
         raise DeviceError(

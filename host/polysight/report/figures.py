@@ -367,6 +367,7 @@ def find_masked_positions(scan: ProcessedScan) -> dict[str, npt.NDArray[np.bool_
 
 
 def _mask(board: BoardQuality, plan: RasterPlan) -> npt.NDArray[np.bool_]:
+    """Return the masked positions of a board, bool [row, column], those of rows that were not recorded among them."""
     mask = np.zeros((plan.rows, plan.columns), np.bool_)
     for row, runs in (board.masked_columns or {}).items():
         for start, stop in runs:
@@ -489,7 +490,7 @@ def focus_figure(
     y_m: npt.NDArray[np.float64],
     simulated: bool,
 ) -> bytes:
-    """Return a PNG of a sweep over depth, and of H before and after focusing.
+    """Return a PNG of a sweep over depth, and of H [ny, nx] before and after focusing.
 
     `sweep` has the keys `depths_mm`, `sharpness`, `depth_mm`, `tilt_deg` and `certain`.
     """

@@ -145,6 +145,7 @@ def _find_truth(patch: PatchFigures) -> Point | None:
 
 
 def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour: str) -> None:
+    """Draw a permittivity with its confidence regions; in old products, with the percentiles of its pixels."""
     centre = (e.real, e.loss)
     if e.spread is not None:
         for share, style in _STYLES.items():

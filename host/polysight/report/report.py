@@ -292,7 +292,7 @@ def _format_estimate(e: PermittivityFigures) -> dict[str, str]:
 
 
 def coverage_sentence(masks: dict[str, npt.NDArray[np.bool_]]) -> str:
-    """Say how many positions of each board are masked; "" if that is not known."""
+    """Say how many positions of each board are masked, bool [row, column]; "" if that is not known."""
     if not masks:
         return ""
     if not any(m.any() for m in masks.values()):

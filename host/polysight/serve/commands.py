@@ -396,6 +396,7 @@ def _process(site: Site, scan: Named, body: ProcessRequest) -> None:
 
 
 def _fit_layers(site: Site, scan: Named, body: LayersRequest) -> None:
+    """Start `polysight permittivity` for a stack of layers, after a check of their texts."""
     for text in body.layers:
         try:
             parse_layer(text)
@@ -417,6 +418,7 @@ class SavedLabels(msgspec.Struct, frozen=True):
 
 
 def _save_labels(site: Site, scan: Named, body: LabelRequest) -> SavedLabels:
+    """Save the boxes drawn on the page beside the products; without boxes the file is removed."""
     del site
     labels = Labels(body.boxes, "mm", body.metal or None, body.specimens, by_hand=True)
     if not labels.boxes:
@@ -446,6 +448,7 @@ def _fit_concentration(site: Site, body: LibraryRequest) -> None:
 
 
 def _export(site: Site, scan: Named, body: ExportRequest) -> None:
+    """Start an export into the folder of the scan, unless `export` is a link that leads out of it."""
     folder = scan.folder.absolute()
     out = folder / "export"
     if not out.resolve().is_relative_to(folder.resolve()):

@@ -100,6 +100,7 @@ class ScanDetails(ListedScan, frozen=True, kw_only=True):
 
 
 async def _send_scans(site: Site, request: Request) -> Response:
+    """Answer with the scans that changed since the stamp of the last answer, and the free space of the disk."""
     root = site.scans.root
     stamp = request.query_params.get("since", "")
 
@@ -139,6 +140,8 @@ async def _send_queue(site: Site, request: Request) -> Response:
 
 
 async def _send_thumbnail(site: Site, request: Request) -> Response:
+    """Answer with a small picture of a scan; 204 if it has none."""
+
     def draw(folder: Path) -> bytes:
         try:
             return draw_map(folder, THUMBNAIL).png
@@ -231,6 +234,7 @@ async def _read_products(site: Site, request: Request, work: Callable[[Path], T]
 
 
 async def _send_map(site: Site, request: Request) -> Response:
+    """Answer with a map of a scan as PNG, between the limits of its colours if the page gives them."""
     name = request.path_params["name"]
     limits = None
     if "low" in request.query_params and "high" in request.query_params:
@@ -297,6 +301,7 @@ def _make_picture_answer(picture: catalogue.Picture) -> Response:
 
 
 def _parse_number(request: Request, key: str) -> float:
+    """Return a number of the query. Raises DataError if it is missing, NaN or a million and more."""
     text = request.query_params.get(key, "")
     try:
         value = float(text)

@@ -168,6 +168,7 @@ def _run(shown: Shown, place: Place, what: str) -> int:
 
 
 def _make_access(place: Place, listener: socket.socket, control: bool) -> Access:
+    """Return who may use the page; a token is required for control and for other machines."""
     token = ""
     if control or not place.loopback:
         token = load_token()
@@ -209,6 +210,7 @@ def load_token() -> str:
 
 
 def _bind(place: Place) -> socket.socket:
+    """Open the socket that listens. Raises DeviceError if the port is taken or not allowed."""
     family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -92,8 +92,10 @@ class ScanProgress:
     committed: int
     row: int = -1
     take: int = 0
+    # Points of the take so far, of `row_points`.
     points: int = 0
     row_points: int = 0
+    # None while unknown.
     remaining_s: float | None = None
     state: str = ""
 

@@ -27,7 +27,9 @@ class State(msgspec.Struct, frozen=True):
     detail: str = ""
     why: str = ""
     do: str = ""
+    # Buttons that may be pressed.
     press: tuple[Button, ...] = ()
+    # Phrases that the page must not show in this state; its tests look for them.
     never: tuple[str, ...] = ()
 
 

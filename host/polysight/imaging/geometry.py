@@ -209,7 +209,7 @@ def find_irregularity(aperture: Aperture) -> str | None:
 
 
 def column_step_m(offsets_m: NDArray[np.float64]) -> float:
-    """Return the mean spacing of positions in a row; 0 for rows of one position."""
+    """Return the mean spacing of positions [row, column, axis] in a row, metres; 0 for rows of one position."""
     x = offsets_m[..., 0]
     return float((x[:, -1] - x[:, 0]).mean()) / max(1, x.shape[1] - 1)
 

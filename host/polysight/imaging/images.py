@@ -317,7 +317,7 @@ class Images:
 
 
 def specular_point_m(antennas: Antennas, z_m: float) -> NDArray[np.float64]:
-    """Return where a board's TX is reflected into its RX on the plane at `z_m`, (x, y), at stage offset zero."""
+    """Return where a board's TX is reflected into its RX on the plane at `z_m`: x, y [2], metres, stage offset zero."""
     tx = antennas.tx_m
     rx = antennas.rx_m.mean(axis=0)
     z_tx = z_m - tx[2]

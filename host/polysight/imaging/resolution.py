@@ -100,7 +100,7 @@ def _combine_positions(aperture: Aperture, weights: NDArray[np.floating]) -> tup
 
 
 def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
-    """Return the half-power width along an axis from the spread of wavenumbers in the aperture, metres."""
+    """Return the half-power width at `point` [3] along an axis, m, from the spread of wavenumbers in the aperture."""
     middle = tuple(n // 2 for n in aperture.offsets_m.shape[:2])
     line = aperture.offsets_m[middle[0]] if axis == 0 else aperture.offsets_m[:, middle[1]]
     slope = np.zeros(len(line))

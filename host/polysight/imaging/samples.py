@@ -522,7 +522,7 @@ class BoardSamples:
         return np.where(gain == 0, 1, gain)
 
     def calibrate_samples(self) -> NDArray[np.complex64]:
-        """Return the samples divided by the gain of each RX, not weighted."""
+        """Return the samples divided by the gain of each RX, not weighted, [rx, frequency, row, column]."""
         return self._cube * (1 / self.rx_calibration()).astype(np.complex64)[:, None, None, None]
 
     def current(self) -> tuple[Image, Image, str | None]:

@@ -80,7 +80,7 @@ class Lattice:
 
     @property
     def wavenumbers(self) -> NDArray[np.float64]:
-        """Wavenumbers of the band, cycles per metre."""
+        """Wavenumbers of the band along x, cycles per metre, in the shape of `band`."""
         return self.band / (self.size_x * self.pitch_x_m)
 
 

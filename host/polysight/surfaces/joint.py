@@ -97,7 +97,7 @@ class JointFit:
                 break
 
     def subtract(self, members: NDArray) -> None:
-        """Add up the RX of windows for the paths as they are, and subtract the echoes from the samples."""
+        """Add up the RX of windows (indices) for the paths as they are, and subtract the echoes from the samples."""
         for index in range(self.values.shape[1]):
             path, slope, _ = unpack_values(self.values[members, index])
             self.steering[members, index] = self.fit.steer(self.windows.at_m[members], path, slope)

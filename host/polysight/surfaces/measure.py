@@ -128,7 +128,7 @@ def _is_wide(shape: Shape) -> NDArray[np.bool_]:
 
 
 def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
-    """Return the number of the connected surface of each echo, largest surface first; -1 for small groups.
+    """Return the number of the connected surface of each echo [n], largest surface first; -1 for small groups.
 
     Neighbouring windows belong together if the path of one follows from that of the other by its slope.
     """

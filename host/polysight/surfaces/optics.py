@@ -110,7 +110,10 @@ def _compute_boresight(board: Board) -> Array:
 
 
 def aim_antenna(at_m: Array, boresight: Array, partner_m: Array, plane_m: float, parts: tuple[float, float]) -> Antenna:
-    """Return an antenna with given parts of s and p towards the point of the object plane that mirrors its partner."""
+    """Return an antenna with given parts of s and p towards the point of the object plane that mirrors its partner.
+
+    Places `at_m` and `partner_m` [3] and the plane in metres, rig frame; `boresight` [3] is a unit vector.
+    """
     share = (plane_m - at_m[2]) / (2 * plane_m - at_m[2] - partner_m[2])
     target = np.array([*(at_m + share * (partner_m - at_m))[:2], plane_m])
     direction = (target - at_m) / np.linalg.norm(target - at_m)
@@ -202,7 +205,7 @@ def bends_by_incidence(points: Array, normals: Array, curvature: Array, at_m: Ar
 
 
 def reflect_flat(eps: NDArray | complex, theta: Array) -> tuple[Complex, Complex]:
-    """Fresnel's coefficients of tangential fields (-1 and -1 for an infinite `eps`)."""
+    """Return Fresnel's r_s and r_p of tangential fields, broadcast; -1 and -1 for an infinite `eps`."""
     r_s, r_p = fresnel(eps, theta)
     return np.asarray(r_s), np.asarray(r_p)
 

@@ -101,7 +101,7 @@ class PermittivityFit:
 
 
 def point_ratio(v: Voltages, gains: Gains) -> Complex:
-    """Ratio r_s / r_p of each point, as if no twist mixed both."""
+    """Return r_s / r_p of each point [n], as if no twist mixed both."""
     b = v.b.copy()
     b[:, 0] /= gains.ratio(v.arrival)
     return _unmix(v, b)
@@ -114,7 +114,7 @@ def _unmix(v: Voltages, b: Complex) -> Complex:
 
 
 def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex:
-    """Permittivity of each point: Eq. 3 of the ratio, corrected for curvature and iterated."""
+    """Return the permittivity of each point [n]: Eq. 3 of the ratio, corrected for curvature and iterated."""
     ratio = point_ratio(v, gains)
     theta = v.theta[:, 0]
     eps = clip_permittivity(permittivity_from_ratio(ratio, theta))
@@ -126,7 +126,7 @@ def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex
 
 
 def clip_permittivity(eps: NDArray) -> Complex:
-    """Limit permittivities to those of solids, so that iterations go on."""
+    """Limit permittivities [any] to those of solids, so that iterations go on."""
     finite = np.where(np.isfinite(eps), eps, 4.0)
     return np.clip(np.real(finite), 1.2, 40) + 1j * np.clip(np.imag(finite), -20, 0.5)
 
@@ -356,7 +356,7 @@ def find_pattern_changes(eps: complex, v: Voltages, wave_number: float) -> Compl
 
 
 def find_common_error(fit: PermittivityFit, miss: Complex, scan: DisturbedScan, wave_number: float) -> Array:
-    """Change of (real, imaginary) of a segment's permittivity, if its scan is understood as `scan`."""
+    """Return the change of a segment's permittivity, (real, imaginary) [2], if its scan is understood as `scan`."""
     coefficients = reflect_points(fit.eps, scan.voltages, wave_number)
     change = find_misses(scan.voltages, scan.gains, coefficients) - miss
     return (fit.answer @ change).real

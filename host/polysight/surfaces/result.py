@@ -252,7 +252,7 @@ def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> tuple[Seen, N
 
 
 def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty: Uncertainty) -> tuple[Array, Array]:
-    """Standard deviations of points along the normal (metres) and of normals (radians, both directions together).
+    """Return standard deviations [n] of points along the normal (m) and of normals (rad, both directions together).
 
     A normal is judged beside that of the surface at the point: a point that slides along a bent surface is beside it.
     """
@@ -376,7 +376,7 @@ def judge_segment(
 
 
 def add_permittivity(segment: Segment, eps: complex, sources: dict[str, Array]) -> Segment:
-    """Add a permittivity with its covariances by source, unless no passive medium has it."""
+    """Add a permittivity with its covariances [2, 2] by source, unless no passive medium has it."""
     (aa, ab), (_, bb) = sum(sources.values(), np.zeros((2, 2))).tolist()
     if eps.imag > MAX_GAIN_SIGMA * bb**0.5 or eps.real < 1.25:
         return replace(segment, reason=NO_SINGLE_MEDIUM)

@@ -132,7 +132,7 @@ def receive(v: Voltages, coefficients: Complex) -> Complex:
 
 
 def expansion_parameter(v: Voltages, wave_number: float) -> Array:
-    """K / (k cos^3 theta) of each point: the ratio of successive orders of the reflection at a curved surface."""
+    """Return K / (k cos^3 theta) of each point [n]: ratio of successive orders of reflection at a curved surface."""
     bend = (np.abs(v.bend_inside) + np.abs(v.bend_across)) / 2
     return bend / (wave_number * np.cos(v.theta[:, 0]) ** 3)
 

@@ -54,7 +54,7 @@ class Samples:
 
     @property
     def middle_m(self) -> Array:
-        """Mean place of the RX: echoes are given as if received there."""
+        """Mean place of the RX [3], metres: echoes are given as if received there."""
         return self.rx_m.mean(axis=0)
 
     @property
@@ -123,6 +123,7 @@ class Windows:
     samples: NDArray[np.complex64]
     valid: Array
     offsets: Array
+    # Stage offsets of the centres, [window, 3].
     at_m: Array
 
 
@@ -349,15 +350,15 @@ def no_echoes() -> Echoes:
 
 
 def select_windows(windows: Windows, keep: NDArray) -> Windows:
-    """Return some of the windows."""
+    """Return some of the windows, by index [k] or bool mask [window]."""
     return Windows(windows.samples[keep], windows.valid[keep], windows.offsets[keep], windows.at_m[keep])
 
 
 def replace_samples(windows: Windows, samples: NDArray) -> Windows:
-    """Return windows with other samples."""
+    """Return windows with other samples of the same shape."""
     return Windows(samples, windows.valid, windows.offsets, windows.at_m)
 
 
 def select_maxima(found: Maximum, keep: NDArray) -> Maximum:
-    """Return copies of some maxima."""
+    """Return copies of some maxima, by index [k] or bool mask [window]."""
     return Maximum(*(getattr(found, f.name)[keep].copy() for f in fields(Maximum)))

@@ -44,7 +44,7 @@ class HighPass:
         return h
 
     def inverse(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return `conj(H) / max(|H|^2, 1/16)`: 1/H where the gain allows it, and at most fourfold noise."""
+        """Return `conj(H) / max(|H|^2, 1/16)`, shape of the frequencies (Hz): 1/H, but at most fourfold noise."""
         f = np.where(np.abs(frequency_hz) < 1.0, 1.0, frequency_hz)
         inverse: NDArray[np.complex128] = np.ones(np.shape(f), complex)
         for corner in self.corners_hz:

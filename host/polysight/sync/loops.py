@@ -55,7 +55,7 @@ class Tone(NamedTuple):
 
 
 def cis(angle: Real) -> NDArray[np.complex64]:
-    """Return exp(j angle) within 3e-7. The angle is reduced in float64; sine and cosine of float32 are vectorised."""
+    """Return exp(j angle), any shape, within 3e-7. Angles are reduced in float64; sines of float32 are vectorised."""
     turns = np.asarray(angle) / (2 * np.pi)
     turns -= np.rint(turns)
     small = (2 * np.pi * turns).astype(np.float32)
@@ -66,7 +66,7 @@ def cis(angle: Real) -> NDArray[np.complex64]:
 
 
 def complex64(values: Complex) -> NDArray[np.complex64]:
-    """Return the values in single precision, contiguous, as the loops take them."""
+    """Return values of any shape in single precision, contiguous, as the loops take them."""
     return np.ascontiguousarray(values, np.complex64)
 
 
@@ -97,7 +97,7 @@ def phasor(frequency: Real, phase: Real, samples: int, origin: float) -> NDArray
 
 @lru_cache(maxsize=8)
 def block_edges(n: int) -> NDArray[np.intp]:
-    """Return the edges of eight blocks in a record of n samples.
+    """Return the edges [9] of eight blocks in a record of n samples; fewer blocks if n is below eight.
 
     For frequencies below half a cycle per record, block sums lose less than 1.3 % of the information.
     """
@@ -105,7 +105,7 @@ def block_edges(n: int) -> NDArray[np.intp]:
 
 
 def block_times(edges: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return the centres of the blocks, in samples from the record's centre."""
+    """Return the centres of the blocks, [edges - 1], in samples from the record's centre."""
     return (edges[:-1] + edges[1:] - 1) / 2 - (edges[-1] - 1) / 2
 
 
@@ -238,7 +238,7 @@ def find_band(chirps: NDArray[np.complex64]) -> NDArray[np.float64]:
 
 
 def peak_between(below: Real, middle: Real, above: Real) -> NDArray[np.float64]:
-    """Return the place of the maximum between three values, relative to the middle one, by a parabola."""
+    """Return the place of the maximum between three values [any], relative to the middle one, by a parabola; or 0."""
     bend = below.astype(np.float64) - 2 * middle + above
     return np.divide(0.5 * (below - above), bend, out=np.zeros(bend.shape), where=bend < 0)
 

@@ -503,12 +503,12 @@ def excess_path_m(
 
 
 def sample_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
-    """Return the transmit frequency of every sample of a chirp, Hz."""
+    """Return the transmit frequency of every sample of a chirp, Hz [sample]."""
     return chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples, dtype=np.float64)
 
 
 def block_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
-    """Return the transmit frequency in the middle of every block of linear samples, Hz."""
+    """Return the transmit frequency in the middle of every block of linear samples, Hz [block]."""
     a, b = whole_blocks(chirp.linear_samples)
     return sample_frequencies_hz(chirp)[a:b].reshape(-1, FOLD).mean(axis=1)
 

@@ -5,10 +5,8 @@ import pickle
 
 import numpy as np
 import pytest
-from tests.support.published_files import write_materials
 from tests.support.refusals import refused
 
-from polysight.materials import Entry
 from polysight.materials.train import read_material, read_materials, read_pickle
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -121,18 +119,6 @@ def test_other_forms_are_errors(tmp_path, broken):
         read_material(path)
 
 
-def test_what_is_written_is_read_back(tmp_path):
-    entries = [
-        Entry("Cane Sugar (1.3%, w glass)", f"s{i}", *(np.full(5, a, np.float32) for a in (0.7, 0.2)),
-              np.full(5, 3 + 1j, np.complex64), 55.0, False, thickness_mm=None)
-        for i in range(2)
-    ]  # fmt: skip
-    write_materials(tmp_path / "materials", entries)
-    back = read_materials(tmp_path / "materials").entries
-    assert sorted(e.scan for e in back) == ["s0", "s1"]
-    for e in back:
-        assert e.name == entries[0].name
-        np.testing.assert_allclose(e.p, entries[0].p)
-        np.testing.assert_allclose(e.h, entries[0].h)
+def test_a_folder_without_material_files_is_refused(tmp_path):
     with refused(ErrorCode.FILE_MISSING, tmp_path):
         read_materials(tmp_path)

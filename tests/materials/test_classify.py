@@ -30,11 +30,11 @@ def powders():
 
 @pytest.fixture(scope="module")
 def two_angles(synthetic, analyse_placement):
-    """Nine plates under both angles: a library of four placements, and the patches file of one to name, by angle."""
+    """Nine plates under both angles: a library of two placements, and the patches file of one to name, by angle."""
     entries = [
         entry
         for angle in ANGLES
-        for seed in range(1000, 1004)
+        for seed in range(1000, 1002)
         for entry in make_entries(TrainingScan(f"{angle:g}-{seed}", analyse_placement(seed, angle), True, seed))
     ]
     scene = synthetic(1)

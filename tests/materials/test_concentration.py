@@ -1,6 +1,9 @@
 """A line from polarisation angle to concentration: recovered, judged on what it has not seen, with honest intervals."""
 
 import json
+import pickle
+from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,6 +37,19 @@ def library(rng=None, noise=0.0, slope=-20.0, patches=3):
             angle = 1.2 + percent / slope / 1.0 * 0.05 + (noise * rng.standard_normal() if rng else 0.0)
             entries.append(entry(name, angle, f"scan{scan}"))
     return Library(tuple(entries))
+
+
+def write_materials(folder: Path, entries: Iterable[Entry]) -> None:
+    """Write entries in the form of the published data set, relative to an ideal metal."""
+    folder.mkdir(parents=True, exist_ok=True)
+    ones = np.ones(1, np.complex64)
+    for number, entry in enumerate(entries):
+        content = {
+            "name": entry.name, "collection_name": entry.scan, "incident_angle": entry.incidence_deg,
+            "ref_name": "metal", "values": [entry.p.conj(), entry.h.astype(np.complex64), entry.v.astype(np.complex64)],
+            "ref_values": [ones, ones, ones], "simulated": entry.simulated,
+        }  # fmt: skip
+        (folder / f"{number}_{entry.incidence_deg:.0f}.pkl").write_bytes(pickle.dumps(content))
 
 
 def test_angle_of_metal_is_45_degrees():
@@ -85,6 +101,24 @@ def test_what_cannot_be_fitted_is_refused():
         fit_concentration(Library(tuple(mixed)))
     with refused(ErrorCode.NOT_ENOUGH_DATA):
         Line.through([1.0, 1.0, 1.0], [0.0, 1.0, 2.0])
+
+
+@pytest.mark.parametrize("form", ["library", "published files"])
+def test_a_library_and_published_files_are_taken_as_typed(tmp_path, capsys, form):
+    path = tmp_path / "sugar.npz"
+    if form == "library":
+        library().save(path)
+    else:
+        path = tmp_path / "materials"
+        write_materials(path, library().entries)
+    assert main(["concentration", str(path), "--value", "water=0", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["median_error_percent"] < 1e-3
+    assert result["source"] == "simulated"  # in the published form too
+    assert main(["concentration", str(path), "--value", "watr=0"]) != 0
+    assert "watr" in capsys.readouterr().err
+    assert main(["concentration", str(path), "--value", "water=0"]) == 0
+    assert "median error" in capsys.readouterr().out
 
 
 def test_a_material_that_is_not_used_is_named(tmp_path, capsys):

@@ -162,16 +162,8 @@ def folder(tmp_path):
 
 def test_a_sheet_on_metal_as_typed(folder, capsys):
     """Thin sheets seldom have a permittivity by one interface: their fit is printed all the same."""
-    words = [
-        "permittivity",
-        str(folder),
-        "--config",
-        str(RIG_FILE),
-        "--layer",
-        "sheet,?,1-2.4",
-        "--layer",
-        "plate,metal",
-    ]
+    layers = ["--layer", "sheet,?,1-2.4", "--layer", "plate,metal"]
+    words = ["permittivity", str(folder), "--config", str(RIG_FILE), *layers]
     assert main([*words, "--json"]) == 0
     layer = json.loads(capsys.readouterr().out)[0]["layer"]
     assert layer["permittivity"] == pytest.approx([3.4, 0.1], rel=0.01)
@@ -182,6 +174,8 @@ def test_a_sheet_on_metal_as_typed(folder, capsys):
     out = capsys.readouterr().out
     assert "thickness 1.70" in out
     assert " mm" in out
+    assert main(["permittivity", str(folder), "--patch", "9"]) != 0
+    assert "no patch 9" in capsys.readouterr().err
 
 
 def test_products_that_do_not_say_what_bands_share_know_no_more_than_one(folder):

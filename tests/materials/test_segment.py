@@ -69,19 +69,6 @@ def test_weak_plates_are_found_beside_strong_ones(synthetic):
     assert extra <= 1
 
 
-@pytest.mark.parametrize("count", [1, 4, 7])
-def test_their_number_is_not_told(synthetic, nine, count):
-    few = dict(list(nine.items())[:count])
-    scene = synthetic(3, few)
-    assert len(segment(scene.h, scene.v, scene.x_m, scene.y_m).patches) == count
-
-
-def test_dim_plate_beside_bright_one_is_found(synthetic):
-    scene = synthetic(5, {"copper": None, "wood": 2.61 - 0.01j, "second": None}, pitch_mm=54.0, jitter_mm=0.0)
-    segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-    assert len(segmentation.patches) == 3
-
-
 def test_noise_alone_has_no_patches(synthetic):
     scene = synthetic(1, {}, noise=0.1)
     assert segment(scene.h, scene.v, scene.x_m, scene.y_m).patches == ()
@@ -122,21 +109,6 @@ def test_metal_is_found_by_itself_whatever_the_gains(synthetic, request):
         assert match_truth(segmentation.patches, scene.plates)[metal.label].name == "copper"
         assert scene.analyse().metal.certain
         assert "brightest in both channels" in metal.how
-
-
-WITHOUT_METAL = {
-    "eight dielectrics": ("rubber", "cardboard (rough)", "silicone rubber", "PET 0.5 mm", "ceramic", "wood (thin)"),
-    "far ahead of the rest": ("ceramic", "silicone rubber", "wood (thin)"),  # |H||V| 2.3 times the next
-    "alone": ("rubber",),
-    "two": ("ceramic", "wood (thin)"),  # 8 times the next
-}
-
-
-@pytest.mark.parametrize("names", WITHOUT_METAL.values(), ids=WITHOUT_METAL.keys())
-def test_scene_without_metal_is_called_uncertain(synthetic, nine, names, request):
-    for seed in range(3 if request.config.getoption("--long") else 1):
-        scene = synthetic(seed, {n: nine[n] for n in names})
-        assert not scene.analyse().metal.certain
 
 
 def test_metal_by_box_and_label(synthetic):
@@ -189,20 +161,6 @@ def test_plates_that_nearly_touch_are_patches_of_their_own(gap_cells, same_mater
     figures = judge_gap(gap_cells, same_material, scenes=8, first_seed=38_000)
     assert figures.share >= 0.95
     assert figures.strays == 0
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_sheet_that_only_h_shows_is_a_patch(synthetic, seed):
-    rng = np.random.default_rng(seed)
-    scene = synthetic(seed, {"sheet": 3.0 - 0.02j}, noise=0.0)
-    # H is 25 dB above the noise, V below it.
-    noise = rng.standard_normal((2, 2, *scene.h.shape)) * np.abs(scene.h).max() * 10 ** (-28 / 20)
-    h = scene.h + noise[0, 0] + 1j * noise[0, 1]
-    v = noise[1, 0] + 1j * noise[1, 1]
-    found = segment(h, v, scene.x_m, scene.y_m)
-    assert len(found.patches) == 1
-    box = scene.plates[0].box_mm
-    assert np.abs(np.subtract(found.patches[0].box_mm, box)).max() < 5.0
 
 
 @pytest.mark.parametrize("seed", range(3))

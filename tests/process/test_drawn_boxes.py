@@ -6,19 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polysight.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library
-from polysight.materials.labels import pack_labels, read_labels
-from polysight.materials.result import make_labels
+from polysight.materials import SIMULATED_LIBRARY, Classifier, Library
+from polysight.materials.labels import read_labels
 from polysight.process import Inputs, boxes_as_patches
 from polysight.settings import DEFAULT
-
-
-@pytest.fixture
-def drawn_result(image_scene):
-    scan = image_scene("nine-materials")
-    return scan.pipeline.find_materials(
-        scan.images, known_scene=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
-    )
 
 
 def again(scan, path, plates=()):
@@ -26,18 +17,6 @@ def again(scan, path, plates=()):
     scene = replace(boxes_as_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m), plates=plates)
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
     return scan.pipeline.find_materials(scan.images, scene, classifier), scene.names
-
-
-def test_labels_of_products_give_the_same_materials_again(image_scene, drawn_result, tmp_path):
-    scan = image_scene("nine-materials")
-    (tmp_path / "labels.json").write_bytes(pack_labels(make_labels(drawn_result)))
-    boxes = read_labels(tmp_path / "labels.json")
-    assert len(boxes.boxes) == len(drawn_result.patches) == 9
-    second, names = again(scan, tmp_path / "labels.json", scan.plates)
-    assert names[second.metal.label] == "metal"
-    assert [p.truth.name for p in second.patches] == [p.truth.name for p in drawn_result.patches]
-    for p in second.patches:
-        assert p.patch.label == second.metal.label or p.verdict.name == p.truth.name
 
 
 def test_drawn_boxes_are_the_patches_and_copper_is_the_reference(image_scene, tmp_path):

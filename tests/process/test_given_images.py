@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from tests.support.refusals import refused
 
 from polysight import open_scan
 from polysight.cli.main import main
+from polysight.jobs.batch import find_scans
 from polysight.materials import Labels
 from polysight.process import Inputs, analyse_given_images, read_given_images
 from polysight.products import ProcessedScan
@@ -239,16 +241,9 @@ def test_a_plate_over_the_plane_is_the_reference_of_every_pixel(save_images, pai
     assert ProcessedScan(out).materials.metal_reference.certain
 
 
-def test_all_images_of_a_folder_are_processed(labels_folder, tmp_path):
-    folder = tmp_path / "labels"
-    for name in ("one", "two"):
-        (folder / name).mkdir(parents=True)
-        for file in ("sar_h.npy", "sar_v.npy"):
-            (folder / name / file).write_bytes((labels_folder / file).read_bytes())
-        (folder / name / f"{name}.json").write_text(json.dumps({"labels": {}}))
-    out = tmp_path / "out"
-    assert main(["process", str(folder), "--out", str(out), "--jobs", "1"]) == 0
-    assert [len(ProcessedScan(out / name).segments) for name in ("one", "two")] == [5, 5]
+def test_all_images_of_a_folder_are_found(labels_folder):
+    other = shutil.copytree(labels_folder, labels_folder.parent / "other")
+    assert find_scans([labels_folder.parent]) == [other, labels_folder]
 
 
 PUBLISHED = os.environ.get("POLYSIGHT_PUBLISHED_IMAGES")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from tests.support.pipelines import make_pipeline
 from tests.support.processes import read_output
 from tests.support.refusals import refused
+from tests.support.scenes import COPPER, PET, scene_of
 
 from polysight.cli.main import main
 from polysight.jobs.process import make_products, process_rows, publish_images
@@ -76,8 +78,9 @@ def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monke
 
 @pytest.mark.parametrize("is_steep", [True, False])
 def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
-    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_steep: bool
+    scan_of: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_steep: bool
 ) -> None:
+    scan = scan_of(tmp_path / "scan", scene_of(COPPER, PET, columns=10, rows=11))
     examine = Pipeline.examine
 
     def examine_tilted(self: Pipeline, *words: object) -> object:

@@ -10,42 +10,9 @@ import pytest
 import xarray
 
 from polysight.cli.main import main
-from polysight.imaging import Images
-from polysight.products import exports, write_image, write_json
+from polysight.products import exports
 from polysight.products.exports import join_complex, read_netcdf, split_complex
-from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError
-from polysight_shared.tables import to_builtins
-
-REPO = Path(__file__).resolve().parents[2]
-PATCH = {
-    "label": 4, "name": "PET", "confidence": 0.75, "votes": {"PET": 0.75, "glass": 0.2, "unknown": 0.05},
-    "metal_reference": False, "metal_like": False, "box_mm": [-30.0, -40.0, 50.0, 40.0], "outline_mm": [],
-    "pixels": 99, "interior_pixels": 77, "incidence_deg": 54.5, "ratio": {"real": 0.0, "imag": 10.0},
-    "inverse_ratio_std": 0.004, "permittivity": {"real": 3.5, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125},
-    "truth": None,
-}  # fmt: skip
-METAL = {**PATCH, "label": 5, "name": None, "confidence": None, "votes": {}, "metal_reference": True,
-         "box_mm": [-100.0, -50.0, -80.0, 50.0], "ratio": None, "permittivity": None}  # fmt: skip
-
-
-@pytest.fixture
-def folder(tmp_path):
-    """Products that somebody else sent: no raw data, no patches.npz."""
-    rng = np.random.default_rng(3)
-    h, v = (rng.standard_normal((2, 6, 11)) + 1j * rng.standard_normal((2, 6, 11))).astype(np.complex64)
-    products = tmp_path / "one"
-    x = np.linspace(-0.1, 0.1, 11)
-    y = np.linspace(0.05, 0.15, 6)
-    write_image(products / "image.npz", Images(h, v, x, y, rng.uniform(size=h.shape) < 0.8, h / v))
-    write_json(products / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
-    rig = to_builtins(load_instrument(REPO / "instrument.toml"))
-    write_json(
-        products / "scan.json", {"scan_id": "s", "simulated": True, "versions": {"numpy": "2"}, "instrument": rig}
-    )
-    boards = {"RH": {"positions": 9, "positions_masked": 2, "rows_recorded": [0, 1, 5]}}
-    write_json(products / "quality.json", {"boards": boards})
-    return products
 
 
 def export_folder(folder: Path) -> xarray.Dataset:

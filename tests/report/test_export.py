@@ -8,32 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
-from tests.support.products import segments
-from tests.support.rigs import rig_table
 
 from polysight.cli.main import main
-from polysight.imaging import Images
-from polysight.products import read_products, write_image, write_json
+from polysight.products import read_products
 from polysight.products.exports import pack_mat
 from polysight.results import to_plain
-
-
-@pytest.fixture
-def folder(tmp_path):
-    """Products as `polysight process` leaves them, of a small made-up image."""
-    rng = np.random.default_rng(7)
-    h, v = (rng.standard_normal((2, 5, 7)) + 1j * rng.standard_normal((2, 5, 7))).astype(np.complex64)
-    valid = rng.uniform(size=(5, 7)) < 0.8
-    x = np.linspace(-0.1, 0.1, 7)
-    y = np.linspace(0.05, 0.15, 5)
-    products = tmp_path / "one"
-    write_image(products / "image.npz", Images(h, v, x, y, valid, h / v))
-    write_json(products / "materials.json", {"scan_id": "s", "simulated": True, "segments": segments("good")})
-    write_json(products / "quality.json", {"boards": {"RH": {"frames_expected": 7}}})
-    rig = rig_table()
-    versions = {"polysight": "0.1.0", "numpy": np.__version__}
-    write_json(products / "scan.json", {"scan_id": "s", "simulated": True, "versions": versions, "instrument": rig})
-    return products
 
 
 def assert_same_arrays(read_array, products):

@@ -141,10 +141,6 @@ def same_image(image: xarray.Dataset, file: Path) -> None:
     assert (image["y_m"].values == saved.y_m).all()
 
 
-def test_the_image_is_what_process_writes(scan, products):
-    same_image(scan.image(), products / "image.npz")
-
-
 def test_the_unreferenced_image_is_what_image_writes(scan, folder, tmp_path):
     command("image", shutil.copytree(folder, tmp_path / "scan"), "--out", tmp_path / "out")
     same_image(scan.image(metal_referenced=False), tmp_path / "out" / "image.npz")

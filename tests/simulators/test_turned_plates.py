@@ -36,10 +36,10 @@ def test_metal_receives_what_the_image_of_the_transmitter_sends(rise_deg):
 def test_a_tilted_dielectric_changes_as_in_vector_physical_optics(permittivity):
     """V / H of a plate at +-1 degree over that of a level one, beside the independent generator of fields."""
     x_m, y_m = map(float, published_rig().centre_m)
-    stack = METAL if permittivity is None else Stack(below=permittivity)
-    if permittivity is None:
-        material = {"metal": True}
-    else:
+    stack = METAL
+    material = {"metal": True}
+    if permittivity is not None:
+        stack = Stack(below=permittivity)
         material = {"permittivity": (permittivity.real, -permittivity.imag)}
     calls = []
     expected = []
@@ -48,10 +48,6 @@ def test_a_tilted_dielectric_changes_as_in_vector_physical_optics(permittivity):
         images = simulate(world, pixels=30)
         middle = slice(8, 22)
         calls.append(images.v[middle, middle].sum() / images.h[middle, middle].sum())
-        if permittivity is None:
-            material = {"metal": True}
-        else:
-            material = {"permittivity": (permittivity.real, -permittivity.imag)}
         h, v = turn_reflection(plate(rise_deg, **material), 78e9, np.array(THETA))
         expected.append(complex(v) / complex(h))
     change = np.array(calls[1:]) / calls[0] - 1

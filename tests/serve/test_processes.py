@@ -57,10 +57,10 @@ class Server:
 
 
 @contextmanager
-def serving(root: Path, state: Path, *options: str) -> Iterator[Server]:
-    command = [sys.executable, "-m", "polysight", "serve", str(root), "--port", "0", *options]
+def serving(root: Path, state: Path, *options: str, command: str = "serve") -> Iterator[Server]:
+    words = [sys.executable, "-m", "polysight", command, str(root), "--port", "0", *options]
     environment = os.environ | {"XDG_STATE_HOME": str(state)}
-    program = subprocess.Popen(command, cwd=state, env=environment, stderr=subprocess.PIPE, text=True)
+    program = subprocess.Popen(words, cwd=state, env=environment, stderr=subprocess.PIPE, text=True)
     try:
         assert program.stderr is not None
         for line in program.stderr:
@@ -122,6 +122,18 @@ def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_no
         finally:
             os.kill(server.program.pid, signal.SIGCONT)
         assert reading.recv(100).startswith(b"HTTP/1.1 200")
+
+
+def test_the_live_view_of_one_scan_has_its_control_alone(scans, tmp_path):
+    """`polysight preview`; e2e/test_operator_page follows, pauses and resumes a scan, tests/page sees one killed."""
+    (tmp_path / "scans" / "two").mkdir()
+    with serving(scans / "one", tmp_path / "state", "--control", command="preview") as server:
+        state = get(server, "/api/state")
+        assert (state["control"], state["running"], state["status"]["headline"]) == (True, False, "No scan here yet")
+        with open_control(scans / "one") as stop:
+            assert post(server, "/api/control/pause", token=server.token)[0] == 200
+            assert stop.paused
+        assert ask(server, "/api/scan?scan=two")[0] == 404
 
 
 INTERRUPT_AT_FORKS = """

@@ -63,7 +63,6 @@ FIRST = (
     "tests/imaging/test_focus.py",
     "tests/stage/test_uno.py",
     "tests/store/test_killed_anywhere.py",
-    "tests/e2e/test_live_view.py",
     "tests/process/test_verdicts.py",
     "tests/stage/test_uno_safety.py",
     "tests/benchmarks/test_runs.py",

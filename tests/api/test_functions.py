@@ -129,14 +129,6 @@ def test_labelled_scans_make_a_library_that_names_them(products, tmp_path):
     assert (named[patch == 2] == "PET").mean() > 0.9
 
 
-def test_a_box_outside_the_image_is_refused_and_nothing_is_written(products, tmp_path):
-    place = shutil.copytree(products, tmp_path / "one")
-    (place / "labels.json").unlink(missing_ok=True)
-    with refused(ErrorCode.VALUE_INVALID):
-        open_scan(place).label({"copper": (900, 900, 910, 910)})
-    assert not (place / "labels.json").exists()
-
-
 @pytest.mark.parametrize("box", [[1, 2, 3], 7.0, "10,10,20,20", (20, 10, 10, 20)])
 def test_what_is_no_box_is_refused_by_name(products, tmp_path, box):
     place = shutil.copytree(products, tmp_path / "one")

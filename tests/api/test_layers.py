@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 from polysight.api.layers import layer_dataset
 from polysight.materials.layers import Layer, Spectrum, predict
 from polysight.products import ProcessedScan, write_json
-from polysight_shared.error_codes import ErrorCode
 
 CHIRP = published_rig().chirp
 SHEET = Layer("sheet", 3.4 - 0.1j, 1.7e-3)
@@ -42,8 +40,3 @@ def test_a_free_thickness_by_one_band_is_told_ambiguous(done):
     layers = layer_dataset(done, CHIRP, ["sheet,?,0.5-4"], None, 10.0)
     assert bool(layers["ambiguous"].values[1])
     assert " mm" in layers["notes"].values[1]
-
-
-def test_other_forms_of_a_layer_are_refused(done):
-    with refused(ErrorCode.VALUE_INVALID):
-        layer_dataset(done, CHIRP, ["sheet"], None, 10.0)

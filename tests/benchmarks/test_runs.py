@@ -23,6 +23,10 @@ def test_quick_trial(
     # Main sets them; here they are put back
     for variable in THREADS:
         monkeypatch.setenv(variable, "1")
+    if name == "demo":
+        few_rows = demo.QUICK.read_text(encoding="utf-8").replace("rows = 27", "rows = 9")
+        monkeypatch.setattr(demo, "QUICK", tmp_path / "few-rows.toml")
+        demo.QUICK.write_text(few_rows, encoding="utf-8")
     assert main(["--out", str(tmp_path), name, "--quick", "--folder", str(tmp_path)]) == 0
     result = json.loads((tmp_path / f"{name}.json").read_text())
     printed = capsys.readouterr().out

@@ -5,8 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 
-import pytest
-
 BLOCK = """
 import sys
 class Absent:
@@ -35,7 +33,6 @@ for package in (polysight_pi, polysight_shared):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
 """
-HELP = "from polysight_pi.cli import main\nmain({arguments})\n"
 
 
 def alone(code: str, *absent: str) -> subprocess.CompletedProcess[str]:
@@ -50,14 +47,6 @@ def test_every_module_imports():
 
 def test_the_block_blocks():
     assert "No module named 'numpy'" in alone("import numpy", *HOST_ONLY).stderr
-
-
-@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["check", "--help"]])
-def test_help(arguments):
-    ended = alone(HELP.format(arguments=arguments), *HOST_ONLY)
-    assert (ended.returncode, ended.stderr) == (0, "")
-    assert "polysight-pi" in ended.stdout
-    assert "example" in ended.stdout
 
 
 def test_gpio_without_gpiod_is_one_message():

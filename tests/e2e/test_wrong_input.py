@@ -146,15 +146,6 @@ def test_library(bench, scan):
     check_refusal(bench.here("train", "--config", RIG_FILE, "--out", "l.npz"), "--simulate")
 
 
-def test_a_scan_without_metal_gives_images_and_no_result(bench, scan):
-    """No metal, no plates: no result, and the images and the report are written all the same."""
-    ended = bench.here("process", scan, "--out", "out")
-    assert ended.status == 7, ended
-    assert "no result" in ended.out
-    assert (bench.folder / "out" / "image.npz").exists()
-    assert "no result" in (bench.folder / "out" / "report.html").read_text()
-
-
 def test_out_is_taken(bench, scan):
     own_folder = bench.folder / "mine"
     own_folder.mkdir()

@@ -9,7 +9,6 @@ from tests.support.rigs import published_rig
 
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene import decode_scene
-from polysight_simulators.scene.cubes import reference_cube
 from polysight_simulators.scene.optics import antennas, field_exact
 from polysight_simulators.scene.radar import SimulatedRig, high_pass, power_on, sample_frequencies_hz, sync_delay_s
 from polysight_simulators.scene.scene_file import pulse_uniform
@@ -65,26 +64,6 @@ def test_the_direct_path_alone_is_a_pure_tone(board: str) -> None:
         np.exp(2j * np.pi * np.outer(ant.direct_m, f) / SPEED_OF_LIGHT_M_S) * (ant.direct_m[0] / ant.direct_m)[:, None]
     )
     assert np.abs(rig.signals(board, ZERO, ZERO)[0] - expected).max() < 1e-4
-
-
-def test_the_reference_cube_is_the_ideal_signal_less_the_direct_path() -> None:
-    tables = {"plates": [PLATE], "points": [POINT]}
-    rig = radar(tables=tables)
-    empty = radar()
-    cube = reference_cube(RIG, rig.scene, remove_direct=False)["RV"]
-    # Row 1, column 8 of a grid whose middle is row 2.5, column 4. Odd rows are scanned towards smaller x.
-    travel_mm = rig.burst_mm(-1)[0]
-    x = np.array([rig.rig.grid.step_x_mm * (8 - 4) + travel_mm])
-    y = np.array([rig.rig.grid.step_y_mm * (1 - 2.5)])
-    echo = rig.signals("RV", x, y) - empty.signals("RV", x, y)
-    assert cube.shape == (4, 6, 9, 256)
-    assert np.abs(cube[:, 1, 8] - echo[0]).max() < 1e-3 * np.abs(echo).max()
-    # The scene's disturbances have no effect, and `remove_direct` turns the phase by that of the direct path.
-    without_direct = reference_cube(RIG, default_radar().scene.with_disturbances(hpf=True), remove_direct=True)["RH"]
-    plain = reference_cube(RIG, radar(tables={"plates": [PLATE]}).scene, remove_direct=False)["RH"]
-    tau = antennas(rig.rig, rig.rig.by_name("RH")).direct_m / SPEED_OF_LIGHT_M_S
-    turn = np.exp(-2j * np.pi * np.outer(tau, sample_frequencies_hz(rig.rig)))
-    assert np.abs(without_direct - plain * turn[:, None, None]).max() < 1e-4
 
 
 # --- determinism -----------------------------------------------------------------------------------------------------

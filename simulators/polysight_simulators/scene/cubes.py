@@ -25,18 +25,16 @@ from polysight_simulators.scene.radar import echo_drift, high_pass, power_on, sa
 from polysight_simulators.scene.scene_file import Scene, apply_scene, stream_key
 
 
-def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) -> dict[str, NDArray[np.complex64]]:
+def reference_cube(rig: Instrument, scene: Scene) -> dict[str, NDArray[np.complex64]]:
     """Return the object's echo after ideal synchronisation, at the true positions.
 
     All disturbances of the scene are ignored: no leakage, gains, noise or direct path. Each position is the mean of its
-    burst (x + direction x mean travel).
+    burst (x + direction x mean travel). Each RX is referenced to its own direct path: phase 2 pi f (tau - tau_direct).
 
     Parameters
     ----------
     rig, scene
         Rig file and scene; the scene's overrides are applied.
-    remove_direct
-        Reference each RX to its own direct path: phase 2 pi f (tau - tau_direct), otherwise 2 pi f tau.
 
     Returns
     -------
@@ -49,10 +47,7 @@ def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) ->
     cubes = {}
     for board in rig.receivers:
         field = build_field(rig, ideal, board, f)
-        direct_m = antennas(rig, board).direct_m
-        path_m = np.full_like(direct_m, field.centre_path_m)
-        if remove_direct:
-            path_m = field.centre_path_m - direct_m
+        path_m = field.centre_path_m - antennas(rig, board).direct_m
         cubes[board.name] = _sample_field(field, rig, f, path_m, np.ones(len(path_m), np.complex64), 0.0)
     return cubes
 

@@ -68,7 +68,7 @@ def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
     """Run every check, in the order of bring-up."""
     pi = instrument.pi
     keys = Path(pi.key_dir)
-    yield attempt("plan", _plan, instrument)
+    yield attempt("plan", _check_plan, instrument)
     if wires is not None:
         yield attempt("simulated wires", _check_wires, instrument, wires)
     else:
@@ -83,7 +83,7 @@ def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
     yield attempt("event address", _check_address, publisher, pi.event_address, keys)
 
 
-def _plan(instrument: Instrument) -> str:
+def _check_plan(instrument: Instrument) -> str:
     check_burst_fits(instrument.grid, instrument.burst, instrument.stage)
     b = instrument.burst
     return f"burst of {b.pulses} x {b.period_us:g} us ends before the next point"
@@ -154,7 +154,7 @@ def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MOD
     chip = attempt("GPIO chip", _check_chip, pi)
     yield chip
     if chip.level == "ok":
-        yield attempt(f"trigger line {pi.trigger_in}", _trigger, pi)
+        yield attempt(f"trigger line {pi.trigger_in}", _check_trigger, pi)
         check_output = _check_output
         measure = measure_width
         if pi.wiring == "spi":
@@ -164,7 +164,7 @@ def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MOD
         yield Finding("ok", pi.pulse_source, where="pulses")
         yield attempt("pulse width", measure, instrument)
     if pi.wiring != "spi" and model.exists() and model.read_bytes().startswith(b"Raspberry Pi"):
-        yield _release(modules)
+        yield _check_release(modules)
 
 
 def _check_chip(pi: Pi) -> str:
@@ -176,7 +176,7 @@ def _check_chip(pi: Pi) -> str:
         raise DeviceError(f"{path}: {e.strerror}", "no such device, or no right", "set pi.gpio_chip; group gpio") from e
 
 
-def _trigger(pi: Pi) -> str:
+def _check_trigger(pi: Pi) -> str:
     TriggerInput(pi).close()
     return f"rising edges with time stamps, {pi.trigger_bias}, debounced by {pi.trigger_debounce_us} us"
 
@@ -237,7 +237,8 @@ def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
     return Finding("error", summary, do=f"{do} (docs/how-to/wiring.md)", where="pulse width")
 
 
-def _release(modules: Path) -> Finding:
+def _check_release(modules: Path) -> Finding:
+    """Warn if the kernel keeps an output as it is when its program dies: SYNC_IN could stay high."""
     summary = "this kernel does not say if outputs are released when their program dies"
     for module in ("pinctrl_bcm2835", "pinctrl_rp1"):
         parameter = modules / module / "parameters" / "persist_gpio_outputs"

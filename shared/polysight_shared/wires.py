@@ -131,6 +131,7 @@ class WireClient:
 
     def _read_line(self, timeout_s: float | None) -> str | None:
         while not self._pending:
+            # A timeout of 0 would make the socket non-blocking.
             self._socket.settimeout(timeout_s if timeout_s is None else max(timeout_s, 1e-6))
             try:
                 data = self._socket.recv(1 << 16)
@@ -145,6 +146,7 @@ class WireClient:
                 raise DeviceError(f"simulated wires at {self._path} were closed", *_RIG_ENDED)
             lines = (self._buffer + data).split(b"\n")
             self._buffer = lines.pop()
+            # The oldest is last, where `pop` takes it.
             self._pending = [line.decode("ascii", "replace") for line in reversed(lines)]
         return self._pending.pop()
 

@@ -152,7 +152,7 @@ def test_addresses_and_bursts(tmp_path, gpio_rig):
     assert (finding.level, "polysight-pi keys" in finding.do) == ("error", True)
     assert attempt("event address", checks._check_address, publisher, "tcp//x", tmp_path).level == "error"
     slow = replace(gpio_rig, burst=replace(gpio_rig.burst, pulses=100))
-    assert attempt("plan", checks._plan, slow).level == "error", "the burst does not end before the next point"
+    assert attempt("plan", checks._check_plan, slow).level == "error", "the burst does not end before the next point"
 
 
 # <linux/gpio.h>: _IOWR(0xB4, 0x0F, two 64-bit words)

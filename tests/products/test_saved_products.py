@@ -37,7 +37,7 @@ STACK = ["glass,5.5,0.05,3", "water,?"]
 ANGLE_DEG = 55.0
 
 
-def write_part(inverse: complex) -> dict:
+def ratio_entry(inverse: complex) -> dict:
     ratio = 1 / inverse
     return {"ratio": {"real": ratio.real, "imag": ratio.imag}, "inverse_ratio_std": 0.005}
 
@@ -49,12 +49,12 @@ def folder(tmp_path, monkeypatch):
     whole_band = predict(layers, Spectrum.from_chirp(USED.chirp, 1), np.radians(ANGLE_DEG))[0]
     parts = predict(layers, Spectrum.from_chirp(USED.chirp, 3), np.radians(ANGLE_DEG))[0]
     bands = [
-        write_part(complex(q)) | {"first_hz": b.first_hz, "last_hz": b.last_hz}
+        ratio_entry(complex(q)) | {"first_hz": b.first_hz, "last_hz": b.last_hz}
         for q, b in zip(parts, sub_bands(USED.chirp, 3), strict=True)
     ]
     row = {"label": 3, "name": "liquid", "incidence_deg": ANGLE_DEG, "permittivity": None, "bands": bands}
     made_folder = tmp_path / "made"
-    write_json(made_folder / "materials.json", {"segments": [row | write_part(complex(whole_band[0]))]})
+    write_json(made_folder / "materials.json", {"segments": [row | ratio_entry(complex(whole_band[0]))]})
     write_json(made_folder / "scan.json", {"scan_id": "s", "simulated": True, "instrument": to_builtins(USED)})
     shutil.copy(RIG_FILE, tmp_path / "instrument.toml")
     monkeypatch.chdir(tmp_path)
@@ -138,6 +138,6 @@ def test_gains_are_relative_to_each_boards_first_rx():
         "RV": np.array([5j, 5j], np.complex128),
     }
     images = Images(none, none, axis, axis, np.ones((1, 1), bool), rx_gains=gains)
-    read_fit = {name: [(g.gain_db, g.phase_deg) for g in board] for name, board in rx_gains(images).items()}
-    assert read_fit["RH"] == [pytest.approx(g) for g in ((0.0, 0.0), (20.0, 0.0), (0.0, 90.0), (-20.0, 180.0))]
-    assert read_fit["RV"] == [pytest.approx((0.0, 0.0))] * 2
+    gains_read = {name: [(g.gain_db, g.phase_deg) for g in board] for name, board in rx_gains(images).items()}
+    assert gains_read["RH"] == [pytest.approx(g) for g in ((0.0, 0.0), (20.0, 0.0), (0.0, 90.0), (-20.0, 180.0))]
+    assert gains_read["RV"] == [pytest.approx((0.0, 0.0))] * 2

@@ -47,7 +47,7 @@ def layer_dataset(
         "permittivity_loss_standard_error": describe(read("std_loss"), "1", "standard error, loss"),
         "thickness_mm": describe(read("thickness_m", 1e3), "mm", thickness),
         "thickness_standard_error_mm": describe(read("std_thickness_m", 1e3), "mm", "0 where it was given"),
-        "ambiguous": describe(ambiguous, "1", "another solution fits, or it is open by 5 %"),
+        "ambiguous": describe(ambiguous, "1", "another solution fits, or it is uncertain by over 5 %"),
         "notes": describe(notes, "", "rivals and other warnings"),
     }
     return xarray.Dataset(table, patch_coordinates(scan))

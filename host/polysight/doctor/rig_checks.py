@@ -76,7 +76,7 @@ _MAX_CLIPPED = 0.01
 _MIN_RMS = 4.0
 # Share of chirps in which the direct path must be found.
 _MIN_DETECTED = 0.9
-# 5 ns trigger clock and some ppm of the crystals
+# A delay that the 5 ns trigger clock and some ppm of the crystals can cause.
 _MAX_DELAY_S = 10e-9
 _SKEW_WARNING_S = 10e-9
 _SKEW_ERROR_S = 20e-9
@@ -176,7 +176,7 @@ def check_receivers(context: CheckContext) -> Finding:
 
 
 def check_disk(context: CheckContext) -> Finding:
-    """Check free space for a scan and the reserve, and for twice the scan's data rate."""
+    """Check for free space for a scan and the reserve, and for a disk twice as fast as the scan's data."""
     rig = context.rig
     folder = _find_existing_parent(context.options.out)
     need = rig.scan_bytes
@@ -200,12 +200,12 @@ def check_disk(context: CheckContext) -> Finding:
 
 
 def _find_existing_parent(folder: Path) -> Path:
-    observed = folder.resolve()
-    while not observed.exists():
-        observed = observed.parent
-    if not observed.is_dir():
-        raise ConfigError(f"--out {folder}: {observed} is a file", "a scan needs a folder", "give another --out")
-    return observed
+    existing = folder.resolve()
+    while not existing.exists():
+        existing = existing.parent
+    if not existing.is_dir():
+        raise ConfigError(f"--out {folder}: {existing} is a file", "a scan needs a folder", "give another --out")
+    return existing
 
 
 def check_time(context: CheckContext) -> Finding:
@@ -303,7 +303,7 @@ def check_trigger(context: CheckContext) -> Finding:
             "only a moving stage gives trigger edges",
             f"`polysight doctor --move` homes it and runs {_POINTS} points: keep clear of the stage",
         )
-    # A scan may have started since then, and begin_run would end it
+    # A scan may have started since `check_free`, and begin_run would end it.
     context.hello = context.pi.hello()
     if (busy := check_free(context)).level == "error":
         return busy

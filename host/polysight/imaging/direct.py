@@ -96,8 +96,9 @@ def backproject(
 def project(reflectivity: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any) -> Any:
     """Compute the echoes of voxels [n], complex128 [position, frequency]; the adjoint of :func:`backproject`."""
     voxels = namespace(reflectivity).asarray(reflectivity)
-    pairs = np.empty((len(tx_m), len(frequencies_hz)))
-    scene = _Scene(pairs, frequencies_hz, tx_m, rx_m, voxels_m, reference_m, like=voxels)
+    # Only the shape of these samples is used.
+    no_samples = np.empty((len(tx_m), len(frequencies_hz)))
+    scene = _Scene(no_samples, frequencies_hz, tx_m, rx_m, voxels_m, reference_m, like=voxels)
     xp = scene.xp
     v = xp.asarray(voxels, dtype=xp.complex128)[:, None]
     rows = []
@@ -110,7 +111,7 @@ def project(reflectivity: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels
 
 
 class _Scene:
-    """Checked geometry of a direct sum as arrays of the samples' library, and delays by chunks of positions."""
+    """Checked geometry of a direct sum, as arrays of the library of `like` (default: `samples`); delays by chunks."""
 
     def __init__(
         self, samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any, like: Any = None
@@ -172,7 +173,7 @@ class DirectImager:
         total = 0
         for r in range(rx):
             by_position = xp.permute_dims(xp.reshape(samples[r, ...], (m, rows * columns)), (1, 0))
-            total = total + backproject(by_position, *self._convert_places(r))
+            total = total + backproject(by_position, *self._list_geometry(r))
         return xp.reshape(total, self.aperture.grid.shape)
 
     def constant(self, echo: Any, weights: Any) -> Any:
@@ -185,10 +186,10 @@ class DirectImager:
         xp = namespace(image)
         rx, m, rows, columns = self.aperture.shape
         pixels = xp.reshape(image, (-1,))
-        answers = [xp.permute_dims(project(pixels, *self._convert_places(r)), (1, 0)) for r in range(rx)]
+        answers = [xp.permute_dims(project(pixels, *self._list_geometry(r)), (1, 0)) for r in range(rx)]
         return xp.reshape(xp.stack(answers), (rx, m, rows, columns))
 
-    def _convert_places(self, rx: int) -> tuple[Any, ...]:
+    def _list_geometry(self, rx: int) -> tuple[Any, ...]:
         """Return the arguments of `backproject` after the samples."""
         a = self.aperture
         shift = a.offsets_m.reshape(-1, 3)

@@ -266,8 +266,8 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
     if files:
         with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:
             scenes_drawn = list(product(files, range(times)))
-            called = [f"simulating and imaging {file.name}, specimens {again}" for file, again in scenes_drawn]
-            for file, again in steps(scenes_drawn, called):
+            labels = [f"simulating and imaging {file.name}, specimens {again}" for file, again in scenes_drawn]
+            for file, again in steps(scenes_drawn, labels):
                 folder = Path(temporary) / f"{file.stem}-{again}"
                 command = ["simulate", str(file), "--config", str(config), "--out", str(folder)]
                 if run_simulator([*command, "--specimens", str(again)]):

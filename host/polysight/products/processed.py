@@ -74,7 +74,7 @@ _OPTIONAL = ("p_sigma",)
 
 
 class PlatesNamed(NamedTuple):
-    """Plates of a simulated scene: named right, of so many; `strange` more are rightly called unknown."""
+    """Number of `plates` of a scene, and of those named right; `strange` others are rightly called unknown."""
 
     right: int
     plates: int
@@ -211,6 +211,7 @@ class ProcessedScan:
     def from_results(cls, folder: Path, **content: Unpack[Computed]) -> Self:
         """Return a result that was just computed; `folder` is where its data were read."""
         scan = cls(folder)
+        # Python looks for a value here before it calls a cached property.
         vars(scan).update({"materials": None, **content})
         if not scan.judged:
             vars(scan).update(plates=(), pixel_names={}, expected_accuracy=None)
@@ -306,7 +307,7 @@ class ProcessedScan:
 
     @cached_property
     def expected_accuracy(self) -> float | None:
-        """Share of pixels that the best classifier is expected to name right; None for saved products."""
+        """Share of pixels that the best classifier should name right; None for saved products or without truth."""
         if self.analysis is None:
             return None
         return predict_pixel_accuracy(self.analysis)

@@ -222,10 +222,10 @@ def reflect_curved(
     # Metal's flat coefficients do not depend on the angle, so its own first order does: V of a sphere of 50 mm by 2 %.
     # For dielectrics the next order of all other terms is missing, and the flat derivatives are closer to the series.
     is_metal = bool(np.any(np.isinf(eps)))
-    around = bends if is_metal else (0 * bend_inside, 0 * bend_across)
-    flat = _reflect_local(eps, theta, around, wave_number)
-    reflection_above = _reflect_local(eps, theta + ANGLE_STEP, around, wave_number)
-    reflection_below = _reflect_local(eps, theta - ANGLE_STEP, around, wave_number)
+    bends_of_slopes = bends if is_metal else (0 * bend_inside, 0 * bend_across)
+    flat = _reflect_local(eps, theta, bends_of_slopes, wave_number)
+    reflection_above = _reflect_local(eps, theta + ANGLE_STEP, bends_of_slopes, wave_number)
+    reflection_below = _reflect_local(eps, theta - ANGLE_STEP, bends_of_slopes, wave_number)
     cos = np.cos(theta)
     sin = np.sin(theta)
     coefficients = []

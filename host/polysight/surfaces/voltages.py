@@ -119,10 +119,10 @@ def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Vol
 
 def reflect_points(eps: NDArray | complex, v: Voltages, wave_number: float) -> Complex:
     """Coefficients (r_s, r_p, s to p, p to s) of the curved surface at each point for H and V, [n, 2, 4]."""
-    of_receivers = np.asarray(eps)[..., None]
-    r_s, r_p = reflect_curved(of_receivers, v.theta, v.bend_inside[:, None], v.bend_across[:, None], wave_number)
-    mixed = mix_twisted(of_receivers, v.theta, v.twist[:, None], wave_number)
-    more_s, more_p = reflect_spherical(of_receivers, v.theta, v.path_m, wave_number)
+    eps_of_receivers = np.asarray(eps)[..., None]
+    r_s, r_p = reflect_curved(eps_of_receivers, v.theta, v.bend_inside[:, None], v.bend_across[:, None], wave_number)
+    mixed = mix_twisted(eps_of_receivers, v.theta, v.twist[:, None], wave_number)
+    more_s, more_p = reflect_spherical(eps_of_receivers, v.theta, v.path_m, wave_number)
     return np.stack([r_s + more_s, r_p + more_p, mixed, mixed], axis=2)
 
 
@@ -138,7 +138,7 @@ def expansion_parameter(v: Voltages, wave_number: float) -> Array:
 
 
 def number_blocks(at_m: Array, shift: tuple[float, float], block_m: float = BLOCK_M) -> NDArray[np.int_]:
-    """Number of the block of each stage offset [n, 2]; `shift`: of the blocks' borders, in blocks."""
+    """Return the number of the block of each stage offset [n, 2]; `shift` moves the borders by a share of a block."""
     cell = np.floor(at_m / block_m + np.array(shift)).astype(int)
     _, number = np.unique(cell, axis=0, return_inverse=True)
     return number.reshape(-1)

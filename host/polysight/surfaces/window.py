@@ -121,6 +121,7 @@ class Windows:
     """Samples of some windows: [window, rx, frequency, position], offsets from their centres [window, position, 2]."""
 
     samples: NDArray[np.complex64]
+    # 1 where a position has data, else 0: [window, position].
     valid: Array
     offsets: Array
     # Stage offsets of the centres, [window, 3].
@@ -133,7 +134,6 @@ class BoardFit:
     def __init__(self, board: Samples) -> None:
         self.board = board
         self.omega = 2 * np.pi * board.frequencies_hz / SPEED_OF_LIGHT_M_S
-        self.middle = float(self.omega.mean())
         self.lever = board.rx_m - board.middle_m
         # The largest gain of the range gate for an echo, and the spread of its frequencies.
         if board.model is None:
@@ -162,7 +162,7 @@ class BoardFit:
 
 
 def _find_gate(board: Samples) -> tuple[float, float]:
-    """Range of excess paths in which the model's gain is looked at: the middle half of its unambiguous range."""
+    """Return the excess paths between which the model's gain is judged: a fifth of its unambiguous range."""
     reach = SPEED_OF_LIGHT_M_S / (board.frequencies_hz[1] - board.frequencies_hz[0])
     centre = find_mirror_path(board, 0.5) - board.direct_m.mean()
     return centre - reach / 10, centre + reach / 10

@@ -359,7 +359,7 @@ def _convert_to_complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
 
 @lru_cache(maxsize=4)
 def _weigh_bins(size: int) -> NDArray[np.float32]:
-    """Return factors of a spectrum's bins: of equal peaks, as of a cupboard, that nearer the band's middle counts."""
+    """Return factors of a spectrum's bins: of two equal peaks, the one nearer the band's middle counts."""
     return np.sinc(np.fft.fftfreq(size)).astype(np.float32)
 
 

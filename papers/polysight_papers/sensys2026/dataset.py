@@ -36,9 +36,11 @@ IMAGES = "images made here"
 # Least correlation of two images of one scan
 _ALIKE = 0.35
 
-# Names of materials.
+# Words that do not tell materials apart.
 _FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate", "the", "of", "box", "container"}
+# Their word for one of ours.
 _ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}
+# A row's name may hold the container of a liquid, which their name need not have.
 _CONTAINERS = {"glass", "plastic"}
 # Least share of common words
 _ENOUGH = 0.5
@@ -195,6 +197,7 @@ def _image_here(scan: materials.LabelledScan, images: Path, notices: list[str]) 
     h = np.where(imaged_mask, h, 0)
     v = np.where(imaged_mask, v, 0)
     theirs = np.abs(scan.h)
+    # Rotations by k x 90 degrees, each also after a flip along y.
     ways = [(k, flip) for k in range(4) for flip in (False, True)]
 
     def turn(image: np.ndarray, way: tuple[int, bool]) -> np.ndarray:
@@ -250,7 +253,7 @@ def words(name: str) -> frozenset[str]:
         if word in _FILLING:
             continue
         if word[0].isdigit():
-            # "pet_05mm"
+            # "pet_05mm" is 0.5 mm thick.
             if re.fullmatch(r"0\d+", word):
                 number = f"0.{word[1:]}"
             else:
@@ -338,10 +341,10 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
     fits: dict[str, Any] = {}
     fitted: list[materials.Entry] = []
     for angle in library.angles_deg:
-        own_library = library.at_angle(angle)
+        library_at_angle = library.at_angle(angle)
         try:
-            fits |= materials.fit_library(own_library).fit["angles"]
-            fitted += own_library.entries
+            fits |= materials.fit_library(library_at_angle).fit["angles"]
+            fitted += library_at_angle.entries
         except DataError as e:
             sys.stderr.write(f"note: {angle:g} degrees left out: {e.what}\n")
     if not fitted:
@@ -366,6 +369,7 @@ def authors_library(data: AuthorsData) -> materials.Library:
         entries_of_source: dict[tuple[str, str, int], list[materials.Entry]] = {}
         for e in library.entries:
             entries_of_source.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(_remove_leakage(e, a, b))
+        # The same patches may be in both folders: those of the later source count.
         merged = {**merged, **entries_of_source}
     entries = tuple(e for group in merged.values() for e in group)
     kind = "files"

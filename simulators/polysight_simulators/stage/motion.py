@@ -89,7 +89,7 @@ class StepEngine:
     def set_accel(self, steps_s2: int) -> None:
         """Set the acceleration, steps/s^2."""
         self.accel = steps_s2
-        # Steps/s gained per tick, x 2^20: 2^20 / TICK_HZ = 8192 / 15625.
+        # Steps/s gained per tick, x 2^20: 2^20 / TICK_HZ = 8192 / 15625. `>> 4` makes it x 2^16, as the speed.
         self._accel_q20 = steps_s2 * 8192 // 15625
         # Speed of the first step: its mean from rest, sqrt(2 a) / 2.
         self._slowest = max(MIN_RATE, math.isqrt(steps_s2 // 2))
@@ -221,6 +221,7 @@ class StepEngine:
         if self.minor:
             # Over n steps of the longer axis the other makes at most n minor / major + 1.
             n = min(n, (clear_minor - 1) * self.major // self.minor)
+        # A single step is left to `step`.
         if n < 2:
             return 0, 0, 0, 0
         self._looks = 0
@@ -255,7 +256,7 @@ class StepEngine:
         return dx, dy, trigger
 
     def interval(self) -> int:
-        """Return the ticks until the next step; 0: the stage is at rest."""
+        """Choose the speed of the next step and return the ticks until it; 0: the stage is at rest."""
         rate = self.leg.rate
         held_at_rest = self.hold and self.ramp == 0
         must_brake = self.ramp > 0 and self.left <= self.ramp

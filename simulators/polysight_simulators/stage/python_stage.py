@@ -43,11 +43,14 @@ class PythonStage:
         self.replies = bytearray()
         self.tick = 0
         self._now_ms = 0
+        # Inputs pressed by an injected fault.
         self._pressed = 0
+        # Ticks of the last motion message, of the next step (if `_armed`), and of the end of the trigger pulse.
         self._told = 0
         self._next = 0
         self._armed = False
         self._fall: int | None = None
+        # True place of the motors, steps from the switches; the engine counts from `_zero` after homing.
         self._x = rig.x
         self._y = rig.y
         self._zero_x = 0
@@ -60,12 +63,14 @@ class PythonStage:
         self._armed = False
         self._was_homed = False
         self._line = bytearray()
+        # HELLO was accepted since the reset; it was the last line, so that any sequence number may follow.
         self._greeted = False
         self._fresh = False
         # The last answered line: its repetition gets the same answer
         self._last: Command | None = None
         self._last_answer = b""
         self._last_is_motion = False
+        # Number of the last motion command, and its `done` or alarm line; empty while it runs.
         self._motion_sequence = 0
         self._outcome = b""
 
@@ -119,6 +124,7 @@ class PythonStage:
         self._settle()
 
     def _take_steps(self, until: int) -> None:
+        """Make the step that is due now, or all steps without an event up to `until`."""
         engine = self._engine
         if self._fall is None:
             end = until
@@ -144,6 +150,7 @@ class PythonStage:
             self._report_motion()
             if self._fall is None:
                 self._send_edge(self.tick, 1)
+                # The width is in us, a tick 500 ns.
                 self._fall = self.tick + 2 * self._logic.parameters[Parameter.TRIGGER]
                 engine.pulses += 1
         ticks = engine.interval()
@@ -157,6 +164,9 @@ class PythonStage:
             self._report_motion()
 
     def _settle(self) -> None:
+        """Let the logic work until nothing more follows without a step; send its replies, and set the zero after
+        homing.
+        """
         while True:
             event = self._logic.service(self._now_ms)
             if event is Event.DONE:
@@ -238,6 +248,7 @@ class PythonStage:
         self._send(Reply("error", sequence, int(number)).encode())
 
     def _answer(self, command: Command) -> None:
+        """Execute a command and answer it; a repeated line gets its first answer again, and is not executed twice."""
         hello = command.verb == "HELLO"
         if not hello:
             if not self._greeted or self._last is None:

@@ -35,7 +35,7 @@ from polysight_shared.raster import RasterPlan
 payloads = st.lists(st.binary(max_size=40), max_size=12)
 
 
-def written(path, records):
+def write_records(path, records):
     path.unlink(missing_ok=True)
     j = JournalFile(path)
     j.write(records)
@@ -61,7 +61,7 @@ def no_waiting_for_the_disk():
 @settings(max_examples=20, deadline=None)
 def test_cut_at_every_byte_leaves_the_whole_records_before_it(tmp_path_factory, records):
     path = tmp_path_factory.mktemp("j") / "a.journal"
-    raw = written(path, records)
+    raw = write_records(path, records)
     ends = [len(MAGIC)]
     for r in records:
         ends.append(ends[-1] + 12 + len(r))
@@ -76,7 +76,7 @@ def test_cut_at_every_byte_leaves_the_whole_records_before_it(tmp_path_factory, 
 @settings(max_examples=60, deadline=None)
 def test_a_damaged_byte_loses_only_what_lies_behind_it(tmp_path_factory, records, data):
     path = tmp_path_factory.mktemp("j") / "a.journal"
-    raw = bytearray(written(path, records))
+    raw = bytearray(write_records(path, records))
     position = data.draw(st.integers(len(MAGIC), len(raw) - 1))
     raw[position] ^= 1 << data.draw(st.integers(0, 7))
     path.write_bytes(raw)
@@ -149,7 +149,7 @@ def test_one_process_a_folder(tmp_path):
 def test_numbers_continue_after_the_hosts_last_event(tmp_path_factory, first, passed, second, seq, limit):
     """No number is used twice, even if the journal has lost events; replay works from any number."""
     path = tmp_path_factory.mktemp("j") / "a.journal"
-    written(path, first)
+    write_records(path, first)
     j = JournalFile(path)
     assert j.number_behind(passed) == max(0, passed - len(first))
     begin = max(passed, len(first)) + 1
@@ -180,7 +180,7 @@ def test_a_new_journal_torn_by_a_power_cut_is_empty(tmp_path, left):
 
 def test_damage_in_the_middle_is_reported_and_the_original_kept(tmp_path):
     path = tmp_path / "a.journal"
-    raw = bytearray(written(path, [b"one", b"two", b"three", b"four"]))
+    raw = bytearray(write_records(path, [b"one", b"two", b"three", b"four"]))
     position = raw.index(b"two")
     # A second damage does not replace the first one's copy
     for number in ("", "2"):
@@ -199,7 +199,7 @@ def test_damage_in_the_middle_is_reported_and_the_original_kept(tmp_path):
 @settings(max_examples=40, deadline=None)
 def test_a_torn_tail_is_not_damage(tmp_path_factory, records, data):
     path = tmp_path_factory.mktemp("j") / "a.journal"
-    raw = written(path, records)
+    raw = write_records(path, records)
     path.write_bytes(raw[: data.draw(st.integers(0, len(raw)))] + bytes(data.draw(st.sampled_from([0, 1, 4096]))))
     j = JournalFile(path)
     assert j.damage == ""
@@ -213,7 +213,7 @@ def test_a_damaged_journal_is_logged(tmp_path):
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
     journal.close()
     path = journal.journal_path("s")
-    raw = written(path, [b"one", b"two", b"three"]).replace(b"one", b"0ne")
+    raw = write_records(path, [b"one", b"two", b"three"]).replace(b"one", b"0ne")
     path.write_bytes(raw)
     journal = Journal(tmp_path, warn=said.append)
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)

@@ -58,13 +58,13 @@ def align(by, words, valid, linear, equaliser=None):
     return align_pieces([words], valid, linear, equaliser, by=by)
 
 
-def same(one: AlignedRow, other: AlignedRow):
+def assert_equal_rows(one: AlignedRow, other: AlignedRow):
     """Equal within float32 rounding; phases may wrap."""
     np.testing.assert_array_equal(one.good, other.good)
     np.testing.assert_array_equal(one.clipped, other.clipped)
-    some = other.good.any(axis=1)  # silent chirps have no band
-    np.testing.assert_allclose(one.centre[some], other.centre[some], rtol=0, atol=1e-6)
-    usable = (other.coherence > 0.1) & some[:, None]  # the tone of a chirp without match is arbitrary
+    has_signal = other.good.any(axis=1)  # silent chirps have no band
+    np.testing.assert_allclose(one.centre[has_signal], other.centre[has_signal], rtol=0, atol=1e-6)
+    usable = (other.coherence > 0.1) & has_signal[:, None]  # the tone of a chirp without match is arbitrary
     assert one.halves.dtype == other.halves.dtype
     np.testing.assert_allclose(
         one.halves, other.halves, rtol=0, atol=3e-6 * max(1.0, float(np.abs(other.halves).max()))
@@ -124,7 +124,9 @@ def test_pieces_that_are_not_the_row_are_refused(loops, positions):
 def test_any_linear_part(loops, rig, linear, filtered):
     words, valid = bursts(), np.ones((5, 6), bool)
     equaliser = make_equaliser(rig) if filtered else None
-    same(align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser))
+    assert_equal_rows(
+        align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser)
+    )
 
 
 @pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
@@ -132,7 +134,9 @@ def test_any_number_of_samples(loops, rig, samples, linear):
     """Also if samples do not fill whole vectors or blocks."""
     words, valid = bursts(samples=samples), np.ones((5, 6), bool)
     equaliser = make_equaliser(rig)
-    same(align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser))
+    assert_equal_rows(
+        align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser)
+    )
 
 
 @pytest.mark.parametrize("chirps", [1, 2, 3, 16, 19, 40])
@@ -140,7 +144,7 @@ def test_any_number_of_chirps(loops, rig, chirps):
     """Sixteen are transformed at once; a single one has no reference."""
     words, valid = bursts(positions=3, chirps=chirps), np.ones((3, chirps), bool)
     equaliser = make_equaliser(rig)
-    same(
+    assert_equal_rows(
         align(loops.align, words, valid, (0, 192), equaliser),
         align(align_in_numpy, words, valid, (0, 192), equaliser),
     )
@@ -157,7 +161,7 @@ def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
     words[5, :5] = rng.integers(-1000, 1000, words[5, :5].shape)
     words[6] = 0
     done = align(loops.align, words, valid, (0, 192), make_equaliser(rig))
-    same(done, align(align_in_numpy, words, valid, (0, 192), make_equaliser(rig)))
+    assert_equal_rows(done, align(align_in_numpy, words, valid, (0, 192), make_equaliser(rig)))
     assert not done.good[1].any()
     assert not done.good[6].any()
     assert not done.good[3, [2, 5]].any()
@@ -171,7 +175,7 @@ def test_any_filter(loops, mode):
     words, valid = bursts(), np.ones((5, 6), bool)
     for corners in [(), (175e3,), (700e3, 1400e3), (350e3, 700e3, 2800e3)]:
         equaliser = Equaliser(HighPass(corners), 10e6, mode == "complex2x", 4, 3 / 192)
-        same(
+        assert_equal_rows(
             align(loops.align, words, valid, (0, 192), equaliser),
             align(align_in_numpy, words, valid, (0, 192), equaliser),
         )
@@ -180,7 +184,7 @@ def test_any_filter(loops, mode):
 def test_words_in_another_order_in_memory(loops):
     words, valid = bursts()[:, :, :, ::-1], np.ones((5, 6), bool)
     assert not words.flags.c_contiguous
-    same(align(loops.align, words, valid, (0, 192)), align(align_in_numpy, words, valid, (0, 192)))
+    assert_equal_rows(align(loops.align, words, valid, (0, 192)), align(align_in_numpy, words, valid, (0, 192)))
 
 
 def test_any_number_of_positions_and_none(loops):
@@ -189,7 +193,7 @@ def test_any_number_of_positions_and_none(loops):
         got = align(loops.align, words, valid, (0, 192))
         assert got.halves.shape == (positions, 2, 4, 48)
         if positions:
-            same(got, align(align_in_numpy, words, valid, (0, 192)))
+            assert_equal_rows(got, align(align_in_numpy, words, valid, (0, 192)))
 
 
 def test_the_direct_path(loops, rig, paths, noise, counts):

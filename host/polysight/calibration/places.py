@@ -153,14 +153,14 @@ def fit_places(
 
     `echoes` are those of :func:`load_echoes`.
     """
-    mm = np.array([p.position_mm for p in points])
+    points_mm = np.array([p.position_mm for p in points])
     centre = np.array(specular_midpoint_m(rig, rig.receivers[0]))
     scale = prior.scale(len(echoes))
     boards = list(echoes.values())
 
     def misfit(unknown: Real, sigma: float) -> Real:
         parts = [
-            _subtract_echoes(b, unknown[3 * i : 3 * i + 3], _place_points(centre, mm, unknown))
+            _subtract_echoes(b, unknown[3 * i : 3 * i + 3], _place_points(centre, points_mm, unknown))
             for i, b in enumerate(boards)
         ]
         flat = np.concatenate([p.ravel() for p in parts]) / sigma
@@ -168,7 +168,7 @@ def fit_places(
 
     # In the order of `Prior.scale`: shift of each board, distance of the plane, x, y and rotation of the target.
     start = np.zeros(scale.size)
-    start[-3:-1] = _find_target(boards, centre, mm)
+    start[-3:-1] = _find_target(boards, centre, points_mm)
     size = sum(b.samples.size for b in boards)
     sigma = float(np.sqrt(np.mean(misfit(start, 1.0)[: 2 * size] ** 2)))
     fit: Any = None
@@ -203,6 +203,7 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
         synced = synchronise_row(words, valid, setup)
         keep = np.flatnonzero(synced.valid)[::stride]
         values = synced.samples[:, keep] @ maps.maps(synced.sweep_hz).T
+        # The last map gives the direct path.
         reduced.append(values[..., :-1])
         direct.append(values[..., -1])
         offsets.append(row_offsets_m(rig, plan.row(row))[keep])
@@ -225,13 +226,13 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
     return BoardEchoes(Antennas.from_rig(rig, board), samples, whitening @ maps.model, places, maps.frequencies_hz)
 
 
-def _place_points(centre: Real, mm: Real, unknown: Real) -> Real:
+def _place_points(centre: Real, points_mm: Real, unknown: Real) -> Real:
     """Return the positions of the target's points, metres [point, 3], rig frame."""
     depth, x, y, turn = unknown[-4:]
     c = np.cos(np.radians(turn))
     s = np.sin(np.radians(turn))
-    flat = mm @ np.array([[c, s], [-s, c]]) + [x, y]
-    return centre + np.column_stack([flat, np.full(len(mm), depth)]) / 1e3
+    flat = points_mm @ np.array([[c, s], [-s, c]]) + [x, y]
+    return centre + np.column_stack([flat, np.full(len(points_mm), depth)]) / 1e3
 
 
 def _model_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
@@ -267,7 +268,7 @@ def _subtract_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDAr
     return samples - design @ amplitude
 
 
-def _find_target(boards: list[BoardEchoes], centre: Real, mm: Real) -> tuple[float, float]:
+def _find_target(boards: list[BoardEchoes], centre: Real, points_mm: Real) -> tuple[float, float]:
     """Return the position of the target on a coarse grid, millimetres: maximum of the power at all points."""
     best = -1.0
     best_place = (0.0, 0.0)
@@ -275,7 +276,7 @@ def _find_target(boards: list[BoardEchoes], centre: Real, mm: Real) -> tuple[flo
     steps = np.arange(-_REACH_MM, _REACH_MM + _STEP_MM / 2, _STEP_MM)
     for x in steps:
         for y in steps:
-            places = _place_points(centre, mm, np.array([0.0, x, y, 0.0]))
+            places = _place_points(centre, points_mm, np.array([0.0, x, y, 0.0]))
             total = 0.0
             for board in small_boards:
                 design = _model_echoes(board, np.zeros(3), places)

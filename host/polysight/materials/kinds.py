@@ -72,13 +72,18 @@ METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat."""
 LEAST_STD_OF_T = 1e-6
 MOST_STD_BEYOND = 30.0
-"""Least standard deviation of t that a distance is measured in, and largest distance, of no probability in practice."""
+"""Least standard deviation of t in which a distance is counted, and the largest distance, at which the density is nearly 0."""
 # Smallest standard deviation of a ratio: below it a covariance has no inverse in double precision.
 LEAST_RATIO_STD = 1e-6
+# Step of numerical derivatives by ln of the real part, and by the loss.
 _STEP = 1e-4
+# Number of thin plates that are drawn.
 _SHEETS = 6000
+# Number of half spaces drawn for several angles.
 _HALF_SPACES = 4000
+# Frequencies of the sweep at which a thin plate is computed.
 _FREQUENCIES = 9
+# Keeps products of odds over several scans finite.
 _MOST_LOG_ODDS = 200.0
 
 
@@ -294,6 +299,7 @@ class Kinds:
             layers += self.sheet_share * _compute_histogram(self.sheets, real, imag, covariance)
         density = np.stack([np.zeros_like(other_density), other_density, layers])
         summed = self.covariance + covariance
+        # A kind counts within 4.5 standard deviations of its mean.
         reach = 4.5 * np.sqrt(summed[:, (0, 1), (0, 1)])
         columns = np.searchsorted(real, self.t.real + np.array([-1, 1])[:, None] * reach[:, 0])
         rows = np.searchsorted(imag, self.t.imag + np.array([-1, 1])[:, None] * reach[:, 1])
@@ -611,7 +617,7 @@ def _evaluate_normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
 def _evaluate_other_density(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> float:
     """Return the density of the measured ratios as any half space.
 
-    With several angles by half spaces that are drawn from the measurement that is known best.
+    With several angles it is averaged over half spaces drawn from the most exact measurement.
     """
     best = min(range(len(scan_evidence)), key=lambda i: float(np.linalg.det(scan_evidence[i].covariance)))
     mean = scan_evidence[best].inverse_ratio

@@ -207,7 +207,7 @@ def average(
 
 
 def check_stack(stack: Sequence[Layer]) -> None:
-    """Raise PolysightError unless every layer before the last has a thickness."""
+    """Raise PolysightError unless every layer before the last has a thickness and known permittivities are passive."""
     open_ended = [layer.name for layer in stack[:-1] if layer.thickness_m is None]
     if not stack or open_ended:
         raise PolysightError(
@@ -229,7 +229,6 @@ def check_stack(stack: Sequence[Layer]) -> None:
             )
 
 
-Real = npt.NDArray[np.float64]
 REAL_RANGE = (1.0, 40.0)
 LOSS_RANGE = (0.0, 60.0)
 """Search ranges of the permittivity: from air to beyond water at these frequencies (9.4 - j18)."""
@@ -237,6 +236,7 @@ THICKNESS_RANGE_M = (0.1e-3, 12e-3)
 """Search range of an unknown thickness."""
 START_PHASE_RAD = 0.25
 """Step of the start grid in the phase of the path through the layer and back: no valley is narrower."""
+# Grid of start values: loss tangents, number of indices, and number of its local minima that are solved.
 LOSS_TANGENTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 2.0)
 INDEX_STEPS = 60
 STARTS = 24
@@ -253,6 +253,10 @@ DETERMINED = 0.05
 _DRAWS = 1500
 # Range of the integration, in standard deviations.
 _REACH = 4.0
+# Width of the distribution that samples are drawn from, relative to the linear standard deviations.
+_DRAW_WIDTH = 1.15
+# Range of the incidence angle's error, in standard deviations.
+_ANGLE_RANGE = (-8.0, 8.0)
 # Ratio of sampled to linear standard deviations above which the sampled ones are used
 _BENT = 1.15
 
@@ -460,7 +464,11 @@ class _Model:
         self.theta_rad = theta_rad
         self.range_mm = tuple(1e3 * d for d in thickness_range_m or (0.0, 0.0))
         self.turned = bands.theta_std_rad > 0
-        limits = [REAL_RANGE, LOSS_RANGE, *([self.range_mm] * self.sized), *([(-8.0, 8.0)] * self.turned)]
+        limits: list[tuple[float, ...]] = [REAL_RANGE, LOSS_RANGE]
+        if self.sized:
+            limits.append(self.range_mm)
+        if self.turned:
+            limits.append(_ANGLE_RANGE)
         self.lower, self.upper = (np.array(end, np.float64) for end in zip(*limits, strict=True))
         self.unknowns = 2 + self.sized
         self.data = (2 if bands.amplitude_h is None else 3) * bands.inverse_ratio.size
@@ -512,7 +520,9 @@ class _Model:
         if self.sized:
             x.append(mesh[2] / (2 * self.wavenumber * mesh[0]))
             out = (x[2] < self.range_mm[0]) | (x[2] > self.range_mm[1])
-        grid = np.stack([*x, *([np.zeros(real.shape)] * self.turned)], axis=-1)
+        if self.turned:
+            x.append(np.zeros(real.shape))
+        grid = np.stack(x, axis=-1)
         chi2 = np.full(real.shape, np.inf)
         # A few frequencies of a sub-band are enough for start values.
         chi2[~out] = np.sum(self.residuals(grid[~out], thin=6) ** 2, axis=-1)
@@ -572,7 +582,7 @@ class _Model:
     def _draw_second_moments(self, solution: _Solution, covariance: Real) -> Real:
         """Return second moments of the posterior about a solution, [unknowns, unknowns]; linear in straight valleys.
 
-        By importance sampling along index and phase, where the valley is straighter than in thickness.
+        By importance sampling along thickness times index, in which the valley is straighter than in thickness.
         """
         n = self.unknowns
         x = solution.x
@@ -583,7 +593,7 @@ class _Model:
         rng = np.random.default_rng(0)
         freedom = 5.0
         unit = rng.standard_normal((_DRAWS, x.size)) / np.sqrt(rng.chisquare(freedom, (_DRAWS, 1)) / freedom)
-        unit = 1.15 * unit[np.sum(unit**2, axis=1) < (_REACH / 1.15) ** 2]
+        unit = _DRAW_WIDTH * unit[np.sum(unit**2, axis=1) < (_REACH / _DRAW_WIDTH) ** 2]
         draws = self._convert_from_straight(x, unit @ np.linalg.cholesky(spread).T)
         inside = np.all((draws >= self.lower) & (draws <= self.upper), axis=-1)
         linear = covariance[:n, :n]
@@ -592,7 +602,7 @@ class _Model:
         draws = draws[inside]
         unit = unit[inside]
         log = -0.5 * np.sum(self.residuals(draws) ** 2, axis=-1)
-        log += (freedom + x.size) / 2 * np.log1p(np.sum((unit / 1.15) ** 2, axis=1) / freedom)
+        log += (freedom + x.size) / 2 * np.log1p(np.sum((unit / _DRAW_WIDTH) ** 2, axis=1) / freedom)
         weight = np.exp(log - log.max())
         weight /= weight.sum()
         differences = (draws - x)[:, :n]
@@ -601,7 +611,7 @@ class _Model:
         return second if np.any(ratio > _BENT) else linear
 
     def _differentiate_straight(self, x: Real) -> Real:
-        """Return derivatives of (eps', eps'', phase instead of thickness, angle) by the unknowns, [n, n]."""
+        """Return derivatives of (eps', eps'', thickness times index, angle) by the unknowns, [n, n]."""
         out = np.eye(x.size)
         if self.sized:
             index = float(np.sqrt(max(x[0] - np.sin(self.theta_rad) ** 2, 1e-3)))

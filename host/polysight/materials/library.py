@@ -156,14 +156,15 @@ class Library:
         ]
         meta = {"format": FORMAT, "note": self.note, "fit": self.fit, "entries": entries}
         text = np.frombuffer(json.dumps(meta, sort_keys=True).encode("utf-8"), np.uint8)
-        empty_f = np.zeros(0, np.float32)
-        empty_c = np.zeros(0, np.complex64)
+        # A library without entries has arrays, too.
+        empty_real = np.zeros(0, np.float32)
+        empty_complex = np.zeros(0, np.complex64)
         buffer = io.BytesIO()
         np.savez_compressed(
             buffer,
-            h=np.concatenate([empty_f, *(e.h for e in self.entries)]),
-            v=np.concatenate([empty_f, *(e.v for e in self.entries)]),
-            p=np.concatenate([empty_c, *(e.p for e in self.entries)]),
+            h=np.concatenate([empty_real, *(e.h for e in self.entries)]),
+            v=np.concatenate([empty_real, *(e.v for e in self.entries)]),
+            p=np.concatenate([empty_complex, *(e.p for e in self.entries)]),
             meta=text,
         )
         write_atomically(Path(path), buffer.getvalue())
@@ -175,7 +176,7 @@ class Library:
         Raises DataError if the file is missing, no library, of another format version, damaged, or has pickled objects.
         """
         path = Path(path)
-        bad = f"{path}: not a material library"
+        problem = f"{path}: not a material library"
         try:
             with open_npz(path) as z:
                 meta = json.loads(z["meta"].tobytes().decode("utf-8"))
@@ -192,19 +193,22 @@ class Library:
         except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
             cause = str(e) if isinstance(e, ValueError) else f"{type(e).__name__}: {e}"
             raise DataError(
-                bad, cause, "give a library of polysight train, or a folder of products", code=ErrorCode.FILE_UNREADABLE
+                problem,
+                cause,
+                "give a library of polysight train, or a folder of products",
+                code=ErrorCode.FILE_UNREADABLE,
             ) from None
         if not isinstance(meta, dict) or meta.get("format") != FORMAT:
             file_format = meta.get("format") if isinstance(meta, dict) else None
             raise DataError(
-                bad, f"its format is {file_format!r}, this program reads {FORMAT!r}", "train it again",
+                problem, f"its format is {file_format!r}, this program reads {FORMAT!r}", "train it again",
                 code=ErrorCode.VERSION_UNSUPPORTED,
             )  # fmt: skip
         try:
             return Library(_read_entries(meta["entries"], h, v, p), dict(meta["fit"]), str(meta["note"]))
         except (KeyError, TypeError, ValueError) as e:
             raise DataError(
-                bad, f"its description does not fit its arrays: {e}", "train it again", code=ErrorCode.FILE_DAMAGED
+                problem, f"its description does not fit its arrays: {e}", "train it again", code=ErrorCode.FILE_DAMAGED
             ) from None
 
 
@@ -273,7 +277,7 @@ _LARGEST_RATIO = 1e12
 def ratio_columns(features: Real) -> Real:
     """Return columns |H|, |V|, Re P, Im P [n, 4] of features |H|, |V|, Re 1/P, Im 1/P; or the features of columns.
 
-    Sub-bands follow each other along the second axis, four columns each.
+    Several angles follow each other, four columns each.
     """
     table = features.reshape(len(features), -1, WIDTH).copy()
     inverse = table[..., 2] + 1j * table[..., 3]

@@ -259,7 +259,7 @@ class _Restricted(pickle.Unpickler):
     """An unpickler for arrays and plain types."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return the named constructor if it is one of numpy's arrays. Raises UnpicklingError."""
+        """Return the named constructor if `_ALLOWED` has it: those of arrays. Raises UnpicklingError."""
         if (module, name) not in _ALLOWED:
             raise pickle.UnpicklingError(f"it wants to call {module}.{name}")
         return super().find_class(module, name)
@@ -310,7 +310,7 @@ def read_material(path: Path) -> Entry:
         angle = float(raw["incident_angle"])
         scan = str(raw["collection_name"])
         reference = str(raw["ref_name"])
-        thickness = _number(raw.get("thickness"))
+        thickness = _parse_thickness(raw.get("thickness"))
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as e:
         raise DataError(
             f"{path}: not a material file: {type(e).__name__}: {e}",
@@ -369,7 +369,7 @@ def _read_pixels(values: Any, most: int) -> npt.NDArray[np.complex128]:
     return np.asarray(values, np.complex128).ravel()
 
 
-def _number(value: Any) -> float | None:
+def _parse_thickness(value: Any) -> float | None:
     # The thickness may be a text such as "3 mm".
     if isinstance(value, str):
         value = value.lower().removesuffix("mm").strip()

@@ -35,6 +35,7 @@ class Plate(msgspec.Struct, frozen=True):
     name: str
     centre_mm: Pair
     size_mm: Pair
+    # Real part and loss; None: metal or layers.
     permittivity: Pair | None = None
     thickness_mm: float | None = None
     background: bool = False

@@ -125,6 +125,7 @@ def _convert_numbers(values: Sequence[Any]) -> npt.NDArray[np.float64]:
 
 
 def _describe(dims: tuple[str, ...], values: Any, units: str, long_name: str) -> tuple[Any, ...]:
+    """Return a variable as xarray takes it: dimensions, values, attributes."""
     return dims, np.array(values), {"units": units, "long_name": long_name}
 
 
@@ -364,6 +365,7 @@ def join_complex(dataset: xarray.Dataset) -> xarray.Dataset:
             attrs["long_name"] = str(attrs.get("long_name", name)).removesuffix(", real part")
             variables[name] = (variable.dims, joined, attrs)
         elif variable.attrs.get(_PART) != suffix or suffix != "imag":
+            # Imaginary parts are left out here: they were joined with their real parts.
             variables[str(full_name)] = variable
     return dataset.drop_vars(list(dataset.data_vars)).assign(variables)
 
@@ -556,7 +558,7 @@ def _convert_column(figure: Figure, scan: ProcessedScan) -> Any:
 def _convert_struct(node: Any) -> Any:
     """Convert nested dicts to structs with MATLAB's names; lists other than of numbers become cell arrays."""
     if isinstance(node, dict):
-        return {_name(k): _convert_struct(v) for k, v in node.items() if v is not None} or np.zeros((0, 0))
+        return {_make_matlab_name(k): _convert_struct(v) for k, v in node.items() if v is not None} or np.zeros((0, 0))
     if isinstance(node, list | tuple):
         if node and all(isinstance(v, int | float) and not isinstance(v, bool) for v in node):
             return np.array(node, np.float64)[None, :]
@@ -569,7 +571,7 @@ def _convert_struct(node: Any) -> Any:
     return node
 
 
-def _name(key: str) -> str:
+def _make_matlab_name(key: str) -> str:
     name = re.sub(r"\W", "_", key)
     if not name[:1].isalpha():
         name = f"x{name}"

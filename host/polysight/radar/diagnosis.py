@@ -264,6 +264,7 @@ class TraceLine(msgspec.Struct, omit_defaults=True):
     t: Annotated[float, msgspec.Meta(ge=0, le=_MAX_S)]
     line: Literal["HOST_INTR", "NRST"] | None = None
     level: Literal[0, 1] | None = None
+    # Queries of the interrupt with the former level, since the line before.
     looks: Annotated[int, msgspec.Meta(ge=0)] | None = None
     out: Words | None = None
     read: Words | None = msgspec.field(default=None, name="in")
@@ -292,7 +293,7 @@ class ReplayedWords:
         self._looks = 0
 
     def now(self) -> float:
-        """Return the trace's time, seconds."""
+        """Return the trace's time, seconds; each query advances it by 1 us, so that a loop with a deadline ends."""
         self._time += 1e-6
         return self._time
 
@@ -347,10 +348,12 @@ class ReplayedWords:
         return not self.done and self._lines[self._at].line == INTERRUPT
 
     def _play_level(self) -> None:
+        """Take over the interrupt's level of the next line."""
         self._level = bool(self._lines[self._at].level)
         self._step()
 
     def _step(self) -> TraceLine:
+        """Return the next line, and move behind it, in time too."""
         line = self._lines[self._at]
         self._time = max(self._time, line.t)
         self._at += 1
@@ -403,7 +406,7 @@ def read_trace(file: Path) -> tuple[dict[str, Any], list[TraceLine]]:
                 raise _invalid_error(file, f"its first line is not that of a trace, version {TRACE_VERSION}")
             facts = value
         elif value is not None:
-            records.append(_trace_line(file, number, value))
+            records.append(_parse_trace_line(file, number, value))
             if len(records) > 1 and records[-1].t < records[-2].t:
                 raise _invalid_error(file, f"line {number} has an earlier time than the one before")
     if facts is None:
@@ -411,7 +414,7 @@ def read_trace(file: Path) -> tuple[dict[str, Any], list[TraceLine]]:
     return facts, records
 
 
-def _trace_line(file: Path, number: int, value: object) -> TraceLine:
+def _parse_trace_line(file: Path, number: int, value: object) -> TraceLine:
     try:
         return msgspec.convert(value, TraceLine)
     except ValueError:

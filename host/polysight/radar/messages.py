@@ -35,6 +35,7 @@ ERROR_BLOCK = 0x0000
 _HEADER = struct.Struct("<6H")
 _BLOCK = struct.Struct("<2H")
 _PAD = b"\xff"
+# Bits of the header's flags.
 _RETRY = 0x0003
 _NO_CRC = 0x0300
 _CRC32 = 0x0400

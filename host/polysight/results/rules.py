@@ -75,26 +75,27 @@ def judge_recording(coverage: Coverage, masked_share: float = 0.0) -> list[Findi
     """Judge rows, frames and manifest against the plan; `masked_share` of the recorded positions is masked."""
     reasons = []
     if coverage.rows_planned:
-        absent = 1 - coverage.rows_recorded / coverage.rows_planned
+        rows_absent = 1 - coverage.rows_recorded / coverage.rows_planned
     else:
-        absent = 1.0
+        rows_absent = 1.0
     if coverage.rows_recorded < coverage.rows_planned:
-        level = "none" if absent > FEW_POSITIONS else "care"
+        level = "none" if rows_absent > FEW_POSITIONS else "care"
         missing = coverage.rows_planned - coverage.rows_recorded
         reasons.append(reason(
-            level, f"{missing} of {coverage.rows_planned} rows are absent ({100 * absent:.1f} % of the positions)",
+            level, f"{missing} of {coverage.rows_planned} rows are absent ({100 * rows_absent:.1f} % of the positions)",
             "the scan was stopped, or rows were lost; plates there are missing or distorted",
-            "`polysight resume SCAN` records the missing rows", 5 + absent,
+            "`polysight resume SCAN` records the missing rows", 5 + rows_absent,
         ))  # fmt: skip
     reasons += [
         reason("care", fault, "a recorded row is missing in the images", "run `polysight validate SCAN`", 6.0)
         for fault in coverage.manifest
     ]
     if coverage.frames_planned:
-        frames = 1 - coverage.frames_received / coverage.frames_planned
+        frames_absent = 1 - coverage.frames_received / coverage.frames_planned
     else:
-        frames = 1.0
-    lost_share = max(masked_share, frames - absent)
+        frames_absent = 1.0
+    # Frames of absent rows are absent, too: those were judged above.
+    lost_share = max(masked_share, frames_absent - rows_absent)
     if lost_share > SOME_POSITIONS:
         reasons.append(reason(
             "none" if lost_share > FEW_POSITIONS else "care",

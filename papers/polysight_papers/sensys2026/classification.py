@@ -163,9 +163,9 @@ class TaskScores:
 
     def row(self) -> tuple[str, ...]:
         """Return a line of the table, published shares beside simulated ones."""
-        name, _, two = self.task.partition(", ")
+        name, _, two_angles = self.task.partition(", ")
         published_h = None
-        if not two:
+        if not two_angles:
             published_h = published_values()["classification"][name]["h_percent"] / 100
         return (
             f"{len(self.knn.names)} {self.task}",
@@ -409,7 +409,7 @@ def pixel_bound(
         cost = np.zeros((TRIALS, len(materials)))
         for c, s in enumerate(std):
             noise = s * np.sqrt(variance) * rng.standard_normal((TRIALS, 1))
-            # A direction: its angle to each material's
+            # Every third column is the direction of P: angles differ, not logarithms.
             if c % 3 == 2:
                 difference = np.angle(mean[k, c] * np.exp(1j * noise) / mean[None, :, c])
             else:

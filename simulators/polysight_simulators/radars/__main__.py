@@ -21,6 +21,8 @@ _TIMEOUT_S = 15.0
 
 
 class _Time:
+    """The trace's time, seconds, which the simulated board reads."""
+
     def __init__(self) -> None:
         self.s = 0.0
 

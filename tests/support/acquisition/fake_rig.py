@@ -56,7 +56,7 @@ class FakePi:
         self.wanted_end = False
         self.commands: list[m.AnyCommand] = []
         self.rows_run: list[tuple[int, int]] = []
-        # Since the last BeginRun
+        # Rows (row, take) that ran since the last BeginRun.
         self._ran: set[tuple[int, int]] = set()
         self.hanging: tuple[Row, int] | None = None
         self.context = zmq.Context()
@@ -153,7 +153,7 @@ class FakePi:
             few = events[c.from_seq - 1 :][: min(c.limit, 3)]
             return m.ReplayReply(events=few, last_seq=len(events))
         elif isinstance(c, m.RunRow):
-            # Else a repeated request
+            # A repeated request runs no row again.
             if (c.row_index, c.take) not in self._ran:
                 self._ran.add((c.row_index, c.take))
                 self.rows_run.append((c.row_index, c.take))
@@ -181,17 +181,17 @@ class FakePi:
                 card.short[row.index, c.take] = card.row_bytes // 2
                 card.send_row(row.index, c.take)
             if self.hang_after_captures:
-                self._captures(row, c.take)
+                self._send_captures(row, c.take)
             return
         if self.timed:
             self._send_frames(row, c.take)
         else:
-            self._captures(row, c.take)
+            self._send_captures(row, c.take)
             for card in self.cards:
                 card.send_row(row.index, c.take)
         fault = self.fail_rows.get((c.row_index, c.take), 0)
         n = row.points
-        # Lasting ones
+        # These faults last until the next homing.
         if fault in (101, 102, 107, 109):
             self.fault = fault
             self.state = "fault"
@@ -201,7 +201,7 @@ class FakePi:
             bursts=n, pulses=n * self.run.pulses, fault=fault, reason=self.notes.get((c.row_index, c.take), ""),
         )  # fmt: skip
 
-    def _captures(self, row: Row, take: int) -> None:
+    def _send_captures(self, row: Row, take: int) -> None:
         assert self.run is not None
         for i in range(row.points):
             self._emit(

@@ -72,7 +72,7 @@ METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat."""
 LEAST_STD_OF_T = 1e-6
 MOST_STD_BEYOND = 30.0
-"""Least standard deviation of t in which a distance is counted, and the largest distance, at which the density is nearly 0."""
+"""Least standard deviation of t in which a distance is counted, and its largest: there the density is nearly 0."""
 # Smallest standard deviation of a ratio: below it a covariance has no inverse in double precision.
 LEAST_RATIO_STD = 1e-6
 # Step of numerical derivatives by ln of the real part, and by the loss.

@@ -42,9 +42,9 @@ class Synthetic:
     def pair(self):
         return Images(self.h, self.v, self.x_m, self.y_m, np.ones(self.h.shape, bool))
 
-    def analyse(self, leakage=(0.0, 0.0), metal=None, segmentation=None, classifier=None, pair=None):
+    def analyse(self, metal=None, segmentation=None, classifier=None, pair=None):
         known_scene = KnownScene(segmentation, metal, plates=self.plates)
-        prior = RigPrior(1e-3, leakage, 0.003, leakage_measured=True)
+        prior = RigPrior(1e-3, leakage_std=0.003, leakage_measured=True)
         return analyse(pair or self.pair, Optics(self.theta, prior), known_scene, classifier)
 
 
@@ -64,42 +64,28 @@ def reflect(eps, theta):
     return (c - n * ct) / (c + n * ct), (ct - n * c) / (ct + n * c)
 
 
-def make(
-    seed,
-    materials=None,
-    uneven=0.01,
-    noise=0.006,
-    gain_h=1.0,
-    gain_v=0.3 + 0.6j,
-    leak=(0.0, 0.0),
-    size_mm=45.0,
-    pitch_mm=60.0,
-    jitter_mm=5.0,
-    pixels=150,
-    pixel_mm=2.0,
-    theta=THETA,
-):
-    """An image pair of plates in random order on a 3 x 3 raster with random shifts."""
+def make(seed, materials=None, uneven=0.01, noise=0.006, gain_v=0.3 + 0.6j, theta=THETA):
+    """An image pair of plates of 45 mm in random order on a 3 x 3 raster of 60 mm, each shifted by up to 5 mm."""
+    pixels = 150
+    pixel_mm = 2.0
     rng = np.random.default_rng(seed)
     materials = NINE if materials is None else materials
     x = (np.arange(pixels) - (pixels - 1) / 2) * pixel_mm
-    places = [((i % 3 - 1) * pitch_mm, (i // 3 - 1) * pitch_mm) for i in rng.permutation(9)]
+    places = [((i % 3 - 1) * 60.0, (i // 3 - 1) * 60.0) for i in rng.permutation(9)]
     s = np.zeros((pixels, pixels), complex)
     p = np.zeros((pixels, pixels), complex)
     plates = []
     for (name, eps), (cx, cy) in zip(materials.items(), places, strict=False):
-        cx = cx + rng.uniform(-jitter_mm, jitter_mm)
-        cy = cy + rng.uniform(-jitter_mm, jitter_mm)
-        half = size_mm / 2
+        cx = cx + rng.uniform(-5.0, 5.0)
+        cy = cy + rng.uniform(-5.0, 5.0)
+        half = 22.5
         plates.append(TruthPlate(name, (cx - half, cy - half, cx + half, cy + half), eps, metal=eps is None))
         inside = (abs(x[:, None] - cy) <= half) & (abs(x[None, :] - cx) <= half)
         s[inside], p[inside] = reflect(eps, theta)
-    h = gain_h * (s + leak[0] * p)
-    v = gain_v * (p + leak[1] * s)
     frequency = np.fft.fftfreq(pixels, pixel_mm)
     passed = (abs(frequency[:, None]) < 0.443 / 3.6) & (abs(frequency[None, :]) < 0.443 / 5.4)
     out = []
-    for channel, gain in ((h, abs(gain_h)), (v, abs(gain_v))):
+    for channel, gain in ((s, 1.0), (gain_v * p, abs(gain_v))):
         n = rng.standard_normal((2, pixels, pixels))
         n = np.fft.ifft2(np.fft.fft2(n[0] + 1j * n[1]) * passed)
         n *= noise * gain / np.sqrt(np.mean(abs(n) ** 2)) if noise else 0.0
@@ -114,11 +100,6 @@ def make(
 @pytest.fixture(scope="session")
 def synthetic():
     return make
-
-
-@pytest.fixture(scope="session")
-def nine():
-    return NINE
 
 
 @pytest.fixture(scope="session")

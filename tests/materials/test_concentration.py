@@ -30,13 +30,9 @@ def entry(name, angle_rad, scan="a", incidence_deg=55.0):
     )
 
 
-def library(rng=None, noise=0.0, slope=-20.0, patches=3):
-    entries = []
-    for name, percent in SUGAR.items():
-        for scan in range(patches):
-            angle = 1.2 + percent / slope / 1.0 * 0.05 + (noise * rng.standard_normal() if rng else 0.0)
-            entries.append(entry(name, angle, f"scan{scan}"))
-    return Library(tuple(entries))
+def library():
+    """Five concentrations in three scans each, on a line of -400 percent a radian."""
+    return Library(tuple(entry(name, 1.2 - p / 400, f"scan{k}") for name, p in SUGAR.items() for k in range(3)))
 
 
 def write_materials(folder: Path, entries: Iterable[Entry]) -> None:

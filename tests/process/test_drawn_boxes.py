@@ -1,7 +1,6 @@
 """Boxes drawn by hand instead of patches that are found."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +11,9 @@ from polysight.process import Inputs, boxes_as_patches
 from polysight.settings import DEFAULT
 
 
-def again(scan, path, plates=()):
+def again(scan, path):
     inputs = Inputs(labels=read_labels(path))
-    scene = replace(boxes_as_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m), plates=plates)
+    scene = boxes_as_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m)
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
     return scan.pipeline.find_materials(scan.images, scene, classifier), scene.names
 

@@ -2,39 +2,17 @@
 
 from __future__ import annotations
 
-import struct
-
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from polysight_simulators.cards.dca1000 import Card, Message, Network, Output, Packets
+from polysight_simulators.cards.dca1000 import Card, Message, Network, Output
 
 HOME = Network("192.168.33.30", "192.168.33.180", bytes.fromhex("123456789012"), 4096, 4098)
-CONFIGURE = bytes.fromhex("5aa5 0300 0600 01010102031e aaee")
-PACKET = bytes.fromhex("5aa5 0b00 0600 be05350c0000 aaee")
-START = bytes.fromhex("5aa5 0500 0000 aaee")
-STOP = bytes.fromhex("5aa5 0600 0000 aaee")
-COMPLETED = bytes.fromhex("5aa5 0a00 0001 aaee")
-
-
-def parse(packet: bytes) -> tuple[int, int, bytes]:
-    sequence, low, high = struct.unpack_from("<IIH", packet)
-    return sequence, low | high << 32, packet[10:]
-
-
-def packets(outputs: list[Output]) -> list[bytes]:
-    return [row.tobytes() for o in outputs if isinstance(o, Packets) for row in o.rows]
 
 
 def messages(outputs: list[Output]) -> list[bytes]:
     return [o.payload for o in outputs if isinstance(o, Message)]
-
-
-def stream(n: int, seed: int = 0) -> NDArray[np.uint8]:
-    return np.random.default_rng(seed).integers(0, 256, n, dtype=np.uint8)
 
 
 @pytest.mark.parametrize(

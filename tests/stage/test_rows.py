@@ -14,7 +14,6 @@ from tests.support.stage.drivers import edges, motions
 from polysight_shared.stage_line import Command, Immediate
 
 # Steps
-MM = 200
 UM = 5  # per step
 ACCEL = 40_000
 

@@ -29,7 +29,7 @@ def events() -> list[tuple[type[m.AnyEvent], dict[str, Any]]]:
     return [*scan, (m.RunStopped, {"exit_status": "success"})]
 
 
-def same(event: m.AnyEvent, other: tuple[type[m.AnyEvent], dict[str, Any]]) -> bool:
+def is_same_event(event: m.AnyEvent, other: tuple[type[m.AnyEvent], dict[str, Any]]) -> bool:
     return type(event) is other[0] and getattr(event, "point", 0) == other[1].get("point", 0)
 
 
@@ -58,7 +58,7 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
         again.open("s", PLAN, 0)
         events_kept = [m.unpack_event(raw) for raw in again.read("s", 1, 1000)[0]]
         assert [e.seq for e in events_kept] == list(range(1, len(events_kept) + 1))
-        assert all(map(same, events_kept, added)), "a prefix of what was added"
+        assert all(map(is_same_event, events_kept, added)), "a prefix of what was added"
         synced = max((e.seq for e in published if not isinstance(e, m.Capture)), default=0)
         assert len(events_kept) >= synced, "what was published as synced is on the disk"
         again.write([NewEvent.now(added[-1][0], **added[-1][1])])

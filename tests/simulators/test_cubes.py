@@ -46,14 +46,14 @@ def rows_by_the_host(scene: Scene, folder: Path) -> dict[str, np.ndarray]:
     return {board: np.stack(rows, axis=1) for board, rows in rows_of_board.items()}
 
 
-def in_blocks(cube: np.ndarray) -> np.ndarray:
+def decimate_cube(cube: np.ndarray) -> np.ndarray:
     """Linear samples of a cube in the middle of each block, as the host decimates them."""
     return flatten(fold(np.ascontiguousarray(cube[..., slice(*RIG.chirp.linear_samples)], np.complex64)))
 
 
-def off_by(raw: np.ndarray, cube: np.ndarray) -> np.ndarray:
+def find_deviation(raw: np.ndarray, cube: np.ndarray) -> np.ndarray:
     """Deviation from one common factor, relative to the cube."""
-    cube = in_blocks(cube)
+    cube = decimate_cube(cube)
     return raw / (np.vdot(cube, raw) / np.vdot(cube, cube)) - cube
 
 
@@ -64,8 +64,8 @@ def test_a_synced_cube_equals_the_synchronised_raw_scan(tmp_path: Path) -> None:
     for board, raw in rows_by_the_host(scene, tmp_path).items():
         cube = synced_cube(RIG, scene, board)
         unlike_cube = synced_cube(RIG, scene.with_disturbances(leakage_h="off", leakage_v="off"), board)
-        own_error = np.sqrt(np.mean(np.abs(off_by(raw, cube)) ** 2) / np.mean(np.abs(cube) ** 2))
-        unlike = np.sqrt(np.mean(np.abs(off_by(raw, unlike_cube)) ** 2) / np.mean(np.abs(unlike_cube) ** 2))
+        own_error = np.sqrt(np.mean(np.abs(find_deviation(raw, cube)) ** 2) / np.mean(np.abs(cube) ** 2))
+        unlike = np.sqrt(np.mean(np.abs(find_deviation(raw, unlike_cube)) ** 2) / np.mean(np.abs(unlike_cube) ** 2))
         assert own_error < 0.01
         assert unlike > 3 * own_error, "the bound is too wide to detect leakage"
 
@@ -88,8 +88,8 @@ def test_the_echo_of_v_drifts_by_what_the_scene_says_and_h_and_the_direct_path_d
 def test_the_noise_is_that_of_averaged_bursts(tmp_path: Path) -> None:
     for board, raw in rows_by_the_host(SCENE, tmp_path).items():
         quiet = synced_cube(RIG, SCENE, board, noise=0.0)
-        drawn = in_blocks(synced_cube(RIG, SCENE, board) - quiet)
-        power = np.mean(np.abs(off_by(raw, quiet)) ** 2)
+        drawn = decimate_cube(synced_cube(RIG, SCENE, board) - quiet)
+        power = np.mean(np.abs(find_deviation(raw, quiet)) ** 2)
         assert power == pytest.approx(np.mean(np.abs(drawn) ** 2), rel=0.05)
         ideal = SCENE.with_disturbances(ideal=True)
         noise_only = synced_cube(RIG, ideal, board, noise=0.3) - synced_cube(RIG, ideal, board)

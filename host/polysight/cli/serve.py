@@ -37,7 +37,7 @@ def _serve(args: argparse.Namespace) -> int:
         raise ConfigError(
             f"{config}: no such file", "--config names a rig file", "correct the path, or leave --config out"
         )
-    return serve(args.root, _place(args), config, not args.read_only)
+    return serve(args.root, _make_place(args), config, not args.read_only)
 
 
 def _run_preview(args: argparse.Namespace) -> int:
@@ -49,7 +49,7 @@ def _run_preview(args: argparse.Namespace) -> int:
     sys.stderr.write("polysight preview: starting\n")
     from polysight.serve import preview
 
-    return preview(args.folder, _place(args), args.control)
+    return preview(args.folder, _make_place(args), args.control)
 
 
 def _check_extra() -> None:
@@ -62,7 +62,7 @@ def _check_extra() -> None:
         )
 
 
-def _place(args: argparse.Namespace) -> Place:
+def _make_place(args: argparse.Namespace) -> Place:
     from polysight.serve import Place
 
     return Place(args.host, args.port, tuple(args.allow_host), args.certificate, args.key)
@@ -150,7 +150,7 @@ def _add_lists(add: Add) -> None:
     )
 
 
-def _point(text: str) -> tuple[float, float]:
+def _parse_point(text: str) -> tuple[float, float]:
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
@@ -166,7 +166,7 @@ def _add_results(add: Add) -> None:
         "polysight probe scans/one 45,0",
     )
     sub.add_argument("folder", type=Path, metavar="DATA", help="scan folder, or a folder of products")
-    sub.add_argument("place_mm", type=_point, metavar="X,Y", help="place, mm from the image's centre")
+    sub.add_argument("place_mm", type=_parse_point, metavar="X,Y", help="place, mm from the image's centre")
     sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
     add_json_option(sub)
     sub = add(

@@ -71,6 +71,10 @@ ODD_NOISE = 2.0
 NOISE_OF_HALVES = 22.0
 """Difference of the halves' medians by noise in V / H, over its root mean square and the root of the pixels: three
 standard deviations, with one independent value in nine pixels and medians that scatter by 1.25 of means."""
+DIM_V = 0.12
+"""|V| over |H| below which the phase between both is not judged."""
+LEAST_COHERENCE = 0.7
+"""Least coherence of H and V over the pixels of a plate."""
 IN_NOISE = 2.0
 """|V| over its background below which V is rather noise: its phase tells nothing."""
 # Margin around patches that does not count as background
@@ -177,8 +181,8 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     power_h = float(np.sum(np.abs(h[pixels].astype(np.complex128)) ** 2))
     power_v = float(np.sum(np.abs(v[pixels].astype(np.complex128)) ** 2))
     level_v = float(np.median(np.abs(v[pixels])))
-    dim = level_v < 0.12 * float(np.median(level)) or level_v < IN_NOISE * dark[1]
-    if not dim and cross < 0.7 * np.sqrt(power_h * power_v):
+    is_dim = level_v < DIM_V * float(np.median(level)) or level_v < IN_NOISE * dark[1]
+    if not is_dim and cross < LEAST_COHERENCE * np.sqrt(power_h * power_v):
         return Finding(
             "error", "H and V do not agree", "their phase difference varies from pixel to pixel, like noise", remedy
         )
@@ -262,7 +266,7 @@ def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Sca
     cut = np.clip(log_ratio.real, -3 * amplitude, 3 * amplitude) + 1j * np.clip(log_ratio.imag, -3 * phase, 3 * phase)
     slope_of = np.linalg.solve(information, centred.T @ cut)
     rest = np.asarray(log_ratio - centred @ slope_of, np.complex128)
-    about = complex(*(1.4826 * float(np.median(np.abs(part - np.median(part)))) for part in (rest.real, rest.imag)))
+    rest_std = complex(*(1.4826 * float(np.median(np.abs(part - np.median(part)))) for part in (rest.real, rest.imag)))
     unit = np.sqrt(np.diag(np.linalg.inv(information)) * rows.size / blocks)
     x, y = places.mean(axis=0).tolist()
     return Scatter(
@@ -270,7 +274,7 @@ def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Sca
         phase=phase,
         blocks=blocks,
         slope=slope_of,
-        slope_std=unit * about,
+        slope_std=unit * rest_std,
         centre_m=(x, y),
         relief_rad=_measure_relief(h[pixels], centred),
     )
@@ -363,8 +367,8 @@ def measure_dispersions(
 
     `metal` is the metal's interior in the scene, `plane` metal that was scanned separately.
 
-    What lies behind the plates adds to each channel's change what its own first moment over the sweep is of the plate's
-    level: a table 100 mm behind, 20 dB below a plate, 0.8.
+    What lies behind the plates adds to each channel's change its own first moment over the sweep, relative to the
+    plate's level: 0.8 for a table 100 mm behind, 20 dB below a plate.
     """
     dispersion = images.dispersion
     of_metal = None
@@ -404,6 +408,7 @@ def _measure_median_change(dispersion: Dispersion, pixels: Mask) -> tuple[Real, 
     if values.shape[1] < LEAST_PIXELS:
         return None
     low, middle, high = np.percentile(values, (25, 50, 75), axis=1)
+    # The distance of the quartiles of a normal distribution is 1 / 0.7413 standard deviations.
     return middle, 0.7413 * (high - low)
 
 

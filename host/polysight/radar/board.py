@@ -443,9 +443,11 @@ class RadarBoard:
         self.firmware = firmware
         self.die_id = die_id
         self.calibration = calibration
+        # Bytes sent since the last report.
         self._sent: list[bytes] = []
         self.link = Link(name, words, clock, self._sent.append)
         self._state = State.OFF
+        # Frames that the board is set for; 0: none.
         self._frames = 0
         self.reason = ""
         self.facts = BoardFacts()
@@ -548,13 +550,14 @@ class RadarBoard:
         commands = (*self.program.waveform, *self._sent_frames)
         sent_blocks = {command.ID: command.block().data for command in commands}
         differences = []
-        for question, setting in ((c.READ_PROFILE, 0x0100), (c.READ_CHIRP, 0x0101), (c.READ_FRAME, 0x0102)):
+        for question, setting in ((c.READ_PROFILE, c.Profile), (c.READ_CHIRP, c.Chirp), (c.READ_FRAME, c.Frame)):
             blocks = self.link.call(question).blocks
             read = b""
             if blocks:
                 read = blocks[0].data
-            if read != sent_blocks[setting]:
-                differences.append(f"0x{setting:04X}: sent {sent_blocks[setting].hex()}, read back {read.hex()}")
+            sent = sent_blocks[setting.ID]
+            if read != sent:
+                differences.append(f"0x{setting.ID:04X}: sent {sent.hex()}, read back {read.hex()}")
         return differences
 
     def reconnect(self, words: WordLink) -> None:

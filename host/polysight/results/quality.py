@@ -154,6 +154,7 @@ class MetalPlate(msgspec.Struct, frozen=True, kw_only=True):
     v_variation_db: float | None = None
     ratio_variation_db: float | None = None
     ratio_variation_deg: float | None = None
+    # Standard deviation of each part of V / H over the plate: noise and speckle.
     spread: float | None = None
     sub_bands: int | UnsetType = UNSET
 

@@ -187,7 +187,7 @@ def fig15(run: Run) -> Item:
 
 
 def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: float | None) -> None:
-    """Standard deviation of a quantity after each stage, with the bounds and the published value, if there is one."""
+    """Draw the standard deviation of a quantity after each stage, its bounds, and the published value, if any."""
     for i, (board, content) in enumerate(summary.items()):
         stages = content["stages"]
         positions = np.array([list(STAGES).index(s) for s in stages]) + 0.12 * (2 * i - 1)

@@ -40,8 +40,8 @@ SLACK_M = 2e-3
 """Largest deviation of a row's start along x from the aperture."""
 # Relative to the strongest principal component: weaker ones are left out
 _LEFT_OUT = 6e-6
-# Wavenumbers processed in double precision at a time
-_CHUNK = 32
+# Wavenumbers processed in double precision at a time: with 32 a live scan keeps 11 MB more, in no less time.
+_CHUNK = 8
 
 
 @dataclass(frozen=True)
@@ -512,19 +512,23 @@ class IncrementalImager(RowSpectra):
     def _compute_principal_kernels(self) -> tuple[Any, Any]:
         """Return kernels [k, lag, component], and the transform from channels, [k, component, channel]."""
         xp = self.xp
-        kernels = self.kernels()
-        by_k = xp.empty(kernels.shape[::-1], dtype=xp.complex64, device=self.device)
+        lattice = self.lattice
+        channels = math.prod(self.aperture.shape[:2])
+        by_k = xp.empty((lattice.band.size, lattice.lags_y, channels), dtype=xp.complex64, device=self.device)
         # The kernels are stored contiguously by k, so that products are fast.
-        by_k[...] = xp.permute_dims(kernels, (2, 1, 0))
-        squares = []
+        by_k[...] = xp.permute_dims(self.kernels(), (2, 1, 0))
+        powers = []
+        bases = []
         for first in range(0, by_k.shape[0], _CHUNK):
             last = min(first + _CHUNK, by_k.shape[0])
             # Weak components need double precision.
             exact = xp.astype(by_k[first:last, :, :], xp.complex128)
-            squares.append(xp.matmul(xp.conj(exact).mT, exact))
-        power, vectors = xp.linalg.eigh(xp.concat(squares))
+            powers_of_chunk, vectors = xp.linalg.eigh(xp.matmul(xp.conj(exact).mT, exact))
+            powers.append(powers_of_chunk)
+            bases.append(xp.astype(vectors, xp.complex64))
+        power = xp.concat(powers)
         # Ascending: the last component is the strongest at every wavenumber
         strongest = xp.max(power, axis=0)
         count = int(xp.sum(xp.astype(strongest > _LEFT_OUT**2 * strongest[-1], xp.int64)))
-        vectors_used = xp.astype(vectors[:, :, -count:], xp.complex64)
+        vectors_used = xp.concat(bases)[:, :, -count:]
         return xp.matmul(by_k, vectors_used), xp.asarray(xp.conj(vectors_used).mT, copy=True)

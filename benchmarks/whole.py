@@ -1,97 +1,22 @@
-"""A full scan of two boards from raw files to images: time, memory, and the wait after its last row.
-
-The processing runs in a process of its own, `python -m benchmarks.whole SOURCE.json HOW`. SOURCE.json names a scan
-folder (`scan`), or rows that are repeated to a grid (`files`, `grid`). HOW is "batch", or "live" as beside a running
-scan, with the images updated by every row. Every line on the standard input processes all of it once, from reading to
-the two images, and is answered by one line of JSON.
-"""
+"""A full scan of two boards from raw files to images: time, memory, and the wait after its last row."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import statistics
-import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from benchmarks import sync
-from benchmarks.data import RepeatedRows, published_scene, recorded_rows, temporary, write_scan
-from benchmarks.measure import AnonymousMemory, Child, Line, Seconds, count_repeats, one_core, show, write
+from benchmarks.chain import Chain
+from benchmarks.data import published_scene, recorded_rows, temporary, write_scan
+from benchmarks.measure import Line, Seconds, count_repeats, one_core, show, write
 from benchmarks.measure import add_arguments as add_common
 from benchmarks.published import form_image
 from polysight.imaging import image_grid
-from polysight.pipeline import Pipeline
-from polysight.store import ScanFolder
 from polysight_shared.config import Instrument
-
-# Times that the last row is added
-LAST_ROWS = 5
-
-
-def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
-    """Process once.
-
-    Returns
-    -------
-    CPU and wall seconds in all (`cpu_s`, `wall_s`); of the steps done once, before the first row and after the last
-    (`once_cpu_s`); wall seconds from the last committed row to both images, again and again (`last_row_wall_s`); wall
-    seconds by stage (`stages`).
-    """
-    if "scan" in source:
-        scan = ScanFolder.load(Path(source["scan"]))
-    else:
-        rig, _ = published_scene(**source["grid"])
-        scan = RepeatedRows(rig, {name: [Path(f) for f in files] for name, files in source["files"].items()})
-    total = Seconds()
-    once = Seconds()
-    last = Seconds()
-    with total.time_block():
-        with once.time_block():
-            pipeline = Pipeline(scan, live=live)
-            rows = list(scan.rows())
-        for row in rows:
-            pipeline.add_row(row)
-        with once.time_block():
-            pipeline.form_images()
-    stages = dict(pipeline.quality.seconds)
-    for _ in range(LAST_ROWS):
-        with last.time_block():
-            pipeline.add_row(rows[-1])
-            pipeline.form_images(from_sums=live)
-    return {
-        "rows": len(rows),
-        "cpu_s": total.cpu[0],
-        "wall_s": total.wall[0],
-        "once_cpu_s": sum(once.cpu),
-        "last_row_wall_s": last.wall,
-        "last_row_cpu_s": last.cpu,
-        "stages": stages,
-    }
-
-
-class Chain(Child):
-    """Such a process, its memory watched."""
-
-    def __init__(self, folder: Path, how: str, source: dict[str, Any]) -> None:
-        path = folder / "source.json"
-        path.write_text(json.dumps(source), encoding="utf-8")
-        super().__init__("benchmarks.whole", path, how)
-        self._memory = AnonymousMemory(self._process.pid)
-
-    def run(self) -> dict[str, Any]:
-        """Process once. Raises RuntimeError when the process ends instead."""
-        self.say()
-        return self.hear()
-
-    def end(self) -> int:
-        """End it; returns the highest anonymous memory it ever held, bytes."""
-        self.close()
-        return self._memory.close()
-
 
 REPEATS = 3
 SPARE_BYTES = 3 << 30
@@ -211,19 +136,3 @@ def _measure_memory(memory: int, part: str) -> Line:
         higher_is_better=False,
         note=f"highest RssAnon of the processing process, at once and row by row; {part}",
     )
-
-
-def main(argv: list[str]) -> int:
-    source = json.loads(Path(argv[1]).read_text(encoding="utf-8"))
-    for _ in sys.stdin:
-        sys.stdout.write(json.dumps(process(source, live=argv[2] == "live")) + "\n")
-        sys.stdout.flush()
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main(sys.argv))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main(sys.argv))

@@ -530,5 +530,5 @@ class IncrementalImager(RowSpectra):
         # Ascending: the last component is the strongest at every wavenumber
         strongest = xp.max(power, axis=0)
         count = int(xp.sum(xp.astype(strongest > _LEFT_OUT**2 * strongest[-1], xp.int64)))
-        vectors_used = xp.concat(bases)[:, :, -count:]
+        vectors_used = xp.concat([vectors[:, :, -count:] for vectors in bases])
         return xp.matmul(by_k, vectors_used), xp.asarray(xp.conj(vectors_used).mT, copy=True)

@@ -201,6 +201,7 @@ class ControlFolder:
         self._doing = "materials"
 
     def _serve(self) -> None:
+        """Obey requests and write `alive`, until the folder is closed."""
         written_life: Life | None = None
         next_alive_s = 0.0
         cleared = False
@@ -229,6 +230,7 @@ class ControlFolder:
             self._folder.rmdir()
 
     def _write(self, life: Life) -> None:
+        """Write `alive`, so that a reader sees the old content or the new one."""
         # A reader sees the old content or the new one; nothing needs to survive a power loss.
         part = self._folder / f".{ALIVE}.part"
         try:

@@ -296,6 +296,7 @@ class PiClient:
         return reply
 
     def _no_answer_error(self, command: str) -> DeviceError:
+        """Return the error for a Pi that is silent, or that refuses the key of this host."""
         if self._handshake.is_refused():
             return DeviceError(
                 f"the Pi at {self._address} refuses this host's key",

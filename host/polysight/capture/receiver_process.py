@@ -156,6 +156,7 @@ class Receiver:
         )
 
     def _begin(self, request: messages.BeginRow) -> messages.Answer:
+        """Begin a row: reserve its file and memory, and drop packets from between rows."""
         if self._socket is None or self._batches is None:
             raise DeviceError("the receiver has no socket yet", "a row began before the cards were opened", _RESTART)
         if self._row is not None:
@@ -187,6 +188,7 @@ class Receiver:
         self._past = Past()
 
     def _receive(self) -> None:
+        """Take over the packets that wait at the socket, at most some batches; send progress if there is any."""
         row = self._row
         batches = self._batches
         if row is None or batches is None:
@@ -200,6 +202,7 @@ class Receiver:
             messages.send(self._connection, row.progress())
 
     def _end(self, request: messages.EndRow) -> messages.Answer:
+        """End the row: place its packets, and write payload, index and packets."""
         row = self._row
         if row is None or self._socket is None or self._batches is None:
             raise DeviceError("no row is being received", "a row ended that had not begun", _RESTART)

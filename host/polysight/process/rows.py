@@ -285,6 +285,7 @@ class KeptSamples:
                 self._save(row, digests)
 
     def _save(self, row: int, digests: dict[str, str]) -> None:
+        """Write a row's record into each board's file, then its line; after an error no more rows are kept."""
         if not self._keep:
             return
         try:

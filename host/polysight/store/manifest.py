@@ -393,6 +393,7 @@ class Manifest:
         return self.facts[old_facts:]
 
     def _add_line(self, head: _Head, line: bytes) -> None:
+        """Count a valid line, compare it with the chain, and add its fact."""
         if head.count is not None and head.previous is not None:
             self._compare(head.count, head.previous)
             self.count = head.count
@@ -427,6 +428,7 @@ class Manifest:
             self.faults.append(manifest_fault(self._lines, "the line before it was replaced", 1))
 
     def _add_up(self, fact: Fact) -> None:
+        """Update rows, rejected rows, start, end and pause of the scan by a fact."""
         if isinstance(fact, RowCommitted):
             self.rows.pop(fact.row, None)
             self.rows[fact.row] = fact

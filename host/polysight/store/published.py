@@ -363,6 +363,7 @@ class PublishedScan(_Published):
         self._files: dict[str, dict[int, Path]] = {b.name: self._list_row_files(b.name) for b in base.boards}
 
     def _list_row_files(self, board_name: str) -> dict[int, Path]:
+        """Return the files of a board by row. Raises DataError if one starts at another column than the plan."""
         files = {}
         for file in (self.path / board_name).glob("*.bin"):
             match = _ROW_FILE.fullmatch(file.name)

@@ -23,6 +23,7 @@ from polysight.surfaces.window import (
     Samples,
     Windows,
     add_up,
+    choose_thinned,
     gather_windows,
     make_echoes,
     maximise,
@@ -30,6 +31,7 @@ from polysight.surfaces.window import (
     pack_values,
     replace_samples,
     select_maxima,
+    select_positions,
     select_windows,
 )
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -47,6 +49,8 @@ MIN_SHARE = 0.05
 # Least share of the power for the echoes after the strongest: a sphere in front of a table that is 16 dB brighter has
 # 0.025.
 MIN_LEFT = 0.012
+# Echoes that a fit to some of the positions makes so much less certain have merged in a fit to all, too.
+THINNED_WIDENING = 5 * MERGED_WIDENING
 # An echo this far below the strongest of the scan is a side lobe or the echo of an edge.
 MIN_POWER = 10 ** (-3.2)
 
@@ -184,29 +188,57 @@ def _refine(
     Returns the windows that keep the newest echo. It is dropped where it only splits another echo in two: the edge of a
     surface does that.
     """
-    members, weakest = echoes[-1]
+    is_likely = _may_be_separate(fit, windows, echoes)
+    members = echoes[-1][0][is_likely]
+    weakest = select_maxima(echoes[-1][1], is_likely)
+    echoes[-1] = (members, weakest)
     part = select_windows(windows, members)
-    places = [np.isin(others, members) for others, _ in echoes]
-    values = np.stack([maximum.values[place] for place, (_, maximum) in zip(places, echoes, strict=True)], axis=1)
-    amplitude = np.stack([maximum.amplitude[place] for place, (_, maximum) in zip(places, echoes, strict=True)], axis=1)
-    joint = JointFit(fit, part, values, amplitude)
-    joint.run()
-    joint.part_merged_echoes()
+    joint = _fit_apart(fit, part, _select_echoes(echoes, members))
     widening = joint.find_widening()
     is_separate = widening[..., 0].max(axis=1) < MERGED_WIDENING
-    for index, (place, (_, maximum)) in enumerate(zip(places, echoes, strict=True)):
+    for index, (others, maximum) in enumerate(echoes):
         values = joint.values[:, index]
         alone = replace_samples(part, joint.rest + joint.synthesise(index))
         better = maximise(fit, add_up(fit, alone, values), part.valid, part.offsets, values, iterations=0)
         # The other echoes make an echo's amplitude and path less certain.
         better.rest = better.rest * widening[:, index, 0]
         better.std = better.std * widening[:, index, 1:]
-        kept = np.flatnonzero(place)[is_separate]
+        kept = np.flatnonzero(np.isin(others, members))[is_separate]
         for field in fields(Maximum):
             getattr(maximum, field.name)[kept] = getattr(better, field.name)[is_separate]
     residual[members[is_separate]] = joint.rest[is_separate]
     echoes[-1] = (members[is_separate], select_maxima(weakest, is_separate))
     return members[is_separate]
+
+
+def _may_be_separate(fit: BoardFit, windows: Windows, echoes: list[tuple[NDArray, Maximum]]) -> NDArray[np.bool_]:
+    """False for windows of the newest echo where a fit to some of the positions finds it merged with another.
+
+    Most windows at the edges of plates are so, and their fits need the most steps.
+    """
+    members = echoes[-1][0]
+    shape = fit.board.window_shape()
+    thinned = choose_thinned(shape)
+    if thinned.size == shape[0] * shape[1]:
+        return np.ones(members.size, bool)
+    part = select_windows(select_positions(windows, thinned), members)
+    joint = _fit_apart(fit, part, _select_echoes(echoes, members))
+    return joint.find_widening()[..., 0].max(axis=1) < THINNED_WIDENING
+
+
+def _fit_apart(fit: BoardFit, windows: Windows, starts: list[Maximum]) -> JointFit:
+    """Fit all echoes of windows together, from other starts too where two have merged."""
+    values = np.stack([maximum.values for maximum in starts], axis=1)
+    amplitude = np.stack([maximum.amplitude for maximum in starts], axis=1)
+    joint = JointFit(fit, windows, values, amplitude)
+    joint.run()
+    joint.part_merged_echoes()
+    return joint
+
+
+def _select_echoes(echoes: list[tuple[NDArray, Maximum]], members: NDArray[np.int_]) -> list[Maximum]:
+    """Return the echoes of some windows, one list entry per rank."""
+    return [select_maxima(maximum, np.isin(others, members)) for others, maximum in echoes]
 
 
 def _compute_power_share(fit: BoardFit, windows: Windows, maximum: Maximum, energy: Array) -> Array:

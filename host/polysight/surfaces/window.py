@@ -17,6 +17,8 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 WINDOW_M = 0.034
 ITERATIONS = 7
+# Positions of a window that are enough to tell whether its echoes lie apart; a window of steps of 2 mm has 289.
+THINNED_POSITIONS = 48
 # Largest step of path (m), slopes, and curvatures (1 / m).
 STEP_LIMITS = np.array([0.02, 0.05, 0.05, 1.5, 1.5, 1.5])
 
@@ -325,12 +327,13 @@ def synthesise(
     `waves` [window, echo, frequency, position], `amplitude` [window, echo], `steering` [window, echo, rx, frequency].
     """
     factors = (amplitude[..., None, None] * steering.conj()).astype(np.complex64)
-    echoes = np.moveaxis(factors.transpose(0, 3, 2, 1) @ np.swapaxes(waves, 1, 2), 1, 2)
+    echoes = np.empty((len(waves), *factors.shape[2:], waves.shape[-1]), np.complex64)
+    np.matmul(factors.transpose(0, 3, 2, 1), np.swapaxes(waves, 1, 2), out=np.moveaxis(echoes, 1, 2))
     if not valid.all():
-        echoes = echoes * valid[:, None, None].astype(np.float32)
+        echoes *= valid[:, None, None].astype(np.float32)
     if fit.board.model is not None:
         echoes = fit.model.astype(np.complex64) @ echoes
-    return echoes.astype(np.complex64, copy=False)
+    return echoes
 
 
 def no_echoes() -> Echoes:
@@ -352,6 +355,20 @@ def no_echoes() -> Echoes:
 def select_windows(windows: Windows, keep: NDArray) -> Windows:
     """Return some of the windows, by index [k] or bool mask [window]."""
     return Windows(windows.samples[keep], windows.valid[keep], windows.offsets[keep], windows.at_m[keep])
+
+
+def choose_thinned(shape: tuple[int, int]) -> NDArray[np.int_]:
+    """Return about `THINNED_POSITIONS` of the positions of a window of so many rows and columns, evenly spread."""
+    step = max(1, round(shape[0] * shape[1] / THINNED_POSITIONS))
+    rows, columns = np.indices(shape)
+    # With the golden ratio the lattice is about as wide in all directions.
+    turn = max(1, round(0.382 * step))
+    return np.flatnonzero((turn * rows + columns) % step == 0)
+
+
+def select_positions(windows: Windows, keep: NDArray[np.int_]) -> Windows:
+    """Return windows with some of their positions."""
+    return Windows(windows.samples[..., keep], windows.valid[:, keep], windows.offsets[:, keep], windows.at_m)
 
 
 def replace_samples(windows: Windows, samples: NDArray) -> Windows:

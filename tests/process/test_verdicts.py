@@ -163,9 +163,7 @@ def test_an_empty_table_is_no_result(examine):
 @pytest.mark.parametrize("plates", [tuple(PLATES), ()], ids=["plates", "noise"])
 def test_without_a_direct_path_there_is_no_result(rig, tmp_path, plates):
     small = {"columns": 31, "rows": 25, "step_x_mm": 14.0, "step_y_mm": 10.0}
-    folder = simulate(
-        rig, world(plates, {"direct_loss_db": "absent"}, grid=small, burst={"pulses": 2}), tmp_path / "scan"
-    )
+    folder = simulate(rig, world(plates, {"direct_loss_db": "absent"}, grid=small), tmp_path / "scan")
     pipeline, images = form_images(open_source(folder, None))
     findings = pipeline.examine(images)
     assert findings.verdict.level == "none"

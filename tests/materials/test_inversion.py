@@ -12,12 +12,12 @@ from polysight.materials.inversion import (
     RigPrior,
     SceneLikelihood,
     invert,
-    ratio_error,
     sample_posterior,
     true_ratio,
 )
 from polysight.materials.kinds import Kind, Kinds, PatchMeasurement, literature, permittivity_slope
 from polysight.materials.phase_sign import join_signs, mirror_phases
+from polysight.materials.result import ratio_error
 from polysight.polarimetry import permittivity_from_ratio
 
 THETA = np.radians(55.0)
@@ -264,6 +264,8 @@ def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evide
         apart = abs(mirrored.permittivity - before.permittivity) ** 2
         expected = (1 - other) * np.trace(before.covariance) + other * (np.trace(mirrored.covariance) + apart)
         assert np.trace(after.covariance) == pytest.approx(expected)
+        wider = np.sqrt(np.diag(after.covariance) / np.diag(before.covariance))
+        np.testing.assert_allclose(np.array(after.half_widths_68) / before.half_widths_68, wider)
         assert sum(after.shares.values()) == pytest.approx(1.0)
     # Without any doubt nothing changes
     assert join_signs(right, wrong, 1e-6)[0] == right
@@ -281,3 +283,26 @@ def test_what_plates_may_be_counts_less_on_leakage_that_was_never_measured():
     errors_in_full = [np.trace(p.covariance) for p in in_full[0].patches]
     assert np.median(np.array(errors) / errors_in_full) > 1.05
     assert found[1].leakage == in_full[1].leakage
+
+
+def test_half_widths_hold_68_percent_of_errors_whose_size_varies_from_plate_to_plate():
+    """Own errors of a drawn size, inverse gamma: 95 % lie where they did, but most errors are small."""
+    rng = np.random.default_rng(3)
+    prior = RigPrior(theta_std_rad=1e-5, leakage_std=5e-4, leakage_measured=True, reference_std=1e-4)
+    inside_68 = []
+    inside_95 = []
+    for _ in range(20):
+        exact = world(rng, (0j, 0j), noise=0.0, dull=0.0, eps=np.full(10, 4.0 - 0.4j))
+        size = 0.01 * np.sqrt(3.0 / rng.chisquare(3.0, 10)) * np.sqrt(5.991 / 19.1)
+        errors = size * (rng.standard_normal(10) + 1j * rng.standard_normal(10))
+        patches = [
+            replace(patch, inverse_ratio=patch.inverse_ratio + complex(error), std=0.01)
+            for patch, error in zip(exact, errors, strict=True)
+        ]
+        for patch in invert(patches, prior).patches:
+            off = np.abs([patch.permittivity.real - 4.0, patch.permittivity.imag + 0.4])
+            inside_68.append(off < patch.half_widths_68)
+            inside_95.append(off < 1.96 * np.sqrt(np.diag(patch.covariance)))
+    # Within three standard deviations of the count of 200 draws
+    np.testing.assert_allclose(np.mean(inside_68, axis=0), 0.683, atol=0.1)
+    np.testing.assert_allclose(np.mean(inside_95, axis=0), 0.95, atol=0.046)

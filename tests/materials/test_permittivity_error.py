@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from polysight.materials.measure import estimate_permittivity
-from polysight.materials.segment import find_patches_at_border
+from polysight.materials.measure import border_errors, estimate_permittivity
 from polysight.polarimetry import PlaneReference, permittivity_from_ratio, ratio_from_permittivity
 
 THETA = np.radians(55.0)
@@ -64,7 +63,7 @@ def test_a_plate_that_the_end_of_a_small_aperture_lights_is_known_less_well(synt
     beside = next(p for p in segmentation.patches if p.label in inside)
     columns = np.flatnonzero(beside.mask.any(axis=0))
     lit = everywhere.copy()
-    lit[:, columns[-1] + 2 :] = False
+    lit[:, columns[-1] - 7 :] = False
     at_border = errors_beside_metal_apart(scene, lit, segmentation)
     assert at_border[beside.label] > 1.2 * inside[beside.label]
 
@@ -72,7 +71,22 @@ def test_a_plate_that_the_end_of_a_small_aperture_lights_is_known_less_well(synt
 def test_a_plate_that_fills_the_lit_pixels_is_lit_as_the_metal_was(synthetic):
     scene = synthetic(3)
     patch = scene.analyse().segmentation.patches[0]
-    assert find_patches_at_border([patch], lit=patch.mask) == frozenset()
+    assert border_errors(patch, patch.mask, scene.x_m) == (0.0, 0.0)
     lit = ndimage.binary_dilation(patch.mask)
-    assert find_patches_at_border([patch], lit=lit) == {patch.label}
-    assert find_patches_at_border([patch], lit=np.ones(patch.mask.shape, bool)) == frozenset()
+    assert min(border_errors(patch, lit, scene.x_m)) > 0.005
+    assert border_errors(patch, np.ones(patch.mask.shape, bool), scene.x_m) == (0.0, 0.0)
+
+
+def test_the_error_at_the_end_of_the_aperture_falls_with_the_distance(synthetic):
+    """Most in amplitude near the end; the phase's falls more slowly."""
+    scene = synthetic(3)
+    patch = scene.analyse().segmentation.patches[0]
+    errors = []
+    for distance_px in range(1, 24, 2):
+        lit = ndimage.binary_dilation(patch.mask, iterations=distance_px)
+        errors.append(border_errors(patch, lit, scene.x_m))
+    amplitude, phase = np.array(errors).T
+    assert (np.diff(amplitude) < 0).all()
+    assert (np.diff(phase) < 0).all()
+    assert amplitude[0] > phase[0]
+    assert amplitude[-1] < phase[-1]

@@ -27,11 +27,11 @@ from polysight.materials.kinds import (
     turn_covariance,
 )
 from polysight.materials.measure import (
-    BORDER_STD,
     LEAST_STD,
     Scatter,
     background,
     background_mean,
+    border_errors,
     check_patches,
     measure_dispersions,
     measure_patch,
@@ -66,7 +66,6 @@ from polysight.materials.segment import (
     SegmentSettings,
     TruthPlate,
     align,
-    find_patches_at_border,
     match_truth,
     segment,
     whole_plane,
@@ -219,6 +218,8 @@ HALO_OF_METAL = 4.0
 HALO_OF_PATCH = 3.0
 """Error of the metal's V / H, and of V on a plate, over the halo of V around them: clipped scenes of an independent
 generator (by 10 to 50 %)."""
+UNEVEN_AT_END = 0.01
+"""Error of ln|V / H| by the end of the aperture above which a plate's slopes tell nothing of the whole scan."""
 ANGLE_BY_APART = 1.0
 """Error of the incidence angle, radians per metre between the images of H and V: boards 2 to 5 mm out of place turn it
 by 2 mrad and move the images 2 mm apart (rms; geometry of the published rig)."""
@@ -331,8 +332,8 @@ class SceneScatter:
         separately.
     metal_spread
         Relative spread of the pixels of metal that was scanned separately; None: it is in the scene.
-    at_border
-        Numbers of the judged patches that the end of the aperture lights.
+    border
+        Patch number to the errors of its ln|V / H| and of its phase by the end of the aperture.
     tilts
         Tilts of the plates.
     lit_evenly
@@ -341,8 +342,8 @@ class SceneScatter:
         Rise of the metal along x and across the plane of incidence, radians.
     halo
         Halo of V around the metal.
-    metal_uneven
-        How far the root mean squares of the metal's pixels are from their median, |ln(V / H)|.
+    metal_std
+        Error of each part of the metal's ln(V / H) by its uneven pixels and by the end of the aperture.
     behind
         Usual mean of H and of V over a place of a plate's size without a plate, relative to metal.
     """
@@ -352,12 +353,12 @@ class SceneScatter:
     metal: Scatter | None
     change: CommonChange | None
     metal_spread: float | None
-    at_border: frozenset[int]
+    border: Mapping[int, tuple[float, float]]
     tilts: Tilts
     lit_evenly: bool
     metal_rise: Rise
     halo: Halo = NO_HALO
-    metal_uneven: float = 0.0
+    metal_std: float = 0.0
     behind: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
@@ -385,25 +386,26 @@ class SceneScatter:
         spread = None if plane is None else plane.spread
         metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
         evenly = images.illumination is not None and images.illumination.known
-        at_border = find_patches_at_border(judged, None if plane is None else images.usable & plane.valid)
-        border_flags = [*(label in at_border for label in scatter), False]
+        lit = images.usable if plane is None else images.usable & plane.valid
+        border = {p.label: border_errors(p, lit, images.x_m) for p in segmentation.patches}
+        border_flags = [*(border[label][0] > UNEVEN_AT_END for label in scatter), False]
         change = None if metal is None else estimate_common_change(scatters, metal.centre_m, border_flags)
         halo = NO_HALO if metal is None else find_halo(reference.mask, segmentation.patches, images)
-        uneven = 0.0 if metal is None else metal_unevenness(raw, reference.mask)
-        behind = background_mean(raw.h, raw.v, segmentation, images.usable)
+        metal_at_end = np.hypot(*border.get(reference.label or 0, (0.0, 0.0))) / np.sqrt(2)
+        uneven = 0.0 if metal is None else UNEVEN_METAL * metal_unevenness(raw, reference.mask)
         return cls(
             scatter=scatter,
             usual=usual_scatter(scatters),
             metal=metal,
             change=change,
             metal_spread=spread,
-            at_border=at_border,
+            border=border,
             tilts=tilts,
             lit_evenly=evenly,
             metal_rise=metal_rise,
             halo=halo,
-            metal_uneven=uneven,
-            behind=behind,
+            metal_std=float(np.hypot(uneven, metal_at_end)),
+            behind=background_mean(raw.h, raw.v, segmentation, images.usable),
         )
 
     @property
@@ -433,17 +435,17 @@ class SceneScatter:
         amplitude, phase = relative_errors(self.metal, self.usual)
         std = float(np.hypot(np.hypot(amplitude, phase) / np.sqrt(2), LEAST_STD))
         around = HALO_OF_METAL * self.halo.level
-        return replace(
-            prior, reference_std=float(np.sqrt(std**2 + around**2 + (UNEVEN_METAL * self.metal_uneven) ** 2))
-        )
+        return replace(prior, reference_std=float(np.sqrt(std**2 + around**2 + self.metal_std**2)))
 
     def measure(
         self, patch: Patch, channels: tuple[Image, Image], theta_rad: float, dispersion: PatchDispersion | None
     ) -> PatchMeasurement:
         """Measure one patch relative to metal."""
-        local_std = self.metal_spread or 0.0
-        if patch.label in self.at_border:
-            local_std = float(np.hypot(local_std, BORDER_STD))
+        at_end = self.border.get(patch.label, (0.0, 0.0))
+        local_std = (
+            float(np.hypot(self.metal_spread or 0.0, at_end[0])),
+            float(np.hypot(self.metal_spread or 0.0, at_end[1])),
+        )
         scatter = self.scatter.get(patch.label)
         rise = self.tilts.in_plane(patch.label)
         change = None

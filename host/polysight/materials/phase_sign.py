@@ -83,4 +83,8 @@ def _join_estimates(patch: PatchEstimate, other: PatchEstimate, probability: flo
     shares = {source: min(share_of_others, 1.0) * share for source, share in patch.shares.items()}
     if shares:
         shares[PHASE_SIGN] = max(0.0, 1.0 - share_of_others)
-    return replace(joined_estimate, covariance=covariance, shares=shares)
+    half_widths_68 = None
+    if patch.half_widths_68 is not None:
+        wider = np.sqrt(np.diag(covariance) / np.diag(patch.covariance))
+        half_widths_68 = (patch.half_widths_68[0] * float(wider[0]), patch.half_widths_68[1] * float(wider[1]))
+    return replace(joined_estimate, covariance=covariance, half_widths_68=half_widths_68, shares=shares)

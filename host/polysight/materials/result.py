@@ -22,7 +22,7 @@ from msgspec import UNSET, structs
 
 from polysight.imaging import Image, Images, Rise
 from polysight.materials.common_change import CommonChange
-from polysight.materials.inversion import Inversion, RigPrior, ratio_error
+from polysight.materials.inversion import Inversion, RigPrior
 from polysight.materials.kinds import PatchDispersion, RatioEvidence, permittivity_slope
 from polysight.materials.labels import Labels
 from polysight.materials.library import Real, feature_matrix
@@ -269,6 +269,27 @@ class MaterialsResult:
         return figures
 
 
+def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
+    """Return the errors of 1 / P at t [...] by leakage and metal reference after the inversion, float64 [..., 2, 6].
+
+    The product with its transpose is the covariance, for several t also between them. To first order
+    d t = -(1 - t) (b + a t) - t rho.
+    """
+    t = np.asarray(t, np.complex128)
+    scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
+    # Pixels without a ratio have no error either.
+    with np.errstate(invalid="ignore"):
+        by_real_part = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
+    by_error = np.stack([by_real_part, 1j * by_real_part], axis=-1).reshape(*t.shape, 6)
+    values, vectors = np.linalg.eigh(estimate.nuisance_covariance)
+    return np.stack([by_error.real, by_error.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def ratio_error(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
+    """Return the standard deviation of 1 / P by leakage and reference, as `t`: root mean variance of both parts."""
+    return np.sqrt(np.sum(ratio_slopes(estimate, prior, t) ** 2, axis=(-2, -1)) / 2)
+
+
 def _add_name(figures: PatchFigures, name: PatchName) -> PatchFigures:
     """Add the name to a patch's figures."""
     return structs.replace(
@@ -301,6 +322,7 @@ def _describe_permittivity(e: Permittivity) -> PermittivityFigures | None:
         real_std=e.real_std,
         imag_std=e.loss_std,
         covariance=None if e.covariance is None else e.covariance.tolist(),
+        half_widths_68=e.half_widths_68,
         shares=dict(e.shares),
         dominated_by=e.dominated_by,
         do=SHRINKS.get(e.dominated_by or "", ""),

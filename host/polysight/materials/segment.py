@@ -277,25 +277,6 @@ def touches_border(mask: Mask) -> bool:
     return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
-def find_patches_at_border(patches: Sequence[Patch], lit: Mask | None) -> frozenset[int]:
-    """Return the numbers of the patches at the border of the illuminated area, where the illumination is uneven.
-
-    With metal in the scene (`lit` is None) these are the patches that reach the border of the image. If the metal was
-    scanned separately, `lit`, bool [ny, nx], are its illuminated pixels: these are the patches that the border of `lit`
-    cuts, except one that fills `lit` as the metal did.
-    """
-    if lit is None:
-        return frozenset(patch.label for patch in patches if touches_border(patch.mask))
-    return frozenset(patch.label for patch in patches if _reaches_end(patch.mask, lit))
-
-
-def _reaches_end(mask: Mask, lit: Mask) -> bool:
-    """Return true if a mask comes within two pixels of the end of what is lit, and does not fill it."""
-    is_inside = np.asarray(scipy.ndimage.binary_erosion(lit, iterations=2), bool)
-    fills = not (lit & ~mask).any()
-    return bool((mask & ~is_inside).any()) and not fills
-
-
 def _is_cut(mask: Mask, smallest_px: float) -> bool:
     """Return true if more than the smallest patch's width lies at the border of the image.
 

@@ -31,12 +31,11 @@ from msgspec import structs
 
 from polysight.imaging import Image, Images, Mask, SubBand
 from polysight.materials.analyse import Optics, level, smooth_inside
-from polysight.materials.inversion import ratio_slopes
 from polysight.materials.layers import METAL, THICKNESS_RANGE_M, Bands, Layer, LayerFit, Spectrum, fit_layer
 from polysight.materials.library import Library
 from polysight.materials.measure import LEAST_STD, NOT_PASSIVE, measure_scatter, median_ratio, relative_errors
 from polysight.materials.metal import MetalReference, to_metal
-from polysight.materials.result import MaterialsResult
+from polysight.materials.result import MaterialsResult, ratio_slopes
 from polysight.polarimetry import PlaneReference, inverse_spread, remove_leakage
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, ScanMaterials
 from polysight_shared.config import Chirp

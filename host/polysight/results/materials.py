@@ -233,7 +233,10 @@ class PermittivityFigures(msgspec.Struct, frozen=True, kw_only=True):
     real_p30_p70, imag_p30_p70
         30th to 70th percentile of the pixels.
     real_std, imag_std
-        Standard errors.
+        Standard errors: 1.96 of them hold 95 %.
+    half_widths_68
+        Half widths of the intervals about `real` and `imag` that hold 68 %: the tails of the errors are heavier than a
+        normal distribution's, so that they are smaller than the standard errors. None in products of old releases.
     covariance
         [2][2] of (`real`, `imag`). With the loss, the mixed term changes its sign.
     shares, dominated_by
@@ -248,6 +251,7 @@ class PermittivityFigures(msgspec.Struct, frozen=True, kw_only=True):
     imag_p30_p70: tuple[float, float] | None = None
     real_std: float | None = None
     imag_std: float | None = None
+    half_widths_68: tuple[float, float] | None = None
     covariance: list[list[float | None]] | None = None
     shares: dict[str, float] = {}
     dominated_by: str | None = None

@@ -58,8 +58,8 @@ RIPPLE_M = 0.015
 """Error of a plate's ln(V / H) over its own slopes: copies of other plates turn their phase against the plate by
 50 to 100 radians per metre. 15 mm fits the errors of plates of the independent generator best (20 and 30 are worse)."""
 PHASE_OF_CHANGE = 0.75
-"""Errors of a plate's phase by drift, fringes and its own slopes, over those that the slopes tell. The phase's slopes are
-larger than the amplitude's, its errors are not: the interval that holds 68 % is 0.73 of what the amplitude needs in
+"""Errors of a plate's phase by drift, fringes and its own slopes, over those that the slopes tell. The phase's slopes
+are larger than the amplitude's, its errors are not: the interval that holds 68 % is 0.73 of what the amplitude needs in
 scenes of the own simulator where these errors dominate, 0.83 in those of the independent generator."""
 USUAL_RIPPLE = 2.0
 """Weight of the scene's usual slopes against a plate's own three."""

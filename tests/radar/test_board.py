@@ -9,7 +9,7 @@ from tests.support.radar.boards import Restarts
 from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard, State
-from polysight.radar.commands import Frame, FrameApply, FrameControl, program
+from polysight.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameControl, program
 from polysight.radar.firmware import check_image
 from polysight.radar.messages import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
 from polysight_shared.error_codes import ErrorCode
@@ -71,6 +71,13 @@ def test_a_board_is_armed_only_after_the_radar_reported_it(radar, monkeypatch):
         radar.arm(FRAMES)
     assert radar.state is State.FAULT
     assert "0x100B" in radar.reason
+
+
+def test_a_board_that_missed_a_pulse_stays_armed(radar, board, clock):
+    radar.arm(FRAMES)
+    pulses(board, clock, FRAMES - 1)
+    clock.sleep(10.0)
+    assert radar.poll() is State.ARMED
 
 
 def test_remaining_frames_are_stopped_before_arming_again(radar, board, clock):
@@ -140,6 +147,31 @@ def test_other_events_are_no_faults(radar, board, number, data):
     assert radar.poll() is State.ARMED
 
 
+def test_an_early_pulse_is_fatal_and_the_next_arming_resets_the_board(radar, board, clock):
+    radar.arm(FRAMES)
+    pulses(board, clock, 2, 1e-4)
+    assert radar.poll() is State.FAULT
+    assert "not triggered" in radar.reason
+    radar.arm(FRAMES)
+    assert radar.state is State.ARMED
+    assert radar.reason == ""
+    assert board.executed.count(RF_POWER_UP.ID) == 2
+    pulses(board, clock, FRAMES)
+    assert radar.poll() is State.DONE
+
+
+def test_an_unplugged_board_is_a_fault_and_recovers_when_plugged_in(radar, board):
+    radar.arm(FRAMES)
+    board.plugged = False
+    assert radar.poll() is State.FAULT
+    assert "unplugged" in radar.reason
+    with refused(ErrorCode.NO_ANSWER, "unplugged"):
+        radar.arm(FRAMES)
+    board.plugged = True
+    radar.arm(FRAMES)
+    assert radar.state is State.ARMED
+
+
 def test_the_report_has_versions_temperatures_calibration_and_every_byte_sent(radar):
     radar.configure()
     radar.arm(FRAMES)
@@ -183,6 +215,17 @@ def test_the_main_core_s_fault_is_ignored_only_until_the_board_is_configured(rig
     assert any("main core fault" in line for line in radar.report()["events"])
     board.say(MAIN_CPU_FAULT, struct.pack("<BBH", 5, 0, 0) + bytes(32))
     assert radar.poll() is State.FAULT
+
+
+def test_a_board_that_restarts_by_itself_is_a_fault_and_recovers(radar, board, clock):
+    radar.arm(FRAMES)
+    board.power(False)
+    board.power(True)
+    clock.sleep(0.1)
+    assert radar.poll() is State.FAULT
+    assert "restarted" in radar.reason
+    radar.arm(FRAMES)
+    assert radar.state is State.ARMED
 
 
 IMAGE = check_image(make_image(), "image.bin")

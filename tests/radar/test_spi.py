@@ -156,6 +156,14 @@ def test_what_comes_while_the_program_is_held_is_read_though_the_time_is_over(wo
     assert link.warnings == []
 
 
+def test_an_unplugged_link_is_an_error_at_once(link, board):
+    board.plugged = False
+    with refused(ErrorCode.NO_ANSWER, "unplugged"):
+        link.call(LOW_POWER_OFF)
+    with refused(ErrorCode.NO_ANSWER, "unplugged"):
+        link.poll()
+
+
 def test_an_event_that_does_not_come_is_a_timeout_with_its_number(link):
     with refused(ErrorCode.NO_ANSWER, "0x100B", "2 s"):
         link.wait_for((0x100B,), 2.0, ignore)

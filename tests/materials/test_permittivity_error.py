@@ -77,6 +77,13 @@ def test_a_plate_that_fills_the_lit_pixels_is_lit_as_the_metal_was(synthetic):
     assert border_errors(patch, np.ones(patch.mask.shape, bool), scene.x_m) == (0.0, 0.0)
 
 
+def test_a_box_over_dark_pixels_has_the_largest_error(synthetic):
+    """Boxes drawn by hand may lie where nothing is lit."""
+    scene = synthetic(3)
+    patch = scene.analyse().segmentation.patches[0]
+    assert border_errors(patch, ~patch.mask, scene.x_m) == (0.2, 0.2)
+
+
 def test_the_error_at_the_end_of_the_aperture_falls_with_the_distance(synthetic):
     """Most in amplitude near the end; the phase's falls more slowly."""
     scene = synthetic(3)

@@ -375,7 +375,8 @@ def border_errors(patch: Patch, lit: Mask, x_m: Real) -> tuple[float, float]:
     if is_lit.all():
         return 0.0, 0.0
     to_end_px = np.asarray(scipy.ndimage.distance_transform_edt(is_lit))[1:-1, 1:-1]
-    middle_m = float(np.median(to_end_px[patch.interior])) * abs(float(x_m[1] - x_m[0]))
+    # Half a pixel: a box drawn by hand may lie over dark pixels, 0 from them.
+    middle_m = max(float(np.median(to_end_px[patch.interior])), 0.5) * abs(float(x_m[1] - x_m[0]))
     amplitude, phase = (
         min(std * (BORDER_M / middle_m) ** power, MOST_BORDER_STD)
         for std, power in zip(BORDER_STD, BORDER_POWERS, strict=True)

@@ -31,10 +31,10 @@ from polysight.materials import TruthPlate
 from polysight.products import ProcessedScan, read_products
 from polysight.report import write_report
 from polysight.report.figures import draw_materials, permittivity_map, phase_limits_deg
-from polysight.report.permittivity_plot import SHARES, fit_ellipse
+from polysight.report.permittivity_plot import SHARES, fit_ellipse, region_matrix
 from polysight.report.report import budget_table
 from polysight.report.style import shorten_labels
-from polysight.results import ErrorBudget
+from polysight.results import ErrorBudget, PermittivityFigures
 from polysight.results.verdict import LEVELS
 
 RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
@@ -139,6 +139,17 @@ def test_products_of_earlier_releases_have_no_verdict_and_no_budget(tmp_path):
     assert "Error budget" not in page
     assert "2.90 ± 0.20" in page
     assert budget_table(ErrorBudget()) is None
+
+
+def test_the_inner_region_has_the_half_widths_that_hold_68_percent():
+    covariance = [[0.04, 0.012], [0.012, 0.01]]
+    figures = PermittivityFigures(real=2.9, imag=-0.2, covariance=covariance, half_widths_68=(0.1, 0.08))
+    of_old_products = msgspec.structs.replace(figures, half_widths_68=None)
+    inner = region_matrix(figures, 0.68)
+    np.testing.assert_allclose(np.sqrt(np.diag(inner)), (0.1, 0.08))
+    np.testing.assert_allclose(inner[0, 1] / (0.1 * 0.08), -0.012 / (0.2 * 0.1))
+    np.testing.assert_array_equal(region_matrix(figures, 0.95), figures.spread.matrix)
+    np.testing.assert_array_equal(region_matrix(of_old_products, 0.68), figures.spread.matrix)
 
 
 @pytest.mark.parametrize("share", SHARES)

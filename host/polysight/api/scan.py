@@ -60,7 +60,8 @@ Box = tuple[float, float, float, float]
 _BOX = "a box is (x0, y0, x1, y1) in mm from the image's centre, x0 < x1 and y0 < y1"
 _PERMITTIVITY = (
     "permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error",
-    "permittivity_real_loss_covariance", "dominated_by", "refused",
+    "permittivity_real_loss_covariance", "permittivity_real_half_width_68", "permittivity_loss_half_width_68",
+    "dominated_by", "refused",
 )  # fmt: skip
 
 
@@ -316,9 +317,10 @@ class Scan:
         -------
         xarray.Dataset
             On dimension `patch`: `permittivity` complex128, `permittivity_real_standard_error`,
-            `permittivity_loss_standard_error`, `permittivity_real_loss_covariance`, `dominated_by` (what most of the
-            error comes from), `refused` (why a patch was not judged), `ratio` (P) complex128,
-            `inverse_ratio_standard_error` (of 1 / P), `patch_incidence_deg` and `patch_incidence_rad`, `name`,
+            `permittivity_loss_standard_error`, `permittivity_real_loss_covariance`, `permittivity_real_half_width_68`,
+            `permittivity_loss_half_width_68` (of intervals of 68 %), `dominated_by` (what most of the error comes
+            from), `refused` (why a patch was not judged), `ratio` (P) complex128, `inverse_ratio_standard_error` (of
+            1 / P), `patch_incidence_deg` and `patch_incidence_rad`, `name`,
             `pixels`; `true_permittivity` for a simulated scene.
 
         Raises

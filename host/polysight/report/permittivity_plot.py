@@ -63,6 +63,20 @@ def fit_ellipse(matrix: Array, share: float) -> tuple[float, float, float]:
     return float(width), float(height), math.degrees(math.atan2(vectors[1, 0], vectors[0, 0]))
 
 
+def region_matrix(e: PermittivityFigures, share: float) -> Array | None:
+    """Return the covariance [2, 2] of (eps', eps'') whose ellipse holds a share; None if no error is known.
+
+    The standard errors say where 95 % lie. 68 % lie within less, as `half_widths_68` tells.
+    """
+    if e.spread is None:
+        return None
+    matrix = e.spread.matrix
+    if share == min(SHARES) and e.half_widths_68 is not None:
+        shrinkage = np.array(e.half_widths_68) / np.sqrt(np.diag(matrix))
+        matrix = matrix * np.outer(shrinkage, shrinkage)
+    return matrix
+
+
 def place_numbers(points: Array, obstacles: Array) -> Array:
     """Place a label beside each point so that labels cover neither one another nor a point.
 
@@ -147,9 +161,11 @@ def _find_truth(patch: PatchFigures) -> Point | None:
 def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour: str) -> None:
     """Draw a permittivity with its confidence regions; in old products, with the percentiles of its pixels."""
     centre = (e.real, e.loss)
-    if e.spread is not None:
-        for share, style in _STYLES.items():
-            width, height, angle = fit_ellipse(e.spread.matrix, share)
+    regions = {share: matrix for share in _STYLES if (matrix := region_matrix(e, share)) is not None}
+    if regions:
+        for share, matrix in regions.items():
+            style = _STYLES[share]
+            width, height, angle = fit_ellipse(matrix, share)
             outline = Ellipse(
                 centre, width, height, angle=angle, facecolor="none", edgecolor=colour, zorder=2.5, **style
             )

@@ -236,7 +236,8 @@ class PermittivityFigures(msgspec.Struct, frozen=True, kw_only=True):
         Standard errors: 1.96 of them hold 95 %.
     half_widths_68
         Half widths of the intervals about `real` and `imag` that hold 68 %: the tails of the errors are heavier than a
-        normal distribution's, so that they are smaller than the standard errors. None in products of old releases.
+        normal distribution's, so that they are mostly smaller than the standard errors. None in products of old
+        releases.
     covariance
         [2][2] of (`real`, `imag`). With the loss, the mixed term changes its sign.
     shares, dominated_by
@@ -334,6 +335,13 @@ class TruthFigures(msgspec.Struct, frozen=True, kw_only=True):
     in_library: bool = True
 
 
+def _half_width_68(patch: "PatchFigures", part: int) -> float | None:
+    """Return the half width of the real part (0) or of the loss (1); None if it is not known."""
+    if patch.permittivity is None or patch.permittivity.half_widths_68 is None:
+        return None
+    return patch.permittivity.half_widths_68[part]
+
+
 class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     """One patch: an entry of `segments` in materials.json. P = H / V; lengths in mm from the image centre.
 
@@ -422,6 +430,14 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     permittivity_covariance = derive_if_known(
         float, "permittivity.spread.covariance",
         Column("permittivity_real_loss_covariance", "covariance of the permittivity's real part and loss"),
+    )  # fmt: skip
+    permittivity_real_half_width_68 = derive_if_known(
+        float, lambda patch: _half_width_68(patch, 0),
+        Column("permittivity_real_half_width_68", "half width of the interval of 68 %, real part"),
+    )  # fmt: skip
+    permittivity_loss_half_width_68 = derive_if_known(
+        float, lambda patch: _half_width_68(patch, 1),
+        Column("permittivity_loss_half_width_68", "half width of the interval of 68 %, loss"),
     )  # fmt: skip
     dominated_by = derive_if_known(
         str, "permittivity.dominated_by",

@@ -18,7 +18,8 @@ PATCH = {
     "box_mm": [10.0, -20.0, 50.0, 40.0], "outline_mm": [], "pixels": 99, "interior_pixels": 77, "incidence_deg": 54.5,
     "ratio": {"real": 0.0, "imag": 10.0}, "inverse_ratio_std": 0.004,
     "permittivity": {"real": 1 / 3 + 3.5, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125,
-                     "covariance": [[0.0625**2, -0.002], [-0.002, 0.125**2]], "half_widths_68": [0.05, 0.09375], "dominated_by": "leakage"},
+                     "covariance": [[0.0625**2, -0.002], [-0.002, 0.125**2]], "half_widths_68": [0.05, 0.09375],
+                     "dominated_by": "leakage"},
     "truth": {"name": "vinyl", "permittivity": {"real": 3.75, "imag": -0.5}},
 }  # fmt: skip
 METAL = {

@@ -131,12 +131,15 @@ def background_mean(h: Image, v: Image, segmentation: Segmentation, usable: Mask
 
 
 def _select_background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> Mask:
-    """Return the usable pixels with some distance to every patch, and to bright regions that are none."""
-    in_region = segmentation.labels > 0
-    for mask in segmentation.left_out:
-        in_region |= mask
-    near_region = np.asarray(scipy.ndimage.binary_dilation(in_region, iterations=_AROUND_PX), bool)
-    return usable & np.isfinite(h) & np.isfinite(v) & ~near_region
+    """Return the usable pixels with some distance to every patch.
+
+    Bright regions that are none belong to it: they may be of the table behind.
+    """
+    in_patch = np.zeros(usable.shape, bool)
+    for patch in segmentation.patches:
+        in_patch |= patch.mask
+    near_patch = np.asarray(scipy.ndimage.binary_dilation(in_patch, iterations=_AROUND_PX), bool)
+    return usable & np.isfinite(h) & np.isfinite(v) & ~near_patch
 
 
 def _average_window(values: Image, width_px: int) -> Image:

@@ -101,7 +101,7 @@ class Optics:
         Width (standard deviation, pixels) of the filter against speckle before permittivity and classification,
         inside each patch.
     other_sign
-        Probability a priori that all phases of the images have the other sign: 0 of own scans.
+        Probability a priori that all phases of the images have the other sign: 0 for scans of this program.
     """
 
     theta_rad: npt.ArrayLike
@@ -113,9 +113,10 @@ class Optics:
     def from_rig(
         cls, rig: Instrument, angles: IncidenceChoice, theta_std_rad: float = 1e-3, channels_known: bool = False
     ) -> Optics:
-        """Return the optics of a rig under the chosen incidence angles.
+        """Return the optics of a rig under the chosen incidence angles, with this standard deviation of the angle.
 
         Leakage without a `leakage_std` in the rig file was not measured: it is not subtracted, its mean is zero.
+        `channels_known`: the images' amplitudes are relative to the direct path.
         """
         p = rig.polarimetry
         leakage = (0j, 0j)
@@ -212,12 +213,12 @@ STEEP = Finding(
 )
 """Why a steep patch gets no permittivity."""
 UNEVEN_METAL = 0.5
-"""Error of each part of the metal's ln(V / H) over the distance of its root mean squares from its median: where metal
-lies at the end of the scan neither is right (scenes of `benchmarks coverage` with small apertures)."""
+"""Error of each part of the metal's ln(V / H), relative to the distance of its root mean squares from its median: where
+metal lies at the end of the scan neither is right (scenes of `benchmarks coverage` with small apertures)."""
 HALO_OF_METAL = 4.0
 HALO_OF_PATCH = 3.0
-"""Error of the metal's V / H, and of V on a plate, over the halo of V around them: clipped scenes of an independent
-generator (by 10 to 50 %)."""
+"""Error of the metal's V / H, and of V on a plate, relative to the halo of V around them: in clipped scenes of an
+independent generator (by 10 to 50 %)."""
 UNEVEN_AT_END = 0.01
 """Error of ln|V / H| by the end of the aperture above which a plate's slopes tell nothing of the whole scan."""
 ANGLE_BY_APART = 1.0
@@ -226,7 +227,7 @@ by 2 mrad and move the images 2 mm apart (rms; geometry of the published rig).""
 FILLED = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material."""
 POSSIBLE_SIGN = 0.05
-"""Probability of the other sign of the phases from which on a metal that nobody declared has to be one with it, too."""
+"""If the other sign of the phases is likelier than this, a metal that nobody declared has to pass with it, too."""
 
 
 def analyse(
@@ -234,7 +235,7 @@ def analyse(
 ) -> MaterialsResult:
     """Find the patches of the images, estimate their permittivities, and name them if there is a classifier.
 
-    A scene without patches, metal or a valid pixel is no error; see `metal` and `refused` of the result.
+    A scene without patches, metal or a valid pixel is no error; see `metal` and each patch's `refused` in the result.
     Raises DataError if the given metal box or patch number does not exist.
     """
     known_scene = given_scene or KnownScene()
@@ -252,10 +253,10 @@ def analyse(
         kinds=kinds,
     )  # fmt: skip
     relative = most_like_metal([scene.relative_to(metal) for metal in _references(images, known_scene, segmentation)])
-    reference, raw, judged, solution = relative.metal, relative.raw, relative.judged, relative.solution
+    judged = relative.judged
     labels = [p.label for p in judged]
-    inversion = solution.inversion
-    calibrated = remove_leakage(raw, inversion.known_leakage(relative.prior))
+    inversion = relative.solution.inversion
+    calibrated = remove_leakage(relative.raw, inversion.known_leakage(relative.prior))
     sh = smooth_inside(calibrated.h, segmentation, optics.smooth_px)
     sv = smooth_inside(calibrated.v, segmentation, optics.smooth_px)
     sp = ratio(sh, sv)
@@ -271,14 +272,15 @@ def analyse(
     labelled = [(p, p.label) for p in segmentation.patches]
     results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in labelled)
     return MaterialsResult(
-        calibrated=calibrated, h=sh, v=sv, p=sp, metal=reference, segmentation=segmentation, patches=results,
+        calibrated=calibrated, h=sh, v=sv, p=sp, metal=relative.metal, segmentation=segmentation, patches=results,
         theta_rad=theta, inversion=inversion, prior=relative.prior, tilts=tilts,
         boxes=dict(known_scene.names), library=() if classifier is None else classifier.names,
         brightness_off={label: ln for label, ln in brightness_off.items() if np.isfinite(ln)},
         evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
         apart_mm=apart_mm, drift=relative.scatter.change, halo=relative.scatter.halo.level,
         behind=relative.scatter.usual_background(relative.measured), ripple=relative.scatter.usual,
-        disturbed=relative.scatter.disturbed, relief_rad=relative.scatter.relief_rad, other_sign=solution.other_sign,
+        disturbed=relative.scatter.disturbed, relief_rad=relative.scatter.relief_rad,
+        other_sign=relative.solution.other_sign,
     )  # fmt: skip
 
 
@@ -394,25 +396,18 @@ class SceneScatter:
         metal_at_end = np.hypot(*border.get(reference.label or 0, (0.0, 0.0))) / np.sqrt(2)
         uneven = 0.0 if metal is None else UNEVEN_METAL * metal_unevenness(raw, reference.mask)
         return cls(
-            scatter=scatter,
-            usual=usual_scatter(scatters),
-            metal=metal,
-            change=change,
-            metal_spread=spread,
-            border=border,
-            tilts=tilts,
-            lit_evenly=evenly,
-            metal_rise=metal_rise,
-            halo=halo,
+            scatter=scatter, usual=usual_scatter(scatters), metal=metal, change=change, metal_spread=spread,
+            border=border, tilts=tilts, lit_evenly=evenly, metal_rise=metal_rise, halo=halo,
             metal_std=float(np.hypot(uneven, metal_at_end)),
             behind=background_mean(raw.h, raw.v, segmentation, images.usable),
-        )
+        )  # fmt: skip
 
     @property
     def disturbed(self) -> dict[int, float]:
         """Patch number to the error of each part of its ln(V / H) by slopes that it has of its own."""
         if self.change is None:
             return {}
+        # The metal's own slopes, last in `ripple`, are left out.
         return dict(zip(self.scatter, self.change.ripple.tolist(), strict=False))
 
     @property
@@ -423,7 +418,7 @@ class SceneScatter:
         return 0.0
 
     def prior(self, prior: RigPrior, apart_mm: float) -> RigPrior:
-        """Return the prior of the rig's errors with what the plates show: the metal's error and tilt.
+        """Return the prior of the rig's errors with what the scene shows of metal, illumination and incidence angle.
 
         `apart_mm` is the distance of the images of H and V before they were laid on each other.
         """
@@ -440,7 +435,10 @@ class SceneScatter:
     def measure(
         self, patch: Patch, channels: tuple[Image, Image], theta_rad: float, dispersion: PatchDispersion | None
     ) -> PatchMeasurement:
-        """Measure one patch relative to metal."""
+        """Measure one patch relative to metal, with its errors by halo and background.
+
+        `channels` are H and V relative to metal, smoothed inside patches; `theta_rad` is the patch's incidence angle.
+        """
         at_end = self.border.get(patch.label, (0.0, 0.0))
         local_std = (
             float(np.hypot(self.metal_spread or 0.0, at_end[0])),
@@ -483,14 +481,14 @@ class RelativeScene:
 
     Attributes
     ----------
-    raw
-        Images relative to it.
-    refused
-        Patch number to why the patch is no flat plate; the others but for the reference are `judged`.
+    metal, raw
+        The reference, and the images relative to it; leakage is not removed.
+    refused, judged
+        Patch number to why the patch is no flat plate, and all other patches but the reference.
     scatter, prior
         What the plates show of the scene's errors, and the prior of the rig's errors with it.
-    measured
-        The judged patches as the joint inversion takes them.
+    measured, solution
+        The judged patches as the joint inversion takes them, in the same order, and its solution.
     """
 
     metal: MetalReference
@@ -548,9 +546,10 @@ class _Scene:
 
 
 def most_like_metal(relatives: Sequence[RelativeScene]) -> RelativeScene:
-    """Return the scene relative to the reference that the other patches show best to be bare metal: the first in doubt.
+    """Return the scene relative to the reference that the other patches show best to be bare metal.
 
-    What contradicts itself by its own V / H, or is no flat plate, is none.
+    A reference that its own V / H contradicts, or that is no flat plate, is taken only if none is better; of equals the
+    first is taken.
     """
 
     def bare(relative: RelativeScene) -> float:
@@ -657,7 +656,7 @@ def _select_patches(images: Images, known_scene: KnownScene) -> Segmentation:
 
 
 def _references(images: Images, known_scene: KnownScene, segmentation: Segmentation) -> tuple[MetalReference, ...]:
-    """Return the given metal reference, or else the brightest patch and others like it; none without patches."""
+    """Return the given metal reference, or else the brightest patch and others like it; without any `no_metal`."""
     if isinstance(known_scene.metal, PlaneReference):
         return (MetalReference(known_scene.metal.valid, None, known_scene.metal.how, given=True),)
     if isinstance(known_scene.metal, int):

@@ -64,14 +64,14 @@ class CatalogueMaterial(msgspec.Struct, frozen=True):
 
 
 class _Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Generic names and default spread of a kind."""
+    """Generic names of a kind, and its default standard deviations of ln eps' and ln eps'' between specimens."""
 
     generic: tuple[str, ...]
     spread: tuple[float, float]
 
 
 class _Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A line of the file."""
+    """A line of the file: eps' and eps'' (positive), frequency in GHz, aliases (`also`); None: the kind's spread."""
 
     name: str
     kind: str
@@ -85,7 +85,7 @@ class _Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file."""
+    """The three tables of the file; see the module's docstring."""
 
     sources: dict[str, str]
     kinds: dict[str, _Kind]
@@ -160,7 +160,7 @@ def same_material(name: str, other: str) -> bool:
 
 @cache
 def _collect_all_names(name: str) -> frozenset[str]:
-    """Return a normalised name with its aliases and generic names, normalised."""
+    """Return a normalised name with its aliases and generic names; alone if the catalogue does not have it."""
     material = _index_names().get(name)
     if material is None:
         return frozenset((name,))

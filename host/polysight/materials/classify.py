@@ -54,7 +54,9 @@ from polysight_shared.errors import DataError
 GRID = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Values of lambda_H and lambda_V to try, relative to lambda_P = 1, with each channel scaled by its spread."""
 MARGIN = 2.0
-"""Largest distance of a known pixel, relative to the distances between the library's own patches."""
+"""Distance beyond which a pixel is unknown, over the 99th percentile of the material's own pixels between scans.
+
+Chosen: a smaller margin calls more pixels of new placements unknown, a larger one accepts more foreign materials."""
 FIT_PIXELS = 3
 """Pixels of each patch to fit weights: pixels of a patch are similar, and the cost grows with the square."""
 
@@ -75,7 +77,7 @@ class Weights:
 
     @staticmethod
     def from_dict(raw: dict[str, Any]) -> Weights:
-        """Rebuild the model from the result of :meth:`to_dict`. Raises DataError."""
+        """Rebuild the weights from the result of :meth:`to_dict`. Raises DataError if they are not valid."""
         try:
             w = Weights(float(raw["h"]), float(raw["v"]), float(raw["p"]), raw["measure"], int(raw["neighbours"]))
         except (KeyError, TypeError, ValueError) as e:
@@ -99,8 +101,8 @@ def combine(channels: Distances, w: Weights) -> Real:
 class PaperKnn(Model):
     """The paper's classifier.
 
-    Weights are fitted unless they are given; a single one of `CHANNELS` has no weight to fit. `thresholds` are the
-    largest distances of known pixels by material; without an entry there is no limit.
+    Weights are fitted unless they are given; with "H" or "V" alone there is none to fit, with "P" the measure only.
+    `thresholds` are the largest distances of known pixels by material; without an entry there is no limit.
     """
 
     def __init__(
@@ -203,18 +205,20 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     few = _draw_few_pixels(samples)
     neighbours = Weights.neighbours
     same_scan = few.groups[:, None] == few.groups[None, :]
-    # Every pixel must find so many in other scans.
+    # Every pixel must find as many neighbours in other scans.
     judge = _LeftOut.prepare(few, same_scan, min(neighbours, int((~same_scan).sum(axis=1).min())))
     grid = [(0.0, 0.0)] if channels == "P" else [(0.0, 0.0), *product(GRID, GRID)]
     tried: list[tuple[float, float, Weights]] = []
     alone: dict[str, float] = {}
     for measure in MEASURES:
         distances = channel_distances(few.x, few.x, measure)
+        # Each channel is scaled by its usual distance, so that the grid's weights compare channels.
         scale = [1 / max(float(np.median(c)), 1e-12) for c in distances]
         for wh, wv in grid:
             w = Weights(wh * scale[0], wv * scale[1], scale[2], measure)
             accuracy = judge.accuracy(combine(distances, w))
-            tried.append((accuracy, -abs(np.log(max(wh, 0.1))) - abs(np.log(max(wv, 0.1))), w))
+            evenness = -abs(np.log(max(wh, 0.1))) - abs(np.log(max(wv, 0.1)))
+            tried.append((accuracy, evenness, w))
             if wh == wv == 0:
                 alone[measure] = accuracy
     top = max(accuracy for accuracy, _, _ in tried)
@@ -285,6 +289,7 @@ def _compute_thresholds(distance: Real, neighbours: int, few: Samples) -> dict[s
 
 PAPER = "weighted KNN (paper)"
 DISCRIMINANT = "discriminant of error sources"
+"""Names of the models in library files."""
 SHORT = {"knn": PAPER, "discriminant": DISCRIMINANT}
 """Names of models in commands."""
 EARLIER = (
@@ -301,6 +306,7 @@ MODELS: dict[str, Callable[[str], Model]] = {
     PAPER: PaperKnn,
     DISCRIMINANT: ErrorDiscriminant,
 }
+"""Name to the model's class, which is called with the channels to use, one of `CHANNELS`."""
 
 
 class Classifier:
@@ -317,6 +323,21 @@ class Classifier:
     angles_deg
         Incidence angle of the scan, or of several scans of the same patches in their order; required if the library
         has more than one.
+
+    Attributes
+    ----------
+    library, fit
+        The library, and its fit at the angles in use.
+    angles_deg
+        The library's angles that are used.
+    model
+        Key of `MODELS`.
+    distributions
+        The materials' distributions.
+    names, permittivities
+        The library's materials, and those of their permittivities that are known, as half spaces; metals have none.
+    kinds
+        The materials that a patch may be of, of library and literature, at each angle.
 
     Raises DataError if the library is empty, has no patch at an angle, or its fit cannot be read.
     """
@@ -364,10 +385,8 @@ class Classifier:
         self._model.fit(samples)
         self.distributions = self._model.distributions
         self.names = library.names
-        # Permittivities of the library's patches as half spaces; metals have none.
         self.permittivities: dict[str, complex] = self.distributions.permittivities
         kinds = (*self._make_library_kinds(), *literature(library.names))
-        # The materials that a patch may be of, at each angle.
         self.kinds = tuple(Kinds(kinds, float(np.radians(angle)), sheets=True) for angle in self.angles_deg)
 
     def _make_library_kinds(self) -> tuple[Kind, ...]:
@@ -390,7 +409,8 @@ class Classifier:
         """Name the patches of one scan, or of several scans of the same patches under different angles.
 
         `patches` are the features of each patch's pixels, [n, 4 * angles] (:func:`feature_matrix`); pixels that are not
-        finite are unknown. `evidence` is what each scan says of each patch; None where only the pixels are known.
+        finite are unknown. `evidence` is what each scan says of each patch; None where only the pixels are known. The
+        paper's KNN uses the pixels alone.
         """
         if self.model == PAPER:
             return [self._name_by_votes(x) for x in patches]
@@ -399,7 +419,7 @@ class Classifier:
             ratios = split_by_angle(x)[2]
             if of_patch is None:
                 of_patch = [
-                    derive_evidence_from_pixels(t, pixels) for t, pixels in zip(ratios.T, self.kinds, strict=True)
+                    derive_evidence_from_pixels(t, kinds) for t, kinds in zip(ratios.T, self.kinds, strict=True)
                 ]
             named.append(name_patch(self.kinds, of_patch, ratios))
         return named
@@ -428,6 +448,7 @@ class Classifier:
 
 
 def _check_model_name(given: str) -> str:
+    """Return the key of `MODELS` for a name, a short or an earlier one. Raises DataError if there is none."""
     name = DISCRIMINANT if given in EARLIER else SHORT.get(given, given)
     if name not in MODELS:
         raise DataError(

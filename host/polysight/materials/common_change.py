@@ -1,7 +1,7 @@
 """How the gain of V over H changes over a scan, from the slopes of ln(V / H) over the plates.
 
-The stage moves the whole rig, so that ln(V / H) of a plate is constant over it, but for four causes, which differ in
-what their slopes have in common:
+The stage moves the whole rig, so that ln(V / H) is constant over a plate, except for four causes. The slopes of
+ln(V / H) that they make differ:
 
 - a drift of the gains is a function of y, because rows are scanned one after the other;
 - a second path beside the direct path makes fringes over the stage's plane, of any direction, as large in amplitude as
@@ -33,6 +33,7 @@ STABLE = 0.8
 DRIFTS: dict[bool, tuple[float, ...]] = {True: (0.002,), False: (0.02, 0.06)}
 """Standard deviations of the drift of ln(V / H) over a scan, each part, equally probable: of a stable rig, and of one
 that drifts, as usual or by 15 % and 9 degrees."""
+# Tried with equal probabilities.
 DRIFT_LENGTHS_M = (0.07, 0.15)
 """Lengths over which a drift changes, along the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
 FRINGES = {0.0: 0.95, 0.05: 0.025, 0.15: 0.025}
@@ -110,8 +111,8 @@ def estimate_common_change(
 ) -> CommonChange:
     """Estimate the change of ln(V / H) over the scan from the slopes of all plates of a scene.
 
-    It is zero at `origin_m`, (x, y) of the metal reference. Plates `at_border` of the image (one value for each plate;
-    none if empty) are left out.
+    It is zero at `origin_m`, (x, y) of the metal reference. The slopes of plates `at_border` of the image (one value
+    for each plate; none if empty) tell nothing; these plates have an estimate as all others.
     """
     border = np.array(at_border, bool) if at_border else np.zeros(len(plates), bool)
     places_m = np.array([plate.centre_m for plate in plates], np.float64).reshape(-1, 2)
@@ -154,14 +155,15 @@ def _estimate_own_slopes(remaining: Sequence[Real], noises: Sequence[Real], bord
     usual = float(
         np.mean([_estimate_excess_variance(s[~border], e[~border]) for s, e in zip(slopes, errors, strict=True)])
     )
+    # Plates at the border, whose slopes tell nothing, get the usual size.
     own = np.where(border, len(slopes) * usual, np.maximum(np.sum(slopes**2 - errors**2, axis=0), 0.0))
     return np.sqrt((USUAL_RIPPLE * usual + own) / (USUAL_RIPPLE + len(slopes)))
 
 
 def _estimate_excess_variance(slopes: Real, errors: Real) -> float:
-    """Return the variance of slopes [plate] beyond their errors; robust: one plate that hardly reflects V is no ripple.
+    """Return the variance of slopes [plate] about zero beyond their errors; 0 with fewer than three plates.
 
-    The mean is known already, so that the median deviation is about zero.
+    It is robust: one plate that hardly reflects V, whose slopes are large, is no ripple.
     """
     if slopes.size < 3:
         return 0.0
@@ -254,7 +256,10 @@ class _Fields:
     def _explain(
         self, slopes: Real, noise: Real, fringe: float, fringe_m: float, common: float, stable: bool
     ) -> _Explained:
-        """Return the same for one of `shared`, averaged over drifts and the plates' own slopes by their evidence."""
+        """Return the same for one of `shared`, averaged over drifts and the plates' own slopes by their evidence.
+
+        `fringe` and `fringe_m` are size and length of the fringes, `common` that of the slopes that all plates have.
+        """
         count = slopes.shape[1]
         seen = slopes.ravel()
         fringes = self.fringes[fringe_m]
@@ -309,7 +314,7 @@ class _Explained:
     Attributes
     ----------
     log_evidence
-        [case].
+        [case]: logarithm of the probability density of the slopes, but for a constant factor.
     mean, square
         [case, plate]: mean and mean square of drift and fringes at each plate.
     drift, drift_square

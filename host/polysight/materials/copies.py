@@ -19,7 +19,7 @@ WEAK_DB = -12.0
 WEAKEST_DB = -30.0
 """Levels of copies relative to the brightest plate: shares of a quarter to a thirtieth."""
 LEAST_OVERLAP = 0.6
-"""Share of a copy that a shifted plate covers, and of the shifted plates that copies cover."""
+"""Least share of a copy that a shifted plate covers, and of the shifted plates that copies cover."""
 SAME_DB = 3.0
 """Largest deviation of a copy's level from the others', relative to its plate."""
 VISIBLE = 0.06
@@ -40,7 +40,8 @@ class Copies:
 def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -> Copies | None:
     """Find weak patches that repeat the brighter ones, all with one shift and one level; None without two of them.
 
-    `h`, `v` complex [ny, nx] are the images that the patches were found in.
+    `h`, `v` complex [ny, nx] are the images that the patches were found in, `pixel_mm` the size of their pixels. Copies
+    in either channel count; of both channels the one with more of them is returned.
     """
     amplitudes = [np.abs(h), np.abs(v)]
     copies_of_channels = []
@@ -54,7 +55,7 @@ def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -
 
 
 def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pixel_mm: float) -> bool:
-    """Return true if the other channel shows the copies of one channel, and not as copies: weak plates of a grid.
+    """Return true if the other channel shows the copies of one channel, but not as copies: they are weak plates.
 
     `other` float [ny, nx] is the amplitude of the other channel, which a second path copies to another place, or by
     the same shift and level.
@@ -70,7 +71,7 @@ def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pix
 
 
 def _find_copies_in_channel(patches: Sequence[Patch], amplitude: np.ndarray, pixel_mm: float) -> Copies | None:
-    """Find the copies of one channel, of `amplitude` float [ny, nx]."""
+    """Find the copies of one channel, of `amplitude` float [ny, nx], at the shift with most of them."""
     if len(patches) < 4:
         return None
     level_db = [20 * np.log10(max(float(np.median(amplitude[p.mask])), 1e-30)) for p in patches]
@@ -100,7 +101,11 @@ def _find_copies_at_shift(
     shift_px: tuple[int, int],
     pixel_mm: float,
 ) -> Copies | None:
-    """Return the copies with this shift (rows, columns), None if fewer than two fit."""
+    """Return the copies with this shift (rows, columns), None if fewer than two fit.
+
+    `weak` are the patches that may be copies, `plates` the pixels of the bright ones, `hidden` those in which a copy
+    cannot be told from a plate's edge, bool [ny, nx].
+    """
     expected = np.asarray(scipy.ndimage.shift(plates.astype(np.uint8), shift_px, order=0), bool) & ~hidden
     observed = np.logical_or.reduce([p.mask for p in weak])
     if not expected.any() or float((expected & observed).sum()) < LEAST_OVERLAP * float(expected.sum()):

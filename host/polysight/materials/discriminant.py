@@ -39,22 +39,25 @@ from polysight.materials.specimens import (
 )
 
 REJECTED = 0.02
-"""Share of the known materials' pixels, and of their patches, that are called unknown."""
+"""Share of the known materials' pixels, and of their patches, that are called unknown. Chosen: a smaller share accepts
+more foreign materials."""
+# Largest numbers of iterations of the common error and of the two-way fit.
 COMMON_ERROR_ROUNDS = 30
 TWO_WAY_ROUNDS = 30
-# Least distance of unknown patches.
+# Least distance of unknown patches: just above 1, the threshold.
 BEYOND = 1.001
 LN_2PI = float(np.log(2 * np.pi))
 
 
-def costs(d: Real, covariances: Real) -> tuple[Real, Real]:
-    """Return squared distances and minus twice the log likelihoods of deviations [n, materials, d], [n, materials].
+def costs(deviations: Real, covariances: Real) -> tuple[Real, Real]:
+    """Return squared distances and minus twice the log likelihoods, [n, materials] each.
 
-    `covariances` are [materials, d, d], or [n, materials, d, d].
+    `deviations` from each material are [n, materials, d], their `covariances` [materials, d, d] or
+    [n, materials, d, d].
     """
     inverse = np.linalg.inv(covariances)
-    distance2 = np.sum(d * (inverse @ d[..., None])[..., 0], axis=-1)
-    return distance2, distance2 - np.linalg.slogdet(inverse)[1] + d.shape[2] * LN_2PI
+    distance2 = np.sum(deviations * (inverse @ deviations[..., None])[..., 0], axis=-1)
+    return distance2, distance2 - np.linalg.slogdet(inverse)[1] + deviations.shape[2] * LN_2PI
 
 
 def shares_of_materials(cost: Real) -> Real:
@@ -92,7 +95,29 @@ def estimate_common_error(mean: Real, own_errors: Real, prior: Real, level: floa
 
 
 class ErrorDiscriminant(Model):
-    """The discriminant of error sources, see the module's docstring; `channels` is one of `CHANNELS`."""
+    """The discriminant of error sources, see the module's docstring; `channels` is one of `CHANNELS`.
+
+    `fit` sets the following; d is the number of features, and the formula's F_m, g, u and e are the module's.
+
+    Attributes
+    ----------
+    names
+        Materials, sorted, str [materials].
+    angles_rad
+        Incidence angles; empty if not known.
+    level
+        float64 [materials, d]: mean of each material, relative to the expansion point of its features.
+    within, between, scan
+        float64 [d, d]: covariances of e, of u by placement, and of g.
+    spread
+        float64 [materials, 2]: variances of ln eps' and of ln eps'' between specimens.
+    pixels
+        Usual number of pixels of a patch.
+    placements, plates
+        float64 [materials]: number of patches and of specimens of each material in the library.
+    patch_level, pixel_level
+        Squared distances beyond which a patch and a pixel are unknown.
+    """
 
     knows_scans = True
 
@@ -107,6 +132,7 @@ class ErrorDiscriminant(Model):
         d = self._compute_deviations(samples.x)[np.arange(material_index.size), material_index]
         width = d.shape[1]
         _, patch, count = np.unique(samples.patches, return_inverse=True, return_counts=True)
+        # First pixel of each patch: the pixels are written backwards, so that the first one stays.
         first = np.zeros(count.size, np.intp)
         first[patch[::-1]] = np.arange(material_index.size)[::-1]
         material = material_index[first]
@@ -133,9 +159,10 @@ class ErrorDiscriminant(Model):
         self._fit_patches(
             residual[informative] * np.sqrt(informative.sum() / dof), material[informative], plate[informative], dof
         )
-        pixels_per_scan = max(informative.sum() / scans, 1.0)
+        patches_per_scan = max(informative.sum() / scans, 1.0)
         common = self._decorrelate_angles(_compute_covariance(offset[np.unique(scan[informative])], max(scans - 1, 1)))
-        self.scan = _clip_eigenvalues(common - self.between / pixels_per_scan) + 1e-8 * np.eye(width)
+        # A scan's offset is a mean over its patches, whose own errors are in it.
+        self.scan = _clip_eigenvalues(common - self.between / patches_per_scan) + 1e-8 * np.eye(width)
         self._set_thresholds(
             (mean - self.level[material])[informative],
             material[informative],
@@ -218,7 +245,10 @@ class ErrorDiscriminant(Model):
         )
 
     def _fit_patches(self, residual: Real, material: npt.NDArray, plate: npt.NDArray, dof: int) -> None:
-        """Estimate the covariance of placements, and of each material's specimens, from patches' residuals."""
+        """Set `spread` and `between` from the residuals of patches [patches, d] with this number of degrees of freedom.
+
+        With few degrees of freedom correlations between features are shrunk.
+        """
         width = residual.shape[1]
         total = self._decorrelate_angles(_compute_covariance(residual, len(residual)))
         shrink = width / (width + dof)
@@ -230,16 +260,20 @@ class ErrorDiscriminant(Model):
         self.between = _clip_eigenvalues(placement - self.within / self.pixels) + 1e-8 * np.eye(width)
 
     def _compute_specimen_effects(self) -> Real:
-        """Return the effect of specimens' deviations on the features of each material, [materials, features, 2]."""
+        """Return the effect F_m of specimens' deviations on the features of each material, [materials, features, 2]."""
         anchor_effects = np.stack([effect(t, self.angles_rad) for t in self._anchor_t])
         effect_matrices = anchor_effects.reshape(*self._anchor_t.shape, 3, 2).transpose(0, 3, 1, 2)
         return self._select_channels(effect_matrices).swapaxes(1, 2)
 
-    def _set_anchors(self, x: Real, of: npt.NDArray[np.intp]) -> None:
-        """Set the expansion point of each material's features: the means of its pixels."""
+    def _set_anchors(self, x: Real, material: npt.NDArray[np.intp]) -> None:
+        """Set the anchor of each material, the point that its features are deviations from: the mean of its pixels.
+
+        `material` [n] is the index of each pixel's material. Set also which pairs of features are of one angle, and
+        which are both gains or both phases, [features, features]; the others are taken as uncorrelated.
+        """
         h, v, t = split_by_angle(x)
         logs = np.log(np.maximum(h, 1e-6)), np.log(np.maximum(v, 1e-6))
-        of_material = [of == k for k in range(self.names.size)]
+        of_material = [material == k for k in range(self.names.size)]
         self._anchor_h, self._anchor_v, self._anchor_t = (
             np.stack([c[members].mean(axis=0) for members in of_material]) for c in (*logs, t)
         )
@@ -289,10 +323,16 @@ class ErrorDiscriminant(Model):
         return self.within / pixels + self.between * placement_factor + differ @ self._effects.mT
 
     def _compute_pixel_covariances(self) -> Real:
+        """Return the covariance of one pixel about each material's mean with all errors, [materials, d, d]."""
         return self._patch_covariances(1.0) + self.scan
 
-    def _set_thresholds(self, patches: Real, material: npt.NDArray, pixels: Real, of: npt.NDArray, dof: float) -> None:
+    def _set_thresholds(
+        self, patches: Real, material: npt.NDArray, pixels: Real, pixel_material: npt.NDArray, dof: float
+    ) -> None:
         """Set the squared distances that known materials exceed with probability REJECTED.
+
+        `patches` and `pixels` are deviations from their material's mean, [patches, d] and [n, d], `material` and
+        `pixel_material` its index.
 
         The larger of Hotelling's distribution, for an estimated mean and covariance, and the quantile of the library's
         own patches (each left out of its material's mean). Without enough patches there is no threshold.
@@ -305,17 +345,21 @@ class ErrorDiscriminant(Model):
             law = np.inf
         left_out = (self.placements / np.maximum(self.placements - 1, 1))[:, None]
 
-        def farthest(d: Real, of: npt.NDArray, covariances: Real) -> float:
-            d = d * left_out[of]
-            q = np.einsum("nd,nde,ne->n", d, np.linalg.inv(covariances)[of], d)
-            return float(np.quantile(q, 1 - REJECTED))
+        def farthest(deviations: Real, index: npt.NDArray, covariances: Real) -> float:
+            d = deviations * left_out[index]
+            distance2 = np.einsum("nd,nde,ne->n", d, np.linalg.inv(covariances)[index], d)
+            return float(np.quantile(distance2, 1 - REJECTED))
 
         self.patch_level = max(law, farthest(patches, material, self._patch_covariances(self.pixels) + self.scan))
-        self.pixel_level = max(law, farthest(pixels, of, self._compute_pixel_covariances()))
+        self.pixel_level = max(law, farthest(pixels, pixel_material, self._compute_pixel_covariances()))
 
 
 def _fit_two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: npt.NDArray) -> tuple[Real, Real]:
-    """Least squares of patch means = material + scan: offsets [scans, d], of mean zero, and levels [materials, d]."""
+    """Fit patch means [patches, d] = material + scan by least squares, in turns.
+
+    Return the offsets [scans, d] and the levels [materials, d]. Only `informative` patches, bool [patches], have an
+    offset; the offsets of scans with such patches have a mean of zero, those of the others are zero.
+    """
     offset = np.zeros((scan.max() + 1, mean.shape[1]))
     level = np.zeros((material.max() + 1, mean.shape[1]))
     of_material = np.arange(len(level))[:, None] == material
@@ -331,6 +375,7 @@ def _fit_two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informati
 
 
 def _compute_covariance(residual: Real, dof: int) -> Real:
+    """Return the covariance [d, d] of residuals [n, d] with this number of degrees of freedom."""
     return residual.T @ residual / max(dof, 1)
 
 

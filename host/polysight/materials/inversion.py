@@ -5,13 +5,14 @@ Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measur
     V / H = (1 + rho) exp(j c + G w) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
 
 with a, b the leakage of p into H and of s into V, rho the error of the metal reference, c the phase by its paint (0 of
-bare metal), w the rise of the plate relative to the metal's and G its effect on ln(V / H), kappa the patch's brightness
-relative to an ideal one (thickness, roughness, illumination). A plate that rises by w across the plane of incidence
-turns this plane about x, and both waves meet its s axis at d = w sin(theta): to first order H receives
+bare metal), w the rise of the plate (in G w relative to the metal's) and G its effect on ln(V / H), kappa the patch's
+brightness relative to an ideal one (thickness, roughness, illumination). A plate that rises by w across the plane of
+incidence turns this plane about x, and both waves meet its s axis at d = w sin(theta): to first order H receives
 (1 - d) r_s - d r_p and V (1 + d) r_p + d r_s, as the image of the transmitter in a tilted mirror confirms. So a plate
 has a and b of its own, smaller and larger by d, and G is 4 sin(theta) across, up to the patterns of boards that see the
 plate from other points. r_s and r_p follow from t and the incidence angle by Eq. 2 and 3. Unknown are a, b, rho, c, G,
-the turn, the angle's error, the usual size of ln kappa, and t of every patch.
+the turn, the angle's error, the metal's brightness, the usual size of ln kappa, whether the mount has moved, the share
+of the library's materials, and t of every patch.
 
 The evidence is that of |V / H| and its phase; brightness is a nuisance of each plate, whose usual size the scene tells.
 Other evidence on the common errors is that every patch has to be some material (`Kinds`): the library's, the
@@ -70,8 +71,9 @@ TURN_STD = 0.1
 whose polarisation turns off axis. A transmitter that is turned to the other side has the other sign."""
 UNEVEN_LIGHT = (1.0, 1.0)
 EVEN_LIGHT = (0.3, 0.5)
-"""Change of ln(V / H) per radian of rise, along x and across, by the patterns of boards that see the plate from other
-points: without and with the correction of the plate's illumination. The independent generator has 0.6 along x."""
+"""Standard deviations of the change of ln(V / H) per radian of rise, along x and across, by the patterns of boards that
+see the plate from other points: without and with the correction of its illumination. The independent generator has 0.6
+along x."""
 PAINTED = 0.02
 POSSIBLY_PAINTED = 0.2
 """Probability that the metal reference is painted or otherwise coated, and that from which on its paint is an error of
@@ -92,6 +94,7 @@ dominate, in drawn scenes 95 % lie within 2.1 to 3.6 times the interval that hol
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
+"""Sources of error in `PatchEstimate.shares`."""
 # Columns of a particle (see `SceneLikelihood`).
 LEAKAGE_H = (0, 1)
 LEAKAGE_V = (2, 3)
@@ -126,10 +129,8 @@ class RigPrior:
     ----------
     theta_std_rad
         Standard deviation of the incidence angle's error, equal for all patches.
-    leakage
-        Leakage of p into H and of s into V: as measured, or zero.
-    leakage_std
-        Standard deviation of each real and imaginary part.
+    leakage, leakage_std
+        Leakage of p into H and of s into V, as measured, or zero; standard deviation of each real and imaginary part.
     leakage_measured
         True if it was measured; otherwise it is the prior of the mount.
     channels_known
@@ -193,7 +194,7 @@ class PatchEstimate:
 
     @property
     def dominated_by(self) -> str | None:
-        """The source with the largest share of the error."""
+        """The source with the largest share of the error; None without shares."""
         return max(self.shares, key=lambda s: self.shares[s], default=None)
 
 
@@ -205,10 +206,8 @@ class Inversion:
     ----------
     patches
         Estimates of the patches, in the given order.
-    leakage
-        Estimated leakage of p into H, of s into V.
-    leakage_std
-        Standard deviation of each: root mean variance of its two parts.
+    leakage, leakage_std
+        Estimated leakage of p into H, of s into V; standard deviation of each: root mean variance of its two parts.
     prior_std
         Standard deviation of each by the prior alone.
     theta_error_rad, theta_std_rad
@@ -278,7 +277,7 @@ def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: 
 def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None = None) -> Inversion:
     """Solve for all patches of a scene together.
 
-    `measurements` are the patches without the metal reference. With `kinds` the patches get probabilities of them.
+    `measurements` are the patches without the metal reference. With `kinds` each patch has to be one of them.
     """
     model = SceneLikelihood(measurements, prior, kinds)
     rng = np.random.default_rng(0)
@@ -316,6 +315,7 @@ def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[
         if hypothesis.prior.painted == 0:
             log_bare = np.logaddexp(log_bare, log_weights[-1])
     log_evidence = float(scipy.special.logsumexp(log_weights))
+    # Resampling returns as many indices as it gets; every n-th of n hypotheses leaves `PARTICLES`.
     chosen = _resample(np.repeat(np.exp(np.array(log_weights) - log_evidence), PARTICLES), rng)[:: len(samples)]
     return np.concatenate(samples)[chosen], log_evidence, float(log_bare) - log_evidence
 
@@ -325,6 +325,10 @@ class SceneLikelihood:
 
     A particle z [width] holds the common errors as deviations from the prior's mean in its standard deviations; its
     columns are named at the top of the module. Methods take z [..., width].
+
+    Of each patch: `measured` V / H, `rise` [patch, 2] and `theta` as in `PatchMeasurement`; `bright`: |H| is used, and
+    `log_level` is its logarithm; `own` [patch, 2, 2]: covariance of t by its own errors; `own_variance`: that of one
+    part of V / H; `densities`: of t as any kind (None without kinds); `log_layer_odds`: of its change over the sweep.
     """
 
     width = WIDTH
@@ -342,7 +346,6 @@ class SceneLikelihood:
         self.bright = np.isfinite(level) & (level > 0) & unlike_metal
         self.log_level = np.log(np.where(self.bright, level, 1.0))
         self.own = self._own_covariances(measurements)
-        # Of one part of the measured ratio
         self.own_variance = np.array([np.trace(s.covariance) / 2 for s in measurements], np.float64)
         self.densities = None if kinds is None or not measurements else self._densities(kinds)
         self.dispersions = tuple(s.dispersion for s in measurements)
@@ -420,6 +423,7 @@ class SceneLikelihood:
         """Return the change of ln(V / H) of each patch by its rise relative to the metal's, [..., patch]."""
         std_along, std_across = self.prior.lighting_std
         rise = self.rise - np.array(self.prior.metal_rise)
+        # The phase of V / H is taken to change by a tenth of what the amplitude does (chosen).
         by_patterns = z[..., LIGHT_ACROSS[0], None] + 0.1j * z[..., LIGHT_ACROSS[1], None]
         across = std_across * by_patterns - 4 * self.turn(z)
         along = std_along * z[..., LIGHT_ALONG, None]
@@ -508,9 +512,9 @@ def _certainties(probability: float) -> list[tuple[float, float]]:
 
 
 def _place(z: Real, certainty: float, probability: float) -> Real:
-    """Return a column of particles that know whether something is so as one of those that do not.
+    """Return a column z of a hypothesis (`certainty` 0 or 1) as a column of a prior with this `probability` of it.
 
-    It is so in the uppermost part of the standard normal distribution that has its probability.
+    The hypothesis holds in the uppermost part of the standard normal distribution that has its probability.
     """
     if certainty == probability:
         return z
@@ -585,7 +589,7 @@ def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:
 def _solution(
     model: SceneLikelihood, posterior: tuple[Real, float, float], patches: tuple[PatchEstimate, ...]
 ) -> Inversion:
-    """Collect the solution from what `sample_posterior` returns."""
+    """Collect the solution from the `posterior` that `sample_posterior` returns and the estimates of the patches."""
     z, log_evidence, log_bare = posterior
     prior = model.prior
     paint = model.paint(z)
@@ -619,7 +623,7 @@ def _solution(
 
 
 def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator) -> PatchEstimate:
-    """Estimate one patch from particles of the common errors: ratio, permittivity, shares of the sources, kinds."""
+    """Estimate patch `i` from particles of the common errors: ratio, permittivity, shares of the sources, evidence."""
     t = model.ratios(z)[:, i]
     middle = complex(t.mean())
     ratio_covariance = np.cov(split_complex(t).T) + model.own[i]
@@ -654,7 +658,11 @@ def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator)
 
 
 def _shares_of_sources(model: SceneLikelihood, z: Real, i: int, value: complex) -> dict[str, float]:
-    """Return the share of each source in the variance of a permittivity, to first order; they add up to 1."""
+    """Return the share of each source in the variance of a permittivity `value`, to first order.
+
+    They add up to 1; empty if the variance is zero or not finite.
+    """
+    # A source alone: its columns vary as in the particles, all others stay at their mean.
     mean = np.tile(z.mean(axis=0), (len(z), 1))
     of_all = model.permittivities(z)[:, i] - value
     slope_at_mean = permittivity_slope(model.ratios(mean[:1])[0, i], model.theta[i])

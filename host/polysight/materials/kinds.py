@@ -27,12 +27,13 @@ Source = Literal["library", "literature"]
 REAL_RANGE = (1.2, 30.0)
 LOSS_RANGE = (0.0, 30.0)
 SOFT_LOSS = 0.05
-"""Range of any half space, and the loss above which it is uniform on a logarithmic scale, linear below: from nearly air
-to beyond water."""
+"""Ranges of eps' and eps'' of any half space, from nearly air to beyond water: eps' is uniform on a logarithmic scale,
+eps'' on one that is logarithmic above `SOFT_LOSS` and linear below."""
 USUAL_LIBRARY_SHARE = 0.5
 """Expected share of a library's materials in a scan that was processed without it."""
 LITERATURE_SHARE = 0.7
-"""Share of the literature in thick plates that are none of the library's materials; others are any half space."""
+"""Share of the literature in thick plates that are none of the library's materials; the others are metal or any half
+space. Chosen, as are the shares of metal and of thin plates: larger ones draw uncertain names to these."""
 METAL_SHARE = 0.1
 """Share of metal in these patches."""
 SHEET_SHARE = 0.15
@@ -232,7 +233,10 @@ def permittivity_slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
 
 
 def move_to_angle_of_kinds(evidence: RatioEvidence, kinds: Kinds) -> RatioEvidence:
-    """Return what a scan says of a patch's ratio at the angle of the kinds."""
+    """Return what a scan says of a patch, with its ratio at the angle of the kinds.
+
+    The covariance stays as it is: angles of a library differ from the scan's by a degree at most.
+    """
     t = HalfSpaces(evidence.inverse_ratio, evidence.theta_rad).move_to_angle(kinds.theta_rad)
     return replace(evidence, theta_rad=kinds.theta_rad, inverse_ratio=complex(t))
 
@@ -274,7 +278,7 @@ class Kinds:
         self.kinds = (*kinds, Kind("metal", None, source="literature", family="metal"))
         self.theta_rad = theta_rad
         self.in_library = np.array([kind.source == "library" for kind in self.kinds])
-        self.t = np.array([_average_ratio(kind, theta_rad) for kind in self.kinds], np.complex128)
+        self.t = np.array([_nominal_ratio(kind, theta_rad) for kind in self.kinds], np.complex128)
         self.effects = np.stack([_compute_effects(kind, theta_rad) for kind in self.kinds])
         self.covariance = self.effects @ self.effects.mT + 1e-10 * np.eye(2)
         self.sheet_share = SHEET_SHARE if sheets else 0.0
@@ -322,12 +326,11 @@ class Kinds:
         return DensityMap(low, high, np.log(density + 1e-12))
 
     def compute_half_space_density(self, t: Complex, covariance: Real) -> Real:
-        """Return the density of t of any half space: ln eps' uniform, eps'' uniform on a scale that ends in a line.
+        """Return the density of t of any half space, as `REAL_RANGE`, `LOSS_RANGE` and `SOFT_LOSS` say, shape of `t`.
 
-        Shape of `t`; `covariance` [2, 2] is that of the real and imaginary part of a measured t.
-
-        Errors of the measurement soften the border of the passive half spaces: the density beyond is that of the
-        passive one at the border, times the probability of an error as large.
+        `covariance` [2, 2] is that of the real and imaginary part of a measured t. Errors of the measurement soften the
+        border of the passive half spaces: the density beyond is that at the border, times exp(-x^2 / 2) with x the
+        distance from it in standard deviations.
         """
         std = float(np.sqrt(np.trace(covariance) / 2))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -415,7 +418,8 @@ def literature(library: Collection[str] = ()) -> list[Kind]:
     ]
 
 
-def _average_ratio(kind: Kind, theta_rad: float) -> complex:
+def _nominal_ratio(kind: Kind, theta_rad: float) -> complex:
+    """Return t of a kind's own permittivity, that of the mean specimen; 1 for metal."""
     if kind.permittivity is None:
         return 1.0 + 0j
     return complex(inverse_ratio(kind.permittivity, theta_rad))
@@ -433,7 +437,10 @@ def _compute_effects(kind: Kind, theta_rad: float) -> Real:
 
 
 def _compute_shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
-    """Return the share of each kind in the library or in the rest, and that of any other half space in the rest."""
+    """Return the share of each kind in the library or in the rest, and that of any other half space in the rest.
+
+    `sheets` is the share of thin plates in the rest.
+    """
     ours = np.array([kind.source == "library" for kind in kinds])
     metal = np.array([kind.permittivity is None for kind in kinds]) & ~ours
     literature = ~ours & ~metal
@@ -569,6 +576,7 @@ def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) 
         * by_dispersion
     )
     sheet = (1 - library_share) * first.sheet_share * float(np.mean(density))
+    # Stacks of layers count only where the change over the sweep can tell them from half spaces.
     if any(evidence.dispersion is not None for evidence in scan_evidence):
         sheet += (1 - library_share) * STACK_SHARE / np.pi ** len(scan_evidence) * float(np.mean(by_dispersion))
     other_weight = (1 - library_share) * first.other * _evaluate_other_density(kinds, scan_evidence)

@@ -1,9 +1,9 @@
 """Names of patches by people and simulators: label files (`labels.json`) and truth files (`truth.json`).
 
 A label file holds boxes with names, the metal reference among them, and their specimens. `polysight label` writes the
-boxes of a person, in millimetres; `polysight process` writes a box inside each patch that it found, in pixels, named by
-the classifier. Both forms are read, and the published data set's files too. `Labels.patches` makes patches of the
-boxes; `check_labels` checks a file before training, `clean_name` and `box_name` one name.
+boxes of a person, in millimetres; `polysight process` writes a box around the interior of each patch that it found, in
+pixels, named by the classifier. Both forms are read, and the published data set's files too. `Labels.patches` makes
+patches of the boxes; `check_labels` checks a file before training, `clean_name` and `box_name` one name.
 """
 
 from __future__ import annotations
@@ -91,7 +91,10 @@ def find_truth(folder: Path) -> tuple[Plates, str]:
 
 
 def _read_plate(raw: Mapping[str, Any]) -> TruthPlate:
-    """Read a plate of a scene file. Raises KeyError, TypeError or ValueError for a malformed one."""
+    """Read a plate of a truth file; metal, strips and stacks of layers have no permittivity.
+
+    Raises KeyError, TypeError or ValueError for a malformed one.
+    """
     cx, cy = (float(c) for c in raw["centre_mm"])
     w, h = (float(s) for s in raw["size_mm"])
     eps = None
@@ -107,6 +110,7 @@ def _read_plate(raw: Mapping[str, Any]) -> TruthPlate:
 
 
 METALS = ("metal", "copper", "aluminium", "aluminum", "steel", "brass", "iron")
+"""Words that make the name of a material that of a metal."""
 SPECIMEN = "#"
 """Separates a box's material from its specimen: `oak#2` is a second piece of oak."""
 
@@ -138,7 +142,8 @@ class Labels:
     unit
         Unit of the boxes.
     metal
-        Name of the box with the metal reference; None: the first box with the name of a metal.
+        Name of the box with the metal reference; None: the box with the name of a metal, the first of several (drawn by
+        hand, only one may have such a name).
     specimens
         Name of a box to its physical piece, if known.
     by_hand
@@ -298,7 +303,7 @@ def patches_from_labels(
     return Segmentation(labels, tuple(patches)), names
 
 
-# Characters of a material's name: one line of a report.
+# Largest number of characters of a name: it has to fit into a line of a report.
 LONGEST_NAME = 80
 RESERVED = ("unknown", "none of these", "possible layer")
 """Words that the classifier uses."""
@@ -311,8 +316,8 @@ _HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]
 def clean_name(text: str, kind: str = "name") -> str:
     """Return a name in Unicode form NFC, with trimmed spaces; `kind` is its description in errors.
 
-    Raises DataError if it is empty, longer than `LONGEST_NAME`, has control characters, is a plain number or a reserved
-    word.
+    Raises DataError if it is empty, longer than `LONGEST_NAME` or has control or hidden characters; if `kind` is "name"
+    also if it is a plain number, a reserved word, or ends with "(literature)".
     """
     name = re.sub(" +", " ", unicodedata.normalize("NFC", text).strip())
     shortened = name if len(name) <= 40 else f"{name[:40]}..."
@@ -360,7 +365,8 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
     `x_m` and `y_m` are the axes of the image, `valid` bool [ny, nx] its illuminated pixels (None: all).
 
     Raises DataError if a box is empty, not finite, outside the image or without a valid pixel; if two boxes overlap; if
-    a name is invalid or used twice; if there are several boxes and the metal reference is not known.
+    a name is invalid or used twice; if a metal reference or a specimen has no box; if there are several boxes and the
+    metal reference is not known.
     """
     labels_mm = labels.in_mm(x_m, y_m)
     boxes = {}
@@ -389,7 +395,7 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
 
 
 def name_taken(name: str, twin: str) -> DataError:
-    """Return the error for a name that exists already."""
+    """Return the error for a box name that exists already; `twin` is its spelling there."""
     as_said = "" if name == twin else f" (as {twin})"
     return DataError(
         f"the name {name} exists already{as_said}",
@@ -401,7 +407,7 @@ def name_taken(name: str, twin: str) -> DataError:
 
 
 def no_box(name: str, boxes: Mapping[str, Any]) -> DataError:
-    """Return the error for an unknown name of a box."""
+    """Return the error for an unknown name of a box; the keys of `boxes` are the known ones."""
     listed = ", ".join(boxes) if boxes else "there are none"
     return DataError(
         f"no box is called {name}", f"the boxes: {listed}", "polysight label SCAN --list shows them",
@@ -410,7 +416,7 @@ def no_box(name: str, boxes: Mapping[str, Any]) -> DataError:
 
 
 def _check_box(name: str, box: Box, extent: Box) -> Box:
-    """Return the box. Raises DataError if it is empty or reaches outside the image."""
+    """Return the box. Raises DataError if it is empty or reaches outside the image, whose edges are `extent`, in mm."""
     if not all(math.isfinite(b) for b in box) or not (box[0] < box[2] and box[1] < box[3]):
         raise DataError(
             f"box of {name}, {', '.join(f'{b:g}' for b in box)}: it is empty",
@@ -429,21 +435,24 @@ def _check_box(name: str, box: Box, extent: Box) -> Box:
     return box
 
 
-def _check_apart(one: str, a: Box, other: str, b: Box) -> None:
+def _check_apart(name: str, a: Box, other_name: str, b: Box) -> None:
     """Raise DataError if two boxes overlap, beyond rounding."""
     across = min(a[2], b[2]) - max(a[0], b[0])
     up = min(a[3], b[3]) - max(a[1], b[1])
     if across > _TOLERANCE_MM and up > _TOLERANCE_MM:
         raise DataError(
-            f"the boxes of {one} and {other} overlap by {across:.1f} x {up:.1f} mm",
-            f"pixels of one material would count as another; {one}: {format_box(a)}; {other}: {format_box(b)}",
+            f"the boxes of {name} and {other_name} overlap by {across:.1f} x {up:.1f} mm",
+            f"pixels of one material would count as another; {name}: {format_box(a)}; {other_name}: {format_box(b)}",
             "make one of them smaller: a box lies inside its material, 5 mm or more from the edge",
             code=ErrorCode.VALUES_CONFLICT,
         )
 
 
 def _find_metal_by_name(boxes: Mapping[str, Box]) -> str | None:
-    """Return the only box with a metal's name. Raises DataError if there are several boxes and not exactly one."""
+    """Return the only box with a metal's name; None if that cannot be said of the only box.
+
+    Raises DataError if there are several boxes and not exactly one has such a name.
+    """
     metals = [name for name in boxes if is_metal(material_name(name))]
     if len(metals) == 1:
         return metals[0]

@@ -37,7 +37,7 @@ Complex = npt.NDArray[np.complex128]
 # Frequencies of a sub-band at which a layer is modelled.
 _FREQUENCIES = 24
 METAL = complex(np.inf, 0.0)
-"""Permittivity of a layer of metal: a perfect conductor."""
+"""Permittivity that stands for a layer of metal: a perfect conductor."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,7 @@ class Bands:
     phase_per_angle: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check that the arrays fit: PolysightError if not, DataError if a ratio or deviation cannot be used."""
         k = self.inverse_ratio.shape
         if self.spectrum.frequency_hz.shape[:1] != k or self.sigma.shape != k:
             raise PolysightError(
@@ -199,7 +200,10 @@ def predict(stack: Sequence[Layer], spectrum: Spectrum, theta_rad: float) -> tup
 def average(
     eps: Sequence[npt.ArrayLike], thickness: Sequence[npt.ArrayLike], spectrum: Spectrum, theta_rad: npt.ArrayLike
 ) -> tuple[Complex, Real]:
-    """Return V / H and |H| [..., K] of stacks; entries are numbers or [..., 1, 1]; else as :func:`predict`."""
+    """Return V / H and |H| [..., K] of stacks of layers, relative to metal: :func:`predict` for many stacks at once.
+
+    `eps` and `thickness` (metres) of each layer, and `theta_rad`, are numbers or arrays [..., 1, 1].
+    """
     reflections = multilayer(eps, thickness, spectrum.frequency_hz, theta_rad)
     r_s, r_p = (np.asarray((r * spectrum.weight).sum(axis=-1), np.complex128) for r in reflections)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -237,6 +241,7 @@ THICKNESS_RANGE_M = (0.1e-3, 12e-3)
 START_PHASE_RAD = 0.25
 """Step of the start grid in the phase of the path through the layer and back: no valley is narrower."""
 # Grid of start values: loss tangents, number of indices, and number of its local minima that are solved.
+# "Index" here and below is sqrt(eps' - sin^2), the wave vector along the normal over that in vacuum.
 LOSS_TANGENTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 2.0)
 INDEX_STEPS = 60
 STARTS = 24
@@ -251,7 +256,7 @@ DETERMINED = 0.05
 """Largest relative half width of 95 % regions of a fit that is not ambiguous."""
 # Draws of the posterior for its second moments.
 _DRAWS = 1500
-# Range of the integration, in standard deviations.
+# Draws farther away than this, in standard deviations, are left out.
 _REACH = 4.0
 # Width of the distribution that samples are drawn from, relative to the linear standard deviations.
 _DRAW_WIDTH = 1.15
@@ -350,7 +355,8 @@ def fit_layer(
     Raises
     ------
     PolysightError
-        if not exactly one layer is unknown, or a thickness is missing.
+        if not exactly one layer is unknown, a thickness is missing, a known layer is not passive, or the range of
+        thicknesses reaches beyond `MAX_THICKNESS_M`.
     DataError
         with fewer data than unknowns.
     """
@@ -377,6 +383,7 @@ def fit_layer(
             "give more sub-bands, the amplitude, or the thickness",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
+    # Solve roughly from every start, and exactly where the result may be the best or a rival.
     by_fit = operator.attrgetter("chi2")
     rough = sorted((model.solve(start, precision=1e-3) for start in model.starts()), key=by_fit)
     level = rough[0].chi2 + 3 * RIVAL * model.fit(rough[0], by_sampling=False).stretch
@@ -403,7 +410,7 @@ def check_range(thickness_range_m: tuple[float, float] | None) -> None:
 
 
 def _differ(a: LayerFit, b: LayerFit) -> bool:
-    """Return true if two solutions differ by more than their error bars and the solver's precision."""
+    """Return true if two solutions differ by more than two standard deviations and the solver's precision."""
     real = abs(a.permittivity.real - b.permittivity.real)
     loss = abs(a.permittivity.imag - b.permittivity.imag)
     thick = abs((a.thickness_m or 0.0) - (b.thickness_m or 0.0))
@@ -451,26 +458,26 @@ class _Model:
         theta_rad: float,
         thickness_range_m: tuple[float, float] | None,
     ) -> None:
-        self.sized = thickness_range_m is not None
+        self.fits_thickness = thickness_range_m is not None
         check_stack(
             [
-                replace(layer, thickness_m=1.0) if self.sized and i == layer_index else layer
+                replace(layer, thickness_m=1.0) if self.fits_thickness and i == layer_index else layer
                 for i, layer in enumerate(stack)
             ]
         )
         self.bands = bands
         self.stack = stack
-        self.at = layer_index
+        self.layer_index = layer_index
         self.theta_rad = theta_rad
         self.range_mm = tuple(1e3 * d for d in thickness_range_m or (0.0, 0.0))
-        self.turned = bands.theta_std_rad > 0
+        self.fits_angle = bands.theta_std_rad > 0
         limits: list[tuple[float, ...]] = [REAL_RANGE, LOSS_RANGE]
-        if self.sized:
+        if self.fits_thickness:
             limits.append(self.range_mm)
-        if self.turned:
+        if self.fits_angle:
             limits.append(_ANGLE_RANGE)
         self.lower, self.upper = (np.array(end, np.float64) for end in zip(*limits, strict=True))
-        self.unknowns = 2 + self.sized
+        self.unknowns = 2 + self.fits_thickness
         self.data = (2 if bands.amplitude_h is None else 3) * bands.inverse_ratio.size
         self.freedom = self.data - self.unknowns
         self.whiten = np.linalg.inv(np.linalg.cholesky(bands.data_covariance))
@@ -478,35 +485,41 @@ class _Model:
         self.wavenumber = 2 * np.pi * float(np.mean(bands.spectrum.frequency_hz)) / SPEED_OF_LIGHT_M_S * 1e-3
 
     def residuals(self, x: npt.ArrayLike, thin: int = 1) -> Real:
-        """Return normalised residuals, [..., data (+ 1)], of unknowns [..., n]; with every `thin`-th frequency."""
+        """Return residuals of unknowns [..., n] in standard deviations, uncorrelated, [..., data (+ 1 for the angle)].
+
+        Only every `thin`-th frequency of each sub-band is computed.
+        """
         x = np.asarray(x, np.float64)
         wide = x[..., None, None, :]
         eps: list[npt.ArrayLike] = [
-            wide[..., 0] - 1j * wide[..., 1] if i == self.at else complex(layer.permittivity or 1.0)
+            wide[..., 0] - 1j * wide[..., 1] if i == self.layer_index else complex(layer.permittivity or 1.0)
             for i, layer in enumerate(self.stack)
         ]
         thick: list[npt.ArrayLike] = [np.inf if y.thickness_m is None else y.thickness_m for y in self.stack]
-        if self.sized:
-            thick[self.at] = wide[..., 2] * 1e-3
-        theta = self.theta_rad + (self.bands.theta_std_rad * wide[..., -1] if self.turned else 0.0)
+        if self.fits_thickness:
+            thick[self.layer_index] = wide[..., 2] * 1e-3
+        theta = self.theta_rad + (self.bands.theta_std_rad * wide[..., -1] if self.fits_angle else 0.0)
         spectrum = self.bands.spectrum.thin(thin) if thin > 1 else self.bands.spectrum
         q, h = average(eps, thick, spectrum, theta)
-        if self.turned:
+        if self.fits_angle:
             q = q * np.exp(1j * self.bands.phase_per_angle * self.bands.theta_std_rad * x[..., -1:])
         miss = q - self.bands.inverse_ratio
         parts = np.stack([miss.real, miss.imag], axis=-1).reshape(*miss.shape[:-1], -1)
         if self.bands.amplitude_h is not None:
             parts = np.concatenate([parts, h - self.bands.amplitude_h], axis=-1)
-        out = np.nan_to_num(parts @ self.whiten.T, nan=1e6, posinf=1e6, neginf=-1e6)
-        return np.concatenate([out, x[..., -1:]], axis=-1) if self.turned else out
+        # Stacks without a finite reflection, such as one that reflects no s, fit as badly as can be.
+        normalised = np.nan_to_num(parts @ self.whiten.T, nan=1e6, posinf=1e6, neginf=-1e6)
+        return np.concatenate([normalised, x[..., -1:]], axis=-1) if self.fits_angle else normalised
 
     def starts(self) -> list[Real]:
         """Return unknowns [n] at local minima of chi-square on a grid of index, phase and loss, best first."""
         sine2 = float(np.sin(self.theta_rad) ** 2)
         low, high = (float(np.sqrt(max(real - sine2, 1e-3))) for real in REAL_RANGE)
-        known_mm = 1e3 * (self.stack[self.at].thickness_m or 0.0)
+        known_mm = 1e3 * (self.stack[self.layer_index].thickness_m or 0.0)
+        # With an unknown thickness the axes are index, loss tangent and the phase through the layer and back; with a
+        # known one index and loss, the index in steps that the phase needs.
         axes = [np.geomspace(low, high, INDEX_STEPS), np.array(LOSS_TANGENTS)]
-        if self.sized:
+        if self.fits_thickness:
             most = 2 * self.wavenumber * self.range_mm[1] * high
             axes.append(np.linspace(0.0, most, int(most / START_PHASE_RAD) + 2)[1:])
         else:
@@ -515,18 +528,18 @@ class _Model:
             axes[1] = np.geomspace(0.02, LOSS_RANGE[1] + 0.02, 25) - 0.02
         mesh = np.meshgrid(*axes, indexing="ij")
         real = mesh[0] ** 2 + sine2
-        x = [real, np.minimum(mesh[1] * real, LOSS_RANGE[1]) if self.sized else mesh[1]]
-        out = np.zeros(real.shape, bool)
-        if self.sized:
+        x = [real, np.minimum(mesh[1] * real, LOSS_RANGE[1]) if self.fits_thickness else mesh[1]]
+        outside = np.zeros(real.shape, bool)
+        if self.fits_thickness:
             x.append(mesh[2] / (2 * self.wavenumber * mesh[0]))
-            out = (x[2] < self.range_mm[0]) | (x[2] > self.range_mm[1])
-        if self.turned:
+            outside = (x[2] < self.range_mm[0]) | (x[2] > self.range_mm[1])
+        if self.fits_angle:
             x.append(np.zeros(real.shape))
         grid = np.stack(x, axis=-1)
         chi2 = np.full(real.shape, np.inf)
         # A few frequencies of a sub-band are enough for start values.
-        chi2[~out] = np.sum(self.residuals(grid[~out], thin=6) ** 2, axis=-1)
-        valleys = (chi2 == scipy.ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~out
+        chi2[~outside] = np.sum(self.residuals(grid[~outside], thin=6) ** 2, axis=-1)
+        valleys = (chi2 == scipy.ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~outside
         index = np.argwhere(valleys)
         order = np.argsort(chi2[tuple(index.T)])[:STARTS]
         return [grid[tuple(cell)] for cell in index[order]]
@@ -564,13 +577,16 @@ class _Model:
         units = np.array([1.0, 1.0, 1e-3])[:n]
         own_covariance = np.asarray(wider * own_covariance * np.outer(units, units), np.float64)
         std = np.sqrt(np.maximum(np.diag(own_covariance), 0.0))
+        thickness_m = self.stack[self.layer_index].thickness_m
+        if self.fits_thickness:
+            thickness_m = float(solution.x[2]) * 1e-3
         ends = zip(("the real part", "the loss", "the thickness"), solution.active, (True, False, True), strict=False)
         return LayerFit(
             permittivity=complex(solution.x[0], -solution.x[1]),
-            thickness_m=float(solution.x[2]) * 1e-3 if self.sized else self.stack[self.at].thickness_m,
+            thickness_m=thickness_m,
             std_real=float(std[0]),
             std_loss=float(std[1]),
-            std_thickness_m=float(std[2]) if self.sized else 0.0,
+            std_thickness_m=float(std[2]) if self.fits_thickness else 0.0,
             chi2=solution.chi2,
             freedom=self.freedom,
             at_limit=tuple(
@@ -613,7 +629,7 @@ class _Model:
     def _differentiate_straight(self, x: Real) -> Real:
         """Return derivatives of (eps', eps'', thickness times index, angle) by the unknowns, [n, n]."""
         out = np.eye(x.size)
-        if self.sized:
+        if self.fits_thickness:
             index = float(np.sqrt(max(x[0] - np.sin(self.theta_rad) ** 2, 1e-3)))
             out[2, 0] = x[2] / (2 * index)
             out[2, 2] = index
@@ -622,7 +638,7 @@ class _Model:
     def _convert_from_straight(self, x: Real, draws: Real) -> Real:
         """Return unknowns [..., n] at samples (eps', eps'', thickness times index, angle) about x."""
         out = x + draws
-        if self.sized:
+        if self.fits_thickness:
             sine2 = np.sin(self.theta_rad) ** 2
             path = x[2] * np.sqrt(max(x[0] - sine2, 1e-3)) + draws[:, 2]
             out[:, 2] = path / np.sqrt(np.maximum(out[:, 0] - sine2, 1e-3))

@@ -27,7 +27,9 @@ from polysight_shared.errors import DataError
 from polysight_shared.files import write_atomically
 
 FORMAT = "polysight-library-1"
+"""Name of the file's format; a file of another one is refused."""
 SAME_ANGLE_DEG = 1.0
+"""Incidence angles that differ by no more count as one: |P| changes by some 10 % in a degree."""
 SIMULATED_LIBRARY = Path(__file__).with_name("simulated-library.npz")
 """The default library: simulated scans of examples/library."""
 
@@ -77,7 +79,18 @@ class Entry:
 
 @dataclass(frozen=True)
 class Library:
-    """Entries, and the model fitted to them (`polysight.materials.train`; empty if none was fitted)."""
+    """Labelled patches, and what was fitted to them.
+
+    Attributes
+    ----------
+    entries
+        The patches.
+    fit
+        {"angles": {"55": fit of that angle, "55+60": fit of both together}}, each of `train.fit_samples`; that fit
+        alone in the part of one angle (`at_angle`); empty if none was fitted.
+    note
+        A sentence on its origin, for reports; may be empty.
+    """
 
     entries: tuple[Entry, ...]
     fit: dict[str, Any] = field(default_factory=dict)
@@ -137,7 +150,7 @@ class Library:
         return x[usable_rows], names[usable_rows], scans[usable_rows]
 
     def fit_for(self, angles_deg: Sequence[float]) -> dict[str, Any]:
-        """Return the fit for an angle, or for several together; may be empty."""
+        """Return the fit (`train.fit_samples`) for an angle, or for several together; empty if there is none."""
         angles = self.fit.get("angles")
         if angles is None:
             return self.fit if len(angles_deg) == 1 else {}
@@ -323,8 +336,12 @@ def find_neighbours(distance: Real, count: int) -> npt.NDArray[np.intp]:
 
 
 def count_votes(neighbour_classes: npt.NDArray[np.intp], classes: int) -> npt.NDArray[np.intp]:
-    """Return how many neighbours of each row are of each class, [rows, classes]."""
+    """Return how many neighbours of each row are of each class, [rows, classes].
+
+    `neighbour_classes` [rows, neighbours] are numbers from 0 to `classes` - 1.
+    """
     rows = len(neighbour_classes)
+    # One count over the cells of the whole table, row after row.
     cell = neighbour_classes + classes * np.arange(rows)[:, None]
     return np.bincount(cell.ravel(), minlength=rows * classes).reshape(rows, classes)
 
@@ -432,7 +449,7 @@ class Samples:
         )
 
     def join(self, other: Samples) -> Samples:
-        """Join with samples of a second angle, patch by patch.
+        """Return samples whose features are those of both angles side by side, patch by patch.
 
         Scans of the same name are paired; without common names, scans are paired in their order. In a pair of scans
         the patches of a material are paired in their order, and their pixels at random, because the pixels of two
@@ -452,6 +469,7 @@ class Samples:
         their_rows = []
         groups = []
         patches = []
+        # Angles are known only if both are.
         angles = self.angles_deg + other.angles_deg if self.angles_deg and other.angles_deg else ()
         for a, b in pairs:
             for name in np.unique(self.names):
@@ -535,7 +553,10 @@ class Model(ABC):
 
 
 def majority(pixel_names: npt.NDArray, distance: Real, patches: npt.NDArray) -> NamedScan:
-    """Name each patch as most of its pixels [n]; confidence is their share, distance the median over all pixels."""
+    """Name each patch as most of its pixels, given the name, distance and patch number of each pixel, [n].
+
+    Its confidence is their share, its distance the median over all of its pixels.
+    """
     ids = np.unique(patches)
     rows = []
     for i in ids:

@@ -59,21 +59,22 @@ nuisances: 0.002 rms in H; in the demo's scene, before a table, 0.85 of what lie
 Real = npt.NDArray[np.float64]
 
 LEAST_PIXELS = 12
+"""Least number of interior pixels of a patch that is measured. Chosen: medians and scatter of fewer mean little."""
 FLAT_CONTRAST = 0.4
 """Largest standard deviation of |H| over its mean in a patch: noise or speckle has 0.52, plates less than 0.25."""
 LEAST_LEVEL = 2.0
-"""Least |H| over the background's root mean square."""
+"""Least |H| of a patch over the background's root mean square."""
 ODD_SHARE = 0.15
 ODD_RATIO = 0.15
-"""Share of pixels, and their distance from the median V / H, that indicate several materials in one patch."""
+"""Share of pixels that are this far from the median V / H above which a patch holds several materials."""
 RIPPLE = 0.5
-"""Distance relative to that median which is no sign of it: real metal ripples by 25 % and 13 degrees, so that a tenth
-of its pixels lie two standard deviations of 0.24 away."""
+"""The same distance relative to the median, where that is larger: real metal ripples by 25 % and 13 degrees, so that a
+tenth of its pixels lie two standard deviations of 0.24 away."""
 HALVES_APART = 0.07
 """Difference of V / H between opposite halves of a dielectric (thrice for metal), above which two materials touch. A
 real plate of one material (acrylic, published rig) has 0.06 after the factor for its V / H."""
 ODD_NOISE = 2.0
-"""Size of V's noise in V / H, in its root mean square, that makes no pixel odd: 2 % of noise exceeds it."""
+"""The same by the noise of V in V / H, in its root mean square, added in squares: 2 % of noise exceeds it."""
 NOISE_OF_HALVES = 22.0
 """Difference of the halves' medians by noise in V / H, over its root mean square and the root of the pixels: three
 standard deviations, with one independent value in nine pixels and medians that scatter by 1.25 of means."""
@@ -99,7 +100,9 @@ THIN = Finding(
 )
 """Why a possible layer gets no permittivity."""
 ACTIVE = 2.0
-"""Limit in standard deviations of gain, or of a real part below 1, for a permittivity to be impossible."""
+"""Standard deviations of gain, or of a real part below 1, beyond which a permittivity is impossible."""
+LEAST_IMPOSSIBLE = 0.02
+"""Gain, or real part below 1, that counts as possible in addition. Chosen: of permittivities known almost exactly."""
 
 
 def background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> tuple[float, float]:
@@ -111,7 +114,7 @@ def background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> 
 
 
 def background_mean(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> tuple[float, float]:
-    """Return the rms of the mean of H and of V over places of a plate's size away from all patches.
+    """Return the rms over places of the mean of H and of V, in squares of a plate's size away from all patches.
 
     What lies behind the plates, such as a table, adds to them as well, with a phase that nobody knows. It changes
     little over a plate, so that neither averaging nor the scatter of the plate's pixels tells of it: on the published
@@ -237,7 +240,8 @@ class Scatter:
     blocks
         Number of independent places on the plate.
     slope, slope_std
-        Its change per metre along x and y, complex [2], and the standard deviation of either part's, [2] each complex.
+        Its change per metre along x and y, complex [2]; real and imaginary part of the second are the standard
+        deviations of those of the first.
     centre_m
         Centre of the pixels, x and y.
     relief_rad
@@ -254,7 +258,10 @@ class Scatter:
 
 
 def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Scatter | None:
-    """Return how V / H scatters over the pixels of a mask [ny, nx]; None with fewer than `LEAST_PIXELS` usable ones."""
+    """Return how V / H scatters over the pixels of a mask [ny, nx].
+
+    None with fewer than `LEAST_PIXELS` usable ones, or if the median V / H is zero.
+    """
     pixels = mask & np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
     rows, columns = np.nonzero(pixels)
     if rows.size < LEAST_PIXELS:
@@ -276,6 +283,7 @@ def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Sca
     slope_of = np.linalg.solve(information, centred.T @ cut)
     rest = np.asarray(log_ratio - centred @ slope_of, np.complex128)
     rest_std = complex(*(1.4826 * float(np.median(np.abs(part - np.median(part)))) for part in (rest.real, rest.imag)))
+    # The errors of a slope from as many independent values as there are blocks, not pixels.
     unit = np.sqrt(np.diag(np.linalg.inv(information)) * rows.size / blocks)
     x, y = places.mean(axis=0).tolist()
     return Scatter(
@@ -306,7 +314,10 @@ def usual_scatter(all_plates: Sequence[Scatter]) -> tuple[float, float]:
 
 
 def relative_errors(plate_scatter: Scatter | None, usual: tuple[float, float]) -> tuple[float, float]:
-    """Return the standard errors of a plate's ln|V / H| and phase, from its own scatter and the scene's usual one."""
+    """Return the standard errors of a plate's mean ln|V / H| and phase, from its own scatter and the scene's usual one.
+
+    Without its own the usual scatter is the error: the plate counts as one place.
+    """
     amplitude, phase = usual
     blocks = 1.0
     if plate_scatter is not None:
@@ -341,8 +352,8 @@ def measure_patch(
     scatter, usual
         The patch's :func:`measure_scatter`, and the scene's :func:`usual_scatter`.
     change
-        Drift of ln(V / H) at the patch relative to the metal, which is removed, and its standard deviations
-        (:meth:`CommonChange.log_ratio`); None if the reference covers the plane.
+        Change of ln(V / H) from the metal to the patch by drift and fringes, which is removed, and its standard
+        deviations (:meth:`CommonChange.log_ratio`); None if it is not known, or the reference covers the plane.
     local_std
         Errors of ln|V / H| and of its phase by the place: metal reference that varies over the plane, end of aperture.
     rise
@@ -453,7 +464,10 @@ def _measure_phase_spread(h: Image) -> float:
 def check_patches(
     segmentation: Segmentation, h: Image, v: Image, dark: tuple[float, float], metal: Mask
 ) -> dict[int, Finding]:
-    """Return patch number to reason for all patches that are no plates; `metal` is the metal reference's interior."""
+    """Return patch number to reason for all patches that are no plates; parameters as of :func:`check_patch`.
+
+    `metal`, bool [ny, nx], is the metal reference's interior.
+    """
     uneven = halves_apart(h, v, metal)
     reasons = ((p.label, check_patch(p, h, v, dark, uneven)) for p in segmentation.patches)
     return {label: reason for label, reason in reasons if reason is not None}
@@ -486,7 +500,8 @@ class Permittivity:
         30th to 70th percentile of the real part and of the imaginary part over the pixels (the paper's choice); None if
         metal-like.
     real_std, loss_std
-        Standard error of eps' and of eps'', including the effect of the plate's place on the plane. None if metal-like.
+        Standard error of eps' and of eps'': by the scene's error budget, or without one by the scatter of the pixels
+        alone. None if metal-like.
     ratio
         Median polarisation ratio P.
     inverse_std
@@ -529,7 +544,7 @@ class Permittivity:
 
     @property
     def dominated_by(self) -> str | None:
-        """The source with the largest share of the error."""
+        """The source with the largest share of the error; None without shares."""
         if self.shares:
             return max(self.shares, key=lambda s: self.shares[s])
         return None
@@ -620,11 +635,12 @@ def permittivity_of_patch(
     theta_rad: float,
     estimate: PatchEstimate | None,
 ) -> Permittivity:
-    """Return the permittivity of one patch with the error budget of the joint inversion.
+    """Return the permittivity of one patch as the joint inversion found it; the percentiles are those of its pixels.
 
     The pixels `h` and `v` [n] of the interior are as for :func:`estimate_permittivity`. `estimate` is the result of the
     inversion; None for a patch that it did not include, which gets no permittivity.
     """
+    # Pixels get the corrections of their patch, so that their median ratio is the inversion's.
     alone = estimate_permittivity(h, v, theta_rad)
     if estimate is not None and alone.ratio and np.isfinite(alone.ratio):
         alone = estimate_permittivity(h, v * complex(estimate.inverse_ratio * alone.ratio), theta_rad)
@@ -655,9 +671,9 @@ def _find_impossibility(e: Permittivity) -> Finding | None:
         return None
     remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
     causes = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
-    if e.value.imag > ACTIVE * e.loss_std + 0.02:
+    if e.value.imag > ACTIVE * e.loss_std + LEAST_IMPOSSIBLE:
         return Finding("error", AMPLIFIES, causes, remedy)
-    if e.value.real < 1 - ACTIVE * e.real_std - 0.02:
+    if e.value.real < 1 - ACTIVE * e.real_std - LEAST_IMPOSSIBLE:
         return Finding("error", BELOW_AIR, causes, remedy)
     return None
 
@@ -665,6 +681,6 @@ def _find_impossibility(e: Permittivity) -> Finding | None:
 def refuse_impossible(
     patches: Mapping[int, Permittivity], estimates: Mapping[int, PatchEstimate], kinds: Kinds
 ) -> dict[int, Finding]:
-    """Return why patches are no half spaces: an impossible permittivity, or possibly a thin plate."""
+    """Return patch number to why it is no half space: an impossible permittivity, or possibly a thin plate."""
     thin = {label: THIN for label, e in estimates.items() if e.evidence is not None and may_be_thin(e.evidence, kinds)}
     return thin | {label: reason for label, e in patches.items() if (reason := _find_impossibility(e)) is not None}

@@ -2,7 +2,8 @@
 
 It is given as a box or a patch, or it is the patch that is brightest in both channels. Evidence is its own: V / H
 against the direct path, which reaches both boards with equal strength. Metal reflects both polarisations fully, a
-dielectric loses most of p at these angles. A declared metal is contradicted by nothing else.
+dielectric loses most of p at these angles. Nothing else contradicts a declared metal; other patches that do not fit it
+only make it uncertain.
 
 The other patches give evidence, too: beside metal their ratios are those of materials. Beside a dielectric of inverse
 ratio t0 they are those of materials divided by t0, too large by far, and their |H| is too large by 1 / |r_s|. The score
@@ -38,25 +39,25 @@ Complex = npt.NDArray[np.complex128]
 DOUBTFUL_V_DB = -2.5
 WEAK_V_DB = -7.0
 """V / H relative to the direct path below which a patch that nobody declared is no metal, and below which even a
-declared one is none: half spaces of eps' up to 10 have -8 dB or less, bare water -4 dB, metal 0 dB, but for the
-patterns of the antennas (-4 dB with those of an independent generator)."""
+declared one is none: at 55 degrees half spaces of eps' up to 8 have -8 dB or less, of 10 -7 dB, bare water -4 dB, metal
+0 dB, but for the patterns of the antennas (-4 dB with those of an independent generator)."""
 LEAST_SCORE = 1.7
 SURE_MARGIN = 1.5
-"""Score from which on a patch that nobody declared counts as metal beside one other patch, and more by which it is
-certain. It grows with the root of their number, for each may be an odd one. Of 125 drawn scenes without metal none
-counts as metal with the direct path (open water comes closest, and is doubtful by its V / H), of 75 with metal all do
-(tests/materials/test_metal_evidence.py)."""
+"""Score from which on a patch that nobody declared counts as metal beside one other patch, and how much more makes it
+certain. The first grows with the root of their number, for each may be an odd one. Of 125 drawn scenes without metal
+none counts as metal with the direct path (open water comes closest, and is doubtful by its V / H), of 75 with metal all
+do (tests/materials/test_metal_evidence.py)."""
 REFERENCE_REAL = (1.5, 30.0)
 REFERENCE_LOSS_TANGENT = (1e-3, 2.0)
 """Permittivities of a reference that is no metal, uniform on logarithmic scales: all half spaces, water among them."""
 CHANNEL_RATIO_STD_DB = 2.5
 """Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
 CONFLICT_SCORE = 0.0
-"""Score below which a declared metal is told to be doubtful, with the patch that fits it least: a dielectric fits the
+"""Score below which a declared metal is reported as doubtful, with the patch that fits it least: a dielectric fits the
 others better. Metal has 1.3 or more in 52 scenes of a generator that knows nothing of this estimator, dielectrics
 declared as metal -0.3 to -8 in eleven."""
 PAINT_SCORE = 7.0
-"""Score that painted metal lacks at most to count as metal: paint is told apart from it, and its error is counted."""
+"""Cost of paint: a reference that counts as metal only if it is painted needs so much more score."""
 ALIKE_DB = 2.5
 LEAST_METAL_LEVEL = 0.15
 MOST_METALS = 3
@@ -156,6 +157,7 @@ class _DielectricReference(SceneLikelihood):
         super().__init__(measurements, prior, kinds)
 
     def _estimate_paint_probability(self) -> float:
+        """Return 0: no paint is considered on a dielectric."""
         return 0.0
 
     def reference_permittivity(self, z: Real) -> Complex:
@@ -177,13 +179,16 @@ class _DielectricReference(SceneLikelihood):
         return np.log(np.abs((cosine - root) / (cosine + root)))
 
     def _log_likelihoods(self, z: Real, half_spaces: HalfSpaces) -> Real:
-        """Return log likelihoods [..., 1 + patch] of the measured ratios, which are t over that of the reference."""
+        """Return log likelihoods [..., 1 + patch] as the base class does, of ratios measured relative to a dielectric.
+
+        What was measured is t of the patch over that of the reference.
+        """
         parts = super()._log_likelihoods(z, half_spaces)
         reference = self.reference_ratio(z)
         size = np.abs(reference)
         measured = half_spaces.t / reference
-        # The density of a measured ratio is |t0|^2 that of t. Two plates may be of the same material, as metal is
-        # beside metal.
+        # With t0 of the reference the density of a measured ratio is |t0|^2 that of t. Two plates may be of the same
+        # material, as metal is beside metal.
         variance = METAL_SPREAD**2 + self.own_variance
         alike = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
         of_some_kind = parts[..., 1:] + 2 * np.log(size)
@@ -195,6 +200,7 @@ class _DielectricReference(SceneLikelihood):
         return np.concatenate([brightness_log, patch_logs], axis=-1)
 
     def _find_middle_angle(self) -> float:
+        """Return the patches' mean incidence angle, taken as that of the reference, radians; 0 without patches."""
         return float(self.theta.mean()) if self.theta.size else 0.0
 
 
@@ -328,7 +334,7 @@ def gains_as_plates(images: Images, metal_mask: Mask) -> tuple[complex, complex]
 def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | None) -> Images:
     """Divide both channels by metal, in the scene or scanned separately; leakage is not removed.
 
-    Without any signal of metal to divide by, the images are returned unchanged.
+    Without any signal of metal to divide by, the images are returned unchanged; DataError if the metal was given.
     """
     if reference is not None:
         return reference.apply(images)
@@ -341,7 +347,7 @@ def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | 
 
 
 def channel_ratio_of(images: Images, metal: MetalReference) -> complex | None:
-    """Return V / H of the metal reference in the images; None without signal."""
+    """Return V / H of the metal reference in the images, by least squares over its pixels; None without signal."""
     h = images.h[metal.mask]
     v = images.v[metal.mask]
     power = float(np.sum(np.abs(h.astype(np.complex128)) ** 2))
@@ -351,7 +357,7 @@ def channel_ratio_of(images: Images, metal: MetalReference) -> complex | None:
 
 
 def metal_unevenness(images: Images, metal_mask: Mask) -> float:
-    """Return how far root mean squares of metal are from its median, |ln(V / H)|, of images relative to metal."""
+    """Return |ln(V / H)| of the root mean squares over the metal, of images in which the median of its V / H is 1."""
     rms_h, rms_v = metal_gains(images.h, images.v, metal_mask)
     return float(abs(np.log(rms_v / rms_h)))
 
@@ -408,7 +414,7 @@ NO_HALO = Halo()
 
 
 def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
-    """Find a halo of V around the metal, which is given by its interior."""
+    """Find a halo of V around the metal, bool [ny, nx], which is given by its interior; `NO_HALO` if there is none."""
     pixel_mm = abs(float(images.x_m[1] - images.x_m[0])) * 1e3
     levels = [float(np.median(np.abs(channel[metal]))) if metal.any() else 0.0 for channel in (images.h, images.v)]
     if min(levels) <= 0:
@@ -437,7 +443,11 @@ def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
 def _measure_excess(
     relative: Sequence[np.ndarray], free: Mask, plate: Mask, reach_mm: tuple[float, float], pixel_mm: float
 ) -> float:
-    """Return the amplitude of V beside a plate beyond its usual one; 0 if it is no halo, or nothing is free."""
+    """Return the amplitude of V beside a plate beyond its usual one; 0 if it is no halo, or nothing is free.
+
+    `relative` are |H| and |V| over those of metal, float [ny, nx]; `free` the pixels away from all plates; `reach_mm`
+    the least and the largest distance from the plate.
+    """
     distance = _measure_distance_mm(plate, pixel_mm)
     ring = free & (distance > reach_mm[0]) & (distance <= reach_mm[1])
     if not ring.any():
@@ -451,4 +461,5 @@ def _measure_excess(
 
 
 def _measure_distance_mm(mask: Mask, pixel_mm: float) -> np.ndarray:
+    """Return the distance of each pixel from a mask, float [ny, nx]; 0 inside."""
     return np.asarray(scipy.ndimage.distance_transform_edt(~mask)) * pixel_mm

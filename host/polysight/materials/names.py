@@ -35,7 +35,7 @@ UNKNOWN = "unknown"
 INCLUSIONS = 0.05
 """Share of a patch's pixels that may be of another material; a pixel's prior is its patch's name otherwise."""
 UNKNOWN_BUDGET = 0.03
-"""Relative error of V / H beside the spread of its pixels if the error budget of its scan is not known."""
+"""Relative error of V / H, beside the spread of its pixels, that is assumed if the scan's error budget is not known."""
 LIKELY = 0.005
 """Materials of less probability are not listed."""
 LAYER = "possible layer"
@@ -231,7 +231,7 @@ def _find_verdict(
 
 
 def _sort_likeliest_first(probability: Mapping[str, float], least: float = LIKELY) -> dict[str, float]:
-    """Return the probabilities of at least `least`, rounded, largest first."""
+    """Return the probabilities of at least `least`, rounded to four digits, largest first."""
     ordered = sorted(probability.items(), key=lambda item: -item[1])
     return {name: round(p, 4) for name, p in ordered if p >= least}
 
@@ -258,7 +258,7 @@ def derive_evidence_from_pixels(inverse_ratios: npt.NDArray[np.complex128], kind
 
 
 def make_patch_without_pixels(pixels: int) -> NamedPatch:
-    """Return a patch without any usable pixel."""
+    """Return the unknown patch of so many `pixels`, none of which is usable."""
     verdict = PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
     return NamedPatch(np.full(pixels, UNKNOWN), np.full(pixels, np.inf), verdict)
 
@@ -368,6 +368,7 @@ def _list_rivals(verdict: PatchName) -> str:
 
 
 def _format_estimate(permittivity: complex | None, covariance: npt.NDArray[np.float64] | None) -> str:
+    """Return a permittivity with its standard deviations as text; empty without one."""
     if permittivity is None:
         return ""
     text = f"permittivity {format_permittivity(permittivity)}"
@@ -384,6 +385,7 @@ def _list_values(literature: Mapping[str, float]) -> str:
 
 
 def _add_permittivity(name: str, permittivity: complex | None) -> str:
+    """Return a material's name, with its permittivity in brackets if it has one."""
     if permittivity is None:
         return name
     return f"{name} ({format_permittivity(permittivity)})"

@@ -80,6 +80,7 @@ class PaperKNeighborsClassifier(KNeighborsClassifier):
         """Ignore the metric that the base class sets: the weights define it."""
 
     def __sklearn_tags__(self) -> Any:
+        """Return scikit-learn's description of the estimator: it takes no sparse arrays."""
         tags = super().__sklearn_tags__()
         tags.input_tags.sparse = False
         return tags

@@ -24,13 +24,14 @@ SIGN_EVIDENCE = 0.5
 one: by 5 (natural logarithm) where liquids stood behind walls; the plates of the published picture speak by 4 in all.
 """
 UNLIKELY_SIGN = 0.005
-"""Probability of the other sign of the phases below which it is left out of the errors."""
+"""Probability of the other sign of the phases below which it is left out of the errors. Chosen: the intervals
+given hold 68 and 95 %."""
 
 
 def mirror_phases(measured: Sequence[PatchMeasurement], prior: RigPrior) -> tuple[list[PatchMeasurement], RigPrior]:
     """Return the patches and the prior as they are if all phases have the other sign.
 
-    Tilts are read from phases, too.
+    Tilts are read from phases, too. The change over the sweep stays: images of other programs have none.
     """
     patches = [
         replace(patch, inverse_ratio=patch.inverse_ratio.conjugate(), rise=(-patch.rise[0], -patch.rise[1]))

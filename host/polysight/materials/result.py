@@ -59,6 +59,7 @@ class Tilts:
 
 
 LEVEL = Tilts({}, 1)
+"""No tilt is known."""
 SHRINKS = {
     "noise": "a larger plate, a finer grid or more pulses a position",
     "metal reference": "a larger metal plate, or `polysight calibrate metal`",
@@ -141,11 +142,12 @@ class MaterialsResult:
     evidence
         Patch number to what its name rests on; not of refused patches and of the metal reference.
     brightness_off
-        Patch number to ln of |H| over that of a half space of its permittivity; not for metal-like patches.
+        Patch number to ln of |H| over that of a half space of its ratio, relative to the scene's usual one; not for
+        metal-like patches.
     apart_mm
         Where the image of V lay relative to that of H (x, y) before it was moved onto it.
     drift
-        Drift of V / H over the scan at the plates, which is removed; None if it is not known.
+        Change of V / H over the scan at the plates by drift and fringes, which is removed; None if it is not known.
     halo
         Amplitude of V around the metal beyond what H has there, relative to the metal.
     behind
@@ -211,9 +213,10 @@ class MaterialsResult:
         return ratio_sigma(h, v, dark, ratio_error(self.inversion, self.prior, inverse))
 
     def errors_by_disturbance(self) -> dict[int, float]:
-        """Return patch number to the relative error of its permittivity by `disturbed`; of V / H without one.
+        """Return patch number to the relative error of its permittivity by `disturbed`, at most that of V / H.
 
-        Refused patches are left out. Near the Brewster angle V is nearly zero, and half of it means little.
+        Without a permittivity it is that of V / H. Refused patches are left out. Near the Brewster angle V is nearly
+        zero, and half of it means little.
         """
         out = {}
         for r in self.patches:
@@ -236,6 +239,7 @@ class MaterialsResult:
         return float(np.degrees(np.mean(angles)))
 
     def _describe_patch(self, r: PatchResult) -> PatchFigures:
+        """Return the figures of one patch for materials.json; lengths, angles and |H| are rounded."""
         label = r.patch.label
         e = r.permittivity
         x0, y0, x1, y1 = r.patch.box_mm
@@ -330,6 +334,7 @@ def _describe_permittivity(e: Permittivity) -> PermittivityFigures | None:
 
 
 def _describe_truth(truth: TruthPlate, library: tuple[str, ...]) -> TruthFigures:
+    """Return the true plate for materials.json; `library` are the names that the classifier could give."""
     return TruthFigures(
         name=truth.name,
         metal=truth.metal,
@@ -341,8 +346,9 @@ def _describe_truth(truth: TruthPlate, library: tuple[str, ...]) -> TruthFigures
 
 PATCHES = "patches.npz"
 PATCHES_FORMAT = "polysight-patches-1"
+"""Name of the file in a scan's products, and of its format: a file of another one is refused."""
 APART_MM = 20.0
-"""Largest distance between the centres of one patch in two scans."""
+"""Largest distance between the centres of one patch in two scans. Chosen: less than half of a plate and its gap."""
 NEAR_MM = 4.0
 """Largest distance between pixels of two scans that show the same spot: about the resolution."""
 
@@ -351,7 +357,8 @@ NEAR_MM = 4.0
 class ScanPatch:
     """A patch in one scan: its centre (mm from the image centre), the positions and features of its pixels.
 
-    `places_mm` float64 [n, 2], `features` float64 [n, 4] of its interior, after the Gaussian filter.
+    `places_mm` float64 [n, 2] from the image centre, `features` float64 [n, 4] of its interior, after the Gaussian
+    filter (`pixel_features`). `truth` is the true material, if known.
     """
 
     label: int
@@ -363,7 +370,10 @@ class ScanPatch:
 
 @dataclass(frozen=True)
 class ScanPatches:
-    """The patches of one scan; `evidence`: patch number to what its name rests on (earlier releases wrote none)."""
+    """The patches of one scan; `evidence`: patch number to what its name rests on (earlier releases wrote none).
+
+    `angle_deg` is the mean incidence angle over the image; `simulated` is true if the scan was.
+    """
 
     angle_deg: float
     simulated: bool
@@ -392,13 +402,16 @@ class MatchedPatch:
 
 
 def pixel_features(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
-    """Return features [n, 4] of pixels; not finite for unusable pixels."""
+    """Return features [n, 4] of pixels (`library.feature_matrix`); not finite for unusable pixels."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return feature_matrix(np.ravel(h), np.ravel(v), np.ravel(p))
 
 
 def make_labels(result: MaterialsResult, description: str = "") -> Labels:
-    """Return boxes around the interiors of a result's patches, in pixels, with unique names as drawn or classified."""
+    """Return boxes around the interiors of a result's patches, in pixels, with unique names as drawn or classified.
+
+    Patches without a name of the library are called "patch", a metal reference that is one of them "metal".
+    """
     boxes: dict[str, Box] = {}
     for r in result.patches:
         name = "patch"
@@ -417,7 +430,7 @@ def make_labels(result: MaterialsResult, description: str = "") -> Labels:
 
 
 def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike, simulated: bool) -> bytes:
-    """Return the content of `patches.npz`."""
+    """Return the content of `patches.npz`; `x_m`, `y_m` are the image's axes."""
     x = axis_mm(x_m)
     y = axis_mm(y_m)
     rows = []
@@ -460,6 +473,7 @@ def _pack_dispersion(dispersion: PatchDispersion | None) -> Real:
 
 
 def _unpack_dispersion(row: Real) -> PatchDispersion | None:
+    """Return what :func:`_pack_dispersion` packed; None if it is not known."""
     if not np.isfinite(row).all():
         return None
     return PatchDispersion(row[:3], row[3:6], (float(row[6]), float(row[7])))
@@ -527,8 +541,8 @@ def _read_patch(row: Mapping[str, Any], places: Real, features: Real) -> ScanPat
 def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
     """Return the patches that all scans show at the same place, pixel by pixel.
 
-    Two patches match if their centres are each other's nearest. Pixels match by their position in the patch, so that
-    the scans' image centres may differ by up to half a patch.
+    Two patches match if their centres are each other's nearest and at most `APART_MM` apart. Pixels match by their
+    position in the patch, so that the scans' image centres may differ by up to half a patch.
     """
     matched = []
     for patch in scans[0].patches:

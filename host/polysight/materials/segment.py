@@ -35,11 +35,11 @@ MOST_SCATTER_DB = 4.0
 """Largest scatter of a background's level: that of a real picture is 3.8 dB; with more, plates are among the pixels."""
 PLAIN_DB = 14.0
 """Level above the background that noise hardly reaches over the width of the smallest patch. Of 200 images of noise
-alone 24 have a patch, 10 without this rule; all that it adds have cells above 5.9 mm (standard deviation)."""
+alone 24 have a patch, 10 without this rule; all that it adds have speckle wider than 5.9 mm (standard deviation)."""
 SMALLEST_SHARE = 0.75
 """Least area of a patch, relative to a square of the least width: a corner of a skirt has 0.6."""
 BODY = 0.65
-"""Parts of a region narrower than this share of its width do not belong to it."""
+"""Parts of a region narrower than this share of its width do not belong to it. Chosen: more rounds corners."""
 STEP_DB = 1.0
 """Step of the falling threshold."""
 BACKGROUND_PERCENT = 20.0
@@ -165,7 +165,10 @@ def box_mask(box_mm: Box, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Mask:
 def make_patch(
     label: int, mask: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float, usable: Mask | None = None
 ) -> Patch:
-    """Make a patch of a mask [ny, nx]; the margin shrinks if the patch is too small for it."""
+    """Make a patch of a mask [ny, nx]; the interior begins a margin inside, or less if the patch is too small for it.
+
+    `x_m` and `y_m` are the image's axes; only `usable` pixels, bool [ny, nx], are in the interior (None: all).
+    """
     x = axis_mm(x_m)
     y = axis_mm(y_m)
     pixel = abs(float(x[1] - x[0]))
@@ -288,7 +291,10 @@ def _is_cut(mask: Mask, smallest_px: float) -> bool:
 
 
 def _find_least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> float:
-    """Return the least level of a patch, dB: above the background by its scatter; infinite if all is background."""
+    """Return the least level of a patch in an image [ny, nx] of levels, dB: above the background by its scatter.
+
+    It is infinite if all is background.
+    """
     level = image[usable]
     if np.ptp(level) == 0:
         return float("inf")
@@ -311,7 +317,7 @@ def _select_gaps(usable: Mask, regions: Sequence[Mask], margin_px: float) -> Mas
 
 
 def _find_reading_place(mask: Mask, y_mm: Real, row_pitch_mm: float) -> tuple[float, float]:
-    """Return the sort key of a patch: top row first, then from left to right."""
+    """Return the sort key of a patch: top row first, then from left to right; rows are `row_pitch_mm` high."""
     rows, cols = np.nonzero(mask)
     return -round(float(y_mm[rows].mean()) / row_pitch_mm), float(cols.mean())
 
@@ -415,7 +421,10 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
 
 
 def _smooth_outline(mask: Mask) -> Mask:
-    """Fill the holes of a region and cut off what is narrower than half of it: speckle, and bridges to a neighbour."""
+    """Fill the holes of a region, cut off what is narrower than `BODY` of its width (speckle, bridges to a neighbour).
+
+    Of what is left the largest part stays, with a smooth outline.
+    """
     # The Gaussian below ends after 4 pixels.
     window = _find_window(mask, 5)
     filled = np.asarray(scipy.ndimage.binary_fill_holes(mask[window]), bool)
@@ -453,6 +462,7 @@ def _find_window(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
 
 
 def _find_components(mask: Mask) -> list[Mask]:
+    """Return the connected regions of a mask, bool [ny, nx] each."""
     labels = np.asarray(skimage.measure.label(mask, connectivity=1))
     return [labels == i for i in range(1, int(labels.max()) + 1)]
 
@@ -489,9 +499,10 @@ def _measure_edges(channel: Image, usable: Mask) -> np.ndarray:
     return np.hypot(rows, columns)
 
 
-# --- total variation and corners, as `denoise_tv_chambolle` and `approximate_polygon` of scikit-image, which load
-# scipy.stats and scipy.signal: a second ---
+# --- total variation and corners: as `denoise_tv_chambolle` and `approximate_polygon` of scikit-image, whose modules
+# take a second to import (scipy.stats and scipy.signal) ---
 
+# Largest number of iterations.
 _ITERATIONS = 100
 _LEAST_CHANGE = 2e-4
 """Change of the cost, relative to its first value, at which the iteration ends."""
@@ -555,7 +566,8 @@ def drop_corners(outline: Real, tolerance: float) -> Real:
 class TruthPlate:
     """A rectangular plate of the true scene.
 
-    Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal, strips and stacks of layers.
+    Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal, strips and stacks of layers;
+    thickness, None if it is not given; `metal`: the plate is metal.
     """
 
     name: str

@@ -23,7 +23,8 @@ Fig. 17 of the paper (variances 0.0021 and 0.0295 of 3.78 and 4.75; 0.0255 and 0
 PRIOR_FREEDOM = 4.0
 """Weight of that prior, in number of specimens."""
 OWN_FREEDOM = 20.0
-"""Weight of the mean of all materials in one material's own spread, in number of specimens."""
+"""Weight of the mean of all materials in one material's own spread, in number of specimens. Both weights are chosen:
+libraries have few specimens of a material."""
 METAL_WITHOUT_PERMITTIVITY = 0.25
 """|P - 1| or |1/P - 1|, the smaller, below which a patch gets no permittivity.
 
@@ -88,7 +89,7 @@ def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
 
 
 def apparent_permittivity(t: Complex, angles_rad: Sequence[float]) -> complex:
-    """Return the half space with ratios t [angles]: mean of Eq. 3 over the angles, limited to passive materials."""
+    """Return the permittivity of the half space of t = V / H [angles]: mean of Eq. 3 over the angles, made passive."""
     eps = complex(np.mean([complex(permittivity_from_ratio(q, angle)) for q, angle in zip(t, angles_rad, strict=True)]))
     return complex(max(eps.real, 1.01), min(eps.imag, -_LEAST_LOSS))
 

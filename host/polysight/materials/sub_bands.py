@@ -1,19 +1,16 @@
-"""Fit a patch's spectrum over the sub-bands of the sweep, or a solution's polarisation angle.
+"""Fit a patch's ratios over the sub-bands of the sweep, or the concentration of a solution to its polarisation angle.
 
-Ratios of the patches in sub-bands of the sweep, to separate thin layers from thick ones.
+Ratios in sub-bands of the sweep tell thin layers, whose reflection changes with frequency, from thick ones. The error
+of a ratio has a part common to all sub-bands of a patch (leakage, metal reference, edges and tilt) and a part of its
+own in each (noise, sidelobes). Differences between sub-bands are therefore known better than each of them: their full
+covariance is stored.
 
-The error of a ratio has a part common to all sub-bands of a patch (leakage, metal reference, edges and tilt) and a part
-of its own in each (noise, sidelobes). Differences between sub-bands are therefore known better than each of them: their
-full covariance is stored.
+`add_bands` measures them; `bands_of_row` reads them back from a segment of materials.json (that is what files call a
+patch), and `fit_row` fits the unknown layer of a stack to it.
 
-`add_bands` measures them; `bands_of_row` reads them back from a segment of materials.json, and `fit_row` fits the
-unknown layer of a stack to it.
-
-Concentration of a solution from its polarisation angle (section 9.4 of the paper).
-
-Phi = arctan |P| (Eq. 8) falls steadily as sugar is dissolved. The calibration is a straight line through known
-concentrations, which gives unknown ones with a prediction interval. It is judged by cross-validation: all patches of
-one concentration are left out together.
+The polarisation angle Phi = arctan |P| (Eq. 8) falls steadily as sugar is dissolved (section 9.4 of the paper).
+`fit_concentration` fits a straight line through known concentrations, which gives unknown ones with a prediction
+interval. It is judged by cross-validation: all patches of one concentration are left out together.
 """
 
 from __future__ import annotations
@@ -101,7 +98,7 @@ def band_rows(
     bands, images
         Sub-bands and their image pairs, [K].
     leakage, smooth_px
-        Leakage and width of the filter against speckle, as for the whole sweep.
+        Leakage to remove, of p into H and of s into V; width of the filter against speckle, as for the whole sweep.
     references
         Metal scanned separately, for each sub-band; None: the metal region of the scene.
 
@@ -272,7 +269,7 @@ def bands_of_row(
     if count > 1 and len(shared) == count:
         covariance = np.array([line for lines in shared for line in lines], np.float64)
     else:
-        # Products of earlier releases have no covariance: K bands are then no better than one.
+        # Products of earlier releases have no covariance: K bands are then no better than one (count = 1 stays as is).
         sigma = np.sqrt(count) * sigma
     theta_std = 0.0
     phase_per_angle = 0.0
@@ -315,6 +312,10 @@ def parse_layer(text: str) -> Layer:
 
 
 def _parse_unknown_layer(name: str, size: str = "") -> Layer:
+    """Return an unknown layer of this thickness in mm: a number, a range, "?", or "" for a half space.
+
+    Raises ValueError for another text.
+    """
     if not size:
         return Layer(name)
     if size == "?":
@@ -328,6 +329,7 @@ def _parse_unknown_layer(name: str, size: str = "") -> Layer:
 
 
 def _parse_metres(mm: float) -> float:
+    """Return a thickness in metres. Raises ValueError unless it is positive and finite."""
     if not 0 < mm < np.inf:
         raise ValueError(mm)
     return mm / 1e3
@@ -408,6 +410,7 @@ def layer_content(fit: LayerFit) -> dict[str, Any]:
 
 
 def _describe_solution(fit: LayerFit) -> dict[str, Any]:
+    """Return permittivity, thickness and chi-square of a solution as plain values for JSON."""
     return {
         "permittivity": [fit.permittivity.real, -fit.permittivity.imag],
         "thickness_mm": None if fit.thickness_m is None else 1e3 * fit.thickness_m,
@@ -483,7 +486,7 @@ class LeftOut:
     """Estimate of one patch by a line fitted without its concentration."""
 
     name: str
-    # Percent by weight: known, estimated, and the ends of the prediction interval.
+    # Percent by weight: known, estimated, and the ends of the prediction interval. `name` is that of the material.
     true_percent: float
     percent: float
     low: float
@@ -565,7 +568,7 @@ def fit_concentration(
 
 
 def _measure_reference_spread(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
-    """Return the relative spread of the metal's pixels."""
+    """Return the relative spread of the metal's pixels, in the scene or scanned separately; 0 if it is not known."""
     if reference is None:
         spread = inverse_spread(h[metal.mask], v[metal.mask])
     else:

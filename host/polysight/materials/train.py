@@ -14,7 +14,7 @@ Two parts of the published data set are read:
 
 `labels/<scan>/{sar_h,sar_v}.npy` and `<scan>.json`: images with boxes [x0, y0, x1, y1] in pixels. The direction of y,
 and the order [y, x] or [x, y] of the images, is not documented. All scans share one convention, which is found from the
-images: with the right one the boxes explain most of the brightness.
+images: with the right one the boxes explain most of the variance of the brightness.
 
 `materials/<name>_<angle>.pkl`: pixels of one material and of its metal reference. The pickles are read with an
 unpickler that allows arrays and plain types only.
@@ -55,8 +55,9 @@ ORIENTATIONS = {
     "x and y swapped": lambda a: a.T,
     "x and y swapped, y from the last row": lambda a: a.T[::-1],
 }
-# How much more of the variance another orientation must explain
+# How much more of the variance another orientation must explain: chosen, so that chance does not turn images.
 _CLEARLY = 0.05
+# Module and name of what the published pickles may call: arrays and plain numbers, of old and new releases of numpy.
 _ALLOWED = {
     ("numpy", "ndarray"),
     ("numpy", "dtype"),
@@ -69,7 +70,9 @@ _ALLOWED = {
     ("numpy.core.numeric", "_frombuffer"),
     ("numpy._core.numeric", "_frombuffer"),
 }
+# Usual number of parts of the cross-validation; one part is left out at a time.
 FOLDS = 8
+# The split of a score whose training and test pixels are of the same patches.
 OPTIMISTIC = "by pixel (optimistic)"
 PIXELS = 16
 """Pixels of each patch, in a library and to judge models."""
@@ -106,10 +109,8 @@ class LabelledScan:
         if not mask.any():
             raise DataError(
                 f"{self.scan}: the box of {name}, {self.boxes[name]}, holds no pixel of the {self.h.shape} image",
-                "the label file is of another scan",
-                "correct the box, or leave the scan out",
-                code=ErrorCode.NO_DATA,
-            )
+                "the label file is of another scan", "correct the box, or leave the scan out", code=ErrorCode.NO_DATA,
+            )  # fmt: skip
         return mask
 
     def orient(self, how: str) -> LabelledScan:
@@ -172,7 +173,7 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
 
 
 def compute_explained_variance(scan: LabelledScan) -> float:
-    """Return the share of the variance of the pixels' brightness (dB) that the boxes explain, 0 to 1."""
+    """Return the share of the variance of ln |H||V| over the pixels that the boxes explain, 0 to 1."""
     level = np.log(np.maximum(np.abs(scan.h) * np.abs(scan.v), 1e-30)).astype(np.float64)
     label = np.zeros(level.shape, int)
     for i, name in enumerate(scan.boxes, 1):
@@ -182,7 +183,7 @@ def compute_explained_variance(scan: LabelledScan) -> float:
 
 
 def image_orientation(scans: Sequence[LabelledScan]) -> str:
-    """Return the orientation of a data set's images: the first of `ORIENTATIONS`, unless another explains more."""
+    """Return the orientation of a data set's images: the first of `ORIENTATIONS`, unless one explains clearly more."""
     shares = {}
     for orientation in ORIENTATIONS:
         try:
@@ -206,9 +207,8 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
         raise DataError(
             f"{scan.scan}: none of its boxes is of metal: {', '.join(scan.boxes)}",
             "everything is measured relative to metal",
-            f"a metal box has one of these words in its name: {', '.join(METALS)}",
-            code=ErrorCode.NO_DATA,
-        )
+            f"a metal box has one of these words in its name: {', '.join(METALS)}", code=ErrorCode.NO_DATA,
+        )  # fmt: skip
     metal_h, metal_v = metal_gains(scan.h, scan.v, scan.mask(scan.metal) & (scan.h != 0) & (scan.v != 0))
     h = scan.h / np.asarray(metal_h, scan.h.dtype)
     v = scan.v / np.asarray(metal_v, scan.v.dtype)
@@ -252,6 +252,7 @@ def angle_in_text(texts: Iterable[str]) -> float | None:
     return None
 
 
+# Largest pickle that is read: a damaged or foreign file must not fill the memory.
 _MAX_BYTES = 1 << 30
 
 
@@ -296,8 +297,8 @@ def read_pickle(path: Path) -> Any:
 def read_material(path: Path) -> Entry:
     """Read a material file as a library entry, divided by its reference.
 
-    `values` and `ref_values` are [P, H, V]; P is divided by the reference's mean P, H and V by the root mean square
-    of its amplitudes (Eq. 8 and 9 of the paper).
+    `values` and `ref_values` are [P, H, V]; P is divided by the reference's mean P (Eq. 9 of the paper), H and V by the
+    root mean square of its amplitudes: of these only amplitudes are used.
 
     Raises DataError as :func:`read_pickle`, or if keys are missing or arrays are invalid.
     """
@@ -370,7 +371,7 @@ def _read_pixels(values: Any, most: int) -> npt.NDArray[np.complex128]:
 
 
 def _parse_thickness(value: Any) -> float | None:
-    # The thickness may be a text such as "3 mm".
+    """Return a thickness in mm, a number or a text such as "3 mm"; None if it is not given."""
     if isinstance(value, str):
         value = value.lower().removesuffix("mm").strip()
     return None if value is None or value == "" else float(value)
@@ -519,29 +520,28 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     names = np.unique(samples.names)
     tables = [_confusions(samples.names[learnt], p[learnt], names) for p in (of_pixel, in_scan, of_patch)]
     judged = np.isin(names, samples.names[learnt])
+    # One pixel stands for each patch: patches of learnt materials, and those of them that were named.
     first = np.unique(samples.patches, return_index=True)[1]
     first = first[learnt[first]]
     named = first[~unknown[first]]
     right = (of_patch == samples.names)[named]
+    pixels_right, in_scan_right, by_patch_right = (float(np.mean(np.diag(t)[judged])) for t in tables)
+    scans = np.unique(samples.independent).size
+    split = OPTIMISTIC if by_pixel else f"whole scans left out, {scans} scans"
     return Score(
-        model,
-        channels,
-        OPTIMISTIC if by_pixel else f"whole scans left out, {np.unique(samples.independent).size} scans",
-        *(float(np.mean(np.diag(t)[judged])) for t in tables),
-        patches=float(np.mean((of_patch == samples.names)[first])),
-        unknown=float(np.mean(unknown[first])),
-        confusion=tables[0],
-        patch_confusion=tables[2],
-        names=tuple(str(n) for n in names),
-        not_judged=tuple(str(n) for n in names[~judged]),
-        calibration=calibration_error(sure[named], right),
-        named=int(named.size),
+        model=model, channels=channels, split=split,
+        pixels=pixels_right, in_scan=in_scan_right, by_patch=by_patch_right,
+        patches=float(np.mean((of_patch == samples.names)[first])), unknown=float(np.mean(unknown[first])),
+        confusion=tables[0], patch_confusion=tables[2],
+        names=tuple(str(n) for n in names), not_judged=tuple(str(n) for n in names[~judged]),
+        calibration=calibration_error(sure[named], right), named=int(named.size),
         said=float(sure[named].mean()) if named.size else float("nan"),
         right=float(right.mean()) if named.size else float("nan"),
-    )
+    )  # fmt: skip
 
 
 def _confusions(true_names: npt.NDArray, predicted: npt.NDArray, names: npt.NDArray) -> Real:
+    """Return the table of `Score.confusion` for pixels [n] of these true and predicted names."""
     table = np.zeros((names.size, names.size))
     np.add.at(table, (np.searchsorted(names, true_names), np.searchsorted(names, predicted)), 1)
     return table / np.maximum(table.sum(axis=1, keepdims=True), 1)

@@ -36,28 +36,35 @@ def accuracy_lines(library: Library) -> list[str]:
     return lines
 
 
-# A standard deviation from n degrees of freedom is known to 1 / sqrt(2 n) of itself: 25 % with 8.
+# Specimens beyond the first of a material that are asked for: a standard deviation from n degrees of freedom is known
+# to 1 / sqrt(2 n) of itself, 25 % with 8.
 FREEDOM_NEEDED = 8
+# With fewer scans than this they are the likely cause of overconfidence. Chosen.
 FEW_SCANS = 4
 LEAST_MISFIT = 0.05
 """Difference between the mean confidence and the share of correct names that is reported, unless it may be chance."""
 ALIKE_STD = 2.0
 """Distance of two materials, in standard deviations of a patch, below which one may be named as the other."""
+# Largest number of pairs of materials that are listed.
 SHOWN_PAIRS = 3
 
 
 def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
-    """Return lines on confidence: whether it is too large or too small, why, and how many specimens are needed."""
+    """Return lines on confidence: whether it is too large or too small, why, and how many specimens are needed.
+
+    `fit` is that of one angle (`train.fit_samples`), `angle` its key in the library's fit.
+    """
     if fit.get("named") is None:
         # Libraries of earlier releases have no confidence.
         return []
     missing = max(FREEDOM_NEEDED - fit["specimen_freedom"], 0)
-    # Scans of one and the same piece cannot show how names fare on another.
+    # Scans of one and the same piece cannot tell how often names are right on another piece.
     need = (
         f"{fit['specimen_freedom']} specimens beyond the first of a material tell how far specimens differ;"
         f" {missing} more are needed to know it to 25 % (scan other pieces: polysight label --specimen NAME=WHICH)"
     )
     lines = []
+    # Standard deviation of a share of so many names by chance, at least that of a share of about 95 %.
     chance = np.sqrt(max(fit["right"] * (1 - fit["right"]), 0.05) / max(fit["named"], 1))
     misfit = fit["said"] - fit["right"]
     if abs(misfit) > max(2 * chance, LEAST_MISFIT):

@@ -24,16 +24,22 @@ from polysight.surfaces.voltages import (
     reflect_points,
 )
 
-# Degree of the gains' polynomial in the direction of arrival, by the angle that the reference covers.
+# Degree of the gains' polynomials in the direction of arrival or departure, if the reference covers directions.
 DEGREE = 2
+# A reference whose directions span no more than this, in radians, is taken for a plate, which has one direction.
+LEAST_SPAN_RAD = 0.1
 # Change of ln(H / V) per radian of direction that a flat plate cannot exclude: two boards 20 degrees apart with the
 # pattern cos^2 differ by 0.7.
 UNKNOWN_SLOPE = 0.7
+# The same beyond the directions of a sphere, over that of a plate: its polynomial continues the pattern. Chosen.
+SHARE_BEYOND_SPHERE = 0.25
 
 
 @dataclass(frozen=True)
 class Gains:
     """Gains of H and V as polynomials of the direction of arrival, learnt from metal.
+
+    Directions are the x and y of unit vectors, [n, 2]; small changes of them are radians.
 
     Attributes
     ----------
@@ -47,7 +53,7 @@ class Gains:
         Middles of the directions of arrival and of departure, and the degree of the polynomials.
     std
         Standard deviation of each part of ln(H / V) within the directions covered: what the polynomial does not follow,
-        beyond the noise of the reference's points.
+        beyond the noise of the reference's points, and the next order of the reference's own curvature.
     covered
         Smallest and largest direction, [2] each.
     terms_root, cell
@@ -79,6 +85,7 @@ class Gains:
         return np.hypot(np.abs(by_arrival - by_departure) / 2, self.estimate_unknown_std(v.arrival))
 
     def _find_levels(self, v: Voltages) -> tuple[Array, Array]:
+        """Return ln|gain of H| by the direction of arrival, and by that of departure, [n] each."""
         arrival_terms, departure_terms = self.level_terms
         departure = _evaluate_polynomials(v.departure - self.departure_middle, self.degree)
         return self._make_basis(v.arrival) @ arrival_terms, departure @ departure_terms
@@ -88,10 +95,12 @@ class Gains:
         return np.hypot(self.std, self._extrapolate_std(arrival))
 
     def _extrapolate_std(self, arrival: Array) -> Array:
+        """Return the standard deviation of ln(H / V) by the distance from the directions covered, [n]; 0 within."""
         low, high = self.covered
         beyond = np.linalg.norm(np.maximum(0, np.maximum(low - arrival, arrival - high)), axis=1)
-        slope = UNKNOWN_SLOPE if self.degree == 0 else UNKNOWN_SLOPE / 4
-        return slope * beyond
+        if self.degree == 0:
+            return UNKNOWN_SLOPE * beyond
+        return SHARE_BEYOND_SPHERE * UNKNOWN_SLOPE * beyond
 
     def list_errors(self, arrival: Array) -> Array:
         """Return independent errors of each part of ln(H / V), one standard deviation each, [errors, n].
@@ -106,10 +115,12 @@ class Gains:
         return np.concatenate([of_terms.T, of_cells, self._extrapolate_std(arrival)[None]])
 
     def _make_basis(self, arrival: Array) -> Array:
+        """Return the polynomials of `ratio_terms` at directions of arrival, [n, terms]."""
         return _evaluate_polynomials(arrival - self.middle, self.degree)
 
 
 def _evaluate_polynomials(d: Array, degree: int) -> Array:
+    """Return all products of powers of both parts of `d` [n, 2] up to a degree in all, [n, terms]."""
     terms = [d[:, 0] ** i * d[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)]
     return np.stack(terms, axis=1)
 
@@ -128,7 +139,10 @@ def _fit_robustly(basis: Array, values: NDArray, weight: Array) -> tuple[NDArray
 
 
 def learn_gains(metal: Voltages, wave_number: float) -> Gains:
-    """Fit the gains to points of metal; directions closer than 6 degrees together give one value for all."""
+    """Fit the gains to points of metal; if their directions span no more than `LEAST_SPAN_RAD`, one value for all.
+
+    `wave_number` is that at the middle of the band, 1 / m.
+    """
     coefficients = reflect_points(np.inf, metal, wave_number)
     gain = metal.b / receive(metal, coefficients)
     sound = np.asarray(np.isfinite(gain).all(axis=1) & (np.abs(gain) > 0).all(axis=1))
@@ -139,7 +153,7 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     middle = np.average(metal.arrival, axis=0, weights=weight)
     departure_middle = np.average(metal.departure, axis=0, weights=weight)
     low, high = np.percentile(metal.arrival, [3, 97], axis=0)
-    degree = DEGREE if float(np.min(high - low)) > 0.1 else 0
+    degree = DEGREE if float(np.min(high - low)) > LEAST_SPAN_RAD else 0
     basis = _evaluate_polynomials(metal.arrival - middle, degree)
     # Phases are taken about their mean, so that none wraps.
     centre = np.angle(np.sum(weight * ratio / np.abs(ratio)))
@@ -154,7 +168,7 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     noise2 = np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1)
     misfit_std, noise_std = _compute_misfit_std(rest, noise2, metal.at_m)
     std = float(np.hypot(np.sqrt(max(0.0, misfit_std**2 - noise_std**2)), next_order))
-    # How the direction changes with the stage; a plate has one direction.
+    # A cell is as wide as the direction changes while the stage moves by a block; a plate has one direction.
     rate = np.linalg.lstsq(metal.at_m - metal.at_m.mean(axis=0), metal.arrival - middle, rcond=None)[0]
     cell = BLOCK_M * np.linalg.norm(rate, axis=0) if degree else np.full(2, np.inf)
     block = number_blocks(metal.at_m, (0.0, 0.0))

@@ -2,6 +2,9 @@
 
 Echoes of two objects 150 mm apart in x are one resolution cell of slope apart. Fits of one after the other, each to
 what the others leave, were 6 mm and 3 dB off after as many rounds as time allowed; all together they are exact.
+
+Echoes that a window hardly resolves make each other uncertain: their widening is the standard error of a value in the
+joint fit over that in a fit of the echo alone.
 """
 
 from __future__ import annotations
@@ -39,7 +42,7 @@ STEERING_GAIN = 0.9
 MERGED_WIDENING = 2
 # Pairs of the six values of a path, each once.
 PAIRS = np.triu_indices(6)
-# Square of a widening beyond any use.
+# Square of the widening that stands for no information at all.
 NO_INFORMATION = 1e12
 
 
@@ -116,6 +119,7 @@ class JointFit:
         return waves, self.windows.samples[members] - echoes
 
     def _descend(self, members: NDArray) -> None:
+        """Improve values and amplitudes of windows (indices), with the RX added up as they are, by damped steps."""
         echoes = self.amplitude.shape[1]
         energy = np.zeros(len(self.rest))
         energy[members] = find_energy(self.rest[members])
@@ -124,6 +128,7 @@ class JointFit:
         for _ in range(JOINT_ITERATIONS):
             normal, gradient = self._find_normal_equations(running)
             diagonal = np.einsum("wii->wi", normal)
+            # A step that leaves less than before is taken and the damping falls; otherwise it grows.
             damped = normal + (damping[running, None] * diagonal + 1e-12)[:, :, None] * np.eye(8 * echoes)
             step = np.linalg.solve(damped, gradient[..., None])[..., 0].reshape(-1, echoes, 8)
             path_step = np.clip(step[..., 2:], -STEP_LIMITS, STEP_LIMITS)
@@ -147,9 +152,10 @@ class JointFit:
                 break
 
     def part_merged_echoes(self) -> None:
-        """Fit again, from starts apart, where two echoes have run into one another: large, and of opposite sign.
+        """Fit again where two echoes have run into one another: they are large then, and of opposite sign.
 
-        Of the fits, the one that leaves the least energy is kept.
+        The two most uncertain echoes start from half a resolution cell on either side of their mean, in path, in g_x
+        and in g_y. Of all fits the one that leaves the least energy is kept.
         """
         widening = self.find_widening()[..., 0]
         merged = np.flatnonzero(widening.max(axis=1) > MERGED_WIDENING)
@@ -197,7 +203,7 @@ class JointFit:
         return normal.reshape(count, 8 * echoes, 8 * echoes), gradient.reshape(count, 8 * echoes)
 
     def _find_directions(self, members: NDArray, index: int) -> NDArray[np.complex128]:
-        """Change of an echo by its 8 unknowns, over the wave and its 6 derivatives: [window, 8, 7]."""
+        """Change of an echo by its 8 unknowns, in terms of the wave and its 6 derivatives: [window, 8, 7]."""
         directions = np.zeros((len(members), 8, 7), complex)
         directions[:, 0, 0] = 1
         directions[:, 1, 0] = 1j
@@ -232,7 +238,7 @@ class JointFit:
         return (products + mixed + np.swapaxes(mixed, 1, 2)).astype(complex)
 
     def fit_amplitudes(self) -> Array:
-        """Fit the amplitudes alone; return how much less certain the others make that of the first echo [window]."""
+        """Fit the amplitudes alone; return the widening of the first echo's, [window]."""
         members = np.arange(len(self.values))
         echoes = self.amplitude.shape[1]
         self.subtract(members)

@@ -27,7 +27,8 @@ from polysight.surfaces.points import (
 from polysight.surfaces.window import WINDOW_M, Echoes, Samples
 
 Array = NDArray[np.float64]
-# Points and normals of neighbouring windows that belong to one surface differ by no more.
+# Points, paths and normals of neighbouring windows that belong to one surface differ by no more than these, beyond the
+# distance of the windows and the noise of the paths.
 MAX_GAP_M = 0.02
 MAX_PATH_MISS_M = 0.002
 MAX_TURN_RAD = 0.35
@@ -36,11 +37,14 @@ NEIGHBOURHOOD_M = 0.024
 # Points so close on a surface have the same curvature; they are counted in cells.
 SAME_CURVATURE_M = 0.012
 CELL_M = 0.004
+# A group of fewer points is no surface: a chance of noise and edges.
 MIN_POINTS = 8
+# Least number of windows to fit a curvature to: five unknowns from two slopes and the curvature of each.
 MIN_NEIGHBOURS = 6
 # Windows of one surface that tell how far slopes ripple. Near the border of a zone that reflects, its edge ripples by
 # waves of about 100 mm, which a fit within 24 mm takes for curvature.
 RIPPLE_REACH_M = 0.054
+# Least number of these windows: nine unknowns are fitted.
 MIN_AROUND = 16
 # Distance at which a window's own curvature counts as a slope: a third of a window.
 LEVER_OF_WINDOW_M = 0.011
@@ -95,7 +99,11 @@ def find_shape(echoes: Echoes, optics: Optics) -> Shape:
 
 
 def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, float]) -> Seen:
-    """Find the specular points of a scan in H, and measure the same points in V."""
+    """Find the specular points of a scan in H, and measure the same points in V.
+
+    `h` and `v` are the boards' samples, `gate_m` the smallest and the largest path that is searched, metres. The points
+    returned are those of echoes in a group, wider than edges and wires, which V's scan covers too.
+    """
     echoes = find_echoes(h, gate_m)
     echoes = echoes[_is_sound(echoes, find_shape(echoes, optics))]
     segment = group_echoes(echoes, optics)
@@ -136,6 +144,7 @@ def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
     if not count:
         return np.zeros(0, int)
     shape = find_shape(echoes, optics)
+    # Up to 2.3 strides: windows two apart along one axis and one along the other, so that one gap does not part them.
     pairs = scipy.spatial.KDTree(echoes.at_m[:, :2]).query_pairs(2.3 * STRIDE_M, output_type="ndarray")
     first, second = pairs.T
     d = (echoes.at_m[second] - echoes.at_m[first])[:, :2]
@@ -246,9 +255,10 @@ def _find_fit(fits: dict[bytes, SlopeFit], d: Array, *, may_change: bool) -> Slo
 def correlate_windows(d: Array) -> tuple[Array, Array]:
     """Correlations [2, n, n] of the errors of both slopes of windows at the offsets `d` [n, 2], by noise and by ripple.
 
-    Windows share data as far as they overlap. Noise counts by its distance from the middle in the direction of the
-    slope, hence 1 - 3 s + 2 s^3 at the share s of a window there, and 1 - s across it. Ripple is as long as a window or
-    longer: normals of simulated plates had correlations of 0.77, 0.49 and 0.13 at 8, 16 and 24 mm, about 1 - s.
+    Windows share data as far as they overlap; s is their distance over the width of a window. Noise counts by its
+    distance from the middle in the direction of the slope: hence 1 - 3 s + 2 s^3 along it, and 1 - s across it. Ripple
+    is as long as a window or longer: normals of simulated plates had correlations of 0.77, 0.49 and 0.13 at 8, 16 and
+    24 mm, about 1 - s.
     """
     distance = np.minimum(1, np.abs(d[:, None] - d[None]) / WINDOW_M)
     across = np.moveaxis(1 - distance, -1, 0)
@@ -273,8 +283,10 @@ def find_share_left(correlation: Array, matrix: Array, inverse: NDArray) -> Arra
 def share_curvatures(echoes: Echoes, segment: NDArray[np.int_], optics: Optics) -> Echoes:
     """Replace the curvature of each echo's path by that of the mean motion of the points close by on the surface.
 
-    A small body shows nearly the same place to all windows, which moves by millimetres: each window alone tells little
-    of its curvature, all together much. On a plane only the next windows see the same place. Echoes count by power.
+    The motion is how far the point moves on the surface while the stage moves (`find_motion`); the path's curvature is
+    linear in it. A small body shows nearly the same place to all windows, which moves by millimetres: each window alone
+    tells little of its curvature, all together much. On a plane only the next windows see the same place. Echoes count
+    by power.
     """
     shape = find_shape(echoes, optics)
     geometry = (shape.points, shape.normals, echoes.at_m, optics.tx.at_m, optics.h.at_m)

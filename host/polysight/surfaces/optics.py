@@ -14,7 +14,8 @@ At a curved surface they differ from Fresnel's to first order in K / k (`reflect
   (`mix_twisted`).
 * a spherical wave of a finite path holds directions, too (`reflect_spherical`), at a plane as well.
 The first is Snyder and Love (IEEE Trans. MTT 23, 134, 1975) and, for metal, the second term of Luneberg and Kline; the
-second is the next order of the stationary phase (Felsen and Marcuvitz, section 4.2). All are linear in K.
+second is the next order of the stationary phase (Felsen and Marcuvitz, section 4.2). The first three are linear in K,
+the last one in 1 / path.
 """
 
 from __future__ import annotations
@@ -38,7 +39,10 @@ ANGLE_STEP = 1e-3
 
 @dataclass(frozen=True)
 class Antenna:
-    """Place (metres), boresight, and field vectors at boresight of the wanted polarisation and of the other one."""
+    """Place (metres), boresight, and field vectors at boresight of the wanted polarisation and of the other one, [3].
+
+    `leakage` is how much of the other polarisation the antenna has beside 1 of the wanted one.
+    """
 
     at_m: Array
     boresight: Array
@@ -52,7 +56,7 @@ class Antenna:
         return _carry(self.boresight, directions, vector)
 
     def turn(self, angle_rad: float) -> Antenna:
-        """Return the antenna with its polarisation turned about the boresight."""
+        """Return the antenna with its polarisation turned about the boresight, right-handed."""
         cos = np.cos(angle_rad)
         sin = np.sin(angle_rad)
         turned = [cos * v + sin * np.cross(self.boresight, v) for v in (self.wanted, self.other)]
@@ -60,7 +64,7 @@ class Antenna:
 
 
 def _carry(start: Array, ends: Array, vector: NDArray) -> NDArray:
-    """Turn `vector` as the unit vector `start` is turned to `ends` [n, 3] on the shortest arc."""
+    """Turn `vector`, across the unit vector `start`, as `start` is turned to `ends` [n, 3] on the shortest arc."""
     across = ends @ vector
     return vector - (start + ends) * (across / np.maximum(1 + ends @ start, 1e-6))[:, None]
 
@@ -105,6 +109,7 @@ def make_optics(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) ->
 
 
 def _compute_boresight(board: Board) -> Array:
+    """Return the unit vector in which a board looks, rig frame, [3]."""
     ahead = np.array(place((0.0, 0.0, 1000.0), board.mount)) - np.array(place((0.0, 0.0, 0.0), board.mount))
     return ahead / np.linalg.norm(ahead)
 
@@ -173,7 +178,10 @@ def visible_normals(rig: Instrument) -> VisibleNormals:
 
 
 def polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx: Antenna) -> Complex:
-    """Coefficients [n, 4] of r_s, r_p, and of what the surface turns from s to p and from p to s, in a voltage."""
+    """Coefficients [n, 4] of r_s, r_p, and of what the surface turns from s to p and from p to s, in a voltage.
+
+    `points` and `normals` [n, 3] are seen from stage offsets `at_m` [n, 3].
+    """
     t, r, *_ = unit_legs(points, at_m, tx.at_m, rx.at_m)
     s_axis = np.cross(normals, t)
     s_axis /= np.maximum(np.linalg.norm(s_axis, axis=1, keepdims=True), 1e-12)
@@ -288,7 +296,11 @@ def mix_twisted(eps: NDArray | complex, theta: Array, twist: Array, wave_number:
 def _reflect_local(
     eps: NDArray | complex, theta: Array, bends: tuple[Array, Array], wave_number: float
 ) -> tuple[Complex, Complex]:
-    """Coefficients of a single cylindrical wave: no sum over directions."""
+    """Coefficients (r_s, r_p) [n] of a single cylindrical wave, without the sum over directions.
+
+    `bends` are the curvatures in the plane of incidence and across it. Both cylinders change the flat coefficients
+    independently, to first order.
+    """
     bend_inside, bend_across = bends
     cos = np.cos(theta)
     sin = np.sin(theta)

@@ -40,7 +40,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 STRIDE_M = 0.008
 # Largest |g_x|, |g_y| searched: a tilt of 17 degrees in x, 24 in y.
 MAX_SLOPE = 0.47
-# Bins of the coarse search per resolution cell.
+# Slopes of the coarse search on each axis, from -MAX_SLOPE to MAX_SLOPE: two in a resolution cell of 0.11.
 SLOPE_BINS = 19
 # Largest number of echoes of one window.
 MAX_ECHOES = 5
@@ -87,11 +87,11 @@ class _Search:
 
     def find(self, windows: Windows) -> Array:
         """Return start values [window, 6] of the strongest echo of each window."""
-        y = windows.samples
-        count, rx = y.shape[:2]
+        samples = windows.samples
+        count, rx = samples.shape[:2]
         total = np.zeros((count, *self.lead.shape[1:]), np.complex64)
         for index in range(rx):
-            by_path = (self.along_f[index] @ y[:, index]).reshape(count, -1, *self.shape)
+            by_path = (self.along_f[index] @ samples[:, index]).reshape(count, -1, *self.shape)
             by_y = np.swapaxes(by_path, -1, -2) @ self.along_y
             by_slope = np.swapaxes(by_y, -1, -2) @ self.along_x
             total += self.lead[index] * by_slope

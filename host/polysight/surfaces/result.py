@@ -48,11 +48,16 @@ SURFACE = "surface.npz"
 POINTS = "surface.ply"
 # Below this radius the first-order correction of curved surfaces is not enough (tests/surfaces, 8..12 % at 30 mm).
 MIN_RADIUS_M = 0.040
+# A surface that bends less than this, 1 / m, is flat: a radius of 2 m.
+FLAT_BEND = 0.5
+# Least number of points away from the edges that a permittivity is fitted to.
 MIN_POINTS = 20
 # Ratio r_s / r_p of metal is 1; a permittivity of 40 without loss has 1.5 at 55 degrees.
 METAL_RATIO = 0.15
-# A loss below zero by so many standard deviations is no property of one medium.
+# A loss below zero by so many standard deviations is no property of one medium, nor is a smaller real part: the fit
+# ends at 1.2.
 MAX_GAIN_SIGMA = 3.0
+LEAST_REAL = 1.25
 # Level of H over that of the medium fitted, and its rise over the band, logarithms: beyond, no single surface reflects.
 # Beyond what the rig's errors explain 46 drawn solids have at most 0.020 and 0.0034; walls that pass as a medium which
 # is not theirs have more than 0.05, or 0.01 (tests/surfaces/test_what_is_no_surface.py).
@@ -79,9 +84,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Segment:
-    """A connected surface. `permittivity` is None where it is not given, and `reason` says why; `covariance` [2][2] is
-    that of (real, imaginary). `radius_mm`: the smallest radius of curvature, None for a plane. `name`: material, or ""
-    without one; `confidence`: its probability. `turned_deg`: how far a turntable had turned the object.
+    """A connected surface.
+
+    Attributes
+    ----------
+    number, points
+        Its number in the scan, and how many points it has.
+    centre_m, normal
+        Means over its points, x, y, z in the rig frame; the normal points towards the antennas.
+    radius_mm
+        The smallest radius of curvature; None for a plane.
+    incidence_deg
+        Mean incidence angle.
+    permittivity, covariance
+        eps' - j eps'', and [2][2] of (real, imaginary); None where they are not given, and `reason` says why.
+    dominated_by
+        Source of the largest part of the covariance; "" without one.
+    name, confidence
+        Material, "" without one, and its probability.
+    turned_deg
+        How far a turntable had turned the object.
     """
 
     number: int
@@ -130,7 +152,11 @@ def analyse_surface(
     scan_id: str = "",
     simulated: bool = False,
 ) -> Surface:
-    """Return shape and permittivity of the points seen; without a reference, the shape alone."""
+    """Return shape and permittivity of the points seen; without a reference, the shape alone.
+
+    `echoes` are those of H and V; `reference` gives the gains for a rig, also for one that differs by the errors that
+    `uncertainty` states.
+    """
     gains = None if reference is None else reference(optics)
     echoes, interior = drop_edges(echoes, optics, gains)
     shape = find_shape(echoes.h, optics)
@@ -286,9 +312,10 @@ def estimate_wall_std(reflection: float) -> float:
 def doubt_places(
     segments: Sequence[Segment], echoes: Seen, shape: Shape, reflection: Array
 ) -> tuple[list[Segment], Array]:
-    """Return the segments with their reasons, and the standard error of places that no single medium explains, metres.
+    """Return the segments with their reasons, and the standard errors of points by what no single medium explains, [n].
 
-    `reflection` [n]: level over that of metal. A wall is not told from other things that no single medium explains.
+    They are in metres, 0 for segments of one medium. `reflection` [n]: level over that of metal. A wall is not told
+    from other things that no single medium explains.
     """
     judged = list(segments)
     unknown_m = np.zeros(len(echoes))
@@ -332,7 +359,7 @@ def find_depth_behind(echoes: Seen, shape: Shape, number: int) -> float | None:
 
 
 def describe_segment(number: int, shape: Shape) -> Segment:
-    """Return what the shape of a segment's points says."""
+    """Return a segment with its place, normal, radius and incidence angle by the shape of its points."""
     # The median of the matrices, for noise spreads the two curvatures of each point.
     usual = np.median(shape.curvature, axis=0)
     bend = float(np.abs(np.linalg.eigvalsh((usual + usual.T) / 2)).max())
@@ -343,12 +370,13 @@ def describe_segment(number: int, shape: Shape) -> Segment:
         points=len(shape.points),
         centre_m=_convert_triple(shape.points.mean(axis=0)),
         normal=_convert_triple(normal),
-        radius_mm=1e3 / bend if bend > 0.5 else None,
+        radius_mm=1e3 / bend if bend > FLAT_BEND else None,
         incidence_deg=float(np.degrees(np.arccos(np.clip(shape.cos, 0, 1)).mean())),
     )
 
 
 def _convert_triple(vector: Array) -> tuple[float, float, float]:
+    """Return a vector [3] as plain numbers."""
     x, y, z = map(float, vector)
     return x, y, z
 
@@ -356,7 +384,10 @@ def _convert_triple(vector: Array) -> tuple[float, float, float]:
 def judge_segment(
     segment: Segment, voltages: Voltages, gains: Gains, disturbed: Sequence[DisturbedScan], wave_number: float
 ) -> tuple[Segment, PermittivityFit | None]:
-    """Fit a segment's permittivity, unless there is a reason why it has none; `disturbed` holds the same points."""
+    """Fit a segment's permittivity; return the segment and the fit, or the reason in the segment and None.
+
+    `disturbed` holds the same points as `voltages`.
+    """
     if len(voltages) < MIN_POINTS:
         cause = f"{len(voltages)} points away from its edges: too few to average over"
         return replace(segment, reason=cause), None
@@ -378,7 +409,7 @@ def judge_segment(
 def add_permittivity(segment: Segment, eps: complex, sources: dict[str, Array]) -> Segment:
     """Add a permittivity with its covariances [2, 2] by source, unless no passive medium has it."""
     (aa, ab), (_, bb) = sum(sources.values(), np.zeros((2, 2))).tolist()
-    if eps.imag > MAX_GAIN_SIGMA * bb**0.5 or eps.real < 1.25:
+    if eps.imag > MAX_GAIN_SIGMA * bb**0.5 or eps.real < LEAST_REAL:
         return replace(segment, reason=NO_SINGLE_MEDIUM)
     dominant = max(sources, key=lambda name: float(np.trace(sources[name])))
     return replace(segment, permittivity=eps, covariance=((aa, ab), (ab, bb)), dominated_by=dominant)
@@ -413,7 +444,8 @@ def read_surface(path: Path) -> Surface:
         covariance = row["covariance"]
         row["permittivity"] = None if eps is None else complex(*eps)
         row["covariance"] = None if covariance is None else tuple(map(tuple, covariance))
-        row["centre_m"], row["normal"] = tuple(row["centre_m"]), tuple(row["normal"])
+        row["centre_m"] = tuple(row["centre_m"])
+        row["normal"] = tuple(row["normal"])
         segments.append(Segment(**row))
     scan_id = str(arrays.pop("scan_id"))
     simulated = bool(arrays.pop("simulated"))
@@ -421,7 +453,7 @@ def read_surface(path: Path) -> Surface:
 
 
 def point_cloud(surface: Surface) -> bytes:
-    """Points as binary PLY, in millimetres, with normals and permittivity as properties of each vertex."""
+    """Return the points as a binary PLY file, in millimetres, with normals and permittivity of each vertex."""
     names = ("x", "y", "z", "nx", "ny", "nz", "permittivity", "loss", "permittivity_std", "incidence_deg")
     eps = surface.permittivity
     columns = [*(1e3 * surface.points_m.T), *surface.normals.T, eps.real, -eps.imag]
@@ -460,7 +492,7 @@ def describe_form(segment: Segment) -> str:
 
 
 def describe_material(segment: Segment) -> str:
-    """Return permittivity, standard errors and name of a segment, or why it has none."""
+    """Return permittivity, standard errors and name of a segment as text, or why it has none."""
     if segment.permittivity is None or segment.covariance is None:
         name = f"{segment.name}, " if segment.name else ""
         return f"{name}no permittivity, {segment.reason}"

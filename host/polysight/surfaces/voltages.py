@@ -36,7 +36,7 @@ class Voltages:
     Attributes
     ----------
     b, std
-        Voltages of H and V without path and spreading, complex [n, 2], and their standard deviations [n, 2].
+        Voltages of H and V without path and spreading, complex [n, 2], and the standard deviations of either part.
     m
         Rows of the coefficients of r_s, r_p, s to p and p to s, complex [n, 2 receivers, 4 coefficients].
     theta
@@ -75,7 +75,7 @@ class Voltages:
 
 
 def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Voltages:
-    """Return the voltages of points; `shape` is that of H's echoes unless given."""
+    """Return the voltages of points; their `shape` is found from H's echoes unless given."""
     if shape is None:
         shape = find_shape(seen.h, optics)
     tx_m = optics.tx.at_m

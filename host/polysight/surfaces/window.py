@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from polysight.surfaces.points import locate, unit_legs
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
+# Side of a window. Chosen: a larger one resolves echoes better and averages more, but bent surfaces leave the parabola.
 WINDOW_M = 0.034
+# Steps of Newton's method: from a start of the coarse search they reach the maximum.
 ITERATIONS = 7
 # Positions of a window that are enough to tell whether its echoes lie apart; a window of steps of 2 mm has 289.
 THINNED_POSITIONS = 48
@@ -77,10 +79,10 @@ class Samples:
 class Echoes:
     """Echoes [n]: stage offset `at_m` [n, 3], path, its gradient [n, 2] and curvature [n, 2, 2] (1 / m) there.
 
-    `amplitude`: complex, exp(-j k path) with the path's phase at the centre frequency in it. `amplitude_std`: of its
+    `amplitude`: complex, with the path's phase exp(-j k path) at the middle of the band in it. `amplitude_std`: of its
     real and of its imaginary part. `path_std_m`, `slope_std` [n, 2]: by the rest of the fit. `share`: of a window's
-    power that its echoes explain. `band_rise`: ln of the amplitude in the upper half of the band over that in the lower
-    half.
+    power, less that of its other echoes, that the echo explains. `band_rise`: ln of the amplitude in the upper half of
+    the band over that in the lower half.
     """
 
     at_m: Array
@@ -131,13 +133,30 @@ class Windows:
 
 
 class BoardFit:
-    """The matched filter of one board: frequencies, weights and directions."""
+    """The matched filter of one board: frequencies, weights and directions.
+
+    Attributes
+    ----------
+    board
+        Its samples.
+    omega
+        float64 [frequency]: rates of phase over path, 2 pi f / c, radians per metre.
+    lever
+        float64 [rx, 3]: places of the RX relative to their mean, metres.
+    model, gain, weights
+        Effect of the range gate [frequency, frequency] (1 on the diagonal without one); what it leaves of an echo,
+        added up over the frequencies; and the share of each frequency in that, [frequency].
+    middle, mean_square
+        Mean of `omega` and of its square with these weights.
+    upper_half, band_rise
+        bool [frequency]: the upper half of the band; ln of the gain there over that of the lower half.
+    """
 
     def __init__(self, board: Samples) -> None:
         self.board = board
         self.omega = 2 * np.pi * board.frequencies_hz / SPEED_OF_LIGHT_M_S
         self.lever = board.rx_m - board.middle_m
-        # The largest gain of the range gate for an echo, and the spread of its frequencies.
+        # The effect on echoes in the middle of the range gate, averaged over paths.
         if board.model is None:
             model = np.eye(self.omega.size)
             gate = np.linspace(0.05, 0.6, 24)
@@ -171,7 +190,7 @@ def _find_gate(board: Samples) -> tuple[float, float]:
 
 
 def find_mirror_path(board: Samples, z_m: float) -> float:
-    """Return the path over a mirror at `z_m`."""
+    """Return the path from TX over a level mirror at the height `z_m` to the middle of the RX, metres."""
     image = board.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
     return float(np.linalg.norm(board.middle_m - image))
 
@@ -196,7 +215,12 @@ def unpack_values(values: Array) -> tuple[Array, Array, Array]:
 
 @dataclass
 class Maximum:
-    """Result of :func:`maximise`: parameters, amplitude, noise, standard deviations, share and rise over the band."""
+    """Result of :func:`maximise` for each window.
+
+    The six values of the path [window, 6], the amplitude with the phase of the matched filter, standard deviations of
+    either part of the amplitude (`rest`) and of the values (`std`, [window, 6]), share of the power explained, and rise
+    over the band as of :class:`Echoes`.
+    """
 
     values: Array
     amplitude: NDArray[np.complex128]
@@ -211,7 +235,9 @@ def maximise(
 ) -> Maximum:
     """Maximise |sum of derotated samples| by Newton's method with the expected curvature.
 
-    `added`: [window, frequency, position], RX added up; `values` [window, 6].
+    `added`: [window, frequency, position], RX added up; `valid` [window, position] and `offsets` [window, position, 2]
+    as of :class:`Windows`; `values` [window, 6] to start from. Without iterations these values stay, and only the
+    amplitude is measured.
     """
     basis = find_basis(offsets)
     count = np.maximum(valid.sum(axis=1), 1)
@@ -265,22 +291,22 @@ def maximise(
     )
 
 
-def make_echoes(fit: BoardFit, windows: Windows, found: Maximum) -> Echoes:
-    """Echoes of the maxima found in windows."""
-    path, slope, bend = unpack_values(found.values)
+def make_echoes(fit: BoardFit, windows: Windows, maximum: Maximum) -> Echoes:
+    """Return the echoes of the maxima in windows."""
+    path, slope, bend = unpack_values(maximum.values)
     # The matched filter's phase is that at the weighted middle of the band.
-    turned = found.amplitude * np.exp(1j * fit.middle * path)
+    turned = maximum.amplitude * np.exp(1j * fit.middle * path)
     return Echoes(
         at_m=windows.at_m,
         path_m=path,
         slope=slope,
         bend=bend,
         amplitude=turned.conj(),
-        amplitude_std=found.rest,
-        path_std_m=found.std[:, 0],
-        slope_std=found.std[:, 1:3],
-        share=found.share,
-        band_rise=found.band_rise,
+        amplitude_std=maximum.rest,
+        path_std_m=maximum.std[:, 0],
+        slope_std=maximum.std[:, 1:3],
+        share=maximum.share,
+        band_rise=maximum.band_rise,
     )
 
 
@@ -309,7 +335,10 @@ def add_rx(factors: NDArray, samples: NDArray[np.complex64]) -> NDArray[np.compl
 
 
 def make_waves(fit: BoardFit, paths: Array) -> NDArray[np.complex64]:
-    """exp(j omega path) of paths [..., position]: [..., frequency, position]."""
+    """exp(j omega path) of paths [..., position]: [..., frequency, position].
+
+    The frequencies are evenly spaced: each wave is the one before, turned by the same phase.
+    """
     waves = np.empty((*paths.shape[:-1], fit.omega.size, paths.shape[-1]), np.complex64)
     wave = np.exp(1j * fit.omega[0] * paths).astype(np.complex64)
     turn = np.exp(1j * (fit.omega[1] - fit.omega[0]) * paths).astype(np.complex64)
@@ -337,7 +366,7 @@ def synthesise(
 
 
 def no_echoes() -> Echoes:
-    """Return the echoes of nothing."""
+    """Return an empty set of echoes."""
     return Echoes(
         at_m=np.zeros((0, 3)),
         path_m=np.zeros(0),
@@ -376,6 +405,6 @@ def replace_samples(windows: Windows, samples: NDArray) -> Windows:
     return Windows(samples, windows.valid, windows.offsets, windows.at_m)
 
 
-def select_maxima(found: Maximum, keep: NDArray) -> Maximum:
+def select_maxima(maximum: Maximum, keep: NDArray) -> Maximum:
     """Return copies of some maxima, by index [k] or bool mask [window]."""
-    return Maximum(*(getattr(found, f.name)[keep].copy() for f in fields(Maximum)))
+    return Maximum(*(getattr(maximum, f.name)[keep].copy() for f in fields(Maximum)))

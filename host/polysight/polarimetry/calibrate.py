@@ -68,7 +68,7 @@ def inverse_spread(h: Image, v: Image) -> float:
 
 
 def with_ratio(images: Images) -> Images:
-    """Return the images with p = h / v."""
+    """Return the images with p = h / v, the polarisation ratio."""
     return replace(images, p=ratio(images.h, images.v))
 
 
@@ -185,7 +185,7 @@ MIN_PIXELS = 100
 
 @dataclass(frozen=True)
 class PlaneReference:
-    """Metal reference of both channels at every pixel.
+    """Metal reference of both channels at every pixel: the gains that images are divided by.
 
     Attributes
     ----------
@@ -303,7 +303,7 @@ class PlaneReference:
 
 
 def _measure_variation_db(gain: Image) -> float:
-    """Return the standard deviation of the level of a gain over its pixels."""
+    """Return the standard deviation of the level of a gain over its pixels, dB."""
     return round(float(np.std(20 * np.log10(np.abs(gain)))), 4)
 
 
@@ -355,6 +355,7 @@ def plane_reference(images: Images, smooth_mm: float = SMOOTH_MM, name: str = ""
 
 
 def _make_disk(radius: int) -> npt.NDArray[np.bool_]:
+    """Return a disk of this radius in pixels as a square mask, for morphology."""
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     return x**2 + y**2 <= radius**2
 
@@ -373,7 +374,7 @@ class Standard:
     Attributes
     ----------
     measured
-        H and V, up to a common factor (:func:`common_direction`).
+        H and V, up to a common factor, also a complex one (:func:`common_direction`).
     wave
         Reflected s and p, up to a factor: :data:`PLATE` or :func:`strips_wave`.
     """
@@ -461,6 +462,8 @@ def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
             "scan the plate, and strips at two orientations; or use the one-parameter axial ratio",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
+    # Both channels are scaled to the same size, so that the equations are well conditioned; the solution is scaled
+    # back.
     m = np.array([s.measured for s in standards], np.complex128)
     scale = np.sqrt(np.mean(np.abs(m / np.linalg.norm(m, axis=1, keepdims=True)) ** 2, axis=0))
     m = m / scale
@@ -469,6 +472,7 @@ def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
     e /= np.linalg.norm(e, axis=1, keepdims=True)
     # m x (M e) = 0: one equation per standard for the entries g_h, g_h a, g_v b, g_v of M.
     rows = np.stack([m[:, 1] * e[:, 0], m[:, 1] * e[:, 1], -m[:, 0] * e[:, 0], -m[:, 0] * e[:, 1]], axis=1)
+    # The entries are determined up to one factor: the singular vector of the smallest, fourth singular value.
     _, sizes, vh = np.linalg.svd(rows)
     if sizes[2] < MIN_CONDITION * sizes[0]:
         raise DataError(
@@ -479,6 +483,7 @@ def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
         )
     g_h, g_ha, g_vb, g_v = vh[3].conj() * np.array([scale[0], scale[0], scale[1], scale[1]])
     matrix = (np.array([[g_h, g_ha], [g_vb, g_v]]) / scale[:, None] @ e.T).T
+    # Sine of the angle between the measured pair and that of the estimate, for each standard.
     sine = np.abs(m[:, 1] * matrix[:, 0] - m[:, 0] * matrix[:, 1]) / np.linalg.norm(matrix, axis=1)
     if len(standards) > 3:
         residual = float(np.sqrt(np.mean(np.minimum(sine, 1.0) ** 2)))
@@ -488,7 +493,10 @@ def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
 
 
 def estimate_axial_ratio(plate: Standard, strips: Standard) -> Leakage:
-    """Estimate equal leakage of both boards (the authors' axial ratio) from the plate and strips in one orientation."""
+    """Estimate equal leakage of both boards (the authors' axial ratio) from the plate and strips in one orientation.
+
+    Raises DataError if the strips reflect s and p alike.
+    """
     # Relative to the plate (H, V) ~ (s + a p, p + a s).
     h, v = (m / plate_value for m, plate_value in zip(strips.measured, plate.measured, strict=True))
     s, p = strips.wave

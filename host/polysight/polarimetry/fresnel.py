@@ -1,14 +1,11 @@
 """Plane waves at the pixels: reflection, permittivity from a ratio, layered media, and the incidence angle.
 
-Reflection of plane waves: Fresnel coefficients, their ratio, the permittivity from a ratio, and layered media.
-
 Time convention `exp(+j omega t)`: a passive medium has permittivity `eps' - j eps''` with `eps'' >= 0`, and waves in it
 decay. Signs of Eq. 2 of the paper: metal has r_s = r_p = -1, so that P = r_s / r_p = +1 at every angle.
 
-Incidence angle of each pixel.
-
-A plane parallel to the stage reflects like a mirror: at every stage offset the reflection comes from the specular
-point, under the same angle. So all pixels have the incidence angle of the specular midpoint.
+The incidence angle of a pixel: a plane parallel to the stage reflects like a mirror: at every stage offset the
+reflection comes from the specular point, under the same angle. So all pixels have the incidence angle of the specular
+midpoint.
 
 The image of a pixel also contains stage offsets within about one Fresnel zone of the specular one, with slightly
 different angles; near the border of the aperture only part of that zone was scanned. :func:`effective_incidence_map`
@@ -36,7 +33,7 @@ Complex = npt.NDArray[np.complex128]
 Real = npt.NDArray[np.float64]
 _AIR = np.asarray(1.0 + 0j)
 _NAN = complex(np.nan, np.nan)
-# Replaces infinite permittivity: reflects -1 within 1e-12
+# Replaces infinite permittivity in stacks: it reflects -1 within 1e-12.
 _CONDUCTOR = 1 - 1e24j
 
 Incidence = Literal["one", "pixel"]
@@ -107,8 +104,8 @@ def permittivity_from_ratio(p: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Compl
     Eq. 3 is evaluated as sin^2 (1 + tan^2 ((1 + P) / (1 - P))^2), the same expression without cancellation. P and 1/P
     give the same result.
 
-    P = 1 (a perfect conductor, at any angle) returns `inf + 0j`. Near it the permittivity grows as 4 / |P - 1|^2, and
-    errors of P with it: a metal-like material has no determinable permittivity.
+    P = 1 (a perfect conductor, at any angle) returns `inf + 0j`. Near it the permittivity grows as
+    4 sin^2 tan^2 / |P - 1|^2, and errors of P with it: a metal-like material has no determinable permittivity.
 
     Parameters
     ----------
@@ -218,6 +215,8 @@ def multilayer(
     theta = np.asarray(theta_rad, np.float64)
     s = np.sin(theta)
     k0 = 2 * np.pi * np.asarray(frequency_hz, np.float64) / SPEED_OF_LIGHT_M_S
+    # Normal wavenumbers over k0, and the same over the permittivity: what is continuous at an interface, for s and for
+    # p.
     q = [np.cos(theta).astype(np.complex128), *(_compute_normal_wavenumber(e, s) for e in media[1:])]
     y = [qi / ei for qi, ei in zip(q, media, strict=True)]
     r_s: Complex = (q[-2] - q[-1]) / (q[-2] + q[-1])
@@ -243,7 +242,7 @@ def _compute_half_bistatic(rig: Instrument, board_index: int, points_m: Real) ->
 
 
 def specular_incidence_rad(rig: Instrument) -> float:
-    """Return the incidence angle at the specular midpoint, radians; mean of H and V, which differ by 0.01 degrees."""
+    """Return the incidence angle at the specular midpoint, radians; mean of H and V, which differ by 0.02 degrees."""
     angles = []
     for i, board in enumerate(rig.receivers):
         angle, _ = _compute_half_bistatic(rig, i, np.asarray(specular_midpoint_m(rig, board)))
@@ -270,6 +269,7 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
     step = np.array([rig.grid.step_x_mm, rig.grid.step_y_mm]) / 1e3
     count = np.array([rig.grid.columns, rig.grid.rows])
     wavelength = SPEED_OF_LIGHT_M_S / (rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2)
+    # The stage offsets that count for a pixel are found by convolving the scanned grid with the weight around a point.
     # The first Fresnel zone is longest along x, half its length is sqrt(lambda z / (2 cos^3)); sum twice as far.
     zone = np.sqrt(wavelength * rig.geometry.object_distance_mm / 2e3 / np.cos(specular_incidence_rad(rig)) ** 3)
     reach = np.ceil(2 * zone / step).astype(int)

@@ -30,6 +30,8 @@ Plain = complex | np.generic | npt.NDArray[Any] | Sequence[Any]
 
 
 class _Fresnel(Protocol):
+    """Type of :func:`fresnel`: labelled arrays if one of the arguments is labelled."""
+
     @overload
     def __call__(self, eps: DataArray, theta_rad: Plain | DataArray) -> tuple[DataArray, DataArray]: ...
     @overload
@@ -39,6 +41,8 @@ class _Fresnel(Protocol):
 
 
 class _PermittivityFromRatio(Protocol):
+    """Type of :func:`permittivity_from_ratio`: a labelled array if one of the arguments is labelled."""
+
     @overload
     def __call__(self, p: DataArray, theta_rad: Plain | DataArray) -> DataArray: ...
     @overload
@@ -48,7 +52,7 @@ class _PermittivityFromRatio(Protocol):
 
 
 class _Multilayer(Protocol):
-    """A list of media that mixes arrays with and without labels counts as one without."""
+    """Type of :func:`multilayer`; a list of media that mixes arrays with and without labels counts as one without."""
 
     @overload
     def __call__(
@@ -99,6 +103,7 @@ def keep_labels(*results: str) -> Callable[[Function], Function]:
             if not any(isinstance(entry, xarray.DataArray) for entry in entries):
                 return function(*arguments, **named)
 
+            # xarray hands over all arrays in one row; they are put back where they were.
             def compute(*arrays: Any) -> Any:
                 remaining = iter(arrays)
                 filled = [_fill(value, remaining) for value in values]
@@ -118,6 +123,7 @@ def keep_labels(*results: str) -> Callable[[Function], Function]:
 
 
 def _list_entries(value: Any) -> list[Any]:
+    """Return the entries of a list or tuple; anything else is one entry."""
     return list(value) if isinstance(value, list | tuple) else [value]
 
 
@@ -129,7 +135,7 @@ def _fill(value: Any, arrays: Iterator[Any]) -> Any:
 
 
 def _refuse_degrees(function: Function) -> Function:
-    """Decorate a function of `theta_rad`: raise ConfigError for an angle beyond the plate's plane."""
+    """Decorate a function of `theta_rad`: raise ConfigError for an angle above pi / 2, which must be in degrees."""
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:

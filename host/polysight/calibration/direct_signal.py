@@ -43,7 +43,7 @@ PASSBAND = 0.9
 # Rows of a scan used by `fit_start`, and by `fit_filter`, which spreads their chirps over many bins of the IF.
 ROWS = 4
 FILTER_ROWS = 6
-# Smallest share of chirps with a direct path.
+# Smallest share of chirps with a direct path that a start offset is estimated from. Chosen.
 MIN_FOUND = 0.25
 # Bins of the filter's response; chirps and SNR (power ratio) that each needs.
 BIN_HZ = 10e3
@@ -108,7 +108,10 @@ def band_hz(rig: Instrument) -> tuple[float, float]:
 
 
 def unwrap_if(if_hz: NDArray[np.float64], rig: Instrument) -> NDArray[np.float64]:
-    """Unwrap the IFs [chirp] of one direct path around their circular mean, where jitter crosses the band edge."""
+    """Return the IFs [chirp] of one direct path, each within half a sample rate of their circular mean.
+
+    Where jitter crosses the band's edge, IFs of one path lie at both of its ends.
+    """
     rate = rig.chirp.sample_rate_hz
     middle = np.angle(np.exp(2j * np.pi * if_hz / rate).sum()) * rate / (2 * np.pi)
     middle += rate * round((if_hz.mean() - middle) / rate)
@@ -164,7 +167,10 @@ def find_direct(
 
 
 def _estimate_recorded_noise(aligned: sync.AlignedRow, noise: NDArray[np.float64]) -> float:
-    """Return the noise power of a recorded sample: the estimate divided by the gain of the filter compensation."""
+    """Return the noise power of a recorded sample: the estimate divided by the power gain of the filter compensation.
+
+    `noise` [position] is the estimate after compensation; the result is the median, 0 if nothing is known.
+    """
     good_chirps = np.maximum(aligned.good.sum(axis=1), 1)
     power_gain = (aligned.gain**2 * aligned.good).sum(axis=1) / good_chirps
     recorded_noise = noise / np.maximum(power_gain, 1e-12)
@@ -221,7 +227,11 @@ def fit_start(source: RawSource, board_name: str) -> BoardStart:
 def choose_start_offset(
     rig: Instrument, board: Board, expected_hz: float, seen_hz: float, error_hz: float, chirps: int
 ) -> BoardStart:
-    """Return the start offset that moves a direct path, aliased to `seen_hz`, to the middle of the IF band."""
+    """Return the start offset that moves a direct path, aliased to `seen_hz`, to the middle of the IF band.
+
+    `expected_hz` is its IF by the rig file, which tells by how many sample rates it is aliased; `error_hz` is the
+    standard error of `seen_hz` over `chirps` chirps. The offset is rounded to 1 Hz.
+    """
     rate = rig.chirp.sample_rate_hz
     middle = sum(band_hz(rig)) / 2
     alias = round((expected_hz - seen_hz) / rate)
@@ -293,9 +303,9 @@ def _measure_power_of_scan(
 def average_in_bins(if_hz: Real, power: Real, noise_power: Real) -> tuple[Real, Real]:
     """Return mean IF (Hz) and amplitude without noise, [bin], in bins of `BIN_HZ` with enough chirps and signal.
 
-    `if_hz`, `power` and `noise_power` are of one chirp each, [chirp]; the IF ascends.
-
-    The level comes from the median power, so that chirps with a wrong direct path do not count.
+    `if_hz`, `power` and `noise_power` are of one chirp each, [chirp], in any order; the bins' IFs ascend. Chirps of a
+    negative IF are left out. The level comes from the median power, so that chirps with a wrong direct path do not
+    count.
     """
     bin_of_chirp = np.floor(if_hz / BIN_HZ).astype(int)
     mean_if_hz = []
@@ -313,7 +323,7 @@ def average_in_bins(if_hz: Real, power: Real, noise_power: Real) -> tuple[Real, 
 
 
 def _estimate_corner_errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple[Real, float]:
-    """Return the standard errors of the corners (Hz), and the residual of the log levels (dB, RMS)."""
+    """Return the standard errors of the corners (Hz), and the residual of the levels (dB, RMS)."""
 
     def residual(logs: Real) -> Real:
         log_misfit = np.log(level) - np.log(np.abs(sync.HighPass(tuple(np.exp(logs))).response(if_hz)))

@@ -45,7 +45,9 @@ from polysight_shared.errors import ConfigError, DataError, DeviceError, quote
 from polysight_shared.tables import decode, read_toml, to_builtins
 
 FORMAT = 1
+"""Latest format of calibration files; files of later ones are refused."""
 IMAGES = ("h", "v", "valid")
+"""Arrays of a `PlaneReference` in the .npz file."""
 MIN_METAL_LEVEL = 0.02
 """Smallest echo of a mirror relative to the direct path; antenna patterns may take some 20 dB."""
 FOLDER = "calibration"
@@ -55,7 +57,7 @@ F = TypeVar("F", bound="CalibrationFile")
 
 
 class SourceScan(msgspec.Struct, frozen=True):
-    """A scan that a calibration was made from."""
+    """A scan that a calibration was made from: its folder, and the number of rows that it has."""
 
     scan_id: str
     folder: str
@@ -64,7 +66,11 @@ class SourceScan(msgspec.Struct, frozen=True):
 
 
 class CalibrationFile(msgspec.Struct, frozen=True, kw_only=True):
-    """Fields that all files have. `kind` is the key in the rig file's [calibration] that names the file."""
+    """Fields that all files have.
+
+    `kind` is the key in the rig file's [calibration] that names the file, `made_utc` date and time in ISO 8601,
+    `versions` are those of the programs, `format` is that of the file.
+    """
 
     kind: str
     made_utc: str
@@ -114,7 +120,7 @@ class PlacesFile(CalibrationFile, frozen=True, kw_only=True):
 
 
 class BoardFilter(msgspec.Struct, frozen=True):
-    """High-pass filter of a receiver: corners of its first-order sections, and the residual of the fit."""
+    """High-pass filter of a receiver: corners of its first-order sections, and the residual of the fit (RMS)."""
 
     corners_khz: list[float]
     standard_error_khz: list[float]
@@ -145,7 +151,9 @@ class MetalBand(msgspec.Struct, frozen=True):
 class MetalFile(CalibrationFile, frozen=True, kw_only=True):
     """`metal`: gains over the plane, in the file `images` beside this one, and the settings they depend on.
 
-    `imaged_with` is None in files of older releases, which are refused. `bands`: lowest frequency first.
+    `images` is the file's name without a folder, `images_crc32` its digest. The shares, variations and the spread are
+    those of :meth:`PlaneReference.facts`, `how` is a sentence for the report. `imaged_with` is None in files of older
+    releases, which are refused. `bands`: lowest frequency first.
     """
 
     images: str
@@ -165,7 +173,9 @@ class SphereFile(CalibrationFile, frozen=True, kw_only=True):
     """`sphere`: points of a metal sphere, the reference of surfaces; gains are learnt from them with the rig in use.
 
     `points`: by channel ("h", "v") rows of stage offset x, y, z, path (m), its slope x, y and curvature xx, xy, yy (1 /
-    m), amplitude's real and imaginary part and their standard deviation.
+    m), amplitude's real and imaginary part and their standard deviation. `radius_mm` is the sphere's own,
+    `radius_found_mm` that of the points' curvature; `centre_mm` (rig frame) lies one true radius behind the points,
+    whose distances from the sphere scatter by `misfit_mm` (median deviation); `gain_std` as `Gains.std`.
     """
 
     radius_mm: float
@@ -188,7 +198,9 @@ class BoardStart(msgspec.Struct, frozen=True):
     expected_if_hz: float
     # Middle of the IF band.
     middle_hz: float
+    # By how many sample rates the direct path was aliased.
     alias: int
+    # Number of chirps with a direct path.
     chirps: int
 
 
@@ -319,6 +331,7 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
 
 
 def _compute_crc32(path: Path) -> str:
+    """Return the digest of a file, eight hexadecimal digits."""
     return f"{zlib.crc32(path.read_bytes()):08x}"
 
 
@@ -359,7 +372,7 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration files of a rig; None for what is not calibrated. `paths` are their paths by kind."""
+    """Calibration files of a rig; None for what is not calibrated. `paths` are their paths by kind, for messages."""
 
     places: PlacesFile | None = None
     filters: FilterFile | None = None
@@ -409,10 +422,11 @@ class Calibration:
 
     @staticmethod
     def _shift_board(board: Board, places: PlacesFile) -> Board:
-        board_places = places.boards.get(board.name)
-        if board_places is None:
+        """Return a board at its measured position: a shift is added behind the steps of its mount."""
+        board_place = places.boards.get(board.name)
+        if board_place is None:
             return board
-        return msgspec.structs.replace(board, mount=(*board.mount, MountStep(shift_mm=board_places.shift_mm)))
+        return msgspec.structs.replace(board, mount=(*board.mount, MountStep(shift_mm=board_place.shift_mm)))
 
     def high_pass(self, board: str) -> HighPass | None:
         """Return the measured filter of a board; None: as programmed."""
@@ -468,12 +482,12 @@ class Calibration:
         return {kind: file for kind, file in files.items() if file is not None}
 
     def path(self, kind: str) -> Path:
-        """Return the path of an active file."""
+        """Return the path of an active file of this kind; the kind itself if no path is known."""
         return (self.paths or {}).get(kind, Path(kind))
 
 
 def load_calibration(paths: dict[str, Path]) -> Calibration:
-    """Load calibration files by kind. Raises ConfigError or DataError for an invalid file."""
+    """Load calibration files, kind to path. Raises ConfigError or DataError for an invalid file."""
 
     def load(name: str, kind: type[F]) -> F | None:
         return read_calibration(paths[name], kind, name) if name in paths else None
@@ -496,7 +510,7 @@ def load_calibration(paths: dict[str, Path]) -> Calibration:
 
 
 def calibration_of_rig(rig: Instrument) -> Calibration:
-    """Load the calibration files that a rig file names. Raises ConfigError."""
+    """Load the calibration files that a rig file names. Raises ConfigError or DataError for an invalid file."""
     return load_calibration({kind: Path(name) for kind, name in to_builtins(rig.calibration).items() if name})
 
 
@@ -590,7 +604,10 @@ def copy_into_scan(rig: Instrument, folder: Path, simulated: bool) -> dict[str, 
 
 
 def open_raw(folder: Path, rig: Instrument | None = None) -> RawSource:
-    """Open a recorded scan with raw data; `rig` is for recordings without a rig file. Raises DataError."""
+    """Open a recorded scan with raw data; `rig` is for recordings without a rig file.
+
+    Raises DataError if it has no raw data, or no complete row.
+    """
     source = raw_source(open_source(folder, rig), folder)
     if next(iter(source.rows()), None) is None:
         raise DataError(

@@ -42,7 +42,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Real = NDArray[np.float64]
 
-# Largest deviation of the plane from the rig file.
+# Largest deviation of the plane from the rig file that the range gate holds.
 DEPTH_M = 0.02
 # Positions used by the fit (more take longer and add little), and by the search for the target.
 POSITIONS = 400
@@ -52,7 +52,7 @@ _REACH_MM = 12.0
 _STEP_MM = 1.5
 # Noise power of a component of the reduced samples, relative to the largest, below which it is empty.
 _MIN_NOISE = 1e-3
-# Part of the power that the points must explain.
+# Part of the power that the points must explain; with less, another target or other objects were seen. Chosen.
 _MIN_EXPLAINED = 0.3
 
 
@@ -113,7 +113,11 @@ class BoardEchoes:
 
 @dataclass
 class PlacesFit:
-    """Estimated unknowns (millimetres, degrees), their covariance, and the explained share of the power."""
+    """Estimated unknowns, their covariance, and the explained share of the power.
+
+    `values` are in the order of `Prior.scale`: shift of each of `boards` (x, y, z), distance of the plane, x and y of
+    the target, each relative to the rig file, in millimetres; and the target's rotation, degrees.
+    """
 
     values: Real
     covariance: Real
@@ -227,7 +231,10 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
 
 
 def _place_points(centre: Real, points_mm: Real, unknown: Real) -> Real:
-    """Return the positions of the target's points, metres [point, 3], rig frame."""
+    """Return the positions of the target's points, metres [point, 3], rig frame.
+
+    `centre` [3] is where the target's middle lies by the rig file; the last four of the unknowns move and turn it.
+    """
     depth, x, y, turn = unknown[-4:]
     c = np.cos(np.radians(turn))
     s = np.sin(np.radians(turn))
@@ -236,7 +243,10 @@ def _place_points(centre: Real, points_mm: Real, unknown: Real) -> Real:
 
 
 def _model_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
-    """Return the echo of each point with amplitude one, complex [rx * position * k, point]."""
+    """Return the echo of each point with amplitude one, complex [rx * position * k, point]; k are the components.
+
+    `shift_mm` [3] is that of the board, `places_m` [point, 3] are the points.
+    """
     tx = board.antennas.tx_m
     rx = board.antennas.rx_m + np.asarray(shift_mm) / 1e3
     # [position, point, 3]
@@ -261,7 +271,7 @@ def _rotate_phase(cycles: Real) -> NDArray[np.complex128]:
 
 
 def _subtract_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
-    """Return the samples minus the best-fitting sum of the points' echoes."""
+    """Return the samples minus the best-fitting sum of the points' echoes, complex [rx * position * k]."""
     design = _model_echoes(board, shift_mm, places_m)
     samples = board.samples.reshape(-1)
     amplitude = np.linalg.lstsq(design.conj().T @ design, design.conj().T @ samples, rcond=1e-9)[0]
@@ -313,11 +323,11 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[file
         vector_after = vector_before + fit.values[board_values] / 1e3
         along = vector_after / np.linalg.norm(vector_after)
         boards[name] = files.BoardPlace(
-            _make_vector(fit.values[board_values]),
-            _make_vector(errors[board_values]),
-            float(np.linalg.norm(vector_after) * 1e3),
-            float(np.linalg.norm(vector_before) * 1e3),
-            float(np.sqrt(along @ fit.covariance[board_values, board_values] @ along)),
+            shift_mm=_make_vector(fit.values[board_values]),
+            standard_error_mm=_make_vector(errors[board_values]),
+            direct_path_mm=float(np.linalg.norm(vector_after) * 1e3),
+            direct_path_was_mm=float(np.linalg.norm(vector_before) * 1e3),
+            direct_path_standard_error_mm=float(np.sqrt(along @ fit.covariance[board_values, board_values] @ along)),
         )
     depth, x, y, turn = (float(v) for v in fit.values[-4:])
     return files.PlacesFile(
@@ -337,5 +347,6 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[file
 
 
 def _make_vector(values: Real) -> files.Vector:
+    """Return a vector [3] as plain numbers."""
     x, y, z = (float(v) for v in values)
     return x, y, z

@@ -36,19 +36,21 @@ from polysight_shared.errors import ConfigError, DataError, no_such
 from polysight_shared.findings import Finding
 
 NPZ = ".npz"
+# Arrays of an .npz file: required, optional, and the one that only image.npz of this program has.
 CHANNELS = ("h", "v")
 AXES = ("x_m", "y_m")
 OPTIONAL = ("valid", "incidence_deg", "simulated", "conjugate")
 OWN_ERROR = "p_sigma"
+# Images in a folder of the published data.
 SAR_FILES = ("sar_h.npy", "sar_v.npy")
 MIN_PIXELS = 8
 """Least rows and columns of an image: the smallest patch is 14 mm wide."""
 EVEN = 0.01
-"""Largest deviation of a pixel's distance from the mean one, relative to it."""
+"""Largest deviation of the distance of two pixels from the mean one, relative to it; of both pitches, too."""
 OTHER_SIGN = 0.3
 PUBLISHED_OTHER_SIGN = 0.05
-"""Probability a priori that images of another program have the other sign of phase, if their file does not say it, and
-that images of the published form have, after `restore_phase_sign`."""
+"""Probability a priori that images of another program have the other sign of phase, if their file does not say it; and
+that images of the published form have it, after `restore_phase_sign`. Chosen: the patches decide where they can."""
 LEAST_PEAK = 1e-9
 MOST_PEAK = 1e9
 """Range of a channel's largest amplitude: squares, and their squares, stay within single precision."""
@@ -210,13 +212,17 @@ def _check_channels(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
 
 
 def _shape(array: npt.NDArray[Any]) -> str:
+    """Return an array's shape as text: `150 x 150`."""
     return " x ".join(map(str, array.shape)) or "a single number"
 
 
 def _make_axis(
     path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str, size: int, rig: Instrument, assumed: list[str]
 ) -> npt.NDArray[np.float64]:
-    """Return the pixel centres along one axis, metres; the rig file's pixel, centred, if the file has none."""
+    """Return the `size` pixel centres along one axis, metres; the rig file's pixel, centred, if the file has none.
+
+    What is assumed is added to `assumed`. Raises DataError if the axis has another size or is not evenly spaced.
+    """
     if name not in arrays:
         pixel_mm = rig.image.pixel_mm
         position = "row 0 is the lowest" if name == "y_m" else "column 0 is the leftmost"
@@ -373,7 +379,7 @@ def place_rig(rig: Instrument, incidence_deg: float) -> Instrument:
 
 @dataclass(frozen=True)
 class Angle:
-    """Incidence angle of given images: degrees, and where it comes from."""
+    """Incidence angle of given images: degrees, and where it comes from ("option", "file" or "rig file")."""
 
     deg: float
     source: str
@@ -397,9 +403,9 @@ def choose_angle(pair: GivenPair, settings: Settings, rig: Instrument) -> Angle:
 
 
 def describe_illumination(images: Images, rig: Instrument) -> Illumination:
-    """Return what the phase of a plate says about its tilt, for a rig; the footprints are not known, and taken as even.
+    """Return the illumination by which the phase of a plate tells its tilt (`Illumination.rise`), for this rig.
 
-    A row of phases gives the tilt (`Illumination.rise`); nothing is divided out.
+    The footprints are not known and taken as even: nothing is divided out.
     """
     chirp = rig.chirp
     middle_hz = chirp.first_sample_hz + chirp.hz_per_sample * float(np.mean(chirp.linear_samples))
@@ -464,8 +470,9 @@ TOLD_SIGN = 0.02
 def sign_reasons(other_sign: float, conjugated: bool, painted: float = 0.0) -> list[Finding]:
     """Return what limits the verdict if the sign of the phases is not known.
 
-    `other_sign` is the probability of the sign that was not taken; `painted` that the metal reference is painted if
-    the phases are as given: either turns all ratios.
+    `other_sign` is the probability of the sign that was not taken, `conjugated` is true if it is that of the file;
+    `painted` is the probability that the metal reference is painted if the phases are as given: paint and the other
+    sign both change the phase of all ratios.
     """
     if other_sign < TOLD_SIGN and not conjugated:
         return []
@@ -517,6 +524,7 @@ def analyse_given_images(
     scene = replace(scene, plates=plates)
     optics = replace(optics, other_sign=pair.other_sign)
     result = materials.analyse(images, optics, scene, classifier)
+    # If the other sign is likelier, all phases are turned and the scene is analysed again.
     conjugated = result.other_sign > 0.5
     painted = result.inversion.painted
     if conjugated:

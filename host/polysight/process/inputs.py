@@ -24,7 +24,10 @@ from polysight_shared.geometry import incidence_deg
 
 @dataclass(frozen=True)
 class Inputs:
-    """Content of the files that settings name: the label file, and the processed scan of a metal plate."""
+    """Content of the files that settings name: the label file, and the processed scan of a metal plate.
+
+    None: the settings name none.
+    """
 
     labels: Labels | None = None
     reference: PlaneReference | None = None
@@ -36,8 +39,10 @@ NO_INPUTS = Inputs()
 def boxes_as_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> KnownScene:
     """Return the boxes drawn by hand as patches of an image with axes `x_m`, `y_m`, and the metal in the scene.
 
-    A drawn box is the metal reference if neither a box nor a scan of a plate is given as one.
-    Raises DataError if a box holds no pixel, or too few to be used.
+    The metal is the given metal box; with a scan of a plate no metal in the scene is used; otherwise it is a drawn box
+    that the labels declare metal, the first of several. Without label file the patches are searched for later.
+
+    Raises DataError if a box holds no pixel; in labels drawn by hand also if they are invalid (`check_labels`).
     """
     labels = inputs.labels
     if labels is None:
@@ -54,7 +59,7 @@ def boxes_as_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m
 def why_unnamed(settings: Settings, rig: Instrument, will_be: bool = False) -> str:
     """Return the reason why nothing was named in scans of a rig, as sentences; "" if names are given.
 
-    With `will_be` they speak of a scan that is processed later.
+    With `will_be` the sentences are about a scan that is processed later.
 
     Raises DataError if the library cannot be loaded.
     """
@@ -83,5 +88,5 @@ def load_classifier(settings: Settings, rig: Instrument) -> Classifier | None:
 
 
 def library_path(settings: Settings) -> Path:
-    """Return the reference library of the settings."""
+    """Return the file of the settings' reference library; the simulated one if they name none."""
     return settings.path("library") or SIMULATED_LIBRARY

@@ -110,11 +110,12 @@ class BoardRows:
     rows: dict[int, RowQuality] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        """Prepare the filters that single out the object's echo, one for samples and one for blocks of them."""
         sweeps = sample_frequencies_hz(self.rig.chirp), block_frequencies_hz(self.rig.chirp)
         self._filters = {sweep.size: object_filter(self.rig, self.board, sweep) for sweep in sweeps}
 
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
-        """Compute and store the figures of a synchronised row."""
+        """Compute and store the figures of a synchronised row, of which `frames_valid` frames were received whole."""
         figures = RowFigures(
             frames_expected=recorded.frames_expected,
             frames_received=frames_valid,
@@ -169,7 +170,7 @@ class BoardRows:
         return None
 
     def residual(self, stage: str) -> float | None:
-        """Return the standard deviation of the phase after a synchronisation stage, radians; None if unknown."""
+        """Return the phase's standard deviation after a synchronisation stage, median over rows, radians, or None."""
         phases = [r.residuals[stage][1] for r in self.figures.values() if stage in r.residuals]
         if phases:
             return float(np.median(phases))
@@ -216,6 +217,7 @@ class BoardRows:
 
 
 def _find_frequency_range(direct_hz: NDArray[np.float64]) -> FrequencyRange | UnsetType:
+    """Return median, least and largest IF, Hz; unset without any."""
     if direct_hz.size == 0:
         return UNSET
     return FrequencyRange(float(np.median(direct_hz)), float(direct_hz.min()), float(direct_hz.max()))
@@ -263,6 +265,19 @@ class Quality:
     """Collects the quality figures of a scan during processing.
 
     `rig` is the source's rig, calibrated with the files `calibration`, by kind.
+
+    Attributes
+    ----------
+    source
+        The scan.
+    boards
+        Figures of each receiving board, by its name.
+    seconds
+        Wall time of each stage.
+    notes
+        Entries of quality.json that others add, by their name.
+    filled
+        Reconstructed positions of each board that has any.
     """
 
     def __init__(
@@ -274,7 +289,6 @@ class Quality:
         self.notes: dict[str, Any] = {}
         if calibration:
             self.notes["calibration"] = dict(calibration)
-        # Reconstructed positions of each board that has any.
         self.filled: Mapping[str, ReconstructedPositions] = {}
         # Rows are processed in several threads, which all add to `seconds`.
         self._lock = threading.Lock()
@@ -427,15 +441,19 @@ def judge(
 
 
 def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifier: Classifier | None) -> list[Finding]:
-    """Return reasons from the scene: patches, metal, leakage, plane, tilts, brightness and angle, as :func:`judge`."""
+    """Return reasons from the scene: patches, metal, leakage, plane, tilts, brightness and angle.
+
+    Parameters are those of :func:`judge`.
+    """
     reasons: list[Finding] = []
     refused = {r.patch.label: r.refused.what for r in result.patches if r.refused is not None}
-    gaining = {
+    # Plates that have a permittivity, but none of a half space: they are no patches of noise or of several materials.
+    no_half_spaces = {
         r.patch.label: r.refused
         for r in result.patches
         if r.refused is not None and r.refused.what in NOT_PASSIVE and r.permittivity.value is not None
     }
-    no_plates = {k: v for k, v in refused.items() if k not in gaining}
+    no_plates = {k: v for k, v in refused.items() if k not in no_half_spaces}
     reasons += rules.judge_patches(no_plates, len(result.patches), result.segmentation.left_out)
     pixel_mm = abs(float(result.calibrated.x_m[1] - result.calibrated.x_m[0])) * 1e3
     copies = find_copies([r.patch for r in result.patches], result.calibrated.h, result.calibrated.v, pixel_mm)
@@ -449,7 +467,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     reasons += rules.judge_background(result.behind)
     reasons += rules.judge_flatness(result.ripple, result.relief_rad)
     reasons += rules.judge_disturbed_plates(result.errors_by_disturbance())
-    reasons += rules.judge_passivity(gaining)
+    reasons += rules.judge_passivity(no_half_spaces)
     metal = result.metal
     if result.patches and metal.evidence is not None:
         evidence = metal.evidence
@@ -502,7 +520,10 @@ def _find_brightest(result: MaterialsResult) -> tuple[int, float]:
 
 
 def _measure_median_level(gain: npt.NDArray[np.complexfloating] | complex | None) -> float | None:
-    """Median of metal's magnitude where it is known; a reference plate need not cover the image. None: nowhere."""
+    """Return the median magnitude of metal's gain where it is known; None if it is known nowhere.
+
+    `gain` is a number, or an image [ny, nx] that a plate need not cover.
+    """
     if gain is None:
         return None
     magnitude = np.abs(np.asarray(gain))
@@ -518,7 +539,7 @@ def _estimate_leakage_error(result: MaterialsResult) -> float:
     for r in result.patches:
         e = r.permittivity
         if e.value is not None and e.covariance is not None and e.shares:
-            share = e.shares.get("leakage", 0.0) + e.shares.get("brightness", 0.0)
+            share = e.shares.get("leakage", 0.0)
             parts.append(float(np.sqrt(share * np.trace(e.covariance) / 2)) / abs(e.value))
     if parts:
         return float(np.median(parts))
@@ -570,4 +591,5 @@ def error_budget(result: MaterialsResult, plane: PlaneEstimate | None) -> ErrorB
 
 
 def _round_complex(value: complex) -> tuple[float, float]:
+    """Return real and imaginary part, rounded for the file."""
     return round(value.real, 5), round(value.imag, 5)

@@ -63,12 +63,16 @@ from polysight_shared.errors import DataError, quote
 from polysight_shared.files import read_json
 
 HEAD = "samples.json"
+"""File that describes the kept samples; `rows.jsonl` lists the rows, and each board has a file of records."""
 FORMAT = 1
+"""Format of these files."""
 MAKING = 1
 """Version of the method that makes samples from raw data."""
 Use = Literal["none", "read", "keep"]
+"""What is done with kept samples, see `KeptSamples`."""
 Filters = Mapping[str, HighPass | None]
 Gate = tuple[float, float]
+"""Smallest and largest excess path of a range gate, metres."""
 Result = TypeVar("Result")
 
 MAX_ROWS = 8
@@ -77,7 +81,10 @@ _log = logging.getLogger(__name__)
 
 
 def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
-    """Return the settings that samples depend on besides raw data and gate: the calibrated rig and its filters."""
+    """Return the settings that samples depend on besides raw data and gate: the calibrated rig and its filters.
+
+    They are plain values as JSON holds them, to be compared with a file.
+    """
     imaged = msgspec.to_builtins(ImagedWith.from_rig(rig, filters))
     imaged.pop("apodisation")
     parts = {name: msgspec.to_builtins(getattr(rig, name)) for name in ("chirp", "burst", "grid")}
@@ -203,7 +210,11 @@ class KeptSamples:
         self._keep &= not self._head or set(self._builders) == set(self._head["frequencies_hz"])
 
     def _gate_m(self, rig: Instrument, needed: Gate, usual: Gate) -> Gate:
-        """Return the gate on disk (without samples: the usual one) if it covers the needed one, else the latter."""
+        """Return the gate on disk (without samples: the usual one) if it covers the needed one, else the latter.
+
+        In the latter case, and if the samples on disk are damaged, these are forgotten; rows of the needed gate are not
+        kept.
+        """
         gate_on_disk = tuple(self._head.get("gate_m", usual))
         if self._head and not _has_frequencies(self._head, rig, gate_on_disk, usual):
             self._head = {}
@@ -215,12 +226,9 @@ class KeptSamples:
         return needed
 
     def processable(self, source: Source, folder: Path) -> list[int]:
-        """Return the rows of a source with raw data or whole samples; log those with neither. `folder` is for messages.
+        """Return the rows of a source that can be processed: those with raw data or whole samples; log the others.
 
-        Raises
-        ------
-        DataError
-            if there are none.
+        `folder` is for messages. Raises DataError if there are none.
         """
         rows = list(source.rows())
         unreadable: list[int] = []
@@ -297,6 +305,7 @@ class KeptSamples:
             for board, digest in digests.items():
                 record, figures = self._record(board, row)
                 with (self._folder / f"{board}.npy").open("r+b") as file:
+                    # From the end of the file: its head has no fixed length.
                     file.seek(-(self._plan.rows - row) * record.nbytes, 2)
                     file.write(record.tobytes())
                 boards[board] = {"crc32": record_digest(record), "raw": digest, "figures": msgspec.to_builtins(figures)}
@@ -362,7 +371,7 @@ class KeptSamples:
         return self._arrays[board]
 
     def _type(self, board: str) -> np.dtype[Any]:
-        """Return the structured type of one board's record of a row."""
+        """Return the structured type of one board's record of a row: reduced samples, echo, direct path, mask."""
         columns = self._plan.columns
         rx = len(self._builders["samples"].boards[board].aperture.antennas.rx_m)
         parts: list[Any] = []
@@ -467,4 +476,5 @@ def _has_frequencies(head: Mapping[str, Any], rig: Instrument, gate: Gate, usual
 
 
 def _is_finite(value: object) -> bool:
+    """True for a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)

@@ -136,7 +136,10 @@ def assemble_result(
     unnamed: str,
     plan: RasterPlan | None = None,
 ) -> products.ProcessedScan:
-    """Return the result with its materials, from findings; parameters as of :func:`collect_processed_scan`."""
+    """Return the result with its materials, from findings; parameters as of :func:`collect_processed_scan`.
+
+    `plan` is the raster of the scan; None for given images.
+    """
     analysis = findings.analysis
     library = unnamed or "Nothing was named."
     model = None
@@ -167,6 +170,7 @@ def assemble_result(
 
 
 def _collect_facts(source: Scan, rig: Instrument, images: Images) -> ScanFacts:
+    """Return the content of scan.json, dated now."""
     return ScanFacts(
         scan_id=source.scan_id,
         simulated=source.simulated,

@@ -45,8 +45,11 @@ CONVENTION = (
     " real - j loss"
 )
 PLANE = ("y_mm", "x_mm")
+"""Dimensions of images in datasets."""
+# Attribute of a real variable that is one part of a complex one.
 _PART = "complex_part"
 UNREFERENCED = "none: h, v and p are in arbitrary units"
+"""Value of the attribute `metal_reference` if only images were made."""
 
 
 def ranges_text(numbers: Sequence[int]) -> str:
@@ -242,6 +245,7 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
 
 
 def _no_materials_error(scan: ProcessedScan) -> DataError:
+    """Return the error for a scan of which only images were made."""
     return DataError(
         f"scan {scan.scan_id} has no materials",
         "only images were made of this scan",
@@ -371,6 +375,7 @@ def join_complex(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def _require_h5netcdf() -> None:
+    """Raise ConfigError if the package for NetCDF files is not installed."""
     try:
         import_module("h5netcdf")
     except ImportError:
@@ -397,7 +402,7 @@ def write_netcdf(path: str | os.PathLike[str], dataset: xarray.Dataset) -> None:
 
 
 def pack_netcdf(dataset: xarray.Dataset) -> bytes:
-    """Return a NetCDF 4 file; complex variables become two real ones, True and False in attributes 1 and 0.
+    """Return the content of a NetCDF 4 file; complex variables become two real ones, True and False 1 and 0.
 
     Raises
     ------
@@ -514,7 +519,7 @@ _LONGEST_NAME = 63
 
 
 def pack_mat(scan: ProcessedScan) -> bytes:
-    """Return a MATLAB file.
+    """Return the content of a MATLAB file.
 
     `h`, `v`, `p`, `valid` [y, x]; `x_mm`, `y_mm` from the image's centre, `x_m`, `y_m` in the rig frame; structs
     `materials`, `config`, `versions`. If known also `p_sigma` [y, x], `verdict` and `verdict_reasons` (JSON).
@@ -572,12 +577,14 @@ def _convert_struct(node: Any) -> Any:
 
 
 def _make_matlab_name(key: str) -> str:
+    """Return a name that MATLAB accepts: a letter first, then letters, digits and underscores."""
     name = re.sub(r"\W", "_", key)
     if not name[:1].isalpha():
         name = f"x{name}"
     return name[:_LONGEST_NAME]
 
 
+# Ending of the folder's name that exports are written to by default.
 _FOLDER = "export"
 
 
@@ -595,7 +602,10 @@ def export_folder(folder: Path, out: Path | None) -> Path:
 
 
 def export(folder: Path, formats: list[str], out: Path | None) -> int:
-    """Write the requested formats, all or none; print each format to stderr before, each file to stdout when all are.
+    """Write the requested formats ("netcdf", "mat", "csv"), all or none; return 0, the exit status of the command.
+
+    Each format is printed to stderr before it is made, each file to stdout when all are written. `folder` is that of
+    the products or of their scan, `out` the folder to write to (:func:`export_folder`).
 
     Raises
     ------

@@ -38,7 +38,9 @@ from polysight_shared.files import sync_folder, write_atomically
 
 LABELS_PICTURE = "labels.png"
 SURFACES = (SURFACE, POINTS, "surface.png")
+# Files and folders that a folder of products may hold; anything else is not ours and is never replaced.
 PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, REPORT, "figures", *SURFACES)
+# Mark of a label file drawn by hand, which can be found in a damaged file, too.
 _BY_HAND = b'"by_hand": true'
 # AT_FDCWD and RENAME_EXCHANGE of renameat2(2): paths start at the current folder, and the two are swapped.
 _HERE = -100
@@ -196,6 +198,7 @@ def _lock(out: Path, new: Path) -> FolderLock:
 
 
 def _no_folder_error(out: Path, e: OSError) -> ConfigError:
+    """Return the error for a folder of products that cannot be created or read."""
     return ConfigError(
         f"{out}: cannot create the folder for products: {e.strerror}",
         "a file has that name, or you have no permission to write there",
@@ -229,7 +232,11 @@ def _create_locked(new: Path) -> FolderLock:
 
 
 def _replace(new: Path, place: Path, old: Path) -> None:
-    """Swap `new` and `place`, then move files of other programs from the old folder to the new one."""
+    """Put the folder `new` in the place of `place`, then move files of other programs from the old folder to it.
+
+    Where both cannot be swapped at once, `old` is the name of the old folder for a moment. The old products end up in
+    the folder `new`.
+    """
     sync_folder(new)
     if not place.exists():
         new.rename(place)
@@ -261,6 +268,7 @@ def _exchange(a: Path, b: Path) -> bool:
 
 
 def _is_product(name: str) -> bool:
+    """Return true for the name of a product, or of the file with the settings of the products."""
     return name in PRODUCTS or name == FINISHED
 
 

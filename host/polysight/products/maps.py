@@ -36,6 +36,7 @@ RATIO_PERCENTILES = (5.0, 95.0)
 NO_RATIOS_DB = (0.0, 20.0)
 # Narrowest range of |P|: below it noise would look like a difference.
 LEAST_RATIO_RANGE_DB = 6.0
+# Smaller amplitudes have the level of this one, so that zero has a level.
 LEAST_AMPLITUDE = 1e-12
 
 

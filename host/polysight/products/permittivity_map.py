@@ -128,6 +128,7 @@ def _remove_leakage(inverse: Complex, leakage: LeakageError) -> Complex:
 
 
 def _join_parts(pair: Pair | UnsetType | None) -> complex | None:
+    """Return real and imaginary part as a complex number; None if one of them is not known."""
     if not pair or pair[0] is None or pair[1] is None:
         return None
     return complex(pair[0], pair[1])
@@ -136,7 +137,8 @@ def _join_parts(pair: Pair | UnsetType | None) -> complex | None:
 def _match_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tuple[Complex, Real, Real]:
     """Move V / H of the pixels of each patch, so that their median has the patch's permittivity.
 
-    Return it with the standard errors of the patch in each pixel, real part and loss; not a number outside of patches.
+    `inverse` complex [ny, nx] is V / H, `angle_rad` a number or [ny, nx]. Return it with the standard errors of the
+    patch in each pixel, real part and loss; not a number outside of patches.
     """
     matched = inverse.copy()
     real_std = np.full(inverse.shape, np.nan)

@@ -52,6 +52,7 @@ from polysight_shared.files import write_atomically
 from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.tables import decode
 
+# Names of the products in their folder.
 SCAN = "scan.json"
 IMAGE = "image.npz"
 QUALITY = "quality.json"
@@ -60,6 +61,7 @@ LABELS = "labels.json"
 REPORT = "report.html"
 # File with the settings of the products, which batch processing writes.
 FINISHED = ".finished.json"
+# Arrays of image.npz and their types.
 _ARRAYS = {
     "h": np.complex64,
     "v": np.complex64,
@@ -83,6 +85,7 @@ class PlatesNamed(NamedTuple):
 
 Labels = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
+# Patch number to the names of its interior's pixels in image order, and that interior.
 PixelNames = Mapping[int, tuple[npt.NDArray[np.str_], Mask]]
 # Folder of the products in a scan folder.
 _PRODUCTS = "products"
@@ -209,7 +212,11 @@ class ProcessedScan:
 
     @classmethod
     def from_results(cls, folder: Path, **content: Unpack[Computed]) -> Self:
-        """Return a result that was just computed; `folder` is where its data were read."""
+        """Return a result that was just computed; `folder` is where its data were read.
+
+        What is not given in `content` has the value of a scan of which only images were made, or is read from the
+        folder.
+        """
         scan = cls(folder)
         # Python looks for a value here before it calls a cached property.
         vars(scan).update({"materials": None, **content})
@@ -316,8 +323,8 @@ class ProcessedScan:
     def plates_named(self) -> PlatesNamed | None:
         """Count the plates of the scene by their names, also those that were not found; None without truth or names.
 
-        Metal is the reference, not a result. What the library does not hold, and was called unknown, is neither right
-        nor wrong.
+        Only plates with a permittivity count: metal is the reference, not a result, and strips and stacks of layers
+        have none. What the library does not hold, and was called unknown, is neither right nor wrong.
         """
         if not self.plates or not any(patch.name for patch in self.segments):
             return None
@@ -441,6 +448,7 @@ class ProcessedScan:
 
     @property
     def _has_pixels(self) -> bool:
+        """True if the products hold the pixels of the patches (patches.npz)."""
         return self.materials is not None and (self.folder / PATCHES).exists()
 
     def _find_pixels(self, places_mm: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:

@@ -177,4 +177,4 @@ def test_plates_that_fill_the_image_are_all_found_beside_metal(seed):
     h, v = (gaussian_filter(amplitude * gain, (2, 1)) + part for gain, part in zip((1.0, 0.6j), noise, strict=True))
     segmentation = segment(h, v, x_m, y_m)
     assert len(segmentation.patches) == levels_db.size
-    assert segmentation.left_out == 0
+    assert segmentation.left_out == ()

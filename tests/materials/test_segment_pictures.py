@@ -11,7 +11,7 @@ from scipy import ndimage
 from polysight.materials.copies import find_copies
 from polysight.materials.labels import patches_from_labels
 from polysight.materials.measure import background, background_mean, check_patch, halves_apart
-from polysight.materials.segment import segment
+from polysight.materials.segment import Segmentation, make_patch, segment
 
 PIXEL_MM = 2.0
 SIDE = 150
@@ -182,7 +182,7 @@ def test_clutter_of_a_plates_size_is_counted_but_no_patch():
     clutter = 10 ** ((-24 + 4 * field / field.std()) / 20)
     segmentation = segment(h + clutter, v + 0.3 * clutter, AXIS, AXIS)
     assert_found(segmentation, plates)
-    assert segmentation.left_out > 0
+    assert len(segmentation.left_out) > 0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -226,6 +226,22 @@ def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_els
         best = max(segmentation.patches, key=lambda p: int((p.mask & drawn).sum()))
         assert (best.mask & drawn).sum() >= 0.85 * drawn.sum(), name
         assert not best.cut
+
+
+def test_a_dim_plate_that_is_no_patch_is_no_background_but_a_table_is():
+    """A dim plate says nothing of what lies behind the others; a table behind is as dim, but larger than any plate."""
+    usable = np.ones((AXIS.size, AXIS.size), bool)
+    patch_mask = np.zeros_like(usable)
+    patch_mask[20:45, 20:45] = True
+    plate_mask = np.zeros_like(usable)
+    plate_mask[80:105, 80:105] = True
+    h = np.where(plate_mask, 0.3, 0.01).astype(np.complex64)
+    patch = make_patch(1, patch_mask, AXIS, AXIS, 5.0, usable)
+    beside_plate = Segmentation(patch_mask.astype(np.int32), (patch,), (plate_mask,))
+    assert background(h, h, beside_plate, usable) == pytest.approx((0.01, 0.01))
+    table = np.where(patch_mask, 1.0, 0.3).astype(np.complex64)
+    before_table = Segmentation(patch_mask.astype(np.int32), (patch,), (~patch_mask,))
+    assert background(table, table, before_table, usable) == pytest.approx((0.3, 0.3))
 
 
 def test_a_background_that_is_alike_over_a_plates_size_does_not_average_away():

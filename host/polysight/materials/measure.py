@@ -86,6 +86,9 @@ IN_NOISE = 2.0
 """|V| over its background below which V is rather noise: its phase tells nothing."""
 # Margin around patches that does not count as background
 _AROUND_PX = 6
+# A region that was left out is a table behind if it is larger than this many times the largest patch. In the demo it is
+# 29 times as large; dim plates of drawn scenes are 0.1 to 1.3 times, or two that touch. Between them it is chosen.
+LARGEST_DIM_PLATE = 6.0
 
 AMPLIFIES = "it would amplify beyond its error bar"
 BELOW_AIR = "its permittivity would be below that of air"
@@ -134,15 +137,22 @@ def background_mean(h: Image, v: Image, segmentation: Segmentation, usable: Mask
 
 
 def _select_background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> Mask:
-    """Return the usable pixels with some distance to every patch.
+    """Return the usable pixels with some distance to every patch, and to dim plates that are no patches.
 
-    Bright regions that are none belong to it: they may be of the table behind.
+    A region that was left out is taken for a dim plate if it is as small as one, else for the table behind, which is
+    background.
     """
-    in_patch = np.zeros(usable.shape, bool)
-    for patch in segmentation.patches:
-        in_patch |= patch.mask
-    near_patch = np.asarray(scipy.ndimage.binary_dilation(in_patch, iterations=_AROUND_PX), bool)
-    return usable & np.isfinite(h) & np.isfinite(v) & ~near_patch
+    in_plate = segmentation.labels > 0
+    largest_px = max((int(patch.mask.sum()) for patch in segmentation.patches), default=0)
+    for region in segmentation.left_out:
+        if region.sum() <= LARGEST_DIM_PLATE * largest_px:
+            in_plate |= region
+    return usable & np.isfinite(h) & np.isfinite(v) & ~_is_near(in_plate)
+
+
+def _is_near(mask: Mask) -> Mask:
+    """Return the pixels of `mask` and those within the margin around them."""
+    return np.asarray(scipy.ndimage.binary_dilation(mask, iterations=_AROUND_PX), bool)
 
 
 def _average_window(values: Image, width_px: int) -> Image:

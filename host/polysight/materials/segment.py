@@ -5,7 +5,7 @@ additive noise and plates are constant with steps between them: total variation 
 Levels of plates differ by 25 dB (thin wood against metal), so a common threshold cannot give their edges. The threshold
 falls from the brightest level instead, and each region that grows with it is cut at half of its own amplitude, the
 position of the edge of a band-limited step. A region is a patch if it stands out from the background; bright ones that
-do not are counted (`Segmentation.left_out`). Where the true plates are known, `match_truth` finds each one's patch.
+do not are left out (`Segmentation.left_out`). Where the true plates are known, `match_truth` finds each one's patch.
 """
 
 from __future__ import annotations
@@ -133,11 +133,11 @@ class Patch:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """Label image int32 [ny, nx] (0: no patch), its patches, and the number of bright regions that are none."""
+    """Label image int32 [ny, nx] (0: no patch), its patches, and the masks of bright regions that are none."""
 
     labels: npt.NDArray[np.int32]
     patches: tuple[Patch, ...]
-    left_out: int = 0
+    left_out: tuple[Mask, ...] = ()
 
 
 def axis_mm(axis_m: npt.ArrayLike) -> Real:
@@ -259,20 +259,20 @@ def segment(
         if gaps.size >= least_pixels:
             least_db = min(least_db, max(float(np.median(gaps)) + PLAIN_DB, cfg.dimmest_db))
     masks: list[Mask] = []
-    left_out = 0
+    left_out: list[Mask] = []
     for mask in regions:
         region_db = float(np.median(smooth_level[mask]))
         if region_db >= least_db:
             masks.append(mask)
         elif region_db >= cfg.dimmest_db:
-            left_out += 1
+            left_out.append(mask)
     labels = np.zeros(h.shape, np.int32)
     patches = []
     for mask in sorted(masks, key=lambda mask: _find_reading_place(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
         labels[mask] = len(patches) + 1
         patch = make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable)
         patches.append(replace(patch, cut=_is_cut(mask, cfg.smallest_mm / pixel_mm)))
-    return Segmentation(labels, tuple(patches), left_out)
+    return Segmentation(labels, tuple(patches), tuple(left_out))
 
 
 def touches_border(mask: Mask) -> bool:

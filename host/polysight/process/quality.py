@@ -454,7 +454,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
         if r.refused is not None and r.refused.what in NOT_PASSIVE and r.permittivity.value is not None
     }
     no_plates = {k: v for k, v in refused.items() if k not in no_half_spaces}
-    reasons += rules.judge_patches(no_plates, len(result.patches), result.segmentation.left_out)
+    reasons += rules.judge_patches(no_plates, len(result.patches), len(result.segmentation.left_out))
     pixel_mm = abs(float(result.calibrated.x_m[1] - result.calibrated.x_m[0])) * 1e3
     copies = find_copies([r.patch for r in result.patches], result.calibrated.h, result.calibrated.v, pixel_mm)
     if copies is not None:

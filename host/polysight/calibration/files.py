@@ -52,12 +52,13 @@ MIN_METAL_LEVEL = 0.02
 """Smallest echo of a mirror relative to the direct path; antenna patterns may take some 20 dB."""
 FOLDER = "calibration"
 """Folder of the copies in a scan's folder."""
+# x, y, z.
 Vector = tuple[float, float, float]
 F = TypeVar("F", bound="CalibrationFile")
 
 
 class SourceScan(msgspec.Struct, frozen=True):
-    """A scan that a calibration was made from: its folder, and the number of rows that it has."""
+    """A scan that a calibration was made from: name, folder, and the number of its rows."""
 
     scan_id: str
     folder: str
@@ -91,11 +92,13 @@ class BoardPlace(msgspec.Struct, frozen=True):
     shift_mm: Vector
     """In the rig frame, added after the board's mount."""
     standard_error_mm: Vector
+    """Of each part of the shift."""
     direct_path_mm: float
     """Length of the direct path from the transmitter to the board's RX1."""
     direct_path_was_mm: float
     """That length by the rig file."""
     direct_path_standard_error_mm: float
+    """Of the length."""
 
 
 class PlacesFile(CalibrationFile, frozen=True, kw_only=True):
@@ -120,8 +123,9 @@ class PlacesFile(CalibrationFile, frozen=True, kw_only=True):
 
 
 class BoardFilter(msgspec.Struct, frozen=True):
-    """High-pass filter of a receiver: corners of its first-order sections, and the residual of the fit (RMS)."""
+    """High-pass filter of a receiver, as measured."""
 
+    # Corners of its first-order sections, and their standard errors.
     corners_khz: list[float]
     standard_error_khz: list[float]
     # Corners set in the rig file.
@@ -129,18 +133,20 @@ class BoardFilter(msgspec.Struct, frozen=True):
     # Range of the direct path that the fit is based on.
     if_from_khz: float
     if_to_khz: float
+    # Number of chirps with a direct path.
     chirps: int
+    # Root mean square of the levels less those of the filter.
     residual_db: float
 
 
 class FilterFile(CalibrationFile, frozen=True, kw_only=True):
-    """`hpf`: the measured filters of the receivers."""
+    """`hpf`: the measured filters of the receivers, by board name."""
 
     boards: dict[str, BoardFilter]
 
 
 class MetalBand(msgspec.Struct, frozen=True):
-    """One sub-band of the metal plate: its frequencies, and the scatter of its pixels."""
+    """One sub-band of the metal plate: its frequencies, and `spread` and `how` of its `PlaneReference`."""
 
     first_hz: float
     last_hz: float
@@ -192,6 +198,7 @@ class BoardStart(msgspec.Struct, frozen=True):
     start_offset_hz: float
     # Value of the rig file that the scan was made with.
     start_offset_was_hz: float
+    # Measured IF of the direct path, as sampled (it may be aliased).
     direct_if_hz: float
     direct_if_standard_error_hz: float
     # IF of the direct path by the rig file.

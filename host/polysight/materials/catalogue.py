@@ -20,6 +20,7 @@ from polysight_shared.errors import ConfigError
 from polysight_shared.tables import decode, read_toml
 
 CATALOGUE = Path(__file__).with_name("catalogue.toml")
+"""The file of the package."""
 
 
 class Source(msgspec.Struct, frozen=True):

@@ -63,7 +63,10 @@ FIT_PIXELS = 3
 
 @dataclass(frozen=True)
 class Weights:
-    """lambda_H, lambda_V, lambda_P, the measure of P, and the number of neighbours."""
+    """Weights of the channels (the paper's lambda_H, lambda_V, lambda_P), measure of P, and number of neighbours.
+
+    A weight multiplies the distance in its channel; only the ratios of `h`, `v` and `p` matter.
+    """
 
     h: float = 1.0
     v: float = 1.0

@@ -269,6 +269,7 @@ class _Fields:
         for field, drift in itertools.product(self.drifts, DRIFTS[stable]):
             explained = alike + drift**2 * field.of_slopes
             total = explained + (noise.ravel() ** 2 + own_slopes)[:, :, None] * np.eye(2 * count)
+            # Gaussian process: `answer` weighs the slopes, its products with covariances are the expected values.
             inverse = np.asarray(np.linalg.inv(total), np.float64)
             answer = inverse @ seen
             of_drift = drift**2 * field.with_slopes

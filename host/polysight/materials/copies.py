@@ -74,6 +74,7 @@ def _find_copies_in_channel(patches: Sequence[Patch], amplitude: np.ndarray, pix
     """Find the copies of one channel, of `amplitude` float [ny, nx], at the shift with most of them."""
     if len(patches) < 4:
         return None
+    # Weak patches may be copies of bright ones.
     level_db = [20 * np.log10(max(float(np.median(amplitude[p.mask])), 1e-30)) for p in patches]
     below_db = np.array(level_db) - max(level_db)
     weak = [p for p, below in zip(patches, below_db, strict=True) if WEAKEST_DB < below < WEAK_DB]
@@ -83,6 +84,7 @@ def _find_copies_in_channel(patches: Sequence[Patch], amplitude: np.ndarray, pix
     plates = np.logical_or.reduce([p.mask for p in bright])
     hidden = np.asarray(scipy.ndimage.binary_dilation(plates, iterations=SKIRT_PX), bool)
     best: Copies | None = None
+    # Each pair of a weak and a bright patch is a shift to try.
     for copy in weak:
         for plate in bright:
             dx, dy = ((a - b) for a, b in zip(copy.centre_mm, plate.centre_mm, strict=True))

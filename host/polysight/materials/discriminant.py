@@ -126,6 +126,7 @@ class ErrorDiscriminant(Model):
 
     def fit(self, samples: Samples) -> ErrorDiscriminant:
         """Estimate means and covariances."""
+        # Deviations of the pixels from their material's anchor, and their means over patches.
         self.names, material_index = np.unique(samples.names, return_inverse=True)
         self.angles_rad = [math.radians(a) for a in samples.angles_deg]
         self._set_anchors(samples.x, material_index)
@@ -143,6 +144,7 @@ class ErrorDiscriminant(Model):
         if not informative.any():
             informative[:] = True
 
+        # Means of materials and offsets of scans; what they leave of a patch is its own error.
         offset, self.level = _fit_two_way(mean, material, scan, informative)
         self.pixels = float(np.median(count))
         self.placements = np.bincount(material).astype(float)
@@ -150,6 +152,7 @@ class ErrorDiscriminant(Model):
         residual = mean - self.level[material] - offset[scan]
         scans = np.unique(scan[informative]).size
         dof = max(int(informative.sum()) - np.unique(material[informative]).size - scans + 1, 1)
+        # Covariances: within patches, between patches, and of the scans' offsets.
         pixel = d - mean[patch]
         used = informative[patch]
         self.within = self._decorrelate_angles(

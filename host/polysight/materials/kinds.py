@@ -90,7 +90,10 @@ _MOST_LOG_ODDS = 200.0
 
 @dataclass(frozen=True)
 class Kind:
-    """One material: its name, permittivity (None: metal), and the standard deviations of ln eps' and ln eps''."""
+    """One material: its name, permittivity (None: metal), and where both are from.
+
+    `spread`: standard deviations of ln eps' and ln eps'' between specimens.
+    """
 
     name: str
     permittivity: complex | None
@@ -307,6 +310,8 @@ class Kinds:
         reach = 4.5 * np.sqrt(summed[:, (0, 1), (0, 1)])
         columns = np.searchsorted(real, self.t.real + np.array([-1, 1])[:, None] * reach[:, 0])
         rows = np.searchsorted(imag, self.t.imag + np.array([-1, 1])[:, None] * reach[:, 1])
+        # The exponent of a normal density is split in parts along x, along y, and a product of both: only the latter is
+        # computed for every cell.
         inverse = np.linalg.inv(summed)
         scale = self.share * np.sqrt(np.linalg.det(inverse)) / (2 * np.pi)
         x = real - self.t.real[:, None]
@@ -539,8 +544,9 @@ def _compute_histogram(draws: Complex, real: Real, imag: Real, covariance: Real)
 
 @dataclass(frozen=True)
 class Odds:
-    """Probabilities of what a patch may be: float64 [kind], of layers, of any other half space; they sum to 1.
+    """Probabilities of what a patch may be; they sum to 1.
 
+    `kinds` float64 [kind]: of each kind; `sheet`: of layers (thin plates and stacks); `other`: of any other half space.
     `distance` [kind] is that of the measurement over the 99 % region of each kind; beyond 1 the probability is 0.
     """
 

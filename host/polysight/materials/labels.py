@@ -46,6 +46,7 @@ def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
         ) from None
 
 
+# True plates of a scene; empty if they are not known.
 Plates = tuple[TruthPlate, ...]
 
 

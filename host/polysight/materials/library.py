@@ -385,6 +385,7 @@ class Samples:
         """
         if self.specimens is None or not (self.specimens != "").any():
             return self.groups
+        # Each group has the name of the first group that it is joined to; a plate joins all groups that show it.
         joined = {g: g for g in np.unique(self.groups).tolist()}
         with_specimen = self.specimens != ""
         plates = self.plates[with_specimen]

@@ -410,6 +410,7 @@ class Halo:
     around: Mapping[int, float] = field(default_factory=dict)
 
 
+# No halo was found, or none could be seen.
 NO_HALO = Halo()
 
 

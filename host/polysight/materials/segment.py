@@ -24,6 +24,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
 Real = npt.NDArray[np.float64]
+# Corners x0, y0, x1, y1.
 Box = tuple[float, float, float, float]
 # Smallest weight of the smoothing, dB: an image without speckle would get a weight of 0.
 _LEAST_WEIGHT = 0.1
@@ -133,7 +134,11 @@ class Patch:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """Label image int32 [ny, nx] (0: no patch), its patches, and the masks of bright regions that are none."""
+    """Patches of an image.
+
+    `labels` int32 [ny, nx]: patch number of each pixel, 0 for none. `left_out`: masks of bright regions, bool
+    [ny, nx] each, that do not stand out enough to be patches.
+    """
 
     labels: npt.NDArray[np.int32]
     patches: tuple[Patch, ...]

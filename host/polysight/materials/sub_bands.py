@@ -61,6 +61,7 @@ PHASE_PER_ANGLE = 4.5
 out of focus. Measured in the same scenes."""
 
 Real = npt.NDArray[np.float64]
+# A concentration in a material's name.
 _PERCENT = re.compile(r"(\d+(?:\.\d+)?)\s*%")
 
 
@@ -289,10 +290,12 @@ def bands_of_row(
     return replace(bands, amplitude_h=h, sigma_h=relative_std * h, common_h=amplitude_error)
 
 
+# Texts that `parse_layer` reads, for help and errors.
 LAYER_FORMS = (
     "NAME,REAL,LOSS,MM (known; without MM a half space), NAME,metal, NAME,?,MM (unknown), NAME,?,A-B (its thickness"
     " too, from A to B mm), NAME,?,? (of any thickness) or NAME,? (unknown half space)"
 )
+# A range of thicknesses, such as 0.5-2.
 _RANGE = re.compile(r"([0-9.eE+]+)\s*-\s*([0-9.eE+]+)")
 
 

@@ -55,6 +55,7 @@ ORIENTATIONS = {
     "x and y swapped": lambda a: a.T,
     "x and y swapped, y from the last row": lambda a: a.T[::-1],
 }
+"""Name to a function that turns an image so that rows are y and columns x."""
 # How much more of the variance another orientation must explain: chosen, so that chance does not turn images.
 _CLEARLY = 0.05
 # Module and name of what the published pickles may call: arrays and plain numbers, of old and new releases of numpy.
@@ -471,9 +472,8 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
         raise DataError(
             f"{groups.size} scan to judge a classifier on",
             "whole scans are left out, and none would remain for training",
-            "process more scans",
-            code=ErrorCode.NOT_ENOUGH_DATA,
-        )
+            "process more scans", code=ErrorCode.NOT_ENOUGH_DATA,
+        )  # fmt: skip
     held_out = samples.groups_of_material[samples.shared]
     if not held_out.size:
         raise DataError(

@@ -364,6 +364,7 @@ PLATE = (1.0, 1.0)
 """The s and p reflected by a metal plate."""
 MIN_CONDITION = 0.02
 """Smallest ratio of third to first singular value: below it the waves do not determine three unknowns."""
+# s and p, or H and V.
 Wave = tuple[complex, complex]
 
 

@@ -308,9 +308,12 @@ def _convolve(a: Real, b: Real) -> Real:
 
 @dataclass(frozen=True)
 class IncidenceChoice:
-    """Specular and effective incidence angle of every pixel, float64 [ny, nx] radians, and the one to use."""
+    """Both kinds of incidence angle of every pixel, float64 [ny, nx] radians, and the one to use.
 
-    # "one": one angle for the image; otherwise by pixel.
+    `choice`: "one" uses `one_rad`, the specular angle, equal in all pixels; "pixel" uses `pixel_rad`, the effective
+    one.
+    """
+
     choice: Incidence
     one_rad: Real
     pixel_rad: Real

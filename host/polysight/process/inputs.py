@@ -33,6 +33,7 @@ class Inputs:
     reference: PlaneReference | None = None
 
 
+# Settings that name no files.
 NO_INPUTS = Inputs()
 
 

@@ -48,6 +48,7 @@ from polysight_shared.config import Board, CheckPlate, Instrument
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
 
+# Nothing is calibrated.
 NO_FILES: Mapping[str, CalibrationSource] = {}
 Count = Annotated[int, msgspec.Meta(ge=0)]
 
@@ -57,6 +58,12 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
+    frames_expected, frames_received
+        Frames of the row, and those that were received whole.
+    bytes_missing, crc32
+        Bytes of raw data that are missing, and the digest of the recorded payload ("" without one).
+    positions, positions_masked
+        Positions of the row, and those without usable data.
     masked_columns
         Half-open ranges [start, stop) of masked columns, from the smallest x.
     stages
@@ -89,6 +96,8 @@ class RowQuality:
 
     Attributes
     ----------
+    figures
+        The row's figures.
     direct_hz, direct_snr
         float64 [position]: IF of the direct path, NaN where not valid, and its SNR, see `_compute_direct_snr`.
     echo
@@ -103,7 +112,7 @@ class RowQuality:
 
 @dataclass
 class BoardRows:
-    """Quality figures of one board, by row; a row added again replaces its earlier figures."""
+    """Quality figures of one board of a calibrated rig, by row; a row added again replaces its earlier figures."""
 
     rig: Instrument
     board: Board

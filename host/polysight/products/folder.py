@@ -36,6 +36,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError
 from polysight_shared.files import sync_folder, write_atomically
 
+# Picture of the boxes, and the products of surfaces.
 LABELS_PICTURE = "labels.png"
 SURFACES = (SURFACE, POINTS, "surface.png")
 # Files and folders that a folder of products may hold; anything else is not ours and is never replaced.

@@ -19,8 +19,10 @@ from polysight.products.processed import ProcessedScan
 
 Real = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+# Lower and upper end.
 Limits = tuple[float, float]
 
+# What maps show: a channel and a quantity of it.
 CHANNELS = ("h", "v", "p")
 QUANTITIES = ("amplitude", "phase")
 # Amplitudes are shown down to this far below the upper end of their colours.

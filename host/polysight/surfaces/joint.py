@@ -220,6 +220,8 @@ class JointFit:
 
     def _multiply(self, members: NDArray, first: int, second: int) -> NDArray[np.complex128]:
         """Products of the waves of two echoes, and of their derivatives: [window, 7, 7]."""
+        # Sums over the frequencies with the powers 0, 1 and 2 of nu, and over the positions with the products of the
+        # basis, give all products of the waves' derivatives: each is linear in nu and in the basis.
         fit = self.fit
         steering = np.mean(self.steering[members, first] * self.steering[members, second].conj(), axis=1)
         factors = (steering * fit.weights * fit.gain)[:, None] * self.nu ** np.arange(3)[:, None]

@@ -71,7 +71,7 @@ def _carry(start: Array, ends: Array, vector: NDArray) -> NDArray:
 
 @dataclass(frozen=True)
 class Optics:
-    """The antennas of a rig as H and V use them: TX, and the middle of the RX of each receiver.
+    """The antennas of a rig as H and V use them: `tx`, and the middle of the RX of both receivers, `h` and `v`.
 
     `wave_number`: at the middle of the band, where echoes have their phases; 1 / m.
     """
@@ -135,9 +135,9 @@ def aim_antenna(at_m: Array, boresight: Array, partner_m: Array, plane_m: float,
 
 @dataclass(frozen=True)
 class VisibleNormals:
-    """Normals that a grid shows at the middle of the image: tilts in x and y, and those at which phases alias; degrees.
+    """Normals that a grid shows at the middle of the image.
 
-    `alias_deg` is infinite where no tilt aliases.
+    `x_deg`, `y_deg`: largest tilts in x and in y. `alias_deg`: those at which phases alias, infinite where none does.
     """
 
     x_deg: float

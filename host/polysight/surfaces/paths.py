@@ -38,7 +38,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Distance of neighbouring windows: their phases connect, and a radius of 50 mm still gives a hundred points.
 STRIDE_M = 0.008
-# Largest |g_x|, |g_y| searched: a tilt of 17 degrees in x, 24 in y.
+# Largest |g_x|, |g_y| searched: a tilt of some 20 degrees in x, 23 in y, at half a metre.
 MAX_SLOPE = 0.47
 # Slopes of the coarse search on each axis, from -MAX_SLOPE to MAX_SLOPE: two in a resolution cell of 0.11.
 SLOPE_BINS = 19

@@ -312,7 +312,7 @@ Reference = Callable[[Optics], Gains]
 
 @dataclass(frozen=True)
 class DisturbedScan:
-    """Voltages of all points and gains, if the rig differs by one standard error in one property."""
+    """Voltages of all points and gains, if the rig differs by one standard error in one property, the `source`."""
 
     source: str
     voltages: Voltages

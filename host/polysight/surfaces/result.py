@@ -125,8 +125,22 @@ class Segment:
 class Surface:
     """Points of a scan [n, ...], metres in the rig frame, and their segments.
 
-    `curvature` [n, 2, 2] in 1 / m in the basis of `tangents` [n, 3, 2]; `permittivity` complex (not a number where its
-    segment has none) with `covariance` [n, 2, 2]; `position_std_m` [n]: along the normal; `normal_std_deg` [n].
+    Attributes
+    ----------
+    scan_id, simulated
+        Name of the scan, and whether it is simulated.
+    points_m, normals
+        float64 [n, 3]: points, and unit vectors towards the antennas.
+    curvature
+        float64 [n, 2, 2] in 1 / m in the basis of `tangents` [n, 3, 2]; positive for convex bodies.
+    incidence_deg
+        float64 [n], of H.
+    permittivity, covariance
+        complex [n] (not a number where its segment has none), and float64 [n, 2, 2] of (real, imaginary).
+    position_std_m, normal_std_deg
+        float64 [n]: standard deviations along the normal, and of the normal.
+    segment, segments
+        Number of each point's segment, [n], and what is known of each.
     """
 
     scan_id: str

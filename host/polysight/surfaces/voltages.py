@@ -40,8 +40,8 @@ class Voltages:
     m
         Rows of the coefficients of r_s, r_p, s to p and p to s, complex [n, 2 receivers, 4 coefficients].
     theta
-        Incidence at H and V, [n, 2]: V sees a point from elsewhere. Near Brewster's angle 0.06 degrees change r_p by
-        a per cent.
+        Incidence at H and V, [n, 2], radians: V sees a point from elsewhere, some 0.1 degrees steeper. Near Brewster's
+        angle that changes r_p by some per cent.
     path_m
         Path from TX to H and V, [n, 2].
     bend_inside, bend_across, twist

@@ -239,6 +239,8 @@ def maximise(
     as of :class:`Windows`; `values` [window, 6] to start from. Without iterations these values stay, and only the
     amplitude is measured.
     """
+    # Expected curvature of the maximum: the covariance, over positions and frequencies, of the phase's rates by the six
+    # values. It is scaled to a diagonal of ones, for the values differ by orders of magnitude.
     basis = find_basis(offsets)
     count = np.maximum(valid.sum(axis=1), 1)
     weighted = valid[:, :, None] * basis

@@ -1,7 +1,7 @@
 """Find and name the patches of two images: segmentation, metal reference, joint inversion, classification.
 
 `analyse` takes the images, the `Optics`, and known facts of the scene (`KnownScene`, the metal reference among them).
-`level` corrects the images for the tilts of the plates.
+`level` corrects the images for the tilts of the plates, given as rises: slopes of their surface in x and y, radians.
 """
 
 from __future__ import annotations
@@ -656,7 +656,7 @@ def _select_patches(images: Images, known_scene: KnownScene) -> Segmentation:
 
 
 def _references(images: Images, known_scene: KnownScene, segmentation: Segmentation) -> tuple[MetalReference, ...]:
-    """Return the given metal reference, or else the brightest patch and others like it; without any `no_metal`."""
+    """Return the given metal reference, or else the brightest patch and others like it; `no_metal` without patches."""
     if isinstance(known_scene.metal, PlaneReference):
         return (MetalReference(known_scene.metal.valid, None, known_scene.metal.how, given=True),)
     if isinstance(known_scene.metal, int):

@@ -259,9 +259,9 @@ class _LeftOut:
 
     def accuracy(self, distance: Real) -> float:
         """Return the pixel accuracy for distances [n, n], mean over the materials of two or more scans."""
-        others = np.where(self.same_scan, np.inf, distance)
+        to_other_scans = np.where(self.same_scan, np.inf, distance)
         # As `find_neighbours` but unsorted: votes need no order.
-        nearest = np.argpartition(others, self.voters - 1, axis=1)[:, : self.voters]
+        nearest = np.argpartition(to_other_scans, self.voters - 1, axis=1)[:, : self.voters]
         count = np.bincount(self.classes)
         voted = count_votes(self.classes[nearest], count.size).argmax(axis=1)
         return float(np.mean((np.bincount(self.classes, voted == self.classes) / count)[self.shared]))
@@ -375,7 +375,9 @@ class Classifier:
         self.library = library
         self.fit = fit
         self.angles_deg = tuple(p.angles_deg[0] for p in parts)
-        self.model = PAPER if weights else _check_model_name(model or fit.get("model", PAPER))
+        self.model = PAPER
+        if not weights:
+            self.model = _check_model_name(model or fit.get("model", PAPER))
         if self.model == PAPER:
             if weights is None:
                 weights = Weights.from_dict(fit["weights"]) if "weights" in fit else Weights()

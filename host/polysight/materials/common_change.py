@@ -156,8 +156,8 @@ def _estimate_own_slopes(remaining: Sequence[Real], noises: Sequence[Real], bord
         np.mean([_estimate_excess_variance(s[~border], e[~border]) for s, e in zip(slopes, errors, strict=True)])
     )
     # Plates at the border, whose slopes tell nothing, get the usual size.
-    own = np.where(border, len(slopes) * usual, np.maximum(np.sum(slopes**2 - errors**2, axis=0), 0.0))
-    return np.sqrt((USUAL_RIPPLE * usual + own) / (USUAL_RIPPLE + len(slopes)))
+    excess = np.where(border, len(slopes) * usual, np.maximum(np.sum(slopes**2 - errors**2, axis=0), 0.0))
+    return np.sqrt((USUAL_RIPPLE * usual + excess) / (USUAL_RIPPLE + len(slopes)))
 
 
 def _estimate_excess_variance(slopes: Real, errors: Real) -> float:
@@ -196,17 +196,18 @@ class _Field:
         `axes` has 1 for each of x and y along which the field changes, and 0 for one along which it is constant.
         """
         count = len(places_m)
-        apart = (places_m[:, None] - places_m[None]) * np.array(axes)
+        distance = (places_m[:, None] - places_m[None]) * np.array(axes)
         from_origin = (places_m - origin_m) * np.array(axes)
-        near = np.exp(-0.5 * np.sum(apart**2, axis=-1) / length_m**2)
-        near_origin = np.exp(-0.5 * np.sum(from_origin**2, axis=-1) / length_m**2)
-        product = apart[..., :, None] * apart[..., None, :] / length_m**2
-        of_slopes = near[..., None, None] * (np.diag(axes) - product) / length_m**2
-        with_slopes = (near[..., None] * apart + (near_origin[:, None] * from_origin)[None]) / length_m**2
+        covariance = np.exp(-0.5 * np.sum(distance**2, axis=-1) / length_m**2)
+        with_origin = np.exp(-0.5 * np.sum(from_origin**2, axis=-1) / length_m**2)
+        # Derivatives of the Gaussian covariance by one place and by both.
+        product = distance[..., :, None] * distance[..., None, :] / length_m**2
+        of_slopes = covariance[..., None, None] * (np.diag(axes) - product) / length_m**2
+        with_slopes = (covariance[..., None] * distance + (with_origin[:, None] * from_origin)[None]) / length_m**2
         return cls(
             of_slopes=of_slopes.transpose(2, 0, 3, 1).reshape(2 * count, 2 * count),
             with_slopes=with_slopes.transpose(0, 2, 1).reshape(count, 2 * count),
-            of_itself=2 - 2 * near_origin,
+            of_itself=2 - 2 * with_origin,
         )
 
 
@@ -261,23 +262,23 @@ class _Fields:
         `fringe` and `fringe_m` are size and length of the fringes, `common` that of the slopes that all plates have.
         """
         count = slopes.shape[1]
-        seen = slopes.ravel()
+        measured = slopes.ravel()
         fringes = self.fringes[fringe_m]
-        alike = common**2 * np.kron(np.eye(2), np.ones((count, count))) + fringe**2 * fringes.of_slopes
+        of_common_causes = common**2 * np.kron(np.eye(2), np.ones((count, count))) + fringe**2 * fringes.of_slopes
         own_slopes, share = _estimate_own_variances(count)
         cases = []
         for field, drift in itertools.product(self.drifts, DRIFTS[stable]):
-            explained = alike + drift**2 * field.of_slopes
+            explained = of_common_causes + drift**2 * field.of_slopes
             total = explained + (noise.ravel() ** 2 + own_slopes)[:, :, None] * np.eye(2 * count)
             # Gaussian process: `answer` weighs the slopes, its products with covariances are the expected values.
             inverse = np.asarray(np.linalg.inv(total), np.float64)
-            answer = inverse @ seen
+            answer = inverse @ measured
             of_drift = drift**2 * field.with_slopes
             of_all = of_drift + fringe**2 * fringes.with_slopes
             variance_of_drift = drift**2 * field.of_itself
             case = _Explained(
                 log_evidence=np.log(share / len(DRIFTS[stable]))
-                - 0.5 * answer @ seen
+                - 0.5 * answer @ measured
                 + 0.5 * np.linalg.slogdet(inverse)[1],
                 mean=answer @ of_all.T,
                 square=_compute_mean_square(answer, inverse, of_all, variance_of_drift + fringe**2 * fringes.of_itself),
@@ -304,8 +305,8 @@ def _estimate_own_variances(count: int) -> tuple[Real, Real]:
 
 def _compute_mean_square(answer: Real, inverse: Real, with_slopes: Real, of_itself: Real) -> Real:
     """Return the mean square of a field at each plate, [case, plate], from its covariance with the slopes."""
-    known = np.sum(with_slopes @ inverse * with_slopes, axis=-1)
-    return np.maximum(of_itself - known, 0.0) + (answer @ with_slopes.T) ** 2
+    explained_variance = np.sum(with_slopes @ inverse * with_slopes, axis=-1)
+    return np.maximum(of_itself - explained_variance, 0.0) + (answer @ with_slopes.T) ** 2
 
 
 @dataclass(frozen=True)

@@ -518,7 +518,8 @@ def _place(z: Real, certainty: float, probability: float) -> Real:
     """
     if certainty == probability:
         return z
-    low, high = (1 - probability, 1.0) if certainty else (0.0, 1 - probability)
+    low = 1 - probability if certainty else 0.0
+    high = 1.0 if certainty else 1 - probability
     return scipy.special.ndtri(low + (high - low) * scipy.special.ndtr(z))
 
 
@@ -649,12 +650,15 @@ def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator)
     distance2 = np.einsum("...i,ij,...j->...", parts, np.linalg.inv(covariance), parts)
     covariance *= float(np.quantile(distance2, 0.95)) / CHI2_95
     shares = _shares_of_sources(model, z, i, value)
-    # Student's t: normal errors whose variance is drawn, too
+    # Student's t: normal errors whose variance is drawn, too.
     scale = OWN_SCALE * np.sqrt(OWN_FREEDOM / np.random.default_rng(i).chisquare(OWN_FREEDOM, noise.shape[:2]))
     drawn_t = t + scale * (noise[..., 0] + 1j * noise[..., 1])
     difference = split_complex(permittivity_from_ratio(drawn_t, angles) - value)
     real_68, imag_68 = np.nanquantile(np.abs(difference), 0.6827, axis=(0, 1)).tolist()
-    return PatchEstimate(middle, ratio_covariance, value, covariance, shares, evidence, (real_68, imag_68))
+    return PatchEstimate(
+        inverse_ratio=middle, inverse_ratio_covariance=ratio_covariance, permittivity=value, covariance=covariance,
+        shares=shares, evidence=evidence, half_widths_68=(real_68, imag_68),
+    )  # fmt: skip
 
 
 def _shares_of_sources(model: SceneLikelihood, z: Real, i: int, value: complex) -> dict[str, float]:
@@ -689,11 +693,7 @@ def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvi
         library_share = float(model.library_share(z).mean())
     off = float(np.median(model.brightness_off(z, half_spaces)[:, i])) if model.bright[i] else np.nan
     return RatioEvidence(
-        theta_rad=kinds.theta_rad,
-        inverse_ratio=complex(t.mean()),
-        covariance=covariance,
-        library_share=library_share,
-        brightness_off=off,
-        brightness_std=float(np.exp(np.log(model.brightness_std(z)).mean())),
+        theta_rad=kinds.theta_rad, inverse_ratio=complex(t.mean()), covariance=covariance, library_share=library_share,
+        brightness_off=off, brightness_std=float(np.exp(np.log(model.brightness_std(z)).mean())),
         dispersion=model.dispersions[i],
-    )
+    )  # fmt: skip

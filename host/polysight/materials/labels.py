@@ -104,7 +104,10 @@ def _read_plate(raw: Mapping[str, Any]) -> TruthPlate:
         re, loss = raw["permittivity"]
         eps = complex(float(re), -float(loss))
     thickness = raw.get("thickness_mm")
-    if not np.isfinite([cx, cy, w, h, *([] if eps is None else [eps.real, eps.imag])]).all():
+    numbers = [cx, cy, w, h]
+    if eps is not None:
+        numbers += [eps.real, eps.imag]
+    if not np.isfinite(numbers).all():
         raise ValueError(f"a number of plate {raw['name']} is not finite")
     box = (cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2)
     return TruthPlate(str(raw["name"]), box, eps, None if thickness is None else float(thickness), metal)
@@ -378,7 +381,9 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
             raise name_taken(clean, twin)
         boxes[clean] = _check_box(clean, box, extent)
         mask = box_mask(box, x_m, y_m)
-        if not (mask if valid is None else mask & valid).any():
+        if valid is not None:
+            mask &= valid
+        if not mask.any():
             raise DataError(
                 f"box of {clean}, {format_box(box)}: no scanned pixel",
                 "it is smaller than a pixel, or outside the scanned area",
@@ -389,7 +394,10 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
         _check_apart(first_name, a, other_name, b)
     specimens = {box_name(n): clean_name(s, "specimen") for n, s in labels_mm.specimens.items()}
     metal = None if labels_mm.metal is None else box_name(labels_mm.metal)
-    missing = [n for n in (*specimens, *([] if metal is None else [metal])) if n not in boxes]
+    named_boxes = list(specimens)
+    if metal is not None:
+        named_boxes.append(metal)
+    missing = [n for n in named_boxes if n not in boxes]
     if missing:
         raise no_box(missing[0], boxes)
     return replace(labels_mm, boxes=boxes, specimens=specimens, metal=metal or _find_metal_by_name(boxes))
@@ -450,7 +458,7 @@ def _check_apart(name: str, a: Box, other_name: str, b: Box) -> None:
 
 
 def _find_metal_by_name(boxes: Mapping[str, Box]) -> str | None:
-    """Return the only box with a metal's name; None if that cannot be said of the only box.
+    """Return the only box with a metal's name; None if there is a single box without such a name, or none.
 
     Raises DataError if there are several boxes and not exactly one has such a name.
     """

@@ -308,8 +308,10 @@ class LayerFit:
     @property
     def relative_std(self) -> float:
         """The larger of the standard deviations of permittivity and of thickness, relative."""
-        real_and_loss_std = float(np.hypot(self.std_real, self.std_loss)) / abs(self.permittivity)
-        return max(real_and_loss_std, self.std_thickness_m / self.thickness_m if self.thickness_m else 0.0)
+        of_permittivity = float(np.hypot(self.std_real, self.std_loss)) / abs(self.permittivity)
+        if not self.thickness_m:
+            return of_permittivity
+        return max(of_permittivity, self.std_thickness_m / self.thickness_m)
 
     @property
     def ambiguous(self) -> bool:
@@ -498,7 +500,9 @@ class _Model:
         thick: list[npt.ArrayLike] = [np.inf if y.thickness_m is None else y.thickness_m for y in self.stack]
         if self.fits_thickness:
             thick[self.layer_index] = wide[..., 2] * 1e-3
-        theta = self.theta_rad + (self.bands.theta_std_rad * wide[..., -1] if self.fits_angle else 0.0)
+        theta: npt.ArrayLike = self.theta_rad
+        if self.fits_angle:
+            theta = self.theta_rad + self.bands.theta_std_rad * wide[..., -1]
         spectrum = self.bands.spectrum.thin(thin) if thin > 1 else self.bands.spectrum
         q, h = average(eps, thick, spectrum, theta)
         if self.fits_angle:
@@ -528,9 +532,10 @@ class _Model:
             axes[1] = np.geomspace(0.02, LOSS_RANGE[1] + 0.02, 25) - 0.02
         mesh = np.meshgrid(*axes, indexing="ij")
         real = mesh[0] ** 2 + sine2
-        x = [real, np.minimum(mesh[1] * real, LOSS_RANGE[1]) if self.fits_thickness else mesh[1]]
+        x = [real, mesh[1]]
         outside = np.zeros(real.shape, bool)
         if self.fits_thickness:
+            x[1] = np.minimum(mesh[1] * real, LOSS_RANGE[1])
             x.append(mesh[2] / (2 * self.wavenumber * mesh[0]))
             outside = (x[2] < self.range_mm[0]) | (x[2] > self.range_mm[1])
         if self.fits_angle:

@@ -392,7 +392,9 @@ class Samples:
         groups = self.groups[with_specimen]
         for plate in np.unique(plates):
             joined_groups = {joined[g] for g in np.unique(groups[plates == plate]).tolist()}
-            joined = {g: min(joined_groups) if target in joined_groups else target for g, target in joined.items()}
+            for group, first_group in joined.items():
+                if first_group in joined_groups:
+                    joined[group] = min(joined_groups)
         out = np.array([joined[g] for g in self.groups.tolist()])
         return out if np.unique(out).size > 1 else self.groups
 
@@ -471,7 +473,9 @@ class Samples:
         groups = []
         patches = []
         # Angles are known only if both are.
-        angles = self.angles_deg + other.angles_deg if self.angles_deg and other.angles_deg else ()
+        angles: tuple[float, ...] = ()
+        if self.angles_deg and other.angles_deg:
+            angles = self.angles_deg + other.angles_deg
         for a, b in pairs:
             for name in np.unique(self.names):
                 our_patches = np.unique(self.patches[(self.groups == a) & (self.names == name)])

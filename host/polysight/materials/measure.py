@@ -68,13 +68,13 @@ ODD_SHARE = 0.15
 ODD_RATIO = 0.15
 """Share of pixels that are this far from the median V / H above which a patch holds several materials."""
 RIPPLE = 0.5
-"""The same distance relative to the median, where that is larger: real metal ripples by 25 % and 13 degrees, so that a
-tenth of its pixels lie two standard deviations of 0.24 away."""
+"""Distance from the median V / H, relative to it, up to which no pixel is odd, either: real metal ripples by 25 % and
+13 degrees, so that a tenth of its pixels lie two standard deviations of 0.24 away."""
 HALVES_APART = 0.07
 """Difference of V / H between opposite halves of a dielectric (thrice for metal), above which two materials touch. A
 real plate of one material (acrylic, published rig) has 0.06 after the factor for its V / H."""
 ODD_NOISE = 2.0
-"""The same by the noise of V in V / H, in its root mean square, added in squares: 2 % of noise exceeds it."""
+"""Size of V's noise in V / H, over its root mean square, that makes no pixel odd: 2 % of noise exceeds it."""
 NOISE_OF_HALVES = 22.0
 """Difference of the halves' medians by noise in V / H, over its root mean square and the root of the pixels: three
 standard deviations, with one independent value in nine pixels and medians that scatter by 1.25 of means."""
@@ -104,8 +104,8 @@ THIN = Finding(
 """Why a possible layer gets no permittivity."""
 ACTIVE = 2.0
 """Standard deviations of gain, or of a real part below 1, beyond which a permittivity is impossible."""
-LEAST_IMPOSSIBLE = 0.02
-"""Gain, or real part below 1, that counts as possible in addition. Chosen: of permittivities known almost exactly."""
+ALLOWED_EXCESS = 0.02
+"""Gain, or real part below 1, that is allowed in addition, however small the error is. Chosen."""
 
 
 def background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> tuple[float, float]:
@@ -681,9 +681,9 @@ def _find_impossibility(e: Permittivity) -> Finding | None:
         return None
     remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
     causes = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
-    if e.value.imag > ACTIVE * e.loss_std + LEAST_IMPOSSIBLE:
+    if e.value.imag > ACTIVE * e.loss_std + ALLOWED_EXCESS:
         return Finding("error", AMPLIFIES, causes, remedy)
-    if e.value.real < 1 - ACTIVE * e.real_std - LEAST_IMPOSSIBLE:
+    if e.value.real < 1 - ACTIVE * e.real_std - ALLOWED_EXCESS:
         return Finding("error", BELOW_AIR, causes, remedy)
     return None
 

@@ -190,9 +190,9 @@ class _DielectricReference(SceneLikelihood):
         # With t0 of the reference the density of a measured ratio is |t0|^2 that of t. Two plates may be of the same
         # material, as metal is beside metal.
         variance = METAL_SPREAD**2 + self.own_variance
-        alike = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
+        of_same_material = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
         of_some_kind = parts[..., 1:] + 2 * np.log(size)
-        patch_logs = np.logaddexp(np.log1p(-METAL_SHARE) + of_some_kind, np.log(METAL_SHARE) + alike)
+        patch_logs = np.logaddexp(np.log1p(-METAL_SHARE) + of_some_kind, np.log(METAL_SHARE) + of_same_material)
         brightness_log = parts[..., :1]
         if self.channel_ratio_db is not None:
             too_dark_db = 20 * np.log10(size) - self.channel_ratio_db
@@ -385,8 +385,8 @@ def find_metals(h: Image, v: Image, segmentation: Segmentation) -> tuple[MetalRe
     how = f"chosen as the patch that is brightest in both channels ({margin_text})"
     metals = [MetalReference(patches[best].interior, patches[best].label, how)]
     for i in order[1:MOST_METALS]:
-        alike = size_v[i] * size_h[best] > size_v[best] * size_h[i] * 10 ** (-ALIKE_DB / 20)
-        if alike and product[i] > LEAST_METAL_LEVEL * product[best]:
+        has_as_much_v = size_v[i] * size_h[best] > size_v[best] * size_h[i] * 10 ** (-ALIKE_DB / 20)
+        if has_as_much_v and product[i] > LEAST_METAL_LEVEL * product[best]:
             level = product[i] / product[best]
             how = "chosen as the patch that the others show best to be bare metal "
             how += f"(|H||V| {level:.1f} times that of patch {patches[best].label}, which fits them less)"

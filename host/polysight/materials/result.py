@@ -239,7 +239,7 @@ class MaterialsResult:
         return float(np.degrees(np.mean(angles)))
 
     def _describe_patch(self, r: PatchResult) -> PatchFigures:
-        """Return the figures of one patch for materials.json; lengths, angles and |H| are rounded."""
+        """Return the figures of one patch for materials.json; lengths, the tilt and |H| are rounded."""
         label = r.patch.label
         e = r.permittivity
         x0, y0, x1, y1 = r.patch.box_mm

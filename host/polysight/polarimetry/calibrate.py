@@ -346,9 +346,8 @@ def plane_reference(images: Images, smooth_mm: float = SMOOTH_MM, name: str = ""
     metal_v = np.where(is_plate, level_v, np.nan).astype(metal_h.dtype)
     relative_std = inverse_spread(h[is_plate] / metal_h[is_plate], v[is_plate] / metal_v[is_plate])
     share = 100 * float(is_plate.mean())
-    description = (
-        f"a metal plate scanned on its own{f' ({name})' if name else ''}, by position on {share:.0f} % of the image"
-    )
+    scan = f" ({name})" if name else ""
+    description = f"a metal plate scanned on its own{scan}, by position on {share:.0f} % of the image"
     return PlaneReference(
         h=metal_h, v=metal_v, valid=is_plate, x_m=images.x_m, y_m=images.y_m, spread=relative_std, how=description
     )
@@ -437,7 +436,9 @@ def common_direction(h: Image, v: Image, mask: Mask | None = None) -> Wave:
 
     Raises DataError if there is no signal.
     """
-    pixels = np.isfinite(h) & np.isfinite(v) & (True if mask is None else mask)
+    pixels = np.isfinite(h) & np.isfinite(v)
+    if mask is not None:
+        pixels &= mask
     m = np.stack([h[pixels], v[pixels]]).astype(np.complex128)
     if m.size == 0 or not np.any(m):
         raise DataError(

@@ -112,7 +112,8 @@ def keep_labels(*results: str) -> Callable[[Function], Function]:
 
             cores: list[list[str]] = [[] for _ in results]
             labelled = xarray.apply_ufunc(compute, *entries, output_core_dims=cores, keep_attrs="override")
-            for array, name in zip(labelled if len(results) > 1 else (labelled,), results, strict=True):
+            labelled_arrays = labelled if len(results) > 1 else (labelled,)
+            for array, name in zip(labelled_arrays, results, strict=True):
                 array.attrs |= {"units": "1", "long_name": name}
                 array.name = None
             return labelled

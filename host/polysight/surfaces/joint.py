@@ -108,9 +108,9 @@ class JointFit:
 
     def synthesise(self, index: int) -> NDArray[np.complex64]:
         """Return the samples of one echo, [window, rx, frequency, position]."""
-        own = slice(index, index + 1)
-        waves = self.waves[:, own]
-        return synthesise(self.fit, self.windows.valid, waves, self.amplitude[:, own], self.steering[:, own])
+        echo = slice(index, index + 1)
+        waves = self.waves[:, echo]
+        return synthesise(self.fit, self.windows.valid, waves, self.amplitude[:, echo], self.steering[:, echo])
 
     def _subtract(self, members: NDArray, values: Array, amplitude: NDArray) -> tuple[NDArray, NDArray[np.complex64]]:
         """Return the waves of echoes of given values [window, echo, 6], and the samples of the windows less these."""
@@ -171,16 +171,16 @@ class JointFit:
         for parameter, cell in enumerate([band_m, slope_cell, slope_cell]):
             values = self.values[merged]
             amplitude = self.amplitude[merged]
-            for which, side in enumerate((-0.5, 0.5)):
+            for echo, side in zip(pair.T, (-0.5, 0.5), strict=True):
                 start = middle.copy()
                 start[:, parameter] += side * cell
-                values[rows, pair[:, which]] = start
-                amplitude[rows, pair[:, which]] = 0
-            other = JointFit(self.fit, part, values, amplitude)
-            other.run()
-            better = find_energy(other.rest) < find_energy(self.rest[merged])
+                values[rows, echo] = start
+                amplitude[rows, echo] = 0
+            refit = JointFit(self.fit, part, values, amplitude)
+            refit.run()
+            better = find_energy(refit.rest) < find_energy(self.rest[merged])
             for name in ("values", "amplitude", "steering", "waves", "rest"):
-                getattr(self, name)[merged[better]] = getattr(other, name)[better]
+                getattr(self, name)[merged[better]] = getattr(refit, name)[better]
 
     def _find_normal_equations(self, members: NDArray) -> tuple[Array, Array]:
         """Return the normal matrix, [window, 8 echoes, 8 echoes], and its right side.
@@ -193,11 +193,11 @@ class JointFit:
         gradient = np.zeros((count, echoes, 8))
         directions = [self._find_directions(members, index) for index in range(echoes)]
         for first in range(echoes):
-            own = directions[first].conj()
-            gradient[:, first] = np.einsum("wip,wp->wi", own, self._project(members, first)).real
+            conjugate = directions[first].conj()
+            gradient[:, first] = np.einsum("wip,wp->wi", conjugate, self._project(members, first)).real
             for second in range(first, echoes):
                 products = self._multiply(members, first, second)
-                block = (own @ products @ np.swapaxes(directions[second], 1, 2)).real
+                block = (conjugate @ products @ np.swapaxes(directions[second], 1, 2)).real
                 normal[:, first, :, second] = block
                 normal[:, second, :, first] = np.swapaxes(block, 1, 2)
         return normal.reshape(count, 8 * echoes, 8 * echoes), gradient.reshape(count, 8 * echoes)
@@ -265,8 +265,8 @@ class JointFit:
         together = np.einsum("wii->wi", np.linalg.inv(scaled)).reshape(count, echoes, 8)
         widening = np.empty((count, echoes, 7))
         for index in range(echoes):
-            own = slice(8 * index, 8 * index + 8)
-            alone = np.einsum("wii->wi", np.linalg.inv(scaled[:, own, own]))
+            unknowns = slice(8 * index, 8 * index + 8)
+            alone = np.einsum("wii->wi", np.linalg.inv(scaled[:, unknowns, unknowns]))
             ratio = together[:, index] / alone
             # Rounding makes the inverse of a matrix that is nearly singular negative: that is no information.
             ratio = np.where((together[:, index] > 0) & (alone > 0), ratio, NO_INFORMATION)

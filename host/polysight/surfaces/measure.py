@@ -192,7 +192,7 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
                 fit = _find_fit(fits, at_m[near] - at_m[place], may_change=True)
                 _, ripple_variance[place] = fit.apply(echoes, members[near])
         for place in np.flatnonzero(is_fitted):
-            near = [other for other in neighbours[place] if is_fitted[other]]
+            near = [neighbour for neighbour in neighbours[place] if is_fitted[neighbour]]
             slope_std[members[place]] = np.hypot(
                 slope_std[members[place]], np.sqrt(np.maximum(0, ripple_variance[near].mean(axis=0)))
             )
@@ -238,9 +238,9 @@ class SlopeFit:
         bends = echoes.bend[others]
         levers = LEVER_OF_WINDOW_M * np.stack([bends[:, 0, 0], bends[:, 0, 1], bends[:, 1, 1]])
         fitted = np.einsum("prn,rn->p", self.answer, np.concatenate([slopes, levers]))
-        left = np.mean((slopes - self.matrix @ fitted) ** 2, axis=1)
-        noise_left = self.noise_left * np.mean(echoes.slope_std[others] ** 2, axis=0)
-        variance = (left - noise_left) / self.ripple_left
+        residual_variance = np.mean((slopes - self.matrix @ fitted) ** 2, axis=1)
+        noise_variance = self.noise_left * np.mean(echoes.slope_std[others] ** 2, axis=0)
+        variance = (residual_variance - noise_variance) / self.ripple_left
         return np.array([[fitted[2], fitted[3]], [fitted[3], fitted[4]]]), variance
 
 

@@ -196,16 +196,16 @@ def _refine(
     joint = _fit_apart(fit, part, _select_echoes(echoes, members))
     widening = joint.find_widening()
     is_separate = widening[..., 0].max(axis=1) < MERGED_WIDENING
-    for index, (others, maximum) in enumerate(echoes):
+    for index, (windows_of_rank, maximum) in enumerate(echoes):
         values = joint.values[:, index]
         alone = replace_samples(part, joint.rest + joint.synthesise(index))
         better = maximise(fit, add_up(fit, alone, values), part.valid, part.offsets, values, iterations=0)
         # The other echoes make an echo's amplitude and path less certain.
         better.rest = better.rest * widening[:, index, 0]
         better.std = better.std * widening[:, index, 1:]
-        kept = np.flatnonzero(np.isin(others, members))[is_separate]
+        rows = np.flatnonzero(np.isin(windows_of_rank, members))[is_separate]
         for field in fields(Maximum):
-            getattr(maximum, field.name)[kept] = getattr(better, field.name)[is_separate]
+            getattr(maximum, field.name)[rows] = getattr(better, field.name)[is_separate]
     residual[members[is_separate]] = joint.rest[is_separate]
     echoes[-1] = (members[is_separate], select_maxima(weakest, is_separate))
     return members[is_separate]
@@ -238,7 +238,7 @@ def _fit_apart(fit: BoardFit, windows: Windows, starts: list[Maximum]) -> JointF
 
 def _select_echoes(echoes: list[tuple[NDArray, Maximum]], members: NDArray[np.int_]) -> list[Maximum]:
     """Return the echoes of some windows, one list entry per rank."""
-    return [select_maxima(maximum, np.isin(others, members)) for others, maximum in echoes]
+    return [select_maxima(maximum, np.isin(windows, members)) for windows, maximum in echoes]
 
 
 def _compute_power_share(fit: BoardFit, windows: Windows, maximum: Maximum, energy: Array) -> Array:

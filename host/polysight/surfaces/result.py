@@ -283,12 +283,12 @@ def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> tuple[Seen, N
         enough = counts[reflecting.segment] >= LEAST_POINTS
         return reflecting[enough], interior[enough]
     shape = find_shape(reflecting.h, optics)
-    kept = interior_counts[reflecting.segment] >= LEAST_POINTS
-    for number in np.unique(reflecting.segment[kept]):
+    is_surface = interior_counts[reflecting.segment] >= LEAST_POINTS
+    for number in np.unique(reflecting.segment[is_surface]):
         members = reflecting.segment == number
         if describe_segment(int(number), shape[members]).radius_mm is None:
-            kept &= interior | ~members
-    return reflecting[kept], interior[kept]
+            is_surface &= interior | ~members
+    return reflecting[is_surface], interior[is_surface]
 
 
 def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty: Uncertainty) -> tuple[Array, Array]:
@@ -355,17 +355,18 @@ def find_depth_behind(echoes: Seen, shape: Shape, number: int) -> float | None:
     """
     window = np.unique(np.round(echoes.h.at_m / SAME_WINDOW_M), axis=0, return_inverse=True)[1].reshape(-1)
     members = np.flatnonzero(echoes.segment == number)
-    others = np.flatnonzero(echoes.segment != number)
-    others = others[np.argsort(echoes.h.path_m[others], kind="stable")]
-    windows, first = np.unique(window[others], return_index=True)
+    # The nearest point of another segment in each window, and for each member that of its window.
+    other_points = np.flatnonzero(echoes.segment != number)
+    other_points = other_points[np.argsort(echoes.h.path_m[other_points], kind="stable")]
+    windows, first = np.unique(window[other_points], return_index=True)
     if not windows.size:
         return None
     place = np.minimum(np.searchsorted(windows, window[members]), windows.size - 1)
-    before = others[first[place]]
+    front = other_points[first[place]]
     is_shared = windows[place] == window[members]
-    away = shape.points[members] - shape.points[before]
-    depth_m = -np.einsum("ni,ni->n", away, shape.normals[before])
-    beside_m = np.sqrt(np.maximum(0, np.sum(away**2, axis=1) - depth_m**2))
+    from_front = shape.points[members] - shape.points[front]
+    depth_m = -np.einsum("ni,ni->n", from_front, shape.normals[front])
+    beside_m = np.sqrt(np.maximum(0, np.sum(from_front**2, axis=1) - depth_m**2))
     is_behind = is_shared & (depth_m > MIN_DEPTH_M) & (beside_m < depth_m)
     if is_behind.mean() < MIN_SHARE_BEHIND:
         return None

@@ -379,7 +379,7 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration files of a rig; None for what is not calibrated. `paths` are their paths by kind, for messages."""
+    """Calibration files of a rig; None for what is not calibrated. `paths` are their paths by kind."""
 
     places: PlacesFile | None = None
     filters: FilterFile | None = None

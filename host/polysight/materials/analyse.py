@@ -319,7 +319,7 @@ def _solve(measured: list[PatchMeasurement], prior: RigPrior, kinds: Kinds, othe
 
 @dataclass(frozen=True)
 class SceneScatter:
-    """How V / H scatters over the plates of a scene, the metal among them, and what the scene says of its own errors.
+    """Scatter of V / H over the plates of a scene, the metal among them, and what the scene shows of its own errors.
 
     Attributes
     ----------

@@ -65,7 +65,8 @@ FIT_PIXELS = 3
 class Weights:
     """Weights of the channels (the paper's lambda_H, lambda_V, lambda_P), measure of P, and number of neighbours.
 
-    A weight multiplies the distance in its channel; only the ratios of `h`, `v` and `p` matter.
+    A weight multiplies the distance in its channel. Names depend on the ratios of `h`, `v` and `p`; thresholds of
+    distances hold for the weights that they were fitted with.
     """
 
     h: float = 1.0

@@ -1,4 +1,4 @@
-"""How the gain of V over H changes over a scan, from the slopes of ln(V / H) over the plates.
+"""Changes of the gain of V over H during a scan, from the slopes of ln(V / H) over the plates.
 
 The stage moves the whole rig, so that ln(V / H) is constant over a plate, except for four causes. The slopes of
 ln(V / H) that they make differ:
@@ -10,8 +10,8 @@ ln(V / H) that they make differ:
 - each plate has slopes of its own: it is uneven, disturbed, or a copy of another lies on it.
 
 The first two are one field g(x, y), drift and fringes together, seen by its derivatives (Gaussian process; Rasmussen
-and Williams, Gaussian Processes for Machine Learning, 2006, 9.4). What the plates' slopes leave of it is in the error
-of every plate.
+and Williams, Gaussian Processes for Machine Learning, 2006, 9.4). The uncertainty that the plates' slopes leave is in
+the error of every plate.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ USUAL_RIPPLE = 2.0
 
 @dataclass(frozen=True)
 class CommonChange:
-    """How ln(V / H) changes over the scan.
+    """Change of ln(V / H) over the scan.
 
     Attributes
     ----------
@@ -311,7 +311,7 @@ def _compute_mean_square(answer: Real, inverse: Real, with_slopes: Real, of_itse
 
 @dataclass(frozen=True)
 class _Explained:
-    """What the slopes of one part tell, for some cases.
+    """Drift and fringes expected from the slopes of one part (real or imaginary), for some cases.
 
     Attributes
     ----------

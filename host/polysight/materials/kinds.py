@@ -1,4 +1,4 @@
-"""What a plate may be: kinds of materials as densities over t = 1 / P, of a library, of the literature, and others.
+"""Kinds of materials that a plate may be of, as densities over t = 1 / P: a library's, the literature's, and others.
 
 A kind is a half space whose `(ln eps', ln eps'')` is normal about its value (two specimens of a material differ). Most
 patches are of the library's kinds; the others are of the literature's, or any half space at all. The density of a
@@ -159,7 +159,7 @@ class PatchMeasurement:
 
 @dataclass(frozen=True)
 class RatioEvidence:
-    """What one scan says of a patch, for its name.
+    """Evidence of one scan on a patch, for its name.
 
     Attributes
     ----------

@@ -109,7 +109,7 @@ ALLOWED_EXCESS = 0.02
 
 
 def background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> tuple[float, float]:
-    """Return the rms of |H| and |V| away from all patches (noise and sidelobes); NaN without such pixels."""
+    """Return the rms of |H| and |V| away from patches and dim plates (noise, sidelobes); NaN without such pixels."""
     background_mask = _select_background(h, v, segmentation, usable)
     if not background_mask.any():
         return float("nan"), float("nan")
@@ -241,7 +241,7 @@ def halves_apart(h: Image, v: Image, mask: Mask) -> float:
 
 @dataclass(frozen=True)
 class Scatter:
-    """How ln(V / H) varies over a plate.
+    """Variation of ln(V / H) over a plate.
 
     Attributes
     ----------

@@ -87,7 +87,7 @@ class PatchName:
 
     @property
     def source(self) -> Literal["library", "literature"] | None:
-        """Where the name is from; None if it is no material's."""
+        """Origin of the name; None if it is no material's."""
         if self.name in (UNKNOWN, LAYER):
             return None
         return "literature" if self.from_literature else "library"

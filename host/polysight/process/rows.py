@@ -1,4 +1,4 @@
-"""How rows reach the images: several at a time, and restored from kept samples where that is possible.
+"""From rows to images: several rows at a time, restored from kept samples where that is possible.
 
 `map_rows` and `map_boards` process rows, or the boards of a row, on several threads: the compiled synchronisation
 releases the interpreter.
@@ -69,7 +69,7 @@ FORMAT = 1
 MAKING = 1
 """Version of the method that makes samples from raw data."""
 Use = Literal["none", "read", "keep"]
-"""What is done with kept samples, see `KeptSamples`."""
+"""Use of kept samples, see `KeptSamples`."""
 Filters = Mapping[str, HighPass | None]
 Gate = tuple[float, float]
 """Smallest and largest excess path of a range gate, metres."""

@@ -223,14 +223,17 @@ def reflect_curved(
 ) -> tuple[Complex, Complex]:
     """Coefficients (r_s, r_p) [n] at a curved surface, to first order in curvature / wave number.
 
-    `bend_inside`, `bend_across`: curvature (1 / m, convex positive) in the plane of incidence and across it.
+    `eps` is the permittivity, infinite for metal, `theta` the incidence angle in radians. `bend_inside`, `bend_across`:
+    curvature (1 / m, convex positive) in the plane of incidence and across it.
     """
     bends = (bend_inside, bend_across)
     single_wave = _reflect_local(eps, theta, bends, wave_number)
     # Metal's flat coefficients do not depend on the angle, so its own first order does: V of a sphere of 50 mm by 2 %.
     # For dielectrics the next order of all other terms is missing, and the flat derivatives are closer to the series.
     is_metal = bool(np.any(np.isinf(eps)))
-    bends_of_slopes = bends if is_metal else (0 * bend_inside, 0 * bend_across)
+    bends_of_slopes = bends
+    if not is_metal:
+        bends_of_slopes = (0 * bend_inside, 0 * bend_across)
     flat = _reflect_local(eps, theta, bends_of_slopes, wave_number)
     reflection_above = _reflect_local(eps, theta + ANGLE_STEP, bends_of_slopes, wave_number)
     reflection_below = _reflect_local(eps, theta - ANGLE_STEP, bends_of_slopes, wave_number)

@@ -31,7 +31,7 @@ BLOCK_M = 2 * WINDOW_M
 
 @dataclass(frozen=True)
 class Voltages:
-    """What points [n] give.
+    """Voltages of points [n], with the directions, angles and curvatures that they depend on.
 
     Attributes
     ----------

@@ -38,15 +38,17 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
 from polysight_shared.findings import Finding
 
+# Times that a command is sent before the card counts as silent (chosen); they share the timeout.
 ATTEMPTS = 3
-# How long a second answer to one request is awaited: a second card answers as soon as the first.
+# How long a second answer to one request is awaited: a second card answers as soon as the first (chosen).
 _TWIN_S = 0.05
 # Datagrams that may wait in the command socket when the time is over: Linux's usual 212,992 bytes hold 280 short ones.
 SOCKET_DATAGRAMS = 1000
-# How long the card's report of a failed write is awaited after its reply.
+# How long the card's report of a failed write is awaited after its reply (chosen: no card has been measured).
 EEPROM_REPORT_S = 0.5
 # Command and data port, as the EEPROM holds them.
 _PORTS = struct.Struct("<HH")
+# MAC address of a card as it is delivered.
 DEFAULT_MAC = "12:34:56:78:90:12"
 _MAC_REMEDY = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
 
@@ -197,9 +199,11 @@ class CardClient:
         self.close()
 
     def _send_command(self, code: Code, data: bytes = b"") -> None:
+        """Send a command, repeated if there is no reply. Raises DeviceError if the card refuses or is silent."""
         self._check(self._exchange(code, data, ATTEMPTS), code)
 
     def _check(self, reply: Reply, code: Code) -> None:
+        """Raise DeviceError if the card refused the command: any status but 0."""
         if reply.status != 0:
             raise DeviceError(
                 f"{self._name()} refused {code.name} with status {reply.status}",
@@ -209,6 +213,7 @@ class CardClient:
             )
 
     def _exchange(self, code: Code, data: bytes, attempts: int) -> Reply:
+        """Send up to `attempts` times and return the first reply. Raises DeviceError if there is none."""
         for _ in range(attempts):
             reply = self._try(code, data, self._timeout_s / attempts)
             if reply is not None:
@@ -216,9 +221,9 @@ class CardClient:
         raise self._no_answer_error(code, attempts)
 
     def _try(self, code: Code, data: bytes, limit_s: float) -> Reply | None:
-        """Send once and wait for the reply to this code."""
+        """Send once and return the reply to this code, None after the timeout. Raises DeviceError if sending fails."""
+        # Late replies to an earlier attempt are ignored.
         for _ in self._replies(0.0):
-            # Late replies to an earlier attempt are ignored.
             pass
         try:
             self._socket.sendto(dca1000.encode_request(code, data), self._address)
@@ -236,8 +241,8 @@ class CardClient:
     def _replies(self, limit_s: float) -> Iterator[Reply]:
         """Yield replies until the timeout; collect status bits and count foreign datagrams.
 
-        Datagrams that are there are read even if the time is over, because this program may have been held meanwhile:
-        as many as a socket holds, for a flood of them has no end.
+        Datagrams that wait already are read even if the time is over, because the system may have suspended this
+        program meanwhile: at most as many as a socket holds, for a flood of them has no end.
         """
         deadline = time.monotonic() + limit_s
         late = 0
@@ -321,7 +326,7 @@ class EepromSettings:
 
     @property
     def confirmation(self) -> str:
-        """The text that confirms writing: the card's new address."""
+        """The text that a user must type to confirm the writing: the card's new address."""
         return self.card_address
 
     def encode(self) -> bytes:
@@ -337,6 +342,7 @@ class EepromSettings:
         )
 
     def _parse_mac(self) -> bytes:
+        """Return the bytes of the MAC address. Raises ValueError if it is not hexadecimal."""
         return bytes.fromhex(self.card_mac.replace(":", "").replace("-", ""))
 
     def _address(self, text: str) -> ipaddress.IPv4Address:
@@ -390,17 +396,19 @@ def program_eeprom(card: CardClient, settings: EepromSettings, confirmed: str) -
 
 HOPS = ("host", "route", "link", "card", "receiver", "buffer", "radar")
 """The host's address and ports, the interface, its cable, the card; then the receiver process, its buffer, data."""
+# Remedy in the note on a radar whose data was not recorded.
 PULSES = "`polysight doctor`: it sends pulses with the stage at rest, and reports each one"
+# The hops of a silent card that are not the card itself.
 _FAULTY_HOP = {Hop.ROUTE: "route", Hop.LINK: "link"}
-# Time between two looks at what has come from a radar.
+# Time between two looks at what has come from a radar (chosen).
 _POLL_S = 0.05
 
 
 @dataclass
 class CardSurvey:
-    """Survey result of one board's capture card; `version` is "" if the card did not reply.
+    """Survey result of one board's capture card; `version` is that of its FPGA, "" if the card did not reply.
 
-    Each finding is about the hop in `where`; a `note` says that the hop was not checked.
+    Each finding in `hops` is about the hop in `where` (one of `HOPS`); a `note` says that the hop was not checked.
     """
 
     board: Board
@@ -430,7 +438,7 @@ def survey_cards(instrument: Instrument, listen_s: float = 0.0) -> list[CardSurv
 
 
 def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: float) -> CardSurvey:
-    """Ask the card hop by hop; hops behind the first that fails become notes without text."""
+    """Check a board's card hop by hop; hops behind the first that fails become notes without text."""
     survey = CardSurvey(board)
     findings = survey.hops
     try:
@@ -447,10 +455,12 @@ def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: f
 
 
 def _ok(hop: str, what: str) -> Finding:
+    """Return the finding that a hop works."""
     return Finding("ok", what, where=hop)
 
 
 def _wrong(hop: str, e: DeviceError) -> Finding:
+    """Return the finding that a hop does not work."""
     return Finding.of_error(e, where=hop)
 
 
@@ -512,11 +522,11 @@ def _receive(card: CardClient, instrument: Instrument, core: Core | None, listen
 
 
 def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument, listen_s: float) -> Finding:
-    """Record for a time, or until a row's bytes have arrived, into a temporary file."""
+    """Record into a temporary file for `listen_s`, or until a row's bytes have arrived; return the finding on them."""
     try:
         with tempfile.TemporaryDirectory(prefix="polysight-card-") as folder:
             card.record_stop()
-            # The reset begins the counters again: where the last record ended is not known.
+            # Where the last record ended is not known. The reset makes the counters begin again at zero.
             card.reset_fpga()
             card.configure(instrument.card)
             listened = Path(folder) / "listened.bin"
@@ -536,23 +546,23 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
     return _report_stream(row_capture)
 
 
-def _report_stream(got: RowCapture) -> Finding:
-    """Report a radar's data; the start of its record is unknown, so only gaps between packets count as lost."""
-    text = f"{got.packets} packets, {got.bytes} bytes came"
-    if got.lost_before_packets:
+def _report_stream(row_capture: RowCapture) -> Finding:
+    """Report a radar's data. Only gaps between packets count as lost: the record is stopped before its end."""
+    text = f"{row_capture.packets} packets, {row_capture.bytes} bytes came"
+    if row_capture.lost_before_packets:
         return Finding(
             "warning",
             text,
-            f"the card reports {got.lost_before_packets.name}: it dropped data",
+            f"the card reports {row_capture.lost_before_packets.name}: it dropped data",
             "a shorter card.packet_delay_us in instrument.toml lets the card send faster",
             "radar",
         )
-    if got.gap_bytes or got.strangers:
+    if row_capture.gap_bytes or row_capture.strangers:
         return Finding(
             "warning",
             text,
-            f"{got.gap_bytes} bytes are lost in {got.gaps} gaps, {got.kernel_drops} packets dropped by this machine,"
-            f" {got.strangers} came from elsewhere",
+            f"{row_capture.gap_bytes} bytes are lost in {row_capture.gaps} gaps, {row_capture.kernel_drops} packets"
+            f" dropped by this machine, {row_capture.strangers} came from elsewhere",
             "check cable and switch, the receive buffer above, and that no two cards have the same ports",
             "radar",
         )

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, ProtocolError
 
+# First and last word of a request and a reply.
 REQUEST_MAGIC = 0xA55A
 FOOTER = 0xEEAA
+# Largest body of a request, bytes.
 MAX_REQUEST_DATA = 504
 # The card sends replies and data from this port, whatever port it listens on.
 CARD_SOURCE_PORT = 1024
@@ -25,8 +27,11 @@ BYTE_COUNT_BITS = 48
 SEQUENCE_BITS = 32
 # The card counts 8 ns ticks.
 DELAY_TICKS_PER_US = 125
+# Magic, code, length of the body.
 _HEAD = struct.Struct("<HHH")
+# Magic, code, status, footer.
 _REPLY = struct.Struct("<HHHH")
+# Sequence (32 bits), lower 32 and upper 16 bits of the byte count.
 _PACKET = struct.Struct("<IIH")
 _FOOTER = struct.Struct("<H")
 
@@ -69,7 +74,7 @@ LOST_BEFORE_PACKETS = Status.DDR_FULL | Status.LVDS_BUFFER_FULL
 
 @dataclass(frozen=True)
 class Reply:
-    """Eight bytes from the card: the reply to a command, or (code STATUS) an asynchronous status."""
+    """Eight bytes from the card: the reply to a command (status 0: done), or (code STATUS) an asynchronous status."""
 
     code: int
     status: int
@@ -127,7 +132,7 @@ def configure_fpga_data(lanes: int = 4) -> bytes:
     if lanes not in (2, 4):
         raise ProtocolError(f"the card captures 2 or 4 LVDS lanes, not {lanes}", code=ErrorCode.VALUE_INVALID)
     lane_mode = 1 if lanes == 4 else 2
-    # The last byte, a timer, is TI's default.
+    # Raw mode, lanes, capture (not playback) over Ethernet, 16 bits, and a timer, which is TI's default.
     return bytes([1, lane_mode, 1, 2, 3, 30])
 
 
@@ -258,7 +263,7 @@ def valid_frames(missing: Gaps, frames: int, frame_bytes: int) -> NDArray[np.boo
 
 
 def _split_words(payload: bytes | memoryview | NDArray[np.uint8], count: int) -> NDArray[np.int16]:
-    """Return the first `count` samples, int16 [count], without a copy. Raises DataError if there are fewer."""
+    """Return the first `count` 16-bit words, int16 [count], without a copy. Raises DataError if there are fewer."""
     raw = np.frombuffer(payload, dtype=np.uint8)
     if raw.size < count * 2:
         raise DataError(

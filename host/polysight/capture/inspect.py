@@ -38,21 +38,23 @@ MAX_BYTES = 256 << 20
 """Part of a file that is read: eleven rows of the published scan."""
 # More chirps do not change the statistics noticeably.
 MAX_CHIRPS = 4096
-# Packets at its beginning by which a file of whole packets is recognised.
+# Packets at its beginning by which a file of whole packets is recognised (chosen).
 _HEADERS_READ = 16
 # Full scale of the ADC, counts.
 _FULL_SCALE = 32767
+# First bytes of pcap in both byte orders (with us, with ns), and of pcapng.
 _PCAP_HEADS = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\n\r\r\n")
 _UDP_HEADER_BYTES = 8
-# Largest capture file: half an hour of three boards.
+# Largest capture file: half an hour of three boards at the published scan's pace.
 _MAX_PCAP_BYTES = 4 << 30
-# Longest record that byte counts are believed to be of: more than a thousand rows of the published scan.
+# Longest record that byte counts are believed to be of: more than seven hundred rows of the published scan.
 _MAX_RECORD_BYTES = 1 << 34
 # Chosen: a peak over the median of the range profile that noise does not have, a constant offset that the radar's
 # high-pass filter does not let through, and the share of the loudest antenna's level below which one counts as off.
 _CLEAR_PEAK_DB = 10.0
 _MUCH_DC = 0.05 * _FULL_SCALE
 _SILENT_SHARE = 0.01
+# First bytes of other kinds of files, and what `recognise_format` calls them.
 MAGIC = {
     b"\x7fELF": "a program", b"\x89PNG": "a picture (PNG)", b"\xff\xd8\xff": "a picture (JPEG)", b"%PDF": "a PDF",
     b"PK\x03\x04": "an archive (zip)", b"\x1f\x8b": "compressed (gzip)", b"\x89HDF": "HDF5",
@@ -70,6 +72,7 @@ def recognise_format(head: bytes) -> str:
         return "empty"
     text = head.decode("utf-8", "ignore")
     printable = all(c.isprintable() or c.isspace() for c in text)
+    # The head may end within a character of UTF-8, of which up to three bytes are left.
     if len(text.encode()) > len(head) - 4 and printable:
         return "text"
     return "unknown bytes"
@@ -77,7 +80,7 @@ def recognise_format(head: bytes) -> str:
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of complex samples in a recording: LVDS lanes (2 or 4), samples of a chirp, antennas, order of I and Q."""
+    """Layout of complex samples in a recording: LVDS lanes (2 or 4), samples of a chirp, RX antennas, Q before I."""
 
     lanes: int = 4
     samples: int = 256
@@ -94,9 +97,10 @@ class Layout:
 class CardReport:
     """A card in a packet capture.
 
-    `replies` are pairs (command, status), `version` is that of the FPGA, `status` all status bits that the card sent.
-    `record` is None without data. The last packet holds `tail_bytes` and came `tail_after_s` after the one before it;
-    both are 0 if it is a full one.
+    `address` is its IPv4 address. `replies` are pairs (command, status) in order, those of asynchronous statuses too,
+    `version` is that of the FPGA, `status` all status bits that the card sent. `record` is the result of placing its
+    data, None without data. The last packet holds `tail_bytes` and came `tail_after_s` after the one before it; both
+    are 0 if it is a full one.
     """
 
     address: str
@@ -115,7 +119,9 @@ class Report:
     `profile_db` is the power range profile, Hann window, mean over chirps and antennas, in dB over its median;
     float64 [samples]; its highest bin is `peak_bin`, of `peak_db`. `rx_profile_db` is that of every antenna, over the
     same median. `rx_rms` and `rx_dc` (constant offset) are one value per antenna, ADC counts. `clipped` counts values
-    at full scale, `left_over_bytes` the bytes behind the last complete chirp.
+    at full scale, `left_over_bytes` the bytes behind the last complete chirp. `chirps` are those in the file, of which
+    the first `MAX_CHIRPS` make the statistics. `remarks` are sentences on what is suspicious; `card` is None unless the
+    file is a packet capture. `simulated` is set by the caller.
     """
 
     path: Path
@@ -259,7 +265,8 @@ def is_mirrored(power: NDArray[np.float64]) -> bool:
     """True if a complex spectrum, float64 [bin], is at negative frequencies: I and Q are swapped.
 
     For complex 1x (IF up to 0.9 sample rates) power in the upper half is no proof, so the last quarter is compared with
-    the first: returns come from near. The bins next to zero are left out.
+    the first: returns come from near. The bins next to zero are left out. Four times the power (chosen) counts as
+    mirrored.
     """
     n = power.size
     rim = 3
@@ -294,7 +301,9 @@ def _collect_remarks(r: Report, mirrored: bool) -> list[str]:
 class Datagram(NamedTuple):
     """One UDP datagram and when it was seen."""
 
+    # Since 1970.
     t_s: float
+    # Address and port.
     source: tuple[str, int]
     payload: bytes
 
@@ -395,7 +404,10 @@ def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") 
 
 
 def _select_from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram]]:
-    """Return a card's replies and its other datagrams. Raises DataError for several cards."""
+    """Return the report of one card, with its replies, and its other datagrams.
+
+    `card_address` "" is any; raises DataError if datagrams of several cards are there then.
+    """
     card = CardReport(address="", replies=[], version="", status=Status(0), record=None, tail_bytes=0, tail_after_s=0.0)
     packets = []
     for datagram in read_pcap(path):
@@ -427,6 +439,7 @@ def _select_from_card(path: Path, card_address: str) -> tuple[CardReport, list[D
 
 
 def _report_without_data(path: Path, layout: Layout, card: CardReport) -> Report:
+    """Return the report of a packet capture with replies of a card only."""
     empty = np.zeros(0)
     return Report(
         path=path,

@@ -2,7 +2,8 @@
 
 `bind_udp` and `enlarge_receive_buffer` make the socket; the kernel may grant a smaller buffer than requested.
 `BatchReceiver` fetches many packets with one `recvmmsg` call into one block of memory, so that a packet costs one copy.
-`silent_hop` finds the first hop that does not work (address, route, link, card), for `silent_card` and `silent_radar`.
+`silent_hop` finds the first hop that does not work (route, link, address, card), for `silent_card`, which returns the
+error for a card without replies; `silent_radar` returns that for a card that replies but sends no data.
 """
 
 from __future__ import annotations
@@ -43,10 +44,12 @@ _MEMINFO_DROPS = 8
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 # A larger jump between two reads means that somebody set the clock: NTP moves it by far less.
 _CLOCK_WAS_SET_NS = 1_000_000
-# Readings of two clocks this close are of one time: a tenth of what an arrival may be early, in `pulse_times`.
+# Readings of two clocks this close are of one time: a tenth of the 200 us that `acquisition/pulse_times.py` lets an
+# arrival be early at most.
 _CLOSE_READINGS_NS = 20_000
+# Chosen: one reading in five is not interrupted, even on a busy machine.
 _CLOCK_READINGS = 5
-# Bytes per packet: more than the largest, to detect longer ones.
+# Memory of one packet, bytes: more than the largest of 1466, to detect longer ones.
 _STRIDE = 1536
 _MSG_DONTWAIT = getattr(socket, "MSG_DONTWAIT", 0x40)
 # Flags in /proc/net/route.
@@ -58,6 +61,8 @@ _ROOT = Path("/")
 
 
 class _IoVec(ctypes.Structure):
+    """`struct iovec`: where the kernel writes a packet."""
+
     _fields_ = (("base", ctypes.c_size_t), ("length", ctypes.c_size_t))
 
 
@@ -161,11 +166,12 @@ class BatchReceiver:
         self.lengths: NDArray[np.uint32] = np.zeros(batch, dtype=np.uint32)
         self.times_ns: NDArray[np.int64] = np.zeros(batch, dtype=np.int64)
         self.strangers = 0
+        # Wall clock minus monotonic clock at the last reception: a jump of it says that somebody set the wall clock.
         self._clocks_differ_ns = measure_clock_difference()
-        # `struct sockaddr_in` of each packet.
+        # `struct sockaddr_in` of each packet, 16 bytes; bytes 4 to 7 are its address.
         self._names = np.zeros((batch, 16), dtype=np.uint8)
         self._sources = self._names[:, 4:8].view(np.uint32)[:, 0]
-        # `struct cmsghdr` of 16 bytes, then `struct timespec`.
+        # `struct cmsghdr` of 16 bytes, then `struct timespec`: seconds and nanoseconds of the arrival.
         self._control = np.zeros((batch, 4), dtype=np.int64)
         self._vectors = (_IoVec * batch)()
         self._messages = (_Message * batch)()
@@ -183,7 +189,10 @@ class BatchReceiver:
         self._recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg
 
     def receive(self) -> int:
-        """Fetch the pending packets; return the number from the card. Packets from elsewhere are counted, removed."""
+        """Fetch the pending packets, at most `batch`; return the number from the card, which come first.
+
+        Packets from elsewhere are counted and removed. Raises DeviceError if the interface went down.
+        """
         self._name_lengths[:] = 16
         self._control_lengths[:] = self._control[0].nbytes
         n = self._recvmmsg(self._socket.fileno(), self._messages, len(self._messages), _MSG_DONTWAIT, None)
@@ -206,7 +215,11 @@ class BatchReceiver:
         return n
 
     def _read_times(self, n: int) -> NDArray[np.int64]:
-        """Return the kernel's times of the packets, which are of the clock of the day; if that was set, the present."""
+        """Return the arrival times of the last `n` packets on the monotonic clock, int64 [n], ns.
+
+        The kernel gives them on the wall clock; if somebody has set that clock since the last call, all are now. Times
+        do not decrease and do not lie in the future.
+        """
         differ_ns = measure_clock_difference()
         now_ns = time.monotonic_ns()
         was_set = abs(differ_ns - self._clocks_differ_ns) > _CLOCK_WAS_SET_NS
@@ -220,10 +233,10 @@ class BatchReceiver:
 
 
 def measure_clock_difference() -> int:
-    """Return the clock of the day minus the monotonic clock, ns.
+    """Return the wall clock minus the monotonic clock, ns.
 
-    A process that the kernel suspends between the two readings measures the pause too: the closest of several readings
-    is used, and the first that is close enough.
+    A process that the kernel suspends between the two readings measures the pause too. So the wall clock is read
+    between two readings of the other, several times, until these are close together; the closest pair is used.
     """
     narrowest_ns = 1 << 62
     difference_ns = 0
@@ -240,14 +253,14 @@ def measure_clock_difference() -> int:
 
 
 def usable_packets(buffer_bytes: int) -> int:
-    """Return the number of full packets that a receive buffer holds."""
+    """Return the number of full packets that a receive buffer of this granted size holds: Linux has twice the bytes."""
     return 2 * buffer_bytes // KERNEL_BYTES_A_PACKET
 
 
 def check_receive_buffer(
     name: str, granted: int, needed_bytes: int, burst_bytes: int, rmem_max: Path = _RMEM_MAX
 ) -> str:
-    """Return a warning if the kernel granted less than requested, otherwise "".
+    """Return a warning if the kernel granted a smaller receive buffer than requested, otherwise "".
 
     Parameters
     ----------
@@ -286,19 +299,25 @@ def check_receive_buffer(
 
 
 class Hop(Enum):
-    """Reason why a card does not answer: the first hop that does not work."""
+    """Reason why a card does not answer: the first hop that does not work, from this machine on."""
 
+    # No interface of this machine is in the card's subnet.
     ROUTE = "no route"
+    # The interface has no carrier.
     LINK = "no link"
+    # Nobody answers for the card's address (ARP).
     NEIGHBOUR = "no device at the address"
+    # A device has the address but does not answer commands.
     CARD = "the card is mute"
+    # The system's tables do not tell, as on loopback.
     UNKNOWN = "unknown"
 
 
 def silent_hop(card_address: str, root: Path = _ROOT) -> Hop:
     """Find the first hop to a card (IPv4 address) that does not work.
 
-    `root` is the folder with `proc/net/route`, `proc/net/arp` and `sys/class/net`; unreadable files are skipped.
+    `root` is the folder with `proc/net/route`, `proc/net/arp` and `sys/class/net`; a hop whose file cannot be read is
+    passed over.
     """
     if card_address.startswith("127."):
         # Loopback is in none of these tables.
@@ -345,7 +364,7 @@ def route_interface(address: str, root: Path = _ROOT) -> str | None:
 
 
 def has_link(interface: str, root: Path = _ROOT) -> bool | None:
-    """True if the interface has a carrier; None if unknown."""
+    """True if the interface has a carrier, i.e. a cable with a device at its other end; None if unknown."""
     folder = root / "sys/class/net" / interface
     try:
         return (folder / "carrier").read_text(encoding="ascii").strip() == "1"

@@ -1,4 +1,8 @@
-"""The packets of a row in the order of their arrival, with the times at which they came."""
+"""The packets of a row in the order of their arrival, with the times at which they came.
+
+A packet is a header of ten bytes (sequence number, byte count: `docs/spec/dca1000.md`) and payload. Which of them are
+the row is decided in `placement.py`.
+"""
 
 from __future__ import annotations
 
@@ -54,6 +58,7 @@ class PacketLog:
         self.kept = 0
         self.malformed = 0
         self.payload_bytes = 0
+        # Bytes of `payload` that are in use.
         self._filled = 0
 
     def add(self, packets: Bytes, lengths: NDArray[np.integer], times_ns: int | Counts) -> None:
@@ -153,7 +158,7 @@ class PacketLog:
     def restore(
         expected: int, sequences: Counts, byte_counts: Counts, sizes: Counts, times_ns: Counts, payload: Bytes
     ) -> PacketLog:
-        """Restore a log from a file; arrays as of the properties."""
+        """Return a log of these packets, as read from a file; arrays as of the properties, `times_ns` as arrivals."""
         log = PacketLog(0)
         log.expected = expected
         log.count = len(sizes)

@@ -28,9 +28,10 @@ Gap = tuple[int, int]
 
 SWITCHED_ON = Counters(0, 1)
 """Counters of the first packet of a card that was switched on or reset."""
-# Fewer packets with strange counters are damaged ones.
+# Fewer packets with counters of a later record have damaged headers. Chosen: two of these need not disturb a row.
 MIN_PACKETS_OF_A_RECORD = 3
-# A packet that comes so many packets late was not delayed by a network: the card has counted its bytes twice.
+# A packet that comes so many packets late was not delayed by a network: the card has counted its bytes twice. Chosen,
+# far more than a switch or the kernel reorders.
 _FAR_BEHIND = 64
 # A packet size seen in fewer packets may be that of last packets, which are short.
 _MIN_PACKETS_OF_A_SIZE = 3
@@ -69,7 +70,7 @@ class PacketCounts:
     restarted: int = 0
     # Packets behind the record's last expected byte, or not kept for lack of memory.
     outside: int = 0
-    # Their byte count and sequence contradict each other.
+    # All others: their byte count and sequence contradict each other, or lie far from the row's.
     disagreeing: int = 0
     # Packets without payload, or longer than the card's.
     malformed: int = 0
@@ -115,7 +116,7 @@ class Placed:
     offsets: Counts
     # int64 [n, 2]: time (monotonic, ns), bytes received by then.
     arrivals: Counts
-    # Missing ranges below the furthest byte, in the card's order.
+    # Missing or uncertain ranges before the furthest byte that came; sorted, also of a record that is not located.
     holes: list[Gap] = field(default_factory=list)
     # The row is not located only because whole frames are missing: triggers were missed.
     slipped: bool = False
@@ -219,6 +220,7 @@ def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
     record = _find_record(log, past, not_before_ns)
     if not record.of_row.any():
         return Preview(0, log.expected == 0, ended=False)
+    # Packets in the order of their place, so that each byte counts once: of a packet, those behind all earlier ends.
     starts = record.offsets[record.of_row]
     ends = np.minimum(starts + log.sizes[record.of_row], log.expected)
     order = np.lexsort((ends, starts))
@@ -242,25 +244,25 @@ class _Record:
     offsets: Counts
     # int64: packets from the start to each packet.
     steps: Counts
-    # Counters within the row, and came after the first pulse
+    # Packets with counters within the row that came after the first pulse.
     of_row: Flags
-    # Counts on from this record behind the row's last byte
+    # Packets whose counters go on from this record behind the row's last byte.
     beyond: Flags
-    # Packets of a record behind this one.
+    # Packets of a record behind this one: their counters do not fit this record's start.
     later: Flags
     # True for packets that came before the row's first pulse.
     early: Flags
     # The early packets with counters of the row.
     too_early: Flags
-    # Has counters of a card that restarted within the row
+    # Packets with counters of a card that restarted within the row.
     after_restart: Flags
     # Payload of a full packet, bytes.
     full: int
-    # Bytes up to the end of the furthest packet
+    # Bytes from the start to the end of the furthest packet.
     length: int = 0
     # The furthest packet is short, as only a record's last one is.
     ended: bool = False
-    # Every sign of an end at the row's last byte
+    # The record ends at the row's last byte, with a short packet if it must, and nothing follows.
     ends_as_planned: bool = False
 
 
@@ -282,6 +284,7 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
         stops = (offsets + sizes)[is_of_row]
         length = int(stops.max())
         ended = bool((sizes[is_of_row][stops == length] < full_payload).all())
+    # Counters further ahead than these (chosen: two rows of bytes, four of packets) are those of damaged headers.
     is_near = (
         (offsets < 2 * expected + 2 * full_payload)
         & (steps > 0)
@@ -291,6 +294,8 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     is_beyond = is_near & counters_agree & (offsets >= expected)
     later = is_near & ~counters_agree & (offsets >= max(length, full_payload))
     ends_in_short = expected % full_payload > 0
+    # A card that restarts counts from byte 0, packet 1 on. Such packets are told from the row's own only if the row
+    # began far from there, and they follow its first packet.
     counts_on_anew = np.zeros_like(is_of_row)
     if start.byte_count > 2 * expected and is_of_row.any():
         counts_anew = (log.byte_counts == full_payload * (log.sequences - 1)) & (log.byte_counts < expected)
@@ -316,7 +321,7 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
 def counter_differences(counters: Counts, origin: int, bits: int) -> Counts:
     """Return `counters - origin`, int64 [n], of counters that wrap after `bits` bits; nearest to zero."""
     spare = 64 - bits
-    # The counter's top bit is the sign.
+    # Shifted to the left end of 64 bits, the difference wraps as the counter does, and its top bit becomes the sign.
     wrapped = (counters.astype(np.uint64) - np.uint64(origin)) << np.uint64(spare)
     return wrapped.view(np.int64) >> np.int64(spare)
 
@@ -348,7 +353,7 @@ class _Doubt:
 
 
 def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) -> _Doubt:
-    """Decide if the place of every byte is certain."""
+    """Return why the place of some bytes is not certain: the first reason that applies (docs/spec/placement.md)."""
     expected = log.expected
     if expected == 0:
         return _Doubt()
@@ -429,9 +434,12 @@ class _Row:
         self.offsets: Counts = np.full(log.count, -1, dtype=np.int64)
         # Byte ranges that are covered by packets: sorted and joined.
         self.covered: list[Gap] = []
+        # Byte ranges in which packets of one place differ.
         self.conflicts: list[Gap] = []
+        # Bytes covered, and the end of the furthest packet in place.
         self.received = 0
         self.extent = 0
+        # End of each packet in the row; what lies behind the row's last byte is cut off.
         self._stops = np.minimum(record.offsets + self._sizes, log.expected)
         self._placed, self._duplicate, self._conflicting = np.zeros((3, log.count), dtype=np.bool_)
         self._place()
@@ -439,19 +447,24 @@ class _Row:
         self._measure()
 
     def _measure(self) -> None:
-        """Find what is covered, and what came late."""
+        """Set what is covered and received, and count the packets that came late or are short."""
         placed = np.flatnonzero(self._placed)
         if not placed.size:
             return
         starts = self._record.offsets[placed]
         stops = self._stops[placed]
+        # In the order of their place, a packet that starts behind all earlier ends begins a new range.
         order = np.argsort(starts, kind="stable")
-        a = starts[order]
-        b = np.maximum.accumulate(stops[order])
-        new = np.flatnonzero(np.append(True, a[1:] > b[:-1]))
-        self.covered = list(zip(a[new].tolist(), b[np.append(new[1:] - 1, len(b) - 1)].tolist(), strict=True))
-        self.extent = int(b[-1])
+        ordered_starts = starts[order]
+        furthest_ends = np.maximum.accumulate(stops[order])
+        first_of_range = np.flatnonzero(np.append(True, ordered_starts[1:] > furthest_ends[:-1]))
+        last_of_range = np.append(first_of_range[1:] - 1, len(order) - 1)
+        range_starts = ordered_starts[first_of_range].tolist()
+        range_ends = furthest_ends[last_of_range].tolist()
+        self.covered = list(zip(range_starts, range_ends, strict=True))
+        self.extent = int(furthest_ends[-1])
         self.received = sum(stop - start for start, stop in self.covered)
+        # In the order of arrival, a packet that starts before an earlier end came late.
         reached = np.maximum.accumulate(np.append(0, stops))[:-1]
         bytes_behind = reached - starts
         self.counts.late = int((bytes_behind > 0).sum())
@@ -459,7 +472,7 @@ class _Row:
         self.counts.short = int((self._sizes[placed] < self._record.full).sum())
 
     def _place(self) -> None:
-        """Select, of the packets at the same place, the first one and any with more bytes."""
+        """Mark the packets that are put in place: of those at one place, the first one and any with more bytes."""
         packets = np.flatnonzero(self._of_row)
         offsets = self._record.offsets[packets]
         order = np.argsort(offsets, kind="stable")
@@ -469,25 +482,26 @@ class _Row:
         self.offsets[packets] = offsets
         if new.all():
             return
+        # Packets i..j-1 of the order have one place.
         firsts = np.flatnonzero(new)
         for i, j in zip(firsts.tolist(), [*firsts[1:].tolist(), order.size], strict=True):
             if j - i > 1:
                 self._compare_overlap(packets[order[i:j]].tolist())
 
     def _compare_overlap(self, packets: list[int]) -> None:
-        """Compare packets of one place, in order of arrival, with the longest so far."""
+        """Compare packets of one place, in order of arrival, with the longest so far.
+
+        One that differs is not placed, and all of its bytes become a conflict; one that adds no bytes is a duplicate.
+        """
         longest = packets[0]
         for k in packets[1:]:
             offset = int(self._record.offsets[k])
             overlap = min(int(self._stops[k]), int(self._stops[longest])) - offset
             if not np.array_equal(self._slice_payload(k)[:overlap], self._slice_payload(longest)[:overlap]):
-                self.conflicts.append((offset, offset + overlap))
+                self.conflicts.append((offset, int(self._stops[k])))
                 self._placed[k] = False
                 self._conflicting[k] = True
                 self.offsets[k] = -1
-                if self._stops[k] > self._stops[longest]:
-                    self.conflicts.append((offset, int(self._stops[k])))
-                    self.conflicts.append((offset, int(self._stops[longest])))
             elif self._stops[k] > self._stops[longest]:
                 longest = k
             else:
@@ -539,6 +553,7 @@ class _Row:
 
 
 def _count_losses(missing: list[Gap], extent: int, expected: int) -> Losses:
+    """Sort missing ranges into head, gaps and tail; `extent`: end of the furthest packet, 0 if none came."""
     if not extent:
         return Losses(tail_bytes=expected)
     head = sum(b - a for a, b in missing if a == 0)
@@ -547,7 +562,8 @@ def _count_losses(missing: list[Gap], extent: int, expected: int) -> Losses:
 
 
 def _find_gaps(covered: list[Gap], extent: int) -> list[Gap]:
-    """Return the ranges of [0, extent) that are not covered."""
+    """Return the ranges of [0, extent) that are not covered; `covered` is sorted and joined."""
+    # Pairs of edges: the end of one covered range (first: 0) and the start of the next (last: `extent`).
     edges = [0, *(edge for gap in covered for edge in gap), extent]
     return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
 

@@ -2,6 +2,7 @@
 
 Requests and answers are msgpack structs on an inherited connection. For each row: `BeginRow` with the file to write,
 `Progress` during reception, `EndRow`, and a `RowCapture` with the result. The process itself is `receiver_process.py`.
+A *take* is one attempt to record a row, counted from 1; a *frame* is what a radar records for one pulse.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
 
-# Below the kernel's threads, and below the Pi's pulses if both run on one machine.
+# Real-time priority: below the kernel's threads, and below the Pi's pulses if both run on one machine.
 REAL_TIME = 5
+# Nice value where real time is not permitted. Chosen: before ordinary programs, behind what the system runs at -20.
 NICE = -5
 PRIORITY_REMEDY = (
     "`sudo host/rights.sh USER` (USER: the user who scans), then log out and in again, or restart the machine"
@@ -39,9 +41,10 @@ class Core(NamedTuple):
 
 
 def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[Core | None]:
-    """Choose a core for each receiver, from the last one down; the first is the host's. None if there is only one.
+    """Choose a core for each receiver, from the last one down; the first is the host's.
 
-    `cores` are the usable cores (default: those of this process).
+    `cores` are the usable cores (default: those of this process). Receivers share cores if these are too few; all get
+    None (any core) if there is only one.
     """
     if cores is None:
         cores = []
@@ -95,11 +98,15 @@ _ANSWER_TIMEOUT_S = 60.0
 
 
 class _Message(msgspec.Struct, frozen=True, tag=True):
-    pass
+    """A request or answer; its class name is sent with it."""
 
 
 class Open(_Message, frozen=True):
-    """Bind the data socket. Answered with Opened or Failed."""
+    """Bind the data socket of `board` to `host_address` and `data_port`. Answered with Opened or Failed.
+
+    `buffer_bytes` is the receive buffer to request, `core` the core to run on (None: any), `own_core` False if other
+    receivers share that core. Packets are taken from `card_address` only.
+    """
 
     board: str
     host_address: str
@@ -111,7 +118,10 @@ class Open(_Message, frozen=True):
 
 
 class BeginRow(_Message, frozen=True):
-    """Drop pending packets and receive a row into the file at `path`. Answered with Began or Failed."""
+    """Drop pending packets and receive a row into the file at `path`. Answered with Began or Failed.
+
+    `expected_bytes` are those of the whole row, `frame_bytes` those of one frame.
+    """
 
     row: int
     take: int
@@ -134,7 +144,10 @@ class EndRow(_Message, frozen=True):
 
 
 class Report(_Message, frozen=True):
-    """Request Progress. `not_before_ns` is a time before the first pulse (monotonic clock), 0 if unknown."""
+    """Request Progress. `not_before_ns` is a time before the first pulse (monotonic clock), 0 if unknown.
+
+    Packets that came before it are not of the row.
+    """
 
     not_before_ns: int = 0
 
@@ -155,8 +168,12 @@ class Began(_Message, frozen=True):
 
 
 class Progress(_Message, frozen=True):
-    """Progress of the row; also sent without a request when every byte has arrived, and on the short last packet."""
+    """Progress of the row; also sent without a request when every byte has arrived, and on the short last packet.
 
+    `received` are the bytes in place; `complete` if all are and the record ends where it should.
+    """
+
+    # -1 between rows.
     row: int
     take: int
     received: int
@@ -170,11 +187,14 @@ class Progress(_Message, frozen=True):
 class RowCapture(_Message, frozen=True):
     """Reception of one row of one board.
 
-    `bytes` counts placed bytes, `missing` are the other byte ranges (the whole row if `located` is False). Arrival
-    times are of the host's monotonic clock, 0 without packets. Packet counts as in
-    :class:`polysight.capture.placement.PacketCounts`, lost bytes as in
-    :class:`polysight.capture.placement.Losses`, `holes` and `slipped` as in
-    :class:`polysight.capture.placement.Placed`. `card_status` are the bits the card reported during the row.
+    `expected` are the bytes of the whole row, `bytes` counts placed ones, `missing` are the other byte ranges (the
+    whole row if `located` is False, for which `reason` says why). Arrival times are of the host's monotonic clock, 0
+    without packets. `packets` is the count `placed` of :class:`polysight.capture.placement.PacketCounts`, whose other
+    counts have their names here; lost bytes as in :class:`polysight.capture.placement.Losses`, `holes` and `slipped` as
+    in :class:`polysight.capture.placement.Placed`. Not of the row are `strangers` (packets from another address than
+    the card's), `stale` (packets from between rows) and `kernel_drops` (dropped by the kernel during the row).
+    `card_status` are the bits the card reported during the row. The three CRC-32 are of the row's files: payload,
+    index, packets.
     """
 
     row: int
@@ -353,8 +373,9 @@ class ReceiverProcess:
     def end_row(self, card_status: Status | None = None, not_before_ns: int = 0) -> RowCapture:
         """End the row; its file is durable on return. Raises DeviceError.
 
-        Packets from before `not_before_ns` (monotonic clock), a time before the first pulse, are left over. With bit 7
-        or 9 in `card_status`, the card dropped data before numbering it, and the row is masked as a whole.
+        Packets from before `not_before_ns` (monotonic clock), a time before the first pulse, count as left over from
+        before the row. With bit 7 or 9 in `card_status`, the card dropped data before numbering it, and the row is
+        masked as a whole.
         """
         return self._ask(EndRow(int(card_status or 0), not_before_ns), RowCapture, _ANSWER_TIMEOUT_S)
 
@@ -374,18 +395,21 @@ class ReceiverProcess:
         self.close()
 
     def _note_answer(self, answer: Answer) -> None:
+        """Remember progress; raise a failure as DeviceError."""
         if isinstance(answer, Progress):
             self._progress = answer
         elif isinstance(answer, Failed):
             raise DeviceError(answer.what, answer.why, answer.remedy, code=ErrorCode(answer.code))
 
     def _receive_answer(self) -> Answer:
+        """Wait for the next answer. Raises DeviceError if the process has ended."""
         try:
             return _answers.decode(self._connection.recv_bytes())
         except (EOFError, OSError):
             raise self._process_error() from None
 
     def _process_error(self) -> DeviceError:
+        """Return the error for a process that has ended by itself."""
         return DeviceError(
             f"{self.board.name}: the receiver process ended with status {self._process.poll()}",
             "it was killed, or it failed; its message is above",

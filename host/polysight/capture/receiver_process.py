@@ -2,7 +2,7 @@
 
 A separate process, so that processing in the host cannot delay reception. It waits in one poll() for requests on the
 inherited socket FD and for the card's data, and ends when the socket closes, which happens at the latest when the host
-ends.
+ends. A *take* is one attempt to record a row; the record, what the card sends between start and stop, is the row's.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from polysight.capture.receiver import take_core, take_priority
 from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets
 from polysight_shared.errors import DeviceError, PolysightError
 
-# Batches fetched before requests are checked again.
+# Batches fetched before requests are checked again (chosen): so many hold more packets than a receive buffer of 8 MiB.
 _MAX_BATCHES = 64
 # A preview is followed by a pause of so many times its own duration: previews take a twentieth of the time at most.
 _PREVIEW_SHARE = 20
-# Remedy for errors in the order of requests, which are the program's own.
+# Remedy where requests came in a wrong order: that is an error of this program, not of the user.
 _RESTART = "start the scan again"
-# Pause in which packets gather in the kernel's buffer: fewer, larger batches.
+# Pause after each reception in which packets gather in the kernel's buffer: fewer, larger batches (chosen).
 _GATHER_MS = 1
 
 
@@ -46,9 +46,12 @@ class _Row:
         self.segment = segment
         self.log = log
         self.past = past
+        # Number of packets from between rows that were dropped when this row began.
         self.stale = 0
+        # Counts of the socket when the row began: packets from other addresses, packets dropped by the kernel.
         self.strangers = 0
         self.drops = 0
+        # Time before the first pulse of the row, monotonic clock; 0 while it is unknown.
         self.not_before_ns = 0
         # What the last report said of the preview: all frames complete, the record ended.
         self._reported = (False, False)
@@ -58,14 +61,19 @@ class _Row:
         self._preview = Preview(0, request.expected_bytes == 0, ended=False)
 
     def has_news(self) -> bool:
-        """True if the host must be notified: the row has become complete, or its last packet came."""
+        """True if the host must be notified: the row has become complete, or its last packet came.
+
+        Previews the row only if it may have ended, packets came since, and the pause after the last preview is over.
+        """
         log = self.log
         if log.payload_bytes < log.expected and not log.last_is_short:
             return False
-        if log.count == self._previewed or (began := time.monotonic_ns()) < self._next_preview_ns:
+        began_ns = time.monotonic_ns()
+        if log.count == self._previewed or began_ns < self._next_preview_ns:
             return False
         self._update()
-        self._next_preview_ns = time.monotonic_ns() + _PREVIEW_SHARE * (time.monotonic_ns() - began)
+        ended_ns = time.monotonic_ns()
+        self._next_preview_ns = ended_ns + _PREVIEW_SHARE * (ended_ns - began_ns)
         last_reported = self._reported
         self._reported = (self._preview.complete, self._preview.ended)
         return self._reported != last_reported and any(self._reported)
@@ -83,6 +91,7 @@ class _Row:
         )
 
     def _update(self) -> None:
+        """Preview the row again if packets came since the last preview."""
         if self.log.count != self._previewed:
             self._previewed = self.log.count
             self._preview = preview(self.log, self.past, self.not_before_ns)
@@ -132,6 +141,7 @@ class Receiver:
             self._row.segment.discard()
 
     def _answer(self, request: messages.Request) -> messages.Answer:
+        """Do what a request says and return the answer; between rows the progress is that of no row (-1)."""
         if isinstance(request, messages.Open):
             return self._open(request)
         if isinstance(request, messages.BeginRow):
@@ -144,6 +154,7 @@ class Receiver:
         return self._row.progress()
 
     def _open(self, request: messages.Open) -> messages.Answer:
+        """Bind the data socket, enlarge its buffer, and take priority and core as far as the system permits."""
         self._socket = bind_udp(request.host_address, request.data_port, f"{request.board} data")
         granted = enlarge_receive_buffer(self._socket, request.buffer_bytes)
         self._batches = BatchReceiver(self._socket, request.card_address)
@@ -188,7 +199,7 @@ class Receiver:
         self._past = Past()
 
     def _receive(self) -> None:
-        """Take over the packets that wait at the socket, at most some batches; send progress if there is any."""
+        """Log the packets that wait at the socket, at most `_MAX_BATCHES` batches; send progress if there is news."""
         row = self._row
         batches = self._batches
         if row is None or batches is None:

@@ -62,8 +62,9 @@ def _explain_damage(path: Path) -> tuple[str, str]:
 class Segment:
     """A file of `size` bytes with reserved disk space, which :meth:`finish` writes at once; its folder is made.
 
-    A mapped file could block the receiver while the kernel writes it back, and the receive buffer holds only a quarter
-    of a second. A row that is not finished is taken again anyway.
+    The row is written at its end, from memory: a file written during reception (a mapped one, too) could block the
+    receiver while the kernel writes it back, and a receive buffer of 8 MiB holds only 0.2 s of a card that sends a
+    packet every 25 us. A row that is not finished is taken again anyway.
 
     Raises
     ------
@@ -145,8 +146,8 @@ def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
 # Suffix of the packet file, which lies beside the row's file.
 PACKETS = ".pkt"
 FORMAT = 2
-"""Files of format 1 describe earlier records in another way, which is not read: their rows are placed as the first of
-a scan."""
+"""Files of format 1 describe earlier records in another way, which is not read: placed again, their rows have an
+unknown start and are masked as a whole."""
 RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), ("size", "<u2"), ("place", "<i8")])
 """Run of consecutive packets of one size: counters of the first, number of packets, payload of each, and its place.
 
@@ -154,7 +155,7 @@ RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), 
 """
 # Pairs: time (CLOCK_MONOTONIC of the host, ns), packets received by then.
 BATCH = np.dtype("<i8")
-# Limit of the batches and runs of a row file: a damaged length cannot fill the memory.
+# Limit of the batches and runs of a packet file (chosen): a damaged length cannot fill the memory.
 _MAX_RUN_BYTES = 256 << 20
 
 
@@ -201,7 +202,7 @@ def _find_runs(log: PacketLog, offsets_in_row: NDArray[np.int64]) -> NDArray[Any
     sequences = log.sequences[: log.kept]
     counts = log.byte_counts[: log.kept]
     is_stored_here = offsets_in_row < 0
-    # Places in this file are negative and fall from packet to packet, see `RUN`.
+    # Places in the packet file are negative and fall from packet to packet, see `RUN`.
     bytes_before = np.cumsum(np.where(is_stored_here, sizes, 0)) - np.where(is_stored_here, sizes, 0)
     places = np.where(is_stored_here, -1 - bytes_before, offsets_in_row)
     expected_steps = np.where(is_stored_here[:-1], -sizes[:-1], sizes[:-1])

@@ -31,10 +31,11 @@ _COMPLETED_TIMEOUT_S = 0.2
 
 
 def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int, silence_ns: int) -> bool:
-    """Return True if one board's record has ended: all bytes are there, the card reports it, or the card is silent.
+    """Return True if one board's record has ended: all bytes are there, or nothing has come for long enough.
 
-    `progress` is the receiver's latest report, `status` what the card reported since the record started. `since_ns`
-    (last pulse) and `now_ns` are on the monotonic clock; `silence_ns` is the silence that ends a record.
+    That is `silence_ns`, or `GRACE_NS` if the card reported the end. `progress` is the receiver's latest report,
+    `status` what the card reported since the record started. The silence counts from the last packet or from `since_ns`
+    (when the row had ended), whichever is later, to `now_ns`, all on the monotonic clock.
     """
     silent_ns = now_ns - max(progress.last_arrival_ns, since_ns)
     # The card reports the end by a short last packet, or by its status.
@@ -45,9 +46,10 @@ def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int,
 
 
 class CaptureRig:
-    """Cards and receivers of the recorded boards; `warnings` lists what differs from the request but suffices to scan.
+    """Cards and receivers of the recorded boards, by board name; a record is what a card sends from start to stop.
 
-    Raises DeviceError if a port is in use, or the receive buffer is smaller than two bursts.
+    `warnings` lists what differs from the request but suffices to scan. Raises DeviceError if a port is in use, or the
+    receive buffer is smaller than two bursts.
     """
 
     def __init__(self, instrument: Instrument) -> None:
@@ -95,19 +97,20 @@ class CaptureRig:
         return versions
 
     def begin_row(self, row: int, take: int, points: int, folder: Path) -> None:
-        """Arm the receivers, then start the records. Raises DeviceError.
+        """Prepare the receivers for a row of `points` positions, then start the records. Raises DeviceError.
 
-        A card whose counters were lost track of is reset and configured first: it then counts from its first counters.
+        `take` is the number of this attempt, `folder` the scan folder. A card whose counters are not known is reset and
+        configured first: it then counts from its first counters.
         """
         frame_bytes = self._instrument.frame_bytes
         expected = points * self._instrument.burst.pulses * frame_bytes
-        reset = set(self._start_lost)
-        for name in reset:
+        cards_to_reset = set(self._start_lost)
+        for name in cards_to_reset:
             self.cards[name].reset_fpga()
             self.configure([name])
         for name, receiver in self.receivers.items():
             path = folder / "raw" / name / f"{row:04d}{PART}"
-            receiver.begin_row(row, take, expected, frame_bytes, path, after_reset=name in reset)
+            receiver.begin_row(row, take, expected, frame_bytes, path, after_reset=name in cards_to_reset)
             # If the row is interrupted, the card's count stays unknown; `end_row` removes the name otherwise.
             self._start_lost.add(name)
         self._recording = True

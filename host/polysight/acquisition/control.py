@@ -27,9 +27,10 @@ import msgspec
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError, quote
 
+# Names of the folder in a scan folder, and of the file with the sign of life.
 CONTROL = "control"
 ALIVE = "alive"
-# Time between two looks for command files.
+# Time between two looks for command files (chosen).
 _POLL_S = 0.2
 # A sign of life that is unchanged is written again after this time, far below LAPSE_S.
 _ALIVE_INTERVAL_S = 1.0
@@ -50,7 +51,7 @@ class StopRequest:
     paused
         True if the next row must not begin yet.
     asker
-        Who sent the last request.
+        Who sent the last request or command.
     """
 
     def __init__(self) -> None:
@@ -140,7 +141,7 @@ class ScanCommand(StrEnum):
 class Life(msgspec.Struct, frozen=True):
     """Content of `alive`: the scan's process with its start time (:func:`read_start_ticks`) and machine, what it does.
 
-    `asked` is the pending command of `asker`, "" for none.
+    `asked` is the pending command of `asker`, "" for none. The reader sets `written_s` (since 1970) from the file.
     """
 
     pid: int = 0
@@ -163,7 +164,7 @@ class Life(msgspec.Struct, frozen=True):
 
 
 def read_start_ticks(pid: int) -> int | None:
-    """Return the start time of a running process in clock ticks since boot, or None.
+    """Return the start time of a running process in clock ticks since boot, or None if it has ended.
 
     It tells a process from a later one with the same number.
     """
@@ -231,7 +232,7 @@ class ControlFolder:
 
     def _write(self, life: Life) -> None:
         """Write `alive`, so that a reader sees the old content or the new one."""
-        # A reader sees the old content or the new one; nothing needs to survive a power loss.
+        # Not durably: nothing needs to survive a power loss.
         part = self._folder / f".{ALIVE}.part"
         try:
             part.write_bytes(msgspec.json.encode(life))
@@ -263,6 +264,7 @@ class ControlFolder:
         accepted.unlink()
 
     def _clear(self) -> None:
+        """Delete every file of the folder."""
         for path in self._folder.iterdir():
             path.unlink(missing_ok=True)
 

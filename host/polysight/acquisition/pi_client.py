@@ -1,7 +1,8 @@
 """Client for the Pi: commands with timeout and retry, events without gaps, and the host's heartbeat.
 
 `PiClient` sends commands and reads events; lost events are fetched from the Pi's journal. `HostHeartbeat` sends
-`Alive` from its own thread and socket.
+`Alive` from its own thread and socket. A *run* is what the Pi calls a scan, a *take* one attempt to record a row;
+*journalled* events are those that the Pi keeps and numbers (`seq`). Protocol: docs/spec/wire.md.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from polysight_shared.sockets import HandshakeMonitor, requester, subscriber
 ATTEMPTS = 3
 # Real-time priority of the heartbeat: below the receiver processes.
 REAL_TIME = 1
-# Heartbeats to wait for the end of a killed program's run: more than the Pi waits before it considers a host dead.
+# Heartbeats to wait for the end of a killed program's run: more than the four after which the Pi considers a host dead.
 _SILENT_BEATS = 10
-# Time to wait for a reply to `Alive` before it is sent again.
+# Time to wait for a reply to `Alive` before it is sent again (chosen).
 _ALIVE_TIMEOUT_S = 1.0
 # States of the Pi that change without a command.
 MOVING: tuple[m.State, ...] = ("homing", "jogging", "running", "held", "done")
@@ -40,9 +41,9 @@ MOVING: tuple[m.State, ...] = ("homing", "jogging", "running", "held", "done")
 _REST_TIMEOUT_S = 10.0
 # Period of the heartbeat during a jog where the rig file has none for rows.
 _JOG_HEARTBEAT_MS = 100
-# Between two questions for the Pi's status.
+# Between two questions for the Pi's status (chosen).
 _POLL_S = 0.05
-# Events that one reply brings from the Pi's journal.
+# Events that one reply brings from the Pi's journal at most (chosen).
 _REPLAY_LIMIT = 1000
 R = TypeVar("R", bound=m.AnyReply)
 
@@ -64,6 +65,7 @@ class HostHeartbeat:
         self._thread.start()
 
     def _send_heartbeats(self) -> None:
+        """Send `Alive`, wait for its reply or the timeout, and repeat, until `stop`."""
         # Without permission for real time, a busy machine may delay a heartbeat and so cause a retake.
         take_priority(REAL_TIME)
         try:
@@ -109,6 +111,7 @@ class PiClient:
         self._address = instrument.pi.command_address
         self._event_address = instrument.pi.event_address
         self._timeout_s = instrument.limits.command_timeout_s
+        # Silence on both sockets after which the Pi is asked if it still answers: ten of its heartbeats.
         self._silence_s = max(10 * instrument.pi.heartbeat_ms / 1e3, instrument.limits.command_timeout_s)
         self._on_event: Callable[[m.AnyEvent], object] = lambda _: None
         keys = Path(instrument.pi.key_dir)
@@ -120,7 +123,7 @@ class PiClient:
         self._last_seq = 0
         self._last_heard_s = time.monotonic()
         self._pending: deque[m.AnyEvent] = deque()
-        # Events that PUB lost and the journal contained.
+        # Events fetched from the Pi's journal, because the event socket did not bring them, or not yet.
         self.gaps_filled = 0
         # State of the Pi in its last heartbeat.
         self.state: m.State = "idle"
@@ -177,7 +180,7 @@ class PiClient:
         self._stop_heartbeat()
 
     def home(self) -> None:
-        """Start homing; retry without a reply if the stage does not home. Raises RefusedError, DeviceError."""
+        """Start homing. Without a reply, retry unless the stage is homing. Raises RefusedError, DeviceError."""
         command = m.Home(owner=self._owner)
         if self._send_once(command, self._timeout_s) is None and self.status().state != "homing":
             self._ask(command, m.Accepted)
@@ -340,6 +343,7 @@ class PiClient:
         return events
 
     def _take(self, event: m.AnyEvent) -> None:
+        """Accept the next event in order: keep it for :meth:`events` and pass it to the follower."""
         self._last_seq = event.seq
         self._pending.append(event)
         self._on_event(event)

@@ -21,7 +21,7 @@ from polysight_shared.messages import ExitStatus
 OnRow = Callable[[int], None]
 # Added to the nice value of the program: the receivers get three times as much processor time.
 NICE = 5
-# Enough for a steady median, few enough to follow a faster rig.
+# Rows of the typical duration. Chosen: enough for a steady median, few enough to follow a faster rig.
 _RECENT_ROWS = 25
 
 
@@ -35,8 +35,9 @@ class ProcessingQueue:
         self._on_row = on_row
         self._limit = limit
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="rows", initializer=_yield_to_capture)
+        # Every row that was queued, and the unprocessed rows of this run.
         self._all: list[Future[None]] = []
-        self._own: list[Future[None]] = []
+        self._of_this_run: list[Future[None]] = []
 
     def add_earlier(self, rows: Iterable[int]) -> None:
         """Queue rows that were committed before this run; the scan does not wait for them."""
@@ -46,15 +47,15 @@ class ProcessingQueue:
     def add(self, row: int) -> None:
         """Queue a row that was just committed."""
         self.add_earlier([row])
-        self._own += self._all[-1:]
+        self._of_this_run += self._all[-1:]
 
     @property
     def behind(self) -> int:
         """Number of unprocessed rows of this run if it is above the limit, otherwise 0."""
-        self._own = [f for f in self._own if not f.done()]
-        if len(self._own) <= self._limit:
+        self._of_this_run = [f for f in self._of_this_run if not f.done()]
+        if len(self._of_this_run) <= self._limit:
             return 0
-        return len(self._own)
+        return len(self._of_this_run)
 
     @property
     def left(self) -> int:
@@ -62,8 +63,8 @@ class ProcessingQueue:
         return sum(not f.done() for f in self._all)
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until the oldest row is processed, or for the timeout."""
-        wait(self._own[:1], timeout_s)
+        """Wait until the oldest row of this run is processed, or for the timeout."""
+        wait(self._of_this_run[:1], timeout_s)
 
     def close(self, now: bool) -> BaseException | None:
         """Process the queued rows (with `now` only the current one); return the first error of processing."""
@@ -88,8 +89,10 @@ class ScanProgress:
 
     phase: str
     message: str
+    # Rows of the scan, and how many of them are committed.
     rows: int
     committed: int
+    # Index of the current row, and the number of this attempt to record it; -1 and 0 before the first.
     row: int = -1
     take: int = 0
     # Points of the take so far, of `row_points`.
@@ -102,7 +105,11 @@ class ScanProgress:
 
 @dataclass
 class ScanResult:
-    """Result of a scan; `processing_error` is the first error of `on_row` and does not affect the recorded data."""
+    """Result of a scan: how it ended, and the number of `retakes` (rows recorded again because of faults).
+
+    `incomplete_rows` were committed with faults. `processing_error` is the first error of `on_row` and does not affect
+    the recorded data.
+    """
 
     folder: ScanFolder
     exit_status: ExitStatus

@@ -12,6 +12,9 @@ a frame less behind a spurious edge.
 In a whole row every train must allow a shift of 0. In a row that is some frames short, the shift only grows, from 0 to
 what is missing at the end; a frame is kept where its bounds meet at a whole number of frames. Of both, only frames are
 kept that were seen at their pulses.
+
+A *burst* is the pulses of one position of the stage. Pulses are numbered through the row; a frame's *slot* is the
+number of its pulse.
 """
 
 from __future__ import annotations
@@ -48,30 +51,36 @@ Times = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 Gap = tuple[int, int]
 
-# A radar needs 150 us between two frames (AWR2243, hardware trigger): trains are further apart than this.
+# Silence between packets that begins a new train (chosen). A radar needs 150 us between two frames (AWR2243, hardware
+# trigger), and the first packet of a frame comes only when it is full.
 SILENCE_NS = 200_000
-# A train may come so much before the quickest known one, and so much behind its frame: of the pulse period, at most.
+# A train is at the time of a pulse if it comes at most so much before its predicted arrival, and at most so much more
+# than the duration of a frame after it: the share of the pulse period, but no longer than the time in ns. Chosen: wide
+# enough for the jitter of network and machine, far less than half a period.
 _EARLY = 0.1
 _EARLY_NS = 200_000
 _LATE = 0.15
 _LATE_NS = 200_000
-# If more trains come at no pulse's time, the machine or the network is slow, and the expected times are not sharp. Then
-# displaced frames show only by so many trains at earlier pulses. At later ones, they show by so many in a row.
+# If more than this share of the trains comes at no pulse's time, the machine or the network is slow, and the expected
+# times are not sharp. Then displaced frames show only by `_DISPLACED` trains at earlier pulses. At later pulses they
+# show by so many trains one after another. Both chosen.
 _BLURRED = 0.1
 _DISPLACED = 3
 # A card drops whole samples of its four antennas (inferred).
 _SAMPLE_BYTES = 16
 # A train that follows the previous one sooner than this share of the pulse period catches up a delay.
 _CATCHING_UP = 0.8
-# Bursts whose delays must agree, within the share of a pulse period or the time.
+# Least number of bursts whose delays from pulse to data must agree, and how closely: within the share of a pulse
+# period, but no more than the time in ns (chosen).
 _AGREEING = 3
 _AGREE = 0.3
 _AGREE_NS = 500_000
-# Crystals of 50 ppm, and a clock that NTP slews.
+# Drift between the clocks of Pi and host: at most that of a clock which NTP slews, usually that of two crystals of 50
+# ppm. With fewer bursts than these it cannot be estimated, and must be negligible (chosen).
 _MAX_DRIFT = 500e-6
 _USUAL_DRIFT = 100e-6
 _DRIFT_BURSTS = 8
-# Host clock over pulse clock; outside, the pulses are in simulated time.
+# Rate of the host's clock over that of the pulses; outside, the pulses are in simulated time.
 _RATES = 0.8, 1.25
 # Number of missed pulses that a message names.
 _SHOWN = 4
@@ -173,16 +182,16 @@ class _Trains(NamedTuple):
     low: Times
     # int64, upper bound of the shift at its last packet, bytes
     high: Times
-    # Trains of one frame at the time of a pulse.
+    # True for trains of one frame at the time of a pulse.
     punctual: Flags
-    # Trains of one frame at no pulse's time.
+    # True for trains of one frame at no pulse's time; trains of several frames are neither.
     astray: Flags
 
 
 def _find_trains(
     pulses_ns: Times, received_ns: Times, arrivals: Times, frame_bytes: int, payload_bytes: int, frame_ns: int
 ) -> _Trains:
-    """Divide the packets into trains, and bound the shift of each."""
+    """Divide the packets into trains, and bound the shift of each; parameters as of :func:`place_frames`."""
     # The short last packet waits for the end of the record.
     new_bytes = np.diff(arrivals[:, 1], prepend=0) > 0
     entries = arrivals[new_bytes & (arrivals[:, 1] % payload_bytes == 0)]
@@ -191,12 +200,14 @@ def _find_trains(
     is_whole = int(arrivals[-1, 1]) == pulses_ns.size * frame_bytes
     expected = _predict_arrivals(pulses_ns, received_ns, entries, frame_bytes, is_whole)
 
+    # A silence begins a train; the first packet follows one, too.
     period_ns = _find_period_ns(pulses_ns)
     silence_ns = min(SILENCE_NS, period_ns // 2)
     heads = np.flatnonzero(np.diff(came_ns, prepend=came_ns[:1] - 2 * silence_ns) > silence_ns)
     tails = np.append(heads[1:], came_ns.size) - 1
     first_stop = stop[heads]
 
+    # Number of the latest pulse that had been sent when a train began and when it ended; -1 before the first.
     early_ns = min(_EARLY * period_ns, _EARLY_NS)
     pulse_of_head = np.searchsorted(expected, came_ns[heads] + early_ns, "right") - 1
     pulse_of_tail = np.searchsorted(expected, came_ns[tails] + early_ns, "right") - 1
@@ -206,6 +217,7 @@ def _find_trains(
     # A train that is late within its burst is at least not of an earlier one: no delay is as long as a pause.
     count = pulses_ns.shape[1]
     first_pulse = np.where(in_time, pulse_of_head, pulse_of_head // count * count)
+    # Its first packet ends with at least one sample of that pulse's frame: so many bytes were sent, `first_stop` came.
     low = np.where(is_single, frame_bytes * first_pulse + _SAMPLE_BYTES - first_stop, -_NO_BOUND)
     # Frames that come faster than pulses are sent catch up with a delay, however long it was.
     to_next_ns = np.diff(came_ns[heads], append=_NO_BOUND)
@@ -223,7 +235,7 @@ def _find_trains(
 
 
 def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int) -> PlacedFrames:
-    """Compare a row that has as many frames as pulses with them."""
+    """Compare the trains of a row that has as many frames as pulses with the pulses: every shift must be 0."""
     is_sharp = (~trains.punctual).sum() <= _BLURRED * trains.punctual.size
     is_early = (trains.high < 0) & trains.punctual
     is_displaced = is_early | (trains.low > 0)
@@ -249,12 +261,14 @@ def _measure_longest_run(flags: Flags) -> int:
 
 def _place_short_row(trains: _Trains, received: int, pulses: int, frame_bytes: int) -> PlacedFrames:
     """Find the pulses of the frames of a row with fewer frames than pulses."""
+    # The shift never falls along the row: lower bounds hold for all later trains, upper bounds for all earlier ones.
     at_the_end = (pulses - received) * frame_bytes
     low = np.maximum.accumulate(np.append(0, trains.low))
     high = np.minimum.accumulate(np.append(trains.high, at_the_end)[::-1])[::-1]
     slots = np.full(received, -1, dtype=np.int64)
     if (low[1:] > high[:-1]).any():
         return PlacedFrames(slots, [], pulses, contradicted=True)
+    # Bounds of each frame: the lower one of the last train that began before it, the upper one of the first after it.
     begins = np.arange(received) * frame_bytes
     least = low[np.searchsorted(trains.first_stop, begins, "right")]
     most = high[np.searchsorted(trains.last_stop, begins + frame_bytes, "left")]
@@ -278,7 +292,8 @@ def _select_frames(trains: _Trains, selected: Flags, frame_bytes: int, frames: i
 
 
 def _find_missed(slots: Times, pulses: int) -> list[int]:
-    """Return the numbers of the pulses between two neighbours that are certain."""
+    """Return the numbers of the pulses that lie between those of two neighbouring frames whose pulses are certain."""
+    # The row's begin and end count as frames with certain pulses.
     number = np.concatenate([[-1], np.arange(slots.size), [slots.size]])
     slot = np.concatenate([[-1], slots, [pulses]])
     sure = np.flatnonzero((slot >= 0) | (number < 0))
@@ -295,7 +310,11 @@ def _find_period_ns(pulses_ns: Times) -> int:
 
 
 def _find_pauses(pulses_ns: Times, received_ns: Times) -> Times:
-    """Return a time (host's clock) in the pause before each burst, int64 [burst]."""
+    """Return a time (host's clock) in the pause before each burst, int64 [burst]; parameters as of `place_frames`.
+
+    The quickest of the capture events gives the offset between the clocks. Raises _UndeterminedError if a quarter of
+    the pause is not enough for its delay, which two events must confirm.
+    """
     last = pulses_ns[:, -1]
     if len(last) < 2:
         raise _UndeterminedError("the offset between the clocks needs two bursts")
@@ -533,6 +552,7 @@ def _find_runs(slots: NDArray[np.int64]) -> list[tuple[int, int, int]]:
     placed = np.flatnonzero(slots >= 0)
     if not placed.size:
         return []
+    # A run begins where frame or slot jumps; -2 makes the first one begin.
     starts = np.flatnonzero((np.diff(placed, prepend=-2) != 1) | (np.diff(slots[placed], prepend=-2) != 1))
     stops = np.append(starts[1:], placed.size)
     return [(int(placed[a]), int(slots[placed[a]]), int(b - a)) for a, b in zip(starts, stops, strict=True)]

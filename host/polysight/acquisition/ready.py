@@ -1,7 +1,7 @@
 """Checks before a row begins: homed stage, free disk space, and a Pi with the same `[stage]` as the rig file.
 
 `make_ready` waits for the stage and homes it if that is safe. `check_same_stage` compares the Pi's own `[stage]` with
-the rig file's.
+the rig file's. A *run* is what the Pi calls a scan: it has the scan's id.
 """
 
 from __future__ import annotations
@@ -97,7 +97,11 @@ def _wait_ready(pi: PiClient, stop: StopRequest, scan_id: str) -> bool:
 
 
 def check_between_rows(status: StatusReply, scan_id: str, first: bool) -> None:
-    """Raise ScanError if the next row needs homing and a person must look at the stage before that."""
+    """Raise ScanError if the next row cannot begin without a person.
+
+    That is so if the Pi restarted or has begun another run than `scan_id` ("" for any), after a fault, or if the stage
+    must be homed. Before the `first` row of this program, homing is allowed, and so are faults but `STAGE_FAULTS`.
+    """
     needs_homing = status.state in ("idle", "homed") or (status.state == "ready" and not status.homed)
     if scan_id and status.scan_id not in ("", scan_id):
         problem = f"the Pi has begun another run in the meantime: {status.scan_id}"

@@ -60,6 +60,7 @@ class FaultKind(StrEnum):
     NO_END = "no_end"
     # Points or pulses are not as planned.
     COUNTS_DIFFER = "counts_differ"
+    # No packet of the board came.
     NO_DATA = "no_data"
     # The row was held so long that the cards ended their records.
     HELD = "held"
@@ -112,21 +113,24 @@ def join_faults(faults: list[TakeFault]) -> str:
 
 @dataclass
 class Take:
-    """Data and events of one take of a row; dictionaries are by board."""
+    """Data and events of one take, an attempt to record a row; dictionaries are by board."""
 
     row: Row
+    # 1 for the first attempt.
     number: int
     # The Pi's report on the end of the row; None if there was none.
     finished: RowFinished | None = None
+    # Results of reception; empty until the records have ended.
     captures: dict[str, RowCapture] = field(default_factory=dict)
     # Reason why the host aborted the row, or did not begin it.
     aborted: TakeFault | None = None
+    # The Pi's events on bursts that it has sent, one for each position of the stage.
     events: list[pulse_times.ReceivedCapture] = field(default_factory=list)
     # Latest state of each radar.
     radars: dict[str, BoardState] = field(default_factory=dict)
     # Radars that did not confirm the end of all frames.
     not_done: list[str] = field(default_factory=list)
-    # Frames placed by their arrival times, for rows of a certain length.
+    # Pulse of each frame by arrival times, for boards whose record has a certain length.
     frames: dict[str, pulse_times.PlacedFrames] = field(default_factory=dict)
 
     def faults(self, pulses_per_point: int) -> list[TakeFault]:
@@ -382,13 +386,21 @@ _DISK_NOTICE_S = 2.0
 class RowState(StrEnum):
     """State of a take."""
 
+    # The stage, the disk or processing is not ready for the row.
     WAITING = "waiting"
+    # The radars are made to wait for pulses, and the cards begin to record.
     ARMING = "arming"
+    # The Pi moves the stage and sends pulses.
     RUNNING = "running"
+    # The row was aborted; the stage brakes.
     ABORTING = "aborting"
+    # Every pulse is sent; data is still on its way.
     COLLECTING = "collecting"
+    # The records are stopped, and the files are made durable.
     WRITING = "writing"
+    # The data is compared with the pulses.
     CHECKING = "checking"
+    # Final: complete; committed although incomplete; deleted; not begun, on request; ended by an error.
     COMMITTED = "committed"
     KEPT = "kept"
     REJECTED = "rejected"
@@ -396,6 +408,7 @@ class RowState(StrEnum):
     FAILED = "failed"
 
 
+# States that may follow each state.
 S = RowState
 TRANSITIONS: dict[RowState, frozenset[RowState]] = {
     S.WAITING: frozenset({S.ARMING, S.STOPPED, S.FAILED}),
@@ -435,7 +448,10 @@ class RowTransaction:
 
 
 class RowTaker:
-    """Record rows, one at a time; `notify(phase, message)` reports delays, `on_point` the number of points done."""
+    """Record rows of scan `scan_id` into the scan folder `folder`, one at a time.
+
+    `notify(phase, message)` reports delays, `on_point` the number of positions done. `stop` is read at every step.
+    """
 
     def __init__(
         self,
@@ -629,7 +645,9 @@ class _SilenceCheck:
         burst_bytes = instrument.burst.pulses * instrument.frame_bytes
         # A card sends a packet only when it is full: silence counts only after bursts that fill two packets.
         self._bursts = -(-2 * instrument.card.packet_bytes // burst_bytes)
+        # Time of the last check, monotonic clock.
         self._checked_ns = 0
+        # True once every board has sent data: nothing is left to check.
         self._all_heard = False
 
     def find_silent_boards(self, events: list[pulse_times.ReceivedCapture]) -> list[str]:
@@ -648,7 +666,7 @@ class _SilenceCheck:
 def row_limit_s(instrument: Instrument, row: Row) -> float:
     """Return the timeout of a row: one minute plus four times the travel to it and along it.
 
-    It is generous on purpose: only a stage that stands still or a Pi that hangs is to reach it.
+    It is generous on purpose (chosen): only a stage that stands still or a Pi that hangs is to reach it.
     """
     stage = instrument.stage
     travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s

@@ -2,6 +2,7 @@
 
 Every row is a transaction (docs/spec/scan-folder.md): it is recorded, checked by count, made durable, and only then
 added to the manifest. After a crash or power loss at any time, `resume_scan` continues with the first missing row.
+A *take* is one attempt to record a row, a *retake* a further one; a row is *committed* once the manifest lists it.
 """
 
 from __future__ import annotations
@@ -77,12 +78,12 @@ from polysight_shared.tables import to_builtins
 
 # Time between two readings of the Pi's events while a scan waits.
 _POLL_S = 0.05
-# 9 degrees of phase at 77 GHz.
+# Lost steps from which on the user is warned (chosen): up to 9 degrees of phase at 77 GHz, over the way there and back.
 _LOST_STEPS_WARNING_MM = 0.05
 
 
 class RunningScan:
-    """A running scan; needs connected devices and a locked folder."""
+    """A running scan; needs connected devices and a locked folder. Parameters as of :func:`run_scan`."""
 
     def __init__(
         self,
@@ -108,17 +109,20 @@ class RunningScan:
         self._radars = radars
         self._queue = ProcessingQueue(on_row, scan.instrument.limits.rows_waiting)
         self._committed = set(scan.committed_rows())
+        # Durations of the rows of this run.
         self._row_seconds: list[float] = []
         # Start of the current row on the monotonic clock, moved on by pauses; None between rows.
         self._row_began: float | None = None
         # Index, take number and points of the current row.
         self._current = (-1, 0, 0)
+        # State of the current row, a `RowState`; "" before the first.
         self._state = ""
         self._stop_announced = False
         # True once the stage was ready in this run.
         self._was_ready = False
         # The error that ended the scan.
         self._error: PolysightError | None = None
+        # Lost steps in x and y; None if they were not measured.
         self._lost_mm: tuple[float, float] | None = None
         self.result = ScanResult(scan, "fail", "ended unexpectedly")
 
@@ -330,7 +334,7 @@ class RunningScan:
         return not self._stop.after_row
 
     def _wait_for_processing(self) -> bool:
-        """Wait until processing has caught up; return False if asked to stop."""
+        """Wait until processing has caught up; return False if asked to stop now, or during the wait."""
         waited = False
         while waiting := self._queue.behind:
             if self._stop.after_row:
@@ -340,7 +344,10 @@ class RunningScan:
             waited = True
             self._queue.wait(_POLL_S)
             self._pi.events()
-        return not (self._stop.now or (waited and self._stop.after_row))
+        # Without a wait, the caller has just asked if the scan ends before this row.
+        if waited and self._stop.after_row:
+            return False
+        return not self._stop.now
 
     def _commit_or_reject(self, take: Take, is_last: bool, transaction: RowTransaction, events: EventWriter) -> bool:
         """Commit or reject the take; return True if it is committed."""
@@ -448,6 +455,7 @@ class RunningScan:
             self.result.warnings.append(f"progress is no longer reported: {type(e).__name__}: {e}")
 
     def _follow_state(self, state: RowState) -> None:
+        """Note the current row's state and report it."""
         self._state = str(state)
         self._notify("state", "")
 
@@ -457,7 +465,7 @@ def takes_so_far(scan: ScanFolder) -> dict[int, int]:
     begun = [(f.row, f.take) for f in (*scan.facts(RowCommitted), *scan.facts(RowRejected))]
     events = read_events(scan.path / EVENTS).events
     begun += [(e.row.index, e.take) for e in events if isinstance(e, RowStarted)]
-    # The highest take of a row is its last.
+    # Sorted by row and take: in the dictionary, the highest take of a row replaces its others.
     return dict(sorted(begun))
 
 
@@ -621,7 +629,10 @@ def _copy_calibration(instrument: Instrument, folder: Path, simulated: bool) -> 
 def _connect(
     stack: ExitStack, instrument: Instrument, progress: OnProgress | None
 ) -> tuple[PiClient, CaptureRig, HelloReply]:
-    """Connect to the Pi and every card, before a scan folder is created."""
+    """Connect to the Pi and every card, before a scan folder is created; return both and the Pi's first reply.
+
+    `stack` closes them.
+    """
     if progress is not None:
         progress(ScanProgress("connect", "connecting to the Pi and the capture cards", instrument.grid.rows, 0))
     # Context.term() would wait forever for a socket that was never closed, as after an interrupt in PiClient().

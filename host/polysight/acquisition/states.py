@@ -14,13 +14,18 @@ import msgspec
 StateLevel = Literal["good", "done", "wait", "warn", "bad"]
 Button = Literal["pause", "continue", "stop", "abort", "resume", "again", "repeat", "process"]
 """`again` starts a scan that could not start once more; `repeat` plans a new one with this one's numbers."""
+# Buttons of a scan that runs, and of one that ended before its last row.
 RUNNING: tuple[Button, ...] = ("pause", "stop", "abort")
 ENDED: tuple[Button, ...] = ("resume", "repeat")
 
 
 class State(msgspec.Struct, frozen=True):
-    """One state: `level` sets colour and sign; `why` and `do` are empty if there is nothing to say."""
+    """One state: `level` sets colour and sign, `headline` and `detail` say what happens, `why` why, `do` what helps.
 
+    A text is empty if there is nothing to say.
+    """
+
+    # Name of the state in `STATES`.
     key: str
     level: StateLevel
     headline: str
@@ -33,6 +38,7 @@ class State(msgspec.Struct, frozen=True):
     never: tuple[str, ...] = ()
 
 
+# Phrases of `never`, and a remedy that several states have.
 _WELL = "All is well"
 _NO_FAULTS = "No faults"
 _FAILED = "has failed"

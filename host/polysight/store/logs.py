@@ -71,7 +71,7 @@ class AppendFile:
         self.length = length
 
     def append(self, data: bytes) -> None:
-        """Append `data` durably. After a DeviceError the file has its former length."""
+        """Append `data` durably. After a DeviceError `length` is unchanged; the file too, if it can be truncated."""
         remaining = memoryview(data)
         end = self.length
         try:
@@ -99,11 +99,11 @@ DAMAGED = ".damaged"
 class EventLog:
     """Content of an event file."""
 
-    # Up to the first that is torn or damaged
+    # The events before the first one that is torn or damaged.
     events: list[AnyEvent]
     # Length of the good records, bytes.
     length: int
-    # The beginning of an event or zeros follow, as after a kill or power cut
+    # True if the beginning of an event or zeros follow, as after a kill or power cut.
     torn: bool = False
     # Description of damage after the good records; "" if there is none.
     damage: str = ""
@@ -136,7 +136,7 @@ def parse_events(raw: bytes) -> EventLog:
 def _is_beginning(raw: bytes) -> bool:
     """True if this may be the incomplete beginning of an event."""
     try:
-        return not any(True for _ in _find_ends(raw))
+        return next(_find_ends(raw), None) is None
     except (ValueError, msgpack.UnpackException):
         return False
 
@@ -157,7 +157,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _find_ends(raw: bytes) -> Iterator[int]:
-    """Yield the end of each complete msgpack object."""
+    """Yield the end of each complete msgpack object, in bytes from the start. Raises as msgpack does for other data."""
     unpacker = msgpack.Unpacker(raw=True, max_buffer_size=max(len(raw), 1))
     unpacker.feed(raw)
     while True:

@@ -56,7 +56,10 @@ class PiDescription(msgspec.Struct, frozen=True):
 
 
 class ScanStarted(Fact, frozen=True, kw_only=True, tag="scan_started"):
-    """First fact of a scan. `instrument` is the rig file, `calibration` describes the copied files by kind."""
+    """First fact of a scan. `instrument` is the rig file, `calibration` describes the copied files by kind.
+
+    `format` is that of the folder (1), `versions` the releases of the software; keys in `_utc` are times, ISO 8601.
+    """
 
     format: int = 0
     scan_id: str
@@ -117,12 +120,17 @@ class BoardRow(Reception, frozen=True, kw_only=True, omit_defaults=True):
     crc32: str
     index_crc32: str = ""
     packets_crc32: str = ""
-    # Frames whose pulse follows from their count alone: all if there are no arrival times, otherwise none.
+    # Number of frames whose pulse follows from their count alone: all if there are no arrival times, otherwise 0.
     frames_untimed: int | None = None
 
 
 class RowCommitted(Fact, frozen=True, kw_only=True, tag="row_committed"):
-    """A committed row; `kept_incomplete` has the reasons, and `faults` the faults, of one with gaps."""
+    """A committed row; `kept_incomplete` has the reasons, and `faults` the faults, of one with gaps.
+
+    `take` is the number of the attempt, `direction` +1 or -1 (of the stage, along x), `pulses` the number that the Pi
+    sent, `events` the digest of the event log at the commit, `note` the Pi's remark. `replaced_utc` is set if the row
+    was placed again from its packets.
+    """
 
     row: int
     take: int
@@ -149,7 +157,7 @@ class RowRejected(Fact, frozen=True, kw_only=True, tag="row_rejected"):
 
 
 class RowWithdrawn(Fact, frozen=True, kw_only=True, tag="row_withdrawn"):
-    """A committed row whose files are not what was committed."""
+    """A committed row whose files are not what was committed: it counts as missing and is taken again."""
 
     row: int
     take: int = 0
@@ -308,6 +316,7 @@ def _check_line(line: bytes) -> _Head | None:
 
 
 def _decode_fact(kind: str, line: bytes) -> Fact:
+    """Return the fact of a valid line; `OtherFact` for an unknown kind, or if its keys are not those of its kind."""
     decoder = _decoders.get(kind)
     if decoder is None:
         return OtherFact(kind=kind)
@@ -368,6 +377,7 @@ class Manifest:
     digest: str = ""
     # One more than the count of the last whole line; less than `count` behind damaged lines.
     _next_whole: int = 0
+    # Lines so far, damaged ones too.
     _lines: int = 0
 
     def feed(self, raw: bytes) -> list[Fact]:
@@ -380,6 +390,7 @@ class Manifest:
         for number, line in enumerate(lines, 1):
             head = _check_line(line)
             if head is None and number == len(lines) and not tail:
+                # The last line, whose end is there but not all that is before it, is torn rather than damaged.
                 self.torn = True
                 break
             self._lines += 1
@@ -546,6 +557,8 @@ def is_being_written(path: Path) -> bool:
 
 class ManifestWriter:
     """Appends facts durably and locks the scan against other programs. A torn last line is cut off.
+
+    `create`: make the file, which must not exist; otherwise it must.
 
     Raises
     ------

@@ -26,9 +26,9 @@ from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan, plan_raster
 
 Gaps = list[tuple[int, int]]
-# Payload of a full packet, if there is no log.
+# Payload of a full packet in bytes, where no log of the packets tells it.
 PACKET_BYTES = 1456
-# Largest deviation of a pause from a whole number of periods between positions, as a share of a period.
+# Largest deviation of a pause from a whole number of periods between positions, as a share of a period (chosen).
 _UNEVEN = 0.25
 
 
@@ -65,7 +65,7 @@ class Stream:
 
     # uint8 [n]: the payload, zero where bytes were lost.
     data: NDArray[np.uint8]
-    # Byte ranges that never arrived.
+    # Byte ranges that never arrived, and the number of packets that they make.
     lost: Gaps
     packets_lost: int
     # Offset of each packet that arrived; empty without a log
@@ -115,8 +115,8 @@ def read_log(path: Path) -> PacketLog | None:
     return PacketLog(sequence, size, at_s)
 
 
-# A stream may span at most this many times the bytes of a row and its file: what is missing is filled with zeros, so
-# that one damaged packet number could fill the memory.
+# A stream may span at most this many times the bytes of a row and its file together (chosen): what is missing is filled
+# with zeros, so that one damaged packet number could fill the memory.
 _MAX_ROWS = 16
 
 
@@ -191,7 +191,8 @@ def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.i
 
 
 def _find_silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
-    """Return the packets that are all zero, bool [packet]."""
+    """Return which packets of `packet` bytes are all zero, bool [packet]; the last one may be shorter."""
+    # Words of eight bytes are compared faster than bytes.
     whole_packets = data.size // packet
     rows = data[: whole_packets * packet].reshape(whole_packets, packet)
     if packet % 8 == 0 and data.ctypes.data % 8 == 0:
@@ -205,7 +206,7 @@ def _find_silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
 
 
 def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDArray[np.uint8] | None) -> int:
-    """Return the sequence number of the row's first packet, which may be lost.
+    """Return the sequence number of the row's first packet, which may be lost; `full`: payload of a full packet, bytes.
 
     With zero filling: the first packet that arrived, minus the packets of zeros at the file's beginning. Without:
     counted back from a short last packet if no position is missing, otherwise the first packet that arrived. If the
@@ -279,6 +280,7 @@ def find_positions(
     times = np.sort(np.concatenate([b.at_s for b in (bursts, *other_boards)]))
     if period is None or period <= 0 or positions < 2:
         return None
+    # Bursts of several boards at one time are one event: a position.
     events = times[np.concatenate([[True], np.diff(times) > period / 2])]
     steps = np.diff(events) / period
     if np.any(np.abs(steps - np.round(steps)) > _UNEVEN):
@@ -304,13 +306,13 @@ SYNCED = "_synced.npy"
 class RowLosses:
     """Losses of one board's recording of one row."""
 
-    # Sent by the card and not received
+    # Packets that the card sent and that were not received.
     packets_lost: int = 0
     # Positions at which the radar did not start.
     positions_missing: int = 0
-    # Positions with fewer frames than pulses: they are masked, because the missed pulse is unknown.
+    # Positions with another number of frames than pulses: they are masked, because the missed pulse is unknown.
     positions_short: int = 0
-    # 1 if unknown positions are missing: the whole row is masked
+    # 1 if positions are missing and it is not known which: the whole row is masked.
     rows_not_placed: int = 0
 
 
@@ -379,6 +381,7 @@ class PublishedScan(_Published):
         return files
 
     def _check_start(self, file: Path, start: int, row: int) -> None:
+        """Raise DataError unless the row starts at the column at which the plan's serpentine does."""
         expected = self._plan.row(row).column(0)
         if start != expected:
             if self.mirrored:
@@ -429,13 +432,13 @@ class PublishedScan(_Published):
         if bursts is None or positions is None:
             self._note(board_name, row, RowLosses(packets_lost, rows_not_placed=1))
             return RowData(split_pieces(np.zeros(shape.bytes, np.uint8)), [(0, shape.bytes)], frames)
-        payload, arrived, missing = _place(stream, bursts, positions, shape)
-        self._note(board_name, row, RowLosses(packets_lost, shape.positions - positions.size, missing))
-        edges = np.flatnonzero(np.diff(np.concatenate([[1], arrived, [1]]).astype(np.int8)))
-        gaps = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        payload, arrived, positions_short = _place(stream, bursts, positions, shape)
+        self._note(board_name, row, RowLosses(packets_lost, shape.positions - positions.size, positions_short))
+        gaps = _find_ranges(~arrived, 1, arrived.size)
         return RowData(split_pieces(payload), gaps, frames)
 
     def _open_stream(self, board_name: str, row: int) -> Stream | None:
+        """Read what a board's card sent in a row; None if there is no file of it."""
         file = self._files.get(board_name, {}).get(row)
         if file is None:
             return None
@@ -480,10 +483,14 @@ class PublishedScan(_Published):
 def _place(
     stream: Stream, bursts: Bursts, positions: NDArray[np.int64], shape: RowShape
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], int]:
-    """Return the row's payload, a mask of bytes that arrived, and the number of positions with a wrong frame count."""
+    """Put each burst at its position, `positions` int64 [burst].
+
+    Returns the row's payload, uint8 [byte], a mask of its bytes that arrived, bool [byte], and the number of positions
+    with a wrong number of frames, which are left out.
+    """
     size = stream.data.size
     burst = shape.burst_bytes
-    missing = 0
+    positions_short = 0
     payload = np.zeros(shape.bytes, np.uint8)
     is_received = np.zeros(shape.bytes, bool)
     arrived = np.ones(size, bool)
@@ -491,13 +498,13 @@ def _place(
         arrived[a:b] = False
     for (a, b), target in zip(bursts.ranges, positions * burst, strict=True):
         if b - a != burst:
-            missing += 1
+            positions_short += 1
             continue
         stop = min(b, size)
         payload[target : target + stop - a] = stream.data[a:stop]
         is_received[target : target + stop - a] = arrived[a:stop]
     payload[~is_received] = 0
-    return payload, is_received, missing
+    return payload, is_received, positions_short
 
 
 class PublishedCubes(_Published):

@@ -24,10 +24,13 @@ DEVICES = "devices_comm_cfg.json"
 class ChirpConfig(msgspec.Struct, frozen=True):
     """One of `chirp_configs`, in SI or in the units of TI's tools (GHz, MHz/us, us, ksps)."""
 
+    # Start frequency and slope.
     f0: float
     slope: float
+    # Times from the start of the ramp.
     ramp_time: float
     adc_start_time: float
+    # Samples of a chirp, and their rate.
     num_adc: int
     Fs: float
 
@@ -35,7 +38,10 @@ class ChirpConfig(msgspec.Struct, frozen=True):
 class Collection(msgspec.Struct, frozen=True):
     """The keys of the JSON files that are used. Lengths in mm, times in ms, angles in degrees, `board_dist` in m.
 
-    `total_x`, `total_y` are positions `dx`, `dy` apart; `num_trigger` the pulses of a position.
+    `total_x`, `total_y` are positions `dx`, `dy` apart; `num_trigger` the pulses of a position, `period_frame` apart;
+    `num_chirp` the chirps of a pulse. `moving_direction` is "row" (along x) or "col". With `packet_zero_filling` the
+    file of a row has zeros where packets were lost, otherwise nothing. Angles and offsets that are None stay those of
+    the base rig.
     """
 
     dx: float
@@ -117,12 +123,12 @@ def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
     table["burst"] |= {"pulses": settings.num_trigger, "period_us": settings.period_frame * 1e3}
     table["geometry"]["object_distance_mm"] = settings.object_distance
     table["chirp"] |= {
-        "start_hz": _convert_to_large_unit(chirp.f0, least=1e6, factor=1e9),
-        "slope_hz_per_s": _convert_to_large_unit(chirp.slope, least=1e6, factor=1e12),
-        "ramp_end_us": _convert_to_large_unit(chirp.ramp_time, least=1, factor=1e6),
-        "adc_start_us": _convert_to_large_unit(chirp.adc_start_time, least=1e-2, factor=1e6),
+        "start_hz": _scale_if_below(chirp.f0, least=1e6, factor=1e9),
+        "slope_hz_per_s": _scale_if_below(chirp.slope, least=1e6, factor=1e12),
+        "ramp_end_us": _scale_if_below(chirp.ramp_time, least=1, factor=1e6),
+        "adc_start_us": _scale_if_below(chirp.adc_start_time, least=1e-2, factor=1e6),
         "samples": chirp.num_adc,
-        "sample_rate_hz": _convert_to_large_unit(chirp.Fs, least=1e5, factor=1e3),
+        "sample_rate_hz": _scale_if_below(chirp.Fs, least=1e5, factor=1e3),
         "linear_samples": [min(n, chirp.num_adc) for n in base.chirp.linear_samples],
     }
     rig = decode(table, Instrument, str(path))
@@ -131,7 +137,7 @@ def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
     return Rig(msgspec.structs.replace(rig, boards=boards), tuple(notices))
 
 
-def _convert_to_large_unit(value: float, least: float, factor: float) -> float:
+def _scale_if_below(value: float, least: float, factor: float) -> float:
     """Return a value in the wanted unit: their files have some in SI, some in the units of TI's tools.
 
     No chirp has a value below `least` in the wanted unit; such a value is in the other one and is multiplied.
@@ -142,7 +148,7 @@ def _convert_to_large_unit(value: float, least: float, factor: float) -> float:
 
 
 def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tuple[MountStep, ...]:
-    """Replace the angles and offsets of the base rig's mount by the scan's.
+    """Return the base rig's mount with the angles and offsets of the scan; append to `notices` what was read otherwise.
 
     The last turn about y points the board at the object, the last about z tilts the receivers, and the shift between
     them is the tilt's offset; the V board has another turn about y before. The last shift is half the distance between
@@ -181,6 +187,7 @@ def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tupl
 
 
 def _list_turns(steps: list[MountStep], axis: str) -> list[int]:
+    """Return the indices of the turns about an axis."""
     return [i for i, step in enumerate(steps) if step.about == axis]
 
 
@@ -215,6 +222,7 @@ def mirror_rig(rig: Instrument) -> Instrument:
 
 
 def _mirror_step(step: MountStep) -> MountStep:
+    """Return the step mirrored in x = y."""
     if step.shift_mm is not None:
         x, y, z = step.shift_mm
         return MountStep(shift_mm=(y, x, z))

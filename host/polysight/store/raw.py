@@ -32,10 +32,10 @@ Digests = dict[str, dict[int, str]]
 class Droppable:
     """Raw files that may be deleted."""
 
-    # Files by row and board.
+    # Files by row and board, and their bytes together.
     files: dict[int, dict[str, Path]]
     bytes: int
-    # Files that must be kept, with the reason
+    # Files that must be kept, each with the reason: "file: reason".
     kept_files: list[str] = field(default_factory=list)
 
 
@@ -97,6 +97,8 @@ def find_droppable(scan: ScanFolder, processed: Digests) -> Droppable:
 
 def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
     """Lock the scan, then record and delete, row by row, the files that :func:`find_droppable` finds.
+
+    `products` is the folder of what was made from the files.
 
     Raises
     ------

@@ -57,20 +57,25 @@ from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan
 from polysight_shared.tables import decode, to_builtins
 
+# Sections of the rig file that may change when a scan is resumed.
 SECTIONS = ("pi", "limits")
 ADDRESSES = ("card_address", "host_address", "command_port", "data_port")
 """Keys of each board that may change; `radar.servers` has the addresses of their control servers."""
 SERIAL = ("port", "baud")
 """Keys of the stage that are not compared: the Pi has its own. Nor is calibration, of which a scan keeps copies."""
+# Format of the folder, in `scan_started`.
 FORMAT = 1
+# File with the Pi's events.
 EVENTS = "events.msgpack"
 # File with the plates of a simulated scene.
 TRUTH = "truth.json"
+# Folder of the kept samples, and the file in it that lists the rows.
 SAMPLES = "samples"
 SAMPLE_ROWS = "rows.jsonl"
 # Suffix of a row during reception.
 PART = ".part"
 
+# The one entry of a scan folder that may be a link out of it, see `check_links`.
 _MAY_BE_LINK = "products"
 MAX_BYTES = 2 << 30
 """Largest size of the arrays in one archive: a hundred times the images of the published scan."""
@@ -114,6 +119,7 @@ def check_same_scan(begun: Instrument, rig_file: Instrument, name: str) -> None:
 
 
 def _replace_connection(table: dict[str, Any], connection: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the rig's table with other connection settings, as of :func:`extract_connection`."""
     boards = [{**b, **connection["boards"].get(b["name"], {})} for b in table["boards"]]
     radar = {**table["radar"], "servers": connection["servers"]}
     return {**table, **{section: connection[section] for section in SECTIONS}, "boards": boards, "radar": radar}
@@ -143,7 +149,7 @@ def new_scan_id() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the releases of all software that affects the data."""
+    """Return the releases of the software that affects the data, by name."""
     releases = {"python": platform.python_version(), "numpy": np.__version__, "polysight": __version__}
     return releases | {package: _release(package) for package in ("scipy", "scikit-learn")}
 
@@ -157,7 +163,11 @@ def _release(package: str) -> str:
 
 
 class ScanFolder:
-    """A scan on disk. Construct with :meth:`create` or :meth:`load`; :meth:`writer` opens it for appending."""
+    """A scan on disk. Construct with :meth:`create` or :meth:`load`; :meth:`writer` opens it for appending.
+
+    `content` is the manifest as last read, `started` its first fact, `instrument` the rig with the connection settings
+    of the last resume.
+    """
 
     mirrored = False
     synchronised = False
@@ -165,6 +175,7 @@ class ScanFolder:
     def __init__(self, path: Path, content: Manifest) -> None:
         self.path = path
         self.content = content
+        # Cache of the committed rows: the manifest and its number of facts when it was filled, and the rows.
         self._rows: tuple[Manifest, int, dict[int, RowCommitted]] | None = None
         for number, fact in content.problems:
             if fact.kind == "scan_started":
@@ -186,6 +197,7 @@ class ScanFolder:
         self.instrument = self._read_latest_rig()
 
     def _unreadable_error(self, number: int, fact: OtherFact) -> ConfigError:
+        """Return the error for a fact, in line `number` of the manifest, whose keys are not those of its kind."""
         return ConfigError(
             f"{self.path / MANIFEST} line {number} ({fact.kind}): {fact.problem}",
             "written by another program or release",
@@ -384,6 +396,7 @@ class ScanFolder:
             )
 
     def _read_missing(self, path: Path, board: BoardRow) -> list[tuple[int, int]]:
+        """Return a row's missing byte ranges from its index `path`. Raises DataError if that is not as committed."""
         if board.missing_bytes == 0:
             return []
         facts, _ = read_index(path)
@@ -395,6 +408,7 @@ class ScanFolder:
         return missing
 
     def _suggest_remedy(self) -> str:
+        """Return the remedy for a file of a row that is not as committed."""
         return (
             f"restore it from a copy, or `polysight resume {quote(self.path)}` takes its row again;"
             f" `polysight validate {quote(self.path)}` names every damaged file"
@@ -505,6 +519,7 @@ def locked_samples(scan: ScanFolder) -> Iterator[None]:
 
 
 def _is_whole(records: NDArray[Any] | None, rows: int, row: int, digest: str) -> bool:
+    """True if a board's `records` of `rows` rows are there and that of `row` has this digest."""
     return records is not None and records.shape == (rows,) and record_digest(records[row]) == digest
 
 
@@ -597,6 +612,7 @@ def check_links(folder: Path) -> None:
 
 
 def _leads_into(link: Path, root: Path) -> bool:
+    """True if the target of a link lies in the folder `root`, whose own links are resolved."""
     try:
         return link.resolve().is_relative_to(root)
     except (OSError, RuntimeError):
@@ -605,6 +621,7 @@ def _leads_into(link: Path, root: Path) -> bool:
 
 
 def _refuse(folder: Path, path: Path, what: str, code: ErrorCode) -> DataError:
+    """Return the error for an entry of a scan folder that may not be there."""
     return DataError(
         f"{folder}: {path.relative_to(folder)} {what}",
         "the folder was made by another program or changed; reading or writing the scan would affect other files",

@@ -1,4 +1,7 @@
-"""The `Source` protocol: recorded rows of one scan in any layout, as processing reads them."""
+"""The `Source` protocol: recorded rows of one scan in any layout, as processing reads them.
+
+A *frame* is what a radar records for one trigger pulse: one chirp, or several. A *position* is a place of the stage.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,7 @@ def split_pieces(payload: NDArray[np.uint8]) -> Pieces:
 
 @dataclass(frozen=True)
 class RowData:
-    """One board's recording of one row. It is read when needed: in pieces, which stay in the cache, or as a whole."""
+    """One board's recording of one row. It is read when needed: in pieces that fit the processor's cache, or whole."""
 
     # Payload as sent by the card, [frames_expected * bytes of a chirp]; zero where missing.
     pieces: Pieces
@@ -98,14 +101,14 @@ class RowData:
 class CubeRow:
     """One board's row of a scan that another program has synchronised; the card's data is not available."""
 
-    # [rx, position, sample], in the order of recording, with that program's reference
+    # [rx, position, sample], in the order of recording; phases relative to that program's reference
     cube: NDArray[np.complex64]
     missing_bytes: int = 0
     crc32: str = ""
 
     @property
     def frames_expected(self) -> int:
-        """One for each position."""
+        """Number of frames: one for each position."""
         return self.cube.shape[1]
 
 

@@ -17,7 +17,7 @@ from polysight_shared.errors import DeviceError, PolysightError, quote
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
 
-# Bytes of a file that are in memory at a time.
+# Bytes of a file that are in memory at a time (chosen).
 _CHUNK = 1 << 22
 # Remedies of a damaged file, a damaged manifest and a damaged event log.
 _COPY = "restore it from a copy, or resume takes its row again"
@@ -49,15 +49,17 @@ def to_json(findings: list[Finding]) -> str:
 
 
 def _make_error(where: str, what: str, do: str = "", code: ErrorCode = ErrorCode.FILE_DAMAGED) -> Finding:
+    """Return the finding that something is damaged; `do` is the remedy."""
     return Finding("error", what, do=do, where=where, code=code)
 
 
 def _note(where: str, what: str, do: str = "") -> Finding:
+    """Return a finding that is no fault of the data."""
     return Finding("note", what, do=do, where=where)
 
 
 def validate(path: Path) -> list[Finding]:
-    """List the faults of a scan folder; empty if it is complete and undamaged. Raises DataError if it is no scan."""
+    """List faults of a scan folder and notes on it; [] if complete and undamaged. Raises DataError if it is no scan."""
     content = manifest.read(path / MANIFEST)
     being_written = manifest.is_being_written(path / MANIFEST)
     findings = []
@@ -225,6 +227,7 @@ def _check_packets(scan: scan_folder.ScanFolder, board: BoardRow, path: Path) ->
 
 
 def _make_read_error(where: str, e: OSError) -> Finding:
+    """Return the finding that a file is missing or cannot be read."""
     if isinstance(e, FileNotFoundError):
         code = ErrorCode.FILE_MISSING
     else:
@@ -293,8 +296,9 @@ def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
     else:
         row = 0
         committed = LogDigest(0, "")
-    # Damage after the last commit is only a note: those events were perhaps not on the disk before a power cut. The
-    # digest of committed events is missing in rows of earlier releases and in simulated ones.
+    # Damage after the last commit is only a note: those events were perhaps not on the disk before a power cut. How
+    # many bytes belong to commits is known if no row is committed (none), and from the last digest, which rows of
+    # earlier releases and simulated ones lack.
     is_known = bool(commits) or not scan.facts(RowCommitted)
     is_committed_damage = bool(log.damage) and not (is_known and log.length >= committed.bytes)
     if is_committed_damage:

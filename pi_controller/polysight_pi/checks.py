@@ -29,17 +29,21 @@ from polysight_shared.findings import Finding
 from polysight_shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
 from polysight_shared.sockets import is_loopback, make_server_context, publisher, replier
 
-# A scan of 70,000 positions journals about 20 MB.
+# Free space that the journals need: a scan of 70,000 positions journals about 20 MB.
 JOURNAL_BYTES = 100 << 20
+# Number of SPI transfers that are timed; chosen, the shortest counts.
 TRANSFERS = 5
-# Longest duration relative to the nominal one: the system call adds some 100 us to 22 ms.
+# Longest duration of a bit relative to the nominal one: the system call adds some 100 us to a transfer of 22 ms.
 MAX_PART = 1.05
-# Number of pairs of system calls that are timed.
+# Number of pairs of system calls (set the line, clear it) that are timed; chosen.
 PAIRS = 500
-# Pause between two pairs.
+# Pause between two pairs: the shortest period of the pulses.
 PAUSE_NS = 300_000
+# The device tree's name of the computer.
 MODEL = Path("/proc/device-tree/model")
+# Parameters of the kernel's modules.
 MODULES = Path("/sys/module")
+# Remedy for a kernel that does not release outputs.
 STRICT = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and reboot the Pi"
 # Words of the command's output, by level.
 VERDICTS = {"ok": "ok", "note": "ok", "warning": "warn", "error": "fail"}
@@ -52,7 +56,10 @@ def to_json(finding: Finding) -> dict[str, Any]:
 
 
 def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Finding:
-    """Run a check. Text it returns becomes an ok finding, an error it raises a failed one."""
+    """Run `check(*args)`. Text that it returns becomes a finding of level `ok`, an error that it raises one of `error`.
+
+    `name` is what the finding is about.
+    """
     try:
         result = check(*args)
     except PolysightError as e:
@@ -65,7 +72,7 @@ def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Fi
 
 
 def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
-    """Run every check, in the order of bring-up."""
+    """Run every check, in the order of bring-up; `wires` is the socket of simulated wires, None for GPIO."""
     pi = instrument.pi
     keys = Path(pi.key_dir)
     yield attempt("plan", _check_plan, instrument)
@@ -223,7 +230,10 @@ def measure_clock(instrument: Instrument) -> str | Finding:
 
 
 def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
-    """Judge measured widths: a row needs thousands of pulses below 4 us, so none of these may be longer."""
+    """Judge measured widths: a row needs thousands of pulses of at most 4 us, so none of these may be longer.
+
+    `one_shot`: a one-shot behind the line makes the width, so any is accepted.
+    """
     widths_ns = sorted(widths_ns)
     median_us = widths_ns[len(widths_ns) // 2] / 1e3
     high_ns = widths_ns[-1]

@@ -22,9 +22,10 @@ from polysight_shared.program import (
 if TYPE_CHECKING:
     from polysight_shared.config import Instrument
 
-# Commands import their modules when they are called: `--help` needs no other package, and Ctrl-C ends in no traceback.
+# Commands import their modules when they are called: `--help` needs no package of others, and Ctrl-C ends in no
+# traceback. A function with `args` and `instrument` is a command of COMMANDS; it returns the exit status.
 
-# Pause between two bursts of `pulse`.
+# Pause between two bursts of `pulse` (chosen).
 PAUSE_NS = 10_000_000
 
 
@@ -40,6 +41,7 @@ def _run(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _check(args: argparse.Namespace, instrument: Instrument) -> int:
+    """Print each finding as soon as it is there; return 1 if one is an error."""
     from polysight_pi.checks import check_all, to_json
     from polysight_pi.client import refuse_beside_service
 
@@ -58,6 +60,7 @@ def _check(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
+    """Send bursts and print their width and jitter; return 1 if one had a fault."""
     from polysight_pi import system
     from polysight_pi.client import refuse_beside_service
     from polysight_pi.lines import open_lines
@@ -122,6 +125,7 @@ def _buzz(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _home(args: argparse.Namespace, instrument: Instrument) -> int:
+    """Home through the running service, or without one; say how many millimetres of steps were lost."""
     from polysight_pi.client import home_by_service
     from polysight_pi.stage import BenchStage
 
@@ -136,6 +140,7 @@ def _home(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _print_position(args: argparse.Namespace, status: Any) -> int:
+    """Print `x_mm` and `y_mm` of a status or position; return 0."""
     position_mm = {"x_mm": status.x_mm, "y_mm": status.y_mm}
     if args.json:
         _write(json.dumps(position_mm))
@@ -145,6 +150,7 @@ def _print_position(args: argparse.Namespace, status: Any) -> int:
 
 
 def _show_events(args: argparse.Namespace, instrument: Instrument) -> int:
+    """Print the events of a scan's journal, or live ones, one JSON object a line."""
     from polysight_pi.client import follow_events, replay_events
 
     if args.scan_id:
@@ -159,6 +165,7 @@ def _show_events(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _make_keys(args: argparse.Namespace) -> int:
+    """Make the keys of Pi and host, or add, remove and list clients. Works without a rig file if `--dir` is given."""
     from polysight_pi.keys import COPY, allow, make_keys, read_allowed, revoke
 
     folder = args.dir or Path(_load_rig(args).pi.key_dir)
@@ -200,6 +207,7 @@ def _parse_speed(text: str) -> float:
 
 
 def _make_option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Return the arguments of `add_argument` for an option or argument of a command."""
     return names, how
 
 
@@ -223,9 +231,10 @@ JOURNAL = _make_option(
     "--journal", dest="journal_dir", metavar="DIR", help="folder of the journals; replaces pi.journal_dir"
 )
 JSON = _make_option("--json", action="store_true", help="print JSON, for programs")
+# Settings of options that are a number of things or a distance.
 COUNT = {"type": _parse_positive, "metavar": "N"}
 MM = {"type": float, "default": 0.0, "metavar": "MM"}
-# Name, action, help, example and options of each command.
+# Name, action, help, example (the words after the name) and options of each command.
 COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str, Any]], ...]], ...] = (
     ("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml", (
         WIRES, STAGE_PORT, JOURNAL,
@@ -296,7 +305,10 @@ def _make_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point. Returns 0 on success; an error is one message on stderr, without a trace."""
+    """Run the command of `argv` (default: the program's arguments) and return the exit status.
+
+    An error of ours or of the operating system is one message on stderr, without a traceback.
+    """
     open_standard_streams()
     try:
         with interrupts_between_imports():

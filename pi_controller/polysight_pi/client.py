@@ -21,13 +21,14 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, os_error
 from polysight_shared.sockets import Socket, requester, subscriber
 
-# A program that does not take a connection in this time is not there.
+# A program that does not accept a connection in this time counts as not running (chosen).
 CONNECT_TIMEOUT_S = 2.0
 # Sends a command and returns the service's reply.
 Ask = Callable[..., Any]
 
 
 def _no_answer_error(address: str) -> DeviceError:
+    """Return the error for a service that does not answer at this address."""
     cause = "the service `polysight-pi run` is not running on this Pi, or it hangs"
     remedy = "start it: `sudo systemctl restart polysight-pi`"
     return DeviceError(f"no answer from {address}", cause, remedy, code=ErrorCode.NO_ANSWER)
@@ -135,7 +136,7 @@ def take_over(instrument: Instrument, action: str) -> str:
 
 
 def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:
-    """Yield live events as plain objects. Raises DeviceError after `timeout_s` without one."""
+    """Yield live events as dicts, for JSON. Raises DeviceError after `timeout_s` without one."""
     context: zmq.Context[Socket] = zmq.Context()
     try:
         listener = subscriber(context, instrument.pi.event_address, Path(instrument.pi.key_dir))
@@ -147,7 +148,10 @@ def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:
 
 
 def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterator[Any]:
-    """Yield a scan's journalled events as plain objects. Raises DeviceError without an answer or a journal."""
+    """Yield a scan's journalled events from number `from_seq` on as dicts, for JSON.
+
+    Raises DeviceError without an answer or a journal.
+    """
     with _open_service(instrument) as ask:
         while True:
             reply = ask(m.Replay(scan_id=scan_id, from_seq=from_seq))

@@ -18,11 +18,11 @@ from typing import NamedTuple
 
 from polysight_shared.raster import Row, Stage
 
-# Lowest speed of the sketch, steps/s (board.h, MIN_RATE).
+# Lowest speed of the stage's firmware, steps/s (arduino_stage/board.h, MIN_RATE).
 MIN_FEED = 31
-# Clock of the timer in the stage's sketch.
+# Clock of the step timer in the stage's firmware (board.h, TICK_HZ).
 TICK_HZ = 2_000_000
-# Relative tolerance of the interval at constant speed. The resonator of an UNO is within 0.5 % of its frequency.
+# Relative tolerance of the interval at constant speed: twice the 0.5 % by which the resonator of an UNO may be off.
 TOLERANCE = 0.01
 # Share of the same interval by which an edge may be stamped after a status that counts its point was written: a
 # simulated trigger wire is later than a simulated serial line.
@@ -32,7 +32,9 @@ STATUS_TOLERANCE = 0.2
 class RowMotion(NamedTuple):
     """A row as the stage is told it, and the motion that follows (docs/spec/stage-line.md, "A row").
 
-    Lengths are in motor steps; `feed` is a speed in steps/s, `accel` in steps/s^2. `step` is below zero towards -x.
+    Lengths are in motor steps: `x_start` and `y` of the first point, in stage coordinates; `step` from point to point,
+    below zero towards -x; `backlash`, the play that the run-up takes up. `feed` is the speed at the points in steps/s,
+    `accel` the acceleration in steps/s^2, `points` the number of trigger points.
     """
 
     x_start: int
@@ -45,7 +47,7 @@ class RowMotion(NamedTuple):
 
     @staticmethod
     def plan(row: Row, stage: Stage, speed_mm_s: float) -> RowMotion:
-        """Return the motion of a row of the plan."""
+        """Return the motion of a row of the plan on this stage, at `speed_mm_s`."""
         k = stage.steps_per_mm
         return RowMotion(
             x_start=round((stage.centre_x_mm + row.x_start_mm) * k),
@@ -59,7 +61,7 @@ class RowMotion(NamedTuple):
 
     @property
     def line(self) -> tuple[int, int, int, int, int]:
-        """Arguments of ROW."""
+        """Arguments of the stage command ROW."""
         return self.x_start, self.step, self.points, self.y, self.feed
 
     @property
@@ -69,14 +71,14 @@ class RowMotion(NamedTuple):
 
     @property
     def ramp(self) -> int:
-        """Steps from rest to full speed."""
+        """Steps from rest to full speed, v^2 / 2a rounded up; 0 for a speed that needs no ramp."""
         if self.feed <= slowest_feed(self.accel):
             return 0
         return -(-(self.feed**2) // (2 * self.accel))
 
     @property
     def run_up(self) -> int:
-        """Steps from rest to the first point, and from the last one to rest."""
+        """Steps from rest to the first point, and from the last one to rest: the ramp and a stretch at full speed."""
         return self.ramp + max(abs(self.step), self.backlash)
 
     @property
@@ -90,13 +92,14 @@ class RowMotion(NamedTuple):
         return self.x_start + (self.points - 1) * self.step + self.direction * self.run_up, self.y
 
     def distance(self, x: int) -> int:
-        """Return the steps from the beginning of the motion to this x."""
+        """Return the steps from the beginning of the row to `x`, a stage coordinate in steps."""
         return self.direction * (x - self.x_start) + self.run_up
 
     def time_points(self, stops: list[int]) -> tuple[list[float], float]:
-        """Return the time of each point and that of the row's end, seconds, if the stage rests at these distances.
+        """Return the time of each point and that of the row's end, seconds, if the stage rests at the `stops`.
 
-        It does not wait there: the times between a point before and one behind a stop are lower limits.
+        `stops` are steps from the beginning of the row, ascending. The time at rest is not included, because nobody
+        knows it: an interval in which a stop lies is a lower limit.
         """
         times: list[float] = []
         begin_s = 0.0
@@ -113,16 +116,18 @@ class RowMotion(NamedTuple):
 class _Leg(NamedTuple):
     """A motion from rest to rest, in the arithmetic of the sketch (motion_step.h)."""
 
+    # Steps from rest to rest.
     distance: int
-    # Time of each step while the stage speeds up
+    # Time from rest until each number of steps is made while the stage speeds up, seconds; the first is 0.
     up_s: list[float]
-    # Time of each step at constant speed.
+    # Duration of a step at constant speed, seconds.
     cruise_s: float
-    # Time from full speed to each step while it slows down
+    # Time from full speed until each number of steps is made while the stage slows down, seconds; the first is 0.
     down_s: list[float]
 
     @staticmethod
     def plan(distance: int, motion: RowMotion) -> _Leg:
+        """Return the leg over `distance` steps with speed and acceleration of `motion`; a short one has half a ramp."""
         ramp = min(motion.ramp, distance // 2)
         slowest = slowest_feed(motion.accel)
         speed = slowest
@@ -145,7 +150,7 @@ class _Leg(NamedTuple):
         return _Leg(distance, up_s, cruise_s, down_s)
 
     def time_s(self, steps: int) -> float:
-        """Return the time from rest to this step."""
+        """Return the time from rest until `steps` steps are made, seconds."""
         ramp = len(self.up_s) - 1
         if steps <= ramp:
             return self.up_s[steps]
@@ -154,17 +159,20 @@ class _Leg(NamedTuple):
 
 
 def _step_s(speed: float) -> float:
-    """Return the time of a step on a ramp, whole ticks of the timer."""
+    """Return the duration in seconds of a step at `speed` steps/s on a ramp: whole ticks of the timer."""
     return TICK_HZ // int(speed) / TICK_HZ
 
 
 def slowest_feed(accel: int) -> int:
-    """Return the speed with which the stage starts and stops, steps/s."""
+    """Return the speed with which the stage starts and stops, steps/s: its first step takes sqrt(2 / accel) seconds."""
     return max(math.isqrt(accel // 2), MIN_FEED)
 
 
 class EdgeTimes:
-    """The edges of one row. Times of edges and statuses are on one clock, nanoseconds."""
+    """The edges of one row, compared with the stage's reports.
+
+    Times of edges and statuses are on one clock, nanoseconds. `points` is the stage's count of passed points.
+    """
 
     def __init__(self, motion: RowMotion) -> None:
         self._motion = motion
@@ -179,11 +187,11 @@ class EdgeTimes:
         self._is_held = False
 
     def note_hold(self) -> None:
-        """Note that a hold is commanded: intervals may be longer from now on, until they are judged at the end."""
+        """Note that a hold is commanded: from now on intervals may be longer; `judge` checks them at the row's end."""
         self._is_held = True
 
     def note_stop(self, x: int, points: int) -> None:
-        """Note that the stage rests at `x` in a hold, after this many points."""
+        """Note that the stage rests at `x` (steps) in a hold, after this many points."""
         distance = self._motion.distance(x)
         stops = self._stops if points else self._early_stops
         if 0 < distance < self._motion.length and distance not in stops:
@@ -200,7 +208,10 @@ class EdgeTimes:
         return self._compare(len(self._edges_ns) - 1, interval_s, self._interval_s)
 
     def note_status(self, points: int, asked_ns: int, written_ns: int) -> str:
-        """Compare the points that the stage has passed with the edges; return what is wrong, or ""."""
+        """Compare a status with the edges: it was requested after `asked_ns` and written by `written_ns`.
+
+        Return what is wrong, or "".
+        """
         self._statuses.append((points, written_ns))
         edges = bisect_right(self._edges_ns, asked_ns)
         if edges <= points:
@@ -246,7 +257,7 @@ class EdgeTimes:
         return ""
 
     def _compare(self, point: int, interval_s: float, expected_s: float) -> str:
-        """Say what is wrong with the edge of a point, or ""."""
+        """Compare the interval before the edge of `point` with the expected one; return what is wrong, or ""."""
         tolerance_s = TOLERANCE * max(self._interval_s, expected_s)
         late_s = interval_s - expected_s
         lost_edges = round(late_s / self._interval_s)

@@ -49,11 +49,13 @@ TURN_S = 0.25
 LATE_S = 3.0
 # Time without a turn after which the executor counts as hung.
 HUNG_S = 10.0
+# Commands that wait or are executed; further ones are refused. Chosen: a host has one at a time.
 COMMANDS_WAITING = 64
+# The same for `Replay`, whose reply is large and comes from the disk.
 REPLAYS_WAITING = 4
 # Lines of the stage that wait; further ones are dropped, so that an endless flood cannot fill the memory.
 LINES_WAITING = 64
-# Events per reply: half a second on a Pi.
+# Events per reply. Chosen: about half a second on a Pi (estimated), well below the host's timeout of a command.
 REPLAYED_AT_REST = 1000
 # Events per reply during a row: packing more would delay the trigger thread.
 REPLAYED_IN_A_ROW = 20
@@ -66,14 +68,15 @@ JOURNALLED = (m.BeginRun, m.EndRun, m.RunRow)
 
 
 class Request(NamedTuple):
-    """A command and the callback for its reply."""
+    """A command that has to be answered exactly once."""
 
     command: m.AnyCommand
+    # Sends the reply to the client.
     answer: Callable[[m.AnyReply], None]
 
 
 def make_refusal(number: int, summary: str, cause: str = "", remedy: str = "") -> m.Refused:
-    """Return a refusal, with texts of limited length; missing ones are those of shared/polysight_shared/faults.py."""
+    """Return a refusal with a PiFault number; missing texts are those of faults.py, long ones are cut."""
     table = explain(number)
     return m.Refused(
         number=int(number),
@@ -92,10 +95,11 @@ def refuse(error: PolysightError | OSError) -> m.Refused:
 
 
 class Executor:
-    """Runs in its own thread; all threads may use :meth:`submit`, :meth:`post`, `status` and `hello`.
+    """Executes commands in a thread of its own; the methods in the section "for other threads" may be called by all.
 
-    `turned` is called after every turn, at least four times a second, while no part is late: it feeds the watchdog.
-    `find_late` names a part of the program that does not answer, "" for none.
+    In each turn of its loop the thread empties its queue, checks deadlines and sends replies. `turned` is called after
+    every turn, about four times a second, while no part is late: it feeds the watchdog. `find_late` names a part of the
+    program that does not answer, "" for none.
     """
 
     def __init__(
@@ -110,26 +114,36 @@ class Executor:
         self.journal = journal
         self._turned = turned
         self._find_late = find_late
-        # Accepted as the owner of every run: a person at the Pi
+        # Secret that is accepted as the owner of every run, for a person at the Pi.
         self.take_over_key = secrets.token_hex(16)
+        # Time of the end of the last turn.
         self._turned_s = time.monotonic()
+        # Items that `_handle` takes, in order.
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._command_slots = threading.Semaphore(COMMANDS_WAITING)
         self._replay_slots = threading.Semaphore(REPLAYS_WAITING)
         self._machine = Machine(stage, loop, self.journal, self._inbox.put)
+        # The active run.
         self._run: m.BeginRun | None = None
+        # Index and take of the row that ended last, so that its repeated command is accepted.
         self._last_row: tuple[int, int] | None = None
-        # The newest one of each row of this scan
+        # Newest take (attempt) of each row of this scan, by the row's index.
         self._takes: dict[int, int] = {}
         # True while a run begins or ends, which the journal must confirm.
         self._waits_for_journal = False
         # Commands that wait until then.
         self._deferred: list[Request] = []
+        # A `BeginRun` that waits for the abort of a lost host's row.
         self._after_row: Request | None = None
+        # Replies to be sent at the end of the turn.
         self._replies: list[tuple[Request, m.AnyReply]] = []
+        # `Pulse` commands whose burst is being sent.
         self._pulsing: list[Request] = []
+        # True once the program is to end; commands are refused from then on.
         self._ending = False
+        # True once the thread is to end.
         self._ended = False
+        # The exception that ended the thread.
         self.crash: BaseException | None = None
         self._thread = threading.Thread(target=self._live, name="executor", daemon=True)
         self._refresh_replies()
@@ -139,7 +153,7 @@ class Executor:
     def post(self, item: StageNews | BurstSent | m.Pulsed | LoopFault | Callable[[], object]) -> None:
         """Append an item to the queue; return at once. Replies of the stage are dropped if too many wait."""
         if isinstance(item, Reply) and self._inbox.qsize() > LINES_WAITING:
-            # The end of a row or of homing is requested again
+            # The end of a motion among them is requested again (`Machine._on_status`).
             return
         self._inbox.put(item)
 
@@ -208,6 +222,7 @@ class Executor:
             raise
 
     def _turn(self) -> None:
+        """Wait for work, do what is in the queue, check deadlines and late parts, send replies, feed the watchdog."""
         try:
             self._handle(self._inbox.get(timeout=min(self._machine.seconds_left(), TURN_S)))
             until_s = time.monotonic() + TURN_TIMEOUT_S
@@ -229,6 +244,7 @@ class Executor:
             self._turned()
 
     def _send_replies(self) -> None:
+        """Send the replies of this turn; those of journalled commands follow when their events are on the disk."""
         replies = self._replies
         self._replies = []
         behind_journal: list[tuple[Request, m.AnyReply]] = []
@@ -263,6 +279,7 @@ class Executor:
             self._machine.note_host_alive()
 
     def _handle(self, item: Any) -> None:
+        """Handle an item of the queue: a result of the trigger loop, a reply of the stage, or a function to call."""
         machine = self._machine
         row = machine.row
         if isinstance(item, BurstSent):
@@ -282,6 +299,7 @@ class Executor:
             self._end_row((row.row.index, row.take))
 
     def _answer_pulses(self, reply: m.AnyReply) -> None:
+        """Give this reply to all waiting `Pulse` commands."""
         self._replies += [(request, reply) for request in self._pulsing]
         self._pulsing.clear()
 
@@ -344,6 +362,10 @@ class Executor:
                 return self._accept(type(command).__name__)
 
     def _replay(self, request: Request, command: m.Replay) -> None:
+        """Have the journal's thread read events and answer with them.
+
+        Raises RefusedError for the events of another scan while a row runs.
+        """
         limit = min(command.limit, REPLAYED_AT_REST)
         if self._machine.row is not None:
             scan_id = self.journal.position[0]
@@ -370,7 +392,7 @@ class Executor:
         self.journal.call(read, answer)
 
     def _accept(self, event: str = "", *args: Any) -> m.Accepted:
-        """Execute a command of the state machine. Raises RefusedError."""
+        """Apply a command to the state machine ("": none) and return the new state. Raises RefusedError."""
         if event:
             self._machine.command(event, *args)
         return m.Accepted(state=self._machine.wire_state)
@@ -427,6 +449,7 @@ class Executor:
         return self._machine.row is not None
 
     def _begin(self, request: Request, run: m.BeginRun) -> None:
+        """Open the journal of the scan and begin the run; the reply follows when `RunStarted` is on the disk."""
         takes: dict[int, int] = {}
 
         def write(journal: Journal) -> None:
@@ -444,12 +467,14 @@ class Executor:
         self._write_synced(request, write, accept_begin)
 
     def _forget_run(self) -> None:
+        """End the active run without an event."""
         self._run = None
         self._last_row = None
         self._takes = {}
         self._machine.happen("EndRun")
 
     def _end_run(self, request: Request, command: m.EndRun) -> m.Accepted | None:
+        """End the run; the reply follows when `RunStopped` is on the disk. Accept a repeated request at once."""
         if self._run is None and command.scan_id == self.journal.position[0]:
             # The host repeats a request that was already executed.
             return self._accept()
@@ -470,7 +495,10 @@ class Executor:
     def _write_synced(
         self, request: Request, write: Callable[[Journal], None], written: Callable[[], m.Accepted]
     ) -> None:
-        """Write an event that has to be on the disk before its command is accepted; `written` accepts it."""
+        """Write an event that has to be on the disk before its command is accepted; `written` then accepts it.
+
+        Other commands that need the journal wait until then.
+        """
         self._commit([])
         self._waits_for_journal = True
 
@@ -494,6 +522,7 @@ class Executor:
         self.journal.call(write, lambda error: self._inbox.put(partial(finish, error)))
 
     def _require_run(self, scan_id: str) -> m.BeginRun:
+        """Return the active run. Raises RefusedError if it is not that of this scan."""
         if self._run is None or self._run.scan_id != scan_id:
             active = "no run"
             if self._run is not None:
@@ -503,6 +532,7 @@ class Executor:
         return self._run
 
     def _run_row(self, command: m.RunRow) -> m.Accepted:
+        """Start a row, or accept a command that was sent again. Raises RefusedError, also for an old take."""
         run = self._require_run(command.scan_id)
         running = self._machine.row
         index = command.row_index
@@ -525,6 +555,7 @@ class Executor:
         return accepted
 
     def _end_row(self, row: tuple[int, int]) -> None:
+        """Note the end of a row (index, take), and execute the command that has waited for it."""
         self._last_row = row
         if self._after_row is not None:
             request = self._after_row
@@ -533,6 +564,7 @@ class Executor:
         self._ended = self._ending
 
     def _end(self) -> None:
+        """Stop all motion because the program ends; the thread ends now, or after the current row."""
         self._ending = True
         self._ended = not self._machine.terminate()
 
@@ -574,7 +606,10 @@ def read_burst(command: m.BeginRun | m.Pulse) -> BurstSpec:
 
 
 def check_run(run: m.BeginRun, stage: Stage) -> None:
-    """Check that this rig can execute a run. Raises RefusedError or ConfigError with the conflicting values."""
+    """Check that the radars accept a run's burst, and the stage its plan.
+
+    Raises RefusedError or ConfigError with the conflicting values.
+    """
     plan = run.plan
     read_burst(run)
     _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")

@@ -36,23 +36,26 @@ from polysight_shared.faults import PiFault, explain
 from polysight_shared.raster import RasterPlan
 
 MAGIC = b"PSJRNL1\n"
+# A longer record is damaged: the longest text of an event has 4000 characters.
 MAX_RECORD_BYTES = 1 << 20
 # Upper limit of the record of a position, bytes.
 CAPTURE_BYTES = 320
-# Space on the disk for the records of faults and retakes.
+# Space on the disk for the records of faults and retakes; chosen, 13,000 positions.
 SPARE_BYTES = 4 << 20
-# Bytes after a damaged record that are searched for a good one.
+# Bytes after a damaged record that are searched for a good one; chosen, as long as the longest record.
 SEARCHED_BYTES = 1 << 20
 # Suffix of the copy of a damaged journal.
 DAMAGED = ".damaged"
-# Longest queue of jobs and largest batch of events. A row stops long before they are full (LATE_S).
+# Longest queue of jobs and largest batch of events; chosen. A row stops long before they are full, because the journal
+# then counts as late (executor.LATE_S).
 JOBS_WAITING = 256
 EVENTS_WAITING = 1000
+# Length of the payload, sequence number, checksum.
 _HEAD = struct.Struct("<III")
 
 
 class JournalFullError(DeviceError):
-    """The journal cannot be written; it contains nothing of the failed write."""
+    """The journal at `path` cannot be written; it contains nothing of the failed write."""
 
     number = PiFault.JOURNAL_FULL
 
@@ -118,7 +121,7 @@ class JournalFile:
         self.damage = ""
         # Number of the newest record, or of the host's newest event if that is later.
         self.last_seq = 0
-        # The newest take of each row.
+        # The newest take (number of the attempt) of each row, by the row's index.
         self.takes: dict[int, int] = {}
         # Sequence number and offset in the file of each record.
         self._index: list[tuple[int, int]] = []
@@ -149,6 +152,7 @@ class JournalFile:
 
     def _recover(self) -> None:
         """Read the records, copy a damaged file, and cut the file after the last good record."""
+        # Offset of the next record.
         self._end = len(MAGIC)
         with self.path.open("rb") as file:
             for offset, self.last_seq, payload in records(file):
@@ -158,6 +162,7 @@ class JournalFile:
             file.seek(self._end)
             tail = file.read()
         if _holds_records(tail):
+            # The first name that is free: .damaged, .damaged2, .damaged3 and so on.
             names = (self.path.with_name(f"{self.path.name}{DAMAGED}{n or ''}") for n in (0, *range(2, 1000)))
             copy = next(name for name in names if not name.exists())
             shutil.copyfile(self.path, copy)
@@ -234,7 +239,9 @@ class NewEvent(NamedTuple):
     """An event that has no number yet."""
 
     kind: type[m.AnyEvent]
+    # Its fields without those that all events have.
     fields: dict[str, Any]
+    # Time of the event, CLOCK_MONOTONIC.
     t_mono_ns: int
 
     @staticmethod
@@ -259,8 +266,11 @@ class Journal:
         self.folder = folder
         self._publish = publish
         self._warn = warn
+        # The current scan's file; None until a scan is opened.
         self._file: JournalFile | None = None
+        # True after a failed write: events are then published without being stored (see `write`).
         self.broken = False
+        # The current scan.
         self.scan_id = ""
         # Current scan and number of its newest published event. Other threads read it, so it is replaced as a whole.
         self.position = ("", 0)
@@ -361,8 +371,9 @@ class Journal:
         """Number events, write them to the file, then publish them; long texts are cut to the limit of the messages.
 
         Raises JournalFullError if they cannot be written; of them only faults and the end of a row are then published.
-        Until the scan is opened again, events have the last good number and are not stored, and a row that is done ends
-        with a fault: what is not journalled is not acknowledged.
+        While the journal is `broken` (until the scan is opened again, or `Home` or `EndRun` tries anew), events have
+        the last good number and are not stored, and a row that is done ends with a fault: what is not journalled is not
+        acknowledged.
         """
         file = None if self.broken else self._file
         seq = self.last_seq
@@ -394,7 +405,10 @@ class Journal:
         self._publish([m.pack(kind(scan_id=scan_id, seq=seq, t_mono_ns=time.monotonic_ns(), **fields))])
 
     def read(self, scan_id: str, from_seq: int, limit: int) -> tuple[list[bytes], int]:
-        """Return packed events of any scan from `from_seq` on and its newest number; ([], 0) without a journal."""
+        """Return at most `limit` packed events of any scan from `from_seq` on, and the scan's newest number.
+
+        Return ([], 0) if the scan has no journal. Raises DataError for a damaged record or a file that is no journal.
+        """
         if self._file is not None and scan_id == self.scan_id:
             return self._file.read(from_seq, limit), self.last_seq
         payloads = []
@@ -416,7 +430,7 @@ class Journal:
 
 
 def _end_with_fault(event: m.AnyEvent) -> m.AnyEvent:
-    """Return the end of a row that is done as one with a fault, because it is not journalled; others as they are."""
+    """Return a `RowFinished` of status `done` as one with a fault, because it is not journalled; others as they are."""
     if not isinstance(event, m.RowFinished) or event.status != "done":
         return event
     explanation = explain(PiFault.JOURNAL_FULL)
@@ -433,21 +447,28 @@ def _read_plan(file: JournalFile) -> RasterPlan | None:
 
 
 class Job(NamedTuple):
-    """Work on the journal, the callback for its result or error, and the time when it was requested."""
+    """Work for the journal's thread."""
 
     work: Callable[[Journal], Any]
+    # Called with the result of `work`, or with the error that it raised.
     then: Callable[[Any], object]
+    # Time of the request, on the monotonic clock.
     requested_s: float
 
 
 class JournalThread:
-    """A thread that alone uses the journal's files. `add` and `commit` are for the executor's thread."""
+    """A thread that alone uses the journal's files. `add` and `commit` are for the executor's thread.
+
+    Events are collected in a batch, which `commit` has written as a whole.
+    """
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
+        # The batch.
         self._events: list[NewEvent] = []
+        # None ends the thread.
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-        # Time when the current job was requested.
+        # Time when the current job was requested; None: no job is executed.
         self._busy_since_s: float | None = None
         self._thread = threading.Thread(target=self._work, name="journal", daemon=True)
         self._closed = False
@@ -459,7 +480,7 @@ class JournalThread:
 
     @property
     def is_broken(self) -> bool:
-        """True since a failed write, until the scan is opened again."""
+        """True after a failed write, until the journal is tried again (`retry`, `EndRun`, or opening the scan)."""
         return self._journal.broken
 
     @property
@@ -513,6 +534,7 @@ class JournalThread:
         self._thread.start()
 
     def _work(self) -> None:
+        """Execute jobs until None comes."""
         try:
             while (job := self._jobs.get()) is not None:
                 self._busy_since_s = job.requested_s

@@ -16,17 +16,21 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 from polysight_shared.sockets import HOST_KEYS
 
+# Names of the two pairs of keys that `make_keys` makes.
 PARTIES = ("pi", "host")
+# File with the list of allowed clients.
 ALLOWED = "allowed_clients"
+# Length of a public key of 32 bytes in Z85 (ZeroMQ RFC 32: 5 characters for 4 bytes).
 KEY_CHARACTERS = 40
 COPY = f"copy {' and '.join(HOST_KEYS)} to the host, into its pi.key_dir; pi.key_secret stays on the Pi"
 
 
 class AllowedKeys:
-    """The clients that may connect."""
+    """The clients that may connect, by the list in the key folder; a changed list is read again at each question."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        # Names of the clients, by public key (Z85 text).
         self._names: dict[str, str] = {}
         # Time and size of the file when it was last read.
         self._stamp = (-1, -1)
@@ -106,6 +110,7 @@ def revoke(folder: Path, name: str) -> None:
 
 
 def _derive_public(folder: Path, name: str) -> str:
+    """Return the public key in `name`.key, Z85 text."""
     return load_certificate(folder / f"{name}.key")[0].decode("ascii")
 
 
@@ -117,6 +122,7 @@ def _create(folder: Path, name: str) -> list[Path]:
 
 
 def _write_allowed(folder: Path, names: dict[str, str]) -> None:
+    """Replace the list of allowed clients (names by public key) as a whole."""
     new = folder / (ALLOWED + ".new")
     new.write_text("".join(f"{key} {name}\n" for key, name in names.items()), encoding="utf-8")
     new.replace(folder / ALLOWED)

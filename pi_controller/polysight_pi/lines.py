@@ -29,25 +29,28 @@ from polysight_shared.wires import WireClient, WireEdge
 
 # Edges kept by the kernel; its default of 16 would lose edges of a program without CPU time.
 EVENT_BUFFER = 1024
-# A sleep may end this much late, so the rest of a wait polls the clock.
+# A sleep may end this much late (chosen), so the rest of a wait polls the clock.
 SPIN_NS = 100_000
+# So long before a pulse its code is brought into the caches (`GpiodLines.sleep_until`); chosen, longer than a system
+# call takes.
 WARM_NS = 30_000
 # Timeout for the pulses of simulated wires: a busy machine delivers them late.
 SIMULATED_LOOK_BACK_S = 2.0
 # Timeout for pulses that were sent and are not seen; the kernel reports them within microseconds.
 LOOK_BACK_S = 0.05
-# Pulses up to this width are as short as two system calls make them.
+# Pulses up to this width are as short as two system calls make them; longer ones wait in between.
 TWO_CALLS_NS = 1000
 # GPIO_V2_LINE_SET_VALUES_IOCTL, with the argument (bits, mask).
 SET_VALUES = 0xC010B40F
 _VALUES = struct.Struct("=QQ")
+# The module parameter of spidev: longest transfer, bytes.
 BUFSIZ = Path("/sys/module/spidev/parameters/bufsiz")
 # _IOW('k', 0, struct spi_ioc_transfer[1]), _IOW('k', 1, __u8): mode 0, without chip select where the driver supports it
 MESSAGE = 0x40206B00
 WRITE_MODE = 0x40016B01
 MODE_NO_CS = 0x40
 MODE_0 = 0x00
-# Tx, rx, len, speed_hz, delay_us, bits, cs_change, tx_nbits, rx_nbits, ...
+# struct spi_ioc_transfer: tx, rx, len, speed_hz, delay_us, bits, cs_change, tx_nbits, rx_nbits, ...
 _TRANSFER = struct.Struct("=QQIIHBBBBBB")
 _RIGHTS = "60-polysight.rules sets the device's group (udev), `sudo usermod -aG gpio,spi USER` adds the user to it"
 _REASONS = {
@@ -129,7 +132,10 @@ def find_chip(name: str, devices: Path = Path("/dev")) -> str:
 
 
 def _request(pi: Pi, line: int, buffer: int | None = None, **settings: Any) -> Any:
-    """Request a line of the rig's chip. Raises DeviceError with the reason."""
+    """Request a line of the rig's chip; `settings` are those of gpiod.LineSettings, `buffer` the number of events kept.
+
+    Raises DeviceError with the reason.
+    """
     gpiod = load_gpiod()
     path = find_chip(pi.gpio_chip)
     config = {(line,): gpiod.LineSettings(**settings)}
@@ -152,7 +158,10 @@ def request_output(pi: Pi) -> Any:
 
 
 def _request_edges(pi: Pi, number: int, debounce_us: int = 0) -> Any:
-    """Request an input whose rising edges the kernel stamps (CLOCK_MONOTONIC) and counts. Raises DeviceError."""
+    """Request GPIO line `number` as an input whose rising edges the kernel stamps (CLOCK_MONOTONIC) and counts.
+
+    Raises DeviceError.
+    """
     line = load_gpiod().line
     return _request(
         pi,
@@ -187,6 +196,7 @@ class TriggerInput:
 
     def __init__(self, pi: Pi) -> None:
         self.check_width = not pi.one_shot
+        # Events that the kernel has delivered and `wait_edge` has not returned yet.
         self._events: deque[Any] = deque()
         self._input = _request_edges(pi, pi.trigger_in, pi.trigger_debounce_us)
         self.is_real_time = _is_stamped_by_the_kernel(pi)
@@ -243,7 +253,10 @@ class GpiodLines(TriggerInput):
             raise
 
     def look_back(self, sent: int) -> Seen | None:
-        """Count the rising edges of the return wire since the last call. Raises DeviceError when the line is lost."""
+        """Count the rising edges of the return wire since the last call; wait for as many as were sent.
+
+        None without a return wire. Raises DeviceError when the line is lost.
+        """
         if self._return is None:
             return None
         pulses = 0
@@ -276,6 +289,7 @@ class GpiodLines(TriggerInput):
         return end_ns - begin_ns
 
     def _make_pulse(self, set_line: Callable[[], object], width_ns: int = 0) -> tuple[int, int]:
+        """Call `set_line`, wait until `width_ns` has passed, clear the line; return the times before and after."""
         # Looked up before the line is set: nothing but the two calls is inside a pulse.
         now = time.monotonic_ns
         clear = self._clear
@@ -308,6 +322,8 @@ class SpiDevice:
 
     def __init__(self, path: str) -> None:
         self.path = path
+        # Bits of MISO during the last transfer, as many as were sent.
+        self.received = array.array("B")
         try:
             self._fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except OSError as e:
@@ -334,9 +350,9 @@ class SpiDevice:
             return DEFAULT_BUFSIZ
 
     def transfer(self, data: bytes, clock_hz: int) -> tuple[int, int]:
-        """Send the bytes; return the times before and after the system call. Raises DeviceError.
+        """Send the bytes and store those of MISO in `received`; return the times before and after the system call.
 
-        `received`: the bits of MISO meanwhile.
+        Raises DeviceError.
         """
         buffer = array.array("B", data)
         self.received = array.array("B", bytes(len(data)))
@@ -376,7 +392,11 @@ class SpiLines(TriggerInput):
             raise
 
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
-        """Send a burst; return the times before and after. Raises DeviceError."""
+        """Send a burst and count the pulses that MISO receives; return the times before and after. Raises DeviceError.
+
+        The first bit on the wire is the most significant one of `high`. So a pulse begins at a set bit whose left
+        neighbour is clear, and the longest pulse has as many bits as `high & high >> 1` can be repeated until it is 0.
+        """
         times = self._device.transfer(burst.data, burst.clock_hz)
         high = int.from_bytes(self._device.received.tobytes(), "big")
         pulses = self._seen.pulses + (high & ~(high >> 1)).bit_count()
@@ -430,9 +450,13 @@ class WireLines:
         self._client = WireClient(path, listen=listen, join=join)
         # Trigger edges that were received while waiting for other edges.
         self._waiting: deque[WireEdge] = deque()
+        # Wire time.
         self._now_ns = 0
+        # Number of the last trigger edge; here none is lost.
         self._seqno = 0
+        # Level of SYNC_IN.
         self._active = False
+        # Edges of SYNC_IN that the hub has not got yet.
         self._unsent: list[WireEdge] = []
 
     def now_ns(self) -> int:
@@ -462,7 +486,7 @@ class WireLines:
         return Edge(edge.t_ns, self._seqno)
 
     def look_back(self, sent: int) -> Seen | None:
-        """Count the pulses that came back since the last call, and measure their widths on the wire."""
+        """Count the pulses that came back since the last call, and measure their widths on the wire; None: no wire."""
         if self._return is None:
             return None
         self._flush()
@@ -514,7 +538,10 @@ class SpiWireLines(WireLines):
     bufsiz = DEFAULT_BUFSIZ
 
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
-        """Send the edges of a transfer, most significant bit first; the line keeps the level of the last bit."""
+        """Make the edges of a transfer, most significant bit first; return the wire times before and after.
+
+        The line keeps the level of the last bit.
+        """
         begin_ns = self._now_ns
         for i, byte in enumerate(burst.data):
             if byte or self._active:

@@ -27,9 +27,9 @@ from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 
 # Time between two published statuses of a moving stage: about four a second are enough to draw it.
 STATUS_EVENT_S = 0.24
-# Consecutive statuses at rest after which the reply to the end of a motion counts as lost.
+# Consecutive statuses at rest after which the stage's report of a motion's end counts as lost.
 RESTS = 3
-# Number of requests to repeat such a reply; a stage that was reset, and whose banner was lost, never answers them.
+# Number of requests to repeat that report; a stage that was reset, and whose banner was lost, never answers them.
 MAX_REPEAT_REQUESTS = 3
 # Errors of the stage after which its position is not known.
 POSITION_LOST = (
@@ -38,7 +38,7 @@ POSITION_LOST = (
 
 
 class RefusedError(PolysightError):
-    """A command is refused with a PiFault number; polysight_shared/faults.py has the default texts of each number."""
+    """A command is refused; `number` is a PiFault, whose default texts are in polysight_shared/faults.py."""
 
     def __init__(self, number: int, summary: str, cause: str = "", remedy: str = "") -> None:
         super().__init__(summary, cause, remedy, code=ErrorCode.REFUSED_BY_PEER)
@@ -50,9 +50,11 @@ HOST_MISSES = 4
 
 
 class Machine:
-    """Applies RULES, checks the time limit of the state and, during a row, the host's heartbeat.
+    """Applies RULES, checks the time limit of the state and, during a motion, the host's heartbeat.
 
-    `post` appends a call to the executor's queue. Used by the executor's thread only, except `note_host_alive`.
+    `post` appends a call to the executor's queue, `clock` gives seconds. Used by the executor's thread only, except
+    `note_host_alive` and `note_jog_alive`. A method whose name is an action of RULES with a leading underscore may
+    return the next state; None means the rule's default.
     """
 
     def __init__(
@@ -81,9 +83,11 @@ class Machine:
         self.fault = 0
         # Reason of the fault.
         self.reason = ""
-        # Lost steps, mm, that the last homing measured.
+        # Steps in x and y that were lost before the last homing, which measured them, millimetres.
         self.lost_mm = (0.0, 0.0)
+        # Longest duration of the current row.
         self.row_timeout_s = math.inf
+        # End of the current state's time limit, by `clock`.
         self._deadline_s = math.inf
         # Sequence number of the HOME line.
         self._homing = -1
@@ -91,17 +95,20 @@ class Machine:
         self._homing_underway = False
         # True while the host of a homing sends heartbeats.
         self._homing_is_watched = False
-        # True if the stage rests in a hold; True if the row is to be resumed once it does.
+        # True if the stage rests in a hold.
         self._rests_in_hold = False
+        # True if the row is to be resumed once the stage rests.
         self._resumes_at_rest = False
-        # True if the lines to trigger and radar have failed; True while the program is being ended.
+        # True once the lines to trigger and radar have failed.
         self._lines_dead = False
+        # True while the program is being ended.
         self._terminating = False
         # Consecutive statuses at rest while the end of a motion is awaited.
         self._rests = 0
         self._watch = TriggerWatch()
         self._status_sent_s = 0.0
         self.watch_host(0)
+        # The next states and the method of each pair of state and event.
         self._rules: dict[tuple[str, str], tuple[list[Any], Callable[..., str | None]]] = {
             (state, rule.event): (rule.leads_to.split(), getattr(self, f"_{rule.action}"))
             for rule in RULES
@@ -109,7 +116,7 @@ class Machine:
         }
 
     def happen(self, event: str, *args: Any) -> bool:
-        """Apply the rule of this event in the current state; return False if there is none."""
+        """Apply the rule of this event in the current state; `args` are its action's. Return False without a rule."""
         if (self.state, event) not in self._rules:
             return False
         state_before = self.state
@@ -128,7 +135,7 @@ class Machine:
             timeout_s = self.row_timeout_s
         self.state = state
         self._deadline_s = self._clock() + timeout_s
-        # The run ends after the bursts that are still in the queue.
+        # The row is judged after the bursts that are still in the queue.
         if state == "ending":
             self._post(partial(self.happen, "settled"))
 
@@ -177,11 +184,12 @@ class Machine:
 
     @property
     def host_lives(self) -> bool:
-        """True if every heartbeat so far arrived on time; False if none is expected."""
+        """True while the newest heartbeat of the run's host is younger than the timeout; False if none is expected."""
         return self._host_timeout_s < math.inf and self._clock() < self._host_alive_s + self._host_timeout_s
 
     @property
     def _host_lost_s(self) -> float:
+        """Time, by `clock`, at which the host counts as lost; infinity while nothing moves for a host."""
         if self.state in ("running", "held") or (self.state == "homing" and self._homing_is_watched):
             return self._host_alive_s + self._host_timeout_s
         if self.jog is not None and self.jog.status is None:
@@ -214,7 +222,7 @@ class Machine:
     # --- events of trigger loop and stage ---------------------------------------------------------------------------
 
     def on_burst(self, sent: BurstSent) -> None:
-        """Journal a burst of the row."""
+        """Journal a burst of the current row, and check the time of its edge; ignore bursts of earlier rows."""
         row = self.row
         record = sent.record
         if row is None or sent.job is not row.job:
@@ -234,7 +242,7 @@ class Machine:
             self.happen("all sent")
 
     def on_loop_fault(self, fault: LoopFault) -> None:
-        """Handle a fault of the trigger loop, which ends the row, or the loop itself."""
+        """Handle a fault of the trigger loop, which ends the row; one without a job has ended the loop itself."""
         if fault.job is None:
             self._lines_dead = True
             self.happen("lasting fault", fault.number, fault.detail)
@@ -242,7 +250,7 @@ class Machine:
             self.happen("row fault", fault.number, fault.detail)
 
     def on_stage(self, reply: Reply) -> None:
-        """Handle an unsolicited reply of the stage."""
+        """Handle a line of the stage: a status, the `ok` of a command, an alarm, a banner or the end of a motion."""
         homing = self.state == "homing"
         answers_home = reply.sequence == self._homing
         if reply.kind == "status":
@@ -252,7 +260,7 @@ class Machine:
             if self.row is not None and reply.sequence == self.row.sequence:
                 self.row.is_underway = True
         elif homing and not self._homing_underway:
-            # The status was sent before HOME was accepted.
+            # Sent before HOME was accepted, so it says nothing about the homing.
             pass
         elif reply.kind == "banner":
             self.happen("stage lost", PiFault.STAGE_LOST, "the stage was reset: it sent its banner")
@@ -344,6 +352,7 @@ class Machine:
         self._post(self._home_now)
 
     def _home_now(self) -> None:
+        """Open the port if necessary and start homing, unless the state has changed meanwhile."""
         if self.state != "homing":
             return
         try:
@@ -371,6 +380,7 @@ class Machine:
 
     @property
     def _at_rest_state(self) -> str:
+        """The state of a stage that has ended a motion without a lasting fault."""
         if not self.homed:
             return "idle"
         if self.in_run:
@@ -387,6 +397,7 @@ class Machine:
         return self.stage.x_mm if axis == "x" else self.stage.y_mm
 
     def _jog(self, command: m.Jog) -> None:
+        """Start a jog. Raises StageRefusedError or StageLostError."""
         x_mm = self.stage.x_mm
         y_mm = self.stage.y_mm
         if command.axis == "x":
@@ -473,6 +484,7 @@ class Machine:
         self.in_run = False
 
     def _start_row(self, row: Row, take: int, spec: BurstSpec, speed_mm_s: float) -> None:
+        """Arm the trigger loop, start the row and journal its start. Raises StageRefusedError or StageLostError."""
         job = self._loop.arm(row.points, spec)
         motion = RowMotion.plan(row, self.stage.config, speed_mm_s)
         try:
@@ -482,6 +494,7 @@ class Machine:
             raise
         edges = EdgeTimes(motion)
         self.row = RunningRow(sequence=sequence, row=row, take=take, job=job, motion=motion, edges=edges)
+        # Chosen: far above the estimate, so that only a stage that hangs is timed out.
         self.row_timeout_s = 30.0 + 3 * estimate_row_duration_s(row, self.stage.config, speed_mm_s)
         self._watch = TriggerWatch()
         self._journal.add(m.RowStarted, row=row, take=take)
@@ -505,14 +518,14 @@ class Machine:
     # --- actions: how a row ends ------------------------------------------------------------------------------------
 
     def _decide(self, status: m.RowStatus, number: int, reason: str, lasting: bool = False) -> None:
-        """Set the row's result, unless it is set already, and disarm the trigger loop."""
+        """Set the row's result and disarm the trigger loop, unless there is no row or its result is set already."""
         if self.row is not None:
             self.row.lasting |= lasting
             if self.row.decide(status, number, reason):
                 self._loop.disarm()
 
     def _stop(self, *_: object) -> str | None:
-        """Stop the stage if it moves. Returns `ending` for a row that cannot be stopped."""
+        """Stop the stage if it moves. Returns `ending` for a row that cannot be stopped because the link is lost."""
         if self.state in ("homing", "jogging", "running", "held"):
             try:
                 self.stage.link.send_byte(Immediate.STOP)
@@ -559,6 +572,7 @@ class Machine:
         self.homed = False
 
     def _time_out(self) -> None:
+        """Handle a motion that has not ended in time: the stage counts as lost."""
         if not self._terminating:
             reasons = {
                 "homing": f"not homed after {HOMING_TIMEOUT_S} s",
@@ -618,6 +632,7 @@ class Machine:
 
     @property
     def _current(self) -> RunningRow:
+        """The row of a state that has one."""
         if self.row is None:
             raise RuntimeError(f"state {self.state} without a row")
         return self.row
@@ -627,6 +642,7 @@ class Machine:
         self.reason = ""
 
     def _report_fault(self, number: int, reason: str) -> None:
+        """Journal a fault, and keep it for Status if it is the first one."""
         e = explain(number)
         if not self.fault:
             self.fault = int(number)

@@ -35,11 +35,13 @@ class _Motion:
 
 @dataclass(kw_only=True)
 class RunningJog(_Motion):
-    """A jog; `target`: its x and y, motor steps."""
+    """A jog: a move of one axis by a distance, by hand. It belongs to no run."""
 
+    # The command that started it.
     command: m.Jog
+    # X and y at its end, stage coordinates in motor steps.
     target: tuple[int, int]
-    # The jog is stopped this long after the host's latest heartbeat.
+    # The jog is stopped this long after the latest heartbeat of the host that commanded it.
     timeout_s: float
     # Time of that heartbeat, on the monotonic clock.
     alive_s: float
@@ -49,10 +51,15 @@ class RunningJog(_Motion):
 class RunningRow(_Motion):
     """A row with its counts."""
 
+    # Place of the row in the plan, millimetres.
     row: Row
+    # Number of the attempt at this row: 1, and one more for each retake.
     take: int
+    # What the trigger loop was told: number of edges and burst; its bursts are recognised by it.
     job: Job
+    # The same row in motor steps.
     motion: RowMotion
+    # The edges so far, with the stage's reports.
     edges: EdgeTimes
     # True once the stage has accepted the row: statuses before that belong to the motion before.
     is_underway: bool = False
@@ -60,7 +67,7 @@ class RunningRow(_Motion):
     lasting: bool = False
     # Points that the stage has passed, by its own count.
     points: int = 0
-    # Bursts that were reported to the host.
+    # Bursts that were given to the journal, which reports them to the host.
     bursts: int = 0
     # True if the stage reported a hold within the row.
     was_held: bool = False
@@ -68,7 +75,7 @@ class RunningRow(_Motion):
     done_ns: int = END_OF_TIME_NS
 
     def judge(self, counts: Counts) -> None:
-        """Set the result of a row that was not stopped: `done` if all counts agree, else `fault`."""
+        """Set the result of a row that was not stopped: `done` if all counts and edge times agree, else `fault`."""
         points = self.row.points
         pulses = points * self.job.spec.pulses
         if self.points == points and counts == Counts(points, points, pulses):
@@ -88,9 +95,9 @@ class RunningRow(_Motion):
 
 
 def estimate_row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:
-    """Estimate the duration of a row, including the longest travel to its first point."""
+    """Estimate the duration of a row at `speed_mm_s`, seconds, including the longest travel to its first point."""
     travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
     points_s = abs(row.step_mm) * row.points / speed_mm_s
-    # Two ramps each of the travel and of the row.
+    # Two ramps of the travel and two of the row, all as if at the row's speed.
     ramps_s = 4 * speed_mm_s / stage.accel_mm_s2
     return travel_s + points_s + ramps_s

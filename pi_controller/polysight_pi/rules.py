@@ -10,18 +10,22 @@ from typing import Literal, NamedTuple
 from polysight_shared import messages as m
 from polysight_shared.stage_line import HOMING_TIMEOUT_S
 
+# `idle`: not homed. `homed`: at rest outside a run; `ready`: at rest in a run. `held`: a row that slows down or rests
+# on request. `stopping`: STOP was sent and the stage slows down. `done`: the stage has reached the row's end, and the
+# last burst is still awaited. `ending`: the stage rests, and bursts in the queue are still to be journalled.
 State = Literal["idle", "homing", "jogging", "homed", "ready", "running", "held", "stopping", "done", "ending", "fault"]
 
 
 class Rule(NamedTuple):
-    """Action (name of a method) and next state of an event in the listed states.
+    """Action and next state of an event in the listed states. Names of states are separated by spaces."""
 
-    `leads_to` has the possible next states, the default first; the action may return one of the others.
-    """
-
+    # Name of a command, or of what has happened to stage, lines, host or time.
     event: str
+    # States in which the rule applies.
     states: str
+    # The possible next states, the default first; the action may return one of the others. "same": no change.
     leads_to: str
+    # Method of `Machine` that is called, without its leading underscore.
     action: str = "nothing"
 
 
@@ -72,18 +76,20 @@ RULES = (
     Rule("timeout", "done", "ending", "disarm"),
     Rule("settled", "ending", "ready idle fault", "finish_row"),
 )
-# A row's own time limit is set when it begins; states that are not listed have none.
+# Longest time in a state, seconds; the event `timeout` follows. The limit of `running` is set when a row begins
+# (`Machine.row_timeout_s`); the other states have none.
 TIMEOUTS_S: dict[State, float] = {
     "homing": HOMING_TIMEOUT_S,
+    # The longest jog, and 5 s (chosen) for ramps and a busy machine.
     "jogging": m.MAX_JOG_S + 5.0,
     # Time from STOP to standstill.
     "stopping": 3.0,
     # Time from the stage's `done` to the last burst.
     "done": 1.0,
 }
-# Time from STOP to standstill when the program is being ended.
+# Longest time from STOP to standstill when the program is being ended, seconds; chosen, systemd waits 5 s for the end.
 END_TIMEOUT_S = 0.5
-# The other states have the same name on the wire.
+# Names in messages of states that hosts do not know; the other states have the same name there.
 WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}
 # States in which the stage moves.
 MOVING = ("homing", "jogging", "running", "held", "stopping")

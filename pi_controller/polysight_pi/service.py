@@ -1,8 +1,8 @@
 """`polysight-pi run`: the two ZeroMQ sockets, and the service that creates all parts and closes them in a safe order.
 
 Events go out on a PUB socket, commands come in on a ROUTER, which keeps each command's envelope, so that `Hello`,
-`Status` and `Alive` are answered while the executor is busy or hangs. Each socket has a thread that alone uses it,
-and an I/O thread of libzmq; others queue messages. Specification: docs/spec/wire.md.
+`Status` and `Alive` are answered while the executor is busy. Each socket has a thread that alone uses it, and an I/O
+thread of libzmq; others queue messages. Specification: docs/spec/wire.md.
 """
 
 from __future__ import annotations
@@ -36,24 +36,30 @@ from polysight_shared.faults import PiFault
 from polysight_shared.program import die_with_parent
 from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, make_server_context, publisher, replier
 
-# How long closed sockets go on sending.
+# How long closed sockets go on sending (chosen).
 LINGER_MS = 200
-# A thread of a socket that has nothing to do completes a turn this often.
+# Longest time of a turn of a socket's thread that has nothing to do.
 POLL_MS = 250
-# Each part gets this long to end; a thread that hangs is left alone then.
+# Each part gets this long to end; a thread that hangs is left alone then. Chosen: all together end within the 5 s of
+# TimeoutStopSec in polysight-pi.service.
 END_TIMEOUT_S = 0.8
 # File beside the journals with a key that every run accepts from a person at the Pi.
 TAKE_OVER_KEY = "take-over-key"
+# Frames of a message before its content: the route to the client, and an empty frame.
 Envelope = tuple[bytes, ...]
 
 
 class Server:
-    """Binds both sockets. Raises ConfigError or DeviceError if an address is wrong, in use, or has no keys."""
+    """The two sockets and their threads. `heartbeat_ms`: period of the Pi's heartbeat.
+
+    Raises ConfigError or DeviceError if an address is wrong, in use, or has no keys.
+    """
 
     def __init__(self, command_address: str, event_address: str, key_dir: Path, heartbeat_ms: int) -> None:
         self._heartbeat_ms = heartbeat_ms
         self._context = make_server_context()
         self._allowed = AllowedKeys(key_dir)
+        # True if clients need a key, and are checked again at each command.
         self._secret = not is_loopback(command_address)
         try:
             # Bound before the others, whose connections it authenticates.
@@ -66,8 +72,11 @@ class Server:
         self.command_address = self._commands.getsockopt_string(zmq.LAST_ENDPOINT)
         self.event_address = self._events.getsockopt_string(zmq.LAST_ENDPOINT)
         self.ports = {int(address.rpartition(":")[2]) for address in (self.command_address, self.event_address)}
+        # Written by other threads, wakes the command socket's thread.
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        # Replies of the executor, to be sent by the command socket's thread.
         self._replies: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
+        # Events to be published; None ends the event socket's thread.
         self._unsent: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._publisher: threading.Thread | None = None
         # When the thread of each socket last completed a turn.
@@ -93,7 +102,7 @@ class Server:
         os.eventfd_write(self._wake, 1)
 
     def run(self, executor: Executor) -> None:
-        """Serve until :meth:`stop` or a crash of the executor. Events are sent until :meth:`finish`."""
+        """Answer commands until :meth:`stop` or a crash of the executor. Events are sent until :meth:`finish`."""
         self._publisher = threading.Thread(target=self._send_events, args=(executor,), name="events", daemon=True)
         self._publisher.start()
         poller = zmq.Poller()
@@ -162,7 +171,7 @@ class Server:
         self._zap.send_multipart([version, number, code, text, key.hex().encode(), b""])
 
     def _receive(self, executor: Executor) -> None:
-        """Answer one command: its envelope (routing frames up to the empty one) and one frame of content."""
+        """Receive one command, its envelope and one frame of content, and answer it or pass it to the executor."""
         frames = self._commands.recv_multipart(copy=False)
         parts = [f.bytes for f in frames]
         if b"" not in parts[1:-1]:
@@ -279,6 +288,7 @@ class Service:
         self.executor.post(item)
 
     def _find_late(self) -> str:
+        """Name a part of the program that has not answered for LATE_S; "" if there is none."""
         late_s = self._journal.late_s
         if late_s > LATE_S:
             return f"the journal has not answered for {late_s:.1f} s"
@@ -327,9 +337,10 @@ def _write_secret(path: Path, secret: str) -> None:
 
 
 def run(instrument: Instrument, wires: Path | None) -> int:
-    """Serve until SIGTERM or SIGINT. Prints `ready <command address>` on stdout once it does.
+    """Serve until SIGTERM or SIGINT, with simulated lines if `wires` is the socket of a hub. Return 0.
 
-    Raises ConfigError or DeviceError if it cannot start.
+    Prints `ready <command address>` and `events <event address>` on stdout once it serves. Raises ConfigError or
+    DeviceError if it cannot start.
     """
     if wires is not None:
         die_with_parent()

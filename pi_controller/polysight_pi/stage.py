@@ -1,8 +1,8 @@
 """The motion stage: its serial link, the driver in millimetres, and the blocking form for bring-up.
 
-`StageLink` sends numbered lines, repeated until answered, and immediate bytes. Its reader thread separates answers to
-lines from unsolicited replies (done, alarm, status, banner) and asks for the stage's status at an interval: this is
-the heartbeat without which a moving stage stops. Protocol: docs/spec/stage-line.md.
+`StageLink` sends numbered lines, repeated until answered, and immediate bytes (one byte that acts during a motion). Its
+reader thread separates answers to lines from unsolicited replies (done, alarm, status, banner) and asks for the stage's
+status at an interval: this is the heartbeat without which a moving stage stops. Protocol: docs/spec/stage-line.md.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from polysight_shared.units import NS_PER_S
 
 # A byte on the serial line, with start and stop bit.
 BITS_PER_BYTE = 10
-# The first opening of the port resets an UNO, whose boot loader takes up to 2 s.
+# The first opening of the port resets an UNO, whose boot loader takes up to 2 s; a second more is chosen.
 BANNER_TIMEOUT_S = 3.0
 # The longest line and its answer take 14 ms at 115200 baud; the rest is for a busy machine.
 ANSWER_TIMEOUT_S = 0.5
-# How often a line is sent before the stage counts as lost.
+# How often a line is sent before the stage counts as lost (chosen).
 TRIES = 4
-# Answers that tell of a damaged line: it is sent again.
+# Error numbers of answers that tell of a damaged line: it is sent again.
 RETRIED = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
 # Status requests to a moving stage per heartbeat, so that a lost one does not stop it.
 STATUS_PER_HEARTBEAT = 4
@@ -62,12 +62,12 @@ MOVING_STATUS_S = 0.5
 STOP_TIMEOUT_S = 3.0
 # Between two attempts to clear an alarm of a stage that still moves.
 CLEAR_RETRY_S = 0.05
-# A thread that commands the stage hangs if it has not completed a turn for so long: longer than a line and its retries
+# The thread that commands the stage counts as hung after so long without a turn: longer than a line and its retries
 # take.
 CALLER_LATE_S = 3.0
 # Largest position in the messages; a reply with a larger one was damaged.
 MAX_MM = 1e6
-# Homing is the longest motion.
+# Longest time for which `BenchStage` waits for the end of a motion: homing is the longest.
 MOTION_TIMEOUT_S = HOMING_TIMEOUT_S
 
 
@@ -88,11 +88,12 @@ class StageRefusedError(DeviceError):
 
 
 class StageLost(NamedTuple):
-    """The link is lost."""
+    """The link is lost; `reason` says how, for people."""
 
     reason: str
 
 
+# What the reader thread of a link reports.
 StageNews = Reply | StageLost
 
 
@@ -100,13 +101,17 @@ class StatusWatch:
     """Schedules status requests and detects a silent stage. All times are those of one clock, in seconds."""
 
     def __init__(self, heartbeat_s: float, now_s: float) -> None:
+        # Timeout of a request to a moving stage.
         self._silence_s = SILENT_HEARTBEATS * heartbeat_s
+        # Time of the newest request.
         self._asked_s = now_s
+        # Time of the oldest request without an answer; None: all are answered.
         self._unanswered_since_s: float | None = None
+        # Time of the last call of `silent_s`.
         self._looked_s = now_s
         # The reader calls `is_due` and `silent_s` at this interval.
         self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)
-        # Between status requests; 0: there are none.
+        # Time between status requests; 0: there are none.
         self.interval_s = 0.0
 
     def ask_every(self, interval_s: float, now_s: float) -> None:
@@ -151,7 +156,9 @@ class StatusWatch:
 
 
 class StageLink:
-    """An open serial link to the stage at `port`. Every method raises StageLostError if the stage does not answer.
+    """An open serial link to the stage at `port`.
+
+    The constructor and all methods that send raise StageLostError if the stage does not answer or the port is lost.
 
     Parameters
     ----------
@@ -163,10 +170,12 @@ class StageLink:
     banner_timeout_s
         Timeout for the banner of a stage that was reset by opening the port; a stage without one is greeted anyway.
     caller_late_s
-        How long the thread that commands the stage has not completed a turn. A stage in motion is stopped if that, and
-        the time since its last command, exceed `CALLER_LATE_S`: the heartbeat must not speak for a thread that hangs.
+        Returns for how long the thread that commands the stage has not completed a turn. A stage in motion is stopped
+        if that and the time since its last command exceed `CALLER_LATE_S`, or the heartbeat would keep a stage moving
+        that nobody controls.
     bound_now_ns
-        Earliest and latest time that it can be now on the clock of the trigger edges, for the times of each reply.
+        Returns the earliest and the latest time that it can be now on the clock of the trigger edges, for the times of
+        each reply.
     """
 
     def __init__(
@@ -183,8 +192,10 @@ class StageLink:
         self._news = news
         self._caller_late_s = caller_late_s
         self._bound_now_ns = bound_now_ns
-        # Times of requests without an answer. More than two are never open: a stage that is silent for so long is lost.
+        # Earliest times of the last two status requests without an answer. A moving stage that leaves more open is
+        # lost; outside of rows the times are not used.
         self._asked_ns: deque[int] = deque(maxlen=2)
+        # Time of the last line that was sent.
         self._commanded_s = time.monotonic()
         self._watch = StatusWatch(heartbeat_s, time.monotonic())
         try:
@@ -203,15 +214,19 @@ class StageLink:
                 code=ErrorCode.FILE_UNREADABLE,
             ) from None
         self._write_lock = threading.Lock()
+        # Replies `ok` and `error`, from the reader; None: the link is lost.
         self._answers: queue.SimpleQueue[Reply | None] = queue.SimpleQueue()
         self._banner: Reply | None = None
         self._banner_seen = threading.Event()
+        # True once the stage has answered HELLO; before that nothing is reported to `news`.
         self._greeted = False
         self._closing = False
+        # Number of the next line.
         self._sequence = 0
+        # Number of received lines that could not be read.
         self.bad_lines = 0
         self._last_line = b""
-        # The reason, once the link is lost
+        # Why the link was lost; "" while it is not.
         self.lost = ""
         self._reader = threading.Thread(target=self._read, name="stage", daemon=True)
         self._reader.start()
@@ -222,6 +237,10 @@ class StageLink:
             raise
 
     def _greet(self, banner_timeout_s: float) -> None:
+        """Wait for the banner of a reset stage, send HELLO, and store release and steps per mm of the firmware.
+
+        Raises StageLostError without an answer or for another version of the protocol.
+        """
         self._banner_seen.wait(banner_timeout_s)
         # The line end completes a partial line that was sent earlier.
         self._write(b"\n")
@@ -252,6 +271,10 @@ class StageLink:
         return answer
 
     def _exchange(self, verb: str, args: tuple[int, ...]) -> Reply:
+        """Send a line with the next number until it is answered; return the answer, which may be an error.
+
+        Raises StageLostError.
+        """
         sequence = self._sequence
         self._sequence = (sequence + 1) % (MAX_SEQUENCE + 1)
         self._last_line = Command(sequence, verb, args).encode()
@@ -271,6 +294,7 @@ class StageLink:
         )
 
     def _answer(self, sequence: int) -> Reply | None:
+        """Return the answer to this line, or an error for a line that could not be read; None after a timeout."""
         deadline = time.monotonic() + ANSWER_TIMEOUT_S
         while (left_s := deadline - time.monotonic()) > 0:
             try:
@@ -303,6 +327,7 @@ class StageLink:
         self._serial.close()
 
     def _write(self, data: bytes) -> None:
+        """Send bytes, from any thread. Raises StageLostError."""
         if self.lost:
             raise StageLostError(f"stage at {self.port} is lost: {self.lost}", "see above", "polysight-pi home")
         try:
@@ -314,6 +339,7 @@ class StageLink:
             raise StageLostError(f"stage at {self.port} is lost: {e}", unplugged, "check the USB cable") from None
 
     def _lose(self, reason: str) -> None:
+        """Note and report, once, that the link is lost; end a wait for an answer."""
         if self.lost or self._closing:
             return
         self.lost = reason
@@ -322,6 +348,7 @@ class StageLink:
             self._news(StageLost(f"stage at {self.port}: {reason}"))
 
     def _read(self) -> None:
+        """The reader thread: distribute received lines, request the status when it is due, detect a silent stage."""
         buffer = b""
         while not self._closing and not self.lost:
             try:
@@ -346,6 +373,10 @@ class StageLink:
                     return
 
     def _ask_status(self, now: float) -> None:
+        """Request the status at `now`, in seconds; stop a moving stage instead if the commanding thread hangs.
+
+        Raises StageLostError.
+        """
         hung_s = min(self._caller_late_s(), now - self._commanded_s)
         if hung_s < CALLER_LATE_S or self._watch.is_at_rest:
             self._asked_ns.append(self._bound_now_ns()[0])
@@ -355,6 +386,7 @@ class StageLink:
             self._lose(f"this program has not commanded it for {hung_s:.1f} s: it was stopped")
 
     def _take(self, line: bytes) -> None:
+        """Distribute a received line: answers to the thread that waits for them, and all but errors to `news`."""
         try:
             reply = Reply.decode(line.replace(b"\r\n", b"\n"))
         except ProtocolError:
@@ -380,13 +412,19 @@ class StageLink:
 
 
 class StageDriver:
-    """The stage of the [stage] table, used by one thread; `news` and `of_link` are arguments of :class:`StageLink`."""
+    """The stage of the [stage] table, in millimetres. Used by one thread.
+
+    `news` and `of_link` are arguments of :class:`StageLink`. `x_mm` and `y_mm` are the position of the last status or
+    end of a motion, in stage coordinates (zero = where homing ends); `firmware` is the release of the sketch. Methods
+    that send raise StageLostError, or StageRefusedError if the stage refuses the command.
+    """
 
     def __init__(self, config: Stage, news: Callable[[StageNews], None], **of_link: Any) -> None:
         self.config = config
         self._of_link = of_link
         self.port = config.port
         self._news = news
+        # The link; None before `connect`.
         self._open: StageLink | None = None
         self.x_mm = 0.0
         self.y_mm = 0.0
@@ -441,7 +479,7 @@ class StageDriver:
                     raise
             if stop:
                 self.link.send_byte(Immediate.STOP)
-            # Still moving: started by an earlier program, or slowing down
+            # The stage still moves: an earlier program started it, or it slows down.
             time.sleep(CLEAR_RETRY_S)
 
     def home(self) -> int:
@@ -458,6 +496,7 @@ class StageDriver:
         return self._start("BUZZ", "xy".index(axis))
 
     def _switch_on(self) -> None:
+        """Stop the stage, clear alarms, send the settings of [stage] in the units of the line, switch the motors on."""
         try:
             self.clear(stop=True)
         except StageRefusedError as e:
@@ -490,7 +529,7 @@ class StageDriver:
         return self._start("ROW", *motion.line)
 
     def move(self, x_mm: float, y_mm: float, speed_mm_s: float) -> int:
-        """Start a move to a position; return the sequence number of its `done`."""
+        """Start a move to a position in stage coordinates; return the sequence number of its `done`."""
         k = self.config.steps_per_mm
         return self._start("MOVE", round(x_mm * k), round(y_mm * k), round(speed_mm_s * k))
 
@@ -518,6 +557,7 @@ class StageDriver:
             link.close()
 
     def _start(self, verb: str, *args: int) -> int:
+        """Begin the heartbeat of a moving stage and send a motion command; return its sequence number."""
         # The heartbeat has to begin before the motion does.
         self.link.ask_status_every(min(self.config.heartbeat_ms / 1e3 / STATUS_PER_HEARTBEAT, MOVING_STATUS_S))
         try:
@@ -529,7 +569,7 @@ class StageDriver:
 
 
 class Position(NamedTuple):
-    """Position of the stage, millimetres."""
+    """Position of the stage, millimetres in stage coordinates."""
 
     x_mm: float
     y_mm: float
@@ -577,6 +617,7 @@ class BenchStage:
         return self._wait(lambda reply: reply.kind == "status", 1.0, silent)
 
     def _finish(self, sequence: int) -> Position:
+        """Wait for the end of the motion with this sequence number; return the position."""
         late = StageLostError(f"the motion has not ended after {MOTION_TIMEOUT_S:.0f} s", "the motors stall", "look")
         try:
             return self._wait(lambda r: r.kind == "done" and r.sequence == sequence, MOTION_TIMEOUT_S, late)
@@ -585,6 +626,7 @@ class BenchStage:
             raise
 
     def _wait(self, matches: Callable[[Reply], bool], timeout_s: float, timeout: StageLostError) -> Position:
+        """Wait for a reply that matches; return the position then. Raises `timeout`, or DeviceError after an alarm."""
         deadline = time.monotonic() + timeout_s
         while (left_s := deadline - time.monotonic()) > 0:
             try:

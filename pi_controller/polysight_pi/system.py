@@ -19,11 +19,13 @@ _MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4
 # holds it must not be preempted by other programs.
 PRIORITY = 50
 OTHERS_PRIORITY = 40
-# The default of 5 ms is three pulse periods.
+# Longest time for which a thread keeps the interpreter while others wait. The default of 5 ms is three periods of the
+# published rig's pulses.
 SWITCH_INTERVAL_S = 100e-6
-# The program needs 30 to 60 MB, a subscriber that does not read up to 50.
+# Memory above which connections are cut. The program needs 30 to 60 MB, a subscriber that does not read up to 50.
 MAX_BYTES = 160 << 20
-# Minimum above the memory left after a cut: not all freed memory returns to the system.
+# The limit is at least so far above the memory that is left after connections were cut, because not all freed memory
+# returns to the system. Chosen.
 SPARE_BYTES = 64 << 20
 # Time between two looks at the memory, and for how long connections are cut after too much was seen.
 LOOK_S = 0.05
@@ -31,7 +33,7 @@ SETTLE_S = 0.5
 
 
 def prepare_process() -> list[str]:
-    """Lock memory, freeze the garbage collector's heap, shorten thread switching, request real-time scheduling.
+    """Lock memory, exempt present objects from garbage collection, shorten thread switching, request real time.
 
     Returns one sentence for each right that was not granted, with the remedy.
     """
@@ -48,7 +50,10 @@ def prepare_process() -> list[str]:
 
 
 def prepare_thread() -> list[str]:
-    """Set the trigger thread's priority and the shortest timer slack. Returns as :func:`prepare_process`."""
+    """Give the calling thread (the trigger thread) its priority and the shortest timer slack.
+
+    Returns as :func:`prepare_process`.
+    """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) != 0:
         return ["timer slack stays at 50 us: pulses may be that late", *_request_real_time(PRIORITY)]

@@ -1,8 +1,9 @@
-"""Bursts of SYNC_IN pulses, and the thread that answers each trigger edge with one and does nothing else.
+"""Bursts of SYNC_IN pulses, and the thread that answers each trigger edge with one.
 
-The radar starts one frame on each rising edge. It accepts pulses of 25 ns .. 4 us and needs at least 300 us between
-frames; an early pulse is a fatal fault of its RF core (TI mmWave Radar Interface Control, frame configuration).
-So the spacing is checked before each pulse, and the width after it.
+The stage sends a trigger edge at each point of a row. The radar starts one frame on each rising edge of SYNC_IN. It
+accepts pulses of 25 ns .. 4 us and needs at least 300 us between frames; an early pulse is a fatal fault of its RF core
+(TI mmWave Radar Interface Control, frame configuration). So the spacing is checked before each pulse, and the width
+after it.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from polysight_shared.units import us_to_ns
 # From edge to first pulse. A fixed delay, longer than the usual wake-up time, keeps the pulses of all positions at the
 # same distance behind their edges; 200 us are 4 um of travel at 20 mm/s.
 FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
-# Timeout of waiting for an edge, after which the loop checks if it has to stop.
+# Timeout of waiting for an edge, after which the loop checks if it has to stop or to send a burst without an edge.
 LOOK_UP_S = 0.1
 # The trigger wire is off if so many consecutive stage statuses came without an edge, while the stage passed at least
 # so many points.
@@ -36,16 +37,19 @@ SILENT_POINTS = 2
 LEAD_BITS = 8
 # Shorter transfers have gaps: spi-bcm2835 writes them byte by byte, longer ones by DMA.
 MIN_BYTES = 96
+# Longest transfer of spidev in bytes, unless its module parameter `bufsiz` says otherwise.
 DEFAULT_BUFSIZ = 4096
-# Shortest duration relative to the nominal one: a shorter transfer was clocked too fast, its frames are too close.
+# Shortest duration of a transfer relative to the nominal one: a shorter one was clocked too fast, its frames are too
+# close. 2 % is chosen.
 MIN_PART = 0.98
 
 
 class Edge(NamedTuple):
-    """A rising edge of the trigger line; a gap in `seqno` means lost edges."""
+    """A rising edge of the trigger line."""
 
     # Time on the clock of the lines.
     t_ns: int
+    # The kernel's count of edges; a gap means lost edges.
     seqno: int
 
 
@@ -67,6 +71,7 @@ class SpiBurst(NamedTuple):
 
     # Bits of the SPI transfer, most significant bit first.
     data: bytes
+    # Bits per second.
     clock_hz: int
     # Index of each set bit.
     bits: tuple[int, ...]
@@ -83,17 +88,19 @@ class SpiBurst(NamedTuple):
 
 
 class BurstRecord(NamedTuple):
-    """Result of sending a burst."""
+    """Result of sending a burst. Times are on the clock of the lines; those of an SPI transfer are estimates."""
 
+    # Number of pulses that were sent, or seen by the return wire.
     pulses: int
-    # Rising edge of the first pulse: the clock just before the line was set
+    # Rising edge of the first pulse: the clock just before the line was set.
     first_ns: int
+    # Rising edge of the last pulse, as `first_ns`.
     last_ns: int
-    # Time of the end of the last pulse.
+    # Time after the last pulse, or after the SPI transfer.
     end_ns: int
-    # Upper bound: from before the line was set until after it was cleared
+    # Upper bound of the pulse widths: from before the line was set until after it was cleared.
     width_max_ns: int = 0
-    # Largest delay of a rising edge after its deadline
+    # Largest delay of a rising edge after its deadline; for an SPI transfer an upper bound.
     jitter_ns: int = 0
     # Number of the PiFault; 0: none.
     fault: int = 0
@@ -110,8 +117,9 @@ class Seen(NamedTuple):
 class _Lines(Protocol):
     """Trigger input and SYNC_IN output (lines.py). Methods raise DeviceError when the lines are lost."""
 
+    # Backend in messages: "gpiod", "spi" or "wires".
     name: str
-    # True without a hardware one-shot: a pulse that may have been too long is a fault
+    # True without a hardware one-shot: a pulse that may have been too long is a fault.
     check_width: bool
     # True if the lines' clock is CLOCK_MONOTONIC.
     is_real_time: bool
@@ -202,7 +210,7 @@ def send_burst(
 
     `previous_rise_ns` is the last rising edge before this burst. `stop` is called before each pulse, or transfer; True
     ends the burst. The record's fault is PERIOD_TOO_SHORT if a pulse was skipped because it would have come too early
-    for the radar, PULSE_TOO_LONG if one may have been longer than 4 us.
+    for the radar, or if an SPI transfer was clocked too fast; PULSE_TOO_LONG if a pulse may have been longer than 4 us.
     """
     if isinstance(lines, BitLines):
         return _send_bits(lines, spec, start_ns, previous_rise_ns, stop)
@@ -235,7 +243,7 @@ def send_burst(
 def _send_bits(
     lines: BitLines, spec: BurstSpec, start_ns: int, previous_rise_ns: int | None, stop: Callable[[], bool]
 ) -> BurstRecord:
-    """Send the burst as one SPI transfer, which cannot be interrupted once it has begun.
+    """Send the burst as one SPI transfer, which cannot be interrupted once it has begun. Arguments as `send_burst`.
 
     The duration of the system call gives an upper bound of the bit length, so every transfer checks the SPI clock: a
     wrong clock (a Pi whose core clock changes) is a fault before it spoils a scan.
@@ -310,35 +318,46 @@ def send_bench(
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A row whose edges are answered: `points` edges are expected, later than `armed_ns`. Compared by identity."""
+    """A row whose edges are answered. Compared by identity, so that a late result is not taken for another row's."""
 
+    # Number of edges that are expected.
     points: int
+    # The burst that answers each.
     spec: BurstSpec
+    # Edges up to this time belong to no row, or to an earlier one.
     armed_ns: int
 
 
 class BurstSent(NamedTuple):
-    """The burst of the `point`-th edge of a row."""
+    """The burst that answered an edge of a row."""
 
     job: Job
+    # Number of the edge in the row, from 0.
     point: int
+    # Time of the edge, on the clock of the lines.
     edge_ns: int
     record: BurstRecord
 
 
 class LoopFault(NamedTuple):
-    """The row of this job (None: every row) has failed; the loop is disarmed."""
+    """The row of a job has failed; the loop is disarmed."""
 
+    # None: the lines are lost, and the loop's thread has ended.
     job: Job | None
+    # Number of the PiFault.
     number: int
+    # What happened, for people.
     detail: str
 
 
 class Counts(NamedTuple):
     """Counts of the row that was armed last."""
 
+    # Trigger edges received since the row was armed.
     edges: int = 0
+    # Bursts of at least one pulse.
     bursts: int = 0
+    # Pulses of all bursts.
     pulses: int = 0
 
 
@@ -365,14 +384,20 @@ class TriggerLoop:
         # The lock is held while an edge is answered: arm and disarm wait for the burst to end.
         self._lock = threading.Lock()
         self._stop = threading.Event()
+        # The armed row; None: edges are not answered.
         self._job: Job | None = None
+        # A burst to be sent without an edge.
         self._bench: BurstSpec | None = None
         self._last_seqno: int | None = None
+        # Last rising edge of SYNC_IN, from which the shortest period is checked.
         self._last_rise_ns: int | None = None
+        # End of the last burst: an edge before it came too early.
         self._busy_until_ns = 0
+        # Number of edges while no row was armed.
         self.strays = 0
         self.counts = Counts()
         self.backend = lines.name
+        # True if the last burst was counted at the connector by a return wire.
         self.sees_pulses = False
         self.timed_by: Timing = "program" if lines.check_width else "one-shot"
         if isinstance(lines, BitLines):
@@ -391,20 +416,23 @@ class TriggerLoop:
         return now_ns, now_ns
 
     def arm(self, points: int, spec: BurstSpec) -> Job:
-        """Answer the edges of this row from now on."""
+        """Answer the next `points` edges, each with the burst `spec`; return the row's job."""
         with self._lock:
             self._job = Job(points, spec, self._lines.now_ns())
             self.counts = Counts()
             return self._job
 
     def disarm(self) -> Counts:
-        """Stop answering edges; a running burst ends after its pulse. Return the counts since :meth:`arm`."""
+        """Stop answering edges and return the counts since :meth:`arm`.
+
+        Waits for a running burst, which ends after its current pulse (an SPI transfer is sent as a whole).
+        """
         self._job = None
         with self._lock:
             return self.counts
 
     def send(self, spec: BurstSpec) -> None:
-        """Send one burst without an edge, within LOOK_UP_S. Only while no row is armed."""
+        """Send one burst without an edge, within LOOK_UP_S; `post` gets the result. Only while no row is armed."""
         self._bench = spec
 
     def check(self, spec: BurstSpec) -> None:
@@ -428,6 +456,7 @@ class TriggerLoop:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
+        """Answer edges until :meth:`stop`; a lost line or an internal error ends the loop with a LoopFault."""
         self._prepare()
         try:
             while not self._stop.is_set():
@@ -448,6 +477,7 @@ class TriggerLoop:
                 self._lines.close()
 
     def _take(self, edge: Edge) -> None:
+        """Answer one edge with a burst and post the result, or post why the row has failed. Stray edges are counted."""
         edges_lost = 0
         if self._last_seqno is not None:
             edges_lost = edge.seqno - self._last_seqno - 1
@@ -481,7 +511,10 @@ class TriggerLoop:
             self._fail(job, PiFault.PULSES_UNSEEN, f"point {point}: {unseen}")
 
     def _look_back(self, record: BurstRecord) -> tuple[BurstRecord, str]:
-        """Return the record with the pulses that were seen instead of those sent, and how they differ, or ""."""
+        """Return the record with the pulses seen by the return wire, and how they differ from those sent, or "".
+
+        Without a return wire the record stays as it is.
+        """
         returned = self._lines.look_back(record.pulses)
         self.sees_pulses = returned is not None
         if returned is None:
@@ -496,6 +529,7 @@ class TriggerLoop:
         return record._replace(pulses=returned.pulses, width_max_ns=width_ns, fault=fault), differ
 
     def _send_without_edge(self, spec: BurstSpec) -> None:
+        """Send a burst that `send` has requested, and post its result."""
         self._bench = None
         start_ns = self._lines.now_ns()
         if self._last_rise_ns is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import ast
 import re
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -34,18 +34,21 @@ PLAIN = re.compile(r"(?<![`\w/-])(polysight(?:-pi)? [a-z][a-z-]+(?: (?![a-z]+\b)
 ACTIONS = ("calibrate", "card", "radar")
 
 
-def list_texts(path: Path) -> Iterator[tuple[int, str]]:
+@cache
+def list_texts(path: Path) -> list[tuple[int, str]]:
     """Strings of a file that are no docstrings, with their lines; a value that is put in is PLACEHOLDER."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    parts: set[int] = set()
+    # Docstrings, and the pieces of a string with values in it.
+    others = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    texts = []
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
-            parts |= {id(value) for value in node.values}
+            others |= {id(value) for value in node.values}
             pieces = [v.value if isinstance(v, ast.Constant) else PLACEHOLDER for v in node.values]
-            yield node.lineno, "".join(map(str, pieces))
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs | parts:
-            yield node.lineno, node.value
+            texts.append((node.lineno, "".join(map(str, pieces))))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in others:
+            texts.append((node.lineno, node.value))
+    return texts
 
 
 def commands_in(text: str) -> list[str]:

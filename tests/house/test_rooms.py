@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -30,6 +32,36 @@ def list_tracked(*suffixes: str) -> list[Path]:
     return [f for f in files if f.suffix in suffixes and f.is_file() and not f.is_symlink()]
 
 
+@dataclass
+class FileFacts:
+    """What the laws below want to know of a file: it is parsed once for all of them.
+
+    Each list has lines: of imports with the dots before a relative one, the module, and the names taken from it; of
+    functions with their lines of code; of errors for people that lack one of their three parts.
+    """
+
+    imports: list[tuple[int, int, str, list[str]]] = field(default_factory=list)
+    functions: list[tuple[str, int]] = field(default_factory=list)
+    incomplete_errors: list[int] = field(default_factory=list)
+
+
+@cache
+def read_facts(file: Path) -> FileFacts:
+    text = file.read_text(encoding="utf-8")
+    lines = text.splitlines()
+    facts = FileFacts()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom):
+            facts.imports.append((node.lineno, node.level, node.module or "", [alias.name for alias in node.names]))
+        elif isinstance(node, ast.Import):
+            facts.imports += [(node.lineno, 0, alias.name, []) for alias in node.names]
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            facts.functions.append((node.name, count_code_lines(node, lines)))
+        elif isinstance(node, ast.Call) and lacks_a_part(node):
+            facts.incomplete_errors.append(node.lineno)
+    return facts
+
+
 def test_no_file_is_over_700_lines():
     sizes = {f: len(f.read_text(encoding="utf-8").splitlines()) for f in list_tracked(".py", *ALSO_SOURCE)}
     assert {str(f.relative_to(ROOT)): n for f, n in sizes.items() if n > LINES} == {}
@@ -48,14 +80,12 @@ def count_code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef, lines: li
 
 
 def test_no_function_is_over_60_lines_of_code():
-    long = {}
-    for file in list_tracked(".py"):
-        text = file.read_text(encoding="utf-8")
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                lines = count_code_lines(node, text.splitlines())
-                if lines > FUNCTION_LINES:
-                    long[f"{file.relative_to(ROOT)}:{node.name}"] = lines
+    long = {
+        f"{file.relative_to(ROOT)}:{name}": lines
+        for file in list_tracked(".py")
+        for name, lines in read_facts(file).functions
+        if lines > FUNCTION_LINES
+    }
     assert long == {}
 
 
@@ -63,23 +93,18 @@ PROGRAM_FOLDERS = ("host", "shared", "pi_controller", "papers")
 ERRORS_FOR_PEOPLE = ("ConfigError", "DataError", "DeviceError", "ScanError")
 
 
-def errors_without_three_parts(file: Path) -> list[int]:
-    """Lines of errors that are raised without a cause or an advice."""
-    lines = []
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
-            continue
-        keywords = {keyword.arg for keyword in node.keywords}
-        parts = len(node.args) + len(keywords & {"why", "remedy"})
-        is_unpacked = any(isinstance(argument, ast.Starred) for argument in node.args)
-        if node.func.id in ERRORS_FOR_PEOPLE and parts < 3 and not is_unpacked:
-            lines.append(node.lineno)
-    return lines
+def lacks_a_part(call: ast.Call) -> bool:
+    """True for an error that is raised without a cause or an advice."""
+    if not isinstance(call.func, ast.Name) or call.func.id not in ERRORS_FOR_PEOPLE:
+        return False
+    keywords = {keyword.arg for keyword in call.keywords}
+    is_unpacked = any(isinstance(argument, ast.Starred) for argument in call.args)
+    return len(call.args) + len(keywords & {"why", "remedy"}) < 3 and not is_unpacked
 
 
 def test_every_error_says_what_why_and_what_to_do():
     files = [file for file in list_tracked(".py") if file.relative_to(ROOT).parts[0] in PROGRAM_FOLDERS]
-    incomplete = {str(file.relative_to(ROOT)): errors_without_three_parts(file) for file in files}
+    incomplete = {str(file.relative_to(ROOT)): read_facts(file).incomplete_errors for file in files}
     assert {name: lines for name, lines in incomplete.items() if lines} == {}
 
 
@@ -100,18 +125,7 @@ def test_a_room_says_what_it_is(room):
 
 
 def imports(file: Path) -> list[tuple[int, str]]:
-    collected = []
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            collected.append((node.lineno, node.module))
-        elif isinstance(node, ast.Import):
-            collected += [(node.lineno, alias.name) for alias in node.names]
-    return collected
-
-
-def imported_names(tree: ast.Module) -> set[str]:
-    statements = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    return {alias.name for node in statements for alias in node.names}
+    return [(line, module) for line, _, module, _ in read_facts(file).imports if module]
 
 
 def find_room(file: Path) -> str:
@@ -136,21 +150,18 @@ def test_no_module_is_taken_from_behind_a_front():
     """Not `from polysight.sync import tone` either, unless the front names it; nor relative imports."""
     past = []
     for file in (f for top in (HOST, PAPERS) for f in top.rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.ImportFrom):
-                continue
-            parts = (node.module or "").split(".")
-            if node.level:
-                past.append(f"{file.relative_to(ROOT)}:{node.lineno} a relative import")
+        for line, level, module, names in read_facts(file).imports:
+            parts = module.split(".")
+            if level:
+                past.append(f"{file.relative_to(ROOT)}:{line} a relative import")
             elif parts[0] == "polysight" and len(parts) == 2 and parts[1] not in (find_room(file), *ENTERED_BY_MODULE):
                 room = HOST / parts[1]
                 # A module at the root, such as pipeline.py, is no room.
                 if not room.is_dir():
                     continue
-                front = (room / "__init__.py").read_text(encoding="utf-8")
-                named = imported_names(ast.parse(front))
-                modules = [a.name for a in node.names if (room / f"{a.name}.py").exists() and a.name not in named]
-                past += [f"{file.relative_to(ROOT)}:{node.lineno} {m}" for m in modules]
+                named = {name for *_, taken in read_facts(room / "__init__.py").imports for name in taken}
+                modules = [name for name in names if (room / f"{name}.py").exists() and name not in named]
+                past += [f"{file.relative_to(ROOT)}:{line} {name}" for name in modules]
     assert past == []
 
 

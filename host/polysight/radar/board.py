@@ -4,7 +4,8 @@ A board is `ARMED` only after the radar reported that it waits for triggers, and
 of its frames. A fatal event leads to `FAULT`, which only a reset leaves. docs/spec/mmwavelink.md ("Power-up") lists the
 errors that healthy boards report at power-up and that are ignored. Not run on hardware yet.
 
-In this file `c` is the module of commands, `e` that of events.
+In this file `c` is the module of commands, `e` that of messages, which has the events. A *die* is the radar chip, with
+an id of its own; a *patch* is the part of the firmware that extends the ROM.
 """
 
 from __future__ import annotations
@@ -28,15 +29,18 @@ from polysight.radar.usb import Clock, WordLink
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, PolysightError
 
+# Timeouts are chosen: a healthy board reports its power-up within a second.
 POWER_UP_TIMEOUT_S = 5.0
 _CALIBRATION_TIMEOUT_S = 5.0
 _BOOT_TIMEOUT_S = 5.0
-# For how long the reset line is held.
+# For how long the reset line is held (chosen).
 _RESET_S = 0.1
 _READY_TIMEOUT_S = 1.0
 # Events that are kept of a board; a faulty one could report without end.
 _MAX_EVENTS = 1000
+# Temperature sensors in the order of the device's answer.
 _SENSORS = ("rx1", "rx2", "rx3", "rx4", "tx1", "tx2", "tx3", "pm", "digital")
+# Remedies for missing firmware and for a board that does not start.
 _FIRMWARE = (
     "set radar.firmware to TI's image, or write it once: `polysight radar firmware` (docs/how-to/radar-bring-up.md)"
 )
@@ -161,6 +165,7 @@ class BringUp:
         return f"main core's patch {patch_after} from flash (before: {patch_before})"
 
     def _reset(self) -> str:
+        """Reset the board and wait until its main core is up; return that event as text."""
         self._board.words.reset(held=True)
         self._board.clock.sleep(_RESET_S)
         self._link.restart()
@@ -178,6 +183,7 @@ class BringUp:
         return str(up)
 
     def _read_boot_status(self, event: e.Event) -> None:
+        """Keep what a start reports: the facts, what it calls for, and its errors, which may be ignored."""
         self._board.facts.boot = dict(event.values)
         self._cure = str(event.values.get("cure", ""))
         if event.detail:
@@ -193,6 +199,7 @@ class BringUp:
             )
 
     def _load_firmware(self) -> str:
+        """Download the rig file's image to RAM if there is one and the flash has not the same; return what was done."""
         if self._board.firmware is not None:
             outcome = self._load_into_ram(self._board.firmware)
         elif self._cure == "firmware":
@@ -212,6 +219,7 @@ class BringUp:
         return f"{image.name} in RAM"
 
     def _boot_from_ram(self, image: Image) -> None:
+        """Wait for the start from RAM. Without its report go on: the versions show later if the image runs."""
         try:
             booted = self._wait_for_boot()
         except NotReportedError as error:
@@ -275,6 +283,7 @@ class BringUp:
             self._link.warnings.append(warning)
 
     def _power_up_rf(self) -> str:
+        """Start the RF core and wait for its report; return that event as text."""
         self._link.call(c.DEVICE_CONFIGURATION)
         self._link.call(c.RF_POWER_UP)
         up = self._link.wait_for((e.RF_POWER_UP_DONE,), POWER_UP_TIMEOUT_S, self.note)
@@ -284,6 +293,7 @@ class BringUp:
         return str(up)
 
     def _check_versions(self) -> str:
+        """Read the versions of both cores; refuse another device, missing or wrong firmware, and a wrong board."""
         facts = self._board.facts
         for core, question in (("RF", c.GET_RF_VERSION), ("main", c.GET_MAIN_VERSION)):
             answer = self._board.ask(question, 16)
@@ -320,6 +330,7 @@ class BringUp:
         return "acknowledged"
 
     def _calibrate_rf(self) -> str:
+        """Run the RF init, with restored calibration data if there is a file of it; otherwise save what it found."""
         die = ""
         saved = None
         restored = ""
@@ -358,6 +369,7 @@ class BringUp:
         return die
 
     def _read_die(self) -> str:
+        """Return the die id, "unknown" for old firmware. Raises DeviceError if it is not that of the rig file."""
         try:
             data = self._board.ask(c.GET_DIE_ID, 16)
         except DeviceError as error:
@@ -401,6 +413,7 @@ _NO_PATCH = describe_patch(0, 0, 0, 0)
 
 
 def _format_patch(version: bytes) -> str:
+    """Return the patch in the answer to a version request as text."""
     return describe_patch(version[10], version[11], version[15] >> 4, version[15] & 15)
 
 
@@ -462,7 +475,7 @@ class RadarBoard:
 
     @property
     def warnings(self) -> list[str]:
-        """Errors of the link that a retry corrected, since the last report."""
+        """Errors since the last report that did not end an operation."""
         return self.link.warnings[:]
 
     def configure(self, on_step: Callable[[Step, str], None] | None = None) -> None:
@@ -496,6 +509,7 @@ class RadarBoard:
                 raise up.add_ignored_errors(error) from None
 
     def _begin(self) -> BringUp:
+        """Forget what is known of the board and return a new bring-up."""
         self._state = State.OFF
         self.reason = ""
         self._frames = 0
@@ -659,6 +673,7 @@ class RadarBoard:
             self._log.append(line)
 
     def _on_event(self, event: e.Event) -> None:
+        """Log an event and change the state by it."""
         self.log_event(str(event))
         if event.fatal:
             self.fail(str(event))
@@ -669,6 +684,7 @@ class RadarBoard:
 
     @contextmanager
     def _fault_on_error(self) -> Iterator[None]:
+        """Enter `FAULT` if the block raises anything."""
         try:
             yield
         except BaseException as error:

@@ -1,8 +1,9 @@
 """Save the results of a board's RF init to a file and restore them at its next starts.
 
 Each power-up calibrates RX gains and filters slightly differently; restored values stay the same. There is one file for
-each die. Only the calibrations that TI recommends are restored; clocks and synthesizers calibrate at every start
-(ICD 70-74). Not run on hardware yet.
+each die (chip) and each set of settings. Only the calibrations that TI recommends are restored; clocks and synthesizers
+calibrate at every start. "ICD 70" is page 70 of the document that `messages` names. In this file `e` is the module
+`messages`. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.files import read_bounded
 
-# ICD 70
+# The calibration data is read and written in parts (ICD 70).
 PARTS = 3
 PART_BYTES = 224
-# ADC offset, both filters, RX gain, I/Q: recommended by TI (ICD 72)
+# Masks of calibrations. Restored: ADC offset, both filters, RX gain, I/Q, which TI recommends (ICD 72).
 RESTORED = 0x14E0
 # Calibrations of the RF init (ICD 63)
 ALL = 0x1FF0
@@ -159,7 +160,8 @@ def read_calibration(link: Link, name: str) -> bytes:
 def restore_calibration(link: Link, name: str, data: bytes, timeout_s: float, note: Callable[[e.Event], None]) -> str:
     """Send a board the calibration of an earlier start and exclude it from the next RF init; return a description.
 
-    Raises DeviceError if the board does not accept it.
+    `note` is called with every event until the board has taken it over, for at most `timeout_s`. Raises DeviceError if
+    the board does not accept it.
     """
     # The first two words select calibrations: of all that were saved only those that TI recommends.
     selected_data = struct.pack("<2I", RESTORED, RESTORED) + data[8:]

@@ -1,8 +1,8 @@
 """Commands of a radar's RF core and main core, their sequence for a board, and the limits of the AWR2243 on a rig file.
 
-Values are in SI-like units, encoded as sub-blocks (`messages`), reserved fields zero. Layouts, codes and limits: ICD at
-its printed page; the order follows ICD section 3 (docs/spec/mmwavelink.md). The commands for calibration data are in
-`calibration_data`. Not run on hardware yet.
+Values have the unit in their name, encoded as sub-blocks (`messages`), reserved fields zero. Layouts, codes and limits:
+"ICD 81" is the printed page 81 of the document that `messages` names; the order follows its section 3
+(docs/spec/mmwavelink.md). The commands for calibration data are in `calibration_data`. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 START_HZ_PER_CODE = 3.6e9 / 2**26
 # ICD 83: 48.279 kHz/us
 SLOPE_HZ_PER_S_PER_CODE = 3.6e9 * 900 / 2**26 * 1e6
+# Units in which the radar counts the times of a chirp, and of a frame.
 CHIRP_TICK_US = 0.01
 FRAME_TICK_US = 0.005
-# ICD 178
+# Actions of `FrameControl` (ICD 178).
 STOP_AT_FRAME_END = 0
 START = 1
 STOP_WHILE_WAITING = 4
-# ICD 92
+# What starts a frame (ICD 92).
 SOFTWARE_TRIGGER = 1
 HARDWARE_TRIGGER = 2
 IfMode = Literal["complex1x", "complex2x"]
@@ -71,7 +72,7 @@ def slope_code(slope_hz_per_s: float) -> int:
 
 
 def gain_code(rx_gain_db: int, rf_gain_target_db: int) -> int:
-    """Return the code of RX gain and RF gain target."""
+    """Return the code of RX gain and RF gain target (30, 33 or 36 dB). Raises ValueError for another target."""
     return rx_gain_db | (30, 33, 36).index(rf_gain_target_db) << 6
 
 
@@ -408,12 +409,15 @@ BAND_HZ = (0x5471C71B * START_HZ_PER_CODE, 0x5A000000 * START_HZ_PER_CODE)
 # Shortest time from the last chirp to the end of a frame (ICD 91), and from there to the next pulse (ICD 93).
 INTER_FRAME_US = 300.0
 AFTER_FRAME_US = 150.0
+# Least and largest period of frames; the radar counts it in 28 bits of 5 ns.
 FRAME_PERIOD_US = (MIN_PERIOD_US, 1.342e6)
+# Memory of the radar for the samples of one chirp.
 SAMPLE_MEMORY_BYTES = 16384
 # Uncertainty of one board's start against the pulse (ICD 92).
 TRIGGER_UNCERTAINTY_S = 5e-9
 # Share of the sample rate that the receiver passes.
 PASSBAND = 0.9
+# 266 MHz/us, for which the bandwidth of the synthesizer is set (`APLL_BANDWIDTH`).
 MAX_SLOPE_CODE = 5510
 # No radar has such values, and sums and products of a few of them are finite
 _LARGEST = 1e30
@@ -500,6 +504,7 @@ def _find_unusable_numbers(rig: Instrument) -> Iterator[Constraint]:
 
 
 def _list_timing_constraints(rig: Instrument, frames: int) -> Iterator[Constraint]:
+    """Yield the rules on frames, pulses and the chirps between them, for rows of `frames` frames."""
     burst = rig.burst
     period = frame_period_us(rig)
     chirp = chirp_us(rig)
@@ -527,6 +532,7 @@ def _list_timing_constraints(rig: Instrument, frames: int) -> Iterator[Constrain
 
 
 def _list_chirp_constraints(rig: Instrument) -> Iterator[Constraint]:
+    """Yield the rules on the chirp, its samples, filters and gains, which are the same on all boards."""
     c = rig.chirp
     end = inf
     if c.sample_rate_hz:
@@ -563,6 +569,7 @@ def _list_chirp_constraints(rig: Instrument) -> Iterator[Constraint]:
 
 
 def _list_constraints_of_board(rig: Instrument, board: Board) -> Iterator[Constraint]:
+    """Yield the rules on one board: its frequencies, its LDO bypass, and of a receiver the IF of the direct path."""
     c = rig.chirp
     of_board = f" of {board.name}"
     start = start_code(c.start_hz + board.start_offset_hz) * START_HZ_PER_CODE

@@ -95,11 +95,12 @@ class RadarControl(ABC):
         self.close()
 
 
-# Time between two queries of the boards.
+# Time between two queries of the boards (chosen).
 _POLL_S = 0.005
 # USB needs some time to find a chip again that was reset or replugged.
 _REOPEN_TIMEOUT_S = 5.0
 _REOPEN_INTERVAL_S = 0.25
+# What the state of a board means for a row; a board in another state is not armed.
 _STATES = {
     State.ARMED: RadarState.ARMED,
     State.RUNNING: RadarState.ARMED,
@@ -186,6 +187,7 @@ class _LostLink:
 
 
 def _make_folder(folder: Path) -> None:
+    """Make the folder of traces. Raises ConfigError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
@@ -198,7 +200,7 @@ def _make_folder(folder: Path) -> None:
 
 
 class NativeRadars(RadarControl):
-    """All boards of a rig, identified by the serial number of their USB chips.
+    """All boards of a rig, each opened at the place that the rig file has: serial number, USB path, or TCP address.
 
     Parameters
     ----------
@@ -271,6 +273,7 @@ class NativeRadars(RadarControl):
             names_by_die[die] = name
 
     def _open(self, name: str) -> WordLink:
+        """Open a board's link, with a trace if the rig file wants one. Raises DeviceError."""
         words = self._open_words(self._rig.radar.native[name].place)
         folder = self._rig.radar.trace_dir
         if not folder:
@@ -314,7 +317,7 @@ class NativeRadars(RadarControl):
         return [n for n, b in self._boards.items() if n in waiting or b.state is State.FAULT]
 
     def states(self) -> dict[str, BoardState]:
-        """Return the states by name, without boards that are not armed; a lost link is a fault."""
+        """Return the states by name, without boards that were not armed yet; a lost link is a fault."""
         states = {}
         for name, board in self._boards.items():
             state = board.poll()
@@ -343,7 +346,9 @@ class NativeRadars(RadarControl):
         self._boards = {}
 
 
+# What the servers of the published rig expect.
 LINE = b"Retrigger\n"
+# Time between two looks whether a line was acknowledged (chosen).
 _POLL_MS = 5
 _START_SERVER = (
     "start the control server of this board (beside mmWave Studio), or correct radar.servers in instrument.toml"
@@ -415,6 +420,7 @@ class LineServers(RadarControl):
         self._sockets.clear()
 
     def _connect(self, board: str) -> None:
+        """Connect to a board's server, in place of an earlier connection. Raises DeviceError."""
         old = self._sockets.pop(board, None)
         if old is not None:
             old.close()
@@ -458,6 +464,7 @@ class LineServers(RadarControl):
                 )
 
     def _unreachable_error(self, board: str, e: OSError) -> DeviceError:
+        """Return the error for a server that cannot be reached, with the likely cause."""
         if isinstance(e, ConnectionRefusedError):
             reason = ": connection refused"
             cause = "that machine is running, but no server listens"

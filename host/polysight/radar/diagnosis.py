@@ -25,6 +25,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError, PolysightError
 from polysight_shared.files import read_bounded
 
+# Picture for a board that does not start.
 JUMPERS = """\
     SOP2      SOP1      SOP0          of the AWR2243BOOST, for control over SPI
    [ o o ]   [ o o ]   [ o=o ]        o=o  jumper set      o o  open
@@ -95,6 +96,7 @@ def check_board(
 
 
 def _check_frame(board: RadarBoard, transmits: bool, on_row: Callable[[Row], None]) -> None:
+    """Run one frame of a configured board, then read back its settings; report both."""
     expected = "frame end, 1 frame"
     if transmits:
         expected += " (this board transmits)"
@@ -116,6 +118,7 @@ def _check_frame(board: RadarBoard, transmits: bool, on_row: Callable[[Row], Non
 
 
 def _describe_failure(step: Step | None, error: PolysightError) -> Row:
+    """Return the result of the step that failed; None: the failure is of no step."""
     if step is None:
         return Row("bring-up", False, "", error.what, f"{error.why}; {error.remedy}")
     picture = ""
@@ -136,9 +139,10 @@ def _judge_supplies(board: RadarBoard) -> Row:
 
 # Version of the file format of traces.
 TRACE_VERSION = 1
+# Names of the two lines in a trace.
 INTERRUPT = "HOST_INTR"
 RESET = "NRST"
-# Largest file that is read as a trace: a scan of some thousand rows takes less.
+# Largest file that is read as a trace (chosen).
 MAX_BYTES = 2**26
 # Latest time in a trace, about four months: a later one is no time of a run.
 _MAX_S = 1e7
@@ -167,6 +171,7 @@ class TracedWords:
         self._clock = clock
         self._began = clock.now()
         self._file = file.open("w", encoding="utf-8")
+        # The interrupt's level in the log; None before the first query.
         self._level: bool | None = None
         # Queries of the interrupt since the last line, all with the same level.
         self._looks = 0
@@ -213,6 +218,7 @@ class TracedWords:
 
     @contextmanager
     def _log_errors(self) -> Iterator[None]:
+        """Log a DeviceError of the block before it is raised."""
         try:
             yield
         except DeviceError as e:
@@ -220,10 +226,12 @@ class TracedWords:
             raise
 
     def _put(self, **what: object) -> None:
+        """Log one action with its time."""
         self._looks = 0
         self._write({"t": round(self._clock.now() - self._began, 6), **what})
 
     def _write(self, line: dict[str, object]) -> None:
+        """Write a line, unless the log has ended."""
         if self.ended:
             return
         try:
@@ -361,6 +369,7 @@ class ReplayedWords:
         return line
 
     def _raise_error(self) -> None:
+        """Raise the error that the next line has, if it has one."""
         if not self.done and self._lines[self._at].error is not None:
             line = self._step()
             raise DeviceError(line.error or "", "as in the trace", "see the error of the traced run")
@@ -379,7 +388,9 @@ class ReplayedWords:
         return line
 
     def _difference_error(self, now: str, then: str) -> DeviceError:
+        """Return the error for an action that is not that of the trace."""
         return DeviceError(
+            # Lines count from 1, and the first has the facts.
             f"line {self._at + 2} of the trace: the host does {now}, the trace has {then}",
             "another version of this program, another rig file or board, or another trace",
             "replay it with the rig file and the version of the traced run",

@@ -2,7 +2,7 @@
 
 An image goes to the device's RAM, which the next reset clears, or to the serial flash; decision 11 has the reasons
 (docs/decisions/0011-firmware-of-radars.md). The file format is that of public copies of TI's `xwr22xx_metaImage.bin`;
-TI documents only magic and CRC. Not run on hardware yet.
+TI documents only magic and CRC. "ICD 302" is page 302 of the document that `messages` names. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _HEADER_BYTES = 128
 _ROM_AT = 0x38
 _PATCH_AT = 0x48
 _VERSION_BYTES = 4
-# Offset of the ROM's version in the answer to a version request.
+# Offset of the ROM's version in the answer to a version request (ICD tables 5.66 and 5.157).
 _ROM_IN_ANSWER = 3
 _REMEDY = "copy xwr22xx_metaImage.bin from TI's mmWave DFP 2.2 again, and compare its size with TI's"
 
@@ -144,6 +144,7 @@ def _read_version(data: bytes, offset: int) -> tuple[int, ...]:
 
 
 def _name_family(generation: int) -> str:
+    """Return the device family with this major ROM version."""
     return FAMILIES.get(generation, "an unknown device")
 
 
@@ -232,6 +233,7 @@ def send_image(
 
 
 def _file_error(name: str, what: str, why: str) -> ConfigError:
+    """Return the error for a file that is not an image, or not one for an AWR2243."""
     return ConfigError(
         f"{name} is no firmware for an AWR2243: {what}; nothing was sent", why, _REMEDY, code=ErrorCode.FILE_FOREIGN
     )

@@ -1,8 +1,10 @@
 """mmWaveLink over 16-bit words: send commands with timeouts and retries, receive answers and events.
 
-Procedure: ICD section 3. After a timeout the same message is sent again with the retry flag, so that the device answers
-without executing it twice; after a NACK it is sent with a new sequence number. Every wait has a timeout, also with a
-device that sends events without end. Not run on hardware yet.
+Procedure: section 3 of the ICD, the document that `messages` names ("ICD 20": page 20). The host sends commands; the
+device raises the *host interrupt* line when it has a message: an answer, or an event. After a timeout the same message
+is sent again with the retry flag, so that the device answers without executing it twice; after a NACK (the device could
+not read it) it is sent with a new sequence number. Every wait has a timeout, also with a device that sends events
+without end. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -19,27 +21,31 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, ProtocolError
 from polysight_shared.findings import Finding
 
+# Timeout of one attempt, and the number of attempts (chosen).
 RESPONSE_TIMEOUT_S = 1.0
 ATTEMPTS = 3
 # Time from the interrupt to the first word (ICD 20).
 SETTLE_S = 30e-6
 # Time from the falling interrupt to the first word read, as in TI's port.
 DATA_DELAY_S = 1e-3
-# Time between two polls.
+# Time between two polls (chosen).
 _INTERVAL_S = 0.5e-3
+# Time in which the interrupt falls after the host is ready to read (chosen).
 _INTERRUPT_TIMEOUT_S = 0.1
-# Time in which a power-up event arrives after a refusal.
+# Time in which a power-up event arrives after a refusal (chosen).
 _RESTART_EVENT_S = 0.1
-# Messages that one poll reads.
+# Messages that one poll reads, and its duration, at most (chosen): a device may send without end.
 MAX_MESSAGES = 64
 MAX_POLL_S = 0.25
 _MAX_WARNINGS = 100
+# Bytes in which the sync word is searched after the first four: the rest of a longest message.
 _SYNC_SEARCH_BYTES = 252
-# Bytes that are read after an invalid header, to resynchronise with the device.
+# Bytes that are read after an invalid header, to resynchronise with the device (docs/spec/mmwavelink.md).
 _FLUSH_BYTES = 244
 _REMEDY = "check the board's power, the 60-pin connector and the USB cable, then `polysight resume SCAN`"
 
 
+# Causes of a lost message, as errors name them.
 _SILENT = "the board has no power, hangs, or its interrupt line is not connected"
 _NOT_CLOCKED = "the board gets no SPI clock or chip select, or its interrupt line is stuck"
 _NO_MISO = "the board's data line (MISO) is not connected, or SPI is disturbed"
@@ -81,7 +87,7 @@ class Link:
     may_start
         True if a power-up event is expected; an unexpected one raises UnexpectedRestartError.
     warnings
-        Errors that a retry corrected, at most 100.
+        Errors that did not end an operation, as most that a retry corrected; at most 100.
     """
 
     def __init__(self, name: str, words: WordLink, clock: Clock, on_sent: Callable[[bytes], None]) -> None:
@@ -159,7 +165,7 @@ class Link:
     def wait_for(
         self, ids: Sequence[int], timeout_s: float, on_event: Callable[[messages.Event], None]
     ) -> messages.Event:
-        """Wait for the first of these events; call `on_event` with every event until then.
+        """Wait for the first of these events and return it; call `on_event` with it and every other event that came.
 
         Raises NotReportedError after the timeout, DeviceError if the link is lost.
         """
@@ -285,10 +291,12 @@ class Link:
                 self.may_start = False
 
     def _write(self, raw: bytes) -> None:
+        """Send bytes, as 16-bit words with the first byte low; their number is even."""
         self._on_sent(raw)
         self._words.write(struct.unpack(f"<{len(raw) // 2}H", raw))
 
     def _read(self, size: int) -> bytes:
+        """Read `size` bytes; the second half of a last word is dropped."""
         words = self._words.read((size + 1) // 2)
         return struct.pack(f"<{len(words)}H", *words)[:size]
 
@@ -299,7 +307,7 @@ class Link:
 
 
 def _make_problem(what: str, why: str) -> Finding:
-    """Return the reason why a message was lost or unreadable."""
+    """Return the reason why a message was lost or unreadable: problem and likely cause."""
     return Finding("warning", what, why)
 
 

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 from polysight_shared.errors import ProtocolError
 
+# First bytes of a message from the host, and from the device.
 HOST_SYNC = bytes.fromhex("34122143")
 DEVICE_SYNC = bytes.fromhex("badccdab")
 # "CNYS": written by the host when the interrupt is high
@@ -30,18 +31,23 @@ MESSAGE_LIMIT = 256
 # Bytes of one sub-block: the chunk size that TI recommends over SPI (ICD 20).
 BODY_LIMIT = 232
 BLOCKS_PER_MESSAGE_ID = 32
+# Message and sub-block of a refusal (ICD 4.4, table 5.1).
 ERROR_MESSAGE = 0
 ERROR_BLOCK = 0x0000
+# Opcode (direction, type, message id), length, flags, remaining chunks, number of sub-blocks, checksum.
 _HEADER = struct.Struct("<6H")
+# Number and length of a sub-block; also error number and sub-block of a refusal.
 _BLOCK = struct.Struct("<2H")
 _PAD = b"\xff"
 # Bits of the header's flags.
 _RETRY = 0x0003
 _NO_CRC = 0x0300
 _CRC32 = 0x0400
+# Cause and remedy of a message that cannot be decoded.
 _WHY = "noise on the SPI lines, or a device out of step"
 _DO = "retried automatically; check the 60-pin connector and the USB cable if it happens again"
 
+# Sub-block numbers of events; 0x10.. are those of the RF core, 0x50.. those of the main core.
 RF_CPU_FAULT = 0x1002
 RF_ESM_FAULT = 0x1003
 RF_INIT_DONE = 0x1004
@@ -58,7 +64,7 @@ BOOT_STATUS = 0x5005
 RF_ERROR = 0x5008
 
 
-# Events of a start without a reset: the board has lost its settings.
+# Events of a start: if none is expected, the board has started by itself and lost its settings.
 RESTARTED = frozenset({MAIN_POWER_UP})
 
 
@@ -125,13 +131,16 @@ class Message:
 
 @dataclass(frozen=True)
 class Header:
-    """A valid header."""
+    """A header whose checksum is right."""
 
     direction: int
     kind: Kind
     message_id: int
+    # Bytes of header, body and CRC.
     length: int
+    # Sequence number, length of the CRC, retry.
     flags: int
+    # Messages that follow with the rest of the content.
     remaining_chunks: int
     block_count: int
 
@@ -275,6 +284,7 @@ def crc(data: bytes, size: int) -> bytes:
 
 
 def _split_blocks(body: bytes, count: int) -> tuple[SubBlock, ...]:
+    """Return the sub-blocks of a body, which may end with up to three bytes of padding. Raises ProtocolError."""
     blocks = []
     start = 0
     for _ in range(count):
@@ -328,7 +338,7 @@ def list_failed_calibrations(event: Event, transmits: bool, run: int) -> list[st
     return [calibration.name for calibration in failed if transmits or not calibration.of_transmitter]
 
 
-# ICD 212, 317
+# Texts by the number in an event, from 0. ICD 212, 317
 _CPU_FAULTS = (
     "undefined instruction",
     "instruction fetch abort",
@@ -438,6 +448,7 @@ REFUSALS = {
     1013: "data rate and clock edges do not go together",
     1023: "words per chirp outside 64..8192",
 }
+# What is read from the data of an event: description, True if it is fatal, and numbers for the manifest.
 _Read = tuple[str, bool, Mapping[str, object]]
 
 
@@ -488,11 +499,13 @@ def decode_event(block: SubBlock) -> Event:
 
 
 def _read_nothing(data: bytes) -> _Read:
+    """Read an event that is its own message."""
     del data
     return "", False, {}
 
 
 def _format_word(words: Mapping[int, str] | tuple[str, ...], number: int, kind: str = "code") -> str:
+    """Return the text of a number, `code 9` if it has none; `kind` stands before such a number."""
     try:
         return words[number]
     except (KeyError, IndexError):
@@ -500,10 +513,13 @@ def _format_word(words: Mapping[int, str] | tuple[str, ...], number: int, kind: 
 
 
 def _name_bits(names: Mapping[int, str], mask: int, kind: str = "code") -> str:
+    """Join the texts of the bits that are set in a mask, each text once."""
     return ", ".join(dict.fromkeys(_format_word(names, b, kind) for b in range(mask.bit_length()) if mask >> b & 1))
 
 
 def _read_cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
+    """Return the reader of a core's fault; `codes` are the texts of its firmware's fatal errors."""
+
     def read(data: bytes) -> _Read:
         kind, code, line = struct.unpack_from("<BBH", data)
         if kind == 0xFF:
@@ -517,6 +533,8 @@ def _read_cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
 
 
 def _read_esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
+    """Return the reader of a core's error signals (error signalling module); all of group 2 are fatal."""
+
     def read(data: bytes) -> _Read:
         group1, group2 = struct.unpack_from("<II", data)
         fatal = bool(group2 or group1 & fatal_in_group1)
@@ -526,6 +544,7 @@ def _read_esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
 
 
 def _read_init_done(data: bytes) -> _Read:
+    """Read the event of the RF init: calibrations that passed, by bit of `INIT_BITS`, and the temperature."""
     status, updated, temperature, _, stamp = struct.unpack_from("<IIhHI", data)
     failed = sum(1 << b for b in INIT_BITS if not status >> b & 1)
     values = {"passed": status, "updated": updated, "temperature_c": temperature, "device_ms": stamp}
@@ -536,6 +555,7 @@ def _read_init_done(data: bytes) -> _Read:
 
 
 def _read_analog(data: bytes) -> _Read:
+    """Read the supplies that failed."""
     kind, _, _, signals = struct.unpack_from("<BBHI", data)
     return _name_bits(_ANALOG, signals) or "no signal reported", bool(kind), {"signals": signals}
 
@@ -577,6 +597,7 @@ def _read_rf_power_up(data: bytes) -> _Read:
 
 
 def _read_rf_error(data: bytes) -> _Read:
+    """Read the main core's report of an RF core in trouble."""
     (flag,) = struct.unpack_from("<I", data)
     return _format_word(_RF_ERRORS, flag), flag in (1, 2, 4), {"flag": flag}
 

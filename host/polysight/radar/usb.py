@@ -28,12 +28,13 @@ _READ_TIMEOUT_S = 0.5
 _LATENCY_MS = 1
 _CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists the chips"
 
-# Channels over TCP.
+# Channels over TCP: a request has channel, W or R, and the number of bytes.
 SCHEME = "tcp://"
 _HEAD = struct.Struct("<ccH")
 _TIMEOUT_S = 30.0
 
-# Pins and MPSSE commands (FTDI AN_108). A direction has a 1 for each output.
+# Pins and MPSSE commands (FTDI AN_108). A direction has a 1 for each output. The other values are levels of the pins:
+# of channel A while a word is written, while one is read, and between words.
 # Channel A: clock, data out, chip select and PMIC reset are outputs.
 SPI_DIRECTION = 0b0100_1011
 SELECTED_WRITE = 0xC0
@@ -43,14 +44,17 @@ IDLE = 0xC8
 INTERRUPT_DIRECTION = 0b0101_1011
 INTERRUPT_IDLE = 0b0001_0011
 INTERRUPT_BIT = 5
+# Channel C: both resets are low when active.
 RESET_DIRECTION = 0b1111_1001
 RESET_PIN = 6
 WARM_RESET_PIN = 7
+# Channel D: the lines that select the mode in which the board starts.
 SENSE_DIRECTION = 0b1111_1111
 # Sense-on-power mode 4: D4 = 1, D3 = D2 = 0.
 FUNCTIONAL_MODE = 0b0001_0000
 # Directions of channels A to D, and True for bit-bang mode.
 _CHANNELS = ((SPI_DIRECTION, False), (INTERRUPT_DIRECTION, False), (RESET_DIRECTION, True), (SENSE_DIRECTION, True))
+# MPSSE commands: set or read pins, shift bytes, answer at once, and the settings of the clock.
 _PINS = 0x80
 _READ_PINS = 0x81
 _WRITE_BYTES = 0x11
@@ -168,7 +172,7 @@ def read_words(count: int) -> bytes:
 class UsbWords:
     """Word link through the four channels of a chip.
 
-    `slow`: one word in each USB transfer, every 0.1 ms, at 1 MHz.
+    `slow`: one word in each USB transfer, at least 0.1 ms apart, at 1 MHz.
     """
 
     def __init__(
@@ -213,6 +217,7 @@ class UsbWords:
         return words
 
     def _pause(self) -> None:
+        """Wait between two words of a slow link."""
         if self._slow:
             self._sleep(_SLOW_GAP_S)
 
@@ -300,6 +305,7 @@ class FtdiPort:
             self._library.tools.release_device(device)
 
 
+# Causes of an error of libusb by its number.
 _CAUSES = {
     errno.EBUSY: "another program uses this chip: mmWave Studio, or a second polysight; end it",
     errno.EACCES: "no permission: the udev rule for 0451:fd03 (docs/how-to/install.md)",
@@ -456,6 +462,7 @@ class _TcpPort:
             raise self._lost_error(e.strerror or str(e)) from None
 
     def _receive(self, size: int) -> bytes:
+        """Receive exactly `size` bytes. Raises DeviceError if the connection ends before."""
         data = b""
         try:
             while len(data) < size:

@@ -16,12 +16,14 @@ from polysight_shared.raster import Burst, Grid, Stage
 from polysight_shared.tables import Count, NonNegative, Positive, Section, decode, read_toml, require, to_builtins
 
 Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
+# Number of a line of the Pi's GPIO chip, as gpioinfo counts.
 GpioLine = Annotated[int, msgspec.Meta(ge=0, le=63)]
+# X, y, z.
 Vector = tuple[float, float, float]
 # Corners of the two high-pass filters that an AWR2243 has (docs/spec/mmwavelink.md).
 HPF_FIRST_KHZ = (175.0, 235.0, 350.0, 700.0)
 HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
-# The kernel debounces by ticks of 4 ms: this much later it has read the level.
+# The kernel debounces by ticks of 4 ms: this much after the debounce time it has certainly read the level.
 DEBOUNCE_TICKS_US = 5_000
 # 2000 x 2000: imaging holds some 200 bytes a pixel, and an image of 9999 x 9999 took all memory of a PC.
 MAX_PIXELS = 4_000_000
@@ -33,7 +35,7 @@ MAX_IMAGE_MM = 4_000.0
 PixelSize = Annotated[float, msgspec.Meta(ge=MIN_PIXEL_MM, le=MAX_PIXEL_MM)]
 # Silence after which a card sends a packet that is not full (docs/spec/dca1000.md, observed).
 CARD_TAIL_S = 2.0
-# GPIO lines of a Pi's header.
+# GPIO lines of a Pi's header that are MOSI and MISO of each SPI controller.
 _MOSI = {"/dev/spidev0": 10, "/dev/spidev1": 20}
 _MISO = {"/dev/spidev0": 9, "/dev/spidev1": 19}
 # Shortest and longest pulse by SPI, which is one bit: at 2 MHz and at 500 kHz.
@@ -41,17 +43,23 @@ SPI_WIDTH_US = (0.5, 2.0)
 
 
 class Chirp(Section, frozen=True):
-    """FMCW chirp and ADC window (AWR2243 profile)."""
+    """FMCW chirp and ADC window (AWR2243 profile). Times count from the start of the ramp."""
 
+    # Transmit frequency at the start of the ramp.
     start_hz: Positive
     slope_hz_per_s: Positive
+    # First ADC sample.
     adc_start_us: NonNegative
+    # ADC samples of a chirp.
     samples: Count
     sample_rate_hz: Positive
     ramp_end_us: Positive
+    # Intermediate frequencies that the ADC keeps: 0 to 0.9 sample rates, or both signs.
     if_mode: Literal["complex1x", "complex2x"] = "complex1x"
+    # Corners of the two high-pass filters of the receivers; 0 for none.
     hpf1_khz: float = 175.0
     hpf2_khz: float = 350.0
+    # Samples that are used, first and end: the published rig's chirp bends in its last 20 us.
     linear_samples: tuple[int, int] = (0, 192)
 
     def __post_init__(self) -> None:
@@ -92,29 +100,34 @@ class Chirp(Section, frozen=True):
 
 
 class Pi(Section, frozen=True):
-    """Raspberry Pi: lines, sockets, journal."""
+    """Raspberry Pi: lines, sockets, journal. SYNC_IN is the radars' input whose rising edges start frames."""
 
+    # Label or path of the GPIO chip.
     gpio_chip: str = "pinctrl-bcm2711"
+    # Trigger of the stage, rising edge.
     trigger_in: GpioLine = 26
+    # SYNC_IN: one line; more only in old files.
     sync_out: tuple[GpioLine, ...] = (22,)
-    # "lines", "gpiomem": of old files, never opened
+    # "fanout": libgpiod sets one line. "spi": MOSI of the SPI controller. "lines", "gpiomem": of old files, not opened.
     wiring: Literal["fanout", "lines", "gpiomem", "spi"] = "fanout"
-    # A hardware one-shot sets the width of the pulses instead of the GPIO line
+    # A hardware one-shot sets the width of the pulses instead of the GPIO line.
     one_shot: bool = False
-    # Return wire of SYNC_IN, MISO with "spi"; None: pulses are sent, not seen
+    # Return wire of SYNC_IN, MISO with "spi"; None: pulses are sent, not seen.
     pulses_in: GpioLine | None = None
     command_address: str = "tcp://127.0.0.1:5601"
     event_address: str = "tcp://127.0.0.1:5602"
     journal_dir: str = "journal"
-    # A relative path counts from the rig file's folder
+    # A relative path counts from the rig file's folder.
     key_dir: str = "keys"
+    # Period of the Pi's heartbeat.
     heartbeat_ms: Count = 500
     trigger_bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
+    # Debouncing of the trigger by the kernel; 0: none.
     trigger_debounce_us: Annotated[int, msgspec.Meta(ge=0)] = 0
     # Not used; old rig files have it.
     gpiomem: str = "/dev/gpiomem"
     spi_device: str = "/dev/spidev0.0"
-    # Period of the host's heartbeat; 0: none
+    # Period of the host's heartbeat; 0: none.
     host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100
 
     def __post_init__(self) -> None:
@@ -153,9 +166,11 @@ class Pi(Section, frozen=True):
 
 
 class MountStep(Section, frozen=True):
-    """One step of a mount: a shift, or a rotation about an axis of the rig."""
+    """One step of a mount, which leads from a board's frame to the rig's: a shift, or a right-handed rotation."""
 
+    # Vector that is added; None for a rotation.
     shift_mm: Vector | None = None
+    # Angle and axis; None for a shift.
     turn_deg: float | None = None
     about: Literal["x", "y", "z"] | None = None
 
@@ -176,23 +191,34 @@ class Antennas(Section, frozen=True):
 class Board(Section, frozen=True):
     """One radar board and its capture card."""
 
+    # Name of the board's folder in a scan.
     name: str
+    # H is the s-polarised wave, V the p-polarised one.
     role: Literal["transmit", "receive_h", "receive_v"]
+    # IP addresses of the card, and of the host's interface to it.
     card_address: str
     host_address: str
+    # UDP ports, the same on card and host: commands with their replies, and samples.
     command_port: Port
     data_port: Port
+    # From the board's frame (RX1 is zero) to the rig's, in order.
     mount: tuple[MountStep, ...]
+    # False: its samples are not stored.
     record: bool = True
+    # Index in `antennas.tx_mm`, of the transmitting board.
     tx_antenna: Annotated[int, msgspec.Meta(ge=0)] = 1
+    # Deviation of its chirp's start from `chirp.start_hz`.
     start_offset_hz: float = 0.0
 
 
 class Card(Section, frozen=True):
     """DCA1000 settings common to all boards."""
 
+    # UDP payload of a full packet, with the card's headers.
     packet_bytes: Annotated[int, msgspec.Meta(ge=24, le=1470)] = 1470
+    # Pause of the card between two packets.
     packet_delay_us: NonNegative = 25.0
+    # Buffer that the host requests for each card's socket.
     receive_buffer_bytes: Count = 8 << 20
 
     @property
@@ -262,6 +288,7 @@ class Radar(Section, frozen=True):
 class Geometry(Section, frozen=True):
     """Position of the object plane."""
 
+    # Z of the plane in the rig frame, whose origin is midway between the origins of TX and H.
     object_distance_mm: Positive
 
 
@@ -271,6 +298,7 @@ class Image(Section, frozen=True):
     columns: Count = 150
     rows: Count = 150
     pixel_mm: PixelSize = 2.0
+    # Window over the aperture.
     apodisation: Literal["none", "kaiser", "taylor"] = "kaiser"
 
     def __post_init__(self) -> None:
@@ -296,8 +324,9 @@ class Polarimetry(Section, frozen=True):
     leakage_h: tuple[float, float] = (0.0, 0.0)
     leakage_v: tuple[float, float] = (0.0, 0.0)
     leakage_std: NonNegative | None = None
-    # rms magnitude of unmeasured leakage of any phase; 0.058 is the rms of amplitudes distributed uniformly up to 0.1
+    # Rms magnitude of unmeasured leakage of any phase; 0.058 is the rms of amplitudes distributed uniformly up to 0.1.
     leakage_prior: NonNegative = 0.058
+    # Standard deviation of the filter, pixels.
     smooth_px: NonNegative = 1.5
 
 
@@ -326,11 +355,15 @@ class CheckPlate(Section, frozen=True):
 class Limits(Section, frozen=True):
     """Limits of a scan: retakes, timeouts, disk space, queue of rows."""
 
+    # Further attempts at a row with faults.
     row_retakes: Annotated[int, msgspec.Meta(ge=0)] = 2
+    # Longest wait for a reply of Pi or card.
     command_timeout_s: Positive = 5.0
+    # Silence of a card after which its record of a row counts as ended.
     end_of_record_s: Positive = 3.0
+    # Space that stays free on the disk of the scans.
     free_disk_bytes: Annotated[int, msgspec.Meta(ge=0)] = 1 << 30
-    # Maximum number of rows that wait for processing while another is recorded
+    # Maximum number of rows that wait for processing while another is recorded.
     rows_waiting: Count = 8
 
 
@@ -379,7 +412,7 @@ class Instrument(Section, frozen=True):
             f'burst.width_us must be {low_us:g}..{high_us:g} us with wiring = "spi" (a bit of the controller)',
         )
         names = [b.name for b in self.boards]
-        # Folders of a scan are named after them
+        # Folders of a scan are named after them.
         for name in names:
             rule = "boards name must be 1..64 letters, digits, spaces, _ - or ., the first a letter, a digit or _"
             require(re.fullmatch(r"\w[\w .-]{0,63}", name) is not None, f"{rule}: {name!r}")

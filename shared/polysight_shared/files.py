@@ -15,7 +15,7 @@ from typing import IO, Any, BinaryIO
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError
 
-# A hundred times the manifest of a scan of ten thousand rows
+# A hundred times the manifest of a scan of ten thousand rows.
 MAX_JSON_BYTES = 256 << 20
 
 
@@ -98,20 +98,22 @@ def open_to_write(path: Path, mode: str = "wb", buffering: int = -1) -> IO[Any]:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file, or leave the present one as it is; see :func:`write_together`."""
+    """Write a file, or leave the present one as it is; raises as :func:`write_together`."""
     write_together({path: data})
 
 
 def write_together(files: Mapping[Path, bytes]) -> None:
-    """Write files that belong together: all of them, or none.
+    """Write files that belong together.
 
     Each is written beside its place and flushed to disk; then all are renamed, in their order. A program killed between
-    two renames leaves the last file as it was: it is the one that makes the others count.
+    two renames leaves the last file as it was: readers must take that one as the sign that the others are complete.
 
     Raises
     ------
     OSError
-        if one cannot be written; nothing has changed then.
+        if one cannot be written; nothing has changed then. If one cannot be renamed, those before it are replaced.
+    DeviceError
+        if a folder cannot be made durable; all files are replaced then.
     """
     parts: dict[Path, Path] = {}
     try:

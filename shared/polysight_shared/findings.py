@@ -29,7 +29,7 @@ class Finding(msgspec.Struct, frozen=True):
     code
         Kind of fault, for programs.
     weight
-        Findings of one level are listed by falling weight.
+        Importance among findings of one level, which are listed by falling weight.
     facts
         Numbers behind it, for programs.
     """

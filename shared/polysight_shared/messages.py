@@ -17,7 +17,7 @@ from polysight_shared.errors import ProtocolError, VersionError
 from polysight_shared.raster import RasterPlan, Row
 
 WIRE_VERSION = "1.0"
-# Limits of `Pulse`; the reply arrives well before the timeout of a command.
+# Limits of `Pulse`: number of pulses, and duration, so that the reply arrives well before the timeout of a command.
 MAX_PULSES_AT_REST = 256
 MAX_PULSES_AT_REST_S = 2.0
 # The Pi closes the connection after a longer command.
@@ -27,8 +27,9 @@ MAX_HEARTBEAT_MS = 10_000
 # Limits of `Jog`: a person who watches the stage presses again.
 MAX_JOG_MM = 100.0
 MAX_JOG_S = 60.0
-# Every field has a finite and bounded type; others are refused. `Number` is a fault number, `Owner`
-# the secret of a host, `Place` a coordinate in mm.
+# Types of the fields: all are finite and bounded, other values are refused. `Index` counts rows, `Take` the attempts at
+# a row, `Seq` the events of a scan. `Number` is a fault number (faults.py), `Owner` the secret of a host, `Micros` a
+# time in microseconds, `Speed` in mm/s, `Place` a coordinate or distance in mm.
 Natural = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Seq = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 Index = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
@@ -69,6 +70,8 @@ _KEYS_ON_THE_WIRE = {"problem": "what", "cause": "why", "lost_events": "lost"}
 
 
 class _Message(msgspec.Struct, frozen=True, tag_field="type", tag=True, kw_only=True):
+    """Base class of all messages; `type` on the wire is the name of the class."""
+
     version: Name = WIRE_VERSION
 
 
@@ -76,10 +79,11 @@ class _Message(msgspec.Struct, frozen=True, tag_field="type", tag=True, kw_only=
 
 
 class Event(_Message, frozen=True, kw_only=True):
-    """Fields of every event.
+    """Fields of every event; `t_mono_ns` is its time on the Pi's monotonic clock.
 
-    `seq` counts the journalled events of one `scan_id` from 1 without gaps. Heartbeats and stage status are not
-    journalled: they have the `seq` of the last journalled event, so that a subscriber detects a lost last event.
+    `seq` counts the journalled events of one `scan_id` from 1, without gaps unless a journal was lost (`lost_events` of
+    `RunStarted`). Heartbeats and stage status are not journalled: they have the `seq` of the last journalled event, so
+    that a subscriber detects a lost last event.
     """
 
     scan_id: ScanIdOrNone
@@ -112,7 +116,8 @@ class RowStarted(Event, frozen=True, kw_only=True):
 class RowFinished(Event, frozen=True, kw_only=True):
     """A row ended. `points` is the stage's count; `edges`, `bursts` and `pulses` are those of the Pi.
 
-    `pulses_seen`: as in `Capture`.
+    `fault` and `reason`: 0 and "" if `status` is `done` (a row that was held has a reason). `timed_by`: source of the
+    pulses' widths and periods. `pulses_seen`: as in `Capture`.
     """
 
     row_index: Index
@@ -129,8 +134,9 @@ class RowFinished(Event, frozen=True, kw_only=True):
 
 
 class Capture(Event, frozen=True, kw_only=True):
-    """One trigger edge and its burst. Times are the Pi's monotonic clock.
+    """One trigger edge and its burst. Times are on the Pi's monotonic clock.
 
+    `point` counts from 0 in the order of the row, `column` from 0 at the smallest x.
     `width_max_ns` is an upper bound of the pulse widths, `jitter_ns` the largest deviation of a rising edge from its
     scheduled time. `pulses_seen`: `pulses` were counted at the connector; False: they were sent, not seen.
     """
@@ -149,7 +155,10 @@ class Capture(Event, frozen=True, kw_only=True):
 
 
 class StageStatus(Event, frozen=True, kw_only=True):
-    """Position of the stage, stage coordinates. Not journalled."""
+    """State and position of the stage, stage coordinates. Not journalled.
+
+    `points`: points of the row that the stage has passed; `alarm`: number of its latched alarm, 0 for none.
+    """
 
     state: Name
     x_mm: Place
@@ -205,6 +214,7 @@ class Hello(Command, frozen=True, kw_only=True):
 class BeginRun(Command, frozen=True, kw_only=True):
     """Start a run, or resume the run with this id after a restart of either side.
 
+    `pulses`, `period_us` and `width_us` are the burst of each position, `speed_mm_s` the speed of the stage in a row.
     `last_seq` is the run's last event that the host has; the Pi continues the sequence after it, even if its journal
     was lost. `heartbeat_ms`: period of the host's `Alive` messages; 0: none. `owner`: a secret chosen by the host,
     required in all commands of this run. `owns_home`: `Home` requires it, too; False from old hosts, whose `Home` has
@@ -233,7 +243,7 @@ class EndRun(Command, frozen=True, kw_only=True):
 
 
 class Alive(Command, frozen=True, kw_only=True):
-    """Heartbeat of the host. A row or a jog ends with fault 108 if four heartbeats in a row are missing.
+    """Heartbeat of the host. A row, a homing or a jog ends with fault 108 if four consecutive heartbeats are missing.
 
     `scan_id` is "" for a jog outside of a run.
     """
@@ -243,7 +253,7 @@ class Alive(Command, frozen=True, kw_only=True):
 
 
 class Home(Command, frozen=True, kw_only=True):
-    """Home the stage. Accepted at once; the state is `homing`, then `ready`.
+    """Home the stage. Accepted at once; the state is `homing`, then `ready` in a run and `homed` outside of one.
 
     `owner`: the owner of the current run, if there is one and its host is alive.
     """
@@ -277,7 +287,7 @@ class RunRow(Command, frozen=True, kw_only=True):
 
 
 class Hold(Command, frozen=True, kw_only=True):
-    """Decelerate and wait."""
+    """Decelerate within the row and wait."""
 
     owner: Owner = ""
 
@@ -289,7 +299,7 @@ class Resume(Command, frozen=True, kw_only=True):
 
 
 class Abort(Command, frozen=True, kw_only=True):
-    """Stop the row at once. RowFinished with status `aborted` follows if a row was running."""
+    """Stop the row, jog or homing at once. RowFinished or Jogged with status `aborted` follows for a row or a jog."""
 
     reason: Text = ""
     owner: Owner = ""
@@ -321,7 +331,12 @@ AnyCommand = Hello | BeginRun | EndRun | Alive | Home | Jog | RunRow | Hold | Re
 
 
 class HelloReply(_Message, frozen=True, kw_only=True):
-    """Identity and state of the Pi. Older releases send 0 for `t_unix_ns` and {} for `stage` (`placement_settings`)."""
+    """Identity and state of the Pi.
+
+    `backend` is what makes the pulses (GPIOD, SPI or WIRES), `last_seq` the newest event of `scan_id`, `in_run` True
+    while a run is active. `t_unix_ns`: the Pi's clock; `stage`: `Stage.placement_settings`; older releases send 0 and
+    {}.
+    """
 
     pi_release: Name
     firmware: Name
@@ -351,6 +366,9 @@ class Refused(_Message, frozen=True, kw_only=True, rename=_KEYS_ON_THE_WIRE):
 
 class StatusReply(_Message, frozen=True, kw_only=True):
     """Status of the Pi. `row_index` is -1 if no row is running.
+
+    `points` and `pulses` are bursts and pulses that were sent in the running row. `fault` and `reason` are the first
+    fault since the last homing, row or jog began; 0 and "" if there was none.
 
     `lost_x_mm`, `lost_y_mm`: position error found by the last homing at the switches, since the homing before it.
     """
@@ -403,6 +421,10 @@ def pack(message: AnyEvent | AnyCommand | AnyReply) -> bytes:
 
 
 def _unpack(raw: bytes, kind: Any, what: str) -> Any:
+    """Decode a message of the union `kind`; `what` names it in errors.
+
+    Raises VersionError for another major version, ProtocolError for anything else that is wrong.
+    """
     try:
         node = msgpack.unpackb(raw, raw=False, strict_map_key=True)
     except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as e:
@@ -435,7 +457,7 @@ def unpack_event(raw: bytes) -> AnyEvent:
 
 
 def pack_with_crc(event: AnyEvent) -> bytes:
-    """Pack an event for a file: its map with a last key `crc`, the CRC-32 of the map without it."""
+    """Pack an event for a file: its map with a last key `crc`, the CRC-32 of the packed map without it."""
     raw = pack(event)
     return msgpack.packb({**msgpack.unpackb(raw), "crc": zlib.crc32(raw)}) or b""
 

@@ -11,11 +11,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-# An interrupted command looks again after this time whether a module is still loading.
+# After this time an interrupted command checks again whether a module is still loading (chosen).
 _RETRY_S = 0.02
 # <linux/prctl.h>
 _PR_SET_PDEATHSIG = 1
-# SIGALRM: the next look of an interrupted command.
+# SIGALRM: the next check of an interrupted command (`_interrupt`).
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
 
 
@@ -50,7 +50,7 @@ def die_with_parent(sig: signal.Signals = signal.SIGTERM) -> None:
 
     parent = os.getppid()
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, int(sig), 0, 0, 0)
-    # The parent ended before the request was made
+    # The parent ended before the request was made.
     if os.getppid() != parent:
         os.kill(os.getpid(), sig)
 
@@ -83,6 +83,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _is_importing(frame: FrameType | None) -> bool:
+    """True if this frame or one of its callers is in Python's import system."""
     while frame is not None:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
             return True

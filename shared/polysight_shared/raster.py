@@ -20,10 +20,13 @@ FIRST_PULSE_DELAY_S = 200e-6
 """Fixed delay from a trigger edge to its first SYNC_IN pulse, longer than the usual wake-up time of the Pi."""
 # Shortest period between rising edges: a shorter one causes a fatal fault of the RF core.
 MIN_PERIOD_US = 300.0
+# Shortest and longest SYNC_IN pulse.
 WIDTH_US = (0.025, 4.0)
 WIDTH_TEXT = f"{WIDTH_US[0]:g}..{WIDTH_US[1]:g} us"
 MIN_PERIOD_NS = us_to_ns(MIN_PERIOD_US)
 MIN_WIDTH_NS, MAX_WIDTH_NS = map(us_to_ns, WIDTH_US)
+# Types of fields. `_Points` counts columns or rows, `_Motion` is a speed, an acceleration or a number of steps per mm,
+# `_Steps` an index or number of rows or points, `_Offset` a coordinate or signed distance in mm.
 _Points = Annotated[int, msgspec.Meta(ge=1, lt=100_000)]
 _Motion = Annotated[float, msgspec.Meta(ge=0.001, le=1e6)]
 _Steps = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
@@ -32,6 +35,7 @@ _Offset = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 INVERTIBLE = ("x_dir", "left_dir", "right_dir", "enable", "pul", "switches", "emergency_stop")
 """Pins of the stage whose level `stage.inverted` inverts against arduino_stage/board.h."""
 _Invertible = Literal["x_dir", "left_dir", "right_dir", "enable", "pul", "switches", "emergency_stop"]
+# Fields of `Stage.placement_settings`.
 _PLACEMENT_KEYS = ("steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2")
 
 
@@ -86,7 +90,7 @@ class Burst(Section, frozen=True):
 
 
 class Grid(Section, frozen=True):
-    """Serpentine raster of stage positions."""
+    """Serpentine raster of stage positions: even rows run towards +x, odd rows towards -x."""
 
     columns: _Points
     rows: _Points
@@ -95,7 +99,13 @@ class Grid(Section, frozen=True):
 
 
 class Stage(Section, frozen=True):
-    """Motion stage and its serial link."""
+    """Motion stage and its serial link.
+
+    Stage coordinates are zero where homing ends and reach to `travel_x_mm`, `travel_y_mm`; `centre_x_mm`, `centre_y_mm`
+    are those of the middle of the grid. `speed_mm_s` is the speed in a row, `travel_speed_mm_s` that between rows.
+    `heartbeat_ms`: silence of the Pi after which a moving stage stops. `backlash_mm`: play of the drive, which is taken
+    up before the first point of a row.
+    """
 
     port: str
     baud: Count = 115200
@@ -112,7 +122,7 @@ class Stage(Section, frozen=True):
     backlash_mm: NonNegative = 0.0
     # Home after the last row to measure lost steps; needs limit switches.
     home_after_scan: bool = False
-    # Pins with the other level than in board.h, sent before the first motion
+    # Pins with the other level than in board.h, sent before the first motion.
     inverted: tuple[_Invertible, ...] = ()
 
     def __post_init__(self) -> None:
@@ -125,9 +135,10 @@ class Stage(Section, frozen=True):
         return {key: float(getattr(self, key)) for key in _PLACEMENT_KEYS}
 
     def run_up_mm(self, step_mm: float, speed_mm_s: float | None = None) -> float:
-        """Return the distance from rest to a row's first point: v^2 / 2a, plus a step or the backlash.
+        """Return the distance from rest to a row's first point: v^2 / 2a, plus a step or the backlash if that is more.
 
-        `speed_mm_s`: speed of the row; default: the stage's. See docs/spec/stage-line.md, "A row".
+        `step_mm`: distance of two points; `speed_mm_s`: speed of the row, default the stage's. See
+        docs/spec/stage-line.md, "A row".
         """
         speed = speed_mm_s or self.speed_mm_s
         return speed**2 / (2 * self.accel_mm_s2) + max(step_mm, self.backlash_mm)
@@ -223,7 +234,7 @@ def burst_middle_s(burst: Burst) -> float:
 
 
 def check_burst_fits(grid: Grid | RasterPlan, burst: Burst, stage: Stage) -> None:
-    """Raise ConfigError if a burst does not end before the next trigger point."""
+    """Raise ConfigError if a burst, with a whole period after its last pulse, does not end before the next point."""
     between_s = grid.step_x_mm / stage.speed_mm_s
     burst_s = burst.pulses * burst.period_us * 1e-6
     if burst_s > between_s:

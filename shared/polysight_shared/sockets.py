@@ -16,9 +16,13 @@ from polysight_shared.messages import MAX_COMMAND_BYTES
 Socket = zmq.Socket[bytes]
 HOST_KEYS = ("pi.key", "host.key_secret")
 """Key files that the host needs, made on the Pi. `pi.key_secret` never leaves the Pi."""
+# Key files that the Pi needs.
 PI_KEYS = ("pi.key_secret",)
+# First frame of every event; the second is the packed event.
 EVENT_TOPIC = b"event"
+# The Pi closes the connection of a subscriber after a longer message (chosen).
 MAX_SUBSCRIPTION_BYTES = 1024
+# A local network takes a command within this time, or there is no connection (chosen).
 SEND_TIMEOUT_MS = 200
 # A connection without a handshake is closed after this time.
 HANDSHAKE_TIMEOUT_MS = 5000
@@ -91,6 +95,10 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
 def _make(
     context: zmq.Context[Any], kind: int, address: str, key_dir: Path, bind: bool, options: dict[int, int | bytes]
 ) -> Socket:
+    """Create a socket of the ZeroMQ type `kind`, set its options and keys, and bind or connect it.
+
+    Raises ConfigError for a wrong address or without usable keys, DeviceError if it cannot be bound.
+    """
     host_name(address)
     socket: Socket = context.socket(kind)
     socket.setsockopt(zmq.LINGER, 0)
@@ -127,14 +135,19 @@ def make_server_context() -> zmq.Context[Socket]:
 
 
 def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """Create the Pi's PUB socket, bound. `context`: from `make_server_context`."""
+    """Create the Pi's PUB socket, bound. `context`: from `make_server_context`.
+
+    Its queue has 100,000 events for each subscriber (chosen: a scan of 70,000 positions fits); further ones are lost to
+    that subscriber, which then requests them (`Replay`).
+    """
     options: dict[int, int | bytes] = {zmq.SNDHWM: 100_000, zmq.MAXMSGSIZE: MAX_SUBSCRIPTION_BYTES}
     options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS, zmq.AFFINITY: EVENT_IO_THREAD}
     return _make(context, zmq.PUB, address, key_dir, bind=True, options=options)
 
 
 def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """Create the Pi's ROUTER socket, bound, for REQ sockets; a message over the limit closes its connection.
+    """Create the Pi's ROUTER socket, bound, for REQ sockets; a longer message than MAX_COMMAND_BYTES closes its
+    connection.
 
     `context`: from `make_server_context`.
     """

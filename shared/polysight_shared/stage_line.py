@@ -16,10 +16,14 @@ from polysight_shared.errors import ProtocolError
 # docs/spec/stage-line.md: the version that the greeting names, and the longest line with its end, bytes.
 PROTOCOL_VERSION = 2
 MAX_LINE_BYTES = 96
+# Largest number of a line; 0 follows.
 MAX_SEQUENCE = 65535
+# An upper bound of a time that is not known.
 END_OF_TIME_NS = 2**63 - 1
-# The Pi waits so long for the end of homing; programs that wait for the Pi need a longer timeout.
+# The Pi waits so long for the end of homing (chosen, the search in short legs over the longest travel takes minutes);
+# programs that wait for the Pi need a longer timeout.
 HOMING_TIMEOUT_S = 300.0
+# An integer, a command line and a field of a reply, without checksum.
 _VALUE = re.compile(r"-?[0-9]{1,10}")
 _COMMAND = re.compile(r"N([0-9]{1,5}) ([A-Z]+)((?: -?[0-9]{1,10})*)")
 _FIELD = re.compile(r"([a-z]+)=([-+.:A-Za-z0-9]+)")
@@ -50,7 +54,7 @@ class Parameter(IntEnum):
 
     # Acceleration, steps/s^2.
     ACCEL = 0
-    # Milliseconds of silence after which a moving stage stops
+    # Milliseconds of silence after which a moving stage stops.
     HEARTBEAT = 1
     # Width of the trigger pulse, microseconds.
     TRIGGER = 2
@@ -60,10 +64,10 @@ class Parameter(IntEnum):
     TRAVEL_Y = 4
     # Speed between rows, steps/s.
     TRAVEL_SPEED = 5
-    # Bits of the pins whose level is inverted, in the order of raster.INVERTIBLE
-    PINS = 7
-    # Steps; rows are approached from below, with at least this run-up; 0 = off
+    # Steps; rows are approached from below in y, with at least this run-up in x; 0 = off.
     BACKLASH = 6
+    # Bits of the pins whose level is inverted, in the order of raster.INVERTIBLE.
+    PINS = 7
 
 
 def crc16(body: bytes) -> int:
@@ -101,7 +105,7 @@ def unseal(line: bytes) -> str:
 
 
 class Command(msgspec.Struct, frozen=True):
-    """Command to the stage: `N<sequence> <VERB> [integers]`."""
+    """Command to the stage: `N<sequence> <VERB> [integers]`; docs/spec/stage-line.md lists verbs and arguments."""
 
     sequence: int
     verb: str
@@ -142,7 +146,8 @@ class Reply(msgspec.Struct, frozen=True):
     * `alarm`: latched fault `number`
     * `status`: answer to the STATUS byte; fields state, x, y, points, pulses, alarm, limits
 
-    The receiver notes that it was written after `asked_ns` and before `written_ns`.
+    x and y are motor steps in stage coordinates. `asked_ns` and `written_ns` are not sent: the receiver notes that the
+    reply was written between these times, on the clock of the trigger edges.
     """
 
     kind: str

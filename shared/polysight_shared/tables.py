@@ -16,6 +16,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, did_you_mean
 from polysight_shared.files import read_bounded
 
+# Chosen: far above any table written by hand.
 _MAX_BYTES = 64 << 20
 _RIG_KEYS = "instrument.toml in the repository explains every key"
 T = TypeVar("T")
@@ -121,7 +122,10 @@ def _suggest_key(key: str, kind: Any) -> str:
 
 
 def _collect_keys(kind: Any, table: str, tables_of_key: dict[str, set[str]]) -> None:
-    """Collect every key of a declaration with the tables that contain it."""
+    """Add every key of the declaration `kind` (msgspec's description of a type) to the tables that contain it.
+
+    `table` is the name of this table in TOML, such as `radar.native`; "" for the top. Only types of tables have fields.
+    """
     for field in getattr(kind, "fields", ()):
         tables_of_key.setdefault(field.name, set()).add(table)
         parts = [field.type, *getattr(field.type, "types", ()), *getattr(field.type, "item_types", ())]

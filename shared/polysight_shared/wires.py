@@ -1,7 +1,7 @@
 """Simulated wires: GPIO edges with timestamps between processes, over a local socket.
 
-A hub (`simulators.wires`) relays between its clients: the stage raises the trigger, the Pi sends SYNC_IN pulses, the
-radars listen. The protocol has ASCII lines:
+A hub (`polysight_simulators.wires`) relays between its clients: the stage raises the trigger, the Pi sends SYNC_IN
+pulses, the radars listen. The protocol has ASCII lines:
 
     `S <t_ns> <line> <0|1>`                 a line changed at wire time t_ns
     `M <t_ns> <x_um> <y_um> <vx_um_s>`      the stage is at (x, y) and moves at vx from now on (stage coordinates)
@@ -28,13 +28,16 @@ from polysight_shared.errors import DeviceError, ProtocolError
 class WireEdge(NamedTuple):
     """A line changed."""
 
+    # Wire time.
     t_ns: int
+    # Number of the GPIO line of the simulated Pi.
     line: int
+    # The new level: 0 or 1.
     value: int
 
 
 class WireMotion(NamedTuple):
-    """Position (um, stage coordinates) and x speed (um/s) of the stage from `t_ns` on."""
+    """Position (um, stage coordinates) and signed x speed (um/s) of the stage from the wire time `t_ns` on."""
 
     t_ns: int
     x_um: int
@@ -69,7 +72,8 @@ def parse(line: str) -> WireMessage:
 class WireClient:
     """Client of the hub at the Unix socket `path`, subscribed to the lines `listen` and, with `motion`, to M lines.
 
-    `join` joins two lines. Raises DeviceError if there is no hub within `timeout_s`.
+    `join` joins two lines: changes of the first are the second's, too. Raises DeviceError if there is no hub within
+    `timeout_s`, ProtocolError if it does not confirm.
     """
 
     def __init__(
@@ -97,7 +101,9 @@ class WireClient:
                         code=ErrorCode.NO_ANSWER,
                     ) from None
                 time.sleep(0.02)
+        # The beginning of a line whose end has not come yet.
         self._buffer = b""
+        # Lines that were received and not returned yet, the oldest last.
         self._pending: list[str] = []
         subscriptions = b""
         if listen:
@@ -130,6 +136,7 @@ class WireClient:
         return None if line is None else parse(line)
 
     def _read_line(self, timeout_s: float | None) -> str | None:
+        """Return the next line, or None after `timeout_s` (None: wait for ever). Raises DeviceError without a hub."""
         while not self._pending:
             # A timeout of 0 would make the socket non-blocking.
             self._socket.settimeout(timeout_s if timeout_s is None else max(timeout_s, 1e-6))
@@ -146,7 +153,6 @@ class WireClient:
                 raise DeviceError(f"simulated wires at {self._path} were closed", *_RIG_ENDED)
             lines = (self._buffer + data).split(b"\n")
             self._buffer = lines.pop()
-            # The oldest is last, where `pop` takes it.
             self._pending = [line.decode("ascii", "replace") for line in reversed(lines)]
         return self._pending.pop()
 

@@ -29,7 +29,7 @@ constexpr int32_t MAX_TRAVEL = 999999;  // steps; also bounds the length of a st
 
 // Step timer: a 16-bit counter at this rate, so that one step takes at most 65535 ticks.
 constexpr uint32_t TICK_HZ = 2000000UL;
-constexpr uint16_t MIN_RATE = 31;     // steps/s
+constexpr uint16_t MIN_RATE = 31;     // steps/s: a slower step would take more than 65535 ticks
 constexpr uint16_t MAX_RATE = 20000;  // steps/s: the step interrupt (hal_uno.cpp) must fit between two steps
 constexpr uint32_t MIN_ACCEL = 100, MAX_ACCEL = 1000000UL;  // steps/s^2
 constexpr int32_t MAX_BACKLASH = 20000;  // steps
@@ -39,7 +39,7 @@ constexpr uint16_t MAX_POINTS = 9999;
 // 100 us is read at most four times at MAX_RATE; a real switch closes for milliseconds.
 constexpr uint8_t LOOKS = 5;
 // An immediate byte counts as a heartbeat only after this much silence, so that continuous chatter never does.
-constexpr uint8_t QUIET_MS = 4;
+constexpr uint8_t QUIET_MS = 4;  // chosen: 46 bytes at BAUD
 
 // Homing: towards the switch, back until it opens, then PULL_OFF steps further, which is the zero.
 constexpr uint16_t HOME_RATE = 4000;   // steps/s
@@ -49,7 +49,7 @@ constexpr uint32_t HOME_ACCEL = 40000UL;  // steps/s^2, independent of SET ACCEL
 constexpr uint16_t FIRST_RATE = 2000;  // steps/s
 constexpr int32_t FIRST_LEG = 2000;    // steps
 constexpr uint16_t PULL_OFF = 400;     // steps from the switch's opening to the zero
-constexpr int32_t MAX_RELEASE = 4000;  // steps within which a pressed switch must open
+constexpr int32_t MAX_RELEASE = 4000;  // steps within which a pressed switch must open (20 mm, chosen)
 
 constexpr uint32_t BAUD = 115200UL;
 

@@ -14,12 +14,12 @@ Stage stage(motion);
 
 namespace {
 
-uint16_t trigger_ticks;
+uint16_t trigger_ticks;   // width of a trigger pulse
 uint8_t inverted;         // bits of Pin
 uint8_t inverted_inputs;  // the same for pressed(): bits of Input
 uint16_t due;  // of the next step, in ticks of timer 1
 static_assert(board::PIN_X_PUL < 8 && board::PIN_LEFT_PUL < 8 && board::PIN_RIGHT_PUL < 8, "PUL pins are on port D");
-constexpr uint16_t PULSE_TICKS = board::TICK_HZ / 1000000 * board::STEP_PULSE_US;
+constexpr uint16_t PULSE_TICKS = board::TICK_HZ / 1000000 * board::STEP_PULSE_US;  // width of a step pulse
 
 // Byte queue between an interrupt and the main program: one side puts, the other takes.
 class Ring {
@@ -46,7 +46,7 @@ class Ring {
 };
 
 Ring received, to_send;
-volatile bool overflowed;
+volatile bool overflowed;  // received bytes were lost because the ring was full
 
 // Direct port access: digitalWrite takes 4 us a pin. On the UNO, D0..D7 are port D, D8..D13 B, A0..A5 (14..19) C.
 template <uint8_t PIN>
@@ -117,6 +117,7 @@ bool uno_lost() {
   return lost;
 }
 
+// A byte has come. A damaged one becomes 0, which is in no line, so that its line is refused.
 ISR(USART_RX_vect) {
   const bool damaged = UCSR0A & (_BV(FE0) | _BV(DOR0));
   const uint8_t byte = UDR0;
@@ -124,6 +125,7 @@ ISR(USART_RX_vect) {
   if (!received.put(damaged ? 0 : byte)) overflowed = true;
 }
 
+// The transmitter takes the next byte.
 ISR(USART_UDRE_vect) {
   if (to_send.empty()) {
     UCSR0B &= (uint8_t)~_BV(UDRIE0);
@@ -132,6 +134,7 @@ ISR(USART_UDRE_vect) {
   }
 }
 
+// A step is due: step the motors, start the trigger pulse, set the time of the next step.
 // Measured worst case: 755 cycles from entry to reti (a ramp step of both axes; avr-gcc 5.4, emulated UNO), of the 800
 // between two steps at MAX_RATE. Steps that other interrupts delay are caught up.
 ISR(TIMER1_COMPA_vect) {
@@ -162,6 +165,7 @@ ISR(TIMER1_COMPA_vect) {
   PIND = pulses;
 }
 
+// The end of the trigger pulse.
 ISR(TIMER1_COMPB_vect) {
   write<board::PIN_TRIGGER>(false);
   TIMSK1 &= (uint8_t)~_BV(OCIE1B);
@@ -201,7 +205,7 @@ void hal_pins(uint8_t bits) {
 
 void hal_trigger_width(uint16_t us) {
   InterruptLock lock;
-  trigger_ticks = us < 4 ? 8 : us * 2;  // a shorter time might pass before the flag is cleared
+  trigger_ticks = us < 4 ? 8 : us * 2;  // at least 4 us: a shorter time might pass before the flag is cleared
 }
 
 uint8_t hal_room() { return to_send.room(); }

@@ -4,6 +4,7 @@
 
 namespace {
 
+// Largest integer whose square is at most n, bit by bit.
 uint16_t square_root(uint32_t n) {
   uint32_t root = 0;
   for (uint32_t bit = 1UL << 30; bit; bit >>= 2) {
@@ -56,6 +57,7 @@ uint32_t Motion::ramp_steps(uint16_t rate) const {
   return ((uint32_t)rate * rate + 2 * accel_ - 1) / (2 * accel_);
 }
 
+// The axis with more steps (major) steps each time; Bresenham's error tells when the other one (minor) steps with it.
 void Motion::start(const Leg& leg) {
   const uint32_t nx = magnitude(leg.dx), ny = magnitude(leg.dy);
   x_major_ = nx >= ny;

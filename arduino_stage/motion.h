@@ -11,8 +11,10 @@
 #include "hal.h"
 #include "stage_errors.h"
 
+// Pins to pulse in a step.
 enum Output : uint8_t { STEP_X = 1, STEP_Y = 2, TRIGGER = 4 };
 
+// A straight motion from rest to rest.
 struct Leg {
   int32_t dx, dy;   // steps
   uint16_t rate;    // steps/s of the axis with more steps
@@ -26,7 +28,9 @@ struct Leg {
 class Motion {
  public:
   Motion() { reset(); }
+  // At rest at (0, 0), no fault, default acceleration.
   void reset();
+  // Acceleration of the next legs; it also sets the speed with which the stage starts and stops.
   void set_accel(uint32_t steps_s2);
 
   // Steps from rest to `rate`, and from there to rest.
@@ -49,18 +53,20 @@ class Motion {
 
   // Slow down to a stop within the leg and wait for resume(). Safe in an interrupt.
   void hold() { hold_ = true; }
+  // Go on with the leg after a hold.
   void resume();
   // Drop the rest of the leg. Only at rest, or if the position no longer matters.
   void abandon();
 
   bool stepping() const { return seen(stepping_); }  // steps are due
-  bool holding() const { return seen(hold_); }
-  bool finished() const { return !seen(stepping_) && left_ == 0; }
+  bool holding() const { return seen(hold_); }       // hold() was called, resume() not yet
+  bool finished() const { return !seen(stepping_) && left_ == 0; }  // no leg, or it has ended
   bool reached() const { return seen(reached_); }  // ended by Leg::until
   StageError fault() const { return seen(fault_); }  // ended by a switch
   bool cruising() const { return seen(stepping_) && seen(cruise_); }  // at the leg's exact rate
   int32_t x_rate() const;                              // steps/s of x now, signed
 
+  // Position, steps.
   int32_t x() const;
   int32_t y() const;
   void set_x(int32_t x);
@@ -72,7 +78,7 @@ class Motion {
 
  private:
   void resume_leg();
-  void look(uint8_t inputs);
+  void look(uint8_t inputs);  // debounce one reading
 
   // Read a variable that the step interrupt writes, from memory. More than a byte needs a lock.
   template <class T>
@@ -81,20 +87,22 @@ class Motion {
   }
 
   // Used by the step interrupt while stepping_, else by the main program. The AVR accesses the first ones fastest.
-  uint8_t stable_, looks_;
-  uint32_t left_;  // steps
+  uint8_t stable_, looks_;  // the debounced switches; readings that differ from them in a row
+  uint32_t left_;  // steps to the end of the leg
   uint32_t ramp_;  // steps to a stop from the present speed
   uint32_t speed_q16_, accel_q20_;  // steps/s x 2^16; steps/s per tick x 2^20
-  uint16_t ticks_, rate_, base_, remainder_, carry_;  // at constant speed: base_ + carried remainder_ / rate_
+  // Ticks of the current step and the leg's rate. At constant speed a step has base_ ticks, and one more each time that
+  // the carried remainder_ / rate_ amounts to one.
+  uint16_t ticks_, rate_, base_, remainder_, carry_;
   uint16_t points_left_;
-  uint32_t ramp_full_, to_trigger_, pitch_;
-  uint32_t major_, minor_, error_;  // Bresenham: steps of the two axes
+  uint32_t ramp_full_, to_trigger_, pitch_;  // steps of the whole ramp, to the next trigger, from trigger to trigger
+  uint32_t major_, minor_, error_;  // Bresenham: steps of the axis with more and of the one with fewer, and the error
   int32_t x_, y_;
-  uint16_t passed_, pulses_, slowest_;
-  int8_t x_direction_, y_direction_;
+  uint16_t passed_, pulses_, slowest_;  // trigger points and pulses in this row; speed of the first step, steps/s
+  int8_t x_direction_, y_direction_;  // -1, 0 or 1
   uint8_t until_;
-  bool x_major_, until_open_;
-  bool stepping_, cruise_, reached_;
+  bool x_major_, until_open_;  // x_major_: x is the axis with more steps
+  bool stepping_, cruise_, reached_;  // cruise_: at constant speed
   volatile bool hold_;
   StageError fault_;
 

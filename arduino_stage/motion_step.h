@@ -35,6 +35,7 @@ IN_INTERRUPT uint16_t ticks_of(uint16_t v) {
   return quotient;
 }
 
+// The switches change after board::LOOKS equal readings in a row.
 IN_INTERRUPT void Motion::look(uint8_t inputs) {
   if (inputs == stable_) {
     looks_ = 0;

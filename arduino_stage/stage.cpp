@@ -325,7 +325,8 @@ Event Stage::next_leg() {
   }
 }
 
-// Per axis: seek the switch, creep back until it opens, pull off to the zero.
+// Per axis, x first: seek the switch, creep back until it opens, pull off to the zero. phase_ counts these six steps;
+// the seek has several legs while the axis has not found its switch since the reset.
 Event Stage::next_homing_leg() {
   if (board::HAS_SWITCHES) {
     const uint8_t step = phase_ % 3;

@@ -25,14 +25,17 @@ enum Immediate : uint8_t {
   IMMEDIATE_STOP = 0x88,
 };
 
+// What service() reports: a motion has ended as commanded, or an alarm was raised.
 enum Event : uint8_t { EVENT_NONE, EVENT_DONE, EVENT_ALARM };
 
 class Stage {
  public:
   explicit Stage(Motion& motion) : motion_(motion) { reset(); }
+  // As after power-on: motors off, not homed, default settings.
   void reset();
 
-  // Commands. A motion command returns at once; service() reports its end.
+  // Commands; docs/spec/stage-line.md has the units of their arguments. Each returns ERROR_NONE or why it is refused.
+  // A motion command returns at once; service() reports its end.
   StageError set(int32_t parameter, int32_t value);
   StageError enable(int32_t on);
   StageError home();
@@ -43,12 +46,14 @@ class Stage {
 
   // Process any received byte; true if it was one of Immediate. Safe in the receive interrupt.
   bool immediate(uint8_t byte);
+  // True once after a status was requested.
   bool take_status_request();
   void heard() { heard_ = true; }  // the host is alive
 
   // Start the next leg, check heartbeat and switches. Call often.
   Event service(uint32_t now_ms);
 
+  // Word for the status line: idle, alarm, move, row, home or hold.
   const char* state() const;
   bool busy() const { return activity_ != IDLE; }
   bool homed() const { return homed_; }
@@ -61,33 +66,43 @@ class Stage {
   const Motion& motion() const { return motion_; }
 
  private:
-  enum Activity : uint8_t { IDLE, MOVE, TRAVEL, ROW, HOMING, BUZZ };
+  enum Activity : uint8_t { IDLE, MOVE, TRAVEL, ROW, HOMING, BUZZ };  // TRAVEL: to the beginning of a row
+  // ERROR_NONE if a motion may begin, else why not.
   StageError ready() const;
+  // End all motion and latch an alarm; an emergency stop also switches the motors off.
   Event raise(StageError alarm, bool position_lost);
+  // Start what follows a finished leg, or report the end.
   Event next_leg();
   Event next_homing_leg();
   Event next_buzz_leg();
+  // True if the place is within the travel.
   bool within(int32_t x, int32_t y) const;
+  // Reset what belongs to the motion before.
   void begin(Activity activity);
+  // Start a leg to a place.
   void go(int32_t x, int32_t y, uint16_t rate);
+  // Read the switches of a stage at rest, once a millisecond.
   void look_at_switches(uint32_t now_ms);
+  // Note when the last byte and the last sign of life came.
   void listen(uint32_t now_ms);
 
   Motion& motion_;
+  // Also written by the receive interrupt. heard_: the host gave a sign of life.
   volatile bool heard_, status_requested_, resume_requested_, stop_requested_;
   volatile bool byte_seen_, quiet_;  // quiet_: no byte came for QUIET_MS
   volatile bool resume_begun_;       // the byte before was a RESUME
   Activity activity_;
   StageError alarm_, stopping_;  // stopping_: alarm to raise when the stage has slowed down
-  bool enabled_, homed_, held_, row_command_, homing_command_, started_, knew_;  // knew_: was homed before this homing
+  bool enabled_, homed_, held_, row_command_, homing_command_;
+  bool started_, knew_;  // started_: a leg of this phase of homing has begun; knew_: was homed before this homing
   uint8_t phase_;  // of homing and of a buzz
   uint8_t found_;  // switches that homing has reached since the reset: bits of Input
-  bool buzz_x_;
+  bool buzz_x_;  // the buzz is along x
   int32_t searched_;  // steps of the search in short legs
-  Leg row_;
-  int32_t row_y_, travel_x_, travel_y_, backlash_;
-  uint16_t travel_rate_, heartbeat_ms_, trigger_us_;
-  uint32_t heard_ms_, byte_ms_, looked_ms_;
-  uint32_t accel_;
-  int32_t lost_x_, lost_y_;
+  Leg row_;  // the leg of the row that the stage travels to
+  int32_t row_y_, travel_x_, travel_y_, backlash_;  // steps
+  uint16_t travel_rate_, heartbeat_ms_, trigger_us_;  // travel_rate_: steps/s
+  uint32_t heard_ms_, byte_ms_, looked_ms_;  // times of the last sign of life, byte, and reading of the switches
+  uint32_t accel_;  // steps/s^2, of all motions but homing and buzz
+  int32_t lost_x_, lost_y_;  // steps
 };

@@ -18,6 +18,7 @@ void run(Machine& machine, uint64_t ticks, bool until_rest) {
   }
 }
 
+// Bytes from the host, two hexadecimal digits each.
 void feed(Machine& machine, const char* hex) {
   unsigned byte;
   for (; sscanf(hex, "%2x", &byte) == 1; hex += 2) machine.receive((uint8_t)byte);

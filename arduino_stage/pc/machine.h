@@ -9,6 +9,7 @@
 
 #include "../protocol.h"
 
+// What differs between simulated rigs.
 struct Rig {
   double steps_per_mm = board::STEPS_PER_MM;
   int trigger_line = 26;
@@ -21,8 +22,9 @@ class Machine {
 
   // The reset button. The motors keep their position.
   void reset(uint32_t now_ms);
+  // A byte from the host.
   void receive(uint8_t byte);
-  // Advance the time to `tick`, with every step and edge that is due.
+  // Advance the time to `tick`, with every step and edge that is due; `now_ms` is what millis() says then.
   void advance(uint64_t tick, uint32_t now_ms);
 
   uint64_t tick() const { return tick_; }
@@ -43,21 +45,21 @@ class Machine {
   uint16_t steps_per_mm() const { return (uint16_t)(rig_.steps_per_mm + 0.5); }
 
  private:
-  void step();
-  void settle();
-  void edge(uint64_t tick, bool high);
-  void report_motion();
-  void end_trigger(uint64_t until);
+  void step();                          // the step interrupt
+  void settle();                        // the main loop
+  void edge(uint64_t tick, bool high);  // of the trigger line
+  void report_motion();                 // position and speed, to the wires
+  void end_trigger(uint64_t until);     // the trigger pulse's end, if it is due
 
   Rig rig_;
   Motion motion_;
   Stage stage_;
   Protocol protocol_;
   std::string wires_, replies_;
-  uint64_t tick_ = 0, next_ = 0, fall_ = 0, told_ = 0;
+  uint64_t tick_ = 0, next_ = 0, fall_ = 0, told_ = 0;  // now, next step, trigger's end, last report of motion
   uint32_t now_ms_ = 0;
-  bool armed_ = false, trigger_high_ = false, was_homed_ = false;
-  uint32_t width_ = 2u * board::DEFAULT_TRIGGER_US;
+  bool armed_ = false, trigger_high_ = false, was_homed_ = false;  // armed_: a step is due at next_
+  uint32_t width_ = 2u * board::DEFAULT_TRIGGER_US;  // ticks
   uint8_t pressed_ = 0;
   int x_sign_ = 1, y_sign_ = 1;
   int64_t x_, y_;                    // true position of the stage: steps from the closing point of its switches

@@ -1,5 +1,5 @@
 // The stage as a process: the sketch behind a pseudo terminal, its trigger and its motion on the simulated wires.
-// Start it with `python -m simulators.stage`, which compiles it.
+// Start it with `python -m polysight_simulators.stage`, which compiles it.
 #include <errno.h>
 #include <poll.h>
 #include <signal.h>
@@ -21,7 +21,7 @@ volatile sig_atomic_t stop_signal;
 
 constexpr uint64_t MS = 1000000;            // ns
 constexpr uint64_t CONNECT_LIMIT = 10000 * MS;
-constexpr int STEP_POLL_MS = 2, REST_POLL_MS = 20;
+constexpr int STEP_POLL_MS = 2, REST_POLL_MS = 20;  // longest wait of a turn while the stage moves, and at rest
 // A process without CPU time slows the simulated world down: the longest advance at once, wall time.
 constexpr uint64_t LONGEST_LEAP = 20 * MS;
 
@@ -66,6 +66,7 @@ bool send_all(int fd, const std::string& bytes) {
   return true;
 }
 
+// Command line; `wires`: the hub's socket, or none.
 struct Options {
   const char *link = nullptr, *wires = nullptr;
   double time_scale = 1.0;
@@ -94,6 +95,7 @@ bool parse(int argc, char** argv, Options& o) {
   return (o.lockstep || o.link) && o.time_scale > 0 && o.rig.steps_per_mm > 0;
 }
 
+// Let the machine's time follow the wall clock (times the scale) until a signal comes; 1 after the wires are lost.
 int serve(const Options& o, SerialPort& port, int wires) {
   Machine machine(o.rig);
   const uint64_t started = wall_ns();

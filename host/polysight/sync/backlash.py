@@ -18,11 +18,11 @@ from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_po
 from polysight_shared.raster import mean_burst_travel_mm, plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Number of groups of rows for the jackknife.
+# Number of groups of rows for the jackknife (chosen).
 _GROUPS = 10
-# Number of Gauss-Newton steps.
+# Number of Gauss-Newton steps (chosen).
 _STEPS = 3
-# Largest share of power in the upper fifth of the spectrum; more means aliasing.
+# Largest share of power in the upper fifth of the spectrum; more means aliasing: positions too far apart (chosen).
 _ALIASED = 0.02
 
 
@@ -31,7 +31,8 @@ def object_filter(rig: Instrument, board: Board, sweep_hz: NDArray[np.float64]) 
 
     `sweep_hz` [sample] is the transmit frequency of each sample; those outside the linear part have weight 0.
     """
-    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    tx = np.array(tx_position_m(rig))
+    rx = np.array(rx_positions_m(rig, board))
     excess = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).mean()
     a, b = rig.chirp.linear_samples
     first, last = sample_frequencies_hz(rig.chirp)[[a, b - 1]]
@@ -92,6 +93,7 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
             slope = np.fft.ifft(1j * k * mean, axis=-1)
             difference = np.fft.ifft(recent[r] - mean, axis=-1)
             power = np.abs(mean) ** 2
+            # An even row has odd neighbours, so that its difference has the opposite sign.
             sums[i * _GROUPS // len(inner)] += (
                 (1 if r % 2 else -1) * (window * slope.conj() * difference).real.sum(),
                 (window * np.abs(slope) ** 2).sum(),

@@ -23,6 +23,7 @@ LIBRARY = "kernels.so"
 SOURCES = ("burst.c", "direct_path.c")
 """Compiled once per vector width."""
 
+# Multiplications and additions may be fused and sums rearranged, so that loops are vectorised.
 _FLAGS = "-std=c99 -Werror=implicit-function-declaration -O3 -fPIC"
 _FLAGS += " -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
 # -fassociative-math instead of -ffast-math, which would change rounding in other libraries, too.
@@ -113,6 +114,7 @@ def _find_zig() -> list[str] | None:
 
 
 def _run(command: Sequence[str]) -> None:
+    """Run a command in the folder of the sources. Raises BuildError with its messages if it fails."""
     try:
         completed = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
     except OSError as e:

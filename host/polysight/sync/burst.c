@@ -46,11 +46,14 @@ static void find_taps(const Equaliser *e, double frequency, Complex *taps)
 
 /* Arrays of one position, per chirp; whole groups of them are used. */
 typedef struct {
-    double frequency[MOST], found[MOST], coherence[MOST], sorted[MOST], left[PARTS * MOST], start[MOST], turns[MOST];
-    Complex product[MOST], found_product[MOST], taps[3 * MOST];
-    float energy[MOST], first[MOST], second[MOST];
-    int peak[MOST];
-    uint8_t whole[MOST], usable[MOST]; /* received, not clipped, silent or disturbed; and those of this round */
+    double frequency[MOST], found[MOST]; /* offset from the reference chirp; that of the latest pass */
+    double coherence[MOST], sorted[MOST]; /* with the reference chirp; work array */
+    double left[PARTS * MOST];            /* energy that the others do not explain, [part][chirp] */
+    double start[MOST], turns[MOST];      /* frequency to mix down by; phase to remove, in turns */
+    Complex product[MOST], found_product[MOST], taps[3 * MOST]; /* amplitudes of the tones at both; equaliser */
+    float energy[MOST], first[MOST], second[MOST];              /* weights in either half of the average */
+    int peak[MOST];                                             /* largest magnitude of a word */
+    uint8_t whole[MOST], usable[MOST]; /* received, neither clipped nor silent nor disturbed; and those of this round */
 } Chirps;
 
 /* Results, [position][chirp] unless noted. */
@@ -198,7 +201,7 @@ static void centre_errors(double *values, const uint8_t *good, int chirps, int c
         values[k] = good[k] ? (values[k] - mean) / 2 : 0;
 }
 
-/* `offsets._align`: one round with the whole chirps; returns the number of disturbed ones, dropped from them. */
+/* `offsets._align_round`: one round with the whole chirps; returns the number of disturbed ones, dropped from them. */
 static int align_round(Work *w, Chirps *c, const Equaliser *e, const int16_t *words, Aligned out)
 {
     int chirps = w->chirps, half = 0;
@@ -250,6 +253,7 @@ static int align_round(Work *w, Chirps *c, const Equaliser *e, const int16_t *wo
     return disturbed;
 }
 
+/* `offsets._align` for one position: find clipped chirps, put the words side by side, and align until none is disturbed. */
 static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t *words, const uint8_t *valid,
                            int full_scale, Aligned out)
 {

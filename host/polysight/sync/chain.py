@@ -4,8 +4,9 @@
 program has synchronised.
 
 Residuals are frequency, phase and amplitude errors after each stage (paper, Fig. 15). They are measured on the scan
-itself, for any scene: an error is half the difference between two measurements with independent noise. For a chirp and
-for the direct path these are two halves of the RX, for the object two averages of every other chirp.
+itself, for any scene: an error is half the difference between two measurements with independent noise. For an aligned
+chirp and for the direct path these are two halves of the RX, for the object two averages of every other chirp. As
+received, and for the amplitude of an aligned chirp, an error is the deviation from the mean.
 
 Cubes: our convention is that an echo of excess path d is `a exp(+j 2 pi f d / c)`, and the direct path is constant. The
 conventions of a cube are unknown, but the geometry determines where direct path and object must lie. From that
@@ -67,6 +68,7 @@ _FULL_SCALE = 32767
 # Positions read at a time: 2 MB, which stay in the processor's cache.
 _POSITIONS = 32
 
+# The numbers for cubes are chosen.
 # Cubes: rows from which their form is detected, and about how many of their positions.
 _CUBE_ROWS = 7
 _FORM_POSITIONS = 300
@@ -80,7 +82,7 @@ _PREFER_SIMPLE = 0.7
 _COHERENT = 0.5
 # Smallest share of positions with a direct path.
 _MIN_FOUND = 0.5
-# Share of power at the object above which the cube contains nothing else.
+# Share of power at the object above which the cube contains nothing else: its direct path was removed.
 _ALONE = 0.8
 
 
@@ -88,7 +90,8 @@ _ALONE = 0.8
 class BoardSetup:
     """Parameters of synchronisation for a board and a whole scan. Create with :meth:`from_rig`.
 
-    `examined` is the largest number of positions per row used for residuals (`errors`).
+    `pulses` are the chirps of a position, `equaliser` compensates the high-pass filter (None: no filter), `path` finds
+    the direct path. `examined` is the largest number of positions per row used for residuals (`errors`).
     """
 
     chirp: Chirp
@@ -173,7 +176,7 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
     ----------
     frames
         int16 [frame, sample, 2, rx] from `row_words` (fastest), or complex64 [rx, frame, sample] in ADC counts;
-        positions in order of recording, `setup.pulses` frames each.
+        positions in order of recording, `setup.pulses` frames each (frames are single chirps here).
     valid
         bool [frame]: frames received whole.
     setup
@@ -236,6 +239,7 @@ def _group_bursts(pieces: Iterable[NDArray[np.int16]], frames: int, setup: Board
 
 
 def _mismatch_error(frames: int, shape: tuple[int, ...], setup: BoardSetup) -> DataError:
+    """Return the error for frames of a `shape` (rx, samples) that are not whole bursts of the setup."""
     rx, samples = setup.path.steering.shape
     return DataError(
         f"{frames} frames of {shape[0]} RX x {shape[1]} samples are not bursts of {setup.pulses} frames"
@@ -318,8 +322,8 @@ def errors(
 ) -> Errors:
     """Return the errors after each stage, float64 [3, n]: Hz, rad, and amplitude relative to its mean.
 
-    At most `most` valid positions are used, evenly spaced. Empty if no position is valid. `referenced` contains only
-    positions with an echo.
+    At most `most` valid positions are used, evenly spaced. Empty if no position is valid. The stage "referenced" has
+    only positions with an echo.
     """
     if not referenced.found.any():
         return {}
@@ -329,6 +333,7 @@ def errors(
     amplitude = referenced.amplitude[examined, None]
     relative_amplitude = aligned.amplitude[examined]
 
+    # As received: offsets of the chirps, with those of their positions added, from their mean.
     frequency = (referenced.frequency[examined, None] + aligned.frequency[examined])[good]
     phase = (np.angle(amplitude) + aligned.phase[examined])[good]
     size = (np.abs(amplitude) * relative_amplitude / aligned.gain[examined])[good]
@@ -424,7 +429,7 @@ class CubeForm:
     Attributes
     ----------
     conjugate
-        The phases have the opposite sign.
+        True if the phases have the opposite sign.
     turn
         complex64 [rx, sample]: multiplies the cube after that.
     constant
@@ -504,16 +509,23 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
             code=ErrorCode.NO_DATA,
         )
     chirp = rig.chirp
-    (a, b), sweep = chirp.linear_samples, chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    a, b = chirp.linear_samples
+    sweep = sample_frequencies_hz(chirp)
     tx = np.array(tx_position_m(rig))
     rx = np.array(rx_positions_m(rig, board))
     direct_m = np.linalg.norm(rx - tx, axis=1)
     gate = _gate_echoes(sweep[a:b], _gate_m(rig, board, tx, rx))
     absolute = np.exp(-2j * np.pi * np.outer(direct_m, sweep) / SPEED_OF_LIGHT_M_S)
-    conjugate, counted_from_tx = _sign_and_origin(cube, absolute, gate, (a, b))
-    turn = absolute if counted_from_tx else np.ones_like(absolute)
-    form = ["conjugated"] * conjugate + ["delays counted from the transmitter"] * counted_from_tx
-    cube = (cube.conj() if conjugate else cube) * turn[:, None]
+    conjugate, counted_from_tx = _find_sign_and_origin(cube, absolute, gate, (a, b))
+    form = []
+    if conjugate:
+        cube = cube.conj()
+        form.append("conjugated")
+    turn = np.ones_like(absolute)
+    if counted_from_tx:
+        turn = absolute
+        form.append("delays counted from the transmitter")
+    cube = cube * turn[:, None]
 
     constant = np.zeros(len(rx))
     path = None
@@ -540,7 +552,7 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     return CubeForm(conjugate, turn.astype(np.complex64), constant.astype(np.complex64), path, chirp, description)
 
 
-def _sign_and_origin(
+def _find_sign_and_origin(
     cube: NDArray[np.complexfloating],
     absolute: NDArray[np.complex128],
     gate: NDArray[np.complex128],
@@ -558,7 +570,9 @@ def _sign_and_origin(
         turn = absolute if counted_from_tx else np.ones_like(absolute)
         part = ((cube.conj() if conjugate else cube) * turn[:, None])[..., a:b]
         power.append(float((np.abs((part * np.hanning(b - a)) @ gate.conj().T) ** 2).mean()))
-    return readings[0 if power[0] >= _PREFER_SIMPLE * max(power) else int(np.argmax(power))]
+    if power[0] >= _PREFER_SIMPLE * max(power):
+        return readings[0]
+    return readings[int(np.argmax(power))]
 
 
 def _average_direct_path(
@@ -604,7 +618,9 @@ def _reference_cube(
 
     Each position of the cube is treated as the average of one chirp.
     """
-    samples, (a, b) = cube.shape[2], whole_blocks(chirp.linear_samples)
+    samples = cube.shape[2]
+    a, b = whole_blocks(chirp.linear_samples)
+    # Mix each position down by its strongest bin, and present it as an aligned row of one chirp, in two equal halves.
     power = (np.abs(np.fft.fft(cube[..., a:b], axis=-1)) ** 2).sum(axis=0)
     centre = np.fft.fftfreq(b - a)[np.argmax(power, axis=-1)].astype(np.float64)
     middle = (a + b - 1) / 2

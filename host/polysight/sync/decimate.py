@@ -27,6 +27,7 @@ TAPS = 10
 FLAT = 9
 """Blocks that `flatten` weights."""
 
+# Samples that `fold` weights on either side of a block, and blocks that `flatten` weights on either side of one.
 _BESIDE = (TAPS - FOLD) // 2
 _EDGE = FLAT // 2
 # Half the passband, cycles per sample: 13 range bins of 192 samples, 1.1 m of path with the published chirp.
@@ -34,7 +35,7 @@ _PASS = 13 / 192
 # Within this distance of the middle, where the scene is, the filters are ten or twenty times as exact.
 _SCENE = 6 / 192
 
-# Weight of small taps for the first block.
+# Weight of small taps for the first block, in the least squares fit (chosen): less noise there for a worse fit.
 _SMALL = 0.08
 
 
@@ -59,13 +60,15 @@ class Decimator(NamedTuple):
 
 @lru_cache(maxsize=1)
 def decimator() -> Decimator:
-    """Return the taps of both filters."""
+    """Return the taps of both filters, fitted at the first call."""
     inner = _design_low_pass()
     first = np.zeros(TAPS)
     first[_BESIDE:-_BESIDE] = 1 / FOLD
     cycles = np.linspace(-_PASS, _PASS, 121)
     weight = np.where(np.abs(cycles) < _SCENE, 10.0, 1.0)
     turns = np.exp(2j * np.pi * np.outer(cycles, np.arange(TAPS) - (TAPS - 1) / 2))
+    # `flatten` of each of the first blocks, and of an inner one: taps over `FLAT` blocks whose response, together with
+    # that of `fold`, is 1 in the passband.
     flat = []
     for block in range(_EDGE + 1):
         lags = FOLD * (np.arange(FLAT) - block)
@@ -78,6 +81,7 @@ def decimator() -> Decimator:
         equations = np.concatenate([model.real, model.imag, small])
         goal = np.concatenate([weight, np.zeros(cycles.size + FLAT)])
         flat.append(np.linalg.lstsq(equations, goal, rcond=None)[0])
+    # Both filters of an inner block as one, over the samples: noise is amplified by the sum of its squares.
     combined_taps = np.zeros(FOLD * (FLAT - 1) + TAPS)
     for k, part in enumerate(flat[-1]):
         combined_taps[FOLD * k : FOLD * k + TAPS] += part * inner
@@ -107,7 +111,8 @@ def fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
     blocks = signal.shape[-1] // FOLD
     folded = np.zeros((*signal.shape[:-1], blocks), np.complex64)
     weights = np.repeat(taps[1][:, None], blocks, axis=1)
-    weights[:, 0], weights[:, -1] = taps[0], taps[2]
+    weights[:, 0] = taps[0]
+    weights[:, -1] = taps[2]
     for q in range(TAPS):
         folded += weights[q] * padded[..., q : q + FOLD * (blocks - 1) + 1 : FOLD]
     return folded

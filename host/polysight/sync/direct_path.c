@@ -48,7 +48,8 @@ static inline void medians(const float *powers, int size, float *median)
     }
 }
 
-/* `NumpyLoops.search` for one spectrum, strongest at the bin top; by powers, which rise with magnitudes. */
+/* `NumpyLoops.search` for one spectrum, strongest at the bin top: the bins of direct path and second candidate. By powers,
+   which rise with magnitudes. */
 static inline void choose_peaks(const Table *t, const float *re, const float *im, int top, int nearest, int farthest,
                                 double comparable, int bins[2])
 {
@@ -110,7 +111,7 @@ static double refine(const float *x, const float *y, const float *estimator, int
 }
 
 /* `NumpyLoops.find`: halves [position][2][rx][block]; weights and steering [2][rx][block], real and imaginary part;
-   preference [bin]; the object is nearest..farthest bins above the direct path; estimator [3][2][rx][block]. Results:
+   preference [bin], `loops._weigh_bins`; the object is nearest..farthest bins above the direct path; estimator [3][2][rx][block]. Results:
    peaks [2][position], median and frequency [position], estimates [position][3]. Returns 0, or 1 without memory. */
 int NAME(find)(const float *halves, const float *weights, const float *preference, int positions, int blocks, int size,
                int nearest, int farthest, const double *comparable, const float *steering, const float *estimator,

@@ -19,10 +19,11 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
 SMALLEST_GAIN = 0.25
-"""Smallest filter gain that is fully compensated."""
+"""Smallest filter gain that is fully compensated (chosen): noise is amplified four times at most."""
 
 REACH_BINS = 3.0
-"""Distance of direct path and object from their middle, in IF bins."""
+"""IF bins on either side of a signal's centre at which its compensation is exact. Chosen: direct path and object of the
+published rig lie within 1.8 bins of their middle."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Equaliser:
     model
         The filter.
     sample_rate_hz, signed
-        Sample rate; IF of -1/2..1/2 of it (complex 2x, signed) or 0..1 (complex 1x).
+        Sample rate; IF of -1/2..1/2 of it (complex 2x, `signed` True) or 0..1 (complex 1x, False).
     spacing
         Samples between taps.
     reach
@@ -87,8 +88,8 @@ class Equaliser:
     def taps(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the taps [..., 3] for signals centred at frequencies [...] in cycles per sample."""
         f = frequency[..., None] + self.reach * np.array([-1.0, 0.0, 1.0])
-        f = ((f + 0.5) % 1.0 - 0.5 if self.signed else f % 1.0) * self.sample_rate_hz
-        low, middle, high = np.moveaxis(self.model.inverse(f), -1, 0)
+        f = (f + 0.5) % 1.0 - 0.5 if self.signed else f % 1.0
+        low, middle, high = np.moveaxis(self.model.inverse(f * self.sample_rate_hz), -1, 0)
         w = 2 * np.pi * self.reach * self.spacing
         even_part = ((low + high) / 2 - middle) / (np.cos(w) - 1)
         odd_part = (high - low) / (2j * np.sin(w))
@@ -134,7 +135,8 @@ def fit_high_pass(
     DataError
         if there are too few points, or no points near a corner.
     """
-    if_hz, amplitude = np.asarray(if_hz, np.float64), np.asarray(amplitude, np.float64)
+    if_hz = np.asarray(if_hz, np.float64)
+    amplitude = np.asarray(amplitude, np.float64)
     if if_hz.size < 8 or np.any(amplitude <= 0) or np.any(if_hz <= 0):
         raise DataError(
             f"{if_hz.size} points do not determine two corners",
@@ -146,6 +148,7 @@ def fit_high_pass(
     turns = None if phase_rad is None else np.exp(1j * np.asarray(phase_rad))
 
     def misfit(log_corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the deviations of the log amplitudes, and of the phases if known, from those of a filter."""
         h = HighPass(tuple(np.exp(log_corners))).response(if_hz)
         gain = measured - np.log(np.abs(h))
         deviation = gain - gain.mean()
@@ -155,7 +158,7 @@ def fit_high_pass(
         return np.concatenate([deviation, np.angle(turn * np.conj(turn.mean()))])
 
     limits = np.log(if_hz.min() / 10), np.log(if_hz.max() * 3)
-    # The corners may lie in any two octaves.
+    # Start from several pairs of corners: the misfit may have several minima.
     starts = itertools.combinations(np.linspace(*limits, 6)[1:-1], 2)
     fits = [scipy.optimize.least_squares(misfit, start, bounds=limits, loss="soft_l1", f_scale=0.1) for start in starts]
     corners = np.exp(np.sort(min(fits, key=lambda fit: fit.cost).x))

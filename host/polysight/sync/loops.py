@@ -33,7 +33,7 @@ CHUNK = 8
 RX = 4
 """Number of RX that the compiled loops support."""
 
-# Blocks of a record whose sums the Newton steps of `refine` use.
+# Blocks of a record whose sums the Newton steps of `refine` use, see `block_edges`.
 _BLOCKS = 8
 MOST_CHIRPS = 256
 """Chirps of a burst that the compiled loops support."""
@@ -605,6 +605,7 @@ class Library:
         """Align positions into the fields of an `offsets.AlignedRow`; parameters as in `offsets.align_in_numpy`."""
         positions, chirps, samples, _, _ = words.shape
         a, b = linear
+        # Without corners the reach has no effect; at this one the factors of the taps are finite.
         filters = [1.0, 1 / 8 / FOLD, 0.0]
         if equaliser is not None:
             filters = [equaliser.sample_rate_hz, equaliser.reach, equaliser.signed, *equaliser.model.corners_hz]

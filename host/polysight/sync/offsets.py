@@ -24,7 +24,7 @@ a direct path `A exp(j w t)` near `w = 0`, with the model `x = A g + A w (jt g)`
 (generalised least squares; Kay 1993, section 6.4). This is a fixed 2 x (4 RX x samples) matrix: a beamformer in space
 and frequency with nulls at the object. R also holds weak clutter behind the object (walls, a table) from any direction;
 otherwise the sidelobes there would be those of a rectangular window. Gauss-Newton steps `w += Re(A w / A)` converge.
-Its input is the average after burst alignment: mixed to zero frequency, with four consecutive samples averaged.
+Its input is the average after burst alignment: mixed to zero frequency and decimated to one sample in four.
 
 The crystals of the boards differ by some ppm, and with them the chirp slopes, so the IF drifts by some kilohertz within
 a chirp, equally for all paths and positions. A third column `jt^2/2 g` estimates this drift; its median over the row is
@@ -66,7 +66,7 @@ _ROUNDS = 4
 _LEAST_LIMIT = 1024
 _AT_LIMIT = 32
 
-# Direct path: size of the search FFT, over averaged samples.
+# Direct path: size of the search FFT, over decimated samples.
 _FFT = 256
 # Standard deviation in x and y of the echoes' origin, around the mirror point.
 _SPREAD_M = 0.1
@@ -84,7 +84,7 @@ _STEPS = 3
 _COMPARABLE = 0.35
 # Smallest amplitude of a direct path, relative to the row's median.
 _LOST = 0.3
-# Positions whose amplitude is further from the row's, in standard deviations, are not used.
+# Standard deviations from the row's amplitude beyond which a position's second peak is tried.
 _OUTLIER = 5.0
 # Smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions.
 _PRESENT = 30.0
@@ -137,10 +137,7 @@ class AlignedRow(NamedTuple):
         return AlignedRow._make(field[positions] for field in self)
 
 
-Align = Callable[
-    [NDArray[np.int16], NDArray[np.bool_], tuple[int, int], hpf.Equaliser | None, int, AlignedRow],
-    None,
-]
+Align = Callable[[NDArray[np.int16], NDArray[np.bool_], tuple[int, int], hpf.Equaliser | None, int, AlignedRow], None]
 """Aligns positions: words, valid, linear samples in whole blocks, filter compensation, full scale; into a row."""
 
 
@@ -205,6 +202,7 @@ def align_pieces(
 
 
 def _choose_loop(chirps: int, rx: int) -> Align:
+    """Return the compiled alignment if it supports these numbers, otherwise that in NumPy."""
     is_supported = rx == loops.RX and chirps <= loops.MOST_CHIRPS
     library = loops.library() if is_supported else None
     return library.align if library else align_in_numpy
@@ -382,6 +380,7 @@ def _refer_to_one(
     centre = np.zeros(positions)
     coherence = np.zeros(is_complete.shape)
     best_sum = np.full(positions, -1.0)
+    # Positions that still need a reference chirp: their latest one matches fewer than half of the others.
     todo = np.flatnonzero(count)
     for attempt in range(min(_REFERENCES, chirps)):
         if todo.size == 0:
@@ -616,7 +615,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
         return run.remove(aligned.halves[positions], flat, complex64(path.estimator), start, _STEPS, scale[positions])
 
     removed = remove(slice(None), first.frequency)
-    _try_others(removed, first.peaks, usable, remove)
+    _try_second_peaks(removed, first.peaks, usable, remove)
     frequency, estimate, step, samples, half_difference = removed
 
     # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
@@ -658,7 +657,7 @@ def half_scale(good_chirps: NDArray[np.int_]) -> NDArray[np.float32]:
     return (chirps / np.maximum(chirps_of_half, 1)).astype(np.float32)
 
 
-def _try_others(
+def _try_second_peaks(
     removed: Removed,
     peaks: NDArray[np.float64],
     usable: NDArray[np.bool_],
@@ -695,6 +694,7 @@ def _find_middle(values: NDArray[np.floating]) -> float:
 
 
 def _divide(moment: NDArray[np.complex128], amplitude: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Return the real parts of the ratios; 0 where the amplitude is 0."""
     ratio = np.zeros(amplitude.shape, complex)
     np.divide(moment, amplitude, out=ratio, where=amplitude != 0)
     return np.real(ratio)

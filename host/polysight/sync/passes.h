@@ -51,7 +51,8 @@ static inline void side_by_side(const int16_t *const chirp[LANES], int count, in
     }
 }
 
-/* Chirps times the conjugate of the reference chirp, summed over the RX, to [sample][LANES]; and their energies. */
+/* Chirps of a group times the conjugate of the reference chirp, summed over the RX, to [sample][LANES]; and their
+   energies. */
 static inline void correlate(const int16_t *words, const float *chosen, int samples, float *re, float *im, float *energy)
 {
     for (int part = 0; part < LANES; part += STEP) {
@@ -92,7 +93,8 @@ static inline Complex interpolated(const Work *w, const float *re, const float *
     return times(peak, cis(whole * (w->n - 1) / 2));
 }
 
-/* `loops.find_band`: middle of the band of a chirp of words, cycles per sample 0..1. The records are quarters of the RX. */
+/* `loops.find_band`: middle of the band of a chirp of words, cycles per sample 0..1. The sixteen records are the quarters of
+   the chirp, of each RX; the spectra are summed in memory that other passes use for rows. */
 static double centre_of_band(Work *w, const int16_t *chirp)
 {
     const int size = w->table.size / 4, samples = w->n / 4;
@@ -160,8 +162,8 @@ static inline void ramps(const double *restrict frequency, const double *restric
     }
 }
 
-/* Extrapolate the `count` values that start at signal + s by s values to either side with the parabola through three
-   values, `high_pass_filter.shifted`. */
+/* Extrapolate the `count` values that start at signal + s by s values to either side, with the parabola through three
+   values at distance s, as `high_pass_filter.apply_filter` does. */
 static inline void extend(float *signal, int count, int s)
 {
     float *end = signal + s + count;
@@ -206,7 +208,8 @@ static inline void mix_and_fold(Work *w, const int16_t *words, const double *fre
     }
 }
 
-/* Filter with three taps for each chirp, one block apart; the signal has a spare block at either end. */
+/* Filter with three taps for each chirp, one block apart, `high_pass_filter.apply_filter`; the signal has a spare block at
+   either end. */
 static inline void equalise(const float *re, const float *im, const Complex *taps, int values, float *to_re, float *to_im)
 {
     float f[3][LANES], g[3][LANES];
@@ -264,7 +267,8 @@ static inline void correlate_part(const float *re, const float *im, const float 
 }
 
 /* Second pass: the tone between each reduced chirp and the sum of the good others, and what that sum does not explain of
-   its energy in each part of the chirp, [part][chirp]; see `loops.against_others`. Returns the energy of the sum. */
+   its energy in each part of the chirp, left [part][chirp]; see `loops.against_others`. apart_f and apart_phase: tone of
+   the even RX minus that of the odd ones. Returns the energy of the sum. */
 static double against_others(Work *w, const uint8_t *good, double *frequency, Complex *tone, float *energy,
                              double *apart_f, double *apart_phase, double *left)
 {

@@ -15,7 +15,7 @@
 #include <string.h>
 
 #define RX 4    /* of an AWR2243 */
-#define FOLD 4  /* samples averaged before fine estimates, `loops.FOLD` */
+#define FOLD 4  /* samples of a block, which decimation makes one, `decimate.FOLD` */
 #define MOST 256 /* chirps of a burst, whole groups, `loops.MOST_CHIRPS` */
 #define LANES 16  /* FOLD x RX; also the number of records transformed together */
 
@@ -46,6 +46,7 @@ static inline Complex times(Complex a, Complex b)
     return (Complex){a.re * b.re - a.im * b.im, a.re * b.im + a.im * b.re};
 }
 
+/* a + factor b */
 static inline Complex plus(Complex a, double factor, Complex b) { return (Complex){a.re + factor * b.re, a.im + factor * b.im}; }
 static inline Complex conjugate(Complex a) { return (Complex){a.re, -a.im}; }
 static inline double squared(Complex a) { return a.re * a.re + a.im * a.im; }
@@ -69,6 +70,7 @@ static inline double angle(Complex a)
 /* Parts of one block of memory, each on its own cache lines; without a block their size is only counted. */
 typedef struct { char *block; size_t used; } Memory;
 
+/* The next part of the memory, for `count` values of `size` bytes; NULL, and only counted, without a block. */
 static inline void *take(Memory *memory, size_t count, size_t size)
 {
     void *here = memory->block ? memory->block + memory->used : NULL;
@@ -78,7 +80,7 @@ static inline void *take(Memory *memory, size_t count, size_t size)
 
 static inline float *floats(Memory *memory, size_t count) { return take(memory, count, sizeof(float)); }
 
-/* Allocate zeroed memory of the size counted, for `free`; returns 0 if there is not enough. */
+/* Allocate zeroed memory of the size counted, to be taken from its beginning and freed; returns 0 if there is not enough. */
 static inline int reserve(Memory *memory)
 {
     void *block;
@@ -89,7 +91,7 @@ static inline int reserve(Memory *memory)
 }
 
 /* As many floats as the processor handles at once: a part of LANES. Compilers do well with these vectors, except for the
-   conversion of words, and sums of products, which `-fassociative-math` takes apart. */
+   conversion of words to floats (`counts`), and sums of products (`add_product`), which `-fassociative-math` takes apart. */
 #define STEP (WIDTH / 32)
 typedef float Vector __attribute__((vector_size(WIDTH / 8), aligned(4), may_alias));
 typedef int32_t Whole __attribute__((vector_size(WIDTH / 8)));
@@ -117,7 +119,7 @@ static inline Vector add_product(Vector sum, Vector a, Vector b) { return sum + 
 #endif
 static inline Vector load(const float *at) { return *(const Vector *)at; }
 static inline void store(float *at, Vector x) { *(Vector *)at = x; }
-static inline Vector all(float x) { return x - (Vector){0}; }
+static inline Vector all(float x) { return x - (Vector){0}; } /* x in every place */
 static inline float total(Vector x)
 {
     float sum = 0;
@@ -129,6 +131,7 @@ static inline float total(Vector x)
 /* Size of a transform, roots of unity exp(-j 2 pi k / size), the bin at each index of its output, the index of each bin. */
 typedef struct { int size, *bin, *place; float *c, *s; } Table;
 
+/* Take memory for a table, or count it. */
 static inline void take_table(Memory *memory, Table *t, int size)
 {
     t->size = size;
@@ -138,6 +141,7 @@ static inline void take_table(Memory *memory, Table *t, int size)
     t->s = floats(memory, size);
 }
 
+/* Fill a table: the output of the transform is in the order of reversed digits, to base four. */
 static inline void fill_table(Table *t)
 {
     for (int i = 0; i < t->size; i++) {
@@ -218,10 +222,11 @@ static inline void strongest(const float *re, const float *im, int size, int32_t
     }
 }
 
+/* The value of a record at index i; re and im begin at the record's lane. */
 static inline Complex value_at(const float *re, const float *im, int i) { return (Complex){re[LANES * i], im[LANES * i]}; }
 
-/* A step of Newton's method on the periodograms of records [part][record], `loops.refine`, from a frequency in cycles
-   per sample. */
+/* A step of Newton's method on the periodograms of `count` records [part][record], `loops.refine`: from frequencies `start`
+   to f, in cycles per sample (both may be one array); t: times of the parts in samples. tone: sums at f. */
 static inline void newton_step(const double *restrict re, const double *restrict im, const double *restrict t, int parts,
                                int count, const double *start, double *f, Complex *restrict tone)
 {

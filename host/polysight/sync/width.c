@@ -5,6 +5,8 @@
 /* By cpuid, for __builtin_cpu_supports is wrong in programs linked by zig. */
 int vector_bits(void)
 {
+    /* Bits of cpuid: FMA and OSXSAVE in ecx of leaf 1; AVX2, and AVX-512 F, DQ, BW, VL in ebx of leaf 7. Of xgetbv: 0x6 if
+       the system saves vectors of 256 bits, 0xe6 if also those of 512. */
     const unsigned fma_and_saved = 1u << 12 | 1u << 27, avx2 = 1u << 5, avx512 = 1u << 16 | 1u << 17 | 1u << 30 | 1u << 31;
     unsigned a, b, c, d, saved, high;
     if (!__get_cpuid(1, &a, &b, &c, &d) || (c & fma_and_saved) != fma_and_saved)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from polysight.imaging.geometry import Aperture, excess_path_m, get_device, namespace, turn
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Products of position and voxel that are in memory at a time.
+# Products of position and voxel that are in memory at a time (chosen).
 _CHUNK = 1 << 20
 
 

@@ -35,7 +35,7 @@ SAME_END_PX = 5.0
 """Distance up to which a plate's end by |H| and by its segmentation are the same one: about a resolution cell."""
 # Tolerance of positions: 2e-3 rad at one position, far below the noise.
 _SAME_M = 1e-6
-# The lattice in y may be finer than the pixels by this factor.
+# The lattice in y (of rows and pixels, `pitch_y_m`) may be finer than the pixels by this factor at most (chosen).
 _FINER = 4
 Window = str | tuple[Any, ...]
 """Window as for scipy.signal.get_window; "boxcar" for none."""
@@ -299,10 +299,11 @@ class StageWindow:
         """
         from_specular = (ends_px[:, None] - self.places_px) * np.sqrt(2 * self.bend_px / np.pi)
         sine, cosine = scipy.special.fresnel(from_specular)
-        phase_difference = (cosine[1] - cosine[0]) + 1j * (sine[1] - sine[0])
+        # Echo of the plate at each position; that of an endless mirror is 1 + j.
+        echo = (cosine[1] - cosine[0]) + 1j * (sine[1] - sine[0])
         distance = columns_px[:, None] - self.places_px
         kernel = self.weights * np.exp(-1j * self.bend_px * distance**2)
-        return np.asarray(kernel @ phase_difference / kernel.sum(axis=1) / (1 + 1j), np.complex128)
+        return np.asarray(kernel @ echo / kernel.sum(axis=1) / (1 + 1j), np.complex128)
 
     def correct_slope(
         self,
@@ -335,7 +336,8 @@ class StageWindow:
         step_rad = slope / slope_per_rad
         columns_px = np.arange(profile.size, dtype=np.float64)
         seen_px = find_ends(profile, lit, inside_px)
-        # Where plates touch, |H| does not fall to half between them.
+        # Where plates touch, |H| does not fall to half between them: there the end is that of the segmentation. A plate
+        # that goes on into the dark has no end.
         touching = np.abs(seen_px - mask_ends_px) > SAME_END_PX
         light_ends_px = np.flatnonzero(lit)[[0, -1]]
         in_light = np.abs(light_ends_px - mask_ends_px) > SAME_END_PX

@@ -70,6 +70,7 @@ _MAX_CHANGE = 2.0
 SAME_MM = 1e-3
 """Tolerance of positions: 2e-3 rad of an echo's phase."""
 SAME_HZ = 1e3
+"""Tolerance of transmit frequencies."""
 SAME_CORNER_KHZ = 10.0
 """Tolerance of filter corners: less than 0.1 dB and 0.1 degrees between direct path and echo, in both channels."""
 ARM_MM = 100.0
@@ -485,6 +486,7 @@ class ImageBuilder:
         return self._make_channels({name: board.current() for name, board in self.boards.items()})
 
     def _make_channels(self, channels: dict[str, tuple[Image, Image, str | None]], offset_m: float = 0.0) -> Images:
+        """Divide the image of each board by its footprint; `channels`: those and a notice, by board (`board.image`)."""
         h, v = channels.values()
         visible = np.ones(self.grid.shape, bool)
         for _, weight, _ in (h, v):

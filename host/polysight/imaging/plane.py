@@ -61,7 +61,7 @@ _TILT_TOLERANCE = 3e-3
 _MAX_RANGE_STD_M = 0.05
 """Largest standard deviation of a height by range that is used."""
 _PHASE_FITS_RAD = 0.5
-"""Largest RMS phase error of plates on one plane; a fifth of the value for random phases."""
+"""Largest RMS phase error of plates on one plane (chosen); random phases have 1.8."""
 _PHASE_STD_M = 5e-5
 """Standard deviation of a height from the phase of the reflection (some degrees for lossy plates) and roughness."""
 
@@ -92,7 +92,7 @@ class Focus:
 
     @property
     def certain(self) -> bool:
-        """True if the sharpness falls by more than 2 % towards both ends of the sweep."""
+        """True if the plane is not near the limits of the search, and the sharpness falls by 2 % towards both ends."""
         is_inside = (
             abs(self.depth_mm) < 0.95 * self.depths_mm[-1] and max(map(abs, self.tilt_deg)) < 0.95 * _MAX_TILT_DEG
         )
@@ -232,7 +232,7 @@ class PlaneEstimate:
 
     @property
     def worth_moving(self) -> bool:
-        """True if the offset from the rig file's plane is large enough to form images and angles again."""
+        """True if the offset from the rig file's plane is large enough to form images again, and within reach."""
         return self.known and abs(self.offset_m) > _WORTH_M and abs(self.offset_m) < PLANE_REACH_M
 
     @property
@@ -313,6 +313,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     plane, covariance = _fit_plane(places[determined], heights[determined], np.hypot(stds[determined], _MIN_STD_M))
     first_board = next(iter(builder.boards.values()))
     phase_heights, rad_per_m = _estimate_heights_by_phase(first_board, masks, places, plane)
+    # A plane has three unknowns: only with four plates can their phases contradict it.
     with_phase = determined & np.isfinite(phase_heights)
     by_phase = False
     if with_phase.sum() >= 4:
@@ -383,6 +384,8 @@ def _estimate_heights_by_range(
         if not power.sum() > 0:
             continue
         weight = power / power.sum()
+        # The change of the amplitude with range, beyond that of a mirror; and how much of it a mirror has per metre of
+        # height.
         with np.errstate(invalid="ignore", divide="ignore"):
             path_slope = np.real(slope[mask] / image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
             by_height = (

@@ -26,9 +26,8 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 # of the published rig are within 3e-4 of those with 24.
 _BLOCKS_ALONG = 24
 _BLOCKS_ACROSS = 8
-# Number of resolution cells that are evaluated to either side of the peak.
+# Number of resolution cells that are evaluated to either side of the peak, and of points per cell (chosen).
 _CELLS = 6.0
-# Number of points per resolution cell.
 _POINTS = 20
 # Nearest ghosts: step of the numerical derivative, reach and precision of the search, places that are tried.
 _STEP_M = 1e-4
@@ -103,7 +102,10 @@ def _combine_positions(
 
 
 def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
-    """Return the half-power width at `point` [3] along an axis, m, from the spread of wavenumbers in the aperture."""
+    """Return the half-power width at `point` [3] along an axis, m, from the spread of wavenumbers in the aperture.
+
+    Of the middle row or column and the first RX; infinite for an aperture of one position.
+    """
     middle = tuple(n // 2 for n in aperture.offsets_m.shape[:2])
     line = aperture.offsets_m[middle[0]] if axis == 0 else aperture.offsets_m[:, middle[1]]
     slope = np.zeros(len(line))
@@ -187,6 +189,7 @@ def board_facts(board: BoardSamples) -> BoardImaging:
     response = point_response(board.aperture, weights)
     return msgspec.structs.replace(
         facts,
+        # Zero is added because a loss of -0.0 would be written so.
         loss_db=round(-20 * float(np.log10(1 - masked)), 4) + 0.0,
         point_width_mm=_round_pair(response.width_mm),
         point_limit_mm=_round_pair(response.limit_mm),
@@ -210,7 +213,7 @@ def _round_pair(pair: tuple[float, float]) -> Pair:
 
 @dataclass(frozen=True)
 class FieldLimits:
-    """Limits for (x, y).
+    """Limits for (x, y) of the rig file's grid of positions.
 
     Attributes
     ----------
@@ -277,5 +280,8 @@ def _find_nearest_ghost_m(
     # Bisection: importing scipy.optimize takes longer than the whole forecast
     while far - near > _PRECISION_M:
         middle = (near + far) / 2
-        near, far = (near, middle) if too_far(middle) else (middle, far)
+        if too_far(middle):
+            far = middle
+        else:
+            near = middle
     return far

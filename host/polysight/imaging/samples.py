@@ -40,12 +40,12 @@ from polysight_shared.errors import DataError
 from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# `Reduction.maps`: echoes from this much before the direct path and behind the gate count, at least as far behind the
-# band's middle as decimation passes them; and their weight beside noise.
+# `Reduction.maps` is fitted to echoes from so much before the direct path to so much behind the gate, and at least so
+# far behind the band's middle (decimation passes 1 m); `_ECHO` is their amplitude beside noise of 1 (chosen).
 _BESIDE_M = 0.1
 _PASSED_M = 1.0
 _ECHO = 30.0
-# Noise power of a sample relative to the gate, for the estimate of the direct path
+# Noise power of a sample relative to echoes from the gate, for the estimate of the direct path (chosen).
 _NOISE = 1e-3
 # Taps of the filter against the motion in a burst: positions to either side.
 REACH = 4
@@ -115,7 +115,7 @@ def scene_gate_m(
     antennas: tuple[geometry.Antennas, ...], plan: RasterPlan, grid: geometry.ImageGrid, depth_m: float = 0.0
 ) -> tuple[float, float]:
     """Return the smallest and largest excess path of all pixels (`depth_m` nearer and farther) and stage positions."""
-    # 2 mm more: the travel within a burst
+    # 2 mm of room (chosen) for the travel of the stage within a burst.
     half_x = ((plan.columns - 1) / 2 * plan.step_x_mm + 2) / 1e3
     half_y = (plan.rows - 1) / 2 * plan.step_y_mm / 1e3
     dx, dy = np.meshgrid(
@@ -252,6 +252,7 @@ def choose_imager(aperture: geometry.Aperture) -> tuple[Imager, str | None]:
     if reason is None:
         return SpectralImager(aperture), None
     rx, _, rows, columns = aperture.shape
+    # The notice assumes ten million terms a second.
     sums = rx * rows * columns * aperture.grid.x_m.size * aperture.grid.y_m.size
     notice = f"imaging by direct sum, {sums:.1e} terms, about {sums / 1e7:.0f} s per board: {reason}"
     return DirectImager(aperture), notice
@@ -318,6 +319,7 @@ class BoardSamples:
         self._filters = burst_filters(rig)
         self._antennas = geometry.Antennas.from_rig(rig, board)
         self._chirp = rig.chirp
+        # Samples of an ideal mirror on the rig file's plane after the range gate, [rx, frequency].
         self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
         self._offsets = geometry.scan_offsets_m(rig)
         self._planned = geometry.row_starts_m(self._offsets)
@@ -325,6 +327,7 @@ class BoardSamples:
         shape = taper.shape
         self._cube = np.zeros((rx, reduction.frequencies_hz.size, *shape), np.complex64)
         self._direct = np.zeros((rx, *shape), np.complex64)
+        # True for positions with data, [row, column].
         self.valid = np.zeros(shape, bool)
         regular = geometry.find_irregularity(self.aperture) is None
         self._final: SpectralImager | None = None
@@ -415,6 +418,7 @@ class BoardSamples:
         offsets_m: NDArray[np.float64] | None = None,
         forward: slice = slice(None),
     ) -> None:
+        """Replace a row in the samples and the live image; `forward` brings `offsets_m` into the order of columns."""
         self._show(index, -1)
         self._cube[:, :, index], self._direct[:, index], self.valid[index] = row
         if offsets_m is not None:
@@ -549,6 +553,7 @@ class BoardSamples:
         return self._image
 
     def _form_images(self, grid: geometry.ImageGrid | None) -> tuple[Image, Image, str | None]:
+        """Form :meth:`image`; on the rig file's pixels from spectra of the rows, which are kept."""
         gains = (1 / self.rx_calibration()).astype(np.complex64)
         notice = None
         if grid is None:
@@ -593,6 +598,7 @@ class BoardSamples:
         return self._slope
 
     def _form_slope_images(self, grid: geometry.ImageGrid | None) -> tuple[Image, Image]:
+        """Form :meth:`range_slope`."""
         imager, _ = self._choose_imager(grid)
         factors = self._compute_range_slope_factors()
         gains = (1 / self.rx_calibration()).astype(np.complex64)
@@ -631,11 +637,13 @@ class BoardSamples:
         return self._make_constant_image(echo * self._compute_range_slope_factors())
 
     def _make_constant_image(self, echo: NDArray[np.complexfloating], grid: geometry.ImageGrid | None = None) -> Image:
+        """Return the image of an echo [rx, frequency] that every valid position has, as a mean."""
         imager, _ = self._choose_imager(grid)
         image: Any = imager.constant(echo.astype(np.complex64), self.weights)
         return (image / self.count).astype(np.complex64)
 
     def _compute_range_slope_factors(self) -> NDArray[np.complex64]:
+        """Return the factors of the samples in :meth:`range_slope`, [frequency], 1 / m."""
         f = self._reduction.frequencies_hz
         return (-2j * np.pi * (f - f.mean()) / SPEED_OF_LIGHT_M_S).astype(np.complex64)
 
@@ -644,6 +652,7 @@ class BoardSamples:
         return self.mirror if grid is None else self._mirror_samples(float(np.mean(grid.z_m)))
 
     def _mirror_samples(self, z_m: float) -> NDArray[np.complex128]:
+        """Return the samples of a mirror on the plane at `z_m`, [rx, frequency]."""
         return mirror_reduced(self._antennas, z_m, self._chirp, self._reduction)
 
     def _choose_imager(self, grid: geometry.ImageGrid | None) -> tuple[Imager, str | None]:

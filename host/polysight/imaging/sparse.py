@@ -35,7 +35,7 @@ MOST_ADDED = 4
 """Largest number of steps into which a step between positions is divided."""
 TEST_SHARE = 10
 """One in so many recorded rows, columns or positions is left out of the first fit, to measure the prediction."""
-# The power iteration comes from below: after 12 rounds 5 % are added, so that the estimate is not too small.
+# The power iteration comes from below: after 12 rounds 5 % are added (chosen), so that the estimate is not too small.
 _POWER_ROUNDS = 12
 _EIGENVALUE_MARGIN = 1.05
 
@@ -231,6 +231,7 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
     last = reconstruct(board, max(1, iterations // 2), start=first.image)
     board.fill(model.samples(last.image))
     samples = board.calibrate_samples()
+    # Only this share of the image comes from reconstructed positions, and has their error.
     reconstructed = _measure_image(model, samples, board.taper * ~recorded)
     share = reconstructed / _measure_image(model, samples, board.taper)
     return ReconstructedPositions(

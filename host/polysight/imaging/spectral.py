@@ -34,6 +34,7 @@ _FADE_COLUMNS = 20
 _FILLED = 1e-5
 KEEP_BYTES = 1 << 28
 """Size of the cache: two boards of the published grid take 90 MB."""
+# Lattices and kernels by key, the least recently used first.
 _cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
 SLACK_M = 2e-3
@@ -193,6 +194,7 @@ def get_cached(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
 
 
 def _count_bytes(arrays: Any) -> int:
+    """Return the bytes of a complex64 array, or of a tuple of these."""
     if isinstance(arrays, tuple):
         return sum(_count_bytes(a) for a in arrays)
     # The size of a lattice is negligible
@@ -400,6 +402,7 @@ class SpectralImager(RowSpectra):
         return self.xp.take(spectrum, self._repeat, axis=0)
 
     def _invert_transform(self, total: Any) -> Any:
+        """Return the pixels [ny, nx] of a spectrum on the lattice [ky, k]."""
         lines = self.xp.take(self._fft.ifft(total, axis=0), self._pixel_rows, axis=0)
         return self.evaluate_pixels(lines)
 
@@ -421,6 +424,7 @@ class IncrementalImager(RowSpectra):
         super().__init__(aperture, xp, device, SLACK_M)
         rows = aperture.shape[2]
         lines = aperture.grid.shape[0]
+        # Lag from the first row of positions to the first row of pixels, and the lags that pixels take from one row.
         self._last = self.lattice.row_stride * (rows - 1)
         self._span = self.lattice.pixel_stride * (lines - 1) + 1
         self._kernels, self._components = get_cached(self.key("rows"), self._compute_principal_kernels)
@@ -495,12 +499,14 @@ class IncrementalImager(RowSpectra):
         xp = self.xp
         rx = self.aperture.shape[0]
         size = (self.lattice.band.size, self.aperture.grid.shape[0])
+        # Spectra of the lines of pixels so far: of the samples [k, ny, rx], and of the constant echo [k, ny].
         self._sum = xp.zeros((*size, rx), dtype=xp.complex64, device=self.device)
         self._constant = xp.zeros(size, dtype=xp.complex64, device=self.device)
         channels = xp.reshape(xp.asarray(echo, dtype=xp.complex64, device=self.device), (-1,))[:, None]
         self._echo_kernel = xp.matmul(self._kernels, xp.matmul(self._components, channels))[:, :, 0]
 
     def _add_all(self, samples: Any, weights: Any) -> None:
+        """Add every row at its place in the aperture."""
         for index, start in enumerate(row_starts_m(self.aperture.offsets_m)):
             self.add_row(index, samples[:, :, index, :], weights[index, :], float(start))
 

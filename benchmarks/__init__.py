@@ -1,1 +1,5 @@
-"""Speed of the instrument's parts, measured side by side with something plain in the same run."""
+"""Speed and accuracy of the instrument on simulated data, beside something plain measured in the same run or a truth.
+
+`measure` has the rules of timing and the tables, `data` the simulated rows and scans, `published` the published method
+as a peer. docs/benchmarks.md has the results.
+"""

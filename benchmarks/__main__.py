@@ -1,4 +1,7 @@
-"""`python -m benchmarks [NAME [options]]`: all benchmarks one after another, or one with its options."""
+"""`python -m benchmarks [NAME [options]]`: the benchmarks of NAMES one after another, or one with its options.
+
+`plans`, `sparse_scans` and `static_chirps` are not among them: each is a program of its own.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ NAMES = (
 
 
 def main(argv: list[str]) -> int:
-    """Run one benchmark or all; each prints its own table."""
+    """Run one benchmark or all; each prints its own table. Return the highest exit status."""
     one_thread_each()
     modules = {name: importlib.import_module(f"benchmarks.{name}") for name in NAMES}
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
@@ -48,6 +51,7 @@ def main(argv: list[str]) -> int:
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)
     for name, options in chosen.items():
+        # Only benchmarks that have the option, and unless it was given.
         if args.out is not None and getattr(options, "json", "") is None:
             options.json = args.out / f"{name}.json"
     return max(modules[name].run(options) for name, options in chosen.items())

@@ -30,17 +30,21 @@ from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = NDArray[np.complex128]
+# Chosen, as IMAGE_SEED below.
 SEED = 20260
 
 
 def _draw_noise(rng: np.random.Generator, shape: tuple[int, ...], snr_db: float) -> Complex:
-    """Complex white noise this far below a tone of amplitude one."""
+    """Draw complex white noise whose power is `snr_db` below that of a tone of amplitude one."""
     sigma = 10 ** (-snr_db / 20) / np.sqrt(2)
     return sigma * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
 
 
 def _simulate_paths(rig: Instrument, board: Board, cycles_away: float = 0.0) -> tuple[Complex, Complex]:
-    """Direct path and echo of the mirror point, each of amplitude one: complex [rx, sample]."""
+    """Return direct path and echo of the specular midpoint, each of amplitude one: complex [rx, sample].
+
+    `cycles_away` turns the echo's phase.
+    """
     tx = np.array(tx_position_m(rig))
     rx = np.array(rx_positions_m(rig, board))
     point = np.array(specular_midpoint_m(rig, board))
@@ -53,7 +57,10 @@ def _simulate_paths(rig: Instrument, board: Board, cycles_away: float = 0.0) -> 
 
 
 def _quantise_bursts(bursts: NDArray[np.complexfloating]) -> NDArray[np.int16]:
-    """int16 [position, chirp, sample, 2, rx] of bursts [position, chirp, rx, sample]; 1 is a thousand counts."""
+    """Return bursts [position, chirp, rx, sample] as the card's words, int16 [position, chirp, sample, I and Q, rx].
+
+    An amplitude of 1 becomes a thousand counts.
+    """
     positions, chirps, rx, samples = bursts.shape
     flat = 1000 * bursts.transpose(2, 0, 1, 3).reshape(rx, positions * chirps, samples)
     return raw_words(flat).reshape(positions, chirps, samples, 2, rx)
@@ -61,20 +68,23 @@ def _quantise_bursts(bursts: NDArray[np.complexfloating]) -> NDArray[np.int16]:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Frequency errors of single chirps against the others of their burst, Hz: rms without gross ones, gross ones."""
+    """Frequency errors of single chirps against the others of their burst, ours and by division, as published."""
 
+    # Of each path over the noise of a channel.
     snr_db: float
+    # Rms error without gross ones, and number of gross ones.
     ours_hz: float
     ours_gross: int
     division_hz: float
     division_gross: int
+    # Number of chirps that were judged.
     chirps: int
 
 
 def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment:
-    """Direct path and equal echo, random offsets, noise of each channel `snr_db` below either of them.
+    """Measure the alignment of a burst's chirps: direct path and equal echo, random offsets, noise `snr_db` below each.
 
-    A gross error is one of more than half an FFT bin of the linear samples. Division's rms is without its gross errors.
+    A gross error is one of more than half an FFT bin of the linear samples; both rms errors are without them.
     """
     rng = np.random.default_rng([SEED, round(10 * snr_db)])
     board = rig.receivers[0]
@@ -95,6 +105,8 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
     half_bin = 0.5 / (b - a)
 
     def errors(estimated: NDArray[np.float64]) -> tuple[float, int]:
+        """Return rms error in Hz and number of gross errors of frequencies in cycles a sample [position, chirp]."""
+        # Only differences within a burst count.
         e = estimated - truth
         e -= np.median(e, axis=1, keepdims=True)
         gross = np.abs(e) > half_bin
@@ -106,7 +118,7 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
 
 
 def one_tone(snr_db: float, trials: int = 4000) -> tuple[float, float]:
-    """Rms error over Cramer-Rao bound of frequency and of phase (at the record's centre), one tone in noise."""
+    """Return rms error over Cramer-Rao bound of frequency and of phase (at the record's centre), one tone in noise."""
     rng = np.random.default_rng([SEED, 1, round(10 * snr_db)])
     samples = 192
     frequency = rng.uniform(-0.4, 0.4, trials)
@@ -143,7 +155,7 @@ def at_bins(rig: Instrument, board: Board, bins: float) -> Instrument:
 
 
 def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials: int = 3000) -> tuple[float, float]:
-    """Phase error of the direct path beside an equal echo: rms error (rad), and the same over its Cramer-Rao bound.
+    """Return the direct path's rms phase error beside an equal echo: in rad, and over its Cramer-Rao bound.
 
     The bound is of the joint estimate from all RX: the direct path's amplitude, phase and frequency, and the echo's
     complex amplitude and frequency, with the directions of both known, from the geometry.
@@ -162,7 +174,7 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
     aligned = align_row(_quantise_bursts(received[:, None]), np.ones((trials, 1), bool), chirp.linear_samples)
     done = reference(aligned, prepare(rig, board), chirp)
     error = np.angle(done.amplitude * np.exp(-1j * phase))[done.found]
-    # The direct path's own, constant
+    # Without the direct path's own phase, which is constant.
     error = np.angle(np.exp(1j * (error - np.angle(np.exp(1j * error).mean()))))
     rms = float(np.sqrt((error**2).mean()))
     bound = np.sqrt(np.mean([_compute_phase_bound(direct, echo, x, (a, b), snr_db) for x in between[:200]]))
@@ -172,7 +184,12 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
 def _compute_phase_bound(
     direct: Complex, echo: Complex, between: float, linear: tuple[int, int], snr_db: float
 ) -> float:
-    """Cramer-Rao bound of the direct path's phase, variance in rad^2; inverse of the Fisher information (Kay 1993)."""
+    """Return the Cramer-Rao bound of the direct path's phase, rad^2: from the inverse Fisher information (Kay 1993).
+
+    `direct` and `echo` are complex [rx, sample], `between` the phase between them, `linear` the samples that are used.
+    The parameters are the direct path's amplitude, phase and frequency, then real part, imaginary part and frequency of
+    the echo.
+    """
     inside = slice(*linear)
     d = direct[:, inside]
     e = echo[:, inside] * np.exp(1j * between)
@@ -183,13 +200,15 @@ def _compute_phase_bound(
 
 
 IMAGE_SEED = 7
+# Points of the scene; positions of the grid that are used; pixels that are compared. Chosen: the float64 sum over all
+# positions and pixels would take hours.
 POINTS = 9
 POSITIONS = 2000
 PIXELS = 60
 
 
 def image_error(rig: Instrument, board: Board) -> float:
-    """Largest difference at some pixels, of the image's peak.
+    """Return the largest difference between our image and the matched filter at some pixels, as a share of the peak.
 
     Points lie anywhere in the image, positions anywhere in the grid (2000 of them, the others masked), and each holds
     its direct path. The matched filter takes all linear samples with the imager's window, after the
@@ -245,7 +264,10 @@ def _match_filter(
     voxels_m: NDArray[np.float64],
     builder: ImageBuilder,
 ) -> NDArray[np.complex128]:
-    """Sum over RX, positions and all linear samples, normalised as the imager does, complex128 [voxel]."""
+    """Sum over RX, positions and all linear samples, normalised as the imager does, complex128 [voxel].
+
+    `samples` [rx, position, sample], `shifts_m` stage offsets [position, 3], `taper` weights of the positions.
+    """
     chirp = rig.chirp
     a, b = chirp.linear_samples
     all_antennas = tuple(Antennas.from_rig(rig, receiver) for receiver in rig.receivers)
@@ -268,6 +290,8 @@ def _match_filter(
 
 
 __all__ = ["add_arguments", "run"]
+# Signal-to-noise ratios and the distance of the two tones in FFT bins; chosen to span what a rig has (7.2 dB: the
+# paper's figures, see static_chirps).
 ALIGN_SNR_DB = (0.0, 2.5, 5.0)
 TONE_SNR_DB = (7.0, 16.0, 22.0, 30.0)
 BINS = 2.5
@@ -275,6 +299,7 @@ TWO_TONE_SNR_DB = 16.0
 
 
 def run(args: argparse.Namespace) -> int:
+    """Measure all parts on one core and print the table; return 0."""
     rig, _ = published_scene(args.quick)
     few = 1
     if args.quick:
@@ -291,6 +316,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _measure_alignment(aligned: Sequence[Alignment]) -> list[Line]:
+    """Return the lines of the table about alignment."""
     ratios = [a.ours_hz / a.division_hz for a in aligned]
     chirps = sum(a.chirps for a in aligned)
     gross = sum(a.ours_gross for a in aligned)
@@ -320,6 +346,7 @@ def _measure_alignment(aligned: Sequence[Alignment]) -> list[Line]:
 
 
 def _measure_tone(tones: Mapping[float, tuple[float, float]], pairs: Mapping[str, tuple[float, float]]) -> list[Line]:
+    """Return the lines about tones: results of `one_tone` by ratio in dB, and of `two_tones` by board."""
     return [
         Line(
             "one tone, 7-30 dB: rms error over Cramer-Rao",
@@ -345,6 +372,7 @@ def _measure_tone(tones: Mapping[float, tuple[float, float]], pairs: Mapping[str
 
 
 def _image_line(images: Mapping[str, float]) -> Line:
+    """Return the line about the image error of each board."""
     return Line(
         "image against a float64 matched filter, of the peak",
         " / ".join(f"{name} {e:.1e}" for name, e in images.items()),

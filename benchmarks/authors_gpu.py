@@ -14,11 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+# The first compiles kernels; chosen so that a median of seven remains.
 ROUNDS = 8
 
 
 def main(checkout: str, settings_path: str, image_path: str) -> int:
-    """Form a board's image from its synchronised cube on disk, as their notebook does."""
+    """Form a board's image from its synchronised cube on disk, as their notebook does; return 0."""
     sys.path.insert(0, checkout)
     sar_eval = importlib.import_module("polysight.dsp.sar").sar_eval
     settings = json.loads(Path(settings_path).read_text(encoding="utf-8"))
@@ -26,7 +27,7 @@ def main(checkout: str, settings_path: str, image_path: str) -> int:
     image = np.empty(0)
     for _ in range(ROUNDS):
         started_s = time.perf_counter()
-        # Images come back as NumPy arrays, so the time holds the GPU's work and the copy
+        # Images come back as NumPy arrays, so the time includes the GPU's work and the copy.
         image = sar_eval(settings, "RH", sum_bins=True).mean(axis=0)
         seconds.append(time.perf_counter() - started_s)
     np.save(image_path, image)

@@ -24,14 +24,15 @@ from polysight_shared.config import Board, Instrument, load_instrument
 RIG = ROOT / "instrument.toml"
 # Blocks of one board: 286 MB, twelve published rows.
 ROW_BLOCKS = 48
+# Share of the requested rate at which the senders count as in pace (chosen).
 KEEPS_PACE = 0.98
 MBIT_A_PACKET = MAX_PAYLOAD_BYTES * 8 / 1e6
 
 
 class Cards:
-    """A sender for each receiving board.
+    """A sender process for each receiving board, on loopback addresses drawn at random so that runs do not meet.
 
-    `blocks` is what each sends again and again, `folder` is where row files go.
+    `blocks` is what each sends again and again, `folder` is where row files go. `stack` ends the processes.
     """
 
     def __init__(self, rig: Instrument, config: Path, folder: Path, stack: ExitStack) -> None:
@@ -53,12 +54,12 @@ class Cards:
             sender.hear()
 
     def start_sending(self, packets: int, rate: float) -> None:
-        """Let every sender send this many packets at its share of the rate."""
+        """Let every sender send this many packets at its share of the rate (packets/s of all)."""
         for sender in self.senders:
             sender.say(packets, rate / len(self.senders))
 
     def sent(self) -> float:
-        """Wait for the senders; returns the longest time one took."""
+        """Wait for the senders; return the longest time that one took, seconds."""
         return max(sender.hear()["seconds"] for sender in self.senders)
 
     def queues(self) -> list[int]:
@@ -80,35 +81,42 @@ def replace_addresses(board: Board, card: str, host: str) -> Board:
 
 @dataclass
 class Trial:
-    """One rate, tried for a time. Rates and counts are of both cards together."""
+    """One rate, tried for a time. Rates (packets/s) and counts are of both cards together."""
 
+    # Requested rate, and the rate that the senders reached.
     wanted: float
     rate: float
+    # Time of sending.
     seconds: float
+    # Packets sent; those not received; those that the kernel counted as dropped.
     packets: int
     lost: int
     kernel_drops: int
+    # True if all complete rows have the right checksum.
     exact: bool
-    # Share of a core, each receiver
+    # Share of a core, each receiver.
     cpu: list[float]
-    # Worst fill of a receive buffer
+    # Worst fill of a receive buffer, as a share.
     queue: float
-    # Worst time to make a row durable and begin the next
+    # Worst time to make a row durable and begin the next.
     turn_s: float
-    # Rows processed a second meanwhile
+    # Rows processed a second meanwhile.
     rows_beside: float
+    # The machine's load average over a minute.
     load: float
 
     @property
     def good(self) -> bool:
+        """True if nothing was lost or changed."""
         return self.lost == 0 and self.exact
 
     @property
     def paced(self) -> bool:
-        """Whether the senders kept the pace that was asked for."""
+        """True if the senders reached the requested rate."""
         return self.rate >= KEEPS_PACE * self.wanted
 
     def line(self) -> str:
+        """Return the trial as a line of the table under HEAD."""
         cpu = "+".join(f"{100 * c:.0f}" for c in self.cpu)
         if self.lost:
             verdict = "LOSS"
@@ -132,7 +140,7 @@ HEAD = (
 
 
 class Receivers:
-    """The project's receivers, writing row files."""
+    """The project's receivers, writing row files. Each file is deleted once it is checked, except the first row's."""
 
     def __init__(self, cards: Cards, stack: ExitStack) -> None:
         self._cards = cards
@@ -146,7 +154,10 @@ class Receivers:
         self._crc: dict[int, list[int]] = {}
 
     def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
-        """Receive rows one after another until the time is over; making them durable in between is not in the time."""
+        """Receive rows for about `seconds` of sending; the time to make them durable in between does not count.
+
+        `rate`: packets/s of all cards; `beside`: process whose progress meanwhile is noted.
+        """
         cards = self._cards
         in_all = max(1, round(rate / len(cards.boards) * seconds / PACKETS))
         rows = -(-in_all // ROW_BLOCKS)
@@ -205,9 +216,11 @@ class Receivers:
         return trial
 
     def _watch(self, trial: Trial, seconds: float) -> None:
+        """Note the worst fill of a receive buffer for so long."""
         limit = time.perf_counter() + seconds
         while (seconds_left := limit - time.perf_counter()) > 0:
             time.sleep(min(0.05, seconds_left))
+            # The kernel grants twice the requested size (socket(7), SO_RCVBUF).
             trial.queue = max(trial.queue, max(self._cards.queues()) / (2 * self._cards.buffer_bytes))
 
     def _drain(self) -> None:
@@ -217,7 +230,7 @@ class Receivers:
             time.sleep(0.01)
 
     def _expected_checksum(self, board: int, blocks: int) -> int:
-        """CRC-32 of so many blocks."""
+        """Return the CRC-32 of so many blocks of a board, one after another."""
         checksums = self._crc.setdefault(board, [0])
         while len(checksums) <= blocks:
             checksums.append(zlib.crc32(self._cards.blocks[board], checksums[-1]))
@@ -225,7 +238,7 @@ class Receivers:
 
 
 class PlainLoops:
-    """A plain `recv_into` loop a card, which only counts."""
+    """A plain `recv_into` loop for each card, in a process of its own, which only counts packets."""
 
     def __init__(self, cards: Cards, stack: ExitStack) -> None:
         self._cards = cards
@@ -238,6 +251,7 @@ class PlainLoops:
             loop.hear()
 
     def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
+        """Count packets at this rate for so long; arguments as of `Receivers.try_rate`."""
         packets = max(1, round(rate / len(self._loops) * seconds / PACKETS)) * PACKETS
         state_before = ask(beside)
         began = time.perf_counter()
@@ -277,7 +291,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Hold the rate, compare; 1 when something was lost."""
+    """Receive at the rate, then compare with plain loops; return 1 if our receivers lost or changed something."""
     rig = load_instrument(RIG)
     with ExitStack() as stack:
         folder = Path(tempfile.mkdtemp(prefix="polysight-bench-", dir=args.folder))

@@ -5,7 +5,7 @@ and answers each when it has sent them. The packets are built once and sent with
 renewed, a block at a time.
 
 `count HOST_ADDRESS PORT BUFFER_BYTES`: the plain way, one `recv_into` a packet, no placement, no file. Reads lines
-`PACKETS`, and answers when that many came, or none for a second.
+`PACKETS`, and answers when that many came, or after three seconds without any in all.
 
 `process RIG ROW_FILE`: the processing of a live scan beside the capture. Decodes and synchronises the first published
 row (350 points of 16 chirps) of a recorded file, again and again, for the receiving boards in turn, and answers every
@@ -57,14 +57,14 @@ def make_block(rig: Instrument, seed: int) -> bytes:
 
 
 def make_packets(block: bytes) -> np.ndarray:
-    """uint8 [PACKETS, header and payload]; the headers are for :func:`number`."""
+    """Return the packets of a block, uint8 [PACKETS, header and payload]; :func:`number` fills the headers in."""
     packets = np.zeros((PACKETS, PACKET_HEADER_BYTES + MAX_PAYLOAD_BYTES), dtype=np.uint8)
     packets[:, PACKET_HEADER_BYTES:] = np.frombuffer(block, dtype=np.uint8).reshape(PACKETS, MAX_PAYLOAD_BYTES)
     return packets
 
 
 def number(packets: np.ndarray, first: int) -> None:
-    """Give the packets the counters of packets `first`, `first + 1`... since power-up."""
+    """Write the headers of packets `first`, `first + 1`... since power-up: sequence number and byte count so far."""
     k = np.arange(first, first + len(packets), dtype=np.uint64)
     heads = np.empty(len(packets), dtype=[("sequence", "<u4"), ("low", "<u4"), ("high", "<u2")])
     count = k * np.uint64(MAX_PAYLOAD_BYTES)
@@ -74,14 +74,14 @@ def number(packets: np.ndarray, first: int) -> None:
     packets[:, :PACKET_HEADER_BYTES] = heads.view(np.uint8).reshape(len(packets), struct.calcsize("<IIH"))
 
 
-# A card catches up on its own buffer at most; packets later than this are delayed
+# A sender that is late by more than this does not catch up: a card has no more than its own buffer (chosen).
 BEHIND_S = 0.005
-# Packets due within this time go together, as the card's own pace is finer than this process can wait
+# Packets due within this time go together, because a card's pace is finer than this process can wait (chosen).
 TURN_S = 0.0005
 
 
 class Sender:
-    """Sends packet after packet, at a pace, from the card's address and source port."""
+    """Sends packet after packet, at a pace, from `source` (the card's address and port) to `destination`."""
 
     def __init__(self, packets: np.ndarray, source: tuple[str, int], destination: tuple[str, int]) -> None:
         self._packets = packets
@@ -100,7 +100,7 @@ class Sender:
         self._next = 0
 
     def send(self, total: int, rate: float) -> float:
-        """Send `total` packets at `rate` packets/s; returns the seconds it took."""
+        """Send `total` packets at `rate` packets/s; return the seconds that it took."""
         start = began = time.perf_counter()
         sent = 0
         while sent < total:
@@ -119,6 +119,7 @@ class Sender:
         return time.perf_counter() - start
 
     def _call(self, at: int, count: int) -> int:
+        """Send at most `count` packets from position `at` of the block on; return how many were sent."""
         n = self._sendmmsg(self._socket.fileno(), ctypes.c_void_p(self._base + at * self._size), min(count, 1024), 0)
         if n < 0:
             number_ = ctypes.get_errno()
@@ -127,6 +128,7 @@ class Sender:
 
 
 def send(rig_path: str, seed: str, card: str, host: str, port: str) -> None:
+    """Serve as a card; see above."""
     # A real card is not starved by what else this machine does.
     take_priority(real_time=1)
     packets = make_packets(make_block(load_instrument(Path(rig_path)), int(seed)))
@@ -141,6 +143,7 @@ def send(rig_path: str, seed: str, card: str, host: str, port: str) -> None:
 
 
 def count(host: str, port: str, buffer_bytes: str) -> None:
+    """Serve as a plain receiver; see above."""
     sock = bind_udp(host, int(port), "plain loop")
     enlarge_receive_buffer(sock, int(buffer_bytes))
     sock.settimeout(1.0)
@@ -166,6 +169,7 @@ def count(host: str, port: str, buffer_bytes: str) -> None:
 
 
 def process(rig_path: str, row_file: str) -> None:
+    """Process a row again and again; see above."""
     rig = load_instrument(Path(rig_path))
     setups = [BoardSetup.from_rig(rig, board) for board in rig.receivers]
     size = np.fromfile(row_file, dtype=np.uint8, count=350 * rig.burst.pulses * rig.frame_bytes).size

@@ -20,7 +20,7 @@ from benchmarks.measure import AnonymousMemory, Child, Seconds
 from polysight.pipeline import Pipeline
 from polysight.store import ScanFolder
 
-# Times that the last row is added
+# How often the last row is added again, to time it.
 LAST_ROWS = 5
 
 
@@ -66,7 +66,7 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
 
 
 class Chain(Child):
-    """Such a process, its memory watched."""
+    """Such a process for a SOURCE, whose memory is watched. SOURCE.json is written into `folder`; `how` is HOW."""
 
     def __init__(self, folder: Path, how: str, source: dict[str, Any]) -> None:
         path = folder / "source.json"
@@ -75,17 +75,18 @@ class Chain(Child):
         self._memory = AnonymousMemory(self._process.pid)
 
     def run(self) -> dict[str, Any]:
-        """Process once. Raises RuntimeError when the process ends instead."""
+        """Process once and return the figures of :func:`process`. Raises RuntimeError if the process ends instead."""
         self.say()
         return self.hear()
 
     def end(self) -> int:
-        """End it; returns the highest anonymous memory it ever held, bytes."""
+        """End the process; return the highest anonymous memory that it held, bytes."""
         self.close()
         return self._memory.close()
 
 
 def main(argv: list[str]) -> int:
+    """Answer lines of the standard input until it ends."""
     source = json.loads(Path(argv[1]).read_text(encoding="utf-8"))
     for _ in sys.stdin:
         sys.stdout.write(json.dumps(process(source, live=argv[2] == "live")) + "\n")

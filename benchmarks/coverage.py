@@ -40,6 +40,7 @@ from polysight_simulators.scene import decode_scene, synced_cube
 from polysight_simulators.scene.scene_file import Scene, apply_scene
 from polysight_simulators.scene.simulated_scan import simulate, truth
 
+# Materials of most scenes: real part and loss (eps' and eps''), eight of them those of the paper's Table 2.
 MATERIALS: dict[str, tuple[float, float]] = {
     "wood": (2.61, 0.01),
     "PTFE": (2.05, 0.005),
@@ -64,20 +65,26 @@ KNOWN: dict[str, tuple[float, float]] = {
     "glass fiber": (4.69, 0.7),
     "wood (thin, smooth)": (2.61, 0.01),
 }
-"""Materials of the simulated library: named scenes hold these, all specimens alike."""
+"""Materials of the simulated library, as above: named scenes hold these, all specimens alike."""
 CLASSES = {"low loss": 0.05, "medium": 0.18, "lossy": np.inf}
 """Material classes by their loss tangent's upper end."""
 GRID = {"columns": 45, "rows": 43, "step_x_mm": 10.0, "step_y_mm": 6.0}
+# Centres of the six plates, mm.
 PLACES = [(x, y) for y in (-34.0, 34.0) for x in (-66.0, 0.0, 66.0)]
 KINDS = ("full", "no metal", "no direct path", "noise", "empty", "named", "sheet", "wide")
-"""Kinds of scenes; "sheet" is "full" with one thin sheet in air that is not declared, "wide" is "full" with
-permittivities and apertures drawn from the ranges below."""
+"""Kinds of scenes. "full": six plates, one of them metal or metal scanned on its own. "no metal": plates without any
+metal. "no direct path": without the path from TX to RX that synchronisation needs; "noise": the same without plates.
+"empty": nothing there. "named": plates of `KNOWN`. "sheet" is "full" with one thin sheet in air that is not declared,
+"wide" is "full" with permittivities and apertures drawn from the ranges below."""
+# Kinds with a metal reference and plates that can be judged.
 WHOLE = ("full", "sheet", "wide")
 WIDE_REAL = (2.0, 12.0)
 WIDE_LOSS_TANGENT = (0.003, 0.4)
 # Columns and rows; the image stays as it is, so that the outer plates lie beyond the smallest aperture.
 WIDE_APERTURES = ((45, 43), (33, 31), (25, 25))
+# Limits of the bins of a name's probability.
 SURE = (0.0, 0.5, 0.8, 0.95, 1.01)
+# Squared distances within which a normal distribution in two dimensions holds 68 and 95 %.
 CHI2_68 = 2.279
 CHI2_95 = 5.991
 # Standard deviations on both sides of a normal distribution's mean that hold 95 %.
@@ -86,29 +93,38 @@ Z_95 = 1.960
 
 @dataclass(frozen=True)
 class PatchFigures:
-    """One judged patch: squared distance of the truth in its region, errors, and its name."""
+    """One judged patch."""
 
+    # Seed of its scene.
     scene: int
+    # The true material, and its class of `CLASSES`.
     material: str
     kind: str
+    # Squared distance of the true permittivity from the estimate, in units of the estimate's covariance.
     distance2: float
+    # Error and stated standard error (rms of both parts), over the true permittivity's magnitude.
     relative_error: float
     relative_std: float
     leakage_measured: bool
+    # False: the metal was scanned on its own.
     metal_in_scene: bool
+    # Level of the scan's verdict.
     level: str
+    # Real part of the true permittivity.
     permittivity_real: float
-    # Error over its standard error, and over the half width of the interval that holds 68 %
+    # Error of each part over its standard error, and over the half width of the interval that holds 68 %.
     real_pull: float
     loss_pull: float
     real_pull_68: float
     loss_pull_68: float
+    # Columns of the scene's grid, which tell its aperture.
     columns: int
+    # True for a thin sheet that was not declared.
     sheet: bool = False
 
 
 class Cubes:
-    """A scene as a source of rows that were synchronised already, in memory."""
+    """A scene as a source of rows that were synchronised already, in memory, for `Pipeline`."""
 
     mirrored = False
     synchronised = True
@@ -131,6 +147,7 @@ class Cubes:
         return CubeRow(np.ascontiguousarray(cube[:, :: self.plan.row(row).direction]))
 
     def recording_facts(self) -> dict[str, Any]:
+        """Return what is known of the recording: nothing."""
         return {"recording": Recording()}
 
 
@@ -213,6 +230,7 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
 
 
 def _image_scan(source: Any, model: str | None = "none", inputs: Inputs = NO_INPUTS) -> Pipeline:
+    """Return a pipeline with all rows of a source; `model` is the library for names ("none", None: the default)."""
     pipeline = Pipeline(source, Settings(model=model), inputs)
     for row in source.rows():
         pipeline.add_row(row)
@@ -220,7 +238,10 @@ def _image_scan(source: Any, model: str | None = "none", inputs: Inputs = NO_INP
 
 
 def judge_scan(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Instrument, Findings, PlaneEstimate]:
-    """Draw, simulate and judge one scene."""
+    """Draw, simulate and judge one scene; return it, its rig, the findings and the estimated plane.
+
+    `raw`: from raw data instead of synchronised samples.
+    """
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     scene = draw_scene(seed, kind)
     model = "none"
@@ -282,6 +303,7 @@ def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigur
 
 
 def _print_coverage(rows: list[PatchFigures], title: str) -> dict[str, float]:
+    """Print and return how many regions hold the truth, rms z and errors; {} without patches."""
     d = np.array([r.distance2 for r in rows])
     if d.size == 0:
         return {}
@@ -303,7 +325,7 @@ def _print_coverage(rows: list[PatchFigures], title: str) -> dict[str, float]:
 
 
 def _pull_table(rows: list[PatchFigures], title: str) -> dict[str, float]:
-    """Coverage of the real part and of the loss: 68 % by its own interval, 95 % by its standard error."""
+    """Print and return the coverage of real part and loss: 68 % by its own interval, 95 % by its standard error."""
     entry = {"patches": float(len(rows))}
     text = f"{title:36s} {len(rows):5d} patches"
     for part in ("real", "loss"):
@@ -322,7 +344,7 @@ def _pull_table(rows: list[PatchFigures], title: str) -> dict[str, float]:
 
 
 def print_pulls(rows: list[PatchFigures]) -> dict[str, Any]:
-    """Coverage of both parts over all patches, by aperture and by real part."""
+    """Print and return the coverage of both parts over all patches, by aperture, real part and leakage."""
     out: dict[str, Any] = {"wide": _pull_table(rows, "real part 2..12, all apertures")}
     for columns, grid_rows in WIDE_APERTURES:
         title = f"  aperture {columns} x {grid_rows}"
@@ -340,7 +362,7 @@ def _measure_scene(job: tuple[int, str, bool]) -> list[PatchFigures]:
 
 
 def _read_names(seed: int) -> list[tuple[float, bool]]:
-    """Probability beside each name of one scene, and whether the name is right."""
+    """Return the probability beside each name of one scene of kind "named", and whether the name is right."""
     scene, rig, findings, _ = judge_scan(seed, "named")
     plates = truth_plates(truth(rig, scene, scene.seed))
     result = findings.analysis
@@ -365,6 +387,10 @@ def _print_reliability(pairs: list[tuple[float, bool]]) -> list[dict[str, float]
 
 
 def _judge_without_result(job: tuple[int, str]) -> tuple[str, int, str, int, str]:
+    """Judge a scene (seed, kind) that must give no result.
+
+    Return kind, seed, level of the verdict, number of patches with a name or permittivity, and first reason.
+    """
     seed, kind = job
     _, _, findings, _ = judge_scan(seed, kind)
     rows = findings.analysis.rows()
@@ -390,7 +416,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the tables; 1 when a scene without anything to name got a name or a permittivity."""
+    """Print the tables; return 1 if a scene without anything to name got a name or a permittivity."""
     seeds = range(args.first, args.first + args.scenes)
     jobs = [(i, "full", False) for i in seeds] + [(args.first + i, "full", True) for i in range(args.raw)]
     print("simulated scenes; regions of the permittivity (real and imaginary part together)")
@@ -423,11 +449,11 @@ def run(args: argparse.Namespace) -> int:
     print(f"  sheets: {args.sheets}; without a permittivity {args.sheets - sum(r.sheet for r in thin)}")
     out["pulls"] = print_pulls(wide)
     same = {(r.scene, r.material): r for r in rows}
-    outliers = [
+    differences = [
         abs(r.relative_error - same[r.scene, r.material].relative_error) for r in raw if (r.scene, r.material) in same
     ]
-    if outliers:
-        median_percent = 100 * float(np.median(outliers))
+    if differences:
+        median_percent = 100 * float(np.median(differences))
         print(f"raw beside samples: errors of the same patches differ by {median_percent:.2f} % (median)")
     said = [w for w in without if w[3] or w[2] != "none"]
     print(f"scenes with nothing to name: {len(without)}; given a name or permittivity: {len(said)}")

@@ -30,15 +30,17 @@ from polysight_simulators.scene import OwnLayout, Scene, SimulatedRig, apply_sce
 ROOT = Path(__file__).parents[1]
 RIG = ROOT / "instrument.toml"
 SCENE = ROOT / "examples" / "nine-materials.toml"
-# Rows that are simulated; all others repeat them. Even, so that directions fit
+# Rows that are simulated; all others repeat them. Even, so that rows keep their direction.
 DISTINCT = 4
-
-
+# Grid of `--quick`.
 QUICK = {"columns": 40, "rows": 20}
 
 
 def published_scene(quick: bool = False, **grid: Any) -> tuple[Instrument, Scene]:
-    """The published rig and grid in front of nine plates; changed, or too small for its figures to mean anything."""
+    """Return the published rig and grid in front of nine plates; `grid` changes keys of the grid.
+
+    `quick`: a grid and an image that are too small for the figures to mean anything.
+    """
     image = {}
     if quick:
         image = {"columns": 30, "rows": 30}
@@ -61,6 +63,7 @@ def recorded_rows(rig: Instrument, scene: Scene, count: int = DISTINCT) -> dict[
     """Return rows about the middle of the grid as both receivers record them: int16 [frame, sample, 8] by board."""
     radar = SimulatedRig(rig, scene)
     plan = plan_raster(rig.grid)
+    # An even row, which runs towards +x.
     first = (plan.rows - count) // 4 * 2
     rows: dict[str, list[NDArray[np.int16]]] = {b.name: [] for b in rig.receivers}
     for row in itertools.islice(plan, first, first + count):
@@ -83,9 +86,9 @@ def write_scan(folder: Path, rig: Instrument, rows: dict[str, list[NDArray[np.in
 
 @dataclass(frozen=True)
 class RepeatedRows:
-    """A scan of any size whose rows all come from a few short files: only its size is real.
+    """A scan of any size, for `Pipeline`, whose rows all come from a few short files: only its size is real.
 
-    `files` names each board's rows, whole published ones; a longer row repeats its positions.
+    `files` names each board's files of one row each; a row that is longer than the file repeats its positions.
     """
 
     instrument: Instrument
@@ -115,7 +118,10 @@ class RepeatedRows:
 
 
 def _read_repeatedly(path: Path, wanted_bytes: int, size: int) -> Iterator[NDArray[np.uint8]]:
-    """Read pieces of a file, from its start again where it ends, `wanted` bytes in all."""
+    """Yield pieces of a file of at most `size` bytes (0: one piece), `wanted_bytes` in all; at its end begin again.
+
+    All pieces share their memory.
+    """
     memory = allocate_pages(min(size, wanted_bytes) or wanted_bytes)
     with path.open("rb") as file:
         while wanted_bytes:
@@ -137,9 +143,10 @@ def point_row(
     frequencies_hz: NDArray[np.float64],
     chosen: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.complex128]:
-    """Echoes of equal points [n, 3] at (chosen) positions of a row, in the order met, [rx, position, frequency].
+    """Return the summed echoes of equal points [n, 3] at the positions of a row, [rx, position, frequency].
 
-    Phase +2 pi f d / c with d the excess path, as after perfect synchronisation.
+    Positions are in the order of the stage; `chosen` is a mask of them. The phase is +2 pi f d / c with d the excess
+    path, as after perfect synchronisation.
     """
     offsets = row_offsets_m(rig, row)
     if chosen is not None:
@@ -151,7 +158,7 @@ def point_row(
 
 
 def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
-    """Synchronised cube of nine points over the image, complex64 [rx, row, column, sample], columns ascending.
+    """Write a synchronised cube of nine points over the image, complex64 [rx, row, column, sample], columns ascending.
 
     The points' echoes are made at a few frequencies and interpolated, which is good to 1e-6.
     """
@@ -178,8 +185,6 @@ def as_synced(rig: Instrument, samples: NDArray[np.complex64], valid: NDArray[np
     """Return the part of a synchronised row that imagers read: samples [rx, position, sample], valid [position]."""
     if valid is None:
         valid = np.ones(samples.shape[1], bool)
-    else:
-        valid = valid
     return cast(
         SyncedRow, SimpleNamespace(samples=samples, sweep_hz=sample_frequencies_hz(rig.chirp), valid=valid, turn=None)
     )

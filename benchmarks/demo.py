@@ -18,6 +18,7 @@ from polysight.store import MANIFEST
 __all__ = ["add_arguments", "run"]
 # Time between two readings of the manifest and of the processes.
 _POLL_S = 0.05
+# How often the scan is processed.
 REPEATS = 3
 # Kind of a process by a part of its command line; the first part that occurs decides.
 KINDS = {
@@ -26,11 +27,12 @@ KINDS = {
     "polysight_simulators": "simulators",
     "polysight": "host",
 }
+# Scene of `--quick`.
 QUICK = ROOT / "examples" / "own-scene.toml"
 
 
 def run(args: argparse.Namespace) -> int:
-    """Scan and process the demo; print CPU seconds."""
+    """Scan and process the demo; print CPU seconds beside limits (chosen)."""
     # Not in `args.folder`: paths of the rig's sockets must be short.
     with temporary(None) as folder:
         scene = ROOT / "examples" / "demo.toml"
@@ -81,6 +83,7 @@ def scan_cpu_s(out: Path, scene: Path) -> tuple[int, dict[str, float]]:
 
 
 def _count_commits(manifest: Path) -> int:
+    """Return the number of rows that a scan's manifest holds; 0 without the file."""
     if not manifest.exists():
         return 0
     return manifest.read_text(encoding="utf-8").count('"row_committed"')
@@ -104,6 +107,7 @@ def _measure_cpu_of_tree(root: int) -> dict[int, tuple[str, float]]:
 
 
 def _list_parents() -> Iterator[tuple[int, int]]:
+    """Yield the id of every process and that of its parent."""
     for process in Path("/proc").iterdir():
         if process.name.isdigit():
             try:
@@ -114,4 +118,5 @@ def _list_parents() -> Iterator[tuple[int, int]]:
 
 
 def _make_seconds_line(name: str, value: float, limit: float, note: str) -> Line:
+    """Return a line of the table for seconds that must not exceed the limit."""
     return Line(name, f"{value:.2f} s", "", value, limit, limit, higher_is_better=False, note=note)

@@ -24,6 +24,7 @@ from polysight_worlds import draw_nuisances, draw_world, published_rig, simulate
 from polysight_worlds.media import Stack
 from polysight_worlds.world import World, dish
 
+# Permittivities eps' - j eps'' of liquids, rounded.
 LIQUIDS: dict[str, complex] = {
     "olive oil": 2.30 - 0.10j,
     "isopropanol": 3.00 - 0.60j,
@@ -33,21 +34,29 @@ LIQUIDS: dict[str, complex] = {
     "sugar water": 7.50 - 12.0j,
 }
 KINDS = ("plates", "dishes", "sheets")
+# Squared distance within which a normal distribution in two dimensions holds 99 %.
 CHI2_99 = 9.21
+# A region whose relative half width is below this claims to know the value.
 NARROW = 0.10
+# Relative distance from the truth within which a name of the literature counts as alike.
 ALIKE = 0.15
 
 
 @dataclass(frozen=True)
 class Piece:
-    """One judged piece: its name, the name's source and probability, `alike` to the truth, and a wrong narrow value."""
+    """One judged piece."""
 
+    # What it is.
     material: str
+    # The name that it was given, "library" or "literature" (None: neither), and its probability.
     name: str
     source: str | None
     confidence: float
+    # True if one of its names of the literature has about the true permittivity.
     alike: bool
+    # True if it was refused as a possible layer.
     thin: bool
+    # True if the 99 % region of its permittivity misses the truth and is narrow.
     misled: bool
 
 
@@ -111,6 +120,7 @@ def judge_scene(kind: str, seed: int, nuisance: str = "none") -> list[Piece]:
 
 
 def _is_alike(name: str, true: complex) -> bool:
+    """True if the literature's material of this name has about the permittivity `true`."""
     material = find_material(name)
     return material is not None and abs(material.permittivity - true) < ALIKE * abs(true)
 
@@ -120,7 +130,7 @@ def _judge(job: tuple[str, int, str]) -> list[Piece]:
 
 
 def format_line(title: str, pieces: Sequence[Piece]) -> str:
-    """Return one line of the table."""
+    """Return one line of the table; its columns are those that the module's docstring lists."""
     library = [p.confidence for p in pieces if p.source == "library"]
     literature = [p.alike for p in pieces if p.source == "literature" and p.confidence >= 0.5]
     figures = (

@@ -34,10 +34,11 @@ from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, tx_position_m
 from polysight_shared.raster import plan_raster
 
+# Rounds of what takes milliseconds.
 ROUNDS = 20
-# Rounds of what takes seconds
+# Rounds of what takes seconds.
 FEW = 3
-# Products of position and voxel per chunk of the exact sum
+# Products of position and voxel per chunk of the exact sum (chosen: the default suits a CPU's cache).
 LARGE_CHUNK = 1 << 24
 
 
@@ -90,7 +91,7 @@ def libraries() -> list[Library]:
 
 
 class Chain:
-    """From a board's cube to its image, in NumPy or on a GPU: the same calls."""
+    """The way from a board's cube in the file `path` to its image, in NumPy or on a GPU: the same calls."""
 
     def __init__(self, rig: Instrument, board: Board, path: Path) -> None:
         grid = image_grid(rig)
@@ -102,7 +103,7 @@ class Chain:
     def reduce(self, xp: Any = np, device: Any = None) -> Any:
         """Read the cube [rx, row, column, sample], copy it to the device and return it through the range gate."""
         matrix = self.gate.matrix.astype(np.complex64)
-        # Samples outside the linear part have weight 0
+        # Samples outside the linear part have weight 0.
         used = np.flatnonzero(np.abs(matrix).max(axis=0))
         linear = slice(int(used[0]), int(used[-1]) + 1)
         maps = xp.asarray(np.ascontiguousarray(matrix[:, linear].T), device=device)
@@ -110,12 +111,15 @@ class Chain:
         return xp.permute_dims(xp.matmul(cube[:, :, :, linear], maps), (0, 3, 1, 2))
 
     def image(self, samples: Any, xp: Any = np, device: Any = None) -> Any:
-        """Return the image of reduced samples, with kernels kept from before where there are any."""
+        """Return the image [ny, nx] of reduced samples, with kernels kept from before where there are any."""
         return SpectralImager(self.aperture, xp=xp, device=device).image(samples)
 
 
 def authors_settings(rig: Instrument, board: Board, folder: Path, bins: int) -> dict[str, Any]:
-    """Return the settings of the authors' imager for this rig: range spectra of `bins` points, every range bin."""
+    """Return the settings of the authors' imager for this rig: range spectra of `bins` points, every range bin.
+
+    Keys and the numbers of antennas (TX 4, RX 7 to 10 of 21) are theirs.
+    """
     chirp = rig.chirp
     grid = image_grid(rig)
     first, last = chirp.linear_samples
@@ -256,7 +260,7 @@ class Figures:
         def exact() -> Image:
             return library.to_numpy(DirectImager(chain.aperture).image(put()))
 
-        # The library's own start is not the imager's
+        # Without the time in which the library itself starts.
         first()
         resident = put()
         seconds = {
@@ -268,7 +272,7 @@ class Figures:
             "cube on disk to image": wall_seconds(from_cube, FEW),
         }
         exact_images: list[Image] = []
-        # A GPU idles in the chunks that suit a CPU's cache
+        # A GPU would idle in the chunks that suit a CPU's cache.
         with patch("polysight.imaging.direct._CHUNK", LARGE_CHUNK):
             seconds["exact sum"] = wall_seconds(lambda: exact_images.append(exact()), 1)
         return cls(library.name, seconds, from_samples(), from_cube(), exact_images[0])
@@ -308,7 +312,10 @@ def wall_seconds(job: Callable[[], Any], rounds: int) -> list[float]:
 
 
 def measure_authors(checkout: Path, rig: Instrument, board: Board, folder: Path, image: Image) -> dict[str, Any]:
-    """Run the authors' imager on the same cube from disk; print its seconds and how like ours its image is."""
+    """Run the authors' imager on the same cube from disk; print and return its seconds and how like ours its image is.
+
+    Their axes may run the other way, so the most similar of the four mirrored images counts.
+    """
     answer: dict[str, Any] = {}
     for bins in (1024, 2048, 4096):
         settings = folder / f"settings-{bins}.json"
@@ -341,7 +348,7 @@ def measure_authors(checkout: Path, rig: Instrument, board: Board, folder: Path,
 
 
 def _correlate(one: Image, other: Image) -> float:
-    """Normalised correlation of two images' magnitudes, 1 if equal but for a factor."""
+    """Return the normalised correlation of two images' magnitudes: 1 if equal but for a factor, 0 for other sizes."""
     if one.shape != other.shape:
         return 0.0
     a = np.abs(one)

@@ -34,7 +34,7 @@ Image = NDArray[np.complexfloating]
 
 
 class Bench:
-    """One board's cube on disk, and the ways to its image."""
+    """One board's cube on disk ([rx, row, column, sample], file `path`), and the ways to its image."""
 
     def __init__(self, rig: Instrument, board: Board, path: Path) -> None:
         self.rig = rig
@@ -42,7 +42,7 @@ class Bench:
         self.path = path
 
     def ours(self, live: bool = False) -> Image:
-        """Image from disk to pixels: all rows, then the image; or an image that every row updates."""
+        """Form the image from disk: all rows, then the image; `live`: an image that every row updates."""
         samples = ImageBuilder(self.rig, live=live).boards[self.board.name]
         for row, met in self._map_rows():
             samples.add_row(row, as_synced(self.rig, met))
@@ -68,18 +68,18 @@ class Bench:
         return Aperture(antennas, scan_offsets_m(self.rig), gate.frequencies_hz, grid), samples
 
     def ours_cold(self) -> Image:
-        """Image as :func:`ours`, without any stored kernel."""
+        """Form the image as :func:`ours`, without any stored kernel."""
         kernels.forget()
         return self.ours()
 
     def theirs(self, points: int = SETTINGS[0], tuned: bool = False) -> Image:
-        """Image by the published method, from disk."""
+        """Form the image by the published method, from disk; arguments as of `form_image`."""
         cube = np.load(self.path, mmap_mode="r")
         return form_image(cube, self.rig, self.board, image_grid(self.rig), points, tuned)
 
 
 def in_turn(jobs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Seconds]:
-    """Run every job once a round."""
+    """Run every job once a round, one after another; return their times."""
     took = {name: Seconds() for name in jobs}
     for _ in range(rounds):
         for name, job in jobs.items():
@@ -89,18 +89,18 @@ def in_turn(jobs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Second
 
 
 def worst(image: Image, true: Image) -> float:
-    """Largest difference, of the peak."""
+    """Return the largest difference of two images, as a share of the peak."""
     return float(np.abs(image - true).max() / np.abs(true).max())
 
 
 def rms(image: Image, true: Image) -> float:
-    """Relative rms difference after the best common factor."""
+    """Return the relative rms difference of two images after the complex factor that fits best."""
     factor = np.vdot(image, true) / np.vdot(image, image)
     return float(np.linalg.norm(factor * image - true) / np.linalg.norm(true))
 
 
 def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
-    """Compare with the published method, from the cube on disk."""
+    """Compare with the published method, from the cube on disk; return lines of the table and figures for the file."""
     bench.ours()
     jobs = {
         "cold": bench.ours_cold,
@@ -227,6 +227,7 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
 
 
 def run(args: argparse.Namespace) -> int:
+    """Run the comparisons on one core and print the table; return 0."""
     rig, _ = published_scene(args.quick)
     lines: list[Line] = []
     figures_of_parts: dict[str, Any] = {}

@@ -40,14 +40,17 @@ from polysight_simulators.scene.simulated_scan import truth
 
 RANGE_M = (0.3e-3, 6e-3)
 """Where the thickness of a sheet is looked for."""
+# Sub-bands of the sweep, in which a scene is imaged.
 BANDS = 4
 A_RIG = 5
 """Scenes of one rig."""
 SIDE_MM = 46.0
+# Permittivity eps', eps'' of the wall in front of a liquid (chosen).
 GLASS = (5.5, 0.05)
 CONDUCTOR = (1.0, 1e9)
 """Permittivity of metal behind a sheet: of a good conductor, reflects -1 to one part in 1e4."""
 KINDS = ("sheet in air", "sheet on metal", "liquid behind a wall")
+# Relative error up to which a result counts as right.
 ENOUGH = 0.05
 Setting = tuple[float, float | None]
 SETTINGS: tuple[Setting, ...] = ((0.1, None), (0.04, None), (0.1, 0.2))
@@ -57,26 +60,36 @@ of the thickness reaches (None: `RANGE_M`)."""
 
 @dataclass(frozen=True)
 class Case:
-    """One stack and what was found of it, by one of `SETTINGS`. Lengths in mm; permittivities as (eps', eps'')."""
+    """One stack and what was fitted to it, by one of `SETTINGS`. Permittivities are (eps', eps'')."""
 
+    # Seed of its scene.
     scene: int
+    # One of `KINDS`.
     kind: str
     setting: Setting
+    # The truth of the layer in question; a liquid's thickness is 0.
     permittivity: tuple[float, float]
     thickness_mm: float
+    # The fit; None if the plate was not found or not fitted.
     fitted: tuple[float, float] | None = None
+    # Relative errors of permittivity and thickness.
     error: float = float("nan")
     thickness_error: float = 0.0
+    # Squared distance of the true permittivity from the fit, in units of the fit's covariance.
     distance2: float = float("nan")
+    # Stated relative standard error.
     relative_std: float = float("nan")
+    # True if the program says that other values fit as well; number of such values.
     ambiguous: bool = True
     rivals: int = 0
+    # Per degree of freedom.
     chi2: float = float("nan")
+    # True if the program warns that the stack does not explain the data.
     unexplained: bool = False
 
     @property
     def right(self) -> bool:
-        """Whether permittivity and thickness are within 5 %."""
+        """True if permittivity and thickness are within 5 % of the truth."""
         return self.error < ENOUGH and self.thickness_error < ENOUGH
 
     @property
@@ -86,7 +99,7 @@ class Case:
 
 
 def draw_scene(seed: int) -> Scene:
-    """Six stacks on the places of a coverage scene."""
+    """Draw six stacks on the places of a coverage scene; `A_RIG` successive seeds have the same rig."""
     rig_rng = np.random.default_rng([20261123, seed // A_RIG])
     rng = np.random.default_rng([20261124, seed])
     leak = [complex(0.1 * rig_rng.random() * np.exp(2j * np.pi * rig_rng.random())) for _ in range(2)]
@@ -130,6 +143,7 @@ def draw_scene(seed: int) -> Scene:
 
 
 def _image_scan(rig: Instrument, scene: Scene) -> Pipeline:
+    """Return a pipeline with all rows of a simulated scene, in sub-bands."""
     source = Cubes(rig, scene)
     pipeline = Pipeline(source, Settings(model="none", bands=BANDS))
     for row in source.rows():
@@ -206,7 +220,7 @@ def judge_fit(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -
 
 
 def cases(seeds: Sequence[int]) -> list[Case]:
-    """Return all stacks of the scenes of one rig."""
+    """Return all stacks of the scenes of one rig, by each of `SETTINGS`."""
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     out = list[Case]()
     metal = metal_scan(rig, draw_scene(seeds[0]))
@@ -226,13 +240,14 @@ def cases(seeds: Sequence[int]) -> list[Case]:
 
 
 def _mean_or_nan(flags: NDArray[np.bool_]) -> float:
+    """Return the share of true flags; NaN without any."""
     if flags.size == 0:
         return float("nan")
     return float(np.mean(flags))
 
 
 def table(rows: list[Case], title: str) -> dict[str, float]:
-    """Print and return the shares of one kind of stack."""
+    """Print and return how many fits of one kind of stack are right, ambiguous or wrong; {} without fits."""
     fits = [r for r in rows if r.fitted is not None]
     everywhere = np.array([r.distance2 for r in fits if not r.rivals])
     sure = [r for r in fits if not r.flagged]
@@ -277,7 +292,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the table; 1 when more than 5 % of the fits not flagged are beyond 5 %."""
+    """Print the table; return 1 if more than 5 % of the fits without a warning are beyond 5 %."""
     scenes = range(args.first, args.first + -(-args.cases // len(PLACES)))
     rigs = [list(group) for _, group in itertools.groupby(scenes, lambda seed: seed // A_RIG)]
     print(f"simulated sheets and liquids, {BANDS} sub-bands")

@@ -19,20 +19,23 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+# Environment variables that limit the threads of numerical libraries.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+# Time between two readings of a process's memory (chosen).
 _LOOK_S = 0.02
 ROOT = Path(__file__).parents[1]
+# Unit of CPU times in /proc.
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
 def one_thread_each() -> None:
-    """Libraries start no threads of their own; to be called before NumPy is imported."""
+    """Keep libraries from starting threads of their own. Call it before NumPy is imported."""
     os.environ.update(dict.fromkeys(THREADS, "1"))
 
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """This process and its children run on one core, whatever they would like."""
+    """Keep this process and its children on one core in the block, however many threads they have."""
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(allowed)})
     try:
@@ -98,7 +101,7 @@ class AnonymousMemory:
                 self.peak_bytes = max(self.peak_bytes, int(line.split()[1]) * 1024)
 
     def close(self) -> int:
-        """Stop watching; returns the highest value seen, bytes."""
+        """Stop watching; return the highest value seen, bytes."""
         self._ended.set()
         self._watcher.join()
         return self.peak_bytes
@@ -121,7 +124,7 @@ def machine() -> dict[str, Any]:
 
 
 class Child:
-    """A helper process that answers lines with lines of JSON."""
+    """A helper process, `python -m MODULE WORDS`, that answers lines with lines of JSON."""
 
     def __init__(self, module: str, *words: object) -> None:
         self._process = subprocess.Popen(
@@ -134,11 +137,13 @@ class Child:
         )
 
     def say(self, *words: object) -> None:
+        """Send a line."""
         if self._process.stdin is not None:
             self._process.stdin.write(" ".join(map(str, words)) + "\n")
             self._process.stdin.flush()
 
     def hear(self) -> Any:
+        """Wait for an answer and return it, `ready` as text. Raises RuntimeError if the process has ended."""
         line = ""
         if self._process.stdout is not None:
             line = self._process.stdout.readline()
@@ -149,11 +154,12 @@ class Child:
         return json.loads(line)
 
     def close(self) -> None:
+        """End the helper's input and wait until it ends."""
         self._process.communicate()
 
 
 def ask(beside: Child | None) -> dict[str, Any]:
-    """Progress of the processing beside."""
+    """Ask the processing beside a measurement for its progress (`rows`, `cpu_s`); zeros without one."""
     if beside is None:
         return {"rows": 0, "cpu_s": 0.0}
     beside.say()
@@ -161,7 +167,7 @@ def ask(beside: Child | None) -> dict[str, Any]:
 
 
 def cpu_s(pid: int) -> float:
-    """CPU seconds of a process so far."""
+    """Return the CPU seconds of a process so far, without those of its children."""
     words = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
     return (int(words[11]) + int(words[12])) * TICK_S
 
@@ -197,6 +203,7 @@ class Line:
 
     @property
     def verdict(self) -> str:
+        """Say if the value reaches a limit; "" for a line without limits."""
         if self.at_least is None or self.aim is None:
             return ""
         if self._reaches(self.aim):
@@ -211,6 +218,7 @@ class Line:
         return self.value <= limit
 
     def cells(self) -> list[str]:
+        """Return the texts of the table's columns (HEAD)."""
 
         def number(x: float | None) -> str:
             if x is None:
@@ -250,7 +258,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def write(path: Path | None, name: str, lines: list[Line], **more: Any) -> None:
-    """Write the figures, with the machine they were measured on."""
+    """Write the figures and the machine they were measured on as JSON; `more`: further keys. None: write nothing."""
     if path is None:
         return
     content = {

@@ -29,8 +29,10 @@ from polysight_simulators import gpio
 
 RIG = Path(__file__).parents[1] / "instrument.toml"
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
+# Limits (chosen): share of a core, and resident memory.
 CPU_AT_MOST = 0.15
 MEMORY_AT_MOST_MB = 60.0
+# Longest time of a row: ROW_POINTS take 3.5 s.
 LIMIT_S = 60.0
 # Rows are short, because a busy machine ends some of them with a fault.
 ROW_POINTS = 35
@@ -42,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure and print; 0 when processor and memory are within their limits."""
+    """Measure and print; return 0 if processor and memory are within their limits."""
     points = 20 if args.quick else args.points
     with temporary(args.folder) as folder, ExitStack() as stack:
         figures = _measure(_make_rig(folder, min(points, ROW_POINTS)), points, folder, stack)
@@ -57,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _make_rig(folder: Path, points: int) -> Instrument:
+    """Return the rig file's rig with one row of so many points, and its devices and journals in `folder`."""
     rig = load_instrument(RIG)
     replace = msgspec.structs.replace
     stage = replace(rig.stage, port=str(folder / "tty"), centre_x_mm=points + 5.0, centre_y_mm=2.0)
@@ -80,6 +83,10 @@ def _start(stack: ExitStack, module: str, *args: object, **environment: str) -> 
 
 
 def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> dict[str, Any]:
+    """Start wires, stage and Pi half, run rows until so many points are measured, and return the figures by name.
+
+    `stack` ends the processes.
+    """
     config = folder / "rig.toml"
     hub = folder / "wires"
     config.write_text(tomli_w.dumps(to_builtins(rig)), encoding="utf-8")
@@ -120,7 +127,7 @@ def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> di
 
 
 class _Rows:
-    """Run rows one after another and record their edges on the wires."""
+    """Run rows one after another and record their edges on the wires; `pid` is the Pi half's."""
 
     def __init__(self, client: PiClient, rig: Instrument, wires: WireClient, pid: int) -> None:
         self._client = client
@@ -142,7 +149,10 @@ class _Rows:
         )  # fmt: skip
 
     def take_row(self) -> None:
-        """Run one row to its end; processor time counts from its first capture on."""
+        """Run one row to its end and add its bursts; processor time counts from its first capture on.
+
+        Raises SystemExit if the row does not end, or if the edges on the wires are not those reported.
+        """
         self.rows += 1
         while (state := self._client.status().state) != "ready":
             if state in ("idle", "fault"):
@@ -188,10 +198,12 @@ class _Rows:
 
 
 def _read_cpu_s(pid: int) -> float:
+    """Return the CPU seconds of a process so far."""
     user, system = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
     return (int(user) + int(system)) * TICK_S
 
 
 def _compute_quantiles(values: list[float]) -> list[float]:
+    """Return median, 99.9th percentile and maximum of ascending values, rounded to hundredths."""
     shares = [0.5, 0.999, 1.0]
     return [round(values[min(len(values) - 1, int(q * len(values)))], 2) for q in shares]

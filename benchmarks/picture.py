@@ -51,12 +51,15 @@ WORLD_NAMES = {
     "wood_thin": "wood_thin",
 }
 """Box to the name in Table 2 of the independent generator."""
+# Box of the metal reference.
 METAL_BOX = "copper"
 RATIO_STD = 0.08
 PHASE_STD_RAD = np.radians(10)
 MOST_STDS = 3.0
 """Errors of |P| and of its phase that the short posterior believes in, and the distance of "none of these"."""
+# Probability from which a wrong name counts as sure and wrong.
 SURE = 0.8
+# Standard deviations on both sides of a normal distribution's mean that hold 95 %.
 TWO_SIDED_95 = 1.96
 
 
@@ -70,7 +73,7 @@ class Form:
 
 
 def write_forms(source: Path, boxes: dict[str, list[int]], scratch: Path) -> list[Form]:
-    """Write the picture in its four forms."""
+    """Write the picture in its four forms below `scratch`; `boxes` are x0, y0, x1, y1 in pixels, row 0 at the top."""
     with np.load(source) as arrays:
         h = arrays["h"]
         v = arrays["v"]
@@ -94,7 +97,7 @@ def write_forms(source: Path, boxes: dict[str, list[int]], scratch: Path) -> lis
 
 
 def process(form: Form, boxes: dict[str, list[int]], library: Path | None) -> tuple[ProcessedScan, dict[str, int]]:
-    """Process one form; return the result, and the patch number of each box."""
+    """Process one form; return the result, and the number of the patch that covers most of each box (0: none)."""
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     pair = read_given_images(form.path, rig)
     drawn = None
@@ -102,7 +105,7 @@ def process(form: Form, boxes: dict[str, list[int]], library: Path | None) -> tu
         drawn = Labels({name: (b[0], b[1], b[2], b[3]) for name, b in boxes.items()})
     settings = Settings(incidence_deg=ANGLE_DEG, library=path_text(library))
     scan, _, _ = analyse_given_images(pair, settings, Inputs(labels=drawn), rig)
-    # Row 0 of the boxes is the top
+    # Row 0 of the boxes is the top, that of the labels the bottom.
     labels = scan.labels[::-1]
     patch_of = {}
     for name, (x0, y0, x1, y1) in boxes.items():
@@ -117,12 +120,16 @@ def process(form: Form, boxes: dict[str, list[int]], library: Path | None) -> tu
 
 @dataclass(frozen=True)
 class PlateFigures:
-    """One plate beside Table 2: its line of the table, and the relative half width of the real part's 95 % region."""
+    """One plate beside Table 2."""
 
+    # Its line of the printed table.
     text: str
+    # True if the 95 % interval of the real part holds Table 2's.
     inside: bool = False
+    # True if the name is right.
     right: bool = False
     sure_and_wrong: bool = False
+    # Relative half width of the real part's 95 % interval; None without a permittivity.
     half_width: float | None = None
 
 
@@ -168,7 +175,7 @@ def table_2_library(extent: str) -> Library:
 
 
 def measure_ratios(source: Path, boxes: dict[str, list[int]]) -> dict[str, complex]:
-    """Return P of each box relative to copper's: medians over its pixels, nothing corrected."""
+    """Return the ratio P = h / v of each box relative to copper's: medians over its pixels, nothing corrected."""
     with np.load(source) as arrays, np.errstate(divide="ignore", invalid="ignore"):
         inverse_ratio = arrays["v"] / arrays["h"]
     ratios = {}
@@ -223,7 +230,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a table for each form; skipped, and said, without the picture."""
+    """Print a table for each form; without the picture print that it is skipped. Return 0."""
     sources = []
     if args.images:
         sources = sorted(Path(args.images).glob("*.npz"))

@@ -43,6 +43,7 @@ from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.raster import plan_raster
 from polysight_simulators.scene import Scene, SimulatedRig, load_scene, row_offsets_mm, truth
 
+# Iterations of a reconstruction (chosen).
 ITERATIONS = 40
 HEAD = (
     "| scan | plan | minutes | image error | plates named right | their pixels | eps' off by (median) |\n"
@@ -51,7 +52,9 @@ HEAD = (
 
 
 def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilder]:
-    """Simulate, synchronise and reduce every row: bursts in their true places, and taken to lie at their triggers."""
+    """Simulate, synchronise and reduce every row; return the samples with bursts in their true places, and as if they
+    lay at their triggers (the motion during a burst is then not compensated).
+    """
     radar = SimulatedRig(rig, scene)
     plan = plan_raster(rig.grid)
     true = ImageBuilder(rig)
@@ -71,13 +74,13 @@ def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilde
 
 
 def tell(text: str) -> None:
-    """Progress, on stderr."""
+    """Print progress on stderr."""
     sys.stderr.write(text + "\n")
     sys.stderr.flush()
 
 
 def image_every_nth(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
-    """Image every n-th row, by matched filter or by reconstruction; the builder is not changed."""
+    """Image every n-th row, by matched filter or (`rebuilt`) by reconstruction; the builder is not changed."""
     valid = {name: board.valid.copy() for name, board in builder.boards.items()}
     weights = {name: board.weights for name, board in builder.boards.items()}
     all_images = builder.finish()
@@ -110,7 +113,7 @@ def image_error(images: Images, ideal: Images) -> float:
 
 
 def name_patches(rig: Instrument, images: Images, plates: tuple[TruthPlate, ...]) -> MaterialsResult:
-    """Analyse the image: patches, permittivities and names."""
+    """Analyse the image with the simulated library: patches, permittivities and names; `plates` are the truth."""
     angles = incidence_choice(rig, images.x_m, images.y_m, "one")
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
     return analyse(images, Optics.from_rig(rig, angles), given_scene=KnownScene(plates=plates), classifier=classifier)
@@ -124,7 +127,7 @@ def measure(
     plates: tuple[TruthPlate, ...],
     every: int = 1,
 ) -> None:
-    """Print figures of one scan; `every` n-th row was scanned."""
+    """Print a line of the table (HEAD) about one scan, of which `every` n-th row was scanned."""
     # Only the rows that are scanned take time.
     scanned = Changes(step_y_mm=every * rig.grid.step_y_mm).apply(rig)
     result = name_patches(rig, images, plates)
@@ -149,16 +152,20 @@ def measure(
     )
 
 
+# A scan's name, rig and images, and that every n-th row was scanned.
 Made = tuple[str, Instrument, Images, int]
 
 
+# The following simulate scans by different plans: `rig` has the published plan.
+
+
 def published_plan(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """Return the rig file's plan."""
+    """Scan by the rig file's plan."""
     yield "published", rig, as_scanned(rig, scene)[0].finish(), 1
 
 
 def fast(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """Plan 100 mm/s with shorter bursts that make whole packets of a row; then with rows left out of it."""
+    """Scan at 100 mm/s with shorter bursts, whose rows fill whole packets; then leave rows out of it."""
     rig = Changes(speed_mm_s=100.0, pulses=13, period_us=750.0).apply(rig)
     builder, uncompensated = as_scanned(rig, scene)
     yield "fast", rig, builder.finish(), 1
@@ -170,19 +177,19 @@ def fast(rig: Instrument, scene: Scene) -> Iterator[Made]:
 
 
 def short(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """Plan the same with fewer chirps."""
+    """Scan at 100 mm/s with fewer chirps."""
     rig = Changes(speed_mm_s=100.0, period_us=750.0, pulses=6).apply(rig)
     yield "fast, 6 chirps", rig, as_scanned(rig, scene)[0].finish(), 1
 
 
 def wide(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """Plan the published burst with rows twice as far apart."""
+    """Scan with the published burst and rows twice as far apart."""
     rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm).apply(rig)
     yield "half the rows, published burst", rig, as_scanned(rig, scene)[0].finish(), 1
 
 
 def first_proposal(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """Return the first proposal of `polysight plan --minutes 30` for the published rig."""
+    """Scan by the first proposal of `polysight plan --minutes 30` for the published rig."""
     rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm, pulses=55, period_us=730.0).apply(rig)
     yield "first proposal for 30 minutes", rig, as_scanned(rig, scene)[0].finish(), 1
 
@@ -191,7 +198,7 @@ SCANS = (fast, published_plan, wide, short, first_proposal)
 
 
 def main() -> int:
-    """Simulate and measure the plans; print a Markdown table."""
+    """Simulate and measure the plans; print a Markdown table. Return 0."""
     parser = argparse.ArgumentParser(description="image error and naming of faster scans, simulated")
     names = [s.__name__ for s in SCANS]
     parser.add_argument("--scans", nargs="*", choices=names, default=names, help="some of them only")

@@ -22,18 +22,18 @@ from polysight_shared.geometry import rx_positions_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = NDArray[np.complexfloating]
-# Alignment transforms are so many times longer than a chirp
+# Constants are the settings of the authors' code. Transforms of the alignment are so many times longer than a chirp.
 UPSCALE = 64
 # Bins of the spectra in which the direct path is searched.
 RANGE_BINS = 1024
-# Points of the closer look, over two bins
+# Points of the finer spectrum around the peak, over two bins.
 ZOOM = 100
-# Alignment looks at this channel alone
+# RX whose samples alone are used for the alignment.
 SYNC_RX = 0
 
 
 class Synchroniser:
-    """One board's positions, one at a time.
+    """Synchronises one board's positions, one at a time.
 
     Parameters
     ----------
@@ -89,13 +89,16 @@ class Synchroniser:
             turn.imag = -np.sin(turns)
             return (chirps * turn).mean(axis=1)
         out = np.empty_like(chirps)
-        # Each makes the same factors again, in double precision
+        # As published: each RX makes the same factors again, in double precision.
         for rx, channel in enumerate(chirps):
             out[rx] = channel * np.exp(-1j * (2 * np.pi * frequency * self._n + phase))
         return out.mean(axis=1)
 
     def offsets(self, chirps: Complex) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Frequency (cycles a sample) and phase (rad at the first sample) of each chirp against the strongest."""
+        """Return frequency (cycles a sample) and phase (rad at the first sample) of each chirp against the strongest.
+
+        `chirps`: complex64 [rx, chirp, sample].
+        """
         channel = chirps[SYNC_RX]
         reference = channel[np.abs(channel).sum(axis=1).argmax()].copy()
         reference[np.abs(reference) < 0.1] = 0.1
@@ -157,7 +160,7 @@ class Synchroniser:
         return np.stack([self.reference(self.align(burst))[0] for burst in bursts], axis=1)
 
 
-# Points of the range FFT, from the cheapest
+# Points of the range FFT, the cheapest first.
 SETTINGS = (1024, 2048, 4096)
 
 
@@ -169,7 +172,7 @@ def form_image(
     points: int = SETTINGS[0],
     tuned: bool = False,
 ) -> NDArray[np.complexfloating]:
-    """Image of one board.
+    """Form the image of one board.
 
     The grid's pixels must be as far apart as the positions; the burst's travel is ignored, as published.
 

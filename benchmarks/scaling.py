@@ -23,7 +23,7 @@ SIZES = {
     2.0: (700, 200, 1.0, 2.0),
     4.0: (700, 400, 1.0, 1.0),
 }
-# Of the published grid, processed by one thread and by two in turn.
+# Rows of the published grid that one thread and two process in turn, and how often.
 ROWS_OF_THREADS = 60
 ROUNDS_OF_THREADS = 5
 
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def time_threads(rig: Instrument, files: dict[str, list[Path]], rows: int, rounds: int) -> dict[int, Seconds]:
-    """CPU and wall seconds of adding rows to the images on one thread and on two, in turn."""
+    """Measure CPU and wall seconds of adding rows to the images on one thread and on two, in turn; by threads."""
     took = {1: Seconds(), 2: Seconds()}
     pipeline = Pipeline(RepeatedRows(rig, files))
     # The first row makes maps and buffers.
@@ -48,6 +48,7 @@ def time_threads(rig: Instrument, files: dict[str, list[Path]], rows: int, round
 
 
 def run(args: argparse.Namespace) -> int:
+    """Measure threads, then sizes; print both. Return 0."""
     rig, scene = published_scene()
     with temporary(args.folder) as folder:
         files: dict[str, list[Path]] = {}
@@ -71,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def time_sizes(folder: Path, files: dict[str, list[Path]], largest: float) -> list[dict[str, Any]]:
-    """Process each size up to `largest` once and print its figures."""
+    """Process each size up to `largest` once; print and return its figures. `files`: rows by board."""
     lines = []
     names = {board: [str(path) for path in paths] for board, paths in files.items()}
     print("\ncost against work: both boards, aperture of 0.7 x 0.4 m, one core, simulated rows repeated")

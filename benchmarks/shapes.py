@@ -34,12 +34,14 @@ from polysight.data import find_packaged
 from polysight_shared.config import load_instrument
 from polysight_worlds.shape_scenes import FREQUENCIES_HZ
 
+# Squared distance within which a normal distribution in two dimensions holds 95 %.
 CHI2_95 = 5.991
 RIG_FILE = find_packaged(Path("instrument.toml"))
-# Paths over fronts of objects and over the table behind them.
+# Paths from TX to RX over fronts of objects and over the table behind them, metres: outside nothing is looked for.
 GATE_M = (1.45, 2.2)
 # Points farther from the object's surface than this are of something else.
 STRAY_M = 0.01
+# Arguments of `ShapeNuisances` by disturbance: what is wrong with the rig.
 DISTURBANCES: dict[str, dict[str, float]] = {
     "none": {},
     "misplaced": {"misplaced_mm": 1.0},
@@ -64,9 +66,9 @@ KNOWN: dict[str, surfaces.Uncertainty] = {
 }
 # Points of the reference that are kept, as `polysight calibrate sphere` keeps them.
 KEPT_POINTS = 240
+# Positions of a quick scan: every so many-th in x and y.
 QUICK_STEP = 2
-# What must hold for the 68th percentile of objects: normals in degrees, points in mm, permittivity in per cent (None:
-# none is to be given).
+# Limits of the 68th percentile over objects: normals in degrees, points in mm, permittivity in per cent (None: none).
 LARGE = (0.5, 0.5, 3.0)
 MUST_HOLD: dict[str, tuple[float | None, float | None, float | None]] = {
     **dict.fromkeys(("plate", "sphere", "cylinder", "cone", "barrel", "saddle", "sheet"), LARGE),
@@ -135,7 +137,7 @@ class ScanKind:
 
     @property
     def optics(self) -> surfaces.Optics:
-        """The rig as the host takes it."""
+        """Places, polarisations and wave number of the rig file's antennas, for the host's analysis."""
         optics = surfaces.make_optics(load_instrument(RIG_FILE))
         if not self.is_quick:
             return optics
@@ -154,7 +156,7 @@ class ScanKind:
 def see_shapes(
     shapes: Sequence[worlds.Shape], nuisances: worlds.ShapeNuisances, scan: ScanKind, number: int
 ) -> surfaces.Seen:
-    """Scan shapes and find their specular points."""
+    """Scan shapes and return their specular points; scans of one rig with another `number` have other noise."""
     boards = scan.boards
     cubes = worlds.scan_shapes(shapes, scan.offsets_m, nuisances, boards=boards, number=number)
     valid = np.ones(scan.offsets_m.shape[:2], bool)
@@ -272,13 +274,13 @@ def judge_permittivity(
 
 
 def squared_distances(away: NDArray, covariances: NDArray) -> NDArray:
-    """Squared distances [n] of complex differences [n] in regions of covariance [n, 2, 2]."""
+    """Return the squared distances [n] of complex differences [n], in units of the covariances [n, 2, 2]."""
     parts = np.stack([np.real(away), np.imag(away)], axis=-1)
     return np.einsum("ni,nij,nj->n", parts, np.linalg.pinv(np.nan_to_num(covariances)), parts)
 
 
 def angles_deg(first: NDArray, second: NDArray) -> NDArray:
-    """Angles [n] between unit vectors [n, 3]."""
+    """Return the angles [n] between unit vectors [n, 3], degrees."""
     return np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(first - second, axis=1) / 2, 0, 1)))
 
 
@@ -287,7 +289,7 @@ def _judge(job: tuple[str, int, str, ScanKind]) -> ObjectFigures:
 
 
 def _percentile_68(values: Iterable[float | None]) -> str:
-    """68th percentile of the figures that are known, as a cell of the table."""
+    """Return the 68th percentile of the figures that are known, as a cell of the table."""
     numbers = [value for value in values if value is not None]
     if not numbers:
         return "-"
@@ -295,7 +297,7 @@ def _percentile_68(values: Iterable[float | None]) -> str:
 
 
 def _percent(values: Iterable[float | bool | None]) -> str:
-    """Mean of shares that are known, in per cent."""
+    """Return the mean of the shares that are known, in per cent, as a cell of the table."""
     numbers = [float(value) for value in values if value is not None]
     if not numbers:
         return "-"
@@ -402,7 +404,7 @@ def load_campaign(path: Path | None) -> list[ObjectFigures]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Judge drawn objects of each kind; print the table."""
+    """Judge drawn objects of each kind; print the tables. Return 0."""
     seeds = range(args.first, args.first + args.objects)
     kinds = args.kinds.split(",")
     disturbances = args.disturbances.split(",")

@@ -27,7 +27,7 @@ SCENES = ("point-targets", "nine-materials")
 
 
 def patterns(rows: int, columns: int) -> Iterator[tuple[str, np.ndarray, float]]:
-    """(name, positions kept [row, column], share of the whole scan's time)."""
+    """Yield scans: name, mask of the positions that are kept [row, column], share of the whole scan's time."""
     rng = np.random.default_rng(1)
 
     def of_rows(chosen: np.ndarray) -> np.ndarray:
@@ -47,7 +47,7 @@ def patterns(rows: int, columns: int) -> Iterator[tuple[str, np.ndarray, float]]
 
 
 def scan_minutes(rig: Instrument) -> float:
-    """Time of the whole scan: rows at constant speed, with run-up, run-out and the step to the next row."""
+    """Return the time of the whole scan: rows at constant speed, with run-up, run-out and the step to the next row."""
     stage = rig.stage
     grid = rig.grid
     length = (grid.columns - 1) * grid.step_x_mm
@@ -57,7 +57,10 @@ def scan_minutes(rig: Instrument) -> float:
 
 
 def predict_image(board: BoardSamples, image: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Matched filter over all positions of the samples that a reconstructed image predicts."""
+    """Return the matched filter over all positions of the samples that a reconstructed image predicts.
+
+    `weights` are those of the positions [row, column].
+    """
     imager, _ = choose_imager(board.aperture)
     samples = imager.samples(image)
     gated = (board.model.astype(np.complex64) @ samples.reshape(*samples.shape[:2], -1)).reshape(samples.shape)
@@ -65,7 +68,7 @@ def predict_image(board: BoardSamples, image: np.ndarray, weights: np.ndarray) -
 
 
 def measure(folder: Path, iterations: int) -> list[tuple[str, float, float, float]]:
-    """(pattern, minutes, error of the matched filter, error of the reconstruction) of one scan."""
+    """Return pattern, minutes, error of the matched filter and of the reconstruction for each pattern of one scan."""
     pipeline = Pipeline(ScanFolder.load(folder))
     for row in pipeline.source.rows():
         pipeline.add_row(row)
@@ -90,7 +93,7 @@ def measure(folder: Path, iterations: int) -> list[tuple[str, float, float, floa
 
 
 def main() -> int:
-    """Simulate, measure, print a Markdown table, draw the figure."""
+    """Simulate and measure; print a Markdown table for each scene. Return 0."""
     parser = argparse.ArgumentParser(description="image error of sparse scans")
     parser.add_argument("--iterations", type=int, default=40)
     parser.add_argument("--scenes", nargs="*", default=SCENES)

@@ -32,7 +32,7 @@ SCENE = {
 
 
 def run(out: Path, positions: int, board_name: str, snr_db: float = SNR_DB) -> str:
-    """Simulate, synchronise and report; returns the text."""
+    """Simulate and synchronise the positions, write the report into `out`, and return its text."""
     rig = load_instrument(Path(__file__).parents[1] / "instrument.toml")
     scene = decode_scene(SCENE, "static_chirps").with_disturbances(direct_snr_db=snr_db)
     radar = SimulatedRig(rig, scene)

@@ -23,12 +23,13 @@ REPEATS = 5
 # The published method is timed on so many of a row's 350 positions, evenly spaced.
 POSITIONS = 70
 STAGES = ("decode and align", "direct path")
+# Required and desired ratio of the published method's time to ours.
 LIMITS = {"decode and align": (80.0, 120.0), "direct path": (60.0, 80.0)}
 
 
 @contextmanager
 def direct_path_timed(into: Seconds) -> Iterator[None]:
-    """Times every call of the chain's direct-path stage."""
+    """Time every call of the chain's direct-path stage in the block, which is replaced meanwhile."""
     original = chain.reference
 
     def run_timed(*args: Any, **kwargs: Any) -> Any:
@@ -59,7 +60,7 @@ class Ours:
         self._pipeline.images = cast(ImageBuilder, _NoImage())
 
     def row(self) -> tuple[float, float]:
-        """One row from its files: CPU seconds of reading, decoding and aligning, and of the direct path."""
+        """Process a row of all boards; return CPU seconds of reading, decoding and aligning, and of the direct path."""
         row_seconds = Seconds()
         inner = Seconds()
         with row_seconds.time_block(), direct_path_timed(inner):
@@ -76,7 +77,7 @@ class Theirs:
         self._chosen = np.linspace(0, rig.grid.columns - 1, min(positions, rig.grid.columns)).astype(int)
 
     def row(self) -> tuple[float, float]:
-        """The chosen positions of each board one after another: CPU seconds as of :class:`Ours`."""
+        """Process the chosen positions of each board one after another; return CPU seconds as :class:`Ours`, scaled."""
         pulses = self._rig.burst.pulses
         size = pulses * self._rig.frame_bytes
         first = Seconds()
@@ -96,7 +97,7 @@ class Theirs:
 
 
 def measure(rig: Instrument, files: dict[str, Path], repeats: int) -> dict[str, np.ndarray]:
-    """Seconds a position of one board [round, stage] of each method, in turn, after a round that is not counted."""
+    """Measure seconds a position of one board, [round, stage] by method, in turn; the first round is not counted."""
     jobs = {
         "ours": Ours(rig, files),
         "published": Theirs(rig, files, tuned=False),
@@ -112,6 +113,7 @@ def measure(rig: Instrument, files: dict[str, Path], repeats: int) -> dict[str, 
 
 
 def run(args: argparse.Namespace) -> int:
+    """Measure all methods on one core and print the table; return 0."""
     rig, scene = published_scene(args.quick)
     with temporary(args.folder) as folder, one_core():
         files = {}

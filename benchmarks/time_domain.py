@@ -18,8 +18,10 @@ from benchmarks.measure import Seconds
 from polysight.imaging.geometry import Antennas, Aperture, ImageGrid
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
+# Bins of a range profile for each frequency: with 32 linear interpolation is good enough (the benchmark prints the
+# difference of both images).
 OVERSAMPLING = 32
-# Positions at a time: their profiles stay in the second-level cache
+# Positions at a time: their profiles stay in the second-level cache.
 BLOCK = 128
 
 
@@ -41,6 +43,10 @@ def _sum(
     cycles_per_m: np.float32,
     image: NDArray[np.float32],  # [2, y, x]
 ) -> None:
+    """Add every position's profile, at each pixel's excess path and turned back by its phase, to the image.
+
+    The image has real and imaginary part. Lengths are metres; a profile begins at the excess path `first_m`.
+    """
     unit = np.float32(1)
     half = np.float32(0.5)
     pi = np.float32(math.pi)
@@ -64,12 +70,12 @@ def _sum(
                         place = (d - first_m) * bins_per_m
                         low = np.int32(place)
                         w = place - np.float32(low)
-                        # Unsigned: no negative indices to look for
+                        # Unsigned, so that the compiled code does not check for negative indices.
                         k = np.uint64(np.uint32(low + np.int32(p) * bins))
                         re = real_part[k] + w * (real_part[k + np.uint64(1)] - real_part[k])
                         im = imaginary_part[k] + w * (imaginary_part[k + np.uint64(1)] - imaginary_part[k])
                         turns = -d * cycles_per_m
-                        # Half the angle: -pi/2..pi/2
+                        # Half the angle, -pi/2..pi/2, where the series of sine (s) and cosine (c) are short.
                         a = (turns - np.floor(turns + half)) * pi
                         q = a * a
                         s = np.float32(-1 / 5040) + q * np.float32(1 / 362880)
@@ -91,7 +97,7 @@ def form_image(
     antennas: Antennas,
     grid: ImageGrid,
 ) -> NDArray[np.complex64]:
-    """Image of one board from reduced samples.
+    """Form the image of one board from reduced samples.
 
     Parameters
     ----------
@@ -151,8 +157,9 @@ def single(a: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def timed_image(aperture: Aperture, samples: NDArray[np.complex64], every: int) -> tuple[NDArray[np.complex64], float]:
-    """Image of every so many-th row of reduced samples [rx, frequency, row, column]; CPU seconds of all rows, scaled.
+    """Form the image of every so many-th row of reduced samples [rx, frequency, row, column].
 
+    Return it, and the CPU seconds that all rows would take.
     The cost is positions times pixels, nothing else.
     """
     part = samples[:, :, ::every]

@@ -25,8 +25,10 @@ THETA_RAD = np.radians(55.0)
 # Half-power width of the response of an even band (sinc) and of one with a Hamming taper, times the band's width.
 WIDTH_EVEN = 0.886
 WIDTH_HAMMING = 1.30
+# Least share of a plate that its patch covers, and largest share of another plate, or by another patch (chosen).
 LEAST_COVERED = 0.5
 MOST_OF_ANOTHER = 0.1
+# Distances between plates, in resolution cells.
 GAPS_CELLS = (1.0, 1.5, 2.0, 3.0)
 FIRST_SEED = 38_000
 Mask = NDArray[np.bool_]
@@ -45,12 +47,15 @@ class PlateScene:
 
 @dataclass(frozen=True)
 class GapFigures:
-    """Separate plates among all plates, and patches that are no plate, at one gap and kind of materials."""
+    """Result at one gap and kind of materials."""
 
+    # Gap in resolution cells.
     gap_cells: float
     same_material: bool
+    # Plates of all scenes, and how many of them are separate.
     plates: int
     separate: int
+    # Patches that are no plate.
     strays: int
 
     @property
@@ -156,7 +161,7 @@ def count_separate(scene: PlateScene) -> tuple[int, int]:
 
 
 def judge_gap(gap_cells: float, same_material: bool, scenes: int, first_seed: int) -> GapFigures:
-    """Segment drawn scenes of one gap."""
+    """Segment `scenes` drawn scenes of one gap and count separate plates."""
     plates = 0
     separate = 0
     strays = 0

@@ -33,7 +33,7 @@ COMMANDS = {
 
 
 def rows_then_products(scan: Path, out: Path) -> dict[str, float]:
-    """Wall seconds behind a scan's last row, as beside a running scan: to the written images, to the report."""
+    """Process a scan as if it were recorded now; return wall seconds from its last row to images and to the report."""
     source = ScanFolder.load(scan)
     pipeline = Pipeline(source, live=True, samples="keep")
     rows = list(source.rows())
@@ -64,14 +64,14 @@ def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
                 for row in rows:
                     pipeline.add_row(row)
                 pipeline.form_images()
-    # The first round makes kernels
+    # The first round makes kernels, so it does not count.
     for took in (same, other_seconds):
         del took.cpu[0], took.wall[0]
     return same, other_seconds
 
 
 def time_list(scan: Path, products: Path, root: Path, count: int) -> tuple[Seconds, Seconds]:
-    """Time a list of `count` copies of a scan and its products: the first look, and later ones."""
+    """Time a list of `count` copies, below `root`, of a scan and its products: the first time, and later ones."""
     for n in range(count):
         shutil.copytree(
             products, root / f"scan-{n}" / "products", ignore=shutil.ignore_patterns("report.html", "figures")
@@ -89,7 +89,7 @@ def time_list(scan: Path, products: Path, root: Path, count: int) -> tuple[Secon
 
 
 def command(words: list[str]) -> tuple[float, float]:
-    """CPU and wall seconds of a command in a process of its own. Raises RuntimeError when it fails."""
+    """Run `polysight WORDS`; return its CPU and wall seconds. Raises RuntimeError if it fails."""
     start = os.times()
     began = time.perf_counter()
     done = subprocess.run([sys.executable, "-m", "polysight", *words], cwd=ROOT, capture_output=True, check=False)
@@ -101,6 +101,7 @@ def command(words: list[str]) -> tuple[float, float]:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Measure all waits and print the table; return 0."""
     rig, scene = published_scene(args.quick)
     repeats = count_repeats(args.quick, REPEATS)
     most_rows = rig.grid.rows
@@ -142,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def small_products(folder: Path) -> Path:
-    """Products of a small scan, to ask commands about."""
+    """Simulate and process a small scan; return the folder of its products, for commands that read products."""
     scan = folder / "small"
     products = folder / "made"
     rig = ["--config", str(ROOT / "instrument.toml")]

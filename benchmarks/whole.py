@@ -19,6 +19,7 @@ from polysight.imaging import image_grid
 from polysight_shared.config import Instrument
 
 REPEATS = 3
+# Space that stays free on the disk (chosen).
 SPARE_BYTES = 3 << 30
 
 
@@ -29,13 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def rows_that_fit(rig: Instrument, rows: int, folder: Path) -> int:
-    """Return as many of the rows as the disk has room for."""
+    """Return how many of `rows` rows the disk of `folder` has room for, at least 2."""
     row_bytes = rig.grid.columns * rig.burst.pulses * rig.frame_bytes * len(rig.receivers)
     return max(2, min(rows, (shutil.disk_usage(folder).free - SPARE_BYTES) // row_bytes))
 
 
 class Published:
-    """Scale a part of the published method's time to the whole scan: every position and every board cost the same."""
+    """The published method on a part of a scan, its time scaled to the whole: positions and boards cost the same."""
 
     def __init__(self, rig: Instrument, files: dict[str, Path], tuned: bool) -> None:
         self._rig = rig
@@ -43,10 +44,11 @@ class Published:
         self._grid = image_grid(rig)
         self._row = sync.Theirs(rig, files, tuned, 35)
         shape = len(rig.antennas.rx_mm), rig.grid.rows, rig.grid.columns, rig.chirp.samples
+        # The time does not depend on the samples.
         self._cube = np.broadcast_to(np.ones(shape[1:], np.complex64), shape)
 
     def run(self) -> float:
-        """CPU seconds of the whole scan."""
+        """Return the CPU seconds of the whole scan."""
         positions = sum(self._row.row()) * self._rig.grid.rows
         image = Seconds()
         with image.time_block():
@@ -55,6 +57,7 @@ class Published:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Measure our processing and the published method in turn on one core, and print the table; return 0."""
     rig, scene = published_scene(args.quick)
     most_rows = args.rows
     if args.quick:
@@ -97,6 +100,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _time_line(seconds: float, published_s: float, tuned_s: float, part: str) -> Line:
+    """Return the line about CPU seconds: ours, the published method's, and its tuned form's."""
     return Line(
         "raw to image, two boards, 9.2 GB",
         f"{seconds:.1f} s",
@@ -110,6 +114,7 @@ def _time_line(seconds: float, published_s: float, tuned_s: float, part: str) ->
 
 
 def _measure_last_row(live: dict[str, list[float]]) -> Line:
+    """Return the line about the wait after the last row, from figures of `Chain.run`."""
     last = statistics.median(live["last_row_wall_s"])
     last_cpu = statistics.median(live["last_row_cpu_s"])
     return Line(
@@ -126,6 +131,7 @@ def _measure_last_row(live: dict[str, list[float]]) -> Line:
 
 
 def _measure_memory(memory: int, part: str) -> Line:
+    """Return the line about memory, bytes."""
     return Line(
         "anonymous memory of a full scan, GB",
         f"{memory / 1e9:.2f} GB",

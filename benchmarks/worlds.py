@@ -55,10 +55,13 @@ THETA_STD_RAD = 1.5e-3
 boards (1.2e-3 by the published rig's geometry), 1 mm in that of the plane (0.9e-3)."""
 LEAKAGE_STD = 0.003
 """The same of a measured leakage, of each real and imaginary part."""
+# Border of a given box that is not used, because the image blurs edges (chosen).
 MARGIN_MM = 6.0
 LEAST_PIXELS = 8
 """Least width and height of a plate's part within the picture."""
+# Squared distance within which a normal distribution in two dimensions holds 95 %.
 CHI2_95 = 5.991
+# Number of a verdict's reasons that count as the first ones (chosen).
 FIRST_REASONS = 2
 FOREIGN: dict[str, complex] = {
     "polycarbonate": 2.77 - 0.018j,
@@ -124,19 +127,21 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class PatchFigures:
-    """One judged patch: squared distance of the truth in its region, relative half width and error, name and its share.
-
-    Figures are None for a refused patch. `of_library`: the name is one of the library's.
-    """
+    """One judged patch. Figures are None for a refused patch."""
 
     nuisance: str
+    # The true material.
     material: str
+    # Squared distance of the true permittivity from the estimate, in units of the estimate's covariance.
     distance2: float | None
+    # Relative half width of the 95 % region (mean of both parts), and relative error.
     half_width: float | None
     error: float | None
+    # The name that it was given, with its probability, and whether it is one of the library's.
     name: str
     confidence: float
     of_library: bool
+    # Why there is no permittivity; "" if there is one.
     refused: str
 
     @property
@@ -163,7 +168,7 @@ class SceneFigures:
     stray: int = 0
 
     def place_named(self, nuisance: str) -> int | None:
-        """Place of the first reason that names a nuisance as a cause, from 0; None without one."""
+        """Return the place of the first reason that names a nuisance as a cause, from 0; None without one."""
         cause = CAUSES.get(nuisance)
         if cause is None:
             return None
@@ -209,7 +214,7 @@ def illumination_of_worlds(shape: tuple[int, int], pixel_m: float) -> Illuminati
 
 
 def dispersion_of_worlds(pair: generator.ImagePair) -> Dispersion:
-    """Return the change of the images over the sweep."""
+    """Return the relative change of the images over the sweep, from their slopes over frequency."""
     first_hz, last_hz = pair.rig.frequencies_hz[[0, -1]].tolist()
     with np.errstate(divide="ignore", invalid="ignore"):
         h = (last_hz - first_hz) * pair.h_slope / pair.h
@@ -395,17 +400,22 @@ def declared_figures(nuisance: str, patch: PatchResult, plate: generator.Plate) 
     )
 
 
+# Scenes of `--metal`: what is declared as the metal reference, and a scene without metal.
 METAL_KINDS = ("copper declared", "dielectric declared", "no metal")
 
 
 @dataclass(frozen=True)
 class MetalFigures:
-    """One scene with sheets and dishes: its kind, the verdict's level, if the declared metal was withdrawn, names."""
+    """One scene with sheets and dishes."""
 
+    # One of `METAL_KINDS`.
     kind: str
     seed: int
+    # Level of the verdict.
     level: str
+    # True if the program found that the declared metal is none.
     withdrawn: bool
+    # Names that the result gives, without "unknown".
     names: tuple[str, ...]
 
 
@@ -539,7 +549,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Judge worlds of each nuisance; print the tables."""
+    """Judge worlds of each nuisance, or with `--metal` scenes of `METAL_KINDS`; print the tables. Return 0."""
     if args.metal:
         seeds = range(args.first, args.first + args.metal)
         of_metal = [(kind, seed, args.searched) for kind in METAL_KINDS for seed in seeds]

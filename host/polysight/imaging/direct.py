@@ -119,6 +119,7 @@ class _Scene:
         pattern = samples if like is None else like
         self.xp = namespace(pattern)
         self.device = get_device(pattern)
+        # Lists have no shape of their own; arrays of other libraries are unknown to `np.shape`.
         shape = tuple(samples.shape) if hasattr(samples, "shape") else np.shape(samples)
         self.frequencies = [float(f) for f in frequencies_hz]
         if len(shape) != 2 or not self.frequencies or len(self.frequencies) != shape[1]:

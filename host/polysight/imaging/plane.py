@@ -253,7 +253,9 @@ class PlaneEstimate:
         d theta / d z = sin theta cos theta / z.
         """
         theta = np.radians(incidence_deg(rig, rig.receivers[0]))
-        offset_std_m = float(np.hypot(self.offset_std_m, MOUNT_STD_M)) if self.known else PRIOR_STD_M
+        offset_std_m = PRIOR_STD_M
+        if self.known:
+            offset_std_m = float(np.hypot(self.offset_std_m, MOUNT_STD_M))
         return float(np.sin(theta) * np.cos(theta) / (rig.geometry.object_distance_mm / 1e3) * offset_std_m)
 
     def transpose(self) -> PlaneEstimate:
@@ -309,7 +311,11 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     determined = np.isfinite(heights)
     if not determined.any():
         return replace(UNKNOWN_PLANE, heights_m=np.full(len(masks), np.nan))
-    places = np.array([(x[m.any(axis=0)].mean(), y[m.any(axis=1)].mean()) if m.any() else (0.0, 0.0) for m in masks])
+    # Middle of each patch (x, y), from the middle of the image.
+    places = np.zeros((len(masks), 2))
+    for place, mask in zip(places, masks, strict=True):
+        if mask.any():
+            place[:] = x[mask.any(axis=0)].mean(), y[mask.any(axis=1)].mean()
     plane, covariance = _fit_plane(places[determined], heights[determined], np.hypot(stds[determined], _MIN_STD_M))
     first_board = next(iter(builder.boards.values()))
     phase_heights, rad_per_m = _estimate_heights_by_phase(first_board, masks, places, plane)
@@ -364,9 +370,12 @@ def move_to_plane(
         return plane, images
     if plane.worth_moving:
         images = builder.finish(plane.offset_m)
-        images = images.transpose() if transposed else images
+        if transposed:
+            images = images.transpose()
     dispersion = builder.disperse(plane.moved_m)
-    return plane, replace(images, dispersion=dispersion.transpose() if transposed else dispersion)
+    if transposed:
+        dispersion = dispersion.transpose()
+    return plane, replace(images, dispersion=dispersion)
 
 
 def _estimate_heights_by_range(

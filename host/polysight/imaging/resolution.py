@@ -107,25 +107,33 @@ def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
     Of the middle row or column and the first RX; infinite for an aperture of one position.
     """
     middle = tuple(n // 2 for n in aperture.offsets_m.shape[:2])
-    line = aperture.offsets_m[middle[0]] if axis == 0 else aperture.offsets_m[:, middle[1]]
+    if axis == 0:
+        line = aperture.offsets_m[middle[0]]
+    else:
+        line = aperture.offsets_m[:, middle[1]]
     slope = np.zeros(len(line))
     for place in (aperture.antennas.tx_m, aperture.antennas.rx_m[0]):
         difference = point - line - place
         slope += difference[:, axis] / np.linalg.norm(difference, axis=1)
     path_range = np.ptp(slope) * aperture.frequencies_hz.mean() / SPEED_OF_LIGHT_M_S
-    return float(0.886 / path_range) if path_range > 0 else float("inf")
+    if path_range > 0:
+        return float(0.886 / path_range)
+    return float("inf")
 
 
 def _cut(
     aperture: Aperture, weights: NDArray[np.floating], point: NDArray[np.float64], axis: int, cell_m: float
 ) -> tuple[NDArray[np.float64], float]:
     """Return the amplitude along an axis through a point [3], relative to the point, and the step in metres."""
+    # Largest numbers of blocks (rows, columns).
     most = (_BLOCKS_ACROSS, _BLOCKS_ALONG) if axis == 0 else (_BLOCKS_ALONG, _BLOCKS_ACROSS)
     blocks, block_weights = _combine_positions(aperture, weights, most)
     point_grid = ImageGrid(point[:1], point[1:2], float(point[2]), aperture.grid.pixel_m)
     of_point = DirectImager(replace(blocks, grid=point_grid)).samples(np.ones((1, 1))) * block_weights
     count = int(_CELLS * _POINTS)
-    step = (cell_m if np.isfinite(cell_m) else aperture.grid.pixel_m) / _POINTS
+    if not np.isfinite(cell_m):
+        cell_m = aperture.grid.pixel_m
+    step = cell_m / _POINTS
     voxels = np.tile(point, (2 * count + 1, 1))
     voxels[:, axis] += np.arange(-count, count + 1) * step
     shift = blocks.offsets_m.reshape(-1, 3)

@@ -659,7 +659,7 @@ class BoardSamples:
         """Return the imager of the rig file's grid or of another one, and a notice if it is slow."""
         if grid is None and self._final is not None:
             return self._final, None
-        imager, notice = choose_imager(replace(self.aperture, grid=self._grid if grid is None else grid))
+        imager, notice = choose_imager(replace(self.aperture, grid=grid or self._grid))
         if notice:
             _log.warning("%s: %s", self.board.name, notice)
         return imager, notice

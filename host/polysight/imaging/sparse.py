@@ -99,7 +99,11 @@ def reconstruct(
         complex64 [ny, nx]: image to start from; None: empty.
     """
     model = _Model(board)
-    weights = np.sqrt(board.weights if selected is None else board.weights * selected)
+    weights = board.weights
+    if selected is not None:
+        weights = weights * selected
+    # The squares of these weigh the squared misfit.
+    weights = np.sqrt(weights)
     data = board.calibrate_samples() * weights
 
     def forward(x: NDArray[np.complex64]) -> NDArray[np.complex64]:

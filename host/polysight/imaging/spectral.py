@@ -428,7 +428,9 @@ class IncrementalImager(RowSpectra):
         self._last = self.lattice.row_stride * (rows - 1)
         self._span = self.lattice.pixel_stride * (lines - 1) + 1
         self._kernels, self._components = get_cached(self.key("rows"), self._compute_principal_kernels)
-        self._clear(np.zeros(aperture.shape[:2]) if echo is None else echo)
+        if echo is None:
+            echo = np.zeros(aperture.shape[:2])
+        self._clear(echo)
 
     def add_row(self, index: int, samples: Any, weights: Any, start_m: float) -> None:
         """Add a row to the image.

@@ -94,8 +94,9 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
             difference = np.fft.ifft(recent[r] - mean, axis=-1)
             power = np.abs(mean) ** 2
             # An even row has odd neighbours, so that its difference has the opposite sign.
+            sign = 1 if r % 2 else -1
             sums[i * _GROUPS // len(inner)] += (
-                (1 if r % 2 else -1) * (window * slope.conj() * difference).real.sum(),
+                sign * (window * slope.conj() * difference).real.sum(),
                 (window * np.abs(slope) ** 2).sum(),
                 power.sum(),
                 power[:, np.abs(k) > 0.8 * np.abs(k).max()].sum(),
@@ -107,14 +108,16 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     for _ in range(_STEPS):
         sums = sum_groups(shift)
         product, slope2, power, power_at_high_k = sums.sum(axis=0)
-        # Jackknife (Efron 1982): sums without one group.
+        # Jackknife (Efron 1982): sums without one group, for each group.
         product_without, slope2_without, _, _ = (sums.sum(axis=0) - sums).T
         if slope2 == 0 or slope2_without.min() <= 0 or power_at_high_k > _ALIASED * power:
             return None
         shift_without_group = shift + product_without / slope2_without
         shift += float(np.clip(product / slope2, -plan.step_x_mm / 2, plan.step_x_mm / 2))
     std = float(np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((shift_without_group - shift_without_group.mean()) ** 2)))
-    return Backlash(shift, std) if std < plan.step_x_mm / 4 else None
+    if std < plan.step_x_mm / 4:
+        return Backlash(shift, std)
+    return None
 
 
 def _compute_spectrum(row: NDArray[np.complex64], k: NDArray[np.floating], shift_mm: float) -> NDArray[np.complex128]:

@@ -109,8 +109,10 @@ class BoardSetup:
         `model` is the measured high-pass filter (`fit_high_pass`); None: the corners in the chirp profile.
         `compensate_filter=False` does not compensate the filter.
         """
-        model = (model or hpf.high_pass(rig.chirp)) if compensate_filter else hpf.HighPass()
-        equaliser = hpf.Equaliser.from_model(model, rig.chirp, FOLD) if model.corners_hz else None
+        model = model or hpf.high_pass(rig.chirp)
+        equaliser = None
+        if compensate_filter and model.corners_hz:
+            equaliser = hpf.Equaliser.from_model(model, rig.chirp, FOLD)
         return cls(rig.chirp, rig.burst.chirps_a_position, equaliser, prepare(rig, board))
 
 
@@ -457,7 +459,9 @@ class CubeForm:
         valid = _find_positions_with_data(cube)
         if not valid.all():
             cube = np.where(valid[:, None], cube, np.complex64(0))
-        samples = (cube.conj() if self.conjugate else cube) * self.turn[:, None]
+        if self.conjugate:
+            cube = cube.conj()
+        samples = cube * self.turn[:, None]
         samples += self.constant[:, None, None]
         samples[:, ~valid] = 0
         if self.path is not None:
@@ -567,8 +571,10 @@ def _find_sign_and_origin(
     readings = list(itertools.product((False, True), (False, True)))
     power = []
     for conjugate, counted_from_tx in readings:
-        turn = absolute if counted_from_tx else np.ones_like(absolute)
-        part = ((cube.conj() if conjugate else cube) * turn[:, None])[..., a:b]
+        part = cube.conj() if conjugate else cube
+        if counted_from_tx:
+            part = part * absolute[:, None]
+        part = part[..., a:b]
         power.append(float((np.abs((part * np.hanning(b - a)) @ gate.conj().T) ** 2).mean()))
     if power[0] >= _PREFER_SIMPLE * max(power):
         return readings[0]
@@ -643,7 +649,10 @@ def _reference_cube(
     )
     # A signal that is mixed down already has an IF of zero: any IF is within the band.
     near_zero = bool(abs(np.median(centre)) < 0.4)
-    done = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x") if near_zero else chirp)
+    if near_zero:
+        done = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x"))
+    else:
+        done = reference(aligned, path, chirp)
     time = np.arange(samples) - middle
     steering = path.steering * np.exp(-0.5j * done.drift * time**2)
     residual_cycles = (done.frequency - centre + 0.5) % 1.0 - 0.5

@@ -77,7 +77,8 @@ def decimator() -> Decimator:
             passed[:, 0] *= (turns @ first) / (turns @ inner)
         model = weight[:, None] * passed
         # Real taps: real and imaginary parts are equations of their own. At the very end, large taps would raise noise.
-        small = (_SMALL if block == 0 else 0) * np.eye(FLAT)
+        weight_of_taps = _SMALL if block == 0 else 0.0
+        small = weight_of_taps * np.eye(FLAT)
         equations = np.concatenate([model.real, model.imag, small])
         goal = np.concatenate([weight, np.zeros(cycles.size + FLAT)])
         flat.append(np.linalg.lstsq(equations, goal, rcond=None)[0])
@@ -121,7 +122,9 @@ def fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
 def flatten(folded: NDArray[np.complex64]) -> NDArray[np.complex64]:
     """Undo the attenuation by :func:`fold` in averages [..., block]; fewer blocks than `FLAT` stay as they are."""
     blocks = folded.shape[-1]
-    return folded if blocks < FLAT else (folded @ _make_flat_matrix(blocks)).astype(np.complex64)
+    if blocks < FLAT:
+        return folded
+    return (folded @ _make_flat_matrix(blocks)).astype(np.complex64)
 
 
 @lru_cache(maxsize=8)

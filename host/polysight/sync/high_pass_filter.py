@@ -88,7 +88,10 @@ class Equaliser:
     def taps(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the taps [..., 3] for signals centred at frequencies [...] in cycles per sample."""
         f = frequency[..., None] + self.reach * np.array([-1.0, 0.0, 1.0])
-        f = (f + 0.5) % 1.0 - 0.5 if self.signed else f % 1.0
+        if self.signed:
+            f = (f + 0.5) % 1.0 - 0.5
+        else:
+            f = f % 1.0
         low, middle, high = np.moveaxis(self.model.inverse(f * self.sample_rate_hz), -1, 0)
         w = 2 * np.pi * self.reach * self.spacing
         even_part = ((low + high) / 2 - middle) / (np.cos(w) - 1)

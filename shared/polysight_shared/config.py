@@ -108,7 +108,8 @@ class Pi(Section, frozen=True):
     trigger_in: GpioLine = 26
     # SYNC_IN: one line; more only in old files.
     sync_out: tuple[GpioLine, ...] = (22,)
-    # "fanout": libgpiod sets one line. "spi": MOSI of the SPI controller. "lines", "gpiomem": of old files, not opened.
+    # "fanout": libgpiod sets one line. "spi": MOSI of the SPI controller. Of old files: "lines" is as "fanout" with one
+    # line; "gpiomem", and several lines, are refused when the lines are opened.
     wiring: Literal["fanout", "lines", "gpiomem", "spi"] = "fanout"
     # A hardware one-shot sets the width of the pulses instead of the GPIO line.
     one_shot: bool = False

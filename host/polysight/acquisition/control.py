@@ -139,8 +139,9 @@ class ScanCommand(StrEnum):
 
 
 class Life(msgspec.Struct, frozen=True):
-    """Content of `alive`: the scan's process with its start time (:func:`read_start_ticks`) and machine, what it does.
+    """Content of `alive`: the scan's process, its start time in `ticks` (:func:`read_start_ticks`), its machine `host`.
 
+    It is `doing` rows, or after these materials.
     `asked` is the pending command of `asker`, "" for none. The reader sets `written_s` (since 1970) from the file.
     """
 

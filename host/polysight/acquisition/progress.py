@@ -18,6 +18,7 @@ from os import PRIO_PROCESS, getpriority, setpriority
 from polysight.store import ScanFolder
 from polysight_shared.messages import ExitStatus
 
+# Called with the index of a committed row.
 OnRow = Callable[[int], None]
 # Added to the nice value of the program: the receivers get three times as much processor time.
 NICE = 5

@@ -47,6 +47,7 @@ from polysight_shared.messages import Capture
 from polysight_shared.raster import Row
 from polysight_shared.units import us_to_ns
 
+# A gap is a range of bytes of the row: its first, and the one behind its last.
 Times = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 Gap = tuple[int, int]
@@ -268,7 +269,8 @@ def _place_short_row(trains: _Trains, received: int, pulses: int, frame_bytes: i
     slots = np.full(received, -1, dtype=np.int64)
     if (low[1:] > high[:-1]).any():
         return PlacedFrames(slots, [], pulses, contradicted=True)
-    # Bounds of each frame: the lower one of the last train that began before it, the upper one of the first after it.
+    # Bounds of each frame: the lower one of the last train whose first packet lies before it, the upper one of the
+    # first train that reaches its end.
     begins = np.arange(received) * frame_bytes
     least = low[np.searchsorted(trains.first_stop, begins, "right")]
     most = high[np.searchsorted(trains.last_stop, begins + frame_bytes, "left")]

@@ -285,6 +285,8 @@ class CardClient:
 class EepromSettings:
     """Settings in the EEPROM; they take effect when the card is next switched on.
 
+    The card answers to `host_address` and `command_port`, and sends data to `host_address` and `data_port`.
+
     Raises
     ------
     ConfigError

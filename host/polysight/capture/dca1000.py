@@ -82,7 +82,7 @@ class Reply:
 
 @dataclass(frozen=True)
 class Version:
-    """FPGA version of a card."""
+    """FPGA version of a card; `playback` if the FPGA plays recordings back instead of capturing."""
 
     major: int
     minor: int
@@ -161,6 +161,7 @@ def decode_packet_header(packet: bytes | memoryview) -> tuple[int, int]:
     return sequence, low | high << 32
 
 
+# Byte ranges of a recording: the first byte of each, and the one behind its last.
 Gaps = Sequence[tuple[int, int]]
 
 

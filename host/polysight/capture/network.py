@@ -47,7 +47,7 @@ _CLOCK_WAS_SET_NS = 1_000_000
 # Readings of two clocks this close are of one time: a tenth of the 200 us that `acquisition/pulse_times.py` lets an
 # arrival be early at most.
 _CLOSE_READINGS_NS = 20_000
-# Chosen: one reading in five is not interrupted, even on a busy machine.
+# Readings at most, of which the closest is used (chosen).
 _CLOCK_READINGS = 5
 # Memory of one packet, bytes: more than the largest of 1466, to detect longer ones.
 _STRIDE = 1536

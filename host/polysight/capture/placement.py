@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from polysight.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, SEQUENCE_BITS, Counters
 from polysight.capture.packet_log import PacketLog
 
+# A gap is a range of bytes of the row: its first, and the one behind its last.
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -62,7 +63,7 @@ class PacketCounts:
     placed: int = 0
     # Every byte of them was there already, with the same value.
     duplicates: int = 0
-    # Their bytes differ from those of a packet with equal counters; both are masked where they overlap.
+    # Their bytes differ from those of a packet with equal counters; their place in the row is masked.
     conflicting: int = 0
     # Number of packets that belong to an earlier record.
     leftover: int = 0

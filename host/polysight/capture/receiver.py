@@ -25,7 +25,7 @@ from polysight_shared.errors import DeviceError
 
 # Real-time priority: below the kernel's threads, and below the Pi's pulses if both run on one machine.
 REAL_TIME = 5
-# Nice value where real time is not permitted. Chosen: before ordinary programs, behind what the system runs at -20.
+# Nice value where real time is not permitted (chosen): before ordinary programs, which have 0.
 NICE = -5
 PRIORITY_REMEDY = (
     "`sudo host/rights.sh USER` (USER: the user who scans), then log out and in again, or restart the machine"
@@ -92,8 +92,8 @@ def take_priority(real_time: int = REAL_TIME) -> tuple[str, str]:
     return f"nice {NICE}", refused
 
 
+# Timeouts of the first answer, for which the process has to start, and of others: ending a row waits for the disk.
 _START_TIMEOUT_S = 30.0
-# Ending a row waits for the disk.
 _ANSWER_TIMEOUT_S = 60.0
 
 
@@ -153,7 +153,10 @@ class Report(_Message, frozen=True):
 
 
 class Opened(_Message, frozen=True):
-    """The socket is bound. `scheduling` has core and priority, `warnings` what the system did not permit."""
+    """The socket is bound to `data_port`, with a receive buffer of `granted_bytes`.
+
+    `scheduling` has core and priority as text, `warnings` what the system did not permit.
+    """
 
     granted_bytes: int
     data_port: int
@@ -173,7 +176,7 @@ class Progress(_Message, frozen=True):
     `received` are the bytes in place; `complete` if all are and the record ends where it should.
     """
 
-    # -1 between rows.
+    # -1 before the first row.
     row: int
     take: int
     received: int
@@ -251,7 +254,7 @@ class RowCapture(_Message, frozen=True):
 
 
 class Failed(_Message, frozen=True):
-    """The request failed; fields as of a PolysightError."""
+    """The request failed; fields as of a PolysightError: problem, cause, remedy, and code."""
 
     what: str
     why: str = ""
@@ -259,6 +262,7 @@ class Failed(_Message, frozen=True):
     code: str = ErrorCode.OTHER
 
 
+# Messages of the host, and of the process.
 Request = Open | BeginRow | EndRow | Report
 Answer = Opened | Began | Progress | RowCapture | Failed
 A = TypeVar("A", bound=Answer)

@@ -534,7 +534,7 @@ class ImageBuilder:
 
 @dataclass(frozen=True)
 class SubBand:
-    """Part of the sweep: its samples [first, last), and its first and last transmit frequency."""
+    """Part of the sweep: its samples [first, last), and the transmit frequencies of the first and the last of them."""
 
     samples: tuple[int, int]
     first_hz: float

@@ -63,7 +63,8 @@ class State(Enum):
 class BoardFacts(msgspec.Struct, omit_defaults=True):
     """What a board reported about itself since its last bring-up began; the keys of its entry in the manifest.
 
-    `boot` and `calibration` are values of events (`messages.Event`).
+    `boot` and `calibration` are values of events (`messages.Event`), `rf_tests_passed` bits of event 0x5001; `hardware`
+    and firmware are versions. Temperatures are by sensor, read at `device_ms` of the device's own clock.
     """
 
     boot: Mapping[str, object] | None = None
@@ -79,7 +80,10 @@ class BoardFacts(msgspec.Struct, omit_defaults=True):
 
 
 class Step(NamedTuple):
-    """One step. `run` executes it and returns its outcome; it raises DeviceError or ConfigError."""
+    """One step. `run` executes it and returns its outcome; it raises DeviceError or ConfigError.
+
+    A person sees `name`, the outcome `expected`, and `remedy` if it fails; then the board is in `state_after`.
+    """
 
     name: str
     expected: str
@@ -369,7 +373,7 @@ class BringUp:
         return die
 
     def _read_die(self) -> str:
-        """Return the die id, "unknown" for old firmware. Raises DeviceError if it is not that of the rig file."""
+        """Return the die id, "unknown" if the firmware cannot tell. Raises DeviceError if the rig file has another."""
         try:
             data = self._board.ask(c.GET_DIE_ID, 16)
         except DeviceError as error:

@@ -42,6 +42,7 @@ IfMode = Literal["complex1x", "complex2x"]
 class Command(ABC):
     """A command of the host: one sub-block."""
 
+    # Number of the sub-block.
     ID: ClassVar[int]
 
     @property
@@ -174,7 +175,12 @@ class LdoBypass(Command):
 
 @dataclass(frozen=True)
 class Profile(Command):
-    """A profile, 0..3: the chirp's ramp and its ADC window (ICD 79-86)."""
+    """A profile, 0..3 (`index`): the chirp's ramp and its ADC window (ICD 79-86).
+
+    The ramp begins `idle_us` after the chirp does; ADC start and ramp end count from the start of the ramp. `hpf1_khz`
+    and `hpf2_khz` are the corners of the high-pass filters, `rf_gain_target_db` is the gain that the RF stage aims at,
+    `tx_backoff_db` how much less than full power is sent.
+    """
 
     ID = 0x0100
     start_hz: float
@@ -233,7 +239,8 @@ class Chirp(Command):
 class Frame(Command):
     """Frames of `loops` chirps, started one by one by edges of SYNC_IN, or all at once by software (ICD 90-94).
 
-    TI's library writes the number of 16-bit words per chirp (2 x `samples`) into a field that the ICD calls reserved.
+    `frames` is their number, `period_us` the frame period (:func:`frame_period_us`), `trigger` what starts them. TI's
+    library writes the number of 16-bit words per chirp (2 x `samples`) into a field that the ICD calls reserved.
     """
 
     ID = 0x0102
@@ -426,7 +433,10 @@ MAX_RATE_HZ = {"complex1x": 22.5e6, "complex2x": 45e6}
 
 
 class Constraint(NamedTuple):
-    """One rule: `low <= value <= high`, all in `unit`; a limit of None does not apply."""
+    """One rule: `low <= value <= high`, all in `unit`; a limit of None does not apply.
+
+    `name` says what it is about, `formula` in words how the value is computed, `remedy` what to change if it is broken.
+    """
 
     name: str
     formula: str

@@ -107,8 +107,11 @@ class Message:
     kind: Kind
     message_id: int
     blocks: tuple[SubBlock, ...] = ()
+    # Number of the command, 0..15; its answer has the same.
     sequence: int = 0
+    # True if the same command was sent before.
     retry: bool = False
+    # Messages that follow with the rest of the content.
     remaining_chunks: int = 0
 
     @property
@@ -458,6 +461,8 @@ class Event:
 
     Attributes
     ----------
+    id, name, detail
+        Number of its sub-block; description of the kind, and of this one.
     fatal
         True if the device must be reset.
     values

@@ -47,7 +47,10 @@ class Fact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag_fi
 
 
 class PiDescription(msgspec.Struct, frozen=True):
-    """The Pi that ran the rows; `stage` has those keys of its `[stage]` that place rows."""
+    """The Pi that ran the rows: release of its program, of the stage's firmware, and its `backend` (real or simulated).
+
+    `stage` has those keys of its `[stage]` that place rows.
+    """
 
     release: str = ""
     firmware: str = ""
@@ -110,7 +113,11 @@ class Reception(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class BoardRow(Reception, frozen=True, kw_only=True, omit_defaults=True):
-    """One board's part of a committed row. `file` is relative to the scan folder; the index is beside it."""
+    """One board's part of a committed row. `file` is relative to the scan folder; the index is beside it.
+
+    `bytes` are those of the whole row, `frames_received` the frames without a missing byte; the three CRC-32 (hex) are
+    of payload, index and packets, "" where there is no such file.
+    """
 
     file: str
     bytes: int
@@ -146,7 +153,7 @@ class RowCommitted(Fact, frozen=True, kw_only=True, tag="row_committed"):
 
 
 class RowRejected(Fact, frozen=True, kw_only=True, tag="row_rejected"):
-    """A take that was rejected and removed; earlier releases wrote no `faults`."""
+    """A take that was rejected and removed; `reasons` are its faults as text. Earlier releases wrote no `faults`."""
 
     row: int
     take: int
@@ -184,7 +191,7 @@ class RawDropped(Fact, frozen=True, kw_only=True, tag="raw_dropped"):
 
 
 class ScanResumed(Fact, frozen=True, kw_only=True, tag="scan_resumed"):
-    """Another run began; `rig` has its connection settings if they were given."""
+    """Another run began, with `rows_missing` rows to record; `rig` has its connection settings if they were given."""
 
     resumed_utc: str = ""
     rows_missing: int | None = None
@@ -207,7 +214,9 @@ class ScanContinued(Fact, frozen=True, kw_only=True, tag="scan_continued"):
 class ScanEnded(Fact, frozen=True, kw_only=True, tag="scan_ended"):
     """A run ended; `lost_mm` are the steps that the drives lost in x and y, None if they were not measured.
 
-    `asked` is the command that ended it, `stop` or `abort`, and `asker` who sent it; "" where nobody did.
+    `exit_status` is success, abort or fail, `reason` a sentence; `why` and `remedy` are those of an error. `asked` is
+    the command that ended it, `stop` or `abort`, and `asker` who sent it; "" where nobody did. `events_refetched` is
+    the number of events that had to be fetched from the Pi's journal.
     """
 
     exit_status: str = ""

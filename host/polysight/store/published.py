@@ -298,6 +298,7 @@ def _find_ranges(missing: NDArray[np.bool_], unit: int, end: int) -> Gaps:
     return [(int(a) * unit, min(int(b) * unit, end)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
+# Name of a row's file: column and row of its start. End of the name of a board's cube.
 _ROW_FILE = re.compile(r"(\d+)_(\d+)\.bin")
 SYNCED = "_synced.npy"
 

@@ -17,6 +17,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 from polysight_shared.tables import decode
 
+# The two files with a scan's settings.
 COLLECTION = "data_collection_cfg.json"
 DEVICES = "devices_comm_cfg.json"
 

@@ -45,7 +45,7 @@ def object_filter(rig: Instrument, board: Board, sweep_hz: NDArray[np.float64]) 
 
 @dataclass(frozen=True)
 class Backlash:
-    """Shift of odd rows along +x relative to even ones, and its standard deviation."""
+    """Shift of odd rows along +x relative to even ones, and the standard deviation of its estimate."""
 
     shift_mm: float
     std_mm: float

@@ -51,6 +51,7 @@ from polysight_shared.errors import DataError
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
+# Stages of `SyncedRow.errors`, and of what each one's errors are.
 STAGES = {
     "received": "one chirp as received",
     "aligned": "one chirp after burst alignment",

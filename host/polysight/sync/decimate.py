@@ -2,7 +2,7 @@
 
 After mixing to the middle of its band, a chirp's signal lies within a few range bins of zero, far below the rate of its
 samples. `fold` weights the samples of each block and its neighbours with a low-pass filter of ten taps. A plain average
-of the block would let echoes from 4 m behind the scene through (-18 dB), which decimation moves into the scene; this
+of the block would let echoes from 4 m behind the scene through (-16 dB), which decimation moves into the scene; this
 filter has -58 dB there. Noise from there would make images differ from those of all samples, too. It attenuates echoes
 away from the middle by some per cent. `flatten` undoes this with nine taps over the blocks, once for each average. Both
 together pass 0.45 m of path to either side of the middle within 7e-5, and 1 m within 5e-4 (published chirp, inner

@@ -30,7 +30,7 @@
 
 typedef struct { double re, im; } Complex;
 
-/* Cosine and sine of a number of turns, within 1e-9, by polynomials of half the angle, which the compiler vectorises. */
+/* Cosine and sine of a number of turns, within 2e-8, by polynomials of half the angle, which the compiler vectorises. */
 static inline Complex cis(double turns)
 {
     double x = TURN / 2 * (turns - floor(turns + 0.5)), q = x * x, s, c;

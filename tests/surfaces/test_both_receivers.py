@@ -71,7 +71,7 @@ def see_exactly(ball: Sphere, optics: Optics) -> tuple[Seen, Shape]:
 
 @pytest.mark.parametrize("medium", [2.8 - 0.1j, 8 - 1j], ids=["2.8", "8"])
 def test_a_large_ball_gives_both_receivers_what_the_series_says(medium, optics):
-    """V's own incidence, 0.06 degrees from H's, is 1 % of r_p at 2.8; the spherical wave turns it by 0.005 rad."""
+    """V's own incidence, about 0.1 degrees from H's, is 1 % of r_p at 2.8; the spherical wave turns it by 0.005 rad."""
     ratios = {}
     share_of_v = np.ones(len(OFFSETS_M))
     for name, stack in (("metal", METAL), ("medium", Stack(below=medium))):

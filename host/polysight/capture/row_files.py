@@ -27,8 +27,8 @@ from polysight_shared.files import open_to_write, read_bounded
 Bytes = NDArray[np.uint8]
 # Each arrival in an index is a pair of these.
 _INDEX_PAIR = np.dtype("<i8")
-# A pair takes 16 bytes: sixteen million arrivals, hundreds of times those of the longest row. A damaged file that is
-# larger is refused before it fills the memory.
+# A pair takes 16 bytes: sixteen million arrivals, a thousand times those of a row of the published scan. A damaged file
+# that is larger is refused before it fills the memory.
 MAX_INDEX_BYTES = 256 << 20
 
 

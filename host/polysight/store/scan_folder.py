@@ -78,7 +78,7 @@ PART = ".part"
 # The one entry of a scan folder that may be a link out of it, see `check_links`.
 _MAY_BE_LINK = "products"
 MAX_BYTES = 2 << 30
-"""Largest size of the arrays in one archive: a hundred times the images of the published scan."""
+"""Largest size of the arrays in one archive (chosen): thousands of times the images of the published scan."""
 
 
 def extract_connection(rig: Instrument) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from hypothesis import HealthCheck, settings
 
 from polysight_shared.config import Instrument
 
-gc.disable()  # until all is imported and collected; what that makes lives to the end
+# Until all is imported and collected, which makes objects that live to the end (pytest_collection_finish).
+gc.disable()
 
 # The tests start some hundred programs: our modules are compiled once for all of them, whatever the shell says; and one
 # thread each for linear algebra, for two that spin against each other on few cores are ten times slower than one.
@@ -22,7 +23,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
-# Before the first import of it: its asserts show their values
+# Before its first import, so that its asserts show their values.
 pytest.register_assert_rewrite("tests.support")
 
 from tests.support import preloaded  # noqa: E402
@@ -91,7 +92,7 @@ UNRENDERED = ("calibration", "house", "jobs", "plan", "process", "products", "st
 
 @pytest.fixture(scope="module", autouse=True)
 def _composed_figures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """In these rooms figures are not rendered."""
+    """In the folders UNRENDERED every figure is saved as one pixel."""
     if request.path.parent.name not in UNRENDERED:
         yield
         return
@@ -117,7 +118,7 @@ def _browser_of_worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bro
 
 @pytest.fixture(scope="module")
 def browser(_browser_of_worker: Browser) -> Iterator[Browser]:
-    """One for all tests of a worker."""
+    """A browser, the same for all tests of a worker."""
     yield _browser_of_worker
     # The page of a server that has ended asks for it again and again.
     _browser_of_worker.open("about:blank")

@@ -19,7 +19,7 @@ __all__ = ["finished", "samples"]
 
 @pytest.fixture
 def rig(monkeypatch):
-    """The timeout of a command passes where the fake Pi loses its reply or the fake card is mute, and nowhere else."""
+    """A started `FakeRig`. A command times out where its Pi loses the reply or a card is mute, and nowhere else."""
     fake = FakeRig(small_instrument())
 
     class Pi(PiClient):
@@ -76,6 +76,7 @@ def config(rig, tmp_path):
 
 @pytest.fixture
 def payload():
+    """`payload(board, row, size)`: bytes that a fake card sends in a row."""
     return make_payload
 
 

@@ -22,7 +22,7 @@ from polysight_simulators.loopback import move_to_free_subnet
 
 
 def small_rig() -> Instrument:
-    """A free subnet, a grid whose rows fit in the receive buffer, and much patience."""
+    """Return a rig on a free subnet whose rows fit into the receive buffer, with a timeout that no test reaches."""
     grid = {"columns": 12, "rows": 2}
     card = {"receive_buffer_bytes": 1 << 20}
     return move_to_free_subnet(rig_with(grid=grid, limits={"command_timeout_s": HANG_S}, card=card))
@@ -30,6 +30,7 @@ def small_rig() -> Instrument:
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Instrument:
+    """A small rig; its file is `tmp_path / "instrument.toml"`."""
     small = small_rig()
     (tmp_path / "instrument.toml").write_text(tomli_w.dumps(to_builtins(small)))
     return small

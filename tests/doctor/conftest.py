@@ -17,6 +17,7 @@ from polysight_simulators.loopback import move_to_free_subnet
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRig]:
+    """A simulated rig that runs, with its Pi."""
     folder = tmp_path_factory.mktemp("d")
     (folder / "base.toml").write_text(tomli_w.dumps(to_builtins(impatient_rig())))
     (folder / "scene.toml").write_text(SCENE)

@@ -17,6 +17,7 @@ from polysight_simulators.loopback import move_to_free_subnet
 
 @pytest.fixture(scope="session")
 def running_rig() -> Callable[..., AbstractContextManager[Rig]]:
+    """`running_rig(folder, ...)`: a simulated rig for a block."""
     return running
 
 
@@ -35,6 +36,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
 
 @pytest.fixture
 def rig_without_compiler(tmp_path: Path) -> Iterator[Rig]:
+    """A rig whose simulators find no compiler: its stage is the Python stand-in."""
     with running(tmp_path, env={"PATH": str(tmp_path)}) as new_rig:
         yield new_rig
 

@@ -17,7 +17,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 @pytest.fixture(scope="session")
 def make_rig(rig):
-    """The published rig with a small grid and image."""
+    """`make_rig(...)`: the published rig with a small grid and image; steps and pixels in mm."""
 
     def make(columns=31, rows=31, step_x=4.0, step_y=4.0, pixels=(40, 40), pixel=2.0) -> Instrument:
         grid = msgspec.structs.replace(rig.grid, columns=columns, rows=rows, step_x_mm=step_x, step_y_mm=step_y)
@@ -29,7 +29,7 @@ def make_rig(rig):
 
 @pytest.fixture(scope="session")
 def synced_row(rig):
-    """A synchronised row from samples [rx, position, sample]."""
+    """`synced_row(samples, valid)`: a synchronised row from samples [rx, position, sample] and a mask [position]."""
 
     def make(samples, valid=None) -> SyncedRow:
         n = samples.shape[1]
@@ -51,7 +51,11 @@ def synced_row(rig):
 
 @pytest.fixture(scope="session")
 def points_rows(synced_row):
-    """Rows of point targets [(x, y, z) m] with complex amplitudes, direct path included, in plan order."""
+    """Makes rows of point targets [(x, y, z) m] with complex amplitudes, direct path included, in plan order.
+
+    `gains` are those of the RX, `noise` the standard deviation of each part; `shifts_m` [row] moves rows along x,
+    `jitter_m` [row, position, 3] positions.
+    """
 
     def make(
         rig: Instrument,

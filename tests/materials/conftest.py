@@ -15,6 +15,7 @@ from polysight.materials import Classifier, Library, MaterialsResult, TrainingSc
 from polysight.materials.analyse import KnownScene, Optics, analyse
 from polysight.materials.inversion import RigPrior
 
+# The paper's incidence angle, and its Table 2 (eps' - j eps''; None is metal).
 THETA = np.radians(55.0)
 NINE = {
     "rubber": 5.06 - 1.11j,
@@ -31,6 +32,8 @@ NINE = {
 
 @dataclass
 class Synthetic:
+    """An image pair, complex64 [ny, nx], with its axes and the plates in it."""
+
     h: np.ndarray
     v: np.ndarray
     x_m: np.ndarray
@@ -65,7 +68,11 @@ def reflect(eps, theta):
 
 
 def make(seed, materials=None, uneven=0.01, noise=0.006, gain_v=0.3 + 0.6j, theta=THETA):
-    """An image pair of plates of 45 mm in random order on a 3 x 3 raster of 60 mm, each shifted by up to 5 mm."""
+    """Return an image pair of plates of 45 mm in random order on a 3 x 3 raster of 60 mm, each shifted by up to 5 mm.
+
+    `uneven` is the relative scatter of the illumination, `noise` that of a pixel over metal's amplitude, `gain_v` the
+    gain of V over H.
+    """
     pixels = 150
     pixel_mm = 2.0
     rng = np.random.default_rng(seed)
@@ -99,6 +106,7 @@ def make(seed, materials=None, uneven=0.01, noise=0.006, gain_v=0.3 + 0.6j, thet
 
 @pytest.fixture(scope="session")
 def synthetic():
+    """`synthetic(seed, ...)`: see `make`."""
     return make
 
 

@@ -53,7 +53,7 @@ def pi(image: Path) -> Iterator[InstalledPi]:
                 begun = time.monotonic()
                 pi.install()
                 print_figure(f"booted in {box.boot_s:.0f} s, installed in {time.monotonic() - begun:.0f} s")
-                # The image's, libraries without a program
+                # The release that came with the image: libraries without a program.
                 box.run("sudo rm -r /opt/polysight/releases/0")
                 pi.allow_for_a_slow_processor()
                 pi.configure()

@@ -11,6 +11,7 @@ from tests.support.rigs import rig_table
 from polysight.imaging import Images
 from polysight.products import write_image, write_json
 
+# Two segments of materials.json.
 PATCH = {
     "label": 4, "name": "PET", "confidence": 0.75, "votes": {"PET": 0.75, "glass": 0.2, "unknown": 0.05},
     "metal_reference": False, "metal_like": False, "box_mm": [-30.0, -40.0, 50.0, 40.0], "outline_mm": [],

@@ -40,6 +40,7 @@ class EmulatedLibrary(Library):
         subprocess.run(command, check=True)
 
     def _call(self, name: str, arguments: Sequence[NDArray[Any] | float]) -> None:
+        """Call a loop in the emulator (call_loop.c has the format); copy the arrays that it has changed back."""
         given = [np.ascontiguousarray(x) if isinstance(x, np.ndarray) else int(x) for x in arguments]
         message = b""
         for argument in given:

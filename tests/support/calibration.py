@@ -45,8 +45,8 @@ def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
     return replace(plate, made_with=ImagedWith.from_rig(rig, {}))
 
 
-def remaining(found: Leakage, truth: Leakage) -> tuple[float, float]:
-    """Larger cross-polar amplitude and deviation of the co-polar ratio from 1, after correction by `found`."""
-    residual = np.linalg.solve(found.matrix(), truth.matrix())
+def remaining(estimate: Leakage, truth: Leakage) -> tuple[float, float]:
+    """Return the larger cross-polar amplitude and the co-polar ratio's deviation from 1, after correction."""
+    residual = np.linalg.solve(estimate.matrix(), truth.matrix())
     crosstalk = max(abs(residual[0, 1] / residual[0, 0]), abs(residual[1, 0] / residual[1, 1]))
     return float(crosstalk), float(abs(residual[0, 0] / residual[1, 1] - 1))

@@ -17,7 +17,7 @@ from typing import Any
 
 
 def kill_at(hits: Path, operation: str, suffix: str, nth: int) -> None:
-    """Arm this process."""
+    """Have this process killed at the `nth` `operation` of `os` on a file whose name ends in `suffix` (0: never)."""
     real = getattr(os, operation)
     hits_left = [nth]
 

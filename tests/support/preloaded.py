@@ -54,7 +54,9 @@ STARTING_OTHERS = ("polysight", "polysight_simulators.rig", "polysight_simulator
 READ_AT_START = ("PYTHON", "LD_", "LC_", "LANG", "OMP_", "OPENBLAS_", "MPL", "MALLOC_")
 # Descriptors below are the program's; above are those on their way to it.
 FIRST_SPARE = 700
+# Length of the server's own command line, over which a program's words are written.
 ROOM_FOR_WORDS = 8000
+# <linux/prctl.h>
 PR_SET_CHILD_SUBREAPER = 36
 
 
@@ -85,10 +87,12 @@ def program_name(words: list[str]) -> str:
 
 
 def is_ours(function: Callable[[], object] | None) -> bool:
+    """True if a function to be called in the new process can be sent to the server by its name."""
     return function is None or function.__module__.partition(".")[0] in PACKAGES
 
 
 def read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return the variables that only a new process takes notice of."""
     return {name: value for name, value in environment.items() if name.startswith(READ_AT_START)}
 
 
@@ -182,8 +186,9 @@ def close() -> None:
     subprocess.Popen.server.close()  # type: ignore[attr-defined]
 
 
-def adopt_orphans(wanted: bool) -> None:
-    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, int(wanted), 0, 0, 0)
+def adopt_orphans(enabled: bool) -> None:
+    """Become the parent of descendants whose parent ends, or no longer."""
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, int(enabled), 0, 0, 0)
 
 
 def start_server() -> tuple[socket.socket, int]:
@@ -258,6 +263,7 @@ def serve(connection: socket.socket) -> list[str]:
 
 
 def moved_up(file: int) -> int:
+    """Return a copy of a descriptor that lies above the program's own."""
     return fcntl.fcntl(file, fcntl.F_DUPFD_CLOEXEC, FIRST_SPARE)
 
 

@@ -11,7 +11,7 @@ from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.tables import decode, to_builtins
 from tests.support.paths import RIG_FILE
 
-# Start offset of a receiver that puts the direct path mid-band
+# Start offset of a receiver that puts the direct path into the middle of the IF band.
 MID_BAND_OFFSET_HZ = 790e3
 Change = Callable[[dict[str, Any]], None]
 

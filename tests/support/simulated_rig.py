@@ -65,7 +65,7 @@ class Rig(Bench):
 
     def wait_mid_row(self, scan: Program, rows: int) -> None:
         """Wait until this number of rows is committed, and the Pi has journalled an event of the next row."""
-        # Bytes of the journal
+        # Bytes of the journal when the row had begun; 0: it has not.
         begun = 0
 
         def is_received() -> bool:

@@ -13,6 +13,7 @@ from polysight_worlds.rig import published_boards
 from polysight_worlds.shape_scenes import ShapeNuisances, reference_sphere, scan_offsets, scan_shapes
 from polysight_worlds.shapes import Shape
 
+# Paths from TX to RX within which specular points are looked for.
 GATE_M = (1.5, 1.85)
 # Fewer than a scan's, for speed: they hold paths of 0.7 m.
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 9)
@@ -22,6 +23,7 @@ See = Callable[..., Seen]
 
 
 def nominal_optics() -> Optics:
+    """Return the places and polarisations of the published rig's antennas, as the estimator takes them."""
     boards = published_boards()
     middle = {name: np.mean([rx.position for rx in rxs], axis=0) for name, rxs in boards.receivers().items()}
     tx_m = boards.tx.position
@@ -37,6 +39,7 @@ def nominal_optics() -> Optics:
 def scan_on_grid(
     shapes: Sequence[Shape], columns: int = COLUMNS, rows: int = ROWS, noise: float = 1.0
 ) -> tuple[Samples, Samples]:
+    """Return the samples of H and V of a scan of shapes; `noise` is relative to the published rig's."""
     offsets = scan_offsets(columns, rows)
     cubes = scan_shapes(shapes, offsets, ShapeNuisances(noise=noise), frequencies_hz=FREQUENCIES_HZ)
     boards = published_boards()
@@ -55,7 +58,7 @@ def optics() -> Optics:
 
 @pytest.fixture(scope="session")
 def see(optics) -> See:
-    """The points that a scan of shapes shows."""
+    """`see(shapes, columns, rows, noise)`: the specular points that a scan of shapes shows."""
 
     def see_shapes(shapes: Sequence[Shape], columns: int = COLUMNS, rows: int = ROWS, noise: float = 1.0) -> Seen:
         return see_points(*scan_on_grid(shapes, columns, rows, noise), optics, GATE_M)
@@ -71,7 +74,7 @@ def metal(see):
 
 @pytest.fixture(scope="session")
 def gains(metal):
-    """Gains by the metal sphere, for any rig."""
+    """`gains(rig)`: the gains that the metal sphere shows for a rig."""
 
     def learn(rig: Optics):
         return learn_gains(find_voltages(metal, rig), rig.wave_number)

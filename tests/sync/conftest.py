@@ -15,12 +15,16 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 
 def sweep_hz(rig: Instrument) -> np.ndarray:
+    """Return the transmit frequency of each sample of a chirp."""
     return rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
 
 
 @pytest.fixture(scope="session")
 def paths(rig: Instrument) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """`paths(board, positions, echo, rng)`: ideal signal [position, rx, sample], and direct path [rx], metres."""
+    """`paths(board, positions, echo, rng)`: ideal signal [position, rx, sample], and direct path [rx], metres.
+
+    `echo` is the rms amplitude of all echoes over the direct path; they lie within `spread_m` of the mirror point.
+    """
 
     def make(
         board: Board, positions: int, echo: float, rng: np.random.Generator, echoes: int = 1, spread_m: float = 0.1
@@ -54,7 +58,10 @@ def noise() -> Callable[..., np.ndarray]:
 
 @pytest.fixture(scope="session")
 def counts() -> Callable[..., np.ndarray]:
-    """int16 [position, chirp, sample, 2, rx] of bursts complex [rx, position, chirp, sample]; 1 is 1000 counts."""
+    """`counts(frames)`: bursts, complex [rx, position, chirp, sample], as int16 [position, chirp, sample, I and Q, rx].
+
+    An amplitude of 1 becomes 1000 counts.
+    """
 
     def make(frames: np.ndarray) -> np.ndarray:
         rx, positions, chirps, samples = frames.shape

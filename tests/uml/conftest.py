@@ -25,7 +25,8 @@ from polysight_shared.tables import to_builtins
 from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
 HERE = Path(__file__).parent
-# Only what hangs reaches it: a published row takes 4 minutes of a core, and a busy machine gives a fifth of one.
+# Longest time of a guest. Only one that hangs reaches it: a published row takes 4 minutes of a core, and a busy machine
+# gives a fifth of one.
 LIMIT_S = 3000
 
 
@@ -36,7 +37,7 @@ def kernel(request: pytest.FixtureRequest) -> Path:
         pytest.skip("not asked for: `make test-uml` builds a user-mode Linux (minutes, once) and runs these too")
     if lacking := missing():
         pytest.skip(f"no emulated UNO without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
-    # Compiled here: in the guest everything is read-only
+    # Compiled here, because in the guest everything is read-only.
     emulator(), firmware()
     built = subprocess.run([str(HERE / "build_kernel.sh")], stdout=subprocess.PIPE, text=True, check=False)
     assert built.returncode == 0, "the kernel was not built: see above"

@@ -8,7 +8,9 @@ import numpy as np
 
 US = 1_000
 MS = 1_000_000
+# Bytes of samples in a full packet.
 PAYLOAD = 1456
+# Time in which a frame's bytes come from the radar.
 FRAME_NS = 128 * US
 
 
@@ -35,9 +37,10 @@ def receive(
     lost: frozenset[int] = frozenset(),
     drift: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the arrivals, int64 [n, 2], and when the host reads each burst's event, int64 [burst].
+    """Return the arrivals, int64 [n, 2] of time (ns) and bytes by then, and when the host reads each burst's event.
 
-    The radar takes the edges, int64 [frame], for its pulses; `lost` packets never come. The clocks' offset is drawn.
+    `edges_ns` [frame] are the edges that the radar takes for pulses, `pulses_ns` [burst, pulse] those that were sent.
+    `lost` are the numbers of packets that never come. The clocks' offset is drawn; `drift` is their relative rate.
     """
     offset = int(rng.integers(10**10, 10**14))
     sent = edges_ns * (1 + drift) + offset
@@ -52,7 +55,7 @@ def receive(
         frame = (stop - 1) // frame_bytes
         sent_ns = sent[frame] + FRAME_NS * (stop - frame * frame_bytes) / frame_bytes
         if stop == end and end % PAYLOAD:
-            # The card waits 2 s before it sends a packet that is not full
+            # The card waits 2 s before it sends a packet that is not full.
             sent_ns += 2_000 * MS
         sent_ns = max([sent_ns, *(b for a, b in stalls if a <= sent_ns < b)])
         ready = max(sent_ns, ready + 25 * US)

@@ -15,6 +15,7 @@ from tests.support.capture.records import FULL, encode_packet
 
 @functools.cache
 def make_payload(board: str, row: int, size: int) -> bytes:
+    """Return the bytes that the card of this board sends in a row, the same in every take."""
     seed = sum(board.encode()) * 1000 + row
     return np.random.default_rng(seed).integers(0, 256, size, dtype=np.uint8).tobytes()
 
@@ -30,11 +31,14 @@ class FakeCard:
         self.commands.settimeout(0.05)
         self.out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.out.bind((board.card_address, 1024))
+        # Counters of the next packet: its number, and the bytes before it.
         self.sequence = 1
         self.count = 0
         self.recording = False
+        # Set by tests: commands get no reply; rows send no data.
         self.mute = False
         self.silent_data = False
+        # Codes of all commands.
         self.codes_received: list[int] = []
         # Faults by (row, take): numbers of the packets that are lost, and bytes that the record lacks at its end, as if
         # the radar had missed triggers.
@@ -47,6 +51,7 @@ class FakeCard:
         # Of rows that are sent frame by frame: bytes of the record so far, and when they would arrive.
         self.arrivals_ns: dict[int, int] = {}
         self._record_bytes = 0
+        # Bytes that do not fill a packet yet.
         self._rest = b""
         self._arrival_ns = 0
         self._stop = threading.Event()
@@ -65,6 +70,7 @@ class FakeCard:
                 self._command(code, sender)
 
     def _command(self, code: int, sender: tuple[str, int]) -> None:
+        """Execute a command and reply (docs/spec/dca1000.md: 1 reset, 5 record start, 6 record stop, 0x0E version)."""
         self.recording = {1: False, 5: True, 6: False}.get(code, self.recording)
         if code == 5:
             self.arrivals_ns = {}
@@ -111,6 +117,7 @@ class FakeCard:
             self.arrivals_ns[self._record_bytes] = self._arrival_ns
 
     def send_row(self, row: int, take: int) -> None:
+        """Send a row at once with the faults of this take, then that the record is completed."""
         if not self.recording or self.silent_data:
             return
         data = make_payload(self.board.name, row, self.row_bytes)

@@ -16,7 +16,7 @@ from tests.support.acquisition.fake_cards import FakeCard
 from tests.support.processes import HANG_S
 from tests.support.rigs import rig_with
 
-# The Pi's clock, less the host's
+# The Pi's clock less the host's.
 PI_AHEAD_NS = 77_000_000_000
 
 
@@ -26,6 +26,7 @@ class FakePi:
     def __init__(self, rig: Instrument, cards: list[FakeCard]) -> None:
         self.rig = rig
         self.cards = cards
+        # Events of every scan.
         self.journal: dict[str, list[m.AnyEvent]] = {}
         self.stage = rig.stage.placement_settings  # in the reply to Hello; {} as of older releases
         self.homed = False
@@ -34,9 +35,9 @@ class FakePi:
         self.homings = 0
         self.home_fails = set()
         self.lost_mm = (0.0, 0.0)
-        # Number of events that PUB loses
+        # Number of events that PUB is still to lose.
         self.lose_events = 0
-        # Number of replies to lose, and of those lost so far
+        # Number of replies still to be lost, and of those lost so far.
         self.lose_replies = 0
         self.replies_lost = 0
         # (row, take): fault number
@@ -52,7 +53,7 @@ class FakePi:
         self.hang_held = False  # such rows are held
         # Reason in RowFinished of a completed row
         self.notes: dict[tuple[int, int], str] = {}
-        # The hanging row must end
+        # Set by tests: the hanging row is to end.
         self.wanted_end = False
         self.commands: list[m.AnyCommand] = []
         self.rows_run: list[tuple[int, int]] = []
@@ -104,6 +105,7 @@ class FakePi:
         return run.scan_id if run else ""
 
     def _emit(self, kind: type, **content: object) -> None:
+        """Journal an event of the current run and publish it, unless it is to be lost."""
         assert self.run is not None
         events = self.journal.setdefault(self.run.scan_id, [])
         event = kind(scan_id=self.run.scan_id, seq=len(events) + 1, t_mono_ns=time.monotonic_ns(), **content)
@@ -114,6 +116,7 @@ class FakePi:
         self.pub.send_multipart([b"event", m.pack(event)])
 
     def _answer(self, c: m.AnyCommand) -> m.AnyReply:
+        """Return the reply to a command; a row that it starts is left to `_finish_command`."""
         self._todo = None
         scan = self._scan_id()
         last = len(self.journal.get(scan, []))
@@ -168,6 +171,7 @@ class FakePi:
         return m.Accepted(state=self.state)
 
     def _finish_command(self) -> None:
+        """Run the row that the last command has started: its events, and the data of all cards."""
         c = self._todo
         if c is None or self.run is None:
             return
@@ -249,6 +253,8 @@ class FakePi:
 
 @dataclass
 class FakeRig:
+    """The fake Pi and a fake card of each recorded board, once started."""
+
     instrument: Instrument
     cards: dict[str, FakeCard] = field(default_factory=dict)
     pi: FakePi | None = None
@@ -259,6 +265,7 @@ class FakeRig:
         self.start_pi()
 
     def start_pi(self) -> None:
+        """Start the Pi, or a new one with the journal of the one before."""
         journal = self.pi.journal if self.pi else {}
         self.pi = FakePi(self.instrument, list(self.cards.values()))
         self.pi.journal = journal

@@ -17,8 +17,9 @@ from polysight_simulators.faults import Faults
 from tests.support.processes import HANG_S
 
 LIMIT_S = 60.0
-# Frames of a radar that streams: of one turn of the thread, some 5 MB/s in all.
+# What a radar that streams sends in one turn of the thread, some 5 MB/s in all.
 FRAMES = np.arange(8192, dtype="<u4").view(np.uint8)
+# A card with more bytes unsent gets none for a while.
 MAX_QUEUED_BYTES = 1 << 20
 
 
@@ -27,13 +28,14 @@ class Cards:
 
     def __init__(self) -> None:
         self.endpoints: dict[str, CardEndpoint] = {}
-        # Bytes that their radars stream, by card
+        # Number of bytes that their radars stream, by card.
         self._streaming: dict[str, int] = {}
         self._tasks: list[Callable[[], None]] = []
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._serve)
 
     def add(self, name: str, network: Network, faults: Faults, streamed_bytes: int) -> None:
+        """Add a card before `start`; its radar streams so many bytes once it records."""
         self.endpoints[name] = CardEndpoint(
             name=name, network=network, faults=faults, seed=0, time_scale=1.0, clock_s=time.monotonic
         )
@@ -79,6 +81,7 @@ class ScriptedCard:
     """A card that replies `answers(code, count)` to each request; `count`: how often the code was received."""
 
     def __init__(self, board: Board, answers: Callable[[int, int], Iterable[bytes]], source_port: int = 1024) -> None:
+        # Code and data of all requests.
         self.seen: list[tuple[int, bytes]] = []
         self._answers = answers
         self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -103,6 +106,7 @@ class ScriptedCard:
                 self._out.sendto(raw, self.host)
 
     def say(self, raw: bytes) -> None:
+        """Send something without a request."""
         self._out.sendto(raw, self.host)
 
     def close(self) -> None:
@@ -113,4 +117,5 @@ class ScriptedCard:
 
 
 def reply(code: int, status: int = 0) -> bytes:
+    """Return a card's reply to a command."""
     return struct.pack("<4H", 0xA55A, code, status, 0xEEAA)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+# IP addresses of two cards.
 CARD = b"\xc0\xa8\x21\xb4"
 OTHER = b"\xc0\xa8\x21\xb5"
 
@@ -18,7 +19,10 @@ def row(
     samples: int = 256,
     dead: int | None = None,
 ) -> np.ndarray:
-    """Two tones a chirp at positive frequencies, noise, int16 words."""
+    """Return a row's int16 words in the layout of 2 or 4 lanes: two tones at positive frequencies a chirp, and noise.
+
+    `q_first`: Q before I; `dead`: an RX without signal.
+    """
     rng = np.random.default_rng(5)
     t = np.arange(samples)
     x = np.zeros((4, chirps, samples), dtype=complex)
@@ -40,6 +44,7 @@ def row(
 
 
 def udp_frame(source_port: int, payload: bytes, card: bytes = CARD) -> bytes:
+    """Return an Ethernet frame with an IPv4 UDP datagram from a card."""
     udp = struct.pack(">HHHH", source_port, 4098, 8 + len(payload), 0) + payload
     ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0x4000, 64, 17, 0, card, b"\xc0\xa8!\x1e")
     return bytes(12) + b"\x08\x00" + ip + udp
@@ -48,7 +53,7 @@ def udp_frame(source_port: int, payload: bytes, card: bytes = CARD) -> bytes:
 def write_pcap(
     path: Path, payloads: list[bytes], order: str = "<", magic: int = 0xA1B2C3D4, cards: tuple[bytes, ...] = (CARD,)
 ) -> None:
-    """Packets, from the cards in turn."""
+    """Write a capture file of UDP payloads, which come from the cards in turn."""
     raw = struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, 65535, 1)
     for k, p in enumerate(payloads):
         frame = udp_frame(1024, p, cards[k % len(cards)])

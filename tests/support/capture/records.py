@@ -11,7 +11,7 @@ from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Past, Placed, place_record
 from polysight_simulators.cards import Sent
 
-# Bytes of samples in a full packet
+# Bytes of samples in a full packet.
 FULL = 1456
 
 
@@ -29,6 +29,8 @@ def encode_packets(data: bytes, sequence: int, byte_count: int) -> list[bytes]:
 
 @dataclass
 class Record:
+    """What a card records of a row: its bytes, and the packets in which they are sent."""
+
     data: bytes
     packets: list[bytes]
 
@@ -39,11 +41,12 @@ class Record:
         return Record(data, encode_packets(data, sequence, count))
 
     def byte_range(self, k: int) -> tuple[int, int]:
+        """Return start and stop of the bytes in packet k."""
         return k * FULL, min((k + 1) * FULL, len(self.data))
 
 
 class Card:
-    """Makes consecutive records; `reset` restarts the counters."""
+    """Makes consecutive records of `size` bytes; `count` and `sequence` are the counters of the first packet."""
 
     def __init__(self, size: int, count: int = 0, sequence: int = 1) -> None:
         self._size = size
@@ -70,7 +73,7 @@ class Card:
 
 
 def make_log(size: int, packets: list[bytes], batch: int = 7, t_ns: int = 1) -> PacketLog:
-    """The packets of a row as a receiver logs them, a batch every nanosecond."""
+    """Return the packets of a row as a receiver logs them, `batch` at a time, the k-th at `t_ns` + k nanoseconds."""
     log = PacketLog(size)
     for i in range(0, len(packets), batch):
         some = packets[i : i + batch]
@@ -95,6 +98,7 @@ def next_start(placed: Placed) -> Counters | None:
 
 
 def make_mask(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
+    """Return bool [size], true in the gaps (start, stop)."""
     mask = np.zeros(size, dtype=bool)
     for a, b in gaps:
         mask[a:b] = True
@@ -102,6 +106,7 @@ def make_mask(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
 
 
 def is_original_or_masked(record: Record, placed: Placed, out: np.ndarray) -> bool:
+    """True if every byte of the placed row is the record's or is masked: the law of placement."""
     is_kept = ~make_mask(out.size, placed.missing)
     return bool((out[is_kept] == np.frombuffer(record.data, dtype=np.uint8)[is_kept]).all())
 

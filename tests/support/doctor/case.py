@@ -11,13 +11,13 @@ from polysight.sync import BoardSetup
 from polysight_simulators.scene import SimulatedRig, decode_scene
 from tests.support.rigs import programmed_rig
 
+# A computer whose disk and receivers are fast enough, measured without measuring.
 QUICK = System(
     write_speed=lambda _folder: 200e6,
     measure_receivers=lambda _rig, rates: ([LoadResult(r, r, 9, 0) for r in rates], "any core"),
 )
+# Frames of a board at rest.
 FRAMES = 32
-
-
 RIG = programmed_rig()
 SMALL = {
     "name": "s",
@@ -37,9 +37,11 @@ setup_of = functools.cache(lambda board: BoardSetup.from_rig(RIG, RIG.by_name(bo
 
 
 def direct_signal(board, rig=RIG, **disturbances):
+    """What the doctor finds of the direct path in simulated frames of a board."""
     words = simulate_frames(board, rig, **disturbances)
     return find_direct(rig, rig.by_name(board), words, np.ones(FRAMES, bool), setup_of(board))
 
 
 def make_context(rig=RIG, out=Path(), system=QUICK, **more):
+    """A context for single checks, with the rig loaded already."""
     return CheckContext(DoctorOptions(Path("rig.toml"), out), system, loaded_rig=rig, **more)

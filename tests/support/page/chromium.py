@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 from tests.support.paths import REPO
 from tests.support.processes import HANG_S, LIMIT_S, idle_s, wait_for
 
-# width, height, whether it is a phone
+# Sizes of a window: width, height, and whether it is a phone.
 DESK = (1400, 900, False)
 PHONE = (390, 844, True)
 

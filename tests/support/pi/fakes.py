@@ -59,7 +59,10 @@ class FakeDriver:
 
 
 class FakeLines:
-    """`late(n)`: how late the n-th sleep ends; `long(n)`: how long the n-th change of the output takes; nanoseconds."""
+    """Trigger lines on a clock of their own, `t`, which only sleeps, edges and changes of the output move on.
+
+    `late(n)`: how late the n-th sleep ends; `long(n)`: how long the n-th change of the output takes; nanoseconds.
+    """
 
     name = "fake"
     is_real_time = True
@@ -69,11 +72,14 @@ class FakeLines:
         self.late = late
         self.long = long
         self.check_width = True
+        # Pulses that the return wire sees of those sent; None: there is no return wire.
         self.seen: Callable[[int], int] | None = None
         self.sleeps = 0
+        # Time and level of each change of the output.
         self.changes: list[tuple[int, bool]] = []
         self.level = False
         self.closed = False
+        # Edges that tests put on the trigger line; an exception is raised instead.
         self.edges: queue.SimpleQueue[Edge | Exception] = queue.SimpleQueue()
 
     def now_ns(self) -> int:
@@ -115,17 +121,20 @@ class FakeLines:
 
     @property
     def rises(self) -> list[int]:
+        """Times of the rising edges of the output."""
         return [t for t, active in self.changes if active]
 
 
 def gone() -> DeviceError:
+    """Return the error of lines whose chip vanished."""
     return DeviceError("the chip vanished")
 
 
 STEPS_PER_MM = 200
-# Two lines of the hub, joined: the stage hears itself
-MARK_LINE, ECHO_LINE = 1000, 1001
-# Steps/s^2
+# Two lines of the hub, joined: when the stage hears its own change, the hub has delivered the edges before it.
+MARK_LINE = 1000
+ECHO_LINE = 1001
+# Acceleration, steps/s^2.
 ACCEL = 40000
 
 
@@ -195,6 +204,7 @@ class FakeStage:
             self.wire.close()
 
     def say(self, reply: Reply) -> None:
+        """Send a reply, garbled if an answer is to be."""
         raw = reply.encode()
         if self.damage and reply.kind in ("ok", "error"):
             self.damage -= 1
@@ -284,6 +294,7 @@ class FakeStage:
             self._carry_out(c)
 
     def _refusal(self, c: Command) -> int:
+        """Number of the error with which a command is refused; 0: it is accepted."""
         if c.verb in ("HOME", "MOVE", "ROW", "BUZZ", "SET") and self.moving:
             return StageError.BUSY
         if c.verb in ("HOME", "MOVE", "ROW") and self.alarm:
@@ -334,6 +345,7 @@ class FakeStage:
         return 0
 
     def _run_row(self, c: Command) -> int:
+        """Pass the points of a row, with the wrong behaviour that is requested; return an alarm's number or 0."""
         x0, dx, n, self.y, feed = c.args
         self.rows_run += 1
         step_ns = abs(dx) * 10**9 // feed
@@ -361,6 +373,7 @@ class FakeStage:
         return 0
 
     def _edge(self, t_ns: int) -> None:
+        """Raise the trigger for 20 us of wire time."""
         if self.wire:
             edges = WireEdge(t_ns, self.trigger, 1), WireEdge(t_ns + 20_000, self.trigger, 0)
             self.wire.send(*edges, WireEdge(t_ns, MARK_LINE, 1))

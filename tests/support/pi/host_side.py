@@ -22,6 +22,7 @@ from polysight_shared.sockets import requester, subscriber
 from tests.support.processes import LIMIT_S, idle_s, wait_for
 
 POLL_MS = 100
+# Step of the ticking clock.
 TICK_S = 0.01
 
 
@@ -79,7 +80,7 @@ class HostSide:
         self.subscriber = subscriber(self.context, event_address, key_dir)
         self.instrument = instrument
         self.events: list[Any] = []
-        # The subscription has arrived
+        # Once an event comes, the subscription has arrived.
         self.wait(object)
 
     def ask(self, command: Any) -> Any:
@@ -102,6 +103,7 @@ class HostSide:
         return reply.number
 
     def begin(self, scan_id: str = "scan", **changes: Any) -> m.BeginRun:
+        """Return the command that begins a run of this rig, with other values for `changes`."""
         i = self.instrument
         fields: dict[str, Any] = {
             "scan_id": scan_id,
@@ -119,6 +121,7 @@ class HostSide:
         self.until_state("ready")
 
     def until_state(self, *states: str) -> m.StatusReply:
+        """Wait until the Pi is in one of these states; return its status."""
         replies: list[Any] = []
 
         def is_reached() -> bool:
@@ -145,6 +148,7 @@ class HostSide:
         return self.must_accept(m.RunRow(scan_id="scan", row_index=row_index, take=take, owner=owner))
 
     def row(self, row_index: int, take: int = 1) -> m.RowFinished:
+        """Run a row to its end."""
         self.start_row(row_index, take)
         return self.wait(m.RowFinished, lambda e: (e.row_index, e.take) == (row_index, take))
 

@@ -13,11 +13,13 @@ from tests.support.pi.fakes import FakeDriver, FakeLines
 
 SPEC = BurstSpec(2, 1_500_000, 1000)
 ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
-# 2 mm at 20 mm/s
+# Time between two edges: 2 mm at 20 mm/s.
 INTERVAL_NS = 100_000_000
 
 
 class FakeJournal:
+    """Keeps the events that the machine adds."""
+
     def __init__(self) -> None:
         self.events: list[Any] = []
 
@@ -28,9 +30,10 @@ class FakeJournal:
 
 
 class Bench:
-    """A machine with its stage, trigger loop and journal."""
+    """A machine with a fake stage and journal, and a trigger loop whose edges the test gives."""
 
     def __init__(self) -> None:
+        # The machine's clock, seconds.
         self.t = 100.0
         self.lines = FakeLines()
         self.stage = FakeDriver()
@@ -43,6 +46,7 @@ class Bench:
         self.row = ROW
 
     def run_posted(self) -> None:
+        """Do what machine and trigger loop have posted, as the executor does."""
         while self.posted:
             item = self.posted.pop(0)
             if isinstance(item, BurstSent):
@@ -90,9 +94,11 @@ class Bench:
         self.stage_says(Reply("done", self.stage.number, fields=fields, **times_ns))
 
     def edge(self) -> None:
+        """Give the next edge at its right time."""
         self.give_edge(self.edge_ns + INTERVAL_NS)
 
     def give_edge(self, t_ns: int) -> None:
+        """Give an edge to the trigger loop, and its results to the machine."""
         self.seqno += 1
         self.edge_ns = t_ns
         self.lines.t = max(self.lines.t, t_ns)

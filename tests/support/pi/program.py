@@ -81,6 +81,8 @@ def run(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 class WiresLog:
+    """Records every edge on the given lines of a hub."""
+
     def __init__(self, hub: Path, *lines: int) -> None:
         self._client = WireClient(hub, listen=lines)
         self.edges: list[WireEdge] = []

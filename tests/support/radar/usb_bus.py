@@ -43,7 +43,7 @@ class Chip:
         self.latency_ms: dict[int, int] = {}
         self.errors: list[str] = []
         self.transfers = 0
-        # The transfer at which it is pulled
+        # Number of the transfer at which it is pulled; None: never.
         self.pull_at: int | None = None
 
 

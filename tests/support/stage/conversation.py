@@ -11,17 +11,23 @@ import pytest
 from polysight_shared.errors import ProtocolError
 from polysight_shared.stage_line import Command, Immediate, crc16, unseal
 
+# Bits of the switches by their letter in a conversation.
 PRESSED = {"X": 1, "Y": 2, "E": 4, "nothing": 0}
 
 
 class Conversation:
+    """One conversation with a stage, whose steps are called one after another."""
+
     def __init__(self, stage) -> None:
         self.stage = stage
+        # Number of the last line.
         self.sequence = 0
+        # Number of the last line with each verb.
         self.by_verb: dict[str, int] = {}
         self.last = b""
 
     def send(self, texts: list[str]) -> None:
+        """Send the bytes of these texts in one piece."""
         self.stage.rx(b"".join([self._bytes(text) for text in texts]))
 
     def _bytes(self, text: str) -> bytes:
@@ -45,6 +51,7 @@ class Conversation:
         return self.last
 
     def expect(self, text: str) -> None:
+        """Wait for a line and compare it: `#` is the last line's number, `#VERB` that verb's, `?` any value."""
         if text == "silence":
             self.stage.linger()
             assert self.stage.received == b""
@@ -57,6 +64,7 @@ class Conversation:
         )
 
     def act(self, text: str) -> None:
+        """Let time pass, press switches, slip or reset the stage."""
         words = text.split()
         if words[-1] == "ms":
             self.stage.run_ms(float(words[0]))

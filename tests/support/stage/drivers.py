@@ -17,6 +17,7 @@ from polysight_simulators.stage import NS_PER_TICK, TICK_HZ, PythonStage, Rig
 from polysight_simulators.uno import HZ, EmulatedUno, PinEdge
 from tests.support.processes import HANG_S, LIMIT_S, idle_s
 
+# Longest time until a stage comes to rest: 10 minutes.
 LIMIT_TICKS = 600 * TICK_HZ
 TICKS_PER_MS = TICK_HZ // 1000
 

@@ -102,6 +102,7 @@ def outlives_its_parent(command: Sequence[str | Path], standard_input: str = "")
 
 
 def runs(pid: int) -> bool:
+    """True if there is such a process and it has not ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):

@@ -21,10 +21,12 @@ import pytest
 
 Fault = Literal["full", "short", "killed", "killed within", "power cut", "worst power cut"]
 SEEN = ("open", "pwrite", "fsync", "mkdir", "rename", "replace", "unlink", "ftruncate", "posix_fallocate")
+# The real functions, while those of `os` and `io` are replaced.
 REAL_OPEN = io.open
 REAL = SimpleNamespace(**{name: getattr(os, name) for name in SEEN})
 # Smaller than a real disk's 512 bytes, for the files of the tests are small.
 SECTOR_BYTES = 64
+# Operations that need space on the disk.
 GROWS = ("write", "pwrite", "posix_fallocate", "create", "mkdir", "rename", "fsync")
 
 
@@ -54,9 +56,11 @@ class FaultyDisk:
         self._fault = fault
         self.at = at
         self._random = random.Random(seed)
+        # True once the program was killed; True once there is space again.
         self._dead = self._space = False
+        # What was done: operation and name of the file.
         self.done: list[str] = []
-        # What of a touched file is on the disk for certain
+        # Content of a touched file that is on the disk for certain.
         self._durable: dict[Path, bytes] = {}
         # Names that are not synced yet: their folder, and how to lose them.
         self._undo: list[tuple[Path, Callable[[], object]]] = []
@@ -86,10 +90,12 @@ class FaultyDisk:
     # --- what a power cut leaves ---
 
     def _touch(self, path: Path) -> None:
+        """Note the content of a file before its first change since it was synced."""
         if str(path).startswith(self._folder):
             self._durable.setdefault(path, path.read_bytes() if path.exists() else b"")
 
     def _sync(self, path: Path) -> None:
+        """Note that a file's content, or the names in a folder, are on the disk."""
         if path.is_dir():
             self._undo = [(folder, back) for folder, back in self._undo if folder != path]
         elif path in self._durable:
@@ -131,12 +137,12 @@ class FaultyDisk:
                 patch.setattr(io, "open", self._opened)
                 yield self
         finally:
-            # Killed passes through here
-            # Drawn losses ("power cut") were never applied; with them two tests find foreign events after a resume.
+            # `Killed` passes through here: now the power cut takes what was not synced.
             if self._dead and self._fault in ("power cut", "worst power cut"):
                 self.lose_power()
 
     def _opened(self, file: Any, mode: str = "r", buffering: int = -1, *more: Any, **named: Any) -> Any:
+        """Replace `io.open`: a file below the folder that is opened for writing is one that the disk sees."""
         path = Path(str(file))
         if isinstance(file, int) or not str(path).startswith(self._folder) or not set(mode) & set("wxa+"):
             return REAL_OPEN(file, mode, buffering, *more, **named)

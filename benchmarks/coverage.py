@@ -402,6 +402,7 @@ def _judge_without_result(job: tuple[int, str]) -> tuple[str, int, str, int, str
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the benchmark."""
     parser.add_argument("--scenes", type=int, default=40, help="full scenes, from samples (default: 40)")
     parser.add_argument("--raw", type=int, default=4, help="full scenes from raw data (default: 4)")
     parser.add_argument("--without", type=int, default=20, help="scenes that hold nothing to name (default: 20)")

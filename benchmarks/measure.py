@@ -91,6 +91,7 @@ class AnonymousMemory:
         self._watcher.start()
 
     def _watch(self) -> None:
+        """Read the memory again and again until the process or the measurement ends."""
         while not self._ended.wait(_LOOK_S):
             try:
                 text = self._path.read_text(encoding="ascii")

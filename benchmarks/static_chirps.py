@@ -52,6 +52,7 @@ def run(out: Path, positions: int, board_name: str, snr_db: float = SNR_DB) -> s
 
 
 def main(argv: list[str]) -> int:
+    """Write the report and print its text; return 0."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.static_chirps", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     parser.add_argument("--positions", type=int, default=40_000, help="number of positions, of 16 chirps each")

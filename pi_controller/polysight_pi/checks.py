@@ -111,12 +111,14 @@ def _check_real_time() -> Finding:
 
 
 def _check_stage(instrument: Instrument) -> str:
+    """Greet the stage and ask where it is; the port's opening may reset it."""
     with BenchStage(instrument.stage) as stage:
         x_mm, y_mm = stage.position()
         return f"{instrument.stage.port} answers, firmware {stage.firmware or '?'}, at {x_mm:.2f}, {y_mm:.2f} mm"
 
 
 def _check_journal(path: Path, needed_bytes: int) -> str:
+    """Check that the journal folder can be written and that no service uses it, and the free space."""
     Journal(path).close()
     free = shutil.disk_usage(path).free
     if free < needed_bytes:
@@ -126,6 +128,7 @@ def _check_journal(path: Path, needed_bytes: int) -> str:
 
 
 def _check_keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
+    """Check that the Pi's secret key is there, for its user alone, unless all addresses are loopback."""
     if all(is_loopback(a) for a in addresses):
         return "not needed: both addresses are loopback"
     secret = folder / "pi.key_secret"
@@ -139,6 +142,7 @@ def _check_keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
 
 
 def _check_address(make: Callable[..., zmq.Socket[bytes]], address: str, key_dir: Path) -> str:
+    """Check that a socket of the service can be bound; `make` creates it."""
     context = make_server_context()
     try:
         make(context, address, key_dir).close()

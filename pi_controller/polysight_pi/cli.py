@@ -104,6 +104,7 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
+    """Move the homed stage by a distance and print its position."""
     from polysight_pi.client import refuse_beside_service
     from polysight_pi.stage import BenchStage
 
@@ -114,6 +115,7 @@ def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _buzz(args: argparse.Namespace, instrument: Instrument) -> int:
+    """Move an axis by 1 mm each way and print the position."""
     from polysight_pi.client import refuse_beside_service
     from polysight_pi.stage import BenchStage
 
@@ -278,6 +280,7 @@ COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str,
 
 
 def _make_parser() -> argparse.ArgumentParser:
+    """Return the parser of COMMANDS."""
     parser = argparse.ArgumentParser(
         prog="polysight-pi",
         description="The Raspberry Pi half of the instrument: controls the stage, answers its triggers with SYNC_IN "

@@ -46,6 +46,7 @@ def _open_service(instrument: Instrument) -> Iterator[Ask]:
         client = requester(context, address, Path(instrument.pi.key_dir))
 
         def ask(command: m.AnyCommand) -> m.AnyReply:
+            """Send a command and return the reply."""
             try:
                 client.send(m.pack(command))
             # There is no connection to the service.

@@ -503,6 +503,7 @@ class Executor:
         self._waits_for_journal = True
 
         def finish(error: PolysightError | OSError | None) -> None:
+            """Accept or refuse the command, in the executor's thread, and execute those that have waited."""
             self._waits_for_journal = False
             # Any other error means that the journal was not opened.
             if isinstance(error, JournalFullError) and self.journal.is_broken:

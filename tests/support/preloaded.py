@@ -102,6 +102,7 @@ class Popen(subprocess.Popen):
     server: Server
 
     def _execute_child(self, *values: Any, **named: Any) -> None:
+        """Start the program: as a fork if it is a plain command of ours, else as `subprocess` does."""
         start = super()._execute_child  # type: ignore[misc]
         bound_arguments = inspect.signature(start).bind(*values, **named).arguments
         if isinstance(bound_arguments["args"], str | bytes | os.PathLike):

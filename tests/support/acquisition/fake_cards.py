@@ -106,6 +106,7 @@ class FakeCard:
         self.report_status()
 
     def _send_packet(self, size: int) -> None:
+        """Send up to `size` of the waiting bytes as a packet, and note when they would arrive."""
         body = self._rest[:size]
         self._rest = self._rest[size:]
         if body:

@@ -71,6 +71,7 @@ class FakePi:
         self._thread.start()
 
     def _serve(self) -> None:
+        """Answer commands, and send a heartbeat every 50 ms."""
         last = 0.0
         while not self._stop.is_set():
             if self.rep.poll(10):

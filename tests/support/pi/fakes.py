@@ -247,6 +247,7 @@ class FakeStage:
                     buffer += bytes([c])
 
     def _immediate(self, c: int) -> None:
+        """Obey an immediate byte."""
         self.bytes_seen.append(c)
         if c == Immediate.STATUS:
             if self.held:
@@ -267,6 +268,7 @@ class FakeStage:
             self._stopping.set()
 
     def _line(self, line: bytes) -> None:
+        """Answer a line as the firmware does, and start its motion."""
         if line == b"\n":
             return None
         if self.lose:
@@ -304,6 +306,7 @@ class FakeStage:
         return 0
 
     def _carry_out(self, c: Command) -> None:
+        """Clear an alarm, or start a motion once the one before has ended."""
         if c.verb == "CLEAR":
             self.alarm = 0
         elif c.verb in ("HOME", "MOVE", "ROW", "BUZZ"):
@@ -315,6 +318,7 @@ class FakeStage:
             self._motion.start()
 
     def _move(self, c: Command) -> None:
+        """Run a motion in a thread of its own, and report its end unless that is to be lost."""
         try:
             number = self._run_row(c) if c.verb == "ROW" else self._run_other_motion(c)
         except PolysightError:

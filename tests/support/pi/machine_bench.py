@@ -66,6 +66,7 @@ class Bench:
             self.run_posted()
 
     def begin_and_home(self) -> Bench:
+        """Begin a run and home the stage; the state is then `ready`."""
         self.machine.command("BeginRun", 0)
         self.machine.command("Home")
         self.run_posted()

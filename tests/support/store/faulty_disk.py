@@ -189,6 +189,7 @@ class FaultyDisk:
             self._undo.append((Path(path).parent, Path(path).rmdir))
 
     def _rename(self, a: Any, b: Any, **named: Any) -> None:
+        """Rename a file; until its folder is synced a power cut may undo that."""
         a = Path(a)
         b = Path(b)
         self._hit("rename", b)
@@ -207,6 +208,7 @@ class FaultyDisk:
         self._undo.append((b.parent, back))
 
     def _unlink(self, path: Any, **named: Any) -> None:
+        """Remove a file; until its folder is synced a power cut may bring it back."""
         path = Path(path)
         is_tracked = str(path).startswith(self._folder) and path.exists()
         self._hit("unlink", path)

@@ -104,6 +104,7 @@ class SmallPi:
         )  # fmt: skip
 
     def run_row(self, scan_id: str, row_index: int, take: int) -> None:
+        """Journal a whole row at once."""
         assert scan_id == self._scan_id
         row = self._plan.row(row_index)
         n = self._instrument.burst.pulses
@@ -190,6 +191,7 @@ class SmallRig:
         return {name: self._end(name, segment) for name, segment in self._segments.items()}
 
     def _end(self, name: str, segment: Segment) -> RowCapture:
+        """Place and write the row of one board, as its receiver does."""
         row, take = self._row
         data = self._samples.of(name, row)
         log = PacketLog(len(data))

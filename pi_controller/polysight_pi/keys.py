@@ -26,7 +26,7 @@ COPY = f"copy {' and '.join(HOST_KEYS)} to the host, into its pi.key_dir; pi.key
 
 
 class AllowedKeys:
-    """The clients that may connect, by the list in the key folder; a changed list is read again at each question."""
+    """The clients that may connect, by the list in the key folder; a list that was changed is read again when asked."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -215,7 +215,7 @@ class Board(Section, frozen=True):
 class Card(Section, frozen=True):
     """DCA1000 settings common to all boards."""
 
-    # UDP payload of a full packet, with the card's headers.
+    # Packet size as the card is told it (0x0B in docs/spec/dca1000.md); 1470 makes packets of 1456 bytes of samples.
     packet_bytes: Annotated[int, msgspec.Meta(ge=24, le=1470)] = 1470
     # Pause of the card between two packets.
     packet_delay_us: NonNegative = 25.0

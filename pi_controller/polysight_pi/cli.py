@@ -227,6 +227,7 @@ def _load_rig(args: argparse.Namespace) -> Instrument:
     return replace(rig, pi=replace(rig.pi, **pi_values), stage=replace(rig.stage, **stage_values))
 
 
+# Options of several commands.
 WIRES = _make_option("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
 STAGE_PORT = _make_option("--stage-port", metavar="TTY", help="serial port of the stage; replaces stage.port")
 JOURNAL = _make_option(

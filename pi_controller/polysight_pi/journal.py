@@ -35,6 +35,7 @@ from polysight_shared.errors import ConfigError, DataError, DeviceError, Polysig
 from polysight_shared.faults import PiFault, explain
 from polysight_shared.raster import RasterPlan
 
+# First bytes of a journal, by which it is recognised.
 MAGIC = b"PSJRNL1\n"
 # A longer record is damaged: the longest text of an event has 4000 characters.
 MAX_RECORD_BYTES = 1 << 20

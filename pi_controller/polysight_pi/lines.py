@@ -52,6 +52,7 @@ MODE_NO_CS = 0x40
 MODE_0 = 0x00
 # struct spi_ioc_transfer: tx, rx, len, speed_hz, delay_us, bits, cs_change, tx_nbits, rx_nbits, ...
 _TRANSFER = struct.Struct("=QQIIHBBBBBB")
+# Likely cause and remedy by error number, of GPIO lines and of SPI devices.
 _RIGHTS = "60-polysight.rules sets the device's group (udev), `sudo usermod -aG gpio,spi USER` adds the user to it"
 _REASONS = {
     errno.EBUSY: ("it is in use", "end that program; `systemctl stop polysight-pi` if it is polysight itself"),

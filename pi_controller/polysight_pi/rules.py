@@ -29,6 +29,7 @@ class Rule(NamedTuple):
     action: str = "nothing"
 
 
+# A pair of event and state has at most one rule.
 RULES = (
     # Commands; refused in all other states.
     Rule("Home", "idle homed ready fault", "homing", "home"),

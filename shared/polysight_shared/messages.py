@@ -7,7 +7,7 @@ fields have defaults and come last, so that all minor versions are compatible. S
 from __future__ import annotations
 
 import zlib
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import msgpack
 import msgspec
@@ -16,6 +16,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ProtocolError, VersionError
 from polysight_shared.raster import RasterPlan, Row
 
+# "major.minor": a new major number whenever older programs could not read a message.
 WIRE_VERSION = "1.0"
 # Limits of `Pulse`: number of pulses, and duration, so that the reply arrives well before the timeout of a command.
 MAX_PULSES_AT_REST = 256
@@ -195,6 +196,7 @@ class Fault(Event, frozen=True, kw_only=True, rename=_KEYS_ON_THE_WIRE):
     remedy: Text = ""
 
 
+# All events; those that are stored in the journal.
 AnyEvent = RunStarted | RunStopped | RowStarted | RowFinished | Capture | StageStatus | Heartbeat | Fault | Jogged
 JOURNALLED = (RunStarted, RunStopped, RowStarted, RowFinished, Capture, Fault, Jogged)
 
@@ -411,8 +413,6 @@ class Pulsed(_Message, frozen=True, kw_only=True):
 
 
 AnyReply = HelloReply | Accepted | Refused | StatusReply | ReplayReply | Pulsed
-
-M = TypeVar("M")
 
 
 def pack(message: AnyEvent | AnyCommand | AnyReply) -> bytes:

@@ -22,6 +22,7 @@ FIRST_PULSE_DELAY_S = 200e-6
 MIN_PERIOD_US = 300.0
 # Shortest and longest SYNC_IN pulse.
 WIDTH_US = (0.025, 4.0)
+# The same for messages, and the limits in nanoseconds.
 WIDTH_TEXT = f"{WIDTH_US[0]:g}..{WIDTH_US[1]:g} us"
 MIN_PERIOD_NS = us_to_ns(MIN_PERIOD_US)
 MIN_WIDTH_NS, MAX_WIDTH_NS = map(us_to_ns, WIDTH_US)

@@ -221,7 +221,7 @@ def row_starts_m(offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def pitch_y_m(aperture: Aperture) -> float | None:
-    """Return a common divisor of row spacing and pixel; None without one."""
+    """Return the largest common divisor of row spacing and pixel of at least a quarter pixel, metres; None without."""
     y = aperture.offsets_m[:, 0, 1]
     for finer in range(1, _FINER + 1):
         pitch = aperture.grid.pixel_m / finer
@@ -282,8 +282,9 @@ def get_device(array: Any) -> Any:
 
 @dataclass(frozen=True)
 class StageWindow:
-    """The scan along one axis: specular points of the stage's positions, in pixels from the first, and their weights.
+    """The scan along one axis: specular points of the stage's positions, and their weights.
 
+    `places_px` [position] are in pixels from the first pixel, `weights` [position] those of the window.
     `bend_px` is the growth of the phase by the square of the distance from the specular point, radians per pixel^2.
     """
 
@@ -327,7 +328,7 @@ class StageWindow:
         slope_per_rad
             Rise for a phase step of one radian.
         profile, lit
-            |H| along this axis over the plate's lines, [pixel], and where the image is lit.
+            |H| along this axis, mean over the plate's lines, [pixel], and where the scan illuminates it enough.
         mask_ends_px
             Where the plate ends along this axis by its segmentation, [2].
         moved_px
@@ -357,7 +358,7 @@ class StageWindow:
 
 
 def find_ends(profile: NDArray[np.float64], lit: NDArray[np.bool_], inside_px: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return where a plate's |H| falls to half of that inside, [2] pixels; infinite where the light ends before."""
+    """Return where a plate's |H| falls to half of that inside, [2] pixels; infinite if it does not within `lit`."""
     half = float(np.median(profile[inside_px])) / 2
     ends = []
     for outwards, start in ((-1, int(inside_px[0])), (1, int(inside_px[-1]))):

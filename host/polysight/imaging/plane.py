@@ -49,17 +49,17 @@ _WORTH_M = 5e-4
 _STEP_M = 2e-4
 """Height step to find the change of range and phase with height."""
 _COHERENT = 0.7
-"""Smallest coherence of the pixels of a plate (1: all equal)."""
+"""Smallest coherence of the pixels of a plate whose phase is used (1: all equal; chosen)."""
 _TILT_PRIOR_RAD = 0.02
-"""Prior standard deviation of the tilt: one degree."""
+"""Prior standard deviation of the tilt: about one degree (chosen)."""
 _MIN_STD_M = 3e-4
 """Smallest standard deviation of a plate's range, due to sidelobes of its neighbours."""
 _MAX_TILT = 0.035
 """Largest tilt that phases may show, rise per metre: two degrees."""
 _TILT_TOLERANCE = 3e-3
-"""Difference of the tilts by phase and by range that is accepted beside their errors, rise per metre."""
+"""Difference of the tilts by phase and by range that is accepted beside their errors, rise per metre (chosen)."""
 _MAX_RANGE_STD_M = 0.05
-"""Largest standard deviation of a height by range that is used."""
+"""Largest standard deviation of a height by range that is used (chosen)."""
 _PHASE_FITS_RAD = 0.5
 """Largest RMS phase error of plates on one plane (chosen); random phases have 1.8."""
 _PHASE_STD_M = 5e-5
@@ -436,7 +436,8 @@ def _estimate_heights_by_phase(
     ambiguity_m = 2 * np.pi / abs(rad_per_m)
     with_phase = np.flatnonzero(np.isfinite(phases))
     design = np.column_stack([np.ones(with_phase.size), places[with_phase]])
-    # The range leaves an ambiguity of some turns, common to all plates except for the tilt: try several tilts.
+    # The range leaves an ambiguity of some turns, common to all plates except for the tilt: try 17 tilts
+    # along each axis, within one standard deviation of the prior.
     tilts = np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD
     trial_planes = plane + np.array([(0.0, tilt_x, tilt_y) for tilt_x in tilts for tilt_y in tilts])
     guesses = trial_planes @ design.T

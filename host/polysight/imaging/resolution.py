@@ -274,7 +274,10 @@ def field_limits(rig: Instrument) -> FieldLimits:
 def _find_nearest_ghost_m(
     slope: PhaseSlope, frequency_hz: float, difference_rad_per_m: float, centre_m: float
 ) -> float:
-    """Return the distance between two places around `centre_m` whose slopes differ by `difference_rad_per_m`."""
+    """Return the distance between two places around `centre_m` whose slopes differ by `difference_rad_per_m`.
+
+    Infinite if it is beyond `_MAX_DISTANCE_M`.
+    """
 
     def too_far(distance_m: float) -> bool:
         far = slope.slope(centre_m + distance_m / 2, frequency_hz)

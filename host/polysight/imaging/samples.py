@@ -102,7 +102,7 @@ class Reduction:
         step_hz = self.sweep_hz[1] - self.sweep_hz[0]
         first = round((sweep_hz[0] - self.sweep_hz[0]) / step_hz - (FOLD - 1) / 2)
         linear = slice(first, first + FOLD * sweep_hz.size)
-        # The middle of a chirp's band lies between the direct path and the gate.
+        # The middle of a chirp's band lies half way between the direct path and the middle of the gate.
         middle_m = sum(self.gate_m) / 4
         decimated = decimation(FOLD * sweep_hz.size, middle_m * step_hz / SPEED_OF_LIGHT_M_S)
         paths = np.linspace(-_BESIDE_M, max(self.gate_m[1] + _BESIDE_M, middle_m + _PASSED_M), 4 * sweep_hz.size)
@@ -116,7 +116,8 @@ def scene_gate_m(
     antennas: tuple[geometry.Antennas, ...], plan: RasterPlan, grid: geometry.ImageGrid, depth_m: float = 0.0
 ) -> tuple[float, float]:
     """Return the smallest and largest excess path of all pixels (`depth_m` nearer and farther) and stage positions."""
-    # 2 mm of room (chosen) for the travel of the stage within a burst.
+    # 2 mm of room (chosen) for the travel of the stage within a burst. The largest excess path is at a corner; the
+    # smallest is flat at its place, so that 41 points per axis (chosen) find it closely.
     half_x = ((plan.columns - 1) / 2 * plan.step_x_mm + 2) / 1e3
     half_y = (plan.rows - 1) / 2 * plan.step_y_mm / 1e3
     dx, dy = np.meshgrid(
@@ -160,6 +161,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     direct = np.linalg.solve(covariance, np.ones(b - a)).conj()
     direct /= direct.sum()
 
+    # The direct path is a constant in x: the estimated one is subtracted before the projection `m`.
     matrix = np.zeros((frequencies.size, chirp.samples), complex)
     matrix[:, a:b] = m - np.outer(m.sum(axis=1), direct)
     spectrum = np.zeros(chirp.samples, complex)
@@ -322,15 +324,18 @@ class BoardSamples:
         self._chirp = rig.chirp
         # Samples of an ideal mirror on the rig file's plane after the range gate, [rx, frequency].
         self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
+        # Stage offsets [row, column, 3], and the x of each row's first position as planned [row], metres.
         self._offsets = geometry.scan_offsets_m(rig)
         self._planned = geometry.row_starts_m(self._offsets)
         rx = len(self._antennas.rx_m)
         shape = taper.shape
+        # Reduced samples [rx, frequency, row, column] and the direct path [rx, row, column], as received.
         self._cube = np.zeros((rx, reduction.frequencies_hz.size, *shape), np.complex64)
         self._direct = np.zeros((rx, *shape), np.complex64)
         # True for positions with data, [row, column].
         self.valid = np.zeros(shape, bool)
         regular = geometry.find_irregularity(self.aperture) is None
+        # Imager of all rows; None if the aperture is irregular, or before it is needed.
         self._final: SpectralImager | None = None
         # Spectra of the rows along x, for the final image
         self._spectra = np.zeros(0, np.complex64)
@@ -340,6 +345,7 @@ class BoardSamples:
         self._stale = set(range(shape[0]))
         # Image of the rows so far, once it was formed
         self._image: tuple[Image, Image, str | None] | None = None
+        # Result of `range_slope` for the rows so far, once it was formed.
         self._slope: tuple[Image, Image] | None = None
         # True if a row was recorded at other places than planned, so that the live image cannot use its spectra.
         self._moved = False
@@ -521,7 +527,7 @@ class BoardSamples:
             self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
 
     def rx_calibration(self) -> NDArray[np.complex128]:
-        """Return the complex gain of each RX, [rx]: mean direct path of all positions times its known length."""
+        """Return the complex gain of each RX, [rx]: mean direct path of valid positions times its length; 1 if none."""
         total = (self._direct * self.valid).sum(axis=(1, 2), dtype=np.complex128)
         gain = total / max(1, int(self.valid.sum())) * self._antennas.direct_m
         return np.where(gain == 0, 1, gain)

@@ -30,7 +30,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 _FADE = 0.08
 # Smallest length of the cross-fade, columns.
 _FADE_COLUMNS = 20
-# Relative to the kernel's strongest spectral bin: weaker ones are left out
+# Relative to the kernel's strongest spectral bin: weaker ones are left out (chosen: more bins are slower).
 _FILLED = 1e-5
 KEEP_BYTES = 1 << 28
 """Size of the cache: two boards of the published grid take 115 MB, 166 MB with the kernels of a live scan."""
@@ -39,7 +39,7 @@ _cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
 SLACK_M = 2e-3
 """Largest deviation of a row's start along x from the aperture."""
-# Relative to the strongest principal component: weaker ones are left out
+# Relative to the strongest principal component: weaker ones are left out (chosen: 17 of the published rig's 40 stay).
 _LEFT_OUT = 6e-6
 # Wavenumbers processed in double precision at a time: with 32 a live scan keeps 11 MB more, in no less time.
 _CHUNK = 8
@@ -144,8 +144,8 @@ def delays_s(aperture: Aperture, x: Any, y: Any, xp: Any = np, device: Any = Non
 def cross_fade(xp: Any, kernel: Any, size: int) -> Any:
     """Return one period of a kernel [..., fade + size], whose first `fade` points precede the period.
 
-    At the end of the period the kernel is cross-faded into its start. The smooth periodic function has a narrow
-    spectrum, so that phase ramps shift it by any fraction.
+    At the end of the period the kernel is cross-faded into those points, which lead to its start. The smooth periodic
+    function has a narrow spectrum, so that phase ramps shift it by any fraction.
     """
     fade = kernel.shape[-1] - size
     # The curve is within 2e-4 of 0 and 1 at its ends (published grid).
@@ -165,6 +165,7 @@ def _find_band(aperture: Aperture, first: float, last: float, step: float, colum
     y = aperture.offsets_m[:, 0, 1]
     # Largest possible wavenumber, cycles per metre
     fastest = 2 * aperture.frequencies_hz[-1] / SPEED_OF_LIGHT_M_S
+    # Two points a cycle would be enough; 2.2 leave room.
     finer = max(1, math.ceil(2.2 * step * fastest))
     size = columns * finer
     fade = size - math.ceil((last - first) / step * finer) - 1
@@ -336,7 +337,9 @@ class SpectralImager(RowSpectra):
         count = sizes.size_y // sizes.row_stride
         # Rows are padded with zeros below.
         self._padded_lines = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)
+        # Spectrum along y: rows are `row_stride` pitches apart, so that theirs repeats as often in that of the lattice.
         self._repeat = self.put(np.arange(sizes.size_y) % count)
+        # Lattice rows of positions, and of pixels.
         self._rows = self.put(np.arange(rows) * sizes.row_stride)
         self._pixel_rows = self.put(self._last + np.arange(lines) * sizes.pixel_stride)
         self._kernels = get_cached(

@@ -75,8 +75,8 @@ class Link:
     ----------
     name
         Name of the board, for errors.
-    words
-        Word link.
+    words, clock
+        Word link, and the clock of timeouts and pauses.
     on_sent
         Called with every message that is sent.
 

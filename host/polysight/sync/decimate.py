@@ -4,9 +4,9 @@ After mixing to the middle of its band, a chirp's signal lies within a few range
 samples. `fold` weights the samples of each block and its neighbours with a low-pass filter of ten taps. A plain average
 of the block would let echoes from 4 m behind the scene through (-16 dB), which decimation moves into the scene; this
 filter has -58 dB there. Noise from there would make images differ from those of all samples, too. It attenuates echoes
-away from the middle by some per cent. `flatten` undoes this with nine taps over the blocks, once for each average. Both
-together pass 0.45 m of path to either side of the middle within 7e-5, and 1 m within 5e-4 (published chirp, inner
-blocks).
+away from the middle by some per cent. `flatten` undoes this with nine taps over the blocks, once for each average over
+chirps. Both together pass 0.45 m of path to either side of the middle within 7e-5, and 1 m within 5e-4 (published
+chirp, inner blocks).
 
 The filters are fitted by least squares. The first and last blocks lack neighbours: there `fold` is the plain average,
 and `flatten` has taps of its own for the four blocks at either end.
@@ -120,7 +120,7 @@ def fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
 
 
 def flatten(folded: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """Undo the attenuation by :func:`fold` in averages [..., block]; fewer blocks than `FLAT` stay as they are."""
+    """Undo the attenuation by :func:`fold` in averages over chirps [..., block]; fewer blocks than `FLAT` stay."""
     blocks = folded.shape[-1]
     if blocks < FLAT:
         return folded

@@ -47,9 +47,9 @@ from polysight_shared.messages import Capture
 from polysight_shared.raster import Row
 from polysight_shared.units import us_to_ns
 
-# A gap is a range of bytes of the row: its first, and the one behind its last.
 Times = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+# A gap is a range of bytes of the row: its first, and the one behind its last.
 Gap = tuple[int, int]
 
 # Silence between packets that begins a new train (chosen). A radar needs 150 us between two frames (AWR2243, hardware
@@ -69,7 +69,7 @@ _BLURRED = 0.1
 _DISPLACED = 3
 # A card drops whole samples of its four antennas (inferred).
 _SAMPLE_BYTES = 16
-# A train that follows the previous one sooner than this share of the pulse period catches up a delay.
+# A train that follows the previous one sooner than this share of the pulse period catches up a delay (chosen).
 _CATCHING_UP = 0.8
 # Least number of bursts whose delays from pulse to data must agree, and how closely: within the share of a pulse
 # period, but no more than the time in ns (chosen).
@@ -81,7 +81,7 @@ _AGREE_NS = 500_000
 _MAX_DRIFT = 500e-6
 _USUAL_DRIFT = 100e-6
 _DRIFT_BURSTS = 8
-# Rate of the host's clock over that of the pulses; outside, the pulses are in simulated time.
+# Rate of the host's clock over that of the pulses; outside, the pulses are in simulated time (chosen).
 _RATES = 0.8, 1.25
 # Number of missed pulses that a message names.
 _SHOWN = 4
@@ -286,7 +286,7 @@ def _select_seen(trains: _Trains, frame_bytes: int, frames: int) -> Flags:
 
 
 def _select_frames(trains: _Trains, selected: Flags, frame_bytes: int, frames: int) -> Flags:
-    """Select the frames in which a packet of the selected trains ends, bool [frame]."""
+    """Select the frames in which the first or the last packet of a selected train ends, bool [frame]."""
     is_selected = np.zeros(frames, dtype=np.bool_)
     is_selected[(trains.first_stop[selected] - 1) // frame_bytes] = True
     is_selected[(trains.last_stop[selected] - 1) // frame_bytes] = True
@@ -314,8 +314,8 @@ def _find_period_ns(pulses_ns: Times) -> int:
 def _find_pauses(pulses_ns: Times, received_ns: Times) -> Times:
     """Return a time (host's clock) in the pause before each burst, int64 [burst]; parameters as of `place_frames`.
 
-    The quickest of the capture events gives the offset between the clocks. Raises _UndeterminedError if a quarter of
-    the pause is not enough for its delay, which two events must confirm.
+    The quickest of the capture events gives the offset between the clocks. Raises _UndeterminedError if the bursts have
+    no pause, if the pulses are in simulated time, or if no second event was as quick within a quarter of the pause.
     """
     last = pulses_ns[:, -1]
     if len(last) < 2:
@@ -386,7 +386,10 @@ def _predict_arrivals(
 
 
 def _estimate_drift(times: NDArray[np.float64], delay: NDArray[np.float64], pulses_ns: Times) -> float:
-    """Relative drift of the clocks from the delay (ns) of bursts at these times (ns): the least that fits."""
+    """Return the least relative drift of the clocks that fits the delays (ns) of bursts at these times (ns).
+
+    Raises _UndeterminedError if there are too few bursts and the row is too long to neglect it.
+    """
     if times.size >= _DRIFT_BURSTS:
         low, high = scipy.stats.theilslopes(delay, times)[2:]
         return float(np.clip(np.clip(0.0, low, high), -_MAX_DRIFT, _MAX_DRIFT))

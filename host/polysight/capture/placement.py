@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from polysight.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, SEQUENCE_BITS, Counters
 from polysight.capture.packet_log import PacketLog
 
-# A gap is a range of bytes of the row: its first, and the one behind its last.
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+# A gap is a range of bytes of the row: its first, and the one behind its last.
 Gap = tuple[int, int]
 
 SWITCHED_ON = Counters(0, 1)
@@ -119,7 +119,7 @@ class Placed:
     arrivals: Counts
     # Missing or uncertain ranges before the furthest byte that came; sorted, also of a record that is not located.
     holes: list[Gap] = field(default_factory=list)
-    # The row is not located only because whole frames are missing: triggers were missed.
+    # True if nothing but missing whole frames (missed triggers) keeps the row from being located.
     slipped: bool = False
 
     @property
@@ -328,7 +328,10 @@ def counter_differences(counters: Counts, origin: int, bits: int) -> Counts:
 
 
 def find_full_payload(log: PacketLog) -> int:
-    """Payload of a full packet in bytes: the card's default unless most packets of a longer row have another."""
+    """Return the payload of a full packet in bytes, as seen in the packets of a row.
+
+    The card's default if a packet has it or the row fits into one; otherwise the most frequent size of three or more.
+    """
     row_fits_one_packet = log.expected < MAX_PAYLOAD_BYTES
     default_is_seen = bool((log.sizes == MAX_PAYLOAD_BYTES).any())
     if row_fits_one_packet or default_is_seen or log.count == 0:

@@ -85,7 +85,7 @@ class RowFault(msgspec.Struct, frozen=True, omit_defaults=True):
 
 class Reception(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Counts of one board's reception of a row (docs/spec/dca1000.md); None where an earlier release or a simulation
-    did not count.
+    did not count. The fields are explained at :class:`polysight.capture.placement.PacketCounts` and at `RowCapture`.
     """
 
     packets: int | None = None
@@ -290,7 +290,7 @@ def compute_digest(line: bytes) -> str:
 
 
 def decode_line(line: bytes) -> dict[str, Any] | None:
-    """Decode a line of any file of such lines, without CRC; None if the line is malformed or its CRC is wrong."""
+    """Return the content of a line without its `crc`; None if the line is malformed or its CRC is wrong."""
     try:
         content = json.loads(line)
     except (ValueError, RecursionError):
@@ -618,7 +618,7 @@ class ManifestWriter:
         return True
 
     def append(self, fact: Fact | Mapping[str, Any]) -> None:
-        """Append one fact durably. After a DeviceError the manifest does not contain it."""
+        """Append one fact durably. After a DeviceError it does not count: the next overwrites what is left of it."""
         line = encode_line(fact, count=self._count, previous=self._digest)
         self._file.append(line)
         self._count += 1

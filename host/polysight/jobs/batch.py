@@ -46,19 +46,26 @@ from polysight_shared.errors import ConfigError, PolysightError
 from polysight_shared.files import read_json
 
 SUMMARY = "processed.json"
+"""File of the outcomes of all scans, in the folder that holds their products."""
 Status = Literal["done", "skipped", "failed", "stopped"]
+# Files without which products do not count as finished, whatever their mark says.
 _PRODUCTS = ("image.npz", "quality.json")
 PROGRAM = (sys.executable, "-m", "polysight.jobs.batch")
 """Module that processes the job on its standard input."""
 ALIVE = "POLYSIGHT_PARENT_ALIVE"
 """Environment variable of the program: number of a pipe that closes when the program that started it ends."""
-# Leave a fifth of the free memory to the system.
+# Leave a fifth of the free memory to the system: `memory_bytes` is an estimate, and other programs grow meanwhile.
 SHARE_OF_FREE_MEMORY = 0.8
+# Time between two looks at a running program and at the request to stop.
 _POLL_S = 0.2
 
 
 class Job(msgspec.Struct, frozen=True):
-    """One scan to process, as plain data: folders, settings, dependencies of its products, rows at a time."""
+    """One scan to process, as plain data.
+
+    `data` and `products` are absolute folders, `made_with` the dependencies that :func:`made_with` returns, `threads`
+    the number of rows processed at a time.
+    """
 
     data: str
     products: str
@@ -79,7 +86,7 @@ class Job(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of one scan, with the time and largest memory (GB) of its program."""
+    """Result of one scan, with the time and largest memory (GB) of its program; 0 if it did not run or is not known."""
 
     name: str
     status: Status
@@ -94,7 +101,10 @@ class Outcome:
 
 
 def find_scans(paths: Sequence[Path]) -> list[Path]:
-    """Return the scans at paths: scan folders themselves, and the scans in other folders."""
+    """Return the scans at paths: scan folders themselves, and the scans in other folders.
+
+    A path without any scan is returned as it is: the error comes from the program that processes it.
+    """
     folders: list[Path] = []
     for path in paths:
         if path.is_dir() and not _is_data(path):
@@ -193,7 +203,7 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
 
 
 def is_finished(job: Job) -> bool:
-    """Return true if the products exist and have exactly these dependencies."""
+    """True if images and quality exist, and the mark file names exactly the dependencies of this job."""
     try:
         mark = read_json(job.out / FINISHED)
     except (OSError, ValueError, PolysightError):
@@ -251,6 +261,7 @@ def _follow(child: subprocess.Popen[bytes], job: Job, stop: Event | None) -> Non
 
 
 def _end_outcome(job: Job, seconds: float = 0.0) -> Outcome:
+    """Return the outcome of a finished scan; without `seconds` its time is taken from the mark file."""
     mark = read_json(job.out / FINISHED)
     return Outcome(job.name, "done", seconds or float(mark.get("seconds", 0.0)), float(mark["memory_gb"]))
 

@@ -33,7 +33,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.tables import to_builtins
 
-# Least size of a plate that serves as reference.
+# Least number of pixels that show metal in all scans of `leakage`; chosen: 25 remain in each quarter for the error.
 LEAST_PIXELS = 100
 # No estimate of the leakage counts as more exact than this: the standards' own errors do not show in it.
 LEAST_LEAKAGE_STD = 1e-3
@@ -44,7 +44,7 @@ MAX_LEAKAGE = 0.5
 def print_result(
     path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool
 ) -> int:
-    """Print the result and the keys to set; return 0."""
+    """Print a calibration as lines, with the keys to set in the rig file, or the file's content as JSON; return 0."""
     if as_json:
         print_json({"file": str(path), "simulated": file.simulated, **to_builtins(file)})
         return 0
@@ -75,7 +75,10 @@ def rig_file_keys(kind: str, path: Path) -> list[str]:
 
 
 def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, out: Path, as_json: bool) -> int:
-    """Calibrate positions of boards and plane with a scan of known points. Raises PolysightError."""
+    """Calibrate positions of boards and plane with a scan of known points; return 0. Raises PolysightError.
+
+    `target` is the file of the points, `prior_mm` the standard deviation of the rig file's positions before the scan.
+    """
     from polysight.calibration import Prior, calibration_of_scan, fit_places, load_echoes, places_file, read_target
 
     points = read_target(target)
@@ -113,7 +116,10 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
 
 
 def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) -> int:
-    """Calibrate the receivers' high-pass filters with scans at several start frequencies. Raises PolysightError."""
+    """Calibrate the receivers' high-pass filters with scans at several start frequencies; return 0.
+
+    Raises PolysightError.
+    """
     from polysight.calibration import fit_filter
 
     rig = load_rig_file(config)
@@ -144,7 +150,7 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
 
 
 def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool) -> int:
-    """Calibrate gains per pixel and sub-band with a scan of a metal plate. Raises PolysightError."""
+    """Calibrate gains per pixel and sub-band with a scan of a metal plate; return 0. Raises PolysightError."""
     from polysight.calibration import MetalFile, read_calibration, write_metal
     from polysight.imaging import sub_bands
 
@@ -170,7 +176,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
 
 
 def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
-    """Choose start offsets that centre the direct paths in the IF band. Raises PolysightError."""
+    """Choose start offsets that centre the direct paths in the IF band; return 0. Raises PolysightError."""
     from polysight.calibration import fit_start
 
     source = open_raw(scan, load_rig_file(config))

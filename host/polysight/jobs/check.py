@@ -28,7 +28,7 @@ def check_scan(scan: ProcessedScan) -> CheckResult:
     Raises
     ------
     ConfigError
-        if its rig file names no check plate.
+        if its rig file is not known, or names no check plate.
     """
     result = None
     if scan.rig is not None:
@@ -52,7 +52,7 @@ def check_scans(folders: Sequence[Path]) -> list[tuple[ProcessedScan, CheckResul
     ConfigError
         if a scan that was named has no check plate.
     DataError
-        if there is no processed scan.
+        if there is no processed scan with a check plate.
     """
     checked = []
     for folder in folders:
@@ -73,7 +73,7 @@ def check_scans(folders: Sequence[Path]) -> list[tuple[ProcessedScan, CheckResul
 
 
 def check(folders: Sequence[Path], chart: Path | None, as_json: bool) -> int:
-    """Print the check plate of each scan, and draw the control chart; return 1 if one is beyond its action limit.
+    """Print the check plate of each scan, and draw the control chart; return 1 if one is beyond its limit or missing.
 
     Raises PolysightError as :func:`check_scans`.
     """
@@ -94,6 +94,7 @@ def check(folders: Sequence[Path], chart: Path | None, as_json: bool) -> int:
 
 
 def _describe(scan: ProcessedScan, result: CheckResult) -> str:
+    """Return the check plate of a scan as a line: measured and known permittivity, distance and level."""
     stamp = " (simulated)" if scan.simulated else ""
     head = f"{scan.scan_id}{stamp}: {result.name}"
     if result.measured is None or result.measured_std is None:

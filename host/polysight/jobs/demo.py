@@ -21,7 +21,6 @@ from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError
 
-# An empty file that tells a folder of an earlier demo, which may be overwritten, from any other.
 # An empty file that marks a folder as a demo, which another demo may overwrite.
 _MARK = ".polysight-demo"
 # Starting is mostly imports, of some seconds; the limit is far above them, for an overloaded machine.
@@ -157,7 +156,7 @@ def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
 
 
 def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> int:
-    """Scan a scene with the simulated rig; returns the scan's exit status.
+    """Scan a scene with the simulated rig; return the scan's exit status, or the number of the signal that killed it.
 
     Raises
     ------

@@ -100,6 +100,7 @@ def _format_survey(survey: CardSurvey) -> str:
 
 
 def _format_hop(finding: Finding) -> str:
+    """Return one network hop as a line, with a line each for cause and remedy, if given."""
     hop = _describe_hop(finding)
     line = f"  {hop['verdict']:12}{finding.where:10}{finding.what}".rstrip() + "\n"
     for word, text in (("why", finding.why), ("do", finding.do)):
@@ -109,6 +110,7 @@ def _format_hop(finding: Finding) -> str:
 
 
 def _find_board(rig: Instrument, name: str, config: Path) -> Board:
+    """Return the board of this name. Raises ConfigError if the rig file has none."""
     try:
         return rig.by_name(name)
     except KeyError:
@@ -212,7 +214,7 @@ def reset_card(config: Path, name: str, radar: bool) -> int:
     return 0
 
 
-# Word for a step that holds, or does not.
+# Word for a step of a board's check that holds, or does not.
 _WORDS = {True: "ok", False: "FAILED"}
 
 
@@ -298,6 +300,7 @@ def _run_check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[]
 
 
 def _format_step(name: str, row: Row) -> str:
+    """Return a step of a board's check as a line; a failed one with what was expected and what to do."""
     lines = [f"{name}  {row.step:12} {_WORDS[row.holds]:6}  {row.came}"]
     if not row.holds:
         lines += [f"      expected: {row.expected}", f"      do: {row.do}"]
@@ -330,11 +333,13 @@ def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
 
 
 def _check_trace(trace: Path | None) -> None:
+    """Raise ConfigError if the file of a new trace exists already."""
     if trace is not None and trace.is_file():
         raise ConfigError(f"{trace} exists already", "traces are never overwritten", "give another name")
 
 
 def _open_words(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, slow: bool) -> WordLink:
+    """Open the USB link to a board; with `trace` everything sent and received is written there too."""
     words = open_board(rig.radar.native[name].place, slow or rig.radar.slow_spi)
     if trace is None:
         return words
@@ -354,6 +359,7 @@ def _load_rig_of_native(config: Path) -> Instrument:
 
 
 def _load_native_rig(config: Path, name: str) -> Instrument:
+    """Load a rig file and check the settings of its radars. Raises ConfigError if this board is not under `native`."""
     rig = _load_rig_of_native(config)
     if name not in rig.radar.native:
         raise ConfigError(f"radar.native has no board {name!r}", "a typing error", f"one of {sorted(rig.radar.native)}")

@@ -48,9 +48,10 @@ from polysight_shared.files import write_together
 METAL = "metal"
 MIN_PIXELS = 16
 """A box of fewer pixels gets a note: a library would learn speckle from it."""
-# Largest margin, as a share of a patch's side.
+# Largest margin at each edge, as a share of a patch's side: two fifths of a narrow patch remain.
 _LARGEST_MARGIN = 0.3
 Ask = Callable[[str], str]
+"""Prints a question and returns the answer; raises EOFError when the input ends."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ class Edits:
     """Changes to labels, applied in this order.
 
     `from_patches` replaces the boxes by one inside each patch of the products, named by the patch's number. `renames`
-    are `OLD=NEW`, `specimens` `NAME=SPECIMEN`; corners of `boxes` are millimetres from the image centre.
+    are `OLD=NEW`, `specimens` `NAME=SPECIMEN`; corners of `boxes` are millimetres from the image centre. `metal` is the
+    name of the box that becomes the metal reference; None keeps the present one.
     """
 
     from_patches: bool = False

@@ -197,7 +197,7 @@ def _start_processing(folder: Path, settings: Settings) -> LiveProcessing:
 
 
 def _check_new(folder: Path) -> None:
-    """Raise ConfigError before the rig moves if the folder is not empty."""
+    """Raise ConfigError before the rig moves if the folder holds more than `_ALLOWED_ENTRIES` and an empty manifest."""
     if not folder.exists():
         return
     if (folder / MANIFEST).exists() and manifest.read(folder / MANIFEST).length:
@@ -215,7 +215,8 @@ def scan(
 ) -> int:
     """Run a new scan into `folder`, and process it; returns the exit status. Raises PolysightError.
 
-    `truth` is the truth.json of a simulated rig, copied into the folder.
+    `truth` is the truth.json of a simulated rig, copied into the folder. With `keep_incomplete` a row that is
+    incomplete after all retakes is committed, masked. Without `process` the rows are only recorded.
     """
     rig = load_instrument(config)
     notifier = rig.notify
@@ -250,7 +251,8 @@ def scan(
 def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
     """Resume a scan at its first uncommitted row; return the exit status. Raises PolysightError.
 
-    `config` is a rig file with the addresses to use from now on; None: those of the scan's own rig file.
+    `config` is a rig file with the addresses to use from now on; None: those of the scan's own rig file, which names no
+    receiver of notifications, so that none are sent. `keep_incomplete` and `process` as for :func:`scan`.
     """
     source = ScanFolder.load(folder)
     require_raw(source)
@@ -288,10 +290,12 @@ def notify(settings: Notify, folder: Path, state: str, text: str) -> None:
 
 
 def _run_command(words: list[str]) -> None:
+    """Run a command without input; its output is discarded. Raises OSError or SubprocessError if it fails."""
     subprocess.run(words, check=True, timeout=NOTIFY_TIMEOUT_S, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
 
 
 def _post(url: str, content: bytes) -> None:
+    """Send JSON to a web address. Raises OSError or ValueError if it is not accepted."""
     with urlopen(Request(url, content, {"Content-Type": "application/json"}), timeout=NOTIFY_TIMEOUT_S):
         pass
 

@@ -58,7 +58,7 @@ from polysight_shared.findings import Finding
 
 # Relative difference of two frequencies that are the same: far above rounding, far below any other chirp.
 _SAME_FREQUENCY = 1e-6
-# Reasons of a verdict that the terminal shows.
+# Largest number of a verdict's reasons that the terminal shows; the report lists all.
 _REASONS = 3
 
 
@@ -167,6 +167,7 @@ def permittivity(
 
 
 def _format_half_space_line(patch: PatchFigures, layer: Mapping[str, Any] | None) -> str:
+    """Return a patch as a line: permittivity as a half space, then that of the layer, if one was fitted."""
     head = f"{patch.label:>3}  {_pad_name(patch.name or '')}"
     if patch.refused is not None:
         text = f"{head} not judged: {patch.refused_text}"
@@ -207,6 +208,7 @@ def _load_library(data: Path) -> Library:
 
 
 def _describe_origin(is_simulated: bool) -> str:
+    """Return the word for the origin of data."""
     return "simulated" if is_simulated else "measured"
 
 
@@ -214,7 +216,8 @@ def concentration(data: Path, values: Sequence[tuple[str, float]], confidence: f
     """Fit concentration against polarisation angle, with leave-one-out errors; return the exit status.
 
     `data` is a library (.npz) or a folder of the published material files, `values` are percentages of materials
-    without one in their name. Raises DataError.
+    without one in their name, `confidence` the share of truths that the printed intervals are to hold, 0 to 1. Raises
+    ConfigError for a value of a material that is not in `data`, else DataError.
     """
     library = _load_library(data)
     percent_by_name = dict(values)
@@ -304,6 +307,7 @@ def _format_catalogue_line(material: CatalogueMaterial, number: Mapping[str, int
 
 
 def _format_patch_line(patch: PatchFigures) -> str:
+    """Return a patch as a line: number, name, confidence, permittivity; a second line says why it has no name."""
     box = ""
     if patch.box:
         box = f"   drawn as {patch.box}"

@@ -21,7 +21,7 @@ from polysight.products import QUALITY, read_products, write_json
 from polysight_shared.config import Instrument
 from polysight_shared.files import write_atomically
 
-# Points of the metal sphere that the calibration file keeps.
+# Largest number of points of the metal sphere that the calibration file keeps.
 KEPT_POINTS = 240
 # Standard errors of places that were measured by hand, and of those that `calibrate direct-path` measured.
 PLACE_STD_M = 1e-3
@@ -132,7 +132,7 @@ def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
 
 
 def thin_out(metal: surfaces.Seen) -> surfaces.Seen:
-    """Return `KEPT_POINTS` points of metal, evenly taken: neighbours overlap."""
+    """Return at most `KEPT_POINTS` points of metal, evenly taken: neighbours see overlapping parts of the surface."""
     index = np.linspace(0, len(metal) - 1, min(KEPT_POINTS, len(metal))).round().astype(int)
     return metal[index]
 

@@ -71,7 +71,7 @@ def process_rows(source: Source, data: Path, settings: Settings = DEFAULT) -> Pi
 
 
 def pixel_axes(pipeline: Pipeline) -> Axes:
-    """Return the pixel centres of the images, x and y, ascending."""
+    """Return the pixel centres of the images, x and y in metres, ascending."""
     grid = pipeline.images.grid
     if pipeline.source.mirrored:
         return grid.y_m, grid.x_m
@@ -291,6 +291,7 @@ class LiveProcessing:
         check_products_folder(self._folder / PRODUCTS, source.scan_id)
 
     def _check(self, rig: Instrument, calibration: Calibration) -> None:
+        """Check the settings' files against the rig as calibrated. Raises PolysightError."""
         placed = calibration.rig(rig)
         grid = image_grid(placed)
         check_inputs(self._settings, self._inputs, calibration, placed, (grid.x_m, grid.y_m))
@@ -354,7 +355,10 @@ def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
 
 
 def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
-    """Find the object plane's distance and tilt by sharpness; focus.json and focus.png. Raises PolysightError."""
+    """Find the object plane's distance and tilt, by flat plates and by sharpness; write focus.json and focus.png.
+
+    `depth_mm` is the largest distance from the rig file's plane that is searched. Raises PolysightError.
+    """
     from polysight.report import focus_figure
 
     source = open_source(data, config, dropped=True)

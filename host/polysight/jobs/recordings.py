@@ -34,7 +34,7 @@ from polysight_shared.errors import DataError, PolysightError, os_error
 
 # Missing ranges that are printed: they fill about one line of a terminal.
 _MAX_RANGES = 8
-# Lowest level in the plot of a range profile.
+# Lowest level in the plot of a range profile, over its median: an antenna that stays below is marked "no signal".
 BOTTOM_DB = -20.0
 
 
@@ -63,6 +63,7 @@ def format_report(report: Report) -> str:
 
 
 def _format_card(card: CardReport) -> list[str]:
+    """Return lines about a capture card: replies, refused commands, version, status, packets and tail."""
     commands = ", ".join(command for command, _ in card.replies)
     lines = [f"card       {card.address}, {len(card.replies)} replies: {commands}"]
     # Replies to these two carry a value; to any other command, a status other than 0 is a refusal.
@@ -102,7 +103,7 @@ def _draw_sparkline(profile_db: NDArray[np.float64]) -> str:
 
 
 def validate_folder(folder: Path, as_json: bool) -> int:
-    """Print all faults of a scan folder; return 0 if there are none."""
+    """Print all findings on a scan folder; return 0 if none of them is an error."""
     findings = validate(folder)
     if as_json:
         sys.stdout.write(to_json(findings) + "\n")
@@ -118,7 +119,7 @@ def _is_pcap(file: Path) -> bool:
 
 
 def find_scan(file: Path) -> ScanFolder | None:
-    """Return the scan that a row's file belongs to, if its manifest can be read."""
+    """Return the scan that a row's file belongs to; None for any other file, or if the manifest cannot be read."""
     folders = file.resolve().parents
     if len(folders) < 3 or folders[1].name != "raw" or not (folders[2] / MANIFEST).is_file():
         return None
@@ -212,10 +213,11 @@ def plot_profile(report: Report, path: Path) -> None:
 
 
 def inspect_placement(file: Path, as_json: bool) -> int:
-    """Print how the packets of a row are placed; return 0 if the row was committed so.
+    """Print how the packets of a row are placed; return 1 if the row was committed with other missing ranges.
 
-    `file` is the row's file, or one of those beside it. Raises DataError when a file is damaged, or is not the one that
-    the scan's manifest has committed.
+    A row whose frames were moved to their pulses is not compared, and gives 0. `file` is the row's file, or one of
+    those beside it. Raises DataError when a file is damaged, is not the one that the scan's manifest has committed,
+    or the packets were not kept.
     """
     row = file.with_suffix(".bin")
     if scan := find_scan(row):
@@ -241,6 +243,7 @@ def inspect_placement(file: Path, as_json: bool) -> int:
 
 
 def _format_placement(file: Path, result: PlacedAgain, same: bool) -> list[str]:
+    """Return lines about the placement of a row's packets; `same` says that it was committed like this."""
     placed = result.placed
     evidence = result.evidence
     counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(placed.counts).items() if n)
@@ -283,6 +286,7 @@ def replace_folder(folder: Path, as_json: bool) -> int:
 
 
 def _list_replaced_lines(folder: Path, rows: list[Replaced]) -> list[str]:
+    """Return lines about rows that changed, rows that were left, and the number of equal ones."""
     changed = [
         f"row {r.row} of {r.board}: {r.missing_before} bytes missing before, {r.missing_after} now"
         for r in rows

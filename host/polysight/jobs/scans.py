@@ -35,7 +35,10 @@ _NAME_WIDTH = 40
 
 
 def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
-    """Print the scans under a folder, the newest first; returns 0. Raises DataError when there is no such folder."""
+    """Print the scans under a folder that have all tags and contain the text, the newest first; return 0.
+
+    Raises DataError when there is no such folder.
+    """
     if not root.is_dir():
         raise no_such(root)
     catalogue = Scans(root)
@@ -80,6 +83,7 @@ def _format_summary(s: Summary) -> str:
 
 
 def _join_searchable_text(s: Summary) -> str:
+    """Return all text of a scan's summary that a search looks at, in small letters."""
     return " ".join((s.name, s.scan_id, s.rig, s.state, s.notes, *s.tags, *s.materials)).casefold()
 
 
@@ -101,7 +105,7 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
 
 
 def ask_scan(folder: Path, request: str) -> int:
-    """Send a command to a running scan; return 0 when it has received it. Raises ScanError."""
+    """Send pause, continue, stop or abort to a running scan; return 0 when it is received. Raises PolysightError."""
     if not folder.is_dir():
         raise no_such(folder)
     send_command(folder, ScanCommand(request), "polysight ask")
@@ -200,7 +204,7 @@ WORD = "drop"
 def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
     """Delete the raw data of processed rows after confirmation; return the exit status.
 
-    Products with a report and whole samples of every row must remain; no other program may be writing them.
+    Products with a report and whole samples of every dropped row must remain; no other program may be writing them.
 
     Raises
     ------

@@ -35,7 +35,7 @@ from polysight_shared.errors import ConfigError, DataError
 
 # Fronts of objects lie up to this before or behind the object plane.
 DEPTH_M = 0.12
-# Points of a metal sphere that its radius and gains are taken from; with few the directions are not covered.
+# Least number of points of a metal sphere for its radius and gains; chosen: with few the directions are not covered.
 LEAST_METAL_POINTS = 60
 # A larger deviation of the radius means another object. That of a metal sphere of 125 mm is found within 0.5 %, with
 # antennas misplaced by 1 mm, too (simulated).
@@ -122,7 +122,7 @@ def make_surface(data: Path, config: Path | None = None, reference: Path | None 
 
 
 def _list_rows(echoes: Echoes) -> list[list[float]]:
-    """Return a row of numbers for each point, as `SphereFile` stores it; `bend` is symmetric: three of its four."""
+    """Return a row of numbers for each point, as `SphereFile` stores it; three elements of the symmetric `bend`."""
     bend = echoes.bend
     columns = [*echoes.at_m.T, echoes.path_m, *echoes.slope.T, bend[:, 0, 0], bend[:, 0, 1], bend[:, 1, 1]]
     columns += [echoes.amplitude.real, echoes.amplitude.imag, echoes.amplitude_std, echoes.band_rise]

@@ -214,6 +214,7 @@ def _process_simulated(data: Path, config: Path) -> TrainingScan:
 
 
 def _no_metal_error(folder: Path) -> DataError:
+    """Return the error of a labelled scan without a metal reference."""
     return DataError(
         f"{folder}: no box is metal",
         "features of materials are relative to metal",
@@ -307,6 +308,7 @@ def number_equal_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
 
 
 def _count(number: int, singular: str, plural: str) -> str:
+    """Return a number with its noun in singular or plural."""
     noun = singular if number == 1 else plural
     return f"{number} {noun}"
 

@@ -1,10 +1,11 @@
 """The operator's page: one web server for the catalogue, the live view and the results of scans.
 
 `serve` shows all scans under a folder; whoever holds the token starts, controls and labels them. `preview` shows one.
-Three processes (`server`): `door` accepts connections and answers commands to scans. It hands the rest to `front`,
-where each request passes the access checks of `guard`; what is no page goes on to the reading process: `reading`
-answers GET requests, `commands` POST requests; `site` holds their shared state: the live views, and the programs that
-scan and process, which outlive the server; `queue` the scans that wait.
+Up to three processes (`server`): `door` accepts connections and answers commands to scans (with TLS, or where nothing
+may be controlled, there is none, and `front` does both). It hands the rest to `front`, where each request passes the
+access checks of `guard`; what is no page goes on to the reading process: `reading` answers GET requests, `commands`
+POST requests; `site` holds their shared state: the live views, and the programs that scan and process, which outlive
+the server; `queue` the scans that wait.
 
 Threat model: docs/decisions/0014-operators-page.md.
 """

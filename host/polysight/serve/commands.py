@@ -33,12 +33,13 @@ from polysight_shared.tables import decode, to_builtins
 
 RIG = "instrument.toml"
 REQUEST = "request.json"
+# Bytes of the file of a request that are read; a request itself cannot be longer (`guard.BODY_BYTES`).
 MAX_REQUEST_BYTES = 1 << 16
 Format = Literal["csv", "mat", "netcdf"]
 """Formats of exports, which are written into `<scan>/export`."""
 # Largest number of positions of a row, and of rows.
 MAX_POSITIONS = 2000
-# Largest number of sub-bands.
+# Largest number of sub-bands that the page may ask for; chosen.
 MAX_BANDS = 16
 Text = Annotated[str, msgspec.Meta(max_length=200)]
 LongText = Annotated[str, msgspec.Meta(max_length=1000)]
@@ -166,7 +167,7 @@ class Named(NamedTuple):
 
 
 def command_routes(site: Site) -> list[Route]:
-    """Return the routes of all POST requests."""
+    """Return the routes of all POST requests, and the GET route of the request that started a scan."""
 
     async def show_request(request: Request) -> Response:
         name = site.name(request)
@@ -222,12 +223,14 @@ def decode_body(body: bytes, kind: type[AnyBody]) -> AnyBody:
 
 
 def _plan(site: Site, body: PlanRequest) -> dict[str, Any]:
+    """Return the forecast of a scan with the numbers of a plan, and the grid of the rig file."""
     plan = forecast_values(forecast(body.apply(site.config)))
     rig = load_instrument(site.config)
     return plan | {"rig": rig.name, "config": str(site.config), "begun_with": to_builtins(rig)["grid"]}
 
 
 def _start_doctor(site: Site, body: Body) -> None:
+    """Start the checks of the rig, unless it is in use."""
     del body
     with site.rig:
         _check_free(site)
@@ -299,15 +302,18 @@ def read_request(folder: Path, name: str) -> StartRequest:
 
 
 def _enqueue_scan(site: Site, body: StartRequest) -> None:
+    """Check a request, and add it to the queue."""
     check_request(site, body)
     site.queue.add(body.name, msgspec.json.encode(body))
 
 
 def _archive_scan(site: Site, scan: Named, body: ScanName) -> None:
+    """Move a scan out of the list; its files are kept in the hidden archive."""
     _put_away(site, scan, body.name)
 
 
 def _delete(site: Site, scan: Named, body: ScanName) -> None:
+    """Move a scan out of the list, and delete its files in the background."""
     # Out of the list at once; the files take their time.
     place = _put_away(site, scan, body.name)
     threading.Thread(target=shutil.rmtree, args=(place, True), name="delete").start()
@@ -370,6 +376,7 @@ def _write_files(folder: Path, rig: Instrument, request: StartRequest) -> Path:
 
 
 def _resume(site: Site, scan: Named, body: ResumeRequest) -> None:
+    """Start `polysight resume` for a scan, unless the rig is in use."""
     words: Words = ["resume", scan.folder.absolute(), *_list_processing_options(site, body.library, None)]
     if body.keep_incomplete:
         words.append("--keep-incomplete")
@@ -379,6 +386,7 @@ def _resume(site: Site, scan: Named, body: ResumeRequest) -> None:
 
 
 def _process(site: Site, scan: Named, body: ProcessRequest) -> None:
+    """Start `polysight process` for a scan; its products go into the scan's folder."""
     folder = scan.folder.absolute()
     words: Words = ["process", folder, "--out", folder / "products"]
     words += _list_processing_options(site, body.library, body.metal)
@@ -431,11 +439,13 @@ def _save_labels(site: Site, scan: Named, body: LabelRequest) -> SavedLabels:
 
 
 def _save_notes(site: Site, scan: Named, body: NotesRequest) -> Notes:
+    """Save notes and tags of a scan; refused if somebody else has changed them meanwhile."""
     del site
     return write_notes(scan.folder, Notes(body.notes, body.tags), body.base)
 
 
 def _train(site: Site, body: TrainRequest) -> None:
+    """Start `polysight train` with labelled scans; the library goes into the folder of libraries."""
     folders = [site.scans.folder(name).absolute() for name in body.scans]
     out = site.scans.root.absolute() / LIBRARIES
     out.mkdir(exist_ok=True)
@@ -444,6 +454,7 @@ def _train(site: Site, body: TrainRequest) -> None:
 
 
 def _fit_concentration(site: Site, body: LibraryRequest) -> None:
+    """Start `polysight concentration` on a library that was trained here."""
     site.programs.start(site.logs, "concentration", ["concentration", _find_library(site, body.library)])
 
 

@@ -30,6 +30,7 @@ from polysight.serve.front import EndingServer
 from polysight.serve.guard import HEAD_BYTES, TOKEN_HEADER
 from polysight_shared.program import delay_interrupts, ignore_interrupts
 
+# First bytes of a command to a scan.
 COMMAND = b"POST /api/control/"
 TOKEN_LINE = TOKEN_HEADER.lower().encode()
 # Connections that are accepted, or taken over, before other work of the process is done.
@@ -63,6 +64,7 @@ class Door:
         self._loop.add_reader(pages, self.ended.set)
 
     def _accept(self) -> None:
+        """Accept waiting connections, and look at the first bytes of each."""
         for _ in range(ACCEPTED_AT_ONCE):
             try:
                 client, _ = self._listener.accept()
@@ -158,6 +160,7 @@ def close_after_each(app: ASGIApp) -> ASGIApp:
 
 
 async def _keep_door(listener: socket.socket, pages: socket.socket, token: str, config: uvicorn.Config) -> None:
+    """Run the door until the pages' process is gone; `config` is that of the commands' application."""
     config.load()
     make_protocol = partial(H11Protocol, config=config, server_state=ServerState(), app_state={})
     loop = asyncio.get_running_loop()
@@ -216,6 +219,7 @@ class PagesServer(EndingServer):
         asyncio.get_running_loop().add_reader(self._door, self._take)
 
     def _take(self) -> None:
+        """Take connections that the door has sent; end when the door is gone."""
         loop = asyncio.get_running_loop()
         make_protocol = partial(
             self._protocol, config=self.config, server_state=self.server_state, app_state=self.lifespan.state

@@ -122,6 +122,7 @@ def make_command_app(front: Front) -> Starlette:
 
 
 def _guard_application(routes: list[Route], access: Access) -> Starlette:
+    """Return the application of these routes behind the guard, with its answers for errors."""
     return Starlette(routes=routes, middleware=[Middleware(Guard, access=access)], exception_handlers=HANDLERS)
 
 
@@ -252,7 +253,10 @@ class RunningScans:
         self._lock = threading.Lock()
 
     def list(self) -> Sequence[RunningScan]:
-        """Return all scans, and those of programs killed shortly before; the previous list while the drive is slow."""
+        """Return the running scans, and those whose program was killed within the last hour.
+
+        The previous list is returned while it is fresh, and while another thread still reads the folder.
+        """
         if time.monotonic() - self._listed_at < RUNNING_AGE_S or not self._lock.acquire(blocking=False):
             return self._running
         try:
@@ -264,6 +268,7 @@ class RunningScans:
         return self._running
 
     def _describe(self, name: str, life: Life) -> RunningScan | None:
+        """Return a scan for the header from its last sign of life; None if that is older than `KILLED_SHOWN_S`."""
         silent_s = time.time() - life.written_s
         if silent_s > KILLED_SHOWN_S:
             return None
@@ -302,6 +307,7 @@ class Reader:
             tasks.cancel_scope.cancel()
 
     async def _relay(self, scope: Scope, receive: Receive, send: Send, body: bytes) -> None:
+        """Send a request to the reading process, and pass on its answer; 503 if it does not answer."""
         is_answered = False
 
         async def send_on(message: Message) -> None:
@@ -325,6 +331,7 @@ class Reader:
                 await refuse(503, ErrorCode.NO_ANSWER, problem, "it starts, or was ended", do)(scope, receive, send)
 
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """Connect to the reading process, which may be starting. Raises OSError after `READER_PATIENCE_S`."""
         deadline = time.monotonic() + READER_PATIENCE_S
         while True:
             try:
@@ -336,6 +343,7 @@ class Reader:
 
 
 def _encode_request(connection: h11.Connection, scope: Scope, body: bytes) -> bytes:
+    """Return a request as bytes for the reading process, without the headers of the browser."""
     target = scope["raw_path"]
     if scope["query_string"]:
         target += b"?" + scope["query_string"]
@@ -412,10 +420,12 @@ class ConnectionLimit:
         self._forget(connection)
 
     def _forget(self, connection: CountedConnection) -> None:
+        """Take a connection out of those that may be closed."""
         self._silent.pop(connection, None)
         self._idle.pop(connection, None)
 
     def _close_one(self) -> None:
+        """Close the first connection without unread bytes: one that never sent a request, else an idle one."""
         for group in (self._silent, self._idle):
             for _ in range(min(self.MAX_PASSED, len(group))):
                 connection, _ = group.popitem(last=False)

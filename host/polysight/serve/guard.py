@@ -1,8 +1,9 @@
 """Access checks of every request: Host, Origin, token, size of head and body; safe headers on every answer.
 
-One middleware in front of the application. Reading needs the token too unless the server is bound to loopback. The
-token comes in a header, which no form, link or image of another page can send; requests that only read (images, event
-streams) may bring the session's cookie instead. How many connections may be open is limited in `front`.
+One middleware in front of the application. Reading needs the token too unless the server is bound to loopback without
+further host names. The token comes in a header, which no form, link or image of another page can send; requests that
+only read (images, event streams) may bring the session's cookie instead. How many connections may be open is limited in
+`front`.
 
 `HANDLERS` turn errors into answers: a code for programs and the three parts that people read.
 """
@@ -27,8 +28,10 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError, os_error
 
 TOKEN_HEADER = "X-Polysight-Token"
+# Largest head (address and headers) and largest body of a request; chosen, far above what the page sends.
 HEAD_BYTES = 1 << 14
 BODY_BYTES = 1 << 16
+# Headers of every answer: a browser loads nothing from elsewhere, shows the page in no frame, and stores nothing.
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none';"
     " form-action 'none'; frame-ancestors 'none'",
@@ -52,11 +55,12 @@ class Access:
     token
         Needed for control, and for reading unless `loopback`; "": nobody controls, everybody reads.
     loopback
-        True if the server is bound to this machine only.
+        True if the server is bound to this machine only, and has no further names: behind a proxy, which needs one,
+        requests of all machines come from this one.
     hosts
         Further host names of the server.
     control
-        True if POST requests are allowed.
+        True if POST requests other than `/api/session` are allowed.
     secure
         True with TLS.
     """
@@ -220,6 +224,7 @@ def _close_after(answer: Response) -> Response:
 
 
 def _refuse_token(status: int) -> Response:
+    """Return the refusal of a request with a wrong or missing token."""
     return refuse(
         status, ErrorCode.TOKEN_WRONG, "The token is wrong or missing", "the address was opened without it, or it was"
         " replaced", "open the address that the server printed when it started",
@@ -291,6 +296,7 @@ async def _tell_nobody(request: Request, e: Exception) -> Response:
 
 
 async def _tell_defect(request: Request, e: Exception) -> Response:
+    """Answer for an exception that nothing has foreseen; its traceback goes to stderr."""
     sys.stderr.write(f"{request.method} {request.url.path}\n{''.join(traceback.format_exception(e))}")
     sys.stderr.flush()
     problem = f"An internal error of the server: {type(e).__name__}"

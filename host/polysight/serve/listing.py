@@ -58,6 +58,7 @@ class ChangingList:
         return ListChanges(stamp=reached, whole=False, scans=changed, gone=removed)
 
     def _take_over(self, scans: dict[str, ListedScan]) -> None:
+        """Make this the newest list; note in which state each scan changed or went. The lock is held."""
         changed = [name for name, scan in scans.items() if self._scans.get(name) != scan]
         removed = [name for name in self._scans if name not in scans]
         if changed or removed:

@@ -52,7 +52,7 @@ class Queue:
         self._thread.start()
 
     def waiting(self) -> Waiting:
-        """Return the requests in the queue."""
+        """Return the names in the queue, and why it is held."""
         return Waiting([name for name, _ in self._list_requests()], self._held)
 
     def add(self, name: str, request: bytes) -> None:
@@ -90,6 +90,7 @@ class Queue:
         return requests
 
     def _run(self) -> None:
+        """Try to start the next scan every `LOOK_S` until the queue is closed."""
         while not self._ended.wait(LOOK_S):
             with self._lock:
                 self._start_next()

@@ -122,6 +122,7 @@ async def _send_scans(site: Site, request: Request) -> Response:
 
 
 async def _send_scan(site: Site, request: Request) -> Response:
+    """Answer with one scan: its line of the list, notes, folder and programs."""
     name = site.name(request)
 
     def read_details(folder: Path) -> ScanDetails:
@@ -133,6 +134,7 @@ async def _send_scan(site: Site, request: Request) -> Response:
 
 
 async def _send_queue(site: Site, request: Request) -> Response:
+    """Answer with the names that wait for the rig; none if no scan can be started here."""
     del request
     if not site.starts:
         return json_answer(Waiting([]))
@@ -156,6 +158,7 @@ async def _send_thumbnail(site: Site, request: Request) -> Response:
 
 
 async def _send_program(site: Site, request: Request) -> Response:
+    """Answer with the state of a program that belongs to no scan; null for any other."""
     kind = request.path_params["kind"]
     if kind not in ("doctor", "train", "concentration"):
         return json_answer(None)
@@ -166,21 +169,25 @@ async def _send_program(site: Site, request: Request) -> Response:
 
 
 async def _open_watch(site: Site, request: Request) -> Watch:
+    """Return the live view of the scan that a request names."""
     name = site.name(request)
     return await site.read_scan(request, lambda folder: site.watches.open(name, folder))
 
 
 async def _send_state(site: Site, request: Request) -> Response:
+    """Answer with the newest state of the live view."""
     return Response((await _open_watch(site, request)).state.data, media_type="application/json")
 
 
 async def _stream_events(site: Site, request: Request) -> Response:
+    """Answer with the events of the live view, as long as the page is open."""
     watch = await _open_watch(site, request)
     events = site.watches.events(site.name(request), watch, site.is_ending)
     return StreamingResponse(events, media_type="text/event-stream")
 
 
 async def _send_live_picture(site: Site, request: Request) -> Response:
+    """Answer with a picture of the live view; 404 until the first row is processed."""
     picture = (await _open_watch(site, request)).shown.pictures.get(request.path_params["name"])
     if picture is None:
         problem = "This picture is not there yet"
@@ -189,6 +196,7 @@ async def _send_live_picture(site: Site, request: Request) -> Response:
 
 
 async def _send_colour_bar(site: Site, request: Request) -> Response:
+    """Answer with the colours of a kind of map as a picture."""
     del site
     kind = request.path_params["kind"]
     colours = {"phase": catalogue.PHASE, "amplitude": catalogue.AMPLITUDE}.get(kind, str(kind))
@@ -201,6 +209,7 @@ async def _send_colour_bar(site: Site, request: Request) -> Response:
 
 
 async def _send_result(site: Site, request: Request) -> Response:
+    """Answer with the results of a scan's products."""
     return json_answer(await _read_products(site, request, catalogue.read_result))
 
 
@@ -246,6 +255,7 @@ async def _send_map(site: Site, request: Request) -> Response:
 
 
 async def _send_probe(site: Site, request: Request) -> Response:
+    """Answer with the results at one place of a scan."""
     x_mm = _parse_number(request, "x")
     y_mm = _parse_number(request, "y")
     name = request.query_params.get("library", "")
@@ -337,6 +347,7 @@ class ControlChart(msgspec.Struct, frozen=True, kw_only=True):
 
 
 async def _send_control_chart(site: Site, request: Request) -> Response:
+    """Answer with the check plates of all processed scans."""
     del request
 
     def read_checks() -> ControlChart:
@@ -373,10 +384,12 @@ async def _use_comparison(site: Site, request: Request, use: Callable[[catalogue
 
 
 async def _send_comparison(site: Site, request: Request) -> Response:
+    """Answer with the differences of two scans as numbers."""
     return json_answer(await _use_comparison(site, request, lambda comparison: comparison.figures))
 
 
 async def _send_comparison_map(site: Site, request: Request) -> Response:
+    """Answer with a map of the differences of two scans."""
     name = request.path_params["name"]
     return _make_picture_answer(
         await _use_comparison(site, request, lambda comparison: catalogue.draw_comparison(comparison, name))

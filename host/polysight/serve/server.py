@@ -1,8 +1,8 @@
 """`polysight serve` and `polysight preview`: the address, the token, and the processes until Ctrl-C.
 
-Three processes, all uvicorn: this one answers requests for pages (`front`), a second one accepts connections (`door`),
-and the reading process reads scans, behind a socket in a folder that only this user may enter. This process starts the
-other two, and restarts the reading process if it ends.
+Three processes, all uvicorn: this one answers requests for pages (`front`), a second one accepts connections (`door`,
+only with control and without TLS; else this one accepts them), and the reading process reads scans, behind a socket in
+a folder that only this user may enter. This process starts the other two, and restarts the reading process if it ends.
 """
 
 from __future__ import annotations
@@ -55,9 +55,12 @@ ACCEPTED_AT_ONCE = 128
 BACKLOG = 4096
 # Idle connections are closed when there are too many, never for their age.
 KEEP_ALIVE_S = 10**6
+# Time that open connections have to end when the server stops.
 CLOSE_S = 1
+# Pause before the reading process is started again, so that one that fails at once takes no processor.
 RESTART_S = 1.0
 LIST_INDEX = "list.json"
+# Random bytes of a token: 144 bits, 24 characters in an address.
 TOKEN_BYTES = 18
 
 
@@ -141,6 +144,7 @@ def preview(folder: Path, place: Place, control: bool) -> int:
 
 
 def _run(shown: Shown, place: Place, what: str) -> int:
+    """Serve until Ctrl-C: bind, start the other processes, print the address of `what`; return 0."""
     place.check()
     listener = _bind(place)
     try:
@@ -332,7 +336,7 @@ def lower_priority() -> None:
 
 
 def _configure(app: ASGIApp, **more: object) -> uvicorn.Config:
-    """Return the settings of both servers: without logging, and stopping within a second."""
+    """Return the settings of all three servers: without logging, and stopping within `CLOSE_S`."""
     logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
     return uvicorn.Config(
         app,

@@ -39,7 +39,9 @@ MAX_COMPARISONS = 4
 MAX_CHECKS = 20_000
 # Each live view forms images with an own pipeline.
 MAX_WATCHES = 4
+# A live view without pages stays open for this long; chosen: a page that is loaded again finds it.
 LINGER_S = 30.0
+# Reads at a time, of all folders and of one: chosen, so that one folder that hangs takes half of the threads at most.
 READERS = 4
 READERS_OF_ONE_FOLDER = 2
 # A folder's size is counted again after so long, at most.
@@ -182,6 +184,7 @@ def _stamp_products(folder: Path) -> tuple[Path, str]:
 
 @lru_cache(maxsize=MAX_PICTURES)
 def _draw(products: Path, stamp: str, name: str, limits: tuple[float, float] | None) -> catalogue.Picture:
+    """Draw a map, or the thumbnail; `stamp` only tells cached products of another generation apart."""
     del stamp
     pixels = catalogue.Pixels(products)
     if name == THUMBNAIL:
@@ -191,6 +194,7 @@ def _draw(products: Path, stamp: str, name: str, limits: tuple[float, float] | N
 
 @lru_cache(maxsize=MAX_CHECKS)
 def _check(products: Path, stamp: str) -> CheckResult | None:
+    """Judge the check plate of products; `stamp` as for `_draw`."""
     del stamp
     scan = read_products(products)
     if scan.rig is None:
@@ -200,6 +204,7 @@ def _check(products: Path, stamp: str) -> CheckResult | None:
 
 @lru_cache(maxsize=MAX_COMPARISONS)
 def _compare(first: Path, second: Path, *stamps: tuple[Path, str]) -> catalogue.Comparison:
+    """Compare two scans; `stamps` only tell cached products of another generation apart."""
     del stamps
     return catalogue.compare(first, second)
 
@@ -234,6 +239,7 @@ class Readers:
                 self._turns.pop(folder, None)
 
     async def _run(self, folder: str, work: Callable[[], T]) -> T:
+        """Run a read in a thread; after `READ_S` leave the thread behind and raise DeviceError."""
         returned = threading.Event()
 
         def work_and_return() -> T:
@@ -257,6 +263,7 @@ class Readers:
 
 
 def _no_answer_error(folder: str) -> DeviceError:
+    """Return the error of a folder that does not answer."""
     return DeviceError(
         f"{folder or 'the folder of scans'} did not answer within {READ_S:g} s", "its drive is gone, or very busy",
         "check the network drive, then load the page again", code=ErrorCode.NO_ANSWER,
@@ -292,6 +299,7 @@ class Sizes:
             threading.Thread(target=self._count, args=(folder,), name="sizes", daemon=True).start()
 
     def _count(self, folder: Path) -> None:
+        """Count one folder, then begin with the next."""
         self._counted[folder] = (catalogue.folder_bytes(folder), time.monotonic())
         with self._lock:
             del self._counting_since[folder]
@@ -337,6 +345,7 @@ class Watches:
         return opened.watch
 
     def _find(self, name: str) -> Watch | None:
+        """Return the live view of a scan if it is open, and note that it was used."""
         with self._lock:
             if name in self._open:
                 self._open[name].used_at = time.monotonic()
@@ -359,6 +368,7 @@ class Watches:
 
     @contextmanager
     def _count_stream(self, name: str) -> Iterator[None]:
+        """Count an event stream of a live view for the block, so that it is not closed meanwhile."""
         opened = self._open.get(name)
         if opened is None:
             yield

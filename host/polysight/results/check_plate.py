@@ -85,6 +85,7 @@ def check_plate(plate: CheckPlate, patches: Sequence[PatchFigures]) -> CheckResu
 
 
 def _contains(patch: PatchFigures, x_mm: float, y_mm: float) -> bool:
+    """True if a place is inside the bounding box of a patch."""
     x0, y0, x1, y1 = patch.box_mm
     return x0 <= x_mm <= x1 and y0 <= y_mm <= y1
 

@@ -22,7 +22,7 @@ def to_plain(value: Any) -> Any:
     """Convert a value to strict JSON types.
 
     Structs become objects without their UNSET fields, numpy arrays lists, complex numbers {real, imag}, numbers that
-    are not finite None, and findings {what, why, do}.
+    are not finite None, findings {what, why, do}, and anything else its text.
     """
     if isinstance(value, Finding):
         return {"what": value.what, "why": value.why, "do": value.do}

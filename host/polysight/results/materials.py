@@ -504,7 +504,10 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
         return max(other_shares, key=lambda other: other.share or 0.0, default=_NameShare())
 
     def without_results(self) -> Self:
-        """Return only place and size: without name, measured values and truth."""
+        """Return the patch without names, ratios, permittivity and truth.
+
+        Place, size, incidence, tilt, the mark of the metal reference and the refusal stay.
+        """
         return msgspec.structs.replace(
             self, name=None, name_source=None, confidence=None, votes={}, probabilities={}, literature={}, why="",
             distance=None, metal_like=False,
@@ -587,8 +590,8 @@ class ScanMaterials(msgspec.Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     verdict
-        None in products of earlier releases. With the level `none` the patches keep only place and size, so that no
-        reader or writer of the results can show names or permittivities.
+        None in products of earlier releases. With the level `none` the patches lose what `without_results` removes, so
+        that no reader or writer of the results can show names or permittivities.
     library, model
         Description of the library that named the patches, and the name of the classifier.
     pixel_accuracy

@@ -17,7 +17,7 @@ from polysight_shared.findings import Finding
 FEW_POSITIONS = 0.5
 """Share of absent or masked positions above which there is no result."""
 SOME_POSITIONS = 0.005
-"""Share of masked positions above which the result needs care."""
+"""Share of masked, reconstructed or clipped positions above which the result needs care."""
 SOME_CHIRPS = 0.05
 """Share of chirps left out as clipped or disturbed above which the result needs care."""
 RECONSTRUCTION_NONE = 0.15

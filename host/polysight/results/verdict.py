@@ -97,7 +97,10 @@ def join_reasons(reasons: Iterable[Finding]) -> Verdict:
 
 
 def read_verdict(content: Mapping[str, Any]) -> Verdict | None:
-    """Read the verdict in the content of quality.json or materials.json; None without one of a known level."""
+    """Read the verdict in the content of quality.json or materials.json; None without one of a known level.
+
+    Files do not hold the level of each reason: all get that of the verdict.
+    """
     raw = content.get("verdict")
     if not isinstance(raw, Mapping):
         return None

@@ -265,6 +265,7 @@ class CardClient:
                 self.strangers += 1
                 continue
             if reply.code == Code.STATUS:
+                # `Status` has twelve bits.
                 self._status |= Status(reply.status & 0x0FFF)
             else:
                 yield reply

@@ -90,7 +90,7 @@ def allow(folder: Path, name: str) -> list[Path]:
     if not name.replace("-", "").replace("_", "").isalnum() or name in PARTIES or name in read_allowed(folder).values():
         raise ConfigError(
             f"client {name!r} cannot be added",
-            "its name is taken, or has characters other than a-z 0-9 - _",
+            "its name is taken, or has characters other than letters, digits, - and _",
             "choose another name, or revoke that client first",
             code=ErrorCode.NAME_TAKEN,
         )

@@ -107,6 +107,7 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
 
 
 def _name_amplitude_unit(scan: ProcessedScan) -> str:
+    """Return the unit of amplitudes, which says what 0 dB is: the metal, an unproved reference, or nothing."""
     if not scan.metal_referenced:
         return "dB"
     return "dB (metal = 0)" if scan.judged else "dB (reference = 0)"
@@ -316,6 +317,7 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
 
 
 def _format_percent(value: float) -> str:
+    """Return a percentage with one digit after the point below 10."""
     if value >= 10:
         return f"{value:.0f} %"
     return f"{value:.1f} %"

@@ -152,6 +152,7 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
 
 
 def _find_truth(patch: PatchFigures) -> Point | None:
+    """Return the true (eps', eps'') of a patch of a simulated scene; None without one."""
     truth = patch.true_permittivity
     if truth is None:
         return None
@@ -215,6 +216,7 @@ def _measure_half_size(e: PermittivityFigures) -> Point:
 
 
 def _draw_legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str], with_truth: bool) -> Legend:
+    """Draw the legend: a line for each patch, the confidence regions, and the crosses of the truth."""
     dot: dict[str, Any] = {
         "marker": "o",
         "linestyle": "",

@@ -44,6 +44,7 @@ from polysight_shared.geometry import incidence_deg
 # Shown where a value is not known.
 DASH = "–"
 NOT_ON_HARDWARE = "Nothing of this instrument has run on hardware yet."
+# Key of `BoardImaging` and heading of each line of the table of imaging.
 _IMAGING_ROWS: tuple[tuple[str, str], ...] = (
     ("masked_positions", "Positions masked"),
     ("rows_without_data", "Rows without any data"),
@@ -67,6 +68,7 @@ ALTERNATIVE_TEXTS = {
 }
 # Figures of a board that have a table or a map of their own, or that only programs read.
 _NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
+# Last word of a key to the unit that it stands for.
 UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
 
 
@@ -145,7 +147,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
 
 
 def _list_notes(scan: ProcessedScan) -> list[str]:
-    """Return the sentences at the top: damage of the manifest, and why nothing was named."""
+    """Return the sentences at the top: damage of the manifest, no run on hardware yet, why nothing was named."""
     notes = [NOT_ON_HARDWARE]
     if scan.quality.coverage and scan.quality.coverage.damage:
         notes.insert(0, scan.quality.coverage.damage)
@@ -177,6 +179,7 @@ def _summarise_rig(rig: Instrument) -> list[tuple[str, str]]:
 
 
 def _list_provenance(scan: ProcessedScan) -> list[tuple[str, str]]:
+    """Return scan, time of processing and versions of the packages: name and text; none for products without a time."""
     processed = scan.facts.processed_utc or ""
     if not processed:
         return []
@@ -217,6 +220,7 @@ def _list_replaced_names(scan: ProcessedScan) -> list[str]:
 
 
 def _write_lead(scan: ProcessedScan) -> str:
+    """Return the sentence below the title: size of the images and of their pixels."""
     ny, nx = scan.h.shape
     pixel_mm = abs(float(scan.x_m[1] - scan.x_m[0])) * 1e3
     kind = "simulated scan" if scan.stamped else "scan"
@@ -332,12 +336,14 @@ def _is_unknown(value: Any) -> bool:
 
 
 def _format_share(value: float | None, digits: int) -> str:
+    """Return a share as percent; a dash if it is not known."""
     if value is None or _is_unknown(value):
         return DASH
     return f"{100 * value:.{digits}f} %"
 
 
 def _format_number(value: Any, between: str = " × ") -> str:
+    """Return a number with three digits, a pair joined by `between`; a dash if it is not known."""
     if _is_unknown(value):
         return DASH
     if isinstance(value, list | tuple):
@@ -450,6 +456,7 @@ def quality_tables(quality: dict[str, Any]) -> list[Table]:
     return out
 
 
+# Text of each `source` of `LeakageError`.
 _SOURCES = {
     "measured": "measured (rig file)",
     "prior and scene": "not measured; estimated from its prior and the scene",
@@ -473,6 +480,7 @@ def budget_table(budget: ErrorBudget) -> Table | None:
 
 
 def _tabulate_leakage(leakage: LeakageError | None) -> list[dict[str, Any]]:
+    """Return the lines of the error budget about leakage."""
     if leakage is None:
         return []
     rows = [_format_cells("Leakage", _SOURCES.get(leakage.source, leakage.source))]
@@ -488,6 +496,7 @@ def _tabulate_leakage(leakage: LeakageError | None) -> list[dict[str, Any]]:
 
 
 def _tabulate_incidence(incidence: IncidenceError | None) -> list[dict[str, Any]]:
+    """Return the line of the error budget about the incidence angle."""
     if incidence is None or incidence.deg is None:
         return []
     angle = f"{incidence.deg:.2f}°"
@@ -497,6 +506,7 @@ def _tabulate_incidence(incidence: IncidenceError | None) -> list[dict[str, Any]
 
 
 def _tabulate_plane(plane: PlaneError | None) -> list[dict[str, Any]]:
+    """Return the lines of the error budget about the plane of the plates."""
     if plane is None:
         return []
     if not plane.known:
@@ -521,6 +531,7 @@ def _format_with_sign(value: float, digits: int) -> str:
 
 
 def _format_cells(*cells: str, share: float | None = None) -> dict[str, Any]:
+    """Return a line of a table; `share` is the length of its bar in percent, None without a bar."""
     return {"cells": list(cells), "share": share}
 
 
@@ -586,6 +597,7 @@ def _flatten(value: dict[str, Any], prefix: str = "", nested: bool = True) -> di
 
 
 def _tabulate_seconds(seconds: Mapping[str, float] | None) -> Table | None:
+    """Return the table of times with a bar each, relative to the longest; None without any."""
     if not seconds:
         return None
     longest = max([*seconds.values(), 1e-9])

@@ -84,6 +84,7 @@ def font_families() -> tuple[str, ...]:
 
 @cache
 def _list_glyphs() -> frozenset[int]:
+    """Return the code points that the fonts of `font_families` can draw."""
     return frozenset(code for family in font_families() for code in get_font(findfont(family)).get_charmap())
 
 
@@ -269,6 +270,7 @@ def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
 
 
 def _widen(box: BboxBase, gap: float) -> Bbox:
+    """Return a box that is wider by `gap` pixels, half of it on each side."""
     return Bbox.from_extents(box.x0 - gap / 2, box.y0, box.x1 + gap / 2, box.y1)
 
 

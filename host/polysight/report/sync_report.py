@@ -60,6 +60,7 @@ class SyncReport:
     """Accumulates the residual errors of one board, row by row, in constant memory."""
 
     def __init__(self, sample_rate_hz: float, linear: tuple[int, int], rx: int) -> None:
+        """Begin without rows; `linear` is the range [first, end) of samples that synchronisation uses of a chirp."""
         self._rate = sample_rate_hz
         self._samples = linear[1] - linear[0]
         self._rx = rx

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 def _run_materials(args: argparse.Namespace) -> int:
+    """Run `polysight materials`. Raises ConfigError unless either scans or the catalogue are asked for."""
     from polysight.jobs.materials import catalogue, materials
 
     if bool(args.data) == args.catalogue:
@@ -32,6 +33,7 @@ def _run_materials(args: argparse.Namespace) -> int:
 
 
 def _run_permittivity(args: argparse.Namespace) -> int:
+    """Run `polysight permittivity`. Raises ConfigError for options that have no effect without layers."""
     from polysight.jobs.materials import permittivity
 
     options = {"--bands": args.bands, "--amplitude": args.amplitude, "--config": args.config}
@@ -56,6 +58,7 @@ def _run_permittivity(args: argparse.Namespace) -> int:
 
 
 def _parse_layer_option(text: str) -> Layer:
+    """Parse a layer of a stack, see `LAYER_FORMS`."""
     from polysight.materials import LAYER_FORMS, parse_layer
 
     try:
@@ -65,6 +68,7 @@ def _parse_layer_option(text: str) -> Layer:
 
 
 def _parse_value(text: str) -> tuple[str, float]:
+    """Parse NAME=PERCENT; the name may contain `=`."""
     name, _, number = text.rpartition("=")
     try:
         return name, _percent(number)
@@ -90,6 +94,7 @@ def add_commands(add: Add) -> None:
 
 
 def _add_results(add: Add) -> None:
+    """Add `polysight materials` and `polysight report`."""
     sub = add(
         "materials",
         _run_materials,
@@ -110,6 +115,7 @@ def _add_results(add: Add) -> None:
 
 
 def _add_permittivity(add: Add) -> None:
+    """Add `polysight permittivity` and its options."""
     sub = add(
         "permittivity",
         _run_permittivity,
@@ -143,6 +149,7 @@ def _add_permittivity(add: Add) -> None:
 
 
 def _add_concentration(add: Add) -> None:
+    """Add `polysight concentration` and its options."""
     sub = add(
         "concentration",
         "materials.concentration",
@@ -164,6 +171,7 @@ def _add_concentration(add: Add) -> None:
 
 
 def _add_classify(add: Add) -> None:
+    """Add `polysight classify` and its options."""
     sub = add(
         "classify",
         "materials.classify",
@@ -184,6 +192,7 @@ def _add_classify(add: Add) -> None:
 
 
 def _train(args: argparse.Namespace) -> int:
+    """Run `polysight train`, on scans and scenes or on the published data set. Raises ConfigError for both."""
     if args.authors is not None and (args.data or args.simulate):
         raise ConfigError(
             f"{'DATA' if args.data else '--simulate'} and --authors together",
@@ -207,6 +216,7 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _add_train(add: Add) -> None:
+    """Add `polysight train` and its options."""
     sub = add(
         "train",
         _train,
@@ -224,6 +234,7 @@ def _add_train(add: Add) -> None:
     add_config_option(sub, shipped=True)
 
 
+# Option of each format to its help.
 _FORMATS = {
     "csv": "materials.csv: a line a patch, permittivity with standard errors",
     "netcdf": "image.nc: an xarray dataset; complex variables as h_real, h_imag (needs h5netcdf)",
@@ -238,6 +249,7 @@ _REMOVED_FORMATS = {
 
 
 def _export(args: argparse.Namespace) -> int:
+    """Run `polysight export`. Raises ConfigError for a format of earlier releases."""
     for name, instead in _REMOVED_FORMATS.items():
         if getattr(args, name):
             raise ConfigError(f"--{name}: no longer exported", "hardly anybody used it", f"use {instead}")
@@ -247,6 +259,7 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _add_export(add: Add) -> None:
+    """Add `polysight export` and its options."""
     sub = add(
         "export",
         _export,
@@ -270,6 +283,7 @@ _LABEL_EXAMPLES = (
 
 
 def _label(args: argparse.Namespace) -> int:
+    """Run `polysight label`; names are asked for only at a terminal."""
     from polysight.jobs.label import Edits, label
 
     edits = Edits(args.from_patches, args.remove, args.rename, args.box, args.specimen, args.metal)
@@ -277,6 +291,7 @@ def _label(args: argparse.Namespace) -> int:
 
 
 def _parse_box(text: str) -> tuple[str, tuple[float, float, float, float]]:
+    """Parse NAME=x0,y0,x1,y1; the name may contain `=`."""
     name, _, corners = text.rpartition("=")
     try:
         x0, y0, x1, y1 = (float(part) for part in corners.split(","))
@@ -286,12 +301,14 @@ def _parse_box(text: str) -> tuple[str, tuple[float, float, float, float]]:
 
 
 def _parse_pair(text: str) -> str:
+    """Check that a text has the form NAME=TEXT, and return it as it is."""
     if "=" not in text.strip("="):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=TEXT")
     return text
 
 
 def _add_label(add: Add) -> None:
+    """Add `polysight label` and its options."""
     sub = add(
         "label",
         _label,

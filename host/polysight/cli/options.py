@@ -20,6 +20,7 @@ from polysight_shared.errors import ConfigError
 RIG = Path("instrument.toml")
 # Number of options that help shows before "more options".
 _FIRST = 3
+# Largest coordinate of a box: far beyond any image, so that a unit mixed up is noticed.
 _FARTHEST_MM = 10_000
 # Names in a parsed command line that are no options.
 _OF_THE_PARSER = ("command", "action", "run")
@@ -159,7 +160,7 @@ def material_settings(args: argparse.Namespace) -> Settings:
 
 
 def rig_file(config: Path | None, data: Path) -> Path | None:
-    """Return the given rig file, or the one in the folder of the data, or in the current folder."""
+    """Return the given rig file, or the one in the folder of the data, or in the current folder; None without any."""
     return config or next((rig for rig in (data / RIG, RIG) if rig.exists()), None)
 
 
@@ -186,6 +187,7 @@ def parse_centred_box(text: str) -> Box:
 
 
 def _parse_four_numbers(text: str, form: str) -> Box:
+    """Parse four numbers separated by commas; `form` describes them in the error message."""
     try:
         a, b, c, d = (float(part) for part in text.split(","))
     except ValueError:

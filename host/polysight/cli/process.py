@@ -70,6 +70,7 @@ def process_settings(args: argparse.Namespace, data: Path) -> Settings:
 
 
 def _process(args: argparse.Namespace) -> int:
+    """Run `polysight process`: one scan in this program, several as a batch."""
     from polysight.jobs.output import say
 
     # Before the other modules are loaded, which takes most of a second.
@@ -85,6 +86,7 @@ def _process(args: argparse.Namespace) -> int:
 
 
 def _run_surface(args: argparse.Namespace) -> int:
+    """Run `polysight surface`."""
     from polysight.jobs.surface import surface
 
     return surface(
@@ -99,6 +101,7 @@ def _run_surface(args: argparse.Namespace) -> int:
 
 
 def _image(args: argparse.Namespace) -> int:
+    """Run `polysight image`."""
     from polysight.jobs.process import image
 
     columns, rows, pixel_mm = args.grid or (None, None, None)
@@ -126,6 +129,7 @@ def _run_sync_report(args: argparse.Namespace) -> int:
 
 
 def _add_surface(add: Add) -> None:
+    """Add `polysight surface` and its options."""
     sub = add(
         "surface",
         _run_surface,
@@ -219,6 +223,7 @@ def _add_data(sub: argparse.ArgumentParser, several: bool = False) -> None:
 
 
 def _add_sparse(sub: argparse.ArgumentParser) -> None:
+    """Add `--sparse`."""
     sub.add_argument(
         "--sparse",
         action="store_true",
@@ -227,6 +232,7 @@ def _add_sparse(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_several_options(sub: argparse.ArgumentParser) -> None:
+    """Add the options for several scans at once."""
     group = sub.add_argument_group(
         "several scans", "their products go to DIR/<scan>/, their messages to DIR/<scan>.log"
     )
@@ -255,6 +261,7 @@ def grid(text: str) -> tuple[int, int, float]:
 
 
 def _add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
+    """Add the options for the metal reference, the incidence angle and the sub-bands."""
     sub.add_argument(
         "--reference",
         type=Path,
@@ -274,6 +281,7 @@ def _add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_calibrate(add: Add) -> None:
+    """Add `polysight calibrate` and its actions."""
     sub = add(
         "calibrate",
         "calibrate.direct_path",
@@ -332,6 +340,7 @@ def _add_calibrate(add: Add) -> None:
 
 
 def _add_direct_path(actions: argparse._SubParsersAction[CommandParser]) -> None:
+    """Add `polysight calibrate direct-path`."""
     sub = add_action(
         actions,
         "direct-path",
@@ -355,6 +364,7 @@ def _add_direct_path(actions: argparse._SubParsersAction[CommandParser]) -> None
 
 
 def _add_outputs(sub: argparse.ArgumentParser, more: str = "") -> None:
+    """Add the options of all actions of `calibrate`; `more` continues the help of `--config`."""
     sub.add_argument(
         "--out", type=Path, default=Path("calibration"), metavar="DIR", help="folder (default: calibration)"
     )
@@ -363,6 +373,7 @@ def _add_outputs(sub: argparse.ArgumentParser, more: str = "") -> None:
 
 
 def _add_leakage(add: Add) -> None:
+    """Add `polysight leakage` and its options."""
     sub = add(
         "leakage",
         "calibrate.leakage",
@@ -384,6 +395,7 @@ def _add_leakage(add: Add) -> None:
 
 
 def _parse_strips(text: str) -> tuple[float, Path]:
+    """Parse DEGREES=SCAN, the orientation of metal strips and their scan."""
     degrees, _, folder = text.partition("=")
     try:
         angle = float(degrees)

@@ -68,6 +68,7 @@ _NUMBERS = (
 
 
 def _plan(args: argparse.Namespace) -> int:
+    """Run `polysight plan`."""
     from polysight.planning import Changes, PlanOptions, run_plan
 
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
@@ -88,6 +89,7 @@ def _plan(args: argparse.Namespace) -> int:
 
 
 def _parse_size(text: str) -> tuple[float, float]:
+    """Parse WIDTH,HEIGHT in millimetres."""
     try:
         width, height = (_scene_side(part) for part in text.split(","))
     except (ValueError, argparse.ArgumentTypeError):
@@ -97,6 +99,7 @@ def _parse_size(text: str) -> tuple[float, float]:
 
 
 def _add_plan(add: Add) -> None:
+    """Add `polysight plan` and its options."""
     sub = add(
         "plan",
         _plan,
@@ -132,6 +135,7 @@ def _add_plan(add: Add) -> None:
 
 
 def _run_doctor(args: argparse.Namespace) -> int:
+    """Run `polysight doctor`. Raises ConfigError for a movement without pulses."""
     from polysight.doctor import DoctorOptions, run_doctor
 
     if args.move and not args.pulse:
@@ -144,6 +148,7 @@ def _run_doctor(args: argparse.Namespace) -> int:
 
 
 def _add_doctor(add: Add) -> None:
+    """Add `polysight doctor` and its options."""
     sub = add(
         "doctor",
         _run_doctor,
@@ -204,6 +209,7 @@ def _add_own_config(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_card(add: Add) -> None:
+    """Add `polysight card` and its actions."""
     card = add(
         "card", _run_card, "check the network path to each capture card; program or reset a card", "polysight card"
     )
@@ -248,6 +254,7 @@ def _add_card(add: Add) -> None:
 
 
 def _inspect(args: argparse.Namespace) -> int:
+    """Run `polysight inspect`; options that are not given leave the rig file's values."""
     from polysight.jobs.recordings import inspect_file, inspect_placement
 
     if args.placement:
@@ -257,6 +264,7 @@ def _inspect(args: argparse.Namespace) -> int:
 
 
 def _add_inspect(add: Add) -> None:
+    """Add `polysight inspect` and its options."""
     sub = add(
         "inspect", _inspect, "describe a recording of a capture card", "polysight inspect scans/one/raw/RH/0000.bin"
     )
@@ -280,11 +288,13 @@ def _add_inspect(add: Add) -> None:
 
 
 def _add_link(sub: argparse.ArgumentParser) -> None:
+    """Add the options of the link between host and board."""
     sub.add_argument("--trace", type=Path, metavar="FILE", help="record all words between host and board")
     sub.add_argument("--slow", action="store_true", help="send words one by one at 1 MHz, for doubtful wiring")
 
 
 def _add_radar(add: Add) -> None:
+    """Add `polysight radar` and its actions."""
     radar = add(
         "radar",
         "devices.plan_radars",
@@ -343,6 +353,7 @@ def _add_radar(add: Add) -> None:
 
 
 def _add_jog(add: Add) -> None:
+    """Add `polysight jog` and its options."""
     sub = add(
         "jog",
         "devices.jog_stage",
@@ -360,6 +371,7 @@ def _add_jog(add: Add) -> None:
 
 
 def _scan(args: argparse.Namespace) -> int:
+    """Run `polysight scan`."""
     from polysight.jobs.live_scan import scan
 
     settings = material_settings(args)
@@ -367,12 +379,14 @@ def _scan(args: argparse.Namespace) -> int:
 
 
 def _resume(args: argparse.Namespace) -> int:
+    """Run `polysight resume`."""
     from polysight.jobs.live_scan import resume
 
     return resume(args.folder, material_settings(args), args.keep_incomplete, not args.no_process, args.config)
 
 
 def _validate(args: argparse.Namespace) -> int:
+    """Run `polysight validate`."""
     from polysight.jobs.recordings import replace_folder, validate_folder
 
     if args.replace:
@@ -381,6 +395,7 @@ def _validate(args: argparse.Namespace) -> int:
 
 
 def _add_recording_options(sub: argparse.ArgumentParser) -> None:
+    """Add the options that `scan` and `resume` share."""
     sub.add_argument(
         "--keep-incomplete", action="store_true", help="after all retakes keep a row with gaps, masked, and continue"
     )
@@ -389,6 +404,7 @@ def _add_recording_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_scans(add: Add) -> None:
+    """Add `polysight scan`, `resume`, `validate` and `drop-raw`."""
     sub = add(
         "scan",
         _scan,
@@ -437,6 +453,7 @@ def _run_demo(args: argparse.Namespace) -> int:
 
 
 def _simulate(args: argparse.Namespace) -> int:
+    """Run `polysight simulate`, after warnings about the scene on stderr."""
     from polysight.jobs.demo import run_simulator
     from polysight.planning import find_scene_warnings
 
@@ -450,6 +467,7 @@ def _simulate(args: argparse.Namespace) -> int:
 
 
 def _run_reproduce(args: argparse.Namespace) -> int:
+    """Run `polysight reproduce`. Raises ConfigError for a wrong rig file, or options without an effect."""
     from polysight.jobs.demo import require_package
 
     if args.config != find_packaged(RIG):
@@ -475,6 +493,7 @@ def _run_reproduce(args: argparse.Namespace) -> int:
 
 
 def _add_simulated(add: Add) -> None:
+    """Add `polysight demo`, `simulate` and `reproduce`."""
     sub = add(
         "demo",
         _run_demo,

@@ -25,6 +25,7 @@ def add_commands(add: Add) -> None:
 
 
 def _serve(args: argparse.Namespace) -> int:
+    """Run `polysight serve`; without `--config` with the rig file of the current folder, if there is one."""
     _check_extra()
     # What it shows takes seconds to load
     sys.stderr.write("polysight serve: starting\n")
@@ -41,6 +42,7 @@ def _serve(args: argparse.Namespace) -> int:
 
 
 def _run_preview(args: argparse.Namespace) -> int:
+    """Run `polysight preview`."""
     _check_extra()
     if args.folder.exists() and not args.folder.is_dir():
         raise ConfigError(
@@ -63,6 +65,7 @@ def _check_extra() -> None:
 
 
 def _make_place(args: argparse.Namespace) -> Place:
+    """Return the address of the server from the options of `_add_place`."""
     from polysight.serve import Place
 
     return Place(args.host, args.port, tuple(args.allow_host), args.certificate, args.key)
@@ -76,6 +79,7 @@ def _parse_port(text: str) -> int:
 
 
 def _add_serve(add: Add) -> None:
+    """Add `polysight serve` and `polysight preview`."""
     sub = add(
         "serve",
         _serve,
@@ -103,6 +107,7 @@ def _add_serve(add: Add) -> None:
 
 
 def _add_folder(sub: argparse.ArgumentParser) -> None:
+    """Add the folder of scans."""
     text = "folder of scans (default: scans)"
     sub.add_argument("root", type=Path, nargs="?", default=Path("scans"), metavar="SCANS", help=text)
 
@@ -121,6 +126,7 @@ def _add_place(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_lists(add: Add) -> None:
+    """Add `polysight scans`, `note` and `ask`."""
     sub = add("scans", "scans.scans", "list the scans under a folder", "polysight scans scans")
     _add_folder(sub)
     sub.add_argument("--find", dest="text", default="", metavar="TEXT", help="search names, notes, tags and materials")
@@ -151,6 +157,7 @@ def _add_lists(add: Add) -> None:
 
 
 def _parse_point(text: str) -> tuple[float, float]:
+    """Parse X,Y in millimetres."""
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
@@ -159,6 +166,7 @@ def _parse_point(text: str) -> tuple[float, float]:
 
 
 def _add_results(add: Add) -> None:
+    """Add `polysight probe`, `compare` and `check`."""
     sub = add(
         "probe",
         "scans.probe_scan",

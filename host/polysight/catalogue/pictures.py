@@ -25,6 +25,7 @@ AMPLITUDE = "cividis"
 PHASE = "twilight"
 UNITS = {"amplitude": "dB", "phase": "°"}
 COLOURS = {"amplitude": AMPLITUDE, "phase": PHASE}
+# Largest side of a thumbnail.
 THUMBNAIL_PIXELS = 96
 
 
@@ -217,6 +218,7 @@ def colour_bar(colours: str) -> bytes:
 
 
 def _encode_png(rgba: NDArray[Any], origin: Literal["lower", "upper"]) -> bytes:
+    """Return colours [ny, nx, 4], 0 to 1, as PNG; with `lower` row 0 is at the bottom."""
     from matplotlib.image import imsave
 
     file = io.BytesIO()

@@ -41,12 +41,13 @@ EXPORT = "export"
 """Folder of a scan that a page has exports written into."""
 FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES, SURFACE, POINTS)
 EXPORTS = (".mat", ".csv", ".nc")
+# Materials of the library that a probe lists.
 MAX_NEAREST = 5
-# The range profile, to either side.
+# The range profile: its reach to either side of the place, its points, and its lowest level below the highest.
 PROFILE_REACH_M = 0.3
 PROFILE_POINTS = 121
 PROFILE_FLOOR_DB = -50.0
-# Smallest spread of a material's ratio between its patches.
+# Smallest spread of a material's ratio between its patches, each part: a material with one patch has none.
 LEAST_SPREAD = 5e-3
 DIFFERENCE = "RdBu"
 SIGNIFICANT = 3.0
@@ -248,6 +249,7 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
 
 
 def _explain_no_permittivity(pixels: Pixels, row: int, column: int) -> str:
+    """Return why a pixel has no permittivity; empty if it has one."""
     if not pixels.referenced:
         return "the images are not referenced to metal, or support no result"
     if not pixels.clear[row, column]:
@@ -290,7 +292,7 @@ def _rank_materials(pixels: Pixels, row: int, column: int, library: Path | None)
     try:
         ratios = _average_library(path, path.stat().st_mtime_ns, float(np.degrees(pixels.theta_rad)))
     except (PolysightError, OSError):
-        # The library was made at another angle.
+        # The library was made at another angle, or cannot be read.
         return []
     p = complex(pixels.p[row, column])
     p_std = float(pixels.p_std[row, column])
@@ -313,6 +315,7 @@ def _rank_materials(pixels: Pixels, row: int, column: int, library: Path | None)
 
 
 def _sort_by_sigmas(material: NearMaterial) -> float:
+    """Return the distance of a material as a key for sorting; unknown ones come last."""
     if material.sigmas is None:
         return math.inf
     return material.sigmas
@@ -358,18 +361,21 @@ def _restore_rows(scan: Path, changed_ns: int) -> Pipeline | None:
 
 
 def _convert_to_db(value: complex) -> float | None:
+    """Return the level of an amplitude in dB; None for zero and for what is not finite."""
     if value and np.isfinite(value):
         return round(float(20 * np.log10(abs(value))), 2)
     return None
 
 
 def _number(value: float) -> float | None:
+    """Return a number rounded for JSON; None if it is not finite."""
     if not np.isfinite(value):
         return None
     return round(float(value), 5)
 
 
 def _split_parts(value: complex) -> ComplexNumber:
+    """Return a complex number as its parts, None for those that are not finite."""
     return ComplexNumber(_number(value.real), _number(value.imag))
 
 
@@ -546,6 +552,7 @@ def _pair_patches(first: list[PatchFigures], second: list[PatchFigures]) -> list
 
 
 def _measure_distance_mm(a: PatchFigures, b: PatchFigures) -> float:
+    """Return the distance of the centres of two patches."""
     return float(np.hypot(a.centre_x_mm - b.centre_x_mm, a.centre_y_mm - b.centre_y_mm))
 
 

@@ -36,7 +36,8 @@ PART_S = 0.1
 """Length of the parts in which a list is read before it is asked for, and of the pauses between them."""
 PROGRAM = "program"
 """Folder of a scan in which programs that a page started keep their process number and log."""
-# The deepest level of folders that scans are searched in, and the number of scans at which the search ends.
+# The deepest level of folders that scans are searched in, and the most scans that are listed below one folder of the
+# root.
 MAX_DEPTH = 4
 MAX_SCANS = 5000
 # End of a program's log that is read: its last messages.
@@ -74,7 +75,8 @@ class Summary(msgspec.Struct, frozen=True):
     rows, committed
         Of the plan, and those that count.
     verdict
-        Level of its products' verdict, "" where it was not processed or not judged.
+        Level of its products' verdict; "" where it was not processed or not judged, "damaged" where they cannot be
+        read.
     processed
         True if there are materials.
     images_only
@@ -182,6 +184,7 @@ def summarise(folder: Path, name: str) -> Summary:
 
 
 def _read_manifest(folder: Path) -> Manifest | None:
+    """Return the manifest of a scan; None if there is none, or it is damaged."""
     if not is_plain(folder / MANIFEST):
         return None
     try:
@@ -270,6 +273,7 @@ def find_program(folder: Path, kind: str) -> Program | None:
 
 
 def _read_status(path: Path) -> int | None:
+    """Return the exit status that a program has left; None if there is none."""
     try:
         if is_plain(path):
             return int(path.read_text(encoding="ascii")[:8])
@@ -500,6 +504,7 @@ class Scans:
                 worker.join(READ_S)
 
     def _read_entries(self, waiting: deque[str], until_s: float) -> None:
+        """Summarise waiting entries of the root, one after another; behind `until_s` drop those that still wait."""
         # Two threads may read: the other one may take the last entry.
         with suppress(IndexError):
             while True:
@@ -592,6 +597,7 @@ class Scans:
         return path
 
     def _summarise(self, name: str) -> Summary:
+        """Return the present summary of a scan, made again if its files have changed."""
         folder = self.root / name
         stamp = _read_stamp(folder)
         stored = self._summaries.get(name)

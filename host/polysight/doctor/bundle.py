@@ -143,6 +143,7 @@ def _collect_contents(
 
 
 def _collect_files(folder: str, paths: Sequence[Path], most: int) -> Iterator[tuple[str, str]]:
+    """Yield name in `folder` and the last `most` bytes of each file, numbered so that equal names do not collide."""
     for number, path in enumerate(paths):
         if (text := _read_tail(path, most)) is not None:
             yield f"{folder}/{number}-{path.name}", text
@@ -167,12 +168,14 @@ def _find_newest(folders: Sequence[Path], pattern: str, count: int) -> list[Path
 
 
 def _list_versions() -> dict[str, object]:
+    """Return releases of this program, of Python and of all packages, and facts of the system."""
     system = {name: getattr(platform, name)() for name in ("platform", "machine", "python_version", "libc_ver")}
     installed = {d.metadata["Name"]: d.version for d in distributions()}
     return {**versions(), **system, "cores": os.cpu_count(), "packages": dict(sorted(installed.items()))}
 
 
 def _describe_kernel(root: Path) -> str:
+    """Return kernel, limits of this process and settings of the kernel under `root` as text."""
     limits = ("RLIMIT_RTPRIO", "RLIMIT_MEMLOCK", "RLIMIT_NOFILE", "RLIMIT_NICE")
     parts = [f"{platform.uname()}", *(f"{name} {resource.getrlimit(getattr(resource, name))}" for name in limits)]
     for name in _KERNEL:
@@ -184,6 +187,7 @@ def _describe_kernel(root: Path) -> str:
 
 
 def _describe_network(root: Path) -> dict[str, object]:
+    """Return the interfaces, and the kernel's tables of routes, neighbours and counters."""
     try:
         names = sorted(p.name for p in (root / "sys/class/net").iterdir())
     except OSError:

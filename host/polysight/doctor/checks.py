@@ -164,6 +164,7 @@ def _format_finding(finding: Finding) -> str:
 
 
 def _count_verdicts(findings: list[Finding], failed: list[str]) -> str:
+    """Return the counts of the verdicts as a line; it names the first failed check, where to begin."""
     verdicts = [verdict(finding) for finding in findings]
     counts = (
         f"{verdicts.count('ok')} ok, {verdicts.count('warning')} warnings, {len(failed)} errors,"

@@ -96,6 +96,7 @@ def read_interface(name: str, root: Path = Path("/")) -> NetworkInterface:
     folder = root / "sys/class/net" / name
 
     def number(file: str) -> int | None:
+        """Return the number in a file of the interface; None if it is missing or negative."""
         try:
             value = int((folder / file).read_text(encoding="ascii"))
         except (OSError, ValueError):

@@ -3,8 +3,7 @@
 Host, Pi and stage come first: rig file, clocks, keys, calibration, library, receivers, disk, trigger line. The trigger
 line is checked with a short row in which every point must give an edge. Only this check moves the stage, and only with
 `--move`. Then comes the capture side: capture cards, network, SYNC_IN pulses, radars, level, direct path, trigger skew.
-The checks from `check_pulses` on use a few bursts captured at rest. Armed radars transmit during these pulses, for some
-tens of milliseconds.
+The checks from `check_pulses` on use a few bursts captured at rest; armed radars transmit then, for tens of ms.
 """
 
 from __future__ import annotations
@@ -58,13 +57,12 @@ from polysight_shared.messages import MAX_PULSES_AT_REST, MAX_PULSES_AT_REST_S, 
 from polysight_shared.raster import RasterPlan, check_burst_fits
 from polysight_shared.sockets import HOST_KEYS, is_loopback
 
-# Disk speed relative to the data rate
+# Least speed of the disk relative to the data rate of a scan; chosen.
 _SPEED_MARGIN = 2.0
 # Largest difference between the clocks of host and Pi.
 _MAX_CLOCK_OFFSET_S = 1.0
 _CLOCK_LOST_S = 60.0
 _SET_CLOCK = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"
-
 # Hops of the network survey that concern a card.
 _CARD_HOPS = ("host", "route", "link", "card")
 _MIN_MTU = 1500
@@ -80,7 +78,7 @@ _MIN_DETECTED = 0.9
 _MAX_DELAY_S = 10e-9
 _SKEW_WARNING_S = 10e-9
 _SKEW_ERROR_S = 20e-9
-# Two trigger clocks of 5 ns give a standard deviation of 2 ns
+# Two trigger clocks of 5 ns give a standard deviation of 2 ns; twice that is a fault.
 _MAX_JITTER_S = 4e-9
 
 
@@ -359,6 +357,7 @@ def _run_row(context: CheckContext) -> RowFinished:
 
 
 def _take_row_end(context: CheckContext) -> RowFinished:
+    """Wait for the event that ends the row. Raises DeviceError after `_ROW_TIMEOUT_S`."""
     deadline = time.monotonic() + _ROW_TIMEOUT_S
     while time.monotonic() < deadline:
         context.pi.event_socket.poll(_POLL_MS)
@@ -436,6 +435,7 @@ def check_network(context: CheckContext, board: Board) -> Finding:
 
 
 def _judge_interface(interface: NetworkInterface) -> Finding:
+    """Judge the settings of a network interface; the first fault is the finding."""
     name = interface.name
     ring = interface.ring
     observed = f"{name}: MTU {interface.mtu or 'unknown'}, {interface.speed_mbit or 'unknown'} Mbit/s"

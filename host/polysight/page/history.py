@@ -310,6 +310,7 @@ class ScanHistory:
             self.last_commit_s += seconds(fact.continued_utc) - self._paused_at
 
     def _add_committed_row(self, fact: store.RowCommitted) -> None:
+        """Add the time of a committed row, and a notice if it was kept with gaps."""
         self.rows_since_trouble += 1
         if fact.kept_incomplete:
             self.rows_since_trouble = 0

@@ -309,6 +309,7 @@ def estimate_time_left(history: ScanHistory, now_s: float) -> tuple[int | None, 
 
 
 def _describe_pictures(history: ScanHistory, shown: Shown) -> PicturesState:
+    """Return the counts of rows in the pictures, their size, and the ends of their colours."""
     image = history.instrument.image
     waiting = max(0, len(history.takes) - len(shown.rows))
     scales = {name: (p.low, p.high, p.unit) for name, p in shown.pictures.items()}
@@ -412,6 +413,7 @@ def judge(inputs: Inputs) -> Status:
 
 
 def _describe_safe_rows(history: ScanHistory) -> str:
+    """Return how many rows are committed, as a sentence."""
     return f"{len(history.takes)} of {history.plan.rows} rows are safe."
 
 

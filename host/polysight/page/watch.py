@@ -152,6 +152,7 @@ class RowViewer:
             return [(row, take) for row, take in takes if take not in (self._done.get(row), self._failed.get(row))]
 
     def _run(self) -> None:
+        """Process waiting rows until closed; a row that fails is shown as a problem, and not tried again."""
         pipeline: Pipeline | None = None
         while not self._ended.is_set():
             waiting = self._list_waiting()
@@ -198,11 +199,13 @@ class RowViewer:
         return Profile(row, excess.round(4).tolist(), boards, (round(nearest, 3), round(farthest, 3)))
 
     def _fail(self, row: int, take: int, problem: Finding) -> None:
+        """Note that a take of a row cannot be shown, and publish the problem."""
         self._failed[row] = take
         self._problem = problem
         self._publish(self.shown.pictures, self.shown.profile)
 
     def _publish(self, pictures: dict[str, Picture], profile: Profile | None) -> None:
+        """Replace `shown` by the rows so far with these pictures and this profile."""
         sync = {name: dict(sorted(rows.items())) for name, rows in self._sync.items()}
         rows = tuple(sorted(self._done))
         self.shown = Shown(self.shown.revision + 1, rows, pictures, profile, sync, self._problem)
@@ -344,6 +347,7 @@ class PiListener:
         self._thread.start()
 
     def _run(self) -> None:
+        """Receive events until closed; `state.deaf` says why if that is not possible."""
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
             pi = self._instrument.pi
@@ -357,6 +361,7 @@ class PiListener:
             context.destroy(linger=0)
 
     def _receive(self, raw: bytes) -> None:
+        """Replace `state` by the one after an event."""
         try:
             event = m.unpack_event(raw)
         except ProtocolError as e:
@@ -447,6 +452,7 @@ class Watch:
         self._grown_at = float("-inf")
 
     def _run(self) -> None:
+        """Take a turn every `TURN_S`; a turn that fails becomes the status."""
         while not self._ended.wait(TURN_S):
             try:
                 self._turn()
@@ -567,6 +573,7 @@ class Watch:
         )
 
     def _close_parts(self) -> None:
+        """Stop the row viewer and the listener, if there are any."""
         for part in (self._viewer, self._listener):
             if part is not None:
                 part.close()

@@ -207,6 +207,8 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
     ------
     ConfigError
         if no scan is given, or a rig file names no check plate.
+    DataError
+        if a folder holds no processed scan with a check plate.
     """
     import xarray
 
@@ -257,6 +259,7 @@ def _check_all(scans: Sequence[Scan | PathText]) -> list[tuple[ProcessedScan, Ch
 
 
 def _find_rig(rig: PathText | None) -> Path:
+    """Return the path of the rig file: the given one, that of the current folder, or the packaged one."""
     return find_packaged(RIG) if rig is None else Path(rig)
 
 

@@ -54,6 +54,7 @@ def layer_dataset(
 
 
 def _parse_layer(layer: str | Layer) -> Layer:
+    """Return a layer, parsed if it is a text. Raises ConfigError if that has another form."""
     if isinstance(layer, Layer):
         return layer
     try:

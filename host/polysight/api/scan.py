@@ -85,7 +85,7 @@ def open_scan(
         A scan folder, a folder `unsynced/<scan>` or `raw/<scan>` of the published data, a folder of products that
         `polysight process` or `polysight image` wrote, or images of another program: an `.npz` file or a folder
         `labels/<scan>` (docs/spec/given-images.md). Saved products in a scan folder are used if they hold all of its
-        rows and none of the parameters below is given; otherwise the rows are processed.
+        rows and none of the parameters below but `rig` is given; otherwise the rows are processed.
     rig
         Rig file of published data, or the rig itself: `instrument.toml` in that folder, in the current folder or the
         packaged one if not given. Scan folders bring their own.
@@ -180,6 +180,7 @@ def _analyse_images(path: Path, rig: str | os.PathLike[str] | Instrument | None,
 
 
 def _open_products_only(path: Path, settings: Settings, process_again: bool) -> Scan:
+    """Open a folder of products. Raises ConfigError if they would have to be processed again."""
     if process_again:
         raise ConfigError(
             f"{path}: products cannot be processed again", "the recorded rows are not in this folder",
@@ -548,6 +549,7 @@ class Scan:
 
     @property
     def _row_count(self) -> str:
+        """Committed and planned rows as text."""
         try:
             rows = self.rows
         except DataError:
@@ -566,6 +568,7 @@ class Scan:
 
     @cached_property
     def _processing(self) -> Processing:
+        """The processing of the recorded rows. Raises DataError if there are none."""
         if self._source is None:
             raise DataError(
                 f"{self.folder}: holds no recorded rows", "it is a folder of products", "open the scan folder instead",
@@ -594,6 +597,7 @@ class Scan:
         return self._processing.unreferenced
 
     def _wrong_kind_error(self, metal_referenced: bool) -> DataError:
+        """Return the error of products that hold images of the other kind only."""
         if metal_referenced:
             return DataError(
                 f"{self.folder}: these images are not referenced to metal", "only images were made of this scan",
@@ -606,6 +610,7 @@ class Scan:
         )  # fmt: skip
 
     def _make_unknown_error(self, what: str) -> DataError:
+        """Return the error of products that do not say `what`."""
         return DataError(
             f"{self.folder}: the {what} of the products is unknown", "an earlier release made them, or scan.json or"
             " quality.json is missing", "open the scan folder instead", code=ErrorCode.KEY_MISSING,

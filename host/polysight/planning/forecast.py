@@ -42,12 +42,13 @@ Real = NDArray[np.float64]
 MAX_STEPS_PER_S = 20_000
 # Default of the simulators' `direct_snr_db`, from recorded data (docs/spec/scene-file.md).
 SIMULATED_DIRECT_SNR_DB = 5.5
+# Speed of the stage of the published rig.
 _PUBLISHED_SPEED_MM_S = 20.0
 # Standard deviation of the phase of the object's peak (paper, section 9.1).
 _PUBLISHED_PHASE_RAD = 0.022
 # Loss by the motion during a burst from which on the forecast warns (chosen).
 _MAX_BURST_LOSS_DB = 0.5
-# A full packet on Ethernet: headers, preamble, checksum, gap
+# A full packet on Ethernet, bytes: packet; headers of Ethernet, IP and UDP; preamble, checksum and gap.
 _WIRE_BYTES = 1470 + 42 + 24
 _ETHERNET_BYTES_PER_US = 125.0
 # The window that polysight.imaging.ImageBuilder uses.
@@ -273,6 +274,7 @@ def describe_aperture(rig: Instrument) -> tuple[imaging.Aperture, Real]:
 
 
 def _compute_tapers(rig: Instrument) -> tuple[Real, Real]:
+    """Return the taper over the rows and that over the columns, as the rig file names them."""
     name = imaging.TAPERS[rig.image.apodisation]
     return imaging.window_weights(name, rig.grid.rows), imaging.window_weights(name, rig.grid.columns)
 
@@ -341,14 +343,17 @@ def find_warnings(rig: Instrument, noise: Noise, scene_mm: tuple[float, float] |
 
 
 def _note(topic: str, text: str) -> Finding:
+    """Return a finding that does not refuse a plan."""
     return Finding("note", text, where=topic)
 
 
 def _make_refusal(topic: str, text: str) -> Finding:
+    """Return a finding that refuses a plan."""
     return Finding("error", text, where=topic)
 
 
 def _check_stage(rig: Instrument) -> Iterator[Finding]:
+    """Yield findings about speed and steps of the stage."""
     stage = rig.stage
     grid = rig.grid
     rate = stage.speed_mm_s * stage.steps_per_mm
@@ -371,6 +376,7 @@ def _check_stage(rig: Instrument) -> Iterator[Finding]:
 
 
 def _check_burst(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
+    """Yield findings about duration, travel and number of chirps of a burst."""
     max_pulses = int(1e3 * burst.between_ms / rig.burst.period_us)
     try:
         check_burst_fits(rig.grid, rig.burst, rig.stage)
@@ -395,6 +401,7 @@ def _check_burst(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
 
 
 def _check_card(rig: Instrument) -> Iterator[Finding]:
+    """Yield findings about packets and data rate of the cards."""
     if fills_whole_packets(rig):
         yield _note(
             "card",
@@ -422,6 +429,7 @@ def _check_card(rig: Instrument) -> Iterator[Finding]:
 
 
 def _check_radar(rig: Instrument) -> Iterator[Finding]:
+    """Yield findings about the constraints of the radars, and the unknown IF."""
     native = rig.radar.control == "native"
     offsets_known = native or any(b.start_offset_hz for b in rig.boards)
     for c in constraints(rig, rig.grid.columns * rig.burst.pulses):
@@ -440,6 +448,7 @@ def _check_radar(rig: Instrument) -> Iterator[Finding]:
 
 
 def _check_field(rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple[float, float]) -> Iterator[Finding]:
+    """Yield findings about ghosts by the step, and about the aperture that flat plates need; sizes are (x, y)."""
     grid = rig.grid
     field = imaging.field_limits(rig)
     axes = (("x", grid.step_x_mm, grid.columns), ("y", grid.step_y_mm, grid.rows))

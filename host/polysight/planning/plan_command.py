@@ -62,7 +62,7 @@ _MAX_FRAMES = 65535
 
 # Characters of a line of warnings.
 _WIDTH = 118
-# Rows from which the noise is measured
+# Rows from which the noise is measured; chosen.
 _NOISE_ROWS = 5
 _SIMULATED = "the simulated rig's (not measured on hardware; set it with --like SCAN or --snr-db)"
 
@@ -242,6 +242,7 @@ def _list_speeds(rig: Instrument, minutes: float) -> Iterator[float]:
 
 
 def _format_duration(seconds: float) -> str:
+    """Return a duration in seconds, minutes or hours."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     if seconds < 6000:
@@ -256,6 +257,7 @@ def _format_bytes(count: float) -> str:
 
 
 def _format_pair(values: tuple[float, float], digits: int = 1) -> str:
+    """Return two lengths as `x x y`; infinite ones are `unlimited`."""
     return " x ".join("unlimited" if math.isinf(v) else f"{v:.{digits}f}" for v in values)
 
 
@@ -327,6 +329,7 @@ def _describe_normals(normals: VisibleNormals) -> str:
 
 
 def _format_table(plans: list[Forecast]) -> str:
+    """Format proposals as a table, one a line, numbered from 1."""
     lines = ["    time      mm/s  chirps  period us  steps mm     grid       image dB  motion  alias-free mm   raw"]
     for i, f in enumerate(plans, 1):
         g = f.rig.grid
@@ -342,6 +345,7 @@ def _format_table(plans: list[Forecast]) -> str:
 
 
 def _replace_infinite(values: tuple[float, float]) -> list[float | None]:
+    """Return the values with None for infinite ones, which JSON lacks."""
     return [float(v) if math.isfinite(v) else None for v in values]
 
 

@@ -90,6 +90,7 @@ def _measure_reach(plates: Sequence[Plate], axis: int) -> float:
 
 
 def _decode_plate(raw: Mapping[str, Any], path: Path) -> Plate:
+    """Return a plate of a scene file; keys that the warnings do not need are left out."""
     known_keys = {key: value for key, value in raw.items() if key in Plate.__struct_fields__}
     return decode(known_keys, Plate, f"{path}: plates")
 

@@ -4,8 +4,9 @@ The names below are the public Python interface. They are imported when first us
 and needs no other package. Start with :func:`open_scan`.
 
 `pipeline.py` is the whole flow on one screen. Every folder is a room: its `__init__` says what it takes and gives, and
-neighbours import from there only (docs/decisions/0008-rooms.md). Beside this package: `polysight_shared`
-(configuration, messages, errors), `polysight_pi` (the Raspberry Pi), `polysight_simulators`, `polysight_papers`.
+neighbours import from there only, but from `jobs` and `api` by module (docs/decisions/0008-rooms.md). Beside
+this package: `polysight_shared` (configuration, messages, errors), `polysight_pi` (the Raspberry Pi),
+`polysight_simulators`, `polysight_papers`.
 """
 
 from importlib import import_module
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from polysight.materials import Library, PaperKNeighborsClassifier
     from polysight.polarimetry.xarray_labels import fresnel, multilayer, permittivity_from_ratio
 
+# Public name to the module that it is imported from.
 _HOME = {
     "Classifier": "polysight.api.classifier",
     "Library": "polysight.materials",

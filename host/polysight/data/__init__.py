@@ -12,7 +12,7 @@ FOLDER = _PACKAGE if (_PACKAGE / "instrument.toml").exists() else _REPOSITORY
 
 
 def find_packaged(path: Path) -> Path:
-    """`path` where it exists; otherwise the file or folder of that name that comes with the package, if there is one.
+    """Return `path` if it exists, else the file or folder of that name that comes with the package, else `path`.
 
     So `instrument.toml` and `examples/demo.toml` are found from any folder, and a file of one's own comes
     first.

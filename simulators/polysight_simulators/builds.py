@@ -16,6 +16,7 @@ from polysight_shared.errors import DeviceError
 SKETCH_DIR = Path(__file__).resolve().parents[2] / "arduino_stage"
 # Ignored by git, removed by `make clean`
 FOLDER = SKETCH_DIR / "build"
+# The language and the restrictions of the Arduino build, with warnings: what compiles here shall compile there.
 _FLAGS = ("-std=gnu++11", "-O2", "-Wall", "-Wextra", "-fno-exceptions", "-fno-rtti")
 
 
@@ -63,6 +64,7 @@ def compile_once(product: str, sources: Iterable[Path], command: Sequence[str], 
 
 
 def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
+    """Run the compiler. Raises DeviceError with its messages, and `on_failure` as cause and remedy, if it fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         message = done.stderr.strip()

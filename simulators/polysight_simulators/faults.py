@@ -14,7 +14,7 @@ from polysight_shared.tables import decode, read_toml
 
 Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Natural = Annotated[int, msgspec.Meta(ge=0)]
-Seconds = Annotated[float, msgspec.Meta(ge=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -24,9 +24,9 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `corrupt` (a flipped payload bit), `status_loss` (of asynchronous status messages), `twin` (a second card with the
     same address).
     The card: `overflow` (half a frame is lost before packetising: no sequence gap, status bit 9), `mute` (no replies),
-    `boot_s` (deaf for so long after a power cycle).
-    The radar: `missed_pulse`, `miss_pulses` (these SYNC_IN pulses start no frame), `spurious_edges` (an edge this many
-    ms behind this pulse). Its control server:
+    `boot_s` (hears no request for so many seconds after a power cycle).
+    The radar: `missed_pulse`, `miss_pulses` (these SYNC_IN pulses start no frame), `spurious_edges` (pairs: pulse
+    number, and ms after that pulse at which an edge comes that nobody sent). Its control server:
     `retrigger_fails` (these lines have no effect), `retrigger_resets` (the connection is reset at these lines). Under
     native control: `radar_fault_pulses` (the RF core faults at these pulses).
     """
@@ -40,10 +40,10 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     twin: bool = False
     overflow: Probability = 0.0
     mute: bool = False
-    boot_s: Seconds = 0.0
+    boot_s: NotNegative = 0.0
     missed_pulse: Probability = 0.0
     miss_pulses: tuple[Natural, ...] = ()
-    spurious_edges: tuple[tuple[Natural, Seconds], ...] = ()
+    spurious_edges: tuple[tuple[Natural, NotNegative], ...] = ()
     retrigger_fails: tuple[Natural, ...] = ()
     retrigger_resets: tuple[Natural, ...] = ()
     radar_fault_pulses: tuple[Natural, ...] = ()
@@ -54,7 +54,7 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return any((self.loss, self.duplicate, self.reorder, self.truncate, self.corrupt))
 
 
-# Faults that need a certain radar control.
+# Faults that need this value of `radar.control` in the rig file.
 OF_CONTROL = {"line_server": ("retrigger_fails", "retrigger_resets"), "native": ("radar_fault_pulses",)}
 
 
@@ -121,6 +121,7 @@ def read_faults(
 
 
 def _merge(table: dict[str, Any], changes: dict[str, Any]) -> None:
+    """Overwrite the keys of `table` with `changes`, in place; the tables of single boards are merged key by key."""
     for key, value in changes.items():
         if isinstance(value, dict):
             table[key] = {**table.get(key, {}), **value}

@@ -15,7 +15,7 @@ from polysight_shared.errors import DeviceError
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.cards import SOURCE_PORT, bound_udp
 
-# Subnets that are tried: other programs may hold ports of some.
+# Subnets that are tried, because other programs may hold ports of some. Chosen: one try nearly always suffices.
 _TRIES = 50
 # Ports and last byte of the address of the simulated Pi, and port of the native connection of a simulated radar.
 _COMMAND_PORT = 5601
@@ -68,7 +68,7 @@ def is_free(rig: Instrument) -> bool:
 def move_to_free_subnet(rig: Instrument) -> Instrument:
     """Return the rig on a random loopback subnet with free addresses.
 
-    Raises DeviceError if there is none in 50 attempts, because this machine's loopback is not 127.0.0.0/8.
+    Raises DeviceError if 50 attempts find none: this machine's loopback is not 127.0.0.0/8, or many rigs run.
     """
     generator = random.Random()
     for _ in range(_TRIES):

@@ -13,7 +13,7 @@ from polysight_shared.program import die_with_parent
 
 
 def command_line(module: str, description: str, example: str) -> argparse.ArgumentParser:
-    """Create a parser for `python -m <module>`; `example` has example arguments."""
+    """Create a parser for `python -m <module>`, without options; `example` are arguments for the end of its help."""
     return argparse.ArgumentParser(
         prog=f"python -m {module}",
         description=description,
@@ -29,7 +29,7 @@ def announce_ready(text: str = "") -> None:
 
 
 def run_program(run: Callable[[], object]) -> int:
-    """Run a program; return its exit status. An error is one message on stderr."""
+    """Run a program; return its exit status: 0, that of the error (one message on stderr), or 130 after Ctrl-C."""
     try:
         run()
     except PolysightError as e:

@@ -33,23 +33,29 @@ from polysight_simulators.radars import make_image
 from polysight_simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight_simulators.wires import MAX_SOCKET_PATH
 
-# The processes share the cores of a busy machine, and may be late.
+# Shortest heartbeat timeout of stage and Pi: the processes share the cores of a busy machine, and may be late.
 MIN_HEARTBEAT_MS = 2000
+# Firmware image of the radars in the folder of the rig.
 IMAGE_FILE = "firmware.bin"
+# Wall times until all processes have printed `ready`, and from SIGTERM to SIGKILL. Chosen for a busy machine.
 READY_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 5.0
 # Largest speed of the emulated UNO: its heartbeat clock is scaled, that of the Pi's program is not.
 UNO_TIME_SCALE = 2.0
 _POLL_S = 0.02
-# It puts the published rig's direct path in the middle of its IF window.
+# Start offset of the receivers: it puts the published rig's direct path in the middle of its IF window.
 _NATIVE_OFFSET_HZ = 790e3
 _LOG_LINES = 15
-# One thread for linear algebra: several processes with more threads on few cores are ten times slower.
+# One thread for linear algebra, unless the environment says otherwise: several processes with more threads on few cores
+# are ten times slower.
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
 
 
 def _set_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
-    """Set native radar control: each board at its card's address, the receivers with a start offset."""
+    """Set native radar control in the rig file's table: an entry for each board, and a start offset of the receivers.
+
+    A start offset in the rig file stays. The board's address follows in `move_to_subnet`.
+    """
     names = [board["name"] for board in table["boards"]]
     table["radar"] |= {"control": "native", "native": {name: {"usb_serial": name} for name in names}}
     for board in table["boards"]:
@@ -146,7 +152,12 @@ class Child:
 
 
 class RigOptions(NamedTuple):
-    """Options of the simulated rig."""
+    """Options of the simulated rig, as on its command line.
+
+    `time_scale`: wire time over wall time; `with_pi`: run the Pi's program; `seed`: None for the scene's; `pattern`:
+    counting pattern instead of the scene's signals; `faults`: file with a `[faults]` table; `cache`: folder of the
+    scene's object fields; `uno`: emulated board instead of the compiled sketch; `native`: the host controls the radars.
+    """
 
     time_scale: float = 1.0
     with_pi: bool = False
@@ -179,6 +190,7 @@ class RigProcesses:
             raise
 
     def _start(self, rig: Instrument, scene: Path | None, options: RigOptions) -> None:
+        """Start the processes in order of need: wires, then stage and cards, then the Pi; wait until each is ready."""
         wires = str(self._folder / "wires.sock")
         config = str(self._folder / "instrument.toml")
         self._wait([self._start_module("wires", "wires", "--socket", wires)])
@@ -202,6 +214,10 @@ class RigProcesses:
         return self.children[-1]
 
     def _wait(self, started: list[Child]) -> None:
+        """Wait until these processes are ready, or `stop` is set.
+
+        Raises DeviceError if one ends or the time is over.
+        """
         deadline = time.monotonic() + READY_TIMEOUT_S
         while not self._stop.is_set():
             self.check()
@@ -242,6 +258,7 @@ def card_groups(rig: Instrument) -> list[str]:
 
 
 def _list_card_options(scene: Path | None, options: RigOptions) -> list[str]:
+    """Return the options of the process of the cards that follow from those of the rig."""
     words = []
     if scene is not None:
         words += ["--scene", str(scene), "--offset-in-rig"]
@@ -257,6 +274,7 @@ def _list_card_options(scene: Path | None, options: RigOptions) -> list[str]:
 
 
 def _find_pi_program() -> str:
+    """Return the path of `polysight-pi` in this environment. Raises ConfigError if it is missing."""
     program = Path(sys.executable).parent / "polysight-pi"
     if not program.exists():
         raise ConfigError(
@@ -266,6 +284,7 @@ def _find_pi_program() -> str:
 
 
 def _write_files(rig: Instrument, scene: Scene | None, folder: Path, options: RigOptions) -> None:
+    """Write rig file and firmware image, and the truth of a scene whose signals are sent."""
     table = to_builtins(rig)
     if rig.name.endswith("(simulated)"):
         table["name"] = rig.name

@@ -1,7 +1,8 @@
 """Hub of the simulated wires: relay GPIO edges and stage motion between the processes of a simulated rig.
 
 Protocol: docs/spec/simulated-rig.md. Lines of a client reach every subscriber in order, and none is
-dropped: unread lines are queued up to a limit; a client that exceeds it is disconnected with a message.
+dropped, unless a fault has cut its wire: unread lines are queued up to a limit; a client that exceeds it is
+disconnected with a message.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
 from polysight_shared.wires import WireMotion, parse
 from polysight_simulators.process import announce_ready, command_line, run_until_stopped
 
+# Limits, chosen: several times the longest line of the protocol, and minutes of edges for a stopped client.
 MAX_LINE_BYTES = 200
 MAX_PENDING_BYTES = 64 << 20
 # `sun_path` of Linux holds 108 bytes with its terminator.
@@ -43,7 +45,10 @@ class _Client:
 
 
 class WireHub:
-    """Relay S lines to the clients that subscribed with L, M lines to those that sent W, never to the sender.
+    """Relay S lines to the clients that subscribed with L, M lines to those that sent W, except to the sender.
+
+    Two faults change that: a cut GPIO line reaches nobody; of two joined lines, the second repeats the edges of the
+    first, and that copy also reaches the sender, as it would on a short circuit.
 
     Parameters
     ----------
@@ -80,7 +85,8 @@ class WireHub:
         self._clients: dict[socket.socket, _Client] = {}
         self._accepted = 0
         self._last_motion = b""
-        # GPIO lines that a fault has cut, and for a line the other one that has the same changes.
+        # Motion line sent last, for late subscribers. GPIO lines (numbers as bytes) that a fault has cut; the line that
+        # repeats the edges of a joined one.
         self._cut: set[bytes] = set()
         self._joined: dict[bytes, bytes] = {}
 
@@ -117,6 +123,7 @@ class WireHub:
         self._selector.register(connection, selectors.EVENT_READ, client)
 
     def _read(self, client: _Client) -> None:
+        """Read from a client and relay its complete lines; disconnect it at its end or at an invalid line."""
         try:
             data = client.connection.recv(_READ_BYTES)
         except BlockingIOError:
@@ -174,11 +181,13 @@ class WireHub:
                 raise ProtocolError(f"not a wire line: {line!r}")
 
     def _pass_on(self, gpio_line: bytes, line: bytes, clients: list[_Client]) -> None:
+        """Queue `line` for the clients that subscribed to this GPIO line, unless it is cut."""
         for client in clients:
             if gpio_line in client.lines and gpio_line not in self._cut:
                 client.pending += line + b"\n"
 
     def _write(self, client: _Client) -> None:
+        """Send what a client takes at once; ask for a notice when it takes more. Disconnect it above the limit."""
         try:
             sent = client.connection.send(client.pending)
         except BlockingIOError:
@@ -197,6 +206,7 @@ class WireHub:
             self._selector.modify(client.connection, events, client)
 
     def _disconnect(self, client: _Client, why: str) -> None:
+        """Drop a client and report why."""
         lines = ", ".join(sorted(word.decode() for word in client.lines)) or "none"
         self._drop(client)
         self._report(f"{client.name} (lines: {lines}) disconnected: {why}")
@@ -208,6 +218,10 @@ class WireHub:
 
 
 def _listen(path: Path) -> socket.socket:
+    """Create the listening socket; an unused socket file is replaced.
+
+    Raises DeviceError, also if a hub answers there.
+    """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         if path.is_socket():

@@ -38,6 +38,7 @@ from polysight_simulators.scene import (
 
 
 def _make_parser() -> argparse.ArgumentParser:
+    """Build the parser of the command line."""
     parser = command_line(
         "polysight_simulators.cards",
         "Radars and capture cards of a simulated rig; `python -m polysight_simulators.rig` starts them.",
@@ -64,6 +65,7 @@ def _make_parser() -> argparse.ArgumentParser:
 
 
 def _check_arguments(args: argparse.Namespace, board_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of the boards to simulate. Raises ConfigError for arguments that make no sense."""
     if args.time_scale <= 0:
         problem = f"--time-scale {args.time_scale}"
         raise ConfigError(problem, "it must be positive", "give a number above 0", code=ErrorCode.VALUE_INVALID)
@@ -83,6 +85,7 @@ def _check_arguments(args: argparse.Namespace, board_names: tuple[str, ...]) -> 
 def _make_source(
     args: argparse.Namespace, rig: Instrument, scene: Scene | None, names: tuple[str, ...]
 ) -> SignalSource:
+    """Return what the radars send: a counting pattern, or the signals of the scene."""
     if scene is None or args.pattern:
         return PatternSource(rig)
     radars = SimulatedRig(rig, scene, args.seed, args.cache)
@@ -94,6 +97,7 @@ def _make_source(
 
 
 def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
+    """Run the cards until `stop`; what has to be closed goes into `open_things`. Raises PolysightError."""
     rig = load_instrument(args.config)
     board_names = tuple(b.name for b in rig.boards)
     names = _check_arguments(args, board_names)

@@ -65,6 +65,7 @@ RADAR = (
     "endless",
 )
 """What a radar can do, in :meth:`Adversary.take`: only the times of its frames tell."""
+# Time in which a radar sends a frame.
 _FRAME_NS = 128_000
 NEAREST_EDGE_NS = 350_000
 """An edge nearer to a missed pulse makes that pulse's frame: the stage has moved by a hundredth of a millimetre."""
@@ -74,7 +75,7 @@ _GAP_NS = 20_000
 
 @dataclass(frozen=True)
 class Arrival:
-    """One packet at the receiver: arrival time (ns), bytes, and the number of its record."""
+    """One packet at the receiver: arrival time (ns), bytes, and the number of its record; -1: the second card's."""
 
     t_ns: int
     packet: bytes
@@ -270,11 +271,13 @@ class Adversary:
         self._late.clear()
 
     def _reset(self) -> None:
+        """Reset the card: counters start again, and bytes waiting for a full packet are lost."""
         self._card = Packetiser(self._payload)
         self.resets += 1
         self._waiting = np.zeros(0, np.int64)
 
     def _make_stream(self, data: NDArray[np.int64]) -> list[bytes]:
+        """Return the packets that these bytes of the data (by number) fill."""
         self._waiting = np.concatenate([self._waiting, data])
         return self._note_last_bytes(self._card.feed(self._bytes[data]))
 
@@ -335,6 +338,7 @@ class Adversary:
         return [Arrival(t_ns, p, sent.number) for t_ns, _, p in sorted(coming, key=lambda c: c[0])]
 
     def _damage(self, packet: bytes, troubles: tuple[str, ...]) -> bytes:
+        """Return a packet, perhaps truncated or with a flipped bit in its header."""
         if "truncate" in troubles and self._chance.random() < 0.05:
             return packet[: self._chance.randint(DATA_HEADER_BYTES, len(packet))]
         if "turn_header_bit" in troubles and self._chance.random() < 0.05:

@@ -2,7 +2,7 @@
 
 :class:`CardEndpoint` is the card alone: state machine, sockets, and the faults between card and host.
 :class:`SimulatedCard` connects it to a radar that turns SYNC_IN pulses into frames. The sender passes many packets per
-call, never more at once than the buffer of the receiver holds.
+call, and waits while the receiver has many unread.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _CATCH_UP_S = 0.01
 
 
 class ReceiveQueue:
-    """Unread data of a UDP socket of this machine, from the kernel's table of sockets."""
+    """Unread data of a UDP socket of this machine, from the kernel's table of sockets (`table`)."""
 
     def __init__(self, address: str, port: int, table: Path = Path("/proc/net/udp")) -> None:
         address_number = struct.unpack("=I", socket.inet_aton(address))[0]
@@ -81,7 +81,7 @@ class CardSender:
     the host's process gets no CPU for a moment; such losses say nothing about the instrument. So before every call the
     sender looks at the receiver's queue, and waits while it is filled. `wait_for_receiver=False` leaves that out.
 
-    The packet delay is kept as a mean: packets leave 44 at a time.
+    The packet delay is kept as a mean: up to 44 packets leave at a time.
 
     Raises
     ------
@@ -118,7 +118,7 @@ class CardSender:
 
     @property
     def queued_bytes(self) -> int:
-        """Bytes of data packets not sent yet; the tests' cards stay far below a full queue."""
+        """Bytes of data packets not sent yet."""
         return self._queued_bytes
 
     def counts(self) -> dict[str, int]:
@@ -213,6 +213,10 @@ class CardSender:
     def _send_datagram(
         self, data: bytes | memoryview, address: tuple[str, int], ancillary: list[tuple[int, int, bytes]] | None = None
     ) -> None:
+        """Send one buffer, which `ancillary` may cut into datagrams.
+
+        Raises DeviceError if the address is unreachable.
+        """
         try:
             self._socket.sendmsg([data], ancillary or [], 0, address)
         except OSError as e:
@@ -318,6 +322,7 @@ class CardEndpoint:
         self._bind(network)
 
     def _bind(self, network: dca1000.Network) -> None:
+        """Bind command socket and sender at these addresses. Raises DeviceError."""
         self._commands = bound_udp(network.card_address, network.command_port)
         self._commands.setblocking(False)
         try:
@@ -400,6 +405,7 @@ class CardEndpoint:
                 self.sender.put_status(output.payload)
 
     def _emit_packets(self, packets: dca1000.Packets) -> None:
+        """Send data packets through the faults of the network; a twin sends the payload reversed."""
         self.counts["packets_made"] += len(packets.rows)
         self.counts["bytes_made"] += packets.payload_bytes
         for rows in self._network_faults.carry(packets.rows):
@@ -423,6 +429,7 @@ class CardEndpoint:
         return self.sender.flush(self._clock_s, self.card.packet_delay_s / self._time_scale)
 
     def _keep_sender_counts(self) -> None:
+        """Add the counts of a sender that is about to be closed."""
         for key, value in self.sender.counts().items():
             self.counts[key] += value
 
@@ -510,6 +517,7 @@ class SimulatedCard:
         self.last_data_wall_s = self._clock_s()
 
     def _send_frames(self, started: list[Pulse], track: StageTrack) -> None:
+        """Send the frames of these pulses, at their numbers in the plan; without a record only count them."""
         if not self.card.recording:
             self.endpoint.counts["frames_not_recorded"] += len(started)
             return

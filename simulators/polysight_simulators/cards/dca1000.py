@@ -28,11 +28,13 @@ TAIL_S = 2.0
 # 2.8: bytes 02 04 (seen)
 FPGA_VERSION = 2 | 8 << 7
 DELAY_TICK_S = 8e-9
+# Timeout after record start without data, until command 0x03 sets another.
 TIMER_S = 30
 _MIN_PACKET = 48
 _MAX_PACKET = 1470
 # Number of choices of each byte of command 0x03 but the last, counted from 1.
 _CHOICES = (2, 2, 2, 2, 3)
+# Choice of byte 1 of command 0x03: four LVDS lanes.
 _FOUR_LANES = 1
 
 Bytes2D = NDArray[np.uint8]
@@ -155,6 +157,7 @@ class Packetiser:
         return self._pack(rest.reshape(1 if len(rest) else 0, len(rest)))
 
     def _pack(self, payload: Bytes2D) -> Bytes2D:
+        """Put headers before payloads, uint8 [n, size], and advance the counters."""
         n, size = payload.shape
         k = np.arange(n, dtype=np.uint64)
         rows = np.empty((n, DATA_HEADER_BYTES + size), np.uint8)
@@ -195,6 +198,7 @@ class Card:
         self._power_up(sequence, byte_count)
 
     def _power_up(self, sequence: int, byte_count: int) -> None:
+        """Reset to the state at power-up, with these counters."""
         self._packetiser = Packetiser(sequence=sequence, byte_count=byte_count)
         self._suits_radar = True
         self._timer_s = TIMER_S
@@ -251,6 +255,7 @@ class Card:
         return [message(code, self._configure(code, body, well_formed))]
 
     def _configure(self, code: int, body: bytes, well_formed: bool) -> int:
+        """Execute a request other than record start and stop; return the status of its reply: 0 done, 1 refused."""
         if code == Code.RESET_FPGA:
             self.reset_fpga()
         elif code == Code.CONFIGURE_FPGA:
@@ -302,6 +307,7 @@ class Card:
         return self._end(Status.NO_LVDS_DATA if self._last_data_s is None else Status.RECORD_COMPLETED)
 
     def _end(self, status: Status) -> list[Output]:
+        """End the record; return the short last packet, if any, and the status."""
         self._recording = False
         tail = self._packetiser.flush()
         return [*([Packets(tail)] if len(tail) else []), message(Code.STATUS, status)]

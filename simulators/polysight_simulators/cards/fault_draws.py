@@ -80,6 +80,7 @@ class NetworkFaults:
         return [packet, packet]
 
     def _corrupt(self, rows: Rows) -> Rows:
+        """Return the packets, some with one payload bit flipped."""
         if not self._faults.corrupt:
             return rows
         rows = rows.copy()

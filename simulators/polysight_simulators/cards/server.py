@@ -21,7 +21,21 @@ IDLE_S = 0.1
 
 
 class CardServer:
-    """All cards of one process, on one set of wires."""
+    """All cards of one process, on one set of wires.
+
+    Parameters
+    ----------
+    time_scale
+        Wire time over wall time.
+    clock_s
+        Wall clock.
+    track
+        Position of the stage; it gets the motion lines and triggers.
+    power_cycle
+        Event that switches every card off and on.
+    control, chips
+        Control servers of the radars, or their USB chips under native control.
+    """
 
     def __init__(
         self,
@@ -124,6 +138,7 @@ class CardServer:
         return any(rising.values())
 
     def _take_edge(self, edge: WireEdge, rising: dict[int, list[int]]) -> None:
+        """Note a rising edge: of the stage's trigger, or of a SYNC_IN line in `rising`."""
         if edge.line == self._trigger:
             self._trigger_ns = edge.t_ns
             self._track.trigger(edge.t_ns)

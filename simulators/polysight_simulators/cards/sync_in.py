@@ -16,7 +16,7 @@ from polysight_simulators.radars import RadarBoard
 
 # Time between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger).
 RECOVERY_US = 150.0
-# Number of motion lines, and of triggers, that are remembered.
+# The last so many motion lines, and triggers, are kept at least; they are cut to it at twice as many.
 _KEEP = 4096
 
 
@@ -70,6 +70,7 @@ class SyncInput:
         return started
 
     def _read_native(self, radar: RadarBoard, pulses: list[Pulse]) -> list[Pulse]:
+        """Return the pulses at which the simulated board starts a frame; count the others."""
         started = []
         for pulse in pulses:
             armed = radar.ready_for_triggers

@@ -31,6 +31,7 @@ from polysight_simulators.radars.cores import (
 
 # Value of the sense-on-power pins: functional mode.
 FUNCTIONAL = 4
+# Delays of an answer, and of its data after the interrupt. Chosen: real timing is not known.
 ANSWER_S = 1e-4
 DATA_S = 1e-3
 
@@ -136,6 +137,7 @@ class RadarBoard:
         return self.cores.destroyed
 
     def _forget(self) -> None:
+        """Reset: drop messages, pulses and the state of the cores; the flash stays."""
         self._in = bytearray()
         self._out = bytearray()
         # Messages not read by the host yet
@@ -174,6 +176,7 @@ class RadarBoard:
         self._held = held
 
     def _boot(self) -> None:
+        """Boot if supply, jumpers and sense lines allow it."""
         if self._mode == FUNCTIONAL and self.functional_jumpers and self.powered and not self.destroyed:
             self.cores.boot()
 
@@ -266,6 +269,7 @@ class RadarBoard:
             )
 
     def _deliver(self) -> None:
+        """Make messages readable that are due by now, and raise the host interrupt for the first."""
         for due_s, raw in sorted(self._later, key=lambda p: p[0]):
             if due_s <= self.now():
                 self._later.remove((due_s, raw))
@@ -277,6 +281,7 @@ class RadarBoard:
         self._later.append((self.now() + delay_s, raw))
 
     def _send_event(self, number: int, data: bytes, delay_s: float) -> None:
+        """Send an event after a delay; numbers from 0x4000 on are the main core's, others the RF core's."""
         main = number >= 0x4000
         if main:
             wide = self.cores.crc32_events
@@ -291,6 +296,7 @@ class RadarBoard:
         )
 
     def _send_message(self, raw: bytes) -> None:
+        """Execute a message of the host (`raw`, without the sync word) and send the answer, with the next fault."""
         opcode, length, flags, remaining, count = struct.unpack_from("<5H", raw)
         fault = None
         if self._faults:
@@ -354,6 +360,7 @@ class RadarBoard:
         self._answer(answer, fault, delay)
 
     def _answer(self, answer: bytes, fault: Fault | None, delay_s: float) -> None:
+        """Send an answer after a delay, damaged by the fault."""
         if fault is Fault.EVENT_BETWEEN:
             self._send_event(0x1012, bytes(20), 0.0)
         elif fault is Fault.BAD_CRC:

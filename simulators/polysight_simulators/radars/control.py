@@ -63,7 +63,7 @@ class UsbChip:
         self.spi_hz = 0.0
         self._fast = False
         self._pins = 0
-        # Number of words since chip select became low.
+        # 1 if a word was sent since chip select became low, else 0.
         self._latched = 0
         # Time for which chip select is high or low, by the duration of the pin commands.
         self._high_s = float("inf")
@@ -191,6 +191,7 @@ class UsbChip:
         return self._refuse_code("B", code)
 
     def _refuse_code(self, name: str, code: int) -> int:
+        """Answer an unknown command as the chip does; return its one byte."""
         self.errors.append(f"unknown command 0x{code:02X} on channel {name}")
         self._answers[name] += bytes((0xFA, code))
         return 1
@@ -218,7 +219,10 @@ class UsbChannel:
 
 
 class _Server:
-    """A TCP server for an event loop that polls `fileno` and calls `serve`. Raises DeviceError if it cannot listen."""
+    """A TCP server for an event loop that polls `fileno` and calls `serve`.
+
+    `what` names it in errors. Raises DeviceError if it cannot listen at `address`, "host:port" or "tcp://host:port".
+    """
 
     def __init__(self, address: str, what: str) -> None:
         host, _, port = address.removeprefix("tcp://").rpartition(":")

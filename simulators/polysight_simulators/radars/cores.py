@@ -94,11 +94,14 @@ def encode_patch_version(image: bytes, main: bool) -> bytes:
     return bytes((major, minor, *date, build << 4 | debug))
 
 
+# Durations of boot, RF power-up, RF calibration and erasing the flash, and delay of an event. Chosen: real timing is
+# not known.
 BOOT_S = 0.05
 RF_UP_S = 0.02
 RF_INIT_S = 0.3
 ERASE_S = 4.0
 READY_S = 1e-3
+# Sub-block numbers of events.
 UP_MAIN = 0x5000
 UP_RF = 0x5001
 MAIN_FAULT = 0x5002
@@ -107,7 +110,7 @@ CALIBRATED = 0x1004
 TRIGGER_READY = 0x100B
 FRAME_END = 0x100F
 RF_FAULT = 0x1002
-# Sub-block numbers (ICD 5): events are above, commands below.
+# Sub-block numbers of commands (ICD 5).
 DOWNLOAD = 0x4080
 SET_EVENT_CHECKSUM = 0x404C
 POWER_UP_RF = 0x4000
@@ -157,7 +160,11 @@ _WITHOUT_RF = (DOWNLOAD, SET_EVENT_CHECKSUM, POWER_UP_RF, READ_MAIN_VERSION)
 
 @dataclass
 class Cores:
-    """Both cores and the serial flash. `event` sends an event after a delay; see `RadarBoard` for the other fields."""
+    """Both cores and the serial flash. `event` sends an event (number, data, delay in s).
+
+    `ram` is a downloaded image, `hardware_bits` are added to the status of a boot; `settings` holds the data of the
+    last sub-block of each number, `profiles` and `chirps` those of each index. See `RadarBoard` for the other fields.
+    """
 
     now: Callable[[], float]
     event: Callable[[int, bytes, float], None]
@@ -232,6 +239,7 @@ class Cores:
         return error, answer, 0.0
 
     def _dispatch(self, number: int, data: bytes) -> tuple[int, bytes]:
+        """Execute a command of right size and state; return error number and answer."""
         if number == START_OR_STOP_FRAMES:
             return self._start_or_stop(struct.unpack_from("<H", data)[0]), b""
         if number == FRAME and self.armed:
@@ -245,6 +253,7 @@ class Cores:
         return 0, self._apply_setting_or_query(number, data)
 
     def _apply_setting_or_query(self, number: int, data: bytes) -> bytes:
+        """Execute a command that cannot fail; return its answer, b"" for none."""
         if number == SET_EVENT_CHECKSUM:
             self.crc32_events = data[0] == 1
         elif number == POWER_UP_RF:
@@ -269,6 +278,7 @@ class Cores:
         return b""
 
     def _read_patch(self) -> bytes:
+        """Return the image that the cores run: the downloaded one, else the flash's; b"" without."""
         if self.ram and not boot_errors(self.ram):
             return self.ram
         return self._booted
@@ -280,6 +290,7 @@ class Cores:
         return bytes(6)
 
     def _report_calibration(self, passed: int) -> None:
+        """Send the event with the calibrations that passed, as bits."""
         self.event(CALIBRATED, struct.pack("<IIhHII", passed, passed, 41, 0, 500, 0), RF_INIT_S)
 
     def _store_profile_or_chirps(self, number: int, data: bytes) -> int:
@@ -334,6 +345,7 @@ class Cores:
         return 0, b""
 
     def _start_or_stop(self, what: int) -> int:
+        """Start (1) or stop frames (0; 4: at once); return 0, or 21: not started, 23: another number."""
         if what == 1:
             return self._start()
         if what not in (0, 4):
@@ -347,6 +359,10 @@ class Cores:
         return 0
 
     def _start(self) -> int:
+        """Arm the radar for SYNC_IN, or run the frames of a software trigger.
+
+        Returns the error number: 0, 20 (armed already), or 22 (settings are missing).
+        """
         if self.armed:
             return 20
         if not self.calibrated or any(n not in self.settings for n in (*_BEFORE_FRAMES, FRAME, 0x40C0)):

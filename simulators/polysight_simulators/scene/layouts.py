@@ -197,6 +197,7 @@ class OwnLayout:
         self._write_fact("scan_ended", exit_status="success", reason="", rows_committed=self._rows)
 
     def _write_fact(self, fact: str, **content: Any) -> None:
+        """Append a line to the manifest, with its number, the digest of the line before, and a CRC-32."""
         record = {"fact": fact, **content, "count": self._lines, "previous": self._digest}
         plain = json.dumps(record, sort_keys=True, separators=(",", ":"))
         record["crc"] = f"{crc32(plain.encode()):08x}"
@@ -218,6 +219,7 @@ class OwnLayout:
         return {"scan_id": self._scan_id, "seq": self._seq, "t_mono_ns": self._now_ns}
 
     def _write_row_events(self, row: Row) -> None:
+        """Write the events that the Pi would send in a row at the stage's speed: start, a capture per point, end."""
         burst = self._rig.burst
         stage = self._rig.stage
         events: list[AnyEvent] = [RowStarted(row=row, take=1, **self._stamp())]
@@ -406,6 +408,7 @@ def _describe_collection(rig: Instrument, scan: str, zero_filling: bool, by_colu
 
 
 def _describe_devices(rig: Instrument) -> dict[str, Any]:
+    """Return chirp and radars as in the published JSON file of devices; hertz and seconds."""
     c = rig.chirp
     chirp = {
         "f0": c.start_hz,
@@ -420,6 +423,7 @@ def _describe_devices(rig: Instrument) -> dict[str, Any]:
 
 
 def _describe_radars(rig: Instrument) -> dict[str, Any]:
+    """Return the boards' network settings, by index, as in the published JSON file."""
     return {
         str(i): {
             "idx": i,

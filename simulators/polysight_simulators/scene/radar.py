@@ -332,6 +332,10 @@ class SimulatedRig:
         pulses: NDArray[np.int64],
         out: NDArray[np.complex64],
     ) -> None:
+        """Add direct path and echoes to `out`, [chirp, rx, sample].
+
+        `x_m`, `y_m` are stage offsets from the middle of the grid, `pulses` the numbers of the chirps' pulses; [chirp].
+        """
         d = self.scene.disturbances
         receiver = self._make_receiving_board(board.name)
         chirp = self.rig.chirp

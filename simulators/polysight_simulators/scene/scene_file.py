@@ -104,6 +104,7 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _require(ok: bool, rule: str) -> None:
+    """Raise ValueError with this rule unless `ok`; the reader of the file makes it a ConfigError."""
     if not ok:
         raise ValueError(rule)
 
@@ -157,6 +158,7 @@ class Plate(_Table, frozen=True):
     rough_length_mm: Size = 6.0
 
     def __post_init__(self) -> None:
+        """Check what the types cannot: one kind of material, what goes with it, and the number of facets."""
         _require(self.strips_deg is None or self.metal, "strips_deg goes with metal = true")
         kinds = (self.metal, self.permittivity is not None, bool(self.layers))
         _require(sum(kinds) == 1, "a plate has one of permittivity = [..], metal = true or [[plates.layers]]")

@@ -28,6 +28,7 @@ from polysight_simulators.process import announce_ready, command_line, run_until
 from polysight_simulators.stage.motion import TICK_HZ
 from polysight_simulators.stage.python_stage import PythonStage, Rig
 
+# Boot loader of the board (chosen), and longest waits for bytes between two advances, all wall time.
 BOOT_MS = 200
 STEP_POLL_MS = 2
 REST_POLL_MS = 20
@@ -74,7 +75,7 @@ class SerialPort:
 
     @property
     def is_open(self) -> bool:
-        """True if a client held the port open at the last call of :meth:`opened`."""
+        """True if a client held the port open at the last call of :meth:`was_opened`."""
         return self._clients > 0
 
     def wait(self, timeout_ms: int) -> None:
@@ -201,6 +202,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace, stop: Signal) -> None:
+    """Become the compiled sketch if it can be built; otherwise serve the Python stand-in. Raises PolysightError."""
     rig = load_instrument(args.config)
     gxx = None
     if not args.python:

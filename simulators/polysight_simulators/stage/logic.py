@@ -13,7 +13,8 @@ from polysight_simulators.stage.motion import EMERGENCY, LOOKS, MAX_RATE, MIN_RA
 MAX_TRAVEL = 999_999
 MAX_POINTS = 9_999
 MAX_BACKLASH = 20_000
-# Homing: rates in steps/s.
+# Homing: rates in steps/s. Until an axis has found its switch since the last reset, its direction may be wrong: it
+# searches slowly, in legs of FIRST_LEG. Then it goes back until the switch opens, at most MAX_RELEASE, and by PULL_OFF.
 HOME_RATE = 4000
 CREEP_RATE = 400
 FIRST_RATE = 2000
@@ -67,6 +68,7 @@ def homing_zero() -> int:
 
 
 def _require(ok: bool, number: StageError) -> None:
+    """Raise Refused with this number unless `ok`."""
     if not ok:
         raise Refused(number)
 
@@ -117,17 +119,19 @@ class StageLogic:
         self._resume_begun = False
         self._byte_seen = False
         self._quiet = True
-        # Homing: whether the stage was homed before, the switches found so far, and the steps of the present search.
+        # Homing: whether the stage was homed before, the switches (bits) found since the last reset, the steps of the
+        # present search, and whether a leg of the present phase was made.
         self._was_homed = False
         self._found_switches = 0
         self._searched_steps = 0
         self._homing_leg_made = False
         self._buzz_x = True
-        # Leg of a homing or a buzz.
+        # Leg of a homing (0 to 2 of x, 3 to 5 of y: search, release, pull off; 6: end), or of a buzz (0 to 2, 3: end).
         self._phase = 0
         self._heard_ms = 0
         self._byte_ms = 0
         self._looked_ms = 0
+        # Steps lost since the previous homing.
         self.lost_x = 0
         self.lost_y = 0
         self._row_leg = Leg(0, 0, MIN_RATE)
@@ -170,6 +174,7 @@ class StageLogic:
         handlers[verb](*args)
 
     def _set(self, index: int, value: int) -> None:
+        """Set a parameter."""
         _require(index in _RANGES, StageError.OUT_OF_RANGE)
         parameter = Parameter(index)
         low, high = _RANGES[parameter]
@@ -197,6 +202,7 @@ class StageLogic:
         self._searched_steps = 0
 
     def _buzz(self, axis: int) -> None:
+        """Begin a buzz of an axis (0: x, 1: y): 1 mm forward, 2 mm back, 1 mm forward."""
         _require(axis in (0, 1), StageError.OUT_OF_RANGE)
         self._begin("buzz")
         self._engine.set_accel(HOME_ACCEL)
@@ -204,6 +210,7 @@ class StageLogic:
         self._phase = 0
 
     def _plan_buzz_leg(self) -> Event:
+        """Start the next leg of a buzz, or end it."""
         if self._phase == 3:
             self._engine.set_accel(self.parameters[Parameter.ACCEL])
             return self._end()
@@ -226,6 +233,10 @@ class StageLogic:
         self._go(x, y, rate)
 
     def _start_row(self, x0: int, pitch: int, points: int, y: int, rate: int) -> None:
+        """Begin a row of `points` triggers from `x0` on, signed `pitch` steps apart, at `y`.
+
+        The stage first travels to the start of the run-up, and to `y` from below, so that backlash is taken up.
+        """
         _require(1 <= points <= MAX_POINTS and pitch != 0 and rate >= MIN_RATE, StageError.OUT_OF_RANGE)
         _require(rate <= MAX_RATE, StageError.TOO_FAST)
         last = x0 + pitch * (points - 1)
@@ -254,6 +265,7 @@ class StageLogic:
         return 0 <= x <= self.parameters[Parameter.TRAVEL_X] and 0 <= y <= self.parameters[Parameter.TRAVEL_Y]
 
     def _begin(self, activity: str) -> None:
+        """Begin a motion command: clear the counters of the last one. It counts as a heartbeat."""
         self.activity = activity
         self.held = False
         self._homing_leg_made = False
@@ -268,7 +280,7 @@ class StageLogic:
         self._arm(self._engine.start(Leg(x - self._engine.x, y - self._engine.y, rate)))
 
     def immediate(self, byte: int) -> bool:
-        """Process a byte; return False if it is not an immediate one."""
+        """Obey HOLD, RESUME, STATUS or STOP, which count without a line; return False for any other byte."""
         alone = self._quiet
         confirmed = self._resume_begun
         self._quiet = False
@@ -291,6 +303,7 @@ class StageLogic:
         return True
 
     def _listen(self, now_ms: int) -> None:
+        """Note the time of bytes and heartbeats, and read the switches once a millisecond at rest."""
         if self._byte_seen:
             self._byte_seen = False
             self._byte_ms = now_ms
@@ -304,6 +317,7 @@ class StageLogic:
             self._engine.look(self._inputs())
 
     def _raise(self, alarm: StageError, position_lost: bool) -> Event:
+        """End all motion and latch an alarm; an emergency stop also switches the motors off."""
         self._engine.abandon()
         self._engine.set_accel(self.parameters[Parameter.ACCEL])
         self.activity = "idle"
@@ -316,7 +330,7 @@ class StageLogic:
         return Event.ALARM
 
     def service(self, now_ms: int) -> Event:
-        """Start the next leg, check heartbeat and switches. Call often."""
+        """Check heartbeat and switches, end a stopped motion, or start the next leg. Call often."""
         engine = self._engine
         self._listen(now_ms)
         if engine.fault is not None:
@@ -350,6 +364,7 @@ class StageLogic:
         return Event.NONE
 
     def _plan_leg(self) -> Event:
+        """Start what follows a finished leg, or report the end."""
         if self.activity == "travel" and self._engine.y != self._row_y:
             self._go(self._engine.x, self._row_y, self.parameters[Parameter.TRAVEL_SPEED])
             return Event.NONE
@@ -369,6 +384,7 @@ class StageLogic:
         return Event.DONE
 
     def _plan_homing_leg(self) -> Event:
+        """Start the next leg of homing, or end it; the alarm HOMING_FAILED if a switch did not change as it should."""
         along_x = self._phase < 3
         step = self._phase % 3
         its_switch = SWITCH_X if along_x else SWITCH_Y

@@ -22,7 +22,7 @@ SWITCH_X = 1
 SWITCH_Y = 2
 EMERGENCY = 4
 SWITCHES = SWITCH_X | SWITCH_Y
-# A switch counts as changed after this many equal readings (debouncing).
+# A switch counts as changed after this many successive readings that differ from the old state (debouncing).
 LOOKS = 5
 
 
@@ -50,7 +50,7 @@ class StepEngine:
     """One leg at a time with trapezoidal speed. Positions are steps, times are ticks of 500 ns."""
 
     def __init__(self) -> None:
-        # Position, steps; trigger points passed and trigger pulses given in this row.
+        # Position in steps; trigger points passed and trigger pulses given in this row (counted by the caller).
         self.x = 0
         self.y = 0
         self.points = 0
@@ -60,7 +60,7 @@ class StepEngine:
         self.stepping = False
         self.cruise = False
         self.reached = False
-        # The switch that ended the leg.
+        # Why the leg ended early: emergency stop or limit switch; None if it did not.
         self.fault: StageError | None = None
         # Steps left in the leg, steps to a stop from the present speed, and from the leg's rate.
         self.left = 0
@@ -141,6 +141,7 @@ class StepEngine:
         return self._start_from_rest()
 
     def _start_from_rest(self) -> int:
+        """Return the ticks to the first step, or 0 if there is no step or the stage is held."""
         if self.left == 0 or self.hold:
             return 0
         self.stepping = True
@@ -157,7 +158,7 @@ class StepEngine:
         self.fault = None
 
     def look(self, inputs: int) -> None:
-        """Debounce the switches: a change counts after :data:`LOOKS` equal readings."""
+        """Debounce the switches: `stable` follows after :data:`LOOKS` successive readings that differ from it."""
         if inputs == self.stable:
             self._looks = 0
         else:

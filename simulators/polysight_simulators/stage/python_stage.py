@@ -19,6 +19,7 @@ from polysight_simulators.stage.motion import NS_PER_TICK, SWITCH_X, SWITCH_Y, T
 FIRMWARE = "0.1.0"
 # Interval of motion messages while the speed changes: 10 ms
 REPORT_TICKS = TICK_HZ // 100
+# Check field at the end of a line: `*` and the CRC-16 in four hexadecimal digits.
 _TAIL = re.compile(rb"\*([^*]{4})")
 
 
@@ -58,6 +59,7 @@ class PythonStage:
         self._power_on()
 
     def _power_on(self) -> None:
+        """Forget all that the board forgets at a reset: engine, dialogue, alarms, homing."""
         self._engine = StepEngine()
         self._logic = StageLogic(self._engine, self._arm, self._read_inputs)
         self._armed = False
@@ -164,9 +166,7 @@ class PythonStage:
             self._report_motion()
 
     def _settle(self) -> None:
-        """Let the logic work until nothing more follows without a step; send its replies, and set the zero after
-        homing.
-        """
+        """Run the logic until nothing more follows without a step; send its replies; take over the zero of a homing."""
         while True:
             event = self._logic.service(self._now_ms)
             if event is Event.DONE:
@@ -188,6 +188,7 @@ class PythonStage:
         self._was_homed = self._logic.homed
 
     def _arm(self, ticks: int) -> None:
+        """Schedule the next step `ticks` from now; 0: there is none."""
         if ticks:
             self._next = self.tick + ticks
             self._armed = True
@@ -196,6 +197,7 @@ class PythonStage:
                 self._report_motion()
 
     def _read_inputs(self) -> int:
+        """Return the pressed switches as bits: those at the ends of the axes, and those of an injected fault."""
         inputs = self._pressed
         if self._x <= 0:
             inputs |= SWITCH_X
@@ -204,14 +206,17 @@ class PythonStage:
         return inputs
 
     def _send_edge(self, tick: int, value: int) -> None:
+        """Queue an edge of the trigger line for the hub."""
         self._fall = self._fall if value else None
         self.wires.append(WireEdge(tick * NS_PER_TICK, self._rig.trigger_line, value))
 
     def _end_trigger(self, until: int) -> None:
+        """End the trigger pulse if it is due by tick `until`."""
         if self._fall is not None and self._fall <= until:
             self._send_edge(self._fall, 0)
 
     def _report_motion(self) -> None:
+        """Queue a motion message: position in um from the zero, and the speed of x in um/s, rounded half up."""
         self._told = self.tick
         um = 1000 / self._rig.steps_per_mm
         values = (self._x - self._zero_x, self._y - self._zero_y, self._engine.x_rate)
@@ -221,6 +226,7 @@ class PythonStage:
         self.replies += line
 
     def _take(self, byte: int) -> None:
+        """Collect a byte of a line; execute the line at its end."""
         if byte != 0x0A:
             self._line.append(byte)
             return
@@ -232,6 +238,7 @@ class PythonStage:
             self._take_line(line)
 
     def _take_line(self, line: bytes) -> None:
+        """Check a line and execute it; a damaged one gets an error without a sequence number."""
         tail = _TAIL.fullmatch(line[-5:])
         if tail is None:
             return self._refuse(StageError.MALFORMED)
@@ -282,6 +289,7 @@ class PythonStage:
         self._send(self._last_answer)
 
     def _format_done(self) -> bytes:
+        """Encode the `done` line of the motion command that has ended (docs/spec/stage-line.md)."""
         engine = self._engine
         logic = self._logic
         fields = {}
@@ -295,6 +303,7 @@ class PythonStage:
         return Reply("done", self._motion_sequence, fields={k: str(v) for k, v in fields.items()}).encode()
 
     def _format_status(self) -> bytes:
+        """Encode a status reply (docs/spec/stage-line.md)."""
         engine = self._engine
         logic = self._logic
         fields: dict[str, object] = {"state": logic.state, "x": engine.x, "y": engine.y}

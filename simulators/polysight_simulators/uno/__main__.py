@@ -49,6 +49,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace) -> None:
+    """Compile emulator and firmware, and become the emulator. Raises PolysightError if a package is missing."""
     if missing_packages := missing():
         problem = f"not installed: {' '.join(missing_packages)}"
         raise PolysightError(problem, "the emulated board is compiled on this machine", ENABLING_COMMAND)

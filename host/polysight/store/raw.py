@@ -17,7 +17,7 @@ import numpy as np
 
 from polysight import capture
 from polysight.store.logs import crc32
-from polysight.store.manifest import BoardRow, DroppedFile, ManifestWriter, RawDropped, RowCommitted
+from polysight.store.manifest import BoardRow, DroppedFile, ManifestWriter, RawDropped, Reception, RowCommitted
 from polysight.store.scan_folder import SAMPLES, ScanFolder, dropped_files, utc_now
 from polysight.store.validation import board_faults, to_text
 from polysight_shared.error_codes import ErrorCode
@@ -290,6 +290,7 @@ def _write_new_files(scan: ScanFolder, board: BoardRow, placed_again: PlacedAgai
     packets_crc = capture.write_packets(new_path.with_suffix(capture.PACKETS), log, placed_again.evidence, placed)
     sync_folder(new_path.parent)
     frames = placed.expected // frame_bytes
+    counts = {name: n for name, n in vars(placed.counts).items() if name in Reception.__struct_fields__}
     return msgspec.structs.replace(
         board,
         file=str(new_path.relative_to(scan.path)),
@@ -300,6 +301,7 @@ def _write_new_files(scan: ScanFolder, board: BoardRow, placed_again: PlacedAgai
         packets_crc32=f"{packets_crc:08x}",
         located=placed.located,
         received_bytes=placed.received,
+        **counts,
         **vars(placed.losses),
     )
 

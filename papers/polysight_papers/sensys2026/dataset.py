@@ -33,7 +33,7 @@ SAME_ANGLE_DEG = 2.5
 MATERIALS = "materials/"
 LABELS = "labels/"
 IMAGES = "images made here"
-# Least correlation of two images of one scan
+# Least correlation of two images of one scan; chosen.
 _ALIKE = 0.35
 
 # Words that do not tell materials apart.
@@ -42,7 +42,7 @@ _FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate"
 _ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}
 # A row's name may hold the container of a liquid, which their name need not have.
 _CONTAINERS = {"glass", "plastic"}
-# Least share of common words
+# Least share of common words of two names of one material; chosen.
 _ENOUGH = 0.5
 
 PIXELS = 16
@@ -158,6 +158,10 @@ def _read_all(read: Callable[[Path], T], paths: Sequence[Path], notices: list[st
 def _make_entries(
     scans: list[materials.LabelledScan], angles: Mapping[str, float], notices: list[str]
 ) -> list[materials.Entry]:
+    """Return the library entries of the labelled boxes; scans that are refused are listed in the notices.
+
+    `angles` has the incidence angle of each scan by its name.
+    """
     entries = []
     for scan in scans:
         try:

@@ -612,6 +612,7 @@ def _estimate_materials(data: AuthorsData, source: str, leakage: float) -> list[
 
 
 def _format_row(e: Estimate) -> tuple[str, ...]:
+    """Return the cells of a material's row; published, estimated as it is, clean and by the recipe."""
     m = e.material
     std = e.clean.real_std
     return (

@@ -108,6 +108,11 @@ def _tabulate_solutions(result: Any, concentration_of_name: Mapping[str, float])
 
 
 def _draw_sugar(plots: list[tuple[str, Any, Any, Any]], printed: float) -> Any:
+    """Draw concentration by polarisation angle, and the distribution of errors with each concentration left out.
+
+    `plots` has for each source: name, polarisation angles in radians, concentrations in %, and the result; `printed` is
+    the published median error in %.
+    """
     fig = new_figure(11.0, 4.3)
     left_axes, right = fig.subplots(1, 2)
     for k, (source, x, y, result) in enumerate(plots):

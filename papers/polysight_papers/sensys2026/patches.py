@@ -148,6 +148,11 @@ def draw(
     common = np.sqrt(errors.shared)
 
     def channel(r: Complex) -> Complex:
+        """Return the ratio to metal in one channel, [scan, material, pixel], for reflection factors `r`.
+
+        Relative amplitude errors and phase errors have a part common to the patch, one of each pixel, and one of the
+        reference plate, which a whole scan shares.
+        """
         shape = (scans, len(materials), 1)
         parts = []
         for std in (errors.amplitude, errors.phase_rad):

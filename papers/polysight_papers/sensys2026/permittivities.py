@@ -263,6 +263,10 @@ def fig17(run: item.Run) -> item.Item:
 def _make_fig17_item(
     true: dict[str, complex], pixels: dict[str, list[Complex]], centres: list[dict[str, Any]]
 ) -> item.Item:
+    """Draw the permittivity of each pixel and tabulate its variance, beside the published one.
+
+    `true` has the permittivity of each material, `pixels` those of each placement, `centres` the plates' places in mm.
+    """
     fig = item.new_figure(11.5, 4.6)
     rows = []
     data = {}

@@ -192,6 +192,7 @@ def write_item(out: Path, item: Item, origin: Origin = SIMULATED) -> dict[str, b
 
 
 def _format_csv(table: Table, origin: Origin) -> str:
+    """Return a table as CSV: its origin and caption in the first line, then the head."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerows([[f"{origin.word}: {table.caption}"], table.head, *table.rows])

@@ -27,11 +27,13 @@ from polysight_shared.config import Chirp, load_instrument
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = npt.NDArray[np.complex64]
+# Units of the errors in the order of `QUANTITIES`.
 UNITS = ("frequency (Hz)", "phase (rad)", "relative amplitude")
 
-# Fig. 9.
+# Fig. 9: a short row, and the IF offsets of the receivers, which sweep the direct path over the filter's skirt.
 GRID = {"columns": 6, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
 OFFSETS_HZ = (200e3, 250e3, 350e3, 450e3, 600e3, 870e3, 1.1e6, 1.3e6, 1.5e6, 1.7e6)
+# The offset of which spectrogram and spectra are shown.
 USUAL_HZ = 870e3
 SKIRT_HZ = (60e3, 200e3)
 """Range of the smear of a bent chirp, relative to its tone."""
@@ -223,7 +225,7 @@ def _tabulate_stages(summary: Mapping[str, Any], limits: Mapping[str, float]) ->
 def tones(chirps: npt.NDArray[np.complex64], chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray]:
     """IF (Hz) and amplitude of the strongest tone of each chirp [rx, chirp, sample], summed in power over RX.
 
-    The peak of the zero-padded spectrum; 4096 points keep its loss from falling between them below 0.1 %.
+    The peak of the zero-padded spectrum: with 4096 points, a peak between two of them loses less than 0.1 %.
     """
     a, b = chirp.linear_samples
     window = np.hanning(b - a)

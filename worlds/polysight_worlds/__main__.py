@@ -31,7 +31,7 @@ def save(images: ImagePair, file: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
+    """Draw a world and its nuisances from the seed, scan it, and write images and truth."""
     parser = argparse.ArgumentParser(prog="python -m polysight_worlds", description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="file that ends in .npz")

@@ -24,10 +24,11 @@ from polysight_worlds.world import Nuisances, Plate, World, disturb_plates
 class ImagePair:
     """Images of one scan in the rig frame, and what is true.
 
-    h_slope, v_slope: what h and v change per Hz: image of the data times (f - mean) over the variance of f.
     h, v: complex64 [ny, nx], row 0 at the smallest y, relative to the direct path. Phases fall with the path, as fields
     of exp(+j omega t) do: H / V of a plate over that of metal is r_s / r_p, and a lossy permittivity eps' - j eps''.
-    `world`: as it was scanned, with the plates' drawn heights and tilts. `rig`: the nominal one.
+    `h_slope`, `v_slope`: change of h and v per Hz: image of the data times (f - mean) over the variance of f.
+    `x_m` [nx], `y_m` [ny]: centres of the pixels in the rig frame. `world`: as it was scanned, with
+    the plates' drawn heights and tilts. `rig`: the nominal one.
     """
 
     h: NDArray
@@ -101,8 +102,8 @@ def simulate(
 ) -> ImagePair:
     """Scan a world and image it on `pixels` x `pixels` of one stage step, centred as `Rig.centre_m`.
 
-    `kaiser_beta`: window over the aperture, 0 is none. With one, H / V of metal changes by some per cent over the
-    picture, for H and V see a place from offsets 17 mm apart.
+    `kaiser_beta`: window over the aperture, 0 is none. With a window, H / V of metal changes by some per cent over the
+    picture, because H and V see a place from offsets 17 mm apart.
     """
     nominal = published_rig() if rig is None else rig
     nuisances = Nuisances() if nuisances is None else nuisances
@@ -166,11 +167,13 @@ def draw_direction(rng: Generator) -> NDArray:
 
 
 def _cut_grid(rig: Rig, nuisances: Nuisances) -> Rig:
+    """Return the rig with the share `aperture` of columns and rows left out."""
     share = 1 - nuisances.aperture
     return replace(rig, columns=round(rig.columns * share), rows=round(rig.rows * share))
 
 
 def _shift_world(world: World, nuisances: Nuisances, width_m: float) -> World:
+    """Shift the plates by the share `border` of a width, in one of four drawn directions."""
     if not nuisances.border:
         return world
     rng = np.random.default_rng([nuisances.seed, 5])
@@ -190,6 +193,7 @@ def _draw_bad_positions(rng: Generator, rig: Rig, nuisances: Nuisances) -> NDArr
 
 
 def _add_runs(rng: Generator, marked: NDArray, share: float) -> NDArray:
+    """Mark runs of 1 to 20 positions in a row until at least this share is marked; changes and returns `marked`."""
     while marked.mean() < share:
         row = rng.integers(marked.shape[0])
         first = rng.integers(marked.shape[1])
@@ -228,6 +232,7 @@ def disturb_data(
 
 
 def _draw_noise(rng: Generator, shape: tuple[int, ...]) -> NDArray:
+    """Draw complex noise of mean power 1, complex64."""
     pair = rng.standard_normal((2, *shape), dtype=np.float32)
     return (pair[0] + 1j * pair[1]) * np.float32(np.sqrt(0.5))
 
@@ -297,5 +302,6 @@ def backproject(rig: Rig, rx: Antenna, data: NDArray, pixels: int, kaiser_beta: 
 
 
 def _measure_distance(antenna: Antenna, x: NDArray, y: NDArray, z: float) -> NDArray:
+    """Return the distances [y, x] from an antenna to points of the plane z, metres."""
     ax, ay, az = antenna.position
     return np.sqrt((x[None, :] - ax) ** 2 + (y[:, None] - ay) ** 2 + (z - az) ** 2)

@@ -109,11 +109,16 @@ def build_rig(
     rows: int = 200,
     leakage: tuple[complex, complex] = (0j, 0j),
 ) -> Rig:
-    """Return the rig of (position, boresight) of three boards, polarised as s, p and both at their mirror points."""
+    """Return the rig of three boards, each (position in metres, boresight).
+
+    At their mirror points, TX sends s and p in equal parts, H receives s and V receives p. `leakage`: the amplitudes of
+    p in H and of s in V, relative to the receiver's polarisation.
+    """
 
     def aim(
         board: tuple[NDArray, NDArray], receiver: tuple[NDArray, NDArray], s_share: complex, p_share: complex
     ) -> Antenna:
+        """Aim a board at the mirror point of a receiver; the dipole has shares along the s and the p direction."""
         direction = find_mirror_point(tx[0], receiver[0], plane_m) - board[0]
         direction /= np.linalg.norm(direction)
         s_axis = np.cross([0.0, 0.0, 1.0], direction)

@@ -91,6 +91,7 @@ def make_shapes(table: dict[str, Any], centre_m: Sequence[float]) -> tuple[Shape
 
 
 def _read_stack(table: dict[str, Any]) -> Stack:
+    """Return the medium of a shape in a scene file: metal, a sheet in air, or a half space."""
     if table.get("metal"):
         return METAL
     real, loss = table["permittivity"]

@@ -432,7 +432,7 @@ class _AzimuthalWaves:
         self._sign = sign
 
     def step(self, n: int) -> tuple[NDArray, NDArray]:
-        """H_n and its derivative by the argument, scaled; orders are asked for in turn, from 0."""
+        """Return H_n and its derivative by the argument, times exp(-i argument); call with n = 0, 1, 2 .. in turn."""
         if n > 0:
             following = 2 * (n - 1) / self._argument * self._now - self._last
             self._last = self._now

@@ -156,12 +156,14 @@ class _Draw:
     axis: tuple[float, float, float]
 
     def point_behind(self, depth_m: float) -> tuple[float, float, float]:
-        """Centre of a body whose front lies `depth_m` before it."""
+        """Return the centre of a body whose front is at `front_m` and lies `depth_m` before it."""
         x, y, z = self.front_m
         return x, y, z + depth_m
 
 
 def _draw_sphere(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[Shape, ...], float]]:
+    """Return a function that draws a sphere with a radius between these, and returns it and its radius of curvature."""
+
     def draw(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
         radius_m = draws.rng.uniform(low_m, high_m)
         return (sphere("sphere", draws.stack, draws.point_behind(radius_m), radius_m),), radius_m
@@ -170,6 +172,8 @@ def _draw_sphere(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[S
 
 
 def _draw_cylinder(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[Shape, ...], float]]:
+    """Return a function that draws a cylinder of 0.4 m with a radius between these, and returns it and its radius."""
+
     def draw(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
         radius_m = draws.rng.uniform(low_m, high_m)
         return (
@@ -180,6 +184,7 @@ def _draw_cylinder(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple
 
 
 def _draw_plate(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    """Draw a tilted plate; its radius of curvature is infinite."""
     tilt_deg = draws.rng.uniform(-15, 15, 2)
     size_m = draws.rng.uniform(0.14, 0.22, 2)
     tilts = float(tilt_deg[0]), float(tilt_deg[1])
@@ -187,6 +192,7 @@ def _draw_plate(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
 
 
 def _draw_cone(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    """Draw a cone with a half angle of 3 to 12 degrees; return it and its radius."""
     radius_m = draws.rng.uniform(0.1, 0.16)
     slope = float(np.tan(np.radians(draws.rng.uniform(3, 12))))
     piece = cylinder("cone", draws.stack, draws.point_behind(radius_m), radius_m, 0.3, axis=draws.axis, slope=slope)
@@ -194,6 +200,7 @@ def _draw_cone(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
 
 
 def _draw_barrel(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    """Draw a barrel with a bulge of 1 to 6 per metre; return it and its radius."""
     radius_m = draws.rng.uniform(0.1, 0.16)
     bulge = float(draws.rng.uniform(1, 6))
     piece = cylinder("barrel", draws.stack, draws.point_behind(radius_m), radius_m, 0.2, axis=draws.axis, bulge=bulge)
@@ -201,6 +208,7 @@ def _draw_barrel(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
 
 
 def _draw_saddle(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    """Draw a saddle; return it and the smaller of its two radii."""
     radii_m = draws.rng.uniform(0.1, 0.2, 2)
     bends = float(1 / radii_m[0]), float(-1 / radii_m[1]), 0.0
     turn_deg = float(draws.rng.uniform(0, 180))
@@ -208,6 +216,7 @@ def _draw_saddle(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
 
 
 def _draw_sheet(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    """Draw a bent sheet without a back; return it and its radius."""
     radius_m = draws.rng.uniform(0.15, 0.6)
     turn_deg = float(draws.rng.uniform(0, 180))
     bends = (1 / radius_m, 0.0, 0.0)
@@ -215,6 +224,7 @@ def _draw_sheet(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
 
 
 def _draw_bottle(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    """Draw a bottle with a wall of 0.5 to 3 mm and air in it; return its pieces and its radius."""
     radius_m = draws.rng.uniform(0.03, 0.05)
     wall_m = draws.rng.uniform(0.5e-3, 3e-3)
     wall = Stack(((draws.stack.below, wall_m),), 1.0)
@@ -222,6 +232,7 @@ def _draw_bottle(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
 
 
 def _draw_thin_sheet(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
+    """Draw a bent sheet 0.5 to 3 mm thick; return it and its radius."""
     radius_m = draws.rng.uniform(0.15, 0.6)
     turn_deg = float(draws.rng.uniform(0, 180))
     wall = Stack(((draws.stack.below, draws.rng.uniform(0.5e-3, 3e-3)),), 1.0)

@@ -177,9 +177,10 @@ TOGETHER = tuple(name for name in NUISANCES if name not in ("border", "aperture"
 
 
 def draw_nuisances(rng: Generator, names: str | Sequence[str] = "none", *, strength: float = 1.0) -> Nuisances:
-    """Nuisances of the given names: "none", "all" (without `border` and `aperture`), one of `NUISANCES`, or several.
+    """Draw the named nuisances.
 
-    With "all" each is drawn from 0 to its upper limit. `strength` multiplies what was drawn.
+    `names`: "none", "all" (without `border` and `aperture`), one of `NUISANCES`, or several. With "all" each is
+    drawn from 0 to its upper limit. `strength` multiplies what was drawn.
     """
     is_all = names == "all"
     if names == "none":
@@ -222,8 +223,9 @@ def draw_world(
     with_table: bool = False,
     pieces: int = 9,
 ) -> World:
-    """Nine places around `centre_m`: copper at a drawn one, and `pieces` - 1 of `materials` (Table 2) at others.
+    """Draw plates at nine places around `centre_m`.
 
+    Copper lies at a drawn one (not without `with_metal`), `pieces` - 1 of `materials` (default: Table 2) at others.
     A material is a permittivity, as half space or slab on a holder (`half_spaces`: never a slab), or a whole stack.
     Sizes are 40 to 50 mm.
     """

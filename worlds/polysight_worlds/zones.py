@@ -142,7 +142,7 @@ class CosineTable:
 
 
 def reflect_facets(tables: Sequence[CosineTable], response: Response) -> Iterator[NDArray]:
-    """Yield r_s s_weight + r_p p_weight by each table; once computed for tables that are the same."""
+    """Yield r_s s_weight + r_p p_weight by each table; successive equal tables are computed once."""
     last = None
     terms = np.zeros(0)
     for table in tables:

@@ -40,7 +40,7 @@ from polysight_shared.errors import ConfigError, ScanError
 
 ROWS = "rows"
 _KEYS = ("row", "take", "pulses", "missing_bytes")
-"""Keys of an event: index of the row, number of takes, SYNC_IN pulses sent, missing bytes."""
+"""Keys of an event: index of the row, number of the committed take (from 1), SYNC_IN pulses sent, missing bytes."""
 _LOOK_S = 0.2
 
 
@@ -86,6 +86,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         await self._end()
 
     async def _end(self) -> None:
+        """Stop a running scan after the current row, and wait for its end; an error of it is dropped."""
         if self._scanning is not None:
             self._stop.request()
             await asyncio.gather(self._scanning, return_exceptions=True)
@@ -185,12 +186,14 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
             return run_scan(rig, folder, progress=show, keep_incomplete=self._keep_incomplete, stop=self._stop)
 
     def _show(self, phase: str, committed: int, folder: Path) -> None:
+        """Set the signals; called in the loop of the run engine."""
         self._set_state(phase)
         self._set_committed(committed)
         if phase == "committed" and committed == 1:
             self._set_scan_id(ScanFolder.load(folder).scan_id)
 
     def _check_result(self, result: ScanResult) -> None:
+        """Raise ScanError if the scan ended before its last row."""
         if result.exit_status != "success":
             raise ScanError(
                 f"{self._place}: {result.reason}",

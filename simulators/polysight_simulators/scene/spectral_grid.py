@@ -22,6 +22,7 @@ FADE_M = 0.06
 TAPS = 12
 # Offsets beyond the aperture, for the taps of the sinc
 MARGIN_M = 0.012
+# Points of the output grid per kernel position.
 OVERSAMPLING = 2
 
 

@@ -216,6 +216,7 @@ def _image_here(scan: materials.LabelledScan, images: Path, notices: list[str]) 
 
 
 def _correlate(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the correlation coefficient of two images of one shape; 0 if one of them is constant."""
     a = a - a.mean()
     b = b - b.mean()
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-30))

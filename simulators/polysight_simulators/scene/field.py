@@ -189,6 +189,11 @@ class _Plane:
     def _level(
         self, height_mm: float, members: tuple[list[int], list[int]], rx: Sequence[int], top_hz: float
     ) -> _Level:
+        """Return the level at this height.
+
+        `members` are indices of plates and of points, `rx` of channels; `top_hz`, the highest frequency,
+        decides how many interpolation nodes the tallest relief on the level needs.
+        """
         z = self.ant.plane_z_m + height_mm / 1e3
         centre = self.ant.centre_m
         wx, wy = np.meshgrid(self.x.w, self.y.w)

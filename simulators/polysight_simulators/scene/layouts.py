@@ -73,7 +73,7 @@ def blank_gaps(payload: NDArray[np.int16], gaps: Gaps) -> bytes:
 
 
 def make_scan_id(name: str) -> str:
-    """Return a scene's name as the id of a scan: letters A to z, digits and hyphens, at most 120 of them."""
+    """Return a scene's name as the id of a scan: Latin letters, digits and hyphens, 120 at most."""
     return re.sub("[^A-Za-z0-9]", "-", name)[:120].strip("-") or "scene"
 
 

@@ -249,8 +249,8 @@ class SimulatedRig:
         x_mm, y_mm
             True stage offset during each chirp, millimetres from the middle of the grid, [n].
         first_pulse
-            Number of the first chirp's SYNC_IN pulse since power-up, which determines timing, phase and noise. None:
-            continue after this board's last call.
+            Number of the first chirp since power-up (`burst.chirps` for each SYNC_IN pulse before it), which determines
+            timing, phase and noise. None: continue after this board's last call.
 
         Returns
         -------
@@ -304,9 +304,9 @@ class SimulatedRig:
         return out
 
     def burst_mm(self, direction: int) -> NDArray[np.floating]:
-        """Return the stage travel from a trigger point to each of its pulses, millimetres [pulse], signed.
+        """Return the stage travel from a trigger point to each chirp there, millimetres [chirp], signed.
 
-        Without burst motion every pulse is at the mean position of the burst. With backlash, rows towards -x are
+        Without burst motion every chirp is at the mean position of the burst. With backlash, rows towards -x are
         shifted along +x.
         """
         burst = self.rig.burst
@@ -334,7 +334,7 @@ class SimulatedRig:
     ) -> None:
         """Add direct path and echoes to `out`, [chirp, rx, sample].
 
-        `x_m`, `y_m` are stage offsets from the middle of the grid, `pulses` the numbers of the chirps' pulses; [chirp].
+        `x_m`, `y_m` are stage offsets from the middle of the grid, `pulses` chirp numbers since power-up; [chirp].
         """
         d = self.scene.disturbances
         receiver = self._make_receiving_board(board.name)
@@ -404,7 +404,7 @@ class SignalSource(Protocol):
     ) -> NDArray[np.int16]:
         """Return frames of one chirp each, int16 [n, samples, 8], for stage offsets x_mm [n], y_mm [n].
 
-        `first_pulse` is the number of the first SYNC_IN pulse since power-up. The eight values of a sample are I of
+        `first_pulse` is the number of the first chirp since power-up. The eight values of a sample are I of
         RX1..RX4, then Q of RX1..RX4.
         """
         ...
@@ -436,7 +436,7 @@ class PatternSource:
     def chirps(
         self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_pulse: int | None = None
     ) -> NDArray[np.int16]:
-        """Return the frames of len(x_mm) pulses from `first_pulse` on; None: continue after the last call."""
+        """Return the frames of len(x_mm) chirps from number `first_pulse` on; None: continue after the last call."""
         del y_mm
         if first_pulse is None:
             first = self._next[board_name]

@@ -95,7 +95,7 @@ def _convert_to_rig_frame(at_mm: Pair, height_mm: float, centre_m: Vector) -> li
 
 
 def row_offsets_mm(radar: SimulatedRig, row: Row) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Return the true stage offsets of every chirp of a row in order of time: x_mm, y_mm, [points * pulses]."""
+    """Return the true stage offsets of every chirp of a row in order of time: x_mm, y_mm, [points * chirps a point]."""
     x = (np.array(row.x_mm)[:, None] + radar.burst_mm(row.direction)).ravel()
     return x, np.full(len(x), row.y_mm)
 

@@ -15,7 +15,7 @@ from polysight_shared.errors import DeviceError
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.cards import SOURCE_PORT, bound_udp
 
-# Subnets that are tried, because other programs may hold ports of some. Chosen: one try nearly always suffices.
+# Subnets that are tried, because other programs may hold ports of some. Chosen.
 _TRIES = 50
 # Ports and last byte of the address of the simulated Pi, and port of the native connection of a simulated radar.
 _COMMAND_PORT = 5601

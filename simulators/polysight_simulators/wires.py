@@ -20,7 +20,7 @@ from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
 from polysight_shared.wires import WireMotion, parse
 from polysight_simulators.process import announce_ready, command_line, run_until_stopped
 
-# Limits, chosen: several times the longest line of the protocol, and minutes of edges for a stopped client.
+# Limits, chosen: several times the longest line of the protocol, and about two million edges for a stopped client.
 MAX_LINE_BYTES = 200
 MAX_PENDING_BYTES = 64 << 20
 # `sun_path` of Linux holds 108 bytes with its terminator.

@@ -23,7 +23,7 @@ from polysight.cli.main import build_parser
 from polysight.serve.commands import Format
 from polysight.serve.front import STATIC, EndingServer
 from polysight.serve.guard import TOKEN_HEADER, Access
-from polysight.serve.server import Place
+from polysight.serve.server import Place, make_access
 from polysight.serve.welcome import ELSEWHERE, describe_server, draw_code, find_addresses
 from polysight_shared.error_codes import ErrorCode
 
@@ -161,6 +161,27 @@ def test_the_code_is_dark_on_light_whatever_the_terminal_s_colours_are(black_tex
     shown = show_on_terminal(draw_code(address), black_text)
     assert shown[: len(expected)] == expected
     assert not any(map(any, shown[len(expected) :]))
+
+
+@pytest.mark.parametrize("control", [False, True])
+@pytest.mark.parametrize(
+    ("place", "is_private"),
+    [
+        (Place(), True),
+        (Place("localhost"), True),
+        (Place(hosts=("lab.example.org",)), False),
+        (Place("0.0.0.0"), False),
+        (Place("0.0.0.0", hosts=("lab.example.org",)), False),
+    ],
+    ids=str,
+)
+def test_whoever_other_machines_may_be_needs_the_token(place, is_private, control, tmp_path, monkeypatch):
+    """Behind a reverse proxy they all are this machine, also where there is nothing but to look."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        access = make_access(place, listener, control)
+    assert access.loopback is is_private
+    assert bool(access.token) is (control or not is_private)
 
 
 def test_a_server_of_all_interfaces_names_each_address_of_this_machine():

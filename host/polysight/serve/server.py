@@ -148,7 +148,7 @@ def _run(shown: Shown, place: Place, what: str) -> int:
     place.check()
     listener = _bind(place)
     try:
-        access = _make_access(place, listener, shown.control)
+        access = make_access(place, listener, shown.control)
         with contextlib.ExitStack() as stack:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="polysight-"))
             stage = None
@@ -171,16 +171,16 @@ def _run(shown: Shown, place: Place, what: str) -> int:
     return 0
 
 
-def _make_access(place: Place, listener: socket.socket, control: bool) -> Access:
+def make_access(place: Place, listener: socket.socket, control: bool) -> Access:
     """Return who may use the page; a token is required for control and for other machines."""
+    # Behind a reverse proxy everybody comes from this machine.
+    is_private = place.loopback and not place.hosts
     token = ""
-    if control or not place.loopback:
+    if control or not is_private:
         token = load_token()
     hosts = set(place.hosts)
     if not place.loopback:
         hosts |= {place.host, socket.gethostname(), str(listener.getsockname()[0])} - {"0.0.0.0", "::"}
-    # Behind a reverse proxy everybody comes from this machine.
-    is_private = place.loopback and not place.hosts
     return Access(token, is_private, tuple(hosts), control, secure=place.certificate is not None)
 
 

@@ -225,7 +225,7 @@ def _write_lead(scan: ProcessedScan) -> str:
     pixel_mm = abs(float(scan.x_m[1] - scan.x_m[0])) * 1e3
     kind = "simulated scan" if scan.stamped else "scan"
     return (
-        f"Co- and cross-polarised images of a {kind}, {nx} × {ny} pixels of {pixel_mm:g} mm: "
+        f"s- and p-polarised images (H and V) of a {kind}, {nx} × {ny} pixels of {pixel_mm:g} mm: "
         "reflectivity, materials and quality of the data."
     )
 

@@ -180,7 +180,7 @@ class Guard:
         if not access.control and path != "/api/session":
             return refuse(
                 403, ErrorCode.READ_ONLY, "This view is read-only", "it was started so",
-                "start it with --control to have buttons",
+                "for buttons start `serve` without --read-only, or `preview` with --control",
             )  # fmt: skip
         if access.has_token(headers):
             return None

@@ -38,7 +38,7 @@ def describe_server(access: Access, what: str, bound: tuple[str, int]) -> str:
     if access.control:
         lines.append("anyone with this address and its token can start, pause and stop scans")
     else:
-        lines.append("read-only; --control adds buttons to pause and stop the scan")
+        lines.append("read-only; buttons come with `serve` without --read-only, or `preview` with --control")
     if not ipaddress.ip_address(host).is_loopback:
         warning = "" if access.secure else "; nothing is encrypted: --certificate and --key do that"
         lines.append(f"anyone who reaches this machine and has the token can read all scans{warning}")

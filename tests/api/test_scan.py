@@ -200,6 +200,10 @@ def test_the_published_layout_opens(tmp_path, monkeypatch, by_columns):
     command("process", data, "--out", tmp_path / "out")  # with the instrument.toml beside the data
     same_image(opened.image(), tmp_path / "out" / "image.npz")
     assert open_scan(tmp_path / "out").rows == opened.rows
+    shutil.copytree(tmp_path / "out", data / "products")
+    assert "recorded rows" not in repr(open_scan(data))
+    assert "recorded rows" in repr(open_scan(data, rig=data / "instrument.toml")), "products are of some other rig file"
+    shutil.rmtree(data / "products")
     (data / "instrument.toml").unlink()
     assert open_scan(data).rig == open_scan(data, rig=load_instrument(REPO / "instrument.toml")).rig
 

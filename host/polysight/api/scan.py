@@ -84,8 +84,8 @@ def open_scan(
     folder
         A scan folder, a folder `unsynced/<scan>` or `raw/<scan>` of the published data, a folder of products that
         `polysight process` or `polysight image` wrote, or images of another program: an `.npz` file or a folder
-        `labels/<scan>` (docs/spec/given-images.md). Saved products in a scan folder are used if they hold all of its
-        rows and none of the parameters below but `rig` is given; otherwise the rows are processed.
+        `labels/<scan>` (docs/spec/given-images.md). Saved products in the folder are used if they hold all of its rows
+        and none of the parameters below is given (but `rig` for a scan folder); otherwise the rows are processed.
     rig
         Rig file of published data, or the rig itself: `instrument.toml` in that folder, in the current folder or the
         packaged one if not given. Scan folders bring their own.
@@ -128,7 +128,8 @@ def open_scan(
     if (path / IMAGE).exists() and not (path / MANIFEST).exists():
         return _open_products_only(path, settings, process_again)
     source = _open_source(path, rig)
-    saved = None if process_again else find_products(path)
+    rig_is_used = rig is not None and not isinstance(source, ScanFolder)
+    saved = None if process_again or rig_is_used else find_products(path)
     if saved is not None and isinstance(source, ScanFolder) and not _is_current(saved, source):
         saved = None
     return Scan(path, source, saved, settings)

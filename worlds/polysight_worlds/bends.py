@@ -2,9 +2,9 @@
 
 Physical optics takes each point's tangent plane for the surface. The true reflection differs by terms of first order
 in 1 / (k R), which are linear in the three curvatures: along the plane of incidence, across it, and the twist between
-both (which couples s and p). Three solids with exact series have each of them in turn: a cylinder across the plane of
-incidence, one along it, and one at 45 degrees. Series minus physical optics at two radii gives the terms for any
-medium, also those of a plane (radius without end) for antennas at a finite distance.
+both (which couples s and p). Three solids with exact series tell them apart: a cylinder across the plane of incidence,
+one along it, and one at 45 degrees. Series minus physical optics at two radii gives the terms for any medium, also
+those of a plane (radius without end) for antennas at a finite distance.
 """
 
 from __future__ import annotations
@@ -22,8 +22,11 @@ from polysight_worlds.series import Pair, scatter_cylinder
 from polysight_worlds.shapes import cylinder, find_specular, follow_path
 from polysight_worlds.zones import spread_of_ray, sum_window
 
+# Angles of incidence at which the terms are found; outside of them, those of the nearest are taken. Chosen.
 ANGLES_DEG = np.linspace(30, 65, 8)
+# Radii of the solids. Chosen: smaller ones have terms of second order, larger ones differ less from physical optics.
 RADII_M = (0.2, 0.4)
+# In the middle of the band; the terms fall as 1 / frequency.
 FREQUENCY_HZ = 78e9
 # Each antenna's distance from the specular point, as in the published rig.
 DISTANCE_M = 0.86
@@ -57,7 +60,7 @@ class BendTerms:
 
 @lru_cache(maxsize=64)
 def find_bend_terms(stack: Stack) -> BendTerms:
-    """Return the terms of a half space or metal."""
+    """Return the terms of a half space or metal; `stack` has no layers."""
     slopes = []
     planes = []
     for axis, _ in SOLIDS:
@@ -65,9 +68,11 @@ def find_bend_terms(stack: Stack) -> BendTerms:
         slope = (near - far) / (1 / RADII_M[0] - 1 / RADII_M[1])
         slopes.append(slope)
         planes.append(far - slope / RADII_M[1])
+    # The slopes by 1 / radius of three solids are sums over their curvatures: solve for the slope by each curvature.
     curvatures = np.array([curvature for _, curvature in SOLIDS])
     by_curvature = np.einsum("rs,sac->arc", np.linalg.inv(curvatures), np.array(slopes))
-    # The third solid bends along both directions, so its own mean of planes is the least sure.
+    # Each solid gives the terms of a plane again. The third one's are left out as the least sure: it bends along both
+    # directions.
     table = np.concatenate([np.mean(planes[:2], axis=0)[:, None], by_curvature], axis=1)
     # By symmetry, only a twist couples s and p, and it does nothing else.
     table[:, :3, 2:] = 0
@@ -76,9 +81,13 @@ def find_bend_terms(stack: Stack) -> BendTerms:
 
 
 def _compare(stack: Stack, axis: tuple[float, float, float], radius_m: float) -> NDArray:
-    """Return series minus physical optics over the ray's spreading, [angle, 4: s to s, p to p, s to p, p to s]."""
+    """Return (series minus physical optics) / amplitude of the ray for a cylinder, complex [angle, 4 as of `PAIRS`].
+
+    The cylinder has the given `axis`, and its front is at the origin, the specular point.
+    """
     sines = np.sin(np.radians(ANGLES_DEG))
     cosines = np.cos(np.radians(ANGLES_DEG))
+    # 10 m are endless here.
     shape = cylinder("solid", stack, (0.0, 0.0, radius_m), radius_m, 10.0, axis=axis)
     s_axis = np.array([0.0, 1.0, 0.0])
     optics = []

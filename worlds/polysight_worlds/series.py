@@ -2,10 +2,14 @@
 
 The antennas are dipoles whose field towards the specular point is that of the antenna. Inside this module fields vary
 as exp(-i omega t), as in the books: permittivities are eps' + i eps'', outgoing waves Hankel functions of the first
-kind. Both functions return the wave of the other sign, exp(+j omega t), as the rest of the package.
+kind. `scatter_sphere` and `scatter_cylinder` return the wave of the other sign, exp(+j omega t), as the rest of the
+package, and take permittivities as eps' - j eps'' (None: metal). Echoes are in 1 / m: for a field of 1 at 1 m from TX.
 
 A body that absorbs shows its front only: its inner wave runs inwards and never comes back (the first term of Debye's
-series). With `with_inside`, what crossed the body is there too.
+series). With `with_inside`, waves that crossed the body are included.
+
+M and N are the transverse electric and transverse magnetic vector waves of these books, k is the wave number in air
+(rad / m), h its part along a cylinder's axis and eta = sqrt(k^2 - h^2) the part across it.
 """
 
 from __future__ import annotations
@@ -22,31 +26,35 @@ from scipy import special
 from polysight_worlds.media import LIGHT_M_PER_S
 from polysight_worlds.optics import Antenna
 
-# A wave absorbed by exp(-2 ABSORBED) on its way through comes back as rounding: then both kinds of inner waves are the
-# same, and only the one that is found downwards is stable.
+# Nepers to the middle of a body. A wave that crossed it is weaker by exp(-2 ABSORBED), 2e-9: then the standing wave
+# (J, j) and the one that only runs inwards (H2, h2) have the same rates, and only the first one's recurrence is stable.
 ABSORBED = 10.0
-# Azimuthal orders whose terms are computed together.
+# Azimuthal orders whose terms are computed together; chosen, it trades memory for fewer calls.
 ORDERS_AT_ONCE = 32
-# Terms beyond the size parameter x: Wiscombe's criterion for double precision, 4.05 x^(1/3) + 2, and some more.
+# Terms beyond x + 4.05 x^(1/3) of the size parameter x. Wiscombe's criterion for double precision (1980) has 2; ten
+# more are chosen.
 MORE_TERMS = 12
-# Places of the integrand over the axial wave number, in units of sqrt(1 / second derivative of the phase), and how much
-# each counts: so that the moments 1, t^2, t^4 and t^6 of exp(-i t^2 / 2), 1, -i, -3 and 15i, come out. The first order
-# in 1 / (k path) needs them all: by t^2 alone H / V of a level cylinder was 1 % off.
+# Orders above the highest at which recurrences downwards begin with a wrong value, which dies out on the way; chosen.
+ORDERS_ABOVE = 30
+# Samples of the integrand over the axial wave number, in units of sqrt(1 / second derivative of the phase), and the
+# weight of each, by which the moments 1, t^2, t^4 and t^6 of exp(-i t^2 / 2) are right: 1, -i, -3 and 15i. The first
+# order in 1 / (k path) needs them all: with t^2 alone H / V of a level cylinder was 1 % off.
 PLACES = np.arange(-3.0, 4.0)
 PLACE_WEIGHTS = np.linalg.solve(np.vander(PLACES, increasing=True).T, [1, 0, -1j, 0, -3, 0, 15j])
-# Of the polynomials in the path by which a cylinder's coefficients are looked up, beyond the radians by which their
-# phase turns over half of the paths: Chebyshev series of exp(i z x) converge from the degree z on. With 23 alone, a
-# cylinder of 173 mm along x had errors of 15 % and 0.2 rad.
+# A cylinder's coefficients are looked up by Chebyshev series in the path. Such a series of exp(i z x) converges from
+# the degree z on, with z the radians by which the coefficients' phase turns over half of the paths: so its degree is z
+# and these more. With the degree 23 alone, a cylinder of 173 mm along x had errors of 15 % and 0.2 rad.
 MORE_DEGREES = 24
-# Up to this many positions, coefficients are computed for each one instead of looked up in a table.
+# Up to this many positions, coefficients are computed for each one instead of looked up in a table, which itself takes
+# as many evaluations as its degree; chosen.
 FEW = 40
 
 
 @dataclass(frozen=True)
 class Pair:
-    """TX and RX relative to the body, for several stage offsets: positions and dipoles, each [3, n].
+    """TX and RX relative to the body, for n stage offsets: positions and dipoles, each [3, n].
 
-    The dipoles are conjugated, for exp(-i omega t).
+    The dipoles (`sent` of TX, `received` of RX) are complex and conjugated, for exp(-i omega t).
     """
 
     tx_m: NDArray
@@ -56,7 +64,7 @@ class Pair:
 
     @staticmethod
     def aim(tx: Antenna, rx: Antenna, offsets_m: NDArray, origin_m: NDArray, points_m: NDArray) -> Pair:
-        """Return antennas that send to `points_m` [3, n], relative to a body at `origin_m` [3]."""
+        """Return antennas aimed at `points_m` [3, n] at stage offsets [n, 3], relative to a body at `origin_m` [3]."""
         places = []
         fields = []
         for antenna in (tx, rx):
@@ -67,7 +75,7 @@ class Pair:
         return Pair(places[0], places[1], fields[0], fields[1])
 
     def rotate(self, axes: NDArray) -> Pair:
-        """Return the pair in local axes (columns of `axes`)."""
+        """Return the pair in local axes (columns of `axes` [3, 3])."""
         return Pair(*(np.einsum("ji,jn->in", axes, part) for part in vars(self).values()))
 
 
@@ -76,16 +84,16 @@ def _dot(a: NDArray, b: NDArray) -> NDArray:
 
 
 def needed_orders(x: float) -> NDArray:
-    """Return the orders 0, 1, .. that a body of size parameter x needs."""
+    """Return the orders 0, 1, .. that a body of size parameter x (k radius) needs."""
     return np.arange(int(np.ceil(x + 4.05 * x ** (1 / 3) + MORE_TERMS)) + 1)
 
 
 def sphere_coefficients(
     radius_m: float, k: float, permittivity: complex | None, *, with_inside: bool
 ) -> tuple[NDArray, NDArray]:
-    """Mie's coefficients (a_n, b_n) for n = 1, 2, .. (Bohren and Huffman, 4.88); `permittivity` None: metal.
+    """Mie's coefficients (a_n, b_n), each [orders], for n = 1, 2, .. (Bohren and Huffman, 4.88).
 
-    `permittivity` is eps' - j eps''.
+    a_n belongs to N (electric multipoles), b_n to M (magnetic ones).
     """
     x = k * radius_m
     orders = needed_orders(x)
@@ -107,7 +115,10 @@ def sphere_coefficients(
 
 
 def _inner_rates(y: complex, count: int, with_inside: bool) -> NDArray:
-    """Logarithmic derivatives for n = 1 .. count of y j_n(y), or of the wave that only runs inwards, y h2_n(y)."""
+    """Logarithmic derivatives for n = 1 .. count of y j_n(y), or of the wave that only runs inwards, y h2_n(y).
+
+    The second one is taken without `with_inside`, unless the body absorbs so much that both are the same.
+    """
     rates = np.zeros(count + 1, complex)
     if not with_inside and y.imag < ABSORBED:
         rates[0] = -1j
@@ -116,7 +127,7 @@ def _inner_rates(y: complex, count: int, with_inside: bool) -> NDArray:
         return rates[1:]
     # Downwards, where the recurrence is stable.
     rate = 0j
-    for n in range(int(max(count, abs(y))) + 30, 0, -1):
+    for n in range(int(max(count, abs(y))) + ORDERS_ABOVE, 0, -1):
         if n <= count:
             rates[n] = rate
         rate = n / y - 1 / (rate + n / y)
@@ -139,6 +150,7 @@ def scatter_sphere(
     to_tx = pair.tx_m / tx_r
     q = pair.received
     p = pair.sent
+    # Cosine of the angle between both directions.
     c = _dot(to_rx, to_tx)
     # Products of the dipoles with the derivatives of c by either direction.
     q_r = _dot(q, to_rx)
@@ -204,16 +216,17 @@ class _Legendre:
 
 @dataclass(frozen=True)
 class EndlessCylinder:
-    """An endless cylinder about x in local axes."""
+    """An endless cylinder about x in local axes; `permittivity` is eps' - j eps'', None: metal."""
 
     radius_m: float
     permittivity: complex | None
     with_inside: bool
 
     def coefficients(self, k: float, h: NDArray, orders: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Scattered waves for incident ones at axial wave numbers h: (M to M, N to N, M to N and N to M), [orders, h].
+        """Scattered waves for incident ones at axial wave numbers h [n]: three tables, complex [orders, n].
 
-        Tangential E and H are continuous at the surface.
+        They are M to M, N to N, and the coupling, which is the same from M to N as from N to M. Tangential E and H are
+        continuous at the surface.
         """
         eta = np.sqrt(k**2 - h**2)
         a = self.radius_m
@@ -223,7 +236,7 @@ class EndlessCylinder:
         h1_below, h1 = _hankel(len(orders), x)
         j_rate = eta * (j_below - n / x * j)
         h1_rate = eta * (h1_below - n / x * h1)
-        # Orders that miss the body give nothing, with Hankel functions beyond all numbers.
+        # Orders far above x pass by the body and scatter nothing; their Hankel functions would overflow.
         too_high = n > np.abs(x) + 4.05 * np.abs(x) ** (1 / 3) + MORE_TERMS
         j = np.where(too_high, 0, j)
         j_rate = np.where(too_high, 0, j_rate)
@@ -247,7 +260,7 @@ class EndlessCylinder:
         return m_m, n_n, m_n
 
     def _inner_rates(self, count: int, y: NDArray) -> NDArray:
-        """J_n' / J_n, or H2_n' / H2_n of a wave that only runs inwards, [count, h]."""
+        """J_n' / J_n, or H2_n' / H2_n of a wave that only runs inwards, [count, n] for y [n], as for a sphere."""
         rates = np.zeros((count, *y.shape), complex)
         if not self.with_inside and np.imag(y).min() < ABSORBED:
             rates[0] = -special.hankel2(1, y) / special.hankel2(0, y)
@@ -256,7 +269,7 @@ class EndlessCylinder:
             return rates
         # Downwards, where the recurrence is stable.
         rate = np.zeros_like(y)
-        for n in range(int(max(count, np.abs(y).max())) + 30, 0, -1):
+        for n in range(int(max(count, np.abs(y).max())) + ORDERS_ABOVE, 0, -1):
             if n < count:
                 rates[n] = rate
             rate = (n - 1) / y - 1 / (rate + n / y)
@@ -265,12 +278,13 @@ class EndlessCylinder:
 
 
 def _bessel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
-    """J_{n-1}(x) and J_n(x) for n = 0 .. count - 1, each [count, x], by Miller's recurrence.
+    """J_{n-1}(x) and J_n(x) for n = 0 .. count - 1, each [count, ...] for x [...], by Miller's recurrence.
 
-    It is stable downwards; the scale is that of J_0 + 2 (u J_1 + u^2 J_2 + ..) = exp(u x), u = +-j, whichever is large.
+    It is stable downwards but leaves a common factor open. That follows from J_0 + 2 (u J_1 + u^2 J_2 + ..) = exp(u x),
+    with u = j or -j, whichever makes the sum large.
     """
     most = max(count, float(np.abs(x).max()))
-    top = int(most + 4.05 * most ** (1 / 3)) + 30
+    top = int(most + 4.05 * most ** (1 / 3)) + ORDERS_ABOVE
     values = np.zeros((count, *x.shape), x.dtype)
     above = np.zeros_like(x)
     value = np.full_like(x, 1e-200)
@@ -283,7 +297,7 @@ def _bessel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
         total += (2 if n else 1) * turns[n % 4] * value
         above, value = value, 2 * n / x * value - above
         if n % 8 == 0:
-            # Far below the order they grow without end.
+            # Where x is far below the order, values grow without end on the way down: scale them, before they overflow.
             grown = np.abs(above) > 1e100
             if grown.any():
                 shrink = np.where(grown, 1e-200, 1.0)
@@ -296,12 +310,12 @@ def _bessel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _hankel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
-    """H1_{n-1}(x) and H1_n(x) for n = 0 .. count - 1, each [count, x]: upwards, where the recurrence is stable."""
+    """H1_{n-1}(x) and H1_n(x) for n = 0 .. count - 1, each [count, ...]: upwards, where the recurrence is stable."""
     values = np.empty((count + 1, *x.shape), complex)
     values[1] = special.hankel1(0, x)
     values[0] = -special.hankel1(1, x)
     for n in range(count - 1):
-        # Beyond the argument they grow without end; such orders are not used.
+        # Orders far above the argument grow without end: they stay at 1e150, and nobody uses them.
         grown = np.abs(values[n + 1]) > 1e150
         values[n + 2] = np.where(grown, 1e150, 2 * n / x * np.where(grown, 0, values[n + 1]) - values[n])
     return values[:-1], values[1:]
@@ -313,9 +327,11 @@ def _tabulate(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Chebyshev series of `EndlessCylinder.coefficients` over the path in the cross-section, [degree + 1, orders].
 
-    `place` is the distance from the stationary axial wave number, see `_axial_wave_number`.
+    `along_m`: from TX to RX along the axis. `place`: distance from the stationary axial wave number, see
+    `_axial_wave_number`. `path_range_m`: shortest and longest path, which are -1 and 1 of the series.
     """
     low, high = path_range_m
+    # Axial wave numbers of the shortest and the longest path.
     ends, _ = _axial_wave_number(k, along_m, np.array(path_range_m), place)
     # Coefficients turn as exp(2i radius sqrt(k^2 - h^2)).
     radians = body.radius_m * abs(np.diff(np.sqrt(k**2 - ends**2))[0])
@@ -352,8 +368,10 @@ def scatter_cylinder(
     second order in 1 / (k path). (On the path of steepest descent, waves that creep around the body would grow.)
     """
     k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
+    # To the nanometre: stage offsets are in both places and leave only rounding, which would forbid a table.
     along_m = np.round(pair.rx_m[0] - pair.tx_m[0], 9)
     distance_m = np.hypot(along_m, path_m)
+    # Ends at whole centimetres, so that several calls share a table.
     low = float(np.floor(100 * path_m.min()) / 100)
     high = float(np.floor(100 * path_m.max()) / 100) + 0.01
     body = EndlessCylinder(radius_m, permittivity, with_inside)
@@ -378,7 +396,11 @@ def scatter_cylinder(
 def sum_orders(
     pair: Pair, coefficients: tuple[NDArray, NDArray, NDArray], k: float, h: NDArray, path_m: NDArray
 ) -> NDArray:
-    """Integrand at axial wave numbers h [n] over exp(i h x + i sqrt(k^2 - h^2) path_m): sum over azimuthal orders."""
+    """Sum the integrand of `scatter_cylinder` at axial wave numbers h [n] over all azimuthal orders, complex [n].
+
+    `coefficients`: those of `EndlessCylinder.coefficients`, transposed to [n, orders]. The sum is divided by the phase
+    of the specular path, exp(i h x + i sqrt(k^2 - h^2) path_m), with x the way from TX to RX along the axis.
+    """
     eta = np.sqrt(k**2 - h**2)
     m_m = coefficients[0]
     ends = (
@@ -386,7 +408,7 @@ def sum_orders(
         _AzimuthalWaves(pair.tx_m, pair.sent, -1, eta, h, k),
     )
     turn = np.exp(1j * (ends[0].angle - ends[1].angle))
-    # Both ends' waves are scaled by exp(-i eta rho).
+    # Both ends' waves come times exp(-i eta rho): turn them back, less the specular path.
     scale = np.exp(1j * eta * (ends[0].rho + ends[1].rho - path_m)) / eta**2
     total = np.zeros(h.shape, complex)
     power = np.ones_like(turn)
@@ -411,7 +433,8 @@ class _AzimuthalWaves:
     """Outgoing waves at one antenna, order by order upwards, and products of its dipole with M and N.
 
     M = curl (x H_n(eta rho) exp(i n phi + i h x)) and N = curl M / k. For the transmitter the signs of n and h in the
-    exponentials change; they are the same in the products but for `sign`.
+    exponentials change, and so do terms that hold one of both: `sign` is 1 for RX, -1 for TX. `place` and `dipole`:
+    [3, n] in local axes.
     """
 
     def __init__(self, place: NDArray, dipole: NDArray, sign: int, eta: NDArray, h: NDArray, k: float) -> None:
@@ -440,7 +463,10 @@ class _AzimuthalWaves:
         return self._now, self._last - n / self._argument * self._now
 
     def products(self, orders: NDArray) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
-        """Dipole times M and times N of these orders and of their negatives, [orders, n] each; asked for in turn."""
+        """Return ((M, M of -orders), (N, N of -orders)) times the dipole, without exp(i n phi), each [orders, n].
+
+        To be called with orders 0, 1, .. in turn.
+        """
         steps = [self.step(n) for n in orders.tolist()]
         z = np.array([value for value, _ in steps])
         slope = np.array([rate for _, rate in steps]) * self._eta

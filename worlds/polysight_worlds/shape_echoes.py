@@ -2,8 +2,11 @@
 
 Spheres and cylinders of one medium have exact series (`series`). All other surfaces are seen by physical optics about
 the specular point of each stage position (`zones`), with what it misses at bent ones (`bends`). What is left after the
-phase of the specular path is smooth, so a coarse lattice of stage positions and a few frequencies are enough; the path
-itself is exact everywhere. Flat plates keep their sharp edges: they are summed facet by facet at every position.
+phase of the specular path (the "slow" part below) is smooth, so a coarse lattice of stage positions and a few
+frequencies are enough; the path itself is exact everywhere. Flat plates keep their sharp edges: they are summed facet
+by facet at every position.
+
+`places` are the parameters (a, b) of the specular points on a shape, each [offsets], see `shapes.find_specular`.
 """
 
 from __future__ import annotations
@@ -31,16 +34,17 @@ from polysight_worlds.zones import (
     window_units,
 )
 
-# What edges diffract turns by a wave in 13 mm of the stage's way, relative to the specular path. The series has none.
+# Steps of the lattice. Waves that edges diffract turn by 2 pi within 13 mm of the stage's way, relative to the specular
+# path; the series has no edges, and its step is chosen.
 LATTICE_M = 0.005
 LATTICE_OF_SERIES_M = 0.018
 # Echoes from the inside of a body below this share of its front's are left out.
 INSIDE_LEVEL = 1e-3
-# Splines are poor at the ends of their lattice.
+# Nodes of the lattice beyond the offsets on each side, because splines are poor at their ends; chosen.
 PADDING = 4
 # Facets of a flat plate: the path bends by 3 / m, so its phase leaves the facet's plane by 0.04 rad.
 PLATE_FACET_M = 0.008
-# Area over both parameters below which a cone has come to its tip: its radius there, metres.
+# A cone ends where its area per unit of both parameters (`Patch.area`), about its radius in metres, is below this.
 LEAST_AREA_M = 1e-9
 
 
@@ -75,7 +79,10 @@ def record_shapes(
 def simulate_echo(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, direct_m: float
 ) -> NDArray:
-    """Wave of one shape at one RX, complex64 [frequencies, offsets], with exp(-jk (path - direct_m))."""
+    """Wave of one shape at one RX, complex64 [frequencies, offsets], with exp(-jk (path - direct_m)).
+
+    `offsets` are stage offsets [offsets, 3] in metres.
+    """
     if shape.is_flat_plate:
         return _sum_facets(shape, tx, rx, frequencies_hz, offsets, direct_m)
     solution = choose_solution(shape)
@@ -101,6 +108,8 @@ def simulate_echo(
     return _add_carrier(slow, path.length_m - direct_m, frequencies_hz, expand)
 
 
+# A function of the shape, TX, RX, frequencies, offsets and specular points that returns the slow part, complex
+# [frequencies, offsets].
 Solution = Callable[[Shape, Antenna, Antenna, NDArray, NDArray, tuple[NDArray, ...]], NDArray]
 
 
@@ -118,11 +127,13 @@ def shows_inside(shape: Shape) -> bool:
     if choose_solution(shape) is sum_bent or shape.stack.is_metal:
         return False
     loss = abs(np.sqrt(shape.stack.below).imag)
+    # Two diameters: the way through the body and back.
     across_m = 4 * shape.scale_m()[1]
     return bool(np.exp(-2 * np.pi * 78e9 / LIGHT_M_PER_S * loss * across_m) > INSIDE_LEVEL)
 
 
 def _find_medium(shape: Shape) -> complex | None:
+    """Return the permittivity of a body as `series` takes it: None for metal."""
     return None if shape.stack.is_metal else shape.stack.below
 
 
@@ -145,10 +156,14 @@ def solve_sphere(
 def solve_cylinder(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
-    """Series of the endless cylinder, without the specular path's phase: [frequencies, offsets]."""
+    """Series of the endless cylinder, without the specular path's phase: [frequencies, offsets].
+
+    `_end_factors` makes a cylinder with ends of it.
+    """
     patch = shape.evaluate(*places)
     path_m = follow_path(patch, *place_antennas(tx, rx, offsets)).length_m
     pair = Pair.aim(tx, rx, offsets, np.asarray(shape.place_m), patch.point).rotate(shape.axes)
+    # The specular path in the cross-section of the cylinder.
     across_m = np.sqrt(path_m**2 - (pair.rx_m[0] - pair.tx_m[0]) ** 2)
     waves = []
     for frequency_hz in frequencies_hz:
@@ -160,7 +175,11 @@ def solve_cylinder(
 
 
 def _end_factors(shape: Shape, hessian: NDArray, along: NDArray, frequencies_hz: NDArray) -> NDArray:
-    """Return the echo of a cylinder relative to an endless one, [frequencies, offsets]: a Fresnel integral along it."""
+    """Return the echo of a cylinder relative to an endless one, [frequencies, offsets]: a Fresnel integral along it.
+
+    `hessian`: second derivatives of the path at the specular points; `along`: their a, metres along the axis.
+    """
+    # Second derivative of the path along the cylinder, if the point slides around it so that the path stays stationary.
     bend = hessian[0, 0] - hessian[0, 1] ** 2 / hessian[1, 1]
     units = window_units()
     weights = window(units) * np.exp(-0.5j * units**2)
@@ -174,7 +193,10 @@ def _end_factors(shape: Shape, hessian: NDArray, along: NDArray, frequencies_hz:
 
 
 def _add_carrier(slow: NDArray, excess_m: NDArray, frequencies_hz: NDArray, expand: NDArray) -> NDArray:
-    """Interpolate [nodes, offsets] in frequency, and turn by the path."""
+    """Interpolate [nodes, offsets] in frequency by the matrix `expand`, and turn by the path, here less the direct one.
+
+    Returns complex64 [frequencies, offsets].
+    """
     echo = (expand @ slow).astype(np.complex64)
     for index, frequency_hz in enumerate(frequencies_hz):
         turns = frequency_hz / LIGHT_M_PER_S * excess_m
@@ -184,7 +206,10 @@ def _add_carrier(slow: NDArray, excess_m: NDArray, frequencies_hz: NDArray, expa
 
 
 def _make_lattice(offsets: NDArray, step_m: float) -> tuple[NDArray | None, NDArray]:
-    """Coarse lattice [rows, columns, 3] around the offsets and their coordinates on it [2, n]; None: they are few."""
+    """Coarse lattice [rows, columns, 3] around the offsets, and their coordinates on it, row and column [2, n].
+
+    None where it had more nodes than there are offsets, or where these do not lie in one plane z.
+    """
     low = offsets.min(axis=0)
     high = offsets.max(axis=0)
     counts = np.ceil((high - low)[:2] / step_m).astype(int) + 1 + 2 * PADDING
@@ -199,11 +224,15 @@ def _make_lattice(offsets: NDArray, step_m: float) -> tuple[NDArray | None, NDAr
 
 
 def _interpolate(values: NDArray, coordinates: NDArray) -> NDArray:
+    """Return the quintic spline through values on a lattice [rows, columns], at coordinates [2, n]: [n]."""
     return np.asarray(ndimage.map_coordinates(values, coordinates, order=5, mode="nearest"))
 
 
 def _place_frequency_nodes(frequencies_hz: NDArray, count: int = 5) -> tuple[NDArray, NDArray]:
-    """Chebyshev nodes over the band and the matrix [frequencies, nodes] that interpolates from them."""
+    """Chebyshev nodes over the band and the matrix [frequencies, nodes] that interpolates from them.
+
+    At most `count` frequencies are nodes themselves. Five are chosen, for waves without the specular path's phase.
+    """
     if len(frequencies_hz) <= count:
         return frequencies_hz, np.eye(len(frequencies_hz))
     middle = (frequencies_hz[0] + frequencies_hz[-1]) / 2
@@ -217,23 +246,26 @@ def _place_frequency_nodes(frequencies_hz: NDArray, count: int = 5) -> tuple[NDA
 def sum_bent(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
-    """Physical optics with what it misses to first order in curvature and distance, where the medium has no layers."""
+    """Physical optics without the specular path's phase: [frequencies, offsets].
+
+    For media without layers, what it misses to first order in curvature and distance is added.
+    """
     # The path is stationary at the tip of a cone, too: beyond the piece's edges, without any surface.
     has_surface = shape.evaluate(*places).area > LEAST_AREA_M
     offsets = offsets[has_surface]
     places = tuple(place[has_surface] for place in places)
     sums = sum_window(shape, tx, rx, frequencies_hz, offsets, places)
     if not shape.stack.layers:
-        sums += _add_bends(shape, tx, rx, frequencies_hz, offsets, places)
+        sums += _find_missing_parts(shape, tx, rx, frequencies_hz, offsets, places)
     waves = np.zeros((len(frequencies_hz), len(has_surface)), complex)
     waves[:, has_surface] = sums
     return waves
 
 
-def _add_bends(
+def _find_missing_parts(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
-    """Add the parts that physical optics misses at the specular points, [frequencies, offsets], see `bends`."""
+    """Return what physical optics misses at the specular points, [frequencies, offsets], see `bends`."""
     tx_m, rx_m = place_antennas(tx, rx, offsets)
     patch = shape.evaluate(*places)
     spread = spread_of_ray(patch, follow_path(patch, tx_m, rx_m), tx_m, rx_m) * shape.cover(*places)
@@ -252,6 +284,7 @@ def _add_bends(
     weights = np.stack([np.ones_like(cosine), curvature[0, 0], curvature[1, 1], curvature[0, 1]], axis=1)
     sent = tx.field(incident)
     received = rx.field(-scattered)
+    # Parts of both fields along s and p, and their products in the order of `bends.PAIRS`.
     parts_in = [np.einsum("in,in->n", sent, axis) for axis in (s_axis, np.cross(s_axis, incident, axis=0))]
     parts_out = [np.einsum("in,in->n", received, axis) for axis in (s_axis, np.cross(scattered, s_axis, axis=0))]
     pairs = np.stack([parts_in[i] * parts_out[j] for i, j in ((0, 0), (1, 1), (0, 1), (1, 0))], axis=1)
@@ -265,7 +298,7 @@ def _add_bends(
 def _sum_facets(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, direct_m: float
 ) -> NDArray:
-    """Sum a flat plate with sharp edges, facet by facet at each position."""
+    """Sum a flat plate with sharp edges, facet by facet at each position: complex64 [frequencies, offsets]."""
     edges = shape.axes[:, :2] * np.asarray(shape.size_m)
     facets = rectangle(np.asarray(shape.place_m), edges[:, 1], edges[:, 0], PLATE_FACET_M)
     area_m2 = float(np.linalg.norm(np.cross(facets.edge_u[:, 0], facets.edge_v[:, 0])))
@@ -273,7 +306,8 @@ def _sum_facets(
     middle = np.asarray(shape.place_m)[:, None]
     antennas = place_antennas(tx, rx, offsets)
     middle_path_m = np.linalg.norm(middle - antennas[0], axis=0) + np.linalg.norm(middle - antennas[1], axis=0)
-    # Paths over a plate differ by less than its diagonal: so many radians to either side over half of the band.
+    # Paths over a plate differ by less than its diagonal from end to end: so many radians lie between the middle and an
+    # end over half of the band, and a Chebyshev series converges from this degree on.
     radians = np.pi / 2 * float(np.hypot(*shape.size_m)) * np.ptp(frequencies_hz) / LIGHT_M_PER_S
     nodes_hz, expand = _place_frequency_nodes(frequencies_hz, 5 + int(np.ceil(radians)))
     tables = [CosineTable.get_cached(shape.stack, f) for f in nodes_hz]

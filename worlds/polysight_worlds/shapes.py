@@ -1,4 +1,4 @@
-"""Shapes: smooth surfaces with a place, a turn and a medium, and what is true of them at a point.
+"""Shapes: smooth surfaces with a place, a turn and a medium, their geometry at a point, and specular points on them.
 
 A shape is a surface p(a, b) over two parameters, with first and second derivatives. `Graph` is a height over a plane
 (plates, bent sheets, saddles), `Revolved` a radius along an axis (cylinders, cones, bottles), `Sphere` a sphere. Local
@@ -7,7 +7,6 @@ axes: z points away from the antennas, and so does the inside of a body.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,7 +15,8 @@ from numpy.typing import NDArray
 from polysight_worlds.media import Stack
 from polysight_worlds.rig import turn
 
-# Edges of curved pieces fade over this width, so that what they diffract is small and varies slowly.
+# Edges of curved pieces fade over this width, so that what they diffract is small and varies slowly. Chosen: wider
+# edges leave less of the piece.
 SOFT_EDGE_M = 0.025
 # Iterations of Newton's method; from the grid's start, four to six are needed.
 ITERATIONS = 25
@@ -71,9 +71,10 @@ def _dots(a: NDArray, b: NDArray) -> NDArray:
 
 @dataclass(frozen=True)
 class Shape:
-    """A piece with a medium. `place_m`: origin of the local axes; `axes`: columns are local x, y, z in the rig frame.
+    """A piece of a surface with a medium (`stack`), a base of the shapes below.
 
-    `size_m`: extent of the two parameters in metres, about the origin.
+    `place_m`: origin of the local axes in the rig frame; `axes`: columns are local x, y, z in the rig frame. `size_m`:
+    full extents of the two parameters, as metres on the surface (`scale_m`), about the origin.
     """
 
     name: str
@@ -82,12 +83,13 @@ class Shape:
     size_m: tuple[float, float]
     axes: NDArray = field(default_factory=lambda: np.eye(3), repr=False)
 
-    # Flat shapes with sharp edges are summed facet by facet, see `shape_echoes`; those with soft ones are not bent.
+    # True for a plane with sharp edges, which `shape_echoes` sums facet by facet.
     is_flat_plate = False
+    # False for a plane, whatever its edges.
     is_bent = True
 
     def rotate(self, axis: NDArray, angle_deg: float) -> Shape:
-        """Return the shape turned about its origin."""
+        """Return the shape turned about its origin, around a unit `axis` [3] of the rig frame."""
         return replace(self, axes=turn(np.asarray(axis, float), angle_deg) @ self.axes)
 
     def local(self, a: NDArray, b: NDArray) -> Patch:
@@ -99,14 +101,14 @@ class Shape:
         return 1.0, 1.0
 
     def evaluate(self, a: NDArray, b: NDArray) -> Patch:
-        """Return the surface in the rig frame."""
+        """Return the surface in the rig frame at parameters a and b, of shapes that broadcast."""
         parts = self.local(np.asarray(a, float), np.asarray(b, float))
         turned = [np.einsum("ij,j...->i...", self.axes, part) for part in vars(parts).values()]
         turned[0] = turned[0] + np.reshape(self.place_m, (3, *(1,) * (turned[0].ndim - 1)))
         return Patch(*turned)
 
     def cover(self, a: NDArray, b: NDArray) -> NDArray:
-        """Return 1 on the piece, 0 beyond its edges, and a smooth step between."""
+        """Return 1 on the piece, 0 beyond its edges, and a step of SOFT_EDGE_M between, 0.5 at the edge."""
         share = np.ones(np.broadcast(a, b).shape)
         for value, scale, size_m in zip((a, b), self.scale_m(), self.size_m, strict=True):
             inside_m = size_m / 2 - np.abs(value) * scale
@@ -121,7 +123,10 @@ class Shape:
         return a.ravel(), b.ravel()
 
     def project(self, points_m: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Nearest place of the surface to points [n, 3]: signed distances (positive in front), a, b; each [n]."""
+        """Nearest place of the surface to points [n, 3]: signed distances (positive in front), a, b; each [n].
+
+        The surface goes on beyond the edges of the piece.
+        """
         points = np.asarray(points_m, float).T
         a, b = self.grid()
         distance2 = ((points[:, :, None] - self.evaluate(a, b).point[:, None]) ** 2).sum(axis=0)
@@ -145,7 +150,10 @@ class Shape:
 
 @dataclass(frozen=True)
 class Graph(Shape):
-    """z = (bend_x x^2 + bend_y y^2) / 2 + twist x y in local axes; bends in 1 / m, positive: convex to the antennas."""
+    """z = (bend_x x^2 + bend_y y^2) / 2 + twist x y in local axes; a is x, b is y, in metres.
+
+    Bends and twist are in 1 / m; a positive bend is convex to the antennas. `is_soft`: a plane has soft edges too.
+    """
 
     bend_x: float = 0.0
     bend_y: float = 0.0
@@ -177,12 +185,9 @@ class Graph(Shape):
         )
 
 
-Profile = Callable[[NDArray], tuple[NDArray, NDArray, NDArray]]
-
-
 @dataclass(frozen=True)
 class Revolved(Shape):
-    """Surface of revolution about local x: a along the axis, b the angle from -z, towards the antennas.
+    """Surface of revolution about local x: a in metres along the axis, b the angle (rad) from -z, towards the antennas.
 
     The radius is radius_m + slope a - bulge a^2 / 2: a cylinder, a cone, or a barrel (`bulge` in 1 / m).
     """
@@ -222,7 +227,7 @@ class Revolved(Shape):
 
 @dataclass(frozen=True)
 class Sphere(Shape):
-    """A sphere about `place_m`: a and b are the angles of longitude about local y and of latitude, from -z."""
+    """A sphere about `place_m`: a and b are the angles (rad) of longitude about local y and of latitude, from -z."""
 
     radius_m: float = 0.1
 
@@ -250,10 +255,13 @@ class Sphere(Shape):
         )
 
 
+# Angle from -z up to which round bodies have a surface. Chosen: specular points lie well within it.
+FRONT_DEG = 80
+
+
 def sphere(name: str, stack: Stack, centre_m: tuple[float, float, float], radius_m: float) -> Sphere:
-    """Return a sphere."""
-    # Its front as far as 80 degrees.
-    extent_m = 2 * np.radians(80) * radius_m
+    """Return the front of a sphere, as far as `FRONT_DEG`."""
+    extent_m = 2 * np.radians(FRONT_DEG) * radius_m
     return Sphere(name, stack, centre_m, (extent_m, extent_m), radius_m=radius_m)
 
 
@@ -268,12 +276,15 @@ def cylinder(
     slope: float = 0.0,
     bulge: float = 0.0,
 ) -> Revolved:
-    """Return a cylinder (with `slope` a cone, with `bulge` a barrel) about `axis` through its centre."""
+    """Return the front of a cylinder (with `slope` a cone, with `bulge` a barrel, see `Revolved`) about its centre.
+
+    `axis`: direction of its axis in the rig frame, not along z.
+    """
     along = np.asarray(axis, float) / np.linalg.norm(axis)
     normal = np.array([0.0, 0.0, 1.0]) - along[2] * along
     normal /= np.linalg.norm(normal)
     axes = np.stack([along, np.cross(normal, along), normal], axis=1)
-    size_m = (length_m, 2 * np.radians(80) * radius_m)
+    size_m = (length_m, 2 * np.radians(FRONT_DEG) * radius_m)
     return Revolved(name, stack, centre_m, size_m, axes, radius_m=radius_m, slope=slope, bulge=bulge)
 
 
@@ -288,7 +299,8 @@ def bottle(
 ) -> tuple[Revolved, ...]:
     """Return body, shoulder and neck of a bottle about `axis`, its body's middle at `centre_m`.
 
-    The shoulder is a cone of half the length and 20 degrees, the neck a cylinder of what it ends with.
+    The shoulder is a cone with a half angle of 20 degrees, as long as half of the body or until 0.3 of its radius is
+    left. The neck is a cylinder with the radius at which the shoulder ends, half as long as the body.
     """
     along = np.asarray(axis, float) / np.linalg.norm(axis)
     slope = -np.tan(np.radians(20))
@@ -315,7 +327,10 @@ def plate(
     bends: tuple[float, float, float] = (0.0, 0.0, 0.0),
     is_soft: bool = False,
 ) -> Graph:
-    """Return a plate: its z rises along x and y by the tilts; with `bends` (x, y, twist; 1 / m) a sheet or saddle."""
+    """Return a plate: its z rises along x and y by the tilts; with `bends` (x, y, twist; 1 / m) a sheet or saddle.
+
+    `turn_deg`: it is turned so far about its normal.
+    """
     slope_x, slope_y = np.tan(np.radians(tilt_deg))
     normal = np.array([-slope_x, -slope_y, 1.0])
     normal /= np.linalg.norm(normal)
@@ -336,7 +351,7 @@ def solve_2x2(matrix: NDArray, right: NDArray) -> NDArray:
 
 @dataclass(frozen=True)
 class PathAt:
-    """Path from TX over a surface to RX; derivatives by the surface's parameters: [...], [2, ...], [2, 2, ...]."""
+    """Path from TX over a surface to RX [...], and its derivatives by both parameters: [2, ...] and [2, 2, ...]."""
 
     length_m: NDArray
     gradient: NDArray
@@ -344,7 +359,7 @@ class PathAt:
 
 
 def follow_path(patch: Patch, tx_m: NDArray, rx_m: NDArray) -> PathAt:
-    """Return the path over a patch for antennas at [3, ...]."""
+    """Return the path from TX by way of each point of the patch to RX, antennas at [3, ...]."""
     length = 0.0
     gradient = 0.0
     hessian = 0.0
@@ -355,6 +370,7 @@ def follow_path(patch: Patch, tx_m: NDArray, rx_m: NDArray) -> PathAt:
         rates = [_dots(unit, patch.d_a), _dots(unit, patch.d_b)]
         tangents = (patch.d_a, patch.d_b)
         seconds = ((patch.d_aa, patch.d_ab), (patch.d_ab, patch.d_bb))
+        # Second derivatives of this antenna's distance from the surface.
         bends = [
             [
                 (_dots(tangents[i], tangents[j]) - rates[i] * rates[j]) / distance + _dots(unit, seconds[i][j])
@@ -369,7 +385,10 @@ def follow_path(patch: Patch, tx_m: NDArray, rx_m: NDArray) -> PathAt:
 
 
 def find_specular(shape: Shape, tx_m: NDArray, rx_m: NDArray) -> tuple[NDArray, NDArray]:
-    """Parameters (a, b), each [n], at which the path from TX to RX [3, n] is stationary."""
+    """Parameters (a, b), each [n], at which the path from TX to RX [3, n] is stationary.
+
+    They can lie beyond the edges of the piece.
+    """
     scale = np.array(shape.scale_m())
     grid = shape.grid()
     coarse = shape.evaluate(*grid)

@@ -39,10 +39,12 @@ TABLE_2: dict[str, complex] = {
 
 @dataclass(frozen=True)
 class Plate:
-    """A flat piece. `height_mm`: its surface above the object plane, towards the antennas. Tilts rise z along x and y.
+    """A flat piece, with its centre in the rig frame and its size along x and y.
 
-    `roughness_mm` and `waviness_mm`: rms of its surface with correlation lengths of 5 and 20 mm. `bow_mm`: how much
-    farther away the edges are than the middle, along x and y. `brightness`: factor on H and V alike. `round_`: a disc.
+    `height_mm`: its surface above the object plane, towards the antennas. With positive tilts z, which points away from
+    the antennas, grows along x and y. `roughness_mm` and `waviness_mm`: rms of its surface with correlation lengths of
+    5 and 20 mm. `bow_mm`: how much farther away the edges are than the middle, along x and y. `brightness`: factor on
+    the amplitudes of H and V alike. `round_`: a disc.
     """
 
     name: str
@@ -68,7 +70,7 @@ class Plate:
 
 @dataclass(frozen=True)
 class Body:
-    """A piece of any form (`optics.ellipsoid`): summed facet by facet, a microsecond for each facet and position."""
+    """A piece of any form, such as an `optics.ellipsoid`: summed in a microsecond for each facet and position."""
 
     name: str
     facets: Facets
@@ -84,13 +86,14 @@ class World:
 
 
 def table(stack: Stack, *, behind_mm: float, centre_m: tuple[float, float], tilt_deg: float = 0.0) -> Plate:
-    """Return a table of 0.7 m by 0.5 m at `behind_mm` behind the object plane."""
+    """Return a table of 0.7 m by 0.5 m at `behind_mm` behind the object plane; z grows along x, falls along y."""
     size_m = (0.7, 0.5)
     return Plate("table", centre_m, size_m, stack, height_mm=-behind_mm, tilt_x_deg=tilt_deg, tilt_y_deg=-tilt_deg)
 
 
 def dish(name: str, centre_m: tuple[float, float], diameter_m: float, liquid: complex, *, wall_m: float) -> Plate:
-    """Return a round glass dish that shows its bottom: glass of `wall_m` before a deep liquid."""
+    """Return a round glass dish that shows its bottom: `wall_m` of glass before a deep liquid, a permittivity."""
+    # Near the glass of Table 2; chosen.
     glass = 6.9 - 0.5j
     return Plate(name, centre_m, (diameter_m, diameter_m), Stack(((glass, wall_m),), liquid), round_=True)
 
@@ -148,7 +151,7 @@ class Nuisances:
         return tuple(f.name for f in fields(self) if f.name != "seed" and getattr(self, f.name))
 
 
-# What one named nuisance sets, each drawn evenly from its range.
+# What one named nuisance sets, each drawn evenly from its range. The ranges are chosen.
 RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "h_turn": {"h_turn_deg": (1, 3)},
     "v_turn": {"v_turn_deg": (1, 3)},
@@ -180,7 +183,7 @@ def draw_nuisances(rng: Generator, names: str | Sequence[str] = "none", *, stren
     """Draw the named nuisances.
 
     `names`: "none", "all" (without `border` and `aperture`), one of `NUISANCES`, or several. With "all" each is
-    drawn from 0 to its upper limit. `strength` multiplies what was drawn.
+    drawn from 0 to its upper limit, else from its lower one. `strength` multiplies what was drawn.
     """
     is_all = names == "all"
     if names == "none":
@@ -254,7 +257,10 @@ def draw_world(
 
 
 def disturb_plates(world: World, nuisances: Nuisances) -> World:
-    """Return the world with heights, tilts, roughness and waviness that `nuisances` add to plates before the table."""
+    """Return the world with what `nuisances` add to plates: heights, tilts, roughness, waviness, bow and brightness.
+
+    A plate named "table" stays as it is.
+    """
     rng = np.random.default_rng([nuisances.seed, 1])
     disturbed = []
     for plate in world.plates:

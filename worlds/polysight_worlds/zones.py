@@ -1,4 +1,4 @@
-"""Physical optics about specular points, and the rays through them.
+"""Physical optics about specular points, and the amplitudes of rays by geometrical optics.
 
 Around a specular point the surface is sampled in units of its Fresnel zone and summed under a smooth window; the
 trapezoidal rule of a smooth integrand converges exponentially. What lies outside adds nothing but edges and shadow
@@ -20,13 +20,15 @@ from polysight_worlds.shapes import Patch, PathAt, Shape, follow_path
 # Window exp(-x) (1 + x + .. + x^4 / 24), x = (distance / WIDTH)^2 / 2, in units of the Fresnel zone, sqrt(1 / (k second
 # derivative)). It is entire and flat to tenth order: of a quadratic phase it misses 945 / (120 (2 WIDTH^2)^5), 7e-4.
 WIDTH = 1.8
+# The last samples, where the window has fallen to 5e-3; chosen.
 END = 9.5
 # Along a flat direction the phase of an oblique path grows faster than by its square. Samples 0.62 apart took its far
 # part for another stationary point: H / V of metal was 0.2 % off.
 SPACING = 0.5
-# Near a caustic the zone would grow without end.
+# Least second derivative of the path for the size of a zone: near a caustic the zone would grow without end. Chosen.
 LEAST_BEND_PER_M = 0.8
-# Currents fade out from this cosine of incidence on: they do not end at the shadow's edge.
+# Below this cosine of incidence, or of scattering, currents fade to 0 at grazing: they do not end suddenly at the
+# shadow's edge. Chosen: a smaller one is truer to the surface and leaves a steeper step.
 GRAZING = 0.3
 
 
@@ -47,7 +49,7 @@ def window(units: NDArray) -> NDArray:
 
 
 def _fade_shadow(normals: NDArray, response: Response) -> NDArray:
-    """Smooth step to 0 towards grazing incidence or scattering."""
+    """Smooth step from 1 to 0 towards grazing incidence or scattering; `normals` [3, ...]."""
     # The gradient is incident minus scattered direction.
     rise = np.einsum("i...,i...->...", normals, response.gradient)
     cosine = np.minimum(response.cos_incidence, -response.cos_incidence - rise)
@@ -56,10 +58,10 @@ def _fade_shadow(normals: NDArray, response: Response) -> NDArray:
 
 
 def spread_of_ray(patch: Patch, path: PathAt, tx_m: NDArray, rx_m: NDArray) -> NDArray:
-    """Amplitude of a ray at specular points by geometrical optics, of 1 at 1 m; after a focus with its phase.
+    """Amplitude of a ray at n specular points by geometrical optics, complex [n], of 1 at 1 m from TX.
 
-    cos(incidence) / (r1 r2 sqrt(det path'')), with the path's second derivatives by the tangent plane's metres; the
-    root has a factor j for each negative curvature of the path.
+    cos(incidence) / (r1 r2 sqrt(det path'')), with the path's second derivatives by the tangent plane's metres. After a
+    focus it has the phase of that: a factor j for each negative curvature of the path.
     """
     out_m = np.linalg.norm(patch.point - tx_m, axis=0)
     back_m = np.linalg.norm(patch.point - rx_m, axis=0)
@@ -109,7 +111,10 @@ def sum_window(
 
 
 def _fresnel_zones(tangents: NDArray, hessian: NDArray, k: float) -> tuple[NDArray, NDArray]:
-    """Parameters' rates [2 axes, 2 parameters, n] per Fresnel zone along the path's two axes, and their area [n]."""
+    """Change of both parameters by one Fresnel zone along each axis [2 axes, 2 parameters, n], and the zone's area [n].
+
+    The axes are those along which the path's second derivatives do not mix. The area is in units of both parameters.
+    """
     bends = np.einsum("ij...,jk...,lk...->il...", tangents, hessian, tangents)
     eigenvalues, vectors = np.linalg.eigh(np.moveaxis(bends, -1, 0))
     lengths = 1 / np.sqrt(k * np.maximum(np.abs(eigenvalues), LEAST_BEND_PER_M))
@@ -119,7 +124,10 @@ def _fresnel_zones(tangents: NDArray, hessian: NDArray, k: float) -> tuple[NDArr
 
 
 class CosineTable:
-    """Reflection coefficients of a medium over the cosine of incidence, linear between 513 places."""
+    """Reflection coefficients of a medium over the cosine of incidence, linear between 513 places, as complex128.
+
+    `media.ReflectionTable` is the same in single precision.
+    """
 
     @staticmethod
     def get_cached(stack: Stack, frequency_hz: float) -> CosineTable:
@@ -130,10 +138,11 @@ class CosineTable:
         cosines = np.linspace(0, 1, 513)
         cosines[0] = 1e-6
         tables = reflect(stack, frequency_hz, cosines)
+        # Values, and their steps to the next place.
         self._tables = [(np.ascontiguousarray(table), np.diff(table, append=table[-1:])) for table in tables]
 
     def look_up(self, cos_incidence: NDArray) -> tuple[NDArray, NDArray]:
-        """(r_s, r_p) as complex128."""
+        """Return (r_s, r_p) as complex128 of the shape of `cos_incidence`."""
         place = np.clip(cos_incidence, 0, 1) * 512
         left_index = np.minimum(place.astype(np.int32), 511)
         share = place - left_index

@@ -11,7 +11,7 @@ from polysight.settings import DEFAULT, Settings
 
 
 class Pipeline:
-    """Processes one scan: add its rows, in any order, then `finish`. `live` and `samples` as of `KeptSamples`."""
+    """Processes one scan: add rows in any order, then `finish`. `live`: images of the rows so far; `samples`: kept ones."""
 
     def __init__(
         self,

@@ -17,14 +17,17 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+# First bytes of a message to the device, of the host's word that it is ready to read, and of a message from the device.
 TO_DEVICE = bytes.fromhex("34122143")
 READY = bytes.fromhex("78566587")
 FROM_DEVICE = bytes.fromhex("badccdab")
+# Kinds of messages.
 RESPONSE = 1
 NACK = 2
 EVENT = 3
 
-# Received from real devices (TI E2E forum, threads 670135, 752121, 1267477).
+# Received from real devices (TI E2E forum, threads 670135, 752121, 1267477): data of the event of a fault of the main
+# core, and of the power-up of a first-generation board with its flash empty or written.
 FAULT_DATA = bytes.fromhex("05000000800000fe") + bytes(16) + b"\xff" * 6 + bytes(2)
 OLD_UP_EMPTY = bytes.fromhex("00000000ff7c0c000000000000000000")
 OLD_UP_WRITTEN = bytes.fromhex("10aa0500") + bytes(16)
@@ -39,7 +42,10 @@ def ones_sum(head: bytes) -> int:
 
 
 def frame(direction: int, kind: int, number: int, body: bytes, count: int, sequence: int, wide: bool) -> bytes:
-    """Encode a message with a CRC of 32 (`wide`) or 16 bits (ICD 2.3); the latter has its acknowledgement bits set."""
+    """Encode a message with a CRC of 32 (`wide`) or 16 bits (ICD 2.3); the latter has its acknowledgement bits set.
+
+    `kind`: such as RESPONSE; `number`: message id; `body`: `count` encoded sub-blocks.
+    """
     flags = sequence << 12 | 0xC
     crc_bytes = 2
     if wide:
@@ -53,10 +59,11 @@ def frame(direction: int, kind: int, number: int, body: bytes, count: int, seque
     return FROM_DEVICE + head + body + crc
 
 
-# ICD table 7.3
+# Bits of the boot status, ICD table 7.3.
 METAHEADER_NOT_FOUND = 1 << 6
 METAHEADER_CRC_FAILURE = 1 << 30
 MSSIMAGE_NOT_FOUND = 1 << 28
+# Versions: major, minor, build, debug, year, month, day. Where the two parts of an image begin.
 _ROM = bytes((2, 2, 1, 7, 20, 3, 17))
 _MAIN_PATCH = bytes((2, 2, 2, 0, 20, 7, 29))
 _RF_PATCH = bytes((2, 2, 4, 0, 22, 7, 6))
@@ -87,7 +94,10 @@ def boot_errors(image: bytes) -> int:
 
 
 def encode_patch_version(image: bytes, main: bool) -> bytes:
-    """Return the last six bytes of a version answer (ICD tables 5.66, 5.157): major, minor, date, build and debug."""
+    """Return the last six bytes of a version answer (ICD tables 5.66, 5.157): major, minor, date, build and debug.
+
+    `main`: of the main core's part of the image, otherwise of the RF core's.
+    """
     start = _MAIN_AT if main else _RF_AT
     offset = start + 0x48
     major, minor, build, debug, *date = image[offset : offset + 7]
@@ -135,6 +145,7 @@ CHIRP_END_BEFORE_START = 61
 CHIRP_PROFILE_OUT_OF_RANGE = 62
 CHIRP_PROFILE_UNDEFINED = 63
 FRAME_WHILE_ARMED = 83
+# More sub-block numbers of commands: settings that are stored, and calibration data.
 PROFILE = 0x0100
 CHIRP = 0x0101
 FRAME = 0x0102
@@ -142,6 +153,7 @@ STREAM_SET = 0x0103
 STREAM = 0x0104
 SAVE = 0x00AB
 RESTORE = 0x008B
+# Calibration data come in three parts.
 CHUNK_BYTES = 224
 CHUNKS = 3
 # Number of data bytes of each sub-block.
@@ -153,6 +165,7 @@ SIZES = {
     0x4041: 12, 0x4042: 8, 0x4043: 4,
     0x4044: 4, 0x4045: 4, 0x4046: 4, SET_EVENT_CHECKSUM: 12, 0x40C0: 8, READ_MAIN_VERSION: 0,
 }  # fmt: skip
+# Commands without which frames do not start.
 _BEFORE_FRAMES = (0x0080, 0x0082, 0x0086, INIT_RF, PROFILE, CHIRP, 0x4041, 0x4042, 0x4043, 0x4044, 0x4045)
 # Commands that are accepted before the RF power-up.
 _WITHOUT_RF = (DOWNLOAD, SET_EVENT_CHECKSUM, POWER_UP_RF, READ_MAIN_VERSION)
@@ -160,10 +173,34 @@ _WITHOUT_RF = (DOWNLOAD, SET_EVENT_CHECKSUM, POWER_UP_RF, READ_MAIN_VERSION)
 
 @dataclass
 class Cores:
-    """Both cores and the serial flash. `event` sends an event (number, data, delay in s).
+    """Both cores and the serial flash.
 
-    `ram` is a downloaded image, `hardware_bits` are added to the status of a boot; `settings` holds the data of the
-    last sub-block of each number, `profiles` and `chirps` those of each index. See `RadarBoard` for the other fields.
+    Attributes
+    ----------
+    now, event
+        Clock in seconds, and a function that sends an event: number, data, delay in s.
+    flash, ram
+        Images in the serial flash and downloaded to RAM; empty: none.
+    die
+        Part of the die id, which identifies the board; 0: the id is all zeros.
+    supply_v
+        Voltage of the RF supplies; LDO bypass above 1.1 V makes the board `destroyed`.
+    erase_s
+        Duration of erasing the flash.
+    fault_at
+        When the main core reports its harmless fault: "power-up", "download" or "never".
+    first_generation
+        Boots and refuses like an AWR1243.
+    hardware_bits
+        Bits added to the status of a boot from flash.
+    main_rom, rf_rom
+        ROM versions of the cores: major, minor, build, debug.
+    executed
+        Numbers of the commands that succeeded, in order.
+    settings, profiles, chirps
+        Data of the last sub-block of each number; of profiles and chirps by their index.
+    armings
+        How often frames were started.
     """
 
     now: Callable[[], float]
@@ -176,7 +213,7 @@ class Cores:
     fault_at: str = "power-up"
     first_generation: bool = False
     hardware_bits: int = 0
-    # Self-tests of the RF core that passed
+    # Bits of the self-tests of the RF core that pass.
     rf_tests: int = 0x07FFFFFF
     # Bits of the RF calibrations that pass.
     passes: int = 0x1FFE
@@ -200,30 +237,39 @@ class Cores:
         self.rf_up = False
         self.calibrated = False
         self.crc32_events = False
+        # Negative: without end.
         self.frames_left = 0
+        # Frames are started and wait for SYNC_IN.
         self.armed = False
+        # When the frame in progress ends, by the clock `now`.
         self.frame_ends = -1.0
         # File type and missing bytes of the download in progress; None: no download.
         self._file: tuple[int, int] | None = None
+        # Parts of calibration data that came so far, by their number.
         self._restored: dict[int, bytes] = {}
+        # Content of the download so far.
         self._part = b""
         for table in (self.settings, self.profiles, self.chirps):
             table.clear()
 
     def boot(self) -> None:
-        """Boot in functional mode: ROM, then the flash's image if it is complete (ICD 5.21.1)."""
+        """Boot in functional mode: ROM, then the flash's image if it is complete (ICD 5.21.1); report it by events."""
         self.main_up = True
         broken = boot_errors(self.flash)
         self._booted = b"" if broken else self.flash
         if self.first_generation:
             self.event(UP_MAIN, OLD_UP_EMPTY if broken else OLD_UP_WRITTEN, BOOT_S)
         else:
+            # Power-up time in 5 ns (chosen), status of the boot, failed self-tests.
             self.event(UP_MAIN, struct.pack("<IQQ", 371_216, broken | self.hardware_bits, 0), BOOT_S)
         if self.fault_at == "power-up":
             self.event(MAIN_FAULT, FAULT_DATA, BOOT_S + 1e-3)
 
     def execute(self, number: int, data: bytes, remaining: int) -> tuple[int, bytes, float]:
-        """Execute a command; return error number (0: none; ICD table 5.1, 7.1, 7.2), answer, and extra delay in s."""
+        """Execute a command; return error number (0: none; ICD table 5.1, 7.1, 7.2), answer, and extra delay in s.
+
+        `number`, `data`: of its sub-block; `remaining`: parts of a file that follow.
+        """
         if number == DOWNLOAD:
             return self._download(data, remaining)
         if number not in SIZES or (self.first_generation and number == 0x008D):
@@ -284,6 +330,7 @@ class Cores:
         return self._booted
 
     def _patch(self, main: bool) -> bytes:
+        """Return the patch version of a core as in a version answer; zeros without a patch."""
         image = self._read_patch()
         if image:
             return encode_patch_version(image, main)
@@ -325,7 +372,10 @@ class Cores:
         return 0, stored
 
     def _save_or_restore_calibration(self, number: int, data: bytes) -> tuple[int, bytes]:
-        """Save or restore 672 bytes of calibration in three parts (ICD 5.2.11, 5.3.2)."""
+        """Save or restore 672 bytes of calibration in three parts (ICD 5.2.11, 5.3.2); return error number and answer.
+
+        The data begin with the status bits, twice. If both differ in what was restored, no calibration passes.
+        """
         _, part = struct.unpack_from("<2H", data)
         if part >= CHUNKS:
             return INVALID_INPUT, b""
@@ -386,7 +436,12 @@ class Cores:
         return struct.unpack_from("<I", self.settings[FRAME], 12)[0] * 5e-9
 
     def _download(self, data: bytes, remaining: int) -> tuple[int, bytes, float]:
-        """Store a part of a file (ICD 5.18.1). The first part erases the flash; its content is checked only at boot."""
+        """Store a part of a file (ICD 5.18.1); return error number, answer, and extra delay in s.
+
+        A file of type 0 goes to RAM and boots when it is complete; the first part of another one erases the flash,
+        whose content is checked only at boot. `remaining`: how many parts follow. Errors: 7, the length is not the one
+        announced; 8, unknown type of file.
+        """
         if not self.main_up:
             return WRONG_STATE, b"", 0.0
         first = self._file is None
@@ -418,5 +473,6 @@ class Cores:
         return 0, b"", self.erase_s if first and kind else 0.0
 
     def _boot_from_ram(self) -> None:
+        """Take the download as the image in RAM, and report its boot."""
         self.ram = self._part
         self.event(BOOTED, struct.pack("<IQQ", 371_216, boot_errors(self.ram), 0), BOOT_S)

@@ -46,11 +46,12 @@ from polysight_simulators.scene.scene_file import Facets, Scene, draw_specimens,
 from polysight_simulators.scene.shapes import shape_field
 from polysight_simulators.scene.spectral_grid import OVERSAMPLING, TAPS, Axis, oversample, spectral_axes
 
-# Error of the Chebyshev series in the local angle
+# Errors relative to an echo, chosen: smaller ones take more kernels, that is more transforms.
+# Of the Chebyshev series in the local angle.
 _ANGLE_TOLERANCE = 1e-4
-# Largest error of the interpolation in dpath/dz.
+# Of the interpolation in dpath/dz.
 _RELIEF_TOLERANCE = 2e-4
-# Range of heights that share a kernel
+# Range of heights that share a kernel. Chosen: a wider one takes fewer levels, each with more nodes of dpath/dz.
 _LEVEL_MM = 2.0
 
 
@@ -62,9 +63,13 @@ def cheb_nodes(q: int) -> optics.Real:
 def _fit_angle_series(
     scene: Scene, reflect: optics.Reflectivity, nodes_hz: optics.Real, theta: tuple[float, float]
 ) -> NDArray[np.complexfloating]:
-    """Return the Chebyshev coefficients of r(theta) for each plate and node, [plate, node, order]."""
+    """Return the Chebyshev coefficients of r(theta) for each plate and node, [plate, node, order].
+
+    `theta`: range of the local angle, rad. There are as many orders as the tolerance needs, the same for all plates.
+    """
     centre = (theta[0] + theta[1]) / 2
     half = max((theta[1] - theta[0]) / 2, 1e-9)
+    # More orders than r(theta) needs anywhere.
     many = 16
     x = cheb_nodes(many)
     to_series = chebyshev.chebvander(x, many - 1).T * (2.0 / many)
@@ -72,6 +77,7 @@ def _fit_angle_series(
     rows = [[reflect(p, f, centre + half * x) for f in nodes_hz] for p in scene.plates]
     values = np.array(rows, dtype=np.complex128)
     series = np.einsum("pfm,jm->pfj", values.reshape(len(scene.plates), len(nodes_hz), many), to_series)
+    # Largest sum of all coefficients from each order on.
     tail = np.cumsum(np.abs(series).max(axis=(0, 1), initial=0.0)[::-1])[::-1]
     orders = max(1, int(np.sum(tail > _ANGLE_TOLERANCE)))
     return series[:, :, :orders]
@@ -86,6 +92,7 @@ def _transform_intervals(
     """
     k = axis.kappa
     width = np.where(sizes > 0, sizes, 1.0)[:, None]
+    # The inverse transform begins at the first offset, the kernel at its first place.
     shift = axis.w[0] + axis.first_u - centres
     envelope = width * np.sinc((np.outer(sizes, k) - (sizes * shifts)[:, None]) / (2 * np.pi))
     return envelope.astype(np.complex128) * np.exp(1j * np.outer(shift, k))
@@ -99,7 +106,7 @@ _PRODUCT_SIZE = 1 << 18
 def _sum_outer_products(
     y: NDArray[np.complexfloating], weight: NDArray[np.complexfloating], x: NDArray[np.complexfloating]
 ) -> NDArray[np.complex64]:
-    """Return the weighted sum of outer products over items, [kappa_y, kappa_x]."""
+    """Return the weighted sum of outer products over items, [kappa_y, kappa_x], of y and x [item, kappa]."""
     scaled = np.ascontiguousarray((y * weight[:, None]).T, np.complex64)
     columns = x.astype(np.complex64)
     summed = np.empty((y.shape[1], x.shape[1]), np.complex64)
@@ -147,6 +154,7 @@ class _Level:
             return None
         at_nodes = chebyshev.chebvander(cheb_nodes(n), n - 1) * (2.0 / n)
         at_nodes[:, 0] /= 2.0
+        # Without a slope dpath/dz is the sum of both cosines, twice the obliquity.
         everywhere = chebyshev.chebvander((2 * oblique - self.middle) / self.half, n - 1)
         return [everywhere @ row for row in at_nodes]
 
@@ -159,7 +167,21 @@ class _Level:
 
 @dataclass(frozen=True)
 class _Plane:
-    """Scene and grid of the computation."""
+    """Plates and points that are computed on one grid: all of a scene, or those in the background or before it.
+
+    Attributes
+    ----------
+    ant
+        Antennas of the board.
+    scene
+        The scene with these plates, points and shapes only.
+    x, y
+        Grid of offsets, kernel and spectrum along each axis.
+    surfaces
+        Facets of each plate.
+    amplitudes
+        Factor of each point in the samples, less 1 / (r1 r2).
+    """
 
     ant: optics.Antennas
     scene: Scene
@@ -279,7 +301,7 @@ class _Plane:
         return y, np.einsum("rc,cx->rx", np.exp(1j * phase).astype(np.complex64), x.astype(np.complex64))
 
     def point_map(self, level: _Level, f: float, m: int) -> NDArray[np.complex64] | None:
-        """Return the spectrum of a level's points, with the phases of C_m."""
+        """Return the spectrum of a level's points, with the phases of C_m; None if it has none."""
         if not level.points:
             return None
         table = np.array([self.scene.points[i].position_mm for i in level.points]) / 1e3
@@ -381,7 +403,7 @@ def _choose_nodes(
     shortest_m = float(min(low for low, _ in ranges))
     longest_m = float(max(high for _, high in ranges))
     inside = 0.0
-    # Echoes inside plates extend the response.
+    # Echoes inside plates extend the response: two round trips are counted.
     for p in scene.plates:
         depth = sum((layer.thickness_mm or 0.0) / 1e3 * abs(np.sqrt(layer.epsilon)) for layer in p.stack)
         inside = max(inside, 4 * depth)
@@ -421,7 +443,11 @@ class _Kernels:
     def prepare(
         cls, plane: _Plane, level: _Level, theta: tuple[float, float], orders: int, centre_m: float
     ) -> _Kernels:
-        """Return the factors over the range of angles of the whole scene."""
+        """Return a level's factors.
+
+        `theta`: range of angles of the whole scene (rad), over which there are `orders` Chebyshev polynomials.
+        `centre_m`: path whose phase is removed.
+        """
         fade = np.outer(plane.y.fade, plane.x.fade)
         low, high = theta
         paths_m = []
@@ -455,9 +481,9 @@ def _add_orders(
     series: optics.Complex, polynomials: NDArray[np.float32]
 ) -> NDArray[np.complex64] | NDArray[np.float32]:
     """Return the sum of a series over polynomials [order, y, x]; without BLAS threads."""
-    (few,) = np.nonzero(series)
-    if len(few) == 1 and series[few[0]] == 1:
-        return polynomials[few[0]]
+    (used_orders,) = np.nonzero(series)
+    if len(used_orders) == 1 and series[used_orders[0]] == 1:
+        return polynomials[used_orders[0]]
     summed = np.empty(polynomials.shape[1:], np.complex64)
     summed.real = np.einsum("j,jyx->yx", series.real.astype(np.float32), polynomials)
     summed.imag = np.einsum("j,jyx->yx", series.imag.astype(np.float32), polynomials)
@@ -478,10 +504,10 @@ def _transform_back(kernel: NDArray[np.complex64]) -> NDArray[np.complex64]:
     return np.asarray(scipy.fft.ifft2(kernel, norm="forward", overwrite_x=True))
 
 
-# Version of the content of cached fields
+# Version of the content of cached fields: it changes with the physics above, so that older files are not read.
 _PHYSICS = 3
 
-# Shape of the Kaiser window of the interpolation.
+# Shape of the Kaiser window of the interpolation; chosen for `TAPS` and `OVERSAMPLING`.
 _KAISER_BETA = 8.0
 
 

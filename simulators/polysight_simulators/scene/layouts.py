@@ -32,6 +32,7 @@ from polysight_simulators.scene.optics import antennas, direct_factor
 from polysight_simulators.scene.radar import sample_frequencies_hz
 from polysight_simulators.scene.scene_file import Scene, apply_scene
 
+# Lost bytes of a row's payload, each from the first to the one after the last.
 Gaps = list[tuple[int, int]]
 # Sequence number and byte count, before each payload.
 _HEADER_BYTES = 10
@@ -45,7 +46,7 @@ class Layout(Protocol):
         ...
 
     def write_row(self, row: Row, payloads: dict[str, NDArray[np.int16]], gaps: dict[str, Gaps]) -> None:
-        """Write a row: int16 [frames, samples, 8] and the lost byte ranges of each board."""
+        """Write a row: by board, int16 [frames, samples, 8] and the lost byte ranges."""
         ...
 
     def end(self) -> None:
@@ -124,7 +125,15 @@ def _copy_calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[s
 
 
 class OwnLayout:
-    """Writer of a scan folder: manifest.jsonl, events.msgpack, raw/<board>/<row>.bin and .idx."""
+    """Writer of a scan folder: manifest.jsonl, events.msgpack, raw/<board>/<row>.bin and .idx.
+
+    Parameters
+    ----------
+    path, rig, plan
+        Folder, rig, and the rows to come.
+    scan_id, started_utc
+        Name and start of the scan, for the manifest and the events.
+    """
 
     def __init__(self, path: Path, rig: Instrument, plan: RasterPlan, scan_id: str, started_utc: str) -> None:
         self.folder = path
@@ -209,17 +218,21 @@ class OwnLayout:
         self._digest = sha256(line.encode()).hexdigest()[:16]
 
     def _write_event(self, *events: AnyEvent) -> None:
+        """Append events, as the Pi sends them, to the file of events."""
         path = self.folder / "events.msgpack"
         with name_in_errors(path), path.open("ab") as f:
             f.write(b"".join(map(pack_with_crc, events)))
 
     def _stamp(self) -> dict[str, Any]:
-        """Return the common fields of the next event."""
+        """Return the common fields of the next event, and count it."""
         self._seq += 1
         return {"scan_id": self._scan_id, "seq": self._seq, "t_mono_ns": self._now_ns}
 
     def _write_row_events(self, row: Row) -> None:
-        """Write the events that the Pi would send in a row at the stage's speed: start, a capture per point, end."""
+        """Write the events that the Pi would send in a row at the stage's speed: start, a capture per point, end.
+
+        One second passes before the first point and one after the last; chosen.
+        """
         burst = self._rig.burst
         stage = self._rig.stage
         events: list[AnyEvent] = [RowStarted(row=row, take=1, **self._stamp())]
@@ -266,6 +279,7 @@ def _make_index(facts: dict[str, Any]) -> bytes:
 
 
 Complex = NDArray[np.complexfloating]
+# Points of a row, by board name and row, at which the radar did not start.
 Skipped = Mapping[tuple[str, int], Collection[int]]
 LATE_S = 2.0
 """Delay after which a card sends the last, incomplete packet (observed on a DCA1000)."""
@@ -320,6 +334,7 @@ class AuthorsLayout:
             skipped = self._skipped.get((name, row.index), frozenset())
             points = [i for i in range(row.points) if i not in skipped]
             sent = payload.reshape(row.points, -1, *payload.shape[1:])[points]
+            # What was not sent cannot be lost.
             lost_ranges = [(a, min(b, sent.nbytes)) for a, b in gaps[name] if a < sent.nbytes]
             folder = self.folder / name
             folder.mkdir(exist_ok=True)
@@ -335,7 +350,7 @@ class AuthorsLayout:
                 (folder / f"{stem}.bin").write_bytes(b"".join(pieces))
             packet_log = self._format_packet_log(len(raw), lost_ranges, points, step_s)
             (folder / f"{stem}_log.csv").write_text(packet_log, encoding="ascii")
-        # The next row begins two seconds after the late packet.
+        # The next row begins two seconds after the late packet; chosen.
         self._now_s += row.points * step_s + LATE_S + 2.0
 
     def end(self) -> None:
@@ -344,6 +359,7 @@ class AuthorsLayout:
     def _format_packet_log(self, size: int, lost: Gaps, points: list[int], step_s: float) -> str:
         """Return a line for each packet received: sequence number, payload bytes, Unix time.
 
+        `size`: bytes sent; `lost`: ranges of them; `points`: numbers of the points sent; `step_s`: time between points.
         The last, incomplete packet is late, for the card sends it after a timeout; the authors' decoder needs that.
         """
         full_bytes = packet_payload_bytes(self._rig)
@@ -358,7 +374,7 @@ class AuthorsLayout:
             if packet in lost_packets:
                 continue
             stop = min(start + full_bytes, size)
-            # The packet is received 0.2 ms after the trigger of the chirp that its last byte is of.
+            # The packet is received 0.2 ms (chosen) after the trigger of the chirp that its last byte is of.
             position, chirp = divmod((stop - 1) // frame_bytes, pulses)
             received_s = self._now_s + points[position] * step_s + chirp * period_s + 2e-4
             if stop - start < full_bytes:
@@ -462,7 +478,7 @@ def write_cube(
     common_reference: bool = False,
     by_columns: bool = False,
 ) -> Path:
-    """Write a cube in `out`/raw/<scan> and return the folder.
+    """Write the echoes of all positions, a cube of each receiving board, in `out`/raw/<scan>; return the folder.
 
     Parameters
     ----------
@@ -471,7 +487,7 @@ def write_cube(
     keep_direct
         Include the direct path.
     from_transmitter
-        Phases are 2 pi f tau; otherwise 2 pi f (tau - tau_direct) with each RX's own direct path.
+        Phases are 2 pi f tau; otherwise 2 pi f (tau - tau_direct) with the direct path of each RX.
     common_reference
         Use the direct path of RX1 for all RX.
     conjugate

@@ -27,6 +27,7 @@ from polysight_simulators.scene.scene_file import Layer, Plate, Scene, draw_spec
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
+# A function of plate, frequency (Hz) and incidence (rad) that returns the plate's reflection in a board's samples.
 Reflectivity = Callable[[Plate, float, Real], Complex]
 
 
@@ -107,8 +108,9 @@ def reflect_layers(
 
 
 def strips(psi_rad: float, theta_rad: NDArray[np.floating] | float) -> tuple[Complex, Complex]:
-    """Return the reflection of a screen that conducts in one direction, for a wave with equal s and p.
+    """Return the reflection of a screen that conducts in one direction only, at `psi_rad` from y towards x.
 
+    The wave has equal s and p, whose sum the strips see: the coefficients hold for such a wave alone.
     The current J along the strips u = (sin psi, cos psi) in (x, y) makes the total field along u zero. It radiates with
     the wave impedances of the polarisations, 1 / (2 cos) for s and cos / 2 for p in units of free space.
 
@@ -196,7 +198,7 @@ def conjugate(factor: Any) -> Any:
 
 
 def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
-    """Return the function that gives a plate's reflection in a board's samples, with cross-polar leakage.
+    """Return the function that gives a plate's reflection in a receiving board's samples, with cross-polar leakage.
 
     H: s + leak_h p. V: p + leak_v s. TX is rotated by 45 degrees and sends both polarisations equally. s and p are what
     a plate returns in the polarisations of H and V (:func:`turn_reflection`).
@@ -304,8 +306,9 @@ def field_exact(
 
 
 def _place_quadrature(size_m: tuple[float, float], top_hz: float) -> tuple[Real, Real, Real]:
-    """Return quadrature points x, y relative to the centre of a rectangle, and their areas."""
-    # The phase changes at most by 2 k per metre; Gauss-Legendre needs about half a point per radian, plus a few.
+    """Return quadrature points x, y relative to the centre of a rectangle, and their areas; each [y, x]."""
+    # The phase changes at most by 2 k per metre. Gauss-Legendre with n points is exact up to the degree 2 n - 1, which
+    # takes a quarter of a point per radian: 0.3, which is 0.6 per k and metre, and 16 more.
     wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
     (nx, ax), (ny, ay) = (np.polynomial.legendre.leggauss(int(wave * s * 0.6) + 16) for s in size_m)
     x, y = np.meshgrid(nx * size_m[0] / 2, ny * size_m[1] / 2)

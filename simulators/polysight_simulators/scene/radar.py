@@ -40,7 +40,10 @@ Complex = NDArray[np.complexfloating]
 
 
 def sync_delay_s(d: Disturbances, seed: int, board: Board, pulses: NDArray[np.int64]) -> Real:
-    """Return the delay from SYNC_IN edge to chirp start: fixed latency plus sampling by the board's clock, [pulse]."""
+    """Return the delay from SYNC_IN edge to chirp start, seconds [pulse].
+
+    It is a fixed latency, the board's own skew, and the wait for the board's clock to sample the edge, drawn by pulse.
+    """
     jitter = pulse_uniform(stream_key(seed, "sync", board.name), pulses)
     return 1e-9 * (d.sync_latency_ns + getattr(d.sync_skew_ns, board.role) + d.sync_uncertainty_ns * jitter)
 
@@ -72,6 +75,8 @@ class Receiver:
 
     Attributes
     ----------
+    board, chirp
+        The board and the chirp of the rig file.
     gains
         complex64 [rx], relative to the nominal channel.
     phase
@@ -85,6 +90,10 @@ class Receiver:
     gains: NDArray[np.complex64]
     phase: Real
     if_error_hz: Real
+
+
+# Period of the ripple after the start of the ramp; chosen.
+_RIPPLE_PERIOD_S = 8e-6
 
 
 def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver:
@@ -111,12 +120,14 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
     phase = 2 * np.pi * (constant * t + slope * t**2 / 2)
     error = constant + slope * t
 
-    # Ripple after the start of the ramp: a decaying oscillation of the IF. Bend before its end: a parabola.
+    # Ripple after the start of the ramp: a decaying oscillation of the IF. Bend before its end: a parabola. Boards have
+    # up to 30 and 20 % more or less of them, chosen. The phase is the integral of the frequency error.
     ramp_s = chirp.adc_start_us * 1e-6 + t
-    swing = d.ripple_hz * rng.uniform(0.7, 1.3) * np.exp((-1 / (d.ripple_us * 1e-6) + 2j * np.pi / 8e-6) * ramp_s)
+    decay_per_s = -1 / (d.ripple_us * 1e-6) + 2j * np.pi / _RIPPLE_PERIOD_S
+    swing = d.ripple_hz * rng.uniform(0.7, 1.3) * np.exp(decay_per_s * ramp_s)
     swing *= np.exp(2j * np.pi * rng.uniform())
     error += swing.real
-    phase += 2 * np.pi * (swing / (-1 / (d.ripple_us * 1e-6) + 2j * np.pi / 8e-6)).real
+    phase += 2 * np.pi * (swing / decay_per_s).real
     height = d.bend_hz * rng.uniform(0.8, 1.2) * rng.choice([-1.0, 1.0])
     into = np.maximum(0.0, 1 + (ramp_s - chirp.ramp_end_us * 1e-6) / (d.bend_us * 1e-6))
     error += height * into**2
@@ -125,7 +136,7 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
 
 
 def echo_drift(rig: Instrument, d: Disturbances, board: Board, pulses: NDArray[np.int64]) -> NDArray[np.complex64]:
-    """Return the factor of a board's echo by pulse [n]: linear drift of V over the scan, one in its middle."""
+    """Return the factor of a board's echo by pulse [n]: V drifts linearly over the scan, with a factor of 1 halfway."""
     if board.role != "receive_v":
         return np.ones(len(pulses), np.complex64)
     share, degrees = d.hv_drift
@@ -139,6 +150,7 @@ def compute_chirp_factors(
 ) -> tuple[NDArray[np.complex64], Real]:
     """Return the factor of each chirp before the filter, and its IF shift (0 without filter), both [chirp, sample].
 
+    `phase_rad` [chirp]: phase of each chirp. `hpf`: True if there is a high-pass filter. The shift is in Hz.
     For a receiver that starts `delay_s` after the transmitter, all paths are shorter by that time:
     exp(-j 2 pi (f0 + K t) delay).
     """
@@ -159,13 +171,26 @@ def compute_chirp_factors(
 # Chirps per batch: their arrays fit in the cache
 _BATCH = 64
 _FULL_SCALE = 32767
-# Delay from TX to RX on the transmit board: some centimetres.
+# Delay from TX to RX on the transmit board, 6 cm, and the amplitude there, relative to the receivers' direct path. Both
+# are chosen: a short path is strong, and the filter weakens its low tone.
 _LEAKAGE_DELAY_S = 0.2e-9
 _LEAKAGE_AMPLITUDE = 2.0
 
 
 class _ReceivingBoard:
-    """Properties of a receiving board that are constant for all chirps."""
+    """Properties of a receiving board that are constant for all chirps.
+
+    Attributes
+    ----------
+    receiver, field
+        Gains and errors of the board, and the object's echo.
+    middle_hz
+        Middle of the signal's IF band, between the direct path and the field's centre path.
+    direct
+        complex64 [2, rx, sample]: F and F1 of the direct path, with the channels' gains.
+    expand
+        complex64 [2, node, sample]: matrices from the field's nodes to the object's F and F1.
+    """
 
     def __init__(self, rig: Instrument, scene: Scene, board: Board, seed: int, cache_dir: Path | None) -> None:
         chirp = rig.chirp
@@ -183,14 +208,12 @@ class _ReceivingBoard:
             2j * np.pi * (f[0] * tau[:, None] + chirp.slope_hz_per_s * np.outer(tau, t))
         )
         gains = self.receiver.gains[:, None]
-        # [2, rx, sample]: F and F1 of the direct path, with the channel's gain.
         shift = chirp.slope_hz_per_s * tau[:, None] - self.middle_hz
         self.direct = (gains * direct * np.stack([np.ones_like(shift), shift])).astype(np.complex64)
         values, slopes = node_matrix(self.field, f)
         carrier = np.exp(2j * np.pi * f * centre)
         first = (chirp.slope_hz_per_s * centre - self.middle_hz) * values
         first = first + slopes * chirp.slope_hz_per_s / 2j / np.pi
-        # [2, node, sample]: the object's F and F1 from its node values.
         self.expand = np.stack([values * carrier, first * carrier]).astype(np.complex64)
 
 

@@ -65,7 +65,8 @@ def _tabulate_normal() -> NDArray[np.float32]:
     return (middles / middles.std()).astype(np.float32)
 
 
-# Every number has both limits: they also refuse NaN and infinities, and keep a scan's size in proportion.
+# Every number has both limits: they also refuse NaN and infinities, and keep a scan's size in proportion. Chosen, wide
+# enough for any scene that makes sense.
 Seed = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 Millimetres = Annotated[float, msgspec.Meta(ge=-2000, le=2000)]
 Size = Annotated[float, msgspec.Meta(ge=0.01, le=2000)]
@@ -110,12 +111,16 @@ def _require(ok: bool, rule: str) -> None:
 
 
 def _check_permittivity(pair: Pair) -> None:
+    """Raise ValueError if eps' is below 1 or the loss eps'' negative."""
     _require(pair[0] >= 1.0, "permittivity's real part must be at least 1")
     _require(pair[1] >= 0.0, "permittivity's second number is the loss eps'' >= 0 of eps' - j eps''")
 
 
 class Layer(_Table, frozen=True):
-    """A layer of a plate; without `thickness_mm` a half space (only the last layer)."""
+    """A layer of a plate; without `thickness_mm` a half space (only the last layer).
+
+    `permittivity` is [eps', eps''] of eps' - j eps''.
+    """
 
     permittivity: tuple[Permittivity, Permittivity]
     thickness_mm: Size | None = None
@@ -267,33 +272,51 @@ class Skews(_Table, frozen=True):
 
 
 class Disturbances(_Table, frozen=True):
-    """Disturbances of the rig. Defaults are those of the published rig; OFF switches all off."""
+    """Disturbances of the rig. Defaults are those of the published rig; OFF switches all off.
 
+    docs/spec/scene-file.md has the source of each default, and says which are assumed.
+    """
+
+    # Each start of a board is late by 0 to this much, drawn by pulse, and by a latency that is the same for all boards.
     sync_uncertainty_ns: Delay = 5.0
     sync_latency_ns: Delay = 160.0
     crystal_ppm: Crystals = Crystals(0.0, 0.8, -1.1)
+    # Start frequency of the receivers above the rig file's, unless the host programs the radars itself.
     if_offset_hz: Hertz = 870e3
+    # A new phase of each chirp and board.
     random_phase: bool = True
+    # Parabolic bend of the IF before the ramp's end: its height and when it starts.
     bend_hz: Hertz = 300e3
     bend_us: Microseconds = 20.0
+    # Oscillation of the IF after the ramp's start, and its decay time.
     ripple_hz: Hertz = 3e3
     ripple_us: Microseconds = 5.0
+    # The IF high-pass filter.
     hpf: bool = True
+    # Gain and phase of each channel lie within plus and minus these; board H has this gain over board V.
     rx_gain_spread_db: GainSpread = 1.0
     rx_phase_spread_deg: Annotated[float, msgspec.Meta(ge=0, le=360)] = 20.0
     hv_gain_db: Gain = 1.5
     # Growth of V's echo against H's from the first to the last position: a share, and degrees. The direct path does not
     # have it, so that referencing to that path does not take it away.
     hv_drift: tuple[Drift, Angle] = (0.0, 0.0)
+    # Share (real, imaginary) of the other polarisation that a board receives too.
     leakage_h: Leakage = (0.05, 0.0)
     leakage_v: Leakage = (0.05, 0.0)
+    # The stage moves during a burst; False: each chirp is at the burst's mean position.
     burst_motion: bool = True
+    # Direct path over noise for each chirp and channel; None: no noise.
     direct_snr_db: Gain | None = 5.5
+    # Amplitude of the ADC's 32767 counts, in direct paths.
     adc_full_scale: Factor = 64.0
+    # Probability that a packet is lost.
     packet_loss: Share = 0.0
+    # Rows towards -x are shifted so far along +x.
     backlash_mm: Height = 0.0
     sync_skew_ns: Skews = Skews()
+    # Attenuation of the direct path alone.
     direct_loss_db: Decibels | Literal["absent"] = 0.0
+    # Standard error of the leakage that the rig file gets, as from a calibration; None: the rig file keeps its own.
     leakage_measured: Annotated[float, msgspec.Meta(ge=0, le=10)] | None = None
 
     @property
@@ -304,6 +327,7 @@ class Disturbances(_Table, frozen=True):
         return 10 ** (-self.direct_loss_db / 20)
 
 
+# The value of each disturbance that switches it off; the start of the bend and the ripple's decay cannot be.
 OFF: dict[str, Any] = {
     "sync_uncertainty_ns": 0.0,
     "sync_latency_ns": 0.0,
@@ -493,7 +517,7 @@ class Facets:
 
 
 def draw_specimens(scene: Scene) -> Scene:
-    """Return the scene with true plates and points; applying it again changes nothing.
+    """Return the scene with plates and points as they truly are; applying it again changes nothing.
 
     Permittivities are drawn with `specimen_spread`: the real part from a normal distribution (at least 1), the loss
     from a log-normal one, around the nominal values; a layer of air stays air. Shift and tilt of the plane are added to
@@ -535,6 +559,7 @@ def slopes(plate: Plate) -> tuple[float, float]:
 
 
 def _find_plane_height_mm(scene: Scene, at_mm: Pair) -> float:
+    """Return how far the shifted and tilted plane lies beyond the nominal one at a place."""
     along = [math.tan(math.radians(a)) * x for a, x in zip(scene.plane_tilt_deg, at_mm, strict=True)]
     return scene.plane_shift_mm + sum(along)
 
@@ -543,17 +568,17 @@ def _move_with_plane(plate: Plate, scene: Scene) -> Plate:
     """Return the plate with shift and tilt of the plane added."""
     tilt = plate.tilt_deg
     if any(scene.plane_tilt_deg):
-        corners = [
+        summed_slopes = [
             math.tan(math.radians(a)) + math.tan(math.radians(b))
             for a, b in zip(tilt, scene.plane_tilt_deg, strict=True)
         ]
-        tilt = (math.degrees(math.atan(corners[0])), math.degrees(math.atan(corners[1])))
+        tilt = (math.degrees(math.atan(summed_slopes[0])), math.degrees(math.atan(summed_slopes[1])))
     height_mm = plate.height_mm + _find_plane_height_mm(scene, plate.centre_mm)
     return msgspec.structs.replace(plate, tilt_deg=tilt, height_mm=height_mm)
 
 
 def _draw_permittivities(plate: Plate, index: int, scene: Scene) -> Plate:
-    """Return the plate with drawn permittivities."""
+    """Return the plate with drawn permittivities; metal stays as it is."""
     if not any(scene.specimen_spread) or plate.metal:
         return plate
     rng = np.random.default_rng([stream_key(scene.seed, "specimen"), index])
@@ -563,6 +588,7 @@ def _draw_permittivities(plate: Plate, index: int, scene: Scene) -> Plate:
 
 
 def _vary_layer(layer: Layer, scene: Scene, rng: np.random.Generator) -> Layer:
+    """Return the layer with a drawn permittivity. Air stays air, but takes its numbers of the generator too."""
     varied = _vary(layer.permittivity, scene.specimen_spread, rng)
     if layer.permittivity == _AIR:
         return layer
@@ -570,6 +596,7 @@ def _vary_layer(layer: Layer, scene: Scene, rng: np.random.Generator) -> Layer:
 
 
 def _vary(nominal: Pair, spread: Pair, rng: np.random.Generator) -> Pair:
+    """Draw eps' and eps'' around nominal ones, with the relative standard deviations `spread`."""
     # Plain Python numbers, which can be written as JSON.
     real, loss = rng.standard_normal(2).tolist()
     # The log-normal factor has mean 1 and standard deviation spread[1]

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from polysight_shared.errors import DeviceError
 from polysight_simulators.builds import SKETCH_DIR, compile_once
 
+# Where Debian's arduino-core-avr puts the Arduino core.
 CORE_DIR = Path("/usr/share/arduino/hardware/arduino/avr/cores/arduino")
 ENABLING_COMMAND = (
     "sudo apt-get install gcc make gcc-avr avr-libc binutils-avr arduino-core-avr libsimavr-dev libelf-dev"
@@ -22,6 +23,7 @@ _SOURCES = sorted(p for p in Path(__file__).parent.iterdir() if p.suffix in (".c
 _CC = ("gcc", "-O2", "-Wall", "-Wextra")
 _LIBRARIES = ("-lsimavr", "-lelf", "-lutil", "-lm")
 _ON_FAILURE = ("a package is missing, or the sources were changed", ENABLING_COMMAND)
+# Clock of the UNO.
 HZ = 16_000_000
 
 
@@ -93,6 +95,11 @@ class EmulatedUno:
         self._collect()
 
     def _collect(self) -> None:
+        """Read the emulator's lines up to the end of an answer, and update the attributes. Raises DeviceError.
+
+        The first letter of a line: E edge, T byte sent by the board, C cost of an interrupt, W widths and times of
+        motor pulses, X trouble, and R, the last one: cycle, motors, and bytes sent to the pseudo terminal.
+        """
         output = self._process.stdout
         if output is None:
             raise DeviceError("the UNO emulator has no output", "a bug", "report it")
@@ -116,6 +123,7 @@ class EmulatedUno:
         raise DeviceError("the UNO emulator ended", "it crashed; its last words are on standard error", "report it")
 
     def _apply_action(self, line: str) -> None:
+        """Send a command to the emulator, and read its answer. Raises DeviceError."""
         if self._process.stdin is None:
             raise DeviceError("the UNO emulator has no input", "a bug", "report it")
         self._process.stdin.write(line + "\n")
@@ -139,15 +147,15 @@ class EmulatedUno:
         self._apply_action(f"settle {pty_bytes}")
 
     def rest(self, limit_s: float = 600.0) -> None:
-        """Run until no motor has stepped for 50 ms."""
+        """Run until no motor has stepped for 50 ms, or `limit_s` has passed on the board."""
         self._apply_action(f"rest {round(limit_s * HZ)}")
 
     def press(self, mask: int) -> None:
-        """Press switches: 1 x, 2 y, 4 emergency stop."""
+        """Hold the switches of this sum, and let go of all others: 1 x, 2 y, 4 emergency stop."""
         self._apply_action(f"inputs {mask}")
 
     def slip(self, dx: int, dy: int) -> None:
-        """Let the motors lose steps."""
+        """Move the motors of x and y by steps that the board does not know of."""
         self._apply_action(f"slip {dx} {dy}")
 
     def reset(self) -> None:

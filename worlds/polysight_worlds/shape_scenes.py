@@ -22,7 +22,8 @@ from polysight_worlds.rig import Boards, published_boards, published_rig, turn
 from polysight_worlds.shape_echoes import record_shapes
 from polysight_worlds.shapes import Shape, Sphere, bottle, cylinder, plate, sphere
 
-# The linear part of the published chirp, in as many frequencies as hold a range gate of 0.5 m.
+# The linear part of the published chirp, in as many frequencies as hold a range gate of 0.5 m: paths that differ by 2 m
+# look alike.
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 24)
 # Linear samples of the published chirp.
 SAMPLES = 192
@@ -30,7 +31,7 @@ SAMPLES = 192
 # in each chirp, and a position averages 16 of them (a fourth of the noise). The direct path is 1.39 m long, and echoes
 # are 1.35 times as strong, as it leaves at the patterns' edge.
 NOISE_A_SAMPLE = 10 ** (-5.5 / 20) / np.sqrt(16) / 1.39 / 1.35
-# From the rig's origin to the middle of the picture: the published rig's object plane.
+# Distance from the rig's origin to the published rig's object plane.
 PLANE_M = 0.499
 
 
@@ -38,8 +39,8 @@ PLANE_M = 0.499
 class ShapeScene:
     """Shapes of one object, and what is true of it.
 
-    `permittivity` is None for metal; `is_uniform` is False for a thin wall, which has no single surface to look at.
-    `background`: a table or nothing.
+    `permittivity` is None for metal; `radius_m`: the smaller radius of its front, infinite for a plate. `is_uniform` is
+    False for a thin wall, which has no single surface to look at. `background`: a table or nothing.
     """
 
     kind: str
@@ -87,7 +88,7 @@ class ShapeNuisances:
 
 
 def disturb_boards(boards: Boards, nuisances: ShapeNuisances) -> Boards:
-    """Return the boards as they really stand."""
+    """Return the boards as they really stand; the same for all scans with these nuisances."""
     rng = np.random.default_rng([nuisances.seed, 11])
 
     def disturb(antennas: tuple[Antenna, ...], leakage: float) -> tuple[Antenna, ...]:
@@ -148,7 +149,10 @@ def reference_sphere(radius_m: float = 0.125) -> Sphere:
 
 @dataclass(frozen=True)
 class _Draw:
-    """What all kinds draw: a front near the middle of the picture, and a medium."""
+    """What all kinds draw: a front near the middle of the picture, a medium, and the direction of an axis.
+
+    `rng`: the generator from which each kind draws its sizes. All ranges here are chosen.
+    """
 
     rng: Generator
     front_m: tuple[float, float, float]
@@ -240,7 +244,7 @@ def _draw_thin_sheet(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
     return (plate("thin sheet", wall, draws.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radius_m
 
 
-# What draws the pieces of each kind of object, and the smaller radius of its front in metres.
+# What draws the pieces of each kind of object, and the smaller radius of its front in metres. Numbers are radii in mm.
 KINDS: dict[str, Callable[[_Draw], tuple[tuple[Shape, ...], float]]] = {
     "plate": _draw_plate,
     "sphere": _draw_sphere(0.1, 0.2),
@@ -265,7 +269,8 @@ def draw_shapes(
 ) -> ShapeScene:
     """Draw an object of a kind (None: any of `KINDS`), real part 2 to 9, loss 0 to 1, front near the picture's middle.
 
-    `with_table`: a wooden table stands 120 to 250 mm behind its front. `metal_share`: of scenes whose object is metal.
+    `with_table`: a wooden table stands 120 to 250 mm behind its front. `metal_share`: of scenes whose object is metal;
+    thin walls never are.
     """
     rng = np.random.default_rng([seed, 21])
     if kind is None:

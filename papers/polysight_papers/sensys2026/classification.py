@@ -1,6 +1,10 @@
 """Fig. 18 (solids under one and two angles, liquids, powders, with confusion matrices) and Fig. 20 (channels).
 
 Pixels are drawn with the errors of `patches.py`. `pixel_bound` is the share that no classifier can pass.
+
+A task is the name of a group of materials, with ", two angles" after it if each pixel is seen under both. "By pixel" a
+pixel may be judged by others of its own patch, which is optimistic; with scans left out it is not. `quick` draws less,
+for a first look.
 """
 
 from __future__ import annotations
@@ -40,14 +44,16 @@ from polysight_papers.sensys2026.item import (
 )
 from polysight_papers.sensys2026.patches import Errors, calibrated_errors, count_draws, draw, groups, spread_table
 
+# The second angle of the task of two angles, in the paper.
 SECOND_ANGLE_DEG = 55.0
 RESULT = 20
 """Seed of the draw that is judged."""
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
 OTHER_DRAWS = tuple(range(21, 29))
 """Seeds of further draws, for the random spread of one draw."""
+# A score, one of its matrices of confusions [true, named], and a title.
 Panel = tuple[Score, npt.NDArray[np.float64], str]
-# Draws for a bound
+# Draws of each material for a bound. Chosen: its standard error is below 1 %.
 TRIALS = 4000
 
 
@@ -65,12 +71,15 @@ def task_samples(task: str, seed: int, quick: bool) -> Samples:
 
 @cache
 def score_simulated(task: str, model: str, channels: str, by_pixel: bool, quick: bool) -> Score:
-    """Return the score of a model on the draw for the results."""
+    """Return the score of a model on the draw for the results.
+
+    `model`: key of the host's models; `channels`: such as "H+V+P"; `by_pixel`: split by pixel, not by scan.
+    """
     return score(task_samples(task, RESULT, quick), model, channels, by_pixel)
 
 
 def noise_text(tasks: Iterable[str], quick: bool) -> str:
-    """Return a sentence with the calibrated amplitude errors."""
+    """Return a note on the errors that pixels are drawn with, and how many pixels there are."""
     names = sorted({t.partition(", ")[0] for t in tasks})
     printed = ", ".join(f"{100 * calibrated_errors(n, count_draws(quick)).amplitude:.2f} % ({n})" for n in names)
     phase_std_rad = published_values()["phase_std_rad"]
@@ -81,6 +90,7 @@ def noise_text(tasks: Iterable[str], quick: bool) -> str:
 
 
 def _parse_angles(task: str) -> tuple[float, ...]:
+    """Return the incidence angles of a task, degrees."""
     name, _, two = task.partition(", ")
     if two:
         return (groups()[name].angle_deg, SECOND_ANGLE_DEG)
@@ -97,6 +107,7 @@ def chance(quick: bool) -> Table:
         name = task.partition(", ")[0]
         scores = [score(task_samples(task, seed, quick), DISCRIMINANT) for seed in seeds]
         errors = calibrated_errors(name, count_draws(quick))
+        # In the order of the kinds below.
         limits = [
             pixel_bound(groups()[name].materials, _parse_angles(task), errors, reference, pixels)
             for reference, pixels in ((True, 1), (False, 1), (False, 12))
@@ -140,7 +151,7 @@ def unknowns(quick: bool) -> Table:
 
 @dataclass(frozen=True)
 class TaskScores:
-    """Scores of one task of Fig. 18: the paper's KNN and the discriminant, scans left out and by pixel."""
+    """Scores of a task of Fig. 18: the paper's KNN and the discriminant, scans left out, and by pixel (`_pixel`)."""
 
     task: str
     knn: Score
@@ -153,7 +164,7 @@ class TaskScores:
 
     @staticmethod
     def score(task: str, quick: bool) -> TaskScores:
-        """Judge both models on a task."""
+        """Judge both models on a task, and the KNN on |H| alone."""
         scores = [
             score_simulated(task, model, channels, by_pixel, quick)
             for model, channels in ((PAPER, "H+V+P"), (DISCRIMINANT, "H+V+P"), (PAPER, "H"))
@@ -181,7 +192,7 @@ class TaskScores:
         )
 
     def to_json(self, quick: bool) -> dict[str, Any]:
-        """Return the content of the JSON file."""
+        """Return the task's part of the JSON file."""
         return {
             "published_percent": published_percent(self.task),
             "simulated": [asdict(s) for s in (self.knn_pixel, self.knn, self.discriminant_pixel, self.discriminant)],
@@ -190,7 +201,7 @@ class TaskScores:
         }
 
     def picture(self) -> Picture:
-        """Return the confusion matrices of H alone, of the discriminant by pixel, and by patch."""
+        """Return the confusion matrices of H alone, and of the discriminant for pixels and patches; scans left out."""
         task = self.task
         h = self.h
         best = self.discriminant
@@ -312,7 +323,7 @@ def fig20(run: Run) -> Item:
 
 
 def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) -> Figure:
-    """Draw one panel for each score and matrix, with its title."""
+    """Draw one panel for each score and matrix, with its title: three at most."""
     n = len(materials)
     if n > 12:
         # Large matrices stand two by two, and leave room for a list of confusions.
@@ -345,6 +356,7 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
         ax.grid(visible=False)
         ax.set_xticks(range(n), [str(m.number) for m in materials], fontsize=size)
         ax.set_yticks(range(n), y_labels, fontsize=size)
+        # Below half of a per cent the number would be 0.
         for i, j in zip(*np.nonzero(shares > 0.005), strict=True):
             colour = "w"
             if shares[i, j] > 0.6:

@@ -3,6 +3,9 @@
 Two ways to keep training and test apart: whole scans left out, which judges materials that at least two scans hold; and
 by pixel, which is optimistic, because pixels of one patch know each other. Table 2 is made by three recipes, the
 authors' among them. The page and the terminal's tables are made here.
+
+A source is `materials/`, `labels/` or the images made here; a task is the name of a group of materials, with
+", two angles" after it for two incidence angles.
 """
 
 from __future__ import annotations
@@ -50,11 +53,13 @@ from polysight_papers.sensys2026.run import Origin, make_folder, make_items
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 
+# The second angle of the task of two angles, in the paper.
 SECOND_ANGLE_DEG = 55.0
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
 ALL = 1500
 AT_LEAST = 6
-"""Pixels of a task, and least number of pixels of a patch."""
+"""Pixels of a task: each patch gives its share of them, or AT_LEAST if that is more, as far as it has so many. Chosen:
+all pixels are compared with all."""
 LEFT_OUT = "scans left out"
 OPTIMISTIC = "by pixel (optimistic)"
 
@@ -90,10 +95,12 @@ def pair_scans(first: Library, second: Library) -> tuple[Library, Library]:
     No scan is in two pairs, so that a pair can be left out as a whole. Scans without a partner are left out.
     """
     names_by_scan = [{s: {e.name for e in lib.entries if e.scan == s} for s in lib.scans} for lib in (first, second)]
+    # All pairs with common materials: how many, and both names.
     pairs = sorted(
         ((len(a & b), s, t) for s, a in names_by_scan[0].items() for t, b in names_by_scan[1].items() if a & b),
         key=lambda p: (-p[0], p[1], p[2]),
     )
+    # New names of the scans of each angle.
     names: tuple[dict[str, str], dict[str, str]] = ({}, {})
     for _, s, t in pairs:
         if s not in names[0] and t not in names[1]:
@@ -118,8 +125,9 @@ def select_repeated(samples: Samples) -> Samples | None:
 
 
 def _split_one_scan(samples: Samples) -> Samples:
-    """Pixels of one scan as if of two, every other pixel each: only for the split by pixel, which is no better.
+    """Return pixels of one scan as if of two, every other pixel each; those of several scans as they are.
 
+    Only for the split by pixel, which lets a patch know itself in any case.
     The halves of a patch are two patches, because weights are fitted to a few pixels of each patch.
     """
     if np.unique(samples.groups).size > 1:
@@ -278,11 +286,11 @@ def authors_fig20(judge: Judgements) -> Item:
     sources = list(dict.fromkeys(s for s, _, _ in judged_tasks))
     bars = [("published", [printed[c] for c in CHANNELS])]
     for source in sources:
-        own_tasks = [(t, x) for s, t, x in judged_tasks if s == source]
+        tasks_of_source = [(t, x) for s, t, x in judged_tasks if s == source]
         means: dict[str, tuple[float, float | None]] = {}
         for channel in CHANNELS:
-            pairs = [judge.score(source, t, PAPER, channel) for t, _ in own_tasks]
-            weight = [np.unique(x.names).size for _, x in own_tasks]
+            pairs = [judge.score(source, t, PAPER, channel) for t, _ in tasks_of_source]
+            weight = [np.unique(x.names).size for _, x in tasks_of_source]
             mixed = float(np.average([p[0].pixels for p in pairs], weights=weight))
             scores_without_scan = [(p[1], len(p[1].names)) for p in pairs if p[1] is not None]
             if scores_without_scan:
@@ -299,7 +307,7 @@ def authors_fig20(judge: Judgements) -> Item:
                     f"{printed[channel]:.2f} %",
                     percent(mixed),
                     percent(held_out_accuracy),
-                    ", ".join(f"{t} {_share(p[1])}" for (t, _), p in zip(own_tasks, pairs, strict=True)),
+                    ", ".join(f"{t} {_share(p[1])}" for (t, _), p in zip(tasks_of_source, pairs, strict=True)),
                 )
             )
             content[f"{channel}, {source}"] = {
@@ -325,7 +333,7 @@ def authors_fig20(judge: Judgements) -> Item:
 
 
 def _draw_channels(bars: list[tuple[str, list[float]]]) -> Any:
-    """Bars of accuracies in per cent: for each label one of each channel."""
+    """Draw bars of accuracies in per cent: for each label one of each channel."""
     fig = new_figure(8.4, 4.2)
     ax = fig.subplots()
     width = 0.84 / len(bars)
@@ -344,6 +352,7 @@ def _draw_channels(bars: list[tuple[str, list[float]]]) -> Any:
 
 
 def _share(score_or_none: Score | None) -> str:
+    """Return the share of pixels named right as a cell; a dash without a score."""
     if score_or_none is None:
         return percent(None)
     return percent(score_or_none.pixels)
@@ -374,10 +383,10 @@ MAKERS: dict[str, Callable[[Judgements], Item]] = {
     "fig20": authors_fig20,
     "fig21": lambda judge: authors_fig21(judge.data),
 }
+# Corrections of the authors before Eq. 3: leakage, a factor on |P| relative to metal, percentiles of |P| to keep.
 AXIAL_RATIO = 0.05
 METAL_FACTOR = 1 / 0.8
 PERCENTILES = (30, 70)
-"""Corrections of the authors before Eq. 3: leakage, a factor on |P| relative to metal, percentiles of |P| to keep."""
 
 
 def reproduce_authors(
@@ -468,6 +477,7 @@ def describe_origin(data: AuthorsData) -> Origin:
 
 def format_table(table: Table) -> str:
     """Format a table for the terminal: columns as wide as their cells, long heads over several lines."""
+    # Heads may be 9 letters wide in any column; their lines stand at the bottom of the head.
     limit = [max([9, *(len(row[k]) for row in table.rows)]) for k in range(len(table.head))]
     heads = [_wrap(head, width) for head, width in zip(table.head, limit, strict=True)]
     width = [max([n, *map(len, lines)]) for n, lines in zip(limit, heads, strict=True)]
@@ -483,6 +493,7 @@ def format_table(table: Table) -> str:
 
 
 def _wrap(text: str, width: int) -> list[str]:
+    """Return lines of at most `width` letters; a longer word is a line of its own."""
     out = [""]
     for word in text.split():
         if out[-1] and len(out[-1]) + 1 + len(word) > width:
@@ -506,7 +517,10 @@ def authors_recipe(p: Complex, angle_deg: float) -> complex:
 
 
 def _collect_pixels(data: AuthorsData, source: str, m: Published) -> tuple[Complex, float, int] | None:
-    """Ratios of a material's pixels, their angle, and how many scans: at the paper's angle, or else the first."""
+    """Ratios of a material's pixels, their angle (degrees), and how many scans; None if the source lacks it.
+
+    At the paper's angle, or else at the smallest there is.
+    """
     paper = next(g.angle_deg for g in groups().values() if m in g.materials)
     entries = list(data.select(source, range(m.number, m.number + 1), paper).entries)
     if not entries:
@@ -533,7 +547,7 @@ class Estimate:
 
     @property
     def metal_like(self) -> bool:
-        """True if there is no permittivity."""
+        """True for metal, and for what has no permittivity or no standard error of one."""
         return self.material.number == 1 or self.clean.value is None or self.clean.real_std is None
 
 
@@ -615,6 +629,7 @@ def _format_row(e: Estimate) -> tuple[str, ...]:
     """Return the cells of a material's row; published, estimated as it is, clean and by the recipe."""
     m = e.material
     std = e.clean.real_std
+    # Table 2 gives no loss for number 23, cork.
     return (
         str(m.number),
         m.name,
@@ -631,13 +646,14 @@ def _format_row(e: Estimate) -> tuple[str, ...]:
 
 
 def _format_cells(value: complex | None) -> tuple[str, str]:
+    """Return real part and loss as cells."""
     if value is None:
         return ("metal-like", "")
     return (f"{value.real:.2f}", f"{-value.imag:.2f}")
 
 
 def _convert_to_json(source: str, e: Estimate) -> dict[str, Any]:
-    """Return the content of the JSON file."""
+    """Return an estimate as it stands in the JSON file."""
     return {
         "source": source,
         "number": e.material.number,

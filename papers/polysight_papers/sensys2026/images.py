@@ -40,6 +40,7 @@ from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figu
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError
 
+# Sides of the plates, as in `examples/nine-materials.toml`.
 PLATE_MM = 45.0
 GRID = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}
 """The sparse aperture of `examples/nine-materials.toml`, explained there."""
@@ -77,7 +78,7 @@ def simulate_scan(
 
 @dataclass(frozen=True)
 class Imaged:
-    """Result of a scan's images, and their axes in the rig frame (float64, metres)."""
+    """Materials found in a scan's images, and the images' axes in the rig frame (float64, metres)."""
 
     result: MaterialsResult
     x_m: npt.NDArray[np.float64]
@@ -112,17 +113,19 @@ PHASE_DEG = 30.0
 
 # Fig. 4.
 FRONT_ON_MM = 60.0
-"""Distance of each board from the middle in the front-on rig: 1.4 degrees of incidence."""
+"""Distance of each board's origin from the middle in the front-on rig. The antennas lie 7 to 15 mm from the middle:
+RX1 of H and V see it under 0.6 and 2.2 degrees of incidence."""
 FRONT_ON_GRID = {"columns": 81, "rows": 81, "step_x_mm": 4.5, "step_y_mm": 4.5}
 """Monostatic, a step d makes ghosts at wavelength * distance / 2 d: 216 mm for 4.5 mm, outside the plates."""
 ROWS = (3, 6, 15)
 """Acrylic, PET and glass in Table 2."""
+# Their places, around copper in the middle.
 FRONT_ON_PLACES_MM = ((-60.0, 0.0), (60.0, 0.0), (0.0, 60.0))
 
 
 @dataclass(frozen=True)
 class ScanView:
-    """A scan's images and its known plates."""
+    """Materials of a scan, and the scan with its images and known plates, as figures are drawn from it."""
 
     result: MaterialsResult
     scan: ProcessedScan
@@ -130,17 +133,23 @@ class ScanView:
 
 @cache
 def view_scan(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 499.0) -> ScanView:
-    """Scan of plates with the permittivities of these rows of Table 2, and a copper plate in the middle."""
+    """Scan plates with the permittivities of these rows of Table 2, and a copper plate in the middle.
+
+    `rows`: eight at most. `distance_mm`: of the object plane.
+    """
     around = [p for p in PLACES_MM if p != (0.0, 0.0)]
     step = len(around) // len(rows)
-    picked_rows = [around[i * step] for i in range(len(rows))]
-    return _scan(name, rows, picked_rows, run.config, 1300, object_distance_mm=distance_mm)
+    places_mm = [around[i * step] for i in range(len(rows))]
+    return _scan(name, rows, places_mm, run.config, 1300, object_distance_mm=distance_mm)
 
 
 def _scan(
     name: str, rows: Sequence[int], at: Sequence[tuple[float, float]], config: Path, seed: int, **more: object
 ) -> ScanView:
-    """Return a scene of a copper plate, and plates with the permittivities of these rows of Table 2 around it."""
+    """Simulate and process a scan of a copper plate in the middle, and of plates of these rows of Table 2.
+
+    `at`: places of the plates, mm; `more`: further keys of the scene file.
+    """
     plates = [plate("copper", None, 0.0, 0.0)]
     plates += [plate(table2()[n - 1].name, table2()[n - 1].permittivity, *xy) for n, xy in zip(rows, at, strict=True)]
     with simulate_scan(name, plates, config, seed=seed, **more) as (source, truth):
@@ -178,7 +187,7 @@ def _label_plates(ax: Any, scan: ProcessedScan) -> None:
 
 
 def _compute_opacity(scan: ProcessedScan) -> npt.NDArray[np.float64]:
-    """Return the opacity of P: pixels 20 dB below metal or less are noise."""
+    """Return the opacity of P, [y, x]: 0 from 20 dB below metal on, where noise begins, 1 from 14 dB on."""
     power = (np.abs(scan.h).astype(np.float64) ** 2 + np.abs(scan.v).astype(np.float64) ** 2) / 2
     power = np.nan_to_num(power)
     level = 10 * np.log10(np.maximum(np.minimum(power, scipy.ndimage.gaussian_filter(power, 1.5)), 1e-12))
@@ -229,7 +238,7 @@ def ratio_table(views: dict[str, ScanView]) -> Table:
 
 
 def ratio_data(views: dict[str, ScanView]) -> dict[str, Any]:
-    """Return the content of the JSON file."""
+    """Return each plate's ratio in each view, for the JSON file."""
     return {
         name: {p.truth.name: p.permittivity.ratio for p in view.result.patches if p.truth is not None}
         for name, view in views.items()
@@ -351,7 +360,7 @@ def fig14(run: Run) -> Item:
 
 
 def front_on(config: Path, folder: Path) -> Path:
-    """Write the rig file with its boards side by side into a folder."""
+    """Write the rig file with its boards side by side into a folder; return the file."""
     rig = tomllib.loads(config.read_text(encoding="utf-8"))
     for board in rig["boards"]:
         shift = next(step["shift_mm"] for step in reversed(board["mount"]) if "shift_mm" in step)
@@ -365,6 +374,7 @@ def fig4(run: Run) -> Item:
     """H, V and P of copper, acrylic, PET and glass, with boards side by side and as in the rig file."""
     with tempfile.TemporaryDirectory(prefix="polysight-reproduce-") as temporary:
         near = front_on(run.config, Path(temporary))
+        # The direct path is some 10 mm here, and echoes are relative to it: a larger gain (chosen) makes up for that.
         views = {
             "front-on": _scan("front-on", ROWS, FRONT_ON_PLACES_MM, near, 400, grid=FRONT_ON_GRID, object_gain=10.0)
         }

@@ -42,7 +42,7 @@ from polysight_papers.sensys2026.item import Published, Table, percent, publishe
 Complex = npt.NDArray[np.complex128]
 SCANS = 8
 PIXELS = 12
-"""Placements of Fig. 17; with 12 pixels each a material has 96, the paper's "about 80 to 120"."""
+"""Scans (the placements of Fig. 17), and pixels of a patch: a material has 96, the paper's "about 80 to 120"."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class Pixels:
-    """Metal-referenced pixels; `h` and `v` complex [scans, materials, pixels]."""
+    """Metal-referenced pixels of one draw; `h` and `v` complex [scans, materials, pixels]."""
 
     materials: tuple[Published, ...]
     angle_deg: float
@@ -142,10 +142,11 @@ def draw(
     scans: int = SCANS,
     pixels: int = PIXELS,
 ) -> Pixels:
-    """Draw pixels of every material in every scan; the same seed gives the same errors up to their size."""
+    """Draw `pixels` pixels of every material in every scan; the same seed gives the same errors up to their size."""
     rng = np.random.default_rng([seed, round(angle_deg * 100)])
-    own_share = np.sqrt(1 - errors.shared)
-    common = np.sqrt(errors.shared)
+    # Factors on the standard deviation: of a pixel's own error, and of the one common to its patch.
+    pixel_factor = np.sqrt(1 - errors.shared)
+    patch_factor = np.sqrt(errors.shared)
 
     def channel(r: Complex) -> Complex:
         """Return the ratio to metal in one channel, [scan, material, pixel], for reflection factors `r`.
@@ -156,14 +157,14 @@ def draw(
         shape = (scans, len(materials), 1)
         parts = []
         for std in (errors.amplitude, errors.phase_rad):
-            patch = common * rng.standard_normal(shape) + own_share * rng.standard_normal((*shape[:2], pixels))
-            parts.append((std * patch, std * common * rng.standard_normal((scans, 1, 1))))
+            error = patch_factor * rng.standard_normal(shape) + pixel_factor * rng.standard_normal((*shape[:2], pixels))
+            parts.append((std * error, std * patch_factor * rng.standard_normal((scans, 1, 1))))
         (a, a_ref), (b, b_ref) = parts
         return np.broadcast_to(r, shape[:2])[..., None] * (1 + a) / (1 + a_ref) * np.exp(1j * (b - b_ref))
 
-    # The same specimens under every angle
-    own_rng = np.random.default_rng([seed, 1])
-    eps = specimens(materials, errors.spread, own_rng.standard_normal((2, scans, len(materials))))
+    # The same specimens under every angle: their generator does not depend on it.
+    specimen_rng = np.random.default_rng([seed, 1])
+    eps = specimens(materials, errors.spread, specimen_rng.standard_normal((2, scans, len(materials))))
     r_s, r_p = fresnel(eps, np.radians(angle_deg))
     return Pixels(materials, angle_deg, channel(-r_s), channel(-r_p))
 
@@ -183,7 +184,7 @@ def count_draws(quick: bool) -> int:
 
 @cache
 def calibrated_errors(group_name: str, draws: int = 3, shared: float = 0.5) -> Errors:
-    """Return the errors with which |H| alone has the published accuracy; V and P are not used.
+    """Return the errors with which the paper's KNN on |H| alone has the published accuracy; V and P are not used.
 
     Bisection over the logarithm of the amplitude error, on draws that no result is made from.
     """
@@ -201,19 +202,22 @@ def calibrated_errors(group_name: str, draws: int = 3, shared: float = 0.5) -> E
 
 SPREADS = ((0.0, 0.0), (0.01, 0.05), (0.02, 0.1), (0.05, 0.2))
 """Relative standard deviations of real part and loss; Fig. 17 of the paper has 1 and 4 % / 23 and 14 %."""
+# Specimens of each material in the library. Chosen: it decides how well their spread is known.
 LIBRARY_SCANS = 24
 TEST_SCANS = 160
 """Enough for a calibration error of 0.01 to 0.03 with exact probabilities (4 to 23 names a scan)."""
 _TEST_SEED = 500
-# Nodes a dimension of the specimens' distribution, to 3.5 standard deviations
+# Nodes of the specimens' distribution in each dimension (real part, loss), to 3.5 standard deviations.
 _GRID = 21
 Real = npt.NDArray[np.float64]
 
 
-class Found(NamedTuple):
-    """Shares of patches named right, and by Bayes' rule; expected calibration error; unknown materials with a name.
+class SpecimenScore(NamedTuple):
+    """Judgement of the discriminant on new specimens.
 
-    `strangers` is (named, of how many), of all and of those that lie outside every known material's 95 % region.
+    `right` and `bound`: shares of patches named right, by it and by Bayes' rule. `calibration`: expected calibration
+    error. `strangers`: patches of materials that it had not learnt, (named, of how many) of all, and the same of those
+    that lie outside every known material's 95 % region.
     """
 
     right: float
@@ -233,7 +237,7 @@ def both_angles(group: str, angles_deg: tuple[float, ...], errors: Errors, seed:
 
 
 @cache
-def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, float], quick: bool) -> Found:
+def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, float], quick: bool) -> SpecimenScore:
     """Judge the discriminant on new specimens and scans, and Bayes' rule on the same errors."""
     test_scans = TEST_SCANS
     if quick:
@@ -245,11 +249,14 @@ def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, 
     named, right, sure = by_patch(model, test)
     calibration = calibration_error(sure[named], right[named])
     share = float((named & right).mean())
-    return Found(share, bayes(group, angles_deg, errors, quick), calibration, strangers_named(taught, test, quick))
+    bound = bayes(group, angles_deg, errors, quick)
+    return SpecimenScore(share, bound, calibration, strangers_named(taught, test, quick))
 
 
 def by_patch(model: Model, test: Samples) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_], Real]:
-    """Name all patches, scan by scan; return for each: named, right (by the nearest material), confidence, [patch]."""
+    """Name all patches, scan by scan; return for each whether it got a name, whether the nearest material is right, and
+    the confidence, [patch]. A patch farther than 1 from all materials gets no name.
+    """
     rows = []
     for scan in np.unique(test.groups):
         scan_samples = test.take(test.groups == scan)
@@ -274,7 +281,8 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
     nodes = np.stack(np.meshgrid(z, z, indexing="ij")).reshape(2, -1, 1)
     weights = np.outer(weight, weight).ravel() / weight.sum() ** 2
     std = np.tile([errors.amplitude, errors.amplitude, errors.phase_rad * np.sqrt(2)], len(angles_deg))
-    std = std * np.sqrt(errors.shared + (1 - errors.shared) / 12)
+    # A patch's mean over its pixels, with the scan's reference known.
+    std = std * np.sqrt(errors.shared + (1 - errors.shared) / PIXELS)
     mean = _compute_features(
         specimens(materials, errors.spread, np.broadcast_to(nodes, (2, z.size**2, len(materials)))), angles_deg
     )
@@ -295,6 +303,7 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
 
 
 def _compute_features(eps: npt.NDArray[np.complex128], angles_deg: tuple[float, ...]) -> Real:
+    """Return ln|r_s|, ln|r_p| and arg(r_s / r_p) under each angle, [..., 3 * angles]."""
     columns = []
     for angle in angles_deg:
         r_s, r_p = fresnel(eps, np.radians(angle))
@@ -329,22 +338,22 @@ def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, i
 def _find_outside(test_samples: Samples, training_samples: Samples) -> npt.NDArray[np.bool_]:
     """Return true for patches outside the regions of 95 % of each known material's patches, [patch].
 
-    Of ln|H|, ln|V| and arg P of patches, normal with mean and covariance from so many patches (Hotelling's law).
+    Of ln|H|, ln|V| and arg 1/P of patches, normal with mean and covariance from so many patches (Hotelling's law).
     """
     features, _ = _patch_features(test_samples)
     means, names = _patch_features(training_samples)
     out = np.ones(len(features), np.bool_)
     for name in np.unique(names):
-        own_means = means[names == name]
-        n, d = own_means.shape
-        difference = features - own_means.mean(axis=0)
-        q = np.einsum("pd,de,pe->p", difference, np.linalg.inv(np.cov(own_means.T)), difference)
+        means_of_material = means[names == name]
+        n, d = means_of_material.shape
+        difference = features - means_of_material.mean(axis=0)
+        q = np.einsum("pd,de,pe->p", difference, np.linalg.inv(np.cov(means_of_material.T)), difference)
         out &= q > (n + 1) * (n - 1) * d / (n * (n - d)) * scipy.stats.f.ppf(0.95, d, n - d)
     return out
 
 
 def _patch_features(samples: Samples) -> tuple[Real, npt.NDArray]:
-    """Return mean ln|H|, ln|V| and arg P under each angle, [patch, 3 * angles], and the patches' names."""
+    """Return mean ln|H|, ln|V| and arg 1/P under each angle, [patch, 3 * angles], and the patches' names."""
     h, v, inverse = split_by_angle(samples.x)
     x = np.concatenate([np.log(h), np.log(v), np.angle(inverse)], axis=1)
     order = np.unique(samples.patches)

@@ -30,14 +30,14 @@ Complex = npt.NDArray[np.complex64]
 # Units of the errors in the order of `QUANTITIES`.
 UNITS = ("frequency (Hz)", "phase (rad)", "relative amplitude")
 
-# Fig. 9: a short row, and the IF offsets of the receivers, which sweep the direct path over the filter's skirt.
+# Fig. 9: a short row, and the IF offsets of the receivers, which sweep the direct path over the filter's slope; chosen.
 GRID = {"columns": 6, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
 OFFSETS_HZ = (200e3, 250e3, 350e3, 450e3, 600e3, 870e3, 1.1e6, 1.3e6, 1.5e6, 1.7e6)
 # The offset of which spectrogram and spectra are shown.
 USUAL_HZ = 870e3
+# Distances from the tone at which the smear of a bent chirp is averaged; chosen.
 SKIRT_HZ = (60e3, 200e3)
-"""Range of the smear of a bent chirp, relative to its tone."""
-# Length of spectra
+# Length of zero-padded spectra.
 _PADDED = 4096
 
 
@@ -66,7 +66,7 @@ class SyncScan:
 
 @cache
 def sync_scan(run: Run) -> SyncScan:
-    """Simulate three metal plates with all disturbances.
+    """Simulate a scan of three metal plates with all disturbances, and synchronise it.
 
     "Before" is one chirp of each position as the hardware trigger left it, mixed down by one frequency for the whole
     scan, so that the object lies in the range gate at all; "after" is the pipeline's.
@@ -77,7 +77,7 @@ def sync_scan(run: Run) -> SyncScan:
         chirp = rig.chirp
         board = rig.receivers[0].name
         setups = {b.name: BoardSetup.from_rig(rig, b) for b in rig.receivers}
-        reports = {n: SyncReport(chirp.sample_rate_hz, chirp.linear_samples, 4) for n in setups}
+        reports = {n: SyncReport(chirp.sample_rate_hz, chirp.linear_samples, rx=4) for n in setups}
         builder_before = ImageBuilder(rig)
         builder_after = ImageBuilder(rig)
         middle = source.plan.rows // 2
@@ -189,7 +189,10 @@ def fig15(run: Run) -> Item:
 
 
 def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: float | None) -> None:
-    """Draw the standard deviation of a quantity after each stage, its bounds, and the published value, if any."""
+    """Draw the standard deviation of a quantity after each stage, its bounds, and the published value `limit`, if any.
+
+    `summary`: by board, as of `SyncReport.summary`; two boards.
+    """
     for i, (board, content) in enumerate(summary.items()):
         stages = content["stages"]
         positions = np.array([list(STAGES).index(s) for s in stages]) + 0.12 * (2 * i - 1)
@@ -215,16 +218,18 @@ def _tabulate_stages(summary: Mapping[str, Any], limits: Mapping[str, float]) ->
     rows = []
     for board, content in summary.items():
         for name, s in content["stages"].items():
+            # The published values hold for the last stage, and the amplitude has none: its cell is cut off.
             printed = [f"{limits[q]:g}" if name == "referenced" and q in limits else "" for q in QUANTITIES]
-            own_figures = [f"{s[f'{q}_std']:.4g}" for q in QUANTITIES]
-            cells = [x for pair in zip(own_figures, printed, strict=True) for x in pair]
+            simulated = [f"{s[f'{q}_std']:.4g}" for q in QUANTITIES]
+            cells = [x for pair in zip(simulated, printed, strict=True) for x in pair]
             rows.append((f"{board}, {name}: {STAGES[name]}", *cells[:-1]))
     return tuple(rows)
 
 
 def tones(chirps: npt.NDArray[np.complex64], chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray]:
-    """IF (Hz) and amplitude of the strongest tone of each chirp [rx, chirp, sample], summed in power over RX.
+    """IF (Hz) and amplitude of the strongest tone of each chirp, both [chirp], of chirps [rx, chirp, sample].
 
+    Power is summed over RX.
     The peak of the zero-padded spectrum: with 4096 points, a peak between two of them loses less than 0.1 %.
     """
     a, b = chirp.linear_samples
@@ -239,7 +244,7 @@ def tones(chirps: npt.NDArray[np.complex64], chirp: Chirp) -> tuple[npt.NDArray,
 def skirt_db(
     chirps: npt.NDArray[np.complex64], rate_hz: float
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Mean spectrum of chirps [..., sample] about their strongest tone: IF from it (Hz), level (dB below the peak).
+    """Mean spectrum of chirps [..., sample] about their strongest tone: IF from it (Hz), level (dB, 0 at the peak).
 
     Hann window. Chirps are laid over each other at their peaks, and their power is averaged.
     """
@@ -250,7 +255,10 @@ def skirt_db(
 
 
 def _sweep_start_frequencies(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
-    """IF (Hz) and amplitude of the direct path over all start frequencies, and the chirps of the usual one."""
+    """Simulate the direct path alone at all start frequencies; return IF (Hz) and amplitude of each chirp, both [n].
+
+    The third result is the chirps of the usual one, [rx, chirp, sample].
+    """
     swept = []
     example = np.zeros((1, 1, chirp.samples), np.complex64)
     for offset in OFFSETS_HZ:
@@ -266,10 +274,10 @@ def _sweep_start_frequencies(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.N
     return if_hz[in_band], amplitude[in_band], example
 
 
-def _draw_spectrogram(ax: Axes, one: Complex, chirp: Chirp) -> None:
+def _draw_spectrogram(ax: Axes, samples: Complex, chirp: Chirp) -> None:
     """Draw the spectrogram of one chirp [sample], and the end of its used part."""
     f, t, power = scipy.signal.spectrogram(
-        one, chirp.sample_rate_hz, nperseg=48, noverlap=44, nfft=256, return_onesided=False
+        samples, chirp.sample_rate_hz, nperseg=48, noverlap=44, nfft=256, return_onesided=False
     )
     f = np.fft.fftshift(f % chirp.sample_rate_hz)
     power = np.fft.fftshift(power, axes=0)
@@ -283,7 +291,7 @@ def _draw_spectrogram(ax: Axes, one: Complex, chirp: Chirp) -> None:
 
 
 def _draw_skirts(ax: Axes, chirps: Complex, chirp: Chirp) -> dict[str, float]:
-    """Spectra about the tone of whole chirps and of their used part; the mean level of their skirts, dB."""
+    """Draw spectra about the tone of whole chirps and of their used part; return the mean level of their smear, dB."""
     smear = {}
     parts = {"whole chirp": ((0, chirp.samples), PALETTE[6]), "used part": (chirp.linear_samples, INK)}
     for part, ((first, last), colour) in parts.items():

@@ -31,6 +31,9 @@ EVENT = 3
 FAULT_DATA = bytes.fromhex("05000000800000fe") + bytes(16) + b"\xff" * 6 + bytes(2)
 OLD_UP_EMPTY = bytes.fromhex("00000000ff7c0c000000000000000000")
 OLD_UP_WRITTEN = bytes.fromhex("10aa0500") + bytes(16)
+# Duration of the power-up in 5 ns, the first word of the event: that of the board whose flash is written. The boot
+# status and the failed self-tests follow.
+POWER_UP_TIME = 0x5AA10
 
 
 def ones_sum(head: bytes) -> int:
@@ -260,8 +263,7 @@ class Cores:
         if self.first_generation:
             self.event(UP_MAIN, OLD_UP_EMPTY if broken else OLD_UP_WRITTEN, BOOT_S)
         else:
-            # Power-up time in 5 ns (chosen), status of the boot, failed self-tests.
-            self.event(UP_MAIN, struct.pack("<IQQ", 371_216, broken | self.hardware_bits, 0), BOOT_S)
+            self.event(UP_MAIN, struct.pack("<IQQ", POWER_UP_TIME, broken | self.hardware_bits, 0), BOOT_S)
         if self.fault_at == "power-up":
             self.event(MAIN_FAULT, FAULT_DATA, BOOT_S + 1e-3)
 
@@ -320,6 +322,7 @@ class Cores:
                 return bytes(32)
             return struct.pack("<8I", 0x5EED0000 + self.die, 0xD1E, 2243, self.die, 0, 0, 0, 0)
         elif number == READ_TEMPERATURES:
+            # Device time in ms, then degrees Celsius of ten sensors; chosen.
             return struct.pack("<I10h", int(self.now() * 1e3) & 0xFFFFFFFF, 41, 41, 42, 42, 45, 46, 45, 40, 43, 0)
         return b""
 
@@ -337,7 +340,7 @@ class Cores:
         return bytes(6)
 
     def _report_calibration(self, passed: int) -> None:
-        """Send the event with the calibrations that passed, as bits."""
+        """Send the event with the calibrations that passed, as bits; temperature and duration in it are chosen."""
         self.event(CALIBRATED, struct.pack("<IIhHII", passed, passed, 41, 0, 500, 0), RF_INIT_S)
 
     def _store_profile_or_chirps(self, number: int, data: bytes) -> int:
@@ -403,6 +406,7 @@ class Cores:
         if not self.armed:
             return 21
         if what == 4 and self.now() < self.frame_ends:
+            # Type, code and line of the firmware; the values are chosen.
             self.event(RF_FAULT, struct.pack("<BBH", 3, 2, 815) + bytes(28), 0.0)
         self.armed = False
         self.event(FRAME_END, b"", READY_S)
@@ -475,4 +479,4 @@ class Cores:
     def _boot_from_ram(self) -> None:
         """Take the download as the image in RAM, and report its boot."""
         self.ram = self._part
-        self.event(BOOTED, struct.pack("<IQQ", 371_216, boot_errors(self.ram), 0), BOOT_S)
+        self.event(BOOTED, struct.pack("<IQQ", POWER_UP_TIME, boot_errors(self.ram), 0), BOOT_S)

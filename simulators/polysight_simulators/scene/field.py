@@ -191,7 +191,10 @@ class _Plane:
     amplitudes: optics.Complex
 
     def levels(self, rx: Sequence[int], top_hz: float) -> list[_Level]:
-        """Group plates and points by height; at least one level, also for an empty scene."""
+        """Group plates and points by height; at least one level, also for an empty scene.
+
+        `rx`: channels; `top_hz`: the highest frequency.
+        """
         plates = self.scene.plates
         points = self.scene.points
         heights = np.array([p.height_mm for p in (*plates, *points)])
@@ -204,6 +207,7 @@ class _Plane:
         all_levels = []
         for group in groups:
             inside = [i for i, height in enumerate(heights) if group[0] <= height <= group[-1]]
+            # Heights are those of plates first, then those of points.
             members = [i for i in inside if i < len(plates)], [i - len(plates) for i in inside if i >= len(plates)]
             all_levels.append(self._level((group[0] + group[-1]) / 2, members, rx, top_hz))
         return all_levels
@@ -220,10 +224,12 @@ class _Plane:
         centre = self.ant.centre_m
         wx, wy = np.meshgrid(self.x.w, self.y.w)
         legs = [self.ant.legs(wx, wy, r, z) for r in rx]
+        # Heights of plates and of points relative to the level.
         lifts = [
             np.array([(table[i].height_mm - height_mm) / 1e3 for i in chosen])
             for table, chosen in zip((self.scene.plates, self.scene.points), members, strict=True)
         ]
+        # Largest height of anything on the level, with the ends of tilted plates and the bumps of rough ones.
         relief = float(np.abs(lifts[1]).max(initial=0.0))
         for i, lift in zip(members[0], lifts[0], strict=True):
             plate = self.scene.plates[i]
@@ -265,9 +271,11 @@ class _Plane:
         ant = self.ant
         plates = [self.scene.plates[i] for i in level.plates]
         table = np.array([(*p.centre_mm, *p.size_mm) for p in plates]) / 1e3
+        # Phase by which a tilted plate turns along x and y, rad/m.
         turn = wave * level.steepness[m] * np.array([slopes(p) for p in plates])
         weights = series[level.plates] * optics.plate_scale(ant, self.scene, f)
         weights = weights * np.reshape(level.lift_phase(level.lift_m, wave, m), (-1, 1))
+        # Spectra along y and x of each row of facets.
         strips = [
             self._transform_plate(self.surfaces[i], table[n, :2], turn[n], wave * level.steepness[m])
             for n, i in enumerate(level.plates)
@@ -276,6 +284,8 @@ class _Plane:
         x = np.concatenate([of_plate for _, of_plate in strips])
         strips_of_plate = [len(of_plate) for of_plate, _ in strips]
         orders = weights.shape[1]
+        # A plate's echo is a sum over orders. Either each plate has a kernel, which holds the sum, or each order has
+        # one, which plates share by their weights.
         if len(plates) < orders:
             shares, kernel_series = np.eye(len(plates), dtype=np.complex128), weights
         else:
@@ -320,11 +330,12 @@ def _range(legs: list[tuple[optics.Real, optics.Real, optics.Real, optics.Real]]
 def compute(
     rig: Instrument, scene: Scene, board: Board, samples_hz: optics.Real, rx: Sequence[int]
 ) -> tuple[NDArray[np.complex64], tuple[float, float], tuple[float, float], optics.Real, float]:
-    """Return the fields of :class:`polysight_simulators.scene.field.ObjectField` for a scene of drawn specimens."""
+    """Return the fields of :class:`ObjectField` in order, for a scene after `draw_specimens` and these channels."""
     top_hz = float(samples_hz[-1])
     planes = _group_planes(rig, scene, board, top_hz)
     levels = [(plane, level) for plane in planes for level in plane.levels(rx, top_hz)]
     nodes_hz, centre = _choose_nodes(scene, levels, samples_hz)
+    # Range of the local angle over all levels and channels.
     legs = [leg for _, level in levels for leg in level.legs]
     low = min(leg[2].min() for leg in legs)
     high = max(leg[2].max() for leg in legs)

@@ -278,7 +278,6 @@ def _make_index(facts: dict[str, Any]) -> bytes:
     return json.dumps({**facts, "arrivals": 0}, sort_keys=True, separators=(",", ":")).encode() + b"\n"
 
 
-Complex = NDArray[np.complexfloating]
 # Points of a row, by board name and row, at which the radar did not start.
 Skipped = Mapping[tuple[str, int], Collection[int]]
 LATE_S = 2.0

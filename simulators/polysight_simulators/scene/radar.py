@@ -168,8 +168,9 @@ def compute_chirp_factors(
     return factor, shift if hpf else np.zeros_like(shift)
 
 
-# Chirps per batch: their arrays fit in the cache
+# Chirps per batch: their arrays fit in the cache; chosen.
 _BATCH = 64
+# Largest count of the ADC's 16 bits.
 _FULL_SCALE = 32767
 # Delay from TX to RX on the transmit board, 6 cm, and the amplitude there, relative to the receivers' direct path. Both
 # are chosen: a short path is strong, and the filter weakens its low tone.

@@ -22,6 +22,7 @@ ENABLING_COMMAND = (
 _SOURCES = sorted(p for p in Path(__file__).parent.iterdir() if p.suffix in (".c", ".h"))
 _CC = ("gcc", "-O2", "-Wall", "-Wextra")
 _LIBRARIES = ("-lsimavr", "-lelf", "-lutil", "-lm")
+# Cause and remedy in the message of a failed compilation.
 _ON_FAILURE = ("a package is missing, or the sources were changed", ENABLING_COMMAND)
 # Clock of the UNO.
 HZ = 16_000_000

@@ -27,6 +27,7 @@ from polysight.results import PatchFigures
 from polysight.settings import Settings, path_text
 from polysight_shared.config import load_instrument
 
+# Environment variable with the folder of the picture.
 FOLDER = "POLYSIGHT_PUBLISHED_IMAGES"
 ANGLE_DEG = 55.0
 TABLE_2 = {
@@ -50,13 +51,14 @@ WORLD_NAMES = {
     "PCB": "glass_fibre",
     "wood_thin": "wood_thin",
 }
-"""Box to the name in Table 2 of the independent generator."""
+"""Box to the name in Table 2 of the independent generator (`benchmarks.worlds`)."""
 # Box of the metal reference.
 METAL_BOX = "copper"
 RATIO_STD = 0.08
 PHASE_STD_RAD = np.radians(10)
 MOST_STDS = 3.0
-"""Errors of |P| and of its phase that the short posterior believes in, and the distance of "none of these"."""
+"""Standard deviations of ln |P| and of its phase in the short posterior; "unknown" weighs as much as a material that is
+`MOST_STDS` of them away."""
 # Probability from which a wrong name counts as sure and wrong.
 SURE = 0.8
 # Standard deviations on both sides of a normal distribution's mean that hold 95 %.
@@ -88,6 +90,7 @@ def write_forms(source: Path, boxes: dict[str, list[int]], scratch: Path) -> lis
         np.save(folder / "sar_v.npy", v)
         content = {"description": "", "labels": boxes if with_boxes else {}}
         (folder / f"{folder.name}.json").write_text(json.dumps(content))
+        # The picture is taken to be square, with pixels of 2 mm; its row 0 is the top.
         top_first = np.arange(h.shape[0])[::-1] * 2e-3
         archive = scratch / f"{folder.name}.npz"
         # The published imaging code makes conjugate images (`restore_phase_sign`); the folders' reader knows that.
@@ -175,7 +178,10 @@ def table_2_library(extent: str) -> Library:
 
 
 def measure_ratios(source: Path, boxes: dict[str, list[int]]) -> dict[str, complex]:
-    """Return the ratio P = h / v of each box relative to copper's: medians over its pixels, nothing corrected."""
+    """Return the ratio P = h / v of each box relative to copper's, nothing corrected.
+
+    That of a box is the inverse of the median of v / h over its pixels.
+    """
     with np.load(source) as arrays, np.errstate(divide="ignore", invalid="ignore"):
         inverse_ratio = arrays["v"] / arrays["h"]
     ratios = {}

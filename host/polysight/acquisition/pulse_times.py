@@ -62,9 +62,9 @@ _EARLY = 0.1
 _EARLY_NS = 200_000
 _LATE = 0.15
 _LATE_NS = 200_000
-# If more than this share of the trains comes at no pulse's time, the machine or the network is slow, and the expected
-# times are not sharp. Then displaced frames show only by `_DISPLACED` trains at earlier pulses. At later pulses they
-# show by so many trains one after another. Both chosen.
+# If more than this share of the trains is not of a single frame at the time of a pulse, the machine or the network is
+# slow, and the expected times are not sharp. Then displaced frames show only by `_DISPLACED` trains at earlier pulses.
+# At later pulses they show by so many trains one after another. Both chosen.
 _BLURRED = 0.1
 _DISPLACED = 3
 # A card drops whole samples of its four antennas (inferred).
@@ -218,7 +218,8 @@ def _find_trains(
     # A train that is late within its burst is at least not of an earlier one: no delay is as long as a pause.
     count = pulses_ns.shape[1]
     first_pulse = np.where(in_time, pulse_of_head, pulse_of_head // count * count)
-    # Its first packet ends with at least one sample of that pulse's frame: so many bytes were sent, `first_stop` came.
+    # When its first packet was full, all frames before that pulse's and at least one sample of it had been sent: what
+    # `first_stop` is short of these bytes is missing.
     low = np.where(is_single, frame_bytes * first_pulse + _SAMPLE_BYTES - first_stop, -_NO_BOUND)
     # Frames that come faster than pulses are sent catch up with a delay, however long it was.
     to_next_ns = np.diff(came_ns[heads], append=_NO_BOUND)
@@ -314,8 +315,9 @@ def _find_period_ns(pulses_ns: Times) -> int:
 def _find_pauses(pulses_ns: Times, received_ns: Times) -> Times:
     """Return a time (host's clock) in the pause before each burst, int64 [burst]; parameters as of `place_frames`.
 
-    The quickest of the capture events gives the offset between the clocks. Raises _UndeterminedError if the bursts have
-    no pause, if the pulses are in simulated time, or if no second event was as quick within a quarter of the pause.
+    The quickest of the capture events gives the offset between the clocks. Raises _UndeterminedError if there are
+    fewer than two bursts, if they have no pause, if the pulses are in simulated time, or if no second event was as
+    quick within a quarter of the pause.
     """
     last = pulses_ns[:, -1]
     if len(last) < 2:
@@ -360,6 +362,7 @@ def _predict_arrivals(
     is_in_its_burst = is_whole and bool((burst_of_packet == frame // count).all())
     for b in range(bursts):
         packets = slice(int(edges[b]), int(edges[b + 1]))
+        # Of a burst without packets all of these arrays are empty.
         first_frame = b * count if is_in_its_burst else frame[packets][:1]
         pulse = frame[packets] - first_frame
         of_burst = (pulse >= 0) & (pulse < count)
@@ -391,6 +394,7 @@ def _estimate_drift(times: NDArray[np.float64], delay: NDArray[np.float64], puls
     Raises _UndeterminedError if there are too few bursts and the row is too long to neglect it.
     """
     if times.size >= _DRIFT_BURSTS:
+        # The ends of the 95 % interval.
         low, high = scipy.stats.theilslopes(delay, times)[2:]
         return float(np.clip(np.clip(0.0, low, high), -_MAX_DRIFT, _MAX_DRIFT))
     if _USUAL_DRIFT * float(np.ptp(pulses_ns)) > _EARLY * _find_period_ns(pulses_ns):
@@ -489,6 +493,7 @@ def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_byt
             os.fsync(f.fileno())
     except OSError as e:
         raise write_error(path, "made durable", e) from None
+    # Each frame is at its pulse now: the row is located, with no reason against it.
     changed = {
         "missing": missing,
         "located": True,
@@ -534,6 +539,7 @@ def frames_to_move(capture: RowCapture | Placed, frames: PlacedFrames | None) ->
     """Return the frames with which a row is rewritten; None if it stays as its packets' counters say.
 
     Only frames are kept that were seen at their pulses. Without times a row stays as it is, and the manifest says so.
+    A row has slipped if nothing but missing whole frames keeps its packets from being located.
     """
     if frames is None or not frames.is_timed:
         return None

@@ -22,8 +22,8 @@ from polysight_shared.geometry import specular_midpoint_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Largest numbers of blocks of positions along a cut and across it. Along: exact within 12 resolution cells to either
-# side. Across it the path to a point of the cut changes alike for all positions but for second order: with 8 the widths
-# of the published rig are within 3e-4 of those with 24.
+# side. Across it the path changes along the cut by nearly the same at all positions (the difference is of second
+# order): with 8 the widths of the published rig are within 3e-4 of those with 24.
 _BLOCKS_ALONG = 24
 _BLOCKS_ACROSS = 8
 # Number of resolution cells that are evaluated to either side of the peak, and of points per cell (chosen).
@@ -48,7 +48,7 @@ class PointResponse:
     limit_mm
         Limit of the geometry: 0.886 over the spread of `(sin theta_tx + sin theta_rx) / lambda` along the aperture
         (half-power width of an evenly filled band); for a plane at height h about 0.886 lambda h / (2 L cos^3) in x and
-        / (2 L cos) in y.
+        / (2 L cos) in y, with L the aperture's length there and cos that of the incidence angle.
     paper_mm
         The paper's formula `r lambda / L` (section 6.1) with r the plane's distance.
     sidelobe_db
@@ -70,10 +70,10 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
     point = np.array([grid.x_m.mean(), grid.y_m.mean(), float(np.mean(grid.z_m))])
     limit = [limit_m(aperture, point, axis) for axis in (0, 1)]
     cuts = [_cut(aperture, weights, point, axis, limit[axis]) for axis in (0, 1)]
-    wave = SPEED_OF_LIGHT_M_S / aperture.frequencies_hz.mean()
+    wavelength_m = SPEED_OF_LIGHT_M_S / aperture.frequencies_hz.mean()
     length = np.ptp(aperture.offsets_m[..., :2], axis=(0, 1))
     distance = point[2] - aperture.offsets_m[..., 2].mean()
-    paper = [1e3 * distance * wave / n if n > 0 else np.inf for n in length]
+    paper = [1e3 * distance * wavelength_m / n if n > 0 else np.inf for n in length]
     widths = [1e3 * _measure_width(cut) * step for cut, step in cuts]
     sidelobes = [_measure_sidelobe_db(cut) for cut, _ in cuts]
     return PointResponse(
@@ -129,6 +129,7 @@ def _cut(
     most = (_BLOCKS_ACROSS, _BLOCKS_ALONG) if axis == 0 else (_BLOCKS_ALONG, _BLOCKS_ACROSS)
     blocks, block_weights = _combine_positions(aperture, weights, most)
     point_grid = ImageGrid(point[:1], point[1:2], float(point[2]), aperture.grid.pixel_m)
+    # The echo of the point alone, [rx, frequency, row, column].
     of_point = DirectImager(replace(blocks, grid=point_grid)).samples(np.ones((1, 1))) * block_weights
     count = int(_CELLS * _POINTS)
     if not np.isfinite(cell_m):
@@ -170,7 +171,7 @@ def _measure_sidelobe_db(cut: NDArray[np.float64]) -> float:
 
 
 def imaging_facts(builder: ImageBuilder, images: Images) -> dict[str, BoardImaging | list[str]]:
-    """Return the entry `imaging` of quality.json, by board."""
+    """Return the entry `imaging` of quality.json: the figures by board, and `notices` if there are any."""
     facts: dict[str, BoardImaging | list[str]] = {name: board_facts(board) for name, board in builder.boards.items()}
     if images.notices:
         facts["notices"] = list(images.notices)
@@ -264,6 +265,7 @@ def field_limits(rig: Instrument) -> FieldLimits:
     for axis, (count, step_mm) in enumerate(((grid.columns, grid.step_x_mm), (grid.rows, grid.step_y_mm))):
         slope = PhaseSlope(rig, axis)
         change = (slope.slope(_STEP_M, (low + high) / 2) - slope.slope(-_STEP_M, (low + high) / 2)) / (2 * _STEP_M)
+        # The phase, change / 2 times the squared distance, is pi at the edge of the zone.
         zone.append(1e3 * float(np.sqrt(2 * np.pi / change)))
         size_m = (count - 1) * step_mm / 1e3
         places = np.linspace(-size_m / 4, size_m / 4, _PLACES)

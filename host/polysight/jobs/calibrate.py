@@ -90,7 +90,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     calibration = calibration_of_scan(source)
     filters = {b.name: calibration.high_pass(b.name) for b in rig.receivers}
     say("places of boards and plane")
-    fit = fit_places(load_echoes(source, rig, filters), rig, points, Prior(prior_mm, prior_mm))
+    fit = fit_places(load_echoes(source, rig, filters), rig, points, Prior(board_mm=prior_mm, plane_mm=prior_mm))
     file = places_file(rig, fit, len(points), [source_scan(source, scan)])
     path = write_calibration(file, out)
     lines = []
@@ -124,10 +124,10 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
 
     rig = load_rig_file(config)
     sources = [open_raw(folder, rig) for folder in scans]
-    chirps = {(s.instrument.chirp.hpf1_khz, s.instrument.chirp.hpf2_khz) for s in sources}
-    if len(chirps) > 1:
+    corners_khz = {(s.instrument.chirp.hpf1_khz, s.instrument.chirp.hpf2_khz) for s in sources}
+    if len(corners_khz) > 1:
         raise DataError(
-            f"the scans have different filters: {sorted(chirps)} kHz",
+            f"the scans have different filters: {sorted(corners_khz)} kHz",
             "they belong to several sweeps",
             "give the scans of one sweep",
         )
@@ -225,7 +225,8 @@ def leakage_of_scans(
     Raises
     ------
     DataError
-        when the scans are of different rigs, do not show metal at the same pixels, or are too alike in orientation.
+        when the scans are of different rigs, do not show metal at the same pixels, or are too alike in orientation,
+        or when the leakage is above `MAX_LEAKAGE`.
     """
     settings = Settings(config=path_text(config))
     pipeline, images = form_scan_images(plate, settings)
@@ -269,7 +270,8 @@ def _estimate_leakage_std(
     """Standard error of each part of the leakage: how far the quarters of the plane disagree, not less than 0.001.
 
     What makes it wrong (edges, wires that are not straight, uneven light) differs from place to place as speckle does,
-    and is no smaller over the whole than half of what it is in a quarter.
+    and is no smaller over the whole than half of what it is in a quarter. With fewer than two usable
+    quarters it is 0.001.
     """
     rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
     middle = [float(np.median(index[mask])) for index in (rows, columns)]

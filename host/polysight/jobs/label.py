@@ -56,7 +56,10 @@ Ask = Callable[[str], str]
 
 @dataclass(frozen=True)
 class PatchToName:
-    """A patch of the products that may get a box: its number, a box inside it (mm), and its present name as text."""
+    """A patch of the products that may get a box: its number, a box inside it (mm), and its present name or state.
+
+    `is_metal_reference` is true for the patch that the analysis took as metal without a box.
+    """
 
     number: int
     box: Box
@@ -96,7 +99,8 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     Raises
     ------
     PolysightError
-        when there is no image, or a box or name is refused; nothing was written then.
+        when there is no image, a box or name is refused, `list_only` meets edits, or the person does not confirm;
+        nothing was written then.
     """
     products = find_products(folder)
     if products is None:
@@ -219,6 +223,7 @@ def list_patches(products: ProcessedScan) -> list[PatchToName]:
         inner_box = (x0 + margin_x_mm, y0 + margin_y_mm, x1 - margin_x_mm, y1 - margin_y_mm)
         description = "not named"
         is_metal_reference = False
+        # Of a patch `box` is the name of the drawn box, not its corners.
         if patch.box:
             description = patch.box
         elif patch.refused is not None:
@@ -277,6 +282,7 @@ def apply_edits(labels: Labels, patches: Sequence[PatchToName], edits: Edits) ->
         new_names[old] = box_name(new)
     boxes = _rename_boxes(boxes, new_names)
     specimens = {new_names[name]: specimen for name, specimen in specimens.items()}
+    # None stays None: no box has an empty name.
     metal = new_names.get(metal or "")
 
     for name, box in edits.boxes:
@@ -369,7 +375,10 @@ def ask_for_names(patches: Sequence[PatchToName], ask: Ask) -> Labels:
 
 
 def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missing: bool) -> tuple[str, bool]:
-    """Ask until the answer is a valid new name or empty; return it, and True if it is the metal."""
+    """Ask until the answer is a valid new name or empty; return it, and True if it is the metal.
+
+    A further piece of a material that is there already is named MATERIAL#PIECE.
+    """
     while True:
         answer = ask(question).strip()
         is_metal = answer in ("m", "M") and metal_missing

@@ -65,6 +65,7 @@ class Spectrum:
         starts = np.linspace(first, last - length, bands)
         # A few frequencies suffice for a smooth window: the phase of inner echoes changes slowly with frequency.
         inside = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES
+        # Every second point of the longer window lies where `inside` does: in the middle of one of equal parts.
         weight = window_weights(window, 2 * _FREQUENCIES - 1)[::2]
         frequency = chirp.first_sample_hz + chirp.hz_per_sample * (starts[:, None] + length * inside)
         return cls(frequency, np.tile(weight / weight.sum(), (bands, 1)))
@@ -100,7 +101,8 @@ class Bands:
     theta_std_rad
         Standard deviation of the incidence angle.
     phase_per_angle
-        Phase of V / H in radians per radian of the angle's error, which also means that the plane is out of focus.
+        Phase of V / H in radians per radian of the angle's error: where the angle is wrong, the plane is out of
+        focus too.
     """
 
     spectrum: Spectrum
@@ -339,6 +341,7 @@ class LayerFit:
             out.append(
                 f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees of freedom"
             )
+        # An error above a fifth of the value is large; of a small loss, one above 0.2.
         if self.std_real > 0.2 * self.permittivity.real or self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
             out.append("the data hardly depend on this layer: its error bar is large")
         if self.at_limit:
@@ -388,6 +391,7 @@ def fit_layer(
     # Solve roughly from every start, and exactly where the result may be the best or a rival.
     by_fit = operator.attrgetter("chi2")
     rough = sorted((model.solve(start, precision=1e-3) for start in model.starts()), key=by_fit)
+    # Chi-square is not exact yet: three times the margin is kept.
     level = rough[0].chi2 + 3 * RIVAL * model.fit(rough[0], by_sampling=False).stretch
     solutions = sorted((model.solve(solution.x) for solution in _drop_repetitions(rough, level, 0.01)), key=by_fit)
     level = solutions[0].chi2 + RIVAL * model.fit(solutions[0], by_sampling=False).stretch
@@ -479,6 +483,7 @@ class _Model:
         if self.fits_angle:
             limits.append(_ANGLE_RANGE)
         self.lower, self.upper = (np.array(end, np.float64) for end in zip(*limits, strict=True))
+        # Numbers of the layer's unknowns and of the data.
         self.unknowns = 2 + self.fits_thickness
         self.data = (2 if bands.amplitude_h is None else 3) * bands.inverse_ratio.size
         self.freedom = self.data - self.unknowns
@@ -504,13 +509,15 @@ class _Model:
         if self.fits_angle:
             theta = self.theta_rad + self.bands.theta_std_rad * wide[..., -1]
         spectrum = self.bands.spectrum.thin(thin) if thin > 1 else self.bands.spectrum
-        q, h = average(eps, thick, spectrum, theta)
+        inverse_ratio, amplitude_h = average(eps, thick, spectrum, theta)
         if self.fits_angle:
-            q = q * np.exp(1j * self.bands.phase_per_angle * self.bands.theta_std_rad * x[..., -1:])
-        miss = q - self.bands.inverse_ratio
+            inverse_ratio = inverse_ratio * np.exp(
+                1j * self.bands.phase_per_angle * self.bands.theta_std_rad * x[..., -1:]
+            )
+        miss = inverse_ratio - self.bands.inverse_ratio
         parts = np.stack([miss.real, miss.imag], axis=-1).reshape(*miss.shape[:-1], -1)
         if self.bands.amplitude_h is not None:
-            parts = np.concatenate([parts, h - self.bands.amplitude_h], axis=-1)
+            parts = np.concatenate([parts, amplitude_h - self.bands.amplitude_h], axis=-1)
         # Stacks without a finite reflection, such as one that reflects no s, fit as badly as can be.
         normalised = np.nan_to_num(parts @ self.whiten.T, nan=1e6, posinf=1e6, neginf=-1e6)
         return np.concatenate([normalised, x[..., -1:]], axis=-1) if self.fits_angle else normalised
@@ -601,14 +608,16 @@ class _Model:
         )
 
     def _draw_second_moments(self, solution: _Solution, covariance: Real) -> Real:
-        """Return second moments of the posterior about a solution, [unknowns, unknowns]; linear in straight valleys.
+        """Return second moments of the posterior about a solution, [unknowns, unknowns].
+
+        In a straight valley they are the linear ones, `covariance`.
 
         By importance sampling along thickness times index, in which the valley is straighter than in thickness.
         """
         n = self.unknowns
         x = solution.x
-        to_z = self._differentiate_straight(x)
-        spread = to_z @ covariance @ to_z.T
+        to_straight = self._differentiate_straight(x)
+        spread = to_straight @ covariance @ to_straight.T
         spread = spread + np.diag(1e-12 * np.maximum(np.diag(spread), 1e-18))
         # A wide proposal (Student's t, five degrees of freedom); beyond _REACH there is another valley: a rival.
         rng = np.random.default_rng(0)

@@ -215,8 +215,8 @@ def multilayer(
     theta = np.asarray(theta_rad, np.float64)
     s = np.sin(theta)
     k0 = 2 * np.pi * np.asarray(frequency_hz, np.float64) / SPEED_OF_LIGHT_M_S
-    # Normal wavenumbers over k0, and the same over the permittivity: what is continuous at an interface, for s and for
-    # p.
+    # Normal wavenumbers over k0, and the same over the permittivity: ratios of the tangential fields for s and for p,
+    # whose differences at an interface reflect.
     q = [np.cos(theta).astype(np.complex128), *(_compute_normal_wavenumber(e, s) for e in media[1:])]
     y = [qi / ei for qi, ei in zip(q, media, strict=True)]
     r_s: Complex = (q[-2] - q[-1]) / (q[-2] + q[-1])
@@ -242,7 +242,10 @@ def _compute_half_bistatic(rig: Instrument, board_index: int, points_m: Real) ->
 
 
 def specular_incidence_rad(rig: Instrument) -> float:
-    """Return the incidence angle at the specular midpoint, radians; mean of H and V, which differ by 0.02 degrees."""
+    """Return the incidence angle at the specular midpoint, radians: the mean of H and V.
+
+    They differ by 0.02 degrees in the default rig.
+    """
     angles = []
     for i, board in enumerate(rig.receivers):
         angle, _ = _compute_half_bistatic(rig, i, np.asarray(specular_midpoint_m(rig, board)))
@@ -255,7 +258,7 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
 
     The weight of offset u for a pixel is exp(-(k D)^2 / 8), where k D is the phase of the path at u minus that of the
     specular path: 1 at the specular offset, about 0.3 at the edge of the first Fresnel zone (k D = pi). H and V are
-    averaged. Pixels without any weight get the specular angle.
+    averaged. Pixels with less than a thousandth of the full weight get the specular angle.
 
     Parameters
     ----------
@@ -287,7 +290,8 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         weight = np.exp(-((2 * np.pi / wavelength * (path - shortest)) ** 2) / 8)
         deviation = _convolve(visited, weight * (angle - specular))
         mass = _convolve(visited, weight)
-        # Sample (row, column) of the full convolution is the pixel at offset + displacement from the midpoint.
+        # An index of the full convolution is that of the offset (0 mm at (count - 1) / 2) plus that of the displacement
+        # (0 at reach); both together lead from the midpoint to the pixel.
         column = (x - middle[0]) / step[0] + (count[0] - 1) / 2 + reach[0]
         row = (y - middle[1]) / step[1] + (count[1] - 1) / 2 + reach[1]
         grid = np.meshgrid(row, column, indexing="ij")
@@ -329,7 +333,10 @@ class IncidenceChoice:
         return self.pixel_rad if self.choice == "one" else self.one_rad
 
     def facts(self, valid: npt.NDArray[np.bool_]) -> IncidenceAngles:
-        """Return both angles and their largest difference over `valid`, bool [ny, nx], for quality.json; degrees."""
+        """Return both angles and their largest difference over `valid`, bool [ny, nx], for quality.json; degrees.
+
+        `pixel_deg` is least, median and largest. Without a valid pixel all pixels count.
+        """
         if valid.any():
             pixel = np.degrees(self.pixel_rad[valid])
         else:

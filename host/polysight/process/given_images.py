@@ -44,9 +44,9 @@ OWN_ERROR = "p_sigma"
 # Images in a folder of the published data.
 SAR_FILES = ("sar_h.npy", "sar_v.npy")
 MIN_PIXELS = 8
-"""Least rows and columns of an image: the smallest patch is 14 mm wide."""
+"""Least rows and columns of an image: the smallest patch is 14 mm wide, seven pixels of 2 mm."""
 EVEN = 0.01
-"""Largest deviation of the distance of two pixels from the mean one, relative to it; of both pitches, too."""
+"""Largest relative deviation of the distance of two pixels from the mean one, and of the pitch in y from that in x."""
 OTHER_SIGN = 0.3
 PUBLISHED_OTHER_SIGN = 0.05
 """Probability a priori that images of another program have the other sign of phase, if their file does not say it; and
@@ -297,7 +297,7 @@ def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArr
 
 
 def _number(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str) -> float | None:
-    """Return an optional single number. Raises DataError if it is none."""
+    """Return an optional single number. Raises DataError if it is not one finite number."""
     if name not in arrays:
         return None
     value = arrays[name]
@@ -405,7 +405,8 @@ def choose_angle(pair: GivenPair, settings: Settings, rig: Instrument) -> Angle:
 def describe_illumination(images: Images, rig: Instrument) -> Illumination:
     """Return the illumination by which the phase of a plate tells its tilt (`Illumination.rise`), for this rig.
 
-    The footprints are not known and taken as even: nothing is divided out.
+    The footprints are not known and taken as even: nothing is divided out. `moved_m` and `steepness_rad_m` are those
+    at each board's specular point, as in :class:`Illumination`.
     """
     chirp = rig.chirp
     middle_hz = chirp.first_sample_hz + chirp.hz_per_sample * float(np.mean(chirp.linear_samples))
@@ -422,6 +423,7 @@ def describe_illumination(images: Images, rig: Instrument) -> Illumination:
 
 def given_reasons(pair: GivenPair, angle: Angle) -> list[Finding]:
     """Return what limits the verdict on given images: no direct path, an assumed geometry, an assumed angle."""
+    # The last number of a reason is its weight: those of one level are listed by falling weight.
     reasons = [reason(
         "care", "the images were given: there is no direct path beside them",
         "gains of H against V, the recording and the plane of the plates cannot be checked",
@@ -470,9 +472,9 @@ TOLD_SIGN = 0.02
 def sign_reasons(other_sign: float, conjugated: bool, painted: float = 0.0) -> list[Finding]:
     """Return what limits the verdict if the sign of the phases is not known.
 
-    `other_sign` is the probability of the sign that was not taken, `conjugated` is true if it is that of the file;
-    `painted` is the probability that the metal reference is painted if the phases are as given: paint and the other
-    sign both change the phase of all ratios.
+    `other_sign` is the probability of the sign that was not taken, `conjugated` is true if the file's sign was not
+    taken; `painted` is the probability that the metal reference is painted if the phases are as given: paint and the
+    other sign both change the phase of all ratios.
     """
     if other_sign < TOLD_SIGN and not conjugated:
         return []
@@ -524,7 +526,8 @@ def analyse_given_images(
     scene = replace(scene, plates=plates)
     optics = replace(optics, other_sign=pair.other_sign)
     result = materials.analyse(images, optics, scene, classifier)
-    # If the other sign is likelier, all phases are turned and the scene is analysed again.
+    # If the other sign is likelier, all phases are turned and the scene is analysed again. `other_sign` of a result is
+    # that of the sign which its images do not have.
     conjugated = result.other_sign > 0.5
     painted = result.inversion.painted
     if conjugated:
@@ -532,7 +535,9 @@ def analyse_given_images(
         result = materials.analyse(images, replace(optics, other_sign=1 - pair.other_sign), scene, classifier)
     sign = sign_reasons(result.other_sign, conjugated, painted)
     limits = [*given_reasons(pair, angle), *sign, *turn_reasons(result)]
+    # None: the plane of the plates was not estimated.
     verdict = join_reasons([*limits, *scene_reasons(result, None, classifier)])
+    # With the verdict "no result" names and permittivities are withheld.
     if not verdict.usable:
         result = result.without_result()
     findings = Findings(images, result, verdict, UNKNOWN_PLANE, classifier, plates)

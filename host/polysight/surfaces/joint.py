@@ -1,7 +1,8 @@
 """Fit of several echoes of a window together.
 
-Echoes of two objects 150 mm apart in x are one resolution cell of slope apart. Fits of one after the other, each to
-what the others leave, were 6 mm and 3 dB off after as many rounds as time allowed; all together they are exact.
+Echoes of two objects 150 mm apart in x are one resolution cell apart in slope (the derivative of the path by the stage
+offset). Fits of one after the other, each to what the others leave, were 6 mm and 3 dB off after as many rounds as time
+allowed; all together they are exact.
 
 Echoes that a window hardly resolves make each other uncertain: their widening is the standard error of a value in the
 joint fit over that in a fit of the echo alone.
@@ -33,7 +34,8 @@ START_BEND = 0.8
 JOINT_ITERATIONS = 14
 JOINT_GAIN = 3e-3
 MOST_DAMPING = 10
-# How often the RX are added up anew at most, and the share of the rest below which once more is worth it.
+# How often the RX are added up anew at most (each turned by its phase for the paths found, `steering`), and the share
+# of the rest below which once more is worth it.
 STEERINGS = 4
 STEERING_GAIN = 0.9
 # Two echoes that make each other's amplitude so much less certain have run into one another, or are two halves of a
@@ -49,8 +51,8 @@ NO_INFORMATION = 1e12
 class JointFit:
     """Paths and amplitudes of all echoes of some windows, by Levenberg's and Marquardt's method.
 
-    Unknown for each echo: two parts of the amplitude and the six values of its path. A step of a path leaves the mean
-    phase as it is.
+    Unknown for each echo: two parts of the amplitude and the six values of its path, L, g_x, g_y, Q_xx, Q_xy, Q_yy
+    (`find_basis`). A step of a path leaves the mean phase as it is.
 
     Attributes
     ----------
@@ -67,13 +69,13 @@ class JointFit:
         self.amplitude = amplitude.astype(complex)
         self.basis = find_basis(windows.offsets)
         count = np.maximum(windows.valid.sum(axis=1), 1)
-        mean = np.einsum("wn,wnp->wp", windows.valid, self.basis) / count[:, None]
+        mean_basis = np.einsum("wn,wnp->wp", windows.valid, self.basis) / count[:, None]
         # Rate of an echo's mean phase by its parameters.
-        self.mean_rate = fit.middle * mean
+        self.mean_rate = fit.middle * mean_basis
         # An echo's wave and its derivatives are j (steady + nu changing) times the wave, nu the frequency's distance
-        # from the middle; both are given in the basis, as [window, 7, 6] and [7, 6].
+        # from the middle; both are given as [window, 7, 6] and [7, 6]: the wave and its six derivatives in the basis.
         self.nu = fit.omega - fit.middle
-        self.steady = np.zeros((len(mean), 7, 6))
+        self.steady = np.zeros((len(mean_basis), 7, 6))
         self.steady[:, 0, 0] = 1
         self.steady[:, 1:] = fit.middle * np.eye(6)
         self.steady[:, 1:, 0] -= self.mean_rate
@@ -82,6 +84,7 @@ class JointFit:
         first, second = PAIRS
         self.products = windows.valid[..., None] * self.basis[..., first] * self.basis[..., second]
         self.product_sums = self.products.sum(axis=1)
+        # [window, echo, rx, frequency] and [window, echo, frequency, position].
         self.steering = np.zeros((*self.amplitude.shape, len(fit.lever), fit.omega.size), complex)
         self.waves = np.zeros((*self.amplitude.shape, fit.omega.size, self.basis.shape[1]), np.complex64)
         self.rest = windows.samples.copy()
@@ -128,7 +131,7 @@ class JointFit:
         for _ in range(JOINT_ITERATIONS):
             normal, gradient = self._find_normal_equations(running)
             diagonal = np.einsum("wii->wi", normal)
-            # A step that leaves less than before is taken and the damping falls; otherwise it grows.
+            # A step that leaves less is taken and the damping falls (0.2 times); otherwise it grows (8 times).
             damped = normal + (damping[running, None] * diagonal + 1e-12)[:, :, None] * np.eye(8 * echoes)
             step = np.linalg.solve(damped, gradient[..., None])[..., 0].reshape(-1, echoes, 8)
             path_step = np.clip(step[..., 2:], -STEP_LIMITS, STEP_LIMITS)
@@ -166,9 +169,9 @@ class JointFit:
         middle = (self.values[merged, pair[:, 0]] + self.values[merged, pair[:, 1]]) / 2
         middle[:, 3:] = [START_BEND, 0, START_BEND]
         part = select_windows(self.windows, merged)
-        band_m = SPEED_OF_LIGHT_M_S / np.ptp(self.fit.board.frequencies_hz)
+        path_cell_m = SPEED_OF_LIGHT_M_S / np.ptp(self.fit.board.frequencies_hz)
         slope_cell = 2 * np.pi / self.fit.middle / WINDOW_M
-        for parameter, cell in enumerate([band_m, slope_cell, slope_cell]):
+        for parameter, cell in enumerate([path_cell_m, slope_cell, slope_cell]):
             values = self.values[merged]
             amplitude = self.amplitude[merged]
             for echo, side in zip(pair.T, (-0.5, 0.5), strict=True):
@@ -224,6 +227,7 @@ class JointFit:
         # basis, give all products of the waves' derivatives: each is linear in nu and in the basis.
         fit = self.fit
         steering = np.mean(self.steering[members, first] * self.steering[members, second].conj(), axis=1)
+        # `weights` are the shares of the frequencies, `gain` is their sum before they were made shares.
         factors = (steering * fit.weights * fit.gain)[:, None] * self.nu ** np.arange(3)[:, None]
         if first == second:
             sums = factors.sum(axis=2)[..., None] * self.product_sums[members, None]
@@ -248,6 +252,7 @@ class JointFit:
         for first in range(echoes):
             for second in range(echoes):
                 gram[:, first, second] = self._multiply(members, first, second)[:, 0, 0]
+        # A small diagonal, so that the amplitudes of echoes that coincide can be solved.
         gram += 1e-6 * np.einsum("wii->w", gram).real[:, None, None] * np.eye(echoes)
         # Twice, as the range gate's effect on an echo is taken by its weights alone.
         for _ in range(2):

@@ -1,5 +1,8 @@
 """From the samples of H and V to specular points with both voltages, and their grouping into segments.
 
+The *bend* of an echo is the curvature of its path over the stage offset; *curvature* alone is that of the surface where
+a `Shape` holds it.
+
 H gives place, normal and curvature. V sees the same point with the same normal from another stage position, some 15 mm
 away: its path is predicted, and the phase is taken against this prediction, for separate ranges of H and V are useless
 (0.3 mm is half a radian).
@@ -39,7 +42,7 @@ SAME_CURVATURE_M = 0.012
 CELL_M = 0.004
 # A group of fewer points is no surface: a chance of noise and edges.
 MIN_POINTS = 8
-# Least number of windows to fit a curvature to: five unknowns from two slopes and the curvature of each.
+# Least number of windows to fit a curvature to: each gives two slopes and three curvatures for the five unknowns.
 MIN_NEIGHBOURS = 6
 # Windows of one surface that tell how far slopes ripple. Near the border of a zone that reflects, its edge ripples by
 # waves of about 100 mm, which a fit within 24 mm takes for curvature.
@@ -116,6 +119,7 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
     at_m = find_offset_that_sees(shape.points, shape.normals, echoes.at_m, tx_m, rx_m)
     path, slope, bend = predict_echo(shape.points, shape.normals, shape.curvature, at_m, tx_m, rx_m)
     window = np.unique(np.round(echoes.at_m / SAME_WINDOW_M), axis=0, return_inverse=True)[1].reshape(-1)
+    # V's echoes are those of the points `inside` V's scan only.
     seen_by_v, inside = measure_echoes(v, at_m, path, slope, bend, window=window, is_measured=keep)
     return Seen(echoes[inside], seen_by_v, segment[inside])
 
@@ -131,8 +135,8 @@ def _is_sound(echoes: Echoes, shape: Shape) -> NDArray[np.bool_]:
 
 def _is_wide(shape: Shape) -> NDArray[np.bool_]:
     """True for points whose radii of curvature are larger than those of edges and wires."""
-    bends = np.linalg.eigvalsh((shape.curvature + np.swapaxes(shape.curvature, 1, 2)) / 2)
-    return np.isfinite(bends).all(axis=1) & (np.abs(bends).max(axis=1) < 1 / MIN_RADIUS_M)
+    curvatures = np.linalg.eigvalsh((shape.curvature + np.swapaxes(shape.curvature, 1, 2)) / 2)
+    return np.isfinite(curvatures).all(axis=1) & (np.abs(curvatures).max(axis=1) < 1 / MIN_RADIUS_M)
 
 
 def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
@@ -152,6 +156,7 @@ def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
     miss = np.abs(echoes.path_m[second] - echoes.path_m[first] - rise)
     gap = np.linalg.norm(shape.points[second] - shape.points[first], axis=1)
     turn = np.linalg.norm(shape.normals[second] - shape.normals[first], axis=1)
+    # Beyond the limits, paths may differ by four standard deviations, and points by twice the distance of the windows.
     tolerance = MAX_PATH_MISS_M + 4 * np.hypot(echoes.path_std_m[first], echoes.path_std_m[second])
     joined = (miss < tolerance) & (gap < MAX_GAP_M + 2 * np.linalg.norm(d, axis=1)) & (turn < MAX_TURN_RAD)
     ones = np.ones(int(joined.sum()))
@@ -210,7 +215,7 @@ class SlopeFit:
         x, y = d.T
         zero = np.zeros(len(d))
         one = np.ones(len(d))
-        # Unknown: g_x, g_y, Q_xx, Q_xy, Q_yy, and with x and y the change of Q_xx, of Q_xy, and of Q_yy.
+        # Unknown: g_x, g_y, Q_xx, Q_xy, Q_yy; dQ_xx/dx, dQ_xx/dy = dQ_xy/dx, dQ_xy/dy = dQ_yy/dx, dQ_yy/dy.
         slope_x = [one, zero, x, y, zero, x * x / 2, x * y, y * y / 2, zero]
         slope_y = [zero, one, zero, x, y, zero, x * x / 2, x * y, y * y / 2]
         bend_xx = [zero, zero, one, zero, zero, x, y, zero, zero]
@@ -272,6 +277,7 @@ def find_share_left(correlation: Array, matrix: Array, inverse: NDArray) -> Arra
 
     trace((1 - S) C (1 - S)') / n, with S = `matrix` `inverse` `matrix`' the smoother and C the correlation [2, n, n].
     `matrix` [2, n, p]: both slopes in terms of the unknown; `inverse` [p, p]: of the normal matrix.
+    Errors of the windows' own curvatures are left out.
     """
     transposed = np.swapaxes(matrix, 1, 2)
     common = transposed @ correlation @ matrix

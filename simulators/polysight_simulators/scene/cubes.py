@@ -65,7 +65,8 @@ def synced_cube(
     """Return the samples of a scan after ideal synchronisation: referenced to the direct path, bursts averaged.
 
     Simulated: leakage, gains and phases of the channels, H over V and its drift, noise, loss of the direct path,
-    backlash; nothing else. An echo of excess path d is a exp(+j 2 pi f d / c), the direct path is constant.
+    backlash; nothing else. An echo of amplitude A whose path exceeds the direct one by d is A exp(+j 2 pi f d / c), the
+    direct path is constant.
 
     Parameters
     ----------
@@ -85,7 +86,8 @@ def synced_cube(
 
     Returns
     -------
-    complex64 [rx, row, column, frequency]; column 0 is the smallest x. Amplitudes are relative to the free direct path.
+    complex64 [rx, row, column, frequency]; column 0 is the smallest x. Amplitudes are relative to the
+    free direct path of RX1.
     """
     rig = apply_scene(rig, scene)
     seed = scene.seed if seed is None else seed
@@ -144,6 +146,7 @@ def _compute_burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int,
     averaged = 10.0 ** (-d.direct_snr_db / 20) / np.sqrt(rig.burst.chirps_a_position)
     if not d.hpf:
         return float(averaged)
+    # The IF is that half way between direct path and echo.
     delay_s = (antennas(rig, board).direct_m[0] + echo_m) / 2 / SPEED_OF_LIGHT_M_S
     if_hz = chirp.slope_hz_per_s * delay_s + power_on(rig, scene, board, seed).if_error_hz.mean()
     return float(averaged / np.abs(high_pass(np.array(if_hz), chirp)[0]))
@@ -164,6 +167,7 @@ def _sample_field(
     if np.array_equal(field.nodes_hz, f):
         to_frequencies = np.eye(len(f))
     else:
+        # The second matrix, the derivative, is not needed.
         to_frequencies = node_matrix(field, f)[0]
     phase_and_gain = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(path_m_of_rx, f)) * gains[:, None]
     # Matrix from the field's own frequencies to those requested, with phase and gain: [rx, node, frequency].
@@ -175,6 +179,7 @@ def _sample_field(
         x = np.array(row.x_mm) + row.direction * travel
         if row.direction < 0:
             x += backlash_mm
+        # [position, rx, node].
         nodes = field.interpolate(x / 1e3, np.full(len(x), row.y_mm / 1e3))
         order = [row.column(i) for i in range(row.points)]
         cube[:, row.index, order] = np.einsum("prq,rqk->rpk", nodes, expand, optimize=True)

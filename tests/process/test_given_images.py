@@ -83,6 +83,13 @@ def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, sav
             assert e.real == pytest.approx(upside_down[near].real, rel=0.05)
 
 
+def test_a_labels_folder_may_be_renamed(labels_folder, tmp_path, rig):
+    renamed = shutil.copytree(labels_folder, tmp_path / "oak")
+    read, expected = (read_given_images(folder, rig) for folder in (renamed, labels_folder))
+    assert read.labels == expected.labels
+    assert expected.labels is not None
+
+
 def test_permittivities_are_those_of_the_plates(labels_folder, rig):
     for s in analyse_file(labels_folder, rig, incidence_deg=ANGLE).segments:
         if s.permittivity is not None:

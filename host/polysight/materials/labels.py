@@ -196,6 +196,20 @@ class Labels:
         return patches_from_labels(dict(self.boxes), x_m, y_m, unit=self.unit)
 
 
+def find_label_file(folder: Path) -> Path:
+    """Return `<scan>.json` of a folder `labels/<scan>`, or its only JSON file. Raises DataError."""
+    file = folder / f"{folder.name}.json"
+    if file.exists():
+        return file
+    json_files = sorted(folder.glob("*.json"))
+    if len(json_files) == 1:
+        return json_files[0]
+    raise DataError(
+        f"{file}: no such label file", "the download is not complete", "fetch the scan again",
+        code=ErrorCode.FILE_MISSING,
+    )  # fmt: skip
+
+
 def read_labels(path: Path) -> Labels:
     """Read a label file; names and boxes are not checked, see :func:`check_labels`.
 

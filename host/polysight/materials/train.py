@@ -36,7 +36,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, fit_weights
-from polysight.materials.labels import METALS, is_metal, read_labels
+from polysight.materials.labels import METALS, find_label_file, is_metal, read_labels
 from polysight.materials.library import Entry, Library, Real, Samples, majority
 from polysight.materials.result import MaterialsResult
 from polysight.materials.segment import Box
@@ -138,15 +138,7 @@ def restore_phase_sign(published: npt.NDArray[np.complexfloating]) -> npt.NDArra
 
 def read_labelled_scan(folder: Path) -> LabelledScan:
     """Read `labels/<scan>`; its images get our sign of phase. Raises DataError if a file is missing or invalid."""
-    file = folder / f"{folder.name}.json"
-    if not file.exists():
-        json_files = sorted(folder.glob("*.json"))
-        if len(json_files) != 1:
-            raise DataError(
-                f"{file}: no such label file", "the download is not complete", "fetch the scan again",
-                code=ErrorCode.FILE_MISSING,
-            )  # fmt: skip
-        file = json_files[0]
+    file = find_label_file(folder)
     boxes = dict(read_labels(file).boxes)
     description = str(read_json(file).get("description", ""))
     images = []

@@ -337,10 +337,9 @@ def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
     assumed = [
         f"no geometry: pixels of {rig.image.pixel_mm:g} mm (rig file), row 0 is the highest; boxes: {orientation}"
     ]
-    file = next(iter([folder / f"{folder.name}.json", *sorted(folder.glob("*.json"))]))
     labels = None
     if scan.boxes:
-        labels = materials.read_labels(file)
+        labels = materials.read_labels(materials.find_label_file(folder))
     images = _sort_axes(scan.h, scan.v, _find_valid(folder, arrays), x_m, y_m)
     return GivenPair(
         path=folder,

@@ -3,7 +3,7 @@
 A scene holds five random sheets and a liquid: sheets in air and sheets on metal of 0.5 to 5 mm, permittivity 2
 to 7, loss tangent up to 0.1; liquids behind a wall of glass of known thickness. Each scene has its own plane distance,
 heights and roughness. Each rig (five scenes) has its own leakage, measured to 0.003, and one scan of a metal plate on
-its own: no half spaces are there that would show a plate in the scene to be metal. Samples are as perfect
+its own, because a scene without half spaces does not show which of its plates is metal. Samples are as perfect
 synchronisation leaves them (`synced_cube`). The program images a scene in sub-bands and fits each stack, the thickness
 of sheets free in a stated range. All is simulated, by simulators that share nothing with the host's optics; what it
 says of a real rig is an expectation.
@@ -42,8 +42,8 @@ RANGE_M = (0.3e-3, 6e-3)
 """Where the thickness of a sheet is looked for."""
 # Sub-bands of the sweep, in which a scene is imaged.
 BANDS = 4
-A_RIG = 5
-"""Scenes of one rig."""
+SCENES_PER_RIG = 5
+# Side of the plates (chosen).
 SIDE_MM = 46.0
 # Permittivity eps', eps'' of the wall in front of a liquid (chosen).
 GLASS = (5.5, 0.05)
@@ -54,8 +54,8 @@ KINDS = ("sheet in air", "sheet on metal", "liquid behind a wall")
 ENOUGH = 0.05
 Setting = tuple[float, float | None]
 SETTINGS: tuple[Setting, ...] = ((0.1, None), (0.04, None), (0.1, 0.2))
-"""How far |H| is trusted (the command's default; as flat smooth plates deserve), and how far from the truth the range
-of the thickness reaches (None: `RANGE_M`)."""
+"""Relative error to which |H| is trusted (0.1: the command's default; 0.04: for flat, smooth plates), and the reach of
+the thickness's range on either side of the truth, as a share (None: `RANGE_M`)."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Case:
     # True if the program says that other values fit as well; number of such values.
     ambiguous: bool = True
     rivals: int = 0
-    # Per degree of freedom.
+    # Misfit, chi-square per degree of freedom.
     chi2: float = float("nan")
     # True if the program warns that the stack does not explain the data.
     unexplained: bool = False
@@ -99,8 +99,8 @@ class Case:
 
 
 def draw_scene(seed: int) -> Scene:
-    """Draw six stacks on the places of a coverage scene; `A_RIG` successive seeds have the same rig."""
-    rig_rng = np.random.default_rng([20261123, seed // A_RIG])
+    """Draw six stacks on the places of a coverage scene; `SCENES_PER_RIG` successive seeds have the same rig."""
+    rig_rng = np.random.default_rng([20261123, seed // SCENES_PER_RIG])
     rng = np.random.default_rng([20261124, seed])
     leak = [complex(0.1 * rig_rng.random() * np.exp(2j * np.pi * rig_rng.random())) for _ in range(2)]
     plates: list[dict[str, Any]] = []
@@ -247,9 +247,13 @@ def _mean_or_nan(flags: NDArray[np.bool_]) -> float:
 
 
 def table(rows: list[Case], title: str) -> dict[str, float]:
-    """Print and return how many fits of one kind of stack are right, ambiguous or wrong; {} without fits."""
+    """Print and return how many fits of one kind of stack are right, ambiguous or wrong; {} without fits.
+
+    "cases", "not fitted" and "wrong, not flagged" are counts, the others shares; "ambiguous" is the share
+    of flagged fits.
+    """
     fits = [r for r in rows if r.fitted is not None]
-    everywhere = np.array([r.distance2 for r in fits if not r.rivals])
+    unrivalled = np.array([r.distance2 for r in fits if not r.rivals])
     sure = [r for r in fits if not r.flagged]
     if not fits:
         return {}
@@ -261,8 +265,8 @@ def table(rows: list[Case], title: str) -> dict[str, float]:
         "ambiguous": float(np.mean([r.flagged for r in fits])),
         "rivals": float(np.mean([r.rivals > 0 for r in fits])),
         "wrong, not flagged": float(sum(not r.right for r in sure)),
-        "in_68, no rivals": _mean_or_nan(everywhere < CHI2_68),
-        "in_95, no rivals": _mean_or_nan(everywhere < CHI2_95),
+        "in_68, no rivals": _mean_or_nan(unrivalled < CHI2_68),
+        "in_95, no rivals": _mean_or_nan(unrivalled < CHI2_95),
         "in_68": _mean_or_nan(d < CHI2_68),
         "in_95": _mean_or_nan(d < CHI2_95),
         "median_std": float(np.median([r.relative_std for r in fits])),
@@ -273,7 +277,7 @@ def table(rows: list[Case], title: str) -> dict[str, float]:
     print(
         f"{title:22s} {len(rows):4d} cases, {len(rows) - len(fits)} not fitted   within 5 %: {percent['right']:5.1f} %"
         f"   ambiguous: {percent['ambiguous']:5.1f} % ({percent['rivals']:.1f} % with rivals)   wrong, not flagged:"
-        f" {entry['wrong, not flagged']:.0f} of {len(sure)}\n{'':22s} regions without rivals ({everywhere.size}): 68 %"
+        f" {entry['wrong, not flagged']:.0f} of {len(sure)}\n{'':22s} regions without rivals ({unrivalled.size}): 68 %"
         f" {percent['in_68, no rivals']:5.1f}, 95 % {percent['in_95, no rivals']:5.1f}; of those not flagged 68 %"
         f" {percent['in_68']:5.1f}, 95 % {percent['in_95']:5.1f}   median error {percent['median_error']:.1f} %, stated"
         f" {percent['median_std']:.1f} %, not explained {percent['unexplained']:.1f} %",
@@ -292,9 +296,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the table; return 1 if more than 5 % of the fits without a warning are beyond 5 %."""
+    """Print the table; return 1 if more than 5 % of the fits that are not flagged are beyond 5 %."""
     scenes = range(args.first, args.first + -(-args.cases // len(PLACES)))
-    rigs = [list(group) for _, group in itertools.groupby(scenes, lambda seed: seed // A_RIG)]
+    rigs = [list(group) for _, group in itertools.groupby(scenes, lambda seed: seed // SCENES_PER_RIG)]
     print(f"simulated sheets and liquids, {BANDS} sub-bands")
     with ProcessPoolExecutor(args.jobs) as pool:
         rows = [case for group in pool.map(cases, rigs) for case in group]

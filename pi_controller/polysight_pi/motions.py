@@ -20,6 +20,7 @@ class _Motion:
     sequence: int
     # The result: None until it is decided.
     status: m.RowStatus | None = None
+    # Number of the `PiFault`; 0: none.
     fault: int = 0
     reason: str = ""
 
@@ -55,7 +56,7 @@ class RunningRow(_Motion):
     row: Row
     # Number of the attempt at this row: 1, and one more for each retake.
     take: int
-    # What the trigger loop was told: number of edges and burst; its bursts are recognised by it.
+    # What the trigger loop was told: number of edges, and the burst for each. Bursts that it reports name their job.
     job: Job
     # The same row in motor steps.
     motion: RowMotion
@@ -63,7 +64,7 @@ class RunningRow(_Motion):
     edges: EdgeTimes
     # True once the stage has accepted the row: statuses before that belong to the motion before.
     is_underway: bool = False
-    # True if the machine stays in the fault state after the row.
+    # True if the stage's state machine stays in the state `fault` after the row.
     lasting: bool = False
     # Points that the stage has passed, by its own count.
     points: int = 0
@@ -71,7 +72,7 @@ class RunningRow(_Motion):
     bursts: int = 0
     # True if the stage reported a hold within the row.
     was_held: bool = False
-    # Latest time at which the stage can have written the row's `done` line.
+    # Latest time at which the stage can have written the row's `done` line, on the clock of the edges.
     done_ns: int = END_OF_TIME_NS
 
     def judge(self, counts: Counts) -> None:
@@ -98,6 +99,6 @@ def estimate_row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:
     """Estimate the duration of a row at `speed_mm_s`, seconds, including the longest travel to its first point."""
     travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
     points_s = abs(row.step_mm) * row.points / speed_mm_s
-    # Two ramps of the travel and two of the row, all as if at the row's speed.
+    # Two ramps of the travel and two of the row, all as if at the row's speed (an estimate).
     ramps_s = 4 * speed_mm_s / stage.accel_mm_s2
     return travel_s + points_s + ramps_s

@@ -18,7 +18,10 @@ COPPER = 1 - 1.3e7j
 
 @dataclass(frozen=True)
 class Stack:
-    """Layers on a half space: `layers` from the top as (relative permittivity, thickness in metres)."""
+    """Layers on a half space: `layers` from the top as (relative permittivity, thickness in metres).
+
+    `below`: relative permittivity of the half space.
+    """
 
     layers: tuple[tuple[complex, float], ...] = ()
     below: complex = 1.0 + 0j
@@ -26,6 +29,7 @@ class Stack:
     @property
     def is_metal(self) -> bool:
         """True if the wave meets metal first."""
+        # Far above every dielectric, far below every metal.
         return not self.layers and abs(self.below) > 1e4
 
 
@@ -40,9 +44,10 @@ def reflect(stack: Stack, frequency_hz: ArrayLike, cos_incidence: ArrayLike) -> 
     k0 = 2 * np.pi * np.asarray(frequency_hz, float) / LIGHT_M_PER_S
     k0, cos_incidence = np.broadcast_arrays(k0, np.asarray(cos_incidence, float))
     permittivities = [1.0, *(eps for eps, _ in stack.layers), stack.below]
-    # The principal root of eps' - j eps'' decays downwards.
+    # Vertical wave numbers over k0. The principal root of eps' - j eps'' decays downwards.
     kz = [np.sqrt(complex(eps) - (1 - cos_incidence**2) + 0j) for eps in permittivities]
     kz[0] = cos_incidence + 0j
+    # Phase over each layer. Air and half space have none: their values do not matter.
     delays = [np.ones_like(kz[0])]
     for (_, thickness_m), root in zip(stack.layers, kz[1:-1], strict=True):
         delays.append(np.exp(-1j * k0 * root * thickness_m))
@@ -86,6 +91,7 @@ def _solve_waves(admittances: list[NDArray], delays: list[NDArray]) -> NDArray:
 class ReflectionTable:
     """Coefficients of a stack at one frequency over the cosine of incidence, for quick look-up."""
 
+    # Chosen.
     POINTS = 513
 
     def __init__(self, stack: Stack, frequency_hz: float) -> None:

@@ -1,9 +1,10 @@
 """Exact echoes of a sphere and of an endless cylinder between two small antennas, by multipole series.
 
 The antennas are dipoles whose field towards the specular point is that of the antenna. Inside this module fields vary
-as exp(-i omega t), as in the books: permittivities are eps' + i eps'', outgoing waves Hankel functions of the first
-kind. `scatter_sphere` and `scatter_cylinder` return the wave of the other sign, exp(+j omega t), as the rest of the
-package, and take permittivities as eps' - j eps'' (None: metal). Echoes are in 1 / m: for a field of 1 at 1 m from TX.
+as exp(-i omega t), as in the books: outgoing waves are Hankel functions of the first kind. `scatter_sphere` and
+`scatter_cylinder` return the wave of the other sign, exp(+j omega t), as the rest of the package. All arguments and
+fields `permittivity` are its eps' - j eps'' (None: metal), conjugated where they are used. Echoes are in 1 / m: for a
+field of 1 at 1 m from TX.
 
 A body that absorbs shows its front only: its inner wave runs inwards and never comes back (the first term of Debye's
 series). With `with_inside`, waves that crossed the body are included.
@@ -45,8 +46,8 @@ PLACE_WEIGHTS = np.linalg.solve(np.vander(PLACES, increasing=True).T, [1, 0, -1j
 # the degree z on, with z the radians by which the coefficients' phase turns over half of the paths: so its degree is z
 # and these more. With the degree 23 alone, a cylinder of 173 mm along x had errors of 15 % and 0.2 rad.
 MORE_DEGREES = 24
-# Up to this many positions, coefficients are computed for each one instead of looked up in a table, which itself takes
-# as many evaluations as its degree; chosen.
+# Up to this many stage offsets, coefficients are computed for each one instead of looked up in a table, which itself
+# takes as many evaluations as its degree; chosen.
 FEW = 40
 
 
@@ -115,8 +116,9 @@ def sphere_coefficients(
 
 
 def _inner_rates(y: complex, count: int, with_inside: bool) -> NDArray:
-    """Logarithmic derivatives for n = 1 .. count of y j_n(y), or of the wave that only runs inwards, y h2_n(y).
+    """Logarithmic derivatives [count] for n = 1 .. count of y j_n(y), or of the wave that only runs inwards, y h2_n(y).
 
+    `y`: size parameter times the refractive index, with an imaginary part above zero in a body that absorbs.
     The second one is taken without `with_inside`, unless the body absorbs so much that both are the same.
     """
     rates = np.zeros(count + 1, complex)
@@ -157,6 +159,7 @@ def scatter_sphere(
     p_r = _dot(p, to_tx)
     q_t = _dot(q, to_tx) - c * q_r
     p_t = _dot(p, to_rx) - c * p_r
+    # By both directions. Of M, what goes with the second and the first derivative of P_n.
     mixed = _dot(q, p) - _dot(p, to_rx) * q_r - p_r * q_t
     across = np.cross(q, to_rx, axis=0)
     m_second = _dot(across, to_tx) * _dot(p, np.cross(to_tx, to_rx, axis=0))
@@ -175,6 +178,7 @@ def scatter_sphere(
         n_part += (radial * rate_tx * q_r * p_t + rate * radial_tx * p_r * q_t) * first
         n_part += rate * rate_tx * (second * q_t * p_t + first * mixed)
         total -= (2 * n + 1) / (n * (n + 1)) * (b_n * m_part + a_n * n_part)
+    # 4 pi, for a field of 1 at 1 m, times the factor i k / (4 pi) of Green's function.
     return np.conj(1j * k * total)
 
 
@@ -252,6 +256,7 @@ class EndlessCylinder:
         u_h = h1_rate - eta**2 / eta_1 * rate * h1
         v_j = j_rate - inside * eta**2 / eta_1 * rate * j
         v_h = h1_rate - inside * eta**2 / eta_1 * rate * h1
+        # With g the coupling, u for M and v for N:
         # [[u_h, g h1], [g h1, v_h]] (M, N) = -[[u_j, g j], [g j, v_j]] (incident M, N)
         determinant = u_h * v_h - (coupling * h1) ** 2
         m_m = -(v_h * u_j - coupling**2 * h1 * j) / determinant
@@ -281,12 +286,13 @@ def _bessel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
     """J_{n-1}(x) and J_n(x) for n = 0 .. count - 1, each [count, ...] for x [...], by Miller's recurrence.
 
     It is stable downwards but leaves a common factor open. That follows from J_0 + 2 (u J_1 + u^2 J_2 + ..) = exp(u x),
-    with u = j or -j, whichever makes the sum large.
+    with u = i or -i, whichever makes the sum large.
     """
     most = max(count, float(np.abs(x).max()))
     top = int(most + 4.05 * most ** (1 / 3)) + ORDERS_ABOVE
     values = np.zeros((count, *x.shape), x.dtype)
     above = np.zeros_like(x)
+    # Any small value: the common factor is found at the end.
     value = np.full_like(x, 1e-200)
     unit = np.where(np.imag(x) > 0, -1j, 1j)
     turns = (np.ones_like(unit), unit, -np.ones_like(unit), -unit)
@@ -336,10 +342,10 @@ def _tabulate(
     # Coefficients turn as exp(2i radius sqrt(k^2 - h^2)).
     radians = body.radius_m * abs(np.diff(np.sqrt(k**2 - ends**2))[0])
     degree = MORE_DEGREES + int(np.ceil(radians))
-    places = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
-    path_m = (low + high) / 2 + (high - low) / 2 * places
+    nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    path_m = (low + high) / 2 + (high - low) / 2 * nodes
     h, _ = _axial_wave_number(k, along_m, path_m, place)
-    to_series = np.linalg.inv(chebyshev.chebvander(places, degree))
+    to_series = np.linalg.inv(chebyshev.chebvander(nodes, degree))
     first, second, third = (to_series @ table.T for table in body.coefficients(k, h, needed_orders(k * body.radius_m)))
     return first, second, third
 
@@ -363,12 +369,13 @@ def scatter_cylinder(
     """Echo of an endless cylinder about local x, complex [n].
 
     `path_m`: specular path in the cross-section, [n]. Dyadic Green's function of the cylinder (Tai 1971, section 9-2):
-    an integral over axial wave numbers h. Its integrand has the phase h x + sqrt(k^2 - h^2) path_m, stationary at the
-    ray's own h. The rest of the integrand is taken at real places as a polynomial of sixth degree, so the error is of
-    second order in 1 / (k path). (On the path of steepest descent, waves that creep around the body would grow.)
+    an integral over axial wave numbers h. Its integrand has the phase h along_m + sqrt(k^2 - h^2) path_m, stationary at
+    the ray's own h (`along_m`: from TX to RX along the axis). The rest of the integrand is taken at real places as a
+    polynomial of sixth degree, so the error is of second order in 1 / (k path). (On the path of steepest descent, waves
+    that creep around the body would grow.)
     """
     k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
-    # To the nanometre: stage offsets are in both places and leave only rounding, which would forbid a table.
+    # To the nanometre: a table needs one value at all stage offsets, which cancel here but for rounding.
     along_m = np.round(pair.rx_m[0] - pair.tx_m[0], 9)
     distance_m = np.hypot(along_m, path_m)
     # Ends at whole centimetres, so that several calls share a table.
@@ -385,11 +392,12 @@ def scatter_cylinder(
             tables = _tabulate(body, k, float(along_m[0]), place, (low, high))
             basis = chebyshev.chebvander(path_places, len(tables[0]) - 1)
             m_m, n_n, m_n = (basis @ table for table in tables)
-        slow = sum_orders(pair, (m_m, n_n, m_n), k, h, path_m)
+        without_phase = sum_orders(pair, (m_m, n_n, m_n), k, h, path_m)
         phase = h * along_m + np.sqrt(k**2 - h**2) * path_m - k * distance_m
-        total += weight * unit * slow * np.exp(1j * (phase + place**2 / 2))
+        total += weight * unit * without_phase * np.exp(1j * (phase + place**2 / 2))
     # The integral of exp(-i t^2 / 2) is sqrt(-2 pi i).
     total *= np.sqrt(2 * np.pi) * np.exp(-0.25j * np.pi)
+    # 4 pi, for a field of 1 at 1 m, times the factor i / (8 pi) of Green's function.
     return np.conj(0.5j * total * np.exp(1j * k * distance_m))
 
 
@@ -417,7 +425,7 @@ def sum_orders(
         (q_m, q_m_back), (q_n, q_n_back) = ends[0].products(orders)
         (p_m, p_m_back), (p_n, p_n_back) = ends[1].products(orders)
         m, n, coupling = (table[:, orders].T for table in coefficients)
-        # Coefficients that couple M and N change sign with the order, the others do not.
+        # Coefficients that couple M and N change sign with the order, the others do not; `_back`: negative orders.
         wave = q_m * (m * p_m + coupling * p_n) + q_n * (n * p_n + coupling * p_m)
         wave_back = q_m_back * (m * p_m_back - coupling * p_n_back) + q_n_back * (n * p_n_back - coupling * p_m_back)
         wave_back[orders == 0] = 0
@@ -432,9 +440,9 @@ def sum_orders(
 class _AzimuthalWaves:
     """Outgoing waves at one antenna, order by order upwards, and products of its dipole with M and N.
 
-    M = curl (x H_n(eta rho) exp(i n phi + i h x)) and N = curl M / k. For the transmitter the signs of n and h in the
-    exponentials change, and so do terms that hold one of both: `sign` is 1 for RX, -1 for TX. `place` and `dipole`:
-    [3, n] in local axes.
+    M = curl (e_x H_n(eta rho) exp(i n phi + i h x)), with e_x along the axis, and N = curl M / k. For the transmitter n
+    and h change their signs in the exponentials, and so do terms with one factor of either: `sign` is 1 for RX, -1 for
+    TX. `place` and `dipole`: [3, n] in local axes.
     """
 
     def __init__(self, place: NDArray, dipole: NDArray, sign: int, eta: NDArray, h: NDArray, k: float) -> None:

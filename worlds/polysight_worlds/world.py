@@ -70,7 +70,7 @@ class Plate:
 
 @dataclass(frozen=True)
 class Body:
-    """A piece of any form, such as an `optics.ellipsoid`: summed in a microsecond for each facet and position."""
+    """A piece of any form, such as an `optics.ellipsoid`. Its echo is a sum over all facets at each stage position."""
 
     name: str
     facets: Facets
@@ -92,7 +92,7 @@ def table(stack: Stack, *, behind_mm: float, centre_m: tuple[float, float], tilt
 
 
 def dish(name: str, centre_m: tuple[float, float], diameter_m: float, liquid: complex, *, wall_m: float) -> Plate:
-    """Return a round glass dish that shows its bottom: `wall_m` of glass before a deep liquid, a permittivity."""
+    """Return a round dish, seen from below: `wall_m` of glass before a deep liquid of permittivity `liquid`."""
     # Near the glass of Table 2; chosen.
     glass = 6.9 - 0.5j
     return Plate(name, centre_m, (diameter_m, diameter_m), Stack(((glass, wall_m),), liquid), round_=True)
@@ -228,7 +228,8 @@ def draw_world(
 ) -> World:
     """Draw plates at nine places around `centre_m`.
 
-    Copper lies at a drawn one (not without `with_metal`), `pieces` - 1 of `materials` (default: Table 2) at others.
+    `pieces` places get a plate: one of copper (`with_metal`), the others of drawn `materials` (default: Table 2).
+    `with_table`: a wooden table stands behind them.
     A material is a permittivity, as half space or slab on a holder (`half_spaces`: never a slab), or a whole stack.
     Sizes are 40 to 50 mm.
     """
@@ -264,7 +265,7 @@ def disturb_plates(world: World, nuisances: Nuisances) -> World:
     rng = np.random.default_rng([nuisances.seed, 1])
     disturbed = []
     for plate in world.plates:
-        # Drawn for the table too: what other plates get does not depend on where it stands in the list.
+        # Drawn for the table too: what a plate gets depends only on its own place in the list.
         height_share = rng.uniform(0, 1)
         tilt_shares = rng.uniform(-1, 1, 2)
         bow_shares = rng.uniform(-1, 1, 2)

@@ -31,7 +31,7 @@ JUMPERS = """\
    [ o o ]   [ o o ]   [ o=o ]        o=o  jumper set      o o  open
     open      open      set           (mmWave Studio needs SOP1 set too: remove it here)"""
 
-# Bit of the boot status (ICD table 7.3) that reports an error of the voltage monitor.
+# Bit of the boot status (TI's mmWave Radar Interface Control Document, table 7.3): error of the voltage monitor.
 VOLTAGE_MONITOR_BIT = 57
 
 
@@ -52,6 +52,8 @@ def check_board(
     on_row: Callable[[Row], None],
 ) -> RadarBoard | None:
     """Bring up a board from USB to one frame; stop at the first step that fails.
+
+    An error of the voltage monitor is reported, but does not stop the bring-up.
 
     Parameters
     ----------
@@ -139,7 +141,7 @@ def _judge_supplies(board: RadarBoard) -> Row:
 
 # Version of the file format of traces.
 TRACE_VERSION = 1
-# Names of the two lines in a trace.
+# Names in a trace of the board's two signals: host interrupt and reset (low: held in reset).
 INTERRUPT = "HOST_INTR"
 RESET = "NRST"
 # Largest file that is read as a trace (chosen).
@@ -158,7 +160,7 @@ class TracedWords:
     file
         Overwritten; each line is flushed at once. A full disk ends only the log, and `ended` has the reason.
     facts
-        Content of the first line: board, place, rig, version, time.
+        Content of the first line, see `trace_words`.
 
     Raises
     ------
@@ -242,7 +244,7 @@ class TracedWords:
 
 
 def trace_words(words: WordLink, clock: Clock, file: Path, rig: Instrument, board: str) -> TracedWords:
-    """Log a board's link to `file`, whose first line has board, place, rig, version and time."""
+    """Log a board's link to `file`, whose first line has board, its place in the rig, rig, version and time."""
     place = rig.radar.native[board].place
     now = round(time.time(), 3)
     facts: dict[str, object] = {
@@ -263,11 +265,12 @@ def new_trace(folder: Path, board: str) -> Path:
     return next(path for path in names if not path.exists())
 
 
+# Words of 16 bits in hexadecimal, the low byte first.
 Words = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{4})*$")]
 
 
 class TraceLine(msgspec.Struct, omit_defaults=True):
-    """One line of a trace: a line's level, words written, words read, or an error, at `t` seconds."""
+    """One line of a trace: a signal's level, words written, words read, or an error, at `t` seconds."""
 
     t: Annotated[float, msgspec.Meta(ge=0, le=_MAX_S)]
     line: Literal["HOST_INTR", "NRST"] | None = None
@@ -288,7 +291,8 @@ class TraceLine(msgspec.Struct, omit_defaults=True):
 class ReplayedWords:
     """Replay of a trace: a word link and a clock in virtual time. `facts` has the trace's first line.
 
-    The host must repeat its actions of the trace; the first difference raises a DeviceError with both.
+    The host must repeat its actions of the trace; the first difference raises a DeviceError with both. The constructor
+    raises the errors of `read_trace`.
     """
 
     def __init__(self, file: Path) -> None:
@@ -339,6 +343,7 @@ class ReplayedWords:
             if later:
                 break
             self._play_level()
+            # A counted change is what this query saw; changes by time may be several since the query before.
             if line.looks is not None:
                 break
         self._raise_error()

@@ -1,8 +1,9 @@
 """Samples of a board, and the fit of one echo's path in windows of stage positions.
 
 In a window of some 34 mm the path of an echo is L + g.d + d'Q d / 2, with d the offset from the window's centre: the
-six values (L, g_x, g_y, Q_xx, Q_xy, Q_yy). A window's RX are added up in phase for the direction from which the echo
-comes, and `maximise` fits values and complex amplitude by the matched filter over positions and frequencies.
+six values (L, g_x, g_y, Q_xx, Q_xy, Q_yy). A path runs from TX over the object to RX. A window's RX are added up in
+phase for the direction from which the echo comes, and `maximise` fits values and complex amplitude by the matched
+filter over positions and frequencies.
 """
 
 from __future__ import annotations
@@ -108,7 +109,10 @@ class Echoes:
         return Echoes(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Echoes)})
 
     def move(self, at_m: Array, wave_number: float) -> Echoes:
-        """Return the echoes at other stage offsets [n, 3] near by: path, slope and phase follow the fitted path."""
+        """Return the echoes at other stage offsets [n, 3] near by: path, slope and phase follow the fitted path.
+
+        `wave_number`: at the middle of the band, rad / m.
+        """
         d = (at_m - self.at_m)[:, :2]
         rise = np.einsum("np,np->n", self.slope, d) + np.einsum("np,npq,nq->n", d, self.bend, d) / 2
         return replace(
@@ -122,13 +126,13 @@ class Echoes:
 
 @dataclass
 class Windows:
-    """Samples of some windows: [window, rx, frequency, position], offsets from their centres [window, position, 2]."""
+    """Samples of some windows: [window, rx, frequency, position], offsets from `at_m` [window, position, 2]."""
 
     samples: NDArray[np.complex64]
     # 1 where a position has data, else 0: [window, position].
     valid: Array
     offsets: Array
-    # Stage offsets of the centres, [window, 3].
+    # Stage offsets for which echoes are given, [window, 3]: the windows' centres, or places near by.
     at_m: Array
 
 
@@ -159,6 +163,7 @@ class BoardFit:
         # The effect on echoes in the middle of the range gate, averaged over paths.
         if board.model is None:
             model = np.eye(self.omega.size)
+            # Any paths: without a model all weights are 1.
             gate = np.linspace(0.05, 0.6, 24)
         else:
             model = board.model
@@ -174,10 +179,14 @@ class BoardFit:
         self.model = model
 
     def steer(self, offsets: Array, path_m: Array, slope: Array) -> NDArray[np.complex128]:
-        """Phase factors [window, rx, frequency] that add up the RX for echoes of given path and slope."""
+        """Phase factors [window, rx, frequency] that add up the RX for echoes of given path and slope.
+
+        `offsets`: stage offsets of the echoes, [window, 3].
+        """
         board = self.board
         points = locate(path_m, slope, offsets, board.tx_m, board.middle_m)
         _, back, *_ = unit_legs(points, offsets, board.tx_m, board.middle_m)
+        # `back` points from the RX to the echo's point: an RX displaced that way has a shorter path.
         excess = -back @ self.lever.T - board.direct_m
         return np.exp(-1j * excess[:, :, None] * self.omega)
 
@@ -196,7 +205,7 @@ def find_mirror_path(board: Samples, z_m: float) -> float:
 
 
 def find_basis(offsets: Array) -> Array:
-    """Rates of the path by (L, g_x, g_y, Q_xx, Q_xy, Q_yy): [window, position, 6]."""
+    """Derivatives of the path by (L, g_x, g_y, Q_xx, Q_xy, Q_yy): [window, position, 6]."""
     x = offsets[..., 0]
     y = offsets[..., 1]
     return np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=-1)
@@ -235,7 +244,7 @@ def maximise(
 ) -> Maximum:
     """Maximise |sum of derotated samples| by Newton's method with the expected curvature.
 
-    `added`: [window, frequency, position], RX added up; `valid` [window, position] and `offsets` [window, position, 2]
+    `added`: [window, frequency, position], of `add_up`; `valid` [window, position] and `offsets` [window, position, 2]
     as of :class:`Windows`; `values` [window, 6] to start from. Without iterations these values stay, and only the
     amplitude is measured.
     """
@@ -262,17 +271,19 @@ def maximise(
         total = (sums * valid).sum(axis=1)
         if step == iterations:
             break
-        slope = np.einsum("wnp,wn->wp", weighted, rates) / np.where(total == 0, 1, total)[:, None]
-        move = np.linalg.solve(scaled, (slope.real / scale)[..., None])[..., 0] / scale
+        gradient = np.einsum("wnp,wn->wp", weighted, rates) / np.where(total == 0, 1, total)[:, None]
+        move = np.linalg.solve(scaled, (gradient.real / scale)[..., None])[..., 0] / scale
         values += np.clip(move, -STEP_LIMITS, STEP_LIMITS)
     # The amplitude may change linearly over the window: a plane is taken out before the rest counts as noise. Its value
-    # at the offset zero is the amplitude there, which the mean is not where a window lies beside its place.
+    # at the offset zero is the amplitude at `at_m`; the mean is not, where `at_m` is not the window's centre.
     plane = weighted[:, :, :3]
     matrix = np.einsum("wnp,wnq->wpq", plane, basis[:, :, :3]) + 1e-12 * np.eye(3)
     plane_inverse = np.linalg.inv(matrix)
     flat = np.einsum("wpq,wnq,wn->wp", plane_inverse, plane, sums, optimize=True)
-    rest = (sums - np.einsum("wnp,wp->wn", basis[:, :, :3], flat)) * valid
-    power = (np.abs(rest) ** 2).sum(axis=1) / np.maximum(count - 9, 1) / fit.gain**2
+    residual = (sums - np.einsum("wnp,wp->wn", basis[:, :, :3], flat)) * valid
+    # Less six values and the plane's three.
+    power = (np.abs(residual) ** 2).sum(axis=1) / np.maximum(count - 9, 1) / fit.gain**2
+    # Variance of the mean's real part, and of its imaginary part.
     noise = power / count / 2
     amplitude = flat[:, 0] / fit.gain
     inverse = np.linalg.inv(scaled)
@@ -296,7 +307,8 @@ def maximise(
 def make_echoes(fit: BoardFit, windows: Windows, maximum: Maximum) -> Echoes:
     """Return the echoes of the maxima in windows."""
     path, slope, bend = unpack_values(maximum.values)
-    # The matched filter's phase is that at the weighted middle of the band.
+    # The matched filter's phase is that at the weighted middle of the band, where samples turn as exp(+j k path);
+    # echoes have the other sign.
     turned = maximum.amplitude * np.exp(1j * fit.middle * path)
     return Echoes(
         at_m=windows.at_m,
@@ -313,7 +325,7 @@ def make_echoes(fit: BoardFit, windows: Windows, maximum: Maximum) -> Echoes:
 
 
 def gather_windows(board: Samples, rows: NDArray, columns: NDArray, at_m: Array) -> Windows:
-    """Windows whose first positions are at (rows, columns), each [window]; `at_m` [window, 3] are their centres."""
+    """Windows whose first positions are at (rows, columns), each [window]; `at_m` as of `Windows`."""
     height, width = board.window_shape()
     r = rows[:, None, None] + np.arange(height)[:, None]
     c = columns[:, None, None] + np.arange(width)
@@ -325,7 +337,7 @@ def gather_windows(board: Samples, rows: NDArray, columns: NDArray, at_m: Array)
 
 
 def add_up(fit: BoardFit, windows: Windows, values: Array) -> NDArray:
-    """Samples of all RX added up for echoes of the given values: [window, frequency, position]."""
+    """Mean of all RX's samples, in phase for echoes of the given values: [window, frequency, position]."""
     path, slope, _ = unpack_values(values)
     return add_rx(fit.steer(windows.at_m, path, slope) / len(fit.lever), windows.samples)
 
@@ -389,7 +401,10 @@ def select_windows(windows: Windows, keep: NDArray) -> Windows:
 
 
 def choose_thinned(shape: tuple[int, int]) -> NDArray[np.int_]:
-    """Return about `THINNED_POSITIONS` of the positions of a window of so many rows and columns, evenly spread."""
+    """Return about `THINNED_POSITIONS` of the positions of a window of so many rows and columns, evenly spread.
+
+    They are indices into the flattened window, row by row.
+    """
     step = max(1, round(shape[0] * shape[1] / THINNED_POSITIONS))
     rows, columns = np.indices(shape)
     # With the golden ratio the lattice is about as wide in all directions.

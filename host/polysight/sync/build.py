@@ -26,7 +26,8 @@ SOURCES = ("burst.c", "direct_path.c")
 # Multiplications and additions may be fused and sums rearranged, so that loops are vectorised.
 _FLAGS = "-std=c99 -Werror=implicit-function-declaration -O3 -fPIC"
 _FLAGS += " -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
-# -fassociative-math instead of -ffast-math, which would change rounding in other libraries, too.
+# -fassociative-math instead of -ffast-math: linked with that, a library may make the whole process, other libraries
+# too, flush subnormal numbers to zero.
 _FLAGS += " -fassociative-math"
 # Flags by width of the vectors in bits: at run time the widest is used that the processor has.
 _WIDTHS = {
@@ -46,7 +47,7 @@ class BuildError(Exception):
 
 
 def source_digest() -> str:
-    """Return the digest of the C sources. A library ends with it, so that no old or truncated one is loaded."""
+    """Return 16 hex digits for C sources and headers. Libraries end with them, so no old or cut one is loaded."""
     digest = hashlib.sha256()
     for path in sorted([*HERE.glob("*.c"), *HERE.glob("*.h")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
@@ -90,6 +91,7 @@ def build(folder: Path = HERE, target: str = "") -> Path:
             for bits, flags in widths.items()
             for source in SOURCES
         ]
+        # Finds the processor's width at run time.
         jobs.append((["width.c"], "width.o"))
         with ThreadPoolExecutor(os.cpu_count()) as workers:
             commands = [

@@ -46,6 +46,7 @@ class HighPass:
 
     def inverse(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return `conj(H) / max(|H|^2, 1/16)`, shape of the frequencies (Hz): 1/H, but at most fourfold noise."""
+        # H is 0 at zero; at 1 Hz it is near enough to that.
         f = np.where(np.abs(frequency_hz) < 1.0, 1.0, frequency_hz)
         inverse: NDArray[np.complex128] = np.ones(np.shape(f), complex)
         for corner in self.corners_hz:
@@ -58,8 +59,9 @@ class Equaliser:
     """Compensates the filter in the narrow band of a chirp's signal, with three taps.
 
     After mixing down by its centre f, the signal of a chirp lies within some tens of kHz of zero. Taps t at -spacing, 0
-    and +spacing samples have the response `t_0 exp(-jw) + t_1 + t_2 exp(jw)`, which equals the inverse filter at f and
-    at `reach` on either side. It is periodic beyond, so that noise far away is not amplified by the slope of 1/H.
+    and +spacing samples have the response `t_0 exp(-jw) + t_1 + t_2 exp(jw)`, with w the phase over a spacing. It
+    equals the inverse filter at f and at `reach` on either side. It is periodic beyond, so that noise far away is not
+    amplified by the slope of 1/H.
 
     Attributes
     ----------
@@ -102,6 +104,7 @@ class Equaliser:
 def apply_filter(signal: NDArray[np.complex64], taps: NDArray[np.complex64]) -> NDArray[np.complex64]:
     """Filter a signal [position, chirp, rx, block] with taps [position, chirp, 3], one block apart.
 
+    A block is one sample of the signal after decimation: the `spacing` of the equaliser.
     Beyond its ends the signal is extrapolated by the parabola through three of its samples.
     """
     block_before = 3 * (signal[..., :1] - signal[..., 1:2]) + signal[..., 2:3]
@@ -136,7 +139,7 @@ def fit_high_pass(
     Raises
     ------
     DataError
-        if there are too few points, or no points near a corner.
+        if there are too few points, values that are not above zero, or no points near a corner.
     """
     if_hz = np.asarray(if_hz, np.float64)
     amplitude = np.asarray(amplitude, np.float64)
@@ -160,6 +163,7 @@ def fit_high_pass(
         turn = turns * np.conj(h) / np.abs(h)
         return np.concatenate([deviation, np.angle(turn * np.conj(turn.mean()))])
 
+    # Limits, starts and the loss are chosen.
     limits = np.log(if_hz.min() / 10), np.log(if_hz.max() * 3)
     # Start from several pairs of corners: the misfit may have several minima.
     starts = itertools.combinations(np.linspace(*limits, 6)[1:-1], 2)

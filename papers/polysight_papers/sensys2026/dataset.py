@@ -38,7 +38,7 @@ _ALIKE = 0.35
 
 # Words that do not tell materials apart.
 _FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate", "the", "of", "box", "container"}
-# Their word for one of ours.
+# Other spellings and words, in the data set's names and in Table 2's, to the one that is compared.
 _ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}
 # A row's name may hold the container of a liquid, which their name need not have.
 _CONTAINERS = {"glass", "plastic"}
@@ -60,7 +60,7 @@ class AuthorsData:
     sources
         `materials/`, `labels/`, `images made here` to a library with the names of Table 2; without empty ones.
     meaning
-        Their names to the rows of Table 2.
+        Their names, with the thickness where it is known, to the rows of Table 2.
     notices
         Skipped files and names, and assumptions.
     """
@@ -101,7 +101,7 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
     Raises
     ------
     DataError
-        when nothing of it can be used.
+        when the folder is missing, the file of names is not valid, or nothing can be used.
     """
     if not folder.is_dir():
         raise DataError(
@@ -112,26 +112,26 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
         )
     base = load_instrument(config)
     notices = []
-    libraries = {}
+    entries_by_source = {}
     if pickles := sorted((folder / "materials").glob("*.pkl")):
-        libraries[MATERIALS] = _read_all(materials.read_material, pickles, notices)
+        entries_by_source[MATERIALS] = _read_all(materials.read_material, pickles, notices)
     scans = _read_all(materials.read_labelled_scan, materials.label_folders(folder / "labels"), notices)
     if scans:
         orientation = materials.image_orientation(scans)
         notices.append(f"boxes of labels/ are read with {orientation}: so they explain the images' brightness best")
         turned = [s.orient(orientation) for s in scans]
         angles = {s.scan: _find_angle(folder, s, base, notices) for s in scans}
-        libraries[LABELS] = _make_entries(turned, angles, notices)
+        entries_by_source[LABELS] = _make_entries(turned, angles, notices)
         if images is not None:
             ours = [s for scan in turned if (s := _image_here(scan, images, notices)) is not None]
-            libraries[IMAGES] = _make_entries(ours, angles, notices)
+            entries_by_source[IMAGES] = _make_entries(ours, angles, notices)
     elif images is not None:
         notices.append("images made here are left out: labels/ holds no boxes to look at them with")
     renames = {}
     if names:
         renames = read_names(names)
-    filled_libraries = {source: entries for source, entries in libraries.items() if entries}
-    meaning, sources = _rename_entries(filled_libraries, renames, notices)
+    filled_sources = {source: entries for source, entries in entries_by_source.items() if entries}
+    meaning, sources = _rename_entries(filled_sources, renames, notices)
     if not sources:
         raise DataError(
             f"{folder}: neither materials/*.pkl nor labels/<scan> with a known material is in it",
@@ -209,6 +209,7 @@ def _image_here(scan: materials.LabelledScan, images: Path, notices: list[str]) 
 
     correlations = {w: _correlate(np.abs(turn(h, w)), theirs) for w in ways if turn(h, w).shape == theirs.shape}
     best = max(correlations, key=lambda w: correlations[w], default=None)
+    # So written, NaN is refused, too.
     if best is None or not correlations[best] >= _ALIKE:
         notices.append(f"{scan.scan}: the image made here does not show what sar_h.npy shows; left out")
         return None
@@ -252,6 +253,7 @@ def _rename_entries(
 
 def words(name: str) -> frozenset[str]:
     """Return words and numbers of a name, in lower case; "metal" for metals."""
+    # "w/ " and "w " mean "with".
     text = re.sub(r"\\?\bw/?\s", " with ", name.lower().replace("_", " "))
     out: list[str] = []
     for word in re.findall(r"[a-z]+|\d+(?:\.\d+)?", text):
@@ -286,7 +288,7 @@ def _share_of_common_words(theirs: frozenset[str], row: Published) -> float:
 
 
 def find_row(name: str, thickness_mm: float | None = None) -> int | None:
-    """Return the number of the row of Table 2 for a name, or None."""
+    """Return the number of the row of Table 2 for a name (1 for metals); None if none fits, or two fit equally well."""
     theirs = words(name)
     if "metal" in theirs:
         return 1
@@ -365,15 +367,18 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
 
 def authors_library(data: AuthorsData) -> materials.Library:
     """Return the patches of all sources except our own images, without leakage and without duplicates."""
-    a = complex(*data.base.polarimetry.leakage_h)
-    b = complex(*data.base.polarimetry.leakage_v)
+    # From V into H, and from H into V.
+    leak_hv = complex(*data.base.polarimetry.leakage_h)
+    leak_vh = complex(*data.base.polarimetry.leakage_v)
     merged: dict[tuple[str, str, int], list[materials.Entry]] = {}
     for source, library in data.sources.items():
         if source == IMAGES:
             continue
         entries_of_source: dict[tuple[str, str, int], list[materials.Entry]] = {}
         for e in library.entries:
-            entries_of_source.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(_remove_leakage(e, a, b))
+            entries_of_source.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(
+                _remove_leakage(e, leak_hv, leak_vh)
+            )
         # The same patches may be in both folders: those of the later source count.
         merged = {**merged, **entries_of_source}
     entries = tuple(e for group in merged.values() for e in group)

@@ -72,9 +72,9 @@ def groups() -> dict[str, Group]:
 
 @dataclass(frozen=True)
 class Errors:
-    """Relative amplitude error and phase error of a pixel, and the share of their variance common to a patch.
+    """Standard deviations of a pixel's relative amplitude and phase, and the share of their variance common to a patch.
 
-    `spread`: relative standard deviations of real part and loss between specimens; each scan has its own.
+    `spread`: relative standard deviations of real part and loss between specimens; each scan has its own specimens.
     """
 
     amplitude: float
@@ -127,7 +127,10 @@ class Pixels:
 
 
 def specimens(materials: tuple[Published, ...], spread: tuple[float, float], z: npt.NDArray[np.float64]) -> Complex:
-    """Return permittivities at z [2, ..., materials] standard deviations (real part normal, loss log-normal)."""
+    """Return permittivities at z [2, ..., materials] standard deviations.
+
+    The real part is normal, but at least 1; the loss is log-normal with the published value as its mean.
+    """
     eps = np.array([m.permittivity for m in materials], np.complex128)
     width = np.sqrt(np.log1p(spread[1] ** 2))
     real = np.maximum(eps.real * (1 + spread[0] * z[0]), 1.0)
@@ -166,6 +169,7 @@ def draw(
     specimen_rng = np.random.default_rng([seed, 1])
     eps = specimens(materials, errors.spread, specimen_rng.standard_normal((2, scans, len(materials))))
     r_s, r_p = fresnel(eps, np.radians(angle_deg))
+    # H is the s polarisation and V the p polarisation; metal reflects -1 in both.
     return Pixels(materials, angle_deg, channel(-r_s), channel(-r_p))
 
 
@@ -201,7 +205,8 @@ def calibrated_errors(group_name: str, draws: int = 3, shared: float = 0.5) -> E
 
 
 SPREADS = ((0.0, 0.0), (0.01, 0.05), (0.02, 0.1), (0.05, 0.2))
-"""Relative standard deviations of real part and loss; Fig. 17 of the paper has 1 and 4 % / 23 and 14 %."""
+"""Relative standard deviations of real part and loss. In Fig. 17 of the paper two plates of one material differ by 1
+and 4 % in the real part, 23 and 14 % in the loss."""
 # Specimens of each material in the library. Chosen: it decides how well their spread is known.
 LIBRARY_SCANS = 24
 TEST_SCANS = 160
@@ -227,7 +232,7 @@ class SpecimenScore(NamedTuple):
 
 
 def both_angles(group: str, angles_deg: tuple[float, ...], errors: Errors, seed: int, scans: int) -> Samples:
-    """Pixels of a group under one angle, or under two of the same specimens."""
+    """Return the pixels of a group under one angle, or the same specimens' pixels under several, joined."""
     joined_samples, *further_samples = (
         draw(groups()[group].materials, a, errors, seed, scans).samples() for a in angles_deg
     )
@@ -255,7 +260,7 @@ def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, 
 
 def by_patch(model: Model, test: Samples) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_], Real]:
     """Name all patches, scan by scan; return for each whether it got a name, whether the nearest material is right, and
-    the confidence, [patch]. A patch farther than 1 from all materials gets no name.
+    the confidence, [patch]. Distances are in units of the model's limit: a patch beyond 1 from all gets no name.
     """
     rows = []
     for scan in np.unique(test.groups):
@@ -281,8 +286,9 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
     nodes = np.stack(np.meshgrid(z, z, indexing="ij")).reshape(2, -1, 1)
     weights = np.outer(weight, weight).ravel() / weight.sum() ** 2
     std = np.tile([errors.amplitude, errors.amplitude, errors.phase_rad * np.sqrt(2)], len(angles_deg))
-    # A patch's mean over its pixels, with the scan's reference known.
+    # A patch's mean over its pixels. The scan's reference counts as known: its error is left out.
     std = std * np.sqrt(errors.shared + (1 - errors.shared) / PIXELS)
+    # [node, material, feature]; `measured` is [trial, feature], `difference` [trial, node, material, feature].
     mean = _compute_features(
         specimens(materials, errors.spread, np.broadcast_to(nodes, (2, z.size**2, len(materials)))), angles_deg
     )
@@ -295,6 +301,7 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
         eps = specimens(materials, errors.spread, rng.standard_normal((2, trials, len(materials))))[:, k]
         measured = _compute_features(eps, angles_deg) + std * rng.standard_normal((trials, std.size))
         difference = measured[:, None, None] - mean[None]
+        # Every third feature is a phase.
         difference[..., 2::3] = (difference[..., 2::3] + np.pi) % (2 * np.pi) - np.pi
         q = np.sum((difference / std) ** 2, axis=-1)
         likelihood = np.einsum("tnm,n->tm", np.exp(-(q - q.min(axis=(1, 2), keepdims=True)) / 2), weights)
@@ -353,7 +360,10 @@ def _find_outside(test_samples: Samples, training_samples: Samples) -> npt.NDArr
 
 
 def _patch_features(samples: Samples) -> tuple[Real, npt.NDArray]:
-    """Return mean ln|H|, ln|V| and arg 1/P under each angle, [patch, 3 * angles], and the patches' names."""
+    """Return mean ln|H|, ln|V| and arg 1/P under each angle, [patch, 3 * angles], and the patches' names.
+
+    1/P, because samples hold it instead of P (`feature_matrix`).
+    """
     h, v, inverse = split_by_angle(samples.x)
     x = np.concatenate([np.log(h), np.log(v), np.angle(inverse)], axis=1)
     order = np.unique(samples.patches)

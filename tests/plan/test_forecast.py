@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import msgspec
 import numpy as np
 import pytest
@@ -11,7 +13,13 @@ from polysight.imaging import ImageBuilder, PhaseSlope, backproject, field_limit
 from polysight.imaging.geometry import Antennas
 from polysight.imaging.resolution import board_facts
 from polysight.planning import Changes, Noise, forecast, propose
-from polysight.planning.forecast import describe_aperture, find_warnings, predict_burst, predict_noise
+from polysight.planning.forecast import (
+    describe_aperture,
+    fills_whole_packets,
+    find_warnings,
+    predict_burst,
+    predict_noise,
+)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 
@@ -163,6 +171,25 @@ def test_proposals_keep_the_time_and_are_possible(rig):
         assert not [w for w in plan.warnings if w.where in ("aliasing", "motion")]
     # More time never gives a worse image.
     assert propose(rig, 60.0, count=1)[0].noise.image_db > plans[0].noise.image_db
+
+
+def test_a_proposed_burst_of_several_frames_of_chirps_travels_at_most_half_a_wavelength(rig):
+    burst = msgspec.structs.replace(rig.burst, pulses=4, chirps=4, chirp_us=143.0, period_us=10_000.0)
+    rig = msgspec.structs.replace(
+        rig, burst=burst, stage=msgspec.structs.replace(rig.stage, speed_mm_s=100.0, travel_speed_mm_s=120.0)
+    )
+    plans = [plan for minutes in (8.0, 12.0) for plan in propose(rig, minutes, count=25, scene_mm=(1.0, 1.0))]
+    assert plans
+    assert max(plan.burst.travel_wavelengths for plan in plans) <= 0.5
+
+
+@pytest.mark.parametrize("changes", [Changes(pulses=13), Changes(columns=91), Changes(pulses=1, columns=91)])
+def test_a_row_of_whole_packets_is_advised_a_number_of_pulses_only_if_it_has_an_end_mark(rig, changes):
+    rig = changes.apply(rig)
+    (text,) = [w.what for w in find_warnings(rig, Noise()) if "no short packet" in w.what]
+    advised = re.search(r"(\d+) pulses a position have an end mark", text)
+    assert (advised is not None) == (not fills_whole_packets(rig, rig.burst.pulses + 1))
+    assert advised is None or not fills_whole_packets(rig, int(advised[1]))
 
 
 def test_too_little_time_has_no_plan(rig):

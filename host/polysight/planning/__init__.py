@@ -1,9 +1,9 @@
 """`polysight plan`: predict a scan before it is made: time, data, resolution, noise, aliases, warnings.
 
 `forecast` predicts the scan of a rig file to which `Changes` were applied; `propose` searches for the plans with the
-least noise within a time. `scan_time` estimates the duration. `run_plan`
-is the command; it can take noise and standstill from an earlier scan. `warn_of_scene` checks the plates of a scene,
-`find_scene_warnings` those of a scene file.
+least noise within a time. `scan_time` estimates the duration. `run_plan` is the command; it can take noise and
+standstill from an earlier scan. `warn_of_scene` checks the plates of a scene, `find_scene_warnings` those of a scene
+file.
 """
 
 from polysight.planning.forecast import (

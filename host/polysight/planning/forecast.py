@@ -44,7 +44,7 @@ MAX_STEPS_PER_S = 20_000
 SIMULATED_DIRECT_SNR_DB = 5.5
 # Speed of the stage of the published rig.
 _PUBLISHED_SPEED_MM_S = 20.0
-# Standard deviation of the phase of the object's peak (paper, section 9.1).
+# Standard deviation of the phase of the object's peak after all stages of synchronisation (paper, section 9.1).
 _PUBLISHED_PHASE_RAD = 0.022
 # Loss by the motion during a burst from which on the forecast warns (chosen).
 _MAX_BURST_LOSS_DB = 0.5
@@ -125,16 +125,21 @@ def turn_s(grid: Grid, stage: Stage) -> float:
 
 
 def fills_whole_packets(rig: Instrument, pulses: int | None = None) -> bool:
-    """Return True if a row with `pulses` pulses a position fills whole packets, so that no short one is delayed."""
-    return rig.row_bytes // rig.burst.pulses * (pulses or rig.burst.pulses) % rig.card.payload_bytes == 0
+    """Return True if a row with `pulses` pulses a position (None: the rig's) fills whole packets.
+
+    No short packet is left then, which the card would delay, and which would mark the row's end.
+    """
+    row_bytes = rig.grid.columns * (pulses or rig.burst.pulses) * rig.frame_bytes
+    return row_bytes % rig.card.payload_bytes == 0
 
 
 def tail_s(rig: Instrument) -> float:
     """Return the wait for the cards' last packet at the end of each row, after the stage has stopped, seconds."""
     if fills_whole_packets(rig):
         return 0.0
-    run_out = (row_motion_s(rig.grid, rig.stage) - measuring_s(rig)) / 2
-    return max(0.0, burst_duration_s(rig.burst) + CARD_TAIL_S - run_out)
+    # From a row's last point, where its last burst begins, to the stage's rest.
+    run_out_s = (row_motion_s(rig.grid, rig.stage) - measuring_s(rig)) / 2
+    return max(0.0, burst_duration_s(rig.burst) + CARD_TAIL_S - run_out_s)
 
 
 def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTime:
@@ -144,14 +149,15 @@ def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTi
     """
     grid = rig.grid
     stage = rig.stage
-    row = row_motion_s(grid, stage)
-    measuring = measuring_s(rig)
-    x = stage.centre_x_mm - (grid.columns - 1) / 2 * grid.step_x_mm - stage.run_up_mm(grid.step_x_mm)
-    y = stage.centre_y_mm - (grid.rows - 1) / 2 * grid.step_y_mm
+    row_s = row_motion_s(grid, stage)
+    measuring_row_s = measuring_s(rig)
+    # The start of the first row, from the home corner; both axes move at once.
+    start_x_mm = stage.centre_x_mm - (grid.columns - 1) / 2 * grid.step_x_mm - stage.run_up_mm(grid.step_x_mm)
+    start_y_mm = stage.centre_y_mm - (grid.rows - 1) / 2 * grid.step_y_mm
     return ScanTime(
-        approach_s=straight_move_s(max(x, y), stage.travel_speed_mm_s, stage.accel_mm_s2),
-        measuring_s=grid.rows * measuring,
-        ramps_s=grid.rows * (row - measuring),
+        approach_s=straight_move_s(max(start_x_mm, start_y_mm), stage.travel_speed_mm_s, stage.accel_mm_s2),
+        measuring_s=grid.rows * measuring_row_s,
+        ramps_s=grid.rows * (row_s - measuring_row_s),
         turns_s=(grid.rows - 1) * turn_s(grid, stage),
         tail_s=grid.rows * tail_s(rig),
         overhead_s=grid.rows * row_overhead_s,
@@ -217,7 +223,7 @@ class NoiseForecast:
 
 @dataclass(frozen=True)
 class Forecast:
-    """Prediction of a scan."""
+    """Prediction of a scan with `rig`, with `raw_bytes` of all boards; `noise_source` says where its noise is from."""
 
     rig: Instrument
     time: ScanTime
@@ -262,15 +268,13 @@ def forecast(
 
 
 def describe_aperture(rig: Instrument) -> tuple[imaging.Aperture, Real]:
-    """Return the aperture of the H receiver and its taper [row, column]."""
+    """Return the aperture of the H receiver, at the frequencies that the imager keeps, and its taper [row, column]."""
     grid = imaging.image_grid(rig)
     antennas = tuple(imaging.Antennas.from_rig(rig, board) for board in rig.receivers)
-    frequencies = imaging.reduction(
-        rig.chirp, imaging.scene_gate_m(antennas, plan_raster(rig.grid), grid), _FAST_TIME_WINDOW
-    ).frequencies_hz
-    return imaging.Aperture(antennas[0], imaging.scan_offsets_m(rig), frequencies, grid), np.outer(
-        *_compute_tapers(rig)
-    )
+    gate_m = imaging.scene_gate_m(antennas, plan_raster(rig.grid), grid)
+    frequencies_hz = imaging.reduction(rig.chirp, gate_m, _FAST_TIME_WINDOW).frequencies_hz
+    aperture = imaging.Aperture(antennas[0], imaging.scan_offsets_m(rig), frequencies_hz, grid)
+    return aperture, np.outer(*_compute_tapers(rig))
 
 
 def _compute_tapers(rig: Instrument) -> tuple[Real, Real]:
@@ -286,13 +290,16 @@ def predict_burst(rig: Instrument) -> BurstForecast:
     travel_mm = stage.speed_mm_s * burst_duration_s(rig.burst)
     middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * sum(rig.chirp.linear_samples) / 2
     half_m = (grid.columns - 1) / 2 * grid.step_x_mm / 1e3
+    # Turn of the echo's phase during the burst, at the aperture's end; an average over it is a sinc.
     change_rad = travel_mm / 1e3 * abs(imaging.PhaseSlope(rig, 0).slope(half_m, middle_hz))
+    average = abs(np.sinc(change_rad / (2 * np.pi)))
     return BurstForecast(
         duration_ms=rig.burst.pulses * rig.burst.period_us * 1e-3,
         between_ms=1e3 * grid.step_x_mm / stage.speed_mm_s,
         travel_mm=travel_mm,
         travel_wavelengths=travel_mm / 1e3 * middle_hz / SPEED_OF_LIGHT_M_S,
-        edge_loss_db=float(-20 * np.log10(max(abs(np.sinc(change_rad / (2 * np.pi))), 1e-6))),
+        # At most 120 dB, where the average vanishes.
+        edge_loss_db=float(-20 * np.log10(max(average, 1e-6))),
     )
 
 
@@ -322,7 +329,8 @@ def predict_noise(rig: Instrument, noise: Noise) -> NoiseForecast:
 def find_warnings(rig: Instrument, noise: Noise, scene_mm: tuple[float, float] | None = None) -> tuple[Finding, ...]:
     """Return every warning about a plan; much faster than the whole forecast.
 
-    First those of level "error": stage, Pi or radars would refuse the plan. `where` is the topic.
+    First those of level "error": stage, Pi or radars would refuse the plan. `where` is the topic. `scene_mm` is as of
+    :func:`forecast`.
     """
     image_mm = (rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm)
     scene_mm = scene_mm or image_mm
@@ -403,11 +411,16 @@ def _check_burst(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
 def _check_card(rig: Instrument) -> Iterator[Finding]:
     """Yield findings about packets and data rate of the cards."""
     if fills_whole_packets(rig):
+        neighbours = (rig.burst.pulses - 1, rig.burst.pulses + 1)
+        with_end_mark = [pulses for pulses in neighbours if pulses and not fills_whole_packets(rig, pulses)]
+        if with_end_mark:
+            remedy = f"{with_end_mark[0]} pulses a position have an end mark"
+        else:
+            remedy = f"no number of pulses has an end mark with {rig.grid.columns} points in a row"
         yield _note(
             "card",
             f"a row of {rig.row_bytes} bytes fills whole packets of {rig.card.payload_bytes}: no short packet marks its"
-            f" end, and an extra frame whose packets are lost shows by its arrival time only;"
-            f" {rig.burst.pulses - 1 or 2} pulses a position have an end mark",
+            f" end, and an extra frame whose packets are lost shows by its arrival time only; {remedy}",
         )
     elif tail := tail_s(rig):
         yield _note(
@@ -431,14 +444,17 @@ def _check_card(rig: Instrument) -> Iterator[Finding]:
 def _check_radar(rig: Instrument) -> Iterator[Finding]:
     """Yield findings about the constraints of the radars, and the unknown IF."""
     native = rig.radar.control == "native"
-    offsets_known = native or any(b.start_offset_hz for b in rig.boards)
-    for c in constraints(rig, rig.grid.columns * rig.burst.pulses):
-        about_if = c.name.startswith("IF")
-        if not c.holds and (offsets_known or not about_if):
-            level = "error" if native else "note"
-            topic = "IF" if about_if else "radar"
-            yield Finding(level, f"{c}: {c.remedy}", where=topic)
+    offsets_known = native or any(board.start_offset_hz for board in rig.boards)
+    # Another program that configures the radars may do what this release would refuse.
+    level = "error" if native else "note"
+    for constraint in constraints(rig, rig.grid.columns * rig.burst.pulses):
+        about_if = constraint.name.startswith("IF")
+        if constraint.holds or (about_if and not offsets_known):
+            continue
+        topic = "IF" if about_if else "radar"
+        yield Finding(level, f"{constraint}: {constraint.remedy}", where=topic)
     if not offsets_known:
+        # Slope times 5 ns, a jitter chosen to show the order of magnitude.
         yield _note(
             "IF",
             "the rig file has no start_offset_hz, so the IF depends on the program that configures the radars: the"
@@ -457,6 +473,7 @@ def _check_field(rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple
         free = field.alias_free_mm[i]
         zone = field.mirror_zone_mm[i]
         size = (count - 1) * step
+        # From an object at one edge of the scene to a pixel at the other edge of the image.
         need = (scene + image_mm[i]) / 2
         if free < need:
             yield _note(

@@ -26,6 +26,7 @@ from polysight.planning.forecast import (
     ROW_OVERHEAD_S,
     Forecast,
     Noise,
+    ScanTime,
     fills_whole_packets,
     find_warnings,
     forecast,
@@ -47,19 +48,20 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.findings import Finding
 from polysight_shared.messages import Capture
+from polysight_shared.raster import burst_duration_s
 from polysight_shared.tables import decode, to_builtins
 
 # Keys of [stage] that the Pi takes from its own rig file: acceleration, and the limit of the speed.
 _PI_KEYS = ("speed_mm_s", "accel_mm_s2")
-# Steps that are compared, as multiples of the rig file's.
+# Steps that are compared, as multiples of the rig file's; chosen.
 _STEP_MULTIPLES = (1, 2, 3, 4, 5)
-# Largest share of the time between two points that a burst may take.
+# Largest share of the time between two points that a burst may take; chosen, the rest allows for jitter of the speed.
 _MAX_DUTY = 0.95
-# Travel during a burst. Echoes of pulses that lie further apart have opposite phases, and averaging them cancels.
+# Largest travel during a burst; chosen. It turns an echo's phase by half a cycle where sin a_tx + sin a_rx is 1
+# (forecast.py), and the average over the burst loses 3.9 dB.
 _MAX_TRAVEL_WAVELENGTHS = 0.5
 # Largest number of frames in a row, as in host/polysight/radar/commands.py.
 _MAX_FRAMES = 65535
-
 # Characters of a line of warnings.
 _WIDTH = 118
 # Rows from which the noise is measured; chosen.
@@ -163,7 +165,7 @@ def propose(
     best: list[tuple[float, Instrument]] = []
     for rig_with_steps in _vary_steps(rig):
         plans = _vary_bursts(rig_with_steps, minutes, row_overhead_s)
-        # The level of a point over the noise, where a burst's motion weakens it most: at the image's edge.
+        # The level of a point over the noise, where a burst's motion weakens it most: at the aperture's ends.
         scored = [(predict_noise(plan, noise).image_db - predict_burst(plan).edge_loss_db, plan) for plan in plans]
         if scored:
             best.append(max(scored, key=lambda scored_plan: scored_plan[0]))
@@ -185,7 +187,7 @@ def _vary_steps(rig: Instrument) -> Iterator[Instrument]:
             try:
                 yield steps.apply(rig)
             except ConfigError:
-                # The aperture, rounded to whole steps, exceeds the travel
+                # The aperture, rounded to whole steps, exceeds the travel.
                 continue
 
 
@@ -226,8 +228,10 @@ def _set_burst(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float
 def _find_max_pulses(rig: Instrument) -> int:
     """Return the most pulses that a burst may have by time, by its travel, and by the radar's frames in a row."""
     by_time = _MAX_DUTY * 1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us
-    travel = predict_burst(rig).travel_wavelengths
-    by_travel = 1 + _MAX_TRAVEL_WAVELENGTHS * (rig.burst.chirps_a_position - 1) / travel
+    wavelengths_per_us = predict_burst(rig).travel_wavelengths / (1e6 * burst_duration_s(rig.burst))
+    # The burst ends with the last chirp of its last frame.
+    frame_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
+    by_travel = 1 + (_MAX_TRAVEL_WAVELENGTHS / wavelengths_per_us - frame_us) / rig.burst.period_us
     return min(int(by_time), int(by_travel), _MAX_FRAMES // rig.grid.columns)
 
 
@@ -263,37 +267,35 @@ def _format_pair(values: tuple[float, float], digits: int = 1) -> str:
 
 def describe(f: Forecast) -> str:
     """Return the text of one forecast: two columns, the second continued on lines without a keyword."""
-    g = f.rig.grid
-    b = f.rig.burst
-    s = f.rig.stage
-    t = f.time
-    r = f.response
-    w = (g.columns - 1) * g.step_x_mm
-    h = (g.rows - 1) * g.step_y_mm
+    grid = f.rig.grid
+    burst = f.rig.burst
+    stage = f.rig.stage
+    response = f.response
+    width_mm = (grid.columns - 1) * grid.step_x_mm
+    height_mm = (grid.rows - 1) * grid.step_y_mm
     lines = [
-        ("scan", f"{g.columns} x {g.rows} positions, steps {g.step_x_mm:g} x {g.step_y_mm:g} mm, {w:g} x {h:g} mm"),
-        ("", f"{s.speed_mm_s:g} mm/s, {b.chirps_a_position} chirps a position, {b.chirp_us or b.period_us:g} us apart"),
         (
-            "time",
-            f"{_format_duration(t.total_s)}, without homing and retakes: {_format_duration(t.measuring_s)} measuring,",
+            "scan",
+            f"{grid.columns} x {grid.rows} positions, steps {grid.step_x_mm:g} x {grid.step_y_mm:g} mm,"
+            f" {width_mm:g} x {height_mm:g} mm",
         ),
         (
             "",
-            f"{_format_duration(t.ramps_s)} ramps, {_format_duration(t.turns_s)} turns,"
-            f" {_format_duration(t.tail_s)} waiting for last packets, {_format_duration(t.overhead_s)} between rows,"
-            f" {_format_duration(t.approach_s)} approach",
+            f"{stage.speed_mm_s:g} mm/s, {burst.chirps_a_position} chirps a position,"
+            f" {burst.chirp_us or burst.period_us:g} us apart",
         ),
+        *_describe_time(f.time),
         ("pulses", f.rig.pi.pulse_source),
         ("raw data", f"{_format_bytes(f.raw_bytes)} of {len(f.rig.recorded)} boards"),
         (
             "resolution",
-            f"{_format_pair(r.width_mm)} mm at half power (x by y), with the rig file's window and taper;"
-            f" limit of the geometry {_format_pair(r.limit_mm)} mm",
+            f"{_format_pair(response.width_mm)} mm at half power (x by y), with the rig file's window and taper;"
+            f" limit of the geometry {_format_pair(response.limit_mm)} mm",
         ),
         (
             "",
-            f"the paper's r lambda / L: {_format_pair(r.paper_mm)} mm (docs/decisions/0002-imaging.md explains the"
-            " difference)",
+            f"the paper's r lambda / L: {_format_pair(response.paper_mm)} mm (docs/decisions/0002-imaging.md explains"
+            " the difference)",
         ),
         ("field", f"without aliases over {_format_pair(f.field.alias_free_mm, 0)} mm"),
         ("", f"flat plates need {_format_pair(f.field.mirror_zone_mm, 0)} mm of aperture beyond them on every side"),
@@ -318,6 +320,19 @@ def describe(f: Forecast) -> str:
     return "\n".join(text_lines) + "\n"
 
 
+def _describe_time(time: ScanTime) -> list[tuple[str, str]]:
+    """Return the two lines about the duration."""
+    seconds = {name: _format_duration(value) for name, value in vars(time).items()}
+    return [
+        ("time", f"{_format_duration(time.total_s)}, without homing and retakes: {seconds['measuring_s']} measuring,"),
+        (
+            "",
+            f"{seconds['ramps_s']} ramps, {seconds['turns_s']} turns, {seconds['tail_s']} waiting for last packets,"
+            f" {seconds['overhead_s']} between rows, {seconds['approach_s']} approach",
+        ),
+    ]
+
+
 def _describe_normals(normals: VisibleNormals) -> str:
     """Describe the tilts at which curved and tilted surfaces are seen."""
     text = f"surfaces tilted by up to {normals.x_deg:.0f} degrees in x, {normals.y_deg:.0f} in y are seen"
@@ -332,12 +347,12 @@ def _format_table(plans: list[Forecast]) -> str:
     """Format proposals as a table, one a line, numbered from 1."""
     lines = ["    time      mm/s  chirps  period us  steps mm     grid       image dB  motion  alias-free mm   raw"]
     for i, f in enumerate(plans, 1):
-        g = f.rig.grid
-        b = f.rig.burst
+        grid = f.rig.grid
+        burst = f.rig.burst
         lines.append(
-            f"{i:2d}  {_format_duration(f.time.total_s):9s} {f.rig.stage.speed_mm_s:4g}  {b.pulses:6d}"
-            f"  {b.period_us:9g}"
-            f"  {f'{g.step_x_mm:g} x {g.step_y_mm:g}':11s}  {f'{g.columns} x {g.rows}':9s}  {f.noise.image_db:8.1f}"
+            f"{i:2d}  {_format_duration(f.time.total_s):9s} {f.rig.stage.speed_mm_s:4g}  {burst.pulses:6d}"
+            f"  {burst.period_us:9g}  {f'{grid.step_x_mm:g} x {grid.step_y_mm:g}':11s}"
+            f"  {f'{grid.columns} x {grid.rows}':9s}  {f.noise.image_db:8.1f}"
             f"  {f.burst.travel_wavelengths:4.2f} w  {_format_pair(f.field.alias_free_mm, 0):13s}"
             f"  {_format_bytes(f.raw_bytes)}"
         )
@@ -351,36 +366,36 @@ def _replace_infinite(values: tuple[float, float]) -> list[float | None]:
 
 def forecast_values(f: Forecast) -> dict[str, Any]:
     """Return a forecast as plain values for JSON; infinite ones as None."""
-    g = f.rig.grid
-    b = f.rig.burst
-    s = f.rig.stage
-    t = f.time
-    r = f.response
+    grid = f.rig.grid
+    burst = f.rig.burst
+    stage = f.rig.stage
+    time = f.time
+    response = f.response
     normals = visible_normals(f.rig)
     return {
         "possible": f.possible,
-        "speed_mm_s": s.speed_mm_s,
-        "accel_mm_s2": s.accel_mm_s2,
-        "pulses": b.pulses,
-        "chirps": b.chirps,
-        "period_us": b.period_us,
-        "columns": g.columns,
-        "rows": g.rows,
-        "step_x_mm": g.step_x_mm,
-        "step_y_mm": g.step_y_mm,
+        "speed_mm_s": stage.speed_mm_s,
+        "accel_mm_s2": stage.accel_mm_s2,
+        "pulses": burst.pulses,
+        "chirps": burst.chirps,
+        "period_us": burst.period_us,
+        "columns": grid.columns,
+        "rows": grid.rows,
+        "step_x_mm": grid.step_x_mm,
+        "step_y_mm": grid.step_y_mm,
         "time_s": {
-            "total": t.total_s,
-            "approach": t.approach_s,
-            "measuring": t.measuring_s,
-            "ramps": t.ramps_s,
-            "turns": t.turns_s,
-            "last_packets": t.tail_s,
-            "standstill": t.overhead_s,
+            "total": time.total_s,
+            "approach": time.approach_s,
+            "measuring": time.measuring_s,
+            "ramps": time.ramps_s,
+            "turns": time.turns_s,
+            "last_packets": time.tail_s,
+            "standstill": time.overhead_s,
         },
         "raw_bytes": f.raw_bytes,
-        "point_width_mm": _replace_infinite(r.width_mm),
-        "point_limit_mm": _replace_infinite(r.limit_mm),
-        "point_paper_mm": _replace_infinite(r.paper_mm),
+        "point_width_mm": _replace_infinite(response.width_mm),
+        "point_limit_mm": _replace_infinite(response.limit_mm),
+        "point_paper_mm": _replace_infinite(response.paper_mm),
         "alias_free_mm": _replace_infinite(f.field.alias_free_mm),
         "mirror_zone_mm": _replace_infinite(f.field.mirror_zone_mm),
         "visible_normals_deg": [normals.x_deg, normals.y_deg],
@@ -448,7 +463,8 @@ def measure_row_overhead(folder: Path) -> float | None:
             triggers_ns[take] = (first_ns, event.edge_ns)
     gaps_s = []
     for (take, (_, last_ns)), (next_take, (first_ns, _)) in pairwise(triggers_ns.items()):
-        # A row that was taken again, or a resumed scan, has a gap of another kind before it.
+        # A row that was taken again has a gap of another kind before it. The one gap before a resumed run's first row
+        # hardly changes the median.
         if next_take[0] == take[0] + 1:
             gaps_s.append((first_ns - last_ns) / 1e9)
     if not gaps_s:
@@ -461,7 +477,17 @@ def measure_row_overhead(folder: Path) -> float | None:
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """Options of the command besides `Changes`: time and number of proposals, assumptions, output."""
+    """Options of the command besides `Changes`.
+
+    Attributes
+    ----------
+    minutes, count
+        Time for which plans are proposed (None: only the forecast), and their largest number.
+    like, snr_db, row_overhead_s
+        Scan whose noise and standstill are taken, and either of them as a number, which comes first.
+    scene_mm, scene
+        Size of the scene in the object plane, and a scene file whose plates are checked.
+    """
 
     minutes: float | None = None
     count: int = 5

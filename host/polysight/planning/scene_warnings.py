@@ -20,17 +20,23 @@ from polysight_shared.errors import PolysightError
 from polysight_shared.findings import Finding
 from polysight_shared.tables import decode, read_toml, to_builtins
 
-# Plates nearer to one another merge into one patch: their images overlap at half power.
+# Gap in resolution cells; plates nearer to one another may merge into one patch: chosen, half a cell more than the
+# width of a point at half power.
 LEAST_GAP_CELLS = 1.5
-# Largest change of the ratio over the sweep, relative to a half space, that is not worth a warning.
+# Largest change of the ratio over the sweep, relative to a half space, that is not worth a warning; chosen.
 LARGEST_RIPPLE = 0.05
+# Tables of a scene file that replace keys of the rig file.
 _OVERRIDES = ("grid", "burst", "image", "stage")
+# Frequencies of the sweep at which a plate's back is computed; chosen.
 _SWEEP_POINTS = 41
 Pair = tuple[float, float]
 
 
 class Plate(msgspec.Struct, frozen=True):
-    """A plate of a scene file, as far as the warnings need it; millimetres from the image's centre."""
+    """A plate of a scene file, as far as the warnings need it; millimetres from the image's centre.
+
+    `background`: a table or wall, which is larger than the image and gets no warnings.
+    """
 
     name: str
     centre_mm: Pair
@@ -65,16 +71,16 @@ def read_scene(path: Path, rig: Instrument) -> tuple[Instrument, list[Plate]]:
 
 
 def find_scene_warnings(scene: Path, config: Path) -> list[Finding]:
-    """Return the notes about the plates of a scene file and the ghosts of its steps.
+    """Return the notes about the plates of a scene file and the ghosts of its steps; none for a wrong file.
 
-    There are none for a wrong file, which the simulator refuses.
+    The simulator says what is wrong with a file.
     """
     try:
         rig, plates = read_scene(scene, load_instrument(config))
     except PolysightError:
         return []
     notes = list(warn_of_scene(rig, plates))
-    # A plate that is larger than the image fills it without its ghosts, too.
+    # A plate that is larger than the image covers every pixel itself, so that its ghosts add nothing.
     image_mm = rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm
     smaller = [plate for plate in plates if plate.size_mm[0] < image_mm[0] or plate.size_mm[1] < image_mm[1]]
     if smaller:
@@ -172,8 +178,10 @@ def _warn_of_thickness(plate: Plate, rig: Instrument) -> Iterator[Finding]:
     if not (np.all(sheet_s) and np.all(bulk_s)):
         # Nothing is reflected: air, or no thickness.
         return
-    # V / H stays finite at the Brewster angle.
-    change = np.abs(sheet_p / sheet_s - bulk_p / bulk_s) / np.maximum(np.abs(bulk_p / bulk_s), LARGEST_RIPPLE)
+    # V / H stays finite at the Brewster angle; near it, where V / H vanishes, the change is relative to the limit.
+    sheet_ratio = sheet_p / sheet_s
+    bulk_ratio = bulk_p / bulk_s
+    change = np.abs(sheet_ratio - bulk_ratio) / np.maximum(np.abs(bulk_ratio), LARGEST_RIPPLE)
     if change.max() > LARGEST_RIPPLE:
         text = (
             f"{plate.name}: {plate.thickness_mm:g} mm are thin enough for its back to change the ratio by up to"

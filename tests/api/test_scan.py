@@ -208,6 +208,12 @@ def test_the_published_layout_opens(tmp_path, monkeypatch, by_columns):
     assert open_scan(data).rig == open_scan(data, rig=load_instrument(REPO / "instrument.toml")).rig
 
 
+def test_the_published_layout_has_surfaces_with_the_rig_that_it_was_opened_with(tmp_path):
+    data = simulate_plates(tmp_path / "data", COPPER, PET, layout="authors")
+    rig = load_instrument((data / "instrument.toml").rename(tmp_path / "rig.toml"))
+    assert open_scan(data, rig=rig).surface().sizes["point"] > 0
+
+
 # --- rows, laziness, side effects -------------------------------------------------------------------------------------
 
 

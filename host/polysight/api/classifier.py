@@ -16,7 +16,7 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from polysight.data import find_packaged
+from polysight.api.scan import find_rig_file
 from polysight.jobs.train import train_from_scans
 from polysight.materials import (
     SHORT,
@@ -32,7 +32,6 @@ from polysight.materials import (
 if TYPE_CHECKING:
     from polysight.api.scan import Scan
 
-RIG = Path("instrument.toml")
 # Neighbours that vote, as in libraries (polysight.materials.classify.Weights).
 NEIGHBOURS = 15
 # |H|, |V|, real and imaginary part of P.
@@ -72,8 +71,7 @@ def train(
     if isinstance(scans, str | os.PathLike):
         scans = [scans]
     folders = [scan if isinstance(scan, str | os.PathLike) else scan.folder for scan in scans]
-    config = find_packaged(RIG) if rig is None else Path(rig)
-    return train_from_scans([Path(folder) for folder in folders], config, note)
+    return train_from_scans([Path(folder) for folder in folders], find_rig_file(rig), note)
 
 
 class Classifier(ClassifierMixin, BaseEstimator):
@@ -83,7 +81,7 @@ class Classifier(ClassifierMixin, BaseEstimator):
     ----------
     model
         "knn": the paper's nearest neighbours, a :class:`PaperKNeighborsClassifier`. "discriminant": the discriminant of
-        error sources, which knows what the pixels of a patch and of a scan share; columns of every angle are needed.
+        error sources, which knows which errors the pixels of a patch and of a scan have in common.
 
     Attributes
     ----------
@@ -105,7 +103,7 @@ class Classifier(ClassifierMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            for other numbers of columns, too few pixels, or what names no classes.
+            for other numbers of columns, fewer than two pixels, or a `y` that holds no classes.
         """
         pixels, names = _validate(self, X, y, ensure_min_samples=2)
         if self.model not in SHORT:
@@ -150,7 +148,7 @@ class Classifier(ClassifierMixin, BaseEstimator):
 
 
 def _collect_samples(X: Columns, y: Names, groups: npt.ArrayLike | None) -> Samples:
-    """Return labelled pixels; those of one material in one scan are a patch."""
+    """Return labelled pixels; those of one material in one scan are a patch. Raises ValueError for a wrong shape."""
     scans = np.zeros(len(X), np.intp) if groups is None else np.asarray(groups)
     if scans.shape != (len(X),):
         raise ValueError(f"groups has the shape {scans.shape}, X has {len(X)} rows")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tomli_w
 
-from polysight.api.scan import RIG, Scan, open_scan
+from polysight.api.scan import Scan, find_rig_file, open_scan
 from polysight.catalogue import Pixels, compare_pixels
 from polysight.data import find_packaged
 from polysight.jobs.check import check_scan, check_scans
@@ -78,7 +78,7 @@ def plan(rig: PathText | Instrument | None = None, *, scene: Scene | None = None
     ConfigError
         if the rig file or a value is wrong.
     """
-    instrument = rig if isinstance(rig, Instrument) else load_instrument(_find_rig(rig))
+    instrument = rig if isinstance(rig, Instrument) else load_instrument(find_rig_file(rig))
     with _open_scene_file(scene) as path:
         return Plan(forecast_scene(instrument, Changes(**changes), path))  # type: ignore[arg-type]
 
@@ -96,7 +96,7 @@ def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: 
         docs/spec/scene-file.md lists all keys. Without a `grid` all positions of the rig file are simulated, which
         takes long; `examples/own-scene.toml` has one that takes seconds.
     out
-        Folder of the scan, which must not exist or be empty.
+        Folder of the scan, which must be empty or not exist yet.
     rig
         Rig file; `instrument.toml` here or the packaged one if not given.
     seed
@@ -112,7 +112,7 @@ def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: 
             raise ConfigError(
                 "no scene was given", "a scene says which objects lie where", "see help(polysight.simulate)"
             )
-        config = _find_rig(rig)
+        config = find_rig_file(rig)
         _warn_of_whole_grid(path)
         for warning in find_scene_warnings(path, config):
             warnings.warn(expand_paths(f"{warning.where}: {warning.what}"), stacklevel=2)
@@ -121,7 +121,7 @@ def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: 
 
 
 def _warn_of_whole_grid(scene: Path) -> None:
-    """Warn if a scene has no grid of its own. A file that cannot be read is left to the simulator."""
+    """Warn the caller of `simulate` if a scene has no grid. A file that cannot be read is left to the simulator."""
     with suppress(OSError, ValueError):
         if "grid" not in tomllib.loads(scene.read_text(encoding="utf-8")):
             text = "the scene has no `grid`: all positions of the rig file are simulated, which takes long"
@@ -201,7 +201,7 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
     xarray.Dataset
         On dimension `scan` (its name): `permittivity`, `permittivity_real_standard_error`,
         `permittivity_loss_standard_error`, `expected_permittivity`, `sigmas` (distance in standard deviations) and
-        `level`: "good", "warning" (as 5 % of good scans), "action" (as 0.3 %), "missing".
+        `level`: "good", "warning" (5 % of good scans are as far off), "action" (0.3 %), "missing".
 
     Raises
     ------
@@ -256,11 +256,6 @@ def _check_all(scans: Sequence[Scan | PathText]) -> list[tuple[ProcessedScan, Ch
             "no scan was given", "nothing can be compared with the known value", "see help(polysight.check)"
         )
     return checked
-
-
-def _find_rig(rig: PathText | None) -> Path:
-    """Return the path of the rig file: the given one, that of the current folder, or the packaged one."""
-    return find_packaged(RIG) if rig is None else Path(rig)
 
 
 @contextmanager

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 def layer_dataset(
     scan: ProcessedScan, chirp: Chirp, stack: Sequence[str | Layer], bands: int | None, amplitude_percent: float
 ) -> xarray.Dataset:
-    """Fit the unknown layer of a stack at each patch; parameters and errors as `Scan.layers`."""
+    """Fit the unknown layer of a stack at each patch; parameters and errors as `Scan.layers`.
+
+    A patch without enough data has no fit: not a number in each column.
+    """
     import xarray
 
     if scan.verdict is not None and not scan.verdict.usable:

@@ -13,7 +13,8 @@ from polysight.products import ProcessedScan
 from polysight.report import draw_overview, figure_label, font_families
 from polysight.results import CheckResult
 
-# Width of one picture, and what its colour bar and the axis of the next one add; height of a title and axis.
+# Inches, chosen by eye: width of a picture; what its colour bar and the axis of the next one add; height of a title
+# and axis.
 _PANEL_IN = 3.8
 _BETWEEN_IN = 1.2
 _TITLE_IN = 0.4

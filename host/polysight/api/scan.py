@@ -57,7 +57,9 @@ if TYPE_CHECKING:
 
 RIG = Path("instrument.toml")
 Box = tuple[float, float, float, float]
+# The form of a box, for errors.
 _BOX = "a box is (x0, y0, x1, y1) in mm from the image's centre, x0 < x1 and y0 < y1"
+# Variables of each patch's permittivity, in the order of the dataset.
 _PERMITTIVITY = (
     "permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error",
     "permittivity_real_loss_covariance", "permittivity_real_half_width_68", "permittivity_loss_half_width_68",
@@ -158,6 +160,11 @@ def _check_arguments(
         )
 
 
+def find_rig_file(rig: str | os.PathLike[str] | None) -> Path:
+    """Return the path of the rig file: the given one, that of the current folder, or the packaged one."""
+    return find_packaged(RIG) if rig is None else Path(rig)
+
+
 def _is_box(box: object) -> bool:
     """True for four corners in order."""
     if not isinstance(box, tuple | list | np.ndarray) or len(box) != 4:
@@ -175,7 +182,7 @@ def _analyse_images(path: Path, rig: str | os.PathLike[str] | Instrument | None,
             "leave bands out",
         )
     if not isinstance(rig, Instrument):
-        rig = load_instrument(find_packaged(RIG) if rig is None else Path(rig))
+        rig = load_instrument(find_rig_file(rig))
     scan, _, _ = process.analyse_given_images(process.read_given_images(path, rig), settings, process.Inputs(), rig)
     return scan
 
@@ -225,6 +232,7 @@ class Scan:
     """
 
     def __init__(self, folder: Path, source: Source | None, saved: ProcessedScan | None, settings: Settings) -> None:
+        # `source` holds recorded rows, `saved` products; at least one of them is given.
         self.folder = folder
         self._source = source
         self._saved = saved
@@ -490,9 +498,8 @@ class Scan:
 
         if self._source is None:
             raise self._make_unknown_error("surface")
-        config = None if self._settings.config is None else Path(self._settings.config)
-        surface = make_surface(self.folder, config, None if reference is None else Path(reference))
-        return surface_dataset(surface)
+        plate = None if reference is None else Path(reference)
+        return surface_dataset(make_surface(self.folder, self._source.instrument, plate))
 
     def plot(self, *, metal_referenced: bool = True) -> Figure:
         """Draw |H|, |V|, |P| (dB), and the materials' names if metal-referenced; axes in mm. Return the figure.

@@ -12,7 +12,7 @@ from polysight.jobs import measure_surfaces
 from polysight.jobs.output import load_rig_file, print_json, print_lines, say
 from polysight.jobs.process import process_rows
 from polysight.pipeline import Pipeline
-from polysight.settings import Settings, path_text
+from polysight.settings import Settings
 from polysight.store import open_source
 from polysight.surfaces import (
     Echoes,
@@ -42,10 +42,13 @@ LEAST_METAL_POINTS = 60
 RADIUS_TOLERANCE = 0.15
 
 
-def process_to_points(data: Path, config: Path | None) -> tuple[Pipeline, Optics, Seen]:
-    """Process the rows of a scan, and find the specular points in it. Raises PolysightError."""
-    source = open_source(data, config, dropped=True)
-    pipeline = process_rows(source, data, Settings(config=path_text(config), depth_range_mm=1e3 * DEPTH_M))
+def process_to_points(data: Path, rig: Path | Instrument | None) -> tuple[Pipeline, Optics, Seen]:
+    """Process the rows of a scan, and find the specular points in it. Raises PolysightError.
+
+    `rig`: rig, or rig file, of published data; scan folders bring their own.
+    """
+    source = open_source(data, rig, dropped=True)
+    pipeline = process_rows(source, data, Settings(depth_range_mm=1e3 * DEPTH_M))
     optics = measure_surfaces.make_rig_optics(pipeline.rig)
     say("specular points")
     points = measure_surfaces.see_rows(pipeline, optics)
@@ -111,12 +114,12 @@ def find_axis(rig: Instrument, axis_mm: tuple[float, float]) -> tuple[float, flo
     return float(middle_m[0]) + axis_mm[0] / 1e3, float(middle_m[2]) + axis_mm[1] / 1e3
 
 
-def make_surface(data: Path, config: Path | None = None, reference: Path | None = None) -> Surface:
+def make_surface(data: Path, rig: Path | Instrument | None = None, reference: Path | None = None) -> Surface:
     """Return the surfaces of a recorded scan; `reference` is a scan of a flat metal plate. Raises PolysightError."""
-    pipeline, optics, points = process_to_points(data, config)
+    pipeline, optics, points = process_to_points(data, rig)
     gains: Reference | None = None
     if reference is not None:
-        _, _, metal = process_to_points(reference, config)
+        _, _, metal = process_to_points(reference, rig)
         gains = measure_surfaces.make_reference(measure_surfaces.thin_out(metal[metal.segment == 0]))
     return measure_surfaces.analyse_points(pipeline, optics, points, gains)
 

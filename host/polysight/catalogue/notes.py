@@ -23,7 +23,7 @@ NOTES = "operator.json"
 MAX_NOTES = 10_000
 MAX_TAG = 40
 MAX_TAGS = 20
-# The longest allowed notes take 10 kB, or 40 kB in UTF-8; a larger file was not written here, and is ignored.
+# The longest allowed notes and tags take 44 kB in UTF-8; a larger file was not written here, and is ignored.
 MAX_NOTES_BYTES = 1 << 17
 
 

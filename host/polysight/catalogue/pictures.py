@@ -21,6 +21,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
 Real = NDArray[np.float64]
+# Colour maps of matplotlib: one that colour-blind people read, and a cyclic one.
 AMPLITUDE = "cividis"
 PHASE = "twilight"
 UNITS = {"amplitude": "dB", "phase": "°"}
@@ -83,11 +84,11 @@ class Pixels(products.ProcessedScan):
 
     def nearest(self, x_mm: float, y_mm: float) -> tuple[int, int]:
         """Return the row and column of the pixel at a place. Raises DataError outside the image."""
-        x_min, right, low, high = self.extent_mm
-        if not (x_min <= x_mm <= right and low <= y_mm <= high):
+        left, right, low, high = self.extent_mm
+        if not (left <= x_mm <= right and low <= y_mm <= high):
             raise DataError(
                 f"x = {x_mm:.6g} mm, y = {y_mm:.6g} mm lies outside the image",
-                f"it reaches from x {x_min:.1f} to {right:.1f} mm, and from y {low:.1f} to {high:.1f} mm",
+                f"it reaches from x {left:.1f} to {right:.1f} mm, and from y {low:.1f} to {high:.1f} mm",
                 "give a place in it, in mm from its centre", code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip
         return int(np.abs(self.y_mm - y_mm).argmin()), int(np.abs(self.x_mm - x_mm).argmin())

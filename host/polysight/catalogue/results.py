@@ -43,18 +43,18 @@ FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES, SURFACE, POINTS)
 EXPORTS = (".mat", ".csv", ".nc")
 # Materials of the library that a probe lists.
 MAX_NEAREST = 5
-# The range profile: its reach to either side of the place, its points, and its lowest level below the highest.
+# The range profile: its reach to either side of the place, its points, and its lowest level below the highest; chosen.
 PROFILE_REACH_M = 0.3
 PROFILE_POINTS = 121
 PROFILE_FLOOR_DB = -50.0
-# Smallest spread of a material's ratio between its patches, each part: a material with one patch has none.
+# Smallest spread of a material's ratio between its patches, each part; chosen, since a material of one patch has none.
 LEAST_SPREAD = 5e-3
 DIFFERENCE = "RdBu"
 SIGNIFICANT = 3.0
 """Standard deviations above which a difference is significant."""
 # Smallest scatter of two scans in their stated errors: a copy has none at all.
 LEAST_SCATTER = 0.1
-# Largest distance of the centres of one patch in both scans.
+# Largest distance of the centres of one patch in both scans; chosen, below the distance of neighbouring plates.
 NEAR_MM = 15.0
 
 
@@ -81,7 +81,7 @@ class File(msgspec.Struct, frozen=True):
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """A processed scan for its page; `metal` says how the metal reference was chosen.
 
-    `generation` tells these products from those that replace them.
+    `generation` tells these products from those that replace them, `extent_mm` is x from, to, y from, to.
     """
 
     generation: str
@@ -174,6 +174,8 @@ class Probe(msgspec.Struct, frozen=True, kw_only=True):
         The pixel's, from the middle of the image.
     lit
         True if the scan illuminates it.
+    h_db, v_db, p, p_sigma
+        Levels of H and V, their ratio, and its standard deviation; relative to metal where `referenced`.
     permittivity, permittivity_real_std, permittivity_loss_std
         As a half space, as in the map of permittivities; `why` it is unknown.
     patch
@@ -485,16 +487,13 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
     significant_share = None
     if judged.size:
         significant_share = float((judged > SIGNIFICANT).mean())
-    rounded_scatter = None
-    if not np.isnan(scatter):
-        rounded_scatter = round(scatter, 3)
     figures = ComparisonFigures(
         patches=_pair_patches(a.segments, b.segments),
         notes=_collect_notes(a, b, scatter),
         extent_mm=a.extent_mm,
         compared=int(np.isfinite(p).sum()),
         significant_share=significant_share,
-        scatter=rounded_scatter,
+        scatter=None if np.isnan(scatter) else round(scatter, 3),
     )
     return Comparison(p, eps, sigmas, figures)
 
@@ -516,6 +515,7 @@ def _match_axes(first: Real, second: Real) -> tuple[NDArray[np.intp], NDArray[np
     """Return the index of the nearest of `second` for each of `first` (mm), and True if it is within half a pixel."""
     nearest = np.abs(first[:, None] - second[None, :]).argmin(axis=1)
     pixel = max(abs(second[1] - second[0]), abs(first[1] - first[0]))
+    # A hundredth allows for rounding.
     return nearest, np.abs(first - second[nearest]) <= pixel * 0.51
 
 
@@ -539,7 +539,7 @@ def _collect_notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
 
 
 def _pair_patches(first: list[PatchFigures], second: list[PatchFigures]) -> list[PatchPair]:
-    """Return the pairs of patches with their centres at one place."""
+    """Return each patch of the first scan with the nearest one of the second, if their centres are at one place."""
     pairs = []
     candidates = [patch for patch in second if not patch.metal_reference]
     for patch in first:
@@ -557,7 +557,7 @@ def _measure_distance_mm(a: PatchFigures, b: PatchFigures) -> float:
 
 
 def _describe_pair(a: PatchFigures, b: PatchFigures) -> PatchPair:
-    """Compare two patches; without two invertible covariances the difference has no standard errors."""
+    """Compare two patches; the difference has standard errors if both have a covariance, and their sum is regular."""
     pair = PatchPair(
         place_mm=(round(a.centre_x_mm, 1), round(a.centre_y_mm, 1)),
         names=(a.name, b.name),

@@ -148,6 +148,7 @@ def summarise(folder: Path, name: str) -> Summary:
     try:
         notes = read_notes(folder)
     except DataError as e:
+        # The list shows what is wrong where the notes would stand.
         notes = Notes(e.what)
     summary = Summary(name, "begun", notes=notes.notes, tags=notes.tags, seconds=_read_modified_s(folder))
     with suppress(PolysightError):
@@ -204,10 +205,7 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
     try:
         products = ProcessedScan(places[0])
         if products.materials is not None:
-            if products.verdict is None:
-                level = ""
-            else:
-                level = products.verdict.level
+            level = "" if products.verdict is None else products.verdict.level
             names = dict.fromkeys(patch.name for patch in products.segments if patch.name)
             summary = replace(summary, verdict=level, materials=tuple(names)[:MAX_NAMES])
         if places[0] == folder:
@@ -493,7 +491,7 @@ class Scans:
     def _read_all(self, waiting: deque[str], until_s: float) -> None:
         """Read entries of the root in a thread; when it makes no progress for `READ_S`, another thread goes on.
 
-        Behind `until_s` (monotonic clock) no further entry is read.
+        After `until_s` (monotonic clock) no further entry is read.
         """
         while waiting:
             worker = threading.Thread(target=self._read_entries, args=(waiting, until_s), name="list", daemon=True)
@@ -625,7 +623,10 @@ def _find_scan_names(root: Path, prefix: str, depth: int) -> Iterator[str]:
 
 
 def _find_scans(root: Path, prefix: str, depth: int) -> Iterator[tuple[str, Path]]:
-    """Return names and paths of the scans below a folder, without links, hidden folders and the insides of scans."""
+    """Return names and paths of the scans below a folder, without links, hidden folders and the insides of scans.
+
+    `depth` is the level of its entries below the listed root, from 1.
+    """
     for entry, path in _list_folders(root):
         name = f"{prefix}{entry}"
         if is_scan(path):

@@ -67,6 +67,7 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
     ),
 }
 """Likely cause and remedy by kind of fault. Those of the Pi are in shared/polysight_shared/faults.py."""
+# The last outcome of a row: committed whole, committed with gaps, or rejected and to be taken again.
 RowMark = Literal["committed", "kept", "rejected"]
 # Counts of a board's reception that the page adds up over the rows.
 RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
@@ -85,13 +86,14 @@ def notice_of_error(error: PolysightError, level: Level = "warning") -> Finding:
 
 
 def notice_of_fault(event: Fault) -> Finding:
-    """Notice of a fault of the Pi; a warning if the Pi retakes the row by itself, a note if somebody asked for it."""
+    """Return the notice of a fault of the Pi: a note if somebody asked for it, a warning if the rig can go on."""
     table = explain(event.number)
-    passing = (PiFault.HOST_LOST, PiFault.POINTS_MISMATCH)
+    passing_faults = (PiFault.HOST_LOST, PiFault.POINTS_MISMATCH)
     level: Level = "error"
     if event.number == PiFault.ABORTED:
         level = "note"
-    elif PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in passing:
+    elif PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in passing_faults:
+        # A fault of the burst or of its pulses costs this row only.
         level = "warning"
     details = {}
     if event.problem != table.problem:
@@ -103,7 +105,7 @@ def notice_of_fault(event: Fault) -> Finding:
 
 
 def _find_cause(faults: Sequence[store.RowFault]) -> tuple[str, str]:
-    """Return the likely cause and remedy of a row's faults: those of the first known kind."""
+    """Return the likely cause and remedy of a row's faults: those of the first known kind; both "" for none."""
     for fault in faults:
         if fault.kind == K.PI_FAULT and fault.number:
             table = explain(fault.number)
@@ -138,7 +140,8 @@ def _make_row_notice(row: int, problem: str, why_do: tuple[str, str], reasons: S
 class BoardCounts(msgspec.Struct):
     """Data of one board over the committed rows.
 
-    `retaken` counts takes that were rejected because of it, `masked` positions without a direct path.
+    `retaken` counts takes that were rejected because of it, `masked` positions without a direct path, `counts` the
+    kinds of `RECEPTION`.
     """
 
     name: str
@@ -205,7 +208,7 @@ class ScanHistory:
     notices
         Faults in the order of the facts and events.
     run_started_s, last_commit_s
-        Times of the last run and the last row, seconds since 1970; without pauses.
+        Times of the last run and the last row, seconds since 1970; a pause moves the latter on by its length.
     last_row_utc
         Time of the last row as the manifest has it; "" before.
     rows_since_trouble
@@ -226,6 +229,7 @@ class ScanHistory:
         self.last_row_utc = ""
         self.rows_since_trouble = 0
         self.trigger: TriggerHealth | None = None
+        # Durations of rows, the time of the last pause, and the numbers of the fault events that have a notice.
         self._row_seconds: list[float] = []
         self._paused_at = 0.0
         self._fault_seqs: set[int] = set()

@@ -28,12 +28,12 @@ PAPER_PHASE_RAD = 0.022
 """Phase residual after all stages, paper section 9.1."""
 # A fault stays in the headline until so many rows came without one.
 RECENT_ROWS = 3
-# A row is late after so many usual durations, and after at least so many seconds.
+# A row is late after so many usual durations, and after at least so many seconds; chosen.
 LATE_ROWS = 3.0
 LATE_S = 60.0
-# Residual of the direct path above which images lose contrast; 0.004 is usual.
+# Residual of the direct path above which a row gives a warning; chosen, 0.004 is usual.
 DIRECT_RAD = 0.1
-# Share of positions without a direct path that gives a warning.
+# Share of positions without a direct path that gives a warning; chosen.
 MASKED_SHARE = 0.05
 # Notices of the manifest that a page lists.
 MAX_NOTICES = 30
@@ -56,7 +56,7 @@ class RowSync(NamedTuple):
 
 
 class Profile(msgspec.Struct, frozen=True):
-    """Range profile of a row: excess path, dB below the direct path by board, and the scene's excess paths."""
+    """Range profile of a row: excess path, dB relative to the direct path by board, and the scene's excess paths."""
 
     row: int
     excess_m: list[float]
@@ -228,24 +228,19 @@ class Motion(msgspec.Struct, frozen=True, kw_only=True):
 def make_snapshot(inputs: Inputs) -> Snapshot:
     """Describe the whole state of a scan."""
     history = inputs.history
-    row_shown = inputs.shown
+    shown = inputs.shown
     if history is None:
         return Snapshot(status=judge(inputs), notices=_collect_notices(inputs), control=inputs.control)
     plan = history.plan
     marks = history.marks
     boards = history.boards
     for board in boards:
-        board.masked = sum(row.masked for row in row_shown.sync.get(board.name, {}).values())
+        board.masked = sum(row.masked for row in shown.sync.get(board.name, {}).values())
     sync = {
         name: {number: round(math.degrees(row.object_rad), 3) for number, row in rows.items()}
-        for name, rows in row_shown.sync.items()
+        for name, rows in shown.sync.items()
     }
-    snr_db = {
-        name: {number: round(row.snr_db, 1) for number, row in rows.items()} for name, rows in row_shown.sync.items()
-    }
-    verdict = None
-    if _may_have_result(inputs, history):
-        verdict = inputs.verdict
+    snr_db = {name: {number: round(row.snr_db, 1) for number, row in rows.items()} for name, rows in shown.sync.items()}
     return Snapshot(
         status=judge(inputs),
         notices=_collect_notices(inputs),
@@ -268,12 +263,12 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
         ),
         boards=boards,
         trigger=history.trigger,
-        pictures=_describe_pictures(history, row_shown),
-        profile=row_shown.profile,
+        pictures=_describe_pictures(history, shown),
+        profile=shown.profile,
         sync=sync,
         snr_db=snr_db,
         lost=history.lost_shares,
-        verdict=verdict,
+        verdict=inputs.verdict if _may_have_result(inputs, history) else None,
     )
 
 
@@ -440,13 +435,13 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
     """Return the status of a scan whose last run has ended."""
     folder = str(inputs.folder)
     safe = _describe_safe_rows(history)
-    words = "Every row is safe."
+    all_safe = "Every row is safe."
     rows_with_gaps = sum(mark == "kept" for mark in history.marks.values())
     if rows_with_gaps:
-        words = f"Every row is safe; {rows_with_gaps} are kept with gaps, masked."
+        all_safe = f"Every row is safe; {rows_with_gaps} are kept with gaps, masked."
     program = inputs.program
     if not _may_have_result(inputs, history):
-        return say("materials", gaps=words)
+        return say("materials", gaps=all_safe)
     if program is not None and program.running and cut_fraction(program.started_utc) > cut_fraction(ended.ended_utc):
         if program.kind == "process":
             return say("processing")
@@ -455,7 +450,7 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
         # Between the last row and materials; whether it is processed is not known yet.
         if inputs.verdict is None and inputs.signs.life is not None and inputs.signs.alive:
             return say("finishing")
-        return _judge_result(inputs, words)
+        return _judge_result(inputs, all_safe)
     if ended.exit_status == "abort":
         key = "aborted" if ended.asked == "abort" else "stopped"
         return say(key, asker=ended.asker or "somebody", safe=safe, folder=folder)
@@ -550,7 +545,10 @@ def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
 
 
 def _find_late_since_s(history: ScanHistory, signs: LifeSigns) -> float:
-    """Return when the last row ended, if that is much longer ago than a row takes; otherwise 0."""
+    """Return when the last row ended, if that is much longer ago than a row takes; otherwise 0.
+
+    The first row alone is no measure.
+    """
     if history.row_seconds is None:
         return 0.0
     row_s, basis = history.row_seconds

@@ -60,7 +60,7 @@ from polysight_shared.raster import plan_raster
 from polysight_shared.sockets import observer
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Range profiles: points of the Fourier transform, points that are shown, and the lowest level.
+# Range profiles: points of the Fourier transform, points that are shown, and the lowest level; chosen.
 FFT_POINTS = 2048
 PROFILE_POINTS = 240
 PROFILE_FLOOR_DB = -70.0
@@ -79,9 +79,9 @@ TURN_S = 0.2
 LISTEN_MS = 200
 # Faults of the current row that are kept for the page.
 MAX_FAULTS = 20
-# Longest time from a manifest's first line to the first sign of life of its program.
+# Longest time from a manifest's first line to the first sign of life of its program; chosen.
 GRACE_S = 6.0
-# Timeout of the Pi's heartbeat.
+# Timeout of the Pi's heartbeat; chosen.
 PI_LIMIT_S = 6.0
 # A scan whose program gives no signs of life counts as alive until no row has come for the time of this many rows.
 UNATTENDED_ROWS = 3.0
@@ -97,8 +97,8 @@ def range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]
     """Return the mean power over RX and positions against excess path, relative to the direct path at 0.
 
     An echo of excess path d is `exp(+j 2 pi f d / c)` (sync/chain.py), so a Fourier transform along the linear
-    samples, Hann-windowed, has it at bin `d N df / c`. Returns dB, float64 [n] as `excess_m`; all at the floor when no
-    position is valid.
+    samples, Hann-windowed, has it at bin `d N df / c` (N is `FFT_POINTS`). Returns dB, float64 [n] as `excess_m`, no
+    less than `PROFILE_FLOOR_DB`, and that where no position is valid.
     """
     first, last = (chirp.first_sample_hz + chirp.hz_per_sample * n for n in chirp.linear_samples)
     linear = (row.sweep_hz >= first) & (row.sweep_hz < last)
@@ -417,6 +417,7 @@ class Watch:
     """Follows a scan folder, which may not exist yet, in a thread of its own, and writes nothing.
 
     `control`: pages may offer to pause and stop the scan. `lapse_s` is the timeout of the scan program's signs of life.
+    Pages are sent `state` (a `Snapshot`) and `motion` as JSON; `shown` has the pictures.
     """
 
     def __init__(self, folder: Path, control: bool = False, lapse_s: float = LAPSE_S) -> None:
@@ -447,6 +448,8 @@ class Watch:
         self._viewer: RowViewer | None = None
         self._listener: PiListener | None = None
         self._problem = ""
+        # The time that the last sign of life names, when it was seen, and when the manifest last grew: the first since
+        # 1970, the others on the monotonic clock.
         self._life_s: float | None = None
         self._life_at = float("-inf")
         self._grown_at = float("-inf")
@@ -467,10 +470,7 @@ class Watch:
         self._update_tasks()
         if self._viewer is not None:
             self.shown = self._viewer.shown
-        if self._listener is not None:
-            pi = self._listener.state
-        else:
-            pi = PiState()
+        pi = PiState() if self._listener is None else self._listener.state
         exists = self.folder.is_dir()
         self._existed |= exists
         program = find_newest_program(self.folder)
@@ -538,9 +538,7 @@ class Watch:
         now = time.monotonic()
         wall_s = time.time()
         life = read_life(self.folder)
-        life_s = None
-        if life is not None:
-            life_s = life.written_s
+        life_s = None if life is None else life.written_s
         if life_s is not None and life_s != self._life_s:
             # The first sign may be old; from then on changes count, not clocks.
             age_s = 0.0
@@ -559,15 +557,12 @@ class Watch:
         alive_s = 0
         if not is_alive:
             alive_s = round(life_s or self._manifest.file.modified_s)
-        pi_silent_s = None
-        if pi.heard_s:
-            pi_silent_s = now - pi.heard_s
         return LifeSigns(
             life=life,
             alive=is_alive,
             killed=killed,
             alive_s=alive_s,
-            pi_silent_s=pi_silent_s,
+            pi_silent_s=now - pi.heard_s if pi.heard_s else None,
             pi_limit_s=PI_LIMIT_S,
             now_s=wall_s,
         )

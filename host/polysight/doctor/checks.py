@@ -65,7 +65,7 @@ CHECKS = (
 
 def run_checks(context: CheckContext) -> Iterator[Finding]:
     """Run every check in order and yield its finding at once."""
-    # (check, board) that failed or was skipped: title of the failed check
+    # Check and board that failed or was skipped, and the title of the check that failed.
     blocked: dict[tuple[str, str], str] = {}
     for check in CHECKS:
         boards: tuple[Board | None, ...] = (None,)
@@ -96,6 +96,7 @@ def _find_failed_prerequisite(check: Check, board: Board | None, blocked: dict[t
         for (name, board_name), failed in blocked.items():
             if name == need and (board is None or board_name in ("", board.name)):
                 return failed
+    # One that was skipped has the title of another check.
     return next((name for name in check.unless if blocked.get((name, "")) == name), "")
 
 

@@ -57,12 +57,13 @@ _ETHTOOL_GRINGPARAM = 0x10
 # Words of struct ethtool_ringparam behind the command: the largest receive ring and the one in use.
 _RX_MAX_WORD = 1
 _RX_WORD = 5
+# Files of sysfs that count packets which an interface dropped.
 _DROP_COUNTERS = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
 # The probe of a disk ends after so many bytes, or so many seconds on a slow disk.
 _PROBE_BYTES = 64 << 20
 _PROBE_S = 2.0
 
-# A card sends its short last packet two seconds after the last data.
+# A card sends its short last packet two seconds after the last data; half a second more, chosen.
 _LAST_PACKET_S = 2.5
 _POLL_S = 0.05
 
@@ -81,7 +82,10 @@ def clock_is_synchronised() -> bool | None:
 
 @dataclass(frozen=True)
 class NetworkInterface:
-    """Settings and drop count of a network interface. None: unknown. `lost`: packets dropped since it came up."""
+    """Settings and drop count of a network interface. None: unknown.
+
+    `ring`, `ring_max`: its receive descriptors and the most it can have. `lost`: packets dropped since it came up.
+    """
 
     name: str
     mtu: int | None = None
@@ -115,7 +119,7 @@ def read_interface(name: str, root: Path = Path("/")) -> NetworkInterface:
 
 
 def _receive_ring(name: str) -> tuple[int, int] | tuple[None, None]:
-    """Receive descriptors in use and their maximum (ethtool -g)."""
+    """Return the receive descriptors in use and their maximum (ethtool -g); None if the interface does not tell."""
     # The structure has the command and eight sizes; the request names the interface and points to it.
     words = array.array("I", [_ETHTOOL_GRINGPARAM] + 8 * [0])
     request = struct.pack("16sP16x", name.encode()[:15], words.buffer_info()[0])
@@ -146,9 +150,9 @@ def write_speed(folder: Path) -> float:
 
 # Time of a packet beyond its configured delay: delays of 5, 10, 25, 50 us give 706, 545, 325, 193 Mbit/s (TI).
 PACKET_TIME_US = 11.0
-# Duration of the load at each rate.
+# Duration of the load at each rate; chosen, the whole check takes a few seconds.
 _RATE_S = 1.5
-# A receiver that was behind gets so long to read what waits in its socket.
+# A receiver that was behind gets so long to read what waits in its socket; chosen.
 _DRAIN_S = 5.0
 _SENDER = Path(__file__).with_name("send_packets.py")
 _BUSY_LOOP = "while True: sum(range(100_000))"
@@ -206,7 +210,7 @@ def measure_receivers(rig: Instrument, rates: list[float], seconds: float = _RAT
 
 
 def _measure_rate(rate: float, packets: int, receivers: list[ReceiverProcess], folder: Path) -> LoadResult:
-    """Send `packets` packets to each receiver, as cards do after a reset: after losses a receiver needs one."""
+    """Send `packets` packets to each receiver, as cards that were reset: losses at an earlier rate do not count."""
     for receiver in receivers:
         part = folder / f"{receiver.board.name}.part"
         receiver.begin_row(0, 1, packets * MAX_PAYLOAD_BYTES, 1, part, after_reset=True)
@@ -271,7 +275,10 @@ def not_checked(what: str, do: str = "") -> Finding:
 
 @dataclass(frozen=True)
 class DoctorOptions:
-    """Options of the command. `out`: folder for scans; `move`: run a row; `pulse`: send SYNC_IN pulses at rest."""
+    """Options of the command.
+
+    `out`: folder for scans; `move`: run a row; `pulse`: send SYNC_IN pulses at rest, `bursts` bursts of them.
+    """
 
     config: Path
     out: Path = Path()

@@ -59,23 +59,25 @@ from polysight_shared.sockets import HOST_KEYS, is_loopback
 
 # Least speed of the disk relative to the data rate of a scan; chosen.
 _SPEED_MARGIN = 2.0
-# Largest difference between the clocks of host and Pi.
+# Differences of the clocks of host and Pi that are a warning and an error; chosen.
 _MAX_CLOCK_OFFSET_S = 1.0
 _CLOCK_LOST_S = 60.0
 _SET_CLOCK = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"
 # Hops of the network survey that concern a card.
 _CARD_HOPS = ("host", "route", "link", "card")
+# Of the interface to a card: a card's frames, its speed, and receive descriptors (chosen).
 _MIN_MTU = 1500
 _MIN_SPEED_MBIT = 1000
 _MIN_RING = 512
-# Share of chirps that may be clipped.
+# Share of chirps that may be clipped; chosen.
 _MAX_CLIPPED = 0.01
-# Least rms of the samples, ADC counts.
+# Least rms of the samples, ADC counts; chosen, an RX that is off gives less.
 _MIN_RMS = 4.0
-# Share of chirps in which the direct path must be found.
+# Share of chirps in which the direct path must be found; chosen.
 _MIN_DETECTED = 0.9
 # A delay that the 5 ns trigger clock and some ppm of the crystals can cause.
 _MAX_DELAY_S = 10e-9
+# Delays of one receiver after the other that are a warning and an error; chosen.
 _SKEW_WARNING_S = 10e-9
 _SKEW_ERROR_S = 20e-9
 # Two trigger clocks of 5 ns give a standard deviation of 2 ns; twice that is a fault.
@@ -209,7 +211,7 @@ def _find_existing_parent(folder: Path) -> Path:
 def check_time(context: CheckContext) -> Finding:
     """Estimate the duration of a scan of the configured grid."""
     rig = context.rig
-    seconds = scan_time(context.rig).total_s
+    seconds = scan_time(rig).total_s
     hours, minutes = divmod(round(seconds / 60), 60)
     duration = f"{seconds / 60:.1f} min"
     if hours:
@@ -382,10 +384,7 @@ def check_stage(context: CheckContext) -> Finding:
             f"{e.remedy}; on the Pi, with its service stopped, run `polysight-pi check` for port and board",
             fault=status.fault,
         )
-    if context.hello is None:
-        firmware = ""
-    else:
-        firmware = context.hello.firmware
+    firmware = "" if context.hello is None else context.hello.firmware
     position = "not homed yet"
     if status.homed:
         position = f"at {status.x_mm:.1f}, {status.y_mm:.1f} mm"

@@ -8,7 +8,7 @@ import struct
 import sys
 import time
 
-# A card catches up no more than its own buffer
+# Longest delay that is caught up; chosen: a card, too, catches up no more than its own buffer holds.
 _MAX_LAG_S = 0.005
 
 
@@ -22,6 +22,7 @@ def main(card: str, card_port: int, host: str, port: int, first: int, packets: i
             count = k * size
             sock.sendto(struct.pack("<IIH", k + 1, count & 0xFFFFFFFF, count >> 32) + bytes(size), (host, port))
             due = max(due + period_s, time.perf_counter() - _MAX_LAG_S)
+            # Shorter sleeps take longer than asked for: several packets are sent at once instead.
             if (ahead := due - time.perf_counter()) > 0.0005:
                 time.sleep(ahead)
         sys.stdout.write(f"{time.perf_counter() - began}\n")

@@ -55,7 +55,7 @@ FIGURES: dict[str, str] = {
     "phase_v": "Phase V",
     "phase_p": "Phase of P = H / V",
 }
-# Pixels further out than this share of a patch's box belong to its edge, where two materials mix.
+# Pixels further out than this share of a patch's box belong to its edge, where two materials mix; chosen.
 _INSIDE = 0.6
 # Range of the phase of P that the colours span: percentiles of the pixels, at least and at most this wide.
 _PERCENTILES = (5.0, 95.0)
@@ -64,9 +64,9 @@ _MAX_DEG = 300.0
 # Outlines of boxes drawn by hand.
 _METAL_BOX = "#ff9e3d"
 _OTHER_BOX = "#ffffff"
-# Levels below the peak that the images of `focus` show.
+# Levels below the peak that the images of `focus` show; chosen.
 _FOCUS_RANGE_DB = 30.0
-# Room around patches and plates: beside them, below them, and above them, where their names stand.
+# Room around patches and plates: beside them, below them, and above them, where their names stand; chosen by eye.
 _SIDE_ROOM_MM = 20
 _LOWER_ROOM_MM = 12
 _UPPER_ROOM_MM = 24
@@ -98,6 +98,7 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     middle = np.angle(sum(part.mean() for part in inside))
     from_middle = np.degrees(np.angle(np.concatenate(inside) * np.exp(-1j * middle)))
     low, high = np.percentile(from_middle, _PERCENTILES) + np.degrees(middle)
+    # Room of 15 % on either side, and limits in steps of 5 degrees: chosen for readable numbers at the colour bar.
     margin = max(0.15 * (high - low), (_LEAST_DEG - (high - low)) / 2)
     low = float(np.floor((low - margin) / 5) * 5)
     high = float(np.ceil((high + margin) / 5) * 5)
@@ -223,9 +224,9 @@ def _keep_inside(ax: Axes, text: Text, top_mm: float) -> None:
 
 
 def _crop_to_plates(ax: Axes, scan: ProcessedScan) -> None:
-    """Set limits around patches and plates: square, inside the image, the same for map and truth."""
+    """Set limits around patches and plates: square where the image has room, the same for map and truth."""
     boxes = [patch.box_mm for patch in scan.segments] + [plate.box_mm for plate in scan.plates]
-    left_mm, right, bottom, top = scan.extent_mm
+    left, right, bottom, top = scan.extent_mm
     if boxes:
         corners = np.array(boxes)
         x0 = corners[:, 0].min() - _SIDE_ROOM_MM
@@ -235,11 +236,11 @@ def _crop_to_plates(ax: Axes, scan: ProcessedScan) -> None:
         half = max(x1 - x0, y1 - y0) / 2
         cx = (x0 + x1) / 2
         cy = (y0 + y1) / 2
-        left_mm = max(left_mm, cx - half)
+        left = max(left, cx - half)
         right = min(right, cx + half)
         bottom = max(bottom, cy - half)
         top = min(top, cy + half)
-    ax.set_xlim(left_mm, right)
+    ax.set_xlim(left, right)
     ax.set_ylim(bottom, top)
 
 
@@ -247,7 +248,7 @@ def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[style.M
     """Draw the true plates. Return the labels."""
     colours = style.assign_colours(scan)
     _crop_to_plates(ax, scan)
-    left_mm, right = ax.get_xlim()
+    left, right = ax.get_xlim()
     bottom, top = ax.get_ylim()
     labels = []
     for number, plate in enumerate(scan.plates, 1):
@@ -260,9 +261,7 @@ def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[style.M
             _keep_inside(ax, text, y1)
         else:
             # The plate is larger than the image: a name above it would be far outside the picture.
-            text = style.write_label(
-                ax, (max(x0, left_mm) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size
-            )
+            text = style.write_label(ax, (max(x0, left) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size)
         labels.append(style.MapLabel(text, str(number), name, colour))
     return labels
 
@@ -416,10 +415,7 @@ def draw_overview(fig: Figure, axes: Sequence[Axes], scan: ProcessedScan, bar_la
     ):
         image, unit = draw_channel(ax, scan, key)
         style.style_axes(ax, title, scan.stamped)
-        label = ""
-        if bar_labels:
-            label = unit
-        style.colour_bar(fig, ax, image, label)
+        style.colour_bar(fig, ax, image, unit if bar_labels else "")
     labels = []
     for ax in axes[3:]:
         labels += draw_materials(ax, scan, size=6.5)

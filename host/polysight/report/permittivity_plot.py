@@ -66,7 +66,8 @@ def fit_ellipse(matrix: Array, share: float) -> tuple[float, float, float]:
 def region_matrix(e: PermittivityFigures, share: float) -> Array | None:
     """Return the covariance [2, 2] of (eps', eps'') whose ellipse holds a share; None if no error is known.
 
-    The standard errors say where 95 % lie. 68 % lie within less, as `half_widths_68` tells.
+    The standard errors are such that their ellipse of 95 % holds 95 %. Errors have long tails, so that 68 % lie closer
+    than in a normal distribution: `half_widths_68` says how close.
     """
     if e.spread is None:
         return None

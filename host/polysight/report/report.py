@@ -101,8 +101,9 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
     """Return the page as text, with the given PNG figures inline."""
     colours = assign_colours(scan)
     rows = [_format_patch_row(patch, colours) for patch in scan.segments]
-    names_found = {row["truth"] for row in rows}
-    centre = [f"{(float(a[0]) + float(a[-1])) * 500:.1f}" for a in (scan.x_m, scan.y_m)]
+    plates_found = {row["truth"] for row in rows}
+    # The image's centre in the rig frame, mm.
+    centre = [f"{1e3 * (float(axis[0]) + float(axis[-1])) / 2:.1f}" for axis in (scan.x_m, scan.y_m)]
     metal_how = ""
     library = ""
     if scan.materials is not None and scan.judged:
@@ -114,7 +115,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         budget = budget_table(scan.materials.error_budget)
     missed_plates: list[str] = []
     if rows:
-        missed_plates = [plate.name for plate in scan.plates if plate.name not in names_found]
+        missed_plates = [plate.name for plate in scan.plates if plate.name not in plates_found]
     config: list[tuple[str, str]] = []
     if scan.rig is not None:
         config = _summarise_rig(scan.rig)
@@ -295,10 +296,8 @@ def _format_estimate(e: PermittivityFigures) -> dict[str, str]:
         row["loss_range"] = f"({-imag_p70:.2f} … {-imag_p30:.2f})"
     row["dominated_by"] = e.dominated_by or ""
     row["do"] = e.do or ""
-    share = e.shares.get(e.dominated_by or "")
-    row["share"] = ""
-    if share is not None:
-        row["share"] = f"{100 * share:.0f} %"
+    share = e.shares.get(row["dominated_by"])
+    row["share"] = "" if share is None else f"{100 * share:.0f} %"
     return row
 
 

@@ -27,7 +27,7 @@ QUANTITIES = ("frequency_hz", "phase_rad", "amplitude")
 _LABELS = ("frequency (Hz)", "phase (rad)", "amplitude / mean - 1")
 # Bins of a histogram: an odd number, so that one is centred at zero.
 _BINS = 121
-# Histograms reach this many standard deviations of the first row to either side.
+# Histograms reach this many standard deviations of the first row to either side; chosen.
 _REACH = 5.0
 
 
@@ -60,7 +60,7 @@ class SyncReport:
     """Accumulates the residual errors of one board, row by row, in constant memory."""
 
     def __init__(self, sample_rate_hz: float, linear: tuple[int, int], rx: int) -> None:
-        """Begin without rows; `linear` is the range [first, end) of samples that synchronisation uses of a chirp."""
+        """Begin without rows; synchronisation uses the samples `linear` [first, end) of a chirp, on `rx` receivers."""
         self._rate = sample_rate_hz
         self._samples = linear[1] - linear[0]
         self._rx = rx

@@ -14,6 +14,7 @@ from msgspec import UNSET, UnsetType
 from polysight.results.json_files import convert, read_object
 from polysight.results.verdict import Coverage, Verdict, read_verdict
 
+# Values along x and y; None: unlimited, which JSON lacks.
 Pair = tuple[float | None, float | None]
 
 
@@ -45,6 +46,8 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
+    bytes_missing
+        Bytes of the raw data that never came.
     chirps_clipped, chirps_disturbed
         Received chirps left out: clipped by the receiver; unlike the others of their burst (another radar, silence).
     positions_clipped

@@ -41,6 +41,7 @@ from polysight_shared.errors import ConfigError, ScanError
 ROWS = "rows"
 _KEYS = ("row", "take", "pulses", "missing_bytes")
 """Keys of an event: index of the row, number of the committed take (from 1), SYNC_IN pulses sent, missing bytes."""
+# Time between two looks at the progress of the scan.
 _LOOK_S = 0.2
 
 
@@ -64,9 +65,10 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         self._place: Path | None = None
         self._stop = StopRequest()
         self._scanning: asyncio.Task[ScanResult] | None = None
-        self._begun = threading.Event()  # rows are being taken
-        self._times: dict[int, float] = {}  # when each row was committed
-        self._collected = 0  # rows that `collect` has given
+        # Set when rows are taken; when each row was committed; rows that `collect` has given; rows committed, planned.
+        self._begun = threading.Event()
+        self._times: dict[int, float] = {}
+        self._collected = 0
         self._progress = (0, 0)
         super().__init__(name=name)
 
@@ -146,17 +148,18 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
 
     async def stop(self, success: bool = True) -> None:
         """Stop the scan after the current row; at once if the run has failed."""
+        # A second request aborts the row.
         self._stop.request()
         if not success:
             self._stop.request()
 
     def describe_collect(self) -> dict[str, dict[str, Any]]:
-        """Data keys of an event, by stream."""
+        """Return the data keys of an event, by stream."""
         about = {"source": f"polysight://{self.name}", "dtype": "integer", "shape": [], "object_name": self.name}
         return {ROWS: {f"{self.name}-{key}": dict(about) for key in _KEYS}}
 
     def collect(self) -> Iterator[Any]:
-        """An event for each committed row since the last call, in the order of the plan."""
+        """Yield an event for each committed row since the last call, in the order of the plan."""
         if self._place is None or not (self._place / MANIFEST).exists():
             return
         rows = list(ScanFolder.load(self._place).committed_rows().values())
@@ -220,7 +223,8 @@ def radar_scan(scan: RadarScan, folder: Path | str, md: dict[str, Any] | None = 
     @bpp.run_decorator(md={**metadata, **(md or {})})
     def run() -> Iterator[Any]:
         yield from bps.prepare(scan, folder, wait=True)
-        yield from bps.clear_checkpoint()  # rows cannot be replayed
+        # Rows cannot be replayed.
+        yield from bps.clear_checkpoint()
         yield from bps.kickoff(scan, wait=True)
         yield from bps.complete(scan, wait=True)
         yield from bps.collect(scan)

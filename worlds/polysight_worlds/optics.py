@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable, Stack
 
-# Facets times positions that are evaluated at once: their arrays stay in the processor's cache.
+# Facets times positions that are evaluated at once; chosen: their arrays stay in the processor's cache.
 CHUNK = 20_000
-# Smallest gain (-30 dB): side lobes keep some power beside and behind the main lobe.
+# Smallest gain (-30 dB, chosen): side lobes keep some power beside and behind the main lobe.
 PATTERN_FLOOR = 0.03
 
 
@@ -68,17 +68,20 @@ class Antenna:
 
 
 def _make_column(vector: NDArray, like: NDArray) -> NDArray:
+    """Return a vector [3] in a shape that broadcasts with `like` [3, ...]; an array of vectors as it is."""
     if vector.ndim == 1:
         return vector.reshape(3, *(1,) * (like.ndim - 1))
     return vector
 
 
 def _dot(a: NDArray, b: NDArray) -> NDArray:
+    """Return the scalar products of vectors [3, ...] or [3], without conjugation."""
     a, b = _make_column(a, b), _make_column(b, a)
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _cross(a: NDArray, b: NDArray) -> NDArray:
+    """Return the vector products of vectors [3, ...] or [3]."""
     a, b = _make_column(a, b), _make_column(b, a)
     product = np.empty(np.broadcast_shapes(a.shape, b.shape), np.result_type(a, b))
     for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
@@ -88,7 +91,7 @@ def _cross(a: NDArray, b: NDArray) -> NDArray:
 
 
 def _carry(start: NDArray, end: NDArray, vector: NDArray) -> NDArray:
-    """Turn `vector` as the unit vector `start` is turned to `end` on the shortest arc."""
+    """Turn `vector` as the unit vector `start` is turned to `end` on the shortest arc; `vector` is across `start`."""
     start = _make_column(start, end)
     vector = _make_column(vector, end)
     summed = start + end
@@ -189,13 +192,11 @@ def respond(waves: Waves, normals: NDArray) -> Response:
     )
 
 
-def integrate_phase(response: Response, edge_u: NDArray, edge_v: NDArray, frequency_hz: float) -> NDArray:
-    """Integral of the linear phase over a parallelogram with the given edges [3, ...], relative to its area."""
-    return integrate_steps(response.path_steps(edge_u, edge_v), frequency_hz)
-
-
 def integrate_steps(steps_m: tuple[NDArray, NDArray], frequency_hz: float) -> NDArray:
-    """Integrate as above, from the path's change along both edges, see `Response.path_steps`."""
+    """Return the integral of the linear phase over a parallelogram, relative to its area.
+
+    `steps_m`: change of the path along both edges, see `Response.path_steps`.
+    """
     over_u, over_v = (np.sinc((frequency_hz / LIGHT_M_PER_S * step_m).astype(np.float32)) for step_m in steps_m)
     return over_u * over_v
 
@@ -246,11 +247,12 @@ def scatter(
         chunk = slice(first, first + positions_at_once)
         points = facets.centres[:, None] - offsets[chunk].T[:, :, None]
         response = respond(Waves.between(tx, rx, points), np.broadcast_to(normals, points.shape))
+        steps_m = response.path_steps(facets.edge_u[:, None], facets.edge_v[:, None])
         for i, frequency_hz in enumerate(frequencies_hz):
             k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
             r_s, r_p = tables[i].look_up(response.cos_incidence)
             terms = r_s * response.s_weight + r_p * response.p_weight
-            phase_integral = integrate_phase(response, facets.edge_u[:, None], facets.edge_v[:, None], frequency_hz)
+            phase_integral = integrate_steps(steps_m, frequency_hz)
             phase = np.exp(-1j * k * response.path_m)
             sums[chunk, i] = 1j * k / (4 * np.pi) * (terms * phase_integral * phase) @ area_m2
     return sums
@@ -280,6 +282,7 @@ def ellipsoid(centre: NDArray, radii: NDArray, facet_m: float, half_widths: NDAr
     step = 2 * half_widths / counts
     x, y = (np.arange(n) * d - w + d / 2 for n, d, w in zip(counts, step, half_widths, strict=True))
     x, y = (grid.ravel() for grid in np.meshgrid(x, y))
+    # Beyond 0.97 (chosen) the slope is over 80 degrees for a sphere: no mirror image is seen there.
     inside = (x / radii[0]) ** 2 + (y / radii[1]) ** 2 < 0.97
     x = x[inside]
     y = y[inside]

@@ -19,10 +19,12 @@ from polysight_worlds.optics import Antenna, Waves, integrate_steps, respond, sc
 from polysight_worlds.rig import Rig
 from polysight_worlds.world import Plate, World
 
+# Correlation lengths of the random heights; chosen: about a wavelength, and several.
 ROUGHNESS_LENGTH_M = 0.005
 WAVINESS_LENGTH_M = 0.020
-# The Taylor series ends where its next term is below this.
+# The Taylor series ends where its next term is below this; chosen.
 SERIES_ERROR = 2e-3
+# Difference of slopes by which the change of an echo with the slope is computed; chosen.
 SLOPE_STEP = 0.01
 
 
@@ -126,6 +128,7 @@ class PlateEchoes:
         self._path_mean = self._rise_mean * surface.height_m + bend_mean / 2 * surface.height_m**2
         k = 2 * np.pi * rig.frequencies_hz[-1] / LIGHT_M_PER_S
         largest = k * np.abs(surface.height_m).max() * np.sqrt(np.sum(weight * self._rise_deviation**2))
+        # The series has one term at least, and twelve at most (chosen).
         self._orders = 1
         term = 2 * largest
         while term > SERIES_ERROR and self._orders < 12:
@@ -133,7 +136,7 @@ class PlateEchoes:
             term *= 2 * largest / self._orders
 
     def _list_points(self, plate: Plate) -> NDArray:
-        """Cell minus offset for all circular lags, [3, lags_y, lags_x]."""
+        """Cell minus offset for all circular lags, [3, lags_y, lags_x], and z of the plate's reference height."""
         rig = self._rig
         surface = self._surface
         offsets_x, offsets_y = rig.offsets_m()
@@ -170,9 +173,11 @@ class PlateEchoes:
         kernel = (common * terms[0]).astype(np.complex64)
         mask = self._brightness * surface.cover * np.exp(-1j * k * self._path_mean)
         spectrum = self._multiply(mask, kernel)
+        # Local slopes to first order: slope times the change of the kernel with it.
         if surface.local_slopes is not None:
             for slope, varied in zip(surface.local_slopes, terms[1:], strict=True):
                 spectrum += self._multiply(mask * slope, common * (varied - terms[0]) / SLOPE_STEP)
+        # Taylor series of exp(-jk (c - mean c) delta): each order multiplies by one factor of height and one of c.
         for order in range(1, self._orders):
             mask = mask * surface.height_m
             kernel = kernel * (-1j * k / order * self._rise_deviation).astype(np.complex64)

@@ -48,7 +48,7 @@ PLACE_WEIGHTS = np.linalg.solve(np.vander(PLACES, increasing=True).T, [1, 0, -1j
 MORE_DEGREES = 24
 # Up to this many stage offsets, coefficients are computed for each one instead of looked up in a table, which itself
 # takes as many evaluations as its degree; chosen.
-FEW = 40
+FEW_OFFSETS = 40
 
 
 @dataclass(frozen=True)
@@ -386,7 +386,7 @@ def scatter_cylinder(
     path_places = (2 * path_m - low - high) / (high - low)
     for place, weight in zip(PLACES.tolist(), PLACE_WEIGHTS.tolist(), strict=True):
         h, unit = _axial_wave_number(k, along_m, path_m, place)
-        if len(h) <= FEW or np.ptp(along_m) > 0:
+        if len(h) <= FEW_OFFSETS or np.ptp(along_m) > 0:
             m_m, n_n, m_n = (table.T for table in body.coefficients(k, h, needed_orders(k * radius_m)))
         else:
             tables = _tabulate(body, k, float(along_m[0]), place, (low, high))

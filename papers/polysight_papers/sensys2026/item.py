@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from polysight.report import INK, MUTED
 
+# Markers of matplotlib for the lines of a figure, in this order.
 MARKERS = "osD^vP*X<>"
 
 

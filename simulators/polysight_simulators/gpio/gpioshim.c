@@ -5,7 +5,9 @@
  *   GPIOSHIM_WIRES=SOCKET  hub of the simulated wires (shared/polysight_shared/wires.py): S lines in are levels on inputs, S lines out are
  *                          changes of outputs, with the time (CLOCK_MONOTONIC) at which they were made
  *   GPIOSHIM_LABEL, GPIOSHIM_LINES                                    label and size of the chip
- *   GPIOSHIM_FAULTS=denied,no-edges,busy:LINE,slow:US,stuck           faults from the start
+ *   GPIOSHIM_FAULTS=LIST   faults from the start: denied (the device cannot be opened), no-edges (no line can watch edges),
+ *                          busy:LINE (another program has it), slow:US (setting lines takes that much longer), stuck (a call
+ *                          that sets a line high never returns)
  *   GPIOSHIM_SPI=PATH      a spidev device beside it: spidev.c
  *   GPIOSHIM_CLOCK=wires   edges carry their wire time, which the thread that reads them uses: a sleep returns at once and
  *                          takes exactly its duration. So a burst is exact even on a busy machine. The chip reports a
@@ -316,7 +318,7 @@ __attribute__((constructor)) static void start(void) {
   if (second < 0) give_up("fork");
   if (second == 0) {
     setsid(); /* signals to the program's group are not meant for it */
-    wires = dup2(wires, 100);
+    wires = dup2(wires, 100); /* above all descriptors that are closed below */
     const int end = dup2(alive[0], 101);
     close_range(0, 99, 0); /* whoever reads the program's output sees its end, and `alive` ends with the program */
     carry(end);

@@ -48,7 +48,9 @@ void sleep_until(uint64_t ns) {
   }
 }
 
-static uint64_t edge_ns(clockid_t clock, uint64_t wire_ns) { /* the mutex is held */
+/* The time that an edge carries: now; in wire time that of the edge before plus what lies between them on the wires. After
+ * ROW_GAP_NS it begins at the clock again, unless that has not come so far. The mutex is held. */
+static uint64_t edge_ns(clockid_t clock, uint64_t wire_ns) {
   static uint64_t last_wire, last;
   const uint64_t now = now_ns(clock);
   if (!wire_clock) return now;
@@ -100,7 +102,8 @@ int level(const struct line *l) {
   return l->driven ? l->outside : !!(l->flags & GPIO_V2_LINE_FLAG_BIAS_PULL_UP);
 }
 
-static void changed(unsigned n, int value, uint64_t wire_ns) { /* the mutex is held */
+/* Set the level of an input, and add an event if its request watches this edge. The mutex is held. */
+static void changed(unsigned n, int value, uint64_t wire_ns) {
   struct line *l = &lines[n];
   const int before = level(l);
   l->driven = 1;
@@ -118,7 +121,8 @@ static void changed(unsigned n, int value, uint64_t wire_ns) { /* the mutex is h
   eventfd_write(l->owner_fd, 1);
 }
 
-static void debounced(unsigned n, int value, uint64_t wire_ns) { /* the mutex is held */
+/* Take a level from the wires; a debounced line changes only when it has stayed. The mutex is held. */
+static void debounced(unsigned n, int value, uint64_t wire_ns) {
   struct line *l = &lines[n];
   if (l->flags & GPIO_V2_LINE_FLAG_OUTPUT) return;
   if (!l->debounce_ns) return changed(n, value, wire_ns);

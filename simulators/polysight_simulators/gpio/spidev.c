@@ -21,8 +21,9 @@
 #include <linux/spi/spidev.h>
 
 #define MODES (SPI_CPOL | SPI_CPHA | SPI_CS_HIGH | SPI_NO_CS | SPI_3WIRE) /* of spi-bcm2835.c */
-#define MOST_HZ 125000000.0
+#define MOST_HZ 125000000.0 /* the core clock by the least divisor, 2 */
 
+/* The settings above; `returned` is the wire from MOSI to MISO. */
 static unsigned mosi = 10, bufsiz = 4096;
 static int returned = 1;
 static double believed_hz = 250e6, core_hz = 250e6;
@@ -38,7 +39,7 @@ void read_spi_settings(void) {
   exact = getenv("GPIOSHIM_EXACT") != 0;
 }
 
-static double bit_ns(uint32_t asked_hz) {
+static double bit_ns(uint32_t asked_hz) { /* duration of a bit; 0 asks for the fastest */
   const double wanted_hz = asked_hz && asked_hz < MOST_HZ ? asked_hz : MOST_HZ;
   unsigned divisor = believed_hz / wanted_hz;
   if (divisor * wanted_hz < believed_hz) divisor++;

@@ -19,6 +19,7 @@ from polysight_shared.errors import ConfigError
 from polysight_shared.tables import to_builtins
 from polysight_simulators.scene.scene_file import Scene
 
+# Group of entry points in which a package offers its function.
 GROUP = "polysight.shape_echoes"
 
 

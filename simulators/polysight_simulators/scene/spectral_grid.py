@@ -1,4 +1,8 @@
-"""The grid on which an object field is computed: kernel positions, spatial frequencies, and offsets of the output."""
+"""The grid on which an object field is computed: kernel positions, spatial frequencies, and offsets of the output.
+
+The field at stage offset u is the sum over object points v of the object times a kernel of w = v - u, a convolution: it
+is computed along each axis as a product of spectra, and interpolated from an oversampled grid of u.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +20,11 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene.optics import Antennas, Real
 from polysight_simulators.scene.scene_file import Scene
 
-# Length of the kernel's fade-out beyond the scene
+# Length of the kernel's fade-out beyond the scene; chosen: a shorter one needs a finer step.
 FADE_M = 0.06
-# Number of taps of the windowed sinc.
+# Number of taps of the windowed sinc that interpolates the output; chosen.
 TAPS = 12
-# Offsets beyond the aperture, for the taps of the sinc
+# Kernel positions beyond those of aperture and scene, for the taps of the sinc: 6 steps of at most 2 mm.
 MARGIN_M = 0.012
 # Points of the output grid per kernel position.
 OVERSAMPLING = 2
@@ -28,7 +32,7 @@ OVERSAMPLING = 2
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of the computation: range of offsets and spectral grid, metres."""
+    """One axis of the computation, metres: ranges of stage offsets u and kernel positions w, and the step of w."""
 
     low_u: float
     high_u: float
@@ -44,19 +48,19 @@ class Axis:
 
     @property
     def w(self) -> Real:
-        """Kernel positions (object point minus stage offset)."""
+        """Kernel positions (object point minus stage offset), [points]."""
         return self.low_w - FADE_M + self.step * np.arange(self.points)
 
     @property
     def fade(self) -> Real:
-        """Fade-out of the kernel: 1 within the scene, smoothly 0 outside."""
+        """Fade-out of the kernel, [points]: 1 within the scene, smoothly 0 outside."""
         w = self.w
         beyond = np.maximum(self.low_w - w, w - self.high_w) / FADE_M
         return np.cos(np.pi / 2 * np.clip(beyond, 0.0, 1.0)) ** 4
 
     @property
     def kappa(self) -> Real:
-        """Spatial frequencies of the DFT, rad/m."""
+        """Spatial frequencies of the DFT, rad/m, [points]."""
         return 2 * np.pi * np.fft.fftfreq(self.points, self.step)
 
     @property
@@ -77,13 +81,15 @@ MAX_KERNEL_POINTS = 4_000_000
 def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -> tuple[Axis, Axis]:
     """Return extent and pitch in x and y from the extent of the scene and the steepest phase of the kernel.
 
-    A tilt moves the specular point of a plate (26 mm per degree), but the kernel already extends from every offset to
-    the edges of every plate.
+    `top_hz` is the highest frequency. A tilt moves the specular point of a plate (26 mm per degree), but the kernel
+    already extends from every offset to the edges of every plate. Raises ConfigError if that is too much memory.
     """
     travel = 2 * mean_burst_travel_mm(rig.burst, rig.stage) + abs(scene.disturbances.backlash_mm)
+    # Centre and half size of each object, mm.
     edges = [(*p.centre_mm, p.size_mm[0] / 2, p.size_mm[1] / 2) for p in scene.plates]
     edges += [(*p.position_mm, 0.0, 0.0) for p in scene.points]
     table = np.array(edges or [(0.0, 0.0, 0.0, 0.0)])
+    # Each axis: least and largest offset, least and largest kernel position.
     spans = []
     for i, (n, step, extra) in enumerate(
         ((rig.grid.columns, rig.grid.step_x_mm, travel + 1.0), (rig.grid.rows, rig.grid.step_y_mm, 1.0))
@@ -92,6 +98,7 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
         low_v = ant.centre_m[i] * 1e3 + np.min(table[:, i] - table[:, i + 2])
         high_v = ant.centre_m[i] * 1e3 + np.max(table[:, i] + table[:, i + 2])
         spans.append(np.array([-half, half, low_v - half, high_v + half]) / 1e3 + [0, 0, -MARGIN_M, MARGIN_M])
+    # The path changes fastest at the edges of the kernel and in the nearest plane.
     corners = np.meshgrid(*(np.linspace(s[2] - FADE_M, s[3] + FADE_M, 9) for s in spans))
     wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
     nearest_z = ant.plane_z_m + min([0.0, *(p.height_mm for p in (*scene.plates, *scene.points))]) / 1e3
@@ -106,6 +113,7 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
                     distances_m[0] ** 2 + distances_m[1] ** 2 + (nearest_z - antenna[2]) ** 2
                 )
             steepest = max(steepest, wave * float(np.abs(slope).max()))
+        # Nyquist's step, with a tenth to spare and room for the spectrum of the fade-out (both chosen), at most 4 mm.
         step = min(np.pi / (1.1 * steepest + 6 * np.pi / FADE_M), 4e-3)
         axes.append(Axis(span[0], span[1], span[2], span[3], step))
     if axes[0].points * axes[1].points > MAX_KERNEL_POINTS:
@@ -124,6 +132,7 @@ def oversample(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDArr
     n = axis.points
     shape = list(spectrum.shape)
     shape[along] = n * OVERSAMPLING
+    # Zeros between the positive and the negative frequencies interpolate.
     padded = np.zeros(shape, dtype=np.complex64)
     head = (n + 1) // 2
     tail = n // 2

@@ -17,6 +17,7 @@ enum { TRIGGER = 2, LEFT_PUL = 3, RIGHT_PUL = 4, X_PUL = 5, DRIVERS_OFF = 7, BRA
 struct rig rig = { 2000, 1500, 0, 0, 5.0, 26, -1 };
 uint64_t last_step;
 static struct pin { char port; uint8_t bit, value, watched; } pins[N_PINS];
+/* Pins, steps, and the cycles of the last edge of DIR and the last rising edge of PUL. */
 static struct motor { int pul, dir; int32_t position; uint64_t dir_changed, risen; } motors[3] = {
   { X_PUL, X_DIR, 0, 0, 0 }, { LEFT_PUL, LEFT_DIR, 0, 0, 0 }, { RIGHT_PUL, RIGHT_DIR, 0, 0, 0 } };
 static uint64_t shortest_pulse = ~0ULL, shortest_setup = ~0ULL, shortest_hold = ~0ULL;
@@ -76,7 +77,7 @@ static void tell_trigger(int value) {
 int connect_wires(const char *path) {
   struct sockaddr_un a = { .sun_family = AF_UNIX };
   strncpy(a.sun_path, path, sizeof a.sun_path - 1);
-  for (int i = 0; i < 500 && !ended; i++) {
+  for (int i = 0; i < 500 && !ended; i++) { /* the hub may start later: 10 s, 20 ms apart */
     const int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
     if (connect(fd, (struct sockaddr *)&a, sizeof a) == 0) return fd;
     close(fd);
@@ -88,7 +89,7 @@ int connect_wires(const char *path) {
 
 /* ---- switches ---- */
 static void drive(int pin, int value) {
-  static uint8_t mask[3], level[3];
+  static uint8_t mask[3], level[3]; /* of ports B, C, D: the pins that are driven from outside, and their levels */
   const int k = pins[pin].port - 'B';
   const uint8_t bit = 1 << pins[pin].bit;
   if (mask[k] & bit && !(level[k] & bit) == !value) return;

@@ -16,14 +16,15 @@ DEFINE_FIFO(uint16_t, uart_fifo);
 int pty = -1;
 uint64_t pty_bytes, pty_sent;
 static avr_uart_t *uart;
-static int pty_watch = -1, pty_clients, dtr;
-static uint64_t line_busy;
+static int pty_watch = -1, pty_clients, dtr; /* pty_watch: inotify, which tells who opens and closes the terminal */
+static uint64_t line_busy;                   /* the end of the last byte, either way */
+/* Bytes on their way, and how many went in and out of each queue. */
 static uint8_t to_board[1 << 16];
 static unsigned to_head, to_tail;
 static struct { uint64_t when; uint8_t byte; } from_board[4096];
 static unsigned from_head, from_tail;
 
-static uint64_t frame(void) { /* 8N1 in cycles; simavr 1.6 counts 11 bits */
+static uint64_t frame(void) { /* cycles of a byte: 10 bits by 8N1; simavr 1.6 counts 11 */
   const unsigned ubrr = avr->data[uart->r_udr - 2] | (avr->data[uart->r_udr - 1] & 15) << 8;
   return 10ULL * (ubrr + 1) * (avr->data[uart->r_ucsra] & 2 ? 8 : 16);
 }

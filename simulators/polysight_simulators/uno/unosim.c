@@ -46,7 +46,9 @@ void say(const char *format, ...) {
   va_end(values);
 }
 
-/* ---- in lockstep ---- */
+/* ---- in lockstep: a command returns false when nothing can follow ---- */
+/* Wait for at most 5 s of real time until `bytes` came through the pseudo terminal, then until the line was idle for 4 ms of
+ * the board's time (chosen), at most 2 s beyond the bytes on their way. */
 static int settle(uint64_t bytes) {
   for (int waits = 0; pty >= 0 && pty_bytes < bytes; waits++) {
     if (waits == 500) { say("X %llu nothing came through the pseudo terminal\n", (u64)avr->cycle); break; }
@@ -118,7 +120,7 @@ static int serve_lockstep(void) {
 }
 
 /* ---- at real time ---- */
-#define SLICE (HZ / 4000)
+#define SLICE (HZ / 4000) /* 250 us: how long the board runs between looks at the clock and the pseudo terminal */
 static uint64_t anchor_ns, anchor_cycle;
 
 static uint64_t wall_ns(void) {
@@ -133,7 +135,7 @@ static void keep_pace(double speed) {
   if (now < due) {
     struct timespec t = { due / 1000000000, due % 1000000000 };
     clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, 0);
-  } else if (now - due > 20000000) { /* starved: slow the simulated world down rather than racing */
+  } else if (now - due > 20000000) { /* 20 ms behind: starved; slow the simulated world down rather than racing */
     anchor_ns = now, anchor_cycle = avr->cycle;
   }
 }

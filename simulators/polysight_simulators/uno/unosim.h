@@ -23,8 +23,8 @@ struct rig {
   int x, y;           /* motor steps the stage stands clear of its switches when it is switched on */
   int zero_x, zero_y; /* motor steps from where the switches close to the zero of stage coordinates */
   double um_per_step;
-  int trigger_line;
-  int wires; /* socket of the hub, -1 without one */
+  int trigger_line; /* of the Pi, for the wires */
+  int wires;        /* socket of the hub, -1 without one */
 };
 extern struct rig rig;
 extern uint64_t last_step;
@@ -39,8 +39,8 @@ void tell_pin_costs(void);
 int connect_wires(const char *path);
 
 /* serial.c: the serial line, and the pseudo terminal at its end */
-extern int pty;
-extern uint64_t pty_bytes, pty_sent;
+extern int pty;                      /* -1 without one */
+extern uint64_t pty_bytes, pty_sent; /* read from it, written to it */
 void serial_begin(void);
 void serial_reset(void);
 int make_pty(const char *link);
@@ -54,6 +54,6 @@ void read_pty(int wait_ms);
 /* chip.c: the microcontroller */
 int chip_begin(const char *hex);
 void reset(void);
-int hang(void); /* until the next reset */
-int run_to(uint64_t cycle);
+int hang(void);             /* until the next reset */
+int run_to(uint64_t cycle); /* false if the program has crashed, or a signal ends the emulator */
 void tell_interrupt_costs(void);

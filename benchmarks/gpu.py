@@ -37,7 +37,7 @@ from polysight_shared.raster import plan_raster
 # Rounds of what takes milliseconds.
 ROUNDS = 20
 # Rounds of what takes seconds.
-FEW = 3
+FEW_ROUNDS = 3
 # Products of position and voxel per chunk of the exact sum (chosen: the default suits a CPU's cache).
 LARGE_CHUNK = 1 << 24
 
@@ -233,8 +233,8 @@ class Figures:
         spectral.forget()
         seconds = {
             "first image": wall_seconds(lambda: chain.image(samples), 1),
-            "image": wall_seconds(lambda: chain.image(samples), FEW),
-            "cube on disk to image": wall_seconds(lambda: chain.image(chain.reduce()), FEW),
+            "image": wall_seconds(lambda: chain.image(samples), FEW_ROUNDS),
+            "cube on disk to image": wall_seconds(lambda: chain.image(chain.reduce()), FEW_ROUNDS),
         }
         return cls("one CPU core", seconds, chain.image(samples), chain.image(chain.reduce()))
 
@@ -264,12 +264,12 @@ class Figures:
         first()
         resident = put()
         seconds = {
-            "first image": wall_seconds(first, FEW),
+            "first image": wall_seconds(first, FEW_ROUNDS),
             "image": wall_seconds(from_samples, rounds),
             "image, samples on the GPU": wall_seconds(
                 lambda: library.to_numpy(chain.image(resident, xp, device)), rounds
             ),
-            "cube on disk to image": wall_seconds(from_cube, FEW),
+            "cube on disk to image": wall_seconds(from_cube, FEW_ROUNDS),
         }
         exact_images: list[Image] = []
         # A GPU would idle in the chunks that suit a CPU's cache.

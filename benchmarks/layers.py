@@ -287,6 +287,7 @@ def table(rows: list[Case], title: str) -> dict[str, float]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
     parser.add_argument(
         "--cases", type=int, default=240, help="stacks, five sheets and a liquid a scene (default: 240)"
     )

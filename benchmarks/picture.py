@@ -153,9 +153,7 @@ def judge_plate(box: str, patch: PatchFigures | None) -> PlateFigures:
         estimate = f"{e.real:5.2f} +- {e.spread.real_std:4.2f}  {e.loss:5.2f} +- {e.spread.loss_std:4.2f}"
     sure = patch.confidence or 0.0
     right = patch.name == name
-    mark = "OUT"
-    if inside:
-        mark = "in"
+    mark = "in" if inside else "OUT"
     return PlateFigures(
         text=f"  {box:16} {real:5.2f} {loss:5.2f}   {estimate:32} {mark:3}  {patch.name} {sure:.2f}",
         inside=inside,
@@ -236,7 +234,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a table for each form; without the picture print that it is skipped. Return 0."""
+    """Print a table for each form; without the picture print that one benchmark is skipped. Return 0."""
     sources = []
     if args.images:
         sources = sorted(Path(args.images).glob("*.npz"))

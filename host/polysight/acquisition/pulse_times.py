@@ -554,6 +554,7 @@ def _keep_payload(path: Path, received: NDArray[np.uint8]) -> int:
     """Store the payload as received in the row's packet file, before the row's file is rewritten; return its CRC-32."""
     if not path.exists():
         return 0
+    # What else the packet file tells of the row stays as it is.
     evidence, log = read_packets(path, received)
     return write_packets(path, log, evidence, None)
 

@@ -213,7 +213,7 @@ def leakage_of_scans(
         Scan of a whole metal plate that covers the plane.
     strips
         (degrees from the vertical towards +x, scan) of strips that cover the plane: two orientations or more; one
-        gives the axial ratio alone, the same in both boards.
+        gives the axial ratio alone: one leakage, taken as that of both boards.
     config
         Rig file for scans in the authors' layout.
 
@@ -320,6 +320,7 @@ def leakage(plate: Path, strips: Sequence[tuple[float, Path]], config: Path | No
     ]
     gain = f"# H over V in the images: {imbalance_db:+.2f} dB, {imbalance_deg:+.1f} degrees"
     gain += f"; from {facts['pixels']} pixels"
+    # Plate and two strips are as many standards as unknowns, and agree in any case.
     if len(strips) > 2:
         gain += f", the standards agree within {measured.residual:.4f} rad"
     print_lines([*lines, gain])

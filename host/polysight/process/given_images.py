@@ -326,8 +326,9 @@ def _sort_axes(
 
 
 def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
-    """Read `labels/<scan>`; row 0 of its images is the top of the published pictures."""
+    """Read `labels/<scan>`; row 0 of its images is the top of the published pictures, the largest y."""
     scan = materials.read_labelled_scan(folder)
+    # How the boxes' pixels are counted in the images, by what explains their brightness best.
     orientation = materials.image_orientation([scan])
     scan = scan.orient(orientation)
     arrays = {"h": scan.h, "v": scan.v}
@@ -505,7 +506,8 @@ def analyse_given_images(
 ) -> tuple[ProcessedScan, Findings, str]:
     """Find the materials of given images; return the result, its findings, and why nothing was named, or "".
 
-    Raises PolysightError as `Pipeline.examine` for a recorded scan.
+    `plates` are the true ones of a simulated scene, if known. Raises PolysightError as `Pipeline.examine` for a
+    recorded scan.
     """
     started_s = time.perf_counter()
     angle = choose_angle(pair, settings, rig)

@@ -126,6 +126,7 @@ class JointFit:
         echoes = self.amplitude.shape[1]
         energy = np.zeros(len(self.rest))
         energy[members] = find_energy(self.rest[members])
+        # Start and factors of the damping (0.2 after a step that helps, 8 after another) are chosen.
         damping = np.full(len(self.rest), 1e-3)
         running = members
         for _ in range(JOINT_ITERATIONS):

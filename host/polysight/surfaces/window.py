@@ -22,7 +22,7 @@ WINDOW_M = 0.034
 ITERATIONS = 7
 # Positions of a window that are enough to tell whether its echoes lie apart; a window of steps of 2 mm has 289.
 THINNED_POSITIONS = 48
-# Largest step of path (m), slopes, and curvatures (1 / m).
+# Largest step of path (m), slopes, and curvatures (1 / m); chosen.
 STEP_LIMITS = np.array([0.02, 0.05, 0.05, 1.5, 1.5, 1.5])
 
 Array = NDArray[np.float64]
@@ -194,6 +194,7 @@ class BoardFit:
 def _find_gate(board: Samples) -> tuple[float, float]:
     """Return the excess paths between which the model's gain is judged: a fifth of its unambiguous range."""
     reach = SPEED_OF_LIGHT_M_S / (board.frequencies_hz[1] - board.frequencies_hz[0])
+    # A mirror at 0.5 m, about the published rig's object plane, stands for the objects' paths (chosen).
     centre = find_mirror_path(board, 0.5) - board.direct_m.mean()
     return centre - reach / 10, centre + reach / 10
 

@@ -100,6 +100,7 @@ def build(folder: Path = HERE, target: str = "") -> Path:
             list(workers.map(_run, commands))
         library = f"{build_folder}/{LIBRARY}"
         objects = [f"{build_folder}/{name}" for _, name in jobs]
+        # ziglang links its own checks of undefined behaviour unless it is told not to.
         _run([*compiler, "-O3", "-fno-sanitize=undefined", "-s", "-shared", "-o", library, *objects, "-lm"])
         new = folder / f".{LIBRARY}-{os.getpid()}"
         new.write_bytes(Path(library).read_bytes() + source_digest().encode())

@@ -33,12 +33,13 @@ from polysight.products.maps import (
     QUANTITIES,
     Limits,
     MapValues,
+    PermittivityMap,
     map_images,
+    map_permittivity,
     map_scan,
     percentile,
     signal_opacity,
 )
-from polysight.products.permittivity_map import PermittivityMap, map_permittivity
 from polysight.products.processed import (
     FINISHED,
     IMAGE,

@@ -27,7 +27,7 @@ import scipy
 from msgspec import UNSET
 
 from polysight.materials import axis_mm, image_centre_mm
-from polysight.products.permittivity_map import map_permittivity, nominal_incidence_rad
+from polysight.products.maps import map_permittivity, nominal_incidence_rad
 from polysight.products.processed import ProcessedScan, read_products
 from polysight.results import Figure, PatchFigures, Verdict, declared_figures, to_plain
 from polysight.store import MAX_BYTES

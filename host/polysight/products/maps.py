@@ -1,7 +1,11 @@
-"""Maps of H, V and P as they are drawn: numbers, opacity and the limits of their colours.
+"""Maps of a processed scan: H, V and P as they are drawn, and the permittivity of each pixel with its errors.
 
 Figures of reports and pictures of pages draw the same values. Amplitudes are in dB, phases in degrees. A phase or a
 ratio means nothing where a channel holds only noise: there its pixels fade out.
+
+For permittivities: the pixels of image.npz are relative to metal and free of known leakage. What the scene tells beyond
+that is in the error budget and in the patches: leakage and incidence angle apply to all pixels, drift, tilt and the
+error of the metal reference are known where a patch is.
 """
 
 from __future__ import annotations
@@ -12,10 +16,20 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import UnsetType
 
 from polysight.imaging import Images
-from polysight.polarimetry import ratio
+from polysight.materials import incidence_std_rad, permittivity_slope
+from polysight.polarimetry import (
+    correct_leakage,
+    fresnel,
+    incidence_choice,
+    permittivity_from_ratio,
+    ratio,
+    specular_incidence_rad,
+)
 from polysight.products.processed import ProcessedScan
+from polysight.results import ErrorBudget, LeakageError, Pair
 
 Real = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -130,3 +144,151 @@ def _find_ratio_limits_db(level: Real, is_opaque: Mask, patches_db: Sequence[flo
         )
     low = float(np.floor(min(low, 0.0) - 1))
     return low, max(float(np.ceil(high + 1)), low + LEAST_RATIO_RANGE_DB)
+
+
+# --- permittivity of each pixel ---
+
+# Largest error of a permittivity that says something, relative to its size.
+LARGEST_ERROR = 0.5
+# Standard errors by which a permittivity may lie beyond what a half space can have.
+LARGEST_DEVIATION = 2.0
+# Step for the derivative by the incidence angle.
+_ANGLE_STEP_RAD = 1e-6
+
+Complex = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class PermittivityMap:
+    """Permittivity of each pixel, [ny, nx].
+
+    Attributes
+    ----------
+    value
+        complex128, eps' - j eps''; not a number where the scan lights nothing.
+    real_std, loss_std
+        float64, standard errors.
+    mask
+        True where the permittivity is known and possible for a half space.
+    """
+
+    value: Complex
+    real_std: Real
+    loss_std: Real
+    mask: npt.NDArray[np.bool_]
+
+
+def map_permittivity(scan: ProcessedScan) -> PermittivityMap:
+    """Return the permittivity of each pixel as a half space.
+
+    The leakage and the incidence angle of the error budget are applied to every pixel. The pixels of a patch are moved
+    together, in V / H, so that their median has the patch's permittivity, and none is more certain than the patch.
+
+    Eq. 3 is analytic in 1 / P, so the error of P adds the same variance to both parts; that of the angle adds its own.
+    `p_sigma` holds noise, metal reference, and what is left of the leakage.
+    Without an incidence angle nothing is known.
+    """
+    budget = None
+    if scan.materials is not None:
+        budget = scan.materials.error_budget or None
+    angle_rad = _estimate_angle(nominal_incidence_rad(scan), budget)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        measured = 1 / np.where(scan.valid, scan.p, np.nan).astype(np.complex128)
+        inverse = measured
+        if budget is not None and budget.leakage is not None:
+            inverse = _remove_leakage(measured, budget.leakage)
+        inverse, least_real_std, least_loss_std = _match_patches(scan, inverse, angle_rad)
+        value = permittivity_from_ratio(1 / inverse, angle_rad)
+        value = np.where(np.isfinite(value), value, complex(np.nan, np.nan))
+        by_ratio = np.abs(permittivity_slope(inverse, angle_rad))
+        by_angle = (permittivity_from_ratio(1 / inverse, angle_rad + _ANGLE_STEP_RAD) - value) / _ANGLE_STEP_RAD
+        inverse_std = np.full(value.shape, np.nan)
+        if scan.images.p_sigma is not None:
+            # d (1 / P) = -dP / P^2.
+            inverse_std = scan.images.p_sigma.astype(np.float64) * np.abs(measured) ** 2
+        angle_std_rad = incidence_std_rad(scan.materials)
+        real_std = np.fmax(np.hypot(by_ratio * inverse_std, by_angle.real * angle_std_rad), least_real_std)
+        loss_std = np.fmax(np.hypot(by_ratio * inverse_std, by_angle.imag * angle_std_rad), least_loss_std)
+        return PermittivityMap(value, real_std, loss_std, _is_known_half_space(value, real_std, loss_std))
+
+
+def nominal_incidence_rad(scan: ProcessedScan) -> Real:
+    """Return the incidence angle of the rig, radians: one number or, if the scan used one by pixel, [ny, nx].
+
+    Not a number if neither rig nor angle are known.
+    """
+    incidence = scan.quality.incidence
+    if scan.rig is None:
+        return np.radians(np.float64(incidence.one_deg if incidence else np.nan))
+    if incidence and incidence.used == "by pixel":
+        return incidence_choice(scan.rig, scan.x_m, scan.y_m, "pixel").used_rad
+    return np.asarray(specular_incidence_rad(scan.rig))
+
+
+def _estimate_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:
+    """Return the incidence angle that the scene tells, radians; the nominal one if the budget has no estimate."""
+    if budget is None or budget.incidence is None or budget.incidence.deg is None:
+        return theta_rad
+    return theta_rad + (np.radians(budget.incidence.deg) - theta_rad.mean())
+
+
+def _remove_leakage(inverse: Complex, leakage: LeakageError) -> Complex:
+    """Return V / H without the estimated leakage, instead of without that which the pixels are free of.
+
+    Unchanged if the products do not say what was removed.
+    """
+    removed_h = _join_parts(leakage.removed_h)
+    removed_v = _join_parts(leakage.removed_v)
+    estimated_h = _join_parts(leakage.h)
+    estimated_v = _join_parts(leakage.v)
+    if removed_h is None or removed_v is None or estimated_h is None or estimated_v is None:
+        return inverse
+    # The channels as received, see `correct_leakage`.
+    h = (1 + removed_h * inverse) / (1 + removed_h)
+    v = (inverse + removed_v) / (1 + removed_v)
+    h, v = correct_leakage(h, v, estimated_h, estimated_v)
+    return v / h
+
+
+def _join_parts(pair: Pair | UnsetType | None) -> complex | None:
+    """Return real and imaginary part as a complex number; None if one of them is not known."""
+    if not pair or pair[0] is None or pair[1] is None:
+        return None
+    return complex(pair[0], pair[1])
+
+
+def _match_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tuple[Complex, Real, Real]:
+    """Move V / H of the pixels of each patch, so that their median has the patch's permittivity.
+
+    `inverse` complex [ny, nx] is V / H, `angle_rad` a number or [ny, nx]. Return it with the standard errors of the
+    patch in each pixel, real part and loss; not a number outside of patches.
+    """
+    matched = inverse.copy()
+    real_std = np.full(inverse.shape, np.nan)
+    loss_std = np.full(inverse.shape, np.nan)
+    for patch in scan.segments:
+        value = patch.permittivity_value
+        if value is None:
+            continue
+        of_patch = scan.labels == patch.label
+        pixels = of_patch & np.isfinite(inverse)
+        if scan.interior is not None:
+            pixels &= scan.interior
+        if not pixels.any():
+            continue
+        patch_angle = float(np.broadcast_to(angle_rad, inverse.shape)[pixels].mean())
+        r_s, r_p = fresnel(value, patch_angle)
+        median = complex(np.median(inverse[pixels].real), np.median(inverse[pixels].imag))
+        matched[of_patch] += complex(r_p / r_s) - median
+        real_std[of_patch] = np.nan if patch.permittivity_real_std is None else patch.permittivity_real_std
+        loss_std[of_patch] = np.nan if patch.permittivity_loss_std is None else patch.permittivity_loss_std
+    return matched, real_std, loss_std
+
+
+def _is_known_half_space(value: Complex, real_std: Real, loss_std: Real) -> npt.NDArray[np.bool_]:
+    """Return where the errors are below half of the value and a half space can have it within twice its errors."""
+    is_known = np.hypot(real_std, loss_std) < LARGEST_ERROR * np.abs(value)
+    # Edges of metal have ratios near 1, of which Eq. 3 makes large negative permittivities.
+    has_real_part = np.real(value) + LARGEST_DEVIATION * real_std >= 1.0
+    has_loss = -np.imag(value) + LARGEST_DEVIATION * loss_std >= 0.0
+    return is_known & has_real_part & has_loss

@@ -19,8 +19,8 @@ import tomli_w
 from polysight.api.scan import Scan, find_rig_file, open_scan
 from polysight.catalogue import Pixels, compare_pixels
 from polysight.data import find_packaged
-from polysight.jobs.check import check_scan, check_scans
 from polysight.jobs.demo import simulate_scene
+from polysight.jobs.scans import check_scan, check_scans
 from polysight.planning import Changes, Forecast, describe, find_scene_warnings, forecast_scene
 from polysight.products import PLANE, ProcessedScan, image_dataset
 from polysight.results import CheckResult

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from polysight.jobs.check import CHART_IN, DOTS_PER_INCH, draw_control_chart
+from polysight.jobs.scans import CHART_IN, DOTS_PER_INCH, draw_control_chart
 from polysight.products import ProcessedScan
 from polysight.report import draw_overview, figure_label, font_families
 from polysight.results import CheckResult

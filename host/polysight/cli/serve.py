@@ -191,7 +191,7 @@ def _add_results(add: Add) -> None:
     add_json_option(sub)
     sub = add(
         "check",
-        "check.check",
+        "scans.check",
         "compare the check plate of scans with its known permittivity",
         "polysight check scans/today\n  polysight check scans --chart check.png",
     )

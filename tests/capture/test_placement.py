@@ -23,8 +23,7 @@ from tests.support.capture.records import (
     place,
 )
 
-from polysight.capture.dca1000 import Counters
-from polysight.capture.packet_log import PacketLog
+from polysight.capture.dca1000 import Counters, PacketLog
 from polysight.capture.placement import Evidence, Losses, Past, place_record
 from polysight.capture.row_files import read_packets, write_packets
 

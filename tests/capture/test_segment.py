@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.capture.packet_log import PacketLog
+from polysight.capture.dca1000 import PacketLog
 from polysight.capture.row_files import Segment, read_index
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError

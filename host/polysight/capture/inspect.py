@@ -24,11 +24,11 @@ from polysight.capture.dca1000 import (
     MAX_PAYLOAD_BYTES,
     Code,
     Counters,
+    PacketLog,
     Status,
     decode_row,
     decode_two_lane,
 )
-from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Past, Placed, counter_differences, place_record
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, ProtocolError

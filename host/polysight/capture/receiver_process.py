@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.capture import receiver as messages
-from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, Status
+from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, PacketLog, Status
 from polysight.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
-from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Evidence, Past, Preview, place_record, preview
 from polysight.capture.receiver import take_core, take_priority
 from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets

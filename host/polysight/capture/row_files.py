@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.capture.packet_log import PacketLog
+from polysight.capture.dca1000 import PacketLog
 from polysight.capture.placement import Evidence, Placed
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, quote

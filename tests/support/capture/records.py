@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polysight.capture.dca1000 import Counters
-from polysight.capture.packet_log import PacketLog
+from polysight.capture.dca1000 import Counters, PacketLog
 from polysight.capture.placement import Past, Placed, place_record
 from polysight_simulators.cards import Sent
 

@@ -19,7 +19,7 @@ import pytest
 from polysight.acquisition import scan as host_run
 from polysight.acquisition.progress import ScanProgress, ScanResult
 from polysight.acquisition.scan import resume_scan, run_scan
-from polysight.capture.packet_log import PacketLog
+from polysight.capture.dca1000 import PacketLog
 from polysight.capture.placement import Evidence, Past, place_record
 from polysight.capture.receiver import RowCapture
 from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets

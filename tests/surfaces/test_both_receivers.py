@@ -12,10 +12,10 @@ from tests.surfaces.test_point_errors import UNIT_GAINS
 from polysight.data import find_packaged
 from polysight.imaging.samples import reduction
 from polysight.surfaces import Echoes, Optics, Seen, find_voltages, make_optics
+from polysight.surfaces.gains import receive, reflect_points
 from polysight.surfaces.measure import Shape
 from polysight.surfaces.permittivity import add_common_errors, fit_permittivity
 from polysight.surfaces.points import find_normals, find_offset_that_sees, predict_echo
-from polysight.surfaces.voltages import receive, reflect_points
 from polysight.surfaces.window import BoardFit, Samples, no_echoes
 from polysight_shared.config import load_instrument
 from polysight_shared.units import SPEED_OF_LIGHT_M_S

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polysight.surfaces.gains import Gains, learn_gains
+from polysight.surfaces.gains import Gains, Voltages, learn_gains
 from polysight.surfaces.optics import reflect_flat
 from polysight.surfaces.permittivity import (
     DisturbedScan,
@@ -16,7 +16,6 @@ from polysight.surfaces.permittivity import (
     point_covariance,
     point_permittivity,
 )
-from polysight.surfaces.voltages import Voltages
 
 WAVE_NUMBER = 1634.0
 EPS = 4.0 - 0.5j

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from polysight.surfaces import Seen, Uncertainty, analyse_surface, find_shape, find_voltages
+from polysight.surfaces.gains import receive, reflect_points
 from polysight.surfaces.permittivity import find_interior, find_reflecting
 from polysight.surfaces.result import (
     NO_SINGLE_MEDIUM,
@@ -16,7 +17,6 @@ from polysight.surfaces.result import (
     find_depth_behind,
     judge_segment,
 )
-from polysight.surfaces.voltages import receive, reflect_points
 from polysight_worlds.media import Stack
 from polysight_worlds.shapes import cylinder, plate
 

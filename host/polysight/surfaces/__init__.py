@@ -7,7 +7,7 @@ files. In order: `window` (fit of one echo), `joint` (of several), `paths` (sear
 (both receivers, segments), `optics` (polarisation, curved reflection), `voltages`, `gains`, `permittivity`, `result`.
 """
 
-from polysight.surfaces.gains import Gains, learn_gains
+from polysight.surfaces.gains import Gains, find_voltages, learn_gains
 from polysight.surfaces.measure import Seen, find_shape, see_points
 from polysight.surfaces.optics import (
     Optics,
@@ -35,5 +35,4 @@ from polysight.surfaces.result import (
     summary_lines,
     write_surface,
 )
-from polysight.surfaces.voltages import find_voltages
 from polysight.surfaces.window import Echoes, Samples

@@ -23,12 +23,10 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.polarimetry import permittivity_from_ratio
-from polysight.surfaces.gains import UNKNOWN_SLOPE, Gains
-from polysight.surfaces.measure import Seen
-from polysight.surfaces.optics import ANGLE_STEP, Antenna, Optics, reflect_flat
-from polysight.surfaces.paths import STRIDE_M
-from polysight.surfaces.voltages import (
+from polysight.surfaces.gains import (
     BLOCK_M,
+    UNKNOWN_SLOPE,
+    Gains,
     Voltages,
     expansion_parameter,
     find_voltages,
@@ -36,6 +34,9 @@ from polysight.surfaces.voltages import (
     receive,
     reflect_points,
 )
+from polysight.surfaces.measure import Seen
+from polysight.surfaces.optics import ANGLE_STEP, Antenna, Optics, reflect_flat
+from polysight.surfaces.paths import STRIDE_M
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.store import open_npz
-from polysight.surfaces.gains import Gains
+from polysight.surfaces.gains import Gains, Voltages, find_voltages
 from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS
 from polysight.surfaces.measure import SAME_WINDOW_M, Seen, Shape, find_shape
 from polysight.surfaces.optics import Optics
@@ -38,7 +38,6 @@ from polysight.surfaces.permittivity import (
     point_ratio,
 )
 from polysight.surfaces.points import tangents
-from polysight.surfaces.voltages import Voltages, find_voltages
 from polysight.surfaces.window import Echoes
 from polysight_shared.files import write_atomically
 

@@ -24,10 +24,9 @@ from polysight.radar.messages import Direction, Kind, SubBlock, decode, decode_e
 from polysight.serve.commands import command_routes
 from polysight.serve.front import Front, make_app
 from polysight.serve.guard import Access
-from polysight.serve.listing import ListedScan
 from polysight.serve.reading import ScanList, reading_routes
 from polysight.serve.server import make_reader_app
-from polysight.serve.site import Site, Watches
+from polysight.serve.site import ListedScan, Site, Watches
 from polysight.serve.stage import StageControl
 from polysight_shared import messages, stage_line
 from polysight_shared.config import load_instrument

@@ -8,7 +8,7 @@ from tests.support.page.asking import get
 from tests.support.page.live_view import served_folder
 from tests.support.products import judged_products
 
-from polysight.serve.listing import ChangingList, ListedScan
+from polysight.serve.site import ChangingList, ListedScan
 
 SEED = 37
 

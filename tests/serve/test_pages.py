@@ -25,8 +25,7 @@ import polysight
 from polysight.catalogue import Notes, find_program, read_notes, write_notes
 from polysight.materials import Library, read_labels
 from polysight.products import ProcessedScan
-from polysight.serve import queue as serve_queue
-from polysight.serve import reading
+from polysight.serve import programs, reading
 from polysight_shared.config import CheckPlate
 from polysight_shared.errors import DataError
 
@@ -385,7 +384,7 @@ def test_notes_are_kept_beside_the_scan(page, scans):
 
 
 def test_a_plan_is_repeated_and_waits_in_the_queue(page, scans, monkeypatch):
-    monkeypatch.setattr(serve_queue, "LOOK_S", 1e6)
+    monkeypatch.setattr(programs, "LOOK_S", 1e6)
     with served_folder(scans, TOKEN, config=RIG_FILE) as view:
         again = Page(page.browser, view)
         again.open("/new?from=one", PHONE)

@@ -10,8 +10,8 @@ import pytest
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
-from polysight.serve import queue as serve_queue
-from polysight.serve.queue import Queue
+from polysight.serve import programs
+from polysight.serve.programs import Queue
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, ScanError
 
@@ -41,7 +41,7 @@ def rig() -> Rig:
 
 @pytest.fixture
 def queue(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Queue]:
-    monkeypatch.setattr(serve_queue, "LOOK_S", 0.01)
+    monkeypatch.setattr(programs, "LOOK_S", 0.01)
     rig_queue = Queue(tmp_path / "queue", rig.start, lambda name: rig.states.get(name, "finished"))
     for name in ("first", "second", "third"):
         rig_queue.add(name, json.dumps({"name": name}).encode())

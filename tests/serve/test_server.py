@@ -23,8 +23,7 @@ from polysight.cli.main import build_parser
 from polysight.serve.commands import Format
 from polysight.serve.front import STATIC, EndingServer
 from polysight.serve.guard import TOKEN_HEADER, Access
-from polysight.serve.server import Place, make_access
-from polysight.serve.welcome import ELSEWHERE, describe_server, draw_code, find_addresses
+from polysight.serve.server import ELSEWHERE, Place, describe_server, draw_code, find_addresses, make_access
 from polysight_shared.error_codes import ErrorCode
 
 

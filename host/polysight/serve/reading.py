@@ -25,9 +25,8 @@ from polysight.page import Watch
 from polysight.products import REPORT, read_products
 from polysight.results import ACTION_SIGMAS, WARNING_SIGMAS, CheckResult
 from polysight.serve.guard import refuse
-from polysight.serve.listing import ListChanges, ListedScan
-from polysight.serve.queue import Waiting
-from polysight.serve.site import THUMBNAIL, Site, check_products, compare_products, draw_map
+from polysight.serve.programs import Waiting
+from polysight.serve.site import THUMBNAIL, ListChanges, ListedScan, Site, check_products, compare_products, draw_map
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError, ScanError
 

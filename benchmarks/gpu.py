@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from benchmarks.data import published_scene, temporary, write_point_cube
 from benchmarks.image import Image, worst
-from benchmarks.measure import add_arguments as add_common
-from benchmarks.measure import count_repeats, one_core, write
+from benchmarks.measure import add_arguments as add_common, count_repeats, one_core, write
 from polysight.imaging import spectral
 from polysight.imaging.direct import DirectImager
 from polysight.imaging.geometry import Antennas, Aperture, image_grid, scan_offsets_m

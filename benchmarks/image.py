@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.data import as_synced, published_scene, temporary, write_point_cube
 from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, one_core, show, write
 from benchmarks.published import SETTINGS, form_image
-from polysight.imaging import ImageBuilder
-from polysight.imaging import spectral as kernels
+from polysight.imaging import ImageBuilder, spectral as kernels
 from polysight.imaging.geometry import Antennas, Aperture, image_grid, row_starts_m, scan_offsets_m
 from polysight.imaging.samples import choose_imager, reduction, scene_gate_m
 from polysight.imaging.spectral import IncrementalImager

@@ -17,8 +17,7 @@ import tomli_w
 import zmq
 
 from benchmarks.data import temporary
-from benchmarks.measure import add_arguments as add_common
-from benchmarks.measure import machine, write
+from benchmarks.measure import add_arguments as add_common, machine, write
 from polysight.acquisition.pi_client import PiClient
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.messages import BeginRun, Capture, RowFinished

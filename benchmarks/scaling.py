@@ -9,8 +9,7 @@ from typing import Any
 
 from benchmarks.chain import Chain
 from benchmarks.data import RepeatedRows, published_scene, recorded_rows, temporary
-from benchmarks.measure import Seconds, machine, one_core, write
-from benchmarks.measure import add_arguments as add_common
+from benchmarks.measure import Seconds, add_arguments as add_common, machine, one_core, write
 from polysight.pipeline import Pipeline
 from polysight.process import map_rows
 from polysight_shared.config import Instrument

@@ -12,8 +12,7 @@ import numpy as np
 from benchmarks import sync
 from benchmarks.chain import Chain
 from benchmarks.data import published_scene, recorded_rows, temporary, write_scan
-from benchmarks.measure import Line, Seconds, count_repeats, one_core, show, write
-from benchmarks.measure import add_arguments as add_common
+from benchmarks.measure import Line, Seconds, add_arguments as add_common, count_repeats, one_core, show, write
 from benchmarks.published import form_image
 from polysight.imaging import image_grid
 from polysight_shared.config import Instrument

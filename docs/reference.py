@@ -2,12 +2,14 @@
 
 The API reference is made from the docstrings with pdoc, pages and notebooks by `docs.site`.
 
-A package that names its public functions (`__all__`) has one page with these; another one has a page for each module.
+A package that names its public functions (`__all__`, or `from ... import A as A`) has one page with these; another one
+has a page for each module.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import inspect
 import pkgutil
 import re
@@ -46,10 +48,19 @@ def modules_of(name: str) -> Iterator[str]:
     """Names of a module and of everything in it that has a page of its own. Imports them."""
     module = import_module(name)
     yield name
-    for public in getattr(module, "__all__", ()):
+    names = getattr(module, "__all__", None) or list_public_imports(module)
+    for public in names:
         setattr(module, public, getattr(module, public))  # a lazy name is imported now, for pdoc to see it
-    if not hasattr(module, "__all__") and hasattr(module, "__path__"):
+    if names:
+        module.__all__ = names  # pdoc takes no other imported name for a public one
+    elif hasattr(module, "__path__"):
         yield from (page for child in _children(module) for page in modules_of(child))
+
+
+def list_public_imports(module: ModuleType) -> list[str]:
+    """Names that a module imports as themselves, which makes them public (PEP 484)."""
+    imports = (node for node in ast.walk(ast.parse(inspect.getsource(module))) if isinstance(node, ast.ImportFrom))
+    return [alias.name for node in imports for alias in node.names if alias.asname == alias.name]
 
 
 def _children(package: ModuleType) -> Iterator[str]:

@@ -23,8 +23,7 @@ from polysight_pi.journal import Journal, JournalFullError, JournalThread, NewEv
 from polysight_pi.machine import Machine, RefusedError
 from polysight_pi.stage import StageDriver, StageLost, StageNews
 from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop
-from polysight_shared import __version__
-from polysight_shared import messages as m
+from polysight_shared import __version__, messages as m
 from polysight_shared.errors import PolysightError, os_error
 from polysight_shared.faults import PiFault, explain
 from polysight_shared.raster import (

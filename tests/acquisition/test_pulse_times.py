@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from tests.support.acquisition.arrival_model import FRAME_NS, MS, PAYLOAD, Load, pulse_times, receive
 from tests.support.capture.records import make_mask
 from tests.support.rigs import published_rig

@@ -22,9 +22,7 @@ from polysight.acquisition.control import StopRequest, ignore_hangup
 from polysight.acquisition.pi_client import PiClient
 from polysight.acquisition.ready import make_ready
 from polysight.acquisition.scan import resume_scan, run_scan
-from polysight.jobs import live_scan as live
-from polysight.jobs import live_scan as progress
-from polysight.jobs import process as processing
+from polysight.jobs import live_scan as live, live_scan as progress, process as processing
 from polysight.settings import DEFAULT
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate

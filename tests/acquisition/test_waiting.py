@@ -17,8 +17,7 @@ from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 
-from polysight.acquisition import ready, row
-from polysight.acquisition import scan as running
+from polysight.acquisition import ready, row, scan as running
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.progress import NICE
 from polysight.acquisition.scan import resume_scan, run_scan

@@ -8,8 +8,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from tests.support.capture.cards import reply
 from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from tests.support.capture.records import FULL, Card, encode_packet, is_original_or_masked, place
 
 from polysight.capture.dca1000 import Counters, decode_packet_header

@@ -17,8 +17,7 @@ from tests.support.radar.boards import native_rig
 from polysight.capture import dca1000
 from polysight.capture.card import EepromSettings
 from polysight.catalogue import Scans
-from polysight.radar import commands
-from polysight.radar import messages as radar_messages
+from polysight.radar import commands, messages as radar_messages
 from polysight.radar.commands import DEVICE_CONFIGURATION, Command, program
 from polysight.radar.messages import Direction, Kind, SubBlock, decode, decode_event
 from polysight.serve.commands import command_routes

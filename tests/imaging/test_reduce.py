@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import scipy.signal
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from polysight.imaging.geometry import Antennas, image_grid
 from polysight.imaging.samples import reduction, scene_gate_m

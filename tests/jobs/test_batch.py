@@ -14,8 +14,7 @@ from tests.support.scenes import scene_of
 from tests.support.store.plain_scan import write_scan
 
 from polysight.cli.main import main
-from polysight.jobs import batch
-from polysight.jobs import batch as many
+from polysight.jobs import batch, batch as many
 from polysight.process import cores
 from polysight.products.processed import FINISHED
 from polysight.settings import Settings

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from benchmarks.foreign import judge_scene
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from polysight.materials import LAYER, UNKNOWN, clean_name
 from polysight.materials.kinds import (

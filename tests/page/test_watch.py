@@ -9,8 +9,7 @@ import subprocess
 
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from msgspec.structs import replace
 from tests.support.page.live_view import GrowingScan
 from tests.support.processes import wait_for

@@ -11,15 +11,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from tests.support.pi.fakes import FakeLines, gone
 from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig, timed_by_spi
 
-from polysight_pi import lines as pi_lines
-from polysight_pi import trigger
+from polysight_pi import lines as pi_lines, trigger
 from polysight_pi.lines import SpiWireLines
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode

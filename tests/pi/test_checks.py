@@ -14,8 +14,7 @@ import pytest
 from tests.support.pi.program import run
 from tests.support.refusals import refused
 
-from polysight_pi import checks
-from polysight_pi import lines as pi_lines
+from polysight_pi import checks, lines as pi_lines
 from polysight_pi.checks import attempt, check_lines, judge_widths, measure_clock
 from polysight_pi.keys import make_keys
 from polysight_pi.lines import GpiodLines, find_chip, open_lines

@@ -9,8 +9,7 @@ from typing import get_args
 
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from tests.support.paths import REPO
 from tests.support.pi.machine_bench import Bench
 from tests.support.rigs import published_rig

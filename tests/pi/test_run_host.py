@@ -12,15 +12,13 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from tests.support.pi.fakes import FakeDriver, FakeLines
 from tests.support.pi.host_side import Running
 from tests.support.processes import HANG_S, wait_for
 from tests.support.rigs import at_stage_port
 
-from polysight_pi import executor as executors
-from polysight_pi import system
+from polysight_pi import executor as executors, system
 from polysight_pi.client import take_over
 from polysight_pi.executor import REPLAYED_IN_A_ROW, Executor
 from polysight_pi.journal import Journal, JournalThread

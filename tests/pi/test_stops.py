@@ -22,9 +22,7 @@ from tests.support.pi.host_side import Running
 from tests.support.processes import HANG_S, wait_for
 from tests.support.rigs import at_stage_port
 
-from polysight_pi import executor as executors
-from polysight_pi import journal as journals
-from polysight_pi import stage as stages
+from polysight_pi import executor as executors, journal as journals, stage as stages
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault
 from polysight_shared.stage_line import Immediate

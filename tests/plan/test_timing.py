@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from polysight.planning import Changes, row_motion_s, scan_time, straight_move_s
 from polysight.planning.forecast import fills_whole_packets, tail_s, turn_s

@@ -7,8 +7,7 @@ opposite sign (a perfect conductor has r_p = +1 there, -1 in Eq. 2 of the paper)
 import numpy as np
 import pytest
 import tmm
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from polysight.polarimetry import fresnel, multilayer
 from polysight_shared.errors import PolysightError

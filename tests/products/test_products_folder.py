@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 from tests.support.refusals import refused
 
-from polysight.products import folder as products_folder
-from polysight.products import write_json
+from polysight.products import folder as products_folder, write_json
 from polysight.products.folder import check_products_folder, making_products
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError

@@ -13,8 +13,7 @@ from polysight.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameContro
 from polysight.radar.firmware import check_image
 from polysight.radar.messages import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
 from polysight_shared.error_codes import ErrorCode
-from polysight_simulators.radars import Fault, cores, make_image
-from polysight_simulators.radars import board as simulated
+from polysight_simulators.radars import Fault, board as simulated, cores, make_image
 
 FRAMES = 32
 PERIOD_S = 1.5e-3

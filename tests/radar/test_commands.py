@@ -6,8 +6,7 @@ import hashlib
 import struct
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from polysight.radar import commands as c
 from polysight.radar.calibration_data import InitCalibrations, RestoreCalibration, SaveCalibration

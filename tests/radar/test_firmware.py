@@ -5,8 +5,7 @@ from __future__ import annotations
 import zlib
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from tests.support.radar.boards import BoardWords, Restarts, VirtualClock, native_rig
 from tests.support.refusals import refused
 
@@ -15,8 +14,7 @@ from polysight.radar.commands import program
 from polysight.radar.firmware import CHUNK_TIMEOUT_S, TO_RAM, check_image, read_image, split_into_chunks
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
-from polysight_simulators.radars import Fault, make_image
-from polysight_simulators.radars import RadarBoard as Simulated
+from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
 
 RIG = native_rig()
 DATA = make_image()

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from tests.support.refusals import refused
 
 from polysight.radar.usb import UsbWords, read_words, set_up_spi, write_words
 from polysight_shared.error_codes import ErrorCode
-from polysight_simulators.radars import UsbChip
-from polysight_simulators.radars import board as simulated
+from polysight_simulators.radars import UsbChip, board as simulated
 
 
 @pytest.fixture

@@ -19,8 +19,7 @@ from polysight.radar.board import RadarBoard, State
 from polysight.radar.commands import program
 from polysight.radar.firmware import Image, check_image
 from polysight_shared.errors import DeviceError
-from polysight_simulators.radars import Fault, make_image
-from polysight_simulators.radars import RadarBoard as Simulated
+from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
 
 RIG = native_rig()
 IMAGE = check_image(make_image(), "image.bin")

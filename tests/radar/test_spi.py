@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 from tests.support.refusals import refused
 
@@ -21,8 +20,7 @@ from polysight.radar.commands import (
 from polysight.radar.link import ATTEMPTS, Link
 from polysight.radar.messages import CALIBRATION_REPORT, MAIN_POWER_UP, READY_TO_READ, RF_POWER_UP_DONE, decode
 from polysight_shared.error_codes import ErrorCode
-from polysight_simulators.radars import Fault, make_image
-from polysight_simulators.radars import RadarBoard as Simulated
+from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
 
 
 def ignore(_):

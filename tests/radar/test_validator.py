@@ -7,8 +7,7 @@ import re
 
 import msgspec
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 from tests.support.radar.boards import native_rig, with_radar
 from tests.support.refusals import refused
 

@@ -28,8 +28,7 @@ from polysight.acquisition.control import ALIVE, CONTROL, Life, read_start_ticks
 from polysight.products import SCAN, write_json
 from polysight.products.folder import making_products
 from polysight.results import ScanFacts, to_plain
-from polysight.serve import commands as control
-from polysight.serve import site
+from polysight.serve import commands as control, site
 from polysight.serve.guard import TOKEN_HEADER
 from polysight_shared.config import CheckPlate, load_instrument
 from polysight_shared.error_codes import ErrorCode

@@ -5,8 +5,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from tests.support.paths import REPO
 from tests.support.processes import HANG_S
 from tests.support.refusals import refused

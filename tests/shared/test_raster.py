@@ -1,8 +1,7 @@
 """The serpentine plan has every position once, alternating rows, and its centre at offset zero."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from tests.support.refusals import refused
 
 from polysight_shared.config import Burst, Grid, Stage

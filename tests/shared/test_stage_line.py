@@ -1,8 +1,7 @@
 """The stage line: lines survive a round trip, and a line with a flipped bit is refused."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from polysight_shared.errors import ProtocolError
 from polysight_shared.stage_line import Command, Immediate, Reply, crc16, seal, unseal

@@ -5,8 +5,7 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from hypothesis import settings
-from hypothesis import strategies as st
+from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from polysight_simulators.cards.dca1000 import TAIL_S, Card, Message, Network, Output, Packets, Status, message

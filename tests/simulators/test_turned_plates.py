@@ -8,8 +8,7 @@ from polysight_simulators.scene.scene_file import Plate
 from polysight_worlds import simulate
 from polysight_worlds.media import METAL, Stack
 from polysight_worlds.rig import published_rig
-from polysight_worlds.world import Plate as PlateOfWorlds
-from polysight_worlds.world import World
+from polysight_worlds.world import Plate as PlateOfWorlds, World
 
 THETA = np.radians(55.0)
 

@@ -17,9 +17,7 @@ from polysight_shared import stage_line
 from polysight_shared.config import Stage
 from polysight_shared.faults import EXPLANATIONS, StageError
 from polysight_shared.stage_line import Immediate, Parameter, Reply
-from polysight_simulators.stage import logic as stage_logic
-from polysight_simulators.stage import motion as stage_motion
-from polysight_simulators.stage import python_stage as stage_python
+from polysight_simulators.stage import logic as stage_logic, motion as stage_motion, python_stage as stage_python
 
 SKETCH = REPO / "arduino_stage"
 PAGE = (REPO / "docs" / "spec" / "stage-line.md").read_text(encoding="utf-8")

@@ -6,8 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from tests.support.store.facts import facts_of, parse_fact
 from tests.support.store.plain_scan import errors, write_scan
 

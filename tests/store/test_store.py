@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from tests.support.acquisition.fake_rig import small_instrument
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of, parse_fact

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from tests.support import arm64
 
-from polysight.sync import build, offsets
-from polysight.sync import loops as sync_loops
+from polysight.sync import build, loops as sync_loops, offsets
 from polysight.sync.high_pass_filter import Equaliser, HighPass, high_pass
 from polysight.sync.offsets import AlignedRow, align_in_numpy, align_pieces, align_row
 

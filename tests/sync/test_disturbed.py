@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight.sync import BoardSetup, align_row, synchronise_row
-from polysight.sync import loops as sync_loops
+from polysight.sync import BoardSetup, align_row, loops as sync_loops, synchronise_row
 from polysight.sync.offsets import align_in_numpy, align_pieces
 
 LINEAR = (0, 192)

@@ -7,39 +7,24 @@ file.
 """
 
 from polysight.planning.forecast import (
-    Forecast,
-    Noise,
-    forecast,
-    row_motion_s,
-    scan_time,
-    straight_move_s,
+    Forecast as Forecast,
+    Noise as Noise,
+    forecast as forecast,
+    row_motion_s as row_motion_s,
+    scan_time as scan_time,
+    straight_move_s as straight_move_s,
 )
 from polysight.planning.plan_command import (
-    Changes,
-    PlanOptions,
-    describe,
-    forecast_scene,
-    forecast_values,
-    propose,
-    run_plan,
+    Changes as Changes,
+    PlanOptions as PlanOptions,
+    describe as describe,
+    forecast_scene as forecast_scene,
+    forecast_values as forecast_values,
+    propose as propose,
+    run_plan as run_plan,
 )
-from polysight.planning.scene_warnings import find_scene_warnings, read_scene, warn_of_scene
-
-__all__ = [
-    "Changes",
-    "Forecast",
-    "Noise",
-    "PlanOptions",
-    "describe",
-    "find_scene_warnings",
-    "forecast",
-    "forecast_scene",
-    "forecast_values",
-    "propose",
-    "read_scene",
-    "row_motion_s",
-    "run_plan",
-    "scan_time",
-    "straight_move_s",
-    "warn_of_scene",
-]
+from polysight.planning.scene_warnings import (
+    find_scene_warnings as find_scene_warnings,
+    read_scene as read_scene,
+    warn_of_scene as warn_of_scene,
+)

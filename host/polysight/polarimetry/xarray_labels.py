@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast, overload
 import numpy as np
 import numpy.typing as npt
 
-from polysight.polarimetry.fresnel import Complex
-from polysight.polarimetry.fresnel import fresnel as plain_fresnel
-from polysight.polarimetry.fresnel import multilayer as plain_multilayer
-from polysight.polarimetry.fresnel import permittivity_from_ratio as plain_permittivity
+from polysight.polarimetry.fresnel import (
+    Complex,
+    fresnel as plain_fresnel,
+    multilayer as plain_multilayer,
+    permittivity_from_ratio as plain_permittivity,
+)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 

@@ -19,9 +19,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from polysight.radar import calibration_data
-from polysight.radar import commands as c
-from polysight.radar import messages as e
+from polysight.radar import calibration_data, commands as c, messages as e
 from polysight.radar.commands import Program
 from polysight.radar.firmware import TO_FLASH, TO_RAM, Image, describe_patch, require_family, require_rom, send_image
 from polysight.radar.link import Link, NotReportedError, UnexpectedRestartError

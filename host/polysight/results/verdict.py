@@ -13,8 +13,7 @@ import numpy as np
 
 from polysight.results.json_files import to_plain
 from polysight_shared.errors import PolysightError
-from polysight_shared.findings import Finding
-from polysight_shared.findings import Level as FindingLevel
+from polysight_shared.findings import Finding, Level as FindingLevel
 
 Level = Literal["good", "care", "none"]
 LEVELS: dict[Level, str] = {"good": "good", "care": "usable with care", "none": "no result"}

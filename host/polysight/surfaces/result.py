@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from polysight.store import open_npz
 from polysight.surfaces.gains import Gains, Voltages, find_voltages
-from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS
-from polysight.surfaces.measure import SAME_WINDOW_M, Seen, Shape, find_shape
+from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS, SAME_WINDOW_M, Seen, Shape, find_shape
 from polysight.surfaces.optics import Optics
 from polysight.surfaces.permittivity import (
     DisturbedScan,

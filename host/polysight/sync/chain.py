@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 
 from polysight.capture import raw_words, row_words, valid_frames
 from polysight.store import CubeRow, RowData, Source
-from polysight.sync import high_pass_filter as hpf
-from polysight.sync import loops
+from polysight.sync import high_pass_filter as hpf, loops
 from polysight.sync.decimate import FOLD, flatten, fold
 from polysight.sync.loops import Complex, Real, block_edges, block_times, cis, complex64, phasor, refine, signal_energy
 from polysight.sync.offsets import (

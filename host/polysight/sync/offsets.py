@@ -43,8 +43,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.sync import high_pass_filter as hpf
-from polysight.sync import loops
+from polysight.sync import high_pass_filter as hpf, loops
 from polysight.sync.decimate import FOLD, decimator
 from polysight.sync.loops import Library, NumpyLoops, Real, Removed, Tone, cis, complex64
 from polysight_shared.config import Board, Chirp, Instrument

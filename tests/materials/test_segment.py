@@ -118,7 +118,7 @@ def test_metal_by_box_and_label(synthetic):
     by_box = metal_in_box(copper.box_mm, segmentation, scene.x_m, scene.y_m)
     assert by_box.label is not None
     assert (by_box.mask == metal_by_label(by_box.label, segmentation).mask).all()
-    with refused(ErrorCode.NO_DATA):
+    with refused(ErrorCode.NO_DATA, "--metal-box x0,y0,x1,y1"):
         metal_in_box((1e3, 1e3, 2e3, 2e3), segmentation, scene.x_m, scene.y_m)
     with refused(ErrorCode.NO_DATA, 99):
         metal_by_label(99, segmentation)

@@ -291,7 +291,7 @@ def metal_in_box(
         raise DataError(
             f"the metal box {tuple(round(b, 1) for b in box_mm)} mm holds no valid pixel",
             "it lies outside the image; boxes are in millimetres from the image centre",
-            "give --metal x,y,w,h inside the image",
+            "give --metal-box x0,y0,x1,y1 inside the image",
             code=ErrorCode.NO_DATA,
         )
     place = "" if label is None else f", inside patch {label}"

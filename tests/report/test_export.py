@@ -58,9 +58,6 @@ def test_the_command_writes_what_is_asked_for(folder, capsys):
     [
         (["--mat"], ["image.npz"]),
         ([], ["--netcdf"]),
-        (["--hdf5"], ["--hdf5", "--netcdf"]),
-        (["--zarr"], ["--zarr", "--netcdf"]),
-        (["--cphd"], ["--cphd", "samples"]),
     ],
 )
 def test_what_cannot_be_exported_is_said(tmp_path, capsys, arguments, words):

@@ -240,19 +240,10 @@ _FORMATS = {
     "netcdf": "image.nc: an xarray dataset; complex variables as h_real, h_imag (needs h5netcdf)",
     "mat": "image.mat: for MATLAB and Octave",
 }
-_REMOVED_FORMATS = {
-    "hdf5": "--netcdf: the file is HDF5 too, and h5py reads it",
-    "zarr": "--netcdf, and xarray's to_zarr",
-    "cphd": "the reduced samples that `polysight process` keeps in the scan folder (docs/spec/samples.md)",
-}
-"""Formats of earlier releases, and what to use instead."""
 
 
 def _export(args: argparse.Namespace) -> int:
-    """Run `polysight export`. Raises ConfigError for a format of earlier releases."""
-    for name, instead in _REMOVED_FORMATS.items():
-        if getattr(args, name):
-            raise ConfigError(f"--{name}: no longer exported", "hardly anybody used it", f"use {instead}")
+    """Run `polysight export`."""
     from polysight.products import export
 
     return export(args.products, [name for name in _FORMATS if getattr(args, name)], args.out)
@@ -270,8 +261,6 @@ def _add_export(add: Add) -> None:
     sub.add_argument("products", type=Path, metavar="DIR", help="folder of products, or a scan folder")
     for name, text in _FORMATS.items():
         sub.add_argument(f"--{name}", action="store_true", help=text)
-    for name in _REMOVED_FORMATS:
-        sub.add_argument(f"--{name}", action="store_true", help=argparse.SUPPRESS)
     sub.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: DIR-export beside it)")
 
 

@@ -387,6 +387,18 @@ def test_overlapping_payload_is_compared():
     assert is_original_or_masked(record, placed, out)
 
 
+def test_a_second_card_with_equal_counters_fills_no_gap():
+    """Two cards with one address that were reset together: where one packet is lost, the other card's is alone."""
+    record = Record.make(40 * FULL + 100, 70_000, 9)
+    twin = Record.make(40 * FULL + 100, 70_000, 9, seed=1)
+    pairs = enumerate(zip(record.packets, twin.packets, strict=True))
+    packets = [p for k, (own, other) in pairs for p in ([other] if k % 20 == 7 else [own, other])]
+    placed, out = place(len(record.data), packets, Counters(70_000, 9), FRAME)
+    assert is_original_or_masked(record, placed, out)
+    assert (placed.located, placed.slipped, placed.past.lost) == (False, False, True)
+    assert "second card" in placed.reason
+
+
 @pytest.mark.parametrize("trouble", ["conflict", "short", "conflict and short"])
 def test_placing_leaves_the_logged_payload_as_it_came(trouble, tmp_path):
     """The row's packet file is written from it afterwards, and gives the same result again."""

@@ -10,6 +10,7 @@ import sys
 import time
 import zlib
 from contextlib import closing
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,10 @@ from tests.support.refusals import refused
 
 from polysight.acquisition.capture_rig import record_ended
 from polysight.acquisition.control import read_start_ticks
-from polysight.capture import network
+from polysight.capture import network, receiver_process
 from polysight.capture.dca1000 import Status
 from polysight.capture.network import BatchReceiver, bind_udp, usable_packets
-from polysight.capture.receiver import Progress, ReceiverProcess
+from polysight.capture.receiver import BeginRow, EndRow, Open, Progress, ReceiverProcess, RowCapture
 from polysight.capture.row_files import read_index
 from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
@@ -118,6 +119,27 @@ def test_strangers_and_stale_packets_are_not_data(board, card, tmp_path):
     assert row.complete
     assert (row.strangers, row.stale) == (1, 4)
     assert (tmp_path / "a.part").read_bytes() == data
+
+
+def test_a_row_ends_with_all_that_came_before(board, card, tmp_path, monkeypatch):
+    """However many packets wait in the kernel, and whoever sent those in front."""
+    for name in ("take_core", "take_priority"):
+        monkeypatch.setattr(receiver_process, name, lambda *_, **__: (None, ""))
+    monkeypatch.setattr(receiver_process, "_MAX_BATCHES", 1)
+    data = noise(600 * FULL, 7)
+    receiver = receiver_process.Receiver(Connection(os.open(os.devnull, os.O_RDWR)))
+    answer = receiver._answer
+    answer(Open(board.name, board.host_address, board.data_port, board.card_address, 4 << 20))
+    answer(BeginRow(0, 1, len(data), FULL, str(tmp_path / "a.part"), after_reset=True))
+    with closing(bind_udp(board.host_address, 0, "stranger")) as stranger:
+        for _ in range(300):
+            stranger.sendto(b"x" * 100, (board.host_address, board.data_port))
+    send(card, board, encode_packets(data, 1, 0))
+    row = answer(EndRow())
+    assert receiver._socket is not None
+    receiver._socket.close()
+    assert isinstance(row, RowCapture)
+    assert (row.complete, row.strangers, row.kernel_drops) == (True, 300, 0)
 
 
 def _waiting(board: Board) -> int:

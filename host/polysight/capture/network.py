@@ -16,6 +16,7 @@ import socket
 import struct
 import sys
 import time
+from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,8 @@ class BatchReceiver:
         machine by its kernel, int64, monotonic clock.
     strangers
         Packets from another address than the card's.
+    is_drained
+        True if the last :meth:`receive` left no packet behind.
     """
 
     def __init__(self, sock: socket.socket, source_address: str, batch: int = 256) -> None:
@@ -166,6 +169,9 @@ class BatchReceiver:
         self.lengths: NDArray[np.uint32] = np.zeros(batch, dtype=np.uint32)
         self.times_ns: NDArray[np.int64] = np.zeros(batch, dtype=np.int64)
         self.strangers = 0
+        self.is_drained = True
+        # Arrival of the newest packet, whoever sent it.
+        self._newest_ns = 0
         # Wall clock minus monotonic clock at the last reception: a jump of it says that somebody set the wall clock.
         self._clocks_differ_ns = measure_clock_difference()
         # `struct sockaddr_in` of each packet, 16 bytes; bytes 4 to 7 are its address.
@@ -196,6 +202,7 @@ class BatchReceiver:
         self._name_lengths[:] = 16
         self._control_lengths[:] = self._control[0].nbytes
         n = self._recvmmsg(self._socket.fileno(), self._messages, len(self._messages), _MSG_DONTWAIT, None)
+        self.is_drained = n < len(self._messages)
         if n < 0:
             number = ctypes.get_errno()
             if number in (errno.EAGAIN, errno.EINTR):
@@ -204,6 +211,7 @@ class BatchReceiver:
             raise DeviceError(problem, "the network interface went down", "`polysight doctor` names the hop")
         self.lengths[:n] = self._received[:n]
         self.times_ns[:n] = self._read_times(n)
+        self._newest_ns = int(self.times_ns[n - 1])
         is_from_card = self._sources[:n] == self._source
         if not is_from_card.all():
             self.strangers += int((~is_from_card).sum())
@@ -213,6 +221,15 @@ class BatchReceiver:
             self.times_ns[: keep.size] = self.times_ns[keep]
             n = int(keep.size)
         return n
+
+    def receive_all(self) -> Iterator[int]:
+        """Fetch every packet that came before this call, in batches; yield the number in each, as :meth:`receive`."""
+        called_ns = time.monotonic_ns()
+        self.is_drained = False
+        self._newest_ns = 0
+        # Packets may come without end.
+        while not self.is_drained and self._newest_ns <= called_ns:
+            yield self.receive()
 
     def _read_times(self, n: int) -> NDArray[np.int64]:
         """Return the arrival times of the last `n` packets on the monotonic clock, int64 [n], ns.

@@ -28,7 +28,7 @@ Gap = tuple[int, int]
 
 SWITCHED_ON = Counters(0, 1)
 """Counters of the first packet of a card that was switched on or reset."""
-# Fewer packets with counters of a later record have damaged headers. Chosen: two of these need not disturb a row.
+# Fewer packets of another record, or of a second card, are damaged ones. Chosen: two of these need not disturb a row.
 MIN_PACKETS_OF_A_RECORD = 3
 # A packet that comes so many packets late was not delayed by a network: the card has counted its bytes twice. Chosen,
 # far more than a switch or the kernel reorders.
@@ -368,6 +368,12 @@ def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) ->
     counted_twice = bool(row.conflicts) or row.counts.late_by_bytes > _FAR_BEHIND * record.full
     if row.counts.restarted or (record.start == SWITCHED_ON and counted_twice):
         return _Doubt("the card restarted within it")
+    # A second card may send what is missing of this one, so packets that are alone at their place are in doubt, too.
+    if row.counts.conflicting >= MIN_PACKETS_OF_A_RECORD:
+        return _Doubt(
+            f"{row.counts.conflicting} packets have other bytes than packets with equal counters: a second card has"
+            " this address"
+        )
     if record.too_early.any():
         return _Doubt("frames came before the first pulse was sent: spurious edges on SYNC_IN")
     if record.length > expected or record.beyond.any():

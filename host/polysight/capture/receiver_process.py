@@ -180,7 +180,7 @@ class Receiver:
             remedy = "scan shorter rows, or fewer pulses"
             raise DeviceError(problem, "the row is larger than memory", remedy) from None
         strays = PacketLog(0)
-        while n := self._batches.receive():
+        for n in self._batches.receive_all():
             strays.add(self._batches.packets[:n], self._batches.lengths[:n], 0)
         if request.after_reset:
             self._past = Past.after_reset()
@@ -204,19 +204,24 @@ class Receiver:
         if row is None or batches is None:
             return
         for _ in range(_MAX_BATCHES):
-            n = batches.receive()
-            if n == 0:
+            self._log(row, batches, batches.receive())
+            if batches.is_drained:
                 break
-            row.log.add(batches.packets[:n], batches.lengths[:n], batches.times_ns[:n])
         if row.has_news():
             messages.send(self._connection, row.progress())
+
+    @staticmethod
+    def _log(row: _Row, batches: BatchReceiver, n: int) -> None:
+        """Log the first `n` packets of the last batch."""
+        row.log.add(batches.packets[:n], batches.lengths[:n], batches.times_ns[:n])
 
     def _end(self, request: messages.EndRow) -> messages.Answer:
         """End the row: place its packets, and write payload, index and packets."""
         row = self._row
         if row is None or self._socket is None or self._batches is None:
             raise DeviceError("no row is being received", "a row ended that had not begun", _RESTART)
-        self._receive()
+        for n in self._batches.receive_all():
+            self._log(row, self._batches, n)
         self._row = None
         begun = row.request
         log = row.log

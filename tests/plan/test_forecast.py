@@ -192,6 +192,19 @@ def test_a_row_of_whole_packets_is_advised_a_number_of_pulses_only_if_it_has_an_
     assert advised is None or not fills_whole_packets(rig, int(advised[1]))
 
 
+# TI's table: delay between two packets (us), and the rate that a card reaches with it (Mbit/s).
+@pytest.mark.parametrize(("delay_us", "mbit_s"), [(5, 706), (10, 545), (25, 325), (50, 193)])
+@pytest.mark.parametrize("share_of_rate", [0.95, 1.05])
+def test_frames_that_come_faster_than_a_card_sends_them_are_noted(rig, delay_us, mbit_s, share_of_rate):
+    burst = msgspec.structs.replace(rig.burst, pulses=4, chirps=16, chirp_us=20.0)
+    card = msgspec.structs.replace(rig.card, packet_delay_us=delay_us)
+    rig = msgspec.structs.replace(rig, burst=burst, card=card)
+    period_us = 8 * rig.frame_bytes / mbit_s / share_of_rate
+    rig = msgspec.structs.replace(rig, burst=msgspec.structs.replace(burst, period_us=period_us))
+    notes = [w for w in find_warnings(rig, Noise()) if w.what.startswith("a card needs")]
+    assert bool(notes) == (share_of_rate > 1)
+
+
 def test_too_little_time_has_no_plan(rig):
     assert propose(rig, 1.0) == []
 

@@ -12,6 +12,7 @@ from polysight.capture.card import CardClient, CardSurvey, EepromSettings, progr
 from polysight.capture.dca1000 import (
     CARD_SOURCE_PORT,
     MAX_PAYLOAD_BYTES,
+    PACKET_TIME_US,
     Code,
     Status,
     Version,

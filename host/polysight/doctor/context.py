@@ -33,6 +33,7 @@ from polysight.acquisition import CaptureRig, PiClient
 from polysight.capture import (
     CARD_SOURCE_PORT,
     MAX_PAYLOAD_BYTES,
+    PACKET_TIME_US,
     CardSurvey,
     ReceiverProcess,
     RowCapture,
@@ -148,8 +149,6 @@ def write_speed(folder: Path) -> float:
         return written_bytes / (time.perf_counter() - started_s)
 
 
-# Time of a packet beyond its configured delay: delays of 5, 10, 25, 50 us give 706, 545, 325, 193 Mbit/s (TI).
-PACKET_TIME_US = 11.0
 # Duration of the load at each rate; chosen, the whole check takes a few seconds.
 _RATE_S = 1.5
 # A receiver that was behind gets so long to read what waits in its socket; chosen.

@@ -27,9 +27,8 @@ from polysight.calibration import (
     load_checked_calibration,
     unwrap_if,
 )
-from polysight.capture import PRIORITY_REMEDY, RowCapture, route_interface, silent_radar
+from polysight.capture import PACKET_TIME_US, PRIORITY_REMEDY, RowCapture, route_interface, silent_radar
 from polysight.doctor.context import (
-    PACKET_TIME_US,
     CheckContext,
     NetworkInterface,
     capture_frames,
@@ -59,7 +58,7 @@ from polysight_shared.sockets import HOST_KEYS, is_loopback
 
 # Least speed of the disk relative to the data rate of a scan; chosen.
 _SPEED_MARGIN = 2.0
-# Differences of the clocks of host and Pi that are a warning and an error; chosen.
+# Differences of the clocks of host and Pi that are a warning and an error (this, too, against our files' time); chosen.
 _MAX_CLOCK_OFFSET_S = 1.0
 _CLOCK_LOST_S = 60.0
 _SET_CLOCK = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"

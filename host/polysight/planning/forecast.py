@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight import imaging
+from polysight.capture import PACKET_TIME_US
 from polysight.process import why_unnamed
 from polysight.radar import constraints
 from polysight.settings import DEFAULT
@@ -48,9 +49,6 @@ _PUBLISHED_SPEED_MM_S = 20.0
 _PUBLISHED_PHASE_RAD = 0.022
 # Loss by the motion during a burst from which on the forecast warns (chosen).
 _MAX_BURST_LOSS_DB = 0.5
-# A full packet on Ethernet, bytes: packet; headers of Ethernet, IP and UDP; preamble, checksum and gap.
-_WIRE_BYTES = 1470 + 42 + 24
-_ETHERNET_BYTES_PER_US = 125.0
 # The window that polysight.imaging.ImageBuilder uses.
 _FAST_TIME_WINDOW = "hann"
 
@@ -434,8 +432,7 @@ def _check_card(rig: Instrument) -> Iterator[Finding]:
             f"a frame of {rig.frame_bytes} bytes is smaller than a packet of {rig.card.payload_bytes}: a missed and a"
             " spurious edge within a packet cannot be seen; use more samples or chirps a frame",
         )
-    packet_us = max(rig.card.packet_delay_us, _WIRE_BYTES / _ETHERNET_BYTES_PER_US)
-    frame_us = rig.frame_bytes / rig.card.payload_bytes * packet_us
+    frame_us = rig.frame_bytes / rig.card.payload_bytes * (rig.card.packet_delay_us + PACKET_TIME_US)
     if frame_us > rig.burst.period_us:
         text = f"a card needs {frame_us:.0f} us to send a frame and gets one every {rig.burst.period_us:g} us"
         yield _note("card", text)

@@ -62,7 +62,7 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
         Stage to its residuals.
     """
 
-    # Counted in chirps; most frames hold one. `frames_masked` were not received.
+    # Counted in chirps; most frames hold one. `frames_masked` were not received whole.
     frames_expected: int = 0
     frames_received: int = 0
     bytes_missing: int = 0

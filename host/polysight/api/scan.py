@@ -349,9 +349,9 @@ class Scan:
         -------
         xarray.Dataset
             `permittivity` complex128 [y_mm, x_mm], eps' - j eps''; `permittivity_real_standard_error` and
-            `permittivity_loss_standard_error`; `mask` bool: True where the errors are below half of the value and
-            a half space can have it (real part 1, loss 0 or more) within twice its errors. Errors
-            of neighbouring pixels are mostly the same ones: a mean over a patch is no more certain than its pixels.
+            `permittivity_loss_standard_error`; `mask` bool: True where the scan lights the pixel, the errors are below
+            half of the value, and a half space can have it (real part 1, loss 0 or more) within twice its errors.
+            Errors of neighbouring pixels are mostly the same ones: a mean over a patch is no more certain than they.
             Pixels are corrected for the leakage and the incidence angle that the scene tells, and those of a patch for
             all that is known of it: their median has the patch's permittivity.
 

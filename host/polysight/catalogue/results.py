@@ -151,7 +151,7 @@ def list_files(folder: Path) -> list[File]:
 
 
 class FocusedProfile(msgspec.Struct, frozen=True):
-    """Level by board (dB below the highest) against the path beyond the place."""
+    """Level by board (dB relative to the highest) against the path beyond the place."""
 
     path_m: list[float]
     boards: dict[str, list[float]]
@@ -405,7 +405,7 @@ class PatchPair(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ComparisonFigures(msgspec.Struct, frozen=True, kw_only=True):
-    """A comparison without its maps.
+    """A comparison without its maps; `extent_mm` is that of the first scan: x from, to, y from, to.
 
     Attributes
     ----------

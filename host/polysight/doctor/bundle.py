@@ -40,7 +40,7 @@ Not included: raw data, images, labels, keys. Words from files in pi.key_dir, an
 this computer.
 """
 HIDDEN = "[removed]"
-# Limits of the archive: lines of a manifest, numbers of scans, logs and traces, and bytes of a file.
+# Limits of the archive: lines of a manifest, numbers of scans, logs and traces, and bytes of a file; chosen.
 _LINES = 60
 _SCANS = 3
 _LOGS = 20

@@ -93,7 +93,7 @@ def notice_of_fault(event: Fault) -> Finding:
     if event.number == PiFault.ABORTED:
         level = "note"
     elif PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in passing_faults:
-        # A fault of the burst or of its pulses costs this row only.
+        # A fault of a burst ends its row, which is taken again.
         level = "warning"
     details = {}
     if event.problem != table.problem:

@@ -1,7 +1,7 @@
 """Home and jog of the stage from the page: the Pi decides what may move, and stops a jog whose server is gone.
 
-In the process that browsers reach, each request in a thread of its own, so that nothing that is read keeps the stage
-from stopping. A scan that runs has the stage: the Pi refuses.
+It works in the server's process, each request in a thread of its own, so that no page that reads scans delays a stop.
+While a scan runs, the Pi refuses these commands.
 """
 
 from __future__ import annotations
@@ -24,14 +24,17 @@ from polysight_shared.messages import MAX_JOG_MM, Axis
 
 
 class JogRequest(Body, frozen=True):
-    """One axis by a distance."""
+    """Move one axis by a distance, at the rig file's speed of a row."""
 
     axis: Axis
     distance_mm: Annotated[float, msgspec.Meta(ge=-MAX_JOG_MM, le=MAX_JOG_MM)]
 
 
 class StagePlace(msgspec.Struct, frozen=True):
-    """Where the stage is, and its limits: 0 and `travel_x_mm`, `travel_y_mm`. `state` as the Pi has it."""
+    """Where the stage is, and its limits: 0 and `travel_x_mm`, `travel_y_mm`.
+
+    `state`, the scan under way and the `reason` of the state are the Pi's.
+    """
 
     state: str
     homed: bool

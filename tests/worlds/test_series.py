@@ -7,7 +7,7 @@ import pytest
 
 from polysight_worlds import METAL, Stack, cylinder, published_boards, published_rig, series, sphere
 from polysight_worlds.media import LIGHT_M_PER_S
-from polysight_worlds.shape_echoes import choose_solution, solve_cylinder, sum_bent
+from polysight_worlds.shape_echoes import choose_solution, solve_cylinder, solve_sphere, sum_bent
 from polysight_worlds.shapes import Shape, find_specular, follow_path
 from polysight_worlds.zones import place_antennas, sum_window
 
@@ -169,6 +169,22 @@ def test_physical_optics_holds_where_a_surface_is_flat_along_the_plane_of_incide
     # V nearly vanishes at Brewster's angle: its error counts over H.
     miss = (optics_v / exact_v) / (optics_h / exact_h) - 1
     assert np.abs(miss * exact_v / exact_h).max() < 0.001
+
+
+@pytest.mark.parametrize(("radius_m", "tolerance"), [(0.1, 0.002), (0.15, 0.0006)])
+def test_physical_optics_of_a_dielectric_sphere_has_no_bias_over_a_scan(radius_m, tolerance):
+    """Neither the slopes of the antennas' patterns nor the shadow behind the sphere's edge may turn H / V."""
+    boards = published_boards()
+    x, y = published_rig().centre_m
+    ball = sphere("ball", Stack(below=4.5 - 0.3j), (float(x), float(y), 0.499 + radius_m), radius_m)
+    grid_x, grid_y = np.meshgrid([-0.15, -0.07, 0.01, 0.09, 0.17], [-0.1, -0.02, 0.06, 0.14])
+    offsets = np.stack([grid_x.ravel(), grid_y.ravel(), np.zeros(grid_x.size)], axis=1)
+    over_series = []
+    for rx in (boards.h[1], boards.v[1]):
+        places = find_specular(ball, *place_antennas(boards.tx, rx, offsets))
+        arguments = ball, boards.tx, rx, np.array([FREQUENCY_HZ]), offsets, places
+        over_series.append(sum_bent(*arguments)[0] / solve_sphere(*arguments)[0])
+    assert np.abs(np.mean(over_series[0] / over_series[1]) - 1) < tolerance
 
 
 @pytest.mark.parametrize("axis", [(-0.967, 0.251, 0.045), (-0.815, 0.568, 0.115), (0.1, 1.0, 0.05)])

@@ -224,12 +224,8 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
         eps = _split_parts(complex(pixels.permittivity.value[row, column]))
         real_std = _number(pixels.permittivity.real_std[row, column])
         loss_std = _number(pixels.permittivity.loss_std[row, column])
-    nearest: list[NearMaterial] = []
-    if eps:
-        nearest = _rank_materials(pixels, row, column, library)
-    patch = None
-    if pixels.referenced:
-        patch = _find_patch(pixels.segments, place)
+    nearest = _rank_materials(pixels, row, column, library) if eps else []
+    patch = _find_patch(pixels.segments, place) if pixels.referenced else None
     profile, profile_why = _focus_profile(folder, float(pixels.x_m[column]), float(pixels.y_m[row]))
     return Probe(
         place_mm=(round(place[0], 2), round(place[1], 2)),

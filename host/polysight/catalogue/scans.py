@@ -264,9 +264,7 @@ def find_program(folder: Path, kind: str) -> Program | None:
     if words[1:3] == ["-m", "polysight"]:
         words = ["polysight", *words[3:]]
     running = read_start_ticks(record.pid) == record.ticks
-    status = None
-    if not running:
-        status = _read_status(base.with_suffix(".status"))
+    status = None if running else _read_status(base.with_suffix(".status"))
     return Program(kind, running, status, tuple(words), record.started_utc, read_log_tail(base.with_suffix(".log")))
 
 
@@ -564,10 +562,7 @@ class Scans:
         valid = len(name) <= 1000 and len(parts) <= MAX_DEPTH and all(map(_is_name, parts))
         if self.only is not None:
             valid = valid and name == self.only
-        if valid:
-            path = self.root / PurePosixPath(name)
-        else:
-            path = self.root
+        path = self.root / PurePosixPath(name) if valid else self.root
         try:
             # The resolved path differs if a part of it is a link.
             valid = valid and path.resolve() == self.root.resolve() / name

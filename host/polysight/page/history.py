@@ -95,9 +95,7 @@ def notice_of_fault(event: Fault) -> Finding:
     elif PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in passing_faults:
         # A fault of a burst ends its row, which is taken again.
         level = "warning"
-    details = {}
-    if event.problem != table.problem:
-        details["detail"] = event.problem
+    details = {} if event.problem == table.problem else {"detail": event.problem}
     problem = f"Fault {event.number} at the Pi: {table.problem}"
     return Finding(
         level, problem, sentence(event.cause or table.cause), sentence(event.remedy or table.remedy), facts=details

@@ -373,10 +373,7 @@ def _mask(board: BoardQuality, plan: RasterPlan) -> npt.NDArray[np.bool_]:
     for row, runs in (board.masked_columns or {}).items():
         for start, stop in runs:
             mask[row, start:stop] = True
-    if board.rows_recorded is UNSET:
-        recorded = range(plan.rows)
-    else:
-        recorded = board.rows_recorded
+    recorded = range(plan.rows) if board.rows_recorded is UNSET else board.rows_recorded
     absent = sorted(set(range(plan.rows)) - set(recorded))
     mask[absent] = True
     return mask

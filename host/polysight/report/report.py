@@ -116,9 +116,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
     missed_plates: list[str] = []
     if rows:
         missed_plates = [plate.name for plate in scan.plates if plate.name not in plates_found]
-    config: list[tuple[str, str]] = []
-    if scan.rig is not None:
-        config = _summarise_rig(scan.rig)
+    config = [] if scan.rig is None else _summarise_rig(scan.rig)
     return _load_template().render(
         scan=scan,
         title=f"Scan {scan.scan_id}".strip(),

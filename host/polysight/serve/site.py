@@ -38,6 +38,7 @@ HIDDEN = ".polysight"
 """Folder beside the scans that holds the logs of programs that belong to no scan."""
 LIBRARIES = "libraries"
 THUMBNAIL = "thumbnail"
+# Drawn pictures and comparisons that are kept for the next request; chosen.
 MAX_PICTURES = 400
 MAX_COMPARISONS = 4
 # A check plate's result takes a few hundred bytes; reading it again takes milliseconds for each scan.

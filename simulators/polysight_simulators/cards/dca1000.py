@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from polysight_shared.errors import ProtocolError
 
+# First and last word of a request and of a reply (docs/spec/dca1000.md).
 REQUEST_HEADER = 0xA55A
 REQUEST_FOOTER = 0xEEAA
 # Port from which replies and data come, as seen on a card.

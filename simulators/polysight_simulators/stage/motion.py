@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from polysight_shared.faults import StageError
 
+# Ticks of the sketch's step timer, 0.5 us (docs/spec/stage-line.md, timing).
 TICK_HZ = 2_000_000
 NS_PER_TICK = 1_000_000_000 // TICK_HZ
 # Slowest and fastest step rate, steps/s.

@@ -9,7 +9,7 @@ import pytest
 
 from polysight.surfaces import Seen, Uncertainty, analyse_surface, find_shape, find_voltages
 from polysight.surfaces.gains import receive, reflect_points
-from polysight.surfaces.permittivity import find_interior, find_reflecting
+from polysight.surfaces.permittivity import find_interior, find_reflecting, find_shares, fit_permittivity
 from polysight.surfaces.result import (
     NO_SINGLE_MEDIUM,
     describe_segment,
@@ -187,6 +187,28 @@ def test_points_near_the_border_of_a_segment_are_told_but_not_where_the_scan_end
     from_border_m = np.minimum(at_m[:, 0] - x.min(), x.max() - at_m[:, 0])
     assert not interior[from_border_m < 0.014].any()
     assert interior[from_border_m > 0.026].all()
+
+
+def test_ripples_of_edges_average_where_points_near_them_count_less(metal, gains, optics):
+    """V / H of a plane that ends 10 mm beyond its points, with a ripple by each edge: the chirp of a half plane."""
+    learnt = gains(optics)
+    voltages = find_voltages(metal, optics)
+    flat = 0 * voltages.bend_inside
+    voltages = replace(voltages, bend_inside=flat, bend_across=flat, twist=flat)
+    gain = np.stack([np.ones(len(metal)), 1 / learnt.ratio(voltages.arrival)], axis=1)
+    b = gain * receive(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
+    low = voltages.at_m.min(axis=0)
+    high = voltages.at_m.max(axis=0)
+    from_edges_m = np.concatenate([voltages.at_m - low, high - voltages.at_m], axis=1) + 0.01
+    ripple = 0.003 / from_edges_m * np.exp(-1j * optics.wave_number * from_edges_m**2 / 0.9)
+    share = find_shares(voltages.at_m, np.zeros(len(metal), int), (low - 0.1, high + 0.1))
+    errors = []
+    for turn in np.exp(2j * np.pi * np.arange(6) / 6):
+        rippled = replace(voltages, b=b * np.stack([np.ones(len(metal)), 1 + turn * ripple.sum(axis=1)], axis=1))
+        fits = [fit_permittivity(rippled, learnt, optics.wave_number, counted) for counted in (1.0, share)]
+        errors.append([abs(fit.eps - MEDIUM) for fit in fits])
+    alike, slowly = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert slowly < 0.6 * alike
 
 
 @pytest.mark.parametrize(("least", "most"), [(0.1, 0.25), (0.25, 0.4), (0.4, 0.7)])

@@ -20,6 +20,8 @@ from polysight.surfaces.gains import Gains, Voltages, find_voltages
 from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS, SAME_WINDOW_M, Seen, Shape, find_shape
 from polysight.surfaces.optics import Optics
 from polysight.surfaces.permittivity import (
+    FRESNEL_ZONE_M,
+    RIPPLE_OF_PLATES_M,
     DisturbedScan,
     PermittivityFit,
     Reference,
@@ -30,6 +32,7 @@ from polysight.surfaces.permittivity import (
     find_interior,
     find_reflecting,
     find_reflection,
+    find_shares,
     fit_permittivity,
     judge_medium,
     point_covariance,
@@ -170,7 +173,8 @@ def analyse_surface(
     `uncertainty` states.
     """
     gains = None if reference is None else reference(optics)
-    echoes, interior = drop_edges(echoes, optics, gains)
+    echoes, share = drop_edges(echoes, optics, gains)
+    interior = share > 0
     shape = find_shape(echoes.h, optics)
     numbers = np.unique(echoes.segment)
     segments = [describe_segment(int(number), shape[echoes.segment == number]) for number in numbers]
@@ -186,7 +190,9 @@ def analyse_surface(
             members = (echoes.segment == segment.number) & interior
             own_voltages = voltages[members]
             of_members = [replace(d, voltages=d.voltages[members]) for d in disturbed]
-            segments[index], fit = judge_segment(segment, own_voltages, gains, of_members, optics.wave_number)
+            segments[index], fit = judge_segment(
+                segment, own_voltages, gains, of_members, optics.wave_number, share=share[members]
+            )
             if fit is None:
                 continue
             sources = add_common_errors(fit, own_voltages, gains, of_members, optics.wave_number)
@@ -262,31 +268,34 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
     )
 
 
-def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> tuple[Seen, NDArray[np.bool_]]:
-    """Return the points at which surfaces reflect, and True for those [n] away from the edges of their surface.
+def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> tuple[Seen, Array]:
+    """Return the points at which surfaces reflect, and what each counts for a permittivity, [n]: 0 near edges.
 
     Flat surfaces end before the zone that their edges disturb. Segments that lie in it altogether are edges, unless
     all do: then the object is small.
     """
     if not len(seen):
-        return seen, np.zeros(0, bool)
+        return seen, np.zeros(0)
     voltages = find_voltages(seen, optics)
     reflecting = seen[find_reflecting(voltages, np.abs(seen.h.amplitude), seen.segment, gains)]
     at_m = seen.h.at_m[:, :2]
     extent_m = (at_m.min(axis=0), at_m.max(axis=0))
-    interior = find_interior(reflecting.h.at_m[:, :2], reflecting.segment, extent_m)
+    at_m = reflecting.h.at_m[:, :2]
+    interior = find_interior(at_m, reflecting.segment, extent_m)
+    share = np.zeros(len(reflecting))
+    share[interior] = find_shares(at_m[interior], reflecting.segment[interior], extent_m)
     counts = np.bincount(reflecting.segment, minlength=1)
     interior_counts = np.bincount(reflecting.segment[interior], minlength=counts.size)
     if interior_counts.max() < LEAST_POINTS:
         enough = counts[reflecting.segment] >= LEAST_POINTS
-        return reflecting[enough], interior[enough]
+        return reflecting[enough], share[enough]
     shape = find_shape(reflecting.h, optics)
     is_surface = interior_counts[reflecting.segment] >= LEAST_POINTS
     for number in np.unique(reflecting.segment[is_surface]):
         members = reflecting.segment == number
         if describe_segment(int(number), shape[members]).radius_mm is None:
             is_surface &= interior | ~members
-    return reflecting[is_surface], interior[is_surface]
+    return reflecting[is_surface], share[is_surface]
 
 
 def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty: Uncertainty) -> tuple[Array, Array]:
@@ -395,11 +404,17 @@ def _convert_triple(vector: Array) -> tuple[float, float, float]:
 
 
 def judge_segment(
-    segment: Segment, voltages: Voltages, gains: Gains, disturbed: Sequence[DisturbedScan], wave_number: float
+    segment: Segment,
+    voltages: Voltages,
+    gains: Gains,
+    disturbed: Sequence[DisturbedScan],
+    wave_number: float,
+    *,
+    share: Array | float = 1.0,
 ) -> tuple[Segment, PermittivityFit | None]:
     """Fit a segment's permittivity; return the segment and the fit, or the reason in the segment and None.
 
-    `disturbed` holds the same points as `voltages`.
+    `disturbed` holds the same points as `voltages`; `share` [n] is what each counts.
     """
     if len(voltages) < MIN_POINTS:
         cause = f"{len(voltages)} points away from its edges: too few to average over"
@@ -408,7 +423,8 @@ def judge_segment(
     ratio = complex(np.median(ratios.real), np.median(ratios.imag))
     if abs(ratio - 1) < METAL_RATIO:
         return replace(segment, reason="its ratio is that of metal", name="metal"), None
-    fit = fit_permittivity(voltages, gains, wave_number)
+    ripple_m = RIPPLE_OF_PLATES_M if segment.radius_mm is None else FRESNEL_ZONE_M
+    fit = fit_permittivity(voltages, gains, wave_number, share, ripple_m)
     level, rise = judge_medium(fit, voltages, gains, disturbed, wave_number)
     if level > MAX_LEVEL_MISS or rise > MAX_BAND_RISE:
         return replace(segment, reason=NO_SINGLE_MEDIUM), None

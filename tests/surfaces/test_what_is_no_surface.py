@@ -189,26 +189,55 @@ def test_points_near_the_border_of_a_segment_are_told_but_not_where_the_scan_end
     assert interior[from_border_m > 0.026].all()
 
 
-def test_ripples_of_edges_average_where_points_near_them_count_less(metal, gains, optics):
-    """V / H of a plane that ends 10 mm beyond its points, with a ripple by each edge: the chirp of a half plane."""
+@pytest.fixture
+def rippled_plane(metal, gains, optics):
+    """Voltages of a plane that ends 10 mm beyond its points, their shares, and the ripple by its edges [n].
+
+    The ripple is the chirp of a half plane by each edge.
+    """
     learnt = gains(optics)
     voltages = find_voltages(metal, optics)
     flat = 0 * voltages.bend_inside
     voltages = replace(voltages, bend_inside=flat, bend_across=flat, twist=flat)
-    gain = np.stack([np.ones(len(metal)), 1 / learnt.ratio(voltages.arrival)], axis=1)
+    gain = np.exp(learnt.level(voltages))
+    gain = np.stack([gain, gain / learnt.ratio(voltages.arrival)], axis=1)
     b = gain * receive(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
     low = voltages.at_m.min(axis=0)
     high = voltages.at_m.max(axis=0)
     from_edges_m = np.concatenate([voltages.at_m - low, high - voltages.at_m], axis=1) + 0.01
     ripple = 0.003 / from_edges_m * np.exp(-1j * optics.wave_number * from_edges_m**2 / 0.9)
     share = find_shares(voltages.at_m, np.zeros(len(metal), int), (low - 0.1, high + 0.1))
+    band_rise = np.tile(learnt.band_rise, (len(metal), 1))
+    return replace(voltages, b=b, band_rise=band_rise), share, ripple.sum(axis=1)
+
+
+# Phases of the ripple.
+TURNS = np.exp(2j * np.pi * np.arange(6) / 6)
+
+
+def test_ripples_of_edges_average_where_points_near_them_count_less(rippled_plane, gains, optics):
+    voltages, share, ripple = rippled_plane
     errors = []
-    for turn in np.exp(2j * np.pi * np.arange(6) / 6):
-        rippled = replace(voltages, b=b * np.stack([np.ones(len(metal)), 1 + turn * ripple.sum(axis=1)], axis=1))
-        fits = [fit_permittivity(rippled, learnt, optics.wave_number, counted) for counted in (1.0, share)]
+    for turn in TURNS:
+        of_both = np.stack([np.ones(len(ripple)), 1 + turn * ripple], axis=1)
+        rippled = replace(voltages, b=voltages.b * of_both)
+        fits = [fit_permittivity(rippled, gains(optics), optics.wave_number, counted) for counted in (1.0, share)]
         errors.append([abs(fit.eps - MEDIUM) for fit in fits])
     alike, slowly = np.sqrt(np.mean(np.square(errors), axis=0))
     assert slowly < 0.6 * alike
+
+
+def test_ripples_of_edges_do_not_make_a_plate_a_wall(rippled_plane, metal, gains, optics):
+    voltages, share, ripple = rippled_plane
+    plane = replace(describe_segment(0, find_shape(metal.h, optics)), radius_mm=None)
+    reasons = []
+    for turn in TURNS:
+        rippled = replace(voltages, b=voltages.b * (1 + 1.5 * turn * ripple)[:, None])
+        for counted in (1.0, share):
+            judged, _ = judge_segment(plane, rippled, gains(optics), [], optics.wave_number, share=counted)
+            reasons.append(judged.reason)
+    assert any(reasons[::2])
+    assert not any(reasons[1::2])
 
 
 @pytest.mark.parametrize(("least", "most"), [(0.1, 0.25), (0.25, 0.4), (0.4, 0.7)])

@@ -97,8 +97,8 @@ class PermittivityFit:
         The permittivity.
     covariance
         Of (real, imaginary), from the scatter of the points alone.
-    used
-        bool [n]: points that count.
+    share
+        What each point counts beside its noise and ripple, [n]; 0 for outliers.
     excess2
         Squares of the points' misses over what their noise gives, [n]; 1 on average for noise alone.
     answer
@@ -107,7 +107,7 @@ class PermittivityFit:
 
     eps: complex
     covariance: Array
-    used: NDArray[np.bool_]
+    share: Array
     excess2: Array
     answer: Complex
 
@@ -232,7 +232,7 @@ def fit_permittivity(
     return PermittivityFit(
         eps=eps,
         covariance=_compute_covariance_of_scatter(step.influence, step.miss, expected, v.at_m, ripple_m),
-        used=step.used,
+        share=step.used * share,
         excess2=(np.abs(step.miss) / np.maximum(step.noise, 1e-30)) ** 2 / 2,
         answer=step.answer,
     )
@@ -480,15 +480,17 @@ def judge_medium(
     that of H or of V, whichever is larger. Both are given less two standard deviations of their own. `fit`, `v` and
     `disturbed` hold the same points.
     """
-    blocks = int(number_blocks(v.at_m[fit.used], (0.0, 0.0)).max()) + 1
+    used = fit.share > 0
+    blocks = int(number_blocks(v.at_m[used], (0.0, 0.0)).max()) + 1
 
     def find_levels(eps: complex, voltages: Voltages, gains: Gains) -> Array:
         expected = receive(voltages, reflect_points(eps, voltages, wave_number))
         levels = np.log(np.abs(voltages.b[:, 0])) - gains.level(voltages) - np.log(np.abs(expected[:, 0]))
-        return levels[fit.used]
+        return levels[used]
 
     levels = find_levels(fit.eps, v, gains)
-    level = float(np.median(levels))
+    # Ripples of a plate's edges change levels by 10 %: they average in the mean by shares, and not in the median.
+    level = float(np.average(levels, weights=fit.share[used]))
     # Where the reference does not tell the ratio of the gains, it does not tell their level either.
     unknown_std = float(np.median(gains.estimate_level_std(v)))
     variance = _spread(levels) ** 2 / blocks + unknown_std**2
@@ -497,9 +499,9 @@ def judge_medium(
     for scan in disturbed:
         real, imaginary = find_common_error(fit, miss, scan, wave_number)
         moved = find_levels(fit.eps + complex(real, imaginary), scan.voltages, scan.gains)
-        variance += (float(np.median(moved)) - level) ** 2
+        variance += (float(np.average(moved, weights=fit.share[used])) - level) ** 2
 
-    rises = v.band_rise[fit.used] - gains.band_rise
+    rises = v.band_rise[used] - gains.band_rise
     rise = np.abs(np.median(rises, axis=0)) - 2 * np.array([_spread(column) for column in rises.T]) / np.sqrt(blocks)
     return max(0.0, abs(level) - 2 * float(np.sqrt(variance))), float(np.max(rise))
 

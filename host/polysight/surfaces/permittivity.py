@@ -232,7 +232,7 @@ def fit_permittivity(
     return PermittivityFit(
         eps=eps,
         covariance=_compute_covariance_of_scatter(step.influence, step.miss, expected, v.at_m, ripple_m),
-        share=step.used * share,
+        share=np.asarray(step.used * share, np.float64),
         excess2=(np.abs(step.miss) / np.maximum(step.noise, 1e-30)) ** 2 / 2,
         answer=step.answer,
     )

@@ -185,7 +185,8 @@ class Receivers:
             size = packets * MAX_PAYLOAD_BYTES
             for r in self._receivers:
                 path = cards.folder / r.board.name / f"{self._row:04d}.part"
-                r.begin_row(self._row, 1, size, cards.rig.frame_bytes, path)
+                # The senders count from their first packet on, as cards that were reset.
+                r.begin_row(self._row, 1, size, cards.rig.frame_bytes, path, after_reset=self._row == 0)
             if ended:
                 trial.turn_s = max(trial.turn_s, time.perf_counter() - ended)
             cards.start_sending(packets, rate)

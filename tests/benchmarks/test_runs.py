@@ -40,6 +40,14 @@ def test_quick_trial(
     assert not list(tmp_path.glob("polysight-bench-*")), "its data is removed"
 
 
+@pytest.mark.slow
+def test_every_row_of_the_capture_trial_is_received(tmp_path: Path) -> None:
+    assert (
+        main(["capture", "--seconds", "0.5", "--rate", "20000", "--alone", "--no-compare", "--folder", str(tmp_path)])
+        == 0
+    )
+
+
 @pytest.mark.parametrize(
     ("value", "higher", "verdict"),
     [(30.0, True, "aim"), (20.0, True, "holds"), (5.0, True, "DOES NOT HOLD"), (5.0, False, "aim")],

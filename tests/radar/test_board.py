@@ -9,9 +9,19 @@ from tests.support.radar.boards import Restarts
 from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard, State
-from polysight.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameControl, program
+from polysight.radar.commands import (
+    RF_POWER_UP,
+    SOFTWARE_TRIGGER,
+    START,
+    STOP_AT_FRAME_END,
+    Frame,
+    FrameApply,
+    FrameControl,
+    program,
+)
 from polysight.radar.firmware import check_image
-from polysight.radar.messages import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
+from polysight.radar.link import NotReportedError
+from polysight.radar.messages import ANALOG_FAULT, FRAME_END, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.radars import Fault, board as simulated, cores, make_image
 
@@ -42,6 +52,20 @@ def test_from_off_to_done(radar, board, clock):
     assert radar.poll() is State.RUNNING
     pulses(board, clock, 1)
     assert radar.poll() is State.DONE
+
+
+def test_frames_of_a_software_trigger_without_number_run_until_they_are_stopped(radar, board, clock):
+    """None of them waits for SYNC_IN."""
+    radar.configure()
+    for command in radar.program.frames(0, SOFTWARE_TRIGGER):
+        radar.link.call(command)
+    radar.link.call(FrameControl(START))
+    clock.sleep(1.0)
+    with pytest.raises(NotReportedError):
+        radar.link.wait_for((FRAME_END,), 1.0, lambda _: None)
+    assert not board.trigger()
+    radar.link.call(FrameControl(STOP_AT_FRAME_END))
+    assert radar.link.wait_for((FRAME_END,), 1.0, lambda _: None).id == FRAME_END
 
 
 def test_every_step_is_reported_once_in_order(radar, board):

@@ -426,11 +426,12 @@ class Cores:
         self.armed = True
         self.frame_ends = -1.0
         self.armings += 1
-        # Software trigger: they run at once (ICD table 5.27)
+        # Software trigger: they run at once (ICD table 5.27), frames without a number until they are stopped
         if trigger == 1:
-            self.armed = False
             self.frames_left = 0
-            self.event(FRAME_END, b"", frames * period * 5e-9)
+            self.armed = frames == 0
+            if frames:
+                self.event(FRAME_END, b"", frames * period * 5e-9)
         else:
             self.event(TRIGGER_READY, b"", READY_S)
         return 0

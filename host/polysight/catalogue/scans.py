@@ -24,6 +24,7 @@ from msgspec.structs import replace
 from polysight.acquisition import LAPSE_S, Life, read_life, read_start_ticks
 from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes
 from polysight.products import IMAGE, LABELS, MATERIALS, QUALITY, SCAN, ProcessedScan, find_labels
+from polysight.results import NoResult
 from polysight.store import MANIFEST, Manifest, manifest
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError, no_such
@@ -220,8 +221,6 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
 
 KINDS = ("scan", "process", "permittivity", "export", "doctor", "train", "concentration")
 """Programs that a page starts; each has its record, log and exit status in `<folder>/program/`."""
-NO_RESULT = 7
-"""Exit status of a program that ended well, but without a result."""
 
 
 class Program(msgspec.Struct, frozen=True):
@@ -280,7 +279,7 @@ def _read_status(path: Path) -> int | None:
 
 def explain_failure(program: Program | None) -> Finding | None:
     """Return why a program failed, from the last error in its log; None if it runs, or has ended well."""
-    if program is None or program.running or program.status in (0, NO_RESULT):
+    if program is None or program.running or program.status in (0, NoResult.exit_status):
         return None
     if program.status is None:
         return Finding("error", f"polysight {program.kind} was killed", "Memory ran out, or somebody killed it")

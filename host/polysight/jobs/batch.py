@@ -27,7 +27,7 @@ from polysight.calibration import calibration_of_scan
 from polysight.jobs.output import exit_status
 from polysight.jobs.process import process
 from polysight.process import cores, is_given_images
-from polysight.products import FINISHED, ProcessedScan, write_json
+from polysight.products import FINISHED, IMAGE, QUALITY, ProcessedScan, write_json
 from polysight.results import NoResult
 from polysight.settings import Settings
 from polysight.store import (
@@ -49,7 +49,7 @@ SUMMARY = "processed.json"
 """File of the outcomes of all scans, in the folder that holds their products."""
 Status = Literal["done", "skipped", "failed", "stopped"]
 # Files without which products do not count as finished, whatever their mark says.
-_PRODUCTS = ("image.npz", "quality.json")
+_PRODUCTS = (IMAGE, QUALITY)
 PROGRAM = (sys.executable, "-m", "polysight.jobs.batch")
 """Module that processes the job on its standard input."""
 ALIVE = "POLYSIGHT_PARENT_ALIVE"

@@ -41,6 +41,7 @@ from polysight.products import (
     find_products,
     label_folder,
 )
+from polysight.store import MANIFEST
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, quote
 from polysight_shared.files import write_together
@@ -104,7 +105,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     """
     products = find_products(folder)
     if products is None:
-        is_scan = (folder / "manifest.jsonl").exists()
+        is_scan = (folder / MANIFEST).exists()
         products_folder = folder / "products" if is_scan else "OUT"
         raise DataError(
             f"{folder}: no {IMAGE} to draw on",

@@ -22,7 +22,7 @@ from polysight.catalogue import NOTES, PROGRAM, Notes, Summary, find_program, fi
 from polysight.jobs.label import remove_labels, save_labels
 from polysight.materials import LAYER_FORMS, Labels, parse_layer
 from polysight.planning import Changes, forecast, forecast_values
-from polysight.products import find_labels, label_folder, read_products
+from polysight.products import LABELS, find_labels, label_folder, read_products
 from polysight.serve.reading import json_answer
 from polysight.serve.site import LIBRARIES, Site
 from polysight.store import ScanFolder
@@ -435,7 +435,7 @@ def _save_labels(site: Site, scan: Named, body: LabelRequest) -> SavedLabels:
     products = read_products(scan.folder)
     place = label_folder(products.folder)
     _, notes = save_labels(place, products, labels)
-    return SavedLabels(str(place / "labels.json"), notes)
+    return SavedLabels(str(place / LABELS), notes)
 
 
 def _save_notes(site: Site, scan: Named, body: NotesRequest) -> Notes:

@@ -52,7 +52,7 @@ def modules_of(name: str) -> Iterator[str]:
     for public in names:
         setattr(module, public, getattr(module, public))  # a lazy name is imported now, for pdoc to see it
     if names:
-        module.__all__ = names  # pdoc takes no other imported name for a public one
+        vars(module)["__all__"] = names  # pdoc takes no other imported name for a public one
     elif hasattr(module, "__path__"):
         yield from (page for child in _children(module) for page in modules_of(child))
 

@@ -112,6 +112,7 @@ def test_a_drift_over_the_rows_is_followed_within_its_error():
     assert (np.abs(deviation.real) <= 2 * change.std.real + 1e-6).all()
     assert np.abs(deviation).max() < 0.6 * np.abs(true).max()
     assert max(change.largest_drift()) > 0.01
+    assert change.drifts > 0.9
 
 
 def test_any_drift_is_within_its_error():
@@ -156,6 +157,7 @@ def test_a_slope_along_y_alone_is_rather_drift_than_one_that_plates_have_both_wa
 def test_slopes_along_a_row_are_no_drift():
     change = estimate_common_change(make_scatter(lambda x, _y: (20 * x, 0j)), ORIGIN_M)
     assert np.abs(change.value).max() < 0.005
+    assert change.drifts < 0.9
 
 
 def test_plates_at_the_border_say_nothing_of_a_drift():

@@ -470,7 +470,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
         reasons += rules.judge_copies(copies.labels, copies.shift_mm, copies.level_db)
     reasons += rules.judge_image_shift(result.apart_mm)
     if result.drift is not None:
-        reasons += rules.judge_drift(*result.drift.largest_drift())
+        reasons += rules.judge_drift(*result.drift.largest_drift(), result.drift.drifts)
         reasons += rules.judge_fringes(result.drift.fringes)
     reasons += rules.judge_halo(result.halo)
     reasons += rules.judge_background(result.behind)

@@ -41,6 +41,9 @@ APART_MM = 1.0
 """Distance of the images of H and V above which boards are out of place; undisturbed scenes have up to 0.6 mm."""
 DRIFT_CARE = 0.035
 """Drift of ln(V / H) between plates above which the result needs care, each part."""
+DRIFT_LIKELY = 0.9
+"""Probability of a drift above which it is told. Below it may as well be slopes that the plates have by themselves: the
+errors contain it, and of 50 undisturbed scenes of the independent generator two have more."""
 HALO_CARE = 0.005
 """Halo of V around the metal above which a receiver is overdriven."""
 BACKGROUND_CARE = 0.04
@@ -371,9 +374,11 @@ def judge_image_shift(apart_mm: tuple[float, float]) -> list[Finding]:
     )]  # fmt: skip
 
 
-def judge_drift(amplitude: float, phase_rad: float) -> list[Finding]:
-    """Judge the drift of V / H over the scan: its largest root mean square at a plate, relative to the metal."""
+def judge_drift(amplitude: float, phase_rad: float, probability: float) -> list[Finding]:
+    """Judge the drift of V / H over the scan: its largest root mean square at a plate, and how likely there is one."""
     if not (is_known(amplitude) and is_known(phase_rad)) or max(amplitude, phase_rad) <= DRIFT_CARE:
+        return []
+    if not probability > DRIFT_LIKELY:
         return []
     return [reason(
         "care", f"V / H drifts by {100 * amplitude:.0f} % and {np.degrees(phase_rad):.0f} degrees between the plates",

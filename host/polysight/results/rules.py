@@ -43,7 +43,7 @@ DRIFT_CARE = 0.035
 """Drift of ln(V / H) between plates above which the result needs care, each part."""
 DRIFT_LIKELY = 0.9
 """Probability of a drift above which it is told. Below it may as well be slopes that the plates have by themselves: the
-errors contain it, and of 50 undisturbed scenes of the independent generator two have more."""
+errors contain it. Of 40 undisturbed scenes of the independent generator two are told so, seven without this limit."""
 HALO_CARE = 0.005
 """Halo of V around the metal above which a receiver is overdriven."""
 BACKGROUND_CARE = 0.04

@@ -303,7 +303,7 @@ def run(args: argparse.Namespace) -> int:
             show(f"{len(cards.boards)} cards, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; {sink.text}")
             show(HEAD)
             # Also makes the row that is processed beside.
-            show(sink.try_rate(20_000, 2.0, None).line())
+            show(sink.try_rate(20_000, min(args.seconds, 2.0), None).line())
             beside = None
             if not args.alone:
                 beside = processing_beside(cards, stack)

@@ -41,11 +41,16 @@ def test_quick_trial(
 
 
 @pytest.mark.slow
-def test_every_row_of_the_capture_trial_is_received(tmp_path: Path) -> None:
-    assert (
-        main(["capture", "--seconds", "0.5", "--rate", "20000", "--alone", "--no-compare", "--folder", str(tmp_path)])
-        == 0
-    )
+def test_the_capture_trial_counts_as_lost_only_what_the_kernel_dropped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In each row: those after the first one were counted as lost. A busy machine may drop packets."""
+    main(["capture", "--seconds", "0.5", "--rate", "20000", "--alone", "--no-compare", "--folder", str(tmp_path)])
+    columns = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("    20000")]
+    assert len(columns) == 2
+    for _, _, _, _, packets, lost, dropped, *_ in columns:
+        assert int(packets) > 0
+        assert int(lost) <= int(dropped)
 
 
 @pytest.mark.parametrize(

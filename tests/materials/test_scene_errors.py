@@ -118,7 +118,7 @@ def test_a_drift_over_the_rows_is_followed_within_its_error():
 def test_any_drift_is_within_its_error():
     """An even rise and waves along y, each part its own; slopes as images show them, each with an error of its own.
 
-    Even rises have slopes that all plates share: they were taken for the plates' own, with errors of a tenth.
+    Even rises have slopes that all plates share: they were taken for the plates' own, and their errors were too small.
     """
     rng = np.random.default_rng(11)
     rows_m = np.array(PLACES_M)[:, 1]

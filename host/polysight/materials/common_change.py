@@ -41,7 +41,7 @@ DRIFT_LENGTHS_M = (0.05, 0.07, 0.15)
 SLOPE_SEEN = 0.88
 """Slope of ln(V / H) within a plate's image over the slope of the gain over the scan. A pixel sees the gain averaged
 over a Fresnel zone, of which near a plate's edge only the plate's side echoes: it sees the gain nearer the middle. In
-100 drifting scenes of the independent generator the changes between plates are 1.13 times what the slopes tell."""
+100 drifting scenes of the independent generator the changes between plates are 1.1 to 1.2 times what slopes tell."""
 FRINGES = {0.0: 0.95, 0.05: 0.025, 0.15: 0.025}
 """Standard deviations of fringes in ln(V / H) by a second path beside the direct path, each part, with their prior
 probabilities; the published rig shows 10 to 20 %."""
@@ -49,7 +49,7 @@ FRINGE_LENGTHS_M = (0.03, 0.05)
 """Correlation lengths of fringes whose period is 0.2 to 0.3 m. Shorter ones average out over a plate."""
 COMMON_SLOPES = {0.15: 0.7, 0.5: 0.2, 2.0: 0.1}
 """Standard deviations of the slope of ln(V / H) that all plates have by themselves, per metre, with their prior
-probabilities: H and V that see the same place (0.1 to 0.3 in scenes of the independent generator), images some
+probabilities (chosen): H and V that see the same place (0.1 to 0.3 in scenes of the independent generator), images some
 millimetres apart (0.5), and a small aperture (1 to 3)."""
 OWN_SLOPES = (0.05, 1.0, 3.0)
 """Standard deviations of the slope that each plate has of its own, per metre: flat plates, uneven or disturbed ones.
@@ -89,7 +89,7 @@ class CommonChange:
     fringes
         Probability of fringes by a second path beside the direct path.
     drifts
-        Probability that the rig is none of the stable ones.
+        Probability that the gains drift, by more than those of a stable rig.
     """
 
     value: Complex

@@ -431,8 +431,7 @@ def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.in
 def find_filling(at_m: Array, segment: NDArray[np.int_], extent_m: tuple[Array, Array]) -> Array:
     """Return the share [n] of a disc about each point that its segment fills, in stage offsets `at_m` [n, 2].
 
-    `extent_m`: smallest and largest offset of the
-    scan, [2] each: where it ends no surface does.
+    `extent_m`: smallest and largest offset of the scan, [2] each: where it ends no surface does.
     """
     filling = np.zeros(len(at_m))
     stride_m = np.array([_find_stride(column) for column in at_m.T])

@@ -39,6 +39,7 @@ def run(args: argparse.Namespace) -> int:
         if args.quick:
             scene = QUICK
         rows, by_kind = scan_cpu_s(folder / "demo", scene)
+        # CPU seconds of each run
         processed = [
             command(["process", str(folder / "demo" / "scan"), "--out", str(folder / f"products{n}")])[0]
             for n in range(count_repeats(args.quick, REPEATS))
@@ -65,7 +66,7 @@ def scan_cpu_s(out: Path, scene: Path) -> tuple[int, dict[str, float]]:
     """
     words = [sys.executable, "-m", "polysight", "demo", "--scene", str(scene), "--out", str(out)]
     demo = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL)
-    # Number of commits, and CPU seconds of each process then, at the first and at the newest commit.
+    # (Number of commits, CPU seconds of each process then) at the first and at the newest commit.
     first = None
     last = None
     while demo.poll() is None:
@@ -118,5 +119,7 @@ def _list_parents() -> Iterator[tuple[int, int]]:
 
 
 def _make_seconds_line(name: str, value: float, limit: float, note: str) -> Line:
-    """Return a line of the table for seconds that must not exceed the limit."""
-    return Line(name, f"{value:.2f} s", "", value, limit, limit, higher_is_better=False, note=note)
+    """Return a line of the table for seconds that must not exceed the limit, without another program to compare."""
+    return Line(
+        name, f"{value:.2f} s", theirs="", value=value, at_least=limit, aim=limit, higher_is_better=False, note=note
+    )

@@ -77,7 +77,7 @@ def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
 
 
 def _make_folder() -> Path:
-    """Return a writable folder for compiled programs. Raises DeviceError if the last one belongs to another user."""
+    """Return a writable folder for compiled programs. Raises DeviceError if the temporary one is another user's."""
     places = [FOLDER]
     # The user may have no home folder.
     with suppress(RuntimeError):

@@ -4,7 +4,7 @@
 
 Writes DIR/instrument.toml, the rig file with the addresses of these processes, DIR/truth.json, the truth of the scene,
 and DIR/logs. Prints `ready DIR/instrument.toml` when all processes are ready. SIGTERM, SIGINT or the end of a process
-ends all of them.
+ends all of them. *Wire time* is the clock of the simulated signals: wall time times the time scale.
 """
 
 from __future__ import annotations
@@ -92,6 +92,7 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     table["stage"]["port"] = str(folder / "ttySTAGE")
     table["pi"] |= {"journal_dir": str(folder / "journal"), "key_dir": str(folder / "keys")}
     table["stage"]["heartbeat_ms"] = max(MIN_HEARTBEAT_MS, table["stage"]["heartbeat_ms"])
+    # Three of four heartbeats may be late.
     table["pi"]["host_heartbeat_ms"] = table["stage"]["heartbeat_ms"] // 4
     return move_to_free_subnet(decode(table, Instrument, f"{rig.name}, simulated"))
 
@@ -261,6 +262,7 @@ def _list_card_options(scene: Path | None, options: RigOptions) -> list[str]:
     """Return the options of the process of the cards that follow from those of the rig."""
     words = []
     if scene is not None:
+        # The rig file has the scene's IF offset already, see `derive`.
         words += ["--scene", str(scene), "--offset-in-rig"]
     if options.pattern:
         words.append("--pattern")

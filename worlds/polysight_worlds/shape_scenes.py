@@ -22,14 +22,14 @@ from polysight_worlds.rig import Boards, published_boards, published_rig, turn
 from polysight_worlds.shape_echoes import record_shapes
 from polysight_worlds.shapes import Shape, Sphere, bottle, cylinder, plate, sphere
 
-# The linear part of the published chirp, in as many frequencies as hold a range gate of 0.5 m: paths that differ by 2 m
-# look alike.
+# The linear part of the chirp of the published rig (instrument.toml), in as many frequencies as hold a range gate of
+# 0.5 m, a path of 1 m: at steps of 151 MHz paths that differ by 2 m look alike.
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 24)
 # Linear samples of the published chirp.
 SAMPLES = 192
 # Noise of a sample, where a free path of 1 m has amplitude 1. In the published rig it is 5.5 dB below the direct path
-# in each chirp, and a position averages 16 of them (a fourth of the noise). The direct path is 1.39 m long, and echoes
-# are 1.35 times as strong, as it leaves at the patterns' edge.
+# in each chirp, and a position averages 16 of them (a fourth of the noise). The direct path is 1.39 m long, and weaker
+# than a free path by the factor 1.35, as it leaves at the edge of the antennas' patterns.
 NOISE_A_SAMPLE = 10 ** (-5.5 / 20) / np.sqrt(16) / 1.39 / 1.35
 # Distance from the rig's origin to the published rig's object plane.
 PLANE_M = 0.499
@@ -62,7 +62,7 @@ class ShapeScene:
             # The back of a body is no surface that antennas see.
             is_seen = facing[:, 2] < 0
             if len(self.shapes) > 1:
-                # Beyond its edges a piece goes on, through other pieces.
+                # The surface of a piece goes on beyond its edges, through other pieces.
                 is_seen &= shape.cover(a, b) > 0
             nearer = is_seen & (np.abs(projected) < np.abs(distances))
             distances = np.where(nearer, projected, distances)
@@ -121,7 +121,7 @@ def scan_shapes(
     cubes = record_shapes(shapes, true_boards, frequencies_hz, offsets_m)
     gains = np.random.default_rng([nuisances.seed, 12])
     noise = np.random.default_rng([nuisances.seed, 13, number])
-    # Fewer frequencies than samples of the chirp hold the same signal.
+    # Each of the fewer frequencies stands for several samples of the chirp, whose noise averages.
     sigma = nuisances.noise * NOISE_A_SAMPLE * np.sqrt(len(frequencies_hz) / SAMPLES)
     for channel, cube in cubes.items():
         level_db = gains.normal()
@@ -204,7 +204,7 @@ def _draw_cone(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
 
 
 def _draw_barrel(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
-    """Draw a barrel with a bulge of 1 to 6 per metre; return it and its radius."""
+    """Draw a barrel, whose profile has a curvature of 1 to 6 per metre; return it and its radius."""
     radius_m = draws.rng.uniform(0.1, 0.16)
     bulge = float(draws.rng.uniform(1, 6))
     piece = cylinder("barrel", draws.stack, draws.point_behind(radius_m), radius_m, 0.2, axis=draws.axis, bulge=bulge)
@@ -214,6 +214,7 @@ def _draw_barrel(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
 def _draw_saddle(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
     """Draw a saddle; return it and the smaller of its two radii."""
     radii_m = draws.rng.uniform(0.1, 0.2, 2)
+    # Curvatures along x and y, and the twist.
     bends = float(1 / radii_m[0]), float(-1 / radii_m[1]), 0.0
     turn_deg = float(draws.rng.uniform(0, 180))
     return (plate("saddle", draws.stack, draws.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radii_m.min()
@@ -231,6 +232,7 @@ def _draw_bottle(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
     """Draw a bottle with a wall of 0.5 to 3 mm and air in it; return its pieces and its radius."""
     radius_m = draws.rng.uniform(0.03, 0.05)
     wall_m = draws.rng.uniform(0.5e-3, 3e-3)
+    # One layer of the medium, and air behind it.
     wall = Stack(((draws.stack.below, wall_m),), 1.0)
     return bottle("bottle", wall, draws.point_behind(radius_m), radius_m, 0.16, axis=draws.axis), radius_m
 
@@ -289,6 +291,7 @@ def draw_shapes(
     if with_table:
         wood = Stack(below=complex(rng.uniform(1.8, 3.5), -0.15))
         place_m = (front_m[0], front_m[1], front_m[2] + rng.uniform(0.12, 0.25))
+        # With soft edges it hardly diffracts.
         background = (plate("table", wood, place_m, (1.6, 1.2), is_soft=True),)
     return ShapeScene(
         kind=kind,

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from polysight.imaging.geometry import Aperture, column_step_m, excess_path_m, fft_module, pitch_y_m, row_starts_m, turn
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Length of the cross-fade relative to the kernel's length in x
+# Length of the cross-fade relative to the kernel's length in x, and its smallest length in columns. Chosen: a shorter
+# one has a wider spectrum, a longer one a longer period.
 _FADE = 0.08
-# Smallest length of the cross-fade, columns.
 _FADE_COLUMNS = 20
 # Relative to the kernel's strongest spectral bin: weaker ones are left out (chosen: more bins are slower).
 _FILLED = 1e-5
@@ -38,7 +38,7 @@ KEEP_BYTES = 1 << 28
 _cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
 SLACK_M = 2e-3
-"""Largest deviation of a row's start along x from the aperture."""
+"""Largest deviation of a row's start along x from the aperture; chosen: one step of the published grid."""
 # Relative to the strongest principal component: weaker ones are left out (chosen: 17 of the published rig's 40 stay).
 _LEFT_OUT = 6e-6
 # Wavenumbers processed in double precision at a time: with 32 a live scan keeps 11 MB more, in no less time.
@@ -99,6 +99,7 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     offsets = aperture.offsets_m
     x = offsets[..., 0]
     y = offsets[:, 0, 1]
+    # Without a common pitch, and without a step in rows of one position, the lattice is that of the pixels.
     pitch_y = pitch_y_m(aperture) or grid.pixel_m
     pixel_stride = round(grid.pixel_m / pitch_y)
     row_stride = round((y[1] - y[0]) / pitch_y) if y.size > 1 else 1
@@ -278,6 +279,7 @@ class RowSpectra:
         self._origin = float(row_starts_m(aperture.offsets_m).min())
         lags_m = aperture.grid.x_m - self._origin - self.lattice.first_lag_m[0]
         wave = np.exp(2j * np.pi * np.outer(self.lattice.wavenumbers, lags_m)) / self.lattice.size_x
+        # Inverse transform along x at the pixels only, [k, nx].
         self._to_pixels = self.put(wave.astype(np.complex64))
 
     def put(self, array: Any) -> Any:
@@ -308,6 +310,7 @@ class RowSpectra:
         count = self.lattice.band.size
         columns = self.aperture.offsets_m.shape[1]
         padding = xp.zeros((*spectra.shape[:-1], self.lattice.size_x - count), dtype=xp.complex64, device=self.device)
+        # The band back at its bins of the kernel's period; bins a period of the rows apart are one bin of theirs.
         spectrum = xp.roll(xp.concat([spectra * xp.conj(ramps), padding], axis=-1), int(self.lattice.band[0]), axis=-1)
         folded = xp.sum(xp.reshape(spectrum, (*spectra.shape[:-1], self.lattice.stride_x, self.period)), axis=-2)
         return self._fft.ifft(folded, axis=-1)[..., :columns] * self.period
@@ -457,10 +460,12 @@ class IncrementalImager(RowSpectra):
         """Add a row that is transformed along x, [rx, frequency, k], and its weights, [k]."""
         xp = self.xp
         rx, m = self.aperture.shape[:2]
+        # Block diagonal [k, channel, rx], so that each RX keeps a column of its own.
         by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
         for r in range(rx):
             by_rx[:, r * m : (r + 1) * m, r] = lines[r, :, :].mT
         lags = self._find_lags(index)
+        # [k, ny, component] @ [k, component, channel] @ [k, channel, rx]
         self._sum += xp.matmul(self._kernels[:, lags, :], xp.matmul(self._components, by_rx))
         self._constant += self._echo_kernel[:, lags] * weight_spectra[:, None]
 

@@ -48,7 +48,7 @@ from polysight_shared.files import write_together
 
 METAL = "metal"
 MIN_PIXELS = 16
-"""A box of fewer pixels gets a note: a library would learn speckle from it."""
+"""A box of fewer pixels (chosen) gets a note: a library would learn speckle from it."""
 # Largest margin at each edge, as a share of a patch's side: two fifths of a narrow patch remain.
 _LARGEST_MARGIN = 0.3
 Ask = Callable[[str], str]
@@ -73,8 +73,9 @@ class Edits:
     """Changes to labels, applied in this order.
 
     `from_patches` replaces the boxes by one inside each patch of the products, named by the patch's number. `renames`
-    are `OLD=NEW`, `specimens` `NAME=SPECIMEN`; corners of `boxes` are millimetres from the image centre. `metal` is the
-    name of the box that becomes the metal reference; None keeps the present one.
+    are `OLD=NEW`, `specimens` `NAME=SPECIMEN`, where a specimen is one physical piece of a material, kept apart from
+    others when a library is judged; corners of `boxes` are millimetres from the image centre. `metal` is the name of
+    the box that becomes the metal reference; None keeps the present one.
     """
 
     from_patches: bool = False
@@ -113,6 +114,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
             f"polysight process {quote(folder)} --out {quote(products_folder)}; or give the folder of its products",
             code=ErrorCode.FILE_MISSING,
         )
+    # The label file's path and its content, or None.
     saved_labels = find_labels(folder)
     patches = list_patches(products)
     if edits.has_changes and list_only:
@@ -208,6 +210,7 @@ def _find_dark_boxes(products: ProcessedScan, masks: Mapping[str, npt.NDArray[np
     power = np.where(products.valid, np.abs(products.h) ** 2 + np.abs(products.v) ** 2, np.nan)
     if not np.isfinite(power).any():
         return []
+    # Relative to the brightest pixels without the brightest per cent, which may be a glint.
     least_power = np.nanpercentile(power, 99) * 10 ** (SegmentSettings().dimmest_db / 10)
     power_in_box = {name: power[mask & products.valid] for name, mask in masks.items()}
     return [name for name, values in power_in_box.items() if values.size and np.nanmedian(values) < least_power]

@@ -1,7 +1,8 @@
 """From the samples of H and V to specular points with both voltages, and their grouping into segments.
 
-The *bend* of an echo is the curvature of its path over the stage offset; *curvature* alone is that of the surface where
-a `Shape` holds it.
+The *path* of an echo is its length from TX over the surface to RX, and `at_m` [n, 3] the stage offset at which it is
+measured, the middle of a window of positions. The *bend* of an echo is the curvature of its path over the stage
+offset; *curvature* alone is that of the surface where a `Shape` holds it.
 
 H gives place, normal and curvature. V sees the same point with the same normal from another stage position, some 15 mm
 away: its path is predicted, and the phase is taken against this prediction, for separate ranges of H and V are useless
@@ -31,7 +32,7 @@ from polysight.surfaces.window import WINDOW_M, Echoes, Samples
 
 Array = NDArray[np.float64]
 # Points, paths and normals of neighbouring windows that belong to one surface differ by no more than these, beyond the
-# distance of the windows and the noise of the paths.
+# distance of the windows and the noise of the paths. Chosen; 2 mm are half a wavelength.
 MAX_GAP_M = 0.02
 MAX_PATH_MISS_M = 0.002
 MAX_TURN_RAD = 0.35
@@ -49,11 +50,13 @@ MIN_NEIGHBOURS = 6
 RIPPLE_REACH_M = 0.054
 # Least number of these windows: nine unknowns are fitted.
 MIN_AROUND = 16
-# Distance at which a window's own curvature counts as a slope: a third of a window.
+# Distance at which a window's own curvature counts as a slope (see SlopeFit): a third of a window, about the rms
+# distance of its positions from its middle.
 LEVER_OF_WINDOW_M = 0.011
-# A smaller radius is an edge or a wire: what it diffracts is no reflection.
+# A smaller radius (chosen, three wavelengths) is an edge or a wire: what it diffracts is no reflection.
 MIN_RADIUS_M = 0.012
-# Range of z in which objects are searched, and the largest slope of an echo's path over the stage offset.
+# Range of z in which objects are searched, and the largest slope of an echo's path over the stage offset; chosen. Fits
+# that start within the search's 0.47 may end somewhat beyond it.
 NEAREST_M = 0.2
 FARTHEST_M = 1.4
 MAX_SLOPE = 0.6
@@ -80,7 +83,10 @@ class Seen:
 
 @dataclass(frozen=True)
 class Shape:
-    """Points [n, 3] (metres, rig frame), normals towards the antennas, cosines of incidence, curvature [n, 2, 2]."""
+    """Points [n, 3] (metres, rig frame), normals [n, 3] towards the antennas, cosines of incidence [n], curvature.
+
+    The curvature [n, 2, 2], 1 / m, is in the basis of `points.tangents`, positive for convex bodies.
+    """
 
     points: Array
     normals: Array
@@ -118,6 +124,7 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
     rx_m = optics.v.at_m
     at_m = find_offset_that_sees(shape.points, shape.normals, echoes.at_m, tx_m, rx_m)
     path, slope, bend = predict_echo(shape.points, shape.normals, shape.curvature, at_m, tx_m, rx_m)
+    # V tells the echoes of one window of H apart by their paths: number the windows.
     window = np.unique(np.round(echoes.at_m / SAME_WINDOW_M), axis=0, return_inverse=True)[1].reshape(-1)
     # V's echoes are those of the points `inside` V's scan only.
     seen_by_v, inside = measure_echoes(v, at_m, path, slope, bend, window=window, is_measured=keep)
@@ -221,6 +228,7 @@ class SlopeFit:
         bend_xx = [zero, zero, one, zero, zero, x, y, zero, zero]
         bend_xy = [zero, zero, zero, one, zero, zero, x, y, zero]
         bend_yy = [zero, zero, zero, zero, one, zero, zero, x, y]
+        # [equation, window, unknown]
         rows = np.moveaxis(np.array([slope_x, slope_y, bend_xx, bend_xy, bend_yy]), 1, 2)
         if not may_change:
             rows = rows[..., :5]
@@ -260,8 +268,9 @@ def _find_fit(fits: dict[bytes, SlopeFit], d: Array, *, may_change: bool) -> Slo
 def correlate_windows(d: Array) -> tuple[Array, Array]:
     """Correlations [2, n, n] of the errors of both slopes of windows at the offsets `d` [n, 2], by noise and by ripple.
 
-    Windows share data as far as they overlap; s is their distance over the width of a window. Noise counts by its
-    distance from the middle in the direction of the slope: hence 1 - 3 s + 2 s^3 along it, and 1 - s across it. Ripple
+    Windows share data as far as they overlap; s is their distance over the width of a window. A sample's noise acts on
+    the slope in proportion to its distance from the window's middle along the slope's axis, whatever its place across:
+    hence the correlation is 1 - 3 s + 2 s^3 along that axis and 1 - s across it. Ripple
     is as long as a window or longer: normals of simulated plates had correlations of 0.77, 0.49 and 0.13 at 8, 16 and
     24 mm, about 1 - s.
     """

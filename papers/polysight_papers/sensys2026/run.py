@@ -42,6 +42,7 @@ TITLES: dict[str, str] = {
     "fig21": "concentration of sugar in water",
     "table2": "permittivity of 36 materials",
 }
+# In the order in which they are made: drawn pixels before simulated scans, which take longer.
 MAKERS: dict[str, Callable[[Run], Item]] = {
     "fig3": fig3,
     "fig16": fig16,
@@ -151,6 +152,7 @@ def make_items(
     pictures: dict[str, bytes] = {}
     failed: dict[str, str] = {}
     chosen = list(dict.fromkeys(keys) or makers)
+    # `steps` prints what is being made, and how long it took.
     for key in steps(chosen, [f"making {TITLES[key]}" for key in chosen]):
         try:
             item = makers[key]()
@@ -219,6 +221,7 @@ def write_page(
         trim_blocks=True,
     )
     made_keys = {i.key for i in items}
+    # On the page `left_out` are items that nobody asked for, `missing` those that cannot be made from these makers.
     page = environment.get_template("reproduce.html").render(
         items=sorted(items, key=lambda i: list(TITLES).index(i.key)),
         images={name: base64.b64encode(data).decode("ascii") for name, data in pictures.items()},

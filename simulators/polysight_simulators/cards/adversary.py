@@ -1,8 +1,9 @@
 """A capture card and a network with every kind of trouble, for records of a few packets to thousands.
 
-`KINDS` lists what a card or a network can do (docs/spec/simulated-rig.md marks what was seen): the card is reset, ends
-a record early or starts one by itself; the network loses, duplicates, delays and reorders packets. Each packet's record
-stays known: `Arrival.record`.
+`KINDS` lists what a card or a network can do (docs/spec/simulated-rig.md marks what a real card was seen to do): the
+card is reset, ends a record early or starts one by itself; the network loses, duplicates, delays and reorders packets.
+Each packet's record stays known: `Arrival.record`. A record is what the card sends of one row of the scan; its frames
+are the radar's, each started by a pulse on SYNC_IN. Probabilities, counts and pauses in here are chosen.
 """
 
 from __future__ import annotations
@@ -65,11 +66,11 @@ RADAR = (
     "endless",
 )
 """What a radar can do, in :meth:`Adversary.take`: only the times of its frames tell."""
-# Time in which a radar sends a frame.
+# Time in which a radar sends a frame: the published chirp.
 _FRAME_NS = 128_000
 NEAREST_EDGE_NS = 350_000
-"""An edge nearer to a missed pulse makes that pulse's frame: the stage has moved by a hundredth of a millimetre."""
-# Time between two packets, ns.
+"""An edge nearer to a missed pulse counts as that pulse: at 20 mm/s the stage moves less than 0.01 mm meanwhile."""
+# Time between two packets where no pulses pace them: a full packet takes 12 us at 1 Gbit/s.
 _GAP_NS = 20_000
 
 
@@ -100,7 +101,8 @@ class Sent:
 class Adversary:
     """A card and network with troubles drawn from `chance`.
 
-    `byte_count` and `sequence` are the counters at the first record, `payload_bytes` those of a full packet.
+    `byte_count` and `sequence` are the card's counters at the first record, `payload_bytes` the data of a full packet
+    (the card's default), without its header. `resets` counts the card's resets since the host's last.
     """
 
     def __init__(
@@ -120,6 +122,10 @@ class Adversary:
         self._twin = Packetiser(payload_bytes, chance.randrange(1 << 32), chance.randrange(1 << 48))
         # Packets that arrive in a later record
         self._late: list[Arrival] = []
+        # Of the record being made: its data, the numbers of the bytes not yet in a packet, and of each packet's last.
+        self._bytes = np.zeros(0, np.uint8)
+        self._waiting = np.zeros(0, np.int64)
+        self._made: list[int] = []
         self.resets = 0
 
     def take_late(self, share: float) -> list[Arrival]:
@@ -135,9 +141,10 @@ class Adversary:
         self.forget_late()
 
     def take(self, pulses_ns: NDArray[np.int64], troubles: tuple[str, ...] = ()) -> Sent:
-        """Send the record of a row whose SYNC_IN pulses, int64 [pulse], start frames. The row's data is that of pulses.
+        """Send the record of a row whose SYNC_IN pulses, int64 [pulse], start frames.
 
-        Troubles may also be of `RADAR`. Each packet arrives when its last frame fills it.
+        Troubles may also be of `RADAR`. The row's data (`Sent.data`) is what all pulses would have given; frames of
+        other edges hold other bytes. Each packet arrives when its last frame fills it.
         """
         chance = self._chance
         draw = np.random.default_rng(chance.getrandbits(32))
@@ -153,7 +160,7 @@ class Adversary:
         if "spurious" in troubles:
             for _ in range(chance.randint(1, 2)):
                 t = chance.randint(int(pulses_ns[0]), int(pulses_ns[-1]))
-                # One within a frame or just behind it starts none; one at a missed pulse makes that pulse's frame.
+                # An edge during a frame or just after it starts none; one near a missed pulse counts as that pulse.
                 if np.abs(np.append(pulses_ns, [e for e, _ in edges]) - t).min() > 5 * _FRAME_NS:
                     edges.append((t, draw.integers(1, 256, self._frame, np.uint8)))
         edges.sort(key=lambda edge: edge[0])
@@ -212,10 +219,10 @@ class Adversary:
         return sent
 
     def _make_packets(self, sent: Sent, data: bytes) -> tuple[list[bytes], list[int]]:
-        """Return the packets of one record as the card sends them, and the last byte of the data in each."""
+        """Return the packets of one record as the card sends them, and the number of the last data byte in each."""
         self._bytes = np.frombuffer(data, dtype=np.uint8)
         self._waiting = np.zeros(0, np.int64)
-        self._made: list[int] = []
+        self._made = []
         out = self._send_record(sent, np.arange(len(data)))
         return out, self._made
 
@@ -236,6 +243,7 @@ class Adversary:
             if "drop_frames" in troubles:
                 dropped_bytes = frame * chance.randint(1, 3)
             else:
+                # Blocks of 16 bytes; chosen.
                 dropped_bytes = 16 * chance.randint(1, 200)
             cut = chance.randrange(max(1, len(data) - dropped_bytes))
             data = np.delete(data, slice(cut, cut + dropped_bytes))
@@ -296,13 +304,13 @@ class Adversary:
         return [bytes(row) for row in rows]
 
     def _find_time_made_ns(self, byte: int, edges_ns: list[int]) -> int:
-        """Time at which a byte of the data leaves the radar."""
+        """Time at which the card sends a byte of the data: 0.1 ms (chosen) after it leaves the radar."""
         return edges_ns[byte // self._frame] + _FRAME_NS * (byte % self._frame) // self._frame + 100_000
 
     def _transmit(self, packets: list[bytes], made_ns: list[int], sent: Sent) -> list[Arrival]:
         """Return the packets that arrive in time, in the order of arrival; keep the delayed ones.
 
-        Packets overtake others by the time that these wait, at most 0.6 ms; only what is "held" waits for pulses.
+        Each trouble delays a packet by at most 0.6 ms, and lets others overtake it; only "held" waits for later pulses.
         """
         t = sent.troubles
         chance = self._chance

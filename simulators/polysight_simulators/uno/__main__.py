@@ -1,7 +1,8 @@
 """The emulated UNO in real time: like `python -m polysight_simulators.stage`, but it runs the flashed machine code.
 
-`--time-scale` is the speed of the whole board, its heartbeat clock included. Use at most 2 with a program that asks for
-the status four times per heartbeat. On a machine that cannot keep up, the simulated world runs slower than asked for.
+`--time-scale` is the speed of the whole board, its heartbeat clock included: the stage stops when no command has come
+for a heartbeat. Use at most 2 with a program that sends `status` four times per heartbeat of real time: at 4 each
+would come too late. On a machine that cannot keep up, the simulated world runs slower than asked for.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ def _run(args: argparse.Namespace) -> None:
         problem = f"not installed: {' '.join(missing_packages)}"
         raise PolysightError(problem, "the emulated board is compiled on this machine", ENABLING_COMMAND)
     rig = load_instrument(args.config)
+    # Steps from the closing point of a limit switch to the stage's zero, on both axes.
     switch_position = homing_zero()
     program = str(emulator())
     command = [program, "--pty", str(args.link), "--speed", repr(args.time_scale), "--boot-ms", str(args.boot_ms)]
@@ -63,6 +65,7 @@ def _run(args: argparse.Namespace) -> None:
         "--um-per-step",
         repr(1000.0 / rig.stage.steps_per_mm),
     ]
+    # The GPIO line of the Pi that the board's trigger output drives.
     command += ["--line", str(rig.pi.trigger_in)]
     if args.wires:
         command += ["--wires", str(args.wires)]

@@ -85,7 +85,7 @@ def _dot(a: NDArray, b: NDArray) -> NDArray:
 
 
 def needed_orders(x: float) -> NDArray:
-    """Return the orders 0, 1, .. that a body of size parameter x (k radius) needs."""
+    """Return the orders 0, 1, .. that a body of size parameter x (k radius) needs, by Wiscombe's criterion (1980)."""
     return np.arange(int(np.ceil(x + 4.05 * x ** (1 / 3) + MORE_TERMS)) + 1)
 
 

@@ -119,7 +119,7 @@ def unwrap_if(if_hz: NDArray[np.float64], rig: Instrument) -> NDArray[np.float64
 
 
 def jitter_hz(rig: Instrument) -> float:
-    """Return the IF change due to 5 ns of trigger uncertainty, Hz."""
+    """Return the IF change due to 5 ns of trigger uncertainty, one clock of the radar at 200 MHz; Hz."""
     return rig.chirp.slope_hz_per_s * 5e-9
 
 

@@ -92,7 +92,10 @@ class Focus:
 
     @property
     def certain(self) -> bool:
-        """True if the plane is not near the limits of the search, and the sharpness falls by 2 % towards both ends."""
+        """True if the plane is not near the limits of the search, and the sharpness falls by 2 % towards both ends.
+
+        Both margins are chosen.
+        """
         is_inside = (
             abs(self.depth_mm) < 0.95 * self.depths_mm[-1] and max(map(abs, self.tilt_deg)) < 0.95 * _MAX_TILT_DEG
         )

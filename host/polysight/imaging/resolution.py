@@ -116,6 +116,7 @@ def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
         difference = point - line - place
         slope += difference[:, axis] / np.linalg.norm(difference, axis=1)
     path_range = np.ptp(slope) * aperture.frequencies_hz.mean() / SPEED_OF_LIGHT_M_S
+    # A uniform aperture's image of a point falls to half its power within 0.886 / range.
     if path_range > 0:
         return float(0.886 / path_range)
     return float("inf")

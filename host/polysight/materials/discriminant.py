@@ -260,6 +260,7 @@ class ErrorDiscriminant(Model):
         )
         placement = self._decorrelate_angles(placement) * self._gain_and_phase
         placement = (1 - shrink) * placement + shrink * np.diag(np.diag(placement))
+        # The added variance, far below any real one, keeps the matrix invertible.
         self.between = _clip_eigenvalues(placement - self.within / self.pixels) + 1e-8 * np.eye(width)
 
     def _compute_specimen_effects(self) -> Real:

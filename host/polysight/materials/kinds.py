@@ -283,6 +283,7 @@ class Kinds:
         self.in_library = np.array([kind.source == "library" for kind in self.kinds])
         self.t = np.array([_nominal_ratio(kind, theta_rad) for kind in self.kinds], np.complex128)
         self.effects = np.stack([_compute_effects(kind, theta_rad) for kind in self.kinds])
+        # The added variance, far below any real one, keeps the matrix invertible where a kind has one effect.
         self.covariance = self.effects @ self.effects.mT + 1e-10 * np.eye(2)
         self.sheet_share = SHEET_SHARE if sheets else 0.0
         self.share, self.other = _compute_shares(self.kinds, self.sheet_share)

@@ -536,6 +536,7 @@ class _Model:
         else:
             steps = max(INDEX_STEPS, int(2 * self.wavenumber * known_mm * (high - low) / START_PHASE_RAD))
             axes[0] = np.linspace(low, high, steps)
+            # From no loss on, finest there; chosen.
             axes[1] = np.geomspace(0.02, LOSS_RANGE[1] + 0.02, 25) - 0.02
         mesh = np.meshgrid(*axes, indexing="ij")
         real = mesh[0] ** 2 + sine2

@@ -281,6 +281,7 @@ def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Sca
     if middle == 0:
         return None
     log_ratio = np.asarray(np.log(inverse / middle), np.complex128)
+    # 1.4826 turns the median of normal deviations into their standard deviation.
     amplitude = 1.4826 * float(np.median(np.abs(log_ratio.real - np.median(log_ratio.real))))
     phase = 1.4826 * float(np.median(np.abs(log_ratio.imag - np.median(log_ratio.imag))))
     places = np.stack([x_m[columns], y_m[rows]], axis=1)

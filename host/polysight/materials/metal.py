@@ -284,6 +284,7 @@ def metal_in_box(
     overlaps = [(int((p.interior & mask).sum()), p) for p in segmentation.patches]
     count, patch = max(overlaps, key=lambda o: o[0], default=(0, None))
     label = None
+    # Fewer pixels (chosen: 3 by 3) are only the patch's edge; the box is then taken as it is.
     if patch is not None and count >= 9:
         mask = mask & patch.interior
         label = patch.label

@@ -179,6 +179,7 @@ def make_patch(
     pixel = abs(float(x[1] - x[0]))
     padded = np.pad(mask, 1)
     depth = np.asarray(scipy.ndimage.distance_transform_edt(padded))[1:-1, 1:-1] * pixel
+    # A narrow patch keeps the inner two fifths of its depth (chosen).
     interior = mask & (depth > min(margin_mm, 0.6 * float(depth.max())))
     if usable is not None:
         interior &= usable
@@ -309,6 +310,7 @@ def _find_least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_
     plate_mask = _open_mask((image > background + PLAIN_DB) & usable, cfg.smallest_mm / pixel_mm / 2)
     if not plate_mask.any() and not _separate(level, bright, cfg.least_contrast_db):
         return float("inf")
+    # Here and below 1.4826 turns the median of normal deviations into their standard deviation.
     scatter = min(1.4826 * float(np.median(np.abs(level[~bright] - background))), MOST_SCATTER_DB)
     return max(background + max(cfg.least_contrast_db, cfg.least_scatter * scatter), cfg.dimmest_db)
 
@@ -358,8 +360,8 @@ def _remove_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: f
 def _separate(level: Real, bright: Mask, least_contrast_db: float) -> bool:
     """Return true if bright and dark are two classes, far enough apart, and not one class cut in two.
 
-    Otsu also splits a single normal distribution, with 2/pi = 0.64 of the variance between the halves. One small patch
-    has little of the variance, but lies far above the spread of the dark class.
+    Otsu also splits a single normal distribution, with 2/pi = 0.64 of the variance between the halves, so that 0.70 is
+    required. One small patch has little of the variance, but lies far above the spread of the dark class.
     """
     w = float(bright.mean())
     gap = float(level[bright].mean() - level[~bright].mean())

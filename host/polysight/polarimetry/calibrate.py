@@ -418,6 +418,7 @@ def strips_wave(psi_rad: float, theta_rad: float) -> Wave:
     """
     w = np.array([np.cos(psi_rad), np.sin(psi_rad) * np.cos(theta_rad)])
     total = float(w.sum())
+    # Chosen; the sum is at most 1.4.
     if abs(total) < 0.1:
         raise PolysightError(
             f"strips at {np.degrees(psi_rad):.0f} degrees reflect almost nothing",

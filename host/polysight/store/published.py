@@ -265,6 +265,7 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
 def period_s(bursts: Bursts) -> float | None:
     """Return the time between positions (most must follow one another); None for fewer than two bursts."""
     if bursts.at_s.size > 1:
+        # A quartile, not the median: missing positions and row ends make gaps longer, nothing makes them shorter.
         return float(np.quantile(np.diff(bursts.at_s), 0.25))
     return None
 

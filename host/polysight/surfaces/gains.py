@@ -259,6 +259,7 @@ def _fit_robustly(basis: Array, values: NDArray, weight: Array) -> tuple[NDArray
         root = np.sqrt(weight)
         coefficients = np.linalg.lstsq(basis * root[:, None], values * root, rcond=None)[0]
         rest = values - basis @ coefficients
+        # 1.48 turns the median of normal deviations into their standard deviation.
         spread = 1.48 * np.median(np.abs(rest))
         weight = weight / (1 + (np.abs(rest) / (2 * spread + 1e-9)) ** 2)
     return coefficients, rest
@@ -275,6 +276,7 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     metal = metal[sound]
     gain = gain[sound]
     ratio = gain[:, 0] / gain[:, 1]
+    # No point counts as better than 1 % (chosen).
     weight = 1 / (np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1) + 1e-4)
     middle = np.average(metal.arrival, axis=0, weights=weight)
     departure_middle = np.average(metal.departure, axis=0, weights=weight)

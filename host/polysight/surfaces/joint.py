@@ -150,6 +150,7 @@ class JointFit:
             self.rest[accepted] = residual[better]
             has_converged = better & (gain < JOINT_GAIN * energy[running])
             energy[accepted] = new_energy[better]
+            # Levenberg and Marquardt's damping; the factors are chosen.
             damping[running] *= np.where(better, 0.2, 8)
             running = running[~has_converged & (damping[running] < MOST_DAMPING)]
             if not running.size:

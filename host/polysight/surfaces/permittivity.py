@@ -194,6 +194,7 @@ def _linearise(
     scale = np.hypot(noise, ripple)
     size = np.abs(miss) / scale
     usual = float(np.median(size)) + 1e-12
+    # Where points fit far better than their errors, good ones would else be outliers.
     used = size < OUTLIER * max(usual, 0.3)
     falloff = 1 / (1 + (size / (2 * usual)) ** 2)
     weights = share * used / scale**2 * falloff
@@ -214,6 +215,7 @@ def fit_permittivity(
     `share` [n]: what each point counts, beside its noise and ripple, which is `ripple_m` long.
     """
     of_points = point_permittivity(v, gains, wave_number)
+    # The start has at least a small loss (chosen).
     eps = complex(np.median(of_points.real), min(np.median(of_points.imag), -0.01))
     level = np.abs(v.b[:, 0] / gains.ratio(v.arrival) * v.m[:, 1, 1])
     # What is common to a point's surroundings: no point counts for more than its ripple allows.
@@ -506,7 +508,7 @@ def judge_medium(
 
 
 def _spread(values: Array) -> float:
-    """Standard deviation of values by the median of their distances from the median."""
+    """Standard deviation of normally distributed values by the median of their distances from the median."""
     return 1.48 * float(np.median(np.abs(values - np.median(values))))
 
 

@@ -325,7 +325,10 @@ def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty:
 
 
 def estimate_wall_std(reflection: float) -> float:
-    """Return the standard error of the points of a thin wall, metres, by its reflection over that of metal."""
+    """Return the standard error of the points of a thin wall, metres, by its reflection over that of metal.
+
+    A reflection below 0.05 (chosen) counts as 0.05.
+    """
     cancelled = max(1.0, WALL_REFLECTION / max(reflection, 0.05))
     return WALL_STD_M * cancelled**WALL_EXPONENT
 

@@ -99,6 +99,7 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
                 sign * (window * slope.conj() * difference).real.sum(),
                 (window * np.abs(slope) ** 2).sum(),
                 power.sum(),
+                # The highest fifth of the wavenumbers: much power there is a sign of steps that are too coarse.
                 power[:, np.abs(k) > 0.8 * np.abs(k).max()].sum(),
             )
         return sums

@@ -101,6 +101,7 @@ class Synchroniser:
         """
         channel = chirps[SYNC_RX]
         reference = channel[np.abs(channel).sum(axis=1).argmax()].copy()
+        # As published: samples near zero are replaced before the division.
         reference[np.abs(reference) < 0.1] = 0.1
         points = UPSCALE * self._samples
         if self._tuned:

@@ -23,7 +23,7 @@ MAX_PULSES_AT_REST = 256
 MAX_PULSES_AT_REST_S = 2.0
 # The Pi closes the connection after a longer command.
 MAX_COMMAND_BYTES = 65_536
-# Longest heartbeat period of the host; after a missing heartbeat the rig stays locked for four periods.
+# Longest heartbeat period of the host (chosen): a host that has died keeps others out for four periods.
 MAX_HEARTBEAT_MS = 10_000
 # Limits of `Jog`: a person who watches the stage presses again.
 MAX_JOG_MM = 100.0
@@ -36,6 +36,7 @@ Seq = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 Index = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
 Take = Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
 Number = Annotated[int, msgspec.Meta(ge=0, lt=1000)]
+# Longest reason or error text, characters; chosen.
 MAX_TEXT = 4000
 Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
 Name = Annotated[str, msgspec.Meta(max_length=120)]
@@ -57,8 +58,8 @@ WIRES = "wires"
 # "gpiomem", the registers of the GPIO lines, is in scans of old releases.
 _HARDWARE = (GPIOD, SPI, "gpiomem")
 Timing = Literal["", "spi", "one-shot", "program"]
-"""Timing source of a burst: SPI controller (widths and periods), one-shot (widths, periods by the program), program;
-"" in events of earlier releases."""
+"""What times a burst: "spi": the SPI controller, all edges; "one-shot": a monostable circuit the widths, the program
+the periods; "program": the program, all edges; "" in events of earlier releases."""
 
 
 def is_simulated(backend: str) -> bool:

@@ -153,7 +153,7 @@ class Preview:
 
 
 class Evidence(msgspec.Struct, frozen=True):
-    """Inputs for placing a row, beside its packets; as of :func:`place_record`."""
+    """Inputs for placing a row, beside its packets (see :func:`place_record`); without `past` the start is unknown."""
 
     # Bytes of the whole row.
     expected: int
@@ -296,21 +296,21 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     ends_in_short = expected % full_payload > 0
     # A card that restarts counts from byte 0, packet 1 on. Such packets are told from the row's own only if the row
     # began far from there, and they follow its first packet.
-    counts_on_anew = np.zeros_like(is_of_row)
+    after_restart = np.zeros_like(is_of_row)
     if start.byte_count > 2 * expected and is_of_row.any():
         counts_anew = (log.byte_counts == full_payload * (log.sequences - 1)) & (log.byte_counts < expected)
         is_behind = np.arange(log.count) > int(np.argmax(is_of_row))
-        counts_on_anew = counts_anew & is_behind & ~is_early & ~is_of_row
+        after_restart = counts_anew & is_behind & ~is_early & ~is_of_row
     return _Record(
         start=start,
         offsets=offsets,
         steps=steps,
         of_row=is_of_row,
         beyond=is_beyond,
-        later=later & ~counts_on_anew,
+        later=later & ~after_restart,
         early=is_early,
         too_early=is_early & counters_agree & (offsets < expected),
-        after_restart=counts_on_anew,
+        after_restart=after_restart,
         full=full_payload,
         length=length,
         ended=ended,

@@ -47,9 +47,9 @@ _PASSED_M = 1.0
 _ECHO = 30.0
 # Noise power of a sample relative to echoes from the gate, for the estimate of the direct path (chosen).
 _NOISE = 1e-3
-# Taps of the filter against the motion in a burst: positions to either side.
+# Taps of the filter against the motion in a burst: positions to either side (chosen).
 REACH = 4
-# Largest frequency of the filter, cycles per position
+# Largest frequency of the filter, cycles per position; chosen, 0.5 is the limit of the sampling.
 _BAND = 0.45
 
 Image = NDArray[np.complex64]
@@ -89,9 +89,9 @@ class Reduction:
     sweep_hz: NDArray[np.float64]
 
     def maps(self, sweep_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return matrix and direct for samples at `sweep_hz`, complex128 [m + 1, sample]: all, or one for each block.
+        """Return matrix and direct for samples at `sweep_hz`, complex128 [m + 1, sample]: all, or one for every four.
 
-        Maps for blocks are fitted by least squares to noise and echoes. Their results differ from those of the maps for
+        Maps for decimated samples are fitted by least squares to noise and echoes. Their results differ from those for
         all samples by 3e-4 in echoes that decimation passes (up to 1 m behind the direct path) and by 2e-4 in echoes
         within the gate; in white noise by 0.2 to 0.4 %, 2 % at the first and last frequency, which the window makes
         weak (0.06 % in the matched filter), and 5 % in the amplitude of the direct path (published chirp).
@@ -151,6 +151,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     band = sweep[-1] - sweep[0]
     product = (gate_m[1] - gate_m[0]) * band / SPEED_OF_LIGHT_M_S
     frequencies = np.linspace(sweep[0], sweep[-1], int(np.ceil(product)) + extra)
+    # Dense (chosen), so that the fits hold between them. `rcond` drops combinations that only rounding tells apart.
     d = np.linspace(*gate_m, max(64, 8 * frequencies.size)) / SPEED_OF_LIGHT_M_S
     target = np.exp(-2j * np.pi * np.outer(d, sweep)) * weight
     basis = np.exp(-2j * np.pi * np.outer(d, frequencies))
@@ -480,7 +481,7 @@ class BoardSamples:
         self._invalidate()
 
     def copy_samples(self, coarse: BoardSamples, steps: tuple[int, int]) -> None:
-        """Take the samples of a board whose steps between (rows, columns) were divided; others are missing."""
+        """Take the samples of a scan whose steps (rows, columns) are so many of this one's; others are missing."""
         rows, columns = steps
         self._cube[:, :, ::rows, ::columns] = coarse._cube
         self._direct[:, ::rows, ::columns] = coarse._direct
@@ -616,7 +617,7 @@ class BoardSamples:
         """Return the change of ln(image / footprint) from the first to the last frequency, complex64 [ny, nx].
 
         NaN where nothing is seen. For an echo that grows as 1 + s (f - f0) the slope of :meth:`range_slope` exceeds the
-        mirror's by -j 2 pi s var(f) / c; the mirror's own second derivative tells the variance of f under the window.
+        mirror's by -j 2 pi s var(f) / c, where the window's var(f) follows from the mirror's own second derivative.
 
         Parameters
         ----------

@@ -39,7 +39,8 @@ from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.findings import Finding
 from polysight_shared.messages import Axis
 
-# Timeout of a question to a card that may be starting, all attempts together, and the time between two questions.
+# Timeout of a question to a card that may be starting, all attempts together, and the time between two questions; both
+# chosen.
 _ASK_S = 1.5
 _PAUSE_S = 0.2
 
@@ -174,7 +175,10 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
 
 
 def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
-    """Return the FPGA version that the card reports at its new address."""
+    """Return the FPGA version that the card reports at its new address, once it was switched off and on.
+
+    With `same_place` the address is the old one, too: only an answer after a silence shows that it was switched off.
+    """
     sys.stdout.write(f"{board.name}: looking for it at {board.card_address} for at most {wait_s:g} s\n")
     sys.stdout.flush()
     deadline = time.monotonic() + wait_s
@@ -339,7 +343,7 @@ def _check_trace(trace: Path | None) -> None:
 
 
 def _open_words(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, slow: bool) -> WordLink:
-    """Open the USB link to a board; with `trace` everything sent and received is written there too."""
+    """Open the USB link to a board, over which words of 16 bits go; with `trace` all of them are written there too."""
     words = open_board(rig.radar.native[name].place, slow or rig.radar.slow_spi)
     if trace is None:
         return words
@@ -363,6 +367,7 @@ def _load_native_rig(config: Path, name: str) -> Instrument:
     rig = _load_rig_of_native(config)
     if name not in rig.radar.native:
         raise ConfigError(f"radar.native has no board {name!r}", "a typing error", f"one of {sorted(rig.radar.native)}")
+    # The frames of one row are the most that a board has to count.
     require(rig, rig.grid.columns * rig.burst.pulses)
     return rig
 

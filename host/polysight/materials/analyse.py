@@ -58,7 +58,7 @@ from polysight.materials.metal import (
 )
 from polysight.materials.names import NamedPatch, PatchName, add_explanation, name_patch
 from polysight.materials.phase_sign import join_signs, mirror_phases
-from polysight.materials.result import MaterialsResult, PatchResult, Tilts, pixel_features
+from polysight.materials.result import LEVEL, MaterialsResult, PatchResult, Tilts, pixel_features
 from polysight.materials.segment import (
     Box,
     Patch,
@@ -82,9 +82,9 @@ from polysight_shared.config import Instrument
 from polysight_shared.findings import Finding
 
 LEAST_LEAKAGE_STD = 5e-4
-"""Least standard deviation of the leakage, whatever the rig file says."""
+"""Least standard deviation of the leakage, whatever the rig file says; chosen."""
 MEASURED_RIG = RigPrior(theta_std_rad=1e-3, leakage_std=0.003, leakage_measured=True)
-"""Prior of a rig whose leakage was measured and found to be zero."""
+"""Prior of a rig whose leakage was measured and found to be zero; the standard deviations are chosen."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def level(images: Images, segmentation: Segmentation, tilts: Tilts | None = None
     Without the illumination of the plane the images are returned unchanged, and no tilt is known.
     """
     if images.illumination is None:
-        return images, Tilts({}, 1)
+        return images, LEVEL
     if tilts is None:
         tilts = _estimate_tilts(images, images.illumination, segmentation)
     risen_patches = [p for p in segmentation.patches if p.label in tilts.rises]
@@ -198,8 +198,8 @@ def _limit_rise(rise: float) -> float:
 
 
 BEHIND_PATCH = 0.6
-"""Background in a plate over that beside the plates: of tables in scenes of the independent generator. Plates and metal
-that change alike are no error of their ratio, and the brightest of the background lies at its own edges."""
+"""Background in a plate over that beside the plates: of tables in scenes of the independent generator. It is less than
+1: what changes plates and metal alike cancels in their ratio, and a table is brightest at its own edges."""
 MAX_BEND = 3.5
 """Curvature above which a patch is no flat plate, 1 / m. Flat plates that are uneven by 0.25 mm have up to 1.4 in drawn
 scenes and ripple of the published picture up to 3; sheets bent to a radius of 150 mm have 5.6, spheres of 100 mm 6 to
@@ -213,21 +213,21 @@ STEEP = Finding(
 )
 """Why a steep patch gets no permittivity."""
 UNEVEN_METAL = 0.5
-"""Error of each part of the metal's ln(V / H), relative to the distance of its root mean squares from its median: where
-metal lies at the end of the scan neither is right (scenes of `benchmarks coverage` with small apertures)."""
+"""Error of each part of the metal's ln(V / H), as a share of the distance between its value by root mean squares and by
+the median of pixels: where metal lies at the end of the scan neither is right (`benchmarks coverage`)."""
 HALO_OF_METAL = 4.0
 HALO_OF_PATCH = 3.0
-"""Error of the metal's V / H, and of V on a plate, relative to the halo of V around them: in clipped scenes of an
-independent generator (by 10 to 50 %)."""
+"""Error of the metal's V / H, and of V on a plate, relative to the halo of V around them: in scenes of an independent
+generator where 10 to 50 % of the largest amplitude were clipped."""
 UNEVEN_AT_END = 0.01
-"""Error of ln|V / H| by the end of the aperture above which a plate's slopes tell nothing of the whole scan."""
+"""Error of ln|V / H| by the end of the aperture above which a plate's slopes tell nothing of the whole scan; chosen."""
 ANGLE_BY_APART = 1.0
 """Error of the incidence angle, radians per metre between the images of H and V: boards 2 to 5 mm out of place turn it
 by 2 mrad and move the images 2 mm apart (rms; geometry of the published rig)."""
 FILLED = 0.1
-"""Least |H| relative to metal at which an image without edges counts as filled with one material."""
+"""Least |H| relative to metal at which an image without edges counts as filled with one material; chosen."""
 POSSIBLE_SIGN = 0.05
-"""If the other sign of the phases is likelier than this, a metal that nobody declared has to pass with it, too."""
+"""If the other sign of the phases is likelier than this (chosen), an undeclared metal has to pass with it, too."""
 
 
 def analyse(
@@ -269,8 +269,8 @@ def analyse(
     refused = relative.refused | refuse_impossible(patches, estimates, kinds)
     named = _name_patches(classifier, (sh, sv, sp), inversion, judged)
     truth = match_truth(segmentation.patches, known_scene.plates)
-    labelled = [(p, p.label) for p in segmentation.patches]
-    results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in labelled)
+    labels_of_all = [(p, p.label) for p in segmentation.patches]
+    results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in labels_of_all)
     return MaterialsResult(
         calibrated=calibrated, h=sh, v=sv, p=sp, metal=relative.metal, segmentation=segmentation, patches=results,
         theta_rad=theta, inversion=inversion, prior=relative.prior, tilts=tilts,

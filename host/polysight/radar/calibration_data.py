@@ -31,6 +31,7 @@ RESTORED = 0x14E0
 ALL = 0x1FF0
 # A die id that does not identify a board
 NO_DIE = "-".join(["00000000"] * 4)
+# A larger file is none of ours: it has 1,344 hexadecimal digits and little else.
 _MAX_FILE_BYTES = 2**16
 # Offset of the temperature at the calibration in the data, int16 in degrees Celsius.
 _TEMPERATURE_BYTE = 16
@@ -45,7 +46,7 @@ class InitCalibrations(Command):
     mask: int = ALL
 
     def data(self) -> bytes:
-        """Pack the mask."""
+        """Pack the mask, and two reserved words."""
         return struct.pack("<3I", self.mask, 0, 0)
 
 
@@ -57,7 +58,7 @@ class SaveCalibration(Command):
     part: int
 
     def data(self) -> bytes:
-        """Pack the part's number."""
+        """Pack a reserved half word and the part's number."""
         return struct.pack("<2H", 0, self.part)
 
 

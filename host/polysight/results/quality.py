@@ -87,7 +87,8 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
 class BoardImaging(msgspec.Struct, frozen=True, kw_only=True):
     """Aperture of one receiver and its response to a point in the middle of the image, for (x, y).
 
-    `masked` is the share of the tapered aperture without data, `loss_db` the loss of a point's sum due to it.
+    `masked` is the share of the tapered aperture without data, `loss_db` the loss of a point's sum due to it;
+    `frequencies` the number of samples of a position after the range gate.
     """
 
     positions: int = 0
@@ -147,7 +148,10 @@ class IncidenceAngles(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MetalPlate(msgspec.Struct, frozen=True, kw_only=True):
-    """Variation of the gains over a metal plate that was scanned separately."""
+    """Variation of the gains over a metal plate that was scanned separately.
+
+    `how` says in words where the gains are from; `sub_bands` is the number of parts of the sweep with own gains.
+    """
 
     how: str = ""
     # Share of the pixels with valid gains.
@@ -171,7 +175,9 @@ class CalibrationSource(msgspec.Struct, frozen=True):
 
 
 class Recording(msgspec.Struct, frozen=True, kw_only=True):
-    """How published data were recorded: direction of the rows, losses by board, form of cubes, notices."""
+    """How published data were recorded: direction of the rows, losses by board, state of the data cubes by board,
+    notices.
+    """
 
     direction: str = ""
     boards: dict[str, dict[str, int]] | UnsetType = UNSET

@@ -15,7 +15,8 @@ from pathlib import Path
 from polysight_simulators.radars.board import FUNCTIONAL, RadarBoard
 from polysight_simulators.radars.cores import make_image
 
-# Step of the simulated clock.
+# Where the traced board raised its interrupt the simulated clock goes on in these steps until the simulated board does,
+# too, at most so long; chosen, longer than a board starts.
 _STEP_S = 1e-4
 _TIMEOUT_S = 15.0
 
@@ -47,6 +48,7 @@ def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> li
         record = json.loads(line)
         time.s = max(time.s, record.get("t", 0.0))
         if record.get("line") == "NRST":
+            # At the release of the reset the board reads its mode from the sense-on-power pins.
             board.sense(FUNCTIONAL)
             board.reset(held=not record["level"])
         elif record.get("line") == "HOST_INTR" and record["level"]:

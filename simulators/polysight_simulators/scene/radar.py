@@ -53,6 +53,7 @@ def high_pass(if_hz: Real, chirp: Chirp) -> tuple[Complex, Complex]:
 
     Two first-order sections, H = prod 1 / (1 - j f_c / f): -3 dB and +45 degrees at each section's corner.
     """
+    # At zero IF, where the filter passes nothing, a division by zero is avoided.
     f = np.where(np.abs(if_hz) < 1e-3, 1e-3, if_hz)
     h = np.ones(np.shape(f), np.complex128)
     log_slope = np.zeros(np.shape(f), np.complex128)
@@ -129,9 +130,10 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
     error += swing.real
     phase += 2 * np.pi * (swing / decay_per_s).real
     height = d.bend_hz * rng.uniform(0.8, 1.2) * rng.choice([-1.0, 1.0])
-    into = np.maximum(0.0, 1 + (ramp_s - chirp.ramp_end_us * 1e-6) / (d.bend_us * 1e-6))
-    error += height * into**2
-    phase += 2 * np.pi * height * into**3 / 3 * d.bend_us * 1e-6
+    # From 0 where the bend begins to 1 at the end of the ramp.
+    progress = np.maximum(0.0, 1 + (ramp_s - chirp.ramp_end_us * 1e-6) / (d.bend_us * 1e-6))
+    error += height * progress**2
+    phase += 2 * np.pi * height * progress**3 / 3 * d.bend_us * 1e-6
     return Receiver(board, chirp, gains.astype(np.complex64), phase - phase[0], error)
 
 
@@ -203,6 +205,7 @@ class _ReceivingBoard:
         tau = ant.direct_m / SPEED_OF_LIGHT_M_S
         centre = self.field.centre_path_m / SPEED_OF_LIGHT_M_S
         self.middle_hz = float(chirp.slope_hz_per_s * (tau.mean() + centre) / 2)
+        # [rx]: free-space loss relative to RX1.
         amplitude = direct_factor(board, scene) * ant.direct_m[0] / ant.direct_m
         amplitude = amplitude * scene.disturbances.direct_gain
         direct = amplitude[:, None] * np.exp(

@@ -24,7 +24,7 @@ _TAIL = re.compile(rb"\*([^*]{4})")
 
 
 class Rig(NamedTuple):
-    """Properties of the rig, and the stage's position at power-on (steps from its switches)."""
+    """Properties of the rig, and the stage's position at power-on: steps from its switches, chosen as 10 and 7.5 mm."""
 
     steps_per_mm: float = 200.0
     trigger_line: int = 26
@@ -109,6 +109,7 @@ class PythonStage:
     def receive(self, data: bytes) -> None:
         """Process bytes from the host."""
         for byte in data:
+            # HOLD, RESUME, STATUS and STOP are single bytes, which act at once, even within a line.
             if not self._logic.immediate(byte):
                 self._take(byte)
             self._settle()
@@ -137,6 +138,7 @@ class PythonStage:
         dy = 0
         ticks = 0
         if end > self.tick and not self._read_inputs():
+            # At most as many steps as leave each axis one step from its switch.
             n, dx, dy, ticks = engine.skip(end - self.tick, abs(self._x) - 1, abs(self._y) - 1)
         if n:
             self._x += dx
@@ -192,7 +194,7 @@ class PythonStage:
         if ticks:
             self._next = self.tick + ticks
             self._armed = True
-            # The leg has no ramp.
+            # A motion without a ramp has its full speed at once, which no later step would report.
             if self._engine.cruise:
                 self._report_motion()
 

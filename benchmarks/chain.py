@@ -20,7 +20,7 @@ from benchmarks.measure import AnonymousMemory, Child, Seconds
 from polysight.pipeline import Pipeline
 from polysight.store import ScanFolder
 
-# How often the last row is added again, to time it.
+# How often the last row is added again, to time it; chosen.
 LAST_ROWS = 5
 
 

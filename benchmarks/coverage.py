@@ -82,7 +82,7 @@ WIDE_REAL = (2.0, 12.0)
 WIDE_LOSS_TANGENT = (0.003, 0.4)
 # Columns and rows; the image stays as it is, so that the outer plates lie beyond the smallest aperture.
 WIDE_APERTURES = ((45, 43), (33, 31), (25, 25))
-# Limits of the bins of a name's probability.
+# Limits of the bins of a name's probability; chosen.
 SURE = (0.0, 0.5, 0.8, 0.95, 1.01)
 # Squared distances within which a normal distribution in two dimensions holds 68 and 95 %.
 CHI2_68 = 2.279

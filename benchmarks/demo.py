@@ -16,9 +16,9 @@ from benchmarks.waits import command
 from polysight.store import MANIFEST
 
 __all__ = ["add_arguments", "run"]
-# Time between two readings of the manifest and of the processes.
+# Time between two readings of the manifest and of the processes; chosen.
 _POLL_S = 0.05
-# How often the scan is processed.
+# How often the scan is processed; chosen.
 REPEATS = 3
 # Kind of a process by a part of its command line; the first part that occurs decides.
 KINDS = {

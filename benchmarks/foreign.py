@@ -38,7 +38,7 @@ KINDS = ("plates", "dishes", "sheets")
 CHI2_99 = 9.21
 # A region whose relative half width is below this claims to know the value.
 NARROW = 0.10
-# Relative distance from the truth within which a name of the literature counts as alike.
+# Relative distance from the truth within which a name of the literature counts as alike; chosen.
 ALIKE = 0.15
 
 

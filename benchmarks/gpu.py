@@ -33,9 +33,9 @@ from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, tx_position_m
 from polysight_shared.raster import plan_raster
 
-# Rounds of what takes milliseconds.
+# Rounds of what takes milliseconds; chosen.
 ROUNDS = 20
-# Rounds of what takes seconds.
+# Rounds of what takes seconds; chosen.
 FEW_ROUNDS = 3
 # Products of position and voxel per chunk of the exact sum (chosen: the default suits a CPU's cache).
 LARGE_CHUNK = 1 << 24

@@ -24,9 +24,9 @@ from polysight_shared.raster import plan_raster
 
 __all__ = ["add_arguments", "run"]
 REPEATS = 5
-# Rounds of methods that take seconds.
+# Rounds of methods that take seconds; chosen.
 ROUNDS = 3
-# Of the rows, one in so many is timed with the time-domain sum.
+# Of the rows, one in so many is timed with the time-domain sum; chosen.
 EVERY = 10
 
 Image = NDArray[np.complexfloating]

@@ -40,7 +40,7 @@ from polysight_simulators.scene.simulated_scan import truth
 
 RANGE_M = (0.3e-3, 6e-3)
 """Where the thickness of a sheet is looked for."""
-# Sub-bands of the sweep, in which a scene is imaged.
+# Sub-bands of the sweep, in which a scene is imaged; chosen.
 BANDS = 4
 SCENES_PER_RIG = 5
 # Side of the plates (chosen).
@@ -50,7 +50,7 @@ GLASS = (5.5, 0.05)
 CONDUCTOR = (1.0, 1e9)
 """Permittivity of metal behind a sheet: of a good conductor, reflects -1 to one part in 1e4."""
 KINDS = ("sheet in air", "sheet on metal", "liquid behind a wall")
-# Relative error up to which a result counts as right.
+# Relative error up to which a result counts as right; chosen.
 ENOUGH = 0.05
 Setting = tuple[float, float | None]
 SETTINGS: tuple[Setting, ...] = ((0.1, None), (0.04, None), (0.1, 0.2))

@@ -66,7 +66,7 @@ KNOWN: dict[str, surfaces.Uncertainty] = {
 }
 # Points of the reference that are kept, as `polysight calibrate sphere` keeps them.
 KEPT_POINTS = 240
-# Positions of a quick scan: every so many-th in x and y.
+# Positions of a quick scan: every so many-th in x and y; chosen.
 QUICK_STEP = 2
 # Limits of the 68th percentile over objects: normals in degrees, points in mm, permittivity in per cent (None: none).
 LARGE = (0.5, 0.5, 3.0)

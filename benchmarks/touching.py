@@ -28,7 +28,7 @@ WIDTH_HAMMING = 1.30
 # Least share of a plate that its patch covers, and largest share of another plate, or by another patch (chosen).
 LEAST_COVERED = 0.5
 MOST_OF_ANOTHER = 0.1
-# Distances between plates, in resolution cells.
+# Distances between plates, in resolution cells; chosen.
 GAPS_CELLS = (1.0, 1.5, 2.0, 3.0)
 FIRST_SEED = 38_000
 Mask = NDArray[np.bool_]

@@ -41,16 +41,16 @@ from polysight_shared.units import us_to_ns
 
 # The rest of the queue waits for the next turn, so that a queue that never empties is not a hang.
 TURN_TIMEOUT_S = 0.2
-# Longest wait for work in one turn of the loop.
+# Longest wait for work in one turn of the loop; chosen.
 TURN_S = 0.25
 # Silence of the executor, the journal or a socket after which motion stops and the watchdog is not fed. An answer of
 # the stage takes up to 2 s; writing to an SD card that tidies up takes about 1 s.
 LATE_S = 3.0
-# Time without a turn after which the executor counts as hung.
+# Time without a turn after which the executor counts as hung; chosen.
 HUNG_S = 10.0
 # Commands that wait or are executed; further ones are refused. Chosen: a host has one at a time.
 COMMANDS_WAITING = 64
-# The same for `Replay`, whose reply is large and comes from the disk.
+# The same for `Replay`, whose reply is large and comes from the disk; chosen.
 REPLAYS_WAITING = 4
 # Lines of the stage that wait; further ones are dropped, so that an endless flood cannot fill the memory.
 LINES_WAITING = 64

@@ -27,7 +27,7 @@ from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 
 # Time between two published statuses of a moving stage: about four a second are enough to draw it.
 STATUS_EVENT_S = 0.24
-# Consecutive statuses at rest after which the stage's report of a motion's end counts as lost.
+# Consecutive statuses at rest after which the stage's report of a motion's end counts as lost; chosen.
 RESTS = 3
 # Number of requests to repeat that report; a stage that was reset, and whose banner was lost, never answers them.
 MAX_REPEAT_REQUESTS = 3
@@ -45,7 +45,7 @@ class RefusedError(PolysightError):
         self.number = int(number)
 
 
-# Missing heartbeats after which the host is lost.
+# Missing heartbeats after which the host is lost; chosen.
 HOST_MISSES = 4
 
 

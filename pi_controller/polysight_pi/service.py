@@ -38,7 +38,7 @@ from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, ma
 
 # How long closed sockets go on sending (chosen).
 LINGER_MS = 200
-# Longest time of a turn of a socket's thread that has nothing to do.
+# Longest time of a turn of a socket's thread that has nothing to do; chosen.
 POLL_MS = 250
 # Each part gets this long to end; a thread that hangs is left alone then. Chosen: all together end within the 5 s of
 # TimeoutStopSec in polysight-pi.service.

@@ -52,15 +52,15 @@ STATUS_PER_HEARTBEAT = 4
 # Timeout of a status request, in heartbeats. With the time until the next request and the read timeout, a silent stage
 # is noticed before its own heartbeat stops it.
 SILENT_HEARTBEATS = 0.5
-# Timeout at rest: nothing has to be stopped, and a busy machine may answer late.
+# Timeout at rest: nothing has to be stopped, and a busy machine may answer late; chosen.
 SILENT_AT_REST_S = 3.0
-# Interval of status requests to a stage at rest.
+# Interval of status requests to a stage at rest; chosen.
 IDLE_STATUS_S = 1.0
 # Longest interval of status requests to a moving stage, however long its heartbeat: shorter than at rest.
 MOVING_STATUS_S = 0.5
-# Longest time from STOP to standstill.
+# Longest time from STOP to standstill; chosen.
 STOP_TIMEOUT_S = 3.0
-# Between two attempts to clear an alarm of a stage that still moves.
+# Between two attempts to clear an alarm of a stage that still moves; chosen.
 CLEAR_RETRY_S = 0.05
 # The thread that commands the stage counts as hung after so long without a turn: longer than a line and its retries
 # take.

@@ -27,7 +27,7 @@ MAX_BYTES = 160 << 20
 # The limit is at least so far above the memory that is left after connections were cut, because not all freed memory
 # returns to the system. Chosen.
 SPARE_BYTES = 64 << 20
-# Time between two looks at the memory, and for how long connections are cut after too much was seen.
+# Time between two looks at the memory, and for how long connections are cut after too much was seen; chosen.
 LOOK_S = 0.05
 SETTLE_S = 0.5
 

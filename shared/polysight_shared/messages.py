@@ -25,7 +25,7 @@ MAX_PULSES_AT_REST_S = 2.0
 MAX_COMMAND_BYTES = 65_536
 # Longest heartbeat period of the host (chosen): a host that has died keeps others out for four periods.
 MAX_HEARTBEAT_MS = 10_000
-# Limits of `Jog`: a person who watches the stage presses again.
+# Limits of `Jog` (chosen): a person who watches the stage presses again.
 MAX_JOG_MM = 100.0
 MAX_JOG_S = 60.0
 # Types of the fields: all are finite and bounded, other values are refused. `Index` counts rows, `Take` the attempts at

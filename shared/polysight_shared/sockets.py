@@ -24,7 +24,7 @@ EVENT_TOPIC = b"event"
 MAX_SUBSCRIPTION_BYTES = 1024
 # A local network takes a command within this time, or there is no connection (chosen).
 SEND_TIMEOUT_MS = 200
-# A connection without a handshake is closed after this time.
+# A connection without a handshake is closed after this time; chosen.
 HANDSHAKE_TIMEOUT_MS = 5000
 # Bits of ZMQ_AFFINITY: which of a context's I/O threads reads and writes the connections of a socket.
 COMMAND_IO_THREAD = 0b01

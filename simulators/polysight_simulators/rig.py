@@ -33,7 +33,7 @@ from polysight_simulators.radars import make_image
 from polysight_simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight_simulators.wires import MAX_SOCKET_PATH
 
-# Shortest heartbeat timeout of stage and Pi: the processes share the cores of a busy machine, and may be late.
+# Shortest heartbeat timeout of stage and Pi: the processes share the cores of a busy machine, and may be late; chosen.
 MIN_HEARTBEAT_MS = 2000
 # Firmware image of the radars in the folder of the rig.
 IMAGE_FILE = "firmware.bin"

@@ -18,9 +18,9 @@ from polysight_worlds.rig import turn
 # Edges of curved pieces fade over this width, so that what they diffract is small and varies slowly. Chosen: wider
 # edges leave less of the piece.
 SOFT_EDGE_M = 0.025
-# Iterations of Newton's method; from the grid's start, four to six are needed.
+# Iterations of Newton's method; from the grid's start, four to six are needed; chosen.
 ITERATIONS = 25
-# Newton's steps are limited to this length: a saddle's path is not convex far from its stationary point.
+# Newton's steps are limited to this length: a saddle's path is not convex far from its stationary point; chosen.
 LONGEST_STEP_M = 0.03
 
 

@@ -34,10 +34,10 @@ ALIVE = "alive"
 _POLL_S = 0.2
 # A sign of life that is unchanged is written again after this time, far below LAPSE_S.
 _ALIVE_INTERVAL_S = 1.0
-# Time in which a scan accepts a command.
+# Time in which a scan accepts a command; chosen.
 _TIMEOUT_S = 5.0
 LAPSE_S = 15.0
-"""Without a sign of life for so long, a scan's program hangs, or runs on a machine that is gone."""
+"""Without a sign of life for so long, a scan's program hangs, or runs on a machine that is gone; chosen."""
 # Characters of the name of who gave a command; more of it is cut off.
 MAX_ASKER = 60
 Doing = Literal["rows", "materials"]

@@ -27,7 +27,7 @@ from polysight_shared.errors import DeviceError, ProtocolError, ScanError
 from polysight_shared.faults import PiFault
 from polysight_shared.sockets import HandshakeMonitor, requester, subscriber
 
-# Number of times that a command is sent before the Pi counts as silent.
+# Number of times that a command is sent before the Pi counts as silent; chosen.
 ATTEMPTS = 3
 # Real-time priority of the heartbeat: below the receiver processes.
 REAL_TIME = 1
@@ -37,7 +37,7 @@ _SILENT_BEATS = 10
 _ALIVE_TIMEOUT_S = 1.0
 # States of the Pi that change without a command.
 MOVING: tuple[m.State, ...] = ("homing", "jogging", "running", "held", "done")
-# Time for the stage to come to rest.
+# Time for the stage to come to rest; chosen.
 _REST_TIMEOUT_S = 10.0
 # Period of the heartbeat during a jog where the rig file has none for rows.
 _JOG_HEARTBEAT_MS = 100

@@ -83,7 +83,7 @@ _USUAL_DRIFT = 100e-6
 _DRIFT_BURSTS = 8
 # Rate of the host's clock over that of the pulses; outside, the pulses are in simulated time (chosen).
 _RATES = 0.8, 1.25
-# Number of missed pulses that a message names.
+# Number of missed pulses that a message names; chosen.
 _SHOWN = 4
 # Stands for no bound: beyond every time in nanoseconds, and every number of bytes.
 _NO_BOUND = 1 << 60

@@ -375,11 +375,11 @@ def explain_incomplete_row(take: Take, faults: list[TakeFault], scan: ScanFolder
     )
 
 
-# Interval at which stop requests and timeouts are checked.
+# Interval at which stop requests and timeouts are checked; chosen.
 _POLL_MS = 50
 # An aborted row ends as soon as the stage has braked; a Pi that is silent longer than this does not respond.
 _ABORT_TIMEOUT_S = 10.0
-# A row that is not on the disk after this time is reported, and again each time it passes.
+# A row that is not on the disk after this time is reported, and again each time it passes; chosen.
 _DISK_NOTICE_S = 2.0
 
 

@@ -76,7 +76,7 @@ from polysight_shared.program import delay_interrupts
 from polysight_shared.raster import Row, check_burst_fits, plan_raster
 from polysight_shared.tables import to_builtins
 
-# Time between two readings of the Pi's events while a scan waits.
+# Time between two readings of the Pi's events while a scan waits; chosen.
 _POLL_S = 0.05
 # Lost steps from which on the user is warned (chosen): up to 9 degrees of phase at 77 GHz, over the way there and back.
 _LOST_STEPS_WARNING_MM = 0.05

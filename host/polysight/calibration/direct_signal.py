@@ -40,12 +40,12 @@ Real = NDArray[np.float64]
 FULL_SCALE = 32767
 # Share of the sample rate that the receiver's filter passes.
 PASSBAND = 0.9
-# Rows of a scan used by `fit_start`, and by `fit_filter`, which spreads their chirps over many bins of the IF.
+# Rows of a scan used by `fit_start`, and by `fit_filter`, which spreads their chirps over many bins of the IF; chosen.
 ROWS = 4
 FILTER_ROWS = 6
 # Smallest share of chirps with a direct path that a start offset is estimated from. Chosen.
 MIN_FOUND = 0.25
-# Bins of the filter's response; chirps and SNR (power ratio) that each needs.
+# Bins of the filter's response; chirps and SNR (power ratio) that each needs; chosen.
 BIN_HZ = 10e3
 MIN_CHIRPS = 6
 MIN_SNR = 20.0

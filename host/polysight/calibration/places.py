@@ -42,7 +42,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Real = NDArray[np.float64]
 
-# Largest deviation of the plane from the rig file that the range gate holds.
+# Largest deviation of the plane from the rig file that the range gate holds; chosen.
 DEPTH_M = 0.02
 # Positions used by the fit (more take longer and add little), and by the search for the target.
 POSITIONS = 400

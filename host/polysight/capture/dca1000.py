@@ -289,9 +289,9 @@ def _split_words(payload: bytes | memoryview | NDArray[np.uint8], count: int) ->
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 
-# Room for packets of an earlier record that arrive late: their payload lies outside the row.
+# Room for packets of an earlier record that arrive late: their payload lies outside the row; chosen.
 _SPARE_BYTES = 1 << 20
-# The payload of so many rows is kept at most. Duplicates from two network paths already make two rows of one.
+# The payload of so many rows is kept at most. Duplicates from two network paths already make two rows of one; chosen.
 _MAX_ROWS = 4
 
 

@@ -26,7 +26,7 @@ AMPLITUDE = "cividis"
 PHASE = "twilight"
 UNITS = {"amplitude": "dB", "phase": "°"}
 COLOURS = {"amplitude": AMPLITUDE, "phase": PHASE}
-# Largest side of a thumbnail.
+# Largest side of a thumbnail; chosen.
 THUMBNAIL_PIXELS = 96
 
 

@@ -41,7 +41,7 @@ EXPORT = "export"
 """Folder of a scan that a page has exports written into."""
 FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES, SURFACE, POINTS)
 EXPORTS = (".mat", ".csv", ".nc")
-# Materials of the library that a probe lists.
+# Materials of the library that a probe lists; chosen.
 MAX_NEAREST = 5
 # The range profile: its reach to either side of the place, its points, and its lowest level below the highest; chosen.
 PROFILE_REACH_M = 0.3

@@ -32,26 +32,26 @@ from polysight_shared.files import write_atomically
 from polysight_shared.findings import Finding
 
 READ_S = 3.0
-"""Time limit for reading one folder of the list; it is then listed as `silent` until the read returns."""
+"""Time limit for reading one folder of the list; it is then listed as `silent` until the read returns; chosen."""
 PART_S = 0.1
-"""Length of the parts in which a list is read before it is asked for, and of the pauses between them."""
+"""Length of the parts in which a list is read before it is asked for, and of the pauses between them; chosen."""
 PROGRAM = "program"
 """Folder of a scan in which programs that a page started keep their process number and log."""
 # The deepest level of folders that scans are searched in, and the most scans that are listed below one folder of the
 # root.
 MAX_DEPTH = 4
 MAX_SCANS = 5000
-# End of a program's log that is read: its last messages.
+# End of a program's log that is read: its last messages; chosen.
 LOG_BYTES = 16384
-# Longest record of a started program that is read: its command line is short.
+# Longest record of a started program that is read: its command line is short; chosen.
 MAX_RECORD_BYTES = 100_000
-# Characters of a program's message, and of its cause and remedy, that the list shows.
+# Characters of a program's message, and of its cause and remedy, that the list shows; chosen.
 MESSAGE_CHARACTERS = 300
 REMEDY_CHARACTERS = 500
-# Names of materials in a line of the list.
+# Names of materials in a line of the list; chosen.
 MAX_NAMES = 12
 CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-# Time that a program may take from the last line of a manifest to its first sign of life.
+# Time that a program may take from the last line of a manifest to its first sign of life; chosen.
 GRACE_S = 20.0
 # Files of a scan that its summary is made from; products lie in a folder of their own, or alone.
 _PRODUCTS = (IMAGE, MATERIALS, QUALITY)
@@ -367,7 +367,7 @@ INDEX_VERSION = 1
 # A file that is written twice within the clock's step of a drive keeps its time (FAT: 2 s): what was written so short a
 # while ago is read again after a restart.
 CLOCK_STEP_S = 2.0
-# A scan at work changes the list with every row; each index is flushed to disk.
+# A scan at work changes the list with every row; each index is flushed to disk. The interval is chosen.
 INDEX_INTERVAL_S = 60.0
 
 

@@ -60,7 +60,7 @@ _RX_MAX_WORD = 1
 _RX_WORD = 5
 # Files of sysfs that count packets which an interface dropped.
 _DROP_COUNTERS = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
-# The probe of a disk ends after so many bytes, or so many seconds on a slow disk.
+# The probe of a disk ends after so many bytes, or so many seconds on a slow disk; chosen.
 _PROBE_BYTES = 64 << 20
 _PROBE_S = 2.0
 

@@ -224,7 +224,7 @@ def check_time(context: CheckContext) -> Finding:
 
 
 SIMULATED = "simulated wires: no hardware is driven"
-# Points of the row that checks the trigger line.
+# Points of the row that checks the trigger line; chosen.
 _POINTS = 8
 _ROW_TIMEOUT_S = 120.0
 _POLL_MS = 100

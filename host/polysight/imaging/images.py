@@ -55,30 +55,30 @@ Mask = NDArray[np.bool_]
 Rise = tuple[float, float]
 """Growth of a plate's height along x and along y."""
 MAX_RISE = 0.06
-"""Largest tilt of a plate (3.4 degrees); a steeper phase has another cause."""
+"""Largest tilt of a plate (3.4 degrees); a steeper phase has another cause; chosen."""
 MIN_RISE = 2e-3
-"""Smallest tilt that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours."""
+"""Smallest tilt that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours; chosen."""
 _FEEBLE = 0.12
 """Level of V relative to H below which its phase is not used: permittivities below 2.8 at 55 degrees."""
 _LEAST_LINES = 6
-"""Columns or rows of pixels in a patch from which a curvature is estimated."""
+"""Columns or rows of pixels in a patch from which a curvature is estimated; chosen."""
 _COHERENT = 0.5
-"""Smallest coherence of the phase steps between pixels (1: all equal)."""
+"""Smallest coherence of the phase steps between pixels (1: all equal); chosen."""
 _MAX_CHANGE = 2.0
 """Largest change of the footprint over the distance `d`; a larger one occurs only at the edge of the aperture."""
 
 SAME_MM = 1e-3
 """Tolerance of positions: 2e-3 rad of an echo's phase."""
 SAME_HZ = 1e3
-"""Tolerance of transmit frequencies."""
+"""Tolerance of transmit frequencies; chosen."""
 SAME_CORNER_KHZ = 10.0
 """Tolerance of filter corners: less than 0.1 dB and 0.1 degrees between direct path and echo, in both channels."""
 ARM_MM = 100.0
 """Points at this distance along a board's x and y show its rotation, which antennas in one line do not."""
 
-# Smallest footprint relative to the strongest; weaker pixels are mostly noise.
+# Smallest footprint relative to the strongest; weaker pixels are mostly noise; chosen.
 _VISIBLE = 0.15
-# Width of the majority filter, pixels.
+# Width of the majority filter, pixels; chosen.
 _NEIGHBOURS = 15
 TAPERS: dict[str, Window] = {"none": "boxcar", "kaiser": ("kaiser", 4.0), "taylor": ("taylor", 4, 30)}
 """Windows over the aperture by their name in the rig file, as for scipy."""

@@ -35,11 +35,11 @@ from polysight.imaging.samples import BoardSamples
 from polysight_shared.config import Instrument
 from polysight_shared.geometry import incidence_deg
 
-# Largest tilt of the plates that is searched; a plane near this limit is not believed.
+# Largest tilt of the plates that is searched; a plane near this limit is not believed; chosen.
 _MAX_TILT_DEG = 3.0
 
 PLANE_REACH_M = 0.015
-"""Search range to either side of the rig file's plane."""
+"""Search range to either side of the rig file's plane; chosen."""
 MOUNT_STD_M = 1e-3
 """Standard deviation of the antennas' positions in the rig file, in addition to that of the plane's distance."""
 PRIOR_STD_M = 5.8e-3
@@ -47,7 +47,7 @@ PRIOR_STD_M = 5.8e-3
 _WORTH_M = 5e-4
 """Smallest offset for which images are formed again: a nearer plane changes the angle by less than MOUNT_STD_M does."""
 _STEP_M = 2e-4
-"""Height step to find the change of range and phase with height."""
+"""Height step to find the change of range and phase with height; chosen."""
 _COHERENT = 0.7
 """Smallest coherence of the pixels of a plate whose phase is used (1: all equal; chosen)."""
 _TILT_PRIOR_RAD = 0.02
@@ -55,7 +55,7 @@ _TILT_PRIOR_RAD = 0.02
 _MIN_STD_M = 3e-4
 """Smallest standard deviation of a plate's range, due to sidelobes of its neighbours."""
 _MAX_TILT = 0.035
-"""Largest tilt that phases may show, rise per metre: two degrees."""
+"""Largest tilt that phases may show, rise per metre: two degrees; chosen."""
 _TILT_TOLERANCE = 3e-3
 """Difference of the tilts by phase and by range that is accepted beside their errors, rise per metre (chosen)."""
 _MAX_RANGE_STD_M = 0.05

@@ -29,7 +29,7 @@ _BLOCKS_ACROSS = 8
 # Number of resolution cells that are evaluated to either side of the peak, and of points per cell (chosen).
 _CELLS = 6.0
 _POINTS = 20
-# Nearest ghosts: step of the numerical derivative, reach and precision of the search, places that are tried.
+# Nearest ghosts: step of the numerical derivative, reach and precision of the search, places that are tried; chosen.
 _STEP_M = 1e-4
 _MAX_DISTANCE_M = 20.0
 _PRECISION_M = 1e-6

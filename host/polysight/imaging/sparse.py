@@ -30,9 +30,9 @@ STRENGTH = 0.002
 a smaller one leaves more aliases.
 """
 ITERATIONS = 40
-"""Steps of the first fit of missing positions; the second fit starts from its image and takes half as many."""
+"""Steps of the first fit of missing positions; the second fit starts from its image and takes half as many; chosen."""
 MOST_ADDED = 4
-"""Largest number of steps into which a step between positions is divided."""
+"""Largest number of steps into which a step between positions is divided; chosen."""
 TEST_SHARE = 10
 """One in so many recorded rows, columns or positions is left out of the first fit, to measure the prediction."""
 # The power iteration comes from below: after 12 rounds 5 % are added (chosen), so that the estimate is not too small.

@@ -56,7 +56,7 @@ ALIVE = "POLYSIGHT_PARENT_ALIVE"
 """Environment variable of the program: number of a pipe that closes when the program that started it ends."""
 # Leave a fifth of the free memory to the system: `memory_bytes` is an estimate, and other programs grow meanwhile.
 SHARE_OF_FREE_MEMORY = 0.8
-# Time between two looks at a running program and at the request to stop.
+# Time between two looks at a running program and at the request to stop; chosen.
 _POLL_S = 0.2
 
 

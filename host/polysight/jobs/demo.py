@@ -25,7 +25,7 @@ from polysight_shared.errors import ConfigError, DataError, DeviceError, Polysig
 _MARK = ".polysight-demo"
 # Starting is mostly imports, of some seconds; the limit is far above them, for an overloaded machine.
 _START_LIMIT_S = 60.0
-# A process that does not end within this time after SIGTERM is killed.
+# A process that does not end within this time after SIGTERM is killed; chosen.
 _STOP_LIMIT_S = 10.0
 TIME_SCALE = 40.0
 """Simulated seconds per second: a row of 18 s takes about half a second."""

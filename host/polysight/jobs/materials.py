@@ -58,7 +58,7 @@ from polysight_shared.findings import Finding
 
 # Relative difference of two frequencies that are the same: far above rounding, far below any other chirp.
 _SAME_FREQUENCY = 1e-6
-# Largest number of a verdict's reasons that the terminal shows; the report lists all.
+# Largest number of a verdict's reasons that the terminal shows; the report lists all; chosen.
 _REASONS = 3
 
 

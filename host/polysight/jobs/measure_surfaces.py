@@ -21,7 +21,7 @@ from polysight.products import QUALITY, read_products, write_json
 from polysight_shared.config import Instrument
 from polysight_shared.files import write_atomically
 
-# Largest number of points of the metal sphere that the calibration file keeps.
+# Largest number of points of the metal sphere that the calibration file keeps; chosen.
 KEPT_POINTS = 240
 # Standard errors of places that were measured by hand, and of those that `calibrate direct-path` measured.
 PLACE_STD_M = 1e-3

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from polysight.process import Progress
 
 T = TypeVar("T")
-# Least time from one line of progress to the next.
+# Least time from one line of progress to the next; chosen.
 _LINE_S = 5.0
 
 

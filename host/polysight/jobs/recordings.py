@@ -86,7 +86,7 @@ def _format_card(card: CardReport) -> list[str]:
     return lines
 
 
-# Width of a line of bars.
+# Width of a line of bars; chosen.
 _SPARKLINE_CHARACTERS = 64
 
 

@@ -33,7 +33,7 @@ from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 
-# Fronts of objects lie up to this before or behind the object plane.
+# Fronts of objects lie up to this before or behind the object plane; chosen.
 DEPTH_M = 0.12
 # Least number of points of a metal sphere for its radius and gains; chosen: with few the directions are not covered.
 LEAST_METAL_POINTS = 60

@@ -52,13 +52,13 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
 GRID = (0.2, 0.5, 1.0, 2.0, 5.0)
-"""Values of lambda_H and lambda_V to try, relative to lambda_P = 1, with each channel scaled by its spread."""
+"""Values of lambda_H and lambda_V to try, relative to lambda_P = 1, with each channel scaled by its spread; chosen."""
 MARGIN = 2.0
 """Distance beyond which a pixel is unknown, over the 99th percentile of the material's own pixels between scans.
 
 Chosen: a smaller margin calls more pixels of new placements unknown, a larger one accepts more foreign materials."""
 FIT_PIXELS = 3
-"""Pixels of each patch to fit weights: pixels of a patch are similar, and the cost grows with the square."""
+"""Pixels of each patch to fit weights: pixels of a patch are similar, and the cost grows with the square; chosen."""
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ PHASE_OF_CHANGE = 0.75
 are larger than the amplitude's, its errors are not: the interval that holds 68 % is 0.73 of what the amplitude needs in
 scenes of the own simulator where these errors dominate, 0.83 in those of the independent generator."""
 USUAL_RIPPLE = 2.0
-"""Weight of the scene's usual slopes against a plate's own three."""
+"""Weight of the scene's usual slopes against a plate's own three; chosen."""
 
 
 @dataclass(frozen=True)

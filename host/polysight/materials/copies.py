@@ -17,15 +17,15 @@ from polysight.materials.segment import Patch
 
 WEAK_DB = -12.0
 WEAKEST_DB = -30.0
-"""Levels of copies relative to the brightest plate: shares of a quarter to a thirtieth."""
+"""Levels of copies relative to the brightest plate: shares of a quarter to a thirtieth; chosen."""
 LEAST_OVERLAP = 0.6
-"""Least share of a copy that a shifted plate covers, and of the shifted plates that copies cover."""
+"""Least share of a copy that a shifted plate covers, and of the shifted plates that copies cover; chosen."""
 SAME_DB = 3.0
-"""Largest deviation of a copy's level from the others', relative to its plate."""
+"""Largest deviation of a copy's level from the others', relative to its plate; chosen."""
 VISIBLE = 0.06
-"""Amplitude relative to the brightest plate at which the other channel shows a patch: -24 dB."""
+"""Amplitude relative to the brightest plate at which the other channel shows a patch: -24 dB; chosen."""
 SKIRT_PX = 4
-"""Pixels around the plates in which a copy cannot be told from the plate's own edge."""
+"""Pixels around the plates in which a copy cannot be told from the plate's own edge; chosen."""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ from polysight.materials.specimens import (
 REJECTED = 0.02
 """Share of the known materials' pixels, and of their patches, that are called unknown. Chosen: a smaller share accepts
 more foreign materials."""
-# Largest numbers of iterations of the common error and of the two-way fit.
+# Largest numbers of iterations of the common error and of the two-way fit; chosen.
 COMMON_ERROR_ROUNDS = 30
 TWO_WAY_ROUNDS = 30
 # Least distance of unknown patches: just above 1, the threshold.

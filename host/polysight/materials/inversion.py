@@ -115,7 +115,7 @@ COLUMNS_OF_SOURCE = {
     "incidence": (ANGLE,),
     "tilt": (TURN_BY_RISE, *LIGHT_ACROSS, LIGHT_ALONG),
 }
-# Particles, moves at each temperature, and draws of a patch's own errors for each particle.
+# Particles, moves at each temperature, and draws of a patch's own errors for each particle; chosen.
 PARTICLES = 600
 MOVES = 6
 DRAWS = 8

@@ -30,24 +30,24 @@ SOFT_LOSS = 0.05
 """Ranges of eps' and eps'' of any half space, from nearly air to beyond water: eps' is uniform on a logarithmic scale,
 eps'' on one that is logarithmic above `SOFT_LOSS` and linear below."""
 USUAL_LIBRARY_SHARE = 0.5
-"""Expected share of a library's materials in a scan that was processed without it."""
+"""Expected share of a library's materials in a scan that was processed without it; chosen."""
 LITERATURE_SHARE = 0.7
 """Share of the literature in thick plates that are none of the library's materials; the others are metal or any half
 space. Chosen, as are the shares of metal and of thin plates: larger ones draw uncertain names to these."""
 METAL_SHARE = 0.1
-"""Share of metal in these patches."""
+"""Share of metal in these patches; chosen."""
 SHEET_SHARE = 0.15
 """Share of thin plates, which reflect at both faces, in the patches that are none of the library's materials."""
 SHEET_REAL = (1.5, 8.0)
 SHEET_LOSS_TANGENT = (1e-3, 0.2)
 SHEET_MM = (0.2, 6.0)
-"""Permittivities and thicknesses of thin plates; all uniform on logarithmic scales."""
+"""Permittivities and thicknesses of thin plates; all uniform on logarithmic scales; chosen."""
 HOLDER_REAL = (1.0, 2.5)
 """Permittivity behind a thin plate: air, foam, wood. Half of the plates have air."""
 SHEET_HZ = 78e9
 """Frequency at which thin plates are drawn, about the middle of the sweep."""
 SHEET_KERNEL = 0.02
-"""Smoothing of the distribution of thin plates, in t."""
+"""Smoothing of the distribution of thin plates, in t; chosen."""
 STACK_SHARE = 0.05
 """Share of plates that are neither half space nor thin plate in the patches that are none of the library's materials: a
 liquid behind glass may reflect as no passive half space does. Their t is uniform on the unit disk. Without them three
@@ -55,7 +55,7 @@ cups of sugar water moved the estimated leakage by three standard deviations, an
 ODD_BRIGHTNESS = 0.1
 ODD_BRIGHTNESS_STD = 1.2
 """Share of patches whose brightness is that of nothing known (shadows, edges), and the spread of its logarithm then."""
-# Cells of a map of densities along each side of its rectangle.
+# Cells of a map of densities along each side of its rectangle; chosen.
 _MAP_CELLS = 96
 DISPERSION_KERNEL = 0.05
 DISPERSION_MODEL = 0.2
@@ -76,13 +76,13 @@ MOST_STD_BEYOND = 30.0
 """Least standard deviation of t in which a distance is counted, and its largest: there the density is nearly 0."""
 # Smallest standard deviation of a ratio: below it a covariance has no inverse in double precision.
 LEAST_RATIO_STD = 1e-6
-# Step of numerical derivatives by ln of the real part, and by the loss.
+# Step of numerical derivatives by ln of the real part, and by the loss; chosen.
 _STEP = 1e-4
 # Number of thin plates that are drawn.
 _SHEETS = 6000
 # Number of half spaces drawn for several angles.
 _HALF_SPACES = 4000
-# Frequencies of the sweep at which a thin plate is computed.
+# Frequencies of the sweep at which a thin plate is computed; chosen.
 _FREQUENCIES = 9
 # Keeps products of odds over several scans finite.
 _MOST_LOG_ODDS = 200.0

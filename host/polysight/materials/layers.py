@@ -34,7 +34,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
-# Frequencies of a sub-band at which a layer is modelled.
+# Frequencies of a sub-band at which a layer is modelled; chosen.
 _FREQUENCIES = 24
 METAL = complex(np.inf, 0.0)
 """Permittivity that stands for a layer of metal: a perfect conductor."""
@@ -154,7 +154,7 @@ class Bands:
 
 
 MAX_PERMITTIVITY = 1000.0
-"""Largest permittivity and loss of a known layer."""
+"""Largest permittivity and loss of a known layer; chosen."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ REAL_RANGE = (1.0, 40.0)
 LOSS_RANGE = (0.0, 60.0)
 """Search ranges of the permittivity: from air to beyond water at these frequencies (9.4 - j18)."""
 THICKNESS_RANGE_M = (0.1e-3, 12e-3)
-"""Search range of an unknown thickness."""
+"""Search range of an unknown thickness; chosen."""
 START_PHASE_RAD = 0.25
 """Step of the start grid in the phase of the path through the layer and back: no valley is narrower."""
 # Grid of start values: loss tangents, number of indices, and number of its local minima that are solved.
@@ -256,7 +256,7 @@ UNLIKELY = 1e-3
 """Probability of a larger chi-square below which the stack does not explain the data."""
 DETERMINED = 0.05
 """Largest relative half width of 95 % regions of a fit that is not ambiguous."""
-# Draws of the posterior for its second moments.
+# Draws of the posterior for its second moments; chosen.
 _DRAWS = 1500
 # Draws farther away than this, in standard deviations, are left out.
 _REACH = 4.0

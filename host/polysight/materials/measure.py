@@ -31,7 +31,7 @@ Speckle averages out; edges, neighbours and ripple are correlated over 10 to 20 
 Scenes of the independent generator are described best by 0.9 and 1.0; for the published picture it is a little more.
 """
 USUAL_BLOCKS = 2.0
-"""Weight of the scene's usual scatter against a plate's own, in independent places of the plate."""
+"""Weight of the scene's usual scatter against a plate's own, in independent places of the plate; chosen."""
 BLOCK_M = 0.012
 """Length over which the errors of V / H within a plate are correlated."""
 LEAST_STD = 0.6e-3
@@ -63,7 +63,7 @@ LEAST_PIXELS = 12
 FLAT_CONTRAST = 0.4
 """Largest standard deviation of |H| over its mean in a patch: noise or speckle has 0.52, plates less than 0.25."""
 LEAST_LEVEL = 2.0
-"""Least |H| of a patch over the background's root mean square."""
+"""Least |H| of a patch over the background's root mean square; chosen."""
 ODD_SHARE = 0.15
 ODD_RATIO = 0.15
 """Share of pixels that are this far from the median V / H above which a patch holds several materials."""
@@ -81,10 +81,10 @@ standard deviations, with one independent value in nine pixels and medians that 
 DIM_V = 0.12
 """|V| over |H| below which the phase between both is not judged."""
 LEAST_COHERENCE = 0.7
-"""Least coherence of H and V over the pixels of a plate."""
+"""Least coherence of H and V over the pixels of a plate; chosen."""
 IN_NOISE = 2.0
 """|V| over its background below which V is rather noise: its phase tells nothing."""
-# Margin around patches that does not count as background
+# Margin around patches that does not count as background; chosen.
 _AROUND_PX = 6
 # A region that was left out is a table behind if it is larger than this many times the largest patch. In the demo it is
 # 29 times as large; dim plates of drawn scenes are 0.1 to 1.3 times, or two that touch. Between them it is chosen.

@@ -41,7 +41,7 @@ METAL_SPECIMENS = 0.1
 """|V/H - 1| below which a material is metal, whose specimens do not differ."""
 SOFT = 0.05
 """|V / H| below which its errors are additive (leakage, noise) instead of relative (gain, phase)."""
-# Difference quotient of the features by ln eps' and ln eps''.
+# Difference quotient of the features by ln eps' and ln eps''; chosen.
 _STEP = 1e-4
 # Expectation maximisation ends after these rounds, or when one changes the pooled variances by less than this share.
 _ROUNDS = 300

@@ -47,7 +47,7 @@ BAND_SHARE = 0.75
 All of these constants are measured in simulated scenes of layered plates (benchmarks/layers).
 """
 BAND_STD = 5e-4
-"""Least value of that error, even with uniform pixels."""
+"""Least value of that error, even with uniform pixels; chosen."""
 BAND_AMPLITUDE_SHARE = 0.5
 BAND_AMPLITUDE_STD = 3e-3
 """Error of ln |H| of one sub-band relative to the others, per spread of the pixels about the whole sweep's |H|, and its

@@ -71,12 +71,12 @@ _ALLOWED = {
     ("numpy.core.numeric", "_frombuffer"),
     ("numpy._core.numeric", "_frombuffer"),
 }
-# Usual number of parts of the cross-validation; one part is left out at a time.
+# Usual number of parts of the cross-validation; one part is left out at a time; chosen.
 FOLDS = 8
 # The split of a score whose training and test pixels are of the same patches.
 OPTIMISTIC = "by pixel (optimistic)"
 PIXELS = 16
-"""Pixels of each patch, in a library and to judge models."""
+"""Pixels of each patch, in a library and to judge models; chosen."""
 
 
 @dataclass(frozen=True)

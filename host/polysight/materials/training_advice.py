@@ -45,7 +45,7 @@ LEAST_MISFIT = 0.05
 """Difference between the mean confidence and the share of correct names that is reported, unless it may be chance."""
 ALIKE_STD = 2.0
 """Distance of two materials, in standard deviations of a patch, below which one may be named as the other."""
-# Largest number of pairs of materials that are listed.
+# Largest number of pairs of materials that are listed; chosen.
 SHOWN_PAIRS = 3
 
 

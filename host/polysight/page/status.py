@@ -26,7 +26,7 @@ SINCE = "{since}"
 """The page puts the elapsed time here."""
 PAPER_PHASE_RAD = 0.022
 """Phase residual after all stages, paper section 9.1."""
-# A fault stays in the headline until so many rows came without one.
+# A fault stays in the headline until so many rows came without one; chosen.
 RECENT_ROWS = 3
 # A row is late after so many usual durations, and after at least so many seconds; chosen.
 LATE_ROWS = 3.0
@@ -35,7 +35,7 @@ LATE_S = 60.0
 DIRECT_RAD = 0.1
 # Share of positions without a direct path that gives a warning; chosen.
 MASKED_SHARE = 0.05
-# Notices of the manifest that a page lists.
+# Notices of the manifest that a page lists; chosen.
 MAX_NOTICES = 30
 # Characters of an ISO time up to its seconds: the page and the manifest write different fractions.
 ISO_SECONDS_CHARACTERS = 19

@@ -64,20 +64,20 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 FFT_POINTS = 2048
 PROFILE_POINTS = 240
 PROFILE_FLOOR_DB = -70.0
-# Excess path that a profile shows before the direct path and beyond the scene.
+# Excess path that a profile shows before the direct path and beyond the scene; chosen.
 BEFORE_M = 0.25
 BEYOND_M = 0.35
-# Shortest time between two pictures, while many rows are caught up with.
+# Shortest time between two pictures, while many rows are caught up with; chosen.
 PICTURE_INTERVAL_S = 0.5
 POLL_S = 0.1
 
-# Bytes at the beginning of a file by which a replaced file is recognised.
+# Bytes at the beginning of a file by which a replaced file is recognised; chosen.
 HEAD_BYTES = 256
-# Time between two readings of the files.
+# Time between two readings of the files; chosen.
 TURN_S = 0.2
-# Timeout of waiting for an event of the Pi.
+# Timeout of waiting for an event of the Pi; chosen.
 LISTEN_MS = 200
-# Faults of the current row that are kept for the page.
+# Faults of the current row that are kept for the page; chosen.
 MAX_FAULTS = 20
 # Longest time from a manifest's first line to the first sign of life of its program; chosen.
 GRACE_S = 6.0

@@ -62,7 +62,7 @@ _MAX_DUTY = 0.95
 _MAX_TRAVEL_WAVELENGTHS = 0.5
 # Largest number of frames in a row, as in host/polysight/radar/commands.py.
 _MAX_FRAMES = 65535
-# Characters of a line of warnings.
+# Characters of a line of warnings; chosen.
 _WIDTH = 118
 # Rows from which the noise is measured; chosen.
 _NOISE_ROWS = 5

@@ -57,7 +57,7 @@ MOST_PEAK = 1e9
 _EXPECTED = (
     "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid [ny, nx], incidence_deg, simulated, conjugate"
 )
-# Distances of the object plane between which `place_rig` looks for an incidence angle.
+# Distances of the object plane between which `place_rig` looks for an incidence angle; chosen.
 _NEAREST_MM = 60.0
 _FARTHEST_MM = 1e5
 
@@ -466,7 +466,7 @@ def turn_reasons(result: materials.MaterialsResult) -> list[Finding]:
 
 TOLD_PAINT = 0.2
 TOLD_SIGN = 0.02
-"""Probability of paint and of the other sign from which on the verdict tells them."""
+"""Probability of paint and of the other sign from which on the verdict tells them; chosen."""
 
 
 def sign_reasons(other_sign: float, conjugated: bool, painted: float = 0.0) -> list[Finding]:

@@ -41,7 +41,7 @@ CHANNELS = ("h", "v", "p")
 QUANTITIES = ("amplitude", "phase")
 # Amplitudes are shown down to this far below the upper end of their colours.
 AMPLITUDE_RANGE_DB = 35.0
-# Single bright pixels shall neither darken the rest of an amplitude nor fade a phase.
+# Single bright pixels shall neither darken the rest of an amplitude nor fade a phase. Both are chosen.
 BRIGHT_PERCENTILE = 99.8
 REFERENCE_PERCENTILE = 99.5
 # Phases and ratios begin to show this far below the brightest pixels, and are opaque from the second level on.
@@ -148,11 +148,11 @@ def _find_ratio_limits_db(level: Real, is_opaque: Mask, patches_db: Sequence[flo
 
 # --- permittivity of each pixel ---
 
-# Largest error of a permittivity that says something, relative to its size.
+# Largest error of a permittivity that says something, relative to its size; chosen.
 LARGEST_ERROR = 0.5
 # Standard errors by which a permittivity may lie beyond what a half space can have.
 LARGEST_DEVIATION = 2.0
-# Step for the derivative by the incidence angle.
+# Step for the derivative by the incidence angle; chosen.
 _ANGLE_STEP_RAD = 1e-6
 
 Complex = npt.NDArray[np.complex128]

@@ -34,7 +34,7 @@ _BOOT_TIMEOUT_S = 5.0
 # For how long the reset line is held (chosen).
 _RESET_S = 0.1
 _READY_TIMEOUT_S = 1.0
-# Events that are kept of a board; a faulty one could report without end.
+# Events that are kept of a board; a faulty one could report without end; chosen.
 _MAX_EVENTS = 1000
 # Temperature sensors in the order of the device's answer.
 _SENSORS = ("rx1", "rx2", "rx3", "rx4", "tx1", "tx2", "tx3", "pm", "digital")

@@ -97,7 +97,7 @@ class RadarControl(ABC):
 
 # Time between two queries of the boards (chosen).
 _POLL_S = 0.005
-# USB needs some time to find a chip again that was reset or replugged.
+# USB needs some time to find a chip again that was reset or replugged. Both times are chosen.
 _REOPEN_TIMEOUT_S = 5.0
 _REOPEN_INTERVAL_S = 0.25
 # What the state of a board means for a row; a board in another state is not armed.

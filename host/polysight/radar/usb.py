@@ -23,7 +23,7 @@ VENDOR = 0x0451
 PRODUCT = 0xFD03
 # A place begins with this prefix if it is a path, such as "usb:1-4.2"; without it, it is a serial number.
 PATH = "usb:"
-# Longest wait for the answer to a command, and after how long the chip sends a packet that is not full.
+# Longest wait for the answer to a command, and after how long the chip sends a packet that is not full; chosen.
 _READ_TIMEOUT_S = 0.5
 _LATENCY_MS = 1
 _CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists the chips"
@@ -72,10 +72,10 @@ SLOW_DIVISOR = 29
 # One pin command holds its pins for 0.2 us (FTDI AN_114), two clocks at 10 MHz; ICD 3.2.4 wants two at least.
 _SELECT_COMMANDS = 2
 _IDLE_COMMANDS = 3
-# Pause between two words of a slow link.
+# Pause between two words of a slow link; chosen.
 _SLOW_GAP_S = 100e-6
 _DESELECT = bytes((_PINS, IDLE, SPI_DIRECTION)) * _IDLE_COMMANDS
-# For how long the reset line is left to settle.
+# For how long the reset line is left to settle; chosen.
 _RESET_S = 0.01
 
 

@@ -57,7 +57,7 @@ FIGURES: dict[str, str] = {
 }
 # Pixels further out than this share of a patch's box belong to its edge, where two materials mix; chosen.
 _INSIDE = 0.6
-# Range of the phase of P that the colours span: percentiles of the pixels, at least and at most this wide.
+# Range of the phase of P that the colours span: percentiles of the pixels, at least and at most this wide; chosen.
 _PERCENTILES = (5.0, 95.0)
 _LEAST_DEG = 20.0
 _MAX_DEG = 300.0

@@ -41,12 +41,12 @@ _STYLES: dict[float, dict[str, Any]] = {
 # Size of a patch's number and of its point in `permittivity_figure`, in points of 1/72 inch, measured on its PNG.
 _LABEL_PT = (9.0, 9.0)
 _POINT_PT = 5.0
-# Places that `place_numbers` tries: rings around the point, and directions on each.
+# Places that `place_numbers` tries: rings around the point, and directions on each; chosen.
 _RADII_PT = (11, 17, 25, 34, 45, 58)
 _ANGLES = 16
 # A number further from its point than the nearest ring, with a little room, gets a line to it.
 _LINE_FROM_PT = _RADII_PT[0] + 1
-# Room for ellipses beyond estimates and truths, and an empty margin, as shares of the span of these.
+# Room for ellipses beyond estimates and truths, and an empty margin, as shares of the span of these; chosen.
 _ELLIPSE_SHARE = 0.75
 _MARGIN_SHARE = 0.08
 # Smallest span of the axes, real part and loss: points that lie together are not drawn far apart.

@@ -68,7 +68,7 @@ LEAKAGE_SHARE = 0.02
 LIBRARY_ANGLE_DEG = 0.3
 """Difference from the library's angle; the ratio of a material changes by 3 % in 0.3 degrees."""
 PAINT_TOLD = 0.2
-"""Probability of a painted metal reference from which on the verdict tells it."""
+"""Probability of a painted metal reference from which on the verdict tells it; chosen."""
 MOST_OUTSHINING_DB = 6.0
 """Largest level of a plate relative to metal: a factor of two by thickness, tilt and illumination (published
 pictures)."""

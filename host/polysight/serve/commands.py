@@ -37,7 +37,7 @@ REQUEST = "request.json"
 MAX_REQUEST_BYTES = 1 << 16
 Format = Literal["csv", "mat", "netcdf"]
 """Formats of exports, which are written into `<scan>/export`."""
-# Largest number of positions of a row, and of rows.
+# Largest number of positions of a row, and of rows; chosen.
 MAX_POSITIONS = 2000
 # Largest number of sub-bands that the page may ask for; chosen.
 MAX_BANDS = 16

@@ -33,7 +33,7 @@ from polysight_shared.program import delay_interrupts, ignore_interrupts
 # First bytes of a command to a scan.
 COMMAND = b"POST /api/control/"
 TOKEN_LINE = TOKEN_HEADER.lower().encode()
-# Connections that are accepted, or taken over, before other work of the process is done.
+# Connections that are accepted, or taken over, before other work of the process is done; chosen.
 ACCEPTED_AT_ONCE = 64
 # Connections that have not sent anything. With one more, the one that is silent for longest is closed.
 MOST_SILENT = 1024

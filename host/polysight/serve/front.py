@@ -55,7 +55,7 @@ MEDIA_TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+
 READER_PATIENCE_S = 20.0
 CONNECT_INTERVAL_S = 0.1
 CHUNK_BYTES = 1 << 16
-# Running scans are looked for at most this often, however many pages ask.
+# Running scans are looked for at most this often, however many pages ask; chosen.
 RUNNING_AGE_S = 0.5
 # The header of every page shows a killed scan for this long; later, only the list of scans does.
 KILLED_SHOWN_S = 3600.0

@@ -132,7 +132,7 @@ def _check_place(place: Path, kind: str) -> None:
 
 # More than a weekend of scans of two hours each.
 MAX_WAITING = 50
-# Time between two attempts to start the next scan.
+# Time between two attempts to start the next scan; chosen.
 LOOK_S = 2.0
 # States of a scan (`page.status`) after which a person has to look at the rig.
 UNFINISHED = ("stopped", "failed", "lost", "frozen", "damaged")

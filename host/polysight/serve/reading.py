@@ -35,7 +35,7 @@ REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src
 CHUNK_BYTES = 1 << 18
 LIST_S = 0.5
 """Time after which a list of scans is sent as far as it was read: the first of 2,000 that no index has take 8 s."""
-# Number of attempts to read products, which may be replaced meanwhile.
+# Number of attempts to read products, which may be replaced meanwhile; chosen.
 MAX_TRIES = 5
 T = TypeVar("T")
 Endpoint = Callable[[Site, Request], Awaitable[Response]]

@@ -48,15 +48,15 @@ from polysight_shared.program import delay_interrupts, ignore_interrupts
 
 # Priority of the reading process, below capture and scan.
 NICE = 10
-# A browser opens up to six connections for a page.
+# A browser opens up to six connections for a page. The number is chosen.
 MAX_CONNECTIONS = 2048
-# Connections that may be accepted before the next one that has sent something is read.
+# Connections that may be accepted before the next one that has sent something is read; chosen.
 ACCEPTED_AT_ONCE = 128
 # Connections in the kernel's queue. A client that finds the queue full tries again after 1 s, and after 2 s more.
 BACKLOG = 4096
 # Idle connections are closed when there are too many, never for their age.
 KEEP_ALIVE_S = 10**6
-# Time that open connections have to end when the server stops.
+# Time that open connections have to end when the server stops; chosen.
 CLOSE_S = 1
 # Pause before the reading process is started again, so that one that fails at once takes no processor.
 RESTART_S = 1.0

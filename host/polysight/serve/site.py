@@ -33,7 +33,7 @@ from polysight_shared.errors import ConfigError, DeviceError
 READ_S = 30.0
 """Time limit of one read. Longer ones are refused, and so is their folder until they have returned."""
 SIZE_S = 30.0
-"""Time after which other folders are counted by another thread."""
+"""Time after which other folders are counted by another thread; chosen."""
 HIDDEN = ".polysight"
 """Folder beside the scans that holds the logs of programs that belong to no scan."""
 LIBRARIES = "libraries"
@@ -43,17 +43,17 @@ MAX_PICTURES = 400
 MAX_COMPARISONS = 4
 # A check plate's result takes a few hundred bytes; reading it again takes milliseconds for each scan.
 MAX_CHECKS = 20_000
-# Each live view forms images with an own pipeline.
+# Each live view forms images with an own pipeline. The number is chosen.
 MAX_WATCHES = 4
 # A live view without pages stays open for this long; chosen: a page that is loaded again finds it.
 LINGER_S = 30.0
 # Reads at a time, of all folders and of one: chosen, so that one folder that hangs takes half of the threads at most.
 READERS = 4
 READERS_OF_ONE_FOLDER = 2
-# A folder's size is counted again after so long, at most.
+# A folder's size is counted again after so long (chosen), at most.
 SIZE_AGE_S = 20.0
 STREAM_INTERVAL_S = 0.1
-# A page that receives nothing for some of these reconnects.
+# A page that receives nothing for some of these (chosen) reconnects.
 ALIVE_INTERVAL_S = 2.0
 T = TypeVar("T")
 

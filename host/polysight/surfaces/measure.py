@@ -36,9 +36,9 @@ Array = NDArray[np.float64]
 MAX_GAP_M = 0.02
 MAX_PATH_MISS_M = 0.002
 MAX_TURN_RAD = 0.35
-# Windows of one surface whose path curvature is averaged.
+# Windows of one surface whose path curvature is averaged; chosen.
 NEIGHBOURHOOD_M = 0.024
-# Points so close on a surface have the same curvature; they are counted in cells.
+# Points so close on a surface have the same curvature; they are counted in cells; chosen.
 SAME_CURVATURE_M = 0.012
 CELL_M = 0.004
 # A group of fewer points is no surface: a chance of noise and edges.

@@ -33,7 +33,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-# Step of numerical derivatives by the angle of incidence, radians.
+# Step of numerical derivatives by the angle of incidence, radians; chosen.
 ANGLE_STEP = 1e-3
 
 

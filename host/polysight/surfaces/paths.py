@@ -42,7 +42,7 @@ STRIDE_M = 0.008
 MAX_SLOPE = 0.47
 # Slopes of the coarse search on each axis, from -MAX_SLOPE to MAX_SLOPE: two in a resolution cell of 0.11.
 SLOPE_BINS = 19
-# Largest number of echoes of one window.
+# Largest number of echoes of one window; chosen.
 MAX_ECHOES = 5
 # Share of a window's power that a plane wave explains; noise alone gives 0.01.
 MIN_SHARE = 0.05

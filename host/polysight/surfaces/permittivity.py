@@ -40,9 +40,9 @@ from polysight.surfaces.paths import STRIDE_M
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-# A point whose ratio lies so many usual misses from the segment's does not belong to it.
+# A point whose ratio lies so many usual misses from the segment's does not belong to it; chosen.
 OUTLIER = 4.0
-# Ripples of edges and of other echoes change over such a distance: points within it have the same scatter.
+# Ripples of edges and of other echoes change over such a distance: points within it have the same scatter; chosen.
 RIPPLE_M = 0.04
 # Side of the square that is as large as a Fresnel zone (40 x 70 mm): ripples that edges make are as long.
 FRESNEL_ZONE_M = 0.053
@@ -79,7 +79,7 @@ MIN_FILLING = 0.75
 LEAST_SHARE = 0.01
 # Offsets closer than this are of one column of windows: rows start a little apart, as the stage moves within a burst.
 SAME_COLUMN_M = 1.5e-3
-# Step of numerical derivatives by the permittivity.
+# Step of numerical derivatives by the permittivity; chosen.
 EPS_STEP = 1e-4
 # Range of permittivities to which iterations are limited, eps' and the imaginary part of eps' - j eps'': solids and
 # water, and a little gain, which noise may give.

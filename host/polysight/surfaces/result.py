@@ -51,7 +51,7 @@ POINTS = "surface.ply"
 MIN_RADIUS_M = 0.040
 # A surface that bends less than this, 1 / m, is flat: a radius of 2 m.
 FLAT_BEND = 0.5
-# Least number of points away from the edges that a permittivity is fitted to.
+# Least number of points away from the edges that a permittivity is fitted to; chosen.
 MIN_POINTS = 20
 # Ratio r_s / r_p of metal is 1; a permittivity of 40 without loss has 1.5 at 55 degrees.
 METAL_RATIO = 0.15

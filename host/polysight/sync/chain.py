@@ -72,15 +72,15 @@ _POSITIONS = 32
 # Cubes: rows from which their form is detected, and about how many of their positions.
 _CUBE_ROWS = 7
 _FORM_POSITIONS = 300
-# Echoes come from within this distance of the mirror point.
+# Echoes come from within this distance of the mirror point; chosen.
 _SPREAD_M = 0.15
-# Noise power of a sample relative to the object, for the estimate of the direct path.
+# Noise power of a sample relative to the object, for the estimate of the direct path; chosen.
 _NOISE = 1e-3
 # The simplest convention is kept if it explains this part of the best one's power.
 _PREFER_SIMPLE = 0.7
 # Smallest constant share of the direct path's power if the cube is referenced to it.
 _COHERENT = 0.5
-# Smallest share of positions with a direct path.
+# Smallest share of positions with a direct path; chosen.
 _MIN_FOUND = 0.5
 # Share of power at the object above which the cube contains nothing else: its direct path was removed.
 _ALONE = 0.8

@@ -50,28 +50,28 @@ from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Burst alignment: reference chirps tried per position.
+# Burst alignment: reference chirps tried per position; chosen.
 _REFERENCES = 4
-# A good chirp has at least this part of the coherence of the position's median chirp.
+# A good chirp has at least this part of the coherence of the position's median chirp; chosen.
 _GOOD = 0.5
 # A chirp is disturbed if the others leave this many times the usual energy of a part of it unexplained; noise leaves
 # twice as much.
 _UNEXPLAINED = 8.0
 # Share of a part's energy that is no disturbance: -30 dB, above the effect of frequencies wrong by 0.1 bins.
 _NEGLIGIBLE = 1e-3
-# Times that a burst is aligned, each without the chirps found disturbed before.
+# Times that a burst is aligned, each without the chirps found disturbed before; chosen.
 _ROUNDS = 4
 # Clipping below full scale: least count, and one in so many words at the limit.
 _LEAST_LIMIT = 1024
 _AT_LIMIT = 32
 
-# Direct path: size of the search FFT, over decimated samples.
+# Direct path: size of the search FFT, over decimated samples; chosen.
 _FFT = 256
 # Standard deviation in x and y of the echoes' origin, around the mirror point.
 _SPREAD_M = 0.1
-# Relative gain and phase differences of the RX that the nulls tolerate.
+# Relative gain and phase differences of the RX that the nulls tolerate; chosen.
 _GAIN_SPREAD = 0.3
-# Noise power of a sample relative to an echo as strong as the direct path.
+# Noise power of a sample relative to an echo as strong as the direct path; chosen.
 _NOISE = 1e-2
 # Clutter behind the object: largest excess path, and power of all of it relative to the direct path. At this power the
 # estimate holds a sixth of the clutter's power that it holds without, and 0.5 % more noise.
@@ -81,7 +81,7 @@ _CLUTTER_POWER = 4e-3
 _STEPS = 3
 # A second peak this strong, one object distance below the first, is the direct path.
 _COMPARABLE = 0.35
-# Smallest amplitude of a direct path, relative to the row's median.
+# Smallest amplitude of a direct path, relative to the row's median; chosen.
 _LOST = 0.3
 # Standard deviations from the row's amplitude beyond which a position's second peak is tried.
 _OUTLIER = 5.0

@@ -35,12 +35,12 @@ _CALL_BYTES = 65_000
 _CALL_SEGMENTS = 44
 # The next packets (about 100 kB) are sent while fewer bytes than these are unread at the receiver.
 _UNREAD_BYTES = 128 << 10
-# Time between two looks at the receiver's queue while it is full.
+# Time between two looks at the receiver's queue while it is full; chosen.
 _POLL_S = 0.001
-# Time to wait for a receiver that does not read; then its packets are lost, as with a real card.
+# Time to wait for a receiver that does not read; then its packets are lost, as with a real card; chosen.
 _WAIT_TIMEOUT_S = 2.0
 _MAX_QUEUED_BYTES = 64 << 20
-# Largest delay of the packets that later calls make up for.
+# Largest delay of the packets that later calls make up for; chosen.
 _CATCH_UP_S = 0.01
 
 
@@ -263,7 +263,7 @@ NO_DATA_FLOOR_S = 10.0
 if TYPE_CHECKING:
     from polysight_simulators.scene import SignalSource
 
-# Number of frames per call, which bounds the memory.
+# Number of frames per call, which bounds the memory; chosen.
 FRAMES_PER_CALL = 64
 MAC = b"\x12\x34\x56\x78\x90\x12"
 Clock = Callable[[], float]

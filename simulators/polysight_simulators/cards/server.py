@@ -13,7 +13,7 @@ from polysight_simulators.cards.dca1000 import TAIL_S
 from polysight_simulators.cards.sync_in import StageTrack
 from polysight_simulators.radars import LineServer, RadarSocket
 
-# Edges that are taken from the wires before the cards send again.
+# Edges that are taken from the wires before the cards send again; chosen.
 EDGES_PER_TURN = 2048
 # Time between reads of the wires with pulses: many frames per call cost less than a few.
 GATHER_S = 0.01

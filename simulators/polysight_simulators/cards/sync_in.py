@@ -16,7 +16,7 @@ from polysight_simulators.radars import RadarBoard
 
 # Time between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger).
 RECOVERY_US = 150.0
-# The last so many motion lines, and triggers, are kept at least; they are cut to it at twice as many.
+# The last so many motion lines, and triggers, are kept at least; they are cut to it at twice as many; chosen.
 _KEEP = 4096
 
 

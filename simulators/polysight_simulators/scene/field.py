@@ -49,7 +49,7 @@ from polysight_simulators.scene.spectral_grid import OVERSAMPLING, TAPS, Axis, o
 # Errors relative to an echo, chosen: smaller ones take more kernels, that is more transforms.
 # Of the Chebyshev series in the local angle.
 _ANGLE_TOLERANCE = 1e-4
-# Of the interpolation in dpath/dz.
+# Of the interpolation in dpath/dz; chosen.
 _RELIEF_TOLERANCE = 2e-4
 # Range of heights that share a kernel. Chosen: a wider one takes fewer levels, each with more nodes of dpath/dz.
 _LEVEL_MM = 2.0

@@ -96,7 +96,7 @@ Spread = Annotated[float, msgspec.Meta(ge=0, le=2)]
 Leakage = tuple[Annotated[float, msgspec.Meta(ge=-10, le=10)], Annotated[float, msgspec.Meta(ge=-10, le=10)]]
 Pair = tuple[float, float]
 MAX_FACETS = 100_000
-"""Largest number of facets of a rough plate."""
+"""Largest number of facets of a rough plate; chosen."""
 _OVERRIDES: dict[str, type] = {"grid": Grid, "burst": Burst, "image": Image, "stage": Stage}
 
 

@@ -17,7 +17,7 @@ from polysight_simulators.stage.logic import MOTION_VERBS, Event, Refused, Stage
 from polysight_simulators.stage.motion import NS_PER_TICK, SWITCH_X, SWITCH_Y, TICK_HZ, StepEngine
 
 FIRMWARE = "0.1.0"
-# Interval of motion messages while the speed changes: 10 ms
+# Interval of motion messages while the speed changes: 10 ms; chosen.
 REPORT_TICKS = TICK_HZ // 100
 # Check field at the end of a line: `*` and the CRC-16 in four hexadecimal digits.
 _TAIL = re.compile(rb"\*([^*]{4})")

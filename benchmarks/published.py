@@ -138,6 +138,7 @@ class Synchroniser:
         else:
             spectrum = np.asarray(scipy.fft.fft(beam, RANGE_BINS))
         power = np.abs(spectrum)
+        # As published: the first of the peaks of at least half the maximum, two bins apart or more.
         peaks, _ = scipy.signal.find_peaks(power, height=power.max() / 2, distance=2)
         best = int(peaks[0] if len(peaks) else power.argmax())
         if beam is not None:

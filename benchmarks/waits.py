@@ -21,8 +21,9 @@ from polysight.settings import Settings
 from polysight.store import MANIFEST, ScanFolder
 
 __all__ = ["add_arguments", "run"]
+# How often each wait is measured; the median counts.
 REPEATS = 3
-# CPU seconds that each command may take; {made} is a folder of products.
+# CPU seconds that each command may take (all limits here are chosen); {made} is a folder of products.
 COMMANDS = {
     "--help": 0.2,
     "materials {made}": 0.6,
@@ -111,6 +112,7 @@ def run(args: argparse.Namespace) -> int:
         scans_in_list = 20
     with temporary(args.folder) as folder:
         count = rows_that_fit(rig, most_rows, folder)
+        # Four simulated rows, again and again.
         write_scan(folder / "scan", rig, recorded_rows(rig, scene, min(4, count)), count)
         behind = [rows_then_products(folder / "scan", folder / f"out{n}") for n in range(repeats)]
         same, other_seconds = from_samples(folder / "scan", repeats)
@@ -123,20 +125,24 @@ def run(args: argparse.Namespace) -> int:
         waited = [seconds_by_stage[stage] for seconds_by_stage in behind]
         note = ", ".join(f"{seconds:.2f}" for seconds in waited)
         lines.append(
-            _report_least(f"last committed row to {stage}, wall s", statistics.median(waited), limit, limit, note)
+            _report_seconds(f"last committed row to {stage}, wall s", statistics.median(waited), limit, limit, note)
         )
     for name, took in (("its own plane", same), ("another plane", other_seconds)):
-        lines.append(_report_least(f"image from kept samples, {name}, a board, CPU s", took.median / boards, 0.15, 0.1))
+        lines.append(
+            _report_seconds(f"image from kept samples, {name}, a board, CPU s", took.median / boards, 0.15, 0.1)
+        )
     for name, took in (("first look", first), ("later", again)):
         note = f"{took.median_wall:.2f} s wall"
         lines.append(
-            _report_least(f"list of 200 scans of the operator's page, {name}, CPU s", took.median, 1.0, 0.5, note)
+            _report_seconds(
+                f"list of {scans_in_list} scans of the operator's page, {name}, CPU s", took.median, 1.0, 0.5, note
+            )
         )
     for name, times in typed.items():
         cpu = statistics.median(t[0] for t in times)
         wall = statistics.median(t[1] for t in times)
         note = f"{wall:.2f} s wall"
-        lines.append(_report_least(f"polysight {name.split()[0]}, CPU s", cpu, COMMANDS[name], COMMANDS[name], note))
+        lines.append(_report_seconds(f"polysight {name.split()[0]}, CPU s", cpu, COMMANDS[name], COMMANDS[name], note))
     show("waiting times, simulated rows", lines, args.quick)
     write(args.json, "waits", lines, behind=behind, commands=typed)
     return 0
@@ -162,5 +168,8 @@ def small_products(folder: Path) -> Path:
     return products
 
 
-def _report_least(name: str, value: float, at_least: float, aim: float, note: str = "") -> Line:
-    return Line(name, f"{value:.3f} s", "", value, at_least, aim, higher_is_better=False, note=note)
+def _report_seconds(name: str, value: float, limit: float, aim: float, note: str = "") -> Line:
+    """Return a line for seconds that must not exceed the limit, and should not exceed the aim."""
+    return Line(
+        name, f"{value:.3f} s", theirs="", value=value, at_least=limit, aim=aim, higher_is_better=False, note=note
+    )

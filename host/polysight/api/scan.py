@@ -570,7 +570,8 @@ class Scan:
         """The result if it is saved or was computed already."""
         if self._saved is not None:
             return self._saved
-        # Cached properties that were computed are in the instance's dict; asking for them would compute them.
+        # Cached properties that were computed are in their instance's dict; asking for them would compute them. If
+        # `_processing` was not, `self` stands for it, which has no `referenced` in its dict.
         processing = vars(self).get("_processing", self)
         return vars(processing).get("referenced")
 

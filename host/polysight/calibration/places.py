@@ -50,7 +50,7 @@ _SEARCH_POSITIONS = 100
 # Range of the search and its step, less than half a resolution cell.
 _REACH_MM = 12.0
 _STEP_MM = 1.5
-# Noise power of a component of the reduced samples, relative to the largest, below which it is empty.
+# Noise power of a component of the reduced samples, relative to the largest, below which it is empty; chosen.
 _MIN_NOISE = 1e-3
 # Part of the power that the points must explain; with less, another target or other objects were seen. Chosen.
 _MIN_EXPLAINED = 0.3
@@ -176,7 +176,7 @@ def fit_places(
     size = sum(b.samples.size for b in boards)
     sigma = float(np.sqrt(np.mean(misfit(start, 1.0)[: 2 * size] ** 2)))
     fit: Any = None
-    # Each fit improves the estimate of the noise
+    # Each fit improves the estimate of the noise. Tolerances and steps (a tenth of each prior) are chosen.
     for tolerance in (1e-3, 1e-6, 1e-8):
         fit = scipy.optimize.least_squares(
             misfit, start, args=(sigma,), method="lm", x_scale=scale / 10, ftol=tolerance, xtol=tolerance

@@ -96,7 +96,7 @@ def _find_failed_prerequisite(check: Check, board: Board | None, blocked: dict[t
         for (name, board_name), failed in blocked.items():
             if name == need and (board is None or board_name in ("", board.name)):
                 return failed
-    # One that was skipped has the title of another check.
+    # For `unless` a check counts if it failed itself: one that was skipped is in `blocked` with another's title.
     return next((name for name in check.unless if blocked.get((name, "")) == name), "")
 
 

@@ -120,6 +120,7 @@ def make_surface(data: Path, rig: Path | Instrument | None = None, reference: Pa
     gains: Reference | None = None
     if reference is not None:
         _, _, metal = process_to_points(reference, rig)
+        # The largest surface has the number 0.
         gains = measure_surfaces.make_reference(measure_surfaces.thin_out(metal[metal.segment == 0]))
     return measure_surfaces.analyse_points(pipeline, optics, points, gains)
 

@@ -11,7 +11,8 @@ On ln|H|, ln|V| and arg P errors of gain and of phase are additive. A pixel of m
 with e the pixel's own error (speckle), u_p the error of the whole patch (placement, uneven illumination), g_s that of
 the scan's metal reference, common to all its patches, and d the deviation of the specimen from its material in ln eps'
 and ln eps'', which F_m converts to features (`specimens.py`): a linear model with random effects (Searle, Casella and
-McCulloch, Variance Components, chapter 5). If V nearly vanishes its error is additive (`soft_modulus`). The covariances
+McCulloch, Variance Components, chapter 5). If V nearly vanishes its error is additive: ln|V| counts relative to a scale
+that stays above zero (`soft_modulus` of `specimens.py`). Logarithms of less than 1e-6 of metal are cut. The covariances
 are estimated from the library: by residual mean squares of pixels, patches and scans; that of patches is divided into
 placement and specimen by expectation maximisation. A decision uses them as follows:
 
@@ -125,7 +126,7 @@ class ErrorDiscriminant(Model):
         self.channels = channels
 
     def fit(self, samples: Samples) -> ErrorDiscriminant:
-        """Estimate means and covariances."""
+        """Estimate means and covariances; of `samples`, `groups` are the scans and `plates` the specimens."""
         # Deviations of the pixels from their material's anchor, and their means over patches.
         self.names, material_index = np.unique(samples.names, return_inverse=True)
         self.angles_rad = [math.radians(a) for a in samples.angles_deg]
@@ -159,6 +160,7 @@ class ErrorDiscriminant(Model):
             _compute_covariance(pixel[used], max(int(used.sum() - informative.sum()), 1))
         )
         self._effects = self._compute_specimen_effects()
+        # The fitted means took degrees of freedom, and variance, from the residuals: they are scaled up for it.
         self._fit_patches(
             residual[informative] * np.sqrt(informative.sum() / dof), material[informative], plate[informative], dof
         )
@@ -219,6 +221,7 @@ class ErrorDiscriminant(Model):
         ids, patch = np.unique(patches, return_inverse=True)
         deviations = self._compute_deviations(x) - self.level
         mean = np.stack([deviations[patch == i].mean(axis=0) for i in range(ids.size)])
+        # The smallest patch's number, at most the library's usual one, stands for all patches.
         pixels = float(min([self.pixels, *np.bincount(patch).tolist()]))
         patch_covariances = self._patch_covariances(pixels)
         informative = ~self._find_metal_like(x, patch)

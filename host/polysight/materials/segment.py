@@ -31,7 +31,7 @@ _LEAST_WEIGHT = 0.1
 EDGE_DB = 6.0
 """A plate's edge is at half of its amplitude, the edge of a band-limited step."""
 OVERFLOW = 1.5
-"""Growth within one step of the threshold by which a region runs into its background."""
+"""Growth within one step of the threshold by which a region runs into its background; chosen."""
 MOST_SCATTER_DB = 4.0
 """Largest scatter of a background's level: that of a real picture is 3.8 dB; with more, plates are among the pixels."""
 PLAIN_DB = 14.0
@@ -42,7 +42,7 @@ SMALLEST_SHARE = 0.75
 BODY = 0.65
 """Parts of a region narrower than this share of its width do not belong to it. Chosen: more rounds corners."""
 STEP_DB = 1.0
-"""Step of the falling threshold."""
+"""Step of the falling threshold; chosen."""
 BACKGROUND_PERCENT = 20.0
 """Percentile of a channel's power that is its background: plates rarely fill more of an image."""
 NOISY = 0.005
@@ -55,14 +55,14 @@ MOST_APART_MM = 10.0
 """Distances between the images of H and V that are corrected: smaller ones are below its error (0.2 mm), and larger
 ones have no such cause."""
 EDGE_FLOOR = 0.05
-"""Level relative to the brightest below which edges do not count."""
+"""Level relative to the brightest below which edges do not count; chosen."""
 ALIKE = 0.5
 """Least correlation of the edges in H and V once they lie on each other: images of noise have less than 0.1."""
 
 
 @dataclass(frozen=True)
 class SegmentSettings:
-    """Settings of the segmentation.
+    """Settings of the segmentation; the defaults are chosen.
 
     Attributes
     ----------
@@ -274,6 +274,7 @@ def segment(
             left_out.append(mask)
     labels = np.zeros(h.shape, np.int32)
     patches = []
+    # Plates of one row lie within two widths of the smallest patch; 1 mm keeps a setting of 0 from dividing by it.
     for mask in sorted(masks, key=lambda mask: _find_reading_place(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
         labels[mask] = len(patches) + 1
         patch = make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable)
@@ -409,15 +410,16 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
     for threshold in np.arange(float(level[usable].max()), cfg.floor_db, -STEP_DB) - STEP_DB:
         grown: list[_Growing] = []
         for region in _find_components(_open_mask((level > threshold) & remaining, opening_px)):
-            # Regions at the threshold before that have grown into this one.
+            # Regions at the threshold before that have grown into this one, and those of them that stand out enough to
+            # be patches: two that meet, or one that runs over, are cut where they were.
             parts = [node for node in growing if (node.mask & region).any()]
-            complete = [node for node in parts if node.level_db - threshold >= cfg.least_contrast_db]
-            overflows = any(region.sum() > OVERFLOW * node.mask.sum() for node in complete)
+            standing_out = [node for node in parts if node.level_db - threshold >= cfg.least_contrast_db]
+            overflows = any(region.sum() > OVERFLOW * node.mask.sum() for node in standing_out)
             region_db = float(np.median(level[region]))
-            if len(complete) > 1 or overflows:
-                for node in complete:
+            if len(standing_out) > 1 or overflows:
+                for node in standing_out:
                     take_region(node.cut(float(threshold)))
-                grown += [node for node in parts if node not in complete]
+                grown += [node for node in parts if node not in standing_out]
             elif region_db - threshold >= EDGE_DB:
                 take_region(region)
             else:
@@ -483,7 +485,7 @@ def align(images: Images) -> tuple[Images, tuple[float, float]]:
     edges_v = _measure_edges(images.v, images.usable)
     if not edges_h.any() or not edges_v.any():
         return images, (0.0, 0.0)
-    # The type stub knows only the default's type, but None is documented.
+    # To a twentieth of a pixel (chosen). The type stub knows only the default's type, but None is documented.
     options: dict[str, Any] = {"upsample_factor": 20, "normalization": None}
     registration = skimage.registration.phase_cross_correlation(edges_h, edges_v, **options)
     back_px = np.asarray(registration[0], np.float64)

@@ -1,9 +1,10 @@
 """`polysight serve` and `polysight preview`: the address, the token, and the processes until Ctrl-C.
 
-Three processes, all uvicorn: this one answers requests for pages (`front`), a second one accepts connections (`door`,
-only with control and without TLS; else this one accepts them), and the reading process reads scans, behind a socket in
-a folder that only this user may enter. This process starts the other two, restarts the reading process if it ends, and
-prints the server's addresses with the token, what they allow, and a QR code for a phone.
+Three processes, all uvicorn: this one answers requests for pages (`front`), a second one accepts connections and
+answers commands to scans at once (`door`; only with control, and without TLS, which hides what a connection brings;
+else this one does both), and the reading process reads scans, behind a socket in a folder that only this user may
+enter. This process starts the other two, restarts the reading process if it ends, and prints the server's addresses
+with the token, what they allow, and a QR code for a phone.
 """
 
 from __future__ import annotations
@@ -199,6 +200,7 @@ def load_token() -> str:
         descriptor = os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
         with os.fdopen(descriptor, "w", encoding="ascii") as f:
             f.write(secrets.token_urlsafe(TOKEN_BYTES))
+        # Of two servers that start at once one makes the file, complete; the other one's link fails.
         try:
             os.link(part, path)
         finally:
@@ -242,9 +244,10 @@ def _keep_reading_process(first: BaseProcess, shown: Shown, path: Path) -> Itera
     def keep_running() -> None:
         process = first
         while True:
+            # `ended` is looked at every 0.2 s (chosen).
             while process.is_alive() and not ended.is_set():
                 process.join(0.2)
-            if ended.wait(0 if ended.is_set() else RESTART_S):
+            if ended.wait(RESTART_S):
                 process.terminate()
                 process.join()
                 return
@@ -390,7 +393,7 @@ def _allow_files() -> None:
 
 # linux/sockios.h
 SIOCGIFADDR = 0x8915
-# A documentation address (RFC 5737): it stands for every network that is reached by the default route.
+# A documentation address (RFC 5737) and any port: it stands for every network that is reached by the default route.
 ELSEWHERE = ("203.0.113.1", 9)
 # One character shows two modules of the code, the keys say whether the upper and the lower one are dark. Colours are
 # given, black on white, since the terminal's own may be either way round and a camera reads no inverted code.

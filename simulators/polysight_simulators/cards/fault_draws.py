@@ -72,6 +72,7 @@ class NetworkFaults:
             self._held.append(packet)
             return []
         if truncate < f.truncate:
+            # Half of a short packet may be less than its header, of which no byte counts as lost.
             half = packet[:, : packet.shape[1] // 2]
             self._counts["truncated"] += 1
             self._counts["truncated_bytes"] += packet.shape[1] - max(half.shape[1], DATA_HEADER_BYTES)

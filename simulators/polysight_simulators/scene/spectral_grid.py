@@ -26,7 +26,7 @@ FADE_M = 0.06
 TAPS = 12
 # Kernel positions beyond those of aperture and scene, for the taps of the sinc: 6 steps of at most 2 mm.
 MARGIN_M = 0.012
-# Points of the output grid per kernel position.
+# Points of the output grid per kernel position; chosen: with fewer the sinc needs more taps.
 OVERSAMPLING = 2
 
 
@@ -89,7 +89,7 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
     edges = [(*p.centre_mm, p.size_mm[0] / 2, p.size_mm[1] / 2) for p in scene.plates]
     edges += [(*p.position_mm, 0.0, 0.0) for p in scene.points]
     table = np.array(edges or [(0.0, 0.0, 0.0, 0.0)])
-    # Each axis: least and largest offset, least and largest kernel position.
+    # Each axis: least and largest offset, with 1 mm to spare (chosen), least and largest kernel position.
     spans = []
     for i, (n, step, extra) in enumerate(
         ((rig.grid.columns, rig.grid.step_x_mm, travel + 1.0), (rig.grid.rows, rig.grid.step_y_mm, 1.0))
@@ -98,7 +98,7 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
         low_v = ant.centre_m[i] * 1e3 + np.min(table[:, i] - table[:, i + 2])
         high_v = ant.centre_m[i] * 1e3 + np.max(table[:, i] + table[:, i + 2])
         spans.append(np.array([-half, half, low_v - half, high_v + half]) / 1e3 + [0, 0, -MARGIN_M, MARGIN_M])
-    # The path changes fastest at the edges of the kernel and in the nearest plane.
+    # The path changes fastest at the edges of the kernel and in the nearest plane (heights count away from the radars).
     corners = np.meshgrid(*(np.linspace(s[2] - FADE_M, s[3] + FADE_M, 9) for s in spans))
     wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
     nearest_z = ant.plane_z_m + min([0.0, *(p.height_mm for p in (*scene.plates, *scene.points))]) / 1e3

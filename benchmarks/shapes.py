@@ -39,7 +39,7 @@ CHI2_95 = 5.991
 RIG_FILE = find_packaged(Path("instrument.toml"))
 # Paths from TX to RX over fronts of objects and over the table behind them, metres: outside nothing is looked for.
 GATE_M = (1.45, 2.2)
-# Points farther from the object's surface than this are of something else.
+# Points farther from the object's surface than this (chosen) are of something else.
 STRAY_M = 0.01
 # Arguments of `ShapeNuisances` by disturbance: what is wrong with the rig.
 DISTURBANCES: dict[str, dict[str, float]] = {
@@ -68,7 +68,7 @@ KNOWN: dict[str, surfaces.Uncertainty] = {
 KEPT_POINTS = 240
 # Positions of a quick scan: every so many-th in x and y; chosen.
 QUICK_STEP = 2
-# Limits of the 68th percentile over objects: normals in degrees, points in mm, permittivity in per cent (None: none).
+# Limits of the 68th percentile over objects (chosen): normals in degrees, points in mm, permittivity in % (None: none).
 LARGE = (0.5, 0.5, 3.0)
 MUST_HOLD: dict[str, tuple[float | None, float | None, float | None]] = {
     **dict.fromkeys(("plate", "sphere", "cylinder", "cone", "barrel", "saddle", "sheet"), LARGE),
@@ -132,6 +132,7 @@ class ScanKind:
         """Antennas of the rig file; of a quick scan, one RX of each board."""
         boards = worlds.load_boards(RIG_FILE)
         if self.is_quick:
+            # One near the middle of the board.
             return replace(boards, h=boards.h[1:2], v=boards.v[1:2])
         return boards
 
@@ -196,6 +197,7 @@ def analyse_shapes(
 def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> ObjectFigures:
     """Draw, scan and judge one object."""
     scene = worlds.draw_shapes(seed, kind, with_table=disturbance in ("table", "all"))
+    # Every rig has unknown gains, spread by 1.5 dB (chosen): the reference has to tell them.
     nuisances = worlds.ShapeNuisances(seed=seed, noise=scan.noise, gain_db=1.5, **DISTURBANCES[disturbance])
     surface, seconds = analyse_shapes(scene, nuisances, KNOWN[disturbance], scan)
     truth = None

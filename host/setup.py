@@ -49,6 +49,7 @@ class BuildWithKernels(build_py):
         folder = sources if self.editable_mode else Path(self.build_lib) / sources
         if not self.editable_mode:
             copy_data(Path(self.build_lib, "polysight", "data"))
+        # A compiled library ends with the digest of its sources.
         if not TARGET and COMPILED.is_file() and COMPILED.read_bytes().endswith(kernels.source_digest().encode()):
             shutil.copyfile(COMPILED, folder / kernels.LIBRARY)
             return

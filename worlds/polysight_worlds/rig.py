@@ -2,8 +2,8 @@
 
 Axes: x from TX to RX, y up, z towards the object. H receives s (along y at the middle of the picture), V receives p, TX
 sends equal parts of both. A board's mount gives place and boresight. Polarisations are exact where the object plane is
-a mirror, as the authors state: the module's turn of 22.5 degrees would mix s and p, and their pictures have no such
-mixture. A stage offset of zero is the middle of the grid.
+a mirror, as the authors state: the turn of 22.5 degrees in the mounts of both receivers would mix s and p, and their
+pictures have no such mixture. A stage offset of zero is the middle of the grid.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polysight_worlds.optics import Antenna
 
-# Six to twelve frequencies hold the range gate: the chirp's linear part is 76.3 to 79.75 GHz.
+# The chirp's linear part. Six to twelve frequencies hold the range gate of a flat scene; eight are chosen.
 FREQUENCIES_HZ = np.linspace(76.3e9, 79.75e9, 8)
 
 

@@ -92,7 +92,7 @@ def table(stack: Stack, *, behind_mm: float, centre_m: tuple[float, float], tilt
 
 
 def dish(name: str, centre_m: tuple[float, float], diameter_m: float, liquid: complex, *, wall_m: float) -> Plate:
-    """Return a round dish, seen from below: `wall_m` of glass before a deep liquid of permittivity `liquid`."""
+    """Return a round dish whose bottom faces the antennas: `wall_m` of glass, and a deep liquid behind it."""
     # Near the glass of Table 2; chosen.
     glass = 6.9 - 0.5j
     return Plate(name, centre_m, (diameter_m, diameter_m), Stack(((glass, wall_m),), liquid), round_=True)

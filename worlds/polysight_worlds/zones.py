@@ -135,7 +135,7 @@ def _fresnel_zones(tangents: NDArray, hessian: NDArray, k: float) -> tuple[NDArr
 
 
 class CosineTable:
-    """Reflection coefficients of a medium over the cosine of incidence, linear between 513 places, as complex128.
+    """Reflection coefficients of a medium over the cosine of incidence, linear between 513 (chosen) places; complex128.
 
     `media.ReflectionTable` is the same in single precision.
     """

@@ -37,7 +37,7 @@ space. Chosen, as are the shares of metal and of thin plates: larger ones draw u
 METAL_SHARE = 0.1
 """Share of metal in these patches; chosen."""
 SHEET_SHARE = 0.15
-"""Share of thin plates, which reflect at both faces, in the patches that are none of the library's materials."""
+"""Share of thin plates, which reflect at both faces, in what is none of the library's materials; chosen."""
 SHEET_REAL = (1.5, 8.0)
 SHEET_LOSS_TANGENT = (1e-3, 0.2)
 SHEET_MM = (0.2, 6.0)
@@ -54,23 +54,23 @@ liquid behind glass may reflect as no passive half space does. Their t is unifor
 cups of sugar water moved the estimated leakage by three standard deviations, and their own t by a fifth."""
 ODD_BRIGHTNESS = 0.1
 ODD_BRIGHTNESS_STD = 1.2
-"""Share of patches whose brightness is that of nothing known (shadows, edges), and the spread of its logarithm then."""
+"""Share of patches whose brightness is that of nothing known (shadows, edges), and its logarithm's spread; chosen."""
 # Cells of a map of densities along each side of its rectangle; chosen.
 _MAP_CELLS = 96
 DISPERSION_KERNEL = 0.05
 DISPERSION_MODEL = 0.2
 """Errors of a thin plate's change over the sweep: smoothing of the drawn plates, and a share of each change (edges, and
-second echoes from beside)."""
+second echoes from beside). Chosen."""
 ODD_DISPERSION = 0.02
 ODD_DISPERSION_STD = 0.05
-"""Share of half spaces whose change over the sweep is that of their surroundings, and the usual size of it then."""
+"""Share of half spaces whose change over the sweep is that of their surroundings, and its usual size then; chosen."""
 LEAST_LOSS_SPREAD = 0.02
-"""Standard deviation of eps'' between specimens of low-loss materials."""
+"""Standard deviation of eps'' between specimens of low-loss materials; chosen."""
 POSSIBLY_THIN = 0.2
 """Probability of layers from which on a patch gets no permittivity: a region that holds 95 % may not leave out more. Of
 383 half spaces of the independent generator none has more, of the published picture's plates none more than 0.08."""
 METAL_SPREAD = 0.01
-"""Standard deviation of metal's t: sheets are not perfectly flat."""
+"""Standard deviation of metal's t: sheets are not perfectly flat. Chosen."""
 LEAST_STD_OF_T = 1e-6
 MOST_STD_BEYOND = 30.0
 """Least standard deviation of t in which a distance is counted, and its largest: there the density is nearly 0."""
@@ -78,9 +78,9 @@ MOST_STD_BEYOND = 30.0
 LEAST_RATIO_STD = 1e-6
 # Step of numerical derivatives by ln of the real part, and by the loss; chosen.
 _STEP = 1e-4
-# Number of thin plates that are drawn.
+# Number of thin plates that are drawn; chosen.
 _SHEETS = 6000
-# Number of half spaces drawn for several angles.
+# Number of half spaces drawn for several angles; chosen.
 _HALF_SPACES = 4000
 # Frequencies of the sweep at which a thin plate is computed; chosen.
 _FREQUENCIES = 9
@@ -329,6 +329,7 @@ class Kinds:
             density[0 if self.in_library[k] else 1, of_rows, of_columns] += np.exp(exponent, out=exponent)
         density[1:] *= 1 - STACK_SHARE
         density[2] += STACK_SHARE / np.pi
+        # A density of zero counts as 1e-12: its logarithm stays finite.
         return DensityMap(low, high, np.log(density + 1e-12))
 
     def compute_half_space_density(self, t: Complex, covariance: Real) -> Real:
@@ -470,6 +471,7 @@ def draw_sheets(theta_rad: float) -> tuple[Complex, Real]:
     with np.errstate(divide="ignore", invalid="ignore"):
         t = r_p / r_s
         brightness_off = np.log(np.abs(r_s)) - HalfSpaces(t, theta_rad).log_brightness()
+    # A plate that reflects no s has no finite t: 1e3 is far from every measured one.
     sheets = np.where(np.isfinite(t), t, 1e3).astype(np.complex128)
     return sheets, np.where(np.isfinite(brightness_off), brightness_off, 0.0)
 

@@ -251,20 +251,21 @@ RIVAL = 9.0
 """A second solution is a rival if its chi-square is within this of the best: three standard deviations, enlarged as the
 error bars if the model misses the data."""
 MAX_THICKNESS_M = 30e-3
-"""Largest thickness to fit."""
+"""Largest thickness to fit; chosen."""
 UNLIKELY = 1e-3
-"""Probability of a larger chi-square below which the stack does not explain the data."""
+"""Probability of a larger chi-square below which the stack does not explain the data; chosen."""
 DETERMINED = 0.05
-"""Largest relative half width of 95 % regions of a fit that is not ambiguous."""
+"""Largest relative half width of 95 % regions of a fit that is not ambiguous; chosen."""
 # Draws of the posterior for its second moments; chosen.
 _DRAWS = 1500
-# Draws farther away than this, in standard deviations, are left out.
+# Draws farther away than this, in standard deviations, are left out; chosen.
 _REACH = 4.0
-# Width of the distribution that samples are drawn from, relative to the linear standard deviations.
+# Width of the distribution that samples are drawn from, relative to the linear standard deviations; chosen: a wider one
+# covers a bent valley, but leaves fewer draws in a straight one.
 _DRAW_WIDTH = 1.15
-# Range of the incidence angle's error, in standard deviations.
+# Range of the incidence angle's error, in standard deviations; chosen, wide enough never to bind.
 _ANGLE_RANGE = (-8.0, 8.0)
-# Ratio of sampled to linear standard deviations above which the sampled ones are used
+# Ratio of sampled to linear standard deviations above which the sampled ones are used; chosen.
 _BENT = 1.15
 
 
@@ -465,6 +466,7 @@ class _Model:
         thickness_range_m: tuple[float, float] | None,
     ) -> None:
         self.fits_thickness = thickness_range_m is not None
+        # Any thickness stands for one that is fitted.
         check_stack(
             [
                 replace(layer, thickness_m=1.0) if self.fits_thickness and i == layer_index else layer
@@ -619,6 +621,7 @@ class _Model:
         x = solution.x
         to_straight = self._differentiate_straight(x)
         spread = to_straight @ covariance @ to_straight.T
+        # A little is added, so that rounding leaves no negative eigenvalue.
         spread = spread + np.diag(1e-12 * np.maximum(np.diag(spread), 1e-18))
         # A wide proposal (Student's t, five degrees of freedom); beyond _REACH there is another valley: a rival.
         rng = np.random.default_rng(0)

@@ -41,7 +41,7 @@ TILT_STD = 0.004
 """Error of V / H if the phase of H spreads over the patch by one radian.
 
 A tilted plate is illuminated from other points, different for H and V; one degree of tilt spreads the phase by 0.3 rad.
-"""
+Chosen."""
 BORDER_M = 0.017
 BORDER_STD = (0.05, 0.03)
 BORDER_POWERS = (4.0, 1.5)
@@ -66,7 +66,7 @@ LEAST_LEVEL = 2.0
 """Least |H| of a patch over the background's root mean square; chosen."""
 ODD_SHARE = 0.15
 ODD_RATIO = 0.15
-"""Share of pixels that are this far from the median V / H above which a patch holds several materials."""
+"""Share of pixels that are this far from the median V / H above which a patch holds several materials; both chosen."""
 RIPPLE = 0.5
 """Distance from the median V / H, relative to it, up to which no pixel is odd, either: real metal ripples by 25 % and
 13 degrees, so that a tenth of its pixels lie two standard deviations of 0.24 away."""
@@ -79,11 +79,11 @@ NOISE_OF_HALVES = 22.0
 """Difference of the halves' medians by noise in V / H, over its root mean square and the root of the pixels: three
 standard deviations, with one independent value in nine pixels and medians that scatter by 1.25 of means."""
 DIM_V = 0.12
-"""|V| over |H| below which the phase between both is not judged."""
+"""|V| over |H| below which the phase between both is not judged; chosen."""
 LEAST_COHERENCE = 0.7
 """Least coherence of H and V over the pixels of a plate; chosen."""
 IN_NOISE = 2.0
-"""|V| over its background below which V is rather noise: its phase tells nothing."""
+"""|V| over its background below which V is rather noise: its phase tells nothing. Chosen."""
 # Margin around patches that does not count as background; chosen.
 _AROUND_PX = 6
 # A region that was left out is a table behind if it is larger than this many times the largest patch. In the demo it is

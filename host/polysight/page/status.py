@@ -46,7 +46,7 @@ MARKS = {"committed": "c", "kept": "k", "rejected": "r"}
 class RowSync(NamedTuple):
     """Synchronisation of one board in one row: phase std after all stages and of the direct path (nan: unknown).
 
-    `snr_db` is the direct path over its scatter from burst to burst.
+    `masked` is the number of positions without a direct path, `snr_db` the direct path over its scatter between bursts.
     """
 
     object_rad: float

@@ -25,7 +25,7 @@ PAPER = {"frequency_hz": 138.0, "phase_rad": 0.022}
 
 QUANTITIES = ("frequency_hz", "phase_rad", "amplitude")
 _LABELS = ("frequency (Hz)", "phase (rad)", "amplitude / mean - 1")
-# Bins of a histogram: an odd number, so that one is centred at zero.
+# Bins of a histogram (chosen): an odd number, so that one is centred at zero.
 _BINS = 121
 # Histograms reach this many standard deviations of the first row to either side; chosen.
 _REACH = 5.0
@@ -70,7 +70,7 @@ class SyncReport:
         self._snr: list[tuple[float, int]] = []
 
     def add(self, row: SyncedRow) -> None:
-        """Add a synchronised row."""
+        """Add a synchronised row; its `errors` are arrays [3, n] by stage, a key of `STAGES`."""
         self.positions += int(row.valid.sum())
         self.chirps += int(row.chirps[row.valid].sum())
         for name, values in row.errors.items():

@@ -140,6 +140,7 @@ def view_scan(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 4
     around = [p for p in PLACES_MM if p != (0.0, 0.0)]
     step = len(around) // len(rows)
     places_mm = [around[i * step] for i in range(len(rows))]
+    # Seeds here and below are any numbers.
     return _scan(name, rows, places_mm, run.config, 1300, object_distance_mm=distance_mm)
 
 

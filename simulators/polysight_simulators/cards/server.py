@@ -17,6 +17,7 @@ from polysight_simulators.radars import LineServer, RadarSocket
 EDGES_PER_TURN = 2048
 # Time between reads of the wires with pulses: many frames per call cost less than a few.
 GATHER_S = 0.01
+# Longest wait for something to do; chosen.
 IDLE_S = 0.1
 
 
@@ -67,6 +68,7 @@ class CardServer:
         self._selector.register(wires, selectors.EVENT_READ)
         for server in (*control, *chips):
             self._selector.register(server, selectors.EVENT_READ)
+        # Whether the wires are watched, whether their client may hold unread lines, and when they are next read.
         self._listening = True
         self._unread = False
         self._next_read_s = 0.0
@@ -158,6 +160,7 @@ class CardServer:
             return min(wait, IDLE_S)
         if card.card.deadline_s is None:
             return IDLE_S
+        # A record's last packet is due `TAIL_S` of wire time after its data: look ten times in this time (chosen).
         return min(IDLE_S, max(0.001, 0.1 * TAIL_S / self._time_scale))
 
     def _listen(self, is_needed: bool) -> None:

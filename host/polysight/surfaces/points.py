@@ -73,7 +73,7 @@ def find_normals(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tupl
 
 
 def tangents(normals: Array) -> Array:
-    """Orthonormal tangents, columns of [n, 3, 2]: the first is perpendicular to y; along x where a surface faces the antennas."""
+    """Orthonormal tangents, columns of [n, 3, 2]: the first across y, near x where a surface faces the antennas."""
     first = np.cross(normals, np.array([0.0, 1.0, 0.0]))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(normals, first)], axis=-1).astype(np.float64)

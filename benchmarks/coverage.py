@@ -152,7 +152,7 @@ class Cubes:
 
 
 def draw_scene(seed: int, kind: str = "full") -> Scene:
-    """Draw a scene of six plates, or another of `KINDS`, with every nuisance at random."""
+    """Draw a scene of six plates, or another of `KINDS`, with every nuisance at random; the ranges are chosen."""
     rng = np.random.default_rng([20261122, seed, KINDS.index(kind)])
     leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
     materials = MATERIALS
@@ -195,6 +195,7 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
             "seed": 1000 + seed,
             "grid": grid,
             "object_distance_mm": 499.0,
+            # 232 mm by 180 mm: all plates, and a margin.
             "image": {"columns": 116, "rows": 90},
             "specimen_spread": specimen_spread,
             "plane_shift_mm": rng.uniform(-10, 10),

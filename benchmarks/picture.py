@@ -58,7 +58,7 @@ RATIO_STD = 0.08
 PHASE_STD_RAD = np.radians(10)
 MOST_STDS = 3.0
 """Standard deviations of ln |P| and of its phase in the short posterior; "unknown" weighs as much as a material that is
-`MOST_STDS` of them away."""
+`MOST_STDS` of them away. All chosen."""
 # Probability from which a wrong name counts as sure and wrong; chosen.
 SURE = 0.8
 # Standard deviations on both sides of a normal distribution's mean that hold 95 %.

@@ -83,9 +83,9 @@ TIMEOUTS_S: dict[State, float] = {
     "homing": HOMING_TIMEOUT_S,
     # The longest jog, and 5 s (chosen) for ramps and a busy machine.
     "jogging": m.MAX_JOG_S + 5.0,
-    # Time from STOP to standstill.
+    # Time from STOP to standstill; chosen.
     "stopping": 3.0,
-    # Time from the stage's `done` to the last burst.
+    # Time from the stage's `done` to the last burst; chosen.
     "done": 1.0,
 }
 # Longest time from STOP to standstill when the program is being ended, seconds; chosen, systemd waits 5 s for the end.

@@ -408,8 +408,8 @@ class RowState(StrEnum):
     FAILED = "failed"
 
 
-# States that may follow each state.
 S = RowState
+# States that may follow each state.
 TRANSITIONS: dict[RowState, frozenset[RowState]] = {
     S.WAITING: frozenset({S.ARMING, S.STOPPED, S.FAILED}),
     S.ARMING: frozenset({S.RUNNING, S.WRITING, S.FAILED}),

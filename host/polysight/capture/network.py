@@ -295,6 +295,7 @@ def check_receive_buffer(
     DeviceError
         if the buffer holds less than two bursts; the remedy is the command that raises the limit.
     """
+    # Two bursts and two packets, at what the kernel needs for each; Linux grants twice the bytes that are asked for.
     enough = max(needed_bytes, (2 * burst_bytes // MAX_PAYLOAD_BYTES + 2) * KERNEL_BYTES_A_PACKET // 2)
     remedy = f"`sysctl -w net.core.rmem_max={enough}`, and the same in /etc/sysctl.d/ to keep it"
     try:

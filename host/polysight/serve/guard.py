@@ -163,6 +163,7 @@ class Guard:
                 403, ErrorCode.ORIGIN_FOREIGN, "The request comes from a page of another site", "only this server's own"
                 " pages may ask", "use the page that this server serves",
             )  # fmt: skip
+        # Of longer numbers int() may refuse to read thousands of digits; such a body is measured while it is read.
         length = headers.get("content-length", "0")
         if length.isdecimal() and len(length) < 19 and int(length) > BODY_BYTES:
             return refuse_body()

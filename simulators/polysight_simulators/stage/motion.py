@@ -85,6 +85,7 @@ class StepEngine:
         self.stable = 0
         self._looks = 0
         self.leg = Leg(0, 0, MIN_RATE)
+        # That of the firmware at its start; the host sets its own.
         self.set_accel(40_000)
 
     def set_accel(self, steps_s2: int) -> None:

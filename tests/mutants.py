@@ -33,6 +33,7 @@ PACKAGES = {
     "papers": "polysight_papers",
 }
 TESTS_OF_PACKAGE = {"polysight_shared": "shared", "polysight_pi": "pi", "polysight_papers": "papers"}
+TESTS_OF_ROOM = {"planning": "plan", "results": "verdict"}
 TIMEOUT_S = 900
 # `|` and `&` stand in annotations, decorators are properties: their mutants are equivalent or do not import.
 # Operators on variables need the names of two.
@@ -60,8 +61,8 @@ class Mutant:
     def tests(self) -> Path:
         """Folder of the tests of its room, from the root."""
         package = self.file.parts[1]
-        room = TESTS_OF_PACKAGE.get(package) or self.file.parts[2].removesuffix(".py")
-        folder = Path("tests", room)
+        room = self.file.parts[2].removesuffix(".py")
+        folder = Path("tests", TESTS_OF_PACKAGE.get(package) or TESTS_OF_ROOM.get(room, room))
         return folder if (REPO / folder).is_dir() else Path("tests", "process")
 
 

@@ -89,6 +89,7 @@ def test_the_command_says_and_draws_it(products_copy, tmp_path, capsys, permitti
     table = polysight.check(products_copy)
     assert table["level"].item() == check["level"]
     assert table["sigmas"].item() == check["sigmas"]
+    assert table["expected_permittivity"].item() == complex(permittivity[0], -permittivity[1])
     assert all({"units", "long_name"} <= set(variable.attrs) for variable in table.variables.values())
     chart_axes = polysight.plot_check(products_copy, polysight.open_scan(products_copy)).axes
     assert [ax.get_ylabel() for ax in chart_axes] == ["real part", "loss"]

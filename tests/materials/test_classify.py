@@ -107,6 +107,13 @@ def test_an_angle_the_library_does_not_hold_is_refused(powders):
         Classifier(powders)
 
 
+def test_angles_up_to_a_degree_apart_are_one(powders):
+    entries = [replace(powders.entries[0], incidence_deg=angle) for angle in (55.0, 56.0, 57.1)]
+    library = Library(tuple(entries), {}, "drawn")
+    assert library.angles_deg == (55.5, 57.1)
+    assert library.at_angle(54.5).entries == tuple(entries[:2])
+
+
 @pytest.mark.parametrize("model", ["knn", "discriminant"])
 def test_patches_under_two_angles_are_named_together(two_angles, scans, model):
     matched = match_patches(scans)

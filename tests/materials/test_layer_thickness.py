@@ -12,7 +12,7 @@ from polysight import multilayer
 from polysight.cli.main import main
 from polysight.imaging import sub_bands
 from polysight.materials import METAL, Layer, parse_layer
-from polysight.materials.layers import Bands, Spectrum, fit_layer, predict
+from polysight.materials.layers import Bands, Spectrum, _Model, fit_layer, predict
 from polysight.materials.sub_bands import bands_of_row
 from polysight.results import ScanMaterials
 
@@ -186,3 +186,12 @@ def test_products_that_do_not_say_what_bands_share_know_no_more_than_one(folder)
     assert old.covariance is None
     np.testing.assert_allclose(old.sigma, 2 * COMMON)
     assert new.covariance.shape == (8, 8)
+
+
+def test_samples_of_the_posterior_follow_the_valley_of_thickness_times_index():
+    """Its derivatives are those of the conversion: a small step along the valley comes back."""
+    model = _Model(measure_bands([SHEET, PLATE]), (Layer("sheet"), PLATE), 0, THETA, RANGE)
+    x = np.array([3.4, 0.1, 1.7])
+    steps = 1e-6 * np.eye(3)
+    derivatives = (model._convert_from_straight(x, steps) - x).T / 1e-6
+    np.testing.assert_allclose(model._differentiate_straight(x) @ derivatives, np.eye(3), atol=1e-5)

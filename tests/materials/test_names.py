@@ -11,6 +11,7 @@ from polysight.materials import LAYER, UNKNOWN, clean_name
 from polysight.materials.kinds import (
     Kind,
     Kinds,
+    Odds,
     PatchDispersion,
     RatioEvidence,
     draw_sheets,
@@ -20,7 +21,7 @@ from polysight.materials.kinds import (
     may_be_thin,
     weigh_kinds,
 )
-from polysight.materials.names import name_patch
+from polysight.materials.names import name_patch, summarise_literature
 from polysight.polarimetry import fresnel, multilayer, permittivity_from_ratio
 from polysight_shared.errors import DataError
 
@@ -63,6 +64,21 @@ def test_what_only_the_literature_explains_is_said_as_like_it():
     verdict = name_ratios(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2).verdict
     assert verdict.source == "literature"
     assert "sapphire" in verdict.literature
+
+
+@pytest.mark.parametrize(("share", "named"), [(0.79, "polymer"), (0.81, "its likeliest")])
+def test_a_family_is_named_by_a_material_that_holds_four_fifths_of_it(share, named):
+    kinds = AT_ANGLES[0].kinds
+    polymers, laminates = (
+        [k for k, kind in enumerate(kinds) if kind.family == family] for family in ("polymer", "laminate")
+    )
+    probability = np.zeros(len(kinds))
+    probability[polymers] = 0.6 * (1 - share) / (len(polymers) - 1)
+    probability[polymers[3]] = 0.6 * share
+    probability[laminates] = 0.4 / len(laminates)
+    odds = Odds(kinds=probability, sheet=0.0, other=0.0, distance=np.zeros(len(kinds)))
+    likeliest = kinds[polymers[3]].name if named == "its likeliest" else named
+    assert summarise_literature(AT_ANGLES[0], odds)[0] == f"like {likeliest} or laminate (literature)"
 
 
 def test_a_second_angle_makes_a_true_name_surer():

@@ -33,7 +33,7 @@ from polysight.report import write_report
 from polysight.report.figures import draw_materials, permittivity_map, phase_limits_deg
 from polysight.report.permittivity_plot import SHARES, fit_ellipse, region_matrix
 from polysight.report.report import budget_table
-from polysight.report.style import shorten_labels
+from polysight.report.style import MapLabel, shorten_labels
 from polysight.results import ErrorBudget, PermittivityFigures
 from polysight.results.verdict import LEVELS
 
@@ -180,6 +180,22 @@ def test_long_names_of_close_patches_become_numbers_that_do_not_touch(tmp_path):
     boxes = [label.text.get_window_extent() for label in labels]
     assert not any(Bbox.intersection(a, b) for i, a in enumerate(boxes) for b in boxes[:i])
     assert permittivity_map(scan) is not None
+
+
+@pytest.mark.parametrize(("out_px", "replaced"), [(-20, 0), (0.9, 0), (1.1, 1)])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_name_may_leave_the_frame_by_a_pixel(side, out_px, replaced):
+    fig = Figure(dpi=100)
+    FigureCanvasAgg(fig)
+    text = fig.text(0, 0.5, "acrylic", ha=side)
+    inside = 1 if side == "left" else -1
+    x_px = (0.0 if side == "left" else fig.bbox.x1) - inside * out_px
+    text.set_x(x_px / fig.bbox.x1)
+    edge = text.get_window_extent()
+    # Text starts at whole pixels of its own: put its drawn edge where it is meant to be.
+    drawn_px = edge.x0 if side == "left" else edge.x1
+    text.set_x((2 * x_px - drawn_px) / fig.bbox.x1)
+    assert len(shorten_labels(fig, [MapLabel(text, "1", "acrylic", "red")])) == replaced
 
 
 def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path):

@@ -160,7 +160,8 @@ def point_row(
 def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
     """Write a synchronised cube of nine points over the image, complex64 [rx, row, column, sample], columns ascending.
 
-    The points' echoes are made at a few frequencies and interpolated, which is good to 1e-6.
+    The points' echoes are made at a few frequencies and interpolated by least squares over paths, which is good to
+    1e-6 with the 24 and 200 of these that are chosen.
     """
     grid = image_grid(rig)
     chirp = rig.chirp

@@ -39,7 +39,7 @@ from polysight_shared.raster import (
 from polysight_shared.stage_line import Reply
 from polysight_shared.units import us_to_ns
 
-# The rest of the queue waits for the next turn, so that a queue that never empties is not a hang.
+# The rest of the queue waits for the next turn, so that a queue that never empties is not a hang; chosen.
 TURN_TIMEOUT_S = 0.2
 # Longest wait for work in one turn of the loop; chosen.
 TURN_S = 0.25
@@ -52,11 +52,11 @@ HUNG_S = 10.0
 COMMANDS_WAITING = 64
 # The same for `Replay`, whose reply is large and comes from the disk; chosen.
 REPLAYS_WAITING = 4
-# Lines of the stage that wait; further ones are dropped, so that an endless flood cannot fill the memory.
+# Lines of the stage that wait; further ones are dropped, so that an endless flood cannot fill the memory; chosen.
 LINES_WAITING = 64
 # Events per reply. Chosen: about half a second on a Pi (estimated), well below the host's timeout of a command.
 REPLAYED_AT_REST = 1000
-# Events per reply during a row: packing more would delay the trigger thread.
+# Events per reply during a row (chosen): packing more would delay the trigger thread.
 REPLAYED_IN_A_ROW = 20
 # Commands that count as a heartbeat of the run's host.
 OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)

@@ -46,6 +46,7 @@ def simulate_echoes(
         wave = np.zeros((len(frequencies_hz), len(offsets)), np.complex64)
         for piece in pieces:
             wave += simulate_echo(piece, boards.tx, rx, np.asarray(frequencies_hz, float), offsets, path_m)
+        # Fields are exp(-j k r) here, and the simulator's phases rise with the path.
         samples.append(wave.conj() / np.float32(level))
     return np.stack(samples)
 

@@ -33,8 +33,8 @@ STABLE = 0.5
 like those that all plates have by themselves. With 0.8 such a drift is missed, with 0.4 the half widths of undisturbed
 scenes are 8 % larger than with 0.6 (scenes of the independent generator)."""
 DRIFTS: dict[bool, tuple[float, ...]] = {True: (0.002,), False: (0.03, 0.06)}
-"""Standard deviations of the drift of ln(V / H) over a scan, each part, equally probable: of a stable rig, and of one
-that drifts, as usual or by 15 % and 9 degrees."""
+"""Standard deviations of the drift of ln(V / H) over a scan, each part, equally probable (chosen): of a stable rig, and
+of one that drifts, as usual or by 15 % and 9 degrees."""
 # Tried with equal probabilities.
 DRIFT_LENGTHS_M = (0.05, 0.07, 0.15)
 """Lengths over which a drift changes, along the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
@@ -56,8 +56,8 @@ OWN_SLOPES = (0.05, 1.0, 3.0)
 All are equally probable: with flat plates preferred the published picture's ripple counts as fringes, and the half
 widths of its plates are 30 instead of 19 %."""
 ALIKE_BOTH_WAYS = 0.7
-"""Probability that the plates' own slopes are as large along x as along y. Bent plates have them along y alone, in
-which direction H and V see different places."""
+"""Probability that the plates' own slopes are as large along x as along y; chosen. Bent plates have them along y alone,
+in which direction H and V see different places."""
 BORDER_SLOPE_STD = 100.0
 """Standard deviation of the slope of a plate at the border of the image: it says nothing."""
 LEAST_SLOPE_STD = 1e-3

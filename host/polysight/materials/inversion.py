@@ -56,7 +56,7 @@ BRIGHTNESS_RANGE = (0.03, 0.7)
 """Range of the standard deviation of ln kappa in a scene, uniform on a logarithmic scale: flat simulated plates differ
 by 3 %, thin, tilted, unevenly lit ones by a factor of two (published pictures)."""
 METAL_BRIGHTNESS_STD = 0.5
-"""Prior standard deviation of the metal's own ln kappa."""
+"""Prior standard deviation of the metal's own ln kappa; chosen."""
 LIBRARY_SHARE = (0.05, 0.95)
 """Range of the share of a scene's patches that are of the library's materials; the scene tells it."""
 WEIGHT_OF_KINDS = 0.8
@@ -64,7 +64,7 @@ WEIGHT_OF_KINDS = 0.8
 2019): plates of a scene are alike, but each is drawn alone. In 33 simulated scenes 1 put losses 0.9 errors too low."""
 MOVED = 0.1
 MOVED_STD = 0.025
-"""Probability that the mount has moved since its leakage was measured, and the leakage's error then: 1 to 3 degrees."""
+"""Probability that the mount has moved since its leakage was measured, and its error then, 1 to 3 degrees; chosen."""
 TURN = -0.82
 TURN_STD = 0.1
 """Leakage by a plate's rise across the plane of incidence: -sin(theta) for the published rig, with a tenth for antennas
@@ -76,8 +76,8 @@ see the plate from other points: without and with the correction of its illumina
 along x."""
 PAINTED = 0.02
 POSSIBLY_PAINTED = 0.2
-"""Probability that the metal reference is painted or otherwise coated, and that from which on its paint is an error of
-pixels and sub-bands, too: less of it lies outside of 95 %."""
+"""Probability that the metal reference is painted or otherwise coated (chosen), and that from which on its paint is an
+error of pixels and sub-bands, too: less of it lies outside of 95 %."""
 MOST_PAINT_RAD = 0.65
 PAINT_RAD_PER_MM = 2.65
 """Largest phase of 1 / P by a coating of metal, and its phase per thickness: 4 pi / lambda sin^2 / cos (1 - 1 / eps) of
@@ -92,7 +92,7 @@ OWN_SCALE = float(np.sqrt(CHI2_95 / (OWN_FREEDOM * (0.05 ** (-2 / OWN_FREEDOM) -
 a few slopes tell, and the scale at which the region that holds 95 % is the normal distribution's. Where own errors
 dominate, in drawn scenes 95 % lie within 2.1 to 3.6 times the interval that holds 68 % (normal: 1.96)."""
 LEAST_DISTANCE = 4.0
-"""|t - 1| in its standard deviations below which no permittivity is given."""
+"""|t - 1| in its standard deviations below which no permittivity is given; chosen."""
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
 """Sources of error in `PatchEstimate.shares`."""
 # Columns of a particle (see `SceneLikelihood`).
@@ -369,7 +369,7 @@ class SceneLikelihood:
             t = drawn_ratios[np.isfinite(drawn_ratios[:, i]) & (np.abs(drawn_ratios[:, i]) < 3.0), i]
             if not t.size:
                 t = np.zeros(1, np.complex128)
-            # The particles may wander a little beyond the first ones.
+            # The particles may wander beyond the first ones: by three own errors and 30 % of their span (chosen).
             reach = 3 * np.sqrt(np.trace(self.own[i])) + 0.3 * float(np.abs(t - t.mean()).max()) + 1e-3
             low = complex(t.real.min() - reach, t.imag.min() - reach)
             high = complex(t.real.max() + reach, t.imag.max() + reach)

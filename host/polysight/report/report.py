@@ -265,6 +265,7 @@ def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str,
         row["real"] = "metal-like"
     if truth is not None:
         row["truth"] = truth.name
+        # Rightly called unknown.
         row["strange"] = patch.name == UNKNOWN and not truth.in_library
         row["right"] = truth.name == patch.name or (patch.metal_reference and truth.metal)
         if truth.metal:

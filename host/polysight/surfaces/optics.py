@@ -317,7 +317,8 @@ def _reflect_local(
     cos_inside = np.sqrt(1 - sin**2 / eps)
     r_s, r_p = reflect_flat(eps, theta)
 
-    # Cylinder across the plane of incidence.
+    # Cylinder across the plane of incidence. Logarithmic derivatives along the normal, over k: of the waves towards the
+    # surface and away from it outside (`into`, `out`), and of the wave inside (`behind`).
     outer = bend_inside / (2 * wave_number * cos**2)
     inner = bend_inside / (2 * wave_number * cos_inside**2)
     into = 1j * cos - outer

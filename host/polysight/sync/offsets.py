@@ -67,7 +67,7 @@ _AT_LIMIT = 32
 
 # Direct path: size of the search FFT, over decimated samples; chosen.
 _FFT = 256
-# Standard deviation in x and y of the echoes' origin, around the mirror point.
+# Standard deviation in x and y of the echoes' origin, around the mirror point; chosen.
 _SPREAD_M = 0.1
 # Relative gain and phase differences of the RX that the nulls tolerate; chosen.
 _GAIN_SPREAD = 0.3
@@ -79,11 +79,11 @@ _CLUTTER_M = 1.5
 _CLUTTER_POWER = 4e-3
 # Gauss-Newton steps to its frequency. In noise the last one stays large, so that no direct path is found.
 _STEPS = 3
-# A second peak this strong, one object distance below the first, is the direct path.
+# A second peak this strong (chosen), one object distance (10 % less to 10 % more) below the first, is the direct path.
 _COMPARABLE = 0.35
 # Smallest amplitude of a direct path, relative to the row's median; chosen.
 _LOST = 0.3
-# Standard deviations from the row's amplitude beyond which a position's second peak is tried.
+# Standard deviations from the row's amplitude beyond which a position's second peak is tried; chosen.
 _OUTLIER = 5.0
 # Smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions.
 _PRESENT = 30.0
@@ -603,7 +603,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
         estimator=complex64(path.drift_estimator),
         steps=_STEPS,
     )
-    # From the median bin, for tones fill few bins.
+    # From the median bin, for tones fill few bins; the median power of noise is ln 2 of its mean.
     floor = first.median**2 / np.log(2) / (_make_window(n) ** 2).sum()
     drifts = _divide(first.estimate[:, 2], first.estimate[:, 0])[usable]
     drift = _find_middle(drifts) if usable.any() else 0.0
@@ -617,7 +617,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     _try_second_peaks(removed, first.peaks, usable, remove)
     frequency, estimate, step, samples, half_difference = removed
 
-    # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
+    # An IF outside the receiver's passband (AWR2243) is an alias; with a last step above 0.02 bins no tone was found.
     amplitude = estimate[:, 0]
     if_frequency = aligned.centre + frequency
     if_frequency = if_frequency % 1.0 if chirp.if_mode == "complex1x" else (if_frequency + 0.5) % 1.0 - 0.5

@@ -77,6 +77,7 @@ def sync_scan(run: Run) -> SyncScan:
         chirp = rig.chirp
         board = rig.receivers[0].name
         setups = {b.name: BoardSetup.from_rig(rig, b) for b in rig.receivers}
+        # All boards of the rig have four RX.
         reports = {n: SyncReport(chirp.sample_rate_hz, chirp.linear_samples, rx=4) for n in setups}
         builder_before = ImageBuilder(rig)
         builder_after = ImageBuilder(rig)
@@ -270,6 +271,7 @@ def _sweep_start_frequencies(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.N
         if offset == USUAL_HZ:
             example = chirps[:, valid]
     if_hz, amplitude = (np.concatenate(part) for part in zip(*swept, strict=True))
+    # Of aliases beyond the receiver's passband, and of tones near zero, the filter tells nothing; chosen.
     in_band = (if_hz > 0.05 * chirp.sample_rate_hz) & (if_hz < 0.9 * chirp.sample_rate_hz)
     return if_hz[in_band], amplitude[in_band], example
 

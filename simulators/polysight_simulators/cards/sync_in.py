@@ -31,7 +31,8 @@ class SyncInput:
     """SYNC_IN of one radar: each rising edge starts a frame, unless it comes too soon, or the radar is not armed.
 
     With `radar.control = "line_server"`, :meth:`arm` arms the radar for the frames of one row; with "native", the
-    simulated board decides; otherwise the radar is always armed.
+    simulated board decides; otherwise the radar is always armed. `rearmed` counts how often it was armed, `unarmed` and
+    `too_soon` the pulses that started no frame.
     """
 
     def __init__(self, rig: Instrument, radar: RadarBoard | None = None) -> None:

@@ -33,7 +33,7 @@ from polysight.report import write_report
 from polysight.report.figures import draw_materials, permittivity_map, phase_limits_deg
 from polysight.report.permittivity_plot import SHARES, fit_ellipse, region_matrix
 from polysight.report.report import budget_table
-from polysight.report.style import MapLabel, shorten_labels
+from polysight.report.style import RIGHT_IN, MapLabel, fit_labels, new_figure, shorten_labels
 from polysight.results import ErrorBudget, PermittivityFigures
 from polysight.results.verdict import LEVELS
 
@@ -196,6 +196,22 @@ def test_a_name_may_leave_the_frame_by_a_pixel(side, out_px, replaced):
     drawn_px = edge.x0 if side == "left" else edge.x1
     text.set_x((2 * x_px - drawn_px) / fig.bbox.x1)
     assert len(shorten_labels(fig, [MapLabel(text, "1", "acrylic", "red")])) == replaced
+
+
+@pytest.mark.parametrize("names", [1, 2, 3, 8, 30])
+def test_a_legend_takes_just_the_room_below_the_axes(names):
+    """The figure grows by the legend's height; the axes stay as large."""
+    fig = new_figure(5, 4, RIGHT_IN)
+    ax = fig.add_subplot()
+    ax.set_xlabel("x, mm")
+    height_px = ax.get_window_extent().height
+    labels = [MapLabel(ax.text(0.9, 0.0, "polyethylene sheet"), "1", "polyethylene", "red") for _ in range(names)]
+    fit_labels(fig, labels, RIGHT_IN)
+    fig.draw_without_rendering()
+    (legend,) = fig.legends
+    free_px = ax.get_tightbbox().y0 - legend.get_window_extent().y1
+    assert 0 <= free_px < 0.2 * fig.dpi
+    assert ax.get_window_extent().height == pytest.approx(height_px)
 
 
 def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path):

@@ -59,7 +59,7 @@ RIGHT_IN = 0.1
 BAR_IN = 0.62
 """Margin on the right of an axes with a colour bar, its numbers and its label."""
 # Height of a line of a legend, inches.
-_LEGEND_LINE_IN = 0.17
+_LEGEND_LINE_IN = 0.195
 # Characters of a name in a legend: two names fit side by side below a map.
 _LONGEST_NAME = 26
 

@@ -139,6 +139,30 @@ def test_band_limited_noise_alone_holds_no_plate(seed):
     assert not segment(*band_limited_noise(np.random.default_rng(seed), 0.0), AXIS, AXIS).patches
 
 
+def test_halves_are_as_far_apart_as_their_median_ratios():
+    """V / H that grows along an axis: the medians of the outer halves, without the middle line."""
+    mask = np.zeros((SIDE, SIDE), bool)
+    mask[40:60, 70:79] = True
+    across = np.arange(SIDE) * np.ones((SIDE, 1))
+    h = np.full((SIDE, SIDE), 2.0 + 0j)
+    for ratio in (across, across.T):
+        extent = np.ptp(ratio[mask]) + 1
+        assert halves_apart(h, h * (0.3 + 0.4j) * ratio, mask) == pytest.approx(0.5 * ((extent + 1) // 2))
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize(("coherence", "agree"), [(0.65, False), (0.75, True)])
+def test_channels_agree_at_a_coherence_above_0_7_in_any_unit(unit, coherence, agree):
+    rng = np.random.default_rng(3)
+    box = (-20.0, -20.0, 20.0, 20.0)
+    patch = patches_from_labels({"plate": box}, AXIS, AXIS)[0].patches[0]
+    angle = np.arccos(coherence) * np.where(rng.random((SIDE, SIDE)) < 0.5, 1, -1)
+    h = np.full((SIDE, SIDE), unit + 0j)
+    cause = check_patch(patch, h, 0.5 * h * np.exp(1j * angle), (0.0, 0.0), 0.0)
+    assert cause is not None
+    assert (cause.what != "H and V do not agree") == agree
+
+
 @pytest.mark.parametrize(("x0", "cut"), [(0, True), (130, True), (8, False)])
 def test_a_plate_at_the_border_is_cut_and_refused(x0, cut):
     plates = {(60, 60, 84, 84): (0.0, COPPER), (x0, 20, min(x0 + 24, SIDE), 44): (-2.0, 0.25)}
@@ -242,6 +266,19 @@ def test_a_dim_plate_that_is_no_patch_is_no_background_but_a_table_is():
     table = np.where(patch_mask, 1.0, 0.3).astype(np.complex64)
     before_table = Segmentation(patch_mask.astype(np.int32), (patch,), (~patch_mask,))
     assert background(table, table, before_table, usable) == pytest.approx((0.3, 0.3))
+
+
+@pytest.mark.parametrize(("pixels", "is_background"), [(6 * 25, False), (6 * 25 + 1, True)])
+def test_a_dim_region_larger_than_six_plates_is_background(pixels, is_background):
+    usable = np.ones((AXIS.size, AXIS.size), bool)
+    patch_mask = np.zeros_like(usable)
+    patch_mask[20:25, 20:25] = True
+    region = np.zeros_like(usable)
+    region.flat[60 * AXIS.size : 60 * AXIS.size + pixels] = True
+    patch = make_patch(1, patch_mask, AXIS, AXIS, 5.0, usable)
+    segmentation = Segmentation(patch_mask.astype(np.int32), (patch,), (region,))
+    h = region.astype(np.complex64)
+    assert (background(h, h, segmentation, usable)[0] > 0) == is_background
 
 
 def test_a_background_that_is_alike_over_a_plates_size_does_not_average_away():

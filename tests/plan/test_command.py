@@ -43,6 +43,20 @@ def test_text_and_json_have_the_same_plan(capsys):
     assert "simulated" in numbers["noise_source"]
 
 
+@pytest.mark.parametrize(("options", "aliases"), [(SMALL, False), (["--columns", "60", "--rows", "60"], True)])
+def test_aliases_of_tilted_surfaces_are_said_only_of_tilts_that_are_seen(capsys, options, aliases):
+    plan = ["plan", *RIG, *options, *(("--step-y-mm", "8") if aliases else ())]
+    assert main([*plan, "--json"]) == 0
+    numbers = json.loads(capsys.readouterr().out)
+    limits = zip(numbers["alias_tilt_deg"], numbers["visible_normals_deg"], strict=True)
+    within = [alias for alias, tilt in limits if alias < tilt]
+    assert bool(within) == aliases
+    assert main(plan) == 0
+    words = capsys.readouterr().out
+    assert ("phases alias" in words) == aliases
+    assert all(f"beyond {alias:.0f} degrees" in words for alias in within)
+
+
 @pytest.mark.parametrize(
     ("options", "status"),
     [

@@ -30,10 +30,10 @@ FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
 # Timeout of waiting for an edge, after which the loop checks if it has to stop or to send a burst without an edge.
 LOOK_UP_S = 0.1
 # The trigger wire is off if so many consecutive stage statuses came without an edge, while the stage passed at least
-# so many points.
+# so many points; chosen: one status may come just before its edge.
 SILENT_STATUSES = 2
 SILENT_POINTS = 2
-# Low bits before the first pulse, and at least as many after the last: MOSI keeps the last bit's level.
+# Low bits before the first pulse, and at least as many after the last (a byte is chosen): MOSI keeps the last level.
 LEAD_BITS = 8
 # Shorter transfers have gaps: spi-bcm2835 writes them byte by byte, longer ones by DMA.
 MIN_BYTES = 96
@@ -569,7 +569,7 @@ class TriggerWatch:
         self._statuses = 0
 
     def is_silent(self, points: int, edges: int) -> bool:
-        """Update with a stage status (points passed, edges received); True if the wire is off."""
+        """Update with a stage status (points passed, edges received, both in this row); True if the wire is off."""
         if edges != self._edges:
             self._edges = edges
             self._points = points

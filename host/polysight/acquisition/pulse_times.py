@@ -383,7 +383,7 @@ def _predict_arrivals(
     widths = residual[sharing - 1 :] - residual[: residual.size - sharing + 1]
     narrowest = int(np.argmin(widths))
     if widths[narrowest] > min(_AGREE * _find_period_ns(pulses_ns), _AGREE_NS):
-        raise _DisturbedError("the delays of the bursts differ by more than a pulse period")
+        raise _DisturbedError("the delays of the bursts differ too much to tell their pulses apart")
     pulses = pulses_ns.reshape(-1)
     return pulses + float(delays[0]) + drift * (pulses - start_ns) + residual[narrowest]
 
@@ -551,10 +551,13 @@ def frames_to_move(capture: RowCapture | Placed, frames: PlacedFrames | None) ->
 
 
 def _keep_payload(path: Path, received: NDArray[np.uint8]) -> int:
-    """Store the payload as received in the row's packet file, before the row's file is rewritten; return its CRC-32."""
+    """Store the payload as received in the row's packet file, before the row's file is rewritten.
+
+    Returns the file's CRC-32; 0 if the packets were not kept.
+    """
     if not path.exists():
         return 0
-    # What else the packet file tells of the row stays as it is.
+    # What else the packet file tells of the row stays as it is. None: no payload is taken from the row's file any more.
     evidence, log = read_packets(path, received)
     return write_packets(path, log, evidence, None)
 

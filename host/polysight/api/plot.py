@@ -32,14 +32,14 @@ class NotebookFigure(Figure):
 
 
 def plot_scan(scan: ProcessedScan) -> Figure:
-    """Amplitude of H, V, P in dB, and the materials where the images are relative to metal; axes in mm."""
+    """Amplitude of H, V and P = H / V in dB, and the materials where the images are relative to metal; axes in mm."""
     rows = 1
     columns = 3
     if scan.metal_referenced:
         # The materials are the fourth picture.
         rows = 2
         columns = 2
-    # A long narrow image is cut neither to a line nor to a tower.
+    # A long narrow image becomes neither a line nor a tower (limits chosen by eye).
     height_over_width = scan.labels.shape[0] / scan.labels.shape[1]
     height_in = _PANEL_IN * min(2.0, max(0.4, height_over_width))
     size = (columns * (_PANEL_IN + _BETWEEN_IN), rows * (height_in + _TITLE_IN) + _HEAD_IN)

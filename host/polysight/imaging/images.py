@@ -81,9 +81,9 @@ _VISIBLE = 0.15
 # Width of the majority filter, pixels; chosen.
 _NEIGHBOURS = 15
 TAPERS: dict[str, Window] = {"none": "boxcar", "kaiser": ("kaiser", 4.0), "taylor": ("taylor", 4, 30)}
-"""Windows over the aperture by their name in the rig file, as for scipy."""
+"""Windows over the aperture by their name in the rig file, as for scipy; Kaiser's beta and Taylor's -30 dB chosen."""
 MIN_SAMPLES = 24
-"""Smallest number of samples in a sub-band; fewer do not separate the object from the direct path."""
+"""Smallest number of samples in a sub-band (chosen); fewer do not separate the object from the direct path."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class Illumination:
     def bend(self, h: Image, v: Image, mask: Mask) -> tuple[float, float]:
         """Estimate a patch's curvature along x and y from its phase, 1 / m, positive where it bends away; 0 if unknown.
 
-        The phase from pixel to pixel, summed over lines of the other axis, grows evenly on a surface of one curvature.
+        The phase from pixel to pixel, summed over 3 or more lines, grows evenly on a surface of one curvature.
         """
         channel = h if np.nansum(np.abs(h[mask])) >= np.nansum(np.abs(v[mask])) else v
         bends = []
@@ -486,7 +486,7 @@ class ImageBuilder:
         return self._make_channels({name: board.current() for name, board in self.boards.items()})
 
     def _make_channels(self, channels: dict[str, tuple[Image, Image, str | None]], offset_m: float = 0.0) -> Images:
-        """Divide the image of each board by its footprint; `channels`: those and a notice, by board (`board.image`)."""
+        """Divide the images by their footprints; `channels`: board name to image, footprint and notice (None: none)."""
         h, v = channels.values()
         visible = np.ones(self.grid.shape, bool)
         for _, weight, _ in (h, v):

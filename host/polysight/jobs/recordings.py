@@ -34,7 +34,7 @@ from polysight_shared.errors import DataError, PolysightError, os_error
 
 # Missing ranges that are printed: they fill about one line of a terminal.
 _MAX_RANGES = 8
-# Lowest level in the plot of a range profile, over its median: an antenna that stays below is marked "no signal".
+# Lowest level in the plot of a range profile, over its median (chosen): an antenna that stays below has "no signal".
 BOTTOM_DB = -20.0
 
 
@@ -63,7 +63,7 @@ def format_report(report: Report) -> str:
 
 
 def _format_card(card: CardReport) -> list[str]:
-    """Return lines about a capture card: replies, refused commands, version, status, packets and tail."""
+    """Return lines about a capture card: replies, refused commands, version, status, packets, and the last packet."""
     commands = ", ".join(command for command, _ in card.replies)
     lines = [f"card       {card.address}, {len(card.replies)} replies: {commands}"]
     # Replies to these two carry a value; to any other command, a status other than 0 is a refusal.

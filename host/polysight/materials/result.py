@@ -277,7 +277,8 @@ def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real
     """Return the errors of 1 / P at t [...] by leakage and metal reference after the inversion, float64 [..., 2, 6].
 
     The product with its transpose is the covariance, for several t also between them. To first order
-    d t = -(1 - t) (b + a t) - t rho.
+    d t = -(1 - t) (b + a t) - t rho, with the errors a, b of the leakages and rho of the reference. The rows are the
+    real and the imaginary part of t, the columns six independent errors made of both parts of a, b and rho.
     """
     t = np.asarray(t, np.complex128)
     scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])

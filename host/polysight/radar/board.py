@@ -4,8 +4,8 @@ A board is `ARMED` only after the radar reported that it waits for triggers, and
 of its frames. A fatal event leads to `FAULT`, which only a reset leaves. docs/spec/mmwavelink.md ("Power-up") lists the
 errors that healthy boards report at power-up and that are ignored. Not run on hardware yet.
 
-In this file `c` is the module of commands, `e` that of messages, which has the events. A *die* is the radar chip, with
-an id of its own; a *patch* is the part of the firmware that extends the ROM.
+In this file `c` is the module of commands, `e` that of messages, which has the events and names TI's document ("ICD").
+A *die* is the radar chip, with an id of its own; a *patch* is the part of the firmware that extends the ROM.
 """
 
 from __future__ import annotations
@@ -467,6 +467,7 @@ class RadarBoard:
         self.reason = ""
         self.facts = BoardFacts()
         self.steps: list[Step] = []
+        # The commands that set frames and trigger, as sent last.
         self._sent_frames: tuple[c.Command, ...] = ()
         self._log: list[str] = []
 
@@ -613,6 +614,7 @@ class RadarBoard:
 
     def read_temperatures(self) -> None:
         """Read the temperatures into `facts`. Raises DeviceError."""
+        # The sub-block ends with two bytes of padding.
         stamp, *degrees = struct.unpack_from("<I9h", self.ask(c.GET_TEMPERATURES, 24))
         self.facts.temperatures_c = dict(zip(_SENSORS, degrees, strict=True))
         self.facts.device_ms = stamp

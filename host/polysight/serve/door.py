@@ -35,9 +35,9 @@ COMMAND = b"POST /api/control/"
 TOKEN_LINE = TOKEN_HEADER.lower().encode()
 # Connections that are accepted, or taken over, before other work of the process is done; chosen.
 ACCEPTED_AT_ONCE = 64
-# Connections that have not sent anything. With one more, the one that is silent for longest is closed.
+# Connections that have not sent anything (chosen). With one more, the one that is silent for longest is closed.
 MOST_SILENT = 1024
-# Connections that the pages' process has not taken yet. With one more, the oldest is answered `BUSY`.
+# Connections that the pages' process has not taken yet (chosen). With one more, the oldest is answered `BUSY`.
 MOST_WAITING = 512
 BUSY = b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
@@ -114,6 +114,7 @@ class Door:
         """Hand connections to the pages' process, as many as it can take."""
         try:
             while self._waiting:
+                # A descriptor travels with at least one byte; which one does not matter.
                 socket.send_fds(self._pages, [b"c"], [self._waiting[0].fileno()])
                 self._waiting.popleft().close()
             self._loop.remove_writer(self._pages)

@@ -1,7 +1,9 @@
 """Permittivity of surface segments from the voltages of H and V, referenced to metal of known shape.
 
 A segment has one permittivity: least squares of b_H (M r)_V = b_V (M r)_H over its points (`fit_permittivity`), with r
-the coefficients of a curved surface, and b_H, b_V the voltages (`voltages`) over the gains (`gains`).
+the coefficients of a curved surface, and b_H, b_V the voltages (`voltages`) over the gains (`gains`). Coefficients are
+arrays [n points, 2 receivers, 4]: r_s, r_p, s to p, p to s; the last two are 0 without a *twist*, a curvature whose
+axes lie askew to the plane of incidence.
 
 The covariance is derived, source by source (`add_common_errors`): the scatter of the points over blocks of windows;
 leakage, axes and places of the antennas, each moved by one standard error for object and reference together; the
@@ -48,16 +50,16 @@ RIPPLE_M = 0.04
 FRESNEL_ZONE_M = 0.053
 # The same for flat surfaces, whose misses have correlations of 0.6 and 0.3 at 8 and 16 mm (drawn plates, simulated).
 RIPPLE_OF_PLATES_M = 0.024
-# Ripple of V / H by which points are weighted, beside their noise.
+# Ripple of V / H by which points are weighted, beside their noise; chosen.
 USUAL_RIPPLE = 0.02
-# Blocks that the scatter of the points is worth, if it were common to a block: the few blocks of a small segment say
-# little of their own scatter.
+# Blocks that the scatter of the points is worth, if it were common to a block (chosen): the few blocks of a small
+# segment say little of their own scatter.
 EXPECTED_BLOCKS = 2.0
 # Error of the curvature, in proportion: those of 14 spheres and cylinders (50 to 190 mm, simulated) are 0.4 to 3 % too
 # large, 1.6 % in the root mean square (windows are not small to them).
 CURVATURE_ERROR = 0.02
-# Second order of the reflection at a curved surface over the first, in K / (k cos^3 theta): 1.9 by the exact series of
-# spheres (100 and 200 mm, permittivity 2.8 to 8). Orders alternate in phase.
+# Second order of the reflection at a curved surface over the first, in K / (k cos^3 theta), K the curvature and k the
+# wave number: 1.9 by the exact series of spheres (100 and 200 mm, permittivity 2.8 to 8). Orders alternate in phase.
 SECOND_ORDER = 2.0
 # At the border of the zone that a surface reflects to, ln of the level is 0.69 below that inside. Patterns of antennas
 # change the level over the directions by about as much, where no reference takes that out.
@@ -69,8 +71,8 @@ MIN_SHARE_AT_LEVEL = 0.75
 # Reflection over metal's below which no surface counts: a half space of permittivity 1.04 at 55 degrees. What the end
 # of a cylinder diffracts had 0.02 (simulated).
 MIN_REFLECTION = 0.03
-# Less than 20 mm from the border of a zone that reflects, a disc of 50 mm is not filled to three quarters. There, edges
-# bend normals by degrees, and H / V of a plate with sharp edges is 10 % too large.
+# Less than 20 mm from the border of a zone that reflects, a disc of 50 mm radius is not filled to three quarters. There
+# edges bend normals by degrees, and H / V of a plate with sharp edges is 10 % too large.
 BORDER_DISC_M = 0.05
 MIN_FILLING = 0.75
 # Points count for a permittivity by how full such a disc of interior points is, none for less than this share: ripples
@@ -120,16 +122,17 @@ def point_ratio(v: Voltages, gains: Gains) -> Complex:
 
 
 def _unmix(v: Voltages, b: Complex) -> Complex:
-    """Ratio r_s / r_p that voltages [n, 2] would mean at a surface without twist."""
+    """Ratio r_s / r_p [n] that voltages [n, 2] would mean at a surface without twist."""
     r = np.linalg.solve(v.m[..., :2], b[..., None])[..., 0]
     return r[:, 0] / np.where(r[:, 1] == 0, 1e-30, r[:, 1])
 
 
 def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex:
-    """Return the permittivity of each point [n]: Eq. 3 of the ratio, corrected for curvature and iterated."""
+    """Return the permittivity of each point [n]: a half space's by its ratio, corrected for curvature and iterated."""
     ratio = point_ratio(v, gains)
     theta = v.theta[:, 0]
     eps = clip_permittivity(permittivity_from_ratio(ratio, theta))
+    # A fixed number of iterations; chosen.
     for _ in range(4):
         r_s, r_p = reflect_flat(eps, theta)
         curved = _unmix(v, receive(v, reflect_points(eps, v, wave_number)))
@@ -194,7 +197,7 @@ def _linearise(
     scale = np.hypot(noise, ripple)
     size = np.abs(miss) / scale
     usual = float(np.median(size)) + 1e-12
-    # Where points fit far better than their errors, good ones would else be outliers.
+    # Where points fit far better than their errors, good ones would else be outliers (0.3 is chosen).
     used = size < OUTLIER * max(usual, 0.3)
     falloff = 1 / (1 + (size / (2 * usual)) ** 2)
     weights = share * used / scale**2 * falloff
@@ -221,6 +224,7 @@ def fit_permittivity(
     # What is common to a point's surroundings: no point counts for more than its ripple allows.
     ripple = USUAL_RIPPLE * level
     step = _linearise(eps, v, gains, wave_number, ripple=ripple, share=share)
+    # Number of iterations and their end are chosen.
     for _ in range(12):
         move = (step.influence @ step.miss).real
         eps = complex(
@@ -294,7 +298,8 @@ def _sum_over_blocks(terms: Array, influence: Complex, at_m: Array, block_m: flo
 class Uncertainty:
     """Standard errors common to a scan: leakage (each part), axes of polarisation, places of the antennas (each).
 
-    By default the leakage is that of a mount that was not measured, 0.058 in the root mean square.
+    By default the leakage is that of a mount that was not measured, 0.058 in the root mean square; the other errors are
+    chosen.
     """
 
     leakage: float = 0.041

@@ -8,8 +8,9 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from polysight.cli.main import main
-from polysight_papers.sensys2026 import run as report
+from polysight_papers.sensys2026 import run as report, synchronisation
 from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figure, published_values, style_axes
+from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError
 
 
@@ -96,3 +97,15 @@ def test_items_are_made_and_stand_beside_the_published_values(key, tmp_path):
     if key == "fig21":
         assert item.data["published_median_error_percent"] == 1.548
         assert 0 < item.data["median_error_percent"] < 3
+
+
+def test_a_filter_is_fitted_to_tones_in_the_passband_alone(monkeypatch):
+    """At the first start frequency tones are near zero, at the last they alias."""
+    monkeypatch.setattr(synchronisation, "OFFSETS_HZ", (0.0, synchronisation.USUAL_HZ, 1.9e6))
+    run = Run(quick=True)
+    chirp = load_instrument(run.config).chirp
+    if_hz, amplitude, example = synchronisation._sweep_start_frequencies(run, chirp)
+    assert if_hz.min() > 0.05 * chirp.sample_rate_hz
+    assert if_hz.max() < 0.9 * chirp.sample_rate_hz
+    assert if_hz.shape == amplitude.shape
+    assert if_hz.size < 3 * example.shape[1]

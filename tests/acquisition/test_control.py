@@ -105,6 +105,21 @@ def test_alive_says_who_scans_and_what_was_asked_and_goes_at_the_end(tmp_path):
     assert not (tmp_path / CONTROL).exists()
 
 
+def test_after_the_rows_no_command_is_obeyed(tmp_path):
+    stop = StopRequest()
+    with ControlFolder(tmp_path, stop) as control:
+        control.open()
+        wait_for((tmp_path / CONTROL / ALIVE).exists, "the first sign of life")
+        control.end_rows()
+        wait_for(lambda: (life := read_life(tmp_path)) is not None and life.doing == "materials", "the end of the rows")
+        (tmp_path / CONTROL / "pause").touch()
+        # Commands are looked for before each sign of life.
+        stop.request("a signal")
+        wait_for(lambda: (life := read_life(tmp_path)) is not None and life.asked != "", "a sign of life after it")
+        assert not stop.paused
+        assert (tmp_path / CONTROL / "pause").exists()
+
+
 def test_a_killed_program_is_told_from_one_that_says_nothing(tmp_path):
     """Also if its process number belongs to another process by now."""
     (tmp_path / CONTROL).mkdir()

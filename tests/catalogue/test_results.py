@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -167,6 +168,15 @@ def test_every_map_is_drawn_in_the_size_of_the_image(processed):
     for draw in (lambda: draw_products(pixels, "x"), lambda: draw_comparison(comparison, "x")):
         with pytest.raises(DataError):
             draw()
+
+
+def test_colours_of_differences_in_standard_deviations_reach_twice_the_significant_one(processed):
+    """A map without a significant difference looks like one; a larger difference widens the scale."""
+    comparison = compare(processed / "one", processed / "two")
+    shape = comparison.sigmas.shape
+    for sigmas, high in ((0.5, 2 * SIGNIFICANT), (30.0, 30.0)):
+        picture = draw_comparison(replace(comparison, sigmas=np.full(shape, sigmas)), "sigmas")
+        assert (picture.low, picture.high) == (0.0, pytest.approx(high))
 
 
 DAMAGED = {

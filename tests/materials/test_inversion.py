@@ -222,6 +222,17 @@ def test_bare_metal_is_not_called_painted():
         assert found.painted < 0.2
 
 
+def test_paint_is_an_error_of_the_reference_from_a_probability_of_a_fifth():
+    """Less probable paint leaves the reference its own error; two scenes, one of each."""
+    probabilities = []
+    for seed in range(2):
+        patches = paint(world(np.random.default_rng(seed), (0.003j, 0.004)), 0.03)
+        found = invert(patches, RigPrior(1e-3, leakage_std=0.01, leakage_measured=True), KINDS)
+        probabilities.append(found.painted)
+        assert (np.diag(found.nuisance_covariance)[5] > 2) == (found.painted > 0.2)
+    assert 0.05 < probabilities[0] < 0.2 < probabilities[1]
+
+
 @pytest.mark.parametrize("draw", range(4))
 def test_a_mount_that_has_moved_is_found_whatever_is_drawn(draw):
     # The patches are of the library, which with the leakage that was measured before the turn none of them fits.

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 NEIGHBOURS = 15
 # |H|, |V|, real and imaginary part of P.
 CHANNELS = 4
-# scikit-learn declares X as text.
+# scikit-learn's type hints declare X as text.
 _validate = cast(Any, validate_data)
 Columns = npt.NDArray[np.float64]
 Names = npt.NDArray[np.str_]

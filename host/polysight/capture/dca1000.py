@@ -140,7 +140,7 @@ def configure_fpga_data(lanes: int = 4) -> bytes:
     if lanes not in (2, 4):
         raise ProtocolError(f"the card captures 2 or 4 LVDS lanes, not {lanes}", code=ErrorCode.VALUE_INVALID)
     lane_mode = 1 if lanes == 4 else 2
-    # Raw mode, lanes, capture (not playback) over Ethernet, 16 bits, and a timer, which is TI's default.
+    # Raw mode, lanes, capture (not playback) over Ethernet, 16 bits, and TI's default of an unexplained timer.
     return bytes([1, lane_mode, 1, 2, 3, 30])
 
 

@@ -33,17 +33,17 @@ Real = npt.NDArray[np.float64]
 
 UNKNOWN = "unknown"
 INCLUSIONS = 0.05
-"""Share of a patch's pixels that may be of another material; a pixel's prior is its patch's name otherwise."""
+"""Share of a patch's pixels that may be of another material (chosen); a pixel's prior is its patch's name otherwise."""
 UNKNOWN_BUDGET = 0.03
-"""Relative error of V / H, beside the spread of its pixels, that is assumed if the scan's error budget is not known."""
+"""Relative error of V / H, beside the spread of its pixels, assumed if the scan's error budget is not known; chosen."""
 LIKELY = 0.005
-"""Materials of less probability are not listed."""
+"""Materials of less probability are not listed; chosen."""
 LAYER = "possible layer"
 """Name of a patch that is rather a thin plate than a half space."""
 MOST_NAMES = 3
-"""Largest number of names in "like ... (literature)"."""
+"""Largest number of names in "like ... (literature)"; chosen."""
 MOST_OF_IT = 0.8
-"""Least share of the literature's probability that these names hold together."""
+"""Least share of the literature's probability that these names hold together; chosen."""
 
 
 @dataclass(frozen=True)
@@ -286,6 +286,7 @@ def _name_pixels(
     pixel_covariance = np.cov(values.T) if len(values) > 2 else np.zeros((parts, parts))
     scan_covariance = scipy.linalg.block_diag(*(evidence.covariance for evidence in kind_evidence))
     errors = scan_covariance + pixel_covariance + 1e-10 * np.eye(parts)
+    # [kind, parts, ways in which specimens differ].
     effects = np.concatenate([kind.effects[has_name] for kind in kinds], axis=1)
     inverse = np.linalg.inv(effects @ effects.mT + errors)
 

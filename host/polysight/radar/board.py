@@ -614,7 +614,7 @@ class RadarBoard:
 
     def read_temperatures(self) -> None:
         """Read the temperatures into `facts`. Raises DeviceError."""
-        # The sub-block ends with two bytes of padding.
+        # A tenth sensor follows, which is left out.
         stamp, *degrees = struct.unpack_from("<I9h", self.ask(c.GET_TEMPERATURES, 24))
         self.facts.temperatures_c = dict(zip(_SENSORS, degrees, strict=True))
         self.facts.device_ms = stamp

@@ -150,6 +150,7 @@ def plan_lines(rig: Instrument) -> tuple[list[str], bool]:
         lines.append(f"\n{board.name}, its settings, with sequence numbers as if only they were sent:")
         commands = program(rig, board)
         for number, sent in enumerate((*commands.basic, *commands.waveform, *commands.frames(frames))):
+            # Sequence numbers have four bits.
             raw = encode(command((sent.block(),), sequence=number % 16))
             lines.append(f"  {sent.name:19} {raw.hex()}")
     lines.append("\nnot shown: power-up, RF init, frame start, and queries (versions, die id, temperatures)")
@@ -246,7 +247,8 @@ class NativeRadars(RadarControl):
     def arm(self, frames: int) -> None:
         """Start `frames` frames on every board and wait until each waits for triggers or has failed.
 
-        `states` reports a failed board, which costs a take, not the scan. Raises ConfigError.
+        `states` reports a failed board, which costs one take of the row (it is retaken), not the scan. Raises
+        ConfigError.
         """
         require(self._rig, frames)
         for board in self._boards.values():
@@ -327,7 +329,7 @@ class NativeRadars(RadarControl):
         return states
 
     def report(self) -> dict[str, object]:
-        """Return checked constraints, and the report of each board since the last call, for the manifest."""
+        """Return each board's report since the last call, for the manifest; the first has the checked constraints."""
         report: dict[str, object] = {"control": "native", "boards": {n: b.report() for n, b in self._boards.items()}}
         if self._constraints:
             report["constraints"] = self._constraints

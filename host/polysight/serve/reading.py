@@ -32,6 +32,7 @@ from polysight_shared.errors import DataError, PolysightError, ScanError
 
 # A report may come from anywhere, so browsers run no script in it and load nothing for it.
 REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
+# Bytes of a file that are read and sent at a time; chosen.
 CHUNK_BYTES = 1 << 18
 LIST_S = 0.5
 """Time after which a list of scans is sent as far as it was read: the first of 2,000 that no index has take 8 s."""
@@ -153,6 +154,7 @@ async def _send_thumbnail(site: Site, request: Request) -> Response:
     png = await site.read_scan(request, draw)
     if not png:
         return Response(status_code=204)
+    # Seconds for which a browser does not ask again; chosen.
     return Response(png, media_type="image/png", headers={"Cache-Control": "private, max-age=5"})
 
 
@@ -376,7 +378,8 @@ async def _use_comparison(site: Site, request: Request, use: Callable[[catalogue
     """Compare the two scans of a request in a thread, and return the result of `use` on the comparison."""
     first = site.name(request, "a")
     second = site.name(request, "b")
-    # A name of its own: if reading one of them hangs, other requests for the other scan still work.
+    # A name of its own, made of their folders below the root: if reading one of them hangs, the other one's requests
+    # still work.
     both_scans = f"{first.partition('/')[0]} and {second.partition('/')[0]}"
     folder = site.scans.folder
     return await site.read(both_scans, lambda: use(compare_products(folder(first), folder(second))))

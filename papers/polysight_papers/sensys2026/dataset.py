@@ -253,7 +253,7 @@ def _rename_entries(
 
 def words(name: str) -> frozenset[str]:
     """Return words and numbers of a name, in lower case; "metal" for metals."""
-    # "w/ " and "w " mean "with".
+    # "w/ ", "\w/ " and "w " mean "with".
     text = re.sub(r"\\?\bw/?\s", " with ", name.lower().replace("_", " "))
     out: list[str] = []
     for word in re.findall(r"[a-z]+|\d+(?:\.\d+)?", text):

@@ -45,7 +45,9 @@ def _make_parser() -> argparse.ArgumentParser:
         "--config rig/instrument.toml --wires rig/wires.sock --pattern",
     )
     parser.add_argument("--config", type=Path, required=True, help="rig file of the simulated rig")
-    parser.add_argument("--wires", type=Path, required=True, help="Unix socket of the wires hub")
+    parser.add_argument(
+        "--wires", type=Path, required=True, help="Unix socket of the process that stands for the rig's wires"
+    )
     parser.add_argument("--scene", type=Path, help="scene file; not needed with --pattern")
     parser.add_argument(
         "--offset-in-rig",
@@ -116,6 +118,7 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
         seed = args.seed
     faults = read_faults(args.faults, args.fault, board_names, base, rig.radar.control)
     source = _make_source(args, rig, scene, names)
+    # The signal asks to switch the cards off and on.
     power_cycle = Event()
     signal.signal(signal.SIGUSR1, lambda _signal, _frame: power_cycle.set())
     cards: list[SimulatedCard] = []

@@ -86,8 +86,8 @@ def synced_cube(
 
     Returns
     -------
-    complex64 [rx, row, column, frequency]; column 0 is the smallest x. Amplitudes are relative to the
-    free direct path of RX1.
+    complex64 [rx, row, column, frequency]; column 0 is the smallest x. Amplitudes are relative to the free direct path
+    of RX1, which has the index 0.
     """
     rig = apply_scene(rig, scene)
     seed = scene.seed if seed is None else seed
@@ -138,7 +138,10 @@ def _compute_drift(rig: Instrument, scene: Scene, board: Board) -> NDArray[np.co
 
 
 def _compute_burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m: float) -> float:
-    """Return the RMS noise of an averaged sample; compensating the high-pass filter divides by its gain at the IF."""
+    """Return the RMS noise of an averaged sample; compensating the high-pass filter divides by its gain at the IF.
+
+    `echo_m` is the path from TX over the object to RX.
+    """
     d = scene.disturbances
     chirp = rig.chirp
     if d.direct_snr_db is None:
@@ -179,7 +182,7 @@ def _sample_field(
         x = np.array(row.x_mm) + row.direction * travel
         if row.direction < 0:
             x += backlash_mm
-        # [position, rx, node].
+        # [position, rx, node], a node being a frequency at which the field was computed.
         nodes = field.interpolate(x / 1e3, np.full(len(x), row.y_mm / 1e3))
         order = [row.column(i) for i in range(row.points)]
         cube[:, row.index, order] = np.einsum("prq,rqk->rpk", nodes, expand, optimize=True)

@@ -8,12 +8,14 @@ import shutil
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 from tests.support.store.facts import facts_of
 
 from polysight.catalogue import NOTES, Notes, Scans, read_notes, scans, write_notes
-from polysight.catalogue.scans import is_scan
+from polysight.catalogue.scans import Program, explain_failure, is_scan
+from polysight.results import NoResult
 from polysight.store import MANIFEST, ScanFolder, manifest
 from polysight_shared import files
 from polysight_shared.errors import ConfigError, DataError
@@ -244,3 +246,16 @@ def test_pipes_and_links_in_a_folder_keep_no_list_waiting(root, tmp_path_factory
     write_notes(root / "done", Notes("mine"))
     assert victim.read_text() == "as it was"
     assert read_notes(root / "done").notes == "mine"
+
+
+def test_a_failure_is_the_last_error_in_the_log_or_that_it_was_killed():
+    program = Program("process", running=False, status=None, words=(), started_utc="", log="")
+    killed = explain_failure(program)
+    assert killed is not None
+    assert killed.what == "polysight process was killed"
+    log = "polysight process: an earlier one\n  why: old\npolysight process: no rows\n  why: none whole\n  do: scan\n"
+    failed = explain_failure(structs.replace(program, status=1, log=log))
+    assert failed is not None
+    assert (failed.what, failed.why, failed.do) == ("no rows", "none whole", "scan")
+    for status, running in ((0, False), (NoResult.exit_status, False), (None, True)):
+        assert explain_failure(structs.replace(program, status=status, running=running, log=log)) is None

@@ -3,12 +3,15 @@
 import csv
 import json
 import re
+from contextlib import nullcontext
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from polysight.cli.main import main
-from polysight_papers.sensys2026 import run as report, synchronisation
+from polysight_papers.sensys2026 import permittivities, run as report, synchronisation
 from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figure, published_values, style_axes
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError
@@ -109,3 +112,22 @@ def test_a_filter_is_fitted_to_tones_in_the_passband_alone(monkeypatch):
     assert if_hz.max() < 0.9 * chirp.sample_rate_hz
     assert if_hz.shape == amplitude.shape
     assert if_hz.size < 3 * example.shape[1]
+
+
+def test_location_independence_counts_pixels_of_its_materials_alone(monkeypatch):
+    """Copper, and a patch on no plate, are left out; of each material the pixels that have a ratio are counted."""
+    p = np.full((8, 8), 2.0 + 0.1j)
+    p[0, 0] = np.nan
+    names = ("copper", "PET", None, "ceramic")
+    patches = []
+    for i, name in enumerate(names):
+        interior = np.zeros(p.shape, bool)
+        interior[2 * i : 2 * i + 2, : 2 + i] = True
+        truth = None if name is None else SimpleNamespace(name=name)
+        patches.append(SimpleNamespace(truth=truth, patch=SimpleNamespace(interior=interior)))
+    result = SimpleNamespace(patches=patches, p=p, theta_rad=np.radians(55.0))
+    monkeypatch.setattr(permittivities, "simulate_scan", lambda *_, **__: nullcontext((None, None)))
+    monkeypatch.setattr(permittivities, "process_scan", lambda *_: SimpleNamespace(result=result))
+    data = permittivities.fig17(Run(quick=True)).data
+    assert data["variances"]["PET pixels"] == [6, 6, 6]
+    assert data["variances"]["ceramic pixels"] == [10, 10, 10]

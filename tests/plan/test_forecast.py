@@ -132,6 +132,7 @@ def test_the_predicted_resolution_is_that_of_quality_json(rig):
 def test_the_published_plan_is_possible_and_takes_two_hours(rig):
     published = forecast(rig)
     assert published.possible
+    assert {warning.where for warning in published.warnings} == {"idle", "card", "IF"}
     assert not forecast(Changes(columns=20, rows=20, speed_mm_s=100.0).apply(rig)).possible
     assert published.time.minutes == pytest.approx(120, rel=0.06)
     assert published.raw_bytes == 2 * 200 * 350 * 16 * 4096

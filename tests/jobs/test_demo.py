@@ -1,0 +1,27 @@
+"""`polysight demo` around its programs: what it says at the end. Whole demos are in e2e."""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+from tests.support.paths import REPO
+
+from polysight.jobs import demo
+from polysight.results import NoResult
+
+
+@pytest.mark.parametrize(
+    ("status", "exit_status", "names_logs"),
+    [(0, 0, False), (NoResult.exit_status, NoResult.exit_status, False), (2, 2, True), (-9, 9, True)],
+)
+def test_a_demo_names_the_logs_of_the_rig_if_its_scan_failed(
+    monkeypatch, tmp_path, capsys, status, exit_status, names_logs
+):
+    rig_file = tmp_path / "rig.toml"
+    monkeypatch.setattr(demo, "run_simulated_rig", lambda *_: contextlib.nullcontext(rig_file))
+    monkeypatch.setattr(demo, "_run_to_its_end", lambda _: status)
+    out = tmp_path / "demo"
+    scene = REPO / "examples" / "demo.toml"
+    assert demo.run_demo(scene, REPO / "instrument.toml", out, None) == exit_status
+    assert (str(out / "rig" / "logs") in capsys.readouterr().err) == names_logs

@@ -6,7 +6,7 @@ import pytest
 
 from polysight.sync import loops
 from polysight.sync.decimate import FOLD
-from polysight.sync.offsets import prepare, reference
+from polysight.sync.offsets import prepare, reference, whole_blocks
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
@@ -54,6 +54,24 @@ def test_without_an_object_it_is_exact(run, board):
     assert done.found.all()
     assert np.abs(f).max() < 0.5
     assert np.abs(phase).max() < 1e-3
+
+
+@pytest.mark.parametrize(("step_bins", "is_found"), [(0.019, True), (-0.019, True), (0.021, False), (-0.021, False)])
+def test_a_tone_whose_frequency_still_steps_by_a_fiftieth_of_a_bin_is_not_found(
+    rig, paths, direct_paths, align_single, board, step_bins, is_found
+):
+    signal, _ = paths(board, 4, 0.0, np.random.default_rng(0))
+    first, last = whole_blocks(rig.chirp.linear_samples)
+
+    class Unsettled(loops.NumpyLoops):
+        @staticmethod
+        def remove(*arguments):
+            removed = loops.NumpyLoops.remove(*arguments)
+            return removed._replace(step=np.full_like(removed.step, step_bins / (last - first)))
+
+    done = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], rig.chirp, by=Unsettled)
+    assert (done.found == is_found).all()
+    assert (np.abs(done.samples).max() > 0) == is_found
 
 
 @pytest.mark.parametrize("echo", [0.5, 1.0, 2.0])

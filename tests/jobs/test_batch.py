@@ -211,6 +211,8 @@ def test_names_folders_and_what_is_a_scan(tmp_path):
 
 
 def test_scans_at_a_time_follow_cores_and_memory():
+    # As docs/how-to/authors-data.md says.
+    assert batch.memory_bytes(1_000_000) == pytest.approx(0.4e9 + 6e3 * 1_000_000)
     need = batch.memory_bytes(70_000)
     assert batch.fit_scans(70_000, cores=8, free_bytes=100 * need) == 8
     assert batch.fit_scans(70_000, cores=8, free_bytes=3 * need) == 2

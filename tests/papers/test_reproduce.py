@@ -11,8 +11,9 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from polysight.cli.main import main
+from polysight.polarimetry import fresnel, ratio_from_permittivity
 from polysight_papers.sensys2026 import permittivities, run as report, synchronisation
-from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figure, published_values, style_axes
+from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figure, published_values, style_axes, table2
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError
 
@@ -83,6 +84,18 @@ def test_published_numbers_stand_in_the_data_file_alone():
     for file in folder.glob("*.py"):
         text = file.read_text(encoding="utf-8")
         assert not [n for n in numbers if n in text], file.name
+
+
+def test_contrast_under_each_angle_is_that_of_eq_2():
+    """The middle pixel at 0 degrees is |H|, at 55 and 60 |P|, of the published permittivity (fig. 16)."""
+    levels = report.MAKERS["fig16"](Run(quick=True)).data["level_db"]
+    materials = {material.name: material.permittivity for material in table2()}
+    for name in levels["0"]:
+        r_s, _ = fresnel(materials[name], 0.0)
+        assert np.median(levels["0"][name]) == pytest.approx(20 * np.log10(abs(r_s)), abs=1.5)
+        for angle in (55, 60):
+            ratio = ratio_from_permittivity(materials[name], np.radians(angle))
+            assert np.median(levels[str(angle)][name]) == pytest.approx(20 * np.log10(abs(ratio)), abs=1.5)
 
 
 @pytest.mark.parametrize("key", ["fig3", "fig21", "table2"])

@@ -32,8 +32,8 @@ _FIELD = re.compile(r"([a-z]+)=([-+.:A-Za-z0-9]+)")
 class Immediate(IntEnum):
     """Bytes that the stage handles in its receive interrupt, even during motion.
 
-    Each differs in at least two bits from every byte of a line. RESUME, which starts motion, differs in three bits
-    from every other byte and must be sent twice.
+    Each differs in at least two bits from every byte of a command line. RESUME, which starts motion, differs in three
+    bits from these and from the other immediate bytes, and must be sent twice.
     """
 
     HOLD = 0x81

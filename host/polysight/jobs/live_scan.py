@@ -42,7 +42,7 @@ from polysight_shared.errors import ConfigError, PolysightError, ScanError, advi
 if TYPE_CHECKING:
     from polysight.jobs.process import LiveProcessing
 
-# A web address that does not answer must not hold up the end of a command.
+# A web address that does not answer must not hold up the end of a command; chosen.
 NOTIFY_TIMEOUT_S = 20.0
 # A new scan's folder may hold the log of the program that starts it, and notes, and nothing else.
 _ALLOWED_ENTRIES = ("program", "operator.json")

@@ -311,6 +311,7 @@ def find_processed_digests(folder: Path) -> store.Digests:
 
 # --- check plates, and their control chart ---
 
+# Size of the chart in inches, and its pixels per inch; chosen.
 CHART_IN = (8.0, 5.0)
 DOTS_PER_INCH = 120
 
@@ -423,5 +424,6 @@ def draw_control_chart(fig: Figure, checked: Sequence[tuple[ProcessedScan, Check
         ax.axhspan(expected - limit, expected + limit, color="green", alpha=0.15)
         ax.set_ylabel(title)
     axes[-1].set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=8)
+    # A scan that does not say whether it was simulated may be: the chart is marked.
     stamp = " (simulated)" if any(scan.simulated is not False for scan, _ in checked) else ""
     fig.suptitle(f"Check plate {latest.name}{stamp}: bars and band hold 95 % of good scans", fontsize=11)

@@ -68,6 +68,7 @@ def why_unnamed(settings: Settings, rig: Instrument, will_be: bool = False) -> s
     if settings.model == "none":
         return f"Nothing {verb} named: naming was left out (--model none)."
     path = library_path(settings)
+    # That of H; V's is nearly the same.
     angle = incidence_deg(rig, rig.receivers[0])
     known_angles = Library.load(path).angles_deg
     # Classifier refuses an empty library.

@@ -39,18 +39,18 @@ Limits = tuple[float, float]
 # What maps show: a channel and a quantity of it.
 CHANNELS = ("h", "v", "p")
 QUANTITIES = ("amplitude", "phase")
-# Amplitudes are shown down to this far below the upper end of their colours.
+# Amplitudes are shown down to this far below the upper end of their colours; chosen.
 AMPLITUDE_RANGE_DB = 35.0
 # Single bright pixels shall neither darken the rest of an amplitude nor fade a phase. Both are chosen.
 BRIGHT_PERCENTILE = 99.8
 REFERENCE_PERCENTILE = 99.5
-# Phases and ratios begin to show this far below the brightest pixels, and are opaque from the second level on.
+# Phases and ratios begin to show this far below the brightest pixels, and are opaque from the second level on; chosen.
 FAINT_DB = -26.0
 CLEAR_DB = -18.0
-# |P| of an image without patches: percentiles of the opaque pixels, and what is shown if there are none.
+# |P| of an image without patches: percentiles of the opaque pixels, and what is shown if there are none; chosen.
 RATIO_PERCENTILES = (5.0, 95.0)
 NO_RATIOS_DB = (0.0, 20.0)
-# Narrowest range of |P|: below it noise would look like a difference.
+# Narrowest range of |P|, chosen: below it noise would look like a difference.
 LEAST_RATIO_RANGE_DB = 6.0
 # Smaller amplitudes have the level of this one, so that zero has a level.
 LEAST_AMPLITUDE = 1e-12
@@ -133,7 +133,10 @@ def map_scan(scan: ProcessedScan, channel: str, quantity: str) -> MapValues:
 
 
 def _find_ratio_limits_db(level: Real, is_opaque: Mask, patches_db: Sequence[float]) -> Limits:
-    """Return the range of |P|, dB: that of the patches if there are any, else of the opaque pixels."""
+    """Return the range of |P| in whole dB: that of the patches if there are any, else of the opaque pixels.
+
+    It holds metal's 0 dB, with a decibel to spare at both ends.
+    """
     if patches_db:
         low = min(patches_db)
         high = max(patches_db)
@@ -150,7 +153,7 @@ def _find_ratio_limits_db(level: Real, is_opaque: Mask, patches_db: Sequence[flo
 
 # Largest error of a permittivity that says something, relative to its size; chosen.
 LARGEST_ERROR = 0.5
-# Standard errors by which a permittivity may lie beyond what a half space can have.
+# Standard errors by which a permittivity may lie beyond what a half space can have; chosen.
 LARGEST_DEVIATION = 2.0
 # Step for the derivative by the incidence angle; chosen.
 _ANGLE_STEP_RAD = 1e-6
@@ -184,7 +187,8 @@ def map_permittivity(scan: ProcessedScan) -> PermittivityMap:
     The leakage and the incidence angle of the error budget are applied to every pixel. The pixels of a patch are moved
     together, in V / H, so that their median has the patch's permittivity, and none is more certain than the patch.
 
-    Eq. 3 is analytic in 1 / P, so the error of P adds the same variance to both parts; that of the angle adds its own.
+    The permittivity is analytic in 1 / P, so the error of P adds the same variance to both parts; that of the angle
+    adds its own.
     `p_sigma` holds noise, metal reference, and what is left of the leakage.
     Without an incidence angle nothing is known.
     """
@@ -288,7 +292,7 @@ def _match_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tu
 def _is_known_half_space(value: Complex, real_std: Real, loss_std: Real) -> npt.NDArray[np.bool_]:
     """Return where the errors are below half of the value and a half space can have it within twice its errors."""
     is_known = np.hypot(real_std, loss_std) < LARGEST_ERROR * np.abs(value)
-    # Edges of metal have ratios near 1, of which Eq. 3 makes large negative permittivities.
+    # Edges of metal have ratios near 1, which mean large permittivities of either sign.
     has_real_part = np.real(value) + LARGEST_DEVIATION * real_std >= 1.0
     has_loss = -np.imag(value) + LARGEST_DEVIATION * loss_std >= 0.0
     return is_known & has_real_part & has_loss

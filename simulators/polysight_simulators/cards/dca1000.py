@@ -1,7 +1,7 @@
 """State machine of one DCA1000EVM capture card: commands in, replies and data packets out, without sockets or clocks.
 
-docs/spec/simulated-rig.md lists the modelled behaviour; "inferred" there marks behaviour that no document or capture
-shows. Times are in seconds of any one clock of the caller.
+docs/spec/simulated-rig.md lists the modelled behaviour: "seen" in a capture of a real card, "read" in documents,
+or "inferred" where neither shows it. Times are in seconds of any one clock of the caller.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ FPGA_VERSION = 2 | 8 << 7
 DELAY_TICK_S = 8e-9
 # Timeout after record start without data, until command 0x03 sets another.
 TIMER_S = 30
+# Smallest (inferred) and largest size of a packet, as command 0x0B counts it.
 _MIN_PACKET = 48
 _MAX_PACKET = 1470
 # Number of choices of each byte of command 0x03 but the last, counted from 1.

@@ -80,7 +80,7 @@ PartsPerMillion = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 Hertz = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 Microseconds = Annotated[float, msgspec.Meta(ge=0.001, le=1e6)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=0.5)]
-# Tilt of a plate; the fast field is checked up to 2 degrees.
+# Tilt of a plate; its fast computation (`field.py`) is checked up to 2 degrees.
 Degrees = Annotated[float, msgspec.Meta(ge=-10, le=10)]
 Tilt = tuple[Degrees, Degrees]
 Height = Annotated[float, msgspec.Meta(ge=-50, le=50)]
@@ -213,7 +213,7 @@ class Point(_Table, frozen=True):
 
 
 class Shape(_Table, frozen=True):
-    """A sphere, cylinder, cone (`slope_deg`), bottle, or plate that may be tilted and bent.
+    """A sphere, cylinder (with `slope_deg` a cone), bottle, or plate that may be tilted and bent.
 
     `centre_mm` and `height_mm` are those of its front: the point nearest to the radars, of a plate its middle. `axis`
     is along a cylinder or bottle, `length_mm` of a bottle that of its body. `bends_per_m`: 1 / radius along the plate's
@@ -251,6 +251,7 @@ class Shape(_Table, frozen=True):
             _require(
                 self.radius_mm is not None and self.size_mm is None, f"a {self.kind} has radius_mm, and no size_mm"
             )
+        # At least 26 degrees away from z; chosen.
         length = math.hypot(*self.axis)
         _require(length > 0 and abs(self.axis[2]) < 0.9 * length, "axis must not point at the radars")
 

@@ -121,8 +121,9 @@ def test_strangers_and_stale_packets_are_not_data(board, card, tmp_path):
     assert (tmp_path / "a.part").read_bytes() == data
 
 
-def test_a_row_ends_with_all_that_came_before(board, card, tmp_path, monkeypatch):
-    """However many batches wait in the kernel, and whoever sent those in front.
+@pytest.mark.parametrize("clock_set_s", [0, 3600])
+def test_a_row_ends_with_all_that_came_before(board, card, tmp_path, monkeypatch, clock_set_s):
+    """However many batches wait in the kernel, whoever sent those in front, and if the wall clock was set meanwhile.
 
     All fits into the buffer that a kernel grants without rights (208 KiB asked, twice that given).
     """
@@ -138,6 +139,8 @@ def test_a_row_ends_with_all_that_came_before(board, card, tmp_path, monkeypatch
         for _ in range(270):
             stranger.sendto(b"x" * 100, (board.host_address, board.data_port))
     send(card, board, encode_packets(data, 1, 0))
+    assert receiver._batches is not None
+    receiver._batches._clocks_differ_ns -= clock_set_s * 10**9
     row = answer(EndRow())
     assert receiver._socket is not None
     receiver._socket.close()

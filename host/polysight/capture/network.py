@@ -50,6 +50,8 @@ _CLOCK_WAS_SET_NS = 1_000_000
 _CLOSE_READINGS_NS = 20_000
 # Readings at most, of which the closest is used (chosen).
 _CLOCK_READINGS = 5
+# What the kernel counts for a packet beyond its bytes, at least: `struct sk_buff` and `skb_shared_info` of Linux 6.
+_PACKET_OVERHEAD_BYTES = 512
 # Memory of one packet, bytes: more than the largest of 1466, to detect longer ones.
 _STRIDE = 1536
 _MSG_DONTWAIT = getattr(socket, "MSG_DONTWAIT", 0x40)
@@ -170,8 +172,8 @@ class BatchReceiver:
         self.times_ns: NDArray[np.int64] = np.zeros(batch, dtype=np.int64)
         self.strangers = 0
         self.is_drained = True
-        # Arrival of the newest packet, whoever sent it.
-        self._newest_ns = 0
+        # Memory of the last packets in the kernel, whoever sent them: at least this many bytes.
+        self._kernel_bytes = 0
         # Wall clock minus monotonic clock at the last reception: a jump of it says that somebody set the wall clock.
         self._clocks_differ_ns = measure_clock_difference()
         # `struct sockaddr_in` of each packet, 16 bytes; bytes 4 to 7 are its address.
@@ -211,7 +213,7 @@ class BatchReceiver:
             raise DeviceError(problem, "the network interface went down", "`polysight doctor` names the hop")
         self.lengths[:n] = self._received[:n]
         self.times_ns[:n] = self._read_times(n)
-        self._newest_ns = int(self.times_ns[n - 1])
+        self._kernel_bytes = int(self._received[:n].sum()) + n * _PACKET_OVERHEAD_BYTES
         is_from_card = self._sources[:n] == self._source
         if not is_from_card.all():
             self.strangers += int((~is_from_card).sum())
@@ -224,12 +226,13 @@ class BatchReceiver:
 
     def receive_all(self) -> Iterator[int]:
         """Fetch every packet that came before this call, in batches; yield the number in each, as :meth:`receive`."""
-        called_ns = time.monotonic_ns()
+        # Packets may come without end, and they come in order: after a full buffer all that waited are fetched. Their
+        # times tell less: they are wrong after somebody set the wall clock, and by the error of its reading.
+        buffer_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         self.is_drained = False
-        self._newest_ns = 0
-        # Packets may come without end.
-        while not self.is_drained and self._newest_ns <= called_ns:
+        while not self.is_drained and buffer_bytes >= 0:
             yield self.receive()
+            buffer_bytes -= self._kernel_bytes
 
     def _read_times(self, n: int) -> NDArray[np.int64]:
         """Return the arrival times of the last `n` packets on the monotonic clock, int64 [n], ns.

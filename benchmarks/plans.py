@@ -183,7 +183,7 @@ def short(rig: Instrument, scene: Scene) -> Iterator[Made]:
 
 
 def wide(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """Scan with the published burst and rows twice as far apart."""
+    """Scan with the published burst, rows twice as far apart, at the speed of `first_proposal`."""
     rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm).apply(rig)
     yield "half the rows, published burst", rig, as_scanned(rig, scene)[0].finish(), 1
 
@@ -213,6 +213,7 @@ def main() -> int:
     rig = Changes(step_x_mm=x * rig.grid.step_x_mm, step_y_mm=y * rig.grid.step_y_mm).apply(rig)
     leakage = scene.disturbances
     still = scene.with_disturbances(ideal=True, leakage_h=leakage.leakage_h, leakage_v=leakage.leakage_v)
+    # Without noise and motion a burst of two pulses is as good as a long one.
     ideal = as_scanned(Changes(pulses=2).apply(rig), still)[0].finish()
     plates = truth_plates(truth(rig, scene, scene.seed))
     print(HEAD, flush=True)

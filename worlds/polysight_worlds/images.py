@@ -110,6 +110,7 @@ def simulate(
     nominal = _cut_grid(nominal, nuisances)
     true_world = disturb_plates(_shift_world(world, nuisances, pixels * nominal.step_m), nuisances)
     true_rig = disturb_rig(nominal, nuisances)
+    # A second number beside the seed: every purpose has random numbers of its own.
     rng = np.random.default_rng([nuisances.seed, 3])
     positions = _draw_bad_positions(rng, nominal, nuisances)
     from_middle_hz = nominal.frequencies_hz - nominal.frequencies_hz.mean()
@@ -221,6 +222,7 @@ def disturb_data(
     if nuisances.noise:
         echoes = echoes + nuisances.noise * rms * _draw_noise(rng, echoes.shape)
     if nuisances.interference:
+        # 2 to 10 times the mean echo, chosen.
         hit = _add_runs(rng, np.zeros(shape, bool), nuisances.interference)
         strength = rms * rng.uniform(2, 10) * np.exp(2j * np.pi * rng.random(echoes.shape))
         echoes = echoes + hit * strength
@@ -238,7 +240,10 @@ def _draw_noise(rng: Generator, shape: tuple[int, ...]) -> NDArray:
 
 
 def _draw_fringes(rng: Generator, rig: Rig) -> NDArray:
-    """Unit phasors [rows, columns] of a second path beside the direct one: curved fringes, 15 to 200 mm wide."""
+    """Unit phasors [rows, columns] of a second path beside the direct one: curved fringes, 15 to 200 mm wide.
+
+    They curve by up to 15 turns at a metre from the middle. Ranges are chosen.
+    """
     x, y = rig.offsets_m()
     period_m = 0.015 * (0.2 / 0.015) ** rng.random()
     direction = rng.uniform(0, 2 * np.pi)

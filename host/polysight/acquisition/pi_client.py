@@ -39,7 +39,7 @@ _ALIVE_TIMEOUT_S = 1.0
 MOVING: tuple[m.State, ...] = ("homing", "jogging", "running", "held", "done")
 # Time for the stage to come to rest; chosen.
 _REST_TIMEOUT_S = 10.0
-# Period of the heartbeat during a jog where the rig file has none for rows.
+# Period of the heartbeat during a jog where the rig file has none for rows; chosen.
 _JOG_HEARTBEAT_MS = 100
 # Between two questions for the Pi's status (chosen).
 _POLL_S = 0.05
@@ -152,7 +152,8 @@ class PiClient:
     def begin_run(self, run: m.BeginRun) -> None:
         """Begin or resume a run and send its heartbeat until the run's end. Safe to repeat.
 
-        Waits some heartbeats if the Pi still considers a killed program of the same scan alive.
+        Waits some heartbeats if the Pi still considers a killed program of the same scan alive. `owns_home`: nobody
+        else may home the stage in this run.
 
         Raises RefusedError, DeviceError.
         """

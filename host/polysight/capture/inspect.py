@@ -264,9 +264,9 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
 def is_mirrored(power: NDArray[np.float64]) -> bool:
     """True if a complex spectrum, float64 [bin], is at negative frequencies: I and Q are swapped.
 
-    For complex 1x (IF up to 0.9 sample rates) power in the upper half is no proof, so the last quarter is compared with
-    the first: returns come from near. The bins next to zero are left out. Four times the power (chosen) counts as
-    mirrored.
+    TI's mode "complex 1x" has IFs up to 0.9 sample rates, so power in the upper half is no proof, and the last quarter
+    is compared with the first: returns come from near. Three bins beside zero are left out. Four times the power counts
+    as mirrored (both chosen).
     """
     n = power.size
     rim = 3
@@ -427,6 +427,7 @@ def _select_from_card(path: Path, card_address: str) -> tuple[CardReport, list[D
             packets.append(datagram)
             continue
         if reply.code == Code.STATUS:
+            # The bits that `Status` names.
             card.status |= Status(reply.status & 0x0FFF)
         if reply.code in set(Code):
             name = Code(reply.code).name

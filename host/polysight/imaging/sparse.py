@@ -34,7 +34,7 @@ ITERATIONS = 40
 MOST_ADDED = 4
 """Largest number of steps into which a step between positions is divided; chosen."""
 TEST_SHARE = 10
-"""One in so many recorded rows, columns or positions is left out of the first fit, to measure the prediction."""
+"""One in so many recorded rows, columns or positions is left out of the first fit, to test the prediction; chosen."""
 # The power iteration comes from below: after 12 rounds 5 % are added (chosen), so that the estimate is not too small.
 _POWER_ROUNDS = 12
 _EIGENVALUE_MARGIN = 1.05
@@ -89,7 +89,7 @@ def reconstruct(
     board
         Samples of one board; omitted positions are not valid.
     iterations
-        Number of steps, each one forward and one adjoint imaging.
+        Number of steps, each one forward and one adjoint imaging; the default is chosen.
     strength
         Weight of sparsity relative to the strongest pixel of the matched filter: pixels below about this level become
         0, and the others weaker by as much. For a few points with many random omissions 0.01 converges faster.

@@ -25,7 +25,7 @@ from polysight_simulators.scene.radar import SimulatedRig
 from polysight_simulators.scene.scene_file import Pair, Plate, Scene, apply_scene, draw_specimens, stream_key
 
 Progress = Callable[[int, int], None]
-# Six times this is in memory. The published rows have 10 MB.
+# Six times this is in memory. The published rows have 10 MB. Chosen.
 MAX_ROW_BYTES = 100_000_000
 
 

@@ -145,3 +145,12 @@ def test_libraries_keep_the_specimen_and_old_files_have_none(tmp_path):
     del meta["entries"][0]["specimen"]
     np.savez(tmp_path / "old.npz", **(content | {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)}))
     assert materials.Library.load(tmp_path / "old.npz").entries[0].specimen is None
+
+
+@pytest.mark.parametrize("other", [(0.0, -20.0, 20.0, 20.0), (-20.0, 5.0, 20.0, 20.0), (5.0, 5.0, 20.0, 20.0)])
+def test_boxes_beside_or_above_each_other_do_not_overlap(other):
+    copper = (-20.0, -20.0, 0.0, 0.0)
+    assert set(check_boxes({"copper": copper, "oak": other}).boxes) == {"copper", "oak"}
+    reaching = (min(other[0], -0.5), min(other[1], -0.5), *other[2:])
+    with refused(CONFLICT, "overlap"):
+        check_boxes({"copper": copper, "oak": reaching})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from msgspec import structs
 from tests.support.page.live_view import add_fact, begin_history
 from tests.support.store.facts import facts_of
 
@@ -43,6 +44,18 @@ def test_counts_are_those_of_the_scan_folder(finished):
         board_rows = [r.boards[board.name] for r in rows.values()]
         assert board.frames_expected == sum(b.frames_expected for b in board_rows)
         assert board.frames_received == sum(b.frames_received for b in board_rows)
+
+
+def test_lost_shares_are_percent_of_the_bytes_of_each_row(finished):
+    history = answer(facts_of(finished))
+    row = history.content.rows[1]
+    boards = {
+        name: structs.replace(part, missing_bytes=part.bytes // 8) if name == "RV" else part
+        for name, part in row.boards.items()
+    }
+    history.content.rows[1] = structs.replace(row, boards=boards)
+    rows = sorted(history.content.rows)
+    assert history.lost_shares == {"RH": dict.fromkeys(rows, 0.0), "RV": dict.fromkeys(rows, 0.0) | {1: 12.5}}
 
 
 def test_trigger_health_is_the_worst_of_all_bursts(finished):

@@ -17,7 +17,7 @@ from tests.support.products import REASON, judged_products
 from tests.support.store.facts import parse_fact
 
 from polysight.acquisition.control import ALIVE, CONTROL, Life, read_start_ticks
-from polysight.page.watch import EventTail, ManifestTail, ProductsTail, Watch, draw
+from polysight.page.watch import EventTail, ManifestTail, Motion, ProductsTail, Versioned, Watch, draw
 from polysight.pipeline import Pipeline
 from polysight.products import SCAN, write_json
 from polysight.results import ScanFacts
@@ -42,6 +42,14 @@ def truth(finished):
     for row in scan.rows():
         pipeline.add_row(row)
     return scan, pipeline, draw(pipeline.images.current())
+
+
+def test_each_content_that_differs_is_a_new_version():
+    first = Versioned(0, b"").publish(Motion(now_s=1))
+    second = first.publish(Motion(now_s=2))
+    third = second.publish(Motion(now_s=1))
+    assert [first.version, second.version, third.version] == [1, 2, 3]
+    assert third.publish(Motion(now_s=1)) is third
 
 
 def test_a_finished_folder_is_shown_as_it_is(finished, truth, watching):

@@ -154,7 +154,7 @@ def _add_surface(add: Add) -> None:
         "--reference",
         type=Path,
         metavar="SCAN",
-        help="scan of a flat metal plate (default: the sphere of the rig file's calibration)",
+        help="scan of a flat metal plate, or of a metal sphere (default: the sphere of the rig file's calibration)",
     )
     add_json_option(sub)
 

@@ -11,11 +11,13 @@ from polysight.calibration import SphereFile, make_header, open_raw, source_scan
 from polysight.jobs import measure_surfaces
 from polysight.jobs.output import load_rig_file, print_json, print_lines, say
 from polysight.jobs.process import process_rows
+from polysight.materials import WEAK_V_DB
 from polysight.pipeline import Pipeline
 from polysight.settings import Settings
 from polysight.store import open_source
 from polysight.surfaces import (
     Echoes,
+    Gains,
     Optics,
     Reference,
     Seen,
@@ -91,7 +93,11 @@ def surface(
         }
         print_json(row)
     else:
-        print_lines([*summary_lines(surface), f"surface: {out / 'surface.npz'}, surface.ply, surface.png"])
+        lines = summary_lines(surface)
+        rig = open_source(scans[0], config, dropped=True).instrument
+        if rig.polarimetry.leakage_std is None:
+            lines.append("the rig's leakage was never measured, and widens all errors: measure it (polysight leakage)")
+        print_lines([*lines, f"surface: {out / 'surface.npz'}, surface.ply, surface.png"])
     return 0
 
 
@@ -122,7 +128,26 @@ def make_surface(data: Path, rig: Path | Instrument | None = None, reference: Pa
         _, _, metal = process_to_points(reference, rig)
         # The largest surface has the number 0.
         gains = measure_surfaces.make_reference(measure_surfaces.thin_out(metal[metal.segment == 0]))
-    return measure_surfaces.analyse_points(pipeline, optics, points, gains)
+    surface = measure_surfaces.analyse_points(pipeline, optics, points, gains)
+    if not len(surface.segment):
+        raise DataError(
+            f"{data}: none of {len(points)} points lies on a surface",
+            "only edges were seen: the object is too small, turned away, or mirrors to where the stage does not go",
+            "turn the object towards the rig; `polysight plan` shows visible normals",
+            code=ErrorCode.NO_DATA,
+        )
+    return surface
+
+
+def check_is_metal(scan: Path, gains: Gains) -> None:
+    """Raise DataError if V of a reference is weaker than any metal's, relative to the direct path."""
+    if gains.v_over_h_db < WEAK_V_DB:
+        raise DataError(
+            f"{scan}: V is {-gains.v_over_h_db:.0f} dB weaker than H, relative to the direct path",
+            "the reference is not of metal, which reflects both alike, or the cable of V is loose",
+            "scan a bare metal sphere or plate that lies alone",
+            code=ErrorCode.MISMATCH,
+        )
 
 
 def _list_rows(echoes: Echoes) -> list[list[float]]:
@@ -164,6 +189,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
         )
     chosen_metal = measure_surfaces.thin_out(metal)
     gains = learn_gains(find_voltages(chosen_metal, optics), optics.wave_number)
+    check_is_metal(scan, gains)
     file = SphereFile(
         **make_header("sphere", [source_scan(raw, scan)]),
         radius_mm=radius_mm,

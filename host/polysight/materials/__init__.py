@@ -93,6 +93,9 @@ from polysight.materials.measure import (
     estimate_permittivity as estimate_permittivity,
     format_permittivity as format_permittivity,
 )
+from polysight.materials.metal import (
+    WEAK_V_DB as WEAK_V_DB,
+)
 from polysight.materials.names import (
     LAYER as LAYER,
     UNKNOWN as UNKNOWN,

@@ -197,6 +197,11 @@ class Gains:
     terms_root: Array
     cell: Array
 
+    @property
+    def v_over_h_db(self) -> float:
+        """V's gain over H's in the middle of the directions; about 0 for samples relative to the direct path."""
+        return float(-20 / np.log(10) * self.ratio_terms[0].real)
+
     def ratio(self, arrival: Array) -> Complex:
         """Return the gain of H over that of V for directions of arrival [n, 2], [n]."""
         return np.exp(self._make_basis(arrival) @ self.ratio_terms)

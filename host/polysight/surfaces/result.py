@@ -55,10 +55,11 @@ FLAT_BEND = 0.5
 MIN_POINTS = 20
 # Ratio r_s / r_p of metal is 1; a permittivity of 40 without loss has 1.5 at 55 degrees.
 METAL_RATIO = 0.15
-# A loss below zero by so many standard deviations is no property of one medium, nor is a smaller real part: the fit
-# ends at 1.2.
+# A loss below zero by so many standard deviations is no property of one medium, nor is a real part beyond these: the
+# fit ends at 1.2 and at 40.
 MAX_GAIN_SIGMA = 3.0
 LEAST_REAL = 1.25
+MOST_REAL = 39.0
 # Level of H over that of the medium fitted, and its rise over the band, logarithms: beyond, no single surface reflects.
 # Beyond what the rig's errors explain 46 drawn solids have at most 0.020 and 0.0034; walls that pass as a medium which
 # is not theirs have more than 0.05, or 0.01 (tests/surfaces/test_what_is_no_surface.py).
@@ -73,12 +74,19 @@ BEHIND_ANOTHER = "no single medium reflects so, and it lies behind another surfa
 # What an edge diffracts changes the slopes of windows near the border of the zone that its surface reflects to: by up
 # to 0.01, in the root mean square 0.0065 (half a plane, tests/surfaces/test_slope_errors.py).
 EDGE_SLOPE_STD = 0.0065
-# Both faces of a wall make one echo, whose path is that of neither, by the more the more they cancel. 95 % of 4000
-# drawn walls (0.5 to 3 mm, permittivity 2 to 9, loss to 1, 53 degrees) appear within 1.96 standard deviations, at any
-# reflection over metal's: 1.7 mm, and from a reflection of 0.45 down more.
-WALL_STD_M = 0.0017
+# Both faces of a wall make one echo, whose path is that of neither: by the more the more its level changes over the
+# band, and the more the faces cancel. 95 % of 4000 drawn walls (0.5 to 25 mm, evenly on a logarithmic scale,
+# permittivity 2 to 9, loss 0.001 to 1, 53 degrees) appear within 1.96 standard deviations: 2.5 mm for a steady level
+# of at least 0.45 of metal's, more per rise of its logarithm, at most that of two faces that one window just resolves.
+WALL_STD_M = 0.0025
+WALL_STD_OF_RISE_M = 0.035
+MOST_WALL_STD_M = 0.011
 WALL_REFLECTION = 0.45
-WALL_EXPONENT = 2.5
+WALL_EXPONENT = 3.0
+MOST_CANCELLED_STD_M = 0.02
+# Relative error of the curvature of what no single medium explains: both faces' echo wanders from window to window.
+# Eleven walls of 1 to 20 mm in exact series of another author's had 0.2 in the root mean square, and 0.45 at most.
+WALL_BEND_ERROR = 0.25
 
 Array = NDArray[np.float64]
 
@@ -93,8 +101,9 @@ class Segment:
         Its number in the scan, and how many points it has.
     centre_m, normal
         Means over its points, x, y, z in the rig frame; the normal points towards the antennas.
-    radius_mm
-        The smallest radius of curvature; None for a plane.
+    radius_mm, radius_std_mm
+        The smallest radius of curvature, and its standard error (of its inverse, over the square of its inverse); None
+        for a plane.
     incidence_deg
         Mean incidence angle.
     permittivity, covariance
@@ -120,6 +129,7 @@ class Segment:
     reason: str = ""
     confidence: float | None = None
     turned_deg: float = 0.0
+    radius_std_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -206,8 +216,7 @@ def analyse_surface(
     of_h = replace(echoes.h, slope_std=np.hypot(echoes.h.slope_std, edge_std))
     position_std_m, normal_std_rad = find_shape_errors(of_h, shape, optics, uncertainty)
     if gains is not None:
-        reflection = find_reflection(voltages, gains)
-        segments, unknown_m = doubt_places(segments, echoes, shape, reflection)
+        segments, unknown_m = doubt_places(segments, echoes, shape, voltages, gains)
         position_std_m = np.hypot(position_std_m, unknown_m)
     return Surface(
         scan_id=scan_id,
@@ -324,23 +333,27 @@ def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty:
     return np.sqrt(position2), np.sqrt(turn2)
 
 
-def estimate_wall_std(reflection: float) -> float:
-    """Return the standard error of the points of a thin wall, metres, by its reflection over that of metal.
+def estimate_wall_std(reflection: float, rise: float) -> float:
+    """Return the standard error of the points of a wall, metres.
 
-    A reflection below 0.05 (chosen) counts as 0.05.
+    `reflection` is its level over that of metal; `rise` the logarithm of its level in the upper half of the band over
+    that in the lower.
     """
+    steady = min(MOST_WALL_STD_M, WALL_STD_M + WALL_STD_OF_RISE_M * abs(rise))
     cancelled = max(1.0, WALL_REFLECTION / max(reflection, 0.05))
-    return WALL_STD_M * cancelled**WALL_EXPONENT
+    return min(MOST_CANCELLED_STD_M, steady * cancelled**WALL_EXPONENT)
 
 
 def doubt_places(
-    segments: Sequence[Segment], echoes: Seen, shape: Shape, reflection: Array
+    segments: Sequence[Segment], echoes: Seen, shape: Shape, voltages: Voltages, gains: Gains
 ) -> tuple[list[Segment], Array]:
     """Return the segments with their reasons, and the standard errors of points by what no single medium explains, [n].
 
-    They are in metres, 0 for segments of one medium. `reflection` [n]: level over that of metal. A wall is not told
-    from other things that no single medium explains.
+    They are in metres, 0 for segments of one medium. A wall is not told from other things that no single medium
+    explains, so that the radius gets a wall's error, too.
     """
+    reflection = find_reflection(voltages, gains)
+    rise = voltages.band_rise[:, 0] - gains.band_rise[0]
     judged = list(segments)
     unknown_m = np.zeros(len(echoes))
     for index, segment in enumerate(segments):
@@ -349,9 +362,12 @@ def doubt_places(
         members = echoes.segment == segment.number
         depth_m = find_depth_behind(echoes, shape, segment.number)
         if depth_m is None:
-            unknown_m[members] = estimate_wall_std(float(np.median(reflection[members])))
+            unknown_m[members] = estimate_wall_std(
+                float(np.median(reflection[members])), float(np.median(rise[members]))
+            )
+            judged[index] = add_bend_error(segment, WALL_BEND_ERROR)
         else:
-            judged[index] = replace(segment, reason=BEHIND_ANOTHER)
+            judged[index] = add_bend_error(replace(segment, reason=BEHIND_ANOTHER), 1.0)
             # That of an even distribution as far as the surface before.
             unknown_m[members] = depth_m / np.sqrt(3)
     return judged, unknown_m
@@ -387,17 +403,49 @@ def describe_segment(number: int, shape: Shape) -> Segment:
     """Return a segment with its place, normal, radius and incidence angle by the shape of its points."""
     # The median of the matrices, for noise spreads the two curvatures of each point.
     usual = np.median(shape.curvature, axis=0)
-    bend = float(np.abs(np.linalg.eigvalsh((usual + usual.T) / 2)).max())
+    bends, axes = np.linalg.eigh((usual + usual.T) / 2)
+    largest = int(np.abs(bends).argmax())
+    bend = float(np.abs(bends[largest]))
     normal = shape.normals.mean(axis=0)
     normal /= np.linalg.norm(normal)
+    radius_mm = None
+    radius_std_mm = None
+    if bend > FLAT_BEND:
+        radius_mm = 1e3 / bend
+        radius_std_mm = radius_mm * estimate_bend_std(shape, axes[:, largest], float(bends[largest])) / bend
     return Segment(
         number=number,
         points=len(shape.points),
         centre_m=_convert_triple(shape.points.mean(axis=0)),
         normal=_convert_triple(normal),
-        radius_mm=1e3 / bend if bend > FLAT_BEND else None,
+        radius_mm=radius_mm,
+        radius_std_mm=radius_std_mm,
         incidence_deg=float(np.degrees(np.arccos(np.clip(shape.cos, 0, 1)).mean())),
     )
+
+
+def estimate_bend_std(shape: Shape, axis: Array, bend: float) -> float:
+    """Return the standard error of a segment's curvature `bend`, 1 / m, along an `axis` [2] of its tangents.
+
+    Curvatures follow from how the paths bend over the stage, and once more from how normals turn over the points. Both
+    agree for a sound surface; a wall or a second echo disturbs them differently. The scatter of the points' curvatures
+    is added whole, for its errors extend over many points.
+    """
+    bends = np.einsum("i,nij,j->n", axis, shape.curvature, axis)
+    low, high = np.percentile(bends, [16, 84])
+    tangent = np.median(tangents(shape.normals), axis=0)
+    moved = (shape.points - shape.points.mean(axis=0)) @ tangent
+    turned = (shape.normals - shape.normals.mean(axis=0)) @ tangent @ axis
+    across = np.array([-axis[1], axis[0]])
+    rates = np.linalg.lstsq(np.stack([moved @ axis, moved @ across], axis=1), turned, rcond=None)[0]
+    return float(np.hypot((high - low) / 2, rates[0] - bend))
+
+
+def add_bend_error(segment: Segment, share: float) -> Segment:
+    """Return a segment whose curvature has a further relative error of `share`."""
+    if segment.radius_mm is None or segment.radius_std_mm is None:
+        return segment
+    return replace(segment, radius_std_mm=float(np.hypot(segment.radius_std_mm, share * segment.radius_mm)))
 
 
 def _convert_triple(vector: Array) -> tuple[float, float, float]:
@@ -441,7 +489,7 @@ def judge_segment(
 def add_permittivity(segment: Segment, eps: complex, sources: dict[str, Array]) -> Segment:
     """Add a permittivity with its covariances [2, 2] by source, unless no passive medium has it."""
     (aa, ab), (_, bb) = sum(sources.values(), np.zeros((2, 2))).tolist()
-    if eps.imag > MAX_GAIN_SIGMA * bb**0.5 or eps.real < LEAST_REAL:
+    if eps.imag > MAX_GAIN_SIGMA * bb**0.5 or not LEAST_REAL <= eps.real <= MOST_REAL:
         return replace(segment, reason=NO_SINGLE_MEDIUM)
     dominant = max(sources, key=lambda name: float(np.trace(sources[name])))
     return replace(segment, permittivity=eps, covariance=((aa, ab), (ab, bb)), dominated_by=dominant)
@@ -517,10 +565,12 @@ def summary_lines(surface: Surface) -> list[str]:
 
 
 def describe_form(segment: Segment) -> str:
-    """Return "flat" or the radius of a segment."""
+    """Return "flat", or the radius of a segment with its standard error."""
     if segment.radius_mm is None:
         return "flat"
-    return f"radius {segment.radius_mm:.0f} mm"
+    if segment.radius_std_mm is None:
+        return f"radius {segment.radius_mm:.0f} mm"
+    return f"radius {segment.radius_mm:.0f} +- {max(1.0, segment.radius_std_mm):.0f} mm"
 
 
 def describe_material(segment: Segment) -> str:

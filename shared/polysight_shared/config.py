@@ -327,6 +327,8 @@ class Polarimetry(Section, frozen=True):
     leakage_std: NonNegative | None = None
     # Rms magnitude of unmeasured leakage of any phase; 0.058 is the rms of amplitudes distributed uniformly up to 0.1.
     leakage_prior: NonNegative = 0.058
+    # Standard error of the antennas' axes of polarisation, degrees: a bracket sets a board to about one.
+    axis_std_deg: NonNegative = 1.0
     # Standard deviation of the filter, pixels.
     smooth_px: NonNegative = 1.5
 

@@ -14,9 +14,11 @@ from polysight.surfaces.gains import receive, reflect_points
 from polysight.surfaces.permittivity import find_interior, find_reflecting, find_shares, fit_permittivity
 from polysight.surfaces.points import find_offset_that_sees, predict_echo
 from polysight.surfaces.result import (
+    BEHIND_ANOTHER,
     NO_SINGLE_MEDIUM,
     add_permittivity,
     describe_segment,
+    doubt_places,
     estimate_wall_std,
     find_depth_behind,
     judge_segment,
@@ -168,7 +170,7 @@ def test_no_drawn_wall_gets_a_permittivity_that_is_not_its_own(metal, gains, opt
         assert error < 0.02
 
 
-def test_what_the_windows_of_a_body_see_behind_it_may_be_an_echo_from_inside(metal, optics):
+def test_what_the_windows_of_a_body_see_behind_it_may_be_an_echo_from_inside(metal, gains, optics):
     def add_echo(path_m, shift_m=0.0):
         """Points of the front, and an echo of each later by `path_m`, seen from `shift_m` farther away in x."""
         later = replace(metal.h, path_m=metal.h.path_m + path_m, at_m=metal.h.at_m + np.array([shift_m, 0.0, 0.0]))
@@ -182,6 +184,16 @@ def test_what_the_windows_of_a_body_see_behind_it_may_be_an_echo_from_inside(met
     assert find_depth_behind(*add_echo(0.2), 0) is None
     assert find_depth_behind(*add_echo(0.02), 1) is None
     assert find_depth_behind(*add_echo(0.2, shift_m=0.5), 1) is None
+
+    # It seems to be of a small ball: that its shape is reliable would be wrong.
+    echoes, shape = add_echo(0.2)
+    front, echo = (describe_segment(number, shape[echoes.segment == number]) for number in (0, 1))
+    echo = replace(echo, radius_mm=18.0, reason="radius 18 mm: below 40 mm only the shape is reliable")
+    judged, unknown_m = doubt_places([front, echo], echoes, shape, find_voltages(echoes, optics, shape), gains(optics))
+    assert [segment.reason for segment in judged] == ["", BEHIND_ANOTHER]
+    assert judged[1].radius_std_mm >= 18.0
+    assert not unknown_m[: len(metal)].any()
+    assert unknown_m[-1] == pytest.approx(0.166 / np.sqrt(3), rel=0.05)
 
 
 def test_points_near_the_border_of_a_segment_are_told_but_not_where_the_scan_ends():

@@ -136,7 +136,7 @@ def _add_surface(add: Add) -> None:
         "measure shape and permittivity of curved and tilted objects",
         "polysight surface scans/bottle --out out/bottle",
     )
-    _add_data(sub, several=True)
+    _add_data(sub, several=True, images=False)
     sub.add_argument(
         "--turned",
         type=_parse_angles,
@@ -208,10 +208,15 @@ def add_commands(add: Add) -> None:
     _add_leakage(add)
 
 
-def _add_data(sub: argparse.ArgumentParser, several: bool = False) -> None:
-    """Add the options for the recorded data, the folder of results, and the rig file of published data."""
+def _add_data(sub: argparse.ArgumentParser, several: bool = False, images: bool = True) -> None:
+    """Add the options for the recorded data, the folder of results, and the rig file of published data.
+
+    Only commands for `several` scans may take `images`, too.
+    """
     text = "scan folder, or published unsynced/<scan> or raw/<scan>"
-    if several:
+    if several and not images:
+        text += "; or several"
+    elif several:
         text += "; or images: published labels/<scan>, or .npz with h and v; or several, or a folder of them"
     sub.add_argument("data", type=Path, nargs="+" if several else None, metavar="DATA", help=text)
     sub.add_argument(

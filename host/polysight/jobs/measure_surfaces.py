@@ -26,8 +26,6 @@ KEPT_POINTS = 240
 # Standard errors of places that were measured by hand, and of those that `calibrate direct-path` measured.
 PLACE_STD_M = 1e-3
 CALIBRATED_PLACE_STD_M = 3e-4
-# Axes of polarisation follow the boards, which are mounted to about a degree.
-AXIS_STD_RAD = 0.0175
 
 
 def take_samples(pipeline: Pipeline) -> tuple[surfaces.Samples, surfaces.Samples]:
@@ -70,7 +68,7 @@ def find_uncertainty(rig: Instrument, *, places_known: bool) -> surfaces.Uncerta
     if polarimetry.leakage_std is not None:
         leakage = polarimetry.leakage_std
     place_std_m = CALIBRATED_PLACE_STD_M if places_known else PLACE_STD_M
-    return surfaces.Uncertainty(float(leakage), AXIS_STD_RAD, place_std_m)
+    return surfaces.Uncertainty(float(leakage), float(np.radians(polarimetry.axis_std_deg)), place_std_m)
 
 
 def make_rig_optics(rig: Instrument) -> surfaces.Optics:

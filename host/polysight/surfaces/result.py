@@ -70,7 +70,7 @@ NO_SINGLE_MEDIUM = "no single medium reflects so: a thin wall, a coating, an edg
 # far, a window does not resolve both.
 MIN_SHARE_BEHIND = 0.8
 MIN_DEPTH_M = 0.03
-BEHIND_ANOTHER = "no single medium reflects so, and it lies behind another surface: an echo from inside a body"
+BEHIND_ANOTHER = "it lies behind another surface: an echo from inside a body, whose place and form are not these"
 # What an edge diffracts changes the slopes of windows near the border of the zone that its surface reflects to: by up
 # to 0.01, in the root mean square 0.0065 (half a plane, tests/surfaces/test_slope_errors.py).
 EDGE_SLOPE_STD = 0.0065
@@ -357,10 +357,14 @@ def doubt_places(
     judged = list(segments)
     unknown_m = np.zeros(len(echoes))
     for index, segment in enumerate(segments):
-        if segment.reason != NO_SINGLE_MEDIUM:
+        # A small radius is judged, too: an echo from inside a body seems to be of a small ball.
+        is_small = segment.radius_mm is not None and segment.radius_mm < 1e3 * MIN_RADIUS_M
+        if segment.name or not (segment.reason == NO_SINGLE_MEDIUM or is_small):
             continue
         members = echoes.segment == segment.number
         depth_m = find_depth_behind(echoes, shape, segment.number)
+        if depth_m is None and segment.reason != NO_SINGLE_MEDIUM:
+            continue
         if depth_m is None:
             unknown_m[members] = estimate_wall_std(
                 float(np.median(reflection[members])), float(np.median(rise[members]))

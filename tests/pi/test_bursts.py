@@ -317,6 +317,15 @@ def test_a_record_bounds_what_the_controller_did(late_ns):
     assert record.jitter_ns <= late_ns / 2 + burst.bit_ns
 
 
+@pytest.mark.parametrize(("period_ns", "rounding_bits"), [(PERIOD, 0), (PERIOD + 1, 0.5)])
+def test_only_pulses_between_bits_are_rounded(period_ns, rounding_bits):
+    """A period of whole bits puts every pulse at its exact time."""
+    lines = Controller(late_ns=0)
+    record = trigger.send_burst(lines, trigger.BurstSpec(16, period_ns, 1000), 1_000_000)
+    ((_, burst),) = lines.sent
+    assert record.jitter_ns == pytest.approx(rounding_bits * burst.bit_ns, abs=1)
+
+
 def test_no_position_is_lost_to_a_width_fault():
     """10,000 positions by the SPI controller; the kernel is up to 5 ms late in every call."""
     rng = random.Random(1)

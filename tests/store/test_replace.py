@@ -18,7 +18,7 @@ from polysight.capture import PACKETS, Evidence, place_record, read_packets, wri
 from polysight.capture.dca1000 import Counters
 from polysight.capture.placement import Past
 from polysight.jobs.recordings import inspect_placement, replace_folder
-from polysight.store import ManifestWriter, ScanFolder, replace_rows
+from polysight.store import ManifestWriter, ScanFolder, describe_damage, replace_rows
 from polysight.store.logs import crc32
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.raster import plan_raster
@@ -136,6 +136,20 @@ def test_a_damaged_file_is_reported_and_never_placed(tmp_path, suffix, other):
         inspect_placement(scan.path / f"raw/{board}/0000.bin", as_json=False)
     remaining = {r.board: r.damaged for r in replace_rows(scan)}
     assert remaining == {"RH": not other, "RV": other}
+
+
+def test_damage_of_a_row_is_that_of_its_own_file(tmp_path):
+    scan, _ = scan_with(tmp_path / "scan", lost=9)
+    damaged = scan.path / "raw/RH/0000.bin"
+    damaged.write_bytes(bytes(damaged.stat().st_size))
+    for path, text in (
+        (damaged, "crc"),
+        (scan.path / "raw/RV/0000.bin", ""),
+        (scan.path / "raw/RV/0001.bin", "no such committed row"),
+    ):
+        damage = describe_damage(scan, path)
+        assert text in damage.lower()
+        assert bool(damage) == bool(text)
 
 
 def test_batches_that_take_packets_back_are_damage(tmp_path):

@@ -53,6 +53,13 @@ def kernel(root: Path, routes: str = LOCAL, carrier: str | None = "1", arp: str 
     return root
 
 
+def test_an_interface_that_does_not_tell_its_link_is_passed_over(tmp_path):
+    root = kernel(tmp_path, carrier=None)
+    assert silent_hop(CARD, root) is Hop.LINK
+    (root / "sys/class/net/eth1/operstate").write_text("unknown\n")
+    assert silent_hop(CARD, root) is Hop.CARD
+
+
 @pytest.mark.parametrize(
     ("given", "hop", "says"),
     [

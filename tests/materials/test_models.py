@@ -75,6 +75,16 @@ def test_the_split_by_pixel_does_straddle_and_says_so():
     assert "optimistic" in score(data, DISCRIMINANT, by_pixel=True).split
 
 
+def test_a_split_by_pixel_needs_two_pixels_of_a_material():
+    two = np.array([0, 1, 2])
+    names = np.array(["PET", "PET", "oak"])
+    pixels = Samples(np.eye(3, 4), names, two, two)
+    judged = np.concatenate([test for _, test in splits(pixels, by_pixel=True)])
+    assert sorted(judged) == [0, 1, 2]
+    with refused(ErrorCode.NOT_ENOUGH_DATA, "two pixels"):
+        list(splits(pixels.take(np.array([False, True, True])), by_pixel=True))
+
+
 def test_a_split_by_pixel_flatters():
     """What the pixels of a patch share is learnt by heart when they stand on both sides of the split."""
     data = samples(pixels=10, offset=0.03, noise=0.003)

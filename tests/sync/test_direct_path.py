@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from polysight.sync import loops
+from polysight.sync.chain import CubeForm
 from polysight.sync.decimate import FOLD
 from polysight.sync.offsets import prepare, reference, whole_blocks
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
@@ -72,6 +73,18 @@ def test_a_tone_whose_frequency_still_steps_by_a_fiftieth_of_a_bin_is_not_found(
     done = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], rig.chirp, by=Unsettled)
     assert (done.found == is_found).all()
     assert (np.abs(done.samples).max() > 0) == is_found
+
+
+@pytest.mark.parametrize("if_mode", ["complex1x", "complex2x"])
+@pytest.mark.parametrize("cycles", [-0.12, 0.05])
+def test_a_cube_that_is_mixed_down_may_have_any_if_near_zero(rig, paths, direct_paths, board, cycles, if_mode):
+    """The passband of a receiver with complex1x has no negative IF; a cube that another program has mixed down may."""
+    signal, _ = paths(board, 6, 0.0, np.random.default_rng(0))
+    chirp = msgspec.structs.replace(rig.chirp, if_mode=if_mode)
+    cube = (signal * np.exp(2j * np.pi * cycles * np.arange(chirp.samples))).astype(np.complex64)
+    turn = np.ones((4, chirp.samples), np.complex64)
+    form = CubeForm(False, turn, np.zeros(4, np.complex64), direct_paths[board.name], chirp, "")
+    assert form.convert_row(cube.transpose(1, 0, 2), 16).valid.all()
 
 
 @pytest.mark.parametrize("echo", [0.5, 1.0, 2.0])

@@ -1,6 +1,7 @@
 """Images of points and planes: position, phase, amplitude, flatness, resolution; rows in any order, or masked."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 import scipy.signal
 from tests.support.refusals import refused
 
-from polysight.imaging import ImageBuilder, backproject, image_grid
+from polysight.imaging import UNKNOWN_PLANE, ImageBuilder, Images, backproject, image_grid, move_to_plane, plane
 from polysight.imaging.geometry import Antennas, row_offsets_m
+from polysight.imaging.images import Dispersion
 from polysight.imaging.samples import mirror_samples, reduction, scene_gate_m
 from polysight.materials.layers import Spectrum
 from polysight.polarimetry import multilayer
@@ -365,3 +367,27 @@ def test_the_image_is_the_float64_matched_filter_over_all_samples(make_rig, sync
     want /= 4 * plan.positions
     pixel_values = np.array([got[j, i] for i, j in pixels])
     assert np.abs(pixel_values - want).max() < 2e-6 * np.abs(want).max()
+
+
+@pytest.mark.parametrize(("offset_m", "moved"), [(4e-4, False), (-6e-4, True), (0.0149, True), (0.0151, False)])
+@pytest.mark.parametrize("transposed", [False, True])
+def test_images_are_formed_again_on_a_plane_that_is_off_and_within_reach(monkeypatch, offset_m, moved, transposed):
+    """With the dispersion on the same plane, both turned as the images are."""
+    nominal = np.arange(6, dtype=complex).reshape(2, 3)
+    axes = np.arange(3.0), np.arange(2.0)
+
+    def images_of(h):
+        return Images(h, h, *axes, np.ones(h.shape, bool))
+
+    builder = SimpleNamespace(
+        finish=lambda offset: images_of(nominal + offset),
+        disperse=lambda offset: Dispersion(nominal + offset, nominal, (76e9, 80e9)),
+    )
+    estimate = replace(UNKNOWN_PLANE, offset_m=offset_m, plates=1)
+    monkeypatch.setattr(plane, "find_plane", lambda *_: estimate)
+    first = images_of(nominal).transpose() if transposed else images_of(nominal)
+    assert move_to_plane(builder, first, [], transposed, move=False) == (estimate, first)
+    _, on_plane = move_to_plane(builder, first, [], transposed, move=True)
+    expected = nominal + (offset_m if moved else 0.0)
+    np.testing.assert_array_equal(on_plane.h, expected.T if transposed else expected)
+    np.testing.assert_array_equal(on_plane.dispersion.h, on_plane.h)

@@ -7,9 +7,9 @@ from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 from polysight.polarimetry import specular_incidence_rad
-from polysight_papers.sensys2026 import run as catalogue
+from polysight_papers.sensys2026 import images, run as catalogue
 from polysight_papers.sensys2026.images import FIG13_DISTANCE_MM, front_on, plate, simulate_scan
-from polysight_papers.sensys2026.item import Run
+from polysight_papers.sensys2026.item import Run, table2
 from polysight_papers.sensys2026.permittivities import APART_MM, REACH_MM, places
 from polysight_papers.sensys2026.synchronisation import tones
 from polysight_shared.config import load_instrument
@@ -78,3 +78,23 @@ def test_the_filter_s_corners_come_back_from_the_sweep():
 
 def test_every_item_of_the_paper_is_made():
     assert set(catalogue.MAKERS) == set(catalogue.TITLES)
+
+
+def test_plates_of_a_scan_have_the_permittivities_of_their_rows_of_table_2(monkeypatch):
+    simulated = []
+
+    def take_plates(_, plates, *__, **___):
+        simulated.append(plates)
+        # The scene is known: nothing is simulated.
+        raise InterruptedError
+
+    monkeypatch.setattr(images, "simulate_scan", take_plates)
+    rows = (2, 9, 30)
+    with pytest.raises(InterruptedError):
+        images.view_scan("rows", rows, Run())
+    copper, *plates = simulated[0]
+    assert copper["metal"]
+    for row, scene_plate in zip(rows, plates, strict=True):
+        published = table2()[row - 1]
+        assert scene_plate["name"] == published.name
+        assert complex(scene_plate["permittivity"][0], -scene_plate["permittivity"][1]) == published.permittivity

@@ -63,7 +63,7 @@ FIT_PIXELS = 3
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the channels (the paper's lambda_H, lambda_V, lambda_P), measure of P, and number of neighbours.
+    """Weights of the channels (the paper's lambda_H, lambda_V, lambda_P), how P's distance is measured, and neighbours.
 
     A weight multiplies the distance in its channel. Names depend on the ratios of `h`, `v` and `p`; thresholds of
     distances hold for the weights that they were fitted with.
@@ -274,8 +274,8 @@ def _compute_thresholds(distance: Real, neighbours: int, few: Samples) -> dict[s
     """Return thresholds: 99th percentile of the distances of a material's pixels between scans, times a margin.
 
     At least half of the materials' median: metal is the reference, so its own distances are zero. At most three times
-    the median: one unusual specimen must not make a material accept everything. A material of a single scan has no
-    threshold.
+    the median: one unusual specimen must not make a material accept everything. Both are chosen. A material of a single
+    scan has no threshold.
     """
     out = {}
     for name in np.unique(few.names):

@@ -28,7 +28,7 @@ _READ_TIMEOUT_S = 0.5
 _LATENCY_MS = 1
 _CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists the chips"
 
-# Channels over TCP: a request has channel, W or R, and the number of bytes.
+# Channels over TCP: a request has channel, W or R, and the number of bytes. The timeout is chosen.
 SCHEME = "tcp://"
 _HEAD = struct.Struct("<ccH")
 _TIMEOUT_S = 30.0
@@ -69,7 +69,7 @@ _NO_LOOPBACK = 0x85
 # The clock is 60 MHz / (2 x (divisor + 1)): 10 MHz, and 1 MHz for a slow link.
 SPI_DIVISOR = 2
 SLOW_DIVISOR = 29
-# One pin command holds its pins for 0.2 us (FTDI AN_114), two clocks at 10 MHz; ICD 3.2.4 wants two at least.
+# One pin command holds its pins for 0.2 us (FTDI AN_114), two clocks at 10 MHz; TI's ICD, 3.2.4, wants two at least.
 _SELECT_COMMANDS = 2
 _IDLE_COMMANDS = 3
 # Pause between two words of a slow link; chosen.
@@ -285,7 +285,7 @@ class FtdiPort:
             raise _usb_error(f"{self._place}: {e}", e, _PULLED) from None
 
     def read(self, size: int) -> bytes:
-        """Receive up to `size` bytes, with a timeout of half a second. Raises DeviceError."""
+        """Receive up to `size` bytes within half a second, by 4 reads in a row (chosen). Raises DeviceError."""
         received = bytearray()
         deadline = time.monotonic() + _READ_TIMEOUT_S
         try:

@@ -51,13 +51,14 @@ PAGES = {
     "/check": ("check", "Check plate · polysight", "scan"),
 }
 MEDIA_TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-# How long a request waits for the reading process to start, or to be started again, and the time between two tries.
+# How long a request waits for the reading process to start (or start again), and the time between two tries; chosen, as
+# the bytes that are passed on at a time.
 READER_PATIENCE_S = 20.0
 CONNECT_INTERVAL_S = 0.1
 CHUNK_BYTES = 1 << 16
 # Running scans are looked for at most this often, however many pages ask; chosen.
 RUNNING_AGE_S = 0.5
-# The header of every page shows a killed scan for this long; later, only the list of scans does.
+# The header of every page shows a killed scan for this long (chosen); later, only the list of scans does.
 KILLED_SHOWN_S = 3600.0
 # Headers of an answer that are not passed on: they concern the connection to the reading process, or uvicorn adds its
 # own.
@@ -382,7 +383,7 @@ class ConnectionLimit:
     not take its own delay for a client's. A connection of which bytes wait to be read is not closed.
     """
 
-    # Connections with unread bytes that are passed over for one that is closed.
+    # Connections with unread bytes that are passed over for one that is closed; chosen.
     MAX_PASSED = 8
 
     def __init__(self, most: int) -> None:

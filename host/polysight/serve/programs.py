@@ -31,7 +31,7 @@ from polysight_shared.errors import ConfigError, DeviceError, PolysightError, Sc
 from polysight_shared.files import write_atomically
 
 OOM_SCORE = Path("/proc/self/oom_score_adj")
-# $1 is the kernel's score of the memory killer; then come the words of the program.
+# $0 is the path of log and status without their ends, $1 the kernel's score of the memory killer; the program follows.
 SHELL = (
     '{ echo "$1" > /proc/self/oom_score_adj; } 2> /dev/null; shift;'
     ' "$@" >> "$0.log" 2>&1 < /dev/null; echo $? > "$0.status"'

@@ -27,11 +27,16 @@ Source = Literal["library", "literature"]
 REAL_RANGE = (1.2, 30.0)
 LOSS_RANGE = (0.0, 30.0)
 SOFT_LOSS = 0.05
-"""Ranges of eps' and eps'' of any half space, from nearly air to beyond water: eps' is uniform on a logarithmic scale,
-eps'' on one that is logarithmic above `SOFT_LOSS` and linear below."""
+"""Ranges of eps' and eps'' of any half space, from nearly air to beyond water. Its coordinates are ln eps' and
+asinh(eps'' / SOFT_LOSS), which is logarithmic above `SOFT_LOSS` and linear below."""
+NEAR_LITERATURE = 0.8
+"""Share of the other half spaces that lie near the literature's: materials that no table has are mostly like those that
+one has. The rest is uniform in both coordinates."""
+NEAR_LITERATURE_STD = (0.12, 0.6)
+"""Distance of these from the literature's in both coordinates, standard deviations."""
 USUAL_LIBRARY_SHARE = 0.5
 """Expected share of a library's materials in a scan that was processed without it; chosen."""
-LITERATURE_SHARE = 0.7
+LITERATURE_SHARE = 0.4
 """Share of the literature in thick plates that are none of the library's materials; the others are metal or any half
 space. Chosen, as are the shares of metal and of thin plates: larger ones draw uncertain names to these."""
 METAL_SHARE = 0.1
@@ -74,6 +79,9 @@ METAL_SPREAD = 0.01
 LEAST_STD_OF_T = 1e-6
 MOST_STD_BEYOND = 30.0
 """Least standard deviation of t in which a distance is counted, and its largest: there the density is nearly 0."""
+# Cells of the table of other half spaces along each coordinate: a fifth of `NEAR_LITERATURE_STD` and less.
+_COORDINATE_CELLS = 256
+_CELL_NUMBERS = np.arange(float(_COORDINATE_CELLS))
 # Smallest standard deviation of a ratio: below it a covariance has no inverse in double precision.
 LEAST_RATIO_STD = 1e-6
 # Step of numerical derivatives by ln of the real part, and by the loss; chosen.
@@ -351,9 +359,8 @@ class Kinds:
         at_border[is_outside] = inverse_ratio(real[is_outside] - 1j * loss[is_outside], self.theta_rad)
         # At the border and not at t: near t = 1, which is metal, the slope has no bound.
         slope = np.abs(permittivity_slope(at_border, self.theta_rad))
-        width = np.log(REAL_RANGE[1] / REAL_RANGE[0]) * np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS)
         floor = np.hypot(SOFT_LOSS, slope * std)
-        density = slope**2 / (width * real * np.hypot(loss, floor))
+        density = slope**2 * _tabulated_coordinate_density(real, loss) / (real * np.hypot(loss, floor))
         beyond = np.abs(t - at_border) / max(std, LEAST_STD_OF_T)
         return np.asarray(density * np.exp(-0.5 * np.minimum(beyond, MOST_STD_BEYOND) ** 2), np.float64)
 
@@ -458,6 +465,45 @@ def _compute_shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
             out[mask] = share / mask.sum()
     out[~ours] *= 1 - sheets
     return out, (1 - METAL_SHARE - share_literature) * (1 - sheets)
+
+
+def _half_space_coordinates(real: npt.ArrayLike, loss: npt.ArrayLike) -> Real:
+    """Return the coordinates of half spaces eps' - j eps'', ln eps' and asinh(eps'' / SOFT_LOSS), float64 [2, ...]."""
+    return np.stack([np.log(real), np.arcsinh(np.asarray(loss, np.float64) / SOFT_LOSS)])
+
+
+@cache
+def _tabulate_coordinate_density() -> tuple[Real, Real, Real]:
+    """Return the density of other half spaces over both coordinates, float64 [eps', eps''], and its two axes.
+
+    Near the literature's each kind of material counts the same, as laminates and tissues are no more common on a table
+    than others. What would lie beyond the ranges is reflected at their ends.
+    """
+    ends = _half_space_coordinates(REAL_RANGE, LOSS_RANGE)
+    axes = [np.linspace(low, high, _COORDINATE_CELLS) for low, high in ends]
+    step = np.array([axis[1] - axis[0] for axis in axes])
+    materials = load_catalogue()
+    families, family_index, family_size = np.unique(
+        [material.kind for material in materials], return_inverse=True, return_counts=True
+    )
+    eps = np.array([material.permittivity for material in materials], np.complex128)
+    places = _half_space_coordinates(np.clip(eps.real, *REAL_RANGE), np.clip(-eps.imag, *LOSS_RANGE))
+    edges = [np.append(axis - d / 2, axis[-1] + d / 2) for axis, d in zip(axes, step, strict=True)]
+    weights = 1 / (families.size * family_size[family_index])
+    count = np.histogram2d(places[0], places[1], edges, weights=weights)[0]
+    near = scipy.ndimage.gaussian_filter(count, np.array(NEAR_LITERATURE_STD) / step, mode="reflect") / step.prod()
+    even = 1 / np.prod(ends[:, 1] - ends[:, 0])
+    return NEAR_LITERATURE * near + (1 - NEAR_LITERATURE) * even, axes[0], axes[1]
+
+
+def _tabulated_coordinate_density(real: Real, loss: Real) -> Real:
+    """Return the density of other half spaces over their two coordinates, interpolated linearly, shape of `real`."""
+    table, real_axis, loss_axis = _tabulate_coordinate_density()
+    x, y = _half_space_coordinates(real, loss)
+    cells = np.stack([np.interp(x, real_axis, _CELL_NUMBERS), np.interp(y, loss_axis, _CELL_NUMBERS)])
+    # map_coordinates takes no scalars.
+    density = scipy.ndimage.map_coordinates(table, cells.reshape(2, -1), order=1, mode="nearest")
+    return np.asarray(density, np.float64).reshape(x.shape)
 
 
 @cache

@@ -3,7 +3,8 @@
 Each mutant is one change by an operator of cosmic-ray (a comparison, a number, an arithmetic sign, a condition) in a
 scratch copy of the repository. The tests of its room run against it, then, if all pass, the whole suite but its slowest
 tests; it is killed when one fails or hangs. A survivor is a law that no test states, or a change without effect: read
-it, and write the law. 100 mutants take some hours.
+it, and write the law. A test that has nothing to do with the mutant it killed fails by itself. 100 mutants take some
+hours.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ def _positions(operator: str, node):
 
 
 def judge(mutant: Mutant, copy: Path) -> str:
-    """Return `killed`, `survived` or `invalid` (no change) for a mutant, tried in a copy of the repository."""
+    """Return `survived`, `invalid` (no change) or `killed by TEST` for a mutant, tried in a copy of the repository."""
     path = copy / mutant.file
     original = path.read_text(encoding="utf-8")
     mutated = mutate_code(original, get_operator(mutant.operator)(), mutant.occurrence)
@@ -101,26 +102,27 @@ def judge(mutant: Mutant, copy: Path) -> str:
         return "invalid"
     path.write_text(mutated, encoding="utf-8")
     try:
-        room_passes = tests_pass(copy, [str(mutant.tests)])
-        if room_passes and tests_pass(copy, ["-m", "not slow"]):
-            return "survived"
-        return "killed"
+        failed = find_failure(copy, [str(mutant.tests)]) or find_failure(copy, ["-m", "not slow"])
+        return f"killed by {failed}" if failed else "survived"
     finally:
         path.write_text(original, encoding="utf-8")
 
 
-def tests_pass(copy: Path, selection: Sequence[str]) -> bool:
-    """Run tests of a copy of the repository; False if one fails or they hang."""
+def find_failure(copy: Path, selection: Sequence[str]) -> str:
+    """Run tests of a copy of the repository; return the name of one that fails, or that they hang; "" if all pass."""
     paths = os.pathsep.join(str(copy / top) for top in ("shared", "pi_controller", "simulators", "host", "papers"))
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "4", "--no-header", *selection]
     environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
     try:
         done = subprocess.run(
-            command, cwd=copy, env=environment, capture_output=True, timeout=TIMEOUT_S, check=False
+            command, cwd=copy, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return False
-    return done.returncode == 0
+        return "a timeout"
+    if done.returncode == 0:
+        return ""
+    failures = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    return failures[0].split()[1] if failures else "an import"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -135,7 +137,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         shutil.copytree(REPO, copy, ignore=shutil.ignore_patterns(".venv", ".git", "out", "__pycache__"))
         for number, mutant in enumerate(draw_mutants(args.count, args.seed), 1):
             outcome = judge(mutant, copy)
-            outcomes[outcome] += 1
+            outcomes[outcome.partition(" ")[0]] += 1
             place = f"{mutant.file} {mutant.operator} {mutant.occurrence}"
             sys.stdout.write(f"{number}/{args.count} {outcome}: {place}\n")
             sys.stdout.flush()

@@ -128,6 +128,7 @@ def test_every_reason_says_what_why_and_what_to_do():
         *rules.judge_background(0.1),
         *rules.judge_flatness((0.1, 0.05), 0.0),
         *rules.judge_flatness((0.1, 0.05), 0.1),
+        *rules.judge_flatness((0.1, 0.05), 0.0, is_boxed=True),
         *rules.judge_fringes(0.9),
         *rules.judge_disturbed_plates({2: 0.2}),
         *rules.judge_moved_boards(1.0),
@@ -333,3 +334,12 @@ def test_a_terminal_shows_the_heaviest_reasons_and_how_many_more_there_are():
 )  # fmt: skip
 def test_100_percent_is_shown_only_if_nothing_is_missing(part, whole, digits, shown):
     assert percent(part, whole, digits) == shown
+
+
+def test_ripple_inside_given_boxes_names_the_edges_before_the_direct_path():
+    """Boxes 3 mm inside the edges of undisturbed plates were blamed on a second path (found from outside)."""
+    (boxed,) = rules.judge_flatness((0.1, 0.05), 0.0, is_boxed=True)
+    assert boxed.why.startswith("boxes that reach the plates' edges")
+    assert "6 mm inside" in boxed.do
+    (found,) = rules.judge_flatness((0.1, 0.05), 0.0)
+    assert "boxes" not in found.why

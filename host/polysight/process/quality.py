@@ -474,7 +474,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
         reasons += rules.judge_fringes(result.drift.fringes)
     reasons += rules.judge_halo(result.halo)
     reasons += rules.judge_background(result.behind)
-    reasons += rules.judge_flatness(result.ripple, result.relief_rad)
+    reasons += rules.judge_flatness(result.ripple, result.relief_rad, is_boxed=bool(result.boxes))
     reasons += rules.judge_disturbed_plates(result.errors_by_disturbance())
     reasons += rules.judge_passivity(no_half_spaces)
     metal = result.metal

@@ -444,10 +444,11 @@ def judge_background(relative_std: float) -> list[Finding]:
     )]  # fmt: skip
 
 
-def judge_flatness(ripple: tuple[float, float], relief_rad: float) -> list[Finding]:
+def judge_flatness(ripple: tuple[float, float], relief_rad: float, is_boxed: bool = False) -> list[Finding]:
     """Judge how well flat plates fit: usual scatter of ln|V / H| and of its phase inside them, and their relief.
 
-    A flat plate has one V / H, and a phase of H that is a plane.
+    A flat plate has one V / H, and a phase of H that is a plane. `is_boxed`: the plates' boxes were given; ones that
+    reach to 3 mm from the edges show the ripple of these.
     """
     if is_known(relief_rad) and relief_rad > RELIEF_CARE_RAD:
         return [reason(
@@ -457,11 +458,15 @@ def judge_flatness(ripple: tuple[float, float], relief_rad: float) -> list[Findi
         )]  # fmt: skip
     if not all(map(is_known, ripple)) or max(ripple) <= RIPPLE_CARE:
         return []
+    cause = "a second path beside the direct path, positions without data, interference, or a small aperture do that"
+    action = "take reflectors away from the line between transmitter and receivers; scan all positions"
+    if is_boxed:
+        cause = f"boxes that reach the plates' edges, {cause}"
+        action = f"draw the boxes at least 6 mm inside the plates; if it stays, {action}"
+    ripple_deg = np.degrees(ripple[1])
     return [reason(
-        "care",
-        f"V / H ripples by {100 * ripple[0]:.0f} % and {np.degrees(ripple[1]):.0f} degrees inside the plates",
-        "a second path beside the direct path, positions without data, interference, or a small aperture do that",
-        "take reflectors away from the line between transmitter and receivers; scan all positions", 2.4,
+        "care", f"V / H ripples by {100 * ripple[0]:.0f} % and {ripple_deg:.0f} degrees inside the plates",
+        cause, action, 2.4,
     )]  # fmt: skip
 
 

@@ -181,6 +181,7 @@ class _Rows:
         if captures:
             self.cpu_s += _read_cpu_s(self._pid) - cpu_at_start_s
             self.wall_s += time.monotonic() - start_s
+        # The last edges may come after the event: until half a second brings none (chosen).
         while isinstance(message := self._wires.receive(0.5), WireEdge):
             edges.append(message)
         if finished.fault:

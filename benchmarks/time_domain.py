@@ -116,6 +116,7 @@ def form_image(
     """
     step_hz = float(frequencies_hz[1] - frequencies_hz[0])
     size = OVERSAMPLING * frequencies_hz.size
+    # Shortest and longest path, on 33 x 33 lags (chosen); linear interpolation needs the bins at and behind both.
     corners = np.array([offsets_m.min(axis=0), offsets_m.max(axis=0)])
     dx = np.linspace(grid.x_m[0] - corners[1, 0], grid.x_m[-1] - corners[0, 0], 33)
     dy = np.linspace(grid.y_m[0] - corners[1, 1], grid.y_m[-1] - corners[0, 1], 33)

@@ -24,8 +24,8 @@ MIN_FEED = 31
 TICK_HZ = 2_000_000
 # Relative tolerance of the interval at constant speed: twice the 0.5 % by which the resonator of an UNO may be off.
 TOLERANCE = 0.01
-# Share of the same interval by which an edge may be stamped after a status that counts its point was written: a
-# simulated trigger wire is later than a simulated serial line.
+# Share of the same interval by which an edge may be stamped after a status that counts its point was written (chosen):
+# a simulated trigger wire is later than a simulated serial line.
 STATUS_TOLERANCE = 0.2
 
 

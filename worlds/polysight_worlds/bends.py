@@ -68,7 +68,8 @@ def find_bend_terms(stack: Stack) -> BendTerms:
         slope = (near - far) / (1 / RADII_M[0] - 1 / RADII_M[1])
         slopes.append(slope)
         planes.append(far - slope / RADII_M[1])
-    # The slopes by 1 / radius of three solids are sums over their curvatures: solve for the slope by each curvature.
+    # The slopes by 1 / radius of three solids s are sums over their curvatures r: solve for the slope by each of these,
+    # at each angle a and for each coefficient c.
     curvatures = np.array([curvature for _, curvature in SOLIDS])
     by_curvature = np.einsum("rs,sac->arc", np.linalg.inv(curvatures), np.array(slopes))
     # Each solid gives the terms of a plane again. The third one's are left out as the least sure: it bends along both

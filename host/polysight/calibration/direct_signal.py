@@ -1,7 +1,7 @@
 """The direct path in recorded bursts: start offset, delay and crystal error, and the receivers' high-pass filters.
 
 IF of the direct path with delay tau, start delay dt of the board relative to the transmitter, and relative frequency
-error p of the board's crystal:
+error p of the board's crystal, at the time t of a chirp that starts at f_0 with the slope K:
 
     f = K tau + start offset + p (f_0 + 2 K t) - K dt        (docs/spec/scene-file.md)
 
@@ -38,7 +38,7 @@ Real = NDArray[np.float64]
 
 # Largest value of a 16-bit word of the card.
 FULL_SCALE = 32767
-# Share of the sample rate that the receiver's filter passes.
+# Share of the sample rate that the receiver's filter passes (TI).
 PASSBAND = 0.9
 # Rows of a scan used by `fit_start`, and by `fit_filter`, which spreads their chirps over many bins of the IF; chosen.
 ROWS = 4
@@ -136,7 +136,8 @@ def find_direct(
     aligned = sync.align_row(
         words.reshape(*shape, *words.shape[1:]), valid.reshape(shape), chirp.linear_samples, setup.equaliser, FULL_SCALE
     )
-    # The drift estimate is linearised: the first pass finds 2 ppm within a tenth, the second the rest.
+    # The drift estimate is linearised: the first pass finds 2 ppm within a tenth, the second the rest. `halves` are two
+    # averages of a position's chirps, mixed down, with one sample for every `FOLD` recorded ones.
     drift = sync.reference(aligned, setup.path, chirp).drift
     time = np.arange(aligned.halves.shape[-1]) * float(sync.FOLD)
     time -= time.mean()

@@ -312,7 +312,18 @@ def see_sphere(optics, radius_m: float = 0.125) -> Seen:
         at_m = find_offset_that_sees(points, normals, np.zeros((len(points), 3)), optics.tx.at_m, receiver.at_m)
         path_m, slope, bend = predict_echo(points, normals, curvature, at_m, optics.tx.at_m, receiver.at_m)
         amplitude = np.exp(-1j * optics.wave_number * path_m)
-        echoes = Echoes(at_m, path_m, slope, bend, amplitude, zero + 1e-3, zero, np.zeros((len(points), 2)), zero, zero)
+        echoes = Echoes(
+            at_m=at_m,
+            path_m=path_m,
+            slope=slope,
+            bend=bend,
+            amplitude=amplitude,
+            amplitude_std=zero + 1e-3,
+            path_std_m=zero,
+            slope_std=np.zeros((len(points), 2)),
+            share=zero,
+            band_rise=zero,
+        )
         channels.append(echoes)
     return Seen(channels[0], channels[1], np.zeros(len(points), int))
 

@@ -33,7 +33,7 @@ NEAR_LITERATURE = 0.8
 """Share of the other half spaces that lie near the literature's: materials that no table has are mostly like those that
 one has. The rest is uniform in both coordinates."""
 NEAR_LITERATURE_STD = (0.12, 0.6)
-"""Distance of these from the literature's in both coordinates, standard deviations."""
+"""Distance of these from the literature's in both coordinates, standard deviations. Share and distance are chosen."""
 USUAL_LIBRARY_SHARE = 0.5
 """Expected share of a library's materials in a scan that was processed without it; chosen."""
 LITERATURE_SHARE = 0.4

@@ -154,6 +154,22 @@ sys.exit(main(sys.argv[3:]))
 """
 
 
+INTERRUPT_IN_LOOP = """
+import os, signal, socket, sys
+from polysight.cli.main import main
+server = os.getpid()
+make_pair = socket.socketpair
+def socketpair(*args):
+    # The event loop's own pair is the first that it makes.
+    if os.getpid() == server and "asyncio" in sys._getframe(1).f_code.co_filename:
+        sys.stderr.write("interrupted\\n")
+        signal.raise_signal(signal.SIGINT)
+    return make_pair(*args)
+socket.socketpair = socketpair
+sys.exit(main(sys.argv[1:]))
+"""
+
+
 def serve_interrupted(forks: str, where: str, folder: Path) -> tuple[int, str]:
     """Exit status and stderr of a server, interrupted at these forks, in itself or in the new processes."""
     words = [sys.executable, "-c", INTERRUPT_AT_FORKS, forks, where, "serve", str(folder), "--port", "0"]
@@ -182,6 +198,15 @@ def test_an_interrupt_of_new_processes_is_left_to_the_server(tmp_path):
     assert status == 128 + signal.SIGINT
     assert "Traceback" not in said
     assert "Exception ignored" not in said
+
+
+def test_an_interrupt_while_the_event_loop_is_made_ends_the_server_as_any_other(tmp_path):
+    """A second after the address is printed half a loop could be left, whose end is a traceback."""
+    words = [sys.executable, "-c", INTERRUPT_IN_LOOP, "serve", str(tmp_path), "--port", "0"]
+    environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
+    program = subprocess.run(words, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
+    assert program.returncode == 128 + signal.SIGINT
+    assert program.stderr.endswith("interrupted\npolysight serve: stopped\n")
 
 
 @pytest.mark.parametrize(

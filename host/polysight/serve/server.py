@@ -167,7 +167,10 @@ def _run(shown: Shown, place: Place, what: str) -> int:
             stack.enter_context(_keep_reading_process(reading, shown, Path(folder) / "reader"))
             sys.stderr.write(describe_server(access, what, listener.getsockname()[:2]))
             sys.stderr.flush()
-            make_server(front, place, door).run(sockets=[listener])
+            server = make_server(front, place, door)
+            # By itself it takes signals when its event loop runs. Ctrl-C while the loop was made left half of one.
+            with server.capture_signals():
+                server.run(sockets=[listener])
     finally:
         listener.close()
     return 0

@@ -62,7 +62,7 @@ def scan_cpu_s(out: Path, scene: Path) -> tuple[int, dict[str, float]]:
     """Run the demo; return the rows between the first commit and the last, and CPU seconds of each kind meanwhile.
 
     The scene's field, which is computed before, and the products are not counted. Raises RuntimeError if the demo
-    fails.
+    fails, or no two commits were seen.
     """
     words = [sys.executable, "-m", "polysight", "demo", "--scene", str(scene), "--out", str(out)]
     demo = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL)

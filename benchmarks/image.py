@@ -56,7 +56,7 @@ class Bench:
             yield row, cube[:, row, :: 1 - 2 * (row % 2)]
 
     def reduce_cube(self, window: str) -> tuple[Aperture, NDArray[np.complex64]]:
-        """Return the cube after the range gate alone, complex64 [rx, frequency, row, column], and its aperture."""
+        """Return the aperture, and the cube after the range gate alone, complex64 [rx, frequency, row, column]."""
         plan = plan_raster(self.rig.grid)
         grid = image_grid(self.rig)
         antennas = Antennas.from_rig(self.rig, self.board)
@@ -109,6 +109,7 @@ def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, 
     }
     took = in_turn(jobs, min(rounds, ROUNDS))
     aperture, samples = bench.reduce_cube("boxcar")
+    # Our sum over all samples, without a window, stands for the exact one; its own tests compare it with a plain sum.
     exact = choose_imager(aperture)[0].image(samples)
     settings: dict[int, dict[str, float]] = {}
     for points in SETTINGS:
@@ -132,14 +133,15 @@ def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, 
                 aim,
                 note=f"against the published method in single precision, padded ({tuned:.2f} s): {tuned / ours:.1f}x"
                 if name == "cold"
-                else f"{tuned / ours:.1f}x; published method's settings, seconds and rms error: {'; '.join(finer)}",
+                else f"{tuned / ours:.1f}x; published method's settings, seconds and rms distance from our image:"
+                f" {'; '.join(finer)}",
             )
         )
     return lines, {"settings": settings, "cpu_s": {name: t.cpu for name, t in took.items()}}
 
 
 def against_time_domain(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
-    """Compare with the time-domain sum, from reduced samples; without numba print nothing."""
+    """Compare with the time-domain sum, from reduced samples; without numba only a line says so."""
     if importlib.util.find_spec("numba") is None:
         print("numba is not here, so there is no time-domain sum: `pip install --group bench` adds it")
         return [], {}

@@ -35,7 +35,7 @@ def one_thread_each() -> None:
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Keep this process and its children on one core in the block, however many threads they have."""
+    """Keep this thread, and what it starts in the block, on one core; threads that run already stay where they are."""
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(allowed)})
     try:
@@ -184,11 +184,11 @@ class Line:
     ours, theirs
         The two figures as text with their units; `theirs` may be empty.
     value
-        The judged value: a ratio (higher is better) or an amount (lower is better).
+        The judged value: a ratio or an amount.
     at_least, aim
         Required and desired limits.
     higher_is_better
-        Whether `value` is such a ratio.
+        Whether a larger `value` is better: of ratios of speed it is, of times, memory and errors it is not.
     note
         How it was measured, when that is not plain.
     """
@@ -242,7 +242,8 @@ def show(title: str, lines: list[Line], quick: bool = False) -> None:
     this_machine = machine()
     print(f"\n{title}{'; a quick trial, not a measurement' if quick else ''}")
     load = this_machine["load_average"][0]
-    print(f"{this_machine['cpu']}, {this_machine['cores']} cores, load {load}; seconds are CPU seconds")
+    where = f"{this_machine['cpu']}, {this_machine['cores']} cores, load {load}"
+    print(f"{where}; seconds are CPU seconds unless a line says otherwise")
     for row in rows:
         print("  ".join(cell.ljust(width[i]) if i < 3 else cell.rjust(width[i]) for i, cell in enumerate(row)))
     for line in lines:

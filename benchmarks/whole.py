@@ -130,7 +130,7 @@ def _measure_last_row(live: dict[str, list[float]]) -> Line:
 
 
 def _measure_memory(memory: int, part: str) -> Line:
-    """Return the line about memory, bytes."""
+    """Return the line about `memory`, which is in bytes."""
     return Line(
         "anonymous memory of a full scan, GB",
         f"{memory / 1e9:.2f} GB",

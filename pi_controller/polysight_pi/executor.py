@@ -1,7 +1,8 @@
 """The executor: one thread that processes commands, replies of the stage and bursts from one queue, in order.
 
 It executes the host's commands and manages the run; machine.py controls stage and row. It waits for no storage: a
-command that has to be journalled is answered by the journal's thread, all others at once.
+command that has to be journalled or replayed is answered by the journal's thread, test pulses when they have ended, all
+others at once.
 docs/spec/wire.md describes each command.
 """
 

@@ -72,7 +72,7 @@ class Chirp(Section, frozen=True):
         top = self.start_hz + self.slope_hz_per_s * self.ramp_end_us * 1e-6
         require(
             self.start_hz >= 76e9 and top <= 81.1e9,
-            f"start_hz, slope_hz_per_s and ramp_end_us give {self.start_hz:.4g}..{top:.5g} Hz; it must be 76..81 GHz",
+            f"start_hz, slope_hz_per_s and ramp_end_us give {self.start_hz:.4g}..{top:.5g} Hz; it must be 76..81.1 GHz",
         )
         none = ", or 0 for no filter (simulated rigs only)"
         require(self.hpf1_khz in (0.0, *HPF_FIRST_KHZ), f"hpf1_khz must be one of {HPF_FIRST_KHZ}{none}")
@@ -488,7 +488,7 @@ class Instrument(Section, frozen=True):
 
 
 def load_instrument(path: Path) -> Instrument:
-    """Read and check a rig file; its relative paths become absolute.
+    """Read and check a rig file; its relative paths become absolute, but for the Pi's own `pi.journal_dir`.
 
     Raises
     ------

@@ -16,7 +16,7 @@ LEVELS: tuple[Level, ...] = ("ok", "note", "warning", "error")
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """What was found, why it matters and what to do: one plain sentence each, without a full stop.
+    """What was found, why it is so and what to do: one plain sentence each, without a full stop.
 
     Attributes
     ----------

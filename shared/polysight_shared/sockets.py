@@ -172,7 +172,8 @@ def subscriber(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket
 def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the SUB socket of a program that only displays events: a short queue, and a heartbeat of ZeroMQ.
 
-    The Pi has a queue for each subscriber; without the heartbeat it would keep the queue of one that hangs.
+    The Pi has a queue for each subscriber; without the heartbeat it would keep the queue of one that was
+    stopped, or whose machine is gone.
     """
     options: dict[int, int | bytes] = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC}
     options |= {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TTL: 5000}

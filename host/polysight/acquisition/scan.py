@@ -318,7 +318,10 @@ class RunningScan:
                 self._row_began += time.monotonic() - started_s
 
     def _wait_while_paused(self) -> bool:
-        """Wait for the end of a pause and record it in the manifest; return False if asked to stop."""
+        """Wait for the end of a pause and record it in the manifest; return False if asked to stop.
+
+        Without a pause only a request to stop now counts: the caller asks whether the scan ends before a row.
+        """
         if not self._stop.paused:
             return not self._stop.now
         self._writer.append(ScanPaused(paused_utc=utc_now()))
@@ -344,7 +347,7 @@ class RunningScan:
             waited = True
             self._queue.wait(_POLL_S)
             self._pi.events()
-        # Without a wait, the caller has just asked if the scan ends before this row.
+        # Without a wait, the caller has just asked if the scan ends before this row, or takes a row again.
         if waited and self._stop.after_row:
             return False
         return not self._stop.now
@@ -501,7 +504,8 @@ def run_scan(
     Raises
     ------
     PolysightError
-        with the hop that failed and what to do, also in the manifest; all committed rows are safe.
+        with the hop that failed and what to do, also in the manifest once the scan has begun; all committed rows are
+        safe.
     """
     plan = plan_raster(instrument.grid)
     check_burst_fits(instrument.grid, instrument.burst, instrument.stage)

@@ -30,7 +30,8 @@ from polysight_shared.files import read_json
 
 
 def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
-    """Return the plates in the content of truth.json: name, centre_mm, size_mm, and permittivity or metal each.
+    """Return the plates in the content of truth.json: name, centre_mm, size_mm, and what it is of: permittivity,
+    metal, layers or strips.
 
     What is marked as background, such as a table, is left out: nobody asks for its name. Raises DataError if the
     content is invalid.
@@ -290,7 +291,7 @@ def patches_from_labels(
     unit: Literal["pixel", "mm"] = "pixel",
     margin_mm: float = 0.0,
 ) -> tuple[Segmentation, dict[int, str]]:
-    """Make patches of boxes drawn by hand; return them, and label to name.
+    """Make patches of boxes, drawn by hand or known; return them, and label to name.
 
     `boxes` are name to (x0, y0, x1, y1): pixel indices (end excluded), or millimetres from the image centre. The
     margin is inside the box; hand-drawn boxes usually lie inside the material already.

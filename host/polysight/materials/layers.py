@@ -229,7 +229,7 @@ def check_stack(stack: Sequence[Layer]) -> None:
         if not (1.0 <= eps.real <= MAX_PERMITTIVITY and 0.0 <= -eps.imag <= MAX_PERMITTIVITY):
             raise PolysightError(
                 f"{layer.name}: permittivity {eps.real:g}, loss {-eps.imag:g}",
-                f"no passive material has less than 1 or a negative loss; more than {MAX_PERMITTIVITY:g} is a metal",
+                f"no material of a layer has less than 1 or a negative loss; more than {MAX_PERMITTIVITY:g} is a metal",
                 "give eps' of at least 1 and eps'' of at least 0; a metal layer as the word metal",
                 code=ErrorCode.VALUE_INVALID,
             )

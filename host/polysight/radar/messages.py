@@ -1,7 +1,7 @@
 """Encode and decode mmWaveLink messages (sync word, header, sub-blocks, CRC), and decode a radar's events.
 
-Source of all numbers: TI, mmWave Radar Interface Control Document, revision 2.23 ("ICD"), sections 2.3 and 3; for the
-events, the ICD page is at each table. ICD 337 lists the fatal events, which require a reset and a new configuration.
+Source of all numbers: TI, mmWave Radar Interface Control Document, revision 2.23 ("ICD"), sections 2.3 and 3; for most
+tables of events the ICD page is given. ICD 337 lists the fatal events, which require a reset and a new configuration.
 Error numbers of refused commands are described as well. The format is described in docs/spec/mmwavelink.md. Not run on
 hardware yet.
 """
@@ -169,7 +169,7 @@ class Header:
 
     @property
     def is_bare_refusal(self) -> bool:
-        """True for an error response that announces a sub-block but has none, as sent by an AWR1243."""
+        """True for an error response without any sub-block, as sent by an AWR1243."""
         refused = self.kind is Kind.RESPONSE and self.message_id == ERROR_MESSAGE
         return refused and self.length == HEADER_BYTES + self.crc_bytes
 

@@ -72,7 +72,7 @@ FALLBACKS = (
     "PingFang HK", "Heiti TC", "Apple SD Gothic Neo", "Yu Gothic", "Meiryo", "MS Gothic", "Microsoft YaHei", "SimHei",
     "Microsoft JhengHei", "Malgun Gothic", "NanumGothic", "Arial Unicode MS", "Droid Sans Fallback", "Noto Sans",
 )  # fmt: skip
-"""Families with CJK glyphs, in the order in which they are tried."""
+"""Families with CJK glyphs, in the order in which they are tried; the last one has other scripts."""
 
 
 @cache
@@ -246,7 +246,7 @@ class MapLabel:
 
 
 def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
-    """Replace all labels by numbers if two touch or one leaves the frame; return the replaced labels."""
+    """Replace all labels by numbers if two touch or one crosses the left or right frame; return the replaced labels."""
     if not labels:
         return []
     engine = fig.get_layout_engine()

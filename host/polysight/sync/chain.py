@@ -132,7 +132,7 @@ class SyncedRow:
     chirps
         int [position]: chirps in each average.
     direct_hz, direct_amplitude
-        float64 [position]: IF and amplitude (ADC counts) of the direct path.
+        float64 [position]: IF and amplitude (ADC counts) of the direct path; of cubes 0 and in their units.
     noise
         float64 [position]: noise power of a sample of one channel of one chirp (ADC counts squared), NaN with fewer
         than two good chirps; None: unknown.
@@ -280,7 +280,10 @@ class RowSynchroniser:
         self._forms: dict[str, CubeForm] = {}
 
     def synchronise(self, board: str, recorded: RowData | CubeRow) -> tuple[SyncedRow, int]:
-        """Synchronise a row of a board; return it and the number of whole frames. Raises DataError."""
+        """Synchronise a row of a board; return it and the number of whole frames, of cubes of valid positions.
+
+        Raises DataError.
+        """
         rig = self._source.instrument
         if isinstance(recorded, CubeRow):
             synced = self._form(board).convert_row(recorded.cube, rig.burst.chirps_a_position)
@@ -631,8 +634,8 @@ def _reference_cube(
     power = (np.abs(np.fft.fft(cube[..., a:b], axis=-1)) ** 2).sum(axis=0)
     centre = np.fft.fftfreq(b - a)[np.argmax(power, axis=-1)].astype(np.float64)
     middle = (a + b - 1) / 2
-    zero_drift = np.zeros(centre.size)
-    mixed = cube * phasor(-centre, zero_drift, samples, middle)
+    zero_phase = np.zeros(centre.size)
+    mixed = cube * phasor(-centre, zero_phase, samples, middle)
     halves = flatten(fold(mixed[..., a:b])).swapaxes(0, 1) / 2
     first_chirp = valid[:, None]
     zeros = np.zeros((centre.size, 1))
@@ -644,7 +647,7 @@ def _reference_cube(
         phase=zeros,
         amplitude=zeros + 1,
         gain=zeros + 1,
-        error=np.zeros((2, centre.size, 1)),
+        error=np.zeros((centre.size, 2, 1)),
         coherence=zeros + 1,
         clipped=~first_chirp,
     )

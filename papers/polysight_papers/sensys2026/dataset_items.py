@@ -653,7 +653,7 @@ def _format_cells(value: complex | None) -> tuple[str, str]:
 
 
 def _convert_to_json(source: str, e: Estimate) -> dict[str, Any]:
-    """Return an estimate as it stands in the JSON file."""
+    """Return an estimate for the JSON file, which gets complex numbers as pairs when it is written."""
     return {
         "source": source,
         "number": e.material.number,

@@ -76,7 +76,7 @@ class RadarBoard:
     first_generation
         Boots and refuses like an AWR1243.
     answers_32_bit
-        Answers with a CRC of 32 bits; events have one if the host requested it.
+        Answers with a CRC of 32 bits; the main core's events have one if the host requested it.
 
     Attributes
     ----------

@@ -201,7 +201,7 @@ def test_an_interrupt_of_new_processes_is_left_to_the_server(tmp_path):
 
 
 def test_an_interrupt_while_the_event_loop_is_made_ends_the_server_as_any_other(tmp_path):
-    """A second after the address is printed half a loop could be left, whose end is a traceback."""
+    """In the moment after the address is printed half a loop could be left, whose end is a traceback."""
     words = [sys.executable, "-c", INTERRUPT_IN_LOOP, "serve", str(tmp_path), "--port", "0"]
     environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
     program = subprocess.run(words, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polysight.surfaces.gains import Gains, Voltages, learn_gains
+from polysight.surfaces.gains import Gains, Voltages, learn_gains, number_blocks
 from polysight.surfaces.optics import reflect_flat
 from polysight.surfaces.permittivity import (
     DisturbedScan,
@@ -16,7 +16,7 @@ from polysight.surfaces.permittivity import (
     point_covariance,
     point_permittivity,
 )
-from polysight.surfaces.result import MAX_LEVEL_MISS
+from polysight.surfaces.result import MAX_BAND_RISE, MAX_LEVEL_MISS
 
 WAVE_NUMBER = 1634.0
 EPS = 4.0 - 0.5j
@@ -137,6 +137,23 @@ def test_what_a_badly_known_rig_does_not_explain_refuses_a_segment():
     moved = DisturbedScan("places", replace(coated, b=1.037 * coated.b), UNIT_GAINS)
     level, _ = judge_medium(fit, coated, UNIT_GAINS, [moved], WAVE_NUMBER)
     assert MAX_LEVEL_MISS < level < 0.113
+
+
+def test_a_rise_that_its_own_scatter_may_be_refuses_no_segment():
+    """A solid of 2.1 reflects little of V, whose rise scatters over the points: 1 % in the mean of its blocks."""
+    rng = np.random.default_rng(1)
+    voltages = make_voltages(np.full(400, 0.005), rng.uniform(0, 0.3, (400, 2)), 0.005)
+    fit = fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER)
+    blocks = 1 + number_blocks(voltages.at_m, (0.0, 0.0)).max()
+    scatter = rng.standard_normal((400, 2))
+    scatter -= np.median(scatter, axis=0)
+
+    def judge(rise, std_of_mean):
+        band_rise = rise + std_of_mean * np.sqrt(blocks) * scatter
+        return judge_medium(fit, replace(voltages, band_rise=band_rise), UNIT_GAINS, [], WAVE_NUMBER)[1]
+
+    assert judge(0.02, 0.008) < MAX_BAND_RISE
+    assert judge(0.02, 0.002) > MAX_BAND_RISE
 
 
 def test_a_wide_object_averages_over_what_a_reference_leaves_and_a_flat_one_does_not():

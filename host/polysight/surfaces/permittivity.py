@@ -483,9 +483,9 @@ def judge_medium(
     """Return what one medium does not explain: ln of the level of H over the expected, and the rise over the band.
 
     A wall or a coating reflects twice: its level is that of no half space, or it changes over the band. The rise is
-    that of H or of V, whichever is larger. Of both the square is given less that of two standard deviations of their
-    own, as a root: what errors of the rig explain is left out, but does not hide what is larger. `fit`, `v` and
-    `disturbed` hold the same points.
+    that of H or of V, whichever is larger, less two standard deviations of its own. The level's square is given less
+    that of two standard deviations, as a root: what errors of the rig explain is left out, but does not hide what is
+    larger. `fit`, `v` and `disturbed` hold the same points.
     """
     used = fit.share > 0
     blocks = int(number_blocks(v.at_m[used], (0.0, 0.0)).max()) + 1
@@ -509,9 +509,8 @@ def judge_medium(
         variance += (float(np.average(moved, weights=fit.share[used])) - level) ** 2
 
     rises = v.band_rise[used] - gains.band_rise
-    rise_variances = np.array([_spread(column) for column in rises.T]) ** 2 / blocks
-    excess2 = np.median(rises, axis=0) ** 2 - 4 * rise_variances
-    return float(np.sqrt(max(0.0, level**2 - 4 * variance))), float(np.sqrt(max(0.0, np.max(excess2))))
+    rise = np.abs(np.median(rises, axis=0)) - 2 * np.array([_spread(column) for column in rises.T]) / np.sqrt(blocks)
+    return float(np.sqrt(max(0.0, level**2 - 4 * variance))), float(np.max(rise))
 
 
 def _spread(values: Array) -> float:

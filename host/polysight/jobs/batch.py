@@ -86,7 +86,10 @@ class Job(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of one scan, with the time and largest memory (GB) of its program; 0 if it did not run or is not known."""
+    """Result of one scan, with the time and largest memory (GB) of its program; 0 if it did not run or is not known.
+
+    `message` is the reason of a failure, else empty.
+    """
 
     name: str
     status: Status
@@ -154,7 +157,10 @@ _PUBLISHED_FILES = ("*_cfg.json", TRUTH, "*/*.bin", "*/*_log.csv", "*_synced.npy
 
 
 def made_with(data: Path, settings: Settings) -> dict[str, Any]:
-    """Return the dependencies of products: releases, options (files by digest), data files by size and time."""
+    """Return the dependencies of products: releases, options, and a digest of the data files' sizes and times.
+
+    An option that names a file counts by the digest of its content, one that names a folder as the data do.
+    """
     config = settings.path("config")
     options = settings.choices()
     for name, path in settings.files().items():
@@ -215,8 +221,9 @@ def is_finished(job: Job) -> bool:
 def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     """Process one scan in a program of its own; its output goes to `<out>.log`. Failures are part of the result.
 
-    That program ends when this one does, however this one ends. A scan with a mark is done: a Dask worker may have been
-    killed between writing the mark and reporting it.
+    That program ends when this one does, however this one ends, or when `stop` is set (None: on a Dask worker, where
+    nothing sets it). A scan with a mark is done: a Dask worker may have been killed between writing the mark and
+    reporting it.
     """
     if is_finished(job):
         return _end_outcome(job)
@@ -341,7 +348,7 @@ def fit_scans(positions: int, cores: int, free_bytes: int) -> int:
 
 
 def free_memory_bytes() -> int:
-    """Return the memory that is available without swapping."""
+    """Return the memory that is available without swapping (Linux), else all of it; 0 on Windows."""
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -357,7 +364,10 @@ def free_memory_bytes() -> int:
 def process_many(
     jobs: Sequence[Job], out: Path, jobs_at_once: int, dask: str | None = None, again: bool = False
 ) -> list[Outcome]:
-    """Process unfinished scans; report each on stderr and update `processed.json` after each.
+    """Process unfinished scans (with `again` all); report each on stderr and update `processed.json` after each.
+
+    `dask` is the address of a scheduler; None: here, `jobs_at_once` programs at a time. The outcomes have the order of
+    the jobs.
 
     Raises
     ------
@@ -395,7 +405,9 @@ def process_many(
 def process_several(
     scans: Sequence[tuple[Path, Settings]], out: Path, at_a_time: int | None, dask: str | None, again: bool
 ) -> int:
-    """Process several scans, `at_a_time` (None: as many as fit); prints their table and returns the exit status.
+    """Process several scans, `at_a_time` (None: as many as fit); print their table and return the exit status.
+
+    With `again` finished scans are processed, too; `dask` is the address of a scheduler to use instead of this machine.
 
     Raises
     ------
@@ -490,7 +502,10 @@ def _read_results(products: Path) -> tuple[str, str, str]:
 
 
 def exit_with_parent(pipe: str | None) -> None:
-    """Exit when the other end of a pipe closes, so that nothing goes on after the parent was killed."""
+    """Exit when the other end of a pipe closes, so that nothing goes on after the parent was killed.
+
+    `pipe` is the number of this end, as text; None: no parent waits for this program.
+    """
     if pipe is None:
         return
 
@@ -516,7 +531,7 @@ def main() -> int:
         sys.stderr.write(f"{e.filename or job.out}: {e.strerror or e}\n")
         return 1
     if status == NoResult.exit_status:
-        # The scan is processed: its products say that nothing can be named
+        # The scan is processed: its products say that nothing can be named.
         status = 0
     if status == 0:
         seconds = round(time.monotonic() - started_s, 1)

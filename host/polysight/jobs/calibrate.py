@@ -1,7 +1,8 @@
 """`polysight calibrate` and `polysight leakage`: calibration of the rig from recorded scans.
 
-Each `calibrate` command looks at scans, writes one dated file, and says what that changes; neither the scans nor the
-rig file are written. `leakage` prints what belongs into the rig file's [polarimetry].
+Each `calibrate` command looks at scans, writes one dated file (`metal` with its images beside it), and prints the keys
+of the rig file that use it; neither the scans nor the rig file are written. `leakage` writes no file, and prints what
+belongs into the rig file's [polarimetry].
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ MAX_LEAKAGE = 0.5
 def print_result(
     path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool
 ) -> int:
-    """Print a calibration as lines, with the keys to set in the rig file, or the file's content as JSON; return 0."""
+    """Print a calibration as lines, with `what_to_set` in the rig file, or the file's content as JSON; return 0."""
     if as_json:
         print_json({"file": str(path), "simulated": file.simulated, **to_builtins(file)})
         return 0
@@ -101,6 +102,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
             f"{name}: direct path to RX1 {b.direct_path_was_mm:.2f} -> {b.direct_path_mm:.2f}"
             f" +- {b.direct_path_standard_error_mm:.2f} mm",
         ]
+        # An error of more than half the prior (chosen): most of the answer is the prior.
         lines += [
             f"{name}: the scan does not tell its shift along {axis}: a wider aperture does"
             for axis, e in zip("xyz", b.standard_error_mm, strict=True)

@@ -55,7 +55,10 @@ def run_simulator(arguments: Sequence[str]) -> int:
 
 
 def simulate_scene(scene: Path, config: Path, out: Path, seed: int | None = None) -> None:
-    """Write the simulated scan of a scene into `out`, quietly. Raises PolysightError with the simulator's message."""
+    """Write the simulated scan of a scene into `out`; only the simulator's notes are printed, at its end, to stderr.
+
+    Raises PolysightError with the simulator's message.
+    """
     require_package("polysight_simulators", "simulators")
     command = [sys.executable, "-m", "polysight_simulators", "simulate", str(scene), "--config", str(config)]
     command += ["--out", str(out), "--json"]
@@ -91,7 +94,7 @@ def _simulator_error(status: int, output: str) -> PolysightError:
 
 
 def _check_folder(out: Path) -> None:
-    """Raise ConfigError if a folder contains anything but an existing demo."""
+    """Raise ConfigError if `out` is a file, or a folder with anything but an existing demo."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out} is a file", "a demo needs a folder", "give another --out")
     if out.exists() and any(out.iterdir()) and not (out / _MARK).exists():
@@ -99,7 +102,7 @@ def _check_folder(out: Path) -> None:
 
 
 def _make_fresh_folder(out: Path) -> None:
-    """Make an empty folder; an existing demo folder is overwritten."""
+    """Make a folder with the mark of a demo alone; an existing demo folder is overwritten."""
     if out.exists() and any(out.iterdir()):
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -110,6 +113,7 @@ def _make_fresh_folder(out: Path) -> None:
 def run_simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) -> Iterator[Path]:
     """Run the simulated rig with its Pi process; yield the rig file with their addresses.
 
+    `folder` gets that file and the logs, `time_scale` is the number of simulated seconds per second.
     It runs in a session of its own, so that Ctrl-C ends the scan first and the rig after it.
 
     Raises
@@ -133,7 +137,7 @@ def run_simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float
 
 
 def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
-    """Return the rig file named by the rig's `ready` line."""
+    """Return the rig file named by the rig's `ready` line. Raises PolysightError if the rig ends or is not ready."""
     if rig.stdout is None or rig.stderr is None:
         raise DeviceError("the simulated rig has no output to read", "it was started without pipes", "start it again")
     deadline = time.monotonic() + _START_LIMIT_S
@@ -157,6 +161,8 @@ def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
 
 def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> int:
     """Scan a scene with the simulated rig; return the scan's exit status, or the number of the signal that killed it.
+
+    `time_scale` is the number of simulated seconds per second; None: `TIME_SCALE`.
 
     Raises
     ------
@@ -183,7 +189,10 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
 
 
 def _run_to_its_end(command: Sequence[str]) -> int:
-    """Run a program and return its status. Ctrl-C stops the program first, cleanly, with a single signal."""
+    """Run a program; return its status, or minus the number of the signal that killed it.
+
+    Ctrl-C stops the program first, cleanly, with a single signal.
+    """
     child = subprocess.Popen(command, start_new_session=True)
     try:
         return child.wait()

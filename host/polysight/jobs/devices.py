@@ -1,7 +1,8 @@
 """`polysight card`, `polysight radar`, `polysight jog`: capture cards, radar boards and the stage, one at a time.
 
-`card` checks the network path to the cards, writes a card's addresses, or resets it; `radar` checks a board from USB to
-one frame, loads its firmware, or replays a trace; `jog` moves the stage. Not run on hardware yet.
+`card` checks the network path to the cards hop by hop (network interface, sockets, the card's replies, its data),
+writes a card's addresses, or resets it; `radar` checks a board from USB to one frame, loads its firmware, or replays a
+trace, the record of all words exchanged with a board; `jog` moves the stage. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -46,7 +47,10 @@ _PAUSE_S = 0.2
 
 
 def show_cards(config: Path, listen_s: float, as_json: bool) -> int:
-    """Check every hop to every card; return 0 if all recorded cards can be used. Raises ConfigError."""
+    """Check every hop to every card; return 0 if all recorded cards can be used. Raises ConfigError.
+
+    `listen_s` is the longest wait for data of the cards; 0: only their replies are checked.
+    """
     rig = load_instrument(config)
     if listen_s:
         sys.stderr.write(f"listening for at most {listen_s:g} s: let the radars be triggered now\n")
@@ -59,7 +63,7 @@ def show_cards(config: Path, listen_s: float, as_json: bool) -> int:
 
 
 def _describe_survey(survey: CardSurvey) -> dict[str, object]:
-    """Survey results as plain data."""
+    """Return the check of one card and its hops as plain data."""
     board = survey.board
     keys = ("name", "role", "record", "card_address", "host_address", "command_port", "data_port")
     return {
@@ -72,7 +76,7 @@ def _describe_survey(survey: CardSurvey) -> dict[str, object]:
 
 
 def _describe_hop(finding: Finding) -> dict[str, str]:
-    """Return one network hop as plain data; a note says if the hop was not checked."""
+    """Return one network hop as plain data; a hop of level `note` was not checked."""
     verdict = finding.level
     if verdict == "note":
         verdict = "not checked"
@@ -86,7 +90,7 @@ def _describe_hop(finding: Finding) -> dict[str, str]:
 
 
 def _format_survey(survey: CardSurvey) -> str:
-    """Survey results as text."""
+    """Return the check of one card and its hops as text; hops that were not checked share one line."""
     b = survey.board
     if b.record:
         role = b.role
@@ -138,6 +142,9 @@ def _set_address(board: Board, at: str) -> Board:
 
 def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: float) -> int:
     """Write a board's addresses into its card after confirmation, and check that it answers there.
+
+    `mac` is the card's MAC address, `at` its present `ADDRESS` or `ADDRESS:PORT` (empty: those of the rig file); `yes`
+    leaves the confirmation out. With a `wait_s` of 0 the check is left out.
 
     Raises
     ------
@@ -233,7 +240,10 @@ def plan_radars(config: Path) -> int:
 
 
 def check_radar(config: Path, name: str, trace: Path | None, slow: bool, as_json: bool) -> int:
-    """Check one board from USB to one frame, step by step; return 0 if all pass. Raises ConfigError, OSError."""
+    """Check one board from USB to one frame, step by step; return 0 if all pass. Raises ConfigError, OSError.
+
+    `trace` is a new file for the words exchanged (None: not kept); `slow` uses the slow SPI clock.
+    """
     rig = _load_native_rig(config, name)
     _check_trace(trace)
     clock = SystemClock()
@@ -250,9 +260,9 @@ def replay_radar(config: Path, trace: Path, as_json: bool) -> int:
 
 
 def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path | None, slow: bool) -> int:
-    """Load firmware into a board's RAM, or write its flash, start it, and verify.
+    """Load firmware into a board's RAM and start it, or with `flash` write and verify its flash; return 0.
 
-    Raises ConfigError, DeviceError, OSError.
+    `trace` and `slow` as for :func:`check_radar`. Raises ConfigError, DeviceError, OSError.
     """
     rig = _load_native_rig(config, name)
     checked_image = read_image(image)
@@ -312,7 +322,10 @@ def _format_step(name: str, row: Row) -> str:
 
 
 def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
-    """Write the flash; report the progress if stopped. Raises DeviceError, ConfigError."""
+    """Write the flash and show the progress; if stopped by Ctrl-C, say what the flash holds.
+
+    Raises DeviceError, ConfigError.
+    """
     parts_sent = 0
     parts = 0
 
@@ -373,7 +386,10 @@ def _load_native_rig(config: Path, name: str) -> Instrument:
 
 
 def jog_stage(config: Path, axis: Axis, distance_mm: float, speed_mm_s: float | None, as_json: bool) -> int:
-    """Move one axis of the homed stage; say where it rests, and its limits. Raises DeviceError, ScanError."""
+    """Move one axis of the homed stage; say where it rests, and its limits. Raises DeviceError, ScanError.
+
+    `speed_mm_s` None: the stage's speed of the rig file.
+    """
     rig = load_instrument(config)
     stage = rig.stage
     if speed_mm_s is None:

@@ -72,10 +72,10 @@ class PatchToName:
 class Edits:
     """Changes to labels, applied in this order.
 
-    `from_patches` replaces the boxes by one inside each patch of the products, named by the patch's number. `renames`
-    are `OLD=NEW`, `specimens` `NAME=SPECIMEN`, where a specimen is one physical piece of a material, kept apart from
-    others when a library is judged; corners of `boxes` are millimetres from the image centre. `metal` is the name of
-    the box that becomes the metal reference; None keeps the present one.
+    `from_patches` replaces the boxes by one inside each patch of the products, named by the patch's number. `removed`
+    are names of boxes, `renames` are `OLD=NEW`, `specimens` `NAME=SPECIMEN`, where a specimen is one physical piece of
+    a material, kept apart from others when a library is judged; corners of `boxes` are millimetres from the image
+    centre. `metal` is the name of the box that becomes the metal reference; None keeps the present one.
     """
 
     from_patches: bool = False
@@ -206,7 +206,7 @@ def remove_labels(folder: Path) -> Path:
 
 
 def _find_dark_boxes(products: ProcessedScan, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
-    """Return the names of boxes too dark in both channels to be detected as plates automatically."""
+    """Return the names of boxes too dark, H and V together, to be detected as plates automatically."""
     power = np.where(products.valid, np.abs(products.h) ** 2 + np.abs(products.v) ** 2, np.nan)
     if not np.isfinite(power).any():
         return []

@@ -100,6 +100,7 @@ class ScanBar:
         """Show the progress `p` of the scan."""
         self._bars.update(self._rows, total=p.rows, completed=p.committed, left=_format_clock(p.remaining_s))
         if p.row_points:
+            # A take is one recording of a row; a row that fails is retaken.
             row_text = f"row {p.row}"
             if p.take > 1:
                 row_text += f" take {p.take}"
@@ -137,7 +138,10 @@ def _run_and_notify(folder: Path, processing: LiveProcessing | None, run_rows: R
 
 @ignore_hangup()
 def _run_and_process(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, stop: StopRequest) -> int:
-    """Run the rows, obey commands to the scan meanwhile, and finish the products; return the exit status."""
+    """Run the rows, obey commands to the scan meanwhile, and finish the products; return the exit status.
+
+    A closed terminal (SIGHUP) does not end it. Raises PolysightError if rows or processing failed, or were stopped.
+    """
     with ScanBar() as bar, ControlFolder(folder, stop) as control:
 
         def show_progress(progress: ScanProgress) -> None:

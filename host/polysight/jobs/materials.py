@@ -117,7 +117,8 @@ def permittivity(
 
     Without a result (verdict `none`) no permittivity is printed, and the exit status is that of NoResult.
 
-    `folder` holds the products, or is the scan folder that holds them. The chirp is the one they were made with, as
+    `folder` holds the products, or is the scan folder that holds them. `stack` are layers from the radars' side, one of
+    them unknown (empty: half spaces alone), `number` is one patch (None: all). The chirp is the one of the products, as
     their scan.json says; `config` replaces it. With `bands` above 1 the stack is fitted to so many sub-bands of the
     sweep, which the products must hold; None takes those of the products if a thickness is fitted, else the whole
     sweep. `amplitude_error` is the relative error of |H|; 0 leaves |H| out.
@@ -213,7 +214,7 @@ def _describe_origin(is_simulated: bool) -> str:
 
 
 def concentration(data: Path, values: Sequence[tuple[str, float]], confidence: float, as_json: bool) -> int:
-    """Fit concentration against polarisation angle, with leave-one-out errors; return the exit status.
+    """Fit concentration against polarisation angle, with leave-one-out errors; return 0.
 
     `data` is a library (.npz) or a folder of the published material files, `values` are percentages of materials
     without one in their name, `confidence` the share of truths that the printed intervals are to hold, 0 to 1. Raises
@@ -369,7 +370,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
     Raises
     ------
     ConfigError
-        when the data are of both kinds.
+        when the data are of both kinds, one scan is given twice, or `library` or `model` is given with a library.
     DataError
         when something in them cannot be used.
 
@@ -405,7 +406,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
 
 
 def _score_models(data: Path, as_json: bool) -> int:
-    """Cross-validate every model on a library; print shares of correct names."""
+    """Cross-validate every model on a library; print shares of correct names. A library of several angles: the last."""
     from polysight.materials import MODELS, Samples, score
 
     library = _load_library(data)
@@ -413,6 +414,7 @@ def _score_models(data: Path, as_json: bool) -> int:
         sys.stderr.write(f"{data}: angles {library.angles_deg} degrees; judged at {library.angles_deg[-1]:g}\n")
         library = library.at_angle(library.angles_deg[-1])
     samples = Samples.from_library(library)
+    # Two for each model: whole scans left out, then single pixels.
     scores = [score(samples, model, by_pixel=by_pixel) for model in MODELS for by_pixel in (False, True)]
     source = _describe_origin(library.simulated)
     if as_json:
@@ -522,7 +524,10 @@ def _describe_contradictions(
     matched: Sequence[MatchedPatch],
     named: Sequence[NamedPatch],
 ) -> list[str]:
-    """Describe patches without a name that match different materials at different angles, one line each."""
+    """Describe patches without a name that match different materials at different angles, one line each.
+
+    `matched` and `named` are one patch each, in the same order; a name counts if its source is the library.
+    """
     if len(angles_deg) < 2 or all(n.verdict.source == "library" for n in named):
         return []
     names_by_angle = []

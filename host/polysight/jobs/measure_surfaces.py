@@ -23,7 +23,8 @@ from polysight_shared.files import write_atomically
 
 # Largest number of points of the metal sphere that the calibration file keeps; chosen.
 KEPT_POINTS = 240
-# Standard errors of places that were measured by hand, and of those that `calibrate direct-path` measured.
+# Standard errors of antenna places that were measured by hand, and of those that `calibrate direct-path` measured; both
+# assumed.
 PLACE_STD_M = 1e-3
 CALIBRATED_PLACE_STD_M = 3e-4
 
@@ -82,13 +83,14 @@ def make_rig_optics(rig: Instrument) -> surfaces.Optics:
 def see_rows(pipeline: Pipeline, optics: surfaces.Optics) -> surfaces.Seen:
     """Find the specular points in the rows that a pipeline holds."""
     h, v = take_samples(pipeline)
+    # The range gate of the images counts from the direct path, that of `see_points` from zero path.
     low, high = pipeline.images.gate_m
     direct_m = float(h.direct_m.mean())
     return surfaces.see_points(h, v, optics, (low + direct_m, high + direct_m))
 
 
 def make_reference(metal: surfaces.Seen) -> surfaces.Reference:
-    """Return the gains that points of metal give, for any rig."""
+    """Return a function from a rig's optics to the gains that these points of metal give with it."""
 
     def learn(optics: surfaces.Optics) -> surfaces.Gains:
         return surfaces.learn_gains(surfaces.find_voltages(metal, optics), optics.wave_number)

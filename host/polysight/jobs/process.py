@@ -73,6 +73,7 @@ def process_rows(source: Source, data: Path, settings: Settings = DEFAULT) -> Pi
 def pixel_axes(pipeline: Pipeline) -> Axes:
     """Return the pixel centres of the images, x and y in metres, ascending."""
     grid = pipeline.images.grid
+    # A scan recorded column by column is processed with x and y exchanged.
     if pipeline.source.mirrored:
         return grid.y_m, grid.x_m
     return grid.x_m, grid.y_m
@@ -307,7 +308,7 @@ class LiveProcessing:
             publish_images(self._pipeline, self._folder / PRODUCTS)
 
     def finish(self) -> int:
-        """Write the products, and print their summary; return the exit status."""
+        """Write the products, and print their summary; return the exit status (0 if there was no row)."""
         if self._pipeline is None:
             return 0
         products = make_products(self._pipeline, self._folder / PRODUCTS, find_plates(self._folder))
@@ -424,7 +425,7 @@ def _format_focus(head: str, distance_mm: float, sharpest: Focus, plates: PlaneE
 
 
 def sync_report(data: Path, out: Path, config: Path | None) -> int:
-    """Write figures, JSON and text of the residual errors of synchronisation; return the exit status."""
+    """Write figures, JSON and text of the residual errors of synchronisation; return 0. Raises PolysightError."""
     from polysight.capture import row_words
     from polysight.report import SyncReport, write_sync_report
     from polysight.sync import BoardSetup, synchronise_row

@@ -96,7 +96,7 @@ def _draw_sparkline(profile_db: NDArray[np.float64]) -> str:
     highest = len(bars) - 1
     groups = np.array_split(profile_db, min(_SPARKLINE_CHARACTERS, profile_db.size))
     tops_db = np.array([group.max() for group in groups])
-    # An empty profile has a maximum of 0.
+    # A recording of zeros has no level above 0.
     span_db = max(float(tops_db.max()), 1e-9)
     heights = np.clip(np.round(tops_db / span_db * highest), 0, highest).astype(int)
     return "".join(bars[height] for height in heights)
@@ -126,7 +126,7 @@ def find_scan(file: Path) -> ScanFolder | None:
     try:
         return ScanFolder.load(folders[2])
     except PolysightError:
-        # `polysight validate` says what is wrong with it
+        # `polysight validate` says what is wrong with it.
         return None
 
 
@@ -138,10 +138,11 @@ def inspect_file(
     as_json: bool,
     changes: dict[str, Any] | None = None,
 ) -> int:
-    """Describe a capture and draw its range profile; return the exit status, that of DataError if it holds no signal.
+    """Describe a capture; return the exit status, that of DataError if all samples are 0.
 
-    `config` is the rig file it was recorded with; a row of a scan folder brings its own. `changes` are fields of
-    `Layout` that replace the rig's. Raises PolysightError.
+    `config` is the rig file it was recorded with; a row of a scan folder brings its own. `plot` is the file for a
+    picture of the range profile; `card_address` chooses one card's packets of a packet capture; `changes` are fields
+    of `Layout` that replace the rig's. Raises PolysightError.
     """
     scan = find_scan(file)
     layout = Layout()

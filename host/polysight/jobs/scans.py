@@ -191,6 +191,7 @@ def _format_error(std: float | None) -> str:
 
 
 def _format_value(value: float | None) -> str:
+    """Format a number with three digits; None as not known."""
     if value is None:
         return "not known"
     return f"{value:.3g}"
@@ -367,8 +368,9 @@ def check_scans(folders: Sequence[Path]) -> list[tuple[ProcessedScan, CheckResul
 
 
 def check(folders: Sequence[Path], chart: Path | None, as_json: bool) -> int:
-    """Print the check plate of each scan, and draw the control chart; return 1 if one is beyond its limit or missing.
+    """Print the check plate of each scan, and draw the control chart into the file `chart`, if given.
 
+    Return 1 if a plate is missing or beyond its action limit.
     Raises PolysightError as :func:`check_scans`.
     """
     checked = check_scans(folders)

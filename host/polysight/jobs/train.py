@@ -126,7 +126,7 @@ def _read_products_without_rows(data: Path, scan: Path) -> ProcessedScan | None:
 
 
 def _process_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
-    """Process a labelled scan from its rows, as `polysight process --labels`."""
+    """Process a labelled scan from its rows, as `polysight process --labels`, without naming its patches."""
     source = open_source(data, config)
     pipeline = process_rows(source, data, Settings(model="none"))
     images = pipeline.form_images()

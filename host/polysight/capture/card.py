@@ -441,7 +441,10 @@ def survey_cards(instrument: Instrument, listen_s: float = 0.0) -> list[CardSurv
 
 
 def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: float) -> CardSurvey:
-    """Check a board's card hop by hop; hops behind the first that fails become notes without text."""
+    """Check a board's card hop by hop; hops that are not checked become notes without text.
+
+    These are all behind the first that fails, and behind the card of a board that is not recorded.
+    """
     survey = CardSurvey(board)
     findings = survey.hops
     try:

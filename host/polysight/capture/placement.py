@@ -101,7 +101,7 @@ class Placed:
     # Bytes of the whole row, and those that are in place.
     expected: int
     received: int
-    # Byte ranges (start, stop) that are missing or uncertain: sorted, not touching
+    # Byte ranges (start, stop) that are missing or uncertain: sorted, not touching.
     missing: list[Gap]
     # True if the place of every byte is certain; otherwise `missing` is the whole record.
     located: bool

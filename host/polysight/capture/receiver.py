@@ -92,7 +92,8 @@ def take_priority(real_time: int = REAL_TIME) -> tuple[str, str]:
     return f"nice {NICE}", refused
 
 
-# Timeouts of the first answer, for which the process has to start, and of others: ending a row waits for the disk.
+# Timeouts of the first answer, for which the process has to start, and of others: ending a row waits for the disk. Both
+# are chosen.
 _START_TIMEOUT_S = 30.0
 _ANSWER_TIMEOUT_S = 60.0
 

@@ -299,7 +299,7 @@ class BringUp:
         facts = self._board.facts
         for core, question in (("RF", c.GET_RF_VERSION), ("main", c.GET_MAIN_VERSION)):
             answer = self._board.ask(question, 16)
-            # Layout of the answer: ICD tables 5.66 and 5.157.
+            # Layout of the answer: ICD tables 5.66 and 5.157; `release` is the version of the ROM.
             hardware = answer[:3]
             release = answer[3:7]
             patch = (*answer[10:12], answer[15] >> 4, answer[15] & 15)
@@ -482,7 +482,7 @@ class RadarBoard:
         return self.link.warnings[:]
 
     def configure(self, on_step: Callable[[Step, str], None] | None = None) -> None:
-        """Reset and configure the board, from any state; call `on_step` with each step and its outcome.
+        """Reset and configure the board, from any state; call `on_step` with each step that passed and its outcome.
 
         Raises DeviceError or ConfigError for the step that failed; the board is then in `FAULT`.
         """
@@ -563,7 +563,7 @@ class RadarBoard:
             self.link.call(command)
 
     def read_back(self) -> list[str]:
-        """Read back profile, chirp and frame of a board that was armed; return the differences. Raises DeviceError."""
+        """Read back profile, chirp and frame, after frames were set; return the differences. Raises DeviceError."""
         commands = (*self.program.waveform, *self._sent_frames)
         sent_blocks = {command.ID: command.block().data for command in commands}
         differences = []

@@ -27,9 +27,9 @@ PARTS = 3
 PART_BYTES = 224
 # Masks of calibrations. Restored: ADC offset, both filters, RX gain, I/Q, which TI recommends (ICD 72).
 RESTORED = 0x14E0
-# Calibrations of the RF init (ICD 63)
+# Calibrations of the RF init (ICD 63).
 ALL = 0x1FF0
-# A die id that does not identify a board
+# A die id that does not identify a board.
 NO_DIE = "-".join(["00000000"] * 4)
 # A larger file is none of ours: it has 1,344 hexadecimal digits and little else.
 _MAX_FILE_BYTES = 2**16

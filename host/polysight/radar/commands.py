@@ -22,9 +22,9 @@ from polysight_shared.geometry import direct_path_m
 from polysight_shared.raster import MIN_PERIOD_US, WIDTH_US
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# ICD 81
+# One step of a start frequency: 53.6 Hz (ICD 81).
 START_HZ_PER_CODE = 3.6e9 / 2**26
-# ICD 83: 48.279 kHz/us
+# One step of a slope: 48.279 kHz/us (ICD 83).
 SLOPE_HZ_PER_S_PER_CODE = 3.6e9 * 900 / 2**26 * 1e6
 # Units in which the radar counts the times of a chirp, and of a frame.
 CHIRP_TICK_US = 0.01
@@ -199,6 +199,7 @@ class Profile(Command):
 
     def data(self) -> bytes:
         """Pack the profile: the firmware selects the VCO, no phase shift, TX starts at the ramp's knee."""
+        # One byte for each of the three transmitters.
         back_off = self.tx_backoff_db * 0x010101
         return struct.pack(
             "<HBB6IhhHHBBHHH",
@@ -406,19 +407,19 @@ def program(rig: Instrument, board: Board) -> Program:
         transmits=bool(tx),
     )
     for command in (*commands.basic, *commands.waveform):
-        # Raises ValueError for a value that exceeds its field
+        # Raises ValueError for a value that exceeds its field.
         command.block()
     return commands
 
 
-# 76..81 GHz, to the code (ICD 81)
+# 76..81 GHz, to the code (ICD 81).
 BAND_HZ = (0x5471C71B * START_HZ_PER_CODE, 0x5A000000 * START_HZ_PER_CODE)
 # Shortest time from the last chirp to the end of a frame (ICD 91), and from there to the next pulse (ICD 93).
 INTER_FRAME_US = 300.0
 AFTER_FRAME_US = 150.0
 # Least and largest period of frames; the radar counts it in 28 bits of 5 ns.
 FRAME_PERIOD_US = (MIN_PERIOD_US, 1.342e6)
-# Memory of the radar for the samples of one chirp.
+# Memory of the radar for the samples of one chirp (docs/spec/mmwavelink.md, with its other limits).
 SAMPLE_MEMORY_BYTES = 16384
 # Uncertainty of one board's start against the pulse (ICD 92).
 TRIGGER_UNCERTAINTY_S = 5e-9
@@ -426,9 +427,9 @@ TRIGGER_UNCERTAINTY_S = 5e-9
 PASSBAND = 0.9
 # 266 MHz/us, for which the bandwidth of the synthesizer is set (`APLL_BANDWIDTH`).
 MAX_SLOPE_CODE = 5510
-# No radar has such values, and sums and products of a few of them are finite
+# No radar has such values, and sums and products of a few of them are finite.
 _LARGEST = 1e30
-# Regular ADC mode, 20 MHz IF (ICD 85)
+# Largest sample rates in regular ADC mode, with an IF of 20 MHz (ICD 85).
 MAX_RATE_HZ = {"complex1x": 22.5e6, "complex2x": 45e6}
 
 
@@ -476,7 +477,7 @@ def direct_if_hz(rig: Instrument, board: Board) -> float:
 
 
 def constraints(rig: Instrument, frames: int) -> list[Constraint]:
-    """Return every constraint on a rig for rows of `frames` frames; if values are not finite, only those.
+    """Return every constraint on a rig for rows of `frames` frames; if values are not finite or huge, only those.
 
     Raises nothing for any rig file. A rig file that keeps all constraints can be encoded by `program`.
     """
@@ -499,7 +500,7 @@ def require(rig: Instrument, frames: int) -> None:
 
 
 def _find_unusable_numbers(rig: Instrument) -> Iterator[Constraint]:
-    """Yield a broken constraint for each value that is infinite or not a number."""
+    """Yield a broken constraint for each value that is not a number, or beyond `_LARGEST`."""
     tables = {"chirp": rig.chirp, "burst": rig.burst, "radar": rig.radar}
     tables |= {f"boards.{b.name}": b for b in rig.boards}
     for table, part in tables.items():
@@ -507,9 +508,10 @@ def _find_unusable_numbers(rig: Instrument) -> Iterator[Constraint]:
             value = getattr(part, key)
             if isinstance(value, int | float) and not -_LARGEST <= value <= _LARGEST:
                 name = f"{table}.{key}"
-                finite_value = value if isinstance(value, float) else inf
+                # An integer may be too large for a float.
+                shown_value = value if isinstance(value, float) else inf
                 yield Constraint(
-                    name, "a number", finite_value, "", f"give a number in {name}", low=-_LARGEST, high=_LARGEST
+                    name, "a number", shown_value, "", f"give a number in {name}", low=-_LARGEST, high=_LARGEST
                 )
 
 

@@ -23,11 +23,11 @@ from polysight_shared.files import read_bounded
 # File types of a download (ICD 302): the RAM, which the next reset clears, and the first of four flash areas.
 TO_RAM = 0
 TO_FLASH = 4
-# TI's limit for each part; the first one is acknowledged after erasing the flash
+# TI's limit for each part; the first one is acknowledged after erasing the flash.
 CHUNK_TIMEOUT_S = 10.0
 # Size of a flash area, more than any image of TI.
 MAX_BYTES = 2**20
-# Major ROM version of AWR2243
+# Major ROM version of AWR2243.
 GENERATION = 2
 # Device family by major ROM version.
 FAMILIES = {

@@ -87,7 +87,7 @@ class Link:
     may_start
         True if a power-up event is expected; an unexpected one raises UnexpectedRestartError.
     warnings
-        Errors that did not end an operation, as most that a retry corrected; at most 100.
+        Errors that did not end an operation, most of them corrected by a retry; at most 100.
     """
 
     def __init__(self, name: str, words: WordLink, clock: Clock, on_sent: Callable[[bytes], None]) -> None:

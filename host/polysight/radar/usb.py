@@ -34,7 +34,7 @@ _HEAD = struct.Struct("<ccH")
 _TIMEOUT_S = 30.0
 
 # Pins and MPSSE commands (FTDI AN_108). A direction has a 1 for each output. The other values are levels of the pins:
-# of channel A while a word is written, while one is read, and between words.
+# of channel A while a word is written, while one is read, and between words (chip select, bit 3, is low for a word).
 # Channel A: clock, data out, chip select and PMIC reset are outputs.
 SPI_DIRECTION = 0b0100_1011
 SELECTED_WRITE = 0xC0

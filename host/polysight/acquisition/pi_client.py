@@ -274,7 +274,10 @@ class PiClient:
             time.sleep(_POLL_S)
 
     def _ask(self, command: m.AnyCommand, kind: type[R]) -> R:
-        """Send a command with retries; for commands that are safe to repeat."""
+        """Send a command, which must be safe to repeat, with retries; return its reply, a `kind`.
+
+        Raises RefusedError, DeviceError without a reply, ProtocolError for a reply of another kind.
+        """
         for _ in range(ATTEMPTS):
             reply = self._send_once(command, self._timeout_s / ATTEMPTS)
             if isinstance(reply, kind):
@@ -285,7 +288,10 @@ class PiClient:
         raise self._no_answer_error(type(command).__name__)
 
     def _send_once(self, command: m.AnyCommand, timeout_s: float) -> m.AnyReply | None:
-        """Send once and return the reply, None after the timeout. A new request replaces the old (relaxed REQ)."""
+        """Send once and return the reply, None after the timeout. A later request replaces this one (ZMQ_REQ_RELAXED).
+
+        Raises RefusedError.
+        """
         try:
             self._commands.send(m.pack(command))
         except zmq.Again:
@@ -325,6 +331,7 @@ class PiClient:
         Raises DeviceError if the Pi is silent on both sockets, or its journal lacks the lost events.
         """
         while self._events.poll(0):
+            # A topic, then the event.
             parts = self._events.recv_multipart()
             self._last_heard_s = time.monotonic()
             event = m.unpack_event(parts[-1])
@@ -350,7 +357,7 @@ class PiClient:
         self._on_event(event)
 
     def _catch_up(self, to_seq: int) -> None:
-        """Fetch the missing journalled events up to `to_seq`."""
+        """Fetch the missing journalled events up to `to_seq`. Raises DeviceError if the journal lacks one."""
         while self._last_seq < to_seq:
             reply = self._ask(
                 m.Replay(scan_id=self._scan_id, from_seq=self._last_seq + 1, limit=_REPLAY_LIMIT), m.ReplayReply

@@ -555,7 +555,7 @@ class RowTaker:
                 )
 
     def _find_fatal_fault(self, take: Take, silence: _SilenceCheck) -> TakeFault | None:
-        """Return a fault for which the row is aborted because it cannot become complete; None if there is none."""
+        """Update the radars' states; return a fault for which the row is aborted because it cannot become complete."""
         take.radars = self._radars.states()
         if stopped := take.stopped_radars:
             texts = (f"{name}: the radar has stopped: {s.detail}" for name, s in stopped.items())

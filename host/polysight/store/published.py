@@ -33,10 +33,12 @@ _UNEVEN = 0.25
 
 
 class PacketLog(NamedTuple):
-    """Packets that arrived, in order of their sequence number, without duplicates: payload bytes, unix seconds."""
+    """Packets that arrived, in order of their sequence number, without duplicates; arrays are [packet]."""
 
     sequence: NDArray[np.int64]
+    # Bytes of payload.
     size: NDArray[np.int64]
+    # Time of arrival, seconds since 1970.
     at_s: NDArray[np.float64]
 
 
@@ -68,16 +70,16 @@ class Stream:
     # Byte ranges that never arrived, and the number of packets that they make.
     lost: Gaps
     packets_lost: int
-    # Offset of each packet that arrived; empty without a log
+    # Offset of each packet that arrived, bytes; empty without a log.
     start: NDArray[np.int64]
-    # Arrival time of each packet.
+    # Time of arrival of each of these, seconds since 1970.
     at_s: NDArray[np.float64]
     # Payload of a full packet, bytes.
     packet_bytes: int
 
 
 class Bursts(NamedTuple):
-    """Bursts of a stream: byte ranges [burst, 2], and when each began to arrive (unix seconds)."""
+    """Bursts of a stream: byte ranges (start, stop), [burst, 2], and when each began to arrive, seconds since 1970."""
 
     ranges: NDArray[np.int64]
     at_s: NDArray[np.float64]
@@ -86,6 +88,7 @@ class Bursts(NamedTuple):
 def read_log(path: Path) -> PacketLog | None:
     """Read a row's packet log; None if there is none. A header line is skipped.
 
+    The first three columns are sequence number, bytes of payload, and time of arrival.
     A last packet that is not full gets the arrival time of the one before it: the card delays it by 2 s, and it would
     look like another position.
 
@@ -263,7 +266,7 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
 
 
 def period_s(bursts: Bursts) -> float | None:
-    """Return the time between positions (most must follow one another); None for fewer than two bursts."""
+    """Return the time between positions, seconds (most must follow one another); None for fewer than two bursts."""
     if bursts.at_s.size > 1:
         # A quartile, not the median: missing positions and row ends make gaps longer, nothing makes them shorter.
         return float(np.quantile(np.diff(bursts.at_s), 0.25))

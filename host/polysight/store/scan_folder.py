@@ -575,7 +575,7 @@ def check_inside(folder: Path, name: str, within: str = "") -> Path:
         is_inside = ".." not in Path(name).parts and target.is_relative_to(home / within)
         is_inside = is_inside and target != root and root.is_relative_to(home)
     except (OSError, ValueError):
-        # A name that no file can have
+        # A name that no file can have.
         is_inside = False
     if not is_inside:
         raise DataError(
@@ -607,7 +607,7 @@ def check_links(folder: Path) -> None:
                     elif not entry.is_file(follow_symlinks=False):
                         raise _refuse(folder, path, "is neither a file nor a folder", ErrorCode.FILE_FOREIGN)
         except OSError:
-            # Deleted in the meantime, or not readable: reported when a file is read
+            # Deleted in the meantime, or not readable: reported when a file is read.
             continue
 
 

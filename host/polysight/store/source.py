@@ -65,11 +65,11 @@ class RowData:
 
     # Payload as sent by the card, [frames_expected * bytes of a chirp]; zero where missing.
     pieces: Pieces
-    # Byte ranges (start, stop) that never arrived: sorted, not touching, half open
+    # Byte ranges (start, stop) that never arrived: sorted, not touching, half open.
     missing: list[tuple[int, int]]
-    # Chirps in `payload`: points of the row x chirps of a position; most frames are one chirp
+    # Chirps in `payload`: points of the row x chirps of a position; most frames are one chirp.
     frames_expected: int
-    # Digest of the recorded payload, hexadecimal; "" if the recording has none
+    # Digest of the recorded payload, hexadecimal; "" if the recording has none.
     crc32: str = ""
 
     @cached_property
@@ -101,7 +101,7 @@ class RowData:
 class CubeRow:
     """One board's row of a scan that another program has synchronised; the card's data is not available."""
 
-    # [rx, position, sample], in the order of recording; phases relative to that program's reference
+    # [rx, position, sample], in the order of recording; phases relative to that program's reference.
     cube: NDArray[np.complex64]
     missing_bytes: int = 0
     crc32: str = ""

@@ -113,7 +113,10 @@ def damaged_rows(scan: scan_folder.ScanFolder) -> dict[int, list[str]]:
 
 
 def describe_damage(scan: scan_folder.ScanFolder, path: Path) -> str:
-    """Compare a row's files with the manifest; return the faults, "" if there are none. `path` is its payload."""
+    """Compare a row's files with the manifest; return the faults as text, "" if there are none.
+
+    `path` is its payload; that no committed row has this file is a fault, too.
+    """
     for row in scan.committed_rows().values():
         for board in row.boards.values():
             if (scan.path / board.file).resolve() == path.resolve():

@@ -425,7 +425,7 @@ def _judge_start(inputs: Inputs) -> Status:
 
 
 def _may_have_result(inputs: Inputs, history: ScanHistory) -> bool:
-    """Return false while the scan goes on or materials are computed: products of an earlier run may lie there."""
+    """True unless the scan goes on or materials are computed: products of an earlier run may lie there then."""
     life = inputs.signs.life
     computing = life is not None and life.doing == "materials" and inputs.signs.alive
     return history.ended is not None and not computing

@@ -69,6 +69,7 @@ BEFORE_M = 0.25
 BEYOND_M = 0.35
 # Shortest time between two pictures, while many rows are caught up with; chosen.
 PICTURE_INTERVAL_S = 0.5
+# Time between two looks for committed rows; chosen.
 POLL_S = 0.1
 
 # Bytes at the beginning of a file by which a replaced file is recognised; chosen.
@@ -175,6 +176,7 @@ class RowViewer:
         self._done[row] = take
         for name, board in pipeline.quality.boards.items():
             figures = board.rows[row].figures
+            # Of each stage of synchronisation: standard deviations of frequency (Hz), phase (rad), relative amplitude.
             phases = {stage: phase_rad for stage, (_, phase_rad, _) in figures.residuals.items()}
             object_rad = phases.get("referenced", math.nan)
             direct_rad = phases.get("averaged", math.nan)

@@ -4,8 +4,8 @@
 Up to three processes (`server`): `door` accepts connections and answers commands to scans (with TLS, or where nothing
 may be controlled, there is none, and `front` does both). It hands the rest to `front`, where each request passes the
 access checks of `guard`; what is no page goes on to the reading process: `reading` answers GET requests, `commands`
-POST requests; `site` holds their shared state: the live views, and the programs that scan and process, which outlive
-the server; `queue` the scans that wait.
+POST requests; `site` holds their shared state. `programs` has what scans and processes, which outlives the server, and
+the queue of scans that wait; `stage` homes and jogs the stage.
 
 Threat model: docs/decisions/0014-operators-page.md.
 """

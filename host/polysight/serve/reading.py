@@ -1,4 +1,4 @@
-"""GET requests below /api: lists, the live view, results, comparisons; nothing here changes a file.
+"""GET requests below /api: lists, the live view, results, comparisons; nothing here changes a scan.
 
 Whatever touches a scan folder goes through `Site.read`: in a thread and with a time limit.
 """
@@ -43,7 +43,7 @@ Endpoint = Callable[[Site, Request], Awaitable[Response]]
 
 
 def reading_routes(site: Site) -> list[Route]:
-    """Return the routes of all GET requests."""
+    """Return the routes of GET requests below /api, except those that `front` and `commands` answer."""
     endpoints: dict[str, Endpoint] = {
         "scans": _send_scans,
         "scan": _send_scan,

@@ -1,10 +1,10 @@
 """`polysight serve` and `polysight preview`: the address, the token, and the processes until Ctrl-C.
 
-Three processes, all uvicorn: this one answers requests for pages (`front`), a second one accepts connections and
-answers commands to scans at once (`door`; only with control, and without TLS, which hides what a connection brings;
-else this one does both), and the reading process reads scans, behind a socket in a folder that only this user may
-enter. This process starts the other two, restarts the reading process if it ends, and prints the server's addresses
-with the token, what they allow, and a QR code for a phone.
+Three processes: this one answers requests for pages (`front`), a second one accepts connections and answers commands to
+scans at once (`door`; only with control, and without TLS, which hides what a connection brings; else this one does
+both), and the reading process reads scans, behind a socket in a folder that only this user may enter. This process
+starts the other two, restarts the reading process if it ends, and prints the server's addresses with the token, what
+they allow, and a QR code for a phone.
 """
 
 from __future__ import annotations
@@ -383,7 +383,7 @@ def make_server(front: Front, place: Place, door: socket.socket | None = None) -
 
 
 def _allow_files() -> None:
-    """Allow as many open files as the system does: connections are files."""
+    """Allow as many open files as the system does, at most 65,536 (chosen): connections are files."""
     with contextlib.suppress(OSError, ValueError, ModuleNotFoundError):
         # A module of POSIX systems: the page's results are read on laptops, too.
         import resource

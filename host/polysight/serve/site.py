@@ -35,7 +35,7 @@ READ_S = 30.0
 SIZE_S = 30.0
 """Time after which other folders are counted by another thread; chosen."""
 HIDDEN = ".polysight"
-"""Folder beside the scans that holds the logs of programs that belong to no scan."""
+"""Hidden folder beside the scans: logs of programs that belong to no scan, the queue, the archive, the list's index."""
 LIBRARIES = "libraries"
 THUMBNAIL = "thumbnail"
 # Drawn pictures and comparisons that are kept for the next request; chosen.
@@ -138,7 +138,7 @@ class Site:
         return await self.read(name, lambda: work(self.scans.folder(name)))
 
     async def act(self, work: Callable[[], T]) -> T:
-        """Run a command in a thread of its own, never behind reads."""
+        """Run a command in a thread that no read can have taken."""
         return await anyio.to_thread.run_sync(work)
 
     def size(self, name: str) -> int | None:
@@ -147,7 +147,7 @@ class Site:
 
     @property
     def logs(self) -> Path:
-        """Folder of programs that belong to no scan."""
+        """The hidden folder, `HIDDEN`."""
         return self.scans.root / HIDDEN
 
     def libraries(self) -> dict[str, Path]:

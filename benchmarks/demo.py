@@ -61,8 +61,8 @@ def run(args: argparse.Namespace) -> int:
 def scan_cpu_s(out: Path, scene: Path) -> tuple[int, dict[str, float]]:
     """Run the demo; return the rows between the first commit and the last, and CPU seconds of each kind meanwhile.
 
-    The scene's field, which is computed before, and the products are not counted. Raises RuntimeError if the demo
-    fails, or no two commits were seen.
+    The fields at the radars, which the simulator computes before the first row, and the products are not counted.
+    Raises RuntimeError if the demo fails, or no two commits were seen.
     """
     words = [sys.executable, "-m", "polysight", "demo", "--scene", str(scene), "--out", str(out)]
     demo = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL)
@@ -115,6 +115,7 @@ def _list_parents() -> Iterator[tuple[int, int]]:
                 status = (process / "stat").read_text(encoding="utf-8", errors="replace")
             except (FileNotFoundError, ProcessLookupError):
                 continue
+            # After the name, which is in brackets: state, then the parent (proc(5)).
             yield int(process.name), int(status.rsplit(")", 1)[1].split()[1])
 
 

@@ -1,4 +1,9 @@
-"""Imaging of a synchronised cube, against the published method and a plain time-domain sum of the same."""
+"""Imaging of a synchronised cube, against the published method (`published.py`) and the best time-domain sum.
+
+Kernels are the spectra of the matched filter over the offset of a pixel from a position; the imager computes them once
+for a geometry and keeps them in memory: with them it is warm, without them cold. The footprint is the image of a
+uniform mirror. Limits are chosen; what the project asks for is in docs/benchmarks.md.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.data import as_synced, published_scene, temporary, write_point_cube
 from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, one_core, show, write
 from benchmarks.published import SETTINGS, form_image
-from polysight.imaging import ImageBuilder, spectral as kernels
+from polysight.imaging import ImageBuilder, spectral
 from polysight.imaging.geometry import Antennas, Aperture, image_grid, row_starts_m, scan_offsets_m
 from polysight.imaging.samples import choose_imager, reduction, scene_gate_m
 from polysight.imaging.spectral import IncrementalImager
@@ -42,15 +47,15 @@ class Bench:
 
     def ours(self, live: bool = False) -> Image:
         """Form the image from disk: all rows, then the image; `live`: an image that every row updates."""
-        samples = ImageBuilder(self.rig, live=live).boards[self.board.name]
-        for row, met in self._map_rows():
-            samples.add_row(row, as_synced(self.rig, met))
-        if live:
-            return samples.current()[0]
-        return samples.image()[0]
+        board_samples = ImageBuilder(self.rig, live=live).boards[self.board.name]
+        for row, cube_row in self._map_rows():
+            board_samples.add_row(row, as_synced(self.rig, cube_row))
+        # Beside the image there are the footprint and a notice.
+        image, _, _ = board_samples.current() if live else board_samples.image()
+        return image
 
     def _map_rows(self) -> Iterator[tuple[int, NDArray[np.complex64]]]:
-        """Return rows [rx, position, sample] in the order of the stage, mapped from the published method's file."""
+        """Return rows [rx, position, sample] of the cube's file in the order of the stage: odd rows run backwards."""
         cube = np.load(self.path, mmap_mode="r")
         for row in range(cube.shape[1]):
             yield row, cube[:, row, :: 1 - 2 * (row % 2)]
@@ -60,6 +65,7 @@ class Bench:
         plan = plan_raster(self.rig.grid)
         grid = image_grid(self.rig)
         antennas = Antennas.from_rig(self.rig, self.board)
+        # Of a sample vector, the gate's matrix makes the few frequencies that describe echoes from the scene.
         gate = reduction(self.rig.chirp, scene_gate_m((antennas,), plan, grid), window)
         maps = gate.matrix.astype(np.complex64)
         cube = np.load(self.path, mmap_mode="r")
@@ -68,11 +74,11 @@ class Bench:
 
     def ours_cold(self) -> Image:
         """Form the image as :func:`ours`, without any stored kernel."""
-        kernels.forget()
+        spectral.forget()
         return self.ours()
 
     def theirs(self, points: int = SETTINGS[0], tuned: bool = False) -> Image:
-        """Form the image by the published method, from disk; arguments as of `form_image`."""
+        """Form the image by the published method, from disk; arguments as of `form_image`: `points` of a range FFT."""
         cube = np.load(self.path, mmap_mode="r")
         return form_image(cube, self.rig, self.board, image_grid(self.rig), points, tuned)
 
@@ -109,8 +115,10 @@ def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, 
     }
     took = in_turn(jobs, min(rounds, ROUNDS))
     aperture, samples = bench.reduce_cube("boxcar")
-    # Our sum over all samples, without a window, stands for the exact one; its own tests compare it with a plain sum.
-    exact = choose_imager(aperture)[0].image(samples)
+    # Our sum over all samples, without a window, as the published method has none. It stands for the exact one; its own
+    # tests compare it with a plain sum.
+    imager, _ = choose_imager(aperture)
+    exact = imager.image(samples)
     settings: dict[int, dict[str, float]] = {}
     for points in SETTINGS:
         once = Seconds()
@@ -131,10 +139,11 @@ def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, 
                 theirs / ours,
                 at_least,
                 aim,
+                # Padded to sizes whose transforms are fast.
                 note=f"against the published method in single precision, padded ({tuned:.2f} s): {tuned / ours:.1f}x"
                 if name == "cold"
-                else f"{tuned / ours:.1f}x; published method's settings, seconds and rms distance from our image:"
-                f" {'; '.join(finer)}",
+                else f"against the tuned method {tuned / ours:.1f}x; published method's settings, seconds and rms"
+                f" distance from our image: {'; '.join(finer)}",
             )
         )
     return lines, {"settings": settings, "cpu_s": {name: t.cpu for name, t in took.items()}}
@@ -152,7 +161,8 @@ def against_time_domain(bench: Bench, rounds: int) -> tuple[list[Line], dict[str
     theirs_s: list[float] = []
     image: Image = np.empty(0, np.complex64)
     for _ in range(min(rounds, ROUNDS)):
-        ours_s += in_turn({"": lambda: choose_imager(aperture)[0].image(samples)}, rounds)[""].cpu
+        ours_s += in_turn({"ours": lambda: choose_imager(aperture)[0].image(samples)}, rounds)["ours"].cpu
+        # Its seconds are scaled to all rows there.
         image, seconds = time_domain.timed_image(aperture, samples, EVERY)
         theirs_s.append(seconds)
     ours = statistics.median(ours_s)
@@ -176,6 +186,7 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
     """Compare imaging row by row with imaging at once, both with the footprint."""
     aperture, samples = bench.reduce_cube("hann")
     weights = np.ones(samples.shape[2:], np.float32)
+    # The echo of the mirror, of whose image the footprint is made: any constant takes the same time.
     mirror = np.ones(samples.shape[:2], np.complex64)
     starts = row_starts_m(aperture.offsets_m)
     images: dict[str, Image] = {}
@@ -184,6 +195,7 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
         imager = IncrementalImager(aperture, mirror)
         for row, start in enumerate(starts):
             imager.add_row(row, samples[:, :, row] * weights[row], weights[row], float(start))
+        # The footprint, whose time counts; then the image, all RX with a factor of 1.
         imager.constant_of_sum()
         images["rows"] = imager.image_of_sum(np.ones(len(samples)))
 
@@ -209,6 +221,7 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
     ):
         ours = took[rows].median
         theirs = took[batch].median
+        # How many images at once all updates of an image row by row cost.
         name = f"all row updates in batch images, both from {placement}"
         note = f"{1e3 * ours / len(starts):.2f} ms a row"
         lines.append(Line(name, f"{ours:.3f} s", f"{theirs:.3f} s", ours / theirs, *limits, False, note))
@@ -237,8 +250,8 @@ def run(args: argparse.Namespace) -> int:
         write_point_cube(path, rig, rig.receivers[0])
         bench = Bench(rig, rig.receivers[0], path)
         for part in (against_published, against_time_domain, against_batch):
-            line, figures = part(bench, count_repeats(args.quick, REPEATS))
-            lines += line
+            part_lines, figures = part(bench, count_repeats(args.quick, REPEATS))
+            lines += part_lines
             figures_of_parts[part.__name__] = figures
     show(f"imaging of one board, {rig.grid.rows} x {rig.grid.columns} positions, one core", lines, args.quick)
     write(args.json, "image", lines, **figures_of_parts)

@@ -37,6 +37,7 @@ def one_thread_each() -> None:
 def one_core() -> Iterator[None]:
     """Keep this thread, and what it starts in the block, on one core; threads that run already stay where they are."""
     allowed = os.sched_getaffinity(0)
+    # Which one does not matter.
     os.sched_setaffinity(0, {max(allowed)})
     try:
         yield
@@ -160,7 +161,10 @@ class Child:
 
 
 def ask(beside: Child | None) -> dict[str, Any]:
-    """Ask the processing beside a measurement for its progress (`rows`, `cpu_s`); zeros without one."""
+    """Ask a process that processes rows while something else is measured for its progress (`rows`, `cpu_s`).
+
+    Without such a process both are 0.
+    """
     if beside is None:
         return {"rows": 0, "cpu_s": 0.0}
     beside.say()
@@ -169,6 +173,7 @@ def ask(beside: Child | None) -> dict[str, Any]:
 
 def cpu_s(pid: int) -> float:
     """Return the CPU seconds of a process so far, without those of its children."""
+    # Fields of proc(5) after the name, which is in brackets and may hold spaces: ticks in user and in system mode.
     words = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
     return (int(words[11]) + int(words[12])) * TICK_S
 
@@ -186,7 +191,7 @@ class Line:
     value
         The judged value: a ratio or an amount.
     at_least, aim
-        Required and desired limits.
+        Required and desired limits: the least that is allowed, or the most if lower is better.
     higher_is_better
         Whether a larger `value` is better: of ratios of speed it is, of times, memory and errors it is not.
     note

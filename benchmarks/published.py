@@ -1,4 +1,4 @@
-"""The published method in plain form: the peer of the instrument's processing.
+"""The published method (POLySIGHT, SenSys 2026: CITATION.cff) in plain form: the peer of the instrument's processing.
 
 The steps, sizes and number formats of the authors' public code and of its notebooks' settings, rewritten for one
 core with NumPy and SciPy; no line is theirs. `docs/benchmarks.md` says how its time compares with their code's.
@@ -130,6 +130,7 @@ class Synchroniser:
         complex [rx, sample], and the direct path's phase (rad) at the first linear sample.
         """
         linear = mean[:, self._a : self._b]
+        # The RX's sum, steered to the direct path; None in the plain form, which transforms each RX and sums spectra.
         beam = None
         if self._tuned:
             beam = self._beam @ linear

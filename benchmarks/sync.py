@@ -60,7 +60,10 @@ class Ours:
         self._pipeline.images = cast(ImageBuilder, _NoImage())
 
     def row(self) -> tuple[float, float]:
-        """Process a row of all boards; return CPU seconds of reading, decoding and aligning, and of the direct path."""
+        """Process a row of all boards; return CPU seconds of all steps but the direct path, and of the direct path.
+
+        The first are reading, decoding and aligning, and what else a row needs, such as the residuals.
+        """
         row_seconds = Seconds()
         inner = Seconds()
         with row_seconds.time_block(), direct_path_timed(inner):
@@ -78,6 +81,7 @@ class Theirs:
 
     def row(self) -> tuple[float, float]:
         """Process the chosen positions of each board one after another; return CPU seconds as :class:`Ours`, scaled."""
+        # A frame of the published rig is one chirp.
         pulses = self._rig.burst.pulses
         size = pulses * self._rig.frame_bytes
         first = Seconds()

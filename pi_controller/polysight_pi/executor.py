@@ -1,9 +1,12 @@
 """The executor: one thread that processes commands, replies of the stage and bursts from one queue, in order.
 
 It executes the host's commands and manages the run; machine.py controls stage and row. It waits for no storage: a
-command that has to be journalled or replayed is answered by the journal's thread, test pulses when they have ended, all
-others at once.
-docs/spec/wire.md describes each command.
+command that has to be journalled or replayed is answered by the journal's thread, test pulses when they have ended, and
+what comes while a run begins or ends when it has; all others at once. docs/spec/wire.md describes each command.
+
+`Machine.happen` applies the rule that a state has for an event, if there is one; `Machine.command` does the same for a
+command, and refuses it without a rule. Both name their event by a string, a key of machine.py's table of rules. What
+the host receives are *events*, too: entries of the journal.
 """
 
 from __future__ import annotations
@@ -40,7 +43,8 @@ from polysight_shared.raster import (
 from polysight_shared.stage_line import Reply
 from polysight_shared.units import us_to_ns
 
-# The rest of the queue waits for the next turn, so that a queue that never empties is not a hang; chosen.
+# Longest time for which one turn takes items from the queue; the rest waits for the next turn, so that a queue that
+# never empties does not hang the thread. Chosen.
 TURN_TIMEOUT_S = 0.2
 # Longest wait for work in one turn of the loop; chosen.
 TURN_S = 0.25
@@ -98,8 +102,8 @@ class Executor:
     """Executes commands in a thread of its own; the methods in the section "for other threads" may be called by all.
 
     In each turn of its loop the thread empties its queue, checks deadlines and sends replies. `turned` is called after
-    every turn, about four times a second, while no part is late: it feeds the watchdog. `find_late` names a part of the
-    program that does not answer, "" for none.
+    every turn while no part is late, at rest about four times a second: it feeds the watchdog. `find_late` names a part
+    of the program that does not answer, "" for none.
     """
 
     def __init__(
@@ -443,7 +447,7 @@ class Executor:
                 "wait for that scan's end, or stop it there",
             )
         if self._machine.row is not None:
-            # The host that started the row is gone, so nothing of the row is committed.
+            # The host that started the row is gone, or begins its run again: nothing of the row is committed.
             self._after_row = request
             self._machine.happen("Abort", f"run {run.scan_id} was begun again")
         return self._machine.row is not None
@@ -467,7 +471,7 @@ class Executor:
         self._write_synced(request, write, accept_begin)
 
     def _forget_run(self) -> None:
-        """End the active run without an event."""
+        """End the active run; nothing is written to the journal, and no event is sent to the host."""
         self._run = None
         self._last_row = None
         self._takes = {}

@@ -27,7 +27,8 @@ HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
 DEBOUNCE_TICKS_US = 5_000
 # 2000 x 2000: imaging holds some 200 bytes a pixel, and an image of 9999 x 9999 took all memory of a PC.
 MAX_PIXELS = 4_000_000
-# The wavelength is 4 mm; the spectral imager's memory grows as one over the size.
+# The wavelength is 4 mm; the memory of the imager (by FFTs over a lattice of pixels) grows as one over the size. Both
+# limits are chosen.
 MIN_PIXEL_MM = 0.05
 MAX_PIXEL_MM = 100.0
 # The range gate's matrices grow as the square of an image's size: one of 400 m took all memory of a PC.
@@ -54,7 +55,7 @@ class Chirp(Section, frozen=True):
     samples: Count
     sample_rate_hz: Positive
     ramp_end_us: Positive
-    # Intermediate frequencies that the ADC keeps: 0 to 0.9 sample rates, or both signs.
+    # Intermediate frequencies that the ADC keeps: 0 to 0.9 sample rates (complex1x), or -0.45 to 0.45 (complex2x).
     if_mode: Literal["complex1x", "complex2x"] = "complex1x"
     # Corners of the two high-pass filters of the receivers; 0 for none.
     hpf1_khz: float = 175.0
@@ -69,6 +70,7 @@ class Chirp(Section, frozen=True):
             f"adc_start_us = {self.adc_start_us} and samples / sample_rate_hz = {window_us:.2f} us"
             f" must end inside the ramp, ramp_end_us = {self.ramp_end_us}",
         )
+        # The radar has 76 to 81 GHz; 0.1 GHz above is let pass (chosen). `radar.control = "native"` checks it exactly.
         top = self.start_hz + self.slope_hz_per_s * self.ramp_end_us * 1e-6
         require(
             self.start_hz >= 76e9 and top <= 81.1e9,
@@ -77,6 +79,7 @@ class Chirp(Section, frozen=True):
         none = ", or 0 for no filter (simulated rigs only)"
         require(self.hpf1_khz in (0.0, *HPF_FIRST_KHZ), f"hpf1_khz must be one of {HPF_FIRST_KHZ}{none}")
         require(self.hpf2_khz in (0.0, *HPF_SECOND_KHZ), f"hpf2_khz must be one of {HPF_SECOND_KHZ}{none}")
+        # At least 12 samples: three whole blocks of the decimation by four (chosen).
         a, b = self.linear_samples
         require(
             a >= 0 and a + 12 <= b <= self.samples,
@@ -118,7 +121,8 @@ class Pi(Section, frozen=True):
     command_address: str = "tcp://127.0.0.1:5601"
     event_address: str = "tcp://127.0.0.1:5602"
     journal_dir: str = "journal"
-    # A relative path counts from the rig file's folder.
+    # Folder of the CURVE keys of both sides, which addresses beyond this machine need. A relative path counts from the
+    # rig file's folder.
     key_dir: str = "keys"
     # Period of the Pi's heartbeat.
     heartbeat_ms: Count = 500
@@ -153,6 +157,7 @@ class Pi(Section, frozen=True):
     @property
     def pulse_source(self) -> str:
         """Say who makes the pulses of SYNC_IN, their spacing and skew, and whether they are seen at the connector."""
+        # 105 is `PiFault.PULSE_TOO_LONG`.
         source = "libgpiod on one line; without a one-shot: pulses above 4 us end a row (105)"
         spacing = "spacing by the program, each event has its lateness"
         if self.wiring == "spi":
@@ -232,8 +237,8 @@ class NativeRadar(Section, frozen=True):
     """One board under `radar.control = "native"`.
 
     It is identified by `usb_serial`, or by `usb_path`, the position of its plug ("1-4.2": bus, then the hub's ports).
-    With `die_id`, another board at this place is refused. `ldo_bypass` can destroy a board with 1.3 V RF supplies, so
-    it requires the board's USB serial number also in `ldo_bypass_acknowledged`.
+    With `die_id`, another board at this place is refused. `ldo_bypass` can destroy a board with 1.3 V RF supplies:
+    before the radars start, the host checks that `ldo_bypass_acknowledged` repeats `usb_serial`, which must be given.
     """
 
     usb_serial: str = ""
@@ -247,7 +252,7 @@ class NativeRadar(Section, frozen=True):
 
     @property
     def place(self) -> str:
-        """Serial number or address of the board, or `usb:` and its path."""
+        """`usb_serial` (a serial number, or `tcp://address:port` of a server), or `usb:` and the path."""
         return self.usb_serial or f"usb:{self.usb_path}"
 
 
@@ -420,6 +425,7 @@ class Instrument(Section, frozen=True):
             rule = "boards name must be 1..64 letters, digits, spaces, _ - or ., the first a letter, a digit or _"
             require(re.fullmatch(r"\w[\w .-]{0,63}", name) is not None, f"{rule}: {name!r}")
         require(len(set(names)) == len(names), f"board names must differ: {names}")
+        # Only the pair must differ: boards may share one of the two.
         hosts = [(b.host_address, b.data_port) for b in self.boards]
         require(len(set(hosts)) == len(hosts), "each board needs its own host_address and data_port")
         unknown = sorted(set(self.radar.servers) - set(names))

@@ -25,7 +25,8 @@ class Finding(msgspec.Struct, frozen=True):
     what, why, do
         What was found, with the value and its unit; the likely cause; the remedy. `why` and `do` may be empty.
     where
-        What it is about: a check, hop, board, file, row or patch; "" for the whole.
+        What it is about: a check, board, file, row, patch, or a hop (a device or link on the way to the data); "" for
+        the whole.
     code
         Kind of fault, for programs.
     weight
@@ -41,6 +42,7 @@ class Finding(msgspec.Struct, frozen=True):
     where: str = ""
     code: ErrorCode = ErrorCode.OTHER
     weight: float = 1.0
+    # msgspec gives every finding an empty dict of its own.
     facts: dict[str, Any] = {}
 
     @classmethod

@@ -112,6 +112,7 @@ def _make(
             socket.connect(address)
     except zmq.ZMQError as e:
         socket.close()
+        # The likeliest cause of any other error, whose own text is told too.
         cause = "the address does not exist on this machine"
         code = ErrorCode.OTHER
         if e.errno == zmq.EADDRINUSE:
@@ -138,7 +139,7 @@ def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the Pi's PUB socket, bound. `context`: from `make_server_context`.
 
     Its queue has 100,000 events for each subscriber (chosen: a scan of 70,000 positions fits); further ones are lost to
-    that subscriber, which then requests them (`Replay`).
+    that subscriber, which then requests them by the command `messages.Replay`.
     """
     options: dict[int, int | bytes] = {zmq.SNDHWM: 100_000, zmq.MAXMSGSIZE: MAX_SUBSCRIPTION_BYTES}
     options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS, zmq.AFFINITY: EVENT_IO_THREAD}
@@ -173,8 +174,9 @@ def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the SUB socket of a program that only displays events: a short queue, and a heartbeat of ZeroMQ.
 
     The Pi has a queue for each subscriber; without the heartbeat it would keep the queue of one that was
-    stopped, or whose machine is gone.
+    stopped, or whose machine is gone. The host's own `subscriber` is rather kept: it must lose no events.
     """
+    # Times in ms: a heartbeat each second, and five seconds until the silent one is dropped; chosen.
     options: dict[int, int | bytes] = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC}
     options |= {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TTL: 5000}
     return _make(context, zmq.SUB, address, key_dir, bind=False, options=options)

@@ -66,7 +66,7 @@ class StopRequest:
 
     @property
     def pending(self) -> str:
-        """Name of the command that is not withdrawn: `abort`, `stop`, `pause`, or "" for none."""
+        """Name of the command in force, obeyed already or not: `abort`, `stop`, `pause`, or "" for none."""
         if self.now:
             return ScanCommand.ABORT
         if self.after_row:
@@ -141,8 +141,8 @@ class ScanCommand(StrEnum):
 class Life(msgspec.Struct, frozen=True):
     """Content of `alive`: the scan's process, its start time in `ticks` (:func:`read_start_ticks`), its machine `host`.
 
-    It is `doing` rows, or after these materials.
-    `asked` is the pending command of `asker`, "" for none. The reader sets `written_s` (since 1970) from the file.
+    It is `doing` "rows" as long as rows are taken, "materials" while they are searched for after the last row. `asked`
+    is the pending command of `asker`, "" for none. The reader sets `written_s` (since 1970) from the file.
     """
 
     pid: int = 0

@@ -63,9 +63,10 @@ _EARLY_NS = 200_000
 _LATE = 0.15
 _LATE_NS = 200_000
 # If more than this share of the trains is not of a single frame at the time of a pulse, the machine or the network is
-# slow, and the expected times are not sharp. Then displaced frames show only by `_DISPLACED` trains at earlier pulses.
-# At later pulses they show by so many trains one after another. Both chosen.
+# slow, and the expected times are not sharp; chosen.
 _BLURRED = 0.1
+# A whole row is contradicted by so many trains one after another that came at other pulses than theirs, or by so many
+# that came before their pulses; if times are sharp, by a single one of these. Chosen.
 _DISPLACED = 3
 # A card drops whole samples of its four antennas (inferred).
 _SAMPLE_BYTES = 16
@@ -93,7 +94,8 @@ _NO_BOUND = 1 << 60
 class PlacedFrames:
     """Pulse numbers of the frames of a row."""
 
-    # int64 [frame]: the pulse number of each received frame; -1 if it was not seen at its pulse
+    # int64 [frame]: the pulse number of each received frame; -1 if it was not seen at its pulse. Empty if the row's
+    # capture events are missing
     slots: Times
     # Numbers of the pulses that were certainly missed
     missed: list[int]
@@ -173,7 +175,7 @@ class _DisturbedError(_UndeterminedError):
 
 
 class _Trains(NamedTuple):
-    """The packets of each frame that came one after another; arrays are [train]."""
+    """Packets that came between two silences, as a rule those of one frame; arrays are [train]."""
 
     # int64, bytes of the record up to the end of its first packet
     first_stop: Times
@@ -185,7 +187,8 @@ class _Trains(NamedTuple):
     high: Times
     # True for trains of one frame at the time of a pulse.
     punctual: Flags
-    # True for trains of one frame at no pulse's time; trains of several frames are neither.
+    # True for trains of one frame that came at no pulse's time, or so soon after the last that they caught up a delay;
+    # of a whole row also for those at another pulse's time. Trains of several frames are neither.
     astray: Flags
 
 
@@ -215,7 +218,8 @@ def _find_trains(
     late_ns = came_ns[heads] - expected[np.maximum(pulse_of_head, 0)]
     is_single = stop[tails] - first_stop < frame_bytes
     in_time = (pulse_of_head >= 0) & (late_ns <= frame_ns + min(_LATE * period_ns, _LATE_NS))
-    # A train that is late within its burst is at least not of an earlier one: no delay is as long as a pause.
+    # A train that is late within its burst is at least not of an earlier burst, as long as no delay is as long as a
+    # pause.
     count = pulses_ns.shape[1]
     first_pulse = np.where(in_time, pulse_of_head, pulse_of_head // count * count)
     # When its first packet was full, all frames before that pulse's and at least one sample of it had been sent: what
@@ -248,6 +252,7 @@ def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int) -> PlacedFr
     trains = trains._replace(punctual=is_in_place, astray=trains.astray | is_displaced)
     slots = np.where(_select_seen(trains, frame_bytes, pulses), np.arange(pulses), -1)
     reason = ""
+    # No frame came at its pulse, and none contradicts the row's length: that no delay is as long as a pause is wrong.
     if not contradicted and (slots < 0).all():
         reason = "the delays in this row are as long as the pauses between its bursts"
     if contradicted or reason:
@@ -442,7 +447,10 @@ def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instru
 
 
 def first_pulse_ns(events: list[ReceivedCapture]) -> int | None:
-    """Return a time before the row's first pulse (monotonic clock) from its capture events; None if undetermined."""
+    """Return a time in the pause before the row's first burst, before which none of its frames was sent.
+
+    It is in the host's monotonic clock, from the row's capture events; None if undetermined.
+    """
     events = sorted((e for e in events if e.event.pulses), key=lambda e: e.event.point)
     if not events or events[0].event.point != 0:
         return None
@@ -557,7 +565,8 @@ def _keep_payload(path: Path, received: NDArray[np.uint8]) -> int:
     """
     if not path.exists():
         return 0
-    # What else the packet file tells of the row stays as it is. None: no payload is taken from the row's file any more.
+    # What else the packet file tells of the row stays as it is. None: the packet file gets all of the payload, because
+    # the row's file, which held it, is rewritten.
     evidence, log = read_packets(path, received)
     return write_packets(path, log, evidence, None)
 

@@ -178,7 +178,9 @@ class RunningScan:
             if begun:
                 # The first error is the one to report.
                 with suppress(PolysightError):
+                    # So much of a reason fits into the Pi's messages and a line of a log (chosen).
                     self._pi.come_to_rest(self.result.reason[:500])
+            # If `_end` failed itself, the manifest gets a second `scan_ended`, with its error: the last one counts.
             with suppress(PolysightError):
                 self._end(begun)
 
@@ -309,7 +311,7 @@ class RunningScan:
 
     @contextmanager
     def _exclude_time(self) -> Iterator[None]:
-        """Exclude the block from the row's duration, unlike waiting for processing."""
+        """Exclude the block from the row's duration, in which the wait for processing is included."""
         started_s = time.monotonic()
         try:
             yield
@@ -504,8 +506,8 @@ def run_scan(
     Raises
     ------
     PolysightError
-        with the hop that failed and what to do, also in the manifest once the scan has begun; all committed rows are
-        safe.
+        with the hop (the device or link on the way to the data) that failed and what to do, also in the manifest once
+        the scan has begun; all committed rows are safe.
     """
     plan = plan_raster(instrument.grid)
     check_burst_fits(instrument.grid, instrument.burst, instrument.stage)
@@ -525,7 +527,8 @@ def run_scan(
         )
         writer = stack.enter_context(scan.writer())
         if progress is not None:
-            # Report progress now, because the radars may take seconds: the caller can accept requests to stop.
+            # Report progress now, because the radars may take seconds: from now on the scan's folder exists, and the
+            # caller can show it and request a stop.
             progress(ScanProgress("check", "making the radars ready", plan.rows, 0))
         radars = stack.enter_context(radars or radar_control(instrument))
         stop = stop or StopRequest()
@@ -574,12 +577,14 @@ def resume_scan(
                 "start the Pi with the backend the scan was begun with, or make a new scan",
                 code=ErrorCode.MISMATCH,
             )
+        # A Pi of an older program tells no stage settings, which `check_same_stage` knows.
         if not hello.stage or (scan.started.pi is not None and scan.started.pi.stage):
             warnings = check_same_stage(scan.instrument.stage, hello, f"{folder}")
         else:
             # The scan began without the Pi's stage settings, which placed its rows: a difference is only a warning.
             differences = stage_differences(scan.instrument.stage, hello)
             warnings = [f"not compared when the scan began: {d}" for d in differences]
+        # Addresses and limits, for the manifest; with `scan.reload` they are in `scan.instrument`.
         connection = None
         if rig_now is not None:
             connection = extract_connection(rig_now)
@@ -609,7 +614,10 @@ def resume_scan(
 
 
 def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProgress | None) -> list[str]:
-    """Withdraw every committed row whose files differ from their digests; return warnings. Raises DeviceError."""
+    """Withdraw every committed row whose files differ from their digests; return warnings.
+
+    Raises DeviceError if the manifest cannot be written.
+    """
     rows = scan.committed_rows()
     if progress is not None:
         progress(ScanProgress("check", f"comparing {len(rows)} committed rows with their digests", scan.plan.rows, 0))

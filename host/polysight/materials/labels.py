@@ -70,7 +70,9 @@ def specimen_seed(path: Path) -> int | None:
 
     Raises DataError.
     """
+    # Only to check the file: what it holds is read again below.
     read_truth(path)
+    # [real, loss]: relative standard deviations of the plates' permittivities; zeros are none.
     scene = read_json(path).get("scene")
     spread = scene.get("specimen_spread") if isinstance(scene, dict) else None
     if isinstance(scene, dict) and isinstance(spread, list) and any(spread):
@@ -93,17 +95,18 @@ def find_truth(folder: Path) -> tuple[Plates, str]:
 
 
 def _read_plate(raw: Mapping[str, Any]) -> TruthPlate:
-    """Read a plate of a truth file; metal, strips and stacks of layers have no permittivity.
+    """Read a plate of a truth file; metal, strips and stacks of layers have no permittivity of their own.
 
-    Raises KeyError, TypeError or ValueError for a malformed one.
+    `strips_deg` is the direction of ideal thin metal strips, `layers` a stack from front to back. Raises KeyError,
+    TypeError, ValueError or OverflowError for a malformed one.
     """
     cx, cy = (float(c) for c in raw["centre_mm"])
     w, h = (float(s) for s in raw["size_mm"])
     eps = None
     metal = bool(raw.get("metal", False))
     if not metal and not raw.get("layers") and raw.get("strips_deg") is None:
-        re, loss = raw["permittivity"]
-        eps = complex(float(re), -float(loss))
+        real, loss = raw["permittivity"]
+        eps = complex(float(real), -float(loss))
     thickness = raw.get("thickness_mm")
     numbers = [cx, cy, w, h]
     if eps is not None:
@@ -132,6 +135,7 @@ def material_name(name: str) -> str:
 
 def format_box(box: Box) -> str:
     """Format a box: `x -22.5 to 22.5, y 0.0 to 45.0 mm`."""
+    # Negative zero plus zero is zero: no "-0.0".
     x0, y0, x1, y1 = (b + 0.0 for b in box)
     return f"x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f} mm"
 
@@ -147,8 +151,8 @@ class Labels:
     unit
         Unit of the boxes.
     metal
-        Name of the box with the metal reference; None: the box with the name of a metal, the first of several (drawn by
-        hand, only one may have such a name).
+        Name of the box with the metal reference; None: every box with the name of a metal counts as metal (drawn by
+        hand, only one may have such a name), and processing takes the first of them.
     specimens
         Name of a box to its physical piece, if known.
     by_hand
@@ -198,7 +202,10 @@ class Labels:
 
 
 def find_label_file(folder: Path) -> Path:
-    """Return `<scan>.json` of a folder `labels/<scan>`, or its only JSON file. Raises DataError."""
+    """Return the label file of a scan of the published data set, whose folder is `labels/<scan>`.
+
+    It is `<scan>.json`, or the only JSON file there. Raises DataError if there is none, or several of other names.
+    """
     file = folder / f"{folder.name}.json"
     if file.exists():
         return file
@@ -214,7 +221,8 @@ def find_label_file(folder: Path) -> Path:
 def read_labels(path: Path) -> Labels:
     """Read a label file; names and boxes are not checked, see :func:`check_labels`.
 
-    Raises DataError if the file is missing, not JSON, an entry is not four numbers, or a key is invalid.
+    Raises DataError if the file is missing, not JSON, an entry is not four numbers, or the value of `unit`, `metal` or
+    `specimens` is invalid.
     """
     remedy = "correct it, or draw the boxes again: polysight label SCAN"
     try:
@@ -275,9 +283,10 @@ def pack_labels(labels: Labels) -> bytes:
 def patches_from_plates(
     plates: Sequence[TruthPlate], x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float
 ) -> tuple[Segmentation, dict[int, str]]:
-    """Return patches at the known plates, and label to name; several plates may have the same name.
+    """Return patches at the known plates, and a patch's number to its name; several plates may have the same name.
 
-    Raises DataError if a plate has no pixel.
+    Pixels nearer than `margin_mm` to a plate's edge belong to its patch, but not to the patch's interior. Raises
+    DataError if a plate has no pixel.
     """
     boxes = {f"{plate.name} ({n})": plate.box_mm for n, plate in enumerate(plates, 1)}
     patches, _ = patches_from_labels(boxes, x_m, y_m, unit="mm", margin_mm=margin_mm)
@@ -291,10 +300,10 @@ def patches_from_labels(
     unit: Literal["pixel", "mm"] = "pixel",
     margin_mm: float = 0.0,
 ) -> tuple[Segmentation, dict[int, str]]:
-    """Make patches of boxes, drawn by hand or known; return them, and label to name.
+    """Make patches of boxes, drawn by hand or known; return them, and the box's name by the patch's number, from 1.
 
-    `boxes` are name to (x0, y0, x1, y1): pixel indices (end excluded), or millimetres from the image centre. The
-    margin is inside the box; hand-drawn boxes usually lie inside the material already.
+    `boxes` are name to (x0, y0, x1, y1): pixel indices (end excluded), or millimetres from the image centre. A patch
+    is the whole box; its interior begins `margin_mm` inside. Hand-drawn boxes usually lie inside the material already.
 
     Raises DataError if a box has no pixel.
     """
@@ -326,14 +335,15 @@ def patches_from_labels(
 LONGEST_NAME = 80
 RESERVED = ("unknown", "none of these", "possible layer")
 """Words that the classifier uses."""
-# Label files hold three decimals, so boxes that touch may overlap by their rounding.
+# Boxes may overlap, or leave the image, by so much. Label files hold three decimals, so that edges that touch may be
+# off by 0.001 mm; chosen ten times as large, far below a pixel.
 _TOLERANCE_MM = 0.01
 # Characters that nobody sees: two names that differ by one of them look the same.
 _HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]")
 
 
 def clean_name(text: str, kind: str = "name") -> str:
-    """Return a name in Unicode form NFC, with trimmed spaces; `kind` is its description in errors.
+    """Return a name in Unicode form NFC, without spaces around it and repeated ones; `kind` describes it in errors.
 
     Raises DataError if it is empty, longer than `LONGEST_NAME` or has control or hidden characters; if `kind` is "name"
     also if it is a plain number, a reserved word, or ends with "(literature)".
@@ -341,6 +351,7 @@ def clean_name(text: str, kind: str = "name") -> str:
     name = re.sub(" +", " ", unicodedata.normalize("NFC", text).strip())
     shortened = name if len(name) <= 40 else f"{name[:40]}..."
     wrong = ""
+    # Categories: control, surrogate and private characters, line and paragraph separators.
     if not name:
         wrong = "it is empty"
     elif len(name) > LONGEST_NAME:
@@ -381,7 +392,7 @@ def image_extent_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Box:
 def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: Mask | None = None) -> Labels:
     """Check labels for training; return them in millimetres, with clean names and the metal box.
 
-    `x_m` and `y_m` are the axes of the image, `valid` bool [ny, nx] its illuminated pixels (None: all).
+    `x_m` and `y_m` are the axes of the image, `valid` bool [ny, nx] its scanned pixels (None: all).
 
     Raises DataError if a box is empty, not finite, outside the image or without a valid pixel; if two boxes overlap; if
     a name is invalid or used twice; if a metal reference or a specimen has no box; if there are several boxes and the

@@ -1,8 +1,9 @@
 """Stacks of layers: sheets thinner than the wave, sheets on metal, liquids behind a container's wall; their fit.
 
-Eq. 3 of the paper holds for one interface. A sheet has two, a filled container three, and the echoes of the rear ones
-are as strong as the first. Here the model is the whole stack (:func:`polysight.polarimetry.multilayer`), and the
-data are those of the sub-bands of the sweep (`Spectrum`, `Bands`).
+Eq. 3 of the POLySIGHT paper (the permittivity of a half space from the ratio of H to V and the incidence angle) holds
+for one interface. A sheet has two, a filled container three, and the echoes of the rear ones are as strong as the
+first. Here the model is the whole stack (:func:`polysight.polarimetry.multilayer`), and the data are those of the
+sub-bands of the sweep (`Spectrum`, `Bands`).
 
 `fit_layer` fits the one unknown layer: its permittivity, and its thickness if it is not known. The solution has the
 least chi-square, with the full covariance of the data (errors common to all sub-bands do not average out, differences
@@ -206,6 +207,7 @@ def average(
 
     `eps` and `thickness` (metres) of each layer, and `theta_rad`, are numbers or arrays [..., 1, 1].
     """
+    # Metal has -1 in both polarisations: reflections are relative to it but for a sign that ratio and magnitude drop.
     reflections = multilayer(eps, thickness, spectrum.frequency_hz, theta_rad)
     r_s, r_p = (np.asarray((r * spectrum.weight).sum(axis=-1), np.complex128) for r in reflections)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -213,7 +215,10 @@ def average(
 
 
 def check_stack(stack: Sequence[Layer]) -> None:
-    """Raise PolysightError unless every layer before the last has a thickness and known permittivities are passive."""
+    """Raise PolysightError unless every layer before the last has a thickness, and known permittivities are possible.
+
+    Possible here: a real part of 1 and more, a loss of 0 and more, both up to MAX_PERMITTIVITY, or infinite (metal).
+    """
     open_ended = [layer.name for layer in stack[:-1] if layer.thickness_m is None]
     if not stack or open_ended:
         raise PolysightError(
@@ -310,7 +315,7 @@ class LayerFit:
 
     @property
     def relative_std(self) -> float:
-        """The larger of the standard deviations of permittivity and of thickness, relative."""
+        """The larger of the standard deviations (one sigma) of permittivity and of thickness, relative."""
         of_permittivity = float(np.hypot(self.std_real, self.std_loss)) / abs(self.permittivity)
         if not self.thickness_m:
             return of_permittivity
@@ -318,7 +323,7 @@ class LayerFit:
 
     @property
     def ambiguous(self) -> bool:
-        """True if there are rivals, or a fitted thickness makes permittivity or thickness uncertain by over 5 %."""
+        """True if there are rivals, or two sigma of permittivity or of a fitted thickness exceed `DETERMINED` (5 %)."""
         return bool(self.rivals) or (self.std_thickness_m > 0 and 2 * self.relative_std > DETERMINED)
 
     def warnings(self) -> list[str]:

@@ -1,9 +1,10 @@
 """Encode and decode mmWaveLink messages (sync word, header, sub-blocks, CRC), and decode a radar's events.
 
-Source of all numbers: TI, mmWave Radar Interface Control Document, revision 2.23 ("ICD"), sections 2.3 and 3; for most
-tables of events the ICD page is given. ICD 337 lists the fatal events, which require a reset and a new configuration.
-Error numbers of refused commands are described as well. The format is described in docs/spec/mmwavelink.md. Not run on
-hardware yet.
+Source of all numbers: TI, mmWave Radar Interface Control Document, revision 2.23 ("ICD"), sections 2.3 and 3; "ICD 337"
+is its page 337, which lists the fatal events: they require a reset and a new configuration. For most tables of events
+the page is given. Error numbers of refused commands are described as well. The format is described in
+docs/spec/mmwavelink.md. The device raises its host interrupt line when it has a message. This code has not run on
+hardware yet; messages that others received from devices are in its tests.
 """
 
 from __future__ import annotations
@@ -21,17 +22,18 @@ from polysight_shared.errors import ProtocolError
 # First bytes of a message from the host, and from the device.
 HOST_SYNC = bytes.fromhex("34122143")
 DEVICE_SYNC = bytes.fromhex("badccdab")
-# "CNYS": written by the host when the interrupt is high
+# Written by the host when the interrupt is high ("CNYS" in the ICD): the word, and filler to 16 bytes.
 READY_TO_READ = bytes.fromhex("78566587") + b"\xff" * 12
 SYNC_BYTES = 4
 HEADER_BYTES = 12
 CRC_BYTES = 4
 # Bytes of a message with its sync word.
 MESSAGE_LIMIT = 256
-# Bytes of one sub-block: the chunk size that TI recommends over SPI (ICD 20).
+# Bytes of a file that one message carries, the data of one sub-block: the chunk size that TI recommends over SPI (ICD
+# 20).
 BODY_LIMIT = 232
 BLOCKS_PER_MESSAGE_ID = 32
-# Message and sub-block of a refusal (ICD 4.4, table 5.1).
+# Message and sub-block of a refusal (ICD section 4.4, table 5.1).
 ERROR_MESSAGE = 0
 ERROR_BLOCK = 0x0000
 # Opcode (direction, type, message id), length, flags, remaining chunks, number of sub-blocks, checksum.
@@ -39,7 +41,7 @@ _HEADER = struct.Struct("<6H")
 # Number and length of a sub-block; also error number and sub-block of a refusal.
 _BLOCK = struct.Struct("<2H")
 _PAD = b"\xff"
-# Bits of the header's flags.
+# Bits of the header's flags. The first two are fields of two bits, of which only both set means yes.
 _RETRY = 0x0003
 _NO_CRC = 0x0300
 _CRC32 = 0x0400
@@ -118,7 +120,7 @@ class Message:
     def error(self) -> tuple[int | None, int | None] | None:
         """Error number and sub-block number of a refusal; None for any other message.
 
-        A refusal has message id 0 (ICD 4.4) and the sub-block of ICD table 5.1. Both numbers are None in a refusal
+        A refusal has message id 0 (ICD section 4.4) and the sub-block of table 5.1. Both numbers are None in a refusal
         without a body, as first-generation devices send it.
         """
         if self.kind is not Kind.RESPONSE:
@@ -331,7 +333,8 @@ _INIT_NAMES = {bit: calibration.name for bit, calibration in INIT_BITS.items()}
 def list_failed_calibrations(event: Event, transmits: bool, run: int) -> list[str]:
     """Return the calibrations that failed in the RF init and that the board needs.
 
-    `run` is the mask of requested calibrations besides clock and synthesizers, which run at every start.
+    `run` is the mask, by the bits of `INIT_BITS`, of requested calibrations besides clock and synthesizers (bits 1 to
+    3), which run at every start.
     """
     passed = event.values.get("passed")
     if not isinstance(passed, int):
@@ -368,9 +371,9 @@ _RF_ERRORS = {1: "RF firmware assert", 2: "RF firmware abort", 3: "ESM group 1",
 _ANALOG = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted", 3: "PA LDO shorted"}
 # Bits 0..26 of 0x5001, 1 = passed
 _RF_TESTS = 0x07FFFFFF
-# Programmable filter, double bit error (ICD 216); its parity error is reserved there
+# Bits of group 1 that are fatal. RF core: the programmable filter's double bit error (ICD 216, which reserves the bit
+# of its parity error). Main core: "FRC lockstep" (ICD 320). The others are not in the list of fatal events.
 _RF_GROUP1_FATAL = 1 << 25
-# FRC lockstep (ICD 320)
 _MAIN_GROUP1_FATAL = 1 << 22
 
 # Boot status (ICD table 7.3), bit: meaning. The first group means an empty flash or a damaged image.
@@ -549,7 +552,7 @@ def _read_esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
 
 
 def _read_init_done(data: bytes) -> _Read:
-    """Read the event of the RF init: calibrations that passed, by bit of `INIT_BITS`, and the temperature."""
+    """Read the event of the RF init: calibrations that passed and were updated, by bit of `INIT_BITS`; temperature."""
     status, updated, temperature, _, stamp = struct.unpack_from("<IIhHI", data)
     failed = sum(1 << b for b in INIT_BITS if not status >> b & 1)
     values = {"passed": status, "updated": updated, "temperature_c": temperature, "device_ms": stamp}
@@ -560,7 +563,7 @@ def _read_init_done(data: bytes) -> _Read:
 
 
 def _read_analog(data: bytes) -> _Read:
-    """Read the supplies that failed."""
+    """Read the supplies that failed; fatal unless the event's type is 0."""
     kind, _, _, signals = struct.unpack_from("<BBHI", data)
     return _name_bits(_ANALOG, signals) or "no signal reported", bool(kind), {"signals": signals}
 
@@ -602,7 +605,7 @@ def _read_rf_power_up(data: bytes) -> _Read:
 
 
 def _read_rf_error(data: bytes) -> _Read:
-    """Read the main core's report of an RF core in trouble."""
+    """Read the main core's report of an RF core in trouble; asserts, aborts and ESM group 2 are fatal."""
     (flag,) = struct.unpack_from("<I", data)
     return _format_word(_RF_ERRORS, flag), flag in (1, 2, 4), {"flag": flag}
 

@@ -112,8 +112,9 @@ def figure_label(name: str, number: str) -> str:
 def assign_colours(scan: ProcessedScan) -> dict[str, str]:
     """Return the colour of each material in the results or the truth, the same in all figures."""
     names = {patch.name for patch in scan.segments if patch.name} | {plate.name for plate in scan.plates}
-    for pixels, _ in scan.pixel_names.values():
-        names |= set(np.unique(pixels).tolist())
+    # Names of pixels, and their distances.
+    for names_of_pixels, _ in scan.pixel_names.values():
+        names |= set(np.unique(names_of_pixels).tolist())
     names.discard("unknown")
     table = {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(sorted(names))}
     return {**table, "unknown": UNKNOWN_COLOUR}

@@ -57,8 +57,8 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     Parameters
     ----------
     rows
-        Echoes by row index, complex64 [rx, position] in the order of the scan: synchronised rows through
-        `object_filter` (:meth:`SyncedRow.through`). Rows without both neighbours are left out.
+        Echoes by row index, complex64 [rx, position] in the order of recording (odd rows with falling x): synchronised
+        rows through `object_filter` (:meth:`SyncedRow.through`). Rows without both neighbours are left out.
     rig
         Rig of the scan.
 

@@ -3,10 +3,13 @@
 `synchronise_row` processes raw chirps; `RowSynchroniser` reads every row of a source, and converts cubes that another
 program has synchronised.
 
-Residuals are frequency, phase and amplitude errors after each stage (paper, Fig. 15). They are measured on the scan
-itself, for any scene: an error is half the difference between two measurements with independent noise. For an aligned
-chirp and for the direct path these are two halves of the RX, for the object two averages of every other chirp. As
-received, and for the amplitude of an aligned chirp, an error is the deviation from the mean.
+Residuals are frequency, phase and amplitude errors after each stage (Fig. 15 of the POLySIGHT paper). They are measured
+on the scan itself, for any scene: an error is half the difference between two measurements with independent noise. For
+an aligned chirp and for the direct path these are two halves of the RX, for the object two averages of every other
+chirp. As received, and for the amplitude of an aligned chirp, an error is the deviation from the mean.
+
+Aligned chirps are decimated: `FOLD` (4) samples become a *block*. Words are a card's int16; their axis of length 2 is
+(I, Q).
 
 Cubes: our convention is that an echo of excess path d is `a exp(+j 2 pi f d / c)`, and the direct path is constant. The
 conventions of a cube are unknown, but the geometry determines where direct path and object must lie. From that
@@ -132,7 +135,8 @@ class SyncedRow:
     chirps
         int [position]: chirps in each average.
     direct_hz, direct_amplitude
-        float64 [position]: IF and amplitude (ADC counts) of the direct path; of cubes 0 and in their units.
+        float64 [position]: IF and amplitude (ADC counts) of the direct path. Of cubes in their units: of one that came
+        referenced the IF is 0, of one without its direct path the amplitude is what :func:`detect_form` made up.
     noise
         float64 [position]: noise power of a sample of one channel of one chirp (ADC counts squared), NaN with fewer
         than two good chirps; None: unknown.
@@ -167,7 +171,10 @@ class SyncedRow:
         return {name: _spread(values) for name, values in self.errors.items() if values.size}
 
     def through(self, weights: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Return the echo of the row through :func:`object_filter`, complex64 [rx, position], in order of recording."""
+        """Return the echo of the row, complex64 [rx, position], in order of recording.
+
+        `weights` [sample] are those of :func:`polysight.sync.backlash.object_filter`.
+        """
         return (self.samples @ weights) * self.valid
 
 
@@ -194,7 +201,10 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
 
 
 def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bool_], setup: BoardSetup) -> SyncedRow:
-    """Synchronise a row given in pieces of whole bursts, as :func:`synchronise_row`; pieces may share memory."""
+    """Synchronise a row given in pieces of whole bursts, int16 words as of :func:`synchronise_row`.
+
+    A piece is not used any more when the next one is asked for, so that pieces may share memory.
+    """
     if valid.size % setup.pulses:
         raise _mismatch_error(valid.size, setup.path.steering.shape, setup)
     received = valid.reshape(-1, setup.pulses)
@@ -273,7 +283,7 @@ class RowSynchroniser:
     """
 
     def __init__(self, source: Source, rig: Instrument, filters: Mapping[str, hpf.HighPass | None]) -> None:
-        # Loaded now, with its warning, and not by the first of several threads.
+        # Compiled loops: loaded now, with the warning if there are none, and not by the first of several threads.
         loops.library()
         self._source = source
         self.setups = {b.name: BoardSetup.from_rig(rig, b, model=filters.get(b.name)) for b in rig.receivers}
@@ -288,15 +298,16 @@ class RowSynchroniser:
         if isinstance(recorded, CubeRow):
             synced = self._form(board).convert_row(recorded.cube, rig.burst.chirps_a_position)
             return synced, int(synced.valid.sum())
+        # Chirps count as frames here, in `frames_expected` too.
         valid = valid_frames(recorded.missing, recorded.frames_expected, rig.frame_bytes // rig.burst.chirps)
         return synchronise_pieces(self._words(recorded), valid, self.setups[board]), int(valid.sum())
 
     def _words(self, recorded: RowData) -> Iterator[NDArray[np.int16]]:
-        """Iterate over the words of a row, [frame, sample, 2, rx], some positions at a time."""
+        """Iterate over the words of a row, [chirp, sample, 2, rx], some positions at a time."""
         rig = self._source.instrument
-        frame = rig.frame_bytes // rig.burst.chirps
-        for piece in recorded.pieces(_POSITIONS * rig.burst.chirps_a_position * frame):
-            yield row_words(piece, (), piece.size // frame, rig.chirp.samples)[0]
+        chirp_bytes = rig.frame_bytes // rig.burst.chirps
+        for piece in recorded.pieces(_POSITIONS * rig.burst.chirps_a_position * chirp_bytes):
+            yield row_words(piece, (), piece.size // chirp_bytes, rig.chirp.samples)[0]
 
     @property
     def direct_path_known(self) -> bool:
@@ -338,7 +349,8 @@ def errors(
     amplitude = referenced.amplitude[examined, None]
     relative_amplitude = aligned.amplitude[examined]
 
-    # As received: offsets of the chirps, with those of their positions added, from their mean.
+    # As received: offsets of the chirps, with those of their positions added, from their mean. Amplitudes are without
+    # the gain that compensated the receiver's filter.
     frequency = (referenced.frequency[examined, None] + aligned.frequency[examined])[good]
     phase = (np.angle(amplitude) + aligned.phase[examined])[good]
     size = (np.abs(amplitude) * relative_amplitude / aligned.gain[examined])[good]
@@ -395,7 +407,10 @@ def _estimate_direct_path_errors(mean: NDArray[np.complex64], path: DirectPath) 
 
 
 def _estimate(signal: NDArray[np.complex64], estimator: NDArray[np.complex128]) -> tuple[Complex, Real]:
-    """Return amplitude and frequency (radians per sample) [...] of the direct path in signals [..., rx, block]."""
+    """Return amplitude and frequency (radians per sample) [...] of the direct path in signals [..., rx, block].
+
+    The rows of `estimator` [2, rx * block] give the amplitude A and A times the frequency.
+    """
     estimate = signal.reshape(*signal.shape[:-2], -1) @ estimator.T.astype(np.complex64)
     return estimate[..., 0].astype(complex), np.real(estimate[..., 1] / estimate[..., 0])
 
@@ -411,7 +426,8 @@ def _estimate_object_errors(halves: NDArray[np.complex64], path: DirectPath) -> 
     product = (echo[:, 0] * echo[:, 1].conj()).sum(axis=1)
     edges = block_edges(n)
     tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
-    # Amplitudes relative to the mean of both halves.
+    # Amplitude of each half: its projection on the sum of both, in which its own energy and the product with the other
+    # half add up.
     energy = signal_energy(echo.reshape(-1, rx, n)).reshape(-1, 2)
     mean_product = product.sum(axis=1)
     size = np.abs(energy + np.array([mean_product, mean_product.conj()]).T)
@@ -552,6 +568,8 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
             path = direct_path
             form.append("not referenced to a direct path; referenced here")
         else:
+            # Any level would do, as amplitudes relative to the direct path mean nothing then. Chosen: the cube's rms
+            # for the first RX, less for those farther away.
             level = np.sqrt(np.mean(np.abs(cube) ** 2))
             constant = level * direct_m[0] / direct_m
             form.append("the direct path was removed; equal RX are assumed")
@@ -651,12 +669,14 @@ def _reference_cube(
         coherence=zeros + 1,
         clipped=~first_chirp,
     )
-    # A signal that is mixed down already has an IF of zero: any IF is within the band.
+    # A signal that is mixed down already has an IF of about zero (within 0.4 cycles per sample, chosen), of either
+    # sign: it is searched for in the band of complex 2x.
     near_zero = bool(abs(np.median(centre)) < 0.4)
     if near_zero:
         done = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x"))
     else:
         done = reference(aligned, path, chirp)
+    # `reference` found how the IF drifts along a chirp: a phase that grows with the square of time, removed here too.
     time = np.arange(samples) - middle
     steering = path.steering * np.exp(-0.5j * done.drift * time**2)
     residual_cycles = (done.frequency - centre + 0.5) % 1.0 - 0.5

@@ -2,9 +2,9 @@
 
 Pixels are drawn with the errors of `patches.py`. `pixel_bound` is the share that no classifier can pass.
 
-A task is the name of a group of materials, with ", two angles" after it if each pixel is seen under both. "By pixel" a
-pixel may be judged by others of its own patch, which is optimistic; with scans left out it is not. `quick` draws less,
-for a first look.
+A task is the name of a group of materials, with ", two angles" after it if each pixel is seen under both. H and V are
+the pixels in both polarisations relative to metal, P is H / V; "H+V+P" uses all three. "By pixel" a pixel may be judged
+by others of its own patch, which is optimistic; with scans left out it is not. `quick` draws less, for a first look.
 """
 
 from __future__ import annotations
@@ -42,12 +42,21 @@ from polysight_papers.sensys2026.item import (
     published_values,
     style_axes,
 )
-from polysight_papers.sensys2026.patches import Errors, calibrated_errors, count_draws, draw, groups, spread_table
+from polysight_papers.sensys2026.patches import (
+    PIXELS,
+    SCANS,
+    Errors,
+    calibrated_errors,
+    count_draws,
+    draw,
+    groups,
+    spread_table,
+)
 
 # The second angle of the task of two angles, in the paper.
 SECOND_ANGLE_DEG = 55.0
-RESULT = 20
-"""Seed of the draw that is judged."""
+RESULT_SEED = 20
+"""Seed of the draw that is judged (chosen)."""
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
 OTHER_DRAWS = tuple(range(21, 29))
 """Seeds of further draws, for the random spread of one draw."""
@@ -66,6 +75,7 @@ def task_samples(task: str, seed: int, quick: bool) -> Samples:
     samples = draw(group.materials, group.angle_deg, errors, seed).samples()
     if not two:
         return samples
+    # `draw` seeds errors by the angle too: those of both angles are independent, as `pixel_bound` assumes.
     return samples.join(draw(group.materials, SECOND_ANGLE_DEG, errors, seed).samples())
 
 
@@ -75,7 +85,7 @@ def score_simulated(task: str, model: str, channels: str, by_pixel: bool, quick:
 
     `model`: key of the host's models; `channels`: such as "H+V+P"; `by_pixel`: split by pixel, not by scan.
     """
-    return score(task_samples(task, RESULT, quick), model, channels, by_pixel)
+    return score(task_samples(task, RESULT_SEED, quick), model, channels, by_pixel)
 
 
 def noise_text(tasks: Iterable[str], quick: bool) -> str:
@@ -84,8 +94,8 @@ def noise_text(tasks: Iterable[str], quick: bool) -> str:
     printed = ", ".join(f"{100 * calibrated_errors(n, count_draws(quick)).amplitude:.2f} % ({n})" for n in names)
     phase_std_rad = published_values()["phase_std_rad"]
     return (
-        f"Amplitude errors set on H alone: {printed}; phase error {phase_std_rad:g} rad. A scan is one"
-        " placement of all materials with its own metal reference; eight scans, 12 pixels a patch."
+        f"Amplitude errors, set so that H alone scores as published: {printed}; phase error {phase_std_rad:g} rad. A"
+        f" scan is one placement of all materials with its own metal reference; {SCANS} scans, {PIXELS} pixels a patch."
     )
 
 
@@ -97,7 +107,7 @@ def _parse_angles(task: str) -> tuple[float, ...]:
     return (groups()[name].angle_deg,)
 
 
-def chance(quick: bool) -> Table:
+def accuracy_over_draws(quick: bool) -> Table:
     """Return the discriminant's accuracy over further draws of the same noise, beside the Bayes limit."""
     seeds = OTHER_DRAWS
     if quick:
@@ -110,7 +120,7 @@ def chance(quick: bool) -> Table:
         # In the order of the kinds below.
         limits = [
             pixel_bound(groups()[name].materials, _parse_angles(task), errors, reference, pixels)
-            for reference, pixels in ((True, 1), (False, 1), (False, 12))
+            for reference, pixels in ((True, 1), (False, 1), (False, PIXELS))
         ]
         cells = []
         for share, limit in zip(("pixels", "in_scan", "by_patch"), limits, strict=True):
@@ -134,15 +144,16 @@ def unknowns(quick: bool) -> Table:
         tasks = TASKS[:1]
     rows = []
     for task in tasks:
-        drawn = task_samples(task, RESULT, quick)
-        missed = score_unseen_materials(drawn, DISCRIMINANT)
-        never = [n for n, share in missed.items() if share < 0.5]
+        drawn = task_samples(task, RESULT_SEED, quick)
+        # For each material left out of training: the share of its patches that is rightly called unknown.
+        called_unknown = score_unseen_materials(drawn, DISCRIMINANT)
+        mistaken = [n for n, share in called_unknown.items() if share < 0.5]
         rows.append(
             (
-                f"{len(missed)} {task}",
+                f"{len(called_unknown)} {task}",
                 percent(score_simulated(task, DISCRIMINANT, "H+V+P", False, quick).unknown),
-                percent(float(np.mean(list(missed.values())))),
-                ", ".join(never) or "–",
+                percent(float(np.mean(list(called_unknown.values())))),
+                ", ".join(mistaken) or "–",
             )
         )
     head = ("Task", "known, called unknown", "never learnt, called unknown", "taken for another more often than not")
@@ -260,7 +271,7 @@ def fig18(run: Run) -> Item:
         ),
         (
             Table("Share of pixels named right, mean over materials", head, tuple(s.row() for s in scores)),
-            chance(run.quick),
+            accuracy_over_draws(run.quick),
             spread_table(run.quick),
             unknowns(run.quick),
         ),
@@ -333,6 +344,7 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
         size = 7.5
         letters_a_line = 60
         axes[3].set_axis_off()
+        # There is room for two panels' confusions; those of the first, H alone, are not listed (chosen).
         axes[3].text(0.02, 0.98, _list_confusions(panels[1:]), va="top", fontsize=9, color=INK, linespacing=1.5)
     else:
         fig = new_figure(11.5, 4.5)
@@ -389,7 +401,7 @@ def _list_confusions(panels: Sequence[Panel]) -> str:
 
 @cache
 def pixel_bound(
-    materials: tuple[Published, ...], angles_deg: Sequence[float], errors: Errors, reference: bool, pixels: int
+    materials: tuple[Published, ...], angles_deg: tuple[float, ...], errors: Errors, reference: bool, pixels: int
 ) -> float:
     """Return the share of pixels that Bayes' rule names right, knowing all means and the sizes of errors.
 
@@ -406,10 +418,12 @@ def pixel_bound(
         Pixels a decision is taken from: their own errors average out, those of the patch do not.
     """
     eps = np.array([m.permittivity for m in materials])
+    # In units of a pixel's variance: the part common to its patch, the reference's, which is as large, and its own.
     variance = errors.shared * (2 if reference else 1) + (1 - errors.shared) / pixels
     columns = []
     std = []
     for angle in angles_deg:
+        # H is s, V is p; metal reflects -1 in both, which changes neither magnitudes nor their ratio.
         r_s, r_p = fresnel(eps, np.radians(angle))
         p = r_s / r_p
         columns += [np.log(np.abs(r_s)), np.log(np.abs(r_p)), p / np.abs(p)]

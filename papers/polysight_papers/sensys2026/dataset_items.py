@@ -2,7 +2,8 @@
 
 Two ways to keep training and test apart: whole scans left out, which judges materials that at least two scans hold; and
 by pixel, which is optimistic, because pixels of one patch know each other. Table 2 is made by three recipes, the
-authors' among them. The page and the terminal's tables are made here.
+authors' among them; the paper's Eq. 3 gives the permittivity from the ratio of H to V, relative to metal, and the angle
+of incidence. The page and the terminal's tables are made here.
 
 A source is `materials/`, `labels/` or the images made here; a task is the name of a group of materials, with
 ", two angles" after it for two incidence angles.
@@ -58,8 +59,8 @@ SECOND_ANGLE_DEG = 55.0
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
 ALL = 1500
 AT_LEAST = 6
-"""Pixels of a task: each patch gives its share of them, or AT_LEAST if that is more, as far as it has so many. Chosen:
-all pixels are compared with all."""
+"""About ALL pixels of a task are judged, equally many of each patch but not fewer than AT_LEAST, if it has them.
+Chosen: all pixels are compared with all, so that the time grows with the square of ALL."""
 LEFT_OUT = "scans left out"
 OPTIMISTIC = "by pixel (optimistic)"
 
@@ -81,6 +82,7 @@ def task_samples(data: AuthorsData, source: str, task: str) -> Samples | None:
     shared = {(e.name, e.scan) for e in first.entries} & {(e.name, e.scan) for e in second.entries}
     if len({name for name, _ in shared}) < 2:
         return None
+    # Patches of a material in a pair of scans are paired in their order, their pixels at random; the rest is left out.
     return _samples(first).join(_samples(second))
 
 
@@ -107,7 +109,8 @@ def pair_scans(first: Library, second: Library) -> tuple[Library, Library]:
             names[0][s] = names[1][t] = f"{s} and {t}"
 
     def rename_scans(library: Library, to: dict[str, str]) -> Library:
-        return Library(tuple(replace(e, scan=to[e.scan]) for e in library.entries if e.scan in to), {}, library.note)
+        entries = tuple(replace(e, scan=to[e.scan]) for e in library.entries if e.scan in to)
+        return Library(entries, note=library.note)
 
     return rename_scans(first, names[0]), rename_scans(second, names[1])
 
@@ -128,7 +131,7 @@ def _split_one_scan(samples: Samples) -> Samples:
     """Return pixels of one scan as if of two, every other pixel each; those of several scans as they are.
 
     Only for the split by pixel, which lets a patch know itself in any case.
-    The halves of a patch are two patches, because weights are fitted to a few pixels of each patch.
+    The halves of a patch are two patches: weights are fitted to a few pixels of each patch, among which both must be.
     """
     if np.unique(samples.groups).size > 1:
         return samples
@@ -220,37 +223,39 @@ def authors_fig18(judge: Judgements) -> Item:
         if not two_angles:
             published_h = printed[name]["h_percent"] / 100
         several = select_repeated(samples)
-        scores = [s for m in (PAPER, DISCRIMINANT) for s in judge.score(source, task, m)]
-        h_only = judge.score(source, task, PAPER, "H")
-        names = np.unique(samples.names)
-        material_count = 0
-        if several is not None:
+        knn_mixed, knn_apart = judge.score(source, task, PAPER)
+        best_mixed, best_apart = judge.score(source, task, DISCRIMINANT)
+        h_mixed, h_apart = judge.score(source, task, PAPER, "H")
+        scores = (knn_mixed, knn_apart, best_mixed, best_apart)
+        if several is None:
+            split = OPTIMISTIC
+            material_count = 0
+            h = h_mixed
+            best = best_mixed
+        else:
+            split = LEFT_OUT
             material_count = np.unique(several.names).size
+            h = h_apart
+            best = best_apart
         rows.append(
             (
-                f"{names.size} {task}",
+                f"{np.unique(samples.names).size} {task}",
                 source,
                 str(np.unique(samples.groups).size),
                 percent(published_h),
-                *(_share(s) for s in h_only),
+                *(_share(s) for s in (h_mixed, h_apart)),
                 percent(paper),
                 *(_share(s) for s in scores),
-                "–" if scores[3] is None else percent(scores[3].patches),
+                # Of patches; the figure's third panel counts their pixels.
+                "–" if best_apart is None else percent(best_apart.patches),
                 str(material_count),
             )
         )
         content[f"{task}, {source}"] = {
             "published_percent": 100 * paper,
-            "scores": [None if s is None else asdict(s) for s in (*scores, *h_only)],
+            "scores": [None if s is None else asdict(s) for s in (*scores, h_mixed, h_apart)],
             "judged_with_scans_left_out": material_count,
         }
-        split = LEFT_OUT if several is not None else OPTIMISTIC
-        if several is None:
-            h = h_only[0]
-            best = scores[2]
-        else:
-            h = h_only[1]
-            best = scores[3]
         if h is None or best is None:
             continue
         key = f"{task}-{source}".replace(", ", "-").replace(" ", "-").replace("/", "")
@@ -383,7 +388,8 @@ MAKERS: dict[str, Callable[[Judgements], Item]] = {
     "fig20": authors_fig20,
     "fig21": lambda judge: authors_fig21(judge.data),
 }
-# Corrections of the authors before Eq. 3: leakage, a factor on |P| relative to metal, percentiles of |P| to keep.
+# Corrections of the authors before Eq. 3: leakage (`a` in `without_leakage`), a factor on |P| relative to metal,
+# percentiles of |P| to keep.
 AXIAL_RATIO = 0.05
 METAL_FACTOR = 1 / 0.8
 PERCENTILES = (30, 70)
@@ -477,13 +483,13 @@ def describe_origin(data: AuthorsData) -> Origin:
 
 def format_table(table: Table) -> str:
     """Format a table for the terminal: columns as wide as their cells, long heads over several lines."""
-    # Heads may be 9 letters wide in any column; their lines stand at the bottom of the head.
+    # Heads may be 9 letters wide in any column (chosen); empty lines above a short head put it beside the last lines.
     limit = [max([9, *(len(row[k]) for row in table.rows)]) for k in range(len(table.head))]
     heads = [_wrap(head, width) for head, width in zip(table.head, limit, strict=True)]
     width = [max([n, *map(len, lines)]) for n, lines in zip(limit, heads, strict=True)]
     tall = max(map(len, heads))
-    lines = [[h[k - tall + len(h)] if k >= tall - len(h) else "" for h in heads] for k in range(tall)]
-    rows = [*lines, ["-" * n for n in width], *table.rows]
+    padded_heads = [[""] * (tall - len(lines)) + lines for lines in heads]
+    rows = [*zip(*padded_heads, strict=True), ["-" * n for n in width], *table.rows]
 
     def line(cells: Sequence[str]) -> str:
         first, *rest = zip(cells, width, strict=True)
@@ -529,6 +535,7 @@ def _collect_pixels(data: AuthorsData, source: str, m: Published) -> tuple[Compl
             return None
         entries = list(data.select(source, range(m.number, m.number + 1), other_angles[0]).entries)
     p = np.concatenate([e.p for e in entries]).astype(np.complex128)
+    # They lie within `dataset.SAME_ANGLE_DEG` of the selected one.
     angle = float(np.mean([e.incidence_deg for e in entries]))
     return p[np.isfinite(p) & (p != 0)], angle, len({e.scan for e in entries})
 
@@ -559,6 +566,7 @@ def authors_table2(data: AuthorsData) -> Item:
     DataError
         when no material of the table is in the data.
     """
+    # Mean of the real parts: the authors' is real, and one for both channels.
     leakage = float(np.mean([data.base.polarimetry.leakage_h[0], data.base.polarimetry.leakage_v[0]]))
     estimates = {
         source: _estimate_materials(data, source, 0.0 if source == IMAGES else leakage) for source in data.sources
@@ -589,13 +597,7 @@ def authors_table2(data: AuthorsData) -> Item:
                 _draw_figure(estimates), "From the files against published; the dotted line is equality."
             )
         },
-        {
-            "materials": [
-                _convert_to_json(source, e)
-                for source, estimates_of_source in estimates.items()
-                for e in estimates_of_source
-            ]
-        },
+        {"materials": [_convert_to_json(source, e) for source, in_source in estimates.items() for e in in_source]},
     )
 
 
@@ -607,6 +609,7 @@ def _estimate_materials(data: AuthorsData, source: str, leakage: float) -> list[
         if pixels is None or not pixels[0].size:
             continue
         p, angle, scans = pixels
+        # Only H / V is known: it stands for H, with V = 1.
         ones = np.ones(p.size, np.complex128)
         theta = np.radians(angle)
         as_is = estimate_permittivity(p, ones, theta)
@@ -619,6 +622,7 @@ def _estimate_materials(data: AuthorsData, source: str, leakage: float) -> list[
                 pixels=p.size,
                 as_is=as_is,
                 clean=clean,
+                # The recipe removes its own leakage, even from ratios that have none any more.
                 recipe=authors_recipe(p, angle),
             )
         )
@@ -683,6 +687,7 @@ def _draw_figure(estimates: Mapping[str, Sequence[Estimate]]) -> Figure:
         true = [e.material.permittivity for e in drawn]
         values = [e.clean.value or 0j for e in drawn]
         std = [e.clean.real_std or 0.0 for e in drawn]
+        # Real part and loss have the same standard error (`estimate_permittivity`).
         axes[0].errorbar([t.real for t in true], [v.real for v in values], yerr=std, **bars)
         axes[1].errorbar([-t.imag for t in true], [-v.imag for v in values], yerr=std, **bars)
     for ax, part in zip(axes, ("real part ε′", "loss ε″"), strict=True):

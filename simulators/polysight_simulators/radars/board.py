@@ -29,7 +29,8 @@ from polysight_simulators.radars.cores import (
     ones_sum,
 )
 
-# Value of the sense-on-power pins: functional mode.
+# Value of the three sense-on-power pins for functional mode: of the bits, in the order of the USB chip's pins
+# (`control.py`), only the last is set.
 FUNCTIONAL = 4
 # Delays of an answer, and of its data after the interrupt. Chosen: real timing is not known.
 ANSWER_S = 1e-4
@@ -58,11 +59,11 @@ class RadarBoard:
     now
         Clock, seconds.
     flash
-        Content of the serial flash; empty in a new board. It boots from `make_image()`.
+        Content of the serial flash; empty in a new board. An image that it boots from is made by `cores.make_image`.
     dead_s
         Minimum time from a frame's pulse to the next; default: the frame period.
     fault_pulses
-        Pulses since the start, from 0, at which the RF core faults.
+        Numbers, from 0, of the pulses at which the RF core faults; all pulses since the board was made are counted.
     die
         Part of the die id, which identifies the board.
     supply_v
@@ -137,7 +138,7 @@ class RadarBoard:
         return self.cores.destroyed
 
     def _forget(self) -> None:
-        """Reset: drop messages, pulses and the state of the cores; the flash stays."""
+        """Reset: drop messages, the last pulse's time and the state of the cores; the flash stays."""
         self._in = bytearray()
         self._out = bytearray()
         # Messages not read by the host yet
@@ -196,8 +197,9 @@ class RadarBoard:
     def trigger(self, pulse_s: float | None = None) -> bool:
         """Give a rising edge on SYNC_IN, now or at a time of the pulses' clock; return True if it starts a frame.
 
-        An edge that comes too early causes a fault, after which pulses are ignored. A time that jumps back further is
-        taken for another clock.
+        An edge sooner after the last frame's than a frame may follow causes a fault, after which pulses are ignored. A
+        time that lies farther back than that before the last frame's is taken for one of another clock, and is no
+        fault.
         """
         self._pulses_seen += 1
         if not self.ready_for_triggers:
@@ -211,6 +213,7 @@ class RadarBoard:
         too_soon = abs(time_s - self._pulse_s) < (period if self._dead_s is None else self._dead_s) - 1e-9
         if too_soon or self._pulses_seen - 1 in self._fault_pulses:
             cores.armed = False
+            # Type (firmware error), code (not triggered by a pulse), line of the firmware (made up), reserved bytes.
             self._send_event(RF_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), 0.0)
             return False
         self._pulse_s = time_s
@@ -225,7 +228,8 @@ class RadarBoard:
         """Send an event now."""
         self._send_event(number, data, 0.0)
 
-    # words
+    # words: a message is a sync word (4 bytes), a header (12: opcode, length without the sync word, flags, remaining
+    # messages, number of sub-blocks, checksum), sub-blocks (number, length with these 4 bytes, data) and a CRC
 
     def write_word(self, word: int) -> None:
         """Receive a word from the host. Raises DeviceError if unplugged."""
@@ -288,6 +292,8 @@ class RadarBoard:
         else:
             wide = not self.cores.first_generation
         block = struct.pack("<HH", number, len(data) + 4) + data
+        # Directions (ICD table 2.2): 6 from the main core to the host, 2 from the RF core. A sub-block's number is that
+        # of its message times 32, and its own.
         self._send(
             frame(
                 direction=6 if main else 2, kind=EVENT, number=number // 32, body=block, count=1, sequence=0, wide=wide
@@ -303,6 +309,7 @@ class RadarBoard:
             fault = self._faults.popleft()
         if fault is Fault.NO_ANSWER or self.destroyed or not self.powered or self.now() < self._busy_until:
             return
+        # The direction of the answer is the command's plus 1; the message's number lies above direction and kind.
         direction = (opcode & 15) + 1
         number = opcode >> 6
         sequence = flags >> 12
@@ -326,6 +333,7 @@ class RadarBoard:
             block, size = struct.unpack_from("<HH", body)
             refused = fault in (Fault.REFUSE, Fault.REFUSE_BARE)
             if refused:
+                # "Error while processing the command".
                 error = 6
                 data = b""
                 extra = 0.0
@@ -362,6 +370,7 @@ class RadarBoard:
     def _answer(self, answer: bytes, fault: Fault | None, delay_s: float) -> None:
         """Send an answer after a delay, damaged by the fault."""
         if fault is Fault.EVENT_BETWEEN:
+            # The report of a run-time calibration: harmless.
             self._send_event(0x1012, bytes(20), 0.0)
         elif fault is Fault.BAD_CRC:
             answer = answer[:-1] + bytes((answer[-1] ^ 1,))

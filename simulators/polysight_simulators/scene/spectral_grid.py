@@ -74,16 +74,19 @@ class Axis:
         return int(np.ceil((self.high_u - self.low_u) / self.step * OVERSAMPLING)) + TAPS + 1
 
 
-# About 24 arrays of these points are in memory: 1.6 GB in all. A scene as wide as the stage (0.8 x 0.5 m) has 0.6e6.
+# Chosen: about 24 arrays of these points are in memory, of 8 or 16 bytes each: 0.8 to 1.6 GB. A scene as wide as the
+# stage (0.8 x 0.5 m) has 0.6e6.
 MAX_KERNEL_POINTS = 4_000_000
 
 
 def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -> tuple[Axis, Axis]:
     """Return extent and pitch in x and y from the extent of the scene and the steepest phase of the kernel.
 
-    `top_hz` is the highest frequency. A tilt moves the specular point of a plate (26 mm per degree), but the kernel
-    already extends from every offset to the edges of every plate. Raises ConfigError if that is too much memory.
+    `top_hz` is the highest frequency. A tilt moves the specular point of a plate (26 mm per degree at half a metre and
+    55 degrees of incidence), but the kernel already extends from every offset to the edges of every plate. Raises
+    ConfigError if that is too much memory.
     """
+    # The last pulse of a burst is sent about twice the mean travel behind the trigger.
     travel = 2 * mean_burst_travel_mm(rig.burst, rig.stage) + abs(scene.disturbances.backlash_mm)
     # Centre and half size of each object, mm.
     edges = [(*p.centre_mm, p.size_mm[0] / 2, p.size_mm[1] / 2) for p in scene.plates]

@@ -49,6 +49,7 @@ def test_unknown_corners_are_recovered(scans, filter_run):
         errors = np.array(board.standard_error_khz)
         np.testing.assert_allclose(corners, TRUE_KHZ, rtol=0.15)
         assert np.all(np.abs(corners - TRUE_KHZ) < 6 * errors)
+        assert np.all(errors < 0.1 * np.array(TRUE_KHZ))
         assert board.programmed_khz == [175.0, 350.0]
         assert board.residual_db < 0.5
     assert (file.simulated, len(file.sources)) == (True, len(scans))

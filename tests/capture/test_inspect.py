@@ -11,6 +11,7 @@ import sys
 import dpkt
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from tests.support.capture.recordings import CARD, OTHER, row, write_pcap
 from tests.support.capture.records import encode_packets
 from tests.support.paths import REAL_CAPTURES, RIG_FILE
@@ -21,7 +22,7 @@ from tests.support.scenes import small_scene
 from polysight.capture import recognise_format
 from polysight.capture.dca1000 import Status
 from polysight.capture.inspect import Layout, inspect_bin, inspect_pcap, is_pcap, read_pcap
-from polysight.jobs.recordings import format_report, inspect_file
+from polysight.jobs.recordings import format_report, inspect_file, plot_profile
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -86,6 +87,17 @@ def test_a_fault_is_the_only_remark(tmp_path, fault):
     r = inspect_bin(tmp_path / "x.bin")
     assert [fault in remark for remark in r.remarks] == [True]
     assert (r.clipped > 0) is (fault == "full scale")
+
+
+@pytest.mark.parametrize("dead", [0, 3])
+def test_the_legend_of_the_range_profile_says_which_antenna_has_no_signal(tmp_path, monkeypatch, dead):
+    row(4, False, dead=dead).tofile(tmp_path / "x.bin")
+    legends = []
+    monkeypatch.setattr(
+        Figure, "savefig", lambda f, *_, **__: legends.append([t.get_text() for t in f.axes[0].get_legend().texts])
+    )
+    plot_profile(inspect_bin(tmp_path / "x.bin"), tmp_path / "x.png")
+    assert legends == [[f"RX{i}" + " (no signal)" * (i == dead) for i in range(4)] + ["mean"]]
 
 
 def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):

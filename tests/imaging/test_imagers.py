@@ -9,7 +9,7 @@ from polysight.imaging import image_grid
 from polysight.imaging.direct import DirectImager
 from polysight.imaging.geometry import Antennas, Aperture, find_irregularity, scan_offsets_m
 from polysight.imaging.samples import choose_imager, reduction, scene_gate_m
-from polysight.imaging.spectral import IncrementalImager, SpectralImager, forget
+from polysight.imaging.spectral import KEEP_BYTES, IncrementalImager, SpectralImager, forget, get_cached
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
@@ -142,6 +142,38 @@ def test_another_geometry_gets_other_kernels(aperture):
         spectral = SpectralImager(geometry).image(samples)
         direct = DirectImager(geometry).image(samples)
         assert np.abs(spectral - direct).max() < 3e-5 * np.abs(direct).max()
+
+
+@pytest.fixture
+def made():
+    """Keys of a small cache whose arrays were made, in order, by `ask(key, share of the cache's size)`."""
+    keys = []
+
+    def ask(key, share):
+        # An array of the shape that fills this share, without its memory.
+        array = np.broadcast_to(np.complex64(0), (int(share * KEEP_BYTES / 8),))
+        return get_cached((key,), lambda: keys.append(key) or array)
+
+    forget()
+    yield ask, keys
+    forget()
+
+
+def test_kernels_are_kept_while_they_fit_and_the_least_recently_used_go_first(made):
+    ask, keys = made
+    for key in "abab":
+        ask(key, 0.4)
+    assert keys == ["a", "b"]
+    ask("c", 0.4)  # drops a
+    ask("b", 0.4)
+    ask("a", 0.4)
+    assert keys == ["a", "b", "c", "a"]
+
+
+def test_kernels_larger_than_the_cache_are_kept_alone(made):
+    ask, keys = made
+    assert ask("a", 1.5).size == ask("a", 1.5).size
+    assert keys == ["a"]
 
 
 def _jitter_x(offsets):

@@ -7,6 +7,7 @@ from tests.support.pipelines import make_pipeline
 
 from polysight.imaging import correct_tilt
 from polysight.imaging.images import Illumination
+from polysight.imaging.plane import find_plane
 from polysight.materials.segment import box_mask
 from polysight.polarimetry import ratio_from_permittivity
 from polysight_simulators.scene import decode_scene
@@ -22,6 +23,10 @@ def tilted_images(rig):
 
 
 def _images(rig, tilts, size=None):
+    return _pipeline(rig, tilts, size).form_images()
+
+
+def _pipeline(rig, tilts, size=None):
     plates = [
         {
             "name": "a",
@@ -34,7 +39,7 @@ def _images(rig, tilts, size=None):
     ]
     grid = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0} | (size or {})
     scene = {"name": "tilts", "object_distance_mm": 499.0, "grid": grid, "plates": plates}
-    return make_pipeline(Cubes(rig, decode_scene(scene, "tilts"))).form_images()
+    return make_pipeline(Cubes(rig, decode_scene(scene, "tilts")))
 
 
 def _insides(images):
@@ -75,6 +80,15 @@ def test_plates_at_the_ends_of_a_small_scan_do_not_seem_tilted(rig, grid):
     deg = np.degrees([images.illumination.rise(images.h, images.v, inside, plate) for inside, plate in pairs])
     assert np.abs(apparent_deg).max() > 0.25
     assert np.sqrt(np.mean(deg**2)) < 0.4 * np.sqrt(np.mean(apparent_deg**2))
+
+
+@pytest.mark.parametrize(("plates", "by_phase"), [(3, False), (4, True), (6, True)])
+def test_phases_of_four_plates_which_can_contradict_a_plane_decide_it(rig, plates, by_phase):
+    pipeline = _pipeline(rig, [(0.0, 0.0)] * 6, {"columns": 25, "rows": 25})
+    insides = _insides(pipeline.form_images())[:plates]
+    found = find_plane(pipeline.samples.filled, insides)
+    assert (found.plates, found.by_phase) == (plates, by_phase)
+    assert (found.offset_std_m < 1e-4) is by_phase
 
 
 def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(tilted_images):

@@ -339,6 +339,12 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, t
         assert get(view, "/api/scan?scan=one")["notes"] == "the operator's"
 
 
+@pytest.mark.parametrize("given", ["certificate", "key"])
+def test_a_certificate_without_its_key_is_refused_before_the_files_are_read(tmp_path, given):
+    with refused(ErrorCode.OTHER, "--certificate and --key"):
+        Place(**{given: tmp_path / "missing.pem"}).check()
+
+
 def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
     program = shutil.which("openssl")
     if program is None:

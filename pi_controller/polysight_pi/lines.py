@@ -45,7 +45,7 @@ SET_VALUES = 0xC010B40F
 _VALUES = struct.Struct("=QQ")
 # The module parameter of spidev: longest transfer, bytes.
 BUFSIZ = Path("/sys/module/spidev/parameters/bufsiz")
-# _IOW('k', 0, struct spi_ioc_transfer[1]), _IOW('k', 1, __u8): mode 0, without chip select where the driver supports it
+# _IOW('k', 0, struct spi_ioc_transfer[1]), _IOW('k', 1, __u8); mode 0, without chip select where the driver has that.
 MESSAGE = 0x40206B00
 WRITE_MODE = 0x40016B01
 MODE_NO_CS = 0x40

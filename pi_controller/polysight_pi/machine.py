@@ -25,8 +25,10 @@ from polysight_shared.faults import PiFault, StageError, explain
 from polysight_shared.raster import Row
 from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 
-# Time between two published statuses of a moving stage: about four a second are enough to draw it.
+# Time between two published statuses of a moving stage, of which about four a second are enough to draw it, and of one
+# at rest; chosen.
 STATUS_EVENT_S = 0.24
+REST_STATUS_EVENT_S = 1.0
 # Consecutive statuses at rest after which the stage's report of a motion's end counts as lost; chosen.
 RESTS = 3
 # Number of requests to repeat that report; a stage that was reset, and whose banner was lost, never answers them.
@@ -327,7 +329,7 @@ class Machine:
     def _publish_status(self, reply: Reply) -> None:
         """Publish a status of the stage, but not more often than a page needs it."""
         now_s = self._clock()
-        interval_s = STATUS_EVENT_S if self.state in MOVING else 1.0
+        interval_s = STATUS_EVENT_S if self.state in MOVING else REST_STATUS_EVENT_S
         if now_s - self._status_sent_s < interval_s:
             return
         self._status_sent_s = now_s

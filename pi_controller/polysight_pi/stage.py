@@ -67,6 +67,9 @@ CLEAR_RETRY_S = 0.05
 CALLER_LATE_S = 3.0
 # Largest position in the messages; a reply with a larger one was damaged.
 MAX_MM = 1e6
+# Timeout of writing a line, and of the answer to a status byte while nothing moves; both chosen.
+WRITE_TIMEOUT_S = 1.0
+POSITION_TIMEOUT_S = 1.0
 # Longest time for which `BenchStage` waits for the end of a motion: homing is the longest.
 MOTION_TIMEOUT_S = HOMING_TIMEOUT_S
 
@@ -199,8 +202,11 @@ class StageLink:
         self._commanded_s = time.monotonic()
         self._watch = StatusWatch(heartbeat_s, time.monotonic())
         try:
-            self._serial = serial.Serial(port, baud, timeout=self._watch.look_s, write_timeout=1.0, exclusive=True)
+            self._serial = serial.Serial(
+                port, baud, timeout=self._watch.look_s, write_timeout=WRITE_TIMEOUT_S, exclusive=True
+            )
             # Keep DTR up when the port is closed: its next rise would reset an UNO, which would lose its position.
+            # Element 2 of the settings has the control flags.
             settings = termios.tcgetattr(self._serial.fileno())
             settings[2] &= ~termios.HUPCL
             termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, settings)
@@ -355,7 +361,7 @@ class StageLink:
                 data = self._serial.read(1)
                 data += self._serial.read(self._serial.in_waiting)
             except (OSError, TypeError) as e:
-                # Pyserial raises TypeError when the port is closed under a read
+                # Pyserial raises TypeError when the port is closed under a read.
                 self._lose(f"reading failed: {e}")
                 return
             *lines, buffer = (buffer + data).split(b"\n")
@@ -614,7 +620,7 @@ class BenchStage:
         """Ask the stage for its position."""
         self._driver.link.send_byte(Immediate.STATUS)
         silent = StageLostError("the stage does not answer the status byte", "wrong firmware", "flash this release")
-        return self._wait(lambda reply: reply.kind == "status", 1.0, silent)
+        return self._wait(lambda reply: reply.kind == "status", POSITION_TIMEOUT_S, silent)
 
     def _finish(self, sequence: int) -> Position:
         """Wait for the end of the motion with this sequence number; return the position."""

@@ -575,7 +575,7 @@ class TriggerWatch:
             self._points = points
             self._statuses = 0
             return False
-        # The stage counts from 0 in each row
+        # The stage counts from 0 in each row.
         self._points = min(self._points, points)
         self._statuses += 1
         return self._statuses >= SILENT_STATUSES and points - max(edges, self._points) >= SILENT_POINTS

@@ -45,6 +45,8 @@ _JOG_HEARTBEAT_MS = 100
 _POLL_S = 0.05
 # Events that one reply brings from the Pi's journal at most (chosen).
 _REPLAY_LIMIT = 1000
+# Characters of a reason that are sent; chosen, a message may hold 4,000.
+_MAX_REASON = 500
 R = TypeVar("R", bound=m.AnyReply)
 
 
@@ -176,7 +178,8 @@ class PiClient:
     def end_run(self, scan_id: str, exit_status: m.ExitStatus, reason: str) -> None:
         """End the run. Raises RefusedError, DeviceError."""
         self._ask(
-            m.EndRun(scan_id=scan_id, exit_status=exit_status, reason=reason[:500], owner=self._owner), m.Accepted
+            m.EndRun(scan_id=scan_id, exit_status=exit_status, reason=reason[:_MAX_REASON], owner=self._owner),
+            m.Accepted,
         )
         self._stop_heartbeat()
 
@@ -259,7 +262,7 @@ class PiClient:
 
     def abort(self, reason: str) -> None:
         """Abort the row now; safe to repeat. Raises RefusedError, DeviceError."""
-        self._ask(m.Abort(reason=reason[:500], owner=self._owner), m.Accepted)
+        self._ask(m.Abort(reason=reason[:_MAX_REASON], owner=self._owner), m.Accepted)
 
     def come_to_rest(self, reason: str) -> None:
         """Abort the row and wait until the stage stands, which `end_run` needs; do nothing in another host's run.

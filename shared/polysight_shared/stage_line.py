@@ -142,9 +142,9 @@ class Reply(msgspec.Struct, frozen=True):
     * `banner`: boot; fields fw, proto
     * `ok`: command `sequence` accepted (motion) or executed (others); fields depend on the command
     * `error`: command refused with `number`; `sequence` is None if the line could not be read
-    * `done`: motion command `sequence` ended; a row has fields points, pulses, x, y
+    * `done`: motion command `sequence` ended; fields x, y, of a row also points, pulses, held, of homing lostx, losty
     * `alarm`: latched fault `number`
-    * `status`: answer to the STATUS byte; fields state, x, y, points, pulses, alarm, limits
+    * `status`: answer to the STATUS byte; fields state, x, y, points, pulses, alarm, limits, homed
 
     x and y are motor steps in stage coordinates. `asked_ns` and `written_ns` are not sent: the receiver notes that the
     reply was written between these times, on the clock of the trigger edges.

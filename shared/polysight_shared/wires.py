@@ -8,7 +8,8 @@ pulses, the radars listen. The protocol has ASCII lines:
     `L <line> [<line> ...]`                 client to hub: subscribe to changes of these lines
     `W`                                     client to hub: subscribe to M lines
     `J <line> <other>`                      client to hub: join two lines: changes of the first are the other's, too
-    `K`                                     hub to client: confirms L, W or J
+    `X <line> <1|0>`                        client to hub: cut a line, or repair it (tests only)
+    `K`                                     hub to client: confirms L, W, J or X
 
 Wire time is the simulated stage's clock, which may be faster than the wall clock. Reactions to an edge are scheduled
 relative to the edge's time, so that the intervals of a simulated scan are exact on a busy machine.

@@ -14,7 +14,7 @@ from pathlib import Path
 from polysight_shared.errors import DeviceError
 
 SKETCH_DIR = Path(__file__).resolve().parents[2] / "arduino_stage"
-# Ignored by git, removed by `make clean`
+# Ignored by git, removed by `make clean`.
 FOLDER = SKETCH_DIR / "build"
 # The language and the restrictions of the Arduino build, with warnings: what compiles here shall compile there.
 _FLAGS = ("-std=gnu++11", "-O2", "-Wall", "-Wextra", "-fno-exceptions", "-fno-rtti")

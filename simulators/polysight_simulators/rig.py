@@ -42,9 +42,11 @@ READY_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 5.0
 # Largest speed of the emulated UNO: its heartbeat clock is scaled, that of the Pi's program is not.
 UNO_TIME_SCALE = 2.0
+# Time between two looks if a process is ready; chosen.
 _POLL_S = 0.02
 # Start offset of the receivers: it puts the published rig's direct path in the middle of its IF window.
 _NATIVE_OFFSET_HZ = 790e3
+# Last lines of a log that an error shows; chosen.
 _LOG_LINES = 15
 # One thread for linear algebra, unless the environment says otherwise: several processes with more threads on few cores
 # are ten times slower.

@@ -84,9 +84,9 @@ class WireHub:
         self._selector.register(self._listener, selectors.EVENT_READ, None)
         self._clients: dict[socket.socket, _Client] = {}
         self._accepted = 0
+        # Motion line sent last, for late subscribers.
         self._last_motion = b""
-        # Motion line sent last, for late subscribers. GPIO lines (numbers as bytes) that a fault has cut; the line that
-        # repeats the edges of a joined one.
+        # GPIO lines (numbers as bytes) that a fault has cut; the line that repeats the edges of a joined one.
         self._cut: set[bytes] = set()
         self._joined: dict[bytes, bytes] = {}
 

@@ -93,7 +93,7 @@ def _make_source(
     radars = SimulatedRig(rig, scene, args.seed, args.cache)
     recorded = [b.name for b in rig.recorded if b.name in names]
     if recorded:
-        # Before the first burst of a scan
+        # Before the first burst of a scan, which it would delay.
         radars.prepare(*recorded)
     return radars
 

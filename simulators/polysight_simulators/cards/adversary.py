@@ -93,7 +93,7 @@ class Sent:
     first_pulse_ns: int
     # Packets in the order of their arrival.
     arrivals: list[Arrival] = field(default_factory=list)
-    # The card sent the complete record, with consecutive counters
+    # The card sent the complete record, with consecutive counters.
     whole: bool = True
     troubles: tuple[str, ...] = ()
 
@@ -120,7 +120,7 @@ class Adversary:
         self._now_ns = 1_000_000_000
         self._number = 0
         self._twin = Packetiser(payload_bytes, chance.randrange(1 << 32), chance.randrange(1 << 48))
-        # Packets that arrive in a later record
+        # Packets that arrive in a later record.
         self._late: list[Arrival] = []
         # Of the record being made: its data, the numbers of the bytes not yet in a packet, and of each packet's last.
         self._bytes = np.zeros(0, np.uint8)
@@ -193,7 +193,7 @@ class Adversary:
         made_ns = [pulse_ns + (k + 1) * _GAP_NS for k in range(len(packets))]
         if edges_ns is not None:
             made_ns = [self._find_time_made_ns(byte, edges_ns) for byte in last_bytes]
-        # A card that was reset may send nothing
+        # A card that was reset may send nothing.
         made_ns = made_ns or [pulse_ns]
         packets_before = self.take_late(0.5)
         in_between = self.take_late(0.7)

@@ -39,6 +39,7 @@ _UNREAD_BYTES = 128 << 10
 _POLL_S = 0.001
 # Time to wait for a receiver that does not read; then its packets are lost, as with a real card; chosen.
 _WAIT_TIMEOUT_S = 2.0
+# Bytes of queued data packets above which the queue is full; chosen.
 _MAX_QUEUED_BYTES = 64 << 20
 # Largest delay of the packets that later calls make up for; chosen.
 _CATCH_UP_S = 0.01
@@ -141,7 +142,7 @@ class CardSender:
         self._queue.append(message)
 
     def put_packets(self, rows: Rows) -> None:
-        """Send data packets, uint8 [n, size]."""
+        """Send data packets, uint8 [n, size], after what was queued before them."""
         self._queue.append(rows)
         self._queued_bytes += rows.size
 
@@ -265,6 +266,7 @@ if TYPE_CHECKING:
 
 # Number of frames per call, which bounds the memory; chosen.
 FRAMES_PER_CALL = 64
+# MAC address of a card as it is delivered.
 MAC = b"\x12\x34\x56\x78\x90\x12"
 Clock = Callable[[], float]
 

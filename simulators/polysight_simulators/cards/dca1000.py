@@ -22,11 +22,11 @@ REQUEST_FOOTER = 0xEEAA
 SOURCE_PORT = 1024
 # Header of a data packet: u32 sequence number, u48 byte count.
 DATA_HEADER_BYTES = 10
-# "packet size 1470" carries 1456 bytes of payload
+# "packet size 1470" carries 1456 bytes of payload.
 PACKET_OVERHEAD_BYTES = 14
 # Time from the last LVDS data to the short last packet, as seen on a card.
 TAIL_S = 2.0
-# 2.8: bytes 02 04 (seen)
+# Version 2.8: bytes 02 04 (seen).
 FPGA_VERSION = 2 | 8 << 7
 DELAY_TICK_S = 8e-9
 # Timeout after record start without data, until command 0x03 sets another.
@@ -257,7 +257,10 @@ class Card:
         return [message(code, self._configure(code, body, well_formed))]
 
     def _configure(self, code: int, body: bytes, well_formed: bool) -> int:
-        """Execute a request other than record start and stop; return the status of its reply: 0 done, 1 refused."""
+        """Execute a request other than record start and stop; return the status of its reply.
+
+        That is 0: done, 1: refused, or the version that was asked for.
+        """
         if code == Code.RESET_FPGA:
             self.reset_fpga()
         elif code == Code.CONFIGURE_FPGA:

@@ -62,7 +62,7 @@ class CardServer:
         self._trigger_ns = 0
         self._pulse_ns = 0
         self._selector = selectors.DefaultSelector()
-        # Number of the card's binding, its descriptor then
+        # Of each card: the number of its binding (`CardEndpoint.bindings`), and its descriptor then.
         self._bound: dict[SimulatedCard, tuple[int, int]] = {}
         self._select_cards()
         self._selector.register(wires, selectors.EVENT_READ)
@@ -152,7 +152,7 @@ class CardServer:
         """Send data and end the record in time; return the seconds until this card has more to do."""
         endpoint = card.endpoint
         wait = endpoint.flush()
-        # Pending data delays the end of the program.
+        # Pulses that wait at the wires keep the record from ending.
         if wait is None and endpoint.due and not self._take_edges():
             card.tick(self.more_expected)
             wait = endpoint.flush()

@@ -44,7 +44,8 @@ _INTERRUPT_BIT = 5
 _CHANNELS = "ABCD"
 # Duration of a pin command (FTDI AN_114).
 _PIN_S = 0.2e-6
-# Two clocks, the minimum before and between chip selects (ICD 3.2.4). The simulation requires twice that.
+# Two clocks, the minimum before and between chip selects (ICD 3.2.4). The simulation requires twice that, a margin that
+# is chosen.
 _CLOCKS_S = 0.2e-6
 # Channel, operation and size of a request.
 _HEAD = struct.Struct("<ccH")

@@ -426,7 +426,7 @@ class Cores:
         self.armed = True
         self.frame_ends = -1.0
         self.armings += 1
-        # Software trigger: they run at once (ICD table 5.27), frames without a number until they are stopped
+        # Software trigger: they run at once (ICD table 5.27), frames without a number until they are stopped.
         if trigger == 1:
             self.frames_left = 0
             self.armed = frames == 0

@@ -46,7 +46,7 @@ class Layout(Protocol):
         ...
 
     def write_row(self, row: Row, payloads: dict[str, NDArray[np.int16]], gaps: dict[str, Gaps]) -> None:
-        """Write a row: by board, int16 [frames, samples, 8] and the lost byte ranges."""
+        """Write a row: by board, int16 [frames, samples, 8] (I of four RX, then Q) and the lost byte ranges."""
         ...
 
     def end(self) -> None:

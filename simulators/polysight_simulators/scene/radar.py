@@ -59,12 +59,12 @@ def high_pass(if_hz: Real, chirp: Chirp) -> tuple[Complex, Complex]:
     log_slope = np.zeros(np.shape(f), np.complex128)
     for corner in (chirp.hpf1_khz * 1e3, chirp.hpf2_khz * 1e3):
         u = corner / f
-        # 1 / (1 - j u), without a complex division
+        # 1 / (1 - j u), without a complex division.
         section = np.empty(np.shape(f), np.complex128)
         section.real = 1.0 / (1.0 + u * u)
         section.imag = u * section.real
         h *= section
-        # -j u section / f
+        # d log(section) / df = -j u section / f.
         log_slope.real += section.imag * u / f
         log_slope.imag -= section.real * u / f
     return h, h * log_slope
@@ -138,7 +138,10 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
 
 
 def echo_drift(rig: Instrument, d: Disturbances, board: Board, pulses: NDArray[np.int64]) -> NDArray[np.complex64]:
-    """Return the factor of a board's echo by pulse [n]: V drifts linearly over the scan, with a factor of 1 halfway."""
+    """Return the factor of a board's echo by chirp [n]: V drifts linearly over the scan, with a factor of 1 halfway.
+
+    `pulses` [n] are numbers of chirps, 0 at the scan's first one.
+    """
     if board.role != "receive_v":
         return np.ones(len(pulses), np.complex64)
     share, degrees = d.hv_drift
@@ -162,7 +165,7 @@ def compute_chirp_factors(
     turns = (receiver.phase + phase_rad[:, None]) / (2 * np.pi) - f * delay_s[:, None]
     turns -= np.rint(turns)
     factor = np.empty(turns.shape, np.complex64)
-    # Less than a turn: single precision is enough
+    # Less than a turn: single precision is enough.
     angle = (2 * np.pi * turns).astype(np.float32)
     factor.real = np.cos(angle)
     factor.imag = np.sin(angle)
@@ -366,7 +369,7 @@ class SimulatedRig:
         d = self.scene.disturbances
         receiver = self._make_receiving_board(board.name)
         chirp = self.rig.chirp
-        # All chirps of a frame start with one pulse
+        # All chirps of a frame start with one pulse.
         frames = pulses // self.rig.burst.chirps
         delay = sync_delay_s(d, self.seed, board, frames) - sync_delay_s(d, self.seed, self.rig.transmitter, frames)
         if d.random_phase:
@@ -445,7 +448,7 @@ def pattern_frames(board: int, first: int, n: int, samples: int) -> NDArray[np.i
     """
     words = samples * 4
     count = np.arange(n * words, dtype="<u4")
-    # May wrap at 32 bits without effect on 28 bits
+    # May wrap at 32 bits without effect on 28 bits.
     count += np.uint32(first * words % (1 << 28))
     count &= np.uint32((1 << 28) - 1)
     count |= np.uint32(board << 28)

@@ -50,11 +50,11 @@ def pulse_normal(key: int, first: int, out: NDArray[np.float32]) -> None:
     continuous distribution, and equal after the ADC. The largest is 4.3; the variance is 1.
     """
     values = out[0].size
-    # The generator's counter counts blocks of 256 bits
+    # The generator's counter counts blocks of 256 bits.
     blocks = -(-values // 16)
     bits = np.random.Philox(key=key, counter=first * blocks).random_raw(len(out) * blocks * 4).view("<u2")
     chosen = bits.reshape(len(out), -1)[:, :values].reshape(out.shape)
-    # "clip": no copy of `out` in case of a wrong index
+    # "clip": no copy of `out` in case of a wrong index.
     np.take(_tabulate_normal(), chosen, out=out, mode="clip")
 
 
@@ -86,7 +86,7 @@ Tilt = tuple[Degrees, Degrees]
 Height = Annotated[float, msgspec.Meta(ge=-50, le=50)]
 SteepTilt = Annotated[float, msgspec.Meta(ge=-60, le=60)]
 Bend = Annotated[float, msgspec.Meta(ge=-100, le=100)]
-# A table lies far behind the plates
+# A table lies far behind the plates.
 PlateHeight = Annotated[float, msgspec.Meta(ge=-50, le=300)]
 Drift = Annotated[float, msgspec.Meta(ge=-0.5, le=0.5)]
 Gain = Annotated[float, msgspec.Meta(ge=-200, le=200)]
@@ -600,6 +600,6 @@ def _vary(nominal: Pair, spread: Pair, rng: np.random.Generator) -> Pair:
     """Draw eps' and eps'' around nominal ones, with the relative standard deviations `spread`."""
     # Plain Python numbers, which can be written as JSON.
     real, loss = rng.standard_normal(2).tolist()
-    # The log-normal factor has mean 1 and standard deviation spread[1]
+    # The log-normal factor has mean 1 and standard deviation spread[1].
     width = math.sqrt(math.log1p(spread[1] ** 2))
     return max(1.0, nominal[0] * (1 + spread[0] * real)), nominal[1] * math.exp(width * loss - width**2 / 2)

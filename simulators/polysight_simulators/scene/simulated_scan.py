@@ -25,7 +25,7 @@ from polysight_simulators.scene.radar import SimulatedRig
 from polysight_simulators.scene.scene_file import Pair, Plate, Scene, apply_scene, draw_specimens, stream_key
 
 Progress = Callable[[int, int], None]
-# Six times this is in memory. The published rows have 10 MB. Chosen.
+# Largest row of a board. Chosen: six times this is in memory, and a row of the published scan has 22.9 MB.
 MAX_ROW_BYTES = 100_000_000
 
 
@@ -208,13 +208,13 @@ def _write_scan(
 ) -> Path:
     """Write a scan with its truth.json of these facts; return its folder."""
     layouts.require_empty(writer.folder)
-    # Before the first file: a scene that cannot be simulated leaves no folder
+    # Before the first file: a scene that cannot be simulated leaves no folder.
     radar.prepare()
     writer.start()
     _write_rows(writer, radar, plan, boards, by_columns, progress)
     content = {**facts, "samples_clipped": radar.clipped}
     (writer.folder / "truth.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    # Last: whatever ends the program before leaves an unfinished scan
+    # Last: whatever ends the program before leaves an unfinished scan.
     writer.end()
     return writer.folder
 

@@ -53,7 +53,7 @@ class SerialPort:
             self._master, slave = os.openpty()
             tty.setraw(slave, termios.TCSANOW)
             settings = termios.tcgetattr(slave)
-            # A serial port has this flag set, a pseudo terminal has not.
+            # A serial port has this control flag (element 2) set, a pseudo terminal has not.
             settings[2] |= termios.HUPCL
             termios.tcsetattr(slave, termios.TCSANOW, settings)
             os.set_blocking(self._master, False)
@@ -97,7 +97,7 @@ class SerialPort:
         except BlockingIOError:
             return False
         rose = False
-        # A watch on one file: no names follow
+        # A watch on one file: no names follow.
         for _, mask, _, _ in _EVENT.iter_unpack(events):
             if mask & _IN_OPEN:
                 rose |= not self._dtr
@@ -113,7 +113,7 @@ class SerialPort:
         try:
             return os.read(self._master, 512)
         except OSError:
-            # EAGAIN, or EIO while no client is there
+            # EAGAIN, or EIO while no client is there.
             return b""
 
     def write(self, data: bytes) -> None:
@@ -155,7 +155,7 @@ def serve(
         wall = now
         ticks += leap * time_scale * TICK_HZ * 1e-9
         now_ms = (now - started) // NS_PER_MS
-        # Opening the port resets the board; its boot loader ignores bytes until it ends
+        # Opening the port resets the board; its boot loader ignores bytes until it ends.
         if port.was_opened():
             boots_at = now + boot_ms * NS_PER_MS
             running = False

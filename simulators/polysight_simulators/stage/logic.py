@@ -36,6 +36,7 @@ _RANGES = {
     Parameter.BACKLASH: (0, MAX_BACKLASH),
     Parameter.PINS: (0, 127),
 }
+# Number of arguments of each command, and the commands that move the stage.
 ARGUMENTS = {"HELLO": 0, "SET": 2, "ENABLE": 1, "HOME": 0, "MOVE": 3, "ROW": 5, "BUZZ": 1, "CLEAR": 0}
 MOTION_VERBS = ("HOME", "MOVE", "ROW", "BUZZ")
 

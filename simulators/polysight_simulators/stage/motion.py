@@ -51,7 +51,7 @@ class StepEngine:
     """One leg at a time with trapezoidal speed. Positions are steps, times are ticks of 500 ns."""
 
     def __init__(self) -> None:
-        # Position in steps; trigger points passed and trigger pulses given in this row (counted by the caller).
+        # Position in steps; trigger points passed in this row, and trigger pulses given, which the caller counts.
         self.x = 0
         self.y = 0
         self.points = 0

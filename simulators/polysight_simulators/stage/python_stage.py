@@ -68,7 +68,7 @@ class PythonStage:
         # HELLO was accepted since the reset; it was the last line, so that any sequence number may follow.
         self._greeted = False
         self._fresh = False
-        # The last answered line: its repetition gets the same answer
+        # The last answered line: its repetition gets the same answer.
         self._last: Command | None = None
         self._last_answer = b""
         self._last_is_motion = False

@@ -35,7 +35,7 @@ class PinEdge(NamedTuple):
     # Number of the pin on the Arduino; A0 is 14.
     pin: int
     value: int
-    # Motor steps, counted at the pins from where the stage stood when it was switched on
+    # Motor steps, counted at the pins from where the stage stood when it was switched on.
     x: int
     left: int
     right: int

@@ -44,9 +44,10 @@ OWN_ERROR = "p_sigma"
 # Images in a folder of the published data.
 SAR_FILES = ("sar_h.npy", "sar_v.npy")
 MIN_PIXELS = 8
-"""Least rows and columns of an image: the smallest patch is 14 mm wide, seven pixels of 2 mm."""
+"""Least rows and columns of an image: one more than the smallest patch has, 14 mm in seven pixels of 2 mm."""
 EVEN = 0.01
-"""Largest relative deviation of the distance of two pixels from the mean one, and of the pitch in y from that in x."""
+"""Largest relative deviation of the distance of two pixels from the mean one, and of the pitch in y from that in x;
+chosen."""
 OTHER_SIGN = 0.3
 PUBLISHED_OTHER_SIGN = 0.05
 """Probability a priori that images of another program have the other sign of phase, if their file does not say it; and
@@ -168,7 +169,7 @@ def conjugate(images: Images) -> Images:
 
 
 def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """Read all arrays of an .npz file. Raises DataError if it is damaged or no such file."""
+    """Read all arrays of an .npz file. Raises DataError if it is damaged, or is no .npz file."""
     try:
         with open_npz(path) as archive:
             return {name: archive[name] for name in archive}
@@ -259,7 +260,11 @@ def _check_square(path: Path, x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.
 
 
 def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.bool_]:
-    """Return the pixels to use. Raises DataError if one is not finite, none is left, or a channel holds nothing."""
+    """Return the pixels to use, bool [ny, nx]: those in `valid` where a channel is not zero.
+
+    Raises DataError if `valid` is no mask of the image, one of its pixels is not finite, none is left, or a channel
+    holds nothing or too small or large numbers.
+    """
     h = arrays["h"]
     v = arrays["v"]
     valid = arrays.get("valid", np.ones(h.shape, bool))
@@ -444,7 +449,8 @@ def given_reasons(pair: GivenPair, angle: Angle) -> list[Finding]:
 
 
 TOLD_TILT_DEG = 0.5
-"""Tilt of a plate across the plane of incidence from which on the verdict tells how its polarisations were turned."""
+"""Tilt of a plate across the plane of incidence from which on the verdict tells how its polarisations were turned;
+chosen."""
 
 
 def turn_reasons(result: materials.MaterialsResult) -> list[Finding]:

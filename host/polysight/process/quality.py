@@ -59,7 +59,7 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     frames_expected, frames_received
-        Frames of the row, and those that were received whole.
+        Frames of the row, and those that were received whole; counted in chirps, for most frames hold one.
     bytes_missing, crc32
         Bytes of raw data that are missing, and the digest of the recorded payload ("" without one).
     positions, positions_masked
@@ -69,7 +69,8 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
     stages
         Each stage of synchronisation with the standard deviations after it: Hz, rad, and relative amplitude.
     chirps_clipped, chirps_disturbed, positions_clipped
-        As of `SyncedRow`; 0 in files of earlier releases, which did not look for them.
+        Chirps left out because the receiver clipped or because they differ from the rest of their burst, and positions
+        of which all chirps clipped; 0 in files of earlier releases, which did not look for them.
     """
 
     frames_expected: Count
@@ -99,9 +100,10 @@ class RowQuality:
     figures
         The row's figures.
     direct_hz, direct_snr
-        float64 [position]: IF of the direct path, NaN where not valid, and its SNR, see `_compute_direct_snr`.
+        float64 [position]: intermediate frequency (IF) of the direct path, NaN where not valid, and its SNR, see
+        `_compute_direct_snr`.
     echo
-        complex64 [rx, position]: echo of the mirror point, for the estimate of the backlash.
+        complex64 [rx, position]: echo of the place that mirrors TX into RX, for the estimate of the stage's backlash.
     """
 
     figures: RowFigures
@@ -450,10 +452,7 @@ def judge(
 
 
 def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifier: Classifier | None) -> list[Finding]:
-    """Return reasons from the scene: patches, metal, leakage, plane, tilts, brightness and angle.
-
-    Parameters are those of :func:`judge`.
-    """
+    """Return reasons from the scene and its images; parameters are those of :func:`judge`."""
     reasons: list[Finding] = []
     refused = {r.patch.label: r.refused.what for r in result.patches if r.refused is not None}
     # Plates that have a permittivity, but none of a half space: they are no patches of noise or of several materials.

@@ -101,7 +101,7 @@ def cores() -> int:
 def map_rows(add: Callable[[int], object], rows: Sequence[int], threads: int | None = None) -> Iterator[int]:
     """Call `add` for every row, on `threads` threads (None: one per core); yield each finished row, in order.
 
-    The first error is raised, and rows that were not started are cancelled.
+    There are at most `MAX_ROWS` threads. The first error is raised, and rows that were not started are cancelled.
     """
     count = min(threads or cores(), MAX_ROWS, len(rows))
     if count <= 1:

@@ -189,7 +189,7 @@ def save_images(out: Path, scan: products.ProcessedScan) -> None:
 
 
 def save_materials(out: Path, scan: products.ProcessedScan, result: MaterialsResult, unnamed: str) -> Products:
-    """Write all products: metal-referenced image.npz, quality.json, materials.json, patches, labels, figures, report.
+    """Write all products: metal-referenced image.npz, scan, quality and materials as JSON, patches, labels, report.
 
     `result` is the analysis behind the scan, `unnamed` the reason why nothing was named; "" if patches were named.
     """
@@ -203,6 +203,7 @@ def save_materials(out: Path, scan: products.ProcessedScan, result: MaterialsRes
     products.write_json(out / products.MATERIALS, scan.materials)
     write_report(out, scan)
     verdict = scan.verdict or Verdict("good")
+    # The terminal shows three reasons, the report all.
     lines = [*verdict.lines(3), *_summarise_result(scan, result)]
     if scan.quality.coverage:
         lines += scan.quality.coverage.lines()

@@ -103,7 +103,8 @@ class Classifier(ClassifierMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            for other numbers of columns, fewer than two pixels, or a `y` that holds no classes.
+            for another model, other numbers of columns, fewer than two pixels, a `y` that holds no classes, or `groups`
+            of another length.
         """
         pixels, names = _validate(self, X, y, ensure_min_samples=2)
         if self.model not in SHORT:

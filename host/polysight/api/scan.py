@@ -112,7 +112,7 @@ def open_scan(
     DataError
         when the folder is none of these, or is damaged.
     ConfigError
-        when a folder of products is given with processing parameters, or a rig file is wrong.
+        when a parameter or a rig file is wrong, or a folder of products is given with processing parameters.
     """
     _check_arguments(model, library, metal_box_mm, bands, incidence)
     path = Path(folder)

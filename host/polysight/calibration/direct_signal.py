@@ -287,7 +287,7 @@ def _measure_power_of_scan(
 ) -> tuple[Real, Real, Real]:
     """Return IF (Hz), power and noise power (ADC counts squared) of the direct path in the chirps of some rows."""
     rig = scan.instrument
-    # Scans of one sweep share the setup
+    # Scans of one sweep share the setup.
     key = f"{places_crc32(rig)} {rig.chirp} {rig.burst!r}"
     if key not in setups:
         setups[key] = sync.BoardSetup.from_rig(rig, board)

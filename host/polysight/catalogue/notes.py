@@ -73,6 +73,8 @@ def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
         if a text is too long, or there are too many tags.
     ScanError
         if the present notes differ from `base`, from which these were edited; None: not checked.
+    DataError
+        if the present notes are damaged, and `base` is given.
     """
     text = printable(notes.notes, keep="\n")
     # A dictionary drops tags that are given twice, and keeps the order.

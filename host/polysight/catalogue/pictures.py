@@ -179,7 +179,7 @@ def thumbnail(pixels: Pixels) -> Picture:
 
 
 def _derive_values(pixels: Pixels, name: str) -> products.MapValues:
-    """Return the maps derived from P: its error, permittivity, loss."""
+    """Return the values of one of the maps derived from P: its error, permittivity, loss."""
     if not pixels.referenced:
         raise DataError(
             "no permittivity is shown", "the images are not referenced to metal, or support no result",
@@ -192,7 +192,7 @@ def _derive_values(pixels: Pixels, name: str) -> products.MapValues:
         eps = pixels.permittivity
         values = eps.value.real if name == "permittivity" else -eps.value.imag
         visible = eps.mask
-    # Edges of plates have any value.
+    # Edges of plates have any value: the colours end at 1.3 times the 85th percentile (chosen).
     high = products.percentile(values, visible, 85, 1.0)
     low = 1.0 if name == "permittivity" else 0.0
     return products.MapValues(values, visible, (low, max(1.3 * high, low + 1e-3)))

@@ -166,7 +166,7 @@ class NearMaterial(msgspec.Struct, frozen=True):
 
 
 class Probe(msgspec.Struct, frozen=True, kw_only=True):
-    """All results at one place.
+    """All results at one place; None where there is no value.
 
     Attributes
     ----------
@@ -495,7 +495,7 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
 
 
 def measure_scatter(differences: Real) -> float:
-    """Estimate the scatter of unchanged pixels, 0.1 to 1, from |differences| [any] in stated errors; NaN without any.
+    """Estimate the scatter of unchanged pixels, 0.1 to 1, from |differences| relative to stated errors; NaN without.
 
     Stated errors include those that both scans share (leakage, metal reference, sidelobes), which cancel in a
     difference. Taken from the median, so that changes of less than half of the image hardly matter: the median of a

@@ -315,7 +315,11 @@ def read_log_tail(path: Path) -> str:
 
 
 def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
-    """Return the summary with its present state: `running` or `paused` if the scan's program is alive."""
+    """Return the summary with its present state.
+
+    `running` or `paused` if the scan's program is alive, `lost` or `frozen` if not; `failed` if a program that was
+    started here ended before it made a scan.
+    """
     if summary.state == "begun":
         # A killed program changes no file.
         failure = explain_failure(find_program(folder, "scan"))

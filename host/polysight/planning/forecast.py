@@ -1,14 +1,10 @@
 """Forecast of a scan from its rig file: time, data, point response, alias-free field, noise, and warnings.
 
 `scan_time` estimates the duration: rows with their ramps, turns, and the standstill between rows
-(docs/spec/stage-line.md, "A row"); motion has trapezoidal speed with constant acceleration. `field_limits` gives the
-alias-free field for a step size, and the mirror zone around flat plates. `forecast` returns all of it; `find_warnings`
-only the warnings, which include settings that stage, Pi or radars would refuse.
-
-Field of view: TX and RX move together, so an echo's phase slope against stage offset, `k (sin a_tx + sin a_rx)`,
-depends only on the object's place relative to the stage. Samples `d` apart cannot distinguish slopes that differ by
-`2 pi / d`: an object has a ghost where its slope differs by that much. The nearest ghost counts, seen from the middle
-half of the aperture, because the taper suppresses the rest.
+(docs/spec/stage-line.md, "A row"); motion has trapezoidal speed with constant acceleration. `imaging.field_limits`
+gives the distance from an object to its nearest ghost for a step size, and the mirror zone around flat plates.
+`forecast` returns all of it; `find_warnings` only the warnings, which include settings that stage, Pi or radars would
+refuse.
 """
 
 from __future__ import annotations

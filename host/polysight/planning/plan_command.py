@@ -507,7 +507,10 @@ def forecast_scene(
     row_overhead_s: float = ROW_OVERHEAD_S,
     scene_mm: tuple[float, float] | None = None,
 ) -> Forecast:
-    """Predict a scan, with warnings about the plates of a scene file, if there is one. Raises ConfigError."""
+    """Predict a scan, with warnings about the plates of a scene file, if there is one. Raises ConfigError.
+
+    Other parameters as of :func:`forecast`.
+    """
     plates: list[Plate] = []
     if scene is not None:
         rig, plates = read_scene(scene, rig)

@@ -53,7 +53,7 @@ class Plate(msgspec.Struct, frozen=True):
 
 
 def read_scene(path: Path, rig: Instrument) -> tuple[Instrument, list[Plate]]:
-    """Return the rig with the scene's grid, burst, image, stage and distance, and the plates.
+    """Return the rig with the scene's grid, burst, image, stage and distance, and the plates but the background.
 
     Raises
     ------

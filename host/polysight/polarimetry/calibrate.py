@@ -80,7 +80,8 @@ def metal_gains(h: Image, v: Image, metal_mask: Mask) -> tuple[complex, complex]
     The gain of V is real: only the phase of the ratio is referenced, for the phase of H and V alone is that of the
     distance (Eq. 7).
 
-    `metal_mask` bool [ny, nx] is the inside of a metal region. Raises DataError if it is empty, not finite or dark.
+    `metal_mask` bool [ny, nx] is the inside of a metal region. Raises DataError if it is empty, not finite or dark, or
+    has another shape than the images.
     """
     if metal_mask.shape != h.shape or h.shape != v.shape:
         raise DataError(
@@ -176,7 +177,7 @@ def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
 
 
 # Of `plane_reference`: default width of the Gaussian window, and lowest level relative to the plate's 90th percentile
-# in each channel.
+# in each channel; chosen.
 SMOOTH_MM = 8.0
 FLOOR_DB = -10.0
 # A smaller area of metal is no plate that covers the plane; chosen.
@@ -538,7 +539,8 @@ def leakage_from_images(
     Leakage
         The imbalance is that of the plate's mean.
 
-    Raises DataError as :func:`estimate_leakage`.
+    Raises DataError as :func:`estimate_leakage`, :func:`estimate_axial_ratio` and :func:`common_direction`,
+    PolysightError as :func:`strips_wave`.
     """
     gain_h, gain_v = plate
     relative = [

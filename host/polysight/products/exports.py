@@ -142,7 +142,7 @@ def image_dataset(scan: ProcessedScan) -> xarray.Dataset:
         frame. `h`, `v`, `p` complex64 [y_mm, x_mm]: s-polarised and p-polarised channel and their ratio, relative to
         metal unless `metal_reference` begins with "none". `valid` bool. `p_sigma` float32, the standard deviation of
         `p`, if the products have it. `incidence_deg` and `incidence_rad`: one angle, or an angle per pixel if the scan
-        was processed so; left out if the rig is unknown. Attributes: :func:`provenance`.
+        was processed so; left out if it is unknown. Attributes: :func:`provenance`.
     """
     import xarray
 

@@ -87,10 +87,10 @@ class FolderLock:
 
 
 def check_products_folder(out: Path, scan_id: str) -> None:
-    """Raise ConfigError if products must not replace this folder; call it before processing.
+    """Raise ConfigError if products must not or cannot replace this folder; call it before processing.
 
-    That is the case for a file, a folder with other files, a mount point, the current folder, and for the only
-    remaining products of another scan, whose raw data was deleted.
+    That is the case for a file, a folder with other files, a mount point, the current folder, a folder that cannot be
+    written, and for the only remaining products of another scan, whose raw data was deleted.
     """
     try:
         _check_writable(out.resolve().parent)

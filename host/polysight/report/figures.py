@@ -70,7 +70,7 @@ _FOCUS_RANGE_DB = 30.0
 _SIDE_ROOM_MM = 20
 _LOWER_ROOM_MM = 12
 _UPPER_ROOM_MM = 24
-# Share of a map's height that a label needs.
+# Share of a map's height that a label needs; chosen by eye.
 _LABEL_HEIGHT = 0.05
 # Share of a map's width between two maps: a colour bar's and an axis's numbers stand there.
 _BETWEEN = 0.26

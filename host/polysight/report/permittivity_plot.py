@@ -49,7 +49,7 @@ _LINE_FROM_PT = _RADII_PT[0] + 1
 # Room for ellipses beyond estimates and truths, and an empty margin, as shares of the span of these; chosen.
 _ELLIPSE_SHARE = 0.75
 _MARGIN_SHARE = 0.08
-# Smallest span of the axes, real part and loss: points that lie together are not drawn far apart.
+# Smallest span of the axes, real part and loss: points that lie together are not drawn far apart; chosen.
 _SMALLEST_SPAN = (0.5, 0.3)
 Array = npt.NDArray[np.float64]
 Point = tuple[float, float]

@@ -1,8 +1,8 @@
 """The rules of the verdict: each function turns one kind of evidence into findings, none if the evidence is good.
 
 A finding says what was found, why it matters and what to do; `join_reasons` joins them to a verdict. All limits are
-constants of this module. The last argument of `reason` is the finding's weight, which orders the findings of one level,
-largest first.
+constants of this module, chosen where no source is given. The last argument of `reason` is the finding's weight, which
+orders the findings of one level, largest first.
 """
 
 from __future__ import annotations

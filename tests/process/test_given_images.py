@@ -138,6 +138,16 @@ def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented
     assert scan.simulated is False
 
 
+def test_exchanged_images_are_told_and_give_no_permittivity(save_images, pair, rig):
+    """Eq. 3 gives the same permittivity for P and 1 / P: only the passivity of half spaces tells both apart."""
+    exchanged = read_given_images(save_images(h=pair["v"], v=pair["h"]), rig)
+    inputs = Inputs(labels=Labels(BOXES, metal="copper"))
+    scan = analyse_given_images(exchanged, Settings(model="none"), inputs, rig)[0]
+    assert scan.verdict.level == "none"
+    assert any("exchanged" in r.what for r in scan.verdict.reasons[:2])
+    assert not any(s.permittivity for s in scan.segments)
+
+
 def test_pixels_marked_invalid_are_left_out(save_images, pair, rig):
     valid = np.ones((150, 150), bool)
     valid[80:] = False

@@ -219,6 +219,7 @@ def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels)
             ("patches 3, 5 have no permittivity: a gain; leakage",),
             "patch ",
         ),
+        (rules.judge_exchange([2, 5], 3), ("H and V may be exchanged: patches 2, 5",), "3"),
         (rules.judge_disturbed_plates({3: 0.2, 1: 0.1, 2: 0.01}), ("within patches 1, 3:", "up to 20 %"), "2,"),
         (rows(1000, 0.25), ("25.0 % of the recorded",), "absent"),
         (path(-3.0), ("RH: the direct path is weak, -3 dB",), "missing"),
@@ -230,6 +231,12 @@ def test_a_reason_shows_the_figure_with_its_sign_and_the_patches_concerned(reaso
     text = f"{only_reason.what}; {only_reason.why}"
     assert all(part in text for part in said), text
     assert never not in text, text
+
+
+@pytest.mark.parametrize(("stronger_v", "plates"), [([], 8), ([3], 1), ([1, 2], 4)])
+def test_a_single_plate_or_half_of_them_do_not_show_that_h_and_v_are_exchanged(stronger_v, plates):
+    """Layers and liquids behind glass may reflect more V than H."""
+    assert rules.judge_exchange(stronger_v, plates) == []
 
 
 def test_reasons_come_from_the_recording_to_the_names():

@@ -89,6 +89,7 @@ from polysight.materials.library import (
 )
 from polysight.materials.measure import (
     NOT_PASSIVE as NOT_PASSIVE,
+    STRONGER_V as STRONGER_V,
     Permittivity as Permittivity,
     estimate_permittivity as estimate_permittivity,
     format_permittivity as format_permittivity,

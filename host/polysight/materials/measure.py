@@ -92,8 +92,9 @@ LARGEST_DIM_PLATE = 6.0
 
 AMPLIFIES = "it would amplify beyond its error bar"
 BELOW_AIR = "its permittivity would be below that of air"
+STRONGER_V = "V is stronger than H, relative to the metal"
 POSSIBLE_LAYER = "possible layer"
-NOT_PASSIVE = (AMPLIFIES, BELOW_AIR, POSSIBLE_LAYER)
+NOT_PASSIVE = (AMPLIFIES, BELOW_AIR, STRONGER_V, POSSIBLE_LAYER)
 """Reasons for refusing plates that are no half spaces; they may be fitted as layers."""
 THIN = Finding(
     "error",
@@ -103,9 +104,9 @@ THIN = Finding(
 )
 """Why a possible layer gets no permittivity."""
 ACTIVE = 2.0
-"""Standard deviations of gain, or of a real part below 1, beyond which a permittivity is impossible."""
+"""Standard deviations of gain, a real part below 1, or |V / H| above 1, beyond which a half space is impossible."""
 ALLOWED_EXCESS = 0.02
-"""Gain, or real part below 1, that is allowed in addition, however small the error is. Chosen."""
+"""Gain, real part below 1, or |V / H| above 1 that is allowed in addition, however small the error is. Chosen."""
 
 
 def background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> tuple[float, float]:
@@ -556,9 +557,7 @@ class Permittivity:
     @property
     def dominated_by(self) -> str | None:
         """The source with the largest share of the error; None without shares."""
-        if self.shares:
-            return max(self.shares, key=lambda s: self.shares[s])
-        return None
+        return max(self.shares, key=lambda s: self.shares[s], default=None)
 
     @property
     def metal_like(self) -> bool:
@@ -678,10 +677,13 @@ def permittivity_of_patch(
 
 def _find_impossibility(e: Permittivity) -> Finding | None:
     """Return why a permittivity is impossible for a passive material, beyond its error; None if it is possible."""
-    if e.value is None or e.real_std is None or e.loss_std is None:
-        return None
     remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
     causes = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
+    # Eq. 3 does not tell P from 1 / P, but no half space reflects more of p than of s.
+    if e.ratio and not e.metal_like and abs(1 / e.ratio) > 1 + ACTIVE * e.inverse_std + ALLOWED_EXCESS:
+        return Finding("error", STRONGER_V, causes, remedy)
+    if e.value is None or e.real_std is None or e.loss_std is None:
+        return None
     if e.value.imag > ACTIVE * e.loss_std + ALLOWED_EXCESS:
         return Finding("error", AMPLIFIES, causes, remedy)
     if e.value.real < 1 - ACTIVE * e.real_std - ALLOWED_EXCESS:

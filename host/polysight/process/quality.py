@@ -20,7 +20,7 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from polysight.imaging import ImageBuilder, Images, PlaneEstimate, imaging_facts
-from polysight.materials import NOT_PASSIVE, Classifier, MaterialsResult, find_copies, permittivity_change
+from polysight.materials import NOT_PASSIVE, STRONGER_V, Classifier, MaterialsResult, find_copies, permittivity_change
 from polysight.polarimetry import IncidenceChoice, PlaneReference
 from polysight.results import (
     Backlash,
@@ -455,12 +455,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     """Return reasons from the scene and its images; parameters are those of :func:`judge`."""
     reasons: list[Finding] = []
     refused = {r.patch.label: r.refused.what for r in result.patches if r.refused is not None}
-    # Plates that have a permittivity, but none of a half space: they are no patches of noise or of several materials.
-    no_half_spaces = {
-        r.patch.label: r.refused
-        for r in result.patches
-        if r.refused is not None and r.refused.what in NOT_PASSIVE and r.permittivity.value is not None
-    }
+    no_half_spaces = _find_no_half_spaces(result)
     no_plates = {k: v for k, v in refused.items() if k not in no_half_spaces}
     reasons += rules.judge_patches(no_plates, len(result.patches), len(result.segmentation.left_out))
     pixel_mm = abs(float(result.calibrated.x_m[1] - result.calibrated.x_m[0])) * 1e3
@@ -476,6 +471,8 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     reasons += rules.judge_flatness(result.ripple, result.relief_rad, is_boxed=bool(result.boxes))
     reasons += rules.judge_disturbed_plates(result.errors_by_disturbance())
     reasons += rules.judge_passivity(no_half_spaces)
+    plates = len(result.patches) - len(no_plates) - (result.metal.label is not None)
+    reasons += rules.judge_exchange([k for k, v in no_half_spaces.items() if v.what == STRONGER_V], plates)
     metal = result.metal
     if result.patches and metal.evidence is not None:
         evidence = metal.evidence
@@ -513,6 +510,16 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
         angle = float(np.degrees(np.mean(result.theta_rad)))
         reasons += rules.judge_incidence(angle, float(classifier.angles_deg[0]))
     return reasons
+
+
+def _find_no_half_spaces(result: MaterialsResult) -> dict[int, Finding]:
+    """Return patch number to why it is no half space: plates all the same, not noise or several materials."""
+    return {
+        r.patch.label: r.refused
+        for r in result.patches
+        if r.refused is not None
+        and (r.refused.what == STRONGER_V or (r.refused.what in NOT_PASSIVE and r.permittivity.value is not None))
+    }
 
 
 def _find_brightest(result: MaterialsResult) -> tuple[int, float]:

@@ -261,8 +261,8 @@ def judge_metal(
     if is_given and painted > PAINT_TOLD:
         return [reason(
             "care", f"the given metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
-            "all patches have the same additional phase of V / H beside it, as a coating on metal makes it;"
-            " permittivities are corrected for it, with its error",
+            "all patches have the same additional phase of V / H beside it, as a coating on metal makes it, or a wet plate"
+            " in the place of metal; permittivities are corrected for a coating, with its error",
             f"take the paint or film off {patch}, or use bare metal", 2.7,
         )]  # fmt: skip
     if is_given and culprit is not None and not likely:
@@ -499,6 +499,20 @@ def judge_passivity(refused: Mapping[int, Finding]) -> list[Finding]:
             subject = f"patches {', '.join(map(str, patches))} have"
         reasons.append(reason("care", f"{subject} no permittivity: {fault.what}", fault.why, fault.do, 2.2))
     return reasons
+
+
+def judge_exchange(stronger_v: Sequence[int], plates: int) -> list[Finding]:
+    """Judge whether H and V are exchanged: `stronger_v` are the patches of `plates` that reflect more V than H.
+
+    No half space does so, and of layers few do: two of them that are more than half of the plates have another cause.
+    """
+    if len(stronger_v) < 2 or 2 * len(stronger_v) <= plates:
+        return []
+    return [reason(
+        "none", f"H and V may be exchanged: patches {', '.join(map(str, stronger_v))} reflect more V than H",
+        "relative to metal no dielectric reflects p more than s; or the metal reference is a dielectric",
+        "exchange the images or the boards (rig file, section `boards`), or name another metal reference", 8.5,
+    )]  # fmt: skip
 
 
 def judge_brightness(off: Mapping[int, float]) -> list[Finding]:

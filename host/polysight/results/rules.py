@@ -261,8 +261,8 @@ def judge_metal(
     if is_given and painted > PAINT_TOLD:
         return [reason(
             "care", f"the given metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
-            "all patches have the same additional phase of V / H beside it, as a coating on metal makes it, or a wet plate"
-            " in the place of metal; permittivities are corrected for a coating, with its error",
+            "all patches have the same additional phase of V / H beside it, as a coating on metal makes it, or a wet"
+            " plate in the place of metal; permittivities are corrected for a coating, with its error",
             f"take the paint or film off {patch}, or use bare metal", 2.7,
         )]  # fmt: skip
     if is_given and culprit is not None and not likely:

@@ -38,6 +38,7 @@ def test_a_missing_direct_path_is_an_error():
     findings = judge_signal(direct_loss_db=60.0)
     assert findings.level == "error"
     assert "if_hz" not in findings.facts
+    assert f"in {FRAMES - findings.facts['heard']} of {FRAMES} chirps" in findings.what
 
 
 @pytest.mark.parametrize("offset_hz", [2.6e6, -900e3])

@@ -124,7 +124,8 @@ def test_a_pair_is_compared_once_for_all_its_maps(view, scans, monkeypatch):
     assert len(done) == 3
 
 
-def test_a_damaged_scan_does_not_hide_the_other_check_plates(view, scans):
+@pytest.mark.parametrize(("damaged", "other"), [("one", "two"), ("two", "one")])
+def test_a_damaged_scan_does_not_hide_the_other_check_plates(view, scans, damaged, other):
     plate = CheckPlate(name="PET", permittivity=(2.9, 0.2), place_mm=(0.0, 0.0))
     for name in ("one", "two"):
         facts = ScanFacts(scan_id="s", simulated=True, instrument=to_plain(load_instrument(RIG_FILE)))
@@ -132,11 +133,11 @@ def test_a_damaged_scan_does_not_hide_the_other_check_plates(view, scans):
         name_check_plate(scans / name / "products", plate)
     chart = get(view, "/api/check")
     assert [(scan["name"], scan["check"]["level"]) for scan in chart["scans"]] == [("one", "good"), ("two", "good")]
-    (scans / "one" / "products" / "materials.json").write_text("{")
+    (scans / damaged / "products" / "materials.json").write_text("{")
     chart = get(view, "/api/check")
-    assert [scan["name"] for scan in chart["scans"]] == ["two"]
+    assert [scan["name"] for scan in chart["scans"]] == [other]
     # It was good before, but now its products are others.
-    assert chart["unreadable"] == ["one"]
+    assert chart["unreadable"] == [damaged]
 
 
 def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):

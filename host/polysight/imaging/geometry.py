@@ -28,8 +28,8 @@ from polysight_shared.raster import Row, mean_burst_travel_mm, plan_raster
 
 ROUNDS = 2
 END_STEP = 0.7
-"""Rounds in which the rise of a plate and its ends are found, and the share of the ends' error taken off in each: with
-more of either, plates half in the dark run away (78 drawn plates, apertures of 25 to 45 columns)."""
+"""`ROUNDS` in which the rise of a plate and its ends are found, and the share of the ends' error taken off in each
+(`END_STEP`): with more of either, plates half in the dark run away (78 drawn plates, apertures of 25 to 45 columns)."""
 
 SAME_END_PX = 5.0
 """Distance up to which a plate's end by |H| and by its segmentation are the same one: about a resolution cell."""

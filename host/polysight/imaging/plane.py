@@ -3,7 +3,7 @@
 Sharpness (`focus_sweep`). The scene is imaged on a stack of planes parallel to the stage. Any plane, also a tilted one,
 is a cut through this volume, so one stack is enough for the whole search.
 
-It is `sum I^2 / (sum I)^2` of the intensities I (Fienup and Miller, J. Opt. Soc. Am. A 20, 2003), counted per
+Sharpness is `sum I^2 / (sum I)^2` of the intensities I (Fienup and Miller, J. Opt. Soc. Am. A 20, 2003), counted per
 resolution cell instead of per pixel: cells grow with the distance of the plane, so that otherwise the nearest plane
 would be the sharpest. Points and edges determine the focus, the inside of a plate does not. A wrong depth causes a
 phase error that grows with the square of the aperture's length: a wide scan resolves a tenth of a millimetre, a narrow
@@ -12,8 +12,8 @@ one does not.
 Echoes of flat plates (`move_to_plane`). A plate's echo gives its range in two ways: coarse but unambiguous from the
 change of the image's amplitude with range (bandwidth of the sweep), and fine but ambiguous by half a wavelength of
 height from its phase. The first gives the plane within about a millimetre and resolves the second. Both are compared
-with a mirror on the rig file's plane, seen from the same positions, so that aperture, taper and masked positions have
-no influence.
+with a mirror on the rig file's plane, seen from the same positions, so that aperture, taper (weights of the positions)
+and masked positions have no influence. The image of that mirror is the footprint.
 
 One plane is fitted to all plates; the height of each plate is returned too.
 """
@@ -35,15 +35,16 @@ from polysight.imaging.samples import BoardSamples
 from polysight_shared.config import Instrument
 from polysight_shared.geometry import incidence_deg
 
-# Largest tilt of the plates that is searched; a plane near this limit is not believed; chosen.
+# Largest tilt of the plates that `focus_sweep` searches; a plane near this limit is not believed; chosen.
 _MAX_TILT_DEG = 3.0
 
 PLANE_REACH_M = 0.015
 """Search range to either side of the rig file's plane; chosen."""
 MOUNT_STD_M = 1e-3
-"""Standard deviation of the antennas' positions in the rig file, in addition to that of the plane's distance."""
+"""Standard deviation of the antennas' positions in the rig file, in addition to that of the plane's distance; chosen.
+"""
 PRIOR_STD_M = 5.8e-3
-"""Standard deviation of the plane's distance if the scene does not determine it: uniform within 10 mm."""
+"""Standard deviation of the plane's distance if the scene does not determine it: uniform within +-10 mm (chosen)."""
 _WORTH_M = 5e-4
 """Smallest offset for which images are formed again: a nearer plane changes the angle by less than MOUNT_STD_M does."""
 _STEP_M = 2e-4
@@ -53,8 +54,8 @@ _COHERENT = 0.7
 _TILT_PRIOR_RAD = 0.02
 """Prior standard deviation of the tilt: about one degree (chosen)."""
 _MIN_STD_M = 3e-4
-"""Smallest standard deviation of a plate's range, due to sidelobes of its neighbours."""
-_MAX_TILT = 0.035
+"""Smallest standard deviation of a plate's range, due to sidelobes of its neighbours; chosen."""
+_MAX_RISE_BY_PHASE = 0.035
 """Largest tilt that phases may show, rise per metre: two degrees; chosen."""
 _TILT_TOLERANCE = 3e-3
 """Difference of the tilts by phase and by range that is accepted beside their errors, rise per metre (chosen)."""
@@ -63,7 +64,8 @@ _MAX_RANGE_STD_M = 0.05
 _PHASE_FITS_RAD = 0.5
 """Largest RMS phase error of plates on one plane (chosen); random phases have 1.8."""
 _PHASE_STD_M = 5e-5
-"""Standard deviation of a height from the phase of the reflection (some degrees for lossy plates) and roughness."""
+"""Standard deviation of a height by phase: phase of the reflection (some degrees for lossy plates), roughness; chosen.
+"""
 
 
 @dataclass(frozen=True)
@@ -213,7 +215,8 @@ class PlaneEstimate:
     tilt_rad, tilt_std_rad
         Rise of the plane's z along x and along y, radians, and their standard deviations.
     heights_m
-        float64 [patch]: height of each patch from its range (from its phase if `by_phase`); NaN if undetermined.
+        float64 [patch]: distance of each patch behind the rig file's plane, from its range (from its phase if
+        `by_phase`); NaN if undetermined.
     by_phase
         The plates' phases lie on one plane and determine it.
     plates
@@ -244,7 +247,7 @@ class PlaneEstimate:
         return self.offset_m if self.worth_moving else 0.0
 
     def apply_to_rig(self, rig: Instrument) -> Instrument:
-        """Return a rig with its object plane at the plates."""
+        """Return a rig with its object plane at the plates; the same rig if moving it is not worth it."""
         if not self.worth_moving:
             return rig
         distance = rig.geometry.object_distance_mm + 1e3 * self.offset_m
@@ -333,7 +336,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         # Thin sheets change the phase themselves: accept the plane only if the ranges agree.
         tolerance = 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, _TILT_TOLERANCE, _TILT_TOLERANCE]
         agrees_with_ranges = bool((np.abs(phase_plane - plane) < tolerance).all())
-        if on_one_plane and agrees_with_ranges and float(np.hypot(*phase_plane[1:])) < _MAX_TILT:
+        if on_one_plane and agrees_with_ranges and float(np.hypot(*phase_plane[1:])) < _MAX_RISE_BY_PHASE:
             plane = phase_plane
             covariance = phase_covariance
             heights = phase_heights
@@ -355,7 +358,7 @@ def move_to_plane(
 ) -> tuple[PlaneEstimate, Images]:
     """Estimate the plane of patches; return it and the images on it with their dispersion.
 
-    Images are formed again if the plane differs from the rig file's.
+    Images are formed again if the plane differs enough from the rig file's (`PlaneEstimate.worth_moving`).
 
     Parameters
     ----------
@@ -384,7 +387,10 @@ def move_to_plane(
 def _estimate_heights_by_range(
     board: BoardSamples, masks: Sequence[NDArray[np.bool_]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the height of each patch from the range of its echo, and its standard deviation, metres."""
+    """Return the height of each patch from the range of its echo, and its standard deviation, metres, [patch].
+
+    NaN and infinite where the range does not determine it.
+    """
     image, footprint, _ = board.image()
     slope, mirror_slope = board.range_slope()
     moved_image = board.mirror_image(_STEP_M)
@@ -441,7 +447,7 @@ def _estimate_heights_by_phase(
     design = np.column_stack([np.ones(with_phase.size), places[with_phase]])
     # The range leaves an ambiguity of some turns, common to all plates except for the tilt: try 17 tilts
     # along each axis, within one standard deviation of the prior.
-    tilts = np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD
+    tilts = np.linspace(-1, 1, 17) * _TILT_PRIOR_RAD
     trial_planes = plane + np.array([(0.0, tilt_x, tilt_y) for tilt_x in tilts for tilt_y in tilts])
     guesses = trial_planes @ design.T
     heights = phases[with_phase] / rad_per_m

@@ -1,4 +1,4 @@
-"""Point response of an aperture: measured widths and sidelobes, the paper's formula and the limit of the geometry.
+"""Point response of an aperture: measured widths and sidelobes, the PolySight paper's formula, the geometry's limit.
 
 `point_response` images a point in the middle of the scene with the aperture's taper and mask; `imaging_facts` gives the
 entry `imaging` of quality.json.
@@ -34,6 +34,7 @@ _STEP_M = 1e-4
 _MAX_DISTANCE_M = 20.0
 _PRECISION_M = 1e-6
 _PLACES = 5
+# As an amplitude.
 _HALF_POWER = np.sqrt(0.5)
 
 
@@ -52,7 +53,7 @@ class PointResponse:
     paper_mm
         The paper's formula `r lambda / L` (section 6.1) with r the plane's distance.
     sidelobe_db
-        Strongest sidelobe.
+        Strongest sidelobe, relative to the peak.
     """
 
     width_mm: tuple[float, float]
@@ -183,7 +184,7 @@ def board_facts(board: BoardSamples) -> BoardImaging:
     """Return the figures of one board.
 
     `masked` is the share of the tapered aperture without data, `loss_db` the loss of a point's sum due to it,
-    `-20 log10(1 - masked)`. Image amplitudes do not change, for images are divided by the number of valid positions.
+    `-20 log10(1 - masked)`. Image amplitudes do not change, for images are divided by the weight of valid positions.
     """
     weights = board.weights
     masked = 1 - float(weights.sum() / board.taper.sum())
@@ -291,7 +292,7 @@ def _find_nearest_ghost_m(
         return float("inf")
     near = 0.0
     far = _MAX_DISTANCE_M
-    # Bisection: importing scipy.optimize takes longer than the whole forecast
+    # Bisection: importing scipy.optimize takes longer than the whole forecast.
     while far - near > _PRECISION_M:
         middle = (near + far) / 2
         if too_far(middle):

@@ -4,9 +4,10 @@
 selects. The samples of an ideal mirror on the object plane (`mirror_samples`) give the footprint, by which images are
 divided.
 
-Range gate (`reduction`): 192 fast-time samples become the few frequency samples that describe the scene. A pixel is the
-matched filter `S(d) = sum_t w_t x_t exp(-j 2 pi f_t d / c)` at its excess path d. All d lie in a gate `[d_1, d_2]` of
-few range cells. The functions `exp(-j 2 pi f d / c)` of d in this gate, f in the swept band B, span a space of about `B
+Range gate (`reduction`): the 192 samples x_t of a chirp, at the frequencies f_t and relative to the direct path, become
+the few frequency samples that describe the scene. A pixel is the matched filter `S(d) = sum_t w_t x_t exp(-j 2 pi f_t d
+/ c)` with the window w_t at its excess path d, the path beyond the direct one. All d lie in a gate `[d_1, d_2]` of few
+range cells. The functions `exp(-j 2 pi f d / c)` of d in this gate, f in the swept band B, span a space of about `B
 (d_2 - d_1) / c + 1` dimensions (Landau and Pollak 1962), so each is a combination of those at a few evenly spaced f_m:
 `exp(-j 2 pi f_t d / c) w_t = sum_m M_mt exp(-j 2 pi f_m d / c)`, with M from least squares over the gate. Then `S(d) =
 sum_m (M x)_m exp(-j 2 pi f_m d / c)`, and `M x` is computed once per position; the imagers use only M x at f_m. Six
@@ -395,7 +396,7 @@ class BoardSamples:
         Raises
         ------
         DataError
-            if the row is not in the plan.
+            if the row is not in the plan, or has another number of positions.
         """
         if not 0 <= index < self._plan.rows:
             raise _wrong_row_error(f"row {index} of board {self.board.name!r} is not in this scan")
@@ -443,7 +444,7 @@ class BoardSamples:
 
     def _apply_gate(self, samples: NDArray[np.complex64], sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Apply the range gate to a row; return samples and the direct path, [rx, frequency + 1, position]."""
-        # A copy: the product of an array with reversed positions is slow.
+        # In the order of memory: the product of an array with reversed positions is slow.
         if samples.strides[1] < 0:
             return self._apply_gate(samples[:, ::-1], sweep_hz)[..., ::-1]
         if sweep_hz.size not in self._maps:

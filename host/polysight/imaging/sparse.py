@@ -50,7 +50,7 @@ class Reconstruction:
         complex64 [ny, nx]: reflectivity of each pixel with the phase of the samples, the conjugate of `Images.h`
         and `v`. A point has its own amplitude in one pixel.
     residual
-        float64 [iteration]: `|W (G A x - y)| / |W y|`, the unexplained share.
+        float64 [iteration]: `|W (G A x - y)| / |W y|`, the unexplained share at the point that the step starts from.
     """
 
     image: NDArray[np.complex64]
@@ -177,7 +177,8 @@ def fill_missing(
     filled
         A builder with samples at all positions of a grid without ghosts; recorded samples are unchanged.
     errors
-        Board name to the errors of its reconstructed positions; boards of which none is missing are left out.
+        Board name to the errors of its reconstructed positions; boards without a missing or without a recorded position
+        are left out.
 
     Raises
     ------

@@ -335,8 +335,8 @@ class SpectralImager(RowSpectra):
         sizes = self.lattice
         rows = aperture.offsets_m.shape[0]
         lines = aperture.grid.shape[0]
-        # Lattice row of the first row of pixels
-        self._last = sizes.row_stride * (rows - 1)
+        # Lattice row of the first row of pixels.
+        self._first_pixel_row = sizes.row_stride * (rows - 1)
         count = sizes.size_y // sizes.row_stride
         # Rows are padded with zeros below.
         self._padded_lines = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)
@@ -344,7 +344,7 @@ class SpectralImager(RowSpectra):
         self._repeat = self.put(np.arange(sizes.size_y) % count)
         # Lattice rows of positions, and of pixels.
         self._rows = self.put(np.arange(rows) * sizes.row_stride)
-        self._pixel_rows = self.put(self._last + np.arange(lines) * sizes.pixel_stride)
+        self._pixel_rows = self.put(self._first_pixel_row + np.arange(lines) * sizes.pixel_stride)
         self._kernels = get_cached(
             self.key("2d", self.lattice.size_y), lambda: self._fft.fft(self.kernels(), n=self.lattice.size_y, axis=-2)
         )
@@ -390,8 +390,8 @@ class SpectralImager(RowSpectra):
         sizes = self.lattice
         lines = self.evaluate_pixels_adjoint(image)
         padded = xp.zeros((sizes.size_y, lines.shape[-1]), dtype=xp.complex64, device=self.device)
-        end = self._last + sizes.pixel_stride * lines.shape[0]
-        padded[self._last : end : sizes.pixel_stride, :] = lines
+        end = self._first_pixel_row + sizes.pixel_stride * lines.shape[0]
+        padded[self._first_pixel_row : end : sizes.pixel_stride, :] = lines
         spectrum = self._fft.fft(padded, axis=0)
         rows = []
         for c in range(self._kernels.shape[0]):
@@ -431,7 +431,7 @@ class IncrementalImager(RowSpectra):
         rows = aperture.shape[2]
         lines = aperture.grid.shape[0]
         # Lag from the first row of positions to the first row of pixels, and the lags that pixels take from one row.
-        self._last = self.lattice.row_stride * (rows - 1)
+        self._first_pixel_row = self.lattice.row_stride * (rows - 1)
         self._span = self.lattice.pixel_stride * (lines - 1) + 1
         self._kernels, self._components = get_cached(self.key("rows"), self._compute_principal_kernels)
         if echo is None:
@@ -522,7 +522,7 @@ class IncrementalImager(RowSpectra):
 
     def _find_lags(self, index: int) -> slice:
         """Return the lags in y between a row of positions and every row of pixels."""
-        first = self._last - index * self.lattice.row_stride
+        first = self._first_pixel_row - index * self.lattice.row_stride
         return slice(first, first + self._span, self.lattice.pixel_stride)
 
     def _compute_principal_kernels(self) -> tuple[Any, Any]:

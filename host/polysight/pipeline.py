@@ -11,7 +11,7 @@ from polysight.settings import DEFAULT, Settings
 
 
 class Pipeline:
-    """Processes a scan: add its rows, then `finish`. `live`: images of the rows so far; `samples`: use of kept ones."""
+    """Processes a scan: add rows, then `finish`. `live`: images of the rows so far; `samples`: as of `KeptSamples`."""
 
     def __init__(
         self,

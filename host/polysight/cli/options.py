@@ -269,7 +269,7 @@ def number(kind: Callable[[str], Number], rule: str, holds: Callable[[Number], b
     return convert
 
 
-# The largest counts are those of 64-bit integers.
 positive = number(float, "a number above 0", lambda value: 0 < value < math.inf)
 count = number(int, "a whole number, 1 or more", lambda value: value >= 1)
+# Up to the largest 64-bit integer, the seed of a scene file.
 count_from_zero = number(int, "a whole number, 0 or more", lambda value: 0 <= value < 1 << 63)

@@ -144,7 +144,7 @@ def _run_doctor(args: argparse.Namespace) -> int:
             "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out",
             code=ErrorCode.VALUES_CONFLICT,
         )  # fmt: skip
-    options = DoctorOptions(args.config, args.out, args.move, args.pulse, args.bursts)
+    options = DoctorOptions(config=args.config, out=args.out, move=args.move, pulse=args.pulse, bursts=args.bursts)
     return run_doctor(options, args.as_json, bundle=args.bundle)
 
 
@@ -472,7 +472,7 @@ def _run_reproduce(args: argparse.Namespace) -> int:
     from polysight.jobs.demo import require_package
 
     if args.config != find_packaged(RIG):
-        # Refuse a wrong one now, not with the first item that needs it
+        # Refuse a wrong one now, not with the first item that needs it.
         load_instrument(args.config)
     require_package("polysight_papers", "papers")
     # The libraries for its figures take seconds to load.

@@ -27,7 +27,7 @@ def add_commands(add: Add) -> None:
 def _serve(args: argparse.Namespace) -> int:
     """Run `polysight serve`; without `--config` with the rig file of the current folder, if there is one."""
     _check_extra()
-    # What it shows takes seconds to load
+    # What it shows takes seconds to load.
     sys.stderr.write("polysight serve: starting\n")
     from polysight.serve import serve
 

@@ -212,7 +212,9 @@ def _measure_rate(rate: float, packets: int, receivers: list[ReceiverProcess], f
     """Send `packets` packets to each receiver, as cards that were reset: losses at an earlier rate do not count."""
     for receiver in receivers:
         part = folder / f"{receiver.board.name}.part"
-        receiver.begin_row(0, 1, packets * MAX_PAYLOAD_BYTES, 1, part, after_reset=True)
+        receiver.begin_row(
+            row=0, take=1, expected_bytes=packets * MAX_PAYLOAD_BYTES, frame_bytes=1, path=part, after_reset=True
+        )
     senders = []
     for receiver in receivers:
         card = (receiver.board.card_address, CARD_SOURCE_PORT)
@@ -304,9 +306,9 @@ class CapturedFrames:
     Attributes
     ----------
     words
-        int16 [frame, sample, 2, rx], I before Q.
+        int16 [chirp, sample, 2, rx], I before Q.
     valid
-        bool [frame]: received complete.
+        bool [chirp]: received complete.
     row
         Packet and byte counts of the receiver.
     radar

@@ -79,7 +79,7 @@ _MAX_DELAY_S = 10e-9
 # Delays of one receiver after the other that are a warning and an error; chosen.
 _SKEW_WARNING_S = 10e-9
 _SKEW_ERROR_S = 20e-9
-# Two trigger clocks of 5 ns give a standard deviation of 2 ns; twice that is a fault.
+# Two trigger clocks of 5 ns give a standard deviation of 2 ns; twice that is a warning.
 _MAX_JITTER_S = 4e-9
 
 
@@ -231,7 +231,7 @@ _POLL_MS = 100
 
 
 def check_keys(context: CheckContext) -> Finding:
-    """Check that the CURVE keys are readable, and by this user only; loopback addresses need none."""
+    """Check that the CURVE keys are readable, the secret one by this user only; loopback addresses need none."""
     pi = context.rig.pi
     if is_loopback(pi.command_address) and is_loopback(pi.event_address):
         return ok("not needed: both addresses are loopback")
@@ -242,7 +242,8 @@ def check_keys(context: CheckContext) -> Finding:
             "the Pi's keys were not copied here, or belong to another user",
             f"copy the Pi's {' and '.join(HOST_KEYS)} here (docs/how-to/install.md); pi.key_dir is {folder}",
         )
-    secret = folder / HOST_KEYS[-1]
+    _, secret_name = HOST_KEYS
+    secret = folder / secret_name
     mode = secret.stat().st_mode
     if mode & 0o077:
         return warning(

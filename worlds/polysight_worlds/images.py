@@ -211,7 +211,11 @@ def disturb_data(
     channel: str,
     dark: NDArray,
 ) -> NDArray:
-    """Echoes relative to the direct path as the synchronisation sees it, complex64 [frequencies, rows, columns]."""
+    """Echoes relative to the direct path as the synchronisation sees it, complex64 [frequencies, rows, columns].
+
+    `echoes` have the same shape, `direct` [frequencies] is the undisturbed path; `channel` is "h" or "v", `dark` bool
+    [rows, columns] marks positions without signal.
+    """
     shape = echoes.shape[1:]
     beside = nuisances.multipath * _draw_fringes(rng, rig)
     received_direct = direct[:, None, None] * (1 + beside)

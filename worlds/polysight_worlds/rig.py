@@ -167,7 +167,7 @@ def load_boards(file: Path) -> Boards:
 
 
 def read_boards(content: dict, leakage: tuple[complex, complex] = (0j, 0j)) -> Boards:
-    """Return the boards of an instrument file's content; `leakage` as of `read_rig`."""
+    """Return the boards of an instrument file's content, their RX evenly spaced; `leakage` as of `read_rig`."""
     steps = {}
     for board in content["boards"]:
         places = [place(board["mount"], antenna_mm)[0] for antenna_mm in content["antennas"]["rx_mm"]]

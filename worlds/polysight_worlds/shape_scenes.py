@@ -72,7 +72,7 @@ class ShapeScene:
 
 @dataclass(frozen=True)
 class ShapeNuisances:
-    """What disturbs a scan of shapes; 0 is none. All is drawn from normal distributions, by `seed`.
+    """What disturbs a scan of shapes; 0 is none. By `seed`, all but the phases is drawn from normal distributions.
 
     `noise`: of the nominal noise. Root mean squares: `misplaced_mm` how far each board stands from where the rig file
     says, `axes_deg` how far its polarisation is turned about its boresight, `leakage` the magnitude of the other

@@ -86,7 +86,7 @@ class World:
 
 
 def table(stack: Stack, *, behind_mm: float, centre_m: tuple[float, float], tilt_deg: float = 0.0) -> Plate:
-    """Return a table of 0.7 m by 0.5 m at `behind_mm` behind the object plane; z grows along x, falls along y."""
+    """Return a table of 0.7 m by 0.5 m at `behind_mm` behind the object plane; by the tilt z grows in x, falls in y."""
     size_m = (0.7, 0.5)
     return Plate("table", centre_m, size_m, stack, height_mm=-behind_mm, tilt_x_deg=tilt_deg, tilt_y_deg=-tilt_deg)
 
@@ -116,7 +116,7 @@ class Nuisances:
     | clipping | share of the largest amplitude of direct path and echo that is cut off |
     | roughness_mm, waviness_mm | rms of all plates' surfaces, correlated over 5 and 20 mm |
     | bow_mm | plates are bent by up to this, either way in x and y |
-    | brightness | plates are brighter or darker by up to 1 plus this, as in the published picture; no cause is known |
+    | brightness | plates are brighter or darker by a factor of up to 1 plus this, as in the published picture |
     | leakage | magnitude of the other polarisation in H and V |
     | border | share of the picture's width by which the scene is shifted |
     | aperture | share of the grid, in each direction, that was not scanned |

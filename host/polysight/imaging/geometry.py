@@ -233,7 +233,7 @@ def pitch_y_m(aperture: Aperture) -> float | None:
 
 def window_weights(name: Window, n: int) -> NDArray[np.float64]:
     """Return a symmetric window of n points without the zeros at its ends, float64 [n]."""
-    # Common ones in NumPy: scipy.signal loads scipy.stats, which takes a second
+    # Common ones in NumPy: scipy.signal loads scipy.stats, which takes a second.
     match name:
         case "boxcar":
             weights = np.ones(n + 2)

@@ -430,7 +430,7 @@ class ImageBuilder:
         self.grid = image_grid(rig)
         self.live = live
         if live:
-            # Load it now instead of after the last row
+            # Load it now instead of after the last row.
             import_module("scipy.ndimage")
         plan = plan_raster(rig.grid)
         antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)

@@ -41,7 +41,7 @@ MOST_CHIRPS = 256
 _log = logging.getLogger(__name__)
 _lock = threading.Lock()
 
-# Any array as an argument in C, made in a third of the time that `ctypes.data` takes
+# Any array as an argument in C, made in a third of the time that `ctypes.data` takes.
 _POINTED = ctypes.c_char * 0
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]

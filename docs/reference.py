@@ -38,10 +38,14 @@ PACKAGES = (
     "polysight_pi",
 )
 
+# Start of the index's navigation, with a link to the other pages.
 _NAVIGATION = '<nav class="pdoc"><p><a href="docs/README.html">How-tos, notebooks, gallery, formats</a></p>'
+# An array's type as Python shows it once it is evaluated.
 _ARRAY = re.compile(r"numpy\.ndarray\[tuple\[(?:typing\.)?Any, \.\.\.\], numpy\.dtype\[(?:numpy\.)?([\w.]+)\]\]")
+# The function itself: `build` replaces the one in `inspect`.
 _as_evaluated = inspect.formatannotation
-_TO_PRIVATE = re.compile(r'<a href="[^"#]*#_[^"]*">(.*?)</a>')  # base classes that have no place of their own
+# Links to base classes that have no place of their own.
+_TO_PRIVATE = re.compile(r'<a href="[^"#]*#_[^"]*">(.*?)</a>')
 
 
 def modules_of(name: str) -> Iterator[str]:
@@ -50,9 +54,11 @@ def modules_of(name: str) -> Iterator[str]:
     yield name
     names = getattr(module, "__all__", None) or list_public_imports(module)
     for public in names:
-        setattr(module, public, getattr(module, public))  # a lazy name is imported now, for pdoc to see it
+        # A lazy name is imported now, for pdoc to see it.
+        setattr(module, public, getattr(module, public))
     if names:
-        vars(module)["__all__"] = names  # pdoc takes no other imported name for a public one
+        # pdoc takes no other imported name for a public one.
+        vars(module)["__all__"] = names
     elif hasattr(module, "__path__"):
         yield from (page for child in _children(module) for page in modules_of(child))
 
@@ -64,6 +70,7 @@ def list_public_imports(module: ModuleType) -> list[str]:
 
 
 def _children(package: ModuleType) -> Iterator[str]:
+    """Names of the public modules in a package."""
     for found in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
         if not found.name.rpartition(".")[2].startswith("_"):
             yield found.name
@@ -82,14 +89,15 @@ def format_type(annotation: object) -> str:
 def build(names: Sequence[str], out: Path) -> list[Path]:
     """Write the pages of these modules, an index and a search index into `out`; returns the pages."""
     pdoc.render.configure(docformat="numpy", show_source=False, footer_text="polysight, from its docstrings")
-    warnings.filterwarnings("ignore", "Error parsing type annotation")  # of named tuples: shown as they are written
+    # Those of named tuples, which are shown as they are written.
+    warnings.filterwarnings("ignore", "Error parsing type annotation")
     modules = {name: pdoc.doc.Module.from_name(name) for name in names}
     pages = []
     for name, module in modules.items():
         _hide_metadata_routing(module)
         page = out / f"{name.replace('.', '/')}.html"
         page.parent.mkdir(parents=True, exist_ok=True)
-        # Of a variable, and of a parameter
+        # The types of variables, and those of parameters.
         with (
             mock.patch.object(pdoc.doc, "formatannotation", format_type),
             mock.patch.object(inspect, "formatannotation", format_type),

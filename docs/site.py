@@ -24,7 +24,9 @@ import polysight
 
 NOTEBOOKS = ROOT / "examples" / "notebooks"
 GALLERY = ROOT / "docs" / "gallery.md"
+# A link or picture within the repository: attribute, file, anchor.
 _TARGET = re.compile(r'((?:href|src)=")([^"#:]+)(#[^"]*)?"')
+# The file that a block of the gallery writes.
 _PICTURE = re.compile(r'"out/(gallery-\w+\.png)"')
 _STYLE = (
     "body{max-width:60em;margin:2em auto;padding:0 1em;font:16px/1.55 system-ui,sans-serif}"
@@ -58,12 +60,13 @@ def _write(path: Path, out: Path, body: str) -> Path:
     pages = {*site_pages(), *NOTEBOOKS.glob("*.ipynb")}
 
     def turn(link: re.Match[str]) -> str:
+        """Return a link as it is from the page; a linked file that is no page is copied beside the pages."""
         target = (path.parent / link[2]).resolve()
         if target in pages:
             place = Path(os.path.relpath(out / target.relative_to(ROOT).with_suffix(".html"), page.parent))
             return f'{link[1]}{place.as_posix()}{link[3] or ""}"'
         if (page.parent / link[2]).is_file():
-            # A picture that was drawn for the page
+            # A picture that was drawn for the page.
             return link[0]
         if target.is_file():
             copy = out / target.relative_to(ROOT)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from docs.check.commands import is_ours
 from docs.check.looking import page_faults
-from docs.check.pages import SHELLS, Page, all_pages, read_page
+from docs.check.pages import SHELLS, Block, Page, all_pages, read_page
 from docs.check.running import PageRun, run_page, scratch_copy
 
 
@@ -20,29 +20,48 @@ def _say(text: str) -> None:
     sys.stdout.flush()
 
 
+def _why_not_run(block: Block, first_line: int, run: PageRun | None) -> str:
+    """Return why the commands of a block were not run, or that one failed; "" if they ran.
+
+    `first_line` is that of its first command, `run` how the commands of its page ended; None without `--run`.
+    """
+    if block.kept_back:
+        return block.kept_back
+    if run is None:
+        return "--run not given"
+    last_line = block.line + block.text.count("\n")
+    if not run.failed_line or run.failed_line > last_line:
+        return ""
+    if run.failed_line < first_line:
+        return "not reached"
+    return "FAILED"
+
+
 def _table(pages: Sequence[Page], runs: dict[Path, PageRun]) -> None:
-    """Every shell block: run, or only checked and why."""
+    """Print every shell block: run, or only checked and why."""
     _say("\nshell blocks of the pages:")
-    count = {True: 0, False: 0}
+    count_run = 0
+    count_checked = 0
     for page in pages:
         for block in page.blocks:
             commands = block.commands() if block.language in SHELLS or block.is_run else []
             if block.language == "python":
-                commands = commands[:1]  # a program counts as one
+                # A program counts as one.
+                commands = commands[:1]
             if block.language == "":
                 commands = [(n, text) for n, text in enumerate(block.text.splitlines(), block.line) if is_ours(text)]
             if not commands:
                 continue
-            run = runs.get(page.path)
-            why = block.kept_back or ("" if run else "--run not given")
-            if run and run.failed_line and not why:
-                first, last = commands[0][0], block.line + block.text.count("\n")
-                why = "not reached" if run.failed_line < first else "FAILED" if run.failed_line <= last else ""
-            count[not why] += len(commands)
-            _say(
-                f"  {'run    ' if not why else 'checked'}  {page.name}:{block.line:<4} {commands[0][1][:70]:70}  {why}"
-            )
-    _say(f"{count[True]} commands run, {count[False]} only checked")
+            first_line, first_command = commands[0]
+            why = _why_not_run(block, first_line, runs.get(page.path))
+            if why:
+                state = "checked"
+                count_checked += len(commands)
+            else:
+                state = "run"
+                count_run += len(commands)
+            _say(f"  {state:7}  {page.name}:{block.line:<4} {first_command[:70]:70}  {why}")
+    _say(f"{count_run} commands run, {count_checked} only checked")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -18,7 +18,9 @@ from docs.check.pages import ROOT
 
 PROGRAMS = {"polysight": "polysight.cli.main", "polysight-pi": "polysight_pi.cli"}
 OWN = ("benchmarks", "docs", "polysight", *(f"polysight_{name}" for name in ("papers", "pi", "shared", "simulators")))
+# Words before a command that run it.
 _BEFORE = ("sudo", "env", "exec", "time", "nohup", "ssh", "timeout", "nice")
+# What ends a command, and what redirects its input or output: words of `shlex` with punctuation.
 _ENDS = re.compile(r"[|&;()\n]+")
 _REDIRECTS = re.compile(r"[<>&]+")
 
@@ -41,6 +43,7 @@ def parser_of(module: str) -> argparse.ArgumentParser | None:
     if importlib.util.find_spec(f"{module}.__main__" if _is_package(module) else module) is None:
         raise ModuleNotFoundError(f"{module} cannot be run with -m")
     loaded = importlib.import_module(f"{module}.__main__" if _is_package(module) else module)
+    # Neither `parse_args` nor `argparse`, nor a function that builds a parser: its `main` must not be called here.
     if "pars" not in Path(str(loaded.__file__)).read_text(encoding="utf-8"):
         return None
 
@@ -56,6 +59,7 @@ def parser_of(module: str) -> argparse.ArgumentParser | None:
 
 
 def _is_package(module: str) -> bool:
+    """True for a module with a folder of its own."""
     spec = importlib.util.find_spec(module)
     return spec is not None and spec.submodule_search_locations is not None
 
@@ -73,7 +77,8 @@ def simple_commands(line: str) -> list[list[str]]:
             found.append([])
         elif _REDIRECTS.fullmatch(word):
             skip = True
-            if found[-1][-1:] in (["1"], ["2"]):  # of 2>&1
+            # The number of the stream in `2>&1` came as a word of its own.
+            if found[-1][-1:] in (["1"], ["2"]):
                 found[-1].pop()
         else:
             found[-1].append(word)
@@ -81,9 +86,11 @@ def simple_commands(line: str) -> list[list[str]]:
 
 
 def _without_runner(words: list[str]) -> list[str]:
+    """Return a command without the programs that run it, their options and values, and variables that are set."""
     while words and (words[0] in _BEFORE or re.fullmatch(r"[A-Za-z_]+=.*|-\w*|\$|!", words[0])):
         runner, words = words[0], words[1:]
         if runner == "ssh":
+            # The first word that is no option is the machine.
             words = words[next((n for n, word in enumerate(words) if not word.startswith("-")), 0) + 1 :]
         elif runner in ("-u", "-n", "timeout"):
             words = words[1:]
@@ -126,6 +133,7 @@ def command_faults(line: str) -> list[str]:
 
 
 def _parse_faults(module: str, arguments: list[str]) -> list[str]:
+    """What the module's own parser says against the arguments; empty when it takes them."""
     try:
         parser = parser_of(module)
     except ModuleNotFoundError as e:
@@ -147,7 +155,8 @@ def mention_faults(text: str) -> list[str]:
     try:
         commands = simple_commands(text)
     except ValueError:
-        return []  # words in code type need not be a shell's
+        # Words in code type need not be a shell's.
+        return []
     faults: list[str] = []
     for words in commands:
         ours = _module(words)
@@ -159,6 +168,7 @@ def mention_faults(text: str) -> list[str]:
 
 
 def _walk(module: str, words: list[str]) -> list[str]:
+    """The first subcommand or option among the words that the module's parser does not have; empty without one."""
     try:
         parser = parser_of(module)
     except ModuleNotFoundError as e:
@@ -187,6 +197,7 @@ def _make_faults(words: list[str]) -> list[str]:
     faults: list[str] = []
     skip = False
     for word in words:
+        # `-C`, and the folder behind it.
         if skip or word == "-C":
             skip = not skip
         elif "=" in word:

@@ -15,8 +15,11 @@ from pathlib import Path
 from docs.check.pages import ROOT, Page
 
 LIMIT_S = 900.0
-"""A page that takes longer has failed."""
-RIG_SCENE, RIG_TIME_SCALE = "examples/nine-materials.toml", 40
+"""A page that takes longer has failed; chosen."""
+# Scene of the simulated rig, and its seconds per second.
+RIG_SCENE = "examples/nine-materials.toml"
+RIG_TIME_SCALE = 40
+# Not copied: what is large, or made by the programs.
 _LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "out", "build", "__pycache__", ".*_cache", "*.egg-info", "scans")
 
 
@@ -35,7 +38,8 @@ def scratch_copy(folder: Path, root: Path = ROOT) -> Path:
     shutil.copytree(root, copy, ignore=_LEFT_OUT)
     (copy / ".venv").symlink_to(root / ".venv")
     for file in copy.rglob("pyproject.toml"):
-        os.utime(file, (0, 0))  # older than .venv/installed: `make` shall not install the copy
+        # Older than .venv/installed: `make` shall not install the copy.
+        os.utime(file, (0, 0))
     return copy
 
 
@@ -45,8 +49,10 @@ def script_of(page: Page) -> str:
     for block in page.blocks:
         for number, text in block.shell_lines() if block.is_run else ():
             lines[number - 1] = text
-        if block.is_run and block.language == "python":  # where the page has its fences
-            lines[block.line - 2], lines[block.line - 1 + block.text.count("\n")] = "python - <<'PYTHON'", "PYTHON"
+        if block.is_run and block.language == "python":
+            # The shell's words stand where the page has its fences.
+            lines[block.line - 2] = "python - <<'PYTHON'"
+            lines[block.line - 1 + block.text.count("\n")] = "PYTHON"
     # On the first line, which is a heading: stop at the first failure, and say before each command where we are.
     lines[0] = f"set -euo pipefail; trap 'echo $LINENO >\"$AT_LINE\"' DEBUG; {lines[0]}"
     return "\n".join(lines) + "\n"
@@ -58,8 +64,10 @@ def run_page(page: Page, copy: Path, limit_s: float = LIMIT_S) -> PageRun:
     work = copy.parent / "work"
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
-    script, at = work / "page.sh", work / "at"
+    script = work / "page.sh"
     script.write_text(script_of(page), encoding="utf-8")
+    # Holds the line of the command that runs, see `script_of`.
+    at = work / "at"
     at.write_text("0")
     environment = {
         **os.environ, "PATH": f"{copy / '.venv/bin'}:{os.environ['PATH']}", "AT_LINE": str(at), "LC_ALL": "C.UTF-8",
@@ -78,11 +86,13 @@ def run_page(page: Page, copy: Path, limit_s: float = LIMIT_S) -> PageRun:
             try:
                 status = shell.wait(limit_s)
             except subprocess.TimeoutExpired:
+                # As of timeout(1).
                 status = 124
         finally:
             if shell is not None:
+                # The shell, or what it left running.
                 with contextlib.suppress(ProcessLookupError):
-                    os.killpg(shell.pid, signal.SIGKILL)  # it, or what it left running
+                    os.killpg(shell.pid, signal.SIGKILL)
                 shell.wait()
             if rig is not None:
                 _end(rig)
@@ -108,6 +118,7 @@ def _start_rig(copy: Path, work: Path, environment: dict[str, str]) -> subproces
 
 
 def _end(rig: subprocess.Popen[str]) -> None:
+    """End the simulated rig; kill it if it does not end within 20 s."""
     rig.terminate()
     try:
         rig.communicate(timeout=20)

@@ -13,17 +13,21 @@ from matplotlib.patheffects import withStroke
 
 from polysight.report import INK, MUTED, PALETTE, STAMP
 
+# Title of each image to the levels at the ends of its colours; chosen by eye.
 SHOWN_DB = {"H, s-polarised": (-35, 0), "V, p-polarised": (-35, 0), "P = H / V": (-3, 24)}
+# Half the width of the part of each image that is shown.
 REACH_MM = 98.0
 
 
 def _loss(permittivity: dict[str, float]) -> str:
-    loss = round(-permittivity["imag"], 1) + 0.0  # + 0.0: no -0.0
+    """Return the loss of a permittivity in materials.json with its standard error, as text."""
+    # Adding zero after rounding removes the sign of a negative zero.
+    loss = round(-permittivity["imag"], 1) + 0.0
     return f"loss {loss:.1f} ± {permittivity['imag_std']:.1f}"
 
 
 def draw(products: Path, to: Path) -> None:
-    """Both channels and their ratio in dB, and what each patch was named, with its relative permittivity."""
+    """Draw both channels and their ratio in dB, and what each patch was named, with its relative permittivity."""
     image = np.load(products / "image.npz", allow_pickle=False)
     materials = json.loads((products / "materials.json").read_text(encoding="utf-8"))
     if not materials["simulated"]:
@@ -34,7 +38,10 @@ def draw(products: Path, to: Path) -> None:
     for ax, (title, (low, high)), key in zip(axes[:3], SHOWN_DB.items(), "hvp", strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
             level = 20 * np.log10(np.abs(image[key]) / (1 if key == "p" else np.abs(image[key]).max()))
-        seen = image["valid"] & (np.abs(image["h"]) > 0.1 * np.abs(image["h"]).max() if key == "p" else True)
+        seen = image["valid"]
+        if key == "p":
+            # Where H is dark, a ratio is noise; the level is chosen.
+            seen = seen & (np.abs(image["h"]) > 0.1 * np.abs(image["h"]).max())
         shown = np.where(seen, level, np.nan)
         picture = ax.imshow(
             shown, origin="lower", extent=(x[0], x[-1], y[0], y[-1]), vmin=low, vmax=high, cmap="cividis"
@@ -49,12 +56,13 @@ def draw(products: Path, to: Path) -> None:
         colour = PALETTE[names.index(part["name"] or "")]
         axes[3].add_patch(Polygon(part["outline_mm"], facecolor=colour + "99", edgecolor=INK, linewidth=1.2))
         x0, y0, x1, y1 = part["box_mm"]
-        words = (part["name"] or "metal").split(" (")[0].replace(" ", "\n", 1)
+        # The name without what stands in brackets, in two lines.
+        name = (part["name"] or "metal").split(" (")[0].replace(" ", "\n", 1)
         eps = part["permittivity"]
-        told = "reference" if eps is None else f"{eps['real']:.1f} ± {eps['real_std']:.1f}\n{_loss(eps)}"
-        for text, size, lift in ((words, 14, 8), (told, 10.5, -13)):
+        value = "reference" if eps is None else f"{eps['real']:.1f} ± {eps['real_std']:.1f}\n{_loss(eps)}"
+        for text, size, up_mm in ((name, 14, 8), (value, 10.5, -13)):
             axes[3].text(
-                (x0 + x1) / 2, (y0 + y1) / 2 + lift, text, ha="center", va="center", fontsize=size, color=INK,
+                (x0 + x1) / 2, (y0 + y1) / 2 + up_mm, text, ha="center", va="center", fontsize=size, color=INK,
                 linespacing=0.95, path_effects=[withStroke(linewidth=3, foreground="white")],
             )  # fmt: skip
     axes[3].set_title("materials, permittivity", fontsize=19, color=INK, fontweight="bold", loc="left")
@@ -65,6 +73,7 @@ def draw(products: Path, to: Path) -> None:
             0.98, 0.02, "SIMULATED", transform=ax.transAxes, ha="right", va="bottom", fontsize=12, color=STAMP,
             fontweight="bold", path_effects=[withStroke(linewidth=3, foreground="white")],
         )  # fmt: skip
+    # The scale: a line of 50 mm.
     axes[0].plot([-94, -44], [-95, -95], color="white", linewidth=3)
     axes[0].text(-69, -93, "50 mm", ha="center", va="bottom", fontsize=12, color="white")
     fig.savefig(to)

@@ -20,6 +20,7 @@ sys.path.insert(0, str(HERE.parents[1]))
 
 from tests.support.page.chromium import DESK, PHONE, Browser, find_chromium  # noqa: E402
 
+# JavaScript: the pictures of the live view; true once rows are in them; the probe at a place right of the middle.
 PICTURES = "[...document.querySelectorAll('.view img')]"
 ROWS_IN = "parseInt(document.getElementById('images-note').innerText) > 0"
 LOOK = (
@@ -30,7 +31,7 @@ LOOK = (
 
 
 def take_preview(browser: Browser, address: str) -> None:
-    """Both pictures, once the six images are there and the page says that all of it is simulated."""
+    """Take both pictures, once the six images are there and the page says that all of it is simulated."""
     for name, size in (("preview", DESK), ("preview-phone", PHONE)):
         browser.size(*size)
         browser.open("about:blank")
@@ -43,7 +44,7 @@ def take_preview(browser: Browser, address: str) -> None:
 
 
 def take_serve(browser: Browser, address: str, scan: str) -> None:
-    """The picture, once the probe has answered."""
+    """Take the picture, once the probe has answered."""
     base, _, token = address.partition("/#")
     browser.size(*DESK)
     browser.open(f"{base}/scan?scan={quote(scan)}#{token}")

@@ -10,15 +10,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 HERE = Path(__file__).parent
+# Pixels: width of a sheet, height of a wire's line, place of the first line, left edges of both boxes and their width.
 WIDTH = 460
 ROW = 34
 TOP = 78
-LEFT, RIGHT, BOX = 8, 312, 140
+LEFT = 8
+RIGHT = 312
+BOX = 140
+# Colour of each kind of wire.
 COLOURS = {"signal": "#1f6fb2", "pulse": "#c0392b", "power": "#c46a00", "ground": "#222222", "motor": "#69498a"}
 
 
 class Wire(NamedTuple):
-    """One wire; `part` is what sits in it: a value, `NC` (a contact drawn closed) or nothing."""
+    """One wire between two terminals; `kind` is one of `COLOURS`.
+
+    `part` is what sits in it: a value, `NC` (a contact drawn closed) or nothing.
+    """
 
     left: str
     right: str
@@ -27,7 +34,7 @@ class Wire(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """A connection between two things."""
+    """A connection between two things, `left` and `right`; `name` is that of the file, `notes` stand below it."""
 
     name: str
     title: str
@@ -38,6 +45,7 @@ class Sheet(NamedTuple):
 
 
 def _driver(name: str, pul: str, direction: str) -> Sheet:
+    """Return the sheet of a motor driver, with the UNO's pins of its pulse and direction inputs."""
     return Sheet(
         f"wiring-driver-{name}",
         f"Motor driver {name} (DM542), common cathode",
@@ -170,6 +178,7 @@ SHEETS = (
 
 
 def _text(x: float, y: float, text: str, size: float = 13, anchor: str = "start", bold: bool = False) -> str:
+    """Return a text element; `anchor` says which end of the text is at x."""
     weight = ' font-weight="bold"' if bold else ""
     text = text.replace("&", "&amp;").replace("<", "&lt;")
     return f'<text x="{x}" y="{y}" font-size="{size}" text-anchor="{anchor}"{weight}>{text}</text>'

@@ -43,7 +43,8 @@ OUT = Path("out/surfaces")
 GATE_M = (1.45, 2.2)
 
 # %% The scene: the rig looks down on a table, on which a bottle, a pipe and a box lie beside each other in y. The
-# simulation knows no shadows and no echoes from one object to another.
+# simulation knows no shadows and no echoes from one object to another. Lengths are metres: centre, then radius and
+# length, or width and height; a stack is layers of (permittivity, thickness) on what lies below.
 x, y = map(float, published_rig().centre_m)
 glass_wall = Stack(((5.5 - 0.1j, 0.002),), 1.0)
 shapes = [

@@ -291,7 +291,7 @@ def _match_filter(
 
 __all__ = ["add_arguments", "run"]
 # Signal-to-noise ratios and the distance of the two tones in FFT bins; chosen to span what a rig has (7.2 dB: the
-# paper's figures, see static_chirps).
+# POLySIGHT paper's figures, see static_chirps).
 ALIGN_SNR_DB = (0.0, 2.5, 5.0)
 TONE_SNR_DB = (7.0, 16.0, 22.0, 30.0)
 BINS = 2.5

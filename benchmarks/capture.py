@@ -280,10 +280,12 @@ class PlainLoops:
 
 
 def show(text: str) -> None:
+    """Print a line at once."""
     print(text, flush=True)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the benchmark."""
     parser.add_argument("--seconds", type=float, default=60.0, help="of the run (default 60)")
     parser.add_argument("--rate", type=float, default=120_000.0, help="packets/s of both cards (default 120000)")
     parser.add_argument("--alone", action="store_true", help="no processing of rows beside the capture")

@@ -193,6 +193,7 @@ def process(rig_path: str, row_file: str) -> None:
 
 
 def say(text: str) -> None:
+    """Write a line to the standard output at once."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 

@@ -29,9 +29,9 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
 
     Returns
     -------
-    CPU and wall seconds in all (`cpu_s`, `wall_s`); of the steps done once, before the first row and after the last
-    (`once_cpu_s`); wall seconds from the last committed row to both images, again and again (`last_row_wall_s`); wall
-    seconds by stage (`stages`).
+    Number of `rows`; CPU and wall seconds in all (`cpu_s`, `wall_s`); CPU seconds of the steps done once, before the
+    first row and after the last (`once_cpu_s`); seconds from the last committed row to both images, again and again
+    (`last_row_wall_s`, `last_row_cpu_s`); wall seconds by stage (`stages`).
     """
     if "scan" in source:
         scan = ScanFolder.load(Path(source["scan"]))

@@ -40,7 +40,7 @@ from polysight_simulators.scene import decode_scene, synced_cube
 from polysight_simulators.scene.scene_file import Scene, apply_scene
 from polysight_simulators.scene.simulated_scan import simulate, truth
 
-# Materials of most scenes: real part and loss (eps' and eps''), eight of them those of the paper's Table 2.
+# Materials of most scenes: real part and loss (eps' and eps''), eight of them of the POLySIGHT paper's Table 2.
 MATERIALS: dict[str, tuple[float, float]] = {
     "wood": (2.61, 0.01),
     "PTFE": (2.05, 0.005),
@@ -78,6 +78,7 @@ metal. "no direct path": without the path from TX to RX that synchronisation nee
 "wide" is "full" with permittivities and apertures drawn from the ranges below."""
 # Kinds with a metal reference and plates that can be judged.
 WHOLE = ("full", "sheet", "wide")
+# Of "wide" scenes: ranges of the real part and of the loss tangent; chosen.
 WIDE_REAL = (2.0, 12.0)
 WIDE_LOSS_TANGENT = (0.003, 0.4)
 # Columns and rows; the image stays as it is, so that the outer plates lie beyond the smallest aperture.
@@ -231,7 +232,7 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
 
 
 def _image_scan(source: Any, model: str | None = "none", inputs: Inputs = NO_INPUTS) -> Pipeline:
-    """Return a pipeline with all rows of a source; `model` is the library for names ("none", None: the default)."""
+    """Return a pipeline with all rows of a source; `model`: "none" names nothing, None is the default classifier."""
     pipeline = Pipeline(source, Settings(model=model), inputs)
     for row in source.rows():
         pipeline.add_row(row)
@@ -263,7 +264,7 @@ def judge_scan(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene,
 
 
 def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigures]:
-    """Judged patches of one scene: the sample from which coverage is counted."""
+    """Return the judged patches of one scene: the sample from which coverage is counted; arguments of `judge_scan`."""
     scene, rig, findings, _ = judge_scan(seed, kind, raw)
     plates = truth_plates(truth(rig, scene, scene.seed))
     result = findings.analysis

@@ -32,7 +32,7 @@ RIG = ROOT / "instrument.toml"
 SCENE = ROOT / "examples" / "nine-materials.toml"
 # Rows that are simulated; all others repeat them. Even, so that rows keep their direction.
 DISTINCT = 4
-# Grid of `--quick`.
+# Grid of `--quick`; chosen.
 QUICK = {"columns": 40, "rows": 20}
 
 
@@ -60,7 +60,10 @@ def temporary(parent: Path | None) -> Iterator[Path]:
 
 
 def recorded_rows(rig: Instrument, scene: Scene, count: int = DISTINCT) -> dict[str, list[NDArray[np.int16]]]:
-    """Return rows about the middle of the grid as both receivers record them: int16 [frame, sample, 8] by board."""
+    """Return rows about the middle of the grid as both receivers record them, by board.
+
+    int16 [chirp, sample, 8]: I of the four RX, then their Q.
+    """
     radar = SimulatedRig(rig, scene)
     plan = plan_raster(rig.grid)
     # An even row, which runs towards +x.

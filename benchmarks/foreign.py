@@ -98,7 +98,7 @@ def judge_scene(kind: str, seed: int, nuisance: str = "none") -> list[Piece]:
         stack = plates[patch.patch.label].stack
         if stack.is_metal:
             continue
-        name = patch.verdict
+        verdict = patch.verdict
         e = patch.permittivity
         if stack.layers:
             true = stack.layers[0][0]
@@ -110,12 +110,26 @@ def judge_scene(kind: str, seed: int, nuisance: str = "none") -> list[Piece]:
             width = 1.96 * float(np.sqrt(np.trace(e.covariance) / 2)) / abs(e.value)
             misled = float(deviation @ np.linalg.solve(e.covariance, deviation)) > CHI2_99 and width < NARROW
         thin = patch.refused is not None and patch.refused.what == "possible layer"
-        if name is None:
-            said = ("not judged", None, 0.0)
-        else:
-            said = (name.name, name.source, name.confidence)
-        agrees = name is not None and any(_is_alike(literature_name, true) for literature_name in name.literature)
-        out.append(Piece(plates[patch.patch.label].name, *said, agrees, thin, misled))
+        name = "not judged"
+        source = None
+        confidence = 0.0
+        alike = False
+        if verdict is not None:
+            name = verdict.name
+            source = verdict.source
+            confidence = verdict.confidence
+            alike = any(_is_alike(literature_name, true) for literature_name in verdict.literature)
+        out.append(
+            Piece(
+                material=plates[patch.patch.label].name,
+                name=name,
+                source=source,
+                confidence=confidence,
+                alike=alike,
+                thin=thin,
+                misled=misled,
+            )
+        )
     return out
 
 
@@ -149,7 +163,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Judge the scenes; print the table."""
+    """Judge the scenes; print the table. Return 0."""
     seeds = range(args.first, args.first + args.scenes)
     print(__doc__)
     titles = ("pieces", "library .8", "library .9", "literature", "alike", "layers", "misled")

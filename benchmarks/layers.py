@@ -39,7 +39,7 @@ from polysight_simulators.scene.scene_file import Plate, Scene, apply_scene
 from polysight_simulators.scene.simulated_scan import truth
 
 RANGE_M = (0.3e-3, 6e-3)
-"""Where the thickness of a sheet is looked for."""
+"""Where the thickness of a sheet is looked for; chosen."""
 # Sub-bands of the sweep, in which a scene is imaged; chosen.
 BANDS = 4
 SCENES_PER_RIG = 5
@@ -163,7 +163,10 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
 def process_scene(
     seed: int, rig: Instrument, scene: Scene, metal: PlaneReference
 ) -> tuple[dict[str, PatchFigures], float]:
-    """Simulate and process one scene; return a row of materials.json for each plate found, and the angle error, rad."""
+    """Simulate and process one scene; return each found plate's row of materials.json, and the incidence angle's error.
+
+    Rows are by the plate's name; the error is a standard deviation, radians.
+    """
     pipeline = _image_scan(rig, scene)
     pipeline.inputs = Inputs(reference=metal)
     findings = pipeline.examine(pipeline.form_images())

@@ -27,6 +27,7 @@ from polysight_shared.wires import WireClient, WireEdge
 from polysight_simulators import gpio
 
 RIG = Path(__file__).parents[1] / "instrument.toml"
+# Unit of the processor times in /proc/PID/stat.
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 # Limits (chosen): share of a core, and resident memory.
 CPU_AT_MOST = 0.15
@@ -38,6 +39,7 @@ ROW_POINTS = 35
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the benchmark."""
     add_common(parser)
     parser.add_argument("--points", type=int, default=350, metavar="N", help="positions to measure (%(default)s)")
 

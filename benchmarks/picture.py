@@ -2,9 +2,9 @@
 
 The picture is no part of the repository: `--images DIR` or POLYSIGHT_PUBLISHED_IMAGES names its folder, with
 `<name>.npz` (h, v) and `<name>.json` (`boxes_px`). It is processed as `.npz` and as the published `labels/<scan>`, with
-its boxes and without. Table 2 of the paper stands beside the figures; the incidence angle, which is not given, is 55
-degrees. With `--table-2` the library is Table 2 as half spaces, all of it or the materials of these plates alone, and
-the names by a posterior of ten lines stand beside ours (`weigh_ratio_alone`).
+its boxes and without. Table 2 of the POLySIGHT paper stands beside the figures; the incidence angle, which is not
+given, is 55 degrees. With `--table-2` the library is Table 2 as half spaces, all of it or the materials of these plates
+alone, and the names by a posterior of ten lines stand beside ours (`weigh_ratio_alone`).
 """
 
 from __future__ import annotations

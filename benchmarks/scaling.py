@@ -22,12 +22,13 @@ SIZES = {
     2.0: (700, 200, 1.0, 2.0),
     4.0: (700, 400, 1.0, 1.0),
 }
-# Rows of the published grid that one thread and two process in turn, and how often.
+# Rows of the published grid that one thread and two process in turn, and how often; chosen.
 ROWS_OF_THREADS = 60
 ROUNDS_OF_THREADS = 5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the benchmark."""
     add_common(parser)
     parser.add_argument("--largest", type=float, default=4.0, help="times the published grid (default 4)")
 

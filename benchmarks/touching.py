@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from polysight.materials.segment import segment
 
+# Distance of the pixels, and the incidence angle: those of the published rig.
 PIXEL_MM = 2.0
 THETA_RAD = np.radians(55.0)
 # Half-power width of the response of an even band (sinc) and of one with a Hamming taper, times the band's width.
@@ -182,7 +183,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a line for each gap and kind of materials."""
+    """Print a line for each gap and kind of materials. Return 0."""
     figures = []
     print("gap (cells)  materials  separate plates    patches that are no plate")
     for gap_cells in GAPS_CELLS:

@@ -51,7 +51,10 @@ def rows_then_products(scan: Path, out: Path) -> dict[str, float]:
 
 
 def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
-    """Read all rows back and make both images, of the rig file's plane and of another, each in a new pipeline."""
+    """Read all rows back and make both images, on the rig file's plane and on another; return the seconds of both.
+
+    Each time in a new pipeline.
+    """
     same = Seconds()
     other_seconds = Seconds()
     for _ in range(repeats + 1):

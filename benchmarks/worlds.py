@@ -182,12 +182,14 @@ def table_2_classifier(theta_rad: float) -> Classifier:
     entries = []
     for piece in range(4):
         for name, permittivity in {**generator.TABLE_2, "copper": None}.items():
-            t = 1.0 + 0j
+            # V / H and |H| of metal.
+            ratio = 1.0 + 0j
             level = 1.0
             if permittivity is not None:
-                t = complex(inverse_ratio(permittivity, theta_rad))
+                ratio = complex(inverse_ratio(permittivity, theta_rad))
                 level = abs(complex(fresnel(permittivity, theta_rad)[0]))
-            pixels = t * np.exp(0.003 * (rng.standard_normal(30) + 1j * rng.standard_normal(30)))
+            # Thirty pixels with some noise, both chosen.
+            pixels = ratio * np.exp(0.003 * (rng.standard_normal(30) + 1j * rng.standard_normal(30)))
             entry = Entry(
                 name=name,
                 scan=f"scan {piece}",

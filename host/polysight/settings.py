@@ -85,7 +85,7 @@ DEFAULT = Settings()
 
 
 def path_text(path: Path | None) -> str | None:
-    """Return a path as settings hold it."""
+    """Return a path as settings hold it: text, or None."""
     if path is None:
         return None
     return str(path)

@@ -46,7 +46,7 @@ def _open_service(instrument: Instrument) -> Iterator[Ask]:
         client = requester(context, address, Path(instrument.pi.key_dir))
 
         def ask(command: m.AnyCommand) -> m.AnyReply:
-            """Send a command and return the reply."""
+            """Send a command and return the reply. Raises DeviceError for a refusal, or without an answer."""
             try:
                 client.send(m.pack(command))
             # There is no connection to the service.

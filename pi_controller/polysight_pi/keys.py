@@ -86,7 +86,10 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
 
 
 def allow(folder: Path, name: str) -> list[Path]:
-    """Make keys for one more client and allow it. Return its files; the secret one is for that client only."""
+    """Make keys for one more client and allow it. Return its files; the secret one is for that client only.
+
+    Raises ConfigError if the name is taken or not valid.
+    """
     if not name.replace("-", "").replace("_", "").isalnum() or name in PARTIES or name in read_allowed(folder).values():
         raise ConfigError(
             f"client {name!r} cannot be added",

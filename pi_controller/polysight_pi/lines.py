@@ -290,7 +290,10 @@ class GpiodLines(TriggerInput):
         return end_ns - begin_ns
 
     def _make_pulse(self, set_line: Callable[[], object], width_ns: int = 0) -> tuple[int, int]:
-        """Call `set_line`, wait until `width_ns` has passed, clear the line; return the times before and after."""
+        """Call `set_line`, wait until `width_ns` has passed, clear the line; return the times before and after.
+
+        Raises DeviceError when the line is lost.
+        """
         # Looked up before the line is set: nothing but the two calls is inside a pulse.
         now = time.monotonic_ns
         clear = self._clear
@@ -469,7 +472,7 @@ class WireLines:
         self._now_ns = max(self._now_ns, t_ns)
 
     def wait_edge(self, timeout_s: float) -> Edge | None:
-        """Send the edges of the last burst and wait for the next rising edge of the trigger line.
+        """Send the edges of the last burst and wait for the next rising edge of the trigger line; None after a timeout.
 
         Raises DeviceError when the hub is lost.
         """

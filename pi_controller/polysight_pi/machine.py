@@ -118,7 +118,10 @@ class Machine:
         }
 
     def happen(self, event: str, *args: Any) -> bool:
-        """Apply the rule of this event in the current state; `args` are its action's. Return False without a rule."""
+        """Apply the rule of this event in the current state; `args` are its action's. Return False without a rule.
+
+        Raises RuntimeError if the action leads to a state that the rule does not name, and what the action raises.
+        """
         if (self.state, event) not in self._rules:
             return False
         state_before = self.state
@@ -341,7 +344,10 @@ class Machine:
     # --- actions: homing and rows -----------------------------------------------------------------------------------
 
     def _home(self) -> None:
-        """Prepare homing; :meth:`_home_now` starts it after the state has changed."""
+        """Prepare homing; :meth:`_home_now` starts it after the state has changed.
+
+        Raises RefusedError if the trigger line is lost.
+        """
         if self._lines_dead:
             remedy = "find out why, then start polysight-pi again"
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self.reason, remedy=remedy)
@@ -527,7 +533,10 @@ class Machine:
                 self._loop.disarm()
 
     def _stop(self, *_: object) -> str | None:
-        """Stop the stage if it moves. Returns `ending` for a row that cannot be stopped because the link is lost."""
+        """Stop the stage if it moves. Return `ending` for a row that cannot be stopped because the link is lost.
+
+        Else return None: the rule says the next state.
+        """
         if self.state in ("homing", "jogging", "running", "held"):
             try:
                 self.stage.link.send_byte(Immediate.STOP)
@@ -585,7 +594,7 @@ class Machine:
             self._lose_stage(PiFault.STAGE_LOST, reasons[self.state])
 
     def _note_passed(self, reply: Reply) -> str | None:
-        """Note that the stage has reached the row's end; return `ending` if every burst was sent."""
+        """Note that the stage has reached the row's end; return `ending` if every burst was sent, else None."""
         row = self._current
         self.stage.slow_down_polling()
         row.points = max(0, _read_integer(reply, "points", row.row.points))
@@ -634,7 +643,7 @@ class Machine:
 
     @property
     def _current(self) -> RunningRow:
-        """The row of a state that has one."""
+        """The row of a state that has one. Raises RuntimeError in any other."""
         if self.row is None:
             raise RuntimeError(f"state {self.state} without a row")
         return self.row

@@ -17,12 +17,14 @@ from polysight_shared.tables import Count, NonNegative, Positive, Section, requi
 from polysight_shared.units import us_to_ns
 
 FIRST_PULSE_DELAY_S = 200e-6
-"""Fixed delay from a trigger edge to its first SYNC_IN pulse, longer than the usual wake-up time of the Pi."""
-# Shortest period between rising edges: a shorter one causes a fatal fault of the RF core.
+"""Fixed delay from a trigger edge to its first SYNC_IN pulse, longer than the usual wake-up time of the Pi;
+chosen."""
+# Shortest period between rising edges: a shorter one causes a fatal fault of the RF core
+# (docs/spec/mmwavelink.md).
 MIN_PERIOD_US = 300.0
 # Shortest and longest SYNC_IN pulse.
 WIDTH_US = (0.025, 4.0)
-# The same for messages, and the limits in nanoseconds.
+# These two as text for messages, and the limits in nanoseconds.
 WIDTH_TEXT = f"{WIDTH_US[0]:g}..{WIDTH_US[1]:g} us"
 MIN_PERIOD_NS = us_to_ns(MIN_PERIOD_US)
 MIN_WIDTH_NS, MAX_WIDTH_NS = map(us_to_ns, WIDTH_US)

@@ -142,7 +142,10 @@ class WireHub:
             self._disconnect(client, str(e))
 
     def _relay(self, sender: _Client, lines: list[bytes]) -> None:
-        """Obey lines by their letter: S edge, M motion, L and W subscribe, X cut or repair a wire, J join two."""
+        """Obey lines by their letter: S edge, M motion, L and W subscribe, X cut or repair a wire, J join two.
+
+        Raises ProtocolError for any other line.
+        """
         other_clients = [p for p in self._clients.values() if p is not sender]
         for line in lines:
             tag = line[:2]

@@ -25,7 +25,8 @@ from polysight_shared.config import CARD_TAIL_S, Instrument
 from polysight_shared.errors import PolysightError
 
 GRACE_NS = 200_000_000
-"""Silence after which a record that the card reported as completed has ended: status and data use different ports."""
+"""Silence after which a record that the card reported as completed has ended: status and data use different ports.
+Chosen."""
 # Timeout from a record's stop to its last packet and its status; chosen.
 _COMPLETED_TIMEOUT_S = 0.2
 

@@ -20,7 +20,7 @@ from polysight_shared.messages import ExitStatus
 
 # Called with the index of a committed row.
 OnRow = Callable[[int], None]
-# Added to the nice value of the program: the receivers get three times as much processor time.
+# Added to the nice value of the program (chosen): the receivers get three times as much processor time.
 NICE = 5
 # Rows of the typical duration. Chosen: enough for a steady median, few enough to follow a faster rig.
 _RECENT_ROWS = 25
@@ -68,7 +68,7 @@ class ProcessingQueue:
         wait(self._of_this_run[:1], timeout_s)
 
     def close(self, now: bool) -> BaseException | None:
-        """Process the queued rows (with `now` only the current one); return the first error of processing."""
+        """Process the queued rows (with `now` only the current one); return the first error of processing, or None."""
         self._worker.shutdown(wait=True, cancel_futures=now)
         return next((f.exception() for f in self._all if not f.cancelled() and f.exception() is not None), None)
 

@@ -512,7 +512,10 @@ class RowTaker:
         return take
 
     def _wait_for_row(self, take: Take, transaction: RowTransaction) -> None:
-        """Wait until the Pi reports the row's end. Abort the row on request, or if its data cannot become complete."""
+        """Wait until the Pi reports the row's end. Abort the row on request, or if its data cannot become complete.
+
+        Raises ScanError if the row does not end in time.
+        """
         limit_s = row_limit_s(self._instrument, take.row)
         deadline = time.monotonic() + limit_s
         silence = _SilenceCheck(self._instrument, self._rig)
@@ -555,7 +558,7 @@ class RowTaker:
                 )
 
     def _find_fatal_fault(self, take: Take, silence: _SilenceCheck) -> TakeFault | None:
-        """Update the radars' states; return a fault for which the row is aborted because it cannot become complete."""
+        """Update the radars' states; return a fault because of which the row cannot become complete, or None."""
         take.radars = self._radars.states()
         if stopped := take.stopped_radars:
             texts = (f"{name}: the radar has stopped: {s.detail}" for name, s in stopped.items())

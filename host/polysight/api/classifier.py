@@ -80,8 +80,8 @@ class Classifier(ClassifierMixin, BaseEstimator):
     Parameters
     ----------
     model
-        "knn": the paper's nearest neighbours, a :class:`PaperKNeighborsClassifier`. "discriminant": the discriminant of
-        error sources, which knows which errors the pixels of a patch and of a scan have in common.
+        "knn": nearest neighbours as in the POLySIGHT paper, a :class:`PaperKNeighborsClassifier`. "discriminant": the
+        discriminant of error sources, which knows which errors the pixels of a patch and of a scan have in common.
 
     Attributes
     ----------

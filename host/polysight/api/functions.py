@@ -260,7 +260,7 @@ def _check_all(scans: Sequence[Scan | PathText]) -> list[tuple[ProcessedScan, Ch
 
 @contextmanager
 def _open_scene_file(scene: Scene | None) -> Iterator[Path | None]:
-    """Yield the path of a scene file; the content of a scene is written into a temporary one."""
+    """Yield the path of a scene file, None without a scene; the content of a scene is written into a temporary one."""
     if scene is None:
         yield None
     elif isinstance(scene, str | os.PathLike):

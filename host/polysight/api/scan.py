@@ -567,7 +567,7 @@ class Scan:
 
     @property
     def _result_at_hand(self) -> ProcessedScan | None:
-        """The result if it is saved or was computed already."""
+        """The result if it is saved or was computed already; else None."""
         if self._saved is not None:
             return self._saved
         # Cached properties that were computed are in their instance's dict; asking for them would compute them. If
@@ -587,7 +587,7 @@ class Scan:
 
     @property
     def _origin(self) -> Source | ProcessedScan:
-        """Recorded rows, or else the products."""
+        """Recorded rows, or else the products. Raises DataError without both."""
         origin = self._source or self._saved
         if origin is None:
             raise DataError(

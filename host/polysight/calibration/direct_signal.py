@@ -10,7 +10,7 @@ offset that puts the direct path in the middle of the IF band.
 
 `fit_filter` fits a high-pass filter to scans of one scene at several start frequencies: each puts the direct path at
 another IF, and trigger jitter spreads it by about 200 kHz. The direct path itself does not change, so its level over IF
-is the frequency response of the filter (paper, Fig. 9).
+is the frequency response of the filter (POLySIGHT paper, Fig. 9).
 """
 
 from __future__ import annotations
@@ -126,9 +126,9 @@ def jitter_hz(rig: Instrument) -> float:
 def find_direct(
     rig: Instrument, board: Board, words: NDArray[Any], valid: NDArray[np.bool_], setup: sync.BoardSetup | None = None
 ) -> DirectSignal:
-    """Find the direct path in bursts: words int16 [frame, sample, 2, rx], `valid` bool [frame] those received whole.
+    """Find the direct path in bursts; `words` int16 [chirp, sample, 2, rx], I before Q.
 
-    `setup` is that of the board, if it exists already.
+    `valid` bool [chirp] is true for those received whole; `setup` is that of the board, if it exists already.
     """
     setup = setup or sync.BoardSetup.from_rig(rig, board)
     chirp = rig.chirp

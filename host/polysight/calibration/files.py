@@ -49,7 +49,7 @@ FORMAT = 1
 IMAGES = ("h", "v", "valid")
 """Arrays of a `PlaneReference` in the .npz file."""
 MIN_METAL_LEVEL = 0.02
-"""Smallest echo of a mirror relative to the direct path; antenna patterns may take some 20 dB."""
+"""Smallest echo of a mirror relative to the direct path; antenna patterns may take some 20 dB; chosen."""
 FOLDER = "calibration"
 """Folder of the copies in a scan's folder."""
 # x, y, z.
@@ -634,7 +634,7 @@ def source_scan(source: RawSource, folder: Path) -> SourceScan:
 def board_rows(
     source: RawSource, board: str, limit: int | None = None
 ) -> Iterator[tuple[int, NDArray[np.int16], NDArray[np.bool_]]]:
-    """Yield index, words int16 [frame, sample, 2, rx] and valid bool [frame] of a board's rows.
+    """Yield index, words int16 [chirp, sample, 2, rx] (I before Q) and valid bool [chirp] of a board's rows.
 
     With a `limit`, only as many rows, evenly spaced.
     """

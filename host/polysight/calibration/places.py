@@ -190,7 +190,10 @@ def fit_places(
 
 
 def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass | None) -> BoardEchoes:
-    """Synchronise a board's scan, reduce it to the range gate, equalise its RX and whiten its noise."""
+    """Synchronise a board's scan, reduce it to the range gate, equalise its RX and whiten its noise.
+
+    Raises DataError if no row has a direct path.
+    """
     board = rig.by_name(name)
     plan = plan_raster(rig.grid)
     setup = BoardSetup.from_rig(rig, board, model=model)

@@ -136,7 +136,10 @@ def decode_reply(raw: bytes) -> Reply:
 
 
 def configure_fpga_data(lanes: int = 4) -> bytes:
-    """Encode the body of 0x03: raw mode, LVDS lanes (4: AWR2243, 2: xWR16xx/18xx/68xx), Ethernet, 16 bit, timer."""
+    """Encode the body of 0x03: raw mode, LVDS lanes (4: AWR2243, 2: xWR16xx/18xx/68xx), Ethernet, 16 bit, timer.
+
+    Raises ProtocolError for another number of lanes.
+    """
     if lanes not in (2, 4):
         raise ProtocolError(f"the card captures 2 or 4 LVDS lanes, not {lanes}", code=ErrorCode.VALUE_INVALID)
     lane_mode = 1 if lanes == 4 else 2
@@ -145,7 +148,10 @@ def configure_fpga_data(lanes: int = 4) -> bytes:
 
 
 def configure_packet_data(packet_bytes: int, delay_us: float) -> bytes:
-    """Encode the body of 0x0B: packet size, delay in 8 ns ticks, zero. 1470 and 25 us gives `be 05 35 0c 00 00`."""
+    """Encode the body of 0x0B: packet size, delay in 8 ns ticks, zero. 1470 and 25 us gives `be 05 35 0c 00 00`.
+
+    Raises ProtocolError for a size or delay that the card does not take.
+    """
     ticks = round(delay_us * DELAY_TICKS_PER_US)
     if not 0 <= ticks <= 0xFFFF:
         problem = f"packet delay of {delay_us} us is {ticks} ticks of 8 ns, outside 0..65535"
@@ -190,7 +196,7 @@ def row_words(
 
 
 def raw_words(frames: NDArray[np.complex64]) -> NDArray[np.int16]:
-    """Encode complex frames [rx, frame, sample] in ADC counts as words: int16 [frame, sample, 2, rx]."""
+    """Encode complex frames [rx, frame, sample] in ADC counts as words: int16 [frame, sample, 2, rx], I before Q."""
     rx, count, samples = frames.shape
     words = np.empty((count, samples, 2, rx), np.int16)
     for part, values in enumerate((frames.real, frames.imag)):

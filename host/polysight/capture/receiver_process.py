@@ -166,7 +166,10 @@ class Receiver:
         )
 
     def _begin(self, request: messages.BeginRow) -> messages.Answer:
-        """Begin a row: reserve its file and memory, and drop packets from between rows."""
+        """Begin a row: reserve its file and memory, and drop packets from between rows.
+
+        Raises DeviceError if no socket is open, or the row is larger than memory.
+        """
         if self._socket is None or self._batches is None:
             raise DeviceError("the receiver has no socket yet", "a row began before the cards were opened", _RESTART)
         if self._row is not None:
@@ -216,7 +219,7 @@ class Receiver:
         row.log.add(batches.packets[:n], batches.lengths[:n], batches.times_ns[:n])
 
     def _end(self, request: messages.EndRow) -> messages.Answer:
-        """End the row: place its packets, and write payload, index and packets."""
+        """End the row: place its packets, and write payload, index and packets. Raises DeviceError without a row."""
         row = self._row
         if row is None or self._socket is None or self._batches is None:
             raise DeviceError("no row is being received", "a row ended that had not begun", _RESTART)

@@ -19,7 +19,7 @@ from polysight_shared.errors import ConfigError, DataError, ScanError
 from polysight_shared.files import write_atomically
 
 NOTES = "operator.json"
-# Characters of the notes and of a tag, and tags of a scan: more would make the list of scans unreadable.
+# Characters of the notes and of a tag, and tags of a scan: more would make the list of scans unreadable; chosen.
 MAX_NOTES = 10_000
 MAX_TAG = 40
 MAX_TAGS = 20

@@ -52,7 +52,7 @@ LEAST_SPREAD = 5e-3
 DIFFERENCE = "RdBu"
 SIGNIFICANT = 3.0
 """Standard deviations above which a difference is significant."""
-# Smallest scatter of two scans in their stated errors: a copy has none at all.
+# Smallest scatter of two scans in their stated errors: a copy has none at all; chosen.
 LEAST_SCATTER = 0.1
 # Largest distance of the centres of one patch in both scans; chosen, below the distance of neighbouring plates.
 NEAR_MM = 15.0
@@ -258,7 +258,7 @@ def _explain_no_permittivity(pixels: Pixels, row: int, column: int) -> str:
 
 
 def _find_patch(patches: list[PatchFigures], place_mm: tuple[float, float]) -> PatchFigures | None:
-    """Return the patch whose outline holds a place."""
+    """Return the patch whose outline holds a place; None if no one does."""
     for patch in patches:
         outline = patch.outline_mm
         if len(outline) > 2 and skimage.measure.points_in_poly([place_mm], outline)[0]:
@@ -320,7 +320,7 @@ def _sort_by_sigmas(material: NearMaterial) -> float:
 
 
 def _focus_profile(folder: Path, x_m: float, y_m: float) -> tuple[FocusedProfile | None, str]:
-    """Return the focused range profile through a place, from the scan's kept samples, or why there is none."""
+    """Return the focused range profile through a place, from the scan's kept samples; or None, and why."""
     scan = find_scan_folder(folder)
     if scan is None or not (scan / MANIFEST).exists():
         return None, "the rows are not in this folder"

@@ -38,7 +38,7 @@ PART_S = 0.1
 PROGRAM = "program"
 """Folder of a scan in which programs that a page started keep their process number and log."""
 # The deepest level of folders that scans are searched in, and the most scans that are listed below one folder of the
-# root.
+# root; chosen.
 MAX_DEPTH = 4
 MAX_SCANS = 5000
 # End of a program's log that is read: its last messages; chosen.

@@ -18,7 +18,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 
 RIG = Path("instrument.toml")
-# Number of options that help shows before "more options".
+# Number of options that help shows before "more options"; chosen.
 _FIRST = 3
 # Largest coordinate of a box: far beyond any image, so that a unit mixed up is noticed.
 _FARTHEST_MM = 10_000

@@ -25,7 +25,10 @@ def add_commands(add: Add) -> None:
 
 
 def _serve(args: argparse.Namespace) -> int:
-    """Run `polysight serve`; without `--config` with the rig file of the current folder, if there is one."""
+    """Run `polysight serve`; without `--config` with the rig file of the current folder, if there is one.
+
+    Raises ConfigError if the rig file or a package is missing.
+    """
     _check_extra()
     # What it shows takes seconds to load.
     sys.stderr.write("polysight serve: starting\n")
@@ -42,7 +45,7 @@ def _serve(args: argparse.Namespace) -> int:
 
 
 def _run_preview(args: argparse.Namespace) -> int:
-    """Run `polysight preview`."""
+    """Run `polysight preview`. Raises ConfigError if the scan is a file, or a package is missing."""
     _check_extra()
     if args.folder.exists() and not args.folder.is_dir():
         raise ConfigError(

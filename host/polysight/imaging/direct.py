@@ -46,7 +46,7 @@ def backproject(
     voxels_m: Shaped,
     reference_m: Shaped,
 ) -> Array | npt.NDArray[np.complex128]:
-    """Backproject samples (paper, equation 6, with the exponent's sign of the conjugate of the received phase).
+    """Backproject samples (POLySIGHT paper, Eq. 6, with the exponent's sign of the conjugate of the received phase).
 
     `image(v) = sum_p sum_f samples[p, f] exp(-j 2 pi f (|v - tx_p| + |v - rx_p| - reference_p) / c)`
 

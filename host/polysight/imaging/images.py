@@ -65,7 +65,7 @@ _LEAST_LINES = 6
 _COHERENT = 0.5
 """Smallest coherence of the phase steps between pixels (1: all equal); chosen."""
 _MAX_CHANGE = 2.0
-"""Largest change of the footprint over the distance `d`; a larger one occurs only at the edge of the aperture."""
+"""Largest change of the footprint over the distance `d`; chosen: larger ones occur only at the aperture's edge."""
 
 SAME_MM = 1e-3
 """Tolerance of positions: 2e-3 rad of an echo's phase."""

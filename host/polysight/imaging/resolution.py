@@ -1,4 +1,4 @@
-"""Point response of an aperture: measured widths and sidelobes, the PolySight paper's formula, the geometry's limit.
+"""Point response of an aperture: measured widths and sidelobes, the POLySIGHT paper's formula, the geometry's limit.
 
 `point_response` images a point in the middle of the scene with the aperture's taper and mask; `imaging_facts` gives the
 entry `imaging` of quality.json.

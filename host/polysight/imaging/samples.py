@@ -252,7 +252,7 @@ class Imager(Protocol):
 
 
 def choose_imager(aperture: geometry.Aperture) -> tuple[Imager, str | None]:
-    """Choose the imager: spectral if the aperture is regular, otherwise the slower direct sum (with a notice)."""
+    """Choose the imager: spectral if the aperture is regular, else the slower direct sum with a notice (else None)."""
     reason = geometry.find_irregularity(aperture)
     if reason is None:
         return SpectralImager(aperture), None

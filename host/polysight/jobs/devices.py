@@ -185,6 +185,7 @@ def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
     """Return the FPGA version that the card reports at its new address, once it was switched off and on.
 
     With `same_place` the address is the old one, too: only an answer after a silence shows that it was switched off.
+    Raises DeviceError after `wait_s`.
     """
     sys.stdout.write(f"{board.name}: looking for it at {board.card_address} for at most {wait_s:g} s\n")
     sys.stdout.flush()

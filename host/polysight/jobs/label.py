@@ -49,7 +49,7 @@ from polysight_shared.files import write_together
 METAL = "metal"
 MIN_PIXELS = 16
 """A box of fewer pixels (chosen) gets a note: a library would learn speckle from it."""
-# Largest margin at each edge, as a share of a patch's side: two fifths of a narrow patch remain.
+# Largest margin at each edge, as a share of a patch's side: two fifths of a narrow patch remain; chosen.
 _LARGEST_MARGIN = 0.3
 Ask = Callable[[str], str]
 """Prints a question and returns the answer; raises EOFError when the input ends."""

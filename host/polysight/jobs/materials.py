@@ -440,7 +440,10 @@ def _score_models(data: Path, as_json: bool) -> int:
 
 
 def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: str | None, as_json: bool) -> int:
-    """Name the patches that lie at the same place in all scans; print names with shares of their pixels."""
+    """Name the patches that lie at the same place in all scans; print names with shares of their pixels.
+
+    Raises DataError if no place has a patch in every scan.
+    """
     from polysight.materials import classifier_sentence
 
     status = max(print_verdict(p, to_terminal=not as_json) for p in products)
@@ -562,7 +565,7 @@ def _print_accuracy(rows: Sequence[dict[str, Any]], names: Container[str]) -> No
 
 
 def _describe_unnamed(products: Sequence[ProcessedScan]) -> dict[str, Any]:
-    """Return the JSON of `classify` if a scan has no result: its patches without names."""
+    """Return the JSON of `classify` if a scan has no result (ValueError: all have one): its patches without names."""
     nothing = {"name": None, "confidence": None, "votes": {}, "probabilities": {}}
     for scan in products:
         if scan.verdict is not None and not scan.verdict.usable:

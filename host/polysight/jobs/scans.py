@@ -234,7 +234,10 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
 
 
 def _confirm_and_drop(scan: store.ScanFolder, folder: Path, products: Path, yes: bool) -> int:
-    """List the files, ask for confirmation, and delete them; return the exit status."""
+    """List the files, ask for confirmation, and delete them; return the exit status.
+
+    Raises DataError if there is nothing to delete, ConfigError if it is not confirmed.
+    """
     processed = find_processed_digests(products)
     rows = store.find_droppable(scan, processed)
     for line in rows.kept_files:

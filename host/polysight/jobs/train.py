@@ -126,7 +126,10 @@ def _read_products_without_rows(data: Path, scan: Path) -> ProcessedScan | None:
 
 
 def _process_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
-    """Process a labelled scan from its rows, as `polysight process --labels`, without naming its patches."""
+    """Process a labelled scan from its rows, as `polysight process --labels`, without naming its patches.
+
+    Raises DataError without metal, NoResult if the verdict allows no result.
+    """
     source = open_source(data, config)
     pipeline = process_rows(source, data, Settings(model="none"))
     images = pipeline.form_images()
@@ -141,7 +144,7 @@ def _process_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
 
 
 def _load_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
-    """Use the saved images of a labelled scan."""
+    """Use the saved images of a labelled scan. Raises as :func:`_process_rows`."""
     if saved.verdict is not None and not saved.verdict.usable:
         raise saved.verdict.error("no library was written")
     checked = check_labels(labels, saved.x_m, saved.y_m, saved.valid)
@@ -155,7 +158,10 @@ def _load_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
 
 
 def _read_optics(saved: ProcessedScan) -> Optics:
-    """Return incidence angle and leakage of saved images; leakage that processing removed is zero here."""
+    """Return incidence angle and leakage of saved images; leakage that processing removed is zero here.
+
+    Raises DataError if the products name no rig.
+    """
     rig = saved.rig
     path = saved.folder / SCAN
     if rig is None:
@@ -194,7 +200,7 @@ def _add_labels(scan: str, materials: MaterialsResult, simulated: bool, labels: 
 
 
 def _process_simulated(data: Path, config: Path) -> TrainingScan:
-    """Process a simulated scan with known plates."""
+    """Process a simulated scan with known plates. Raises DataError if none of these is metal."""
     source = open_source(data, config)
     plates = read_truth(data / TRUTH)
     metal = next((t for t in plates if t.metal), None)

@@ -25,7 +25,7 @@ from polysight_shared.raster import WIDTH_US
 SINCE = "{since}"
 """The page puts the elapsed time here."""
 PAPER_PHASE_RAD = 0.022
-"""Phase residual after all stages, paper section 9.1."""
+"""Phase residual after all stages, POLySIGHT paper, section 9.1."""
 # A fault stays in the headline until so many rows came without one; chosen.
 RECENT_ROWS = 3
 # A row is late after so many usual durations, and after at least so many seconds; chosen.
@@ -477,7 +477,7 @@ def _judge_result(inputs: Inputs, gaps: str) -> Status:
 
 
 def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
-    """Return the status if a program or the Pi does not answer, or a request is pending."""
+    """Return the status if a program or the Pi does not answer, or a request is pending; else None."""
     signs = inputs.signs
     folder = str(inputs.folder)
     safe = _describe_safe_rows(history)
@@ -494,7 +494,7 @@ def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
 
 
 def _judge_request(life: Life, history: ScanHistory, folder: str) -> Status | None:
-    """Return the status of a scan that was requested to pause, stop or abort, by anyone."""
+    """Return the status of a scan that was requested to pause, stop or abort, by anyone; None without a request."""
     asker = life.asker or "somebody"
     if life.asked == "abort":
         return say("aborting", asker=asker)
@@ -508,7 +508,7 @@ def _judge_request(life: Life, history: ScanHistory, folder: str) -> Status | No
 
 
 def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
-    """Return the status of a rig that has stopped, is held, or homes."""
+    """Return the status of a rig that has stopped, is held, homes, or has taken all rows; else None."""
     pi = inputs.pi
     all_rows_are_safe = len(history.takes) == history.plan.rows
     if pi.state == "fault" and pi.faults:
@@ -528,7 +528,7 @@ def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
 
 
 def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
-    """Return the status if rows are retaken, late, or of poor quality."""
+    """Return the status if rows are retaken, late, or of poor quality; else None."""
     pi = inputs.pi
     newest_warning = next((notice for notice in reversed(history.notices) if notice.level == "warning"), None)
     if pi.row >= 0 and history.marks.get(pi.row) == "rejected":

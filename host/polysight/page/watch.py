@@ -329,7 +329,7 @@ class ProductsTail:
 
 
 def find_newest_program(folder: Path) -> Program | None:
-    """Return the program of a scan (`scan` or `process`) that a page started last."""
+    """Return the program of a scan (`scan` or `process`) that a page started last; None without any."""
     programs = [find_program(folder, kind) for kind in ("scan", "process")]
     return max((p for p in programs if p is not None), key=lambda p: p.started_utc, default=None)
 

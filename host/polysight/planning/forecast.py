@@ -41,7 +41,8 @@ MAX_STEPS_PER_S = 20_000
 SIMULATED_DIRECT_SNR_DB = 5.5
 # Speed of the stage of the published rig.
 _PUBLISHED_SPEED_MM_S = 20.0
-# Standard deviation of the phase of the object's peak after all stages of synchronisation (paper, section 9.1).
+# Standard deviation of the phase of the object's peak after all stages of synchronisation (POLySIGHT paper, section
+# 9.1).
 _PUBLISHED_PHASE_RAD = 0.022
 # Loss by the motion during a burst from which on the forecast warns (chosen).
 _MAX_BURST_LOSS_DB = 0.5

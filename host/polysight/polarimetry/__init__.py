@@ -3,7 +3,8 @@
 `calibrate` divides the images by a metal region in the scene, a `PlaneReference` by a metal plate from another scan.
 `correct_leakage` removes cross-polar leakage; `leakage_from_images` estimates it from metal at two orientations.
 `incidence_choice` gives the incidence angle of each pixel. `fresnel` and `multilayer` compute the reflection of a
-material, `permittivity_from_ratio` the permittivity from a polarisation ratio (Eq. 2 and 3 of the paper).
+material, `permittivity_from_ratio` the permittivity from a polarisation ratio (Eq. 2 and 3 of the
+POLySIGHT paper).
 """
 
 from polysight.polarimetry.calibrate import (

@@ -1,4 +1,4 @@
-"""Metal reference, cross-polar leakage and smoothing of the H and V images (section 6.2 of the paper).
+"""Metal reference, cross-polar leakage and smoothing of the H and V images (section 6.2 of the POLySIGHT paper).
 
 Model of one pixel, for a transmitter that excites s and p equally:
 
@@ -363,7 +363,7 @@ def _make_disk(radius: int) -> npt.NDArray[np.bool_]:
 PLATE = (1.0, 1.0)
 """The s and p reflected by a metal plate."""
 MIN_CONDITION = 0.02
-"""Smallest ratio of third to first singular value: below it the waves do not determine three unknowns."""
+"""Smallest ratio of third to first singular value: below it the waves do not determine three unknowns; chosen."""
 # s and p, or H and V.
 Wave = tuple[complex, complex]
 

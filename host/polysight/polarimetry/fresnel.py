@@ -1,7 +1,7 @@
 """Plane waves at the pixels: reflection, permittivity from a ratio, layered media, and the incidence angle.
 
 Time convention `exp(+j omega t)`: a passive medium has permittivity `eps' - j eps''` with `eps'' >= 0`, and waves in it
-decay. Signs of Eq. 2 of the paper: metal has r_s = r_p = -1, so that P = r_s / r_p = +1 at every angle.
+decay. Signs of Eq. 2 of the POLySIGHT paper: metal has r_s = r_p = -1, so that P = r_s / r_p = +1 at every angle.
 
 The incidence angle of a pixel: a plane parallel to the stage reflects like a mirror: at every stage offset the
 reflection comes from the specular point, under the same angle. So all pixels have the incidence angle of the specular

@@ -105,7 +105,7 @@ class GivenPair:
         return self.path.name
 
     def boxes(self, hand_labels: materials.Labels | None) -> materials.Labels | None:
-        """Return drawn boxes, or else those that came with the images, in millimetres from the image centre."""
+        """Return drawn boxes, or else those that came with the images, mm from the image centre; None without any."""
         labels = self.labels
         if hand_labels is not None:
             labels = hand_labels
@@ -302,7 +302,7 @@ def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArr
 
 
 def _number(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str) -> float | None:
-    """Return an optional single number. Raises DataError if it is not one finite number."""
+    """Return a single number; None without that array. Raises DataError if it is not one finite number."""
     if name not in arrays:
         return None
     value = arrays[name]

@@ -324,7 +324,7 @@ class KeptSamples:
         return {name: raw_digest(committed.boards[name]) for name in self._quality.boards}
 
     def _line(self, row: int) -> dict[str, Any] | None:
-        """Return the line of rows.jsonl for a row, if it was made from the committed raw data."""
+        """Return the line of rows.jsonl for a row, if it was made from the committed raw data; else None."""
         digests = self._read_digests(row)
         if digests is None or not self._head:
             return None

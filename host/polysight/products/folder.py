@@ -254,7 +254,10 @@ def _replace(new: Path, place: Path, old: Path) -> None:
 
 
 def _exchange(a: Path, b: Path) -> bool:
-    """Swap two folders atomically (Linux, renameat2). False if system or file system do not support it."""
+    """Swap two folders atomically (Linux, renameat2). False if system or file system do not support it.
+
+    Raises OSError for any other failure.
+    """
     if sys.platform != "linux":
         return False
     renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)

@@ -378,7 +378,7 @@ class ProcessedScan:
 
     @cached_property
     def rig(self) -> Instrument | None:
-        """Rig of the images; None if unknown."""
+        """Rig of the images; None if unknown. Raises DataError if scan.json holds no valid one."""
         path = self.folder / SCAN
         try:
             if self.facts.instrument:

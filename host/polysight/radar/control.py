@@ -448,7 +448,10 @@ class LineServers(RadarControl):
         return True
 
     def _wait_taken(self, board: str, deadline: float) -> None:
-        """Wait until the other machine acknowledged the line, or the connection ended."""
+        """Wait until the other machine acknowledged the line, or the connection ended.
+
+        Raises DeviceError at the deadline (monotonic clock).
+        """
         connection = self._sockets[board]
         ended = select.poll()
         # With no events requested, poll reports a reset, or the end of both directions.

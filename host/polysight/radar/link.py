@@ -193,7 +193,7 @@ class Link:
             self._clock.sleep(_INTERVAL_S)
 
     def _read_messages(self) -> Finding | None:
-        """Read pending messages, within limits, and keep their events; return the reason if one was lost."""
+        """Read pending messages, within limits, and keep their events; return the reason if one was lost, or None."""
         deadline = self._clock.now() + MAX_POLL_S
         for _ in range(MAX_MESSAGES):
             if not self._words.interrupt():

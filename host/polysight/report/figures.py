@@ -39,10 +39,10 @@ VIEWS = (
     ((2, 1), "From the side", ("z (mm), away from the rig", "y (mm)")),
     ((0, 2), "From above", ("x (mm)", "z (mm), away from the rig")),
 )
-# Normals drawn in a view of a surface, and their length; more of them would hide the points.
+# Normals drawn in a view of a surface, and their length; more of them would hide the points; chosen.
 NORMALS_SHOWN = 60
 NORMAL_MM = 12.0
-# Segments that are described below a surface.
+# Most segments that are described below a surface; chosen.
 MAX_LINES = 8
 # Colour of points without a permittivity.
 NO_PERMITTIVITY = "#9aa3ad"

@@ -534,7 +534,7 @@ def _format_cells(*cells: str, share: float | None = None) -> dict[str, Any]:
 
 
 def _tabulate_boards(boards: Any) -> Table | None:
-    """Return a table with a line for each figure and a column for each board: narrow enough for a phone."""
+    """Return a table of a line for each figure and a column for each board, narrow enough for a phone; None without."""
     if not isinstance(boards, dict) or not boards:
         return None
     flat = {name: _flatten_board(board) for name, board in boards.items()}
@@ -563,7 +563,7 @@ def _flatten_board(board: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tabulate_residuals(boards: Any) -> Table | None:
-    """Return a table of `synchronisation` of all boards: a line for each stage, a column for each quantity."""
+    """Return a table of `synchronisation` of all boards, a line a stage and a column a quantity; None without any."""
     if not isinstance(boards, dict):
         return None
     flat: dict[str, dict[str, Any]] = {}

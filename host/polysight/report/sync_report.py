@@ -1,6 +1,6 @@
 """Residual frequency, phase and amplitude errors after synchronisation, for any scan: `polysight sync-report`.
 
-It is the paper's Fig. 15 for one scan: histograms after each of four stages, with the Cramer-Rao bounds.
+It is Fig. 15 of the POLySIGHT paper for one scan: histograms after each of four stages, with the Cramer-Rao bounds.
 """
 
 from __future__ import annotations

@@ -101,7 +101,7 @@ class BoardImaging(msgspec.Struct, frozen=True, kw_only=True):
     point_width_mm: Pair | UnsetType = UNSET
     # The geometry's limit of the width, without taper.
     point_limit_mm: Pair | UnsetType = UNSET
-    # The paper's estimate r lambda / L of the width.
+    # The POLySIGHT paper's estimate r lambda / L of the width.
     point_paper_mm: Pair | UnsetType = UNSET
     # Strongest sidelobe, relative to the peak.
     point_sidelobe_db: Pair | UnsetType = UNSET

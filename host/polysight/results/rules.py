@@ -26,8 +26,8 @@ below twice the expected ones (tests/imaging/test_sparse.py); of nine simulated 
 DIRECT_SNR_NONE_DB = -14.0
 """Direct path over noise in one sample of one chirp and channel, below which it counts as missing."""
 DIRECT_SNR_CARE_DB = 0.0
-"""The same ratio, below which the direct path counts as weak. The simulated rig has 5.5 dB, as the paper's phase errors
-suggest."""
+"""The same ratio, below which the direct path counts as weak. The simulated rig has 5.5 dB, as the phase errors of the
+POLySIGHT paper suggest."""
 DIRECT_LEVELS = (0.4, 3.0)
 """Range of metal's brightness relative to the direct path; in published data both are equal within a factor of 1.5."""
 DIRECT_PHASE_CARE_RAD = 0.05

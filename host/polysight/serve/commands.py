@@ -386,7 +386,10 @@ def _resume(site: Site, scan: Named, body: ResumeRequest) -> None:
 
 
 def _process(site: Site, scan: Named, body: ProcessRequest) -> None:
-    """Start `polysight process` for a scan; its products go into the scan's folder."""
+    """Start `polysight process` for a scan; its products go into the scan's folder.
+
+    Raises ConfigError if the scan's boxes are asked for, and there are none.
+    """
     folder = scan.folder.absolute()
     words: Words = ["process", folder, "--out", folder / "products"]
     words += _list_processing_options(site, body.library, body.metal)
@@ -459,7 +462,7 @@ def _fit_concentration(site: Site, body: LibraryRequest) -> None:
 
 
 def _export(site: Site, scan: Named, body: ExportRequest) -> None:
-    """Start an export into the folder of the scan, unless `export` is a link that leads out of it."""
+    """Start an export into the folder of the scan. Raises DataError if `export` is a link that leads out of it."""
     folder = scan.folder.absolute()
     out = folder / "export"
     if not out.resolve().is_relative_to(folder.resolve()):

@@ -68,7 +68,7 @@ class Programs:
         self._thread.submit(self._start, folder, kind, words).result()
 
     def _start(self, folder: Path, kind: str, words: Sequence[str | Path]) -> None:
-        """Do the work of `start` in the thread that keeps the old priority."""
+        """Do the work of `start` in the thread that keeps the old priority; raises as `start`."""
         earlier = find_program(folder, kind)
         if earlier is not None and earlier.running:
             raise ScanError(

@@ -47,7 +47,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.program import delay_interrupts, ignore_interrupts
 
-# Priority of the reading process, below capture and scan.
+# Nice value of the reading process, chosen: it gives way to capture and scan.
 NICE = 10
 # A browser opens up to six connections for a page. The number is chosen.
 MAX_CONNECTIONS = 2048

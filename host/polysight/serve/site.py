@@ -200,7 +200,7 @@ def _draw(products: Path, stamp: str, name: str, limits: tuple[float, float] | N
 
 @lru_cache(maxsize=MAX_CHECKS)
 def _check(products: Path, stamp: str) -> CheckResult | None:
-    """Judge the check plate of products; `stamp` as for `_draw`."""
+    """Judge the check plate of products; None if the rig file names none. `stamp` as for `_draw`."""
     del stamp
     scan = read_products(products)
     if scan.rig is None:
@@ -351,7 +351,7 @@ class Watches:
         return opened.watch
 
     def _find(self, name: str) -> Watch | None:
-        """Return the live view of a scan if it is open, and note that it was used."""
+        """Return the live view of a scan, and note that it was used; None if it is not open."""
         with self._lock:
             if name in self._open:
                 self._open[name].used_at = time.monotonic()

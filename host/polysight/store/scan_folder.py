@@ -284,7 +284,10 @@ class ScanFolder:
         return dict(self._read_cached_rows())
 
     def _read_cached_rows(self) -> dict[int, RowCommitted]:
-        """Return the committed rows from a cache, which is valid until facts are added."""
+        """Return the committed rows from a cache, which is valid until facts are added.
+
+        Raises DataError if a committed row cannot be read.
+        """
         if self._rows is None or self._rows[0] is not self.content or self._rows[1] != len(self.content.facts):
             for number, fact in self.content.problems:
                 if fact.kind in ("row_committed", "row_withdrawn"):

@@ -2,7 +2,7 @@
 
 The AWR2243 has two high-pass sections in the IF, with corners selected in the profile (175/235/350/700 kHz and
 350/700/1400/2800 kHz). Direct path and object have different IF, which change with the timing of every chirp, so the
-filter is compensated before anything else is estimated (paper, section 5.2).
+filter is compensated before anything else is estimated (POLySIGHT paper, section 5.2).
 """
 
 from __future__ import annotations

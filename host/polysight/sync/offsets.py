@@ -1,9 +1,9 @@
 """Estimate and remove offsets of frequency and phase: of each chirp in its burst, then of each position.
 
 Burst alignment (`align_row`). A board samples SYNC_IN with its own clock, so each chirp is the same signal times
-`exp(j(2 pi df t + dphi))` (paper, eq. 4). The conjugate product with a reference chirp, summed over the RX, is a tone
-with the positive envelope `|s(t)|^2`; the maximum of its spectrum is the maximum-likelihood offset for any signal `s`.
-The paper divides by the reference chirp instead, which amplifies noise where direct path and object cancel.
+`exp(j(2 pi df t + dphi))` (POLySIGHT paper, Eq. 4). The conjugate product with a reference chirp, summed over the RX,
+is a tone with the positive envelope `|s(t)|^2`; the maximum of its spectrum is the maximum-likelihood offset for any
+signal `s`. The paper divides by the reference chirp instead, which amplifies noise where direct path and object cancel.
 
 After mixing each chirp to zero frequency, its signal fills only a few range bins, so one sample in four is enough
 (`decimate.py`). Filter compensation, a second estimate (each chirp against the sum of all others) and everything after
@@ -224,7 +224,7 @@ def align_in_numpy(
 
 
 def _empty_row(bursts: tuple[int, ...], words: tuple[int, ...], blocks: int) -> AlignedRow:
-    """Return memory for the row: bursts [position, chirp], words [position, chirp, sample, 2, rx]."""
+    """Return memory for a row; arguments are the shapes (position, chirp) and (position, chirp, sample, 2, rx)."""
     positions, chirps = bursts
     rx = words[-1]
     return AlignedRow(

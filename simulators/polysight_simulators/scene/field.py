@@ -581,7 +581,10 @@ class ObjectField:
         return first + (half - 1) * step, first + (n - half - 1) * step
 
     def _compute_taps(self, u: optics.Real, axis: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        """Return grid indices [n, taps] and weights of the Kaiser-windowed sinc at offsets u."""
+        """Return grid indices [n, taps] and weights of the Kaiser-windowed sinc at offsets u.
+
+        Raises DataError for an offset outside the simulated aperture.
+        """
         low, high = self._reach(axis)
         if u.min() < low or u.max() > high:
             raise DataError(

@@ -96,7 +96,10 @@ def new_folder(path: Path) -> None:
 
 
 def _copy_calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, str]]]:
-    """Copy the files that `[calibration]` names into the scan; return the entry for the manifest."""
+    """Copy the files that `[calibration]` names into the scan; return the entry for the manifest.
+
+    Raises DataError if one cannot be copied.
+    """
     entries = {}
     for kind, name in to_builtins(rig.calibration).items():
         if not name:

@@ -1,7 +1,7 @@
 """Reflection of flat plates, the integrand of the object's echo, and its exact but slow sum.
 
 Reflection at 76..81 GHz in both polarisations, implemented independently of the host. Media are eps' - j eps'' (time
-dependence exp(+j omega t)). Signs of the paper's Eq. 2: a perfect conductor has r_s = r_p = -1, so that
+dependence exp(+j omega t)). Signs of Eq. 2 of the POLySIGHT paper: a perfect conductor has r_s = r_p = -1, so that
 P = r_s / r_p = 1. The echo is physical optics on flat plates, each with its own height and tilt.
 
 A receiver's samples are the conjugate of the wave: a delay is exp(-j 2 pi f tau) in the wave and +2 pi f tau in the

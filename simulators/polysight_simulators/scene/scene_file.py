@@ -398,7 +398,10 @@ class Scene(_Table, frozen=True):
 
 
 def _apply_switches(table: Any, source: str) -> Any:
-    """Replace `ideal = true` and "off"/"on" (or false/true) in a [disturbances] table by plain values."""
+    """Replace `ideal = true` and "off"/"on" (or false/true) in a [disturbances] table by plain values.
+
+    Raises ConfigError for a switch that is none.
+    """
     if not isinstance(table, dict):
         return table
     values = dict(table)

@@ -110,7 +110,8 @@ def test_a_scan_is_planned_started_and_shown(lab):
     lab.wait_end(folder)
     assert ScanFolder.load(folder).plan.rows == 5
     lab.open("/")
-    lab.browser.wait("document.querySelectorAll('#list li').length == 1", "the list")
+    # A card has no text before it is painted.
+    lab.browser.wait("document.querySelector('#list li')?.innerText", "the card of the scan")
     said = lab.browser.text("list")
     assert "first" in said
     assert "the first one" in said

@@ -29,8 +29,10 @@ from polysight.serve import programs, reading
 from polysight_shared.config import CheckPlate
 from polysight_shared.errors import DataError
 
+# What each page shows when it is complete. Cards of the list have no text before they are painted (`content-visibility`
+# in catalogue.css).
 PAGES = {
-    "/": "document.querySelectorAll('#list li').length == 2",
+    "/": "document.querySelectorAll('#list li').length == 2 && document.getElementById('list').innerText",
     "/scan?scan=one": "document.querySelector('#scale img')?.naturalWidth > 1",
     "/compare?a=one&b=two": "document.querySelector('#rows tr')",
     "/new": "document.querySelector('.time')",

@@ -328,10 +328,10 @@ class SceneScatter:
     usual
         Usual scatter of ln|V / H| and of its phase in this scene.
     metal
-        Scatter of the metal reference; None if it was scanned separately.
+        Scatter of the metal reference; None if it was scanned separately, or has too few pixels.
     change
-        Drift of ln(V / H) over the scan at the plates of `scatter`, in their order; None with metal that was scanned
-        separately.
+        Drift of ln(V / H) over the scan at the plates of `scatter`, in their order, and at the metal; None if `metal`
+        is.
     metal_spread
         Relative spread of the pixels of metal that was scanned separately; None: it is in the scene.
     border
@@ -341,7 +341,7 @@ class SceneScatter:
     lit_evenly
         True if the illumination of tilted plates was corrected.
     metal_rise
-        Rise of the metal along x and across the plane of incidence, radians.
+        Rise of the metal along the plane of incidence and across it, radians.
     halo
         Halo of V around the metal.
     metal_std

@@ -1,4 +1,4 @@
-"""Name the pixels and patches of a scan by a reference library; the paper's classifier.
+"""Name the pixels and patches of a scan by a reference library; the classifier of the POLySIGHT paper.
 
 `MODELS` lists the models: the paper's KNN and the discriminant of error sources. `Classifier` uses the library's model,
 or the requested one.
@@ -66,7 +66,7 @@ class Weights:
     """Weights of the channels (the paper's lambda_H, lambda_V, lambda_P), how P's distance is measured, and neighbours.
 
     A weight multiplies the distance in its channel. Names depend on the ratios of `h`, `v` and `p`; thresholds of
-    distances hold for the weights that they were fitted with.
+    distances hold for the weights that they were fitted with. The number of neighbours is chosen.
     """
 
     h: float = 1.0
@@ -406,6 +406,7 @@ class Classifier:
             if eps is None:
                 out.append(Kind(name, None))
                 continue
+            # Each of its patches counts as a specimen of its own.
             count = sum(e.name == name for e in self.library.entries)
             real, loss = (float(s) * float(np.sqrt(1 + 1 / count)) for s in spread[name])
             out.append(Kind(name, eps, (real, loss)))

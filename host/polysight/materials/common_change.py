@@ -179,6 +179,7 @@ def _estimate_excess_variance(slopes: Real, errors: Real) -> float:
     if slopes.size < 3:
         return 0.0
     scatter = 1.4826 * float(np.median(np.abs(slopes)))
+    # Larger by the freedom that what all plates share has taken: it was fitted to the same slopes (two, chosen).
     return max(0.0, scatter**2 - float(np.median(errors)) ** 2) * slopes.size / (slopes.size - 2)
 
 

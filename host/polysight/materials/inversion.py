@@ -77,8 +77,8 @@ see the plate from other points: without and with the correction of its illumina
 along x."""
 PAINTED = 0.02
 POSSIBLY_PAINTED = 0.2
-"""Probability that the metal reference is painted or otherwise coated (chosen), and that from which on its paint is an
-error of pixels and sub-bands, too: less of it lies outside of 95 %."""
+"""Probability that the metal reference is painted or otherwise coated, and that from which on its paint is an error of
+pixels and sub-bands, too. Both chosen: below the second, paint would widen the errors of what is rather bare metal."""
 MOST_PAINT_RAD = 0.65
 PAINT_RAD_PER_MM = 2.65
 """Largest phase of 1 / P by a coating of metal, and its phase per thickness: 4 pi / lambda sin^2 / cos (1 - 1 / eps) of
@@ -143,9 +143,9 @@ class RigPrior:
     moved
         Probability that a mount whose leakage was measured has moved since.
     metal_rise
-        Rise of the metal reference along x and across the plane of incidence, radians.
+        Rise of the metal reference along the plane of incidence and across it, radians.
     lighting_std
-        Standard deviation of G along x and across: per radian of a plate's rise.
+        Standard deviation of G along the plane of incidence and across it: per radian of a plate's rise.
     painted
         Probability that the metal reference is painted.
     """
@@ -178,7 +178,7 @@ class PatchEstimate:
     covariance
         float64 [2, 2] of its real and its imaginary part; None if metal-like.
     shares
-        Source to its share of the covariance's trace; the sum is 1.
+        Source to its share of the covariance's trace; the sum is 1. Empty if metal-like.
     evidence
         What its name rests on; None without kinds.
     half_widths_68
@@ -381,10 +381,10 @@ class SceneLikelihood:
         """Return the same scene with each certainty on what the prior leaves open, and the probability of each."""
         out: list[tuple[SceneLikelihood, float]] = []
         paint_cases = _certainties(self._estimate_paint_probability())
-        for moved, painted in itertools.product(_certainties(self.prior.moved), paint_cases):
+        for (moved, share), (painted, paint_share) in itertools.product(_certainties(self.prior.moved), paint_cases):
             hypothesis = copy.copy(self)
-            hypothesis.prior = replace(self.prior, moved=moved[0], painted=painted[0])
-            out.append((hypothesis, moved[1] * painted[1]))
+            hypothesis.prior = replace(self.prior, moved=moved, painted=painted)
+            out.append((hypothesis, share * paint_share))
         return out
 
     def within(self, prior: RigPrior, z: Real) -> Real:

@@ -1,8 +1,9 @@
 """Kinds of materials that a plate may be of, as densities over t = 1 / P: a library's, the literature's, and others.
 
-A kind is a half space whose `(ln eps', ln eps'')` is normal about its value (two specimens of a material differ). Most
-patches are of the library's kinds; the others are of the literature's, or any half space at all. The density of a
-measured ratio under all of them is the prior of the joint inversion, and its parts are the probabilities of names.
+P = H / V is relative to metal. A kind is a half space whose ln eps' and eps'' are normal about its value (two specimens
+of a material differ); to first order its t is normal, too. Patches are of the library's kinds, of the literature's, or
+any half space, thin plate or stack. The density of a measured ratio under all of them is the prior of the joint
+inversion, and its parts are the probabilities of names. Eq. 2 and 3 of the POLySIGHT paper convert eps to P and back.
 """
 
 from __future__ import annotations
@@ -72,8 +73,9 @@ ODD_DISPERSION_STD = 0.05
 LEAST_LOSS_SPREAD = 0.02
 """Standard deviation of eps'' between specimens of low-loss materials; chosen."""
 POSSIBLY_THIN = 0.2
-"""Probability of layers from which on a patch gets no permittivity: a region that holds 95 % may not leave out more. Of
-383 half spaces of the independent generator none has more, of the published picture's plates none more than 0.08."""
+"""Probability of layers from which on a patch gets no permittivity: as that of a half space it would be wrong with this
+probability. Chosen: of 383 half spaces of an independent generator none has more, of the published picture's plates
+none more than 0.08."""
 METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat. Chosen."""
 LEAST_STD_OF_T = 1e-6
@@ -100,7 +102,7 @@ _MOST_LOG_ODDS = 200.0
 class Kind:
     """One material: its name, permittivity (None: metal), and where both are from.
 
-    `spread`: standard deviations of ln eps' and ln eps'' between specimens.
+    `spread`: standard deviations of ln eps' and of eps'' over its value between specimens.
     """
 
     name: str
@@ -145,7 +147,7 @@ class PatchMeasurement:
     relative_std
         Standard deviations of ln|V / H| and of its phase by what scatters over the plate: edges, ripple, tilt.
     rise
-        Rise of the plate along x and across the plane of incidence, radians.
+        Rise of the plate along the plane of incidence and across it, radians.
     dispersion
         Change over the sweep; None if it is not known.
     """
@@ -223,6 +225,7 @@ class HalfSpaces:
         """Return t of the same half spaces at another angle, complex128, broadcast."""
         other2 = np.sin(other_rad) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
+            # Of both roots that in the direction of q: a loss stays a loss. Then u at the other angle, and t of it.
             root = np.sqrt(np.square(self._q) + (self._sine2 - other2))
             along_q = root.real * self._q.real + root.imag * self._q.imag
             root = root * np.copysign(np.cos(other_rad) / other2, along_q)
@@ -625,11 +628,8 @@ def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) 
     weight = weight * np.where(first.in_library, library_share, 1 - library_share)
     drawn_sheets = np.stack([kind.sheets for kind in kinds], axis=1)
     by_dispersion = _weigh_dispersion(kinds, scan_evidence)
-    density = (
-        _evaluate_normal(drawn_sheets, t, errors + SHEET_KERNEL**2 * np.eye(size))
-        * _weigh_brightness(kinds, scan_evidence)
-        * by_dispersion
-    )
+    density = _evaluate_normal(drawn_sheets, t, errors + SHEET_KERNEL**2 * np.eye(size))
+    density = density * _weigh_brightness(kinds, scan_evidence) * by_dispersion
     sheet = (1 - library_share) * first.sheet_share * float(np.mean(density))
     # Stacks of layers count only where the change over the sweep can tell them from half spaces.
     if any(evidence.dispersion is not None for evidence in scan_evidence):

@@ -247,7 +247,7 @@ THICKNESS_RANGE_M = (0.1e-3, 12e-3)
 """Search range of an unknown thickness; chosen."""
 START_PHASE_RAD = 0.25
 """Step of the start grid in the phase of the path through the layer and back: no valley is narrower."""
-# Grid of start values: loss tangents, number of indices, and number of its local minima that are solved.
+# Grid of start values: loss tangents, number of indices, and number of its local minima that are solved; chosen.
 # "Index" here and below is sqrt(eps' - sin^2), the wave vector along the normal over that in vacuum.
 LOSS_TANGENTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 2.0)
 INDEX_STEPS = 60
@@ -347,7 +347,7 @@ class LayerFit:
             out.append(
                 f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees of freedom"
             )
-        # An error above a fifth of the value is large; of a small loss, one above 0.2.
+        # An error above a fifth of the value is large; of a small loss, one above 0.2. Chosen.
         if self.std_real > 0.2 * self.permittivity.real or self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
             out.append("the data hardly depend on this layer: its error bar is large")
         if self.at_limit:
@@ -600,6 +600,7 @@ class _Model:
         thickness_m = self.stack[self.layer_index].thickness_m
         if self.fits_thickness:
             thickness_m = float(solution.x[2]) * 1e-3
+        # The last says if the lower end counts: a loss of zero is no limit of the search.
         ends = zip(("the real part", "the loss", "the thickness"), solution.active, (True, False, True), strict=False)
         return LayerFit(
             permittivity=complex(solution.x[0], -solution.x[1]),

@@ -226,7 +226,10 @@ class Library:
 
 
 def _read_entries(rows: list[dict[str, Any]], h: npt.NDArray, v: npt.NDArray, p: npt.NDArray) -> tuple[Entry, ...]:
-    """Cut the arrays of all entries, [pixel] one entry after the other, into entries; `rows` are their other fields."""
+    """Cut the arrays of all entries, [pixel] one entry after the other, into entries; `rows` are their other fields.
+
+    Raises KeyError, TypeError or ValueError if they do not fit.
+    """
     if not h.shape == v.shape == p.shape or h.ndim != 1 or sum(r["pixels"] for r in rows) != h.size:
         raise ValueError(f"arrays {h.shape}, {v.shape}, {p.shape}")
     out = []

@@ -2,6 +2,9 @@
 
 `measure_patch` gives the input of the joint inversion, `permittivity_of_patch` combines its result with the percentiles
 of the pixels. `check_patches` refuses patches that are no flat plates.
+
+The constants of errors were fitted to scenes of two generators, this project's simulator and an independent one with
+other physics (package `polysight_worlds`), and to a picture that the authors of POLySIGHT published.
 """
 
 from __future__ import annotations
@@ -14,9 +17,7 @@ import numpy.typing as npt
 import scipy
 
 from polysight.imaging import Dispersion, Image, Images, Mask
-from polysight.materials.inversion import (
-    PatchEstimate,
-)
+from polysight.materials.inversion import PatchEstimate
 from polysight.materials.kinds import Kinds, PatchDispersion, PatchMeasurement, may_be_thin, permittivity_slope
 from polysight.materials.segment import Patch, Segmentation, touches_border
 from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
@@ -53,9 +54,9 @@ apertures (own simulator, leakage known) 68 % of plates are within 0.156 and 0.0
 DISPERSION_STD = (0.006, 0.008)
 DISPERSION_SHARE = 0.5
 DISPERSION_BEHIND = 1.0
-"""Least errors of a half space's change of ln |H| and of ln(V / H) over the sweep, and their part by what scatters over
-its pixels and the metal's, and by what lies behind it. Half spaces in scenes of the independent generator with single
-nuisances: 0.002 rms in H; in the demo's scene, before a table, 0.85 of what lies behind."""
+"""Least errors of a half space's change of ln |H| and of ln(V / H) over the sweep, and the shares that count of its
+pixels' scatter and the metal's, and of what lies behind it. Half spaces in scenes of the independent generator with
+single nuisances: 0.002 rms in H; in the demo's scene, before a table, 0.85 of what lies behind."""
 Real = npt.NDArray[np.float64]
 
 LEAST_PIXELS = 12
@@ -104,7 +105,7 @@ THIN = Finding(
 )
 """Why a possible layer gets no permittivity."""
 ACTIVE = 2.0
-"""Standard deviations of gain, a real part below 1, or |V / H| above 1, beyond which a half space is impossible."""
+"""Chosen: standard deviations of gain, a real part below 1, or |V / H| above 1, beyond which no half space is so."""
 ALLOWED_EXCESS = 0.02
 """Gain, real part below 1, or |V / H| above 1 that is allowed in addition, however small the error is. Chosen."""
 
@@ -177,7 +178,7 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     dark
         Result of :func:`background`, in the same units.
     uneven
-        Difference between halves of the metal reference: the scan's own effect on a single material.
+        :func:`halves_apart` of the metal reference: the scan's own effect on a single material.
     """
     pixels = patch.interior & np.isfinite(h) & np.isfinite(v)
     remedy = "check the image, the direct path and the range profile"
@@ -369,7 +370,7 @@ def measure_patch(
     local_std
         Errors of ln|V / H| and of its phase by the place: metal reference that varies over the plane, end of aperture.
     rise
-        Its rise along x and across the plane of incidence, radians.
+        Its rise along the plane of incidence and across it, radians.
     """
     pixels = patch.interior
     ratio = median_ratio(h[pixels], v[pixels])
@@ -419,7 +420,7 @@ def measure_dispersions(
 ) -> list[PatchDispersion | None]:
     """Measure the change of patches over the sweep relative to metal; None where it or the metal's is not known.
 
-    `metal` is the metal's interior in the scene, `plane` metal that was scanned separately.
+    `metal`, bool [ny, nx], is the metal's interior in the scene; `plane`, metal scanned separately, is used instead.
 
     What lies behind the plates adds to each channel's change its own first moment over the sweep, relative to the
     plate's level: 0.8 for a table 100 mm behind, 20 dB below a plate.

@@ -51,13 +51,14 @@ REFERENCE_REAL = (1.5, 30.0)
 REFERENCE_LOSS_TANGENT = (1e-3, 2.0)
 """Permittivities of a reference that is no metal, uniform on logarithmic scales: all half spaces, water among them."""
 CHANNEL_RATIO_STD_DB = 2.5
-"""Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
+"""Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis.
+Chosen."""
 CONFLICT_SCORE = 0.0
 """Score below which a declared metal is reported as doubtful, with the patch that fits it least: a dielectric fits the
 others better. Metal has 1.3 or more in 52 scenes of a generator that knows nothing of this estimator, dielectrics
 declared as metal -0.3 to -8 in eleven."""
 PAINT_SCORE = 7.0
-"""Cost of paint: a reference that counts as metal only if it is painted needs so much more score."""
+"""Cost of paint: a reference that counts as metal only if it is painted needs so much more score. Chosen."""
 ALIKE_DB = 2.5
 LEAST_METAL_LEVEL = 0.15
 MOST_METALS = 3
@@ -65,9 +66,9 @@ MOST_METALS = 3
 patches are compared: coated metal (sheets, boards with copper behind) may be the brighter one. Dielectrics reflect p by
 8 dB less; all nuisances together have made bare metal darker than a coated one by a factor of four."""
 HALO_MM = (6.0, 36.0)
-"""Distances from the metal's edge at which its halo is measured."""
+"""Distances from the metal's edge at which its halo is measured; chosen."""
 AROUND_MM = (4.0, 14.0)
-"""The same for the other plates."""
+"""The same for the other plates; chosen."""
 HALO_EXCESS = 1.26
 """Median of |V| over |H| beside the metal, each relative to metal, above which it is a halo: 2 dB. Undisturbed scenes
 of an independent generator have -4 to 1.1 dB, clipped ones -0.3 to 8.7 dB (seven of eight above 2.4 dB)."""
@@ -146,7 +147,10 @@ def log_evidence_of_dielectric(
 
 
 class _DielectricReference(SceneLikelihood):
-    """The same scene if the reference is a dielectric of unknown permittivity instead of metal."""
+    """The same scene if the reference is a dielectric of unknown permittivity instead of metal.
+
+    A particle has two more columns, normal like the others: for the real part and the loss tangent of the reference.
+    """
 
     width = WIDTH + 2
 
@@ -315,7 +319,7 @@ def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
 
 
 def no_metal(usable: Mask) -> MetalReference:
-    """Return the reference of a scene without patches: images are scaled by their own mean brightness."""
+    """Return the reference of a scene without patches: images are scaled by their own root mean squares."""
     return MetalReference(usable, None, "none: no patch was found")
 
 

@@ -1,4 +1,4 @@
-"""Names of patches and of their pixels, from the ratio t = V / H that one scan or several measured.
+"""Names of patches and of their pixels, from the ratio t = V / H, relative to metal, that one scan or several measured.
 
 A *kind* is a material that a patch may be of: of the user's library, or of the literature. `Kinds` holds them for one
 incidence angle, `Odds` their probabilities for one patch.
@@ -97,7 +97,8 @@ class PatchName:
 class NamedPatch:
     """Names of a patch's pixels [n], their distances over the threshold [n], and the patch's verdict.
 
-    `confidence` [n]: probability of each pixel's likeliest material, 0 for unusable pixels; None: the model gives none.
+    `confidence` [n]: probability of each pixel's likeliest name but "unknown", 0 for unusable pixels; None: the model
+    gives none.
     """
 
     names: npt.NDArray[np.str_]
@@ -270,7 +271,9 @@ def _name_pixels(
     patch_odds: Real,
     name_of_kind: npt.NDArray[np.str_],
 ) -> tuple[npt.NDArray, Real, Real]:
-    """Return name, distance over the threshold, and probability of the name of each pixel, [n] each.
+    """Return name, distance over the threshold, and probability of the likeliest name of each pixel, [n] each.
+
+    The probability is that of the likeliest name even where the pixel is too far from it and called unknown.
 
     `inverse_ratios` complex [n, scan] are V / H of the pixels with the corrections of their patch, `patch_odds` [kind]
     the probabilities of the patch's kinds, and `name_of_kind` [kind] the name that each kind gets.

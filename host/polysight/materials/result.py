@@ -80,7 +80,8 @@ class PatchResult:
     patch, permittivity
         Its geometry and its permittivity.
     named
-        Names of the patch and of its pixels; None if it was not named (no classifier, or the metal reference).
+        Names of the patch and of its pixels; None if it was not named (no classifier, no flat plate, or the metal
+        reference).
     truth
         The true plate, if known.
     refused

@@ -1,8 +1,11 @@
 """Half spaces as seen by the rig, and the effect of differences between specimens.
 
 Two plates of the same material differ by some per cent in the real part of the permittivity and by tens of per cent in
-the loss (Fig. 17 of the paper). `(ln eps', ln eps'')` is assumed to be normal; Eq. 2 converts its spread to correlated
-errors of ln|H|, ln|V| and arg P, for all angles together because they show the same specimen.
+the loss (Fig. 17 of the POLySIGHT paper). `(ln eps', ln eps'')` is assumed to be normal; Eq. 2 of the paper, Fresnel's
+coefficients, converts its spread to correlated errors of ln|H|, ln|V| and arg P (P = H / V), relative to metal, for all
+angles together because they show the same specimen.
+
+Thresholds near metal and the scale `SOFT` are chosen.
 """
 
 from __future__ import annotations
@@ -159,7 +162,8 @@ def _spread_each_material(
 ) -> Real:
     """Return the variances of each material, [material, 2]: the pooled ones, corrected by its own specimens' squares.
 
-    `second_moments` [specimen, 2] are these squares; `has_spread` [material] is true where a material has several.
+    `second_moments` [specimen, 2] are these squares; `has_spread` [material] is true for a dielectric with several
+    specimens.
     """
     spreads = np.tile(pooled, (has_spread.size, 1))
     for k in np.flatnonzero(has_spread):

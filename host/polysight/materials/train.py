@@ -194,7 +194,7 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
 
     The scan is in the right orientation.
 
-    Raises DataError if no box is of metal, or a box holds no pixel.
+    Raises DataError if no box is of metal, the metal has no signal, or a box holds no pixel.
     """
     if scan.metal is None:
         raise DataError(
@@ -546,7 +546,7 @@ def score_unseen_materials(samples: Samples, model: str) -> dict[str, float]:
     """
     scores = {}
     for name in np.unique(samples.names):
-        missed = []
+        called_unknown = []
         for train, test in splits(samples):
             other_samples = train[samples.names[train] != name]
             fitted = MODELS[model]("H+V+P")
@@ -555,15 +555,16 @@ def score_unseen_materials(samples: Samples, model: str) -> dict[str, float]:
                 test_set = test[samples.groups[test] == group]
                 naming = fitted.by_scan(samples.x[test_set], samples.patches[test_set])
                 own_patches = np.unique(samples.patches[test_set][samples.names[test_set] == name])
-                missed += list(naming.distance[np.searchsorted(naming.patches, own_patches)] > 1)
-        scores[str(name)] = float(np.mean(missed))
+                called_unknown += list(naming.distance[np.searchsorted(naming.patches, own_patches)] > 1)
+        scores[str(name)] = float(np.mean(called_unknown))
     return scores
 
 
 def fit_library(library: Library) -> Library:
     """Return the library with its fit, for each incidence angle and for all together.
 
-    Raises DataError with fewer than two scans of an angle: a split by pixel would be too optimistic.
+    Raises DataError with fewer than two scans of an angle, or without a material in two of them: a split by pixel would
+    be too optimistic.
     """
     samples = {f"{angle:g}": Samples.from_library(library.at_angle(angle), PIXELS) for angle in library.angles_deg}
     fits = {angle: fit_samples(angle_samples) for angle, angle_samples in samples.items()}
@@ -575,8 +576,8 @@ def fit_library(library: Library) -> Library:
 def fit_samples(samples: Samples) -> dict[str, Any]:
     """Return model and scores on labelled pixels, as plain values for a library's file.
 
-    The scores are of materials in two or more scans; `not_judged` lists the others. Accuracies are None, and `judged`
-    is empty, if no material but metal is in two scans.
+    The scores are of materials in two or more scans; `not_judged` lists the others. `pixel_accuracy`, `patch_accuracy`
+    and `named` are None, and `judged` is empty, if no material but metal is in two scans.
     """
     scores = {model: score(samples, model) for model in MODELS}
     weighted = fit_weights(samples)
@@ -679,7 +680,7 @@ def make_entries(scan: TrainingScan) -> list[Entry]:
 def make_library(scans: Iterable[TrainingScan], note: str = "") -> Library:
     """Make a library of several scans, with its fit.
 
-    Raises DataError with no patch of known material, or fewer than two scans with one.
+    Raises DataError with no patch of known material, or as :func:`fit_library`.
     """
     entries = [e for scan in scans for e in make_entries(scan)]
     if not entries:

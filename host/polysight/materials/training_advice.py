@@ -42,9 +42,10 @@ FREEDOM_NEEDED = 8
 # With fewer scans than this they are the likely cause of overconfidence. Chosen.
 FEW_SCANS = 4
 LEAST_MISFIT = 0.05
-"""Difference between the mean confidence and the share of correct names that is reported, unless it may be chance."""
+"""Difference between the mean confidence and the share of correct names that is reported, unless it may be chance.
+Chosen."""
 ALIKE_STD = 2.0
-"""Distance of two materials, in standard deviations of a patch, below which one may be named as the other."""
+"""Distance of two materials, in standard deviations of a patch, below which one may be named as the other. Chosen."""
 # Largest number of pairs of materials that are listed; chosen.
 SHOWN_PAIRS = 3
 
